@@ -1,0 +1,46 @@
+"""Motions as features: what a model sees, and the way back to joints."""
+
+from abc import ABC, abstractmethod
+
+import torch
+from torch import Tensor, nn
+
+from flame_mdm.representations.skeleton import Skeleton
+
+
+class Representation(nn.Module, ABC):
+    """Motion <-> features. Mean and std are buffers, so that sampling from a checkpoint needs no data set on disk."""
+
+    mean: Tensor
+    std: Tensor
+
+    def __init__(self, name: str, features: int, fps: float, skeleton: Skeleton):
+        """`name` stands in the store and in checkpoints: features of different names are never mixed."""
+        super().__init__()
+        self.name, self.features, self.fps, self.skeleton = name, features, fps, skeleton
+        self.register_buffer("mean", torch.zeros(features))
+        self.register_buffer("std", torch.ones(features))
+
+    @abstractmethod
+    def encode(self, motion: Tensor) -> Tensor:
+        """Raw motion -> features (F', D) in the data's units, float32, not normalised."""
+
+    @abstractmethod
+    def decode(self, features: Tensor) -> Tensor:
+        """Features (..., F, D) in the data's units -> joints (..., F, J, 3), metres, y up. Differentiable."""
+
+    @abstractmethod
+    def statistics(self, features: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean and std (D,) to normalise with, from all training frames (N, D)."""
+
+    def normalize(self, features: Tensor) -> Tensor:
+        """(..., D) in the data's units -> normalised."""
+        return (features - self.mean) / self.std
+
+    def denormalize(self, x: Tensor) -> Tensor:
+        """(..., D) normalised -> the data's units."""
+        return x * self.std + self.mean
+
+    def to_joints(self, x: Tensor) -> Tensor:
+        """(..., F, D) normalised -> joints (..., F, J, 3), metres, y up. Differentiable."""
+        return self.decode(self.denormalize(x))

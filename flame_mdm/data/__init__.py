@@ -1,0 +1,58 @@
+"""Data sets: from what their owners hand out to packed stores and training batches."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+Split = Literal["train", "val", "test"]
+
+
+@dataclass
+class Clip:
+    """One motion on its way from a data set into a store.
+
+    Attributes:
+        id: unique name; mirrored copies are named `M` + the name of their original.
+        motion: what the representation encodes, at its frame rate; for joint-based representations the joint positions
+            (F, J, 3) in metres, y up, in the joint order of its skeleton.
+        captions: what is done, each a full description of the clip; empty for sets with action labels only.
+        split: mirrored copies and cuts of a take stand in the split of that take.
+        source: the take the clip comes from; clips of one source never stand in two splits.
+        action: index into the data set's `actions`, or None.
+        attributes: exact facts about the motion, where the set knows them (side, count, direction, speed ...).
+    """
+
+    id: str
+    motion: np.ndarray
+    captions: list[str]
+    split: Split
+    source: str
+    action: int | None = None
+    attributes: Mapping[str, str | int | float] = field(default_factory=dict)
+
+
+class MotionSource(ABC):
+    """A data set as its owners hand it out."""
+
+    name: str
+    actions: tuple[str, ...] = ()
+    """Names of the action labels, in the order of their numbers; empty for sets without labels."""
+
+    @abstractmethod
+    def count(self) -> int:
+        """Number of clips that `clips` yields, known without reading motions, for the progress bar.
+
+        Raises:
+            FileNotFoundError: the raw data is not where the recipe says; the message says how to get it.
+        """
+
+    @abstractmethod
+    def clips(self, fps: float) -> Iterator[Clip]:
+        """All clips at `fps` frames a second, always in the same order.
+
+        Raises:
+            ValueError: a file is damaged; the message names it.
+        """

@@ -1,0 +1,66 @@
+"""A web page that plays motions: one file, no network, opens from disk."""
+
+import base64
+import html
+import json
+import re
+from collections.abc import Sequence
+from importlib import resources
+from pathlib import Path
+
+import numpy as np
+
+from flame_mdm.visualize.scene import Motion, check_any, written_whole
+
+MILLIMETRE = 0.001
+
+
+def write_player(path: str | Path, motions: Sequence[Motion], title: str = "Motions") -> None:
+    """Writes a self-contained HTML page that plays motions side by side in 3D, under one clock and one camera.
+
+    Positions are rounded to millimetres; a motion that spans more than 65 m is rounded to 1/65534 of its span.
+
+    Args:
+        path: the HTML file to write.
+        motions: what to show; skeletons, lengths and frame rates may differ.
+        title: heading of the page.
+
+    Raises:
+        ValueError: there are no motions.
+    """
+    path = Path(path)
+    check_any(motions, path)
+    # "<" never stands in the data, so no caption can close the script element
+    content = {
+        "TITLE": html.escape(title),
+        "DATA": json.dumps([_packed(motion) for motion in motions], separators=(",", ":")).replace("<", "\\u003c"),
+    }
+    template = resources.files(__package__).joinpath("player.html").read_text(encoding="utf-8")
+    page = re.sub("__(TITLE|DATA)__", lambda match: content[match[1]], template)
+    with written_whole(path) as temporary:
+        temporary.write_text(page, encoding="utf-8")
+
+
+def _packed(motion: Motion) -> dict:
+    low, high = motion.joints.min((0, 1)).astype(float), motion.joints.max((0, 1)).astype(float)
+    center = (low + high) / 2
+    step = max(MILLIMETRE, float((high - low).max()) / 65534)
+    return {
+        "id": motion.id,
+        "caption": motion.caption,
+        "fps": motion.fps,
+        "frames": len(motion.joints),
+        "parents": list(motion.skeleton.parents),
+        "sides": motion.sides,
+        "radii": motion.radii,
+        "head": motion.head,
+        "center": center.tolist(),
+        "step": step,
+        "joints": _base64(np.rint((motion.joints - center) / step).astype("<i2")),
+        "feet": [] if motion.contacts is None else list(motion.feet),
+        "contacts": "" if motion.contacts is None else _base64(motion.contacts.astype("u1")),
+    }
+
+
+def _base64(array: np.ndarray) -> str:
+    return base64.b64encode(array.tobytes()).decode("ascii")

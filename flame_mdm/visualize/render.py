@@ -1,0 +1,296 @@
+"""Still images and videos of motions, drawn with Pillow."""
+
+import math
+import shutil
+import subprocess
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+from flame_mdm.visualize.scene import Motion, check_any, written_whole
+
+SIDE_COLORS = {1: (47, 127, 209), -1: (226, 112, 42), 0: (140, 149, 163)}
+PAPER, GROUND, LINE, TEXT, FAINT = (255, 255, 255), (243, 245, 247), (205, 211, 219), (28, 36, 48), (102, 112, 133)
+SHADOW, TRAIL, CONTACT = (212, 216, 222), (122, 91, 208), (15, 157, 107)
+SMOOTH = 2
+"""Images are drawn this many times larger and then reduced."""
+
+
+def frames_array(motion: Motion, size: int = 256) -> np.ndarray:
+    """Draws each frame of a motion: (F, size, size, 3) uint8, for the video panels of loggers."""
+    return np.stack([np.asarray(_figure(motion, frame, size)) for frame in range(len(motion.joints))])
+
+
+def write_gif(path: str | Path, motions: Sequence[Motion], size: int = 256) -> None:
+    """Writes an animation of motions side by side, captions below; it plays at their frame rate and loops.
+
+    Args:
+        path: the GIF to write.
+        motions: drawn under one clock, that of the highest frame rate; a motion that ends earlier stays at its last
+            frame. The format shows at most 50 frames a second: of faster motions frames are left out.
+        size: width and height of a panel in pixels.
+
+    Raises:
+        ValueError: there are no motions.
+    """
+    path = Path(path)
+    check_any(motions, path)
+    seconds, fps = _clock(motions)
+    fps /= math.ceil(fps / 50)
+    images = _video(motions, fps, size)
+    palette = _palette(images)
+    images = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
+    # GIF counts in hundredths of a second: round the times, not the durations, so that errors do not add up
+    times = np.rint(100 * np.minimum(np.arange(len(images) + 1) / fps, seconds)).astype(int)
+    with written_whole(path) as temporary:
+        images[0].save(
+            temporary,
+            format="GIF",
+            save_all=True,
+            append_images=images[1:],
+            duration=(10 * np.diff(times)).tolist(),
+            loop=0,
+        )
+
+
+def write_mp4(path: str | Path, motions: Sequence[Motion], size: int = 384) -> None:
+    """Writes the animation of `write_gif` as H.264 video, by the program ffmpeg.
+
+    Raises:
+        FileNotFoundError: ffmpeg is not installed.
+        ValueError: there are no motions.
+        RuntimeError: ffmpeg failed.
+    """
+    path = Path(path)
+    check_any(motions, path)
+    ffmpeg = shutil.which("ffmpeg")
+    if ffmpeg is None:
+        raise FileNotFoundError(f"{path}: MP4 needs ffmpeg on the PATH; install it, or write a .gif")
+    fps = _clock(motions)[1]
+    video = np.stack([np.asarray(image) for image in _video(motions, fps, size)])
+    height, width = (length // 2 * 2 for length in video.shape[1:3])  # H.264 codes even sizes only
+    with written_whole(path) as temporary:
+        command = [ffmpeg, "-loglevel", "error", "-y", "-f", "rawvideo", "-pix_fmt", "rgb24"]
+        command += ["-s", f"{width}x{height}", "-r", str(fps), "-i", "-", "-c:v", "libx264", "-pix_fmt", "yuv420p"]
+        command += ["-threads", "1", "-fflags", "+bitexact", "-movflags", "+faststart", str(temporary)]
+        run = subprocess.run(command, input=video[:, :height, :width].tobytes(), capture_output=True, check=False)
+        if run.returncode:
+            raise RuntimeError(f"{path}: ffmpeg failed: {run.stderr.decode(errors='replace').strip()}")
+
+
+def contact_sheet(path: str | Path, motions: Sequence[Motion], frames: int = 6, size: int = 192) -> None:
+    """Writes one PNG with a row for each motion: its poses at equally spaced times from first to last, and its caption.
+
+    Args:
+        path: the PNG to write.
+        motions: one row each.
+        frames: poses a row.
+        size: width and height of a pose in pixels.
+
+    Raises:
+        ValueError: there are no motions, or fewer than one pose a row.
+    """
+    path = Path(path)
+    check_any(motions, path)
+    if frames < 1:
+        raise ValueError(f"{path}: {frames} poses a row, expected at least 1")
+    rows = []
+    for motion in motions:
+        row = Image.new("RGB", (frames * size, size), PAPER)
+        pen = ImageDraw.Draw(row)
+        for k, frame in enumerate(np.rint(np.linspace(0, len(motion.joints) - 1, frames)).astype(int).tolist()):
+            row.paste(_figure(motion, frame, size), (k * size, 0))
+            pen.text((k * size + 8, 6), f"{frame / motion.fps:.2f} s", FAINT, _font(size))
+        rows.append(_captioned(row, motion, _caption_lines([motion], row.width, size), size))
+    sheet = Image.new("RGB", (frames * size, sum(row.height for row in rows)), PAPER)
+    top = 0
+    for row in rows:
+        sheet.paste(row, (0, top))
+        top += row.height
+    with written_whole(path) as temporary:
+        sheet.save(temporary, format="PNG", optimize=True)
+
+
+def _palette(images: Sequence[Image.Image]) -> Image.Image:
+    """One palette for the whole animation, so that colors do not flicker: from four of its images."""
+    some = [images[k] for k in np.linspace(0, len(images) - 1, 4).astype(int)]
+    strip = Image.new("RGB", (some[0].width, 4 * some[0].height))
+    for k, image in enumerate(some):
+        strip.paste(image, (0, k * image.height))
+    return strip.quantize(64, method=Image.Quantize.MAXCOVERAGE)
+
+
+def _clock(motions: Sequence[Motion]) -> tuple[float, float]:
+    return max(motion.seconds for motion in motions), max(motion.fps for motion in motions)
+
+
+def _video(motions: Sequence[Motion], fps: float, size: int) -> list[Image.Image]:
+    """Images of the panels side by side, one every 1 / fps seconds."""
+    seconds = _clock(motions)[0]
+    columns = min(4, math.ceil(math.sqrt(len(motions)))) if len(motions) > 3 else len(motions)
+    lines = _caption_lines(motions, size, size)
+    panels: dict[tuple[int, int], Image.Image] = {}  # frames that a slower or ended motion shows again
+    images = []
+    count = max(1, math.ceil(seconds * fps - 1e-6))
+    for tick in range(count):
+        cells = []
+        for k, motion in enumerate(motions):
+            frame = motion.frame_at(tick / fps)
+            if (k, frame) not in panels:
+                panels[k, frame] = _captioned(_figure(motion, frame, size), motion, lines, size)
+            cells.append(panels[k, frame])
+        rows = math.ceil(len(cells) / columns)
+        image = Image.new("RGB", (columns * size, rows * cells[0].height + 3), PAPER)
+        for k, cell in enumerate(cells):
+            image.paste(cell, (k % columns * size, k // columns * cell.height))
+        done = image.width * (tick + 1) / count
+        ImageDraw.Draw(image).rectangle((0, image.height - 3, done, image.height), TRAIL)
+        images.append(image)
+    return images
+
+
+def _figure(motion: Motion, frame: int, size: int) -> Image.Image:
+    """One pose on the ground, (size, size) pixels; the camera follows the root smoothed over a second."""
+    side = size * SMOOTH
+    image = Image.new("RGB", (side, side), PAPER)
+    pen = ImageDraw.Draw(image)
+    joints = motion.joints[frame].astype(float)
+    half = round(motion.fps / 2)
+    x, _, z = motion.joints[max(0, frame - half) : frame + half + 1, 0].mean(0).tolist()
+    project = _camera(np.array([x, 0.85, z]), side)
+    near = size / 256 * SMOOTH
+
+    ring = np.linspace(0, 2 * np.pi, 49)[:, None]
+    pen.polygon(_points(project(np.array([x, 0, z]) + 3 * np.hstack([np.cos(ring), 0 * ring, np.sin(ring)]))), GROUND)
+    for k in range(-3, 4):
+        gx, gz = round(x) + k, round(z) + k
+        for inside, ends in (
+            (9 - (gx - x) ** 2, lambda reach, g=gx: [[g, 0, z - reach], [g, 0, z + reach]]),
+            (9 - (gz - z) ** 2, lambda reach, g=gz: [[x - reach, 0, g], [x + reach, 0, g]]),
+        ):
+            if inside > 0:
+                pen.line(_points(project(np.array(ends(inside**0.5)))), LINE, round(near))
+
+    floor = np.array([1.0, 0.0, 1.0])
+    root = motion.joints[: frame + 1, 0] * floor
+    root = root[np.linalg.norm(root - [x, 0, z], axis=1) < 3]
+    if len(root) > 1:
+        pen.line(_points(project(root)), TRAIL, round(1.5 * near))
+    shadow = project(joints * floor)
+    for joint, parent in enumerate(motion.skeleton.parents):
+        if parent >= 0:
+            _capsule(pen, shadow[parent], shadow[joint], 0.05, 0.05, SHADOW)
+    if motion.contacts is not None:
+        for joint in np.array(motion.feet)[motion.contacts[frame]]:
+            cx, cy, scale = shadow[joint][:3]
+            pen.ellipse((cx - 0.06 * scale, cy - 0.02 * scale, cx + 0.06 * scale, cy + 0.02 * scale), CONTACT)
+    for depth_part in sorted(_body(motion, joints, project), key=lambda part: -part[0]):
+        _limb(pen, *depth_part[1:], near)
+    return image.reduce(SMOOTH)
+
+
+def _camera(target: np.ndarray, side: int) -> Callable[[np.ndarray], np.ndarray]:
+    """A camera in front, to the left and above: (N, 3) metres -> (N, 4) x, y, pixels a metre and depth."""
+    yaw, pitch, distance = 0.6, 0.24, 5.0
+    toward = np.array([math.sin(yaw) * math.cos(pitch), math.sin(pitch), math.cos(yaw) * math.cos(pitch)])
+    right = np.array([math.cos(yaw), 0, -math.sin(yaw)])
+    up = np.cross(toward, right)
+
+    def project(points: np.ndarray) -> np.ndarray:
+        offset = points - target
+        depth = np.maximum(distance - offset @ toward, 0.3)
+        scale = 2.05 * side / depth
+        return np.stack([side / 2 + offset @ right * scale, side / 2 - offset @ up * scale, scale, depth], 1)
+
+    return project
+
+
+def _points(projected: np.ndarray) -> list[tuple[float, float]]:
+    return [(x, y) for x, y in projected[:, :2].tolist()]
+
+
+def _body(motion: Motion, joints: np.ndarray, project: Callable[[np.ndarray], np.ndarray]) -> list[tuple]:
+    """(depth, end, other end, their radii, color) of each limb."""
+    at, radii, sides, parents = project(joints), motion.radii, motion.sides, motion.skeleton.parents
+    parts = []
+    for joint, parent in enumerate(parents):
+        if parent >= 0:
+            color = SIDE_COLORS[sides[joint] if sides[parent] == sides[joint] else 0]
+            thick = min(radii[parent], 1.35 * radii[joint])
+            parts.append(((at[parent, 3] + at[joint, 3]) / 2, at[parent], at[joint], thick, radii[joint], color))
+    if motion.head is not None:
+        up = joints[motion.head] - joints[parents[motion.head]]
+        up /= np.linalg.norm(up) or 1
+        chin, crown = project(joints[motion.head] + np.array([[0.05], [0.11]]) * up)
+        parts.append((crown[3], chin, crown, 0.08, 0.09, SIDE_COLORS[0]))
+    return parts
+
+
+def _limb(
+    pen: ImageDraw.ImageDraw, a: np.ndarray, b: np.ndarray, ra: float, rb: float, color: tuple, near: float
+) -> None:
+    """A tapered limb: dark rim, its color, and a highlight toward the light, which falls from above left."""
+    _capsule(pen, a, b, ra, rb, _shade(color, -0.45), grow=near)
+    _capsule(pen, a, b, ra, rb, color)
+    across = np.array([-(b - a)[1], (b - a)[0]])
+    across = across / (np.linalg.norm(across) or 1)
+    across = -across if across @ [-0.5, -0.87] < 0 else across
+    shift = np.zeros(4)
+    shift[:2] = across * min(ra * a[2], rb * b[2]) * 0.35
+    _capsule(pen, a + shift, b + shift, 0.45 * ra, 0.45 * rb, _shade(color, 0.3))
+
+
+def _capsule(
+    pen: ImageDraw.ImageDraw, a: np.ndarray, b: np.ndarray, ra: float, rb: float, color: tuple, grow: float = 0
+) -> None:
+    """Fills the outline around two circles of radius `ra` and `rb` metres, `grow` pixels wider."""
+    (ax, ay, ra), (bx, by, rb) = (*a[:2], ra * a[2] + grow), (*b[:2], rb * b[2] + grow)
+    length = math.hypot(bx - ax, by - ay)
+    if length > abs(ra - rb):
+        angle, open_ = math.atan2(by - ay, bx - ax), math.acos((ra - rb) / length)
+        corners = [
+            (x + r * math.cos(angle + turn), y + r * math.sin(angle + turn))
+            for x, y, r, turn in ((ax, ay, ra, open_), (bx, by, rb, open_), (bx, by, rb, -open_), (ax, ay, ra, -open_))
+        ]
+        pen.polygon(corners, color)
+    for x, y, r in ((ax, ay, ra), (bx, by, rb)):
+        pen.ellipse((x - r, y - r, x + r, y + r), color)
+
+
+def _shade(color: tuple, light: float) -> tuple:
+    """-1 black, 0 as it is, 1 white."""
+    return tuple(round(c + (255 - c) * light if light > 0 else c * (1 + light)) for c in color)
+
+
+def _font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
+    return ImageFont.load_default(max(10, size // 18))
+
+
+def _wrapped(text: str, width: int, size: int) -> list[str]:
+    """Breaks a caption between words so that each line fits; the third line ends in dots where more is left."""
+    lines, font = [""], _font(size)
+    for word in text.split():
+        longer = f"{lines[-1]} {word}".strip()
+        if font.getlength(longer) <= width - 16:
+            lines[-1] = longer
+        else:
+            lines.append(word)
+    lines = [line for line in lines if line]
+    return [*lines[:2], f"{lines[2]} …"] if len(lines) > 3 else lines
+
+
+def _caption_lines(motions: Sequence[Motion], width: int, size: int) -> int:
+    return max(len(_wrapped(motion.caption or motion.id, width, size)) for motion in motions)
+
+
+def _captioned(image: Image.Image, motion: Motion, lines: int, size: int) -> Image.Image:
+    """The image with `lines` lines of caption below."""
+    line = round(max(10, size // 18) * 1.35)
+    taller = Image.new("RGB", (image.width, image.height + lines * line + 10), PAPER)
+    taller.paste(image)
+    pen = ImageDraw.Draw(taller)
+    for k, text in enumerate(_wrapped(motion.caption or motion.id, image.width, size)):
+        pen.text((8, image.height + 4 + k * line), text, TEXT, _font(size))
+    return taller

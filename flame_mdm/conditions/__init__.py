@@ -4,6 +4,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from pathlib import Path
 
+import torch
 from torch import nn
 
 from flame_mdm.motion import Condition, MotionBatch
@@ -17,10 +18,33 @@ class ConditionEncoder(nn.Module, ABC):
 
     @abstractmethod
     def forward(self, batch: MotionBatch) -> Condition:
-        """Encodes the conditions of a batch, on the device of `batch.x`."""
+        """Encodes the conditions of a batch, on the device of `batch.x`.
+
+        Raises:
+            ValueError: the batch lacks the captions or labels that the encoder reads.
+        """
 
     def precompute(self, captions: Sequence[str], folder: Path) -> None:
         """Fills the cache on disk for these captions, where the encoder keeps one. Called on one process only."""
 
     def load_cache(self, captions: Sequence[str], folder: Path) -> None:
-        """Opens the cache that `precompute` filled. Called on every process."""
+        """Opens the cache that `precompute` filled. Called on every process.
+
+        Raises:
+            FileNotFoundError: there is no whole cache for these captions.
+        """
+
+
+class Unconditional(ConditionEncoder):
+    """Nothing to condition on: vectors and tokens of width 0, which are their own null."""
+
+    features = 0
+
+    def forward(self, batch: MotionBatch) -> Condition:
+        return self._nothing(batch, len(batch), null=self._nothing(batch, 1))
+
+    @staticmethod
+    def _nothing(batch: MotionBatch, size: int, null: Condition | None = None) -> Condition:
+        x = batch.x
+        token_mask = torch.zeros(size, 0, dtype=torch.bool, device=x.device)
+        return Condition(x.new_zeros(size, 0), x.new_zeros(size, 0, 0), token_mask, null)

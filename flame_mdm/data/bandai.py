@@ -1,0 +1,517 @@
+"""The Bandai-Namco-Research-Motiondataset 1 and 2: 3,077 takes of three actors, 25 contents in 19 styles.
+
+Kobayashi, Liao, Inoue, Yojima, Takahashi, "Motion Capture Dataset for Practical Use of AI-based Motion Editing and
+Stylization", arXiv 2306.08861, 2023; CC BY-NC 4.0. `docs/bandai.md` describes the set and how it is prepared.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import lzma
+import os
+import re
+import signal
+import tarfile
+import zipfile
+import zlib
+from collections import deque
+from collections.abc import Container, Generator, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import closing
+from dataclasses import dataclass
+from functools import cache
+from multiprocessing import get_context
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+
+from flame_mdm.data import Clip, MotionSource, Split, bvh
+
+# The joint of the BVH files that stands for each of the 22 joints of SMPL, in the order of SMPL. The files have two
+# joints between hips and neck where SMPL has three: spine1 is put at 40 % of the way from Hips to Spine.
+JOINTS = {
+    "pelvis": "Hips",
+    "left_hip": "UpperLeg_L",
+    "right_hip": "UpperLeg_R",
+    "spine1": "Hips",
+    "left_knee": "LowerLeg_L",
+    "right_knee": "LowerLeg_R",
+    "spine2": "Spine",
+    "left_ankle": "Foot_L",
+    "right_ankle": "Foot_R",
+    "spine3": "Chest",
+    "left_foot": "Toes_L",
+    "right_foot": "Toes_R",
+    "neck": "Neck",
+    "left_collar": "Shoulder_L",
+    "right_collar": "Shoulder_R",
+    "head": "Head",
+    "left_shoulder": "UpperArm_L",
+    "right_shoulder": "UpperArm_R",
+    "left_elbow": "LowerArm_L",
+    "right_elbow": "LowerArm_R",
+    "left_wrist": "Hand_L",
+    "right_wrist": "Hand_R",
+}
+SPINE1, SPINE2 = list(JOINTS).index("spine1"), list(JOINTS).index("spine2")
+
+CONTENTS_1 = (
+    "walk",
+    "run",
+    "dash",
+    "walk-back",
+    "walk-left",
+    "walk-right",
+    "bow",
+    "bye",
+    "guide",
+    "byebye",
+    "respond",
+    "call",
+    "punch",
+    "kick",
+    "slash",
+    "dance-long",
+    "dance-short",
+)
+STYLES_1 = (
+    "normal",
+    "happy",
+    "sad",
+    "angry",
+    "proud",
+    "not-confident",
+    "masculinity",
+    "feminine",
+    "childish",
+    "old",
+    "tired",
+    "active",
+    "musical",
+    "giant",
+    "chimpira",
+)
+STYLES_2: tuple[str, ...] = (
+    "active",
+    "elderly",
+    "exhausted",
+    "feminine",
+    "masculine",
+    "normal",
+    "youthful",
+)
+# Published takes of data set 2, by content, in the order of STYLES_2. The split is drawn from these numbers, not from
+# the files at hand, so that a missing or excluded file moves no other take to another split.
+TAKES_2 = {
+    "walk": (32, 17, 23, 27, 25, 24, 27),
+    "walk-turn-left": (41, 31, 39, 31, 30, 34, 30),
+    "walk-turn-right": (41, 30, 37, 31, 30, 35, 30),
+    "run": (59, 28, 41, 45, 47, 52, 45),
+    "wave-both-hands": (35, 29, 31, 27, 28, 30, 28),
+    "wave-left-hand": (36, 28, 30, 27, 28, 31, 29),
+    "wave-right-hand": (34, 28, 31, 28, 28, 30, 29),
+    "raise-up-both-hands": (102, 39, 40, 60, 58, 74, 61),
+    "raise-up-left-hand": (104, 42, 41, 65, 54, 76, 62),
+    "raise-up-right-hand": (100, 42, 40, 65, 51, 79, 60),
+}
+
+SIDES = {"bye": "right", "guide": "right", "respond": "left", "byebye": "both"}  # where the name does not tell
+
+# Captions of a content, {side} where it has one; {how} is where the style goes.
+PHRASES = {
+    "walk": (
+        "a person walks forward {how}",
+        "someone is walking straight ahead {how}",
+        "the person takes several steps forward {how}",
+        "a person walks {how}",
+    ),
+    "run": (
+        "a person runs forward {how}",
+        "someone jogs straight ahead {how}",
+        "the person is running {how}",
+        "a person jogs forward {how}",
+    ),
+    "dash": (
+        "a person sprints forward {how}",
+        "someone dashes straight ahead {how}",
+        "the person runs forward very fast {how}",
+        "a person is sprinting {how}",
+    ),
+    "walk-back": (
+        "a person walks backwards {how}",
+        "someone is walking backward {how}",
+        "the person takes several steps back {how}",
+        "a person steps backwards {how}",
+    ),
+    "walk-{side}": (
+        "a person walks to the {side} {how}",
+        "someone walks diagonally to the {side} {how}",
+        "the person walks to the {side} {how} with the head turned to the {other}",
+        "a person walks {how} to the {side} with the body half turned and the head to the front",
+    ),
+    "bow": (
+        "a person bows {how} with the hands at the waist, then stands up",
+        "someone bends forward {how} in a bow and straightens up again",
+        "the person takes a bow {how}",
+        "a person bows down {how} and comes back up",
+    ),
+    "bye": (
+        "a person waves goodbye {how} with the {side} hand",
+        "someone raises the {side} hand and waves goodbye {how}",
+        "the person waves {how} with the {side} hand",
+        "a person says goodbye {how}, waving the {side} hand",
+    ),
+    "guide": (
+        "a person stretches out the {side} arm {how} to show the way",
+        "someone shows the way {how} with the {side} arm",
+        "the person extends the {side} arm {how} as if guiding someone",
+        "a person points out the way {how} with the {side} hand",
+    ),
+    "byebye": (
+        "a person waves goodbye {how} with both hands",
+        "someone raises both hands and waves goodbye {how}",
+        "the person waves {how} with both hands",
+        "a person says goodbye {how}, waving both hands",
+    ),
+    "respond": (
+        "a person leans forward and raises the {side} hand {how} as if answering",
+        "someone raises the {side} hand {how} to answer",
+        "the person bends forward a little and puts the {side} hand up {how}",
+        "a person answers {how} with the {side} hand raised",
+    ),
+    "call": (
+        "a person cups the hands at the mouth and shouts {how}",
+        "someone calls out loud {how} with the hands at the mouth",
+        "the person holds both hands to the mouth and calls someone {how}",
+        "a person shouts {how} through cupped hands",
+    ),
+    "punch": (
+        "a person punches {how} in a fighting stance",
+        "someone throws punches {how}",
+        "the person is boxing {how}",
+        "a person takes a fighting stance and punches {how}",
+    ),
+    "kick": (
+        "a person does spinning kicks {how}",
+        "someone spins around and kicks {how}",
+        "the person performs spinning kicks {how}",
+        "a person kicks while spinning {how}",
+    ),
+    "slash": (
+        "a person swings a two-handed sword {how}",
+        "someone slashes {how} with a sword in both hands",
+        "the person is fighting {how} with a two-handed sword",
+        "a person strikes {how} with a sword held in both hands",
+    ),
+    "dance-long": (
+        "a person dances {how}",
+        "someone is dancing {how}",
+        "the person performs a dance {how}",
+        "a person does a long dance {how}",
+    ),
+    "dance-short": (
+        "a person dances {how}",
+        "someone is dancing {how}",
+        "the person performs a dance {how}",
+        "a person does a short dance {how}",
+    ),
+    "walk-turn-{side}": (
+        "a person walks forward {how}, then turns {side} 90 degrees and walks on",
+        "someone walks {how} and makes a turn to the {side}",
+        "the person turns {side} while walking {how}",
+        "a person walks ahead {how}, turns to the {side} and keeps walking",
+    ),
+    "raise-up-both-hands": (
+        "a person raises both hands {how} and lowers them",
+        "someone lifts both arms up {how}, then puts them down",
+        "the person raises both hands above the head {how}",
+        "a person puts both hands up {how} and brings them down again",
+    ),
+    "raise-up-{side}-hand": (
+        "a person raises the {side} hand {how} and lowers it",
+        "someone lifts the {side} arm up {how}, then puts it down",
+        "the person raises the {side} hand above the head {how}",
+        "a person puts the {side} hand up {how} and brings it down again",
+    ),
+    "wave-both-hands": (
+        "a person raises both hands and waves {how}",
+        "someone waves both hands {how}",
+        "the person waves {how} with both arms up",
+        "a person lifts both hands and waves them {how}",
+    ),
+    "wave-{side}-hand": (
+        "a person raises the {side} hand and waves {how}",
+        "someone waves the {side} hand {how}",
+        "the person waves {how} with the {side} arm up",
+        "a person lifts the {side} hand and waves it {how}",
+    ),
+}
+STYLES = {
+    "normal": ("", "", "", ""),
+    "happy": ("happily", "in a happy mood", "cheerfully", "full of joy"),
+    "sad": ("sadly", "in a sad mood", "sorrowfully", "full of sadness"),
+    "angry": ("angrily", "in an angry mood", "in anger", "full of anger"),
+    "proud": ("proudly", "with pride", "in a proud way", "full of pride"),
+    "not-confident": ("timidly", "without confidence", "hesitantly", "in an insecure way"),
+    "masculinity": ("in a masculine way", "in a manly way", "with masculine movements", "in a masculine manner"),
+    "masculine": ("in a masculine way", "in a manly way", "with masculine movements", "in a masculine manner"),
+    "feminine": ("in a feminine way", "in a womanly way", "with feminine movements", "in a feminine manner"),
+    "childish": ("like a child", "in a childish way", "childishly", "like a little kid"),
+    "old": ("like an old person", "like an elderly person", "as if very old", "like a senior"),
+    "elderly": ("like an elderly person", "like an old person", "as if very old", "like a senior"),
+    "tired": ("wearily", "in a tired way", "tiredly", "as if tired"),
+    "exhausted": ("wearily", "as if exhausted", "in an exhausted way", "as if very tired"),
+    "active": ("energetically", "in an active way", "with a lot of energy", "vigorously"),
+    "youthful": ("in a lively way", "like a young person", "in a youthful way", "with youthful energy"),
+    "musical": ("as if dancing to music", "rhythmically", "as if listening to music", "to the beat of music"),
+    "giant": (
+        "heavily like a giant",
+        "like a giant",
+        "ponderously like a giant",
+        "with the heavy movements of a giant",
+    ),
+    "chimpira": ("with a swagger", "like a street thug", "in a swaggering way", "like a thug with a swagger"),
+}
+
+FILE = re.compile(r"dataset-([12])_([^_]+)_([^_]+)_(\d+)\.bvh")
+
+
+@dataclass(frozen=True)
+class Take:
+    """One BVH file."""
+
+    id: str
+    dataset: int
+    content: str
+    style: str
+    split: Split
+
+
+class Bandai(MotionSource):
+    """Both data sets as joint positions of SMPL's 22 joints, with captions made from content and style.
+
+    Mirrored copies belong to the split of their take, and only those of the training split are yielded: validation
+    and test hold originals alone.
+    """
+
+    name = "bandai"
+    actions = tuple(dict.fromkeys([*CONTENTS_1, *TAKES_2]))
+
+    def __init__(self, path: str, mirror: bool = True, workers: int = 0, exclude: Sequence[str] = ()):
+        """Reads nothing yet.
+
+        Args:
+            path: the folder of the original repository or any folder above the BVH files, or a zip or tar of one.
+            mirror: yield a mirrored copy after each clip of the training split.
+            workers: processes that read and convert; 0 = one a core, 1 = none but this one.
+            exclude: takes to leave out, by the name of the BVH file without its ending.
+        """
+        self.path, self.mirror, self.workers, self.exclude = Path(path), mirror, workers, tuple(exclude)
+        self._found: list[Take] | None = None
+
+    def count(self) -> int:
+        return sum(1 + (self.mirror and take.split == "train") for take in self.takes())
+
+    def clips(self, fps: float) -> Iterator[Clip]:
+        takes = self.takes()
+        ready: dict[str, np.ndarray] = {}  # members of an archive come in any order
+        with closing(self._motions({take.id for take in takes}, fps)) as motions:
+            for take in takes:
+                while take.id not in ready:
+                    id_, motion = next(motions)
+                    ready[id_] = motion
+                motion = ready.pop(take.id)
+                yield self._clip(take, motion, mirrored=False)
+                if self.mirror and take.split == "train":
+                    yield self._clip(take, motion, mirrored=True)
+
+    def takes(self) -> list[Take]:
+        """The takes that are there and not excluded, sorted by name.
+
+        Raises:
+            FileNotFoundError: there is no such folder or archive, or no BVH file of the data sets in it.
+            ValueError: a damaged archive, a file that is there twice, an unknown name in `exclude`.
+        """
+        if self._found is None:
+            names: dict[str, str] = {}
+            for name, _ in _files(self.path, wanted=()):
+                id_ = PurePosixPath(name).stem
+                if id_ in names:
+                    raise ValueError(f"{self.path}: {id_} is there twice, as {names[id_]} and as {name}")
+                names[id_] = name
+            if not names:
+                raise _not_found(f"{self.path}: no file dataset-1_*.bvh or dataset-2_*.bvh in it")
+            unknown = set(self.exclude) - set(names)
+            if unknown:
+                raise ValueError(f"data.source.exclude: {self.path} has no {', '.join(sorted(unknown))}")
+            self._found = [_take(id_) for id_ in sorted(set(names) - set(self.exclude))]
+        return self._found
+
+    def _motions(self, ids: set[str], fps: float) -> Generator[tuple[str, np.ndarray]]:
+        """Id and joints of these takes in the order of the folder or archive."""
+        files = ((name, data) for name, data in _files(self.path, ids) if PurePosixPath(name).stem in ids)
+        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        workers = min(self.workers or cores, len(ids))
+        if workers == 1:
+            yield from (convert(name, data, fps) for name, data in files)
+            return
+        # Fresh processes: a fork would copy the threads' locks of a process that may have used torch before.
+        # They leave Ctrl-C to this process, which then ends them.
+        with ProcessPoolExecutor(workers, get_context("spawn"), signal.signal, (signal.SIGINT, signal.SIG_IGN)) as pool:
+            pending = deque()
+            for name, data in files:
+                pending.append(pool.submit(convert, name, data, fps))
+                if len(pending) > 4 * workers:
+                    yield pending.popleft().result()
+            while pending:
+                yield pending.popleft().result()
+
+    def _clip(self, take: Take, motion: np.ndarray, mirrored: bool) -> Clip:
+        content, side = take.content, side_of(take.content)
+        if mirrored:
+            content, side, motion = swap_sides(content), swap_sides(side), mirror(motion)
+        attributes: dict[str, str | int | float] = {"content": content, "style": take.style, "dataset": take.dataset}
+        if side:
+            attributes["side"] = side
+        return Clip(
+            id=f"M{take.id}" if mirrored else take.id,
+            motion=motion,
+            captions=captions(content, take.style, side),
+            split=take.split,
+            source=take.id,
+            action=self.actions.index(content),
+            attributes=attributes,
+        )
+
+
+def convert(name: str, data: bytes, fps: float) -> tuple[str, np.ndarray]:
+    """A BVH file of the data sets -> its id and joints (F, 22, 3) float32 in metres, y up, at `fps`.
+
+    Local rotations and the place of the hips are interpolated, so bones keep their length.
+
+    Raises:
+        ValueError: the file is damaged or has another skeleton; the message names it.
+    """
+    id_ = PurePosixPath(name).stem
+    try:
+        motion = bvh.parse(data, name)
+        missing = sorted(set(JOINTS.values()) - set(motion.joints))
+        if missing:
+            raise ValueError(f"{name}: not the skeleton of this data set, there is no joint {', '.join(missing)}")
+    except ValueError as error:
+        raise ValueError(f"{error}; to go on without it: data.source.exclude=[{id_}]") from error
+    positions, _ = bvh.forward_kinematics(motion.parents, *motion.resample(fps))
+    joints = positions[:, [motion.joints.index(joint) for joint in JOINTS.values()]] / 100
+    joints[:, SPINE1] += 0.4 * (joints[:, SPINE2] - joints[:, SPINE1])
+    return id_, joints.astype(np.float32)
+
+
+def mirror(motion: np.ndarray) -> np.ndarray:
+    """Joints (F, 22, 3) of the same motion done with the other side: x -> -x, left and right joints swapped."""
+    names = list(JOINTS)
+    return motion[:, [names.index(swap_sides(name)) for name in names]] * np.array([-1, 1, 1], motion.dtype)
+
+
+def swap_sides(text: str) -> str:
+    """Left for right and right for left."""
+    return re.sub("left|right", lambda match: "right" if match[0] == "left" else "left", text)
+
+
+def side_of(content: str) -> str:
+    """The side that moves or is moved to: left, right, both, or "" where a content has none."""
+    named = re.search("left|right|both", content)
+    return named[0] if named else SIDES.get(content, "")
+
+
+def captions(content: str, style: str, side: str) -> list[str]:
+    """Four descriptions in the manner of HumanML3D; `side` is left or right where the content has one of them."""
+    phrases = PHRASES[re.sub("left|right", "{side}", content)]
+    filled = (
+        phrase.format(side=side, other=swap_sides(side), how=how)
+        for phrase, how in zip(phrases, STYLES[style], strict=True)
+    )
+    return [" ".join(caption.split()).replace(" ,", ",") for caption in filled]
+
+
+def split_of(dataset: int, content: str, style: str, number: int) -> Split:
+    """The split of a take, from its name alone.
+
+    Neighboring takes come from one session and look alike, so whole blocks of five go to one split; of data set 1,
+    which has a single take of most combinations, the combination does. The normal takes of walk-turn-left and -right
+    overlap in time across names and are all for training.
+    """
+    if dataset == 1:
+        draw = _hash(f"dataset-1_{content}_{style}") % 20
+        return "test" if draw < 2 else "val" if draw == 2 else "train"
+    if style == "normal" and content.startswith("walk-turn-"):
+        return "train"
+    return _split_of_blocks(content, style).get((number - 1) // 5, "train")
+
+
+@cache
+def _split_of_blocks(content: str, style: str) -> dict[int, Split]:
+    """Blocks of one combination of data set 2 that are not for training: 10 % test, 5 % validation, at least one."""
+    takes = TAKES_2[content][STYLES_2.index(style)]
+    blocks = sorted(range(-(-takes // 5)), key=lambda block: _hash(f"dataset-2_{content}_{style}_{block}"))
+    splits: list[Split] = ["test"] * max(1, round(0.1 * len(blocks))) + ["val"] * max(1, round(0.05 * len(blocks)))
+    return dict(zip(blocks, splits, strict=False))
+
+
+def _hash(text: str) -> int:
+    return int(hashlib.sha1(text.encode()).hexdigest()[:8], 16)
+
+
+def _take(id_: str) -> Take:
+    name, content, style, number = id_.split("_")
+    dataset = int(name[-1])
+    contents, styles = (CONTENTS_1, STYLES_1) if dataset == 1 else (TAKES_2, STYLES_2)
+    if content not in contents or style not in styles:
+        raise ValueError(f"{id_}.bvh: data set {dataset} has no content {content} in a style {style}")
+    return Take(id_, dataset, content, style, split_of(dataset, content, style, int(number)))
+
+
+def _files(path: Path, wanted: Container[str]) -> Iterator[tuple[str, bytes]]:
+    """Path and content of the BVH files in a folder or archive; the content is empty where the id is not `wanted`.
+
+    Archives are read in place: they unpack to 550 MB, which would have to be cleaned up whatever happens.
+    """
+
+    def belongs(name: str) -> bool:
+        return FILE.fullmatch(PurePosixPath(name).name) is not None
+
+    def is_wanted(name: str) -> bool:
+        return PurePosixPath(name).stem in wanted
+
+    if path.is_dir():
+        for file in sorted(path.rglob("dataset-*.bvh")):
+            if belongs(file.name):
+                yield file.as_posix(), file.read_bytes() if is_wanted(file.name) else b""
+    elif not path.exists():
+        raise _not_found(f"{path}: no such folder or archive")
+    elif zipfile.is_zipfile(path):
+        try:
+            with zipfile.ZipFile(path) as archive:
+                for name in archive.namelist():
+                    if belongs(name):
+                        yield f"{path}/{name}", archive.read(name) if is_wanted(name) else b""
+        except (zipfile.BadZipFile, zlib.error, EOFError) as error:
+            raise ValueError(f"{path}: damaged archive: {error}") from error
+    elif tarfile.is_tarfile(path):
+        try:
+            with tarfile.open(path) as archive:
+                for member in archive:
+                    file = archive.extractfile(member) if belongs(member.name) else None
+                    if file is not None:
+                        yield f"{path}/{member.name}", file.read() if is_wanted(member.name) else b""
+        except (tarfile.TarError, lzma.LZMAError, zlib.error, EOFError) as error:
+            raise ValueError(f"{path}: damaged archive: {error}") from error
+    else:
+        raise ValueError(f"{path}: neither a folder nor a zip or tar archive")
+
+
+def _not_found(what: str) -> FileNotFoundError:
+    return FileNotFoundError(
+        f"{what}; the data sets are published at "
+        "https://github.com/BandaiNamcoResearchInc/Bandai-Namco-Research-Motiondataset (CC BY-NC 4.0): clone it and "
+        "set data.source.path=/path/to/the/clone"
+    )

@@ -1,0 +1,683 @@
+"""Procedural motions with captions and exact attributes: a person moves without any download.
+
+Joint angles move the upper body by forward kinematics; the legs follow planned footprints by two-bone inverse
+kinematics, so that a foot on the ground stays exactly where it is. Bone lengths are close to HumanML3D's reference
+skeleton (Guo et al. 2022). The grammar of the captions and the limits of the set stand in `docs/synthetic.md`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from flame_mdm.data import Clip, MotionSource, Split
+
+# Offsets from the parent in metres, standing with hanging arms, facing +z; x for the left side, mirrored on the right.
+HIP, SPINE1, SPINE2, SPINE3 = (0.075, -0.075, 0.0), (0.0, 0.131, -0.015), (0.0, 0.142, 0.0), (0.0, 0.057, 0.01)
+NECK, HEAD, COLLAR, SHOULDER = (0.0, 0.217, -0.02), (0.0, 0.085, 0.058), (0.072, 0.119, -0.01), (0.125, -0.02, -0.01)
+THIGH, SHIN, UPPER_ARM, FOREARM = 0.393, 0.429, 0.260, 0.268
+ANKLE_HEIGHT, FOOT = 0.06, (0.0, -0.06, 0.134)  # a flat foot: the ankle at 6 cm, the toe joint on the floor
+STAND = 0.97  # height of the pelvis in metres that the legs are asked for and, standing, just do not reach
+
+SIDES = {"left": (0,), "right": (1,), "both": (0, 1)}
+SIGN = np.array([1.0, -1.0])  # left is +x
+TIMES = ("", "once", "twice", "three times")
+NUMBERS = ("", "one", "two", "three")
+
+Attributes = dict[str, str | int | float]
+
+
+def _ease(t: np.ndarray, start: float, end: float) -> np.ndarray:
+    """0 before `start`, 1 after `end`, with the least jerk between (Flash & Hogan 1985)."""
+    s = np.clip((t - start) / (end - start), 0, 1)
+    return s * s * s * (10 + s * (6 * s - 15))
+
+
+def _pulse(t: np.ndarray, start: float, top: float, leave: float, end: float) -> np.ndarray:
+    """Rises from 0 to 1 between `start` and `top`, falls back between `leave` and `end`."""
+    return _ease(t, start, top) - _ease(t, leave, end)
+
+
+def _rotation(axis: int, angle: np.ndarray) -> np.ndarray:
+    """Rotations (..., 3, 3) about x, y or z (0, 1, 2) by radians (...)."""
+    i, j = (axis + 1) % 3, (axis + 2) % 3
+    matrix = np.zeros((*np.shape(angle), 3, 3))
+    matrix[..., axis, axis] = 1
+    matrix[..., i, i] = matrix[..., j, j] = np.cos(angle)
+    matrix[..., j, i] = np.sin(angle)
+    matrix[..., i, j] = -matrix[..., j, i]
+    return matrix
+
+
+class _Body:
+    """What an action controls: curves over the frames, at first those of somebody who stands and breathes.
+
+    Angles are radians. Feet and arms have the side first: 0 = left, 1 = right.
+    """
+
+    def __init__(self, rng: np.random.Generator, t: np.ndarray, width: float | None = None):
+        self.t = t
+        self.position = np.zeros((len(t), 3))
+        self.heading = np.zeros(len(t))
+        self.pelvis = self._drift(rng, 0.015, 3)  # pitch forward, yaw to the left, roll to the left
+        self.spine = self._drift(rng, 0.025, 3)
+        self.spine[0] += 0.012 * np.sin(2 * np.pi * (rng.uniform(0.22, 0.32) * t + rng.random())) + rng.normal(0, 0.03)
+        self.head = self._drift(rng, 0.05, 3)
+        self.arms = self._drift(rng, 0.03, 2, 4)  # forward, sideways, turned outward, elbow
+        self.arms += np.array([rng.normal(0.03, 0.05), rng.uniform(0.1, 0.22), -0.5, rng.uniform(0.2, 0.4)])[:, None]
+
+        half = rng.uniform(0.085, 0.12) if width is None else width
+        self.ankles = np.zeros((2, len(t), 3))
+        self.ankles[..., 0] = half * SIGN[:, None]
+        self.ankles[..., 1] = ANKLE_HEIGHT
+        self.ankles[..., 2] = -0.03 + rng.normal(0, 0.012, (2, 1))
+        self.foot_yaw = np.repeat((rng.uniform(0.05, 0.2, 2) * SIGN)[:, None], len(t), 1)
+        self.foot_pitch = np.zeros((2, len(t)))  # heel up
+
+        self.position[:, 1] = STAND - rng.uniform(0, 0.015)
+        self.position[:, [0, 2]] += self._drift(rng, 0.008, 2).T
+        self.position[:, [0, 2]] -= self.position[0, [0, 2]]
+
+    def _drift(self, rng: np.random.Generator, size: float, *shape: int) -> np.ndarray:
+        """Slow smooth noise (*shape, F): two waves of 0.1 to 0.7 Hz."""
+        frequency, phase = rng.uniform(0.1, 0.7, (2, *shape, 1)), rng.random((2, *shape, 1))
+        weight = rng.normal(0, size, (2, *shape, 1))
+        return (weight * np.sin(2 * np.pi * (frequency * self.t + phase))).sum(0)
+
+    def move_arm(self, side: int, weight: np.ndarray, pose: Sequence[float | np.ndarray]) -> None:
+        """Blends one arm by `weight` (F,) into a pose: forward, sideways, turned outward, elbow."""
+        for angle, wanted in enumerate(pose):
+            self.arms[side, angle] += weight * (wanted - self.arms[side, angle])
+
+    def joints(self) -> np.ndarray:
+        """Joint positions (F, 22, 3) in metres, y up."""
+        out = np.empty((len(self.t), 22, 3))
+        facing = _rotation(1, self.heading)
+        pelvis = facing @ _rotation(1, self.pelvis[1]) @ _rotation(0, self.pelvis[0]) @ _rotation(2, -self.pelvis[2])
+        hips = np.stack([pelvis @ np.array([SIGN[side] * HIP[0], *HIP[1:]]) for side in (0, 1)])
+
+        # A raised heel turns about the toes, raised toes turn about the ankle: what touches the floor does not move.
+        foot = _rotation(1, self.foot_yaw) @ _rotation(0, self.foot_pitch)
+        toe_offset = foot @ np.array(FOOT)
+        heel_up = (self.foot_pitch > 0)[..., None]
+        ankles = self.ankles + heel_up * (_rotation(1, self.foot_yaw) @ np.array(FOOT) - toe_offset)
+
+        # The pelvis sinks where a leg would not reach its footprint: the bob of a walk follows from it.
+        reach = 0.998 * (THIGH + SHIN)
+        out[:, 0] = self.position
+        apart = np.sum((ankles - hips - self.position)[..., [0, 2]] ** 2, -1)
+        limits = ankles[..., 1] + np.sqrt(np.maximum(reach**2 - apart, 0.04)) - hips[..., 1]
+        heights = np.stack([self.position[:, 1], *limits])
+        out[:, 0, 1] = -np.log(np.exp(-120 * heights).sum(0)) / 120  # a smooth minimum
+
+        for side in (0, 1):
+            hip, ankle = out[:, 0] + hips[side], ankles[side]
+            leg = ankle - hip
+            length = np.linalg.norm(leg, axis=-1, keepdims=True)
+            along = (THIGH**2 - SHIN**2 + length**2) / (2 * length)
+            yaw = (self.heading + self.foot_yaw[side]) / 2
+            forward = np.cross(leg / length, np.stack([np.cos(yaw), 0 * yaw, -np.sin(yaw)], -1))
+            forward /= np.linalg.norm(forward, axis=-1, keepdims=True)
+            bend = np.sqrt(THIGH**2 - along**2)
+            out[:, 1 + side] = hip
+            out[:, 4 + side] = hip + along * leg / length + bend * forward
+            out[:, 7 + side] = ankle
+            out[:, 10 + side] = ankle + toe_offset[side]
+
+        bone = pelvis
+        third = self.spine / 3
+        step = _rotation(1, third[1]) @ _rotation(0, third[0]) @ _rotation(2, -third[2])
+        for joint, parent, offset in ((3, 0, SPINE1), (6, 3, SPINE2), (9, 6, SPINE3)):
+            out[:, joint] = out[:, parent] + bone @ np.array(offset)
+            bone = bone @ step
+        out[:, 12] = out[:, 9] + bone @ np.array(NECK)
+        head = bone @ _rotation(1, self.head[1]) @ _rotation(0, self.head[0]) @ _rotation(2, -self.head[2])
+        out[:, 15] = out[:, 12] + head @ np.array(HEAD)
+
+        down = np.array([0.0, -1.0, 0.0])
+        for side, sign in enumerate(SIGN):
+            forward, sideways, outward, elbow = self.arms[side]
+            arm = _rotation(2, sign * sideways) @ _rotation(0, -forward) @ _rotation(1, sign * outward)
+            lift = 0.2 * (1 + (arm @ down)[:, 1])  # the shoulder girdle rises with the arm
+            collar = bone @ _rotation(2, sign * lift)
+            out[:, 13 + side] = out[:, 9] + bone @ np.array([sign * COLLAR[0], *COLLAR[1:]])
+            out[:, 16 + side] = out[:, 13 + side] + collar @ np.array([sign * SHOULDER[0], *SHOULDER[1:]])
+            arm = bone @ arm
+            out[:, 18 + side] = out[:, 16 + side] + arm @ down * UPPER_ARM
+            out[:, 20 + side] = out[:, 18 + side] + arm @ _rotation(0, -elbow) @ down * FOREARM
+        return out
+
+
+@dataclass
+class _Gait:
+    """How steps are taken. Seconds, metres, radians."""
+
+    step: float  # from one footprint to the next
+    swing: float  # a foot in the air; above 1 step both feet leave the ground in between
+    lift: float  # of the foot in mid-swing
+    heel_off: float  # the heel's angle when the foot leaves the floor
+    toe_up: float  # the toes' angle when the foot comes down; negative: the toes come down first
+    width: float  # half the distance between the tracks
+    bounce: float = 0.0  # of the pelvis, highest between the steps
+
+
+def _walk_along(
+    body: _Body,
+    rng: np.random.Generator,
+    gait: _Gait,
+    speed: float,
+    place: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray, np.ndarray]],
+    stops: bool,
+    first: int | None = None,
+) -> np.ndarray:
+    """Moves the pelvis along a path and puts the feet down beside it.
+
+    Args:
+        body: standing; its pelvis, heading and feet are replaced.
+        rng: draws the first foot.
+        gait: how.
+        speed: along the path, once under way.
+        place: way along the path (N,) -> x (N,), z (N,) and heading (N,).
+        stops: come to a stand before the clip ends.
+        first: the side that steps first; drawn where not given.
+
+    Returns:
+        (F,) how far the right foot is in front of the left one, in metres, seen from the pelvis.
+    """
+    t, end = body.t, body.t[-1]
+    start = rng.uniform(0.1, 0.2)
+    fine = np.arange(0, end + 3, 0.01)
+    halt = end - 0.05 - 1.5 * gait.step if stops else end + 2
+    pace = speed * _pulse(fine, start - 0.1, start + 0.55, halt - 0.5, halt)
+    way = np.concatenate([[0.0], np.cumsum(pace)[:-1] * 0.01])
+
+    def at(time: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        return place(np.interp(time, fine, way))
+
+    x, z, heading = at(t)
+    sway, yaw0 = body.position[:, [0, 2]].copy(), body.foot_yaw[:, 0].copy()
+    back = body.ankles[0, 0, 2]
+    body.position[:, 0], body.position[:, 2] = x + sway[:, 0], z + sway[:, 1]
+    body.heading = heading
+    prints = np.array([[gait.width * SIGN[side], back, yaw0[side]] for side in (0, 1)])
+    body.ankles[..., 0], body.ankles[..., 2] = prints[:, :1], prints[:, 1:2]
+    raised = np.zeros((2, len(t)))
+
+    moving = np.interp(t, fine, pace) / speed
+    body.position[:, 1] += moving * gait.bounce * np.cos(2 * np.pi * ((t - start) / gait.step - gait.swing / 2 + 0.5))
+    side, lift_off = int(rng.integers(2)) if first is None else first, start
+    while lift_off < min(end, halt + gait.step):
+        down = lift_off + gait.swing
+        stance = 2 * gait.step - gait.swing
+        px, pz, yaw = (float(v[0]) for v in at(np.array([down + stance / 2])))
+        across = gait.width * SIGN[side]
+        goal = np.array(
+            [
+                px + across * np.cos(yaw) + back * np.sin(yaw),
+                pz - across * np.sin(yaw) + back * np.cos(yaw),
+                yaw + yaw0[side],
+            ]
+        )
+        s = np.clip((t - lift_off) / gait.swing, 0, 1)
+        share = _ease(s, 0.08, 0.96)
+        length = np.hypot(*(goal - prints[side])[:2])
+        size = np.clip(length / 0.5 + abs(goal[2] - prints[side][2]) / 1.0, 0.25, 1.0)
+        body.ankles[side, :, 0] += share * (goal[0] - prints[side][0])
+        body.ankles[side, :, 2] += share * (goal[1] - prints[side][1])
+        body.foot_yaw[side] += share * (goal[2] - prints[side][2])
+        rise = np.sin(np.pi * s) ** 1.5 * (1 + 0.4 * np.cos(np.pi * s))
+        body.ankles[side, :, 1] += size * gait.lift * rise
+        raised[side] += np.sin(np.pi * s) ** 2
+        peel = min(0.45 * stance, 0.22)
+        heel_up = _pulse(t, lift_off - peel, lift_off + 0.03, lift_off + 0.03, down - 0.03)
+        toe_up = _pulse(t, lift_off + 0.5 * gait.swing, down - 0.02, down, down + 0.1)
+        body.foot_pitch[side] += size * (gait.heel_off * heel_up - gait.toe_up * toe_up)
+        prints[side] = goal
+        side, lift_off = 1 - side, lift_off + gait.step
+
+    forward, left = np.array([np.sin(heading), np.cos(heading)]), np.array([np.cos(heading), -np.sin(heading)])
+    body.position[:, [0, 2]] += (0.025 * (raised[1] - raised[0]) * left).T
+    apart = body.ankles[1][:, [0, 2]] - body.ankles[0][:, [0, 2]]
+    return (apart.T * forward).sum(0)
+
+
+def _walk(rng: np.random.Generator, t: np.ndarray, asked: Attributes) -> _Body:
+    direction, stops = asked["direction"], bool(t[-1] > 2.4 and rng.random() < 0.5)
+    sign = 1 if direction in ("left", "counterclockwise") else -1
+    sideways = direction in ("left", "right")
+    body = _Body(rng, t, 0.15 if sideways else None)
+    if sideways:
+        speed, first = rng.uniform(0.45, 0.6), 0 if sign > 0 else 1
+        gait = _Gait(0.46, 0.38, 0.15, 0.25, 0.05, 0.16)
+        _walk_along(body, rng, gait, speed, lambda s: (sign * s, 0 * s, 0 * s), stops, first)
+        return body
+    if direction == "backward":
+        speed = rng.uniform(0.6, 0.9)
+        gait = _Gait(0.54, 0.42, 0.12, -0.2, -0.4, rng.uniform(0.08, 0.1))
+        apart = _walk_along(body, rng, gait, speed, lambda s: (0 * s, -s, 0 * s), stops)
+    elif direction == "forward":
+        low, high = {"slow": (0.5, 0.7), "normal": (1.0, 1.25), "fast": (1.55, 1.8)}[str(asked["speed"])]
+        speed = rng.uniform(low, high)
+        step = np.interp(speed, [0.5, 1.2, 1.8], [0.66, 0.52, 0.42]) * rng.uniform(0.95, 1.05)
+        gait = _Gait(step, 0.82 * step, rng.uniform(0.1, 0.13), 0.25 + 0.4 * speed, 0.15 + 0.12 * speed, 0.085)
+        body.spine[0] += 0.03 * speed
+        apart = _walk_along(body, rng, gait, speed, lambda s: (0 * s, s, 0 * s), stops)
+    else:
+        speed = rng.uniform(1.0, 1.2)
+        radius = speed * (t[-1] - 0.45) / rng.uniform(np.radians(180), np.radians(220))
+        gait = _Gait(0.5, 0.41, 0.11, 0.6, 0.25, 0.085)
+        body.spine[2] += 0.06 * sign
+        body.head[1] += 0.2 * sign
+
+        def circle(s: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+            angle = s / radius
+            return sign * radius * (1 - np.cos(angle)), radius * np.sin(angle), sign * angle
+
+        apart = _walk_along(body, rng, gait, speed, circle, False, 0 if sign > 0 else 1)
+    _swing_arms(body, apart, rng.uniform(0.5, 0.75))
+    return body
+
+
+def _run(rng: np.random.Generator, t: np.ndarray, asked: Attributes) -> _Body:
+    body = _Body(rng, t)
+    body.spine[0] += 0.12
+    body.pelvis[0] += 0.06
+    body.position[:, 1] -= 0.03
+    step = rng.uniform(0.34, 0.38)
+    gait = _Gait(step, 1.3 * step, rng.uniform(0.2, 0.26), 1.1, 0.15, 0.07, 0.03)
+    apart = _walk_along(body, rng, gait, rng.uniform(2.4, 3.0), lambda s: (0 * s, s, 0 * s), False)
+    for side in (0, 1):
+        body.move_arm(side, _ease(t, 0, 0.5), (-0.1, 0.2, -0.6, rng.uniform(1.4, 1.7)))
+    _swing_arms(body, apart, rng.uniform(0.7, 0.9))
+    return body
+
+
+def _swing_arms(body: _Body, apart: np.ndarray, size: float) -> None:
+    """Swings the arms against the legs, and the shoulders against the hips."""
+    body.pelvis[1] += 0.15 * apart
+    body.spine[1] -= 0.3 * apart
+    for side in (0, 1):
+        body.arms[side, 0] += size * SIGN[side] * apart
+        body.arms[side, 3] += 0.35 * np.maximum(SIGN[side] * apart, 0)
+
+
+def _turn(rng: np.random.Generator, t: np.ndarray, asked: Attributes) -> _Body:
+    body, sign = _Body(rng, t), 1 if asked["direction"] == "left" else -1
+    speed = rng.uniform(np.radians(85), np.radians(140)) / (t[-1] - 1.2)
+    gait = _Gait(0.36, 0.3, 0.07, 0.3, 0.0, 0.1)
+    _walk_along(body, rng, gait, speed, lambda s: (0 * s, 0 * s, sign * s), True, 0 if sign > 0 else 1)
+    ahead = np.gradient(body.heading, t)
+    body.head[1] += 0.2 * ahead  # one looks where one turns
+    body.spine[1] += 0.08 * ahead
+    return body
+
+
+def _events(rng: np.random.Generator, t: np.ndarray, count: int, slowest: float) -> list[tuple[float, float]]:
+    """(start, seconds) of `count` equal repetitions, somewhere inside the clip."""
+    seconds = min(rng.uniform(0.85, 1.0) * slowest, (t[-1] - 0.3) / count)
+    start = rng.uniform(0.1, max(0.15, min(0.6, t[-1] - 0.15 - seconds * count)))
+    return [(start + n * seconds, seconds) for n in range(count)]
+
+
+def _jump(rng: np.random.Generator, t: np.ndarray, asked: Attributes) -> _Body:
+    body = _Body(rng, t)
+    depth, reach = rng.uniform(0.16, 0.24), rng.uniform(0.8, 1.6)
+    for start, seconds in _events(rng, t, int(asked["count"]), 1.05):
+        up = start + 0.4 * seconds
+        air = min(rng.uniform(0.36, 0.44), 0.42 * seconds)
+        land = up + air
+        crouch = _pulse(t, start, start + 0.25 * seconds, start + 0.25 * seconds, up + 0.02)
+        absorb = _pulse(t, land - 0.03, land + 0.1, land + 0.1, start + seconds)
+        s = np.clip((t - up) / air, 0, 1)
+        height = 9.81 / 8 * air**2 * 4 * s * (1 - s)
+        body.position[:, 1] += height - depth * crouch - 0.6 * depth * absorb
+        body.position[:, 2] -= 0.05 * crouch
+        body.ankles[..., 1] += height + 0.04 * np.sin(np.pi * s) ** 2
+        body.foot_pitch += 0.6 * _pulse(t, up - 0.1, up, land - 0.05, land + 0.08)
+        body.spine[0] += 0.45 * crouch + 0.25 * absorb
+        body.pelvis[0] += 0.2 * crouch + 0.1 * absorb
+        body.arms[:, 0] += reach * _pulse(t, up - 0.15, up + 0.15, up + 0.15, land + 0.2) - 0.7 * crouch
+    return body
+
+
+def _wave(rng: np.random.Generator, t: np.ndarray, asked: Attributes) -> _Body:
+    body = _Body(rng, t)
+    start, end = rng.uniform(0.1, 0.3), t[-1]
+    weight = _pulse(t, start, start + 0.5, end - 0.45, end + 0.05)
+    swing = 2 * np.pi * rng.uniform(1.6, 2.2) * t + rng.uniform(0, 2 * np.pi)
+    forward, sideways, size = rng.uniform(0.2, 0.5), rng.uniform(1.3, 1.7), rng.uniform(0.4, 0.55)
+    for side in SIDES[str(asked["side"])]:
+        pose = (forward, sideways + 0.1 * np.sin(swing), np.pi / 2, rng.uniform(1.3, 1.5) + size * np.sin(swing))
+        body.move_arm(side, weight, pose)
+        body.spine[2] -= 0.03 * SIGN[side] * weight
+    return body
+
+
+def _raise(rng: np.random.Generator, t: np.ndarray, asked: Attributes) -> _Body:
+    body = _Body(rng, t)
+    start = rng.uniform(0.15, 0.5)
+    weight = _ease(t, start, start + rng.uniform(0.7, 1.0))
+    over_front, high = rng.random() < 0.5, rng.uniform(2.7, 3.0)
+    for side in SIDES[str(asked["side"])]:
+        pose = (high, 0.05, -0.2, 0.15) if over_front else (0.1, high, 1.2, 0.15)
+        body.move_arm(side, weight, pose)
+        body.spine[2] -= 0.05 * SIGN[side] * weight
+    return body
+
+
+def _kick(rng: np.random.Generator, t: np.ndarray, asked: Attributes) -> _Body:
+    body = _Body(rng, t)
+    (side,) = SIDES[str(asked["side"])]
+    high = rng.uniform(1.15, 1.45)
+    events = _events(rng, t, int(asked["count"]), 1.25)
+    first, last = events[0][0], events[-1][0] + events[-1][1]
+    leaning = _pulse(t, first - 0.1, first + 0.2, last - 0.2, last)
+    body.position[:, 0] -= 0.07 * SIGN[side] * leaning
+    body.spine[2] += 0.06 * SIGN[side] * leaning
+    for arm in (0, 1):
+        body.move_arm(arm, leaning, (0.5, 0.4, -0.6, 1.3))
+    for start, seconds in events:
+        at = start + seconds * np.array([0.0, 0.18, 0.28, 0.52, 0.58, 0.8, 1.0])
+        back = _pulse(t, at[0], at[1], at[1], at[3])
+        out = _pulse(t, at[1], at[3], at[4], at[6])
+        hip = high * out - 0.4 * back
+        knee = 0.2 + 1.3 * _pulse(t, at[0], at[2], at[2], at[3]) + 0.9 * _pulse(t, at[4], at[5], at[5], at[6])
+        free = _pulse(t, at[0], at[1], at[5], at[6])
+        root = body.position + np.array([SIGN[side] * HIP[0], HIP[1], HIP[2]])
+        zero = np.zeros_like(hip)
+        thigh = np.stack([zero, -np.cos(hip), np.sin(hip)], -1)
+        shin = np.stack([zero, -np.cos(hip - knee), np.sin(hip - knee)], -1)
+        body.ankles[side] += free[:, None] * (root + THIGH * thigh + SHIN * shin - body.ankles[side])
+        body.foot_pitch[side] += 0.4 * back + 0.3 * free - 0.8 * out
+        body.pelvis[0] -= 0.15 * out
+        body.spine[0] += 0.1 * out
+        body.spine[1] += 0.25 * SIGN[side] * out
+        body.arms[1 - side, 0] += 0.6 * out
+        body.arms[side, 0] -= 0.6 * out
+    return body
+
+
+def _punch(rng: np.random.Generator, t: np.ndarray, asked: Attributes) -> _Body:
+    body = _Body(rng, t, 0.13)
+    (side,) = SIDES[str(asked["side"])]
+    body.ankles[..., 2] += rng.uniform(0.04, 0.1) * rng.choice([-1, 1]) * SIGN[:, None]
+    body.position[:, 1] -= 0.03
+    events = _events(rng, t, int(asked["count"]), 0.8)
+    first, last = events[0][0], events[-1][0] + events[-1][1]
+    guard = _pulse(t, first - 0.1, first + 0.2, last, last + 0.4)
+    for arm in (0, 1):
+        body.move_arm(arm, guard, (0.6, 0.2, -0.5, 2.2))
+    for start, seconds in events:
+        at = start + seconds * np.array([0.15, 0.45, 0.55, 1.0])
+        out = _pulse(t, *at)
+        body.move_arm(side, out, (1.55, 0.1, -0.5, 0.12))
+        body.spine[1] -= 0.5 * SIGN[side] * out
+        body.pelvis[1] -= 0.15 * SIGN[side] * out
+        body.head[1] += 0.5 * SIGN[side] * out
+        body.position[:, 2] += 0.05 * out
+    return body
+
+
+def _squat(rng: np.random.Generator, t: np.ndarray, asked: Attributes) -> _Body:
+    body = _Body(rng, t, rng.uniform(0.12, 0.15))
+    depth, reach = rng.uniform(0.34, 0.44), rng.uniform(1.0, 1.5)
+    for start, seconds in _events(rng, t, int(asked["count"]), 1.5):
+        down = _pulse(t, start, start + 0.45 * seconds, start + 0.5 * seconds, start + seconds)
+        body.position[:, 1] -= depth * down
+        body.position[:, 2] -= 0.16 * down
+        body.pelvis[0] += 0.35 * down
+        body.spine[0] += 0.35 * down
+        body.head[0] -= 0.4 * down
+        body.arms[:, 0] += (reach + 0.3) * down
+    return body
+
+
+def _bow(rng: np.random.Generator, t: np.ndarray, asked: Attributes) -> _Body:
+    body = _Body(rng, t)
+    start, end = rng.uniform(0.15, 0.35), t[-1] - rng.uniform(0.1, 0.25)
+    middle, half = (start + end) / 2, rng.uniform(0.1, 0.25)
+    down = _pulse(t, start, middle - half, middle + half, end)
+    deep = rng.uniform(0.9, 1.3)
+    body.pelvis[0] += 0.4 * deep * down
+    body.spine[0] += 0.6 * deep * down
+    body.head[0] += 0.2 * down
+    body.position[:, 2] -= 0.13 * deep * down
+    body.arms[:, 0] += 0.75 * deep * down
+    return body
+
+
+def _stand(rng: np.random.Generator, t: np.ndarray, asked: Attributes) -> _Body:
+    return _Body(rng, t)
+
+
+MOTIONS: Mapping[str, Callable[[np.random.Generator, np.ndarray, Attributes], _Body]] = {
+    "walk": _walk,
+    "run": _run,
+    "turn": _turn,
+    "jump": _jump,
+    "wave": _wave,
+    "raise": _raise,
+    "kick": _kick,
+    "punch": _punch,
+    "squat": _squat,
+    "bow": _bow,
+    "stand": _stand,
+}
+SHARES = {"walk": 6, "turn": 2, "jump": 2, "wave": 2, "raise": 2, "kick": 2, "punch": 2}  # others: 1
+MOST = {"jump": 3, "punch": 3, "kick": 2, "squat": 2}
+SHORTEST_EVENT = 0.8
+"""Seconds a repetition takes at least; it bounds how many fit into a clip."""
+
+
+def _draw(rng: np.random.Generator, max_seconds: float) -> Attributes:
+    """What a clip shows: action, and of side, count, direction and speed those that the action has."""
+    shares = np.array([SHARES.get(name, 1) for name in MOTIONS], float)
+    action = str(rng.choice(list(MOTIONS), p=shares / shares.sum()))
+    asked: Attributes = {"action": action}
+    if action in ("wave", "raise"):
+        asked["side"] = str(rng.choice(["left", "right", "both"]))
+    elif action in ("kick", "punch"):
+        asked["side"] = str(rng.choice(["left", "right"]))
+    if action in MOST:
+        asked["count"] = int(rng.integers(1, min(MOST[action], int((max_seconds - 0.35) / SHORTEST_EVENT)) + 1))
+    if action == "walk":
+        ways = ["forward", "backward", "left", "right", "clockwise", "counterclockwise"]
+        asked["direction"] = str(rng.choice(ways, p=[0.3, 0.14, 0.14, 0.14, 0.14, 0.14]))
+        if asked["direction"] == "forward":
+            asked["speed"] = str(rng.choice(["slow", "normal", "fast"]))
+    elif action == "run":
+        asked["direction"] = "forward"
+    elif action == "turn":
+        asked["direction"] = str(rng.choice(["left", "right"]))
+    return asked
+
+
+def captions(asked: Attributes) -> list[str]:
+    """Every predicate that says exactly what is asked: "walks forward slowly", "kicks twice with the left leg", ..."""
+    side, direction, count = asked.get("side"), asked.get("direction"), int(asked.get("count", 0))
+    times, number, plural = TIMES[count], NUMBERS[count], "s" if count > 1 else ""
+    match asked["action"]:
+        case "walk" if direction == "forward":
+            how = {"slow": (" slowly", " at a slow pace"), "fast": (" quickly", " at a fast pace")}
+            words = how.get(str(asked.get("speed")), ("", ""))
+            ways = ("walks forward", "walks straight ahead", "is walking forward", "goes forward on foot")
+            return [f"{way}{words[n % 2]}" for n, way in enumerate(ways)]
+        case "walk" if direction == "backward":
+            return ["walks backward", "walks backwards", "is walking backward", "takes steps backward"]
+        case "walk" if direction in ("left", "right"):
+            return [
+                f"walks sideways to the {direction}",
+                f"side-steps to the {direction}",
+                f"takes side steps to the {direction}",
+                f"is stepping sideways to the {direction}",
+            ]
+        case "walk":
+            hand = "left" if direction == "counterclockwise" else "right"
+            return [
+                f"walks in a circle {direction}",
+                f"walks in a {direction} circle",
+                f"is walking {direction} in a circle",
+                f"walks {direction} in a circle to the {hand}",
+            ]
+        case "run":
+            return ["runs forward", "is running forward", "runs straight ahead", "jogs forward"]
+        case "turn":
+            return [
+                f"turns to the {direction}",
+                f"turns {direction} on the spot",
+                f"is turning {direction} in place",
+                f"turns around to the {direction} without walking",
+            ]
+        case "jump":
+            return [
+                f"jumps {times}",
+                f"jumps up {times}",
+                f"does {number} jump{plural}",
+                f"is jumping in place {times}",
+            ]
+        case "wave" if side == "both":
+            return [
+                "waves with both hands",
+                "waves both hands",
+                "is waving with both arms",
+                "raises both hands and waves",
+            ]
+        case "wave":
+            return [
+                f"waves with the {side} hand",
+                f"waves the {side} hand",
+                f"is waving with the {side} arm",
+                f"greets by waving the {side} arm",
+            ]
+        case "raise" if side == "both":
+            return [
+                "raises both arms",
+                "lifts both arms up",
+                "is raising both hands high",
+                "puts both arms up",
+            ]
+        case "raise":
+            return [
+                f"raises the {side} arm",
+                f"lifts the {side} arm up",
+                f"is raising the {side} hand high",
+                f"puts the {side} arm up",
+            ]
+        case "kick":
+            return [
+                f"kicks {times} with the {side} leg",
+                f"kicks with the {side} foot {times}",
+                f"does {number} kick{plural} with the {side} leg",
+                f"is kicking {times} with the {side} foot",
+            ]
+        case "punch":
+            return [
+                f"punches {times} with the {side} hand",
+                f"punches with the {side} fist {times}",
+                f"throws {number} punch{'es' if count > 1 else ''} with the {side} arm",
+                f"is punching {times} with the {side} arm",
+            ]
+        case "squat":
+            return [
+                f"squats {times}",
+                f"squats down {times}",
+                f"does {number} squat{plural}",
+                f"bends the knees and squats {times}",
+            ]
+        case "bow":
+            return ["bows", "takes a bow", "bows forward and stands up again", "is bowing politely"]
+        case _:
+            return ["stands still", "is standing still", "stands in place", "does not move and stands still"]
+
+
+class Synthetic(MotionSource):
+    """Clips of the 22 SMPL joints, y up, that start at the origin facing +z; each shows one action.
+
+    The clip of a number depends on the seed and the number alone.
+    """
+
+    name = "synthetic"
+    actions = tuple(MOTIONS)
+
+    def __init__(self, clips: int = 5000, seed: int = 0, min_seconds: float = 2.0, max_seconds: float = 3.0):
+        """`clips` motions of `min_seconds` to `max_seconds`.
+
+        Raises:
+            ValueError: no clips, a negative seed, or durations below 2 s or out of order.
+        """
+        if clips < 1 or seed < 0:
+            raise ValueError(f"synthetic: clips={clips}, seed={seed}: give at least one clip and a seed from 0 on")
+        if not 2 <= min_seconds <= max_seconds:
+            raise ValueError(
+                f"synthetic: min_seconds={min_seconds}, max_seconds={max_seconds}: give 2 <= min_seconds <= max_seconds"
+            )
+        self.size, self.seed, self.min_seconds, self.max_seconds = clips, seed, min_seconds, max_seconds
+
+    def count(self) -> int:
+        return self.size
+
+    def clips(self, fps: float) -> Iterator[Clip]:
+        for index in range(self.size):
+            yield self.clip(index, fps)
+
+    def clip(self, index: int, fps: float) -> Clip:
+        """Clip number `index`, `round(seconds * fps) + 1` frames."""
+        rng = np.random.default_rng((self.seed, index))
+        asked = _draw(rng, self.max_seconds)
+        shortest = max(self.min_seconds, 0.35 + SHORTEST_EVENT * int(asked.get("count", 0)))
+        seconds = rng.uniform(shortest, self.max_seconds)
+        subjects = rng.permutation(["a person", "someone", "the person", "a human"])
+        texts = [f"{subject} {predicate}" for subject, predicate in zip(subjects, captions(asked), strict=True)]
+        name = f"synthetic_{self.seed}_{index:06d}"
+        t = np.arange(round(seconds * fps) + 1) / fps
+        return Clip(
+            id=name,
+            motion=MOTIONS[str(asked["action"])](rng, t, asked).joints().astype(np.float32),
+            captions=texts,
+            split=_split(name),
+            source=name,
+            action=self.actions.index(str(asked["action"])),
+            attributes=asked,
+        )
+
+
+def _split(name: str) -> Split:
+    """85 % train, 5 % val, 10 % test, by the name alone: more clips do not move any."""
+    share = int(hashlib.sha1(name.encode()).hexdigest()[:8], 16) % 100
+    return "train" if share < 85 else "val" if share < 90 else "test"
+
+
+def prompts() -> list[tuple[str, Attributes]]:
+    """Fixed prompts with what they ask for: shown on the dashboard, read back by `evaluators.attributes`."""
+    asked: list[Attributes] = [
+        {"action": "walk", "direction": "forward"},
+        {"action": "walk", "direction": "forward", "speed": "slow"},
+        {"action": "walk", "direction": "forward", "speed": "fast"},
+        {"action": "walk", "direction": "backward"},
+        {"action": "walk", "direction": "left"},
+        {"action": "walk", "direction": "right"},
+        {"action": "walk", "direction": "counterclockwise"},
+        {"action": "walk", "direction": "clockwise"},
+        {"action": "run", "direction": "forward"},
+        {"action": "turn", "direction": "left"},
+        {"action": "turn", "direction": "right"},
+        {"action": "jump", "count": 1},
+        {"action": "jump", "count": 2},
+        {"action": "wave", "side": "left"},
+        {"action": "wave", "side": "right"},
+        {"action": "wave", "side": "both"},
+        {"action": "raise", "side": "left"},
+        {"action": "raise", "side": "right"},
+        {"action": "raise", "side": "both"},
+        {"action": "kick", "side": "left", "count": 1},
+        {"action": "kick", "side": "right", "count": 2},
+        {"action": "punch", "side": "left", "count": 2},
+        {"action": "punch", "side": "right", "count": 1},
+        {"action": "squat", "count": 1},
+        {"action": "bow"},
+        {"action": "stand"},
+    ]
+    return [(f"a person {captions(wanted)[0]}", wanted) for wanted in asked]

@@ -17,10 +17,10 @@ class Skeleton:
         joints: names in the order of the data; `left_` and `right_` tell the sides.
         parents: parent of each joint, -1 for the root.
         chains: the paths along which HumanML3D's inverse kinematics walks.
-        raw_offsets: (J, 3) unit direction in the rest pose of the bone that ends in a joint, 0 for the root, as published
-            with HumanML3D (`paramUtil.py`).
-        facing: right hip, left hip, right shoulder, left shoulder: the heading is the vertical crossed with the way from
-            left to right.
+        raw_offsets: (J, 3) unit direction in the rest pose of the bone that ends in a joint, 0 for the root; those of
+            HumanML3D's `paramUtil.py`.
+        facing: right hip, left hip, right shoulder, left shoulder: the heading is the vertical crossed with the way
+            from left to right.
         feet: the joints that touch the ground, in the order of HumanML3D's contact features.
         leg: (knee, ankle), whose bones measure the size of a body.
     """

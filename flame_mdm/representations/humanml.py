@@ -1,0 +1,279 @@
+"""HumanML3D's features: root velocity, local joints, 6D rotations, joint velocities and foot contacts."""
+
+from collections.abc import Iterable, Sequence
+from typing import Literal
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from scipy.ndimage import gaussian_filter1d
+from torch import Tensor
+
+from flame_mdm.representations import Representation, rotation
+from flame_mdm.representations.skeleton import SKELETONS, global_rotations
+
+LEGACY_SMOOTHING_FRAMES = 20
+SMOOTHING_SECONDS = 1.0
+"""Deviation of the Gaussian that takes the swing of the arms out of the heading: 20 frames at 20 fps, as published."""
+
+SMALLEST_STD = 1e-4
+"""A group of features that varies less is constant up to rounding (positions in KIT's units round to 3e-5)."""
+
+
+class HumanML(Representation):
+    """Features of Guo et al. 2022 (HumanML3D): 263 for 22 joints, 251 for KIT's 21, 12 J - 1 for J joints.
+
+    A motion of T frames gives T - 1 rows. Columns by name, in `slices`:
+
+    | name | width | content |
+    |---|---|---|
+    | turn | 1 | heading change to the next frame, radians |
+    | root_velocity | 2 | x and z of the root's way to the next frame, seen by the body |
+    | root_height | 1 | y of the root |
+    | positions | 3 (J - 1) | joints but the root, seen by the body: root at x = z = 0, facing +z |
+    | rotations | 6 (J - 1) | 6D (columns) of each bone relative to the one before; shortest arcs, no SMPL rotations |
+    | velocities | 3 J | each joint's way to the next frame, seen by the body |
+    | contacts | 4 | 1 where a foot joint (`skeleton.feet`) hardly moves to the next frame |
+
+    The heading is 0 where the body faces +z and grows as it turns left, towards +x. Motions are made canonical first:
+    lowest joint at y = 0, the root of the first frame at x = z = 0, facing +z there.
+
+    Variant "legacy" equals the published data with all its peculiarities: its heading subtracts the hips from the
+    shoulders in place of adding them, and is 0 in the first frame although the smoothed one is not; `turn` is half the
+    turn to the right and changes sign where the heading crosses 180 degrees; the root velocity is seen by the next
+    frame's body; rotations are those of bones in the world relative to the inverse heading, also at the shoulders. Its
+    `decode` is the published one. Where a bone is exactly opposite to its rest direction, the published code gives NaN;
+    here it is a half turn.
+
+    Variant "clean" has none of these. Headings are unwrapped before they are smoothed, point-symmetrically past both
+    ends, which keeps the first and the last heading and steady turns as they are; rotations are those of the body that
+    faces +z, each relative to its parent in the skeleton.
+    """
+
+    def __init__(
+        self,
+        skeleton: str = "smpl22",
+        variant: Literal["clean", "legacy"] = "clean",
+        fps: float = 20.0,
+        bone_lengths: Sequence[float] | None = None,
+        units_per_metre: float = 1.0,
+        contact_threshold: float = 0.002,
+    ):
+        """Joints come in and go out in metres; features are in units of 1 / `units_per_metre` metres.
+
+        Args:
+            skeleton: key in `SKELETONS`.
+            variant: the features as they are meant, or as they were published.
+            fps: frames a second of the motions.
+            bone_lengths: J lengths in the features' unit, of the bone that ends in each joint, to give to every motion;
+                None leaves each motion its own.
+            units_per_metre: KIT's features are in units of about 1/640 of a metre.
+            contact_threshold: squared way of a foot to the next frame, in the features' unit, below which it is in
+                contact: 0.002 for HumanML3D, 0.05 for KIT.
+
+        Raises:
+            ValueError: an unknown skeleton or variant, or the wrong number of bone lengths.
+        """
+        if skeleton not in SKELETONS:
+            raise ValueError(f"skeleton: {skeleton!r} is unknown; use one of {', '.join(SKELETONS)}")
+        if variant not in ("clean", "legacy"):
+            raise ValueError(f"variant: {variant!r} is unknown; use clean or legacy")
+        joints = len(SKELETONS[skeleton])
+        if bone_lengths is not None and len(bone_lengths) != joints:
+            raise ValueError(f"bone_lengths: {len(bone_lengths)} numbers for the {joints} joints of {skeleton}")
+        widths = {
+            "turn": 1,
+            "root_velocity": 2,
+            "root_height": 1,
+            "positions": 3 * (joints - 1),
+            "rotations": 6 * (joints - 1),
+            "velocities": 3 * joints,
+            "contacts": 4,
+        }
+        super().__init__(f"humanml-{variant}-{skeleton}", sum(widths.values()), fps, SKELETONS[skeleton])
+        ends = np.cumsum(list(widths.values())).tolist()
+        self.slices = {name: slice(end - widths[name], end) for name, end in zip(widths, ends, strict=True)}
+        self.legacy = variant == "legacy"
+        self.bone_lengths, self.units_per_metre = bone_lengths, units_per_metre
+        self.contact_threshold = contact_threshold
+
+    def encode(self, motion: Tensor) -> Tensor:
+        """Joints (T, J, 3) in metres, y up -> features (T - 1, D) float32.
+
+        Raises:
+            ValueError: fewer than 3 frames, another number of joints, or coordinates that are not finite.
+        """
+        return self.encode_many([motion])[0]
+
+    def encode_many(self, motions: Sequence[Tensor]) -> list[Tensor]:
+        """Encodes several motions; one pass over all their frames is faster than one pass a motion."""
+        joints, lengths = self._canonical(motions)
+        heading = torch.cat([self._heading(clip) for clip in joints.split(lengths)])
+        last = torch.tensor(lengths).cumsum(0) - 1
+        now = torch.ones(len(joints), dtype=torch.bool).index_fill(0, last, False).nonzero()[:, 0]
+        way = joints[now + 1] - joints[now]
+        joints, heading, next_heading = joints[now], heading[now], heading[now + 1]
+
+        turn = next_heading - heading
+        root_velocity = rotation.rotate_y(way[:, 0], -(next_heading if self.legacy else heading))[:, ::2]
+        if self.legacy:
+            turn = torch.arcsin(torch.sin(-turn / 2))
+        local = joints.clone()
+        local[..., ::2] -= joints[:, :1, ::2]
+        local = rotation.rotate_y(local, -heading[:, None])
+        rotations = self._rotations(joints if self.legacy else local, heading)
+        velocities = rotation.rotate_y(way, -heading[:, None])
+        contacts = way[:, list(self.skeleton.feet)].square().sum(-1) < self.contact_threshold
+        features = [turn[:, None], root_velocity, joints[:, 0, 1:2]]
+        features += [local[:, 1:].flatten(1), rotations.flatten(1), velocities.flatten(1), contacts]
+        return list(torch.cat([part.float() for part in features], 1).split([length - 1 for length in lengths]))
+
+    def canonicalize(self, motion: Tensor) -> Tensor:
+        """Joints (T, J, 3) in metres -> (T, J, 3) float64, as the features see them: `decode(encode(motion))`.
+
+        Raises:
+            ValueError: as `encode`.
+        """
+        return self._canonical([motion])[0] / self.units_per_metre
+
+    def decode(self, features: Tensor) -> Tensor:
+        """Features (..., F, D) -> joints (..., F, J, 3) in metres, from turn, root and positions. Differentiable."""
+        heading, root = self._root(features)
+        local = features[..., self.slices["positions"]].unflatten(-1, (-1, 3))
+        turned = rotation.rotate_y(local, heading[..., None])
+        ground = root * root.new_tensor([1.0, 0.0, 1.0])
+        return torch.cat([root[..., None, :], turned + ground[..., None, :]], -2) / self.units_per_metre
+
+    def decode_rotations(self, features: Tensor, bone_lengths: Tensor) -> Tensor:
+        """Features (..., F, D) -> joints (..., F, J, 3) in metres, from turn, root and rotations. Differentiable.
+
+        Args:
+            features: in the data's units.
+            bone_lengths: (J,) metres, length of the bone that ends in each joint.
+        """
+        heading, root = self._root(features)
+        facing = torch.zeros_like(root)
+        facing[..., 1] = -heading if self.legacy else heading
+        local = rotation.rot6d_to_matrix(features[..., self.slices["rotations"]].unflatten(-1, (-1, 6)), "columns")
+        local = torch.cat([rotation.axis_angle_to_matrix(facing)[..., None, :, :], local], -3)
+        turned = global_rotations(local, self.skeleton.chain_parents if self.legacy else self.skeleton.parents)
+        offsets = features.new_tensor(self.skeleton.raw_offsets) * bone_lengths[:, None]
+        return self.skeleton.assemble((turned @ offsets[..., None])[..., 0], root / self.units_per_metre)
+
+    def root(self, features: Tensor) -> tuple[Tensor, Tensor]:
+        """Features (..., F, D) -> heading (..., F) in radians, 0 = +z, positive to the left; position (..., F, 3)."""
+        heading, position = self._root(features)
+        return heading, position / self.units_per_metre
+
+    def statistics(self, features: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean of each feature; std averaged over each entry of `slices`, so that scales within one stay as they are.
+
+        A group that does not vary (`SMALLEST_STD`) gets 1: it carries nothing, and must not blow up rounding errors.
+        """
+        chunks = features.split(1 << 16)  # the frames of a data set, in float64, would not fit in memory
+        mean = sum((chunk.double().sum(0) for chunk in chunks), torch.zeros(())) / len(features)
+        variance = sum(((chunk.double() - mean).square().sum(0) for chunk in chunks), torch.zeros(())) / len(features)
+        std = variance.sqrt()
+        for columns in self.slices.values():
+            average = std[columns].mean()
+            std[columns] = average if average > SMALLEST_STD else 1.0
+        return mean.float(), std.float()
+
+    def joint_features(self, joints: Iterable[int]) -> Tensor:
+        """(D,) bool, True for the features that describe these joints, to keep or to edit a part of the body.
+
+        The root features belong to joint 0. With the lower body, root included, this is MDM's `HML_LOWER_BODY_MASK`.
+        """
+        part = torch.zeros(len(self.skeleton), dtype=torch.bool)
+        part[list(joints)] = True
+        feet = part[list(self.skeleton.feet)]
+        return torch.cat(
+            [part[:1].expand(4), *(part[1:].repeat_interleave(n) for n in (3, 6)), part.repeat_interleave(3), feet]
+        )
+
+    def weigh_root(self, std: Tensor, weight: float = 5.0) -> Tensor:
+        """Std (D,) with root features and contacts scaled up by `weight`, as Guo et al. train their evaluators."""
+        std = std.clone()
+        for name in ("turn", "root_velocity", "root_height", "contacts"):
+            std[self.slices[name]] /= weight
+        return std
+
+    def _canonical(self, motions: Sequence[Tensor]) -> tuple[Tensor, list[int]]:
+        """All frames (N, J, 3) of the canonical motions, float64 in the features' unit, and their numbers of frames."""
+        for number, motion in enumerate(motions):
+            name = f"motion {number}" if len(motions) > 1 else "motion"
+            if motion.ndim != 3 or motion.shape[1:] != (len(self.skeleton), 3):
+                raise ValueError(
+                    f"{name}: shape {tuple(motion.shape)}, but {self.name} takes (frames, {len(self.skeleton)}, 3)"
+                )
+            if len(motion) < 3:
+                raise ValueError(f"{name}: {len(motion)} frames, but features need at least 3; leave the motion out")
+            if not motion.isfinite().all():
+                frame = int((~motion.isfinite()).flatten(1).any(1).nonzero()[0, 0])
+                raise ValueError(f"{name}: coordinates in frame {frame} are not finite; leave the motion out")
+        lengths = [len(motion) for motion in motions]
+        clip = torch.arange(len(motions)).repeat_interleave(torch.tensor(lengths))
+        first = torch.tensor([0, *lengths[:-1]]).cumsum(0)
+        joints = torch.cat(list(motions)).double() * self.units_per_metre
+        if self.bone_lengths is not None:
+            joints = self._retarget(joints, first, clip)
+        start = joints[first]
+        floor = torch.stack([part[..., 1].min() for part in joints.split(lengths)])
+        shift = torch.stack([start[:, 0, 0], floor, start[:, 0, 2]], -1)
+        facing = self._facing(start)
+        return rotation.rotate_y(joints - shift[clip, None], -torch.atan2(*facing.unbind(-1))[clip, None]), lengths
+
+    def _retarget(self, joints: Tensor, first: Tensor, clip: Tensor) -> Tensor:
+        """Gives the bones their lengths; the root moves as many leg lengths (of the first frame) as before."""
+        target = torch.tensor(self.bone_lengths, dtype=joints.dtype)
+        bones = self.skeleton.bones(joints)
+        leg = list(self.skeleton.leg)
+        scale = target[leg].sum() / bones[first][:, leg].norm(dim=-1).sum(-1)
+        return self.skeleton.assemble(F.normalize(bones, dim=-1) * target[:, None], joints[:, 0] * scale[clip, None])
+
+    def _facing(self, joints: Tensor) -> Tensor:
+        """(N, J, 3) -> x and z of the direction that hips and shoulders face, shorter where the body lies on a side."""
+        right_hip, left_hip, right_shoulder, left_shoulder = (joints[:, joint] for joint in self.skeleton.facing)
+        return _turn_forward((right_hip - left_hip) + (right_shoulder - left_shoulder))
+
+    def _heading(self, joints: Tensor) -> Tensor:
+        """Smoothed heading (T,) of one canonical motion (T, J, 3)."""
+        if self.legacy:
+            right_hip, left_hip, right_shoulder, left_shoulder = (joints[:, joint] for joint in self.skeleton.facing)
+            forward = _turn_forward((left_hip - right_hip) + (right_shoulder - left_shoulder)).numpy()
+            x, z = gaussian_filter1d(forward, LEGACY_SMOOTHING_FRAMES, axis=0, mode="nearest").T
+            heading = np.arctan2(x, z)
+            heading[0] = 0
+            return torch.from_numpy(heading)
+        heading = np.unwrap(np.arctan2(*self._facing(joints).numpy().T))
+        sigma = SMOOTHING_SECONDS * self.fps
+        margin = int(4 * sigma + 0.5)
+        padded = np.pad(heading, margin, mode="reflect", reflect_type="odd")
+        smooth = gaussian_filter1d(padded, sigma)[margin:-margin]
+        return torch.from_numpy(smooth - smooth[0])
+
+    def _rotations(self, joints: Tensor, heading: Tensor) -> Tensor:
+        """6D columns (N, J - 1, 6) of the shortest arcs from rest to the bones, relative to each other."""
+        rest = joints.new_tensor(self.skeleton.raw_offsets)
+        arcs = rotation.between(rest, self.skeleton.bones(joints))
+        if self.legacy:
+            arcs[:, 0, 0], arcs[:, 0, 2] = torch.cos(heading / 2), -torch.sin(heading / 2)
+        parents = list((self.skeleton.chain_parents if self.legacy else self.skeleton.parents)[1:])
+        relative = rotation.multiply(rotation.inverse(arcs[:, parents]), arcs[:, 1:])
+        return rotation.matrix_to_rot6d(rotation.quaternion_to_matrix(relative), "columns")
+
+    def _root(self, features: Tensor) -> tuple[Tensor, Tensor]:
+        """Heading (..., F) and position (..., F, 3) of the root in the features' unit."""
+        turn = F.pad(features[..., :-1, 0].cumsum(-1), (1, 0))
+        heading = -2 * turn if self.legacy else turn
+        x, z = features[..., :-1, self.slices["root_velocity"]].unbind(-1)
+        way = torch.stack([x, torch.zeros_like(x), z], -1)
+        way = rotation.rotate_y(way, heading[..., 1:] if self.legacy else heading[..., :-1])
+        ground = F.pad(way.cumsum(-2), (0, 0, 1, 0))
+        return heading, torch.stack([ground[..., 0], features[..., 3], ground[..., 2]], -1)
+
+
+def _turn_forward(right: Tensor) -> Tensor:
+    """(N, 3) -> the vertical crossed with the direction of `right`, (N, 2) x and z."""
+    right = F.normalize(right, dim=-1)
+    return torch.stack([right[:, 2], -right[:, 0]], -1)

@@ -98,12 +98,17 @@ class Edit:
         mode: how the process imposes it. "x0" overwrites the clean estimate (MDM); "x_t" replaces the noisy sample
             by the equally noisy known part (FLAME, RePaint); "trajectory" rewrites the flow's path early on (MFM).
         until: for "trajectory", the flow time up to which (included) the path is rewritten.
+        blend: for "x_t", replace the kept part "after" each step (FLAME, eq. 6), which ends in the known motion itself,
+            or "before" each call of the denoiser (FLAME's code), which ends in the model's version of it.
+        resample: for "x_t", how often each step is taken, going back by fresh noise in between (RePaint, algorithm 1).
     """
 
     known: Tensor
     keep: Tensor
     mode: Literal["x0", "x_t", "trajectory"] = "x0"
     until: float = 0.2
+    blend: Literal["after", "before"] = "after"
+    resample: int = 1
 
 
 Denoise = Callable[[Tensor, Tensor, Tensor, Condition], Tensor]

@@ -28,7 +28,7 @@ class Process(nn.Module, ABC):
 
     @abstractmethod
     def to_x0(self, output: Tensor, x_t: Tensor, t: Tensor) -> Tensor:
-        """Clean estimate (B, F, D); to_x0(target(x, noise, t), corrupt(x, noise, t), t) = x."""
+        """Clean estimate (B, F, D): of target(x, noise, t) and corrupt(x, noise, t), it is x."""
 
     @abstractmethod
     def loss(

@@ -1,0 +1,167 @@
+"""Flow matching on straight paths (Lipman et al. 2023; Motion Flow Matching)."""
+
+from typing import Literal, get_args
+
+import torch
+from torch import Tensor
+
+from flame_mdm.losses import masked_mse
+from flame_mdm.motion import Condition, Denoise, Edit, Noise
+from flame_mdm.processes import Auxiliary, Process, samplers
+from flame_mdm.processes.diffusion import check_edit
+
+TimeDistribution = Literal["uniform", "logit_normal"]
+STEPS = {"euler": samplers.euler, "midpoint": samplers.midpoint, "heun": samplers.heun, "rk4": samplers.rk4}
+
+
+class FlowMatching(Process):
+    """A straight path from noise at t = 0 to motion at t = 1; the denoiser predicts its velocity and gets 1000 t."""
+
+    def __init__(
+        self,
+        sigma_min: float = 1e-4,
+        time_distribution: TimeDistribution = "uniform",
+        quantize_time: bool = False,
+        odeint_grid: bool = False,
+    ):
+        """Options.
+
+        Args:
+            sigma_min: deviation of the noise left at t = 1 (Lipman et al. 2023, eq. 20-23).
+            time_distribution: of training times: even on [0, 1), or the logistic of a normal variable, which favors
+                the middle (Esser et al. 2024, eq. 19).
+            quantize_time: legacy of MFM's code: the denoiser gets floor(1000 t), a row of its time table.
+            odeint_grid: legacy of MFM's code, which takes torchdiffeq's Euler steps: times are float32 multiples of
+                1 / N, at some N one row of the table lower than N equal steps (never at 10, 20 or 30).
+
+        Raises:
+            ValueError: an unknown time distribution, or sigma_min not in [0, 1).
+        """
+        super().__init__()
+        if time_distribution not in get_args(TimeDistribution):
+            known = ", ".join(get_args(TimeDistribution))
+            raise ValueError(f"unknown time_distribution '{time_distribution}': choose from {known}")
+        if not 0 <= sigma_min < 1:
+            raise ValueError(f"sigma_min is {sigma_min}: choose a number in [0, 1)")
+        self.sigma_min = sigma_min
+        self.time_distribution = time_distribution
+        self.quantize_time = quantize_time
+        self.odeint_grid = odeint_grid
+
+    def out_features(self, features: int) -> int:
+        return features
+
+    def corrupt(self, x: Tensor, noise: Tensor, t: Tensor) -> Tensor:
+        t = t[:, None, None]
+        return t * x + (1 - (1 - self.sigma_min) * t) * noise
+
+    def target(self, x: Tensor, noise: Tensor, t: Tensor) -> Tensor:
+        return x - (1 - self.sigma_min) * noise
+
+    def to_x0(self, output: Tensor, x_t: Tensor, t: Tensor) -> Tensor:
+        """As the contract, exactly: x_t + (1 - t) u, which MFM's code uses, leaves sigma_min times the noise."""
+        return (1 - (1 - self.sigma_min) * t[:, None, None]) * output + (1 - self.sigma_min) * x_t
+
+    def table_time(self, t: Tensor) -> Tensor:
+        """Flow times -> times as the denoiser gets them, [0, 1000]; beyond 1000 only where a solver looks beyond 1."""
+        # In float32, whatever t is: trained models were shown this rounding.
+        return (t.to(torch.float32) * 1000).floor() if self.quantize_time else t * 1000
+
+    def times(self, num_inference_steps: int) -> list[float]:
+        """The N + 1 times from 0 to 1 between which steps are taken."""
+        count = num_inference_steps
+        if self.odeint_grid:
+            return [*(torch.arange(count, dtype=torch.float32) * (1 / count)).tolist(), 1.0]
+        return [i / count for i in range(count + 1)]
+
+    def loss(
+        self,
+        denoise: Denoise,
+        x: Tensor,
+        mask: Tensor,
+        cond: Condition,
+        *,
+        t: Tensor | None = None,
+        noise: Tensor | None = None,
+        auxiliary: Auxiliary | None = None,
+    ) -> dict[str, Tensor]:
+        """Terms "mse" of the velocity (Lipman et al. 2023, eq. 23), those of `auxiliary`, and "loss"."""
+        if t is None and self.time_distribution == "uniform":
+            t = torch.rand(len(x), device=x.device)
+        elif t is None:
+            t = torch.randn(len(x), device=x.device).sigmoid()
+        if noise is None:
+            noise = torch.randn_like(x)
+        x_t = self.corrupt(x, noise, t)
+        output = denoise(x_t, self.table_time(t), mask, cond).to(x_t.dtype)
+        terms = {"mse": masked_mse(output, self.target(x, noise, t), mask)}
+        if auxiliary is not None:
+            terms |= auxiliary(self.to_x0(output, x_t, t), x, mask)
+        return terms | {"loss": torch.stack(list(terms.values())).sum(0)}
+
+    def sample(
+        self,
+        denoise: Denoise,
+        noise: Noise,
+        mask: Tensor,
+        cond: Condition,
+        *,
+        sampler: str = "euler",
+        num_inference_steps: int,
+        edit: Edit | None = None,
+        trajectory: list[Tensor] | None = None,
+    ) -> Tensor:
+        """As the contract; draws noise number 0 alone.
+
+        Args:
+            denoise: the denoiser, guided or not; called 1 (euler), 2 (midpoint, heun) or 4 times (rk4) a step.
+            noise: the start.
+            mask: (B, F).
+            cond: the condition.
+            sampler: "euler", "midpoint", "heun", "rk4" or "dopri5".
+            num_inference_steps: N >= 1 equal steps; "dopri5" chooses its own.
+            edit: mode "trajectory" (MFM, algorithm 1) rewrites the kept part before each step at a time <= `until`, by
+                the straight path from its noise to the known motion; from there on the model alone moves it. Mode
+                "x0" overwrites the clean estimate of every call and so meets the kept part exactly. Not with "dopri5".
+            trajectory: list that the clean estimate of each call (B, F, D) is appended to.
+
+        Raises:
+            ValueError: the sampler, the number of steps or the edit is not possible.
+        """
+        if sampler != "dopri5" and sampler not in STEPS:
+            raise ValueError(f"unknown sampler '{sampler}': FlowMatching has {', '.join(STEPS)}, dopri5")
+        if num_inference_steps < 1:
+            raise ValueError(f"num_inference_steps is {num_inference_steps}: a flow takes 1 or more")
+        if edit is not None:
+            check_edit(edit, mask, ("trajectory", "x0"), "FlowMatching")
+            if sampler == "dopri5":
+                raise ValueError(f"dopri5 chooses its own steps and cannot edit: choose from {', '.join(STEPS)}")
+        start = noise(0)
+
+        def velocity(x: Tensor, t: float | Tensor) -> Tensor:
+            # A number fills a tensor on the device; nothing is copied or waited for.
+            precision = torch.promote_types(x.dtype, torch.float32)
+            time = t.expand(len(x)) if isinstance(t, Tensor) else x.new_full((len(x),), t, dtype=precision)
+            output = denoise(x, self.table_time(time), mask, cond).to(x.dtype)
+            if trajectory is None and (edit is None or edit.mode != "x0"):
+                return output
+            x0_hat = self.to_x0(output, x, time)
+            if edit is not None and edit.mode == "x0":
+                x0_hat = torch.where(edit.keep, edit.known, x0_hat)
+                known_velocity = (x0_hat - (1 - self.sigma_min) * x) / (1 - (1 - self.sigma_min) * time[:, None, None])
+                output = torch.where(edit.keep, known_velocity, output)
+            if trajectory is not None:
+                trajectory.append(x0_hat * mask[..., None])
+            return output
+
+        if sampler == "dopri5":
+            return samplers.dopri5(velocity, start) * mask[..., None]
+        step, times, count = STEPS[sampler], self.times(num_inference_steps), num_inference_steps
+        x = start
+        for i in range(count):
+            if edit is not None and edit.mode == "trajectory" and i / count <= edit.until:
+                x = torch.where(edit.keep, (start * (count - i) + edit.known * i) / count, x)
+            x = step(velocity, x, times[i], times[i + 1] - times[i])
+        if edit is not None and edit.mode == "x0":
+            x = torch.where(edit.keep, edit.known, x)
+        return x * mask[..., None]

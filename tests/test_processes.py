@@ -1,0 +1,445 @@
+"""Schedules, the two processes, their losses and the steps they train on."""
+
+import math
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from fixtures import Arrays, golden, meta
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+from flame_mdm.losses import masked_mean, masked_mse
+from flame_mdm.motion import Condition, length_mask
+from flame_mdm.processes.diffusion import GaussianDiffusion, LossAwareTimesteps
+from flame_mdm.processes.flow_matching import FlowMatching
+from flame_mdm.processes.schedules import build_schedule, timesteps
+
+GAUSSIAN, MFM = golden("gaussian"), golden("mfm")
+SHARED = Condition(torch.zeros(1, 1), torch.zeros(1, 0, 1), None)
+TABLES = {
+    "betas": "betas",
+    "alphas_cumprod": "alphas_cumprod",
+    "posterior_variance": "posterior_variance",
+    "posterior_log_variance_clipped": "posterior_log_variance",
+    "posterior_mean_coef1": "posterior_x0",
+    "posterior_mean_coef2": "posterior_x_t",
+    "sqrt_alphas_cumprod": "signal",
+    "sqrt_one_minus_alphas_cumprod": "noise",
+}
+DTYPES = [torch.float32, torch.float64]
+# Options of the four point-wise cases, by what the fixture calls them.
+POINTWISE = {
+    "startx_fixedsmall_clip0": GaussianDiffusion(),
+    "startx_fixedsmall_clip1": GaussianDiffusion(clip_x0=True),
+    "startx_fixedlarge": GaussianDiffusion(variance="fixed_large"),
+    "eps_learnedrange_clip0": GaussianDiffusion(prediction="epsilon", variance="learned_range"),
+    "eps_learnedrange_clip1": GaussianDiffusion(prediction="epsilon", variance="learned_range", clip_x0=True),
+}
+
+
+def motions(array: np.ndarray, dtype: torch.dtype = torch.float32) -> Tensor:
+    """(B, joints, features, frames) or (B, D, frames) -> (B, F, D)."""
+    return torch.from_numpy(array).to(dtype).flatten(1, -2).transpose(1, 2).contiguous()
+
+
+def linear_denoiser(A: np.ndarray, b: np.ndarray, g: float, features: int):
+    """The fixtures' denoiser: each group of `features` channels mixed by A, plus b + g t / 1000."""
+
+    def denoise(x_t: Tensor, t: Tensor, mask: Tensor, cond: Condition) -> Tensor:
+        weight, bias = torch.from_numpy(A).to(x_t), torch.from_numpy(b).to(x_t)
+        grouped = x_t.unflatten(-1, (-1, features))
+        output = torch.einsum("jk,blkf->bljf", weight, grouped) + bias + g * t.to(x_t)[:, None, None, None] / 1000
+        return output.flatten(-2)
+
+    return denoise
+
+
+def assert_golden(arrays: Arrays, key: str, value: Tensor, within: float = 10.0) -> None:
+    """Against the float64 run in float64; else within ten times what float32 cost the authors' code."""
+    if value.dtype == torch.float64 and f"f64/{key}" in arrays:
+        expected = arrays[f"f64/{key}"]
+        tolerance = 1e-10 * max(1.0, np.abs(expected).max())
+    else:
+        expected = arrays[key]
+        cost = np.ravel(meta(arrays)["max_abs_diff_f32_vs_f64"].get(key, 0.0))[0]
+        tolerance = max(within * cost, 1e-6 * max(1.0, np.abs(expected).max()))
+    if expected.ndim > 2:
+        value = value.transpose(1, 2).reshape(expected.shape)
+    np.testing.assert_allclose(value.numpy(), expected, rtol=0, atol=tolerance, err_msg=key)
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize("key", [pytest.param(k, id=f"gaussian-{k}") for k in GAUSSIAN if k.startswith("sched/")])
+def test_schedule_is_that_of_the_papers(key):
+    _, case, table = key.split("/")
+    name, total = case.split("_T")
+    tables = build_schedule(name, int(total)).tables
+    if table == "sqrt_recip_alphas_cumprod":
+        value = 1 / tables["signal"]
+    elif table == "sqrt_recipm1_alphas_cumprod":
+        value = tables["noise"] / tables["signal"]
+    else:
+        value = tables[TABLES[table]]
+    np.testing.assert_allclose(value.numpy(), GAUSSIAN[key], rtol=1e-9)
+
+
+def spaced(total: int, spec: str) -> list[int]:
+    """The fixtures' names of step choices: "ddimN", "N" or the counts of equal sections "a,b,c"."""
+    if spec.startswith("ddim"):
+        return timesteps(total, int(spec.removeprefix("ddim")), "stride")
+    counts = [int(count) for count in spec.split(",")]
+    steps, start = [], 0
+    for index, count in enumerate(counts):
+        size = total // len(counts) + (index < total % len(counts))
+        steps += [start + step for step in timesteps(size, count)]
+        start += size
+    return steps
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize("key", [pytest.param(k, id=f"gaussian-{k}") for k in GAUSSIAN if k.startswith("respace/")])
+def test_steps_and_their_betas(key):
+    total, spec = key.removeprefix("respace/T").split("/")
+    steps = spaced(int(total), spec)
+    assert steps == GAUSSIAN[key].tolist()
+    betas = build_schedule("cosine", int(total)).respace(steps).tables["betas"]
+    np.testing.assert_allclose(betas.numpy(), GAUSSIAN[key.replace("respace/", "respace_betas/")], rtol=1e-9)
+
+
+@pytest.mark.parametrize("total", [10, 50, 100, 1000])
+@pytest.mark.parametrize("name", ["cosine", "linear"])
+def test_schedules_lose_signal_step_by_step(name, total):
+    tables = build_schedule(name, total).tables
+    assert (tables["betas"] > 0).all()
+    assert (tables["betas"] <= 0.999).all()
+    assert (tables["alphas_cumprod"].diff() < 0).all()
+    assert tables["alphas_cumprod"][-1] < 1e-4
+    if name == "linear":
+        assert tables["betas"][0].item() == pytest.approx(0.1 / total)
+
+
+@given(st.integers(10, 1000), st.data())
+@settings(max_examples=50, deadline=None)
+def test_linspace_takes_both_ends_evenly(total, data):
+    count = data.draw(st.integers(2, total))
+    steps = timesteps(total, count)
+    assert len(steps) == count
+    assert (steps[0], steps[-1]) == (0, total - 1)
+    gaps = np.diff(steps)
+    assert gaps.min() >= max(1, math.floor((total - 1) / (count - 1)))
+    assert gaps.max() <= math.ceil((total - 1) / (count - 1)) + 1
+
+
+@pytest.mark.parametrize(("count", "spacing"), [(0, "linspace"), (1001, "linspace"), (400, "stride"), (5, "karras")])
+def test_impossible_steps_are_refused(count, spacing):
+    with pytest.raises(ValueError, match=r"choose"):
+        timesteps(1000, count, spacing)
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize("dtype", DTYPES, ids=["gaussian-f32", "gaussian-f64"])
+def test_corrupt_and_posterior(dtype):
+    process = GaussianDiffusion(num_train_timesteps=meta(GAUSSIAN)["options"]["T"])
+    x, noise, t = (
+        motions(GAUSSIAN["pw/x0"], dtype),
+        motions(GAUSSIAN["pw/noise"], dtype),
+        torch.tensor(GAUSSIAN["pw/t"]),
+    )
+    x_t = process.corrupt(x, noise, t.float())
+    assert_golden(GAUSSIAN, "pw/x_t", x_t)
+    assert_golden(GAUSSIAN, "pw/q_posterior_mean", process.schedule.posterior_mean(x, x_t, t))
+
+
+def pointwise_output(x_t: Tensor, learned: bool) -> Tensor:
+    suffix = "2" if learned else ""
+    A, b = GAUSSIAN[f"lin4/A{suffix}"], GAUSSIAN[f"lin4/b{suffix}"]
+    t = torch.tensor(GAUSSIAN["pw/t"]).float()
+    denoise = linear_denoiser(A, b, float(GAUSSIAN["lin4/g"]), b.shape[1])
+    return denoise(x_t, t, torch.ones(x_t.shape[:2], dtype=torch.bool), SHARED)
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize("dtype", DTYPES, ids=["f32", "f64"])
+@pytest.mark.parametrize("case", [pytest.param(case, id=f"gaussian-{case}") for case in POINTWISE])
+def test_reverse_step(case, dtype):
+    process, t = POINTWISE[case], torch.tensor(GAUSSIAN["pw/t"])
+    x_t = motions(GAUSSIAN["f64/pw/x_t" if dtype == torch.float64 else "pw/x_t"], dtype)
+    output = pointwise_output(x_t, "learned" in case)
+    x0_hat = process.to_x0(output, x_t, t)
+    if process.clip_x0:
+        x0_hat = x0_hat.clamp(-1, 1)
+    log_variance = torch.as_tensor(process.log_variance(output, x_t, t, process.schedule)).expand_as(x_t)
+    assert_golden(GAUSSIAN, f"pw/{case}/pred_xstart", x0_hat)
+    assert_golden(GAUSSIAN, f"pw/{case}/log_variance", log_variance)
+    if process.variance == "fixed_small":  # not clipped at step 0, unlike its logarithm
+        variance = torch.as_tensor(process.schedule.at("posterior_variance", t, x_t)).expand_as(x_t)
+    else:
+        variance = log_variance.exp()
+    assert_golden(GAUSSIAN, f"pw/{case}/variance", variance)
+    assert_golden(GAUSSIAN, f"pw/{case}/mean", process.schedule.posterior_mean(x0_hat, x_t, t))
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize("dtype", DTYPES, ids=["f32", "f64"])
+@pytest.mark.parametrize("case", ["gaussian-guided_bits", "gaussian-flame_nats"])
+def test_variational_bound(case, dtype):
+    legacy = {"vlb_units": "bits", "vlb_decoder": "discretized"} if "guided" in case else {}
+    process = GaussianDiffusion(prediction="epsilon", variance="learned_range", **legacy)
+    x, noise = motions(GAUSSIAN["pw/x0"], dtype), motions(GAUSSIAN["pw/noise"], dtype)
+    mask, t = torch.ones(x.shape[:2], dtype=torch.bool), torch.tensor(GAUSSIAN["pw/t"]).float()
+    x_t = process.corrupt(x, noise, t)
+    if "guided" in case:
+        output = pointwise_output(x_t, learned=True)
+    else:  # FLAME's code has one channel a joint: the bias of channel 0 for all.
+        A, b = GAUSSIAN["lin4/A2"], GAUSSIAN["lin4/b2"][:, :1]
+        denoise = linear_denoiser(A, b, float(GAUSSIAN["lin4/g"]), GAUSSIAN["lin4/b2"].shape[1])
+        output = denoise(x_t, t, mask, SHARED)
+    bound = masked_mean(process.vlb(output, x, x_t, t), mask)
+    assert_golden(GAUSSIAN, f"pw/vb_{case.removeprefix('gaussian-')}", bound)
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize("dtype", DTYPES, ids=["gaussian-f32", "gaussian-f64"])
+def test_prior(dtype):
+    x = motions(GAUSSIAN["pw/x0"], dtype)
+    prior = GaussianDiffusion(vlb_units="bits").prior(x, torch.ones(x.shape[:2], dtype=torch.bool))
+    # Near 0 the divergence is what rounding leaves; float64 says what it is.
+    np.testing.assert_allclose(
+        prior.numpy(), GAUSSIAN["f64/pw/prior_bits"], rtol=0, atol=1e-15 if dtype == torch.float64 else 1e-7
+    )
+
+
+PROCESSES = {
+    "x0": GaussianDiffusion(prediction="x0"),
+    "epsilon": GaussianDiffusion(prediction="epsilon"),
+    "velocity": GaussianDiffusion(prediction="velocity", schedule="linear"),
+    "learned": GaussianDiffusion(num_train_timesteps=50, prediction="epsilon", variance="learned_range"),
+    "flow": FlowMatching(),
+    "flow_sigma": FlowMatching(sigma_min=0.1, quantize_time=True),
+}
+
+
+def random_times(process: GaussianDiffusion | FlowMatching, batch: int) -> Tensor:
+    if isinstance(process, FlowMatching):
+        return torch.cat([torch.tensor([0.0]), torch.rand(batch - 1)])
+    return torch.randint(len(process.schedule), (batch,)).float()
+
+
+@pytest.mark.parametrize("name", PROCESSES)
+def test_clean_estimate_undoes_the_target(name):
+    torch.manual_seed(0)
+    process = PROCESSES[name]
+    x, noise = torch.randn(2, 16, 7, 5, dtype=torch.float64).unbind()
+    t = random_times(process, 16).double()
+    target = process.target(x, noise, t)
+    assert target.shape == x.shape
+    torch.testing.assert_close(process.to_x0(target, process.corrupt(x, noise, t), t), x, rtol=0, atol=1e-7)
+
+
+@pytest.mark.parametrize("name", PROCESSES)
+def test_oracle_has_no_loss_and_padding_has_no_say(name):
+    torch.manual_seed(0)
+    process = PROCESSES[name]
+    lengths, features = torch.tensor([7, 4, 1]), 5
+    mask = length_mask(lengths)
+    x, noise = torch.randn(2, 3, 7, features).unbind()
+    x = x * mask[..., None]
+    t = random_times(process, 3)
+    spare = process.out_features(features) - features
+
+    def oracle(x_t, time, mask, cond):
+        target = process.target(x, noise, t)
+        assert (time >= 0).all()
+        assert (time < 1000).all()
+        garbage = torch.where(mask[..., None], target, 1e3)
+        return torch.cat([garbage, torch.zeros(*garbage.shape[:2], spare)], -1)
+
+    seen = {}
+
+    def auxiliary(x0_hat, clean, mask):
+        seen["error"] = masked_mse(x0_hat, clean, mask)
+        return {"extra": torch.full((3,), 0.25)}
+
+    terms = process.loss(oracle, x, mask, SHARED, t=t, noise=noise, auxiliary=auxiliary)
+    assert set(terms) == {"mse", "extra", "loss"} | ({"vlb"} if spare else set())
+    torch.testing.assert_close(terms["mse"], torch.zeros(3))
+    torch.testing.assert_close(seen["error"], torch.zeros(3), rtol=0, atol=1e-2)
+    total = sum(value for key, value in terms.items() if key != "loss")
+    torch.testing.assert_close(terms["loss"], total)
+    other = process.loss(
+        oracle, x, mask, SHARED, t=t, noise=torch.where(mask[..., None], noise, 0.0), auxiliary=auxiliary
+    )
+    torch.testing.assert_close(other["loss"], terms["loss"])
+
+
+def constant(value: float, channels: int):
+    return lambda x_t, t, mask, cond: torch.full((*x_t.shape[:2], channels), value).to(x_t)
+
+
+def test_hybrid_loss_trains_the_variance_alone():
+    torch.manual_seed(0)
+    process = GaussianDiffusion(prediction="epsilon", variance="learned_range", vlb_weight=0.002)
+    x, mask, t = torch.randn(2, 6, 3), torch.ones(2, 6, dtype=torch.bool), torch.tensor([0.0, 500.0])
+    noise = torch.randn_like(x)
+    output = torch.randn(2, 6, 6, requires_grad=True)
+    terms = process.loss(lambda *_: output, x, mask, SHARED, t=t, noise=noise)
+    x_t = process.corrupt(x, noise, t)
+    torch.testing.assert_close(terms["vlb"], 0.002 * 1000 * masked_mean(process.vlb(output, x, x_t, t), mask))
+    terms["vlb"].sum().backward()
+    assert output.grad is not None
+    assert (output.grad[..., :3] == 0).all()
+    assert (output.grad[..., 3:] != 0).all()
+
+
+def test_average_padding_gives_short_motions_less_weight():
+    torch.manual_seed(0)
+    mask, x = length_mask(torch.tensor([8, 2])), torch.zeros(2, 8, 3)
+    noise, t = torch.randn_like(x), torch.zeros(2)
+
+    def silent(x_t, t, mask, cond):
+        return torch.zeros(2, 8, 6)
+
+    options = {"prediction": "epsilon", "variance": "learned_range"}
+    sound = GaussianDiffusion(**options).loss(silent, x, mask, SHARED, t=t, noise=noise)
+    legacy = GaussianDiffusion(**options, average_padding=True).loss(silent, x, mask, SHARED, t=t, noise=noise)
+    torch.testing.assert_close(legacy["mse"], sound["mse"] * torch.tensor([1.0, 0.25]))
+    torch.testing.assert_close(legacy["vlb"][0], sound["vlb"][0])
+    assert legacy["vlb"][1] != sound["vlb"][1]
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{"schedule": "sigmoid"}, {"prediction": "noise"}, {"variance": "fixed"}, {"vlb_units": "bytes"},
+     {"vlb_decoder": "x"}, {"timestep_sampling": "x"}, {"num_train_timesteps": 1}],
+)  # fmt: skip
+def test_unknown_options_are_refused(options):
+    with pytest.raises(ValueError, match=str(next(iter(options.values())))):
+        GaussianDiffusion(**options)
+
+
+@pytest.mark.parametrize("options", [{"time_distribution": "beta"}, {"sigma_min": 1.0}])
+def test_unknown_flow_options_are_refused(options):
+    with pytest.raises(ValueError, match=str(next(iter(options.values())))):
+        FlowMatching(**options)
+
+
+def test_loss_aware_sampling_needs_a_full_history_and_then_follows_the_losses():
+    torch.manual_seed(0)
+    sampling = LossAwareTimesteps(4)
+    for _ in range(9):
+        sampling.update(torch.arange(4), torch.arange(1.0, 5.0))
+    assert (sampling.probabilities() == 0.25).all()
+    sampling.update(torch.tensor([3, 1, 0, 2]), torch.tensor([4.0, 2.0, 1.0, 3.0]))
+    expected = 0.999 * torch.tensor([0.1, 0.2, 0.3, 0.4]) + 0.001 / 4
+    torch.testing.assert_close(sampling.probabilities(), expected)
+    t, weights = sampling.draw(20_000)
+    torch.testing.assert_close(torch.bincount(t) / 20_000, expected, rtol=0, atol=0.02)
+    torch.testing.assert_close(weights, 1 / (4 * expected[t]))
+    assert weights.mean() == pytest.approx(1, abs=0.03)
+
+
+def test_loss_history_keeps_the_last_ten_of_each_step():
+    rng = np.random.default_rng(0)
+    sampling, kept = LossAwareTimesteps(3), {0: [], 1: [], 2: []}
+    for batch in (1, 5, 40, 2, 13):
+        t, losses = rng.choice(3, batch, p=[0.6, 0.3, 0.1]), rng.random(batch).astype(np.float32)
+        sampling.update(torch.from_numpy(t), torch.from_numpy(losses))
+        for step, loss in zip(t, losses, strict=True):
+            kept[int(step)].append(loss)
+    for step, values in kept.items():
+        assert sorted(sampling.history[step].tolist(), reverse=True)[: len(values)] == sorted(
+            values[-10:], reverse=True
+        )
+        assert sampling.counts[step] == len(values)
+
+
+def test_loss_aware_training_is_a_function_of_what_is_saved():
+    def trained(process: GaussianDiffusion, steps: range) -> list[Tensor]:
+        losses = []
+        for step in steps:
+            torch.manual_seed(step)
+            x = torch.randn(64, 3, 2)
+            losses.append(process.loss(constant(0.0, 2), x, torch.ones(64, 3, dtype=torch.bool), SHARED)["loss"])
+        return losses
+
+    options = {"num_train_timesteps": 10, "prediction": "epsilon", "timestep_sampling": "loss_aware"}
+    whole = GaussianDiffusion(**options)
+    expected = trained(whole, range(12))
+    half, resumed = GaussianDiffusion(**options), GaussianDiffusion(**options)
+    trained(half, range(6))
+    resumed.load_state_dict(half.state_dict())
+    for a, b in zip(trained(resumed, range(6, 12)), expected[6:], strict=True):
+        assert torch.equal(a, b)
+    assert whole.timesteps is not None
+    before = whole.timesteps.counts.clone()
+    trained(whole.eval(), range(1))
+    assert torch.equal(whole.timesteps.counts, before)
+
+
+def test_tables_keep_their_precision_when_the_model_is_cast():
+    process = GaussianDiffusion(prediction="epsilon").to(torch.bfloat16)
+    x, t = torch.ones(1, 1, 1), torch.tensor([999.0])
+    assert process.corrupt(x, 0 * x, t).item() == pytest.approx(process.schedule.tables["signal"][-1].item(), rel=1e-6)
+    assert process.corrupt(x.bfloat16(), 0 * x.bfloat16(), t).dtype == torch.float32
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize("dtype", DTYPES, ids=["mfm-f32", "mfm-f64"])
+def test_flow_path_and_target(dtype):
+    process = FlowMatching(sigma_min=meta(MFM)["sigma_min"])
+    x, noise = motions(MFM["loss/x_start"], dtype), motions(MFM["loss/noise"], dtype)
+    t = torch.from_numpy(MFM["loss/t"]).to(dtype)
+    assert_golden(MFM, "loss/x_t", process.corrupt(x, noise, t))
+    assert_golden(MFM, "loss/target", process.target(x, noise, t))
+
+
+def flow_field(x: Tensor, t: Tensor, mask: Tensor, cond: Condition) -> Tensor:
+    """The fixture's velocity field: A x + b + c t, channels first, t as the flow has it."""
+    A, b = torch.from_numpy(MFM["field/A"]).to(x), torch.from_numpy(MFM["field/b"]).to(x)
+    groups = x.unflatten(-1, (A.shape[0], -1))
+    output = torch.einsum("jk,blkf->bljf", A, groups) + b + float(MFM["field/c"]) * t.to(x)[:, None, None, None] / 1000
+    return output.flatten(-2)
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize("case", ["mfm-field"])
+def test_flow_loss(case):
+    process = FlowMatching(sigma_min=meta(MFM)["sigma_min"])
+    x, noise, t = motions(MFM["loss/x_start"]), motions(MFM["loss/noise"]), torch.from_numpy(MFM["loss/t"])
+    mask = torch.from_numpy(MFM["in/mask"]).flatten(1)
+    terms = process.loss(flow_field, x, mask, SHARED, t=t, noise=noise)
+    assert_golden(MFM, "loss/field/rot_mse", terms["mse"])
+    assert_golden(MFM, "loss/field/loss", terms["loss"])
+
+
+GRIDS = sorted(key.removesuffix("_row") for key in MFM if key.startswith("times/") and key.endswith("_row"))
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize("case", [pytest.param(key, id=f"mfm-{key}") for key in GRIDS])
+def test_flow_times_and_rows(case):
+    name, count = case.removeprefix("times/").split("_N")
+    process = FlowMatching(quantize_time=True, odeint_grid=name == "odeint")
+    times = torch.tensor(process.times(int(count)), dtype=torch.float64)
+    assert times[-1] == 1
+    assert np.array_equal(times[:-1].to(torch.float32).numpy(), MFM[f"{case}_t"])
+    assert process.table_time(times[:-1]).long().tolist() == MFM[f"{case}_row"].tolist()
+
+
+@pytest.mark.parametrize("distribution", ["uniform", "logit_normal"])
+def test_flow_times_are_drawn_as_named(distribution):
+    torch.manual_seed(0)
+    process, seen = FlowMatching(time_distribution=distribution), SimpleNamespace()
+
+    def denoise(x_t, t, mask, cond):
+        seen.t = t / 1000
+        return x_t
+
+    process.loss(denoise, torch.zeros(4000, 1, 1), torch.ones(4000, 1, dtype=torch.bool), SHARED)
+    middle = ((seen.t > 0.25) & (seen.t < 0.75)).float().mean()
+    assert seen.t.mean() == pytest.approx(0.5, abs=0.03)
+    # P(|logit| < ln 3) of a normal variable is 0.728.
+    assert middle == pytest.approx(0.5 if distribution == "uniform" else 0.728, abs=0.03)

@@ -1,0 +1,102 @@
+"""The network of FLAME (Kim et al. 2023, section "Architecture", tables 4, 6 and 7)."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor, nn
+
+from flame_mdm.denoisers import Denoiser
+from flame_mdm.denoisers.layers import Transformer, with_prefix
+from flame_mdm.motion import Condition
+
+
+class FLAME(Denoiser):
+    """Transformer decoder over [ML, TS, CLS, frame 1, frame 2, ...] that reads [ML, TS, CLS, text tokens].
+
+    ML embeds the length of the motion, TS is the sinusoid of the time, CLS the projected pooled condition.
+    Frames past the end of a motion come out as 0.
+    """
+
+    def __init__(
+        self,
+        in_features: int,
+        out_features: int,
+        cond_features: int,
+        *,
+        latent_dim: int,
+        ff_size: int,
+        num_layers: int,
+        num_heads: int,
+        dropout: float,
+        max_frames: int,
+        length_token: bool = True,
+        cross_attention: bool = True,
+    ):
+        """Builds the network.
+
+        Args:
+            in_features: D of the noisy motion.
+            out_features: channels to predict; with learned variance 2D.
+            cond_features: C, width of the condition; 0 = unconditioned.
+            latent_dim: width of the transformer.
+            ff_size: hidden width of its feed-forward layers.
+            num_layers: number of its layers.
+            num_heads: attention heads.
+            dropout: probability inside the layers.
+            max_frames: longest motion that ML knows.
+            length_token: False leaves ML out (table 4, first row).
+            cross_attention: False leaves a transformer encoder over ML, TS, CLS and frames (table 4, first two rows).
+        """
+        super().__init__()
+        self.max_frames = max_frames
+        # A table of max_frames rows serves the lengths 1 to max_frames: row 0, which no length of the authors' code
+        # reads, is that of the longest motion.
+        self.length_embedding = nn.Embedding(max_frames, latent_dim) if length_token else None
+        self.input = nn.Linear(in_features, latent_dim)
+        self.pooled_projection = nn.Linear(cond_features, latent_dim) if cond_features else None
+        self.token_projection = nn.Linear(cond_features, latent_dim) if cond_features and cross_attention else None
+        self.transformer = Transformer(
+            latent_dim, ff_size, num_layers, num_heads, dropout, nn.ReLU, cross_attention=cross_attention
+        )
+        self.output = nn.Linear(latent_dim, out_features)
+
+    def forward(self, x_t: Tensor, t: Tensor, mask: Tensor, cond: Condition) -> Tensor:
+        """Predicts as the contract says.
+
+        Raises:
+            ValueError: a motion is longer than `max_frames`.
+        """
+        x = self.input(x_t)
+        prefix = [cosine_first_sinusoid(t, x.shape[-1]).to(x_t.dtype)]
+        if self.length_embedding is not None:
+            lengths = mask.sum(1)
+            if x_t.shape[1] > self.max_frames and lengths.max() > self.max_frames:
+                raise ValueError(
+                    f"a motion of {int(lengths.max())} frames is longer than the length token knows: "
+                    f"raise denoiser.max_frames ({self.max_frames})"
+                )
+            prefix.insert(0, self.length_embedding(lengths % self.max_frames))
+        if self.pooled_projection is not None:
+            prefix.append(self.pooled_projection(cond.pooled))
+        prefix = torch.stack(prefix, 1)
+        memory = memory_mask = None
+        if self.token_projection is not None:
+            memory = torch.cat([prefix, self.token_projection(cond.tokens)], 1)
+            if cond.token_mask is not None:
+                memory_mask = with_prefix(cond.token_mask, prefix.shape[1])
+        else:
+            memory = prefix
+        x = torch.cat([prefix, x], 1)
+        x = x + cosine_first_sinusoid(torch.arange(x.shape[1], device=x.device), x.shape[-1]).to(x_t.dtype)
+        x = self.transformer(x, with_prefix(mask, prefix.shape[1]), memory, memory_mask)
+        return self.output(x[:, prefix.shape[1] :]) * mask[..., None]
+
+
+def cosine_first_sinusoid(position: Tensor, features: int) -> Tensor:
+    """(N,) positions or times -> (N, features) float32: cosines in the first half, sines in the second."""
+    half = features // 2
+    frequency = torch.exp(-math.log(10000.0) * torch.arange(half, device=position.device, dtype=torch.float32) / half)
+    angle = position.float()[:, None] * frequency
+    return torch.cat([angle.cos(), angle.sin()], -1)

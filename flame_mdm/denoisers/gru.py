@@ -1,0 +1,56 @@
+"""The recurrent network of the Human Motion Diffusion Model (Tevet et al. 2023, "MDM", section 4.1, appendix C)."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from flame_mdm.denoisers import Denoiser
+from flame_mdm.denoisers.layers import TimeAndCondition, sinusoid
+from flame_mdm.motion import Condition
+
+
+class MDMGRU(Denoiser):
+    """GRU over the frames, time + condition concatenated to each of them.
+
+    It runs forward in time, so that padding at the end reaches no real frame.
+    """
+
+    def __init__(
+        self,
+        in_features: int,
+        out_features: int,
+        cond_features: int,
+        *,
+        latent_dim: int,
+        num_layers: int,
+        dropout: float,
+        project_condition: bool = True,
+        recur_over_batch: bool = False,
+    ):
+        """Builds the network.
+
+        Args:
+            in_features: D of the noisy motion.
+            out_features: channels to predict.
+            cond_features: C, width of the condition; 0 = unconditioned.
+            latent_dim: width of the recurrent state.
+            num_layers: number of recurrent layers.
+            dropout: probability, after the positions.
+            project_condition: False adds the condition to the time as it is.
+            recur_over_batch: recurs from sample to sample in place of from frame to frame, as MDM's released code
+                does by a swap of axes; only to reproduce it: results then depend on the order of the batch.
+        """
+        super().__init__()
+        self.condition = TimeAndCondition(latent_dim, cond_features, project_condition)
+        self.input = nn.Linear(in_features + latent_dim, latent_dim)
+        self.dropout = nn.Dropout(dropout)
+        self.gru = nn.GRU(latent_dim, latent_dim, num_layers, batch_first=not recur_over_batch)
+        self.output = nn.Linear(latent_dim, out_features)
+
+    def forward(self, x_t: Tensor, t: Tensor, mask: Tensor, cond: Condition) -> Tensor:
+        frames = x_t.shape[1]
+        token = self.condition(t, cond.pooled)[:, None].expand(-1, frames, -1)
+        x = self.input(torch.cat([x_t, token], -1))
+        x = self.dropout(x + sinusoid(torch.arange(frames, device=x.device), x.shape[-1]).to(x_t.dtype))
+        return self.output(self.gru(x)[0])

@@ -1,0 +1,161 @@
+"""Parts that the denoisers share: sinusoids, post-norm transformer, time and condition in one vector."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+
+def sinusoid(position: Tensor, features: int) -> Tensor:
+    """Sines on even and cosines on odd channels (Vaswani et al. 2017, section 3.5).
+
+    Computed in float32 whatever the precision of the network, as released weights were trained with.
+
+    Args:
+        position: (N,), integer or not.
+        features: width of the result, even.
+
+    Returns:
+        (N, features) float32.
+    """
+    channel = torch.arange(0, features, 2, device=position.device, dtype=torch.float32)
+    angle = position.float()[:, None] * torch.exp(channel * (-math.log(10000.0) / features))
+    return torch.stack([angle.sin(), angle.cos()], -1).flatten(1)
+
+
+def with_prefix(mask: Tensor, prefix: int) -> Tensor:
+    """(B, N) mask -> (B, prefix + N): what stands before the sequence is always real."""
+    return torch.cat([mask.new_ones(len(mask), prefix), mask], 1)
+
+
+class Attention(nn.Module):
+    """Multi-head attention of x to itself or to a memory (Vaswani et al. 2017, section 3.2.2).
+
+    Query, key and value share one matrix (3C, C), so that self-attention projects once and released weights map one
+    to one.
+    """
+
+    def __init__(self, features: int, num_heads: int, dropout: float):
+        super().__init__()
+        if features % num_heads:
+            raise ValueError(f"latent_dim ({features}) is not a multiple of num_heads ({num_heads})")
+        self.num_heads, self.dropout = num_heads, dropout
+        self.qkv = nn.Linear(features, 3 * features)
+        self.out = nn.Linear(features, features)
+        nn.init.xavier_uniform_(self.qkv.weight)
+        nn.init.zeros_(self.qkv.bias)
+        nn.init.zeros_(self.out.bias)
+
+    def forward(self, x: Tensor, mask: Tensor | None, memory: Tensor | None = None) -> Tensor:
+        """Attends from x (B, N, C) to the real entries (mask (B, S), None = all) of memory (B, S, C), or of x."""
+        if memory is None:
+            query, key, value = self.qkv(x).chunk(3, -1)
+        else:
+            size = x.shape[-1]
+            weight, bias = self.qkv.weight, self.qkv.bias
+            query = functional.linear(x, weight[:size], bias[:size])
+            key, value = functional.linear(memory, weight[size:], bias[size:]).chunk(2, -1)
+        query, key, value = (y.unflatten(-1, (self.num_heads, -1)).transpose(1, 2) for y in (query, key, value))
+        y = functional.scaled_dot_product_attention(
+            query,
+            key,
+            value,
+            attn_mask=None if mask is None else mask[:, None, None],
+            dropout_p=self.dropout if self.training else 0.0,
+        )
+        return self.out(y.transpose(1, 2).flatten(2))
+
+
+class TransformerLayer(nn.Module):
+    """Self-attention, cross-attention where asked for, feed-forward; the norm comes after each residual sum."""
+
+    def __init__(
+        self,
+        features: int,
+        ff_size: int,
+        num_heads: int,
+        dropout: float,
+        activation: type[nn.Module],
+        cross_attention: bool,
+    ):
+        super().__init__()
+        self.self_attention = Attention(features, num_heads, dropout)
+        self.self_norm = nn.LayerNorm(features)
+        self.cross_attention = Attention(features, num_heads, dropout) if cross_attention else None
+        self.cross_norm = nn.LayerNorm(features) if cross_attention else None
+        self.feed_forward = nn.Sequential(
+            nn.Linear(features, ff_size), activation(), nn.Dropout(dropout), nn.Linear(ff_size, features)
+        )
+        self.feed_forward_norm = nn.LayerNorm(features)
+        self.dropout = nn.Dropout(dropout)
+
+    def forward(self, x: Tensor, mask: Tensor | None, memory: Tensor | None, memory_mask: Tensor | None) -> Tensor:
+        x = self.self_norm(x + self.dropout(self.self_attention(x, mask)))
+        if self.cross_attention is not None and self.cross_norm is not None:
+            x = self.cross_norm(x + self.dropout(self.cross_attention(x, memory_mask, memory)))
+        return self.feed_forward_norm(x + self.dropout(self.feed_forward(x)))
+
+
+class Transformer(nn.Module):
+    """A stack of post-norm layers, with cross-attention (a decoder) or without (an encoder); no causal mask."""
+
+    def __init__(
+        self,
+        features: int,
+        ff_size: int,
+        num_layers: int,
+        num_heads: int,
+        dropout: float,
+        activation: type[nn.Module] = nn.GELU,
+        cross_attention: bool = False,
+    ):
+        super().__init__()
+        self.layers = nn.ModuleList(
+            TransformerLayer(features, ff_size, num_heads, dropout, activation, cross_attention)
+            for _ in range(num_layers)
+        )
+
+    def forward(
+        self,
+        x: Tensor,
+        mask: Tensor | None,
+        memory: Tensor | None = None,
+        memory_mask: Tensor | None = None,
+    ) -> Tensor:
+        """Transforms x (B, N, C), with memory (B, S, C) for a decoder; masks (B, N) and (B, S), None = all real."""
+        for layer in self.layers:
+            x = layer(x, mask, memory, memory_mask)
+        return x
+
+
+class TimeAndCondition(nn.Module):
+    """z_tk of MDM: the embedded time plus the projected condition (Tevet et al. 2023, section 3).
+
+    The time is a row of the sinusoidal table, sent through two linear layers; the null condition is a zero vector
+    *before* the projection, so that it leaves the projection's bias.
+    """
+
+    def __init__(self, features: int, cond_features: int, project_condition: bool):
+        super().__init__()
+        if cond_features and not project_condition and cond_features != features:
+            raise ValueError(
+                f"without project_condition the condition is added to the time embedding as it is: its width "
+                f"({cond_features}) must equal latent_dim ({features})"
+            )
+        self.features, self.cond_features = features, cond_features
+        self.time_embedding = nn.Sequential(nn.Linear(features, features), nn.SiLU(), nn.Linear(features, features))
+        self.projection = nn.Linear(cond_features, features) if cond_features and project_condition else nn.Identity()
+
+    def time(self, t: Tensor) -> Tensor:
+        """(B,) times -> (B, features)."""
+        return self.time_embedding(sinusoid(t, self.features).to(next(self.parameters()).dtype))
+
+    def forward(self, t: Tensor, condition: Tensor) -> Tensor:
+        """Times (B,) and condition (B, C) or (B, S, C) -> (B, features) or (B, S, features)."""
+        time = self.time(t)
+        if not self.cond_features:
+            return time
+        return self.projection(condition) + (time if condition.ndim == 2 else time[:, None])

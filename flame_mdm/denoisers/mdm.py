@@ -1,0 +1,163 @@
+"""The transformers of the Human Motion Diffusion Model (Tevet et al. 2023, "MDM", section 3 and appendix C)."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import torch
+from torch import Tensor, nn
+
+from flame_mdm.denoisers import Denoiser
+from flame_mdm.denoisers.layers import TimeAndCondition, Transformer, sinusoid, with_prefix
+from flame_mdm.motion import Condition
+
+
+class MDMEncoder(Denoiser):
+    """Transformer encoder over [time + condition, frame 1, frame 2, ...]; the network of MDM and of MFM."""
+
+    def __init__(
+        self,
+        in_features: int,
+        out_features: int,
+        cond_features: int,
+        *,
+        latent_dim: int,
+        ff_size: int,
+        num_layers: int,
+        num_heads: int,
+        dropout: float,
+        project_condition: bool = True,
+        max_tokens: int = 0,
+        mask_padding: bool = True,
+    ):
+        """Builds the network.
+
+        Args:
+            in_features: D of the noisy motion.
+            out_features: channels to predict.
+            cond_features: C, width of the condition; 0 = unconditioned.
+            latent_dim: width of the transformer.
+            ff_size: hidden width of its feed-forward layers.
+            num_layers: number of its layers.
+            num_heads: attention heads.
+            dropout: probability, after the positions and inside the layers.
+            project_condition: False adds the condition to the time as it is (MDM's learned action embeddings).
+            max_tokens: 0 = the pooled condition is added to the time. Otherwise up to so many condition tokens stand
+                between the time and the frames (MFM with T5: 30); frames keep their positions when there are fewer.
+            mask_padding: False lets frames attend to the padding, as the released models of MDM and MFM do: they are
+                sampled at the padded length of their training and cropped.
+        """
+        super().__init__()
+        self.max_tokens, self.mask_padding = max_tokens, mask_padding
+        self.condition = TimeAndCondition(latent_dim, cond_features, project_condition)
+        self.input = nn.Linear(in_features, latent_dim)
+        self.dropout = nn.Dropout(dropout)
+        self.transformer = Transformer(latent_dim, ff_size, num_layers, num_heads, dropout)
+        self.output = nn.Linear(latent_dim, out_features)
+
+    def forward(self, x_t: Tensor, t: Tensor, mask: Tensor, cond: Condition) -> Tensor:
+        """Predicts as the contract says.
+
+        Raises:
+            ValueError: no condition tokens where they are asked for, or more than `max_tokens`.
+        """
+        token_mask = mask[:, :0]
+        if self.max_tokens:
+            tokens, token_mask = condition_tokens(cond)
+            if tokens.shape[1] > self.max_tokens:
+                raise ValueError(
+                    f"{tokens.shape[1]} condition tokens: denoiser.max_tokens ({self.max_tokens}) must be at least that"
+                )
+            prefix = torch.cat([self.condition.time(t)[:, None], self.condition.projection(tokens)], 1)
+        else:
+            prefix = self.condition(t, cond.pooled)[:, None]
+        size = prefix.shape[1]
+        frame_positions = 1 + self.max_tokens + torch.arange(x_t.shape[1], device=x_t.device)
+        positions = torch.cat([torch.arange(size, device=x_t.device), frame_positions])
+        x = torch.cat([prefix, self.input(x_t)], 1)
+        x = self.dropout(x + sinusoid(positions, x.shape[-1]).to(x_t.dtype))
+        frame_mask = mask if self.mask_padding else torch.ones_like(mask)
+        x = self.transformer(x, with_prefix(torch.cat([token_mask, frame_mask], 1), 1))
+        return self.output(x[:, size:])
+
+
+class MDMDecoder(Denoiser):
+    """Transformer decoder over the frames that reads time + condition as cross-attention memory."""
+
+    def __init__(
+        self,
+        in_features: int,
+        out_features: int,
+        cond_features: int,
+        *,
+        latent_dim: int,
+        ff_size: int,
+        num_layers: int,
+        num_heads: int,
+        dropout: float,
+        project_condition: bool = True,
+        input_token: Literal["none", "condition", "time"] = "none",
+        token_memory: bool = False,
+        mask_padding: bool = True,
+    ):
+        """Builds the network.
+
+        Args:
+            in_features: D of the noisy motion.
+            out_features: channels to predict.
+            cond_features: C, width of the condition; 0 = unconditioned.
+            latent_dim: width of the transformer.
+            ff_size: hidden width of its feed-forward layers.
+            num_layers: number of its layers.
+            num_heads: attention heads.
+            dropout: probability, after the positions and inside the layers.
+            project_condition: False adds the condition to the time as it is (MDM's learned action embeddings).
+            input_token: what stands before the frames: "condition" is the paper's "+ input token", time + condition
+                entering both ways, as in the released model; "time" is MDM's code since February 2025, where the
+                token is the time alone.
+            token_memory: the memory is all condition tokens, the time added to each (MDM with DistilBERT), in place of
+                the one pooled vector.
+            mask_padding: False lets frames attend to the padding, as the released models without `mask_frames` do.
+        """
+        super().__init__()
+        if input_token not in ("none", "condition", "time"):
+            raise ValueError(f"input_token is none, condition or time, not {input_token!r}")
+        self.input_token, self.mask_padding = input_token, mask_padding
+        self.token_memory = token_memory and cond_features > 0
+        self.condition = TimeAndCondition(latent_dim, cond_features, project_condition)
+        self.input = nn.Linear(in_features, latent_dim)
+        self.dropout = nn.Dropout(dropout)
+        self.transformer = Transformer(latent_dim, ff_size, num_layers, num_heads, dropout, cross_attention=True)
+        self.output = nn.Linear(latent_dim, out_features)
+
+    def forward(self, x_t: Tensor, t: Tensor, mask: Tensor, cond: Condition) -> Tensor:
+        """Predicts as the contract says.
+
+        Raises:
+            ValueError: no condition tokens where they are asked for.
+        """
+        x = self.input(x_t)
+        if self.input_token == "condition":
+            x = torch.cat([self.condition(t, cond.pooled)[:, None], x], 1)
+        elif self.input_token == "time":
+            x = torch.cat([self.condition.time(t)[:, None], x], 1)
+        prefix = x.shape[1] - x_t.shape[1]
+        x = self.dropout(x + sinusoid(torch.arange(x.shape[1], device=x.device), x.shape[-1]).to(x_t.dtype))
+        if self.token_memory:
+            tokens, memory_mask = condition_tokens(cond)
+            memory = self.condition(t, tokens)
+        else:
+            memory, memory_mask = self.condition(t, cond.pooled)[:, None], None
+        x = self.transformer(x, with_prefix(mask, prefix) if self.mask_padding else None, memory, memory_mask)
+        return self.output(x[:, prefix:])
+
+
+def condition_tokens(cond: Condition) -> tuple[Tensor, Tensor]:
+    """Tokens (B, S, C) and their mask (B, S).
+
+    Raises:
+        ValueError: the condition encoder returns no tokens.
+    """
+    if cond.token_mask is None or not cond.tokens.shape[1]:
+        raise ValueError("this denoiser reads condition tokens, but the condition encoder returns none: choose another")
+    return cond.tokens, cond.token_mask

@@ -1,0 +1,130 @@
+"""The U-Net of the Human Motion Diffusion Model (Tevet et al. 2023, "MDM", section 4.1), of which no code is public.
+
+The paper says: convolutions over time, joints as channels, 23.47 M parameters. The rest follows the network of DDPM
+(Ho et al. 2020, appendix B) with the scale-and-shift injection of Dhariwal and Nichol 2021.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from flame_mdm.denoisers import Denoiser
+from flame_mdm.denoisers.layers import TimeAndCondition
+from flame_mdm.motion import Condition
+
+
+class MDMUNet(Denoiser):
+    """U-Net over time, the features of a frame as channels; any length, and padding reaches no real frame.
+
+    Padded frames are zeroed before every convolution, as if the motion ended there, and left out of the statistics of
+    the norms. A frame of a coarser level is real where the first of its two finer frames is.
+    """
+
+    def __init__(
+        self,
+        in_features: int,
+        out_features: int,
+        cond_features: int,
+        *,
+        latent_dim: int,
+        channels: Sequence[int],
+        num_groups: int,
+        dropout: float,
+        project_condition: bool = True,
+    ):
+        """Builds the network.
+
+        Args:
+            in_features: D of the noisy motion.
+            out_features: channels to predict.
+            cond_features: C, width of the condition; 0 = unconditioned.
+            latent_dim: width of the time and condition embedding.
+            channels: width of each level; each has half the frame rate of the one before.
+            num_groups: groups of the group norms; divides all widths.
+            dropout: probability inside the residual blocks.
+            project_condition: False adds the condition to the time as it is.
+        """
+        super().__init__()
+
+        def block(in_channels: int, out_channels: int) -> ResidualBlock:
+            return ResidualBlock(in_channels, out_channels, latent_dim, num_groups, dropout)
+
+        self.condition = TimeAndCondition(latent_dim, cond_features, project_condition)
+        self.input = nn.Conv1d(in_features, channels[0], 3, padding=1)
+        finer = [channels[0], *channels[:-1]]
+        self.down = nn.ModuleList(block(a, b) for a, b in zip(finer, channels, strict=True))
+        self.downsample = nn.ModuleList(nn.Conv1d(c, c, 3, stride=2, padding=1) for c in channels[:-1])
+        self.middle = nn.ModuleList(block(channels[-1], channels[-1]) for _ in range(2))
+        self.up = nn.ModuleList(block(2 * b, a) for a, b in zip(finer, channels, strict=True))
+        self.upsample = nn.ModuleList(nn.Conv1d(c, c, 3, padding=1) for c in channels[:-1])
+        self.output_norm = MaskedGroupNorm(channels[0], num_groups)
+        self.output = nn.Conv1d(channels[0], out_features, 3, padding=1)
+
+    def forward(self, x_t: Tensor, t: Tensor, mask: Tensor, cond: Condition) -> Tensor:
+        token = functional.silu(self.condition(t, cond.pooled))
+        masks = [mask[:, None].to(x_t.dtype)]
+        for _ in self.downsample:
+            masks.append(masks[-1][..., ::2])
+        x = self.input(x_t.transpose(1, 2) * masks[0])
+        skips = []
+        for level, block in enumerate(self.down):
+            if level:
+                x = self.downsample[level - 1](x * masks[level - 1])
+            x = block(x, token, masks[level])
+            skips.append(x)
+        for block in self.middle:
+            x = block(x, token, masks[-1])
+        for level in reversed(range(len(self.up))):
+            x = self.up[level](torch.cat([x, skips[level]], 1), token, masks[level])
+            if level:
+                finer = masks[level - 1]
+                x = x.repeat_interleave(2, -1)[..., : finer.shape[-1]]
+                x = self.upsample[level - 1](x * finer)
+        x = functional.silu(self.output_norm(x, masks[0]))
+        return self.output(x * masks[0]).transpose(1, 2)
+
+
+class ResidualBlock(nn.Module):
+    """Norm, SiLU, convolution, twice; time and condition scale and shift the second norm."""
+
+    def __init__(self, in_channels: int, out_channels: int, features: int, num_groups: int, dropout: float):
+        super().__init__()
+        self.norm1 = MaskedGroupNorm(in_channels, num_groups)
+        self.conv1 = nn.Conv1d(in_channels, out_channels, 3, padding=1)
+        self.scale_shift = nn.Linear(features, 2 * out_channels)
+        self.norm2 = MaskedGroupNorm(out_channels, num_groups)
+        self.dropout = nn.Dropout(dropout)
+        self.conv2 = nn.Conv1d(out_channels, out_channels, 3, padding=1)
+        self.skip = nn.Conv1d(in_channels, out_channels, 1) if in_channels != out_channels else nn.Identity()
+
+    def forward(self, x: Tensor, token: Tensor, mask: Tensor) -> Tensor:
+        """Maps x (B, in_channels, F), token (B, features), mask (B, 1, F) of 0 and 1 -> (B, out_channels, F)."""
+        y = self.conv1(functional.silu(self.norm1(x, mask)) * mask)
+        scale, shift = self.scale_shift(token)[..., None].chunk(2, 1)
+        y = functional.silu(self.norm2(y, mask) * (1 + scale) + shift)
+        return self.skip(x) + self.conv2(self.dropout(y) * mask)
+
+
+class MaskedGroupNorm(nn.Module):
+    """Group norm (Wu and He 2018) with statistics over real frames only."""
+
+    def __init__(self, channels: int, num_groups: int):
+        super().__init__()
+        if channels % num_groups:
+            raise ValueError(f"num_groups ({num_groups}) does not divide a width of channels ({channels})")
+        self.num_groups = num_groups
+        self.weight = nn.Parameter(torch.ones(channels))
+        self.bias = nn.Parameter(torch.zeros(channels))
+
+    def forward(self, x: Tensor, mask: Tensor) -> Tensor:
+        """Normalizes x (B, C, F) with mask (B, 1, F) of 0 and 1 -> (B, C, F)."""
+        groups = x.unflatten(1, (self.num_groups, -1))
+        mask = mask[:, None]
+        count = groups.shape[2] * mask.sum(-1, keepdim=True).clamp(min=1)
+        centered = groups - (groups * mask).sum((2, 3), keepdim=True) / count
+        variance = (centered * mask).square().sum((2, 3), keepdim=True) / count
+        return (centered * (variance + 1e-5).rsqrt()).flatten(1, 2) * self.weight[:, None] + self.bias[:, None]

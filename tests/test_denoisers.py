@@ -1,0 +1,293 @@
+"""What every denoiser of `experiments/denoiser` promises."""
+
+from pathlib import Path
+
+import pytest
+import torch
+from fixtures import ROOT
+from hydra.utils import get_class, instantiate
+from omegaconf import OmegaConf
+
+from flame_mdm.denoisers import Denoiser
+from flame_mdm.denoisers.flame import FLAME
+from flame_mdm.denoisers.layers import sinusoid
+from flame_mdm.denoisers.mdm import MDMDecoder, MDMEncoder
+from flame_mdm.denoisers.unet import MaskedGroupNorm, MDMUNet
+from flame_mdm.motion import Condition, length_mask
+
+CONFIGS = sorted((ROOT / "experiments" / "denoiser").glob("*.yaml"))
+TINY = {"latent_dim": 16, "ff_size": 24, "num_layers": 2, "num_heads": 2, "channels": [8, 8, 16], "num_groups": 4}
+D, C, LENGTHS = 7, 12, [11, 8, 1]
+
+
+def config_of(path: Path) -> dict:
+    config = OmegaConf.to_container(OmegaConf.load(path))
+    assert isinstance(config, dict)
+    return {str(key): value for key, value in config.items()}
+
+
+def tiny(path: Path, out_features: int = D, cond_features: int = C, **options) -> Denoiser:
+    """The denoiser of a YAML in the smallest sizes, in float64 so that only real differences show."""
+    torch.manual_seed(0)
+    config = config_of(path)
+    config |= {key: value for key, value in TINY.items() if key in config}
+    return instantiate(config, D, out_features, cond_features, **options).double().eval()
+
+
+def batch(lengths: list[int] = LENGTHS, frames: int | None = None, tokens: int = 5, cond_features: int = C):
+    """x_t, t, mask, cond; noise stands past the end of the motions and in masked tokens."""
+    generator = torch.Generator().manual_seed(1)
+
+    def normal(*shape: int) -> torch.Tensor:
+        return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+    size = len(lengths)
+    x_t, t = normal(size, max(lengths), D), torch.tensor([0.0, 437.25, 999.0])[:size]
+    pooled, text = normal(size, cond_features), normal(size, tokens, cond_features)
+    mask = length_mask(torch.tensor(lengths), frames)
+    x_t = torch.cat([x_t, 100 * normal(size, mask.shape[1] - x_t.shape[1], D)], 1)
+    token_mask = length_mask(torch.arange(size) % tokens + 1, tokens)
+    null = Condition(normal(1, cond_features), normal(1, tokens, cond_features), torch.ones(1, tokens).bool())
+    return x_t, t, mask, Condition(pooled, text, token_mask, null)
+
+
+def assert_same(actual: torch.Tensor, expected: torch.Tensor) -> None:
+    torch.testing.assert_close(actual, expected, rtol=0, atol=1e-10)
+
+
+each_denoiser = pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.stem)
+
+
+@each_denoiser
+def test_shape_and_determinism(path: Path) -> None:
+    denoiser, inputs = tiny(path, out_features=2 * D, dropout=0.5), batch()
+    torch.manual_seed(1)
+    y = denoiser(*inputs)
+    assert y.shape == (len(LENGTHS), max(LENGTHS), 2 * D)
+    assert y.isfinite().all()
+    torch.manual_seed(2)
+    assert torch.equal(denoiser(*inputs), y)
+
+
+@each_denoiser
+def test_padding_does_not_leak(path: Path) -> None:
+    """The padded length and what stands in it change nothing in real frames, nor does the rest of the batch."""
+    denoiser = tiny(path)
+    x_t, t, mask, cond = batch()
+    y = denoiser(x_t, t, mask, cond)
+    longer = batch(frames=max(LENGTHS) + 6)
+    y_longer = denoiser(*longer)
+    for i, length in enumerate(LENGTHS):
+        assert_same(y_longer[i, :length], y[i, :length])
+        assert cond.token_mask is not None
+        real = cond.token_mask[i]
+        alone = Condition(cond.pooled[i : i + 1], cond.tokens[i : i + 1, real], cond.token_mask[i : i + 1, real])
+        y_alone = denoiser(x_t[i : i + 1, :length], t[i : i + 1], mask[i : i + 1, :length], alone)
+        assert_same(y_alone[0], y[i, :length])
+
+
+@each_denoiser
+def test_dropped_condition_is_the_null(path: Path) -> None:
+    denoiser = tiny(path)
+    x_t, t, mask, cond = batch()
+    null = cond.null
+    assert null is not None
+    size = len(x_t)
+    everywhere = Condition(
+        null.pooled.expand(size, -1), null.tokens.expand(size, -1, -1), torch.ones(size, 5, dtype=torch.bool)
+    )
+    y, y_null = denoiser(x_t, t, mask, cond), denoiser(x_t, t, mask, everywhere)
+    assert_same(denoiser(x_t, t, mask, cond.drop(torch.ones(size, dtype=torch.bool))), y_null)
+    mixed = denoiser(x_t, t, mask, cond.drop(torch.tensor([False, True, False])))
+    assert_same(mixed[1], y_null[1])
+    assert_same(mixed[::2], y[::2])
+    assert ((y - y_null)[mask].abs() > 1e-6).any(), "the condition has no effect"
+
+
+@each_denoiser
+def test_all_weights_get_gradients(path: Path) -> None:
+    denoiser = tiny(path)
+    x_t, t, mask, cond = batch()
+    denoiser(x_t, t, mask, cond)[mask].square().sum().backward()
+    without = [name for name, p in denoiser.named_parameters() if p.grad is None or not p.grad.abs().sum() > 0]
+    assert without == []
+
+
+@each_denoiser
+def test_time_is_continuous_and_matters(path: Path) -> None:
+    denoiser = tiny(path)
+    x_t, _, mask, cond = batch()
+
+    def at(t: float) -> torch.Tensor:
+        return denoiser(x_t, torch.full((len(x_t),), t), mask, cond)[mask]
+
+    assert (at(400.5) - at(400.0)).abs().max() > 1e-6
+    assert (at(400.0001) - at(400.0)).abs().max() < (at(400.5) - at(400.0)).abs().max() / 100
+
+
+@each_denoiser
+def test_unconditioned(path: Path) -> None:
+    denoiser = tiny(path, cond_features=0)
+    x_t, t, mask, _ = batch()
+    size = len(x_t)
+    nothing = Condition(torch.zeros(size, 0), torch.zeros(size, 0, 0), None)
+    if config_of(path).get("max_tokens"):
+        with pytest.raises(ValueError, match="tokens"):
+            denoiser(x_t, t, mask, nothing)
+        return
+    assert denoiser(x_t, t, mask, nothing).isfinite().all()
+
+
+@each_denoiser
+def test_yaml_holds_all_sizes_and_no_derived_ones(path: Path) -> None:
+    config = config_of(path)
+    get_class(config["_target_"])
+    assert not config.keys() & {"in_features", "out_features", "cond_features"}
+    assert path.read_text().startswith("# ")
+
+
+PAPER = [
+    ("mdm_encoder", 17_880_327),
+    ("mdm_decoder", 26_293_511),
+    ("mdm_decoder_token", 26_293_511),
+    ("mdm_gru", 4_472_071),
+    ("mdm_unet", 23_565_959),
+    ("flame", 64_905_766),
+]
+
+
+@pytest.mark.parametrize(("name", "parameters"), PAPER)
+def test_paper_size(name: str, parameters: int) -> None:
+    config = config_of(ROOT / "experiments" / "denoiser" / f"{name}.yaml")
+    features = (147, 294, 768) if name == "flame" else (263, 263, 512)
+    with torch.device("meta"):
+        denoiser = instantiate(config, *features)
+    assert sum(p.numel() for p in denoiser.parameters()) == parameters
+
+
+def test_unet_is_within_5_percent_of_the_papers_count() -> None:
+    assert abs(dict(PAPER)["mdm_unet"] / 23.47e6 - 1) < 0.05
+
+
+@each_denoiser
+def test_runs_under_bf16_autocast(path: Path) -> None:
+    denoiser = tiny(path).float()
+    x_t, t, mask, cond = batch()
+    cond = Condition(cond.pooled.float(), cond.tokens.float(), cond.token_mask)
+    exact = denoiser(x_t.float(), t, mask, cond)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        y = denoiser(x_t.float(), t, mask, cond)
+    error = (y.float() - exact)[mask].square().mean().sqrt() / exact[mask].std()
+    assert error < 0.05
+
+
+def test_sinusoid_is_the_papers() -> None:
+    table = sinusoid(torch.tensor([0.0, 1.0, 2.5]), 4)
+    angle = torch.tensor([[0.0, 0.0], [1.0, 0.01], [2.5, 0.025]])
+    torch.testing.assert_close(table[:, 0::2], angle.sin())
+    torch.testing.assert_close(table[:, 1::2], angle.cos())
+
+
+def test_group_norm_without_padding_is_torchs() -> None:
+    norm = MaskedGroupNorm(8, 4)
+    torch.nn.init.normal_(norm.weight)
+    torch.nn.init.normal_(norm.bias)
+    x = torch.randn(2, 8, 5)
+    expected = torch.nn.functional.group_norm(x, 4, norm.weight, norm.bias)
+    torch.testing.assert_close(norm(x, torch.ones(2, 1, 5)), expected)
+
+
+TRANSFORMER = {"latent_dim": 16, "ff_size": 24, "num_layers": 2, "num_heads": 2, "dropout": 0.0}
+
+
+@pytest.mark.parametrize("network", [MDMEncoder, MDMDecoder])
+def test_attention_to_padding_is_the_legacy_flag(network: type[Denoiser]) -> None:
+    """Without the mask, padding is seen by every frame, as in the released models."""
+    denoiser = network(D, D, C, **TRANSFORMER, mask_padding=False).double().eval()
+    x_t, t, mask, cond = batch()
+    y = denoiser(x_t, t, mask, cond)
+    assert_same(denoiser(x_t, t, torch.ones_like(mask), cond), y)
+    x_t[1, -1] += 1
+    assert ((denoiser(x_t, t, mask, cond) - y)[1, 0].abs() > 1e-9).any()
+
+
+def test_gru_recurs_over_frames_or_by_flag_over_the_batch() -> None:
+    x_t, t, mask, cond = batch()
+    changed = x_t.clone()
+    changed[0, 0] += 1
+    frames = tiny(ROOT / "experiments/denoiser/mdm_gru.yaml")
+    reached = (frames(changed, t, mask, cond) - frames(x_t, t, mask, cond)).abs().amax(-1) > 1e-12
+    assert reached[0].all()
+    assert not reached[1:].any()
+    legacy = tiny(ROOT / "experiments/denoiser/mdm_gru.yaml", recur_over_batch=True)
+    reached = (legacy(changed, t, mask, cond) - legacy(x_t, t, mask, cond)).abs().amax(-1) > 1e-12
+    assert reached[:, 0].all()
+    assert not reached[:, 1:].any()
+
+
+@pytest.mark.parametrize("length_token", [True, False])
+@pytest.mark.parametrize("cross_attention", [True, False])
+def test_flame_ablations(length_token: bool, cross_attention: bool) -> None:
+    """Table 4: what is left out leaves no weights, and text tokens act through cross-attention alone."""
+    flame = FLAME(
+        D, D, C, **TRANSFORMER, max_frames=20, length_token=length_token, cross_attention=cross_attention
+    ).double()
+    x_t, t, mask, cond = batch()
+    y = flame(x_t, t, mask, cond)
+    y[mask].square().sum().backward()
+    assert all(p.grad is not None and p.grad.abs().sum() > 0 for p in flame.parameters())
+    names = " ".join(flame.state_dict())
+    assert ("length_embedding" in names) == length_token
+    assert ("cross_attention" in names) == ("token_projection" in names) == cross_attention
+    other = Condition(cond.pooled, cond.tokens + 1, cond.token_mask)
+    assert torch.equal(flame(x_t, t, mask, other), y) != cross_attention
+
+
+def test_flame_returns_zeros_past_the_end() -> None:
+    x_t, t, mask, cond = batch()
+    y = tiny(ROOT / "experiments/denoiser/flame.yaml")(x_t, t, mask, cond)
+    assert (y[~mask] == 0).all()
+    assert (y[mask] != 0).all()
+
+
+def test_flame_knows_lengths_up_to_max_frames() -> None:
+    flame = FLAME(D, D, C, **TRANSFORMER, max_frames=11).double()
+    assert flame(*batch(frames=14)).isfinite().all()
+    with pytest.raises(ValueError, match=r"12 frames .* denoiser\.max_frames \(11\)"):
+        flame(*batch([12, 3], frames=14))
+
+
+def test_token_positions_do_not_move_the_frames() -> None:
+    """Absent tokens shift no frame: masked tokens and fewer tokens are the same."""
+    encoder = MDMEncoder(D, D, C, **TRANSFORMER, max_tokens=5).double().eval()
+    x_t, t, mask, cond = batch()
+    two = torch.tensor([True, True, False, False, False]).expand(3, 5)
+    fewer = Condition(cond.pooled, cond.tokens[:, :2], two[:, :2])
+    assert_same(encoder(x_t, t, mask, Condition(cond.pooled, cond.tokens, two)), encoder(x_t, t, mask, fewer))
+    with pytest.raises(ValueError, match=r"6 condition tokens: denoiser\.max_tokens \(5\)"):
+        encoder(*batch(tokens=6))
+
+
+def test_action_embedding_is_added_as_it_is() -> None:
+    encoder = MDMEncoder(D, D, 16, **TRANSFORMER, project_condition=False).double()
+    assert not [name for name in encoder.state_dict() if "projection" in name]
+    x_t, t, mask, cond = batch(cond_features=16)
+    unconditioned = MDMEncoder(D, D, 0, **TRANSFORMER).double()
+    unconditioned.load_state_dict(encoder.state_dict())
+    zero = Condition(torch.zeros_like(cond.pooled), cond.tokens, cond.token_mask)
+    assert_same(encoder(x_t, t, mask, zero), unconditioned(x_t, t, mask, zero))
+    with pytest.raises(ValueError, match=r"\(12\) must equal latent_dim \(16\)"):
+        MDMEncoder(D, D, C, **TRANSFORMER, project_condition=False)
+
+
+def test_bad_options_are_named() -> None:
+    with pytest.raises(ValueError, match=r"latent_dim \(16\) is not a multiple of num_heads \(3\)"):
+        MDMEncoder(D, D, C, **{**TRANSFORMER, "num_heads": 3})
+    with pytest.raises(ValueError, match="input_token is none, condition or time, not 'both'"):
+        MDMDecoder(D, D, C, **TRANSFORMER, input_token="both")  # pyright: ignore[reportArgumentType]
+    with pytest.raises(ValueError, match=r"num_groups \(3\)"):
+        MDMUNet(D, D, C, latent_dim=16, channels=[8], num_groups=3, dropout=0.0)
+    x_t, t, mask, cond = batch()
+    pooled_only = Condition(cond.pooled, cond.tokens[:, :0], None)
+    with pytest.raises(ValueError, match="the condition encoder returns none"):
+        MDMDecoder(D, D, C, **TRANSFORMER, token_memory=True).double()(x_t, t, mask, pooled_only)

@@ -31,7 +31,8 @@ class ConditionEncoder(nn.Module, ABC):
         """Opens the cache that `precompute` filled. Called on every process.
 
         Raises:
-            FileNotFoundError: there is no whole cache for these captions.
+            FileNotFoundError: there is no cache for these captions.
+            ValueError: it is damaged.
         """
 
 

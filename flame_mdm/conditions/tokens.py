@@ -18,9 +18,10 @@ WORD = re.compile(r"[^\W_]+")
 class LearnedTokens(ConditionEncoder):
     """Hashed words, learned positions and one transformer layer; the null is one learned vector.
 
-    A word is the sum of two rows of the table, picked by two hashes (Svenstrup et al. 2017, "Hash embeddings"): no
-    vocabulary has to be kept, and two words are confused only if both hashes collide. The hashes (CRC-32) are the same
-    on every machine. Captions are lowercased, punctuation separates words, and words after `max_words` are dropped.
+    A word is the sum of two rows of the table, picked by two parts of its hash (Svenstrup et al. 2017, "Hash
+    embeddings"): no vocabulary has to be kept, and two words are confused only if both parts collide. The hash (CRC-32)
+    is the same on every machine. Captions are lowercased, punctuation separates words, and words after `max_words` are
+    dropped.
 
     The pooled vector is the mean of the tokens, and the null token is the null vector: whichever of the two a denoiser
     reads, all parameters take part.
@@ -51,9 +52,9 @@ class LearnedTokens(ConditionEncoder):
     def rows(self, caption: str) -> list[tuple[int, int]]:
         """The two rows of the table for the start token and each word of a caption."""
         words = [START, *WORD.findall(caption.lower())[: self.max_words]]
-        return [
-            (zlib.crc32(f"1{w}".encode()) % self.buckets, zlib.crc32(f"2 {w}".encode()) % self.buckets) for w in words
-        ]
+        # Not two hashes of the word with unlike prefixes: CRC is linear, and they would collide together.
+        hashes = [zlib.crc32(word.encode()) for word in words]
+        return [(h % self.buckets, h // self.buckets % self.buckets) for h in hashes]
 
     def forward(self, batch: MotionBatch) -> Condition:
         if batch.text is None:

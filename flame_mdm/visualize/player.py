@@ -5,7 +5,6 @@ import html
 import json
 import re
 from collections.abc import Sequence
-from importlib import resources
 from pathlib import Path
 
 import numpy as np
@@ -35,7 +34,7 @@ def write_player(path: str | Path, motions: Sequence[Motion], title: str = "Moti
         "TITLE": html.escape(title),
         "DATA": json.dumps([_packed(motion) for motion in motions], separators=(",", ":")).replace("<", "\\u003c"),
     }
-    template = resources.files(__package__).joinpath("player.html").read_text(encoding="utf-8")
+    template = Path(__file__).with_suffix(".html").read_text(encoding="utf-8")
     page = re.sub("__(TITLE|DATA)__", lambda match: content[match[1]], template)
     with written_whole(path) as temporary:
         temporary.write_text(page, encoding="utf-8")
@@ -57,7 +56,7 @@ def _packed(motion: Motion) -> dict:
         "center": center.tolist(),
         "step": step,
         "joints": _base64(np.rint((motion.joints - center) / step).astype("<i2")),
-        "feet": [] if motion.contacts is None else list(motion.feet),
+        "feet": [] if motion.contacts is None else list(motion.skeleton.feet),
         "contacts": "" if motion.contacts is None else _base64(motion.contacts.astype("u1")),
     }
 

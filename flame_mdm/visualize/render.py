@@ -3,17 +3,22 @@
 import math
 import shutil
 import subprocess
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from flame_mdm.visualize.scene import Motion, check_any, written_whole
 
-SIDE_COLORS = {1: (47, 127, 209), -1: (226, 112, 42), 0: (140, 149, 163)}
+Color = tuple[int, int, int]
+SIDE_COLORS: dict[int, Color] = {1: (47, 127, 209), -1: (226, 112, 42), 0: (140, 149, 163)}
 PAPER, GROUND, LINE, TEXT, FAINT = (255, 255, 255), (243, 245, 247), (205, 211, 219), (28, 36, 48), (102, 112, 133)
 SHADOW, TRAIL, CONTACT = (212, 216, 222), (122, 91, 208), (15, 157, 107)
+NEAR = 0.3
+"""What comes closer to the camera than this, in metres, is not drawn."""
+LIT, DARK = 0.3, -0.45
 SMOOTH = 2
 """Images are drawn this many times larger and then reduced."""
 
@@ -37,13 +42,12 @@ def write_gif(path: str | Path, motions: Sequence[Motion], size: int = 256) -> N
     """
     path = Path(path)
     check_any(motions, path)
-    seconds, fps = _clock(motions)
+    fps = max(motion.fps for motion in motions)
     fps /= math.ceil(fps / 50)
-    images = _video(motions, fps, size)
-    palette = _palette(images)
-    images = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
+    palette = _palette()
+    images = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in _video(motions, fps, size)]
     # GIF counts in hundredths of a second: round the times, not the durations, so that errors do not add up
-    times = np.rint(100 * np.minimum(np.arange(len(images) + 1) / fps, seconds)).astype(int)
+    times = np.rint(100 * np.arange(len(images) + 1) / fps).astype(int)
     with written_whole(path) as temporary:
         images[0].save(
             temporary,
@@ -68,14 +72,15 @@ def write_mp4(path: str | Path, motions: Sequence[Motion], size: int = 384) -> N
     ffmpeg = shutil.which("ffmpeg")
     if ffmpeg is None:
         raise FileNotFoundError(f"{path}: MP4 needs ffmpeg on the PATH; install it, or write a .gif")
-    fps = _clock(motions)[1]
-    video = np.stack([np.asarray(image) for image in _video(motions, fps, size)])
-    height, width = (length // 2 * 2 for length in video.shape[1:3])  # H.264 codes even sizes only
+    fps = max(motion.fps for motion in motions)
+    video = [np.asarray(image) for image in _video(motions, fps, size)]
+    height, width = (length // 2 * 2 for length in video[0].shape[:2])  # H.264 codes even sizes only
     with written_whole(path) as temporary:
         command = [ffmpeg, "-loglevel", "error", "-y", "-f", "rawvideo", "-pix_fmt", "rgb24"]
         command += ["-s", f"{width}x{height}", "-r", str(fps), "-i", "-", "-c:v", "libx264", "-pix_fmt", "yuv420p"]
         command += ["-threads", "1", "-fflags", "+bitexact", "-movflags", "+faststart", str(temporary)]
-        run = subprocess.run(command, input=video[:, :height, :width].tobytes(), capture_output=True, check=False)
+        pixels = b"".join(image[:height, :width].tobytes() for image in video)
+        run = subprocess.run(command, input=pixels, capture_output=True, check=False)
         if run.returncode:
             raise RuntimeError(f"{path}: ffmpeg failed: {run.stderr.decode(errors='replace').strip()}")
 
@@ -113,42 +118,37 @@ def contact_sheet(path: str | Path, motions: Sequence[Motion], frames: int = 6, 
         sheet.save(temporary, format="PNG", optimize=True)
 
 
-def _palette(images: Sequence[Image.Image]) -> Image.Image:
-    """One palette for the whole animation, so that colors do not flicker: from four of its images."""
-    some = [images[k] for k in np.linspace(0, len(images) - 1, 4).astype(int)]
-    strip = Image.new("RGB", (some[0].width, 4 * some[0].height))
-    for k, image in enumerate(some):
-        strip.paste(image, (0, k * image.height))
-    return strip.quantize(64, method=Image.Quantize.MAXCOVERAGE)
+def _palette() -> Image.Image:
+    """All colors drawn, and their blends at smoothed edges: one palette, so that colors never flicker."""
+    limbs = [color for side in SIDE_COLORS.values() for color in (side, _shade(side, LIT), _shade(side, DARK))]
+    drawn = np.array([*limbs, LINE, TEXT, FAINT, SHADOW, TRAIL, CONTACT])
+    grounds = np.array([PAPER, GROUND])
+    blends = [back + part * (drawn - back) for back in grounds for part in (0.25, 0.5, 0.75)]
+    image = Image.new("P", (1, 1))
+    image.putpalette(np.rint(np.concatenate([grounds, drawn, *blends])).astype("u1").tobytes())
+    return image
 
 
-def _clock(motions: Sequence[Motion]) -> tuple[float, float]:
-    return max(motion.seconds for motion in motions), max(motion.fps for motion in motions)
-
-
-def _video(motions: Sequence[Motion], fps: float, size: int) -> list[Image.Image]:
-    """Images of the panels side by side, one every 1 / fps seconds."""
-    seconds = _clock(motions)[0]
-    columns = min(4, math.ceil(math.sqrt(len(motions)))) if len(motions) > 3 else len(motions)
+def _video(motions: Sequence[Motion], fps: float, size: int) -> Iterator[Image.Image]:
+    """Images of the panels side by side, one every 1 / fps seconds, with a bar that shows the time."""
+    seconds = max(motion.seconds for motion in motions)
+    columns = len(motions) if len(motions) < 4 else min(4, math.ceil(math.sqrt(len(motions))))
     lines = _caption_lines(motions, size, size)
-    panels: dict[tuple[int, int], Image.Image] = {}  # frames that a slower or ended motion shows again
-    images = []
+    frames = [-1] * len(motions)
+    panels = [Image.new("RGB", (0, 0))] * len(motions)
     count = max(1, math.ceil(seconds * fps - 1e-6))
     for tick in range(count):
-        cells = []
         for k, motion in enumerate(motions):
-            frame = motion.frame_at(tick / fps)
-            if (k, frame) not in panels:
-                panels[k, frame] = _captioned(_figure(motion, frame, size), motion, lines, size)
-            cells.append(panels[k, frame])
-        rows = math.ceil(len(cells) / columns)
-        image = Image.new("RGB", (columns * size, rows * cells[0].height + 3), PAPER)
-        for k, cell in enumerate(cells):
-            image.paste(cell, (k % columns * size, k // columns * cell.height))
+            if motion.frame_at(tick / fps) != frames[k]:
+                frames[k] = motion.frame_at(tick / fps)
+                panels[k] = _captioned(_figure(motion, frames[k], size), motion, lines, size)
+        height = panels[0].height
+        image = Image.new("RGB", (columns * size, math.ceil(len(motions) / columns) * height + 3), PAPER)
+        for k, panel in enumerate(panels):
+            image.paste(panel, (k % columns * size, k // columns * height))
         done = image.width * (tick + 1) / count
         ImageDraw.Draw(image).rectangle((0, image.height - 3, done, image.height), TRAIL)
-        images.append(image)
-    return images
+        yield image
 
 
 def _figure(motion: Motion, frame: int, size: int) -> Image.Image:
@@ -160,7 +160,7 @@ def _figure(motion: Motion, frame: int, size: int) -> Image.Image:
     half = round(motion.fps / 2)
     x, _, z = motion.joints[max(0, frame - half) : frame + half + 1, 0].mean(0).tolist()
     project = _camera(np.array([x, 0.85, z]), side)
-    near = size / 256 * SMOOTH
+    pixel = size / 256 * SMOOTH
 
     ring = np.linspace(0, 2 * np.pi, 49)[:, None]
     pen.polygon(_points(project(np.array([x, 0, z]) + 3 * np.hstack([np.cos(ring), 0 * ring, np.sin(ring)]))), GROUND)
@@ -171,23 +171,24 @@ def _figure(motion: Motion, frame: int, size: int) -> Image.Image:
             (9 - (gz - z) ** 2, lambda reach, g=gz: [[x - reach, 0, g], [x + reach, 0, g]]),
         ):
             if inside > 0:
-                pen.line(_points(project(np.array(ends(inside**0.5)))), LINE, round(near))
+                pen.line(_points(project(np.array(ends(inside**0.5)))), LINE, round(pixel))
 
     floor = np.array([1.0, 0.0, 1.0])
     root = motion.joints[: frame + 1, 0] * floor
     root = root[np.linalg.norm(root - [x, 0, z], axis=1) < 3]
     if len(root) > 1:
-        pen.line(_points(project(root)), TRAIL, round(1.5 * near))
+        pen.line(_points(project(root)), TRAIL, round(1.5 * pixel))
     shadow = project(joints * floor)
     for joint, parent in enumerate(motion.skeleton.parents):
         if parent >= 0:
             _capsule(pen, shadow[parent], shadow[joint], 0.05, 0.05, SHADOW)
     if motion.contacts is not None:
-        for joint in np.array(motion.feet)[motion.contacts[frame]]:
+        for joint in np.array(motion.skeleton.feet)[motion.contacts[frame]]:
             cx, cy, scale = shadow[joint][:3]
             pen.ellipse((cx - 0.06 * scale, cy - 0.02 * scale, cx + 0.06 * scale, cy + 0.02 * scale), CONTACT)
-    for depth_part in sorted(_body(motion, joints, project), key=lambda part: -part[0]):
-        _limb(pen, *depth_part[1:], near)
+    for limb in sorted(_body(motion, joints, project), key=lambda limb: -limb.depth):
+        if min(limb.a[3], limb.b[3]) > NEAR:
+            _draw(pen, limb, pixel)
     return image.reduce(SMOOTH)
 
 
@@ -200,7 +201,7 @@ def _camera(target: np.ndarray, side: int) -> Callable[[np.ndarray], np.ndarray]
 
     def project(points: np.ndarray) -> np.ndarray:
         offset = points - target
-        depth = np.maximum(distance - offset @ toward, 0.3)
+        depth = np.maximum(distance - offset @ toward, NEAR)
         scale = 2.05 * side / depth
         return np.stack([side / 2 + offset @ right * scale, side / 2 - offset @ up * scale, scale, depth], 1)
 
@@ -211,39 +212,51 @@ def _points(projected: np.ndarray) -> list[tuple[float, float]]:
     return [(x, y) for x, y in projected[:, :2].tolist()]
 
 
-def _body(motion: Motion, joints: np.ndarray, project: Callable[[np.ndarray], np.ndarray]) -> list[tuple]:
-    """(depth, end, other end, their radii, color) of each limb."""
+class Limb(NamedTuple):
+    """Two ends (x, y, pixels a metre, depth), their radii in metres, and a color."""
+
+    a: np.ndarray
+    b: np.ndarray
+    radius_a: float
+    radius_b: float
+    color: Color
+
+    @property
+    def depth(self) -> float:
+        return float(self.a[3] + self.b[3]) / 2
+
+
+def _body(motion: Motion, joints: np.ndarray, project: Callable[[np.ndarray], np.ndarray]) -> list[Limb]:
     at, radii, sides, parents = project(joints), motion.radii, motion.sides, motion.skeleton.parents
-    parts = []
+    limbs = []
     for joint, parent in enumerate(parents):
         if parent >= 0:
             color = SIDE_COLORS[sides[joint] if sides[parent] == sides[joint] else 0]
             thick = min(radii[parent], 1.35 * radii[joint])
-            parts.append(((at[parent, 3] + at[joint, 3]) / 2, at[parent], at[joint], thick, radii[joint], color))
+            limbs.append(Limb(at[parent], at[joint], thick, radii[joint], color))
     if motion.head is not None:
         up = joints[motion.head] - joints[parents[motion.head]]
         up /= np.linalg.norm(up) or 1
         chin, crown = project(joints[motion.head] + np.array([[0.05], [0.11]]) * up)
-        parts.append((crown[3], chin, crown, 0.08, 0.09, SIDE_COLORS[0]))
-    return parts
+        limbs.append(Limb(chin, crown, 0.08, 0.09, SIDE_COLORS[0]))
+    return limbs
 
 
-def _limb(
-    pen: ImageDraw.ImageDraw, a: np.ndarray, b: np.ndarray, ra: float, rb: float, color: tuple, near: float
-) -> None:
-    """A tapered limb: dark rim, its color, and a highlight toward the light, which falls from above left."""
-    _capsule(pen, a, b, ra, rb, _shade(color, -0.45), grow=near)
-    _capsule(pen, a, b, ra, rb, color)
+def _draw(pen: ImageDraw.ImageDraw, limb: Limb, rim: float) -> None:
+    """A limb in its color, with a dark rim and a highlight toward the light, which falls from above left."""
+    a, b, radius_a, radius_b, color = limb
+    _capsule(pen, a, b, radius_a, radius_b, _shade(color, DARK), grow=rim)
+    _capsule(pen, a, b, radius_a, radius_b, color)
     across = np.array([-(b - a)[1], (b - a)[0]])
-    across = across / (np.linalg.norm(across) or 1)
-    across = -across if across @ [-0.5, -0.87] < 0 else across
-    shift = np.zeros(4)
-    shift[:2] = across * min(ra * a[2], rb * b[2]) * 0.35
-    _capsule(pen, a + shift, b + shift, 0.45 * ra, 0.45 * rb, _shade(color, 0.3))
+    across /= np.linalg.norm(across) or 1
+    if across @ [-0.5, -0.87] < 0:
+        across = -across
+    shift = np.append(across * min(radius_a * a[2], radius_b * b[2]) * 0.35, [0, 0])
+    _capsule(pen, a + shift, b + shift, 0.45 * radius_a, 0.45 * radius_b, _shade(color, LIT))
 
 
 def _capsule(
-    pen: ImageDraw.ImageDraw, a: np.ndarray, b: np.ndarray, ra: float, rb: float, color: tuple, grow: float = 0
+    pen: ImageDraw.ImageDraw, a: np.ndarray, b: np.ndarray, ra: float, rb: float, color: Color, grow: float = 0
 ) -> None:
     """Fills the outline around two circles of radius `ra` and `rb` metres, `grow` pixels wider."""
     (ax, ay, ra), (bx, by, rb) = (*a[:2], ra * a[2] + grow), (*b[:2], rb * b[2] + grow)
@@ -259,9 +272,10 @@ def _capsule(
         pen.ellipse((x - r, y - r, x + r, y + r), color)
 
 
-def _shade(color: tuple, light: float) -> tuple:
+def _shade(color: Color, light: float) -> Color:
     """-1 black, 0 as it is, 1 white."""
-    return tuple(round(c + (255 - c) * light if light > 0 else c * (1 + light)) for c in color)
+    red, green, blue = (round(c + (255 - c) * light if light > 0 else c * (1 + light)) for c in color)
+    return red, green, blue
 
 
 def _font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:

@@ -22,14 +22,13 @@ class Motion:
     Attributes:
         joints: (F, J, 3) joint positions in metres, y up, floor at y = 0.
         fps: frames a second.
-        skeleton: names and parents of the J joints; names that start with `left_` and `right_` tell the sides.
+        skeleton: names and parents of the J joints; `left_` and `right_` tell the sides.
         caption: what the motion is asked to be; shown below it.
         id: name of the motion; shown below it.
-        contacts: (F, N) bool, True = this foot joint stands on the floor; None where it is not known.
-        feet: the N joints that `contacts` speaks of.
+        contacts: (F, N) bool, True = this one of the N joints `skeleton.feet` stands on the floor; None = not known.
 
     Raises:
-        ValueError: wrong shapes, joints that are not finite, or a skeleton that is not a tree of these joints.
+        ValueError: wrong shapes, joints that are not finite, or a frame rate that is no positive number.
     """
 
     joints: np.ndarray
@@ -38,34 +37,26 @@ class Motion:
     caption: str = ""
     id: str = ""
     contacts: np.ndarray | None = None
-    feet: Sequence[int] = ()
 
     def __post_init__(self) -> None:
-        name = f"motion {self.id!r}"
+        name, skeleton = f"motion {self.id!r}", self.skeleton
         self.joints = np.asarray(self.joints, dtype=np.float32)
-        parents = self.skeleton.parents
-        if self.joints.ndim != 3 or self.joints.shape[2] != 3 or not len(self.joints):
-            raise ValueError(f"{name}: joints have shape {self.joints.shape}, expected (frames, joints, 3)")
-        if self.joints.shape[1] != len(parents):
-            raise ValueError(f"{name}: {self.joints.shape[1]} joints on a skeleton of {len(parents)} joints")
+        shape = self.joints.shape
+        if len(shape) != 3 or shape[2] != 3 or not shape[0]:
+            raise ValueError(f"{name}: joints have shape {shape}, expected (frames, joints, 3)")
+        if shape[1] != len(skeleton.joints):
+            raise ValueError(f"{name}: {shape[1]} joints, but skeleton {skeleton.name} has {len(skeleton.joints)}")
         if not np.isfinite(self.joints).all():
             frame, joint, _ = np.argwhere(~np.isfinite(self.joints))[0]
             raise ValueError(f"{name}: joint {joint} in frame {frame} is not finite; did the model diverge?")
-        if not (np.isfinite(self.fps) and self.fps > 0):
+        self.fps = float(self.fps)
+        if not 0 < self.fps < float("inf"):
             raise ValueError(f"{name}: fps is {self.fps}, expected a number above 0")
-        if parents[0] != -1 or any(not 0 <= parent < joint for joint, parent in enumerate(parents) if joint):
-            raise ValueError(
-                f"{name}: parents {tuple(parents)}: the root (-1) and each parent must stand before a joint"
-            )
         if self.contacts is not None:
             self.contacts = np.asarray(self.contacts, dtype=bool)
-            if self.contacts.shape != (len(self.joints), len(self.feet)):
-                raise ValueError(
-                    f"{name}: contacts have shape {self.contacts.shape}, expected (frames, feet) = "
-                    f"({len(self.joints)}, {len(self.feet)})"
-                )
-            if any(not 0 <= joint < len(parents) for joint in self.feet):
-                raise ValueError(f"{name}: feet {tuple(self.feet)} are not joints of a skeleton of {len(parents)}")
+            given, expected = self.contacts.shape, (shape[0], len(skeleton.feet))
+            if given != expected:
+                raise ValueError(f"{name}: contacts have shape {given}, expected (frames, feet) = {expected}")
 
     @property
     def seconds(self) -> float:

@@ -1,0 +1,281 @@
+import base64
+import json
+import shutil
+import subprocess
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image, ImageSequence
+
+from flame_mdm.representations.skeleton import SKELETONS, Skeleton
+from flame_mdm.visualize import Motion, contact_sheet, frames_array, write_gif, write_mp4, write_player
+from flame_mdm.visualize.render import SIDE_COLORS
+from flame_mdm.visualize.scene import written_whole
+
+HOSTILE = "</script><img src=x onerror=alert(1)><!-- __TITLE__ \u2028 \"'&amp; &"
+
+
+def walk(
+    frames: int = 30, fps: float = 20, skeleton: Skeleton = SKELETONS["smpl22"], contacts: bool = False, **names: str
+) -> Motion:
+    """A figure that stands on its rest pose, sways and moves forward."""
+    bones = 0.2 * np.array(skeleton.raw_offsets, dtype=float)
+    pose = np.zeros((len(bones), 3))
+    for joint, parent in enumerate(skeleton.parents[1:], 1):
+        pose[joint] = pose[parent] + bones[joint]
+    pose[:, 1] -= pose[:, 1].min()
+    time = np.arange(frames)[:, None, None] / fps
+    joints = pose + np.random.default_rng(0).normal(0, 0.05, pose.shape) * np.sin(6 * time) + time * [0, 0, 1.2]
+    touch = np.arange(frames * len(skeleton.feet)).reshape(frames, -1) % 3 == 0
+    return Motion(joints, fps, skeleton, contacts=touch if contacts else None, **names)
+
+
+class Page(HTMLParser):
+    """Tags of a page, and the text of its elements by id or tag."""
+
+    def __init__(self, path: Path):
+        super().__init__()
+        self.tags: list[str] = []
+        self.texts: dict[str, str] = {}
+        self.inside = ""
+        self.source = path.read_text(encoding="utf-8")
+        self.feed(self.source)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+        self.inside = dict(attrs).get("id") or tag
+
+    def handle_endtag(self, tag: str) -> None:
+        self.inside = ""
+
+    def handle_data(self, data: str) -> None:
+        self.texts[self.inside] = self.texts.get(self.inside, "") + data
+
+    @property
+    def motions(self) -> list[dict]:
+        return json.loads(self.texts["data"])
+
+
+def unpacked(packed: dict) -> np.ndarray:
+    quanta = np.frombuffer(base64.b64decode(packed["joints"]), "<i2").reshape(packed["frames"], -1, 3)
+    return packed["center"] + quanta * packed["step"]
+
+
+def test_player_holds_the_joints_to_half_a_millimetre(tmp_path):
+    motions = [walk(contacts=True), walk(7, 12.5, SKELETONS["kit21"])]  # lengths, rates and skeletons may differ
+    write_player(tmp_path / "p.html", motions, "t")
+    for packed, motion in zip(Page(tmp_path / "p.html").motions, motions, strict=True):
+        np.testing.assert_allclose(unpacked(packed), motion.joints, rtol=0, atol=0.0005 + 1e-6)
+        assert packed["parents"] == list(motion.skeleton.parents)
+        assert packed["fps"] == motion.fps
+    contacts = np.frombuffer(base64.b64decode(Page(tmp_path / "p.html").motions[0]["contacts"]), "u1")
+    np.testing.assert_array_equal(contacts.reshape(30, -1), motions[0].contacts)
+
+
+def test_player_rounds_a_huge_motion_coarser_instead_of_wrapping_around(tmp_path):
+    motion = walk()
+    motion.joints *= 1000
+    write_player(tmp_path / "p.html", [motion])
+    span = np.ptp(motion.joints, axis=(0, 1)).max()
+    np.testing.assert_allclose(
+        unpacked(Page(tmp_path / "p.html").motions[0]), motion.joints, rtol=0, atol=span / 65534 / 2 + 1e-3
+    )
+
+
+def test_player_is_one_file_without_references(tmp_path):
+    write_player(tmp_path / "p.html", [walk()], "t")
+    page = Page(tmp_path / "p.html")
+    assert not {"link", "img", "iframe"} & set(page.tags)
+    for reference in ("http:", "https:", "src=", "href=", "url(", "@import", "import(", "fetch(", "XMLHttpRequest"):
+        assert reference not in page.source, reference
+
+
+def test_player_escapes_captions_ids_and_title(tmp_path):
+    write_player(tmp_path / "p.html", [walk(caption=HOSTILE, id=HOSTILE)], HOSTILE)
+    page = Page(tmp_path / "p.html")
+    assert page.tags.count("script") == 2
+    assert "img" not in page.tags
+    assert page.texts["title"] == page.texts["h1"] == HOSTILE
+    assert (page.motions[0]["caption"], page.motions[0]["id"]) == (HOSTILE, HOSTILE)
+
+
+def test_player_of_twenty_clips_stays_small(tmp_path):
+    write_player(tmp_path / "p.html", [walk(60, contacts=True, id=str(k)) for k in range(20)])
+    assert (tmp_path / "p.html").stat().st_size < 400_000
+
+
+@pytest.mark.skipif(shutil.which("chromium") is None, reason="chromium is not installed")
+@pytest.mark.parametrize("count", [1, 13])
+def test_player_runs_in_a_browser(tmp_path, count):
+    page = tmp_path / "p.html"
+    write_player(page, [walk(contacts=True, caption=HOSTILE, id=f"m{k}") for k in range(count)], "t")
+    # reports what the page's script made of the data: pixels of both sides in the first panel, clock, filter
+    report = """<script>setTimeout(() => {
+      goTo(7); redraw();
+      const { canvas } = motions[0], { data } = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height);
+      let blue = 0, orange = 0;
+      for (let i = 0; i < data.length; i += 4) {
+        blue += data[i + 2] > data[i] + 80; orange += data[i] > data[i + 2] + 80;
+      }
+      document.title = JSON.stringify({ blue, orange, frame: scrub.value, of: scrub.max, filter: !filter.hidden,
+        joint: motions[0].joints.length, images: document.images.length,
+        caption: document.querySelector("figcaption p").textContent });
+    }, 300)</script></body>"""
+    page.write_text(page.read_text(encoding="utf-8").replace("</body>", report), encoding="utf-8")
+    command = ["chromium", "--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-dev-shm-usage"]
+    command += ["--disable-background-networking", f"--user-data-dir={tmp_path / 'profile'}", "--window-size=900,700"]
+    command += ["--virtual-time-budget=1500", "--dump-dom", page.as_uri()]
+    dump = subprocess.run(command, capture_output=True, check=True, timeout=60).stdout.decode()
+    (tmp_path / "dump.html").write_text(dump, encoding="utf-8")
+    seen = json.loads(Page(tmp_path / "dump.html").texts["title"])
+    assert min(seen.pop("blue"), seen.pop("orange")) > 50
+    assert seen == {
+        "frame": "7",
+        "of": "29",
+        "filter": count > 12,
+        "joint": 30 * 22 * 3,
+        "images": 0,
+        "caption": HOSTILE,
+    }
+
+
+@pytest.mark.parametrize(
+    ("fps", "frames", "shown"),
+    [(20, 30, 30), (30, 30, 30), (12.5, 10, 10), (100, 100, 50), (120, 120, 40)],
+)
+def test_gif_keeps_frames_and_time(tmp_path, fps, frames, shown):
+    write_gif(tmp_path / "m.gif", [walk(frames, fps, caption="walks")], size=64)
+    with Image.open(tmp_path / "m.gif") as image:
+        durations = [frame.info["duration"] for frame in ImageSequence.Iterator(image)]
+        assert image.info["loop"] == 0
+    assert len(durations) == shown
+    assert sum(durations) == pytest.approx(1000 * frames / fps, abs=5)
+    assert min(durations) >= 20  # browsers slow shorter ones down
+    assert max(durations) - min(durations) <= 10
+
+
+def test_gif_holds_a_motion_that_ended(tmp_path):
+    write_gif(tmp_path / "m.gif", [walk(8), walk(16)], size=64)
+    with Image.open(tmp_path / "m.gif") as image:
+        assert image.width == 128
+        frames = [np.asarray(frame.convert("RGB"))[:64] for frame in ImageSequence.Iterator(image)]
+    assert len(frames) == 16
+    np.testing.assert_array_equal(frames[8][:, :64], frames[15][:, :64])
+    assert (frames[8][:, 64:] != frames[15][:, 64:]).any()
+
+
+@pytest.mark.parametrize("write", [write_player, write_gif, contact_sheet])
+def test_same_input_gives_the_same_bytes(tmp_path, write):
+    for name in "ab":
+        write(tmp_path / name, [walk(5, contacts=True, caption="walks")])
+    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
+
+
+def limb_rows(image: np.ndarray, side: int) -> np.ndarray:
+    return np.nonzero((np.abs(image.astype(int) - SIDE_COLORS[side]) < 12).all(-1))[0]
+
+
+def test_frames_show_both_sides_and_height():
+    motion = walk(3, skeleton=SKELETONS["smpl24"])
+    frames = frames_array(motion, size=128)
+    assert frames.shape == (3, 128, 128, 3)
+    assert frames.dtype == np.uint8
+    motion.joints[:, :, 1] += 0.3
+    floating = frames_array(motion, size=128)
+    for side in (-1, 1):
+        assert len(limb_rows(frames[0], side)) > 50
+        lifted = limb_rows(frames[0], side).mean() - limb_rows(floating[0], side).mean()
+        assert lifted == pytest.approx(0.3 * 2.05 * 128 / 5, rel=0.2)
+
+
+def test_contact_sheet_shows_first_to_last_pose_of_each_motion(tmp_path):
+    motions = [walk(30, caption="walks"), walk(4, caption="walks briefly")]
+    contact_sheet(tmp_path / "sheet.png", motions, frames=3, size=96)
+    sheet = np.asarray(Image.open(tmp_path / "sheet.png"))
+    assert sheet.shape[1:] == (3 * 96, 3)
+    last = frames_array(motions[0], size=96)[-1]
+    np.testing.assert_array_equal(sheet[24:96, -96:], last[24:])  # the time stands above
+    np.testing.assert_array_equal(sheet[sheet.shape[0] // 2 + 24 :][:60, :96], frames_array(motions[1], 96)[0][24:84])
+
+
+@pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="ffmpeg is not installed")
+def test_mp4_keeps_frames(tmp_path):
+    write_mp4(tmp_path / "m.mp4", [walk(12, 30)], size=65)
+    command = ["ffmpeg", "-loglevel", "error", "-i", str(tmp_path / "m.mp4"), "-f", "rawvideo", "-pix_fmt", "gray", "-"]
+    pixels = subprocess.run(command, capture_output=True, check=True).stdout
+    assert len(pixels) % 12 == 0
+    assert len(pixels) // 12 >= 64 * 64
+    assert [path.name for path in tmp_path.iterdir()] == ["m.mp4"]
+
+
+def test_mp4_without_ffmpeg_says_so(tmp_path, monkeypatch):
+    monkeypatch.setattr(shutil, "which", lambda name: None)
+    with pytest.raises(FileNotFoundError, match=r"m\.mp4: MP4 needs ffmpeg .* write a \.gif"):
+        write_mp4(tmp_path / "m.mp4", [walk(2)])
+
+
+def test_a_failure_leaves_the_old_file_and_nothing_else(tmp_path):
+    path = tmp_path / "new" / "p.html"
+    with written_whole(path) as temporary:
+        temporary.write_text("old")
+
+    def fail():
+        with written_whole(path) as temporary:
+            temporary.write_text("half")
+            raise OSError("disk full")
+
+    with pytest.raises(OSError, match="disk full"):
+        fail()
+    assert path.read_text() == "old"
+    assert list(path.parent.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("write", [write_player, write_gif, write_mp4, contact_sheet])
+def test_every_writer_goes_through_a_temporary_name(tmp_path, monkeypatch, write):
+    if write is write_mp4 and shutil.which("ffmpeg") is None:
+        pytest.skip("ffmpeg is not installed")
+
+    def full(*_):
+        raise OSError("disk full")
+
+    monkeypatch.setattr(Path, "replace", full)
+    with pytest.raises(OSError, match="disk full"):
+        write(tmp_path / "out.mp4", [walk(2)])
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("write", [write_player, write_gif, write_mp4, contact_sheet])
+def test_nothing_to_show_is_an_error(tmp_path, write):
+    with pytest.raises(ValueError, match=r"out\.x: no motions to show"):
+        write(tmp_path / "out.x", [])
+
+
+def test_contact_sheet_without_poses_is_an_error(tmp_path):
+    with pytest.raises(ValueError, match=r"c\.png: 0 poses a row"):
+        contact_sheet(tmp_path / "c.png", [walk()], frames=0)
+
+
+def damaged() -> np.ndarray:
+    joints = walk(4).joints
+    joints[2, 5, 1] = np.nan
+    return joints
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"joints": damaged()}, "'m': joint 5 in frame 2 is not finite"),
+        ({"joints": np.zeros((4, 66))}, r"'m': joints have shape \(4, 66\)"),
+        ({"joints": np.zeros((0, 22, 3))}, r"'m': joints have shape \(0, 22, 3\)"),
+        ({"joints": np.zeros((4, 24, 3))}, "'m': 24 joints, but skeleton smpl22 has 22"),
+        ({"fps": 0}, "'m': fps is 0"),
+        ({"fps": float("nan")}, "'m': fps is nan"),
+        ({"contacts": np.zeros((3, 4))}, r"'m': contacts have shape \(3, 4\), expected \(frames, feet\) = \(4, 4\)"),
+    ],
+)
+def test_bad_motions_are_refused_by_name(change, message):
+    good = {"joints": np.zeros((4, 22, 3)), "fps": 20, "skeleton": SKELETONS["smpl22"], "id": "m"}
+    with pytest.raises(ValueError, match=message):
+        Motion(**{**good, **change})

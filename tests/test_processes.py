@@ -6,7 +6,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from fixtures import Arrays, golden, meta
+from analytic import NO_CONDITION, assert_golden, flow_field, linear_denoiser, motions, spaced
+from fixtures import golden, meta
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
@@ -18,7 +19,6 @@ from flame_mdm.processes.flow_matching import FlowMatching
 from flame_mdm.processes.schedules import build_schedule, timesteps
 
 GAUSSIAN, MFM = golden("gaussian"), golden("mfm")
-SHARED = Condition(torch.zeros(1, 1), torch.zeros(1, 0, 1), None)
 TABLES = {
     "betas": "betas",
     "alphas_cumprod": "alphas_cumprod",
@@ -40,37 +40,6 @@ POINTWISE = {
 }
 
 
-def motions(array: np.ndarray, dtype: torch.dtype = torch.float32) -> Tensor:
-    """(B, joints, features, frames) or (B, D, frames) -> (B, F, D)."""
-    return torch.from_numpy(array).to(dtype).flatten(1, -2).transpose(1, 2).contiguous()
-
-
-def linear_denoiser(A: np.ndarray, b: np.ndarray, g: float, features: int):
-    """The fixtures' denoiser: each group of `features` channels mixed by A, plus b + g t / 1000."""
-
-    def denoise(x_t: Tensor, t: Tensor, mask: Tensor, cond: Condition) -> Tensor:
-        weight, bias = torch.from_numpy(A).to(x_t), torch.from_numpy(b).to(x_t)
-        grouped = x_t.unflatten(-1, (-1, features))
-        output = torch.einsum("jk,blkf->bljf", weight, grouped) + bias + g * t.to(x_t)[:, None, None, None] / 1000
-        return output.flatten(-2)
-
-    return denoise
-
-
-def assert_golden(arrays: Arrays, key: str, value: Tensor, within: float = 10.0) -> None:
-    """Against the float64 run in float64; else within ten times what float32 cost the authors' code."""
-    if value.dtype == torch.float64 and f"f64/{key}" in arrays:
-        expected = arrays[f"f64/{key}"]
-        tolerance = 1e-10 * max(1.0, np.abs(expected).max())
-    else:
-        expected = arrays[key]
-        cost = np.ravel(meta(arrays)["max_abs_diff_f32_vs_f64"].get(key, 0.0))[0]
-        tolerance = max(within * cost, 1e-6 * max(1.0, np.abs(expected).max()))
-    if expected.ndim > 2:
-        value = value.transpose(1, 2).reshape(expected.shape)
-    np.testing.assert_allclose(value.numpy(), expected, rtol=0, atol=tolerance, err_msg=key)
-
-
 @pytest.mark.golden
 @pytest.mark.parametrize("key", [pytest.param(k, id=f"gaussian-{k}") for k in GAUSSIAN if k.startswith("sched/")])
 def test_schedule_is_that_of_the_papers(key):
@@ -84,19 +53,6 @@ def test_schedule_is_that_of_the_papers(key):
     else:
         value = tables[TABLES[table]]
     np.testing.assert_allclose(value.numpy(), GAUSSIAN[key], rtol=1e-9)
-
-
-def spaced(total: int, spec: str) -> list[int]:
-    """The fixtures' names of step choices: "ddimN", "N" or the counts of equal sections "a,b,c"."""
-    if spec.startswith("ddim"):
-        return timesteps(total, int(spec.removeprefix("ddim")), "stride")
-    counts = [int(count) for count in spec.split(",")]
-    steps, start = [], 0
-    for index, count in enumerate(counts):
-        size = total // len(counts) + (index < total % len(counts))
-        steps += [start + step for step in timesteps(size, count)]
-        start += size
-    return steps
 
 
 @pytest.mark.golden
@@ -157,8 +113,8 @@ def pointwise_output(x_t: Tensor, learned: bool) -> Tensor:
     suffix = "2" if learned else ""
     A, b = GAUSSIAN[f"lin4/A{suffix}"], GAUSSIAN[f"lin4/b{suffix}"]
     t = torch.tensor(GAUSSIAN["pw/t"]).float()
-    denoise = linear_denoiser(A, b, float(GAUSSIAN["lin4/g"]), b.shape[1])
-    return denoise(x_t, t, torch.ones(x_t.shape[:2], dtype=torch.bool), SHARED)
+    denoise = linear_denoiser(A, b, float(GAUSSIAN["lin4/g"]))
+    return denoise(x_t, t, torch.ones(x_t.shape[:2], dtype=torch.bool), NO_CONDITION)
 
 
 @pytest.mark.golden
@@ -194,9 +150,9 @@ def test_variational_bound(case, dtype):
     if "guided" in case:
         output = pointwise_output(x_t, learned=True)
     else:  # FLAME's code has one channel a joint: the bias of channel 0 for all.
-        A, b = GAUSSIAN["lin4/A2"], GAUSSIAN["lin4/b2"][:, :1]
-        denoise = linear_denoiser(A, b, float(GAUSSIAN["lin4/g"]), GAUSSIAN["lin4/b2"].shape[1])
-        output = denoise(x_t, t, mask, SHARED)
+        A, b = GAUSSIAN["lin4/A2"], np.repeat(GAUSSIAN["lin4/b2"][:, :1], GAUSSIAN["lin4/b2"].shape[1], 1)
+        denoise = linear_denoiser(A, b, float(GAUSSIAN["lin4/g"]))
+        output = denoise(x_t, t, mask, NO_CONDITION)
     bound = masked_mean(process.vlb(output, x, x_t, t), mask)
     assert_golden(GAUSSIAN, f"pw/vb_{case.removeprefix('gaussian-')}", bound)
 
@@ -263,14 +219,14 @@ def test_oracle_has_no_loss_and_padding_has_no_say(name):
         seen["error"] = masked_mse(x0_hat, clean, mask)
         return {"extra": torch.full((3,), 0.25)}
 
-    terms = process.loss(oracle, x, mask, SHARED, t=t, noise=noise, auxiliary=auxiliary)
+    terms = process.loss(oracle, x, mask, NO_CONDITION, t=t, noise=noise, auxiliary=auxiliary)
     assert set(terms) == {"mse", "extra", "loss"} | ({"vlb"} if spare else set())
     torch.testing.assert_close(terms["mse"], torch.zeros(3))
     torch.testing.assert_close(seen["error"], torch.zeros(3), rtol=0, atol=1e-2)
     total = sum(value for key, value in terms.items() if key != "loss")
     torch.testing.assert_close(terms["loss"], total)
     other = process.loss(
-        oracle, x, mask, SHARED, t=t, noise=torch.where(mask[..., None], noise, 0.0), auxiliary=auxiliary
+        oracle, x, mask, NO_CONDITION, t=t, noise=torch.where(mask[..., None], noise, 0.0), auxiliary=auxiliary
     )
     torch.testing.assert_close(other["loss"], terms["loss"])
 
@@ -285,7 +241,7 @@ def test_hybrid_loss_trains_the_variance_alone():
     x, mask, t = torch.randn(2, 6, 3), torch.ones(2, 6, dtype=torch.bool), torch.tensor([0.0, 500.0])
     noise = torch.randn_like(x)
     output = torch.randn(2, 6, 6, requires_grad=True)
-    terms = process.loss(lambda *_: output, x, mask, SHARED, t=t, noise=noise)
+    terms = process.loss(lambda *_: output, x, mask, NO_CONDITION, t=t, noise=noise)
     x_t = process.corrupt(x, noise, t)
     torch.testing.assert_close(terms["vlb"], 0.002 * 1000 * masked_mean(process.vlb(output, x, x_t, t), mask))
     terms["vlb"].sum().backward()
@@ -303,8 +259,8 @@ def test_average_padding_gives_short_motions_less_weight():
         return torch.zeros(2, 8, 6)
 
     options = {"prediction": "epsilon", "variance": "learned_range"}
-    sound = GaussianDiffusion(**options).loss(silent, x, mask, SHARED, t=t, noise=noise)
-    legacy = GaussianDiffusion(**options, average_padding=True).loss(silent, x, mask, SHARED, t=t, noise=noise)
+    sound = GaussianDiffusion(**options).loss(silent, x, mask, NO_CONDITION, t=t, noise=noise)
+    legacy = GaussianDiffusion(**options, average_padding=True).loss(silent, x, mask, NO_CONDITION, t=t, noise=noise)
     torch.testing.assert_close(legacy["mse"], sound["mse"] * torch.tensor([1.0, 0.25]))
     torch.testing.assert_close(legacy["vlb"][0], sound["vlb"][0])
     assert legacy["vlb"][1] != sound["vlb"][1]
@@ -362,7 +318,7 @@ def test_loss_aware_training_is_a_function_of_what_is_saved():
         for step in steps:
             torch.manual_seed(step)
             x = torch.randn(64, 3, 2)
-            losses.append(process.loss(constant(0.0, 2), x, torch.ones(64, 3, dtype=torch.bool), SHARED)["loss"])
+            losses.append(process.loss(constant(0.0, 2), x, torch.ones(64, 3, dtype=torch.bool), NO_CONDITION)["loss"])
         return losses
 
     options = {"num_train_timesteps": 10, "prediction": "epsilon", "timestep_sampling": "loss_aware"}
@@ -396,21 +352,13 @@ def test_flow_path_and_target(dtype):
     assert_golden(MFM, "loss/target", process.target(x, noise, t))
 
 
-def flow_field(x: Tensor, t: Tensor, mask: Tensor, cond: Condition) -> Tensor:
-    """The fixture's velocity field: A x + b + c t, channels first, t as the flow has it."""
-    A, b = torch.from_numpy(MFM["field/A"]).to(x), torch.from_numpy(MFM["field/b"]).to(x)
-    groups = x.unflatten(-1, (A.shape[0], -1))
-    output = torch.einsum("jk,blkf->bljf", A, groups) + b + float(MFM["field/c"]) * t.to(x)[:, None, None, None] / 1000
-    return output.flatten(-2)
-
-
 @pytest.mark.golden
 @pytest.mark.parametrize("case", ["mfm-field"])
 def test_flow_loss(case):
     process = FlowMatching(sigma_min=meta(MFM)["sigma_min"])
     x, noise, t = motions(MFM["loss/x_start"]), motions(MFM["loss/noise"]), torch.from_numpy(MFM["loss/t"])
     mask = torch.from_numpy(MFM["in/mask"]).flatten(1)
-    terms = process.loss(flow_field, x, mask, SHARED, t=t, noise=noise)
+    terms = process.loss(flow_field(MFM), x, mask, NO_CONDITION, t=t, noise=noise)
     assert_golden(MFM, "loss/field/rot_mse", terms["mse"])
     assert_golden(MFM, "loss/field/loss", terms["loss"])
 
@@ -438,7 +386,7 @@ def test_flow_times_are_drawn_as_named(distribution):
         seen.t = t / 1000
         return x_t
 
-    process.loss(denoise, torch.zeros(4000, 1, 1), torch.ones(4000, 1, dtype=torch.bool), SHARED)
+    process.loss(denoise, torch.zeros(4000, 1, 1), torch.ones(4000, 1, dtype=torch.bool), NO_CONDITION)
     middle = ((seen.t > 0.25) & (seen.t < 0.75)).float().mean()
     assert seen.t.mean() == pytest.approx(0.5, abs=0.03)
     # P(|logit| < ln 3) of a normal variable is 0.728.

@@ -1,0 +1,59 @@
+"""The analytic denoisers of the diffusion and flow fixtures, and how values are compared with these."""
+
+import numpy as np
+import torch
+from fixtures import Arrays, meta
+from torch import Tensor
+
+from flame_mdm.motion import Condition, Denoise
+from flame_mdm.processes.schedules import timesteps
+
+NO_CONDITION = Condition(torch.zeros(1, 1), torch.zeros(1, 0, 1), None)
+
+
+def motions(array: np.ndarray, dtype: torch.dtype = torch.float32) -> Tensor:
+    """(B, joints, features, frames) or (B, D, frames) -> (B, F, D)."""
+    return torch.from_numpy(array).to(dtype).flatten(1, -2).transpose(1, 2).contiguous()
+
+
+def linear_denoiser(A: np.ndarray, b: np.ndarray, g: float) -> Denoise:
+    """Each group of channels (one a column of b) mixed by A (outputs, inputs), plus b and g t / 1000."""
+
+    def denoise(x_t: Tensor, t: Tensor, mask: Tensor, cond: Condition) -> Tensor:
+        weight, bias = torch.from_numpy(A).to(x_t), torch.from_numpy(b).to(x_t)
+        output = torch.einsum("jk,blkf->bljf", weight, x_t.unflatten(-1, (A.shape[1], b.shape[1]))) + bias
+        return (output + g * t.to(x_t)[:, None, None, None] / 1000).flatten(-2)
+
+    return denoise
+
+
+def assert_golden(arrays: Arrays, key: str, value: Tensor, within: float = 10.0) -> None:
+    """Against the float64 run in float64; else within ten times what float32 cost the authors' code."""
+    if value.dtype == torch.float64 and f"f64/{key}" in arrays:
+        expected = arrays[f"f64/{key}"]
+        tolerance = 1e-10 * max(1.0, np.abs(expected).max())
+    else:
+        expected = arrays[key]
+        cost = np.ravel(meta(arrays)["max_abs_diff_f32_vs_f64"].get(key, 0.0))[0]
+        tolerance = max(within * cost, 1e-6 * max(1.0, np.abs(expected).max()))
+    if expected.ndim > 2:
+        value = value.transpose(1, 2).reshape(expected.shape)
+    np.testing.assert_allclose(value.numpy(), expected, rtol=0, atol=tolerance, err_msg=key)
+
+
+def spaced(total: int, spec: str) -> list[int]:
+    """The fixtures' names of step choices: "ddimN", "N" or the counts of equal sections "a,b,c"."""
+    if spec.startswith("ddim"):
+        return timesteps(total, int(spec.removeprefix("ddim")), "stride")
+    counts = [int(count) for count in spec.split(",")]
+    steps, start = [], 0
+    for index, count in enumerate(counts):
+        size = total // len(counts) + (index < total % len(counts))
+        steps += [start + step for step in timesteps(size, count)]
+        start += size
+    return steps
+
+
+def flow_field(arrays: Arrays) -> Denoise:
+    """The fixture's velocity field A x + b + c t, with t as the flow has it."""
+    return linear_denoiser(arrays["field/A"], arrays["field/b"], float(arrays["field/c"]))

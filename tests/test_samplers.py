@@ -1,0 +1,542 @@
+"""Every sampler of both processes: against the authors' loops, diffusers and torchdiffeq, and against an oracle."""
+
+import math
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import pytest
+import torch
+from analytic import NO_CONDITION, assert_golden, flow_field, linear_denoiser, motions, spaced
+from diffusers import DDIMScheduler, DDPMScheduler, DPMSolverMultistepScheduler  # pyright: ignore[reportPrivateImportUsage]
+from fixtures import golden, groups, meta
+from torch import Tensor
+from torchdiffeq import odeint
+
+from flame_mdm.motion import Denoise, Edit, Noise, length_mask
+from flame_mdm.processes.diffusion import GaussianDiffusion
+from flame_mdm.processes.flow_matching import STEPS, FlowMatching
+from flame_mdm.processes.samplers import CountedDenoise, ancestral_step, ddim_step
+
+GAUSSIAN, MFM = golden("gaussian"), golden("mfm")
+OPTIONS = meta(GAUSSIAN)["options"]
+PRECISIONS = [pytest.param(torch.float32, id="f32"), pytest.param(torch.float64, id="f64")]
+DIFFUSION = ["ancestral", "ddim", "dpm_solver_pp_2m"]
+CALLS = {"euler": 1, "midpoint": 2, "heun": 2, "rk4": 4}
+
+
+def replay(first: Tensor, rest: Sequence[Tensor] | Tensor) -> Noise:
+    """Noise from recorded draws; asking for more of them is an error."""
+    return lambda draw: first if draw == 0 else rest[draw - 1]
+
+
+def drawn(shape: tuple[int, ...], dtype: torch.dtype = torch.float32) -> Noise:
+    """Noise that depends on the number of the draw alone."""
+    return lambda draw: torch.randn(shape, generator=torch.Generator().manual_seed(draw), dtype=dtype)
+
+
+def steps_of(section: str | list[int], total: int) -> list[int]:
+    return spaced(total, section if isinstance(section, str) else ",".join(map(str, section)))
+
+
+def ones(x: Tensor) -> Tensor:
+    return torch.ones(x.shape[:2], dtype=torch.bool)
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize("dtype", PRECISIONS)
+@pytest.mark.parametrize("case", [pytest.param(name, id=f"gaussian-{name}") for name in OPTIONS["mdm_loops"]])
+def test_mdm_loop(case, dtype):
+    total, section, kind, options = OPTIONS["mdm_loops"][case]
+    process = GaussianDiffusion(num_train_timesteps=total)
+    x_T = motions(GAUSSIAN["loop/x_T"], dtype)
+    draws = [motions(noise, dtype) for noise in GAUSSIAN[f"loop/{case}/noise"]]
+    edit = None
+    if options.get("inpaint"):
+        keep = motions(GAUSSIAN["loop/inpainting_mask"]) > 0
+        edit = Edit(motions(GAUSSIAN["loop/inpainted_motion"], dtype), keep, mode="x0")
+    x = process.sample(
+        linear_denoiser(GAUSSIAN["loop/lin4/A"], GAUSSIAN["loop/lin4/b"], float(GAUSSIAN["lin4/g"])),
+        replay(x_T, draws),
+        ones(x_T),
+        NO_CONDITION,
+        sampler={"ddpm": "ancestral", "ddim": "ddim"}[kind],
+        num_inference_steps=steps_of(section, total),
+        edit=edit,
+        eta=options.get("eta", 0.0),
+    )
+    assert_golden(GAUSSIAN, f"loop/{case}/out", x)
+    if edit is not None:
+        torch.testing.assert_close(x[edit.keep], edit.known[edit.keep], rtol=0, atol=1e-12)
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize("dtype", PRECISIONS)
+@pytest.mark.parametrize("case", [pytest.param(name, id=f"gaussian-{name}") for name in OPTIONS["flame_loops"]])
+def test_flame_loop(case, dtype):
+    options = OPTIONS["flame_loops"][case]
+    process = GaussianDiffusion(options["T"], prediction="epsilon", variance="learned_range", clip_x0=True)
+    x_T = motions(GAUSSIAN["floop/x_T"], dtype)
+    edit = None
+    if "edit" in options:
+        joints, keep_translation = options["edit"]
+        keep = torch.ones_like(x_T, dtype=torch.bool)
+        keep[..., :3] = keep_translation
+        keep[..., 3:].unflatten(-1, (-1, 6))[..., joints, :] = False
+        known = motions(GAUSSIAN["floop/ref_motion"], dtype).expand_as(x_T)
+        edit = Edit(known, keep, mode="x_t", blend="before")
+    x = process.sample(
+        linear_denoiser(GAUSSIAN["floop/A"], GAUSSIAN["floop/b"][:, None], float(GAUSSIAN["lin4/g"])),
+        replay(x_T, [motions(noise, dtype) for noise in GAUSSIAN[f"floop/{case}/noise"]]),
+        ones(x_T),
+        NO_CONDITION,
+        sampler={"ddpm": "ancestral", "ddim": "ddim"}[options["kind"]],
+        num_inference_steps=steps_of(options["sec"], options["T"]),
+        edit=edit,
+    )
+    assert_golden(GAUSSIAN, f"floop/{case}/out", x)
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize("dtype", PRECISIONS)
+@pytest.mark.parametrize(
+    "case", [pytest.param(name, id=f"gaussian-{name}") for name in ["p_sample", "0.0", "0.5", "1.0"]]
+)
+def test_one_step(case, dtype):
+    process, t = GaussianDiffusion(OPTIONS["T"]), torch.tensor(GAUSSIAN["pw/t"])
+    x_t = motions(GAUSSIAN["f64/pw/x_t" if dtype == torch.float64 else "pw/x_t"], dtype)
+    noise = motions(GAUSSIAN["step/noise"][["p_sample", "0.0", "0.5", "1.0"].index(case)], dtype)
+    denoise = linear_denoiser(GAUSSIAN["lin4/A"], GAUSSIAN["lin4/b"], float(GAUSSIAN["lin4/g"]))
+    x0_hat = denoise(x_t, t.float(), ones(x_t), NO_CONDITION)
+    if case == "p_sample":
+        log_variance = process.log_variance(x0_hat, x_t, t, process.schedule)
+        assert_golden(GAUSSIAN, "step/p_sample", ancestral_step(x_t, x0_hat, log_variance, process.schedule, t, noise))
+    else:
+        x = ddim_step(x_t, x0_hat, process.schedule, t, noise, eta=float(case))
+        assert_golden(GAUSSIAN, f"step/ddim_eta{case}", x)
+
+
+ANALYTIC_RUNS = [name for name, run in meta(MFM)["config"]["runs"].items() if run["on"] == "field"]
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize("case", [pytest.param(name, id=f"mfm-{name}") for name in ANALYTIC_RUNS])
+def test_flow_run(case):
+    run = meta(MFM)["config"]["runs"][case]
+    method = run.get("method", "euler")
+    process = FlowMatching(sigma_min=meta(MFM)["sigma_min"], odeint_grid=method == "euler")
+    seen = []
+
+    def field(x_t, t, mask, cond):
+        seen.append(t[0].item() / 1000)
+        return flow_field(MFM)(x_t, t, mask, cond)
+
+    start = motions(MFM["sample/x_init"])
+    edit = None
+    if "edit" in method:
+        keep = motions(MFM["edit/inpainting_mask"]) > 0
+        known = motions(MFM["edit/inpainted_motion"])
+        edit = Edit(known, keep, mode="trajectory", until=run.get("edit_till", 1.0))
+    x = process.sample(
+        field,
+        replay(start, []),
+        ones(start),
+        NO_CONDITION,
+        sampler={"euler_raw": "euler", "euler_replacement_edit_till": "euler"}.get(method, method),
+        num_inference_steps=round(1 / run.get("step_size", 0.1)),
+        edit=edit,
+    )
+    assert_golden(MFM, f"run/{case}", x)
+    np.testing.assert_allclose(seen, MFM[f"times/{case}"], rtol=0, atol=1e-6)
+
+
+# What an oracle returns has to be the data, whatever the sampler and the number of steps.
+
+
+def oracle(process: GaussianDiffusion | FlowMatching, x: Tensor, learned: bool = False) -> Denoise:
+    """The denoiser that knows the data, from which the noise in x_t follows."""
+
+    def denoise(x_t, t, mask, cond):
+        if isinstance(process, FlowMatching):
+            time = t / 1000
+            noise = (x_t - time[:, None, None] * x) / (1 - (1 - process.sigma_min) * time[:, None, None])
+            return process.target(x, noise, time)
+        noise = (x_t - process.schedule.at("signal", t, x_t) * x) / process.schedule.at("noise", t, x_t)
+        output = process.target(x, noise, t)
+        return torch.cat([output, torch.zeros_like(output)], -1) if learned else output
+
+    return denoise
+
+
+@pytest.mark.parametrize("count", [2, 5, 50])
+@pytest.mark.parametrize("sampler", DIFFUSION)
+@pytest.mark.parametrize("prediction", ["x0", "epsilon", "velocity"])
+@pytest.mark.parametrize("variance", ["fixed_small", "fixed_large", "learned_range"])
+def test_oracle_diffusion_returns_the_data(variance, prediction, sampler, count):
+    torch.manual_seed(0)
+    process = GaussianDiffusion(50, prediction=prediction, variance=variance)
+    mask = length_mask(torch.tensor([6, 3]))
+    data = torch.randn(2, 6, 4, dtype=torch.float64) * mask[..., None]
+    denoise = CountedDenoise(oracle(process, data, learned=variance == "learned_range"))
+    estimates: list[Tensor] = []
+    x = process.sample(
+        denoise, drawn((2, 6, 4), torch.float64), mask, NO_CONDITION,
+        sampler=sampler, num_inference_steps=count, trajectory=estimates,
+    )  # fmt: skip
+    torch.testing.assert_close(x, data, rtol=0, atol=1e-6)
+    assert (x[~mask] == 0).all()
+    assert denoise.calls == count == len(estimates)
+    # At the noisiest steps float64 leaves 1e-9 of a signal of 1e-5 in doubt.
+    torch.testing.assert_close(estimates[-1], data, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("count", [1, 10])
+@pytest.mark.parametrize("sampler", [*STEPS, "dopri5"])
+def test_oracle_flow_returns_the_data(sampler, count):
+    torch.manual_seed(0)
+    process = FlowMatching(sigma_min=1e-3)
+    mask = length_mask(torch.tensor([6, 3]))
+    data, noise = torch.randn(2, 2, 6, 4, dtype=torch.float64)
+    data = data * mask[..., None]
+    velocity = process.target(data, noise, torch.zeros(2))
+    denoise = CountedDenoise(lambda x_t, t, mask, cond: velocity)
+    estimates: list[Tensor] = []
+    x = process.sample(
+        denoise, replay(noise, []), mask, NO_CONDITION,
+        sampler=sampler, num_inference_steps=count, trajectory=estimates,
+    )  # fmt: skip
+    # The path ends where its last noise has deviation sigma_min; every estimate on it is the data itself.
+    torch.testing.assert_close(x, (data + 1e-3 * noise) * mask[..., None], rtol=0, atol=1e-5)
+    for estimate in estimates:
+        torch.testing.assert_close(estimate, data, rtol=0, atol=1e-5)
+    assert len(estimates) == denoise.calls
+    if sampler != "dopri5":
+        assert denoise.calls == count * CALLS[sampler]
+
+
+def gaussian_data(process: GaussianDiffusion, deviation: float) -> Denoise:
+    """The exact clean estimate of data that is normal with mean 0.5 and this deviation."""
+
+    def denoise(x_t, t, mask, cond):
+        signal, noise = process.schedule.at("signal", t, x_t), process.schedule.at("noise", t, x_t)
+        gain = signal * deviation**2 / (signal**2 * deviation**2 + noise**2)
+        return 0.5 + gain * (x_t - 0.5 * signal)
+
+    return denoise
+
+
+@pytest.mark.parametrize("count", [50, 1000])
+@pytest.mark.parametrize("sampler", DIFFUSION)
+def test_samples_have_the_distribution_of_the_data(sampler, count):
+    process = GaussianDiffusion(1000)
+    x = process.sample(
+        gaussian_data(process, 0.3), drawn((1, 1, 4000), torch.float64), torch.ones(1, 1, dtype=torch.bool),
+        NO_CONDITION, sampler=sampler, num_inference_steps=count,
+    )  # fmt: skip
+    assert x.mean() == pytest.approx(0.5, abs=0.02)
+    # Few ancestral steps with the posterior's variance lose some of it.
+    assert x.std() == pytest.approx(0.3, rel=0.1 if (sampler, count) == ("ancestral", 50) else 0.04)
+
+
+def test_solver_of_order_two_needs_fewer_steps():
+    process = GaussianDiffusion(1000)
+
+    def sample(sampler: str, count: int) -> Tensor:
+        return process.sample(
+            gaussian_data(process, 0.3), drawn((1, 1, 100), torch.float64), torch.ones(1, 1, dtype=torch.bool),
+            NO_CONDITION, sampler=sampler, num_inference_steps=count,
+        )  # fmt: skip
+
+    exact = sample("ddim", 1000)
+    error = {sampler: (sample(sampler, 25) - exact).abs().mean() for sampler in ("ddim", "dpm_solver_pp_2m")}
+    assert error["dpm_solver_pp_2m"] < error["ddim"] / 2
+
+
+# Other people's code. Its step formulas are sound where we compare; its choice of steps is not used.
+
+
+def scheduler_options(process: GaussianDiffusion, prediction: str) -> dict:
+    return {
+        "num_train_timesteps": len(process.schedule),
+        "trained_betas": process.schedule.tables["betas"].numpy(),
+        "prediction_type": {"x0": "sample", "epsilon": "epsilon", "velocity": "v_prediction"}[prediction],
+    }
+
+
+@pytest.mark.parametrize("prediction", ["x0", "epsilon", "velocity"])
+@pytest.mark.parametrize("variance", ["fixed_small", "fixed_large"])
+def test_ancestral_agrees_with_diffusers(variance, prediction, monkeypatch):
+    process = GaussianDiffusion(1000, prediction=prediction, variance=variance)
+    scheduler = DDPMScheduler(**scheduler_options(process, prediction), variance_type=variance, clip_sample=False)
+    steps = [0, 90, 400, 401, 777, 950]
+    scheduler.set_timesteps(timesteps=steps[::-1])
+    noise, used = drawn((1, 3, 2), torch.float64), iter(range(1, 100))
+    monkeypatch.setattr("diffusers.schedulers.scheduling_ddpm.randn_tensor", lambda *_, **__: noise(next(used)))
+    denoise = linear_denoiser(np.array([[0.3, -0.2], [0.1, 0.4]]), np.array([[0.2], [-0.1]]), 0.3)
+    mask = torch.ones(1, 3, dtype=torch.bool)
+    x = noise(0)
+    for t in scheduler.timesteps:
+        output = denoise(x, torch.tensor([float(t)]), mask, NO_CONDITION)
+        x = scheduler.step(output, int(t), x).prev_sample
+    ours = process.sample(denoise, noise, mask, NO_CONDITION, sampler="ancestral", num_inference_steps=steps)
+    # Theirs computes alpha products in float32.
+    torch.testing.assert_close(ours, x, rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.parametrize("prediction", ["x0", "epsilon", "velocity"])
+@pytest.mark.parametrize("eta", [0.0, 0.7])
+def test_ddim_agrees_with_diffusers(eta, prediction):
+    process = GaussianDiffusion(1000, prediction=prediction)
+    scheduler = DDIMScheduler(
+        **scheduler_options(process, prediction), clip_sample=False, set_alpha_to_one=True, timestep_spacing="leading"
+    )
+    scheduler.set_timesteps(20)
+    steps = sorted(scheduler.timesteps.tolist())
+    noise, used = drawn((1, 3, 2), torch.float64), iter(range(1, 100))
+    denoise = linear_denoiser(np.array([[0.3, -0.2], [0.1, 0.4]]), np.array([[0.2], [-0.1]]), 0.3)
+    mask = torch.ones(1, 3, dtype=torch.bool)
+    x = noise(0)
+    for t in scheduler.timesteps:
+        output = denoise(x, torch.tensor([float(t)]), mask, NO_CONDITION)
+        variance_noise = noise(next(used)) if eta and t > 0 else torch.zeros_like(x)
+        x = scheduler.step(output, int(t), x, eta=eta, variance_noise=variance_noise).prev_sample
+    ours = process.sample(
+        denoise, noise, mask, NO_CONDITION, sampler="ddim", num_inference_steps=20, spacing="stride", eta=eta
+    )
+    assert steps == process._steps(20, "stride")
+    torch.testing.assert_close(ours, x, rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.parametrize("prediction", ["x0", "epsilon", "velocity"])
+def test_dpm_solver_agrees_with_diffusers(prediction):
+    process = GaussianDiffusion(1000, prediction=prediction)
+    scheduler = DPMSolverMultistepScheduler(**scheduler_options(process, prediction), final_sigmas_type="zero")
+    steps = [0, 30, 90, 250, 400, 600, 777, 950]
+    scheduler.set_timesteps(timesteps=steps[::-1])
+    denoise = linear_denoiser(np.array([[0.3, -0.2], [0.1, 0.4]]), np.array([[0.2], [-0.1]]), 0.3)
+    mask, noise = torch.ones(1, 3, dtype=torch.bool), drawn((1, 3, 2), torch.float64)
+    x = noise(0)
+    for t in scheduler.timesteps:
+        output = denoise(x, torch.tensor([float(t)]), mask, NO_CONDITION)
+        x = scheduler.step(output, t, x).prev_sample
+    ours = process.sample(denoise, noise, mask, NO_CONDITION, sampler="dpm_solver_pp_2m", num_inference_steps=steps)
+    torch.testing.assert_close(ours, x, rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.parametrize("sampler", STEPS)
+def test_fixed_steps_agree_with_torchdiffeq(sampler):
+    torch.manual_seed(0)
+    field = flow_field(
+        {"field/A": np.random.default_rng(0).normal(size=(4, 4)), "field/b": np.ones((4, 1)), "field/c": 2.0}
+    )  # type: ignore[dict-item]
+    start, mask = torch.randn(2, 5, 4, dtype=torch.float64), torch.ones(2, 5, dtype=torch.bool)
+    ours = FlowMatching().sample(field, replay(start, []), mask, NO_CONDITION, sampler=sampler, num_inference_steps=7)
+    theirs = odeint(
+        lambda t, x: field(x, 1000 * t.expand(2), mask, NO_CONDITION),
+        start,
+        torch.linspace(0, 1, 8, dtype=torch.float64),
+        method={"heun": "heun2"}.get(sampler, sampler),
+    )
+    torch.testing.assert_close(ours, theirs[-1], rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize(("sampler", "order"), [("euler", 1), ("midpoint", 2), ("heun", 2), ("rk4", 4)])
+def test_order_of_convergence(sampler, order):
+    def rotate(x, t, mask, cond):
+        return (1 + t[:, None, None] / 1000) * torch.stack([-x[..., 1], x[..., 0]], -1)
+
+    start, mask = torch.tensor([[[1.0, 0.0]]], dtype=torch.float64), torch.ones(1, 1, dtype=torch.bool)
+    exact = torch.tensor([[[math.cos(1.5), math.sin(1.5)]]], dtype=torch.float64)
+
+    def error(count: int) -> float:
+        flow = FlowMatching()
+        x = flow.sample(rotate, replay(start, []), mask, NO_CONDITION, sampler=sampler, num_inference_steps=count)
+        return (x - exact).norm().item()
+
+    assert math.log2(error(20) / error(40)) == pytest.approx(order, abs=0.3)
+
+
+# Editing.
+
+
+def half_kept(x: Tensor) -> Tensor:
+    keep = torch.zeros_like(x, dtype=torch.bool)
+    keep[:, ::2] = True
+    return keep
+
+
+def pulled(x: Tensor) -> Denoise:
+    """A denoiser that wants all motion at 3 and sees the mean of each sample."""
+    return lambda x_t, t, mask, cond: 3 + 0.1 * x_t + 0.1 * x_t.mean((1, 2), keepdim=True)
+
+
+def sampled(process: GaussianDiffusion | FlowMatching, sampler: str, edit: Edit | None, count: int = 10) -> Tensor:
+    shape = (2, 6, 3)
+    return process.sample(
+        pulled(torch.zeros(shape)), drawn(shape), torch.ones(shape[:2], dtype=torch.bool), NO_CONDITION,
+        sampler=sampler, num_inference_steps=count, edit=edit,
+    )  # fmt: skip
+
+
+EXACT: list[tuple[Callable[[], GaussianDiffusion | FlowMatching], str, str]] = [
+    *((GaussianDiffusion, sampler, mode) for sampler in DIFFUSION for mode in ("x0", "x_t")),
+    *((FlowMatching, sampler, "x0") for sampler in STEPS),
+]
+
+
+@pytest.mark.parametrize(("build", "sampler", "mode"), EXACT)
+def test_kept_parts_are_met_exactly_and_seen_by_the_rest(build, sampler, mode):
+    known = torch.full((2, 6, 3), -2.0)
+    keep = half_kept(known)
+    free, edited = sampled(build(), sampler, None), sampled(build(), sampler, Edit(known, keep, mode))
+    assert torch.equal(edited[keep], known[keep])
+    assert edited.isfinite().all()
+    # The denoiser sees the kept part, so the rest follows it downwards.
+    assert edited[~keep].mean() < free[~keep].mean() - 0.05
+    nothing = sampled(build(), sampler, Edit(known, torch.zeros_like(keep), mode, blend="before"))
+    if mode == "x0" or sampler != "ancestral":  # blending uses up draws of the ancestral sampler
+        torch.testing.assert_close(nothing, free)
+
+
+def test_clipping_does_not_move_kept_parts():
+    known = torch.full((2, 6, 3), -2.0)
+    keep = half_kept(known)
+    edited = sampled(GaussianDiffusion(clip_x0=True), "ancestral", Edit(known, keep, "x0"))
+    assert torch.equal(edited[keep], known[keep])
+    assert (edited[~keep] <= 1).all()
+
+
+@pytest.mark.parametrize("sampler", ["ancestral", "ddim"])
+def test_resampling_takes_every_noisy_step_again(sampler):
+    process, count = GaussianDiffusion(), 6
+    data = torch.randn(2, 6, 3, generator=torch.Generator().manual_seed(0))
+    keep = half_kept(data)
+    denoise = CountedDenoise(oracle(process, data))
+    edit = Edit(data, keep, "x_t", resample=3)
+    x = process.sample(
+        denoise, drawn((2, 6, 3)), torch.ones(2, 6, dtype=torch.bool), NO_CONDITION,
+        sampler=sampler, num_inference_steps=count, edit=edit,
+    )  # fmt: skip
+    assert denoise.calls == 3 * (count - 1) + 1
+    torch.testing.assert_close(x, data, rtol=0, atol=1e-4)
+
+
+@pytest.mark.parametrize("blend", ["after", "before"])
+def test_blended_parts_are_as_noisy_as_the_rest(blend):
+    """What the denoiser sees of a kept part is the known motion, corrupted to exactly the step it is told."""
+    process, known = GaussianDiffusion(100), torch.full((1, 1, 4000), 2.0)
+    seen = {}
+
+    def denoise(x_t, t, mask, cond):
+        seen[int(t[0])] = (x_t.mean().item(), x_t.std().item())
+        return torch.zeros_like(x_t)
+
+    process.sample(
+        denoise, drawn((1, 1, 4000)), torch.ones(1, 1, dtype=torch.bool), NO_CONDITION, sampler="ancestral",
+        num_inference_steps=10, edit=Edit(known, torch.ones_like(known, dtype=torch.bool), "x_t", blend=blend),
+    )  # fmt: skip
+    assert len(seen) == 10
+    for step, (mean, deviation) in seen.items():
+        signal, noise = (process.schedule.tables[name][step].item() for name in ("signal", "noise"))
+        assert mean == pytest.approx(2 * signal, abs=0.06)
+        assert deviation == pytest.approx(noise, rel=0.05)
+
+
+@pytest.mark.parametrize("sampler", STEPS)
+def test_rewriting_ends_at_its_threshold(sampler):
+    start, known = torch.randn(1, 6, 3, generator=torch.Generator().manual_seed(0)), torch.full((1, 6, 3), -2.0)
+    keep, count = half_kept(known), 25
+    seen = []
+
+    def still(x_t, t, mask, cond):
+        seen.append((t[0].item() / 1000, x_t))
+        return torch.zeros_like(x_t)
+
+    process = FlowMatching()
+    process.sample(
+        still, replay(start, []), torch.ones(1, 6, dtype=torch.bool), NO_CONDITION,
+        sampler=sampler, num_inference_steps=count, edit=Edit(known, keep, "trajectory", until=0.2),
+    )  # fmt: skip
+    calls = seen[:: CALLS[sampler]]
+    assert len(calls) == count
+    for i, (time, x) in enumerate(calls):
+        share = min(i, 5) / count
+        assert time == pytest.approx(i / count)
+        torch.testing.assert_close(x[keep], ((1 - share) * start + share * known)[keep])
+        torch.testing.assert_close(x[~keep], start[~keep])
+
+
+@pytest.mark.parametrize(
+    ("build", "options", "message"),
+    [
+        (GaussianDiffusion, {"sampler": "euler"}, "has ancestral, ddim, dpm_solver_pp_2m"),
+        (GaussianDiffusion, {"num_inference_steps": 1}, "2 to 1000"),
+        (GaussianDiffusion, {"num_inference_steps": 1001}, "1000"),
+        (GaussianDiffusion, {"num_inference_steps": [5, 3]}, "rising"),
+        (GaussianDiffusion, {"num_inference_steps": [5, 1000]}, "999"),
+        (GaussianDiffusion, {"eta": 1.0}, "ddim"),
+        (GaussianDiffusion, {"edit": "trajectory"}, "x0, x_t"),
+        (FlowMatching, {"sampler": "ddim"}, "has euler, midpoint, heun, rk4, dopri5"),
+        (FlowMatching, {"sampler": "euler", "num_inference_steps": 0}, "1 or more"),
+        (FlowMatching, {"sampler": "euler", "edit": "x_t"}, "trajectory, x0"),
+        (FlowMatching, {"sampler": "dopri5", "edit": "x0"}, "cannot edit"),
+    ],
+)
+def test_the_impossible_is_refused_in_one_line(build, options, message):
+    known = torch.zeros(1, 4, 2)
+    options = {"sampler": "ancestral", "num_inference_steps": 5} | options
+    if "edit" in options:
+        options["edit"] = Edit(known, half_kept(known), mode=options["edit"])
+    with pytest.raises(ValueError, match=message) as error:
+        build().sample(pulled(known), drawn((1, 4, 2)), torch.ones(1, 4, dtype=torch.bool), NO_CONDITION, **options)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("change", [{"known": torch.zeros(1, 5, 2)}, {"blend": "never"}, {"resample": 0}])
+def test_edits_that_do_not_fit_are_refused(change):
+    known = torch.zeros(1, 4, 2)
+    edit = Edit(**({"known": known, "keep": half_kept(known), "mode": "x_t"} | change))
+    with pytest.raises(ValueError, match=r"^edit "):
+        GaussianDiffusion().sample(
+            pulled(known), drawn((1, 4, 2)), torch.ones(1, 4, dtype=torch.bool), NO_CONDITION,
+            sampler="ancestral", num_inference_steps=5, edit=edit,
+        )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("build", "sampler"), [(GaussianDiffusion, name) for name in DIFFUSION] + [(FlowMatching, "rk4")]
+)
+def test_padding_changes_no_real_frame(build, sampler):
+    """With noise drawn for each sample at its own length and a denoiser that respects the mask."""
+
+    def denoise(x_t, t, mask, cond):
+        mean = (x_t * mask[..., None]).sum(1, keepdim=True) / mask.sum(1)[:, None, None]
+        return torch.where(mask[..., None], 0.5 * x_t + mean, 1e4)
+
+    def noise(frames: int) -> Noise:
+        def draw(number: int) -> Tensor:
+            real = drawn((1, 4, 3))(number)
+            return torch.cat([real, torch.full((1, frames - 4, 3), 7.0)], 1)
+
+        return draw
+
+    def run(frames: int) -> Tensor:
+        mask = length_mask(torch.tensor([4]), frames)
+        return build().sample(denoise, noise(frames), mask, NO_CONDITION, sampler=sampler, num_inference_steps=6)
+
+    assert (run(9)[:, 4:] == 0).all()
+    torch.testing.assert_close(run(9)[:, :4], run(4))
+
+
+def test_half_precision_denoisers_are_sampled_in_float32():
+    process = GaussianDiffusion()
+    x = process.sample(
+        lambda x_t, t, mask, cond: x_t.bfloat16(), drawn((1, 4, 2)), torch.ones(1, 4, dtype=torch.bool),
+        NO_CONDITION, sampler="ancestral", num_inference_steps=5,
+    )  # fmt: skip
+    assert x.dtype == torch.float32
+
+
+def test_fixture_loops_are_all_replayed():
+    assert groups(GAUSSIAN, "noise") != []
+    replayed = {f"loop/{name}" for name in OPTIONS["mdm_loops"]} | {f"floop/{name}" for name in OPTIONS["flame_loops"]}
+    assert {name for name in groups(GAUSSIAN, "out") if "loop/" in name and not name.startswith("f64/")} == replayed

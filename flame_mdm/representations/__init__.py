@@ -1,6 +1,7 @@
 """Motions as features: what a model sees, and the way back to joints."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
@@ -24,6 +25,10 @@ class Representation(nn.Module, ABC):
     @abstractmethod
     def encode(self, motion: Tensor) -> Tensor:
         """Raw motion -> features (F', D) in the data's units, float32, not normalised."""
+
+    def encode_many(self, motions: Sequence[Tensor]) -> list[Tensor]:
+        """Encodes several motions."""
+        return [self.encode(motion) for motion in motions]
 
     @abstractmethod
     def decode(self, features: Tensor) -> Tensor:

@@ -1,0 +1,451 @@
+import itertools
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from fixtures import ROOT, SHARED, Arrays, golden, groups, load, needs_third_party, third_party
+from hydra.utils import instantiate
+from omegaconf import OmegaConf
+from torch import Tensor
+
+from flame_mdm.representations import Representation, rotation
+from flame_mdm.representations.humanml import HumanML
+from flame_mdm.representations.skeleton import KIT21, SKELETONS, SMPL22, forward_kinematics
+
+HUMANML_TOLERANCE = dict.fromkeys(["turn", "root_velocity", "root_height", "positions", "velocities"], 2e-5) | {
+    "rotations": 1e-4,
+    "contacts": 0.0,
+}
+KIT_TOLERANCE = dict.fromkeys(["root_velocity", "root_height", "positions", "velocities"], 5e-3) | {
+    "turn": 1e-4,
+    "rotations": 1e-4,
+    "contacts": 0.0,
+}
+FIXTURES = {
+    "hml263": golden,
+    "kit251": golden,
+    "third_party-hml263": third_party,
+    "third_party-hml263_bandai": third_party,
+}
+
+
+def arrays(stem: str) -> Arrays:
+    return FIXTURES[stem](stem.removeprefix("third_party-"))
+
+
+def cases(key: str) -> list:
+    """(fixture, clip) of every clip that holds `key`."""
+    return [
+        pytest.param(stem, clip, id=f"{stem}-{clip}", marks=[needs_third_party] if "third" in stem else [])
+        for stem in FIXTURES
+        for clip in groups(arrays(stem), key) or ["absent"]
+        if clip != "absent" or ("third" in stem and not SHARED.is_dir())
+    ]
+
+
+def legacy(stem: str) -> tuple[HumanML, Tensor]:
+    """The published features of a fixture, in its own units, and the bone lengths of its target skeleton."""
+    lengths = torch.from_numpy(np.linalg.norm(arrays(stem)["tgt_offsets"], axis=-1))
+    if stem.startswith("kit"):
+        return HumanML("kit21", "legacy", fps=12.5, bone_lengths=lengths.tolist(), contact_threshold=0.05), lengths
+    return HumanML("smpl22", "legacy", bone_lengths=lengths.tolist()), lengths
+
+
+def fixture(stem: str, clip: str, key: str) -> Tensor:
+    return torch.from_numpy(arrays(stem)[f"{clip}/{key}"])
+
+
+def position_tolerance(stem: str) -> float:
+    return 5e-3 if stem.startswith("kit") else 2e-5
+
+
+def close(actual: Tensor, expected: Tensor, atol: float) -> None:
+    torch.testing.assert_close(actual.double(), expected.double(), atol=atol, rtol=0)
+
+
+def yaw_quaternion(angle: Tensor) -> Tensor:
+    zero = torch.zeros_like(angle)
+    return torch.stack([torch.cos(angle / 2), zero, torch.sin(angle / 2), zero], -1)
+
+
+def wander(skeleton: str = "smpl22", frames: int = 60, seed: int = 0, turns: float = 2.0) -> Tensor:
+    """A body of random proportions that bends its joints and walks a full circle `turns` times. Metres, float64."""
+    rng = torch.Generator().manual_seed(seed)
+    body = SKELETONS[skeleton]
+    time = torch.linspace(0, 1, frames, dtype=torch.float64)
+    size = 0.05 + 0.4 * torch.rand(len(body), 1, generator=rng, dtype=torch.float64)
+    amplitude = 0.3 * torch.randn(len(body), 3, generator=rng, dtype=torch.float64)
+    phase = torch.rand(len(body), 1, generator=rng, dtype=torch.float64)
+    amplitude[0] = 0
+    bend = amplitude * torch.sin(2 * math.pi * (2 * time[:, None, None] + phase))
+    bend[:, 0, 1] = 2 * math.pi * turns * time
+    across = torch.stack([torch.sin(bend[:, 0, 1]), 0.2 * torch.sin(9 * time), torch.cos(bend[:, 0, 1])], -1)
+    offsets = torch.tensor(body.raw_offsets, dtype=torch.float64) * size
+    return forward_kinematics(body, rotation.axis_angle_to_matrix(bend), offsets, across)
+
+
+# Skeletons
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize("stem", ["hml263", "kit251"])
+def test_skeleton_constants(stem: str):
+    skeleton = legacy(stem)[0].skeleton
+    assert skeleton.parents == tuple(arrays(stem)["parents"])
+    assert np.array_equal(skeleton.raw_offsets, arrays(stem)["raw_offsets"])
+    if "kinematic_chain_padded" in arrays(stem):
+        assert skeleton.chains == tuple(tuple(c[c >= 0].tolist()) for c in arrays(stem)["kinematic_chain_padded"])
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize(
+    "clip", [clip for clip in groups(golden("hml263"), "joints_in") if "mirror" in clip], ids=lambda v: f"hml263-{v}"
+)
+def test_mirrored_joints(clip: str):
+    joints = fixture("hml263", clip.removesuffix("_mirror"), "joints_in")
+    assert torch.equal(SMPL22.mirror(joints), fixture("hml263", clip, "joints_in"))
+
+
+@pytest.mark.parametrize("skeleton", SKELETONS.values(), ids=lambda s: s.name)
+def test_skeletons_are_trees(skeleton):
+    assert len(skeleton.joints) == len(set(skeleton.joints)) == len(skeleton.parents) == len(skeleton.raw_offsets)
+    assert skeleton.parents[0] == -1
+    assert all(0 <= parent < joint for parent, joint in skeleton.edges)
+    assert len(skeleton.edges) == len(skeleton) - 1
+    in_chains = [edge for chain in skeleton.chains for edge in itertools.pairwise(chain)]
+    assert sorted(in_chains) == sorted(skeleton.edges), "the chains walk every bone once"
+    joints = wander(skeleton.name)
+    assert torch.equal(skeleton.mirror(skeleton.mirror(joints)), joints)
+    assert sum(a != b for a, b in enumerate(skeleton.mirrored)) == 2 * sum("left" in name for name in skeleton.joints)
+    close(skeleton.assemble(skeleton.bones(joints), joints[:, 0]), joints, 1e-12)
+
+
+def test_forward_kinematics_is_the_sum_over_the_chain():
+    rotations = rotation.axis_angle_to_matrix(
+        torch.randn(2, 21, 3, generator=torch.Generator().manual_seed(0)).double()
+    )
+    offsets, root = torch.arange(63.0, dtype=torch.float64).reshape(21, 3) / 50, torch.ones(2, 3, dtype=torch.float64)
+    posed = forward_kinematics(KIT21, rotations, offsets, root)
+    for joint in range(21):
+        path = [joint]
+        while KIT21.parents[path[0]] >= 0:
+            path.insert(0, KIT21.parents[path[0]])
+        expected, turned = root, torch.eye(3, dtype=torch.float64)
+        for parent, child in itertools.pairwise(path):
+            turned = turned @ rotations[:, parent]
+            expected = expected + turned @ offsets[child]
+        close(posed[:, joint], expected, 1e-12)
+
+
+# HumanML3D's features as published
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize(("stem", "clip"), cases("joints_in"))
+def test_published_features(stem: str, clip: str):
+    representation, _ = legacy(stem)
+    features = representation.encode(fixture(stem, clip, "joints_in"))
+    expected = fixture(stem, clip, "feats")
+    assert features.dtype == torch.float32
+    assert features.shape == expected.shape == (len(expected), representation.features)
+    tolerances = KIT_TOLERANCE if stem.startswith("kit") else HUMANML_TOLERANCE
+    for name, columns in representation.slices.items():
+        close(features[:, columns], expected[:, columns], tolerances[name])
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize(("stem", "clip"), cases("global_positions"))
+def test_published_canonical_joints(stem: str, clip: str):
+    canonical = legacy(stem)[0].canonicalize(fixture(stem, clip, "joints_in"))
+    close(canonical, fixture(stem, clip, "global_positions"), position_tolerance(stem))
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize(("stem", "clip"), cases("uniform"))
+def test_published_retargeting(stem: str, clip: str):
+    joints = fixture(stem, clip, "joints_in").double()
+    one_clip = torch.zeros(len(joints), dtype=torch.int64)
+    retargeted = legacy(stem)[0]._retarget(joints, torch.tensor([0]), one_clip)
+    close(retargeted, fixture(stem, clip, "uniform"), position_tolerance(stem))
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize(("stem", "clip"), cases("ik_root"))
+def test_published_root_rotation(stem: str, clip: str):
+    heading = legacy(stem)[0]._heading(fixture(stem, clip, "global_positions").double())
+    expected = fixture(stem, clip, "ik_root")
+    actual = yaw_quaternion(-heading)
+    close(actual * (actual * expected).sum(-1, keepdim=True).sign(), expected, 1e-5)
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize(("stem", "clip"), cases("rec_ric"))
+def test_published_joints(stem: str, clip: str):
+    features = fixture(stem, clip, "feats")
+    close(legacy(stem)[0].decode(features), fixture(stem, clip, "rec_ric"), position_tolerance(stem))
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize(("stem", "clip"), cases("root_quat"))
+def test_published_root(stem: str, clip: str):
+    heading, position = legacy(stem)[0].root(fixture(stem, clip, "feats"))
+    close(yaw_quaternion(-heading), fixture(stem, clip, "root_quat"), 1e-5)
+    close(position, fixture(stem, clip, "root_pos"), position_tolerance(stem))
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize(("stem", "clip"), cases("rec_rot"))
+def test_published_joints_from_rotations(stem: str, clip: str):
+    representation, lengths = legacy(stem)
+    joints = representation.decode_rotations(fixture(stem, clip, "feats"), lengths)
+    close(joints, fixture(stem, clip, "rec_rot"), position_tolerance(stem))
+
+
+@pytest.mark.golden
+@needs_third_party
+@pytest.mark.parametrize("stem", ["third_party-hml263"])
+def test_published_statistics(stem: str):
+    portable = load(SHARED / "golden" / "portable" / "hml263.npz")
+    clips = [arrays(stem)["official/feats"]]
+    clips += [portable[f"{clip}/feats"] for clip in groups(portable, "feats") if "mirror" not in clip]
+    mean, std = legacy(stem)[0].statistics(torch.from_numpy(np.concatenate(clips)))
+    close(mean, fixture(stem, "stats_all", "mean"), 1e-5)  # the published one sums in float32
+    close(std, fixture(stem, "stats_all", "std"), 1e-5)
+
+
+@pytest.mark.golden
+@needs_third_party
+@pytest.mark.parametrize("stem", ["third_party-hml263"])
+def test_published_normalization(stem: str):
+    representation, _ = legacy(stem)
+    features = fixture(stem, "official", "feats")
+    for prefix, key in (("", "normed"), ("eval_", "normed_eval")):
+        representation.mean = torch.from_numpy(arrays(stem)[f"{prefix}mean"])
+        representation.std = torch.from_numpy(arrays(stem)[f"{prefix}std"])
+        close(representation.normalize(features), fixture(stem, "official", key), 2e-5)
+        close(representation.denormalize(representation.normalize(features)), features, 1e-5)
+        joints = representation.to_joints(representation.normalize(features))
+        close(joints, fixture(stem, "official", "joints"), 2e-5)
+    biased = representation.weigh_root(torch.from_numpy(arrays(stem)["std"]))
+    close(biased, torch.from_numpy(arrays(stem)["std_feat_bias5"]), 1e-7)
+
+
+def test_published_features_of_opposite_bones_are_finite():
+    joints = wander()
+    joints[:, 4] = joints[:, 1] + torch.tensor([0, 0.4, 0])  # a thigh straight up, opposite to its rest direction
+    assert HumanML(variant="legacy").encode(joints).isfinite().all()
+
+
+# HumanML3D's features, mended
+
+
+@pytest.mark.parametrize("skeleton", SKELETONS)
+@pytest.mark.parametrize("turns", [-2.0, 0.0, 0.5, 1.0, 2.0])
+def test_clean_round_trip(skeleton: str, turns: float):
+    representation = HumanML(skeleton)
+    joints = wander(skeleton, frames=120, turns=turns)
+    features, canonical = representation.encode(joints), representation.canonicalize(joints)
+    close(representation.decode(features), canonical[:-1], 1e-5)
+    lengths = representation.skeleton.bones(canonical[0]).norm(dim=-1)
+    close(representation.decode_rotations(features.double(), lengths), canonical[:-1], 1e-5)
+    close(representation.root(features.double())[1], canonical[:-1, 0], 1e-5)
+
+
+@pytest.mark.parametrize("skeleton", SKELETONS)
+def test_clean_motions_are_canonical(skeleton: str):
+    representation = HumanML(skeleton)
+    joints = rotation.rotate_y(wander(skeleton), torch.tensor(2.0)) + torch.tensor([3.0, -1.0, 5.0])
+    canonical = representation.canonicalize(joints)
+    assert canonical[..., 1].min() == 0
+    close(canonical[0, 0, ::2], torch.zeros(2), 1e-12)
+    right_hip, left_hip, right_shoulder, left_shoulder = canonical[0, list(representation.skeleton.facing)]
+    across = right_hip - left_hip + right_shoulder - left_shoulder
+    assert across[2].item() == pytest.approx(0, abs=1e-9)
+    assert across[0] < 0, "facing +z, the right side is at -x"
+    moved = wander(skeleton)
+    close(representation.encode(moved), representation.encode(joints), 1e-5)
+
+
+@pytest.mark.parametrize("turns", [-2.0, 1.0, 2.0])
+def test_clean_turn_is_the_heading_rate(turns: float):
+    frames = 81
+    turn = HumanML().encode(spin(turns, frames))[:, 0]
+    close(turn, torch.full((frames - 1,), 2 * math.pi * turns / (frames - 1)), 1e-6)
+
+
+def test_clean_turn_left_is_positive_and_velocity_is_in_the_body_frame():
+    frames = 60
+    angle = torch.linspace(0, math.pi, frames, dtype=torch.float64)
+    joints = rotation.rotate_y(wander(turns=0, frames=frames)[:1], angle[:, None])
+    forward = rotation.rotate_y(torch.tensor([0.0, 0.0, 0.05], dtype=torch.float64).expand(frames, 3), angle)
+    start = HumanML().canonicalize(joints)
+    features = HumanML().encode(start - start[:, :1] + forward.cumsum(0)[:, None] - forward[:, None])
+    assert (features[:, 0] > 0).all()
+    close(features[:, 1:3], torch.tensor([0.0, 0.05]).expand(frames - 1, 2), 1e-6)
+    close(features[:, HumanML().slices["velocities"]][:, :3:2], features[:, 1:3], 1e-7)
+
+
+def spin(turns: float, frames: int) -> Tensor:
+    """A stiff body that turns in place at a steady rate."""
+    angle = torch.linspace(0, 2 * math.pi * turns, frames, dtype=torch.float64)
+    return rotation.rotate_y(wander(turns=0)[:1], angle[:, None])
+
+
+def test_clean_pose_does_not_depend_on_the_heading():
+    representation = HumanML()
+    features = representation.encode(spin(1.5, 60))
+    for name in ("root_height", "positions", "rotations"):
+        part = features[:, representation.slices[name]]
+        close(part, part[:1].expand_as(part), 1e-5)
+
+
+def test_clean_features_of_a_mirror_image_are_mirrored():
+    representation, joints = HumanML(), wander(turns=0.7)
+    features, mirrored = representation.encode(joints), representation.encode(SMPL22.mirror(joints))
+    close(mirrored[:, 0], -features[:, 0], 1e-6)
+    close(mirrored[:, 1:3], features[:, 1:3] * torch.tensor([-1, 1]), 1e-6)
+    close(representation.decode(mirrored), SMPL22.mirror(representation.decode(features)), 1e-5)
+    x, y = (f[:, representation.slices["rotations"]].unflatten(1, (21, 6)) for f in (features, mirrored))
+    signs = torch.tensor([1, -1, -1, -1, 1, 1])
+    close(y, x[:, [joint - 1 for joint in SMPL22.mirrored[1:]]] * signs, 1e-5)
+    assert torch.equal(mirrored[:, -4:], features[:, [-2, -1, -4, -3]])
+
+
+@pytest.mark.parametrize("tilt", [0.0, 1e-9, 1e-4])
+def test_clean_opposite_bones(tilt: float):
+    representation, joints = HumanML(), wander(turns=0)
+    joints = rotation.rotate_y(joints, -torch.atan2(*representation._facing(joints).unbind(-1))[:, None])
+    lengths = representation.skeleton.bones(joints[0]).norm(dim=-1)
+    offset = joints[:, 4] - joints[:, 1]
+    joints[:, [4, 7, 10]] += torch.tensor([tilt, lengths[4].item(), 0]) - offset[:, None]
+    features = representation.encode(joints)
+    assert features.isfinite().all()
+    close(representation.decode_rotations(features.double(), lengths), representation.canonicalize(joints)[:-1], 1e-5)
+
+
+def test_retargeted_motion_has_the_given_bones():
+    lengths = [0.0, *(0.1 + 0.01 * joint for joint in range(21))]
+    for variant in ("clean", "legacy"):
+        canonical = HumanML(variant=variant, bone_lengths=lengths).canonicalize(wander())
+        close(SMPL22.bones(canonical).norm(dim=-1), torch.tensor(lengths).expand(60, 22), 1e-7)
+
+
+@pytest.mark.parametrize("variant", ["clean", "legacy"])
+def test_many_motions_at_once_are_encoded_as_one_by_one(variant):
+    representation = HumanML(variant=variant, bone_lengths=[0.2] * 22)
+    motions = [wander(frames=frames, seed=frames, turns=frames / 30) for frames in (3, 41, 20)]
+    for many, motion in zip(representation.encode_many(motions), motions, strict=True):
+        assert torch.equal(many, representation.encode(motion))
+
+
+@pytest.mark.parametrize("variant", ["clean", "legacy"])
+def test_decoding_is_batched_and_differentiable(variant):
+    representation = HumanML(variant=variant)
+    features = torch.stack([representation.encode(wander(seed=seed)) for seed in range(4)]).unflatten(0, (2, 2))
+    joints = representation.decode(features)
+    assert joints.shape == (2, 2, 59, 22, 3)
+    close(joints[1, 0], representation.decode(features[1, 0]), 1e-6)
+    x = features[0, 0, :3].double().requires_grad_()
+    assert torch.autograd.gradcheck(representation.to_joints, x)
+    representation.decode_rotations(x, torch.full((22,), 0.3).double()).square().sum().backward()
+    assert x.grad is not None
+    assert x.grad.isfinite().all()
+    assert x.grad[:, representation.slices["rotations"]].abs().max() > 0
+
+
+def test_features_are_in_units_and_joints_in_metres():
+    joints = wander("kit21")
+    units = HumanML("kit21", "legacy", units_per_metre=640, contact_threshold=0.05)
+    features = units.encode(joints)
+    close(features, HumanML("kit21", "legacy", contact_threshold=0.05).encode(joints * 640), 0)
+    close(units.decode(features), units.canonicalize(joints)[:-1], 1e-5)
+    lengths = KIT21.bones(joints[0]).norm(dim=-1)
+    close(units.decode_rotations(features.double(), lengths), units.canonicalize(joints)[:-1], 1e-5)
+
+
+def test_contacts_tell_standing_from_moving_feet():
+    joints = wander(turns=0)[:1].repeat(20, 1, 1)
+    joints[10:, [7, 10]] += 0.1 * torch.arange(1, 11)[:, None, None]
+    contacts = HumanML().encode(joints)[:, -4:]
+    assert contacts[:9].all()
+    assert torch.equal(contacts[10:], torch.tensor([0.0, 0.0, 1.0, 1.0]).expand(9, 4))
+
+
+def test_statistics():
+    representation = HumanML()
+    features = torch.randn(500, 263, generator=torch.Generator().manual_seed(0)) * torch.linspace(0.1, 3, 263)
+    features[:, representation.slices["contacts"]] = 1.0
+    features[:, representation.slices["root_height"]] = 0.9
+    mean, std = representation.statistics(features)
+    close(mean, features.mean(0), 1e-6)
+    for name, columns in representation.slices.items():
+        expected = (
+            1.0 if name in ("contacts", "root_height") else features[:, columns].std(0, unbiased=False).mean().item()
+        )
+        close(std[columns], torch.full_like(std[columns], expected), 1e-6)
+
+
+def test_features_of_joints():
+    representation = HumanML()
+    lower = [
+        joint
+        for joint, name in enumerate(SMPL22.joints)
+        if name.split("_")[-1] in ("pelvis", "hip", "knee", "ankle", "foot")
+    ]
+    mask = representation.joint_features(lower)
+    assert mask.shape == (263,)
+    assert mask[:4].all()
+    assert mask[-4:].all()
+    assert mask.sum() == 4 + 8 * 9 + 9 * 3 + 4
+    assert torch.equal(mask, ~representation.joint_features(set(range(22)) - set(lower)))
+    one = representation.joint_features([20])
+    features, joints = torch.zeros(1, 263), torch.zeros(22, 3)
+    features[:, one] = 1
+    joints[20] = 1
+    close(representation.decode(features)[0], joints, 0)
+    assert one.sum() == 12
+
+
+@pytest.mark.parametrize(
+    ("motion", "message"),
+    [
+        (torch.zeros(2, 22, 3), "2 frames"),
+        (torch.zeros(5, 21, 3), r"\(5, 21, 3\).*\(frames, 22, 3\)"),
+        (torch.zeros(5, 66), r"\(5, 66\)"),
+        (torch.full((5, 22, 3), math.nan), "frame 0 are not finite"),
+        (torch.zeros(5, 22, 3).index_fill(0, torch.tensor([3]), math.inf), "frame 3 are not finite"),
+    ],
+)
+def test_bad_motions(motion: Tensor, message: str):
+    with pytest.raises(ValueError, match=message):
+        HumanML().encode(motion)
+    with pytest.raises(ValueError, match=f"motion 1: .*{message}"):
+        HumanML().encode_many([wander(), motion])
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"skeleton": "smpl23"}, "smpl23.*smpl22"),
+        ({"variant": "old"}, "old.*legacy"),
+        ({"bone_lengths": [1.0, 2.0]}, "bone_lengths: 2 numbers for the 22 joints"),
+    ],
+)
+def test_bad_options(options: dict, message: str):
+    with pytest.raises(ValueError, match=message):
+        HumanML(**options)
+
+
+# All representations
+
+
+@pytest.mark.parametrize("path", sorted(ROOT.glob("experiments/representation/*.yaml")), ids=lambda path: path.stem)
+def test_every_recipe_builds(path: Path):
+    representation = instantiate(OmegaConf.load(path))
+    assert isinstance(representation, Representation)
+    assert representation.mean.shape == representation.std.shape == (representation.features,)
+    joints = representation.to_joints(torch.randn(2, 5, representation.features))
+    assert joints.shape == (2, 5, len(representation.skeleton), 3)
+    assert joints.isfinite().all()

@@ -1,0 +1,207 @@
+"""What a motion shows, read from its joints by geometric rules: action, side, count, direction, speed.
+
+The rules know nothing of how a motion was made. They read what a person would see on a clip of a few seconds that shows
+one action of the synthetic set; thresholds are stated beside them. The joints are the 22 of SMPL.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from scipy.ndimage import gaussian_filter1d
+from torch import Tensor, tensor
+from torchmetrics import Metric
+
+PELVIS, NECK, HEAD = 0, 12, 15
+HIPS, ANKLES, TOES, SHOULDERS, ELBOWS, WRISTS = (1, 2), (7, 8), (10, 11), (16, 17), (18, 19), (20, 21)
+SIDES = ("left", "right")
+BONES = [(1, 4), (2, 5), (4, 7), (5, 8), (16, 18), (17, 19), (18, 20), (19, 21)]  # thighs, shins, arms
+
+ATTRIBUTES = ("action", "side", "count", "direction", "speed")
+
+
+def read_attributes(joints: np.ndarray, fps: float) -> dict[str, str | int]:
+    """Reads one clip of the 22 SMPL joints.
+
+    Args:
+        joints: (F, 22, 3) metres, y up, at any place and facing anywhere.
+        fps: frames a second.
+
+    Returns:
+        "action" and those of "side", "count", "direction", "speed" that the action has; empty where no action of the
+        set is recognised, as in noise, or in a body that is none.
+    """
+    joints = np.asarray(joints, np.float64)
+    if len(joints) < fps or not np.isfinite(joints).all():
+        return {}
+    smooth = gaussian_filter1d(joints, 0.05 * fps, axis=0, mode="nearest")
+    if not _is_a_body(joints, smooth):
+        return {}
+    floor = np.percentile(smooth[:, TOES, 1], 10)
+    across = (smooth[:, HIPS[0]] - smooth[:, HIPS[1]] + smooth[:, SHOULDERS[0]] - smooth[:, SHOULDERS[1]])[:, [0, 2]]
+    left = across / np.linalg.norm(across, axis=-1, keepdims=True)
+    forward = np.stack([-left[:, 1], left[:, 0]], -1)
+    yaw = np.unwrap(np.arctan2(forward[:, 0], forward[:, 1]))
+    turned = np.degrees(yaw[-3:].mean() - yaw[:3].mean())
+
+    walked = _locomotion(smooth, forward, left, turned, fps)
+    if walked:
+        return walked
+    jumps = _count((smooth[:, TOES, 1] - floor).min(1), 0.07, 0.035)
+    if jumps:
+        return {"action": "jump", "count": jumps}
+    kicked = _kick(smooth, floor, forward)
+    if kicked:
+        return kicked
+    pelvis = smooth[:, PELVIS, 1]
+    squats = _count(np.percentile(pelvis, 95) - pelvis, 0.18, 0.1)
+    if squats:
+        return {"action": "squat", "count": squats}
+    trunk = smooth[:, NECK] - smooth[:, PELVIS]
+    if np.degrees(np.arctan2(np.linalg.norm(trunk[:, [0, 2]], axis=-1), trunk[:, 1])).max() > 33:
+        return {"action": "bow"}
+    if abs(turned) > 45:
+        return {"action": "turn", "direction": "left" if turned > 0 else "right"}
+    return _arms(smooth, fps)
+
+
+def _is_a_body(joints: np.ndarray, smooth: np.ndarray) -> bool:
+    """Upright, limbs of 15 to 60 cm that keep their length within a quarter, less than 2 cm off a smooth curve."""
+    bones = np.stack([np.linalg.norm(smooth[:, a] - smooth[:, b], axis=-1) for a, b in BONES])
+    length = np.median(bones, 1, keepdims=True)
+    steady = (np.abs(bones / np.maximum(length, 1e-6) - 1) < 0.25).mean() > 0.9
+    sized = bool(((length > 0.15) & (length < 0.6)).all())
+    upright = np.median(smooth[:, NECK, 1] - smooth[:, PELVIS, 1]) > 0.25
+    standing = np.median(smooth[:, PELVIS, 1] - smooth[:, TOES, 1].min(1)) > 0.5
+    calm = np.median(np.linalg.norm(joints - smooth, axis=-1)) < 0.02
+    return bool(steady and sized and upright and standing and calm)
+
+
+def _count(signal: np.ndarray, high: float, low: float) -> int:
+    """How often a signal rises above `high`, having been below `low` before."""
+    count, armed = 0, False
+    for value in signal:
+        if armed and value > high:
+            count, armed = count + 1, False
+        elif value < low:
+            armed = True
+    return count
+
+
+def _locomotion(
+    smooth: np.ndarray, forward: np.ndarray, left: np.ndarray, turned: float, fps: float
+) -> dict[str, str | int]:
+    """Walks and runs go further than 33 cm from where they began."""
+    ground = gaussian_filter1d(smooth[:, PELVIS][:, [0, 2]], 0.15 * fps, axis=0, mode="nearest")
+    if np.linalg.norm(ground - ground[0], axis=-1).max() < 0.33:
+        return {}
+    velocity = np.gradient(ground, 1 / fps, axis=0)
+    speed = np.percentile(np.linalg.norm(velocity, axis=-1), 80)
+    ahead, aside = (velocity * forward).sum(-1).mean(), (velocity * left).sum(-1).mean()
+    if abs(turned) > 90:
+        direction = "counterclockwise" if turned > 0 else "clockwise"
+    elif abs(ahead) > abs(aside):
+        direction = "forward" if ahead > 0 else "backward"
+    else:
+        direction = "left" if aside > 0 else "right"
+    if speed > 2.1:
+        return {"action": "run", "direction": direction}
+    pace = "slow" if speed < 0.85 else "fast" if speed > 1.4 else "normal"
+    return {"action": "walk", "direction": direction, "speed": pace}
+
+
+def _kick(smooth: np.ndarray, floor: float, forward: np.ndarray) -> dict[str, str | int]:
+    """A foot more than 35 cm in front of the pelvis and more than 25 cm above where it stands."""
+    out = smooth[:, ANKLES] - smooth[:, [PELVIS]]
+    ahead = (out[..., [0, 2]] * forward[:, None]).sum(-1)
+    high = smooth[:, ANKLES, 1] - floor - 0.06
+    reach = np.where(high > 0.25, ahead, 0).max(0)
+    side = int(reach.argmax())
+    kicks = _count(np.where(high[:, side] > 0.15, ahead[:, side], 0), 0.35, 0.2)
+    return {"action": "kick", "side": SIDES[side], "count": kicks} if kicks and reach[side] > 0.35 else {}
+
+
+def _arms(smooth: np.ndarray, fps: float) -> dict[str, str | int]:
+    """Raised arms, waves, punches; or nothing but standing."""
+    upper = smooth[:, ELBOWS] - smooth[:, SHOULDERS]
+    fore = smooth[:, WRISTS] - smooth[:, ELBOWS]
+    arm = smooth[:, WRISTS] - smooth[:, SHOULDERS]
+    length = np.median(np.linalg.norm(upper, axis=-1) + np.linalg.norm(fore, axis=-1), 0)
+    straight = np.linalg.norm(arm, axis=-1) / length
+    above = arm[..., 1] / length
+
+    raised, waving = [], []
+    for side, name in enumerate(SIDES):
+        up = (fore[:, side, 1] > 0.2 * length[side]) & (above[:, side] > 0.1)
+        if up.sum() < 0.35 * fps:
+            continue
+        # A wave swings the forearm about the elbow; a raised arm holds still.
+        swing = straight[up, side] - gaussian_filter1d(straight[up, side], 0.25 * fps, mode="nearest")
+        if np.percentile(straight[up, side], 20) < 0.88 and swing.std() > 0.02:
+            waving.append(name)
+        elif np.percentile(above[up, side], 70) > 0.75 and above[:3, side].mean() < 0:
+            raised.append(name)
+    for action, sides in (("wave", waving), ("raise", raised)):
+        if sides:
+            return {"action": action, "side": "both" if len(sides) == 2 else sides[0]}
+
+    reach = np.linalg.norm(arm[..., [0, 2]], axis=-1) / length
+    side = int(reach.max(0).argmax())
+    punches = _count(reach[:, side], 0.8, 0.6)
+    if punches:
+        return {"action": "punch", "side": SIDES[side], "count": punches}
+    moved = np.ptp(smooth[:, [*WRISTS, *ANKLES, HEAD]], axis=0)
+    return {"action": "stand"} if np.linalg.norm(moved, axis=-1).max() < 0.35 else {}
+
+
+class AttributeAccuracy(Metric):
+    """Share of motions that show what was asked, by attribute.
+
+    Args:
+        fps: frames a second of the motions.
+    """
+
+    higher_is_better = True
+    full_state_update = False
+
+    def __init__(self, fps: float, **kwargs: Any):
+        super().__init__(**kwargs)
+        self.fps = fps
+        for name in (*ATTRIBUTES, "all"):
+            self.add_state(f"right_{name}", tensor(0), dist_reduce_fx="sum")
+            self.add_state(f"asked_{name}", tensor(0), dist_reduce_fx="sum")
+
+    def update(self, joints: Tensor, mask: Tensor, asked: Sequence[Mapping[str, str | int | float]]) -> None:
+        """Adds motions.
+
+        Args:
+            joints: (B, F, 22, 3) metres, y up.
+            mask: (B, F) bool, True = real frame.
+            asked: of each motion, some of action, side, count, direction, speed; the action at least.
+
+        Raises:
+            ValueError: `asked` is not one a motion, or asks for something that cannot be read.
+        """
+        if len(asked) != len(joints):
+            raise ValueError(f"attributes: {len(joints)} motions but {len(asked)} sets of attributes were asked")
+        for motion, real, wanted in zip(joints.detach().cpu(), mask.cpu(), asked, strict=True):
+            unknown = set(wanted) - set(ATTRIBUTES)
+            if unknown or "action" not in wanted:
+                raise ValueError(f"attributes: asked for {dict(wanted)}; give an action, and only of {ATTRIBUTES}")
+            seen = read_attributes(motion[real].numpy(), self.fps)
+            right = {name: seen.get(name) == value for name, value in wanted.items()}
+            right["all"] = right["action"] and right.get("side", True)
+            for name, hit in right.items():
+                setattr(self, f"right_{name}", getattr(self, f"right_{name}") + int(hit))
+                setattr(self, f"asked_{name}", getattr(self, f"asked_{name}") + 1)
+
+    def compute(self) -> dict[str, float | None]:
+        """Accuracy in [0, 1] by attribute, None where it was never asked; `all` = action and side both right."""
+        return {
+            name: int(getattr(self, f"right_{name}")) / asked
+            if (asked := int(getattr(self, f"asked_{name}")))
+            else None
+            for name in (*ATTRIBUTES, "all")
+        }

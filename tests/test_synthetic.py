@@ -1,0 +1,180 @@
+"""The synthetic set: repeatable clips of a body that keeps its bones, its feet on the floor, and its captions true."""
+
+from collections import Counter
+
+import numpy as np
+import pytest
+
+from flame_mdm.data import Clip
+from flame_mdm.data.synthetic import Synthetic, captions, prompts
+
+PARENTS = [-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19]
+FPS = 20
+
+
+@pytest.fixture(scope="module")
+def clips() -> list[Clip]:
+    return list(Synthetic(400, seed=3).clips(FPS))
+
+
+def bones(motion: np.ndarray) -> np.ndarray:
+    """(F, 21) lengths."""
+    return np.linalg.norm(motion[:, 1:] - motion[:, PARENTS[1:]], axis=-1)
+
+
+def test_a_clip_depends_on_seed_and_number_alone(clips: list[Clip]):
+    few = list(Synthetic(3, seed=3).clips(FPS))
+    for clip, same in zip(few, clips, strict=False):
+        assert clip.id == same.id
+        assert clip.captions == same.captions
+        np.testing.assert_array_equal(clip.motion, same.motion)
+    other = Synthetic(1, seed=4).clip(0, FPS)
+    assert other.id != clips[0].id
+    assert other.motion.shape != clips[0].motion.shape or not np.allclose(other.motion, clips[0].motion)
+
+
+def test_count_and_lengths(clips: list[Clip]):
+    assert Synthetic(400).count() == len(clips) == len({clip.id for clip in clips})
+    lengths = [len(clip.motion) for clip in clips]
+    assert min(lengths) >= 2 * FPS + 1
+    assert max(lengths) <= 3 * FPS + 1
+    assert all(clip.motion.shape[1:] == (22, 3) and clip.motion.dtype == np.float32 for clip in clips)
+
+
+def test_longer_clips_hold_together():
+    for clip in Synthetic(40, seed=1, min_seconds=5, max_seconds=8).clips(30):
+        assert 151 <= len(clip.motion) <= 241
+        assert np.isfinite(clip.motion).all()
+        np.testing.assert_allclose(bones(clip.motion), bones(clip.motion)[:1].repeat(len(clip.motion), 0), atol=1e-5)
+
+
+def test_frame_rates_sample_the_same_motion():
+    slow, fast = Synthetic(1).clip(0, 10), Synthetic(1).clip(0, 20)
+    both = min(len(slow.motion), len(fast.motion[::2]))
+    np.testing.assert_allclose(slow.motion[:both], fast.motion[::2][:both], atol=1e-6)
+
+
+def test_one_body_above_the_floor(clips: list[Clip]):
+    first = bones(clips[0].motion)[0]
+    for clip in clips:
+        np.testing.assert_allclose(
+            bones(clip.motion), np.tile(first, (len(clip.motion), 1)), atol=2e-6, err_msg=clip.id
+        )
+        assert clip.motion[..., 1].min() > -1e-6, clip.id
+        assert 1.3 < clip.motion[0, 15, 1] < 1.7, clip.id
+    assert first[PARENTS.index(9) - 1 :].min() > 0.05
+    np.testing.assert_allclose(first[[0, 3, 6, 9]], first[[1, 4, 7, 10]], atol=1e-6)
+
+
+def test_starts_at_the_origin_facing_z(clips: list[Clip]):
+    for clip in clips:
+        start = clip.motion[0]
+        np.testing.assert_allclose(start[0, [0, 2]], 0, atol=1e-6)
+        across = start[16] - start[17]
+        assert across[0] > 0.9 * np.linalg.norm(across), f"{clip.id}: the left shoulder is not at +x"
+        assert start[10, 2] > start[7, 2], f"{clip.id}: the toes point backward"
+
+
+def test_feet_on_the_floor_do_not_move(clips: list[Clip]):
+    """A toe joint at rest height in two adjacent frames of a stance stays within a millimetre."""
+    planted = 0
+    for clip in clips:
+        toes = clip.motion[:, [10, 11]]
+        resting = toes[..., 1] < 1e-5
+        stance = resting[1:-2] & resting[2:-1] & resting[:-3] & resting[3:]
+        moved = np.linalg.norm(np.diff(toes[..., [0, 2]], axis=0), axis=-1)[1:-1]
+        assert (moved[stance] < 1e-3).all(), f"{clip.id} {clip.attributes}: {moved[stance].max():.4f} m"
+        planted += stance.sum()
+    assert planted > 400 * FPS  # the check saw feet: more than half a second of each clip
+
+
+def test_knees_bend_forward_and_elbows_do_not_bend_back(clips: list[Clip]):
+    for clip in clips:
+        motion = clip.motion.astype(np.float64)
+        left = motion[:, 1] - motion[:, 2]
+        for side in (0, 1):
+            hip, knee, ankle = motion[:, 1 + side], motion[:, 4 + side], motion[:, 7 + side]
+            forward = np.cross(ankle - hip, left)
+            assert (((knee - (hip + ankle) / 2) * forward).sum(-1) > 0).all(), clip.id
+            upper, fore = motion[:, 18 + side] - motion[:, 16 + side], motion[:, 20 + side] - motion[:, 18 + side]
+            lowered = upper[:, 1] < -0.2
+            chest_forward = np.cross(motion[:, 16] - motion[:, 17], motion[:, 12] - motion[:, 0])
+            bend = fore - upper * (fore * upper).sum(-1, keepdims=True) / (upper * upper).sum(-1, keepdims=True)
+            assert ((bend * chest_forward).sum(-1)[lowered] > -1e-3).all(), clip.id
+
+
+def test_nothing_jumps_between_frames(clips: list[Clip]):
+    fastest = max(np.linalg.norm(np.diff(clip.motion, axis=0), axis=-1).max() * FPS for clip in clips)
+    assert fastest < 13  # metres a second; a kick's toes, as in motion capture
+
+
+def test_every_action_side_count_direction_and_speed_occurs(clips: list[Clip]):
+    seen = Counter((name, value) for clip in clips for name, value in clip.attributes.items())
+    for name, values in {
+        "action": Synthetic.actions,
+        "side": ("left", "right", "both"),
+        "count": (1, 2, 3),
+        "direction": ("forward", "backward", "left", "right", "clockwise", "counterclockwise"),
+        "speed": ("slow", "normal", "fast"),
+    }.items():
+        for value in values:
+            assert seen[name, value] > 2, f"{name}={value}"
+    assert all(Synthetic.actions[clip.action or 0] == clip.attributes["action"] for clip in clips)
+
+
+def test_captions_say_the_attributes(clips: list[Clip]):
+    words = {1: ("once", "one"), 2: ("twice", "two"), 3: ("three",), "slow": ("slow",), "fast": ("quick", "fast")}
+    for clip in clips:
+        assert len(clip.captions) == len(set(clip.captions)) == 4
+        for caption in clip.captions:
+            for name, value in clip.attributes.items():
+                # Nobody says "at normal speed", and only the first words of "backward(s)" are sure to be there.
+                if name == "action" or value in ("normal", "forward"):
+                    continue
+                assert any(word in caption for word in words.get(value, (str(value),))), f"{caption}: {name}={value}"
+            for speed in ("slow", "quick", "fast"):
+                if speed in caption:
+                    assert clip.attributes["speed"] == {"slow": "slow"}.get(speed, "fast")
+
+
+def test_speed_words_are_true(clips: list[Clip]):
+    speeds: dict[str, list[float]] = {"slow": [], "normal": [], "fast": []}
+    for clip in clips:
+        if "speed" in clip.attributes:
+            steps = np.linalg.norm(np.diff(clip.motion[:, 0, [0, 2]], axis=0), axis=-1) * FPS
+            speeds[str(clip.attributes["speed"])].append(float(np.percentile(steps, 75)))
+    assert max(speeds["slow"]) < 0.85 < min(speeds["normal"])
+    assert max(speeds["normal"]) < 1.4 < min(speeds["fast"])
+
+
+def test_no_two_meanings_share_a_caption(clips: list[Clip]):
+    meaning: dict[str, dict] = {}
+    for clip in clips:
+        for predicate in captions(dict(clip.attributes)):
+            assert meaning.setdefault(predicate, dict(clip.attributes)) == dict(clip.attributes), predicate
+
+
+def test_splits_are_fixed_by_the_id(clips: list[Clip]):
+    more = {clip.id: clip.split for clip in Synthetic(410, seed=3).clips(2)}
+    assert all(more[clip.id] == clip.split for clip in clips)
+    assert all(clip.source == clip.id for clip in clips)
+    shares = Counter(clip.split for clip in clips)
+    assert 0.78 < shares["train"] / 400 < 0.92
+    assert shares["val"] >= 8
+    assert shares["test"] >= 20
+
+
+def test_prompts_cover_actions_and_sides():
+    texts = [text for text, _ in prompts()]
+    assert len(set(texts)) == len(texts) >= 20
+    assert {asked["action"] for _, asked in prompts()} == set(Synthetic.actions)
+    assert {asked.get("side") for _, asked in prompts()} == {None, "left", "right", "both"}
+    assert ("a person waves with the left hand", {"action": "wave", "side": "left"}) in prompts()
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"clips": 0}, {"seed": -1}, {"min_seconds": 1.0}, {"min_seconds": 3.0, "max_seconds": 2.5}]
+)
+def test_impossible_settings_are_named(wrong: dict):
+    with pytest.raises(ValueError, match=rf"synthetic: .*{next(iter(wrong))}"):
+        Synthetic(**wrong)

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from flame_mdm.losses import masked_mean, masked_mse
-from flame_mdm.motion import Condition, length_mask
+from flame_mdm.motion import length_mask
 from flame_mdm.processes.diffusion import GaussianDiffusion, LossAwareTimesteps
 from flame_mdm.processes.flow_matching import FlowMatching
 from flame_mdm.processes.schedules import build_schedule, timesteps

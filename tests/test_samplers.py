@@ -146,7 +146,8 @@ def test_flow_run(case):
         edit=edit,
     )
     assert_golden(MFM, f"run/{case}", x)
-    np.testing.assert_allclose(seen, MFM[f"times/{case}"], rtol=0, atol=1e-6)
+    # Adaptive steps follow from errors near the rounding of float32.
+    np.testing.assert_allclose(seen, MFM[f"times/{case}"], rtol=0, atol=2e-4 if method == "dopri5" else 1e-6)
 
 
 # What an oracle returns has to be the data, whatever the sampler and the number of steps.
@@ -224,7 +225,7 @@ def gaussian_data(process: GaussianDiffusion, deviation: float) -> Denoise:
     return denoise
 
 
-@pytest.mark.parametrize("count", [50, 1000])
+@pytest.mark.parametrize("count", [250, 1000])
 @pytest.mark.parametrize("sampler", DIFFUSION)
 def test_samples_have_the_distribution_of_the_data(sampler, count):
     process = GaussianDiffusion(1000)
@@ -233,22 +234,25 @@ def test_samples_have_the_distribution_of_the_data(sampler, count):
         NO_CONDITION, sampler=sampler, num_inference_steps=count,
     )  # fmt: skip
     assert x.mean() == pytest.approx(0.5, abs=0.02)
-    # Few ancestral steps with the posterior's variance lose some of it.
-    assert x.std() == pytest.approx(0.3, rel=0.1 if (sampler, count) == ("ancestral", 50) else 0.04)
+    assert x.std() == pytest.approx(0.3, rel=0.05)
 
 
-def test_solver_of_order_two_needs_fewer_steps():
-    process = GaussianDiffusion(1000)
+def test_order_of_diffusion_solvers():
+    """Against the exact flow of normal data, which scales the start: DDIM is of order 1, DPM-Solver++ (2M) of 2."""
+    process, noise = GaussianDiffusion(1000), drawn((1, 1, 100), torch.float64)
+    signal, sigma = (process.schedule.tables[name][-1] for name in ("signal", "noise"))
+    exact = 0.5 + 0.3 * (noise(0) - 0.5 * signal) / (signal**2 * 0.3**2 + sigma**2).sqrt()
 
-    def sample(sampler: str, count: int) -> Tensor:
-        return process.sample(
-            gaussian_data(process, 0.3), drawn((1, 1, 100), torch.float64), torch.ones(1, 1, dtype=torch.bool),
-            NO_CONDITION, sampler=sampler, num_inference_steps=count,
+    def error(sampler: str, count: int) -> float:
+        x = process.sample(
+            gaussian_data(process, 0.3), noise, torch.ones(1, 1, dtype=torch.bool), NO_CONDITION,
+            sampler=sampler, num_inference_steps=count,
         )  # fmt: skip
+        return (x - exact).abs().mean().item()
 
-    exact = sample("ddim", 1000)
-    error = {sampler: (sample(sampler, 25) - exact).abs().mean() for sampler in ("ddim", "dpm_solver_pp_2m")}
-    assert error["dpm_solver_pp_2m"] < error["ddim"] / 2
+    assert error("ddim", 100) / error("ddim", 200) == pytest.approx(2, abs=0.3)
+    assert error("dpm_solver_pp_2m", 100) / error("dpm_solver_pp_2m", 200) > 3
+    assert error("dpm_solver_pp_2m", 100) < error("ddim", 100) / 2
 
 
 # Other people's code. Its step formulas are sound where we compare; its choice of steps is not used.
@@ -279,7 +283,7 @@ def test_ancestral_agrees_with_diffusers(variance, prediction, monkeypatch):
         x = scheduler.step(output, int(t), x).prev_sample
     ours = process.sample(denoise, noise, mask, NO_CONDITION, sampler="ancestral", num_inference_steps=steps)
     # Theirs computes alpha products in float32.
-    torch.testing.assert_close(ours, x, rtol=1e-3, atol=1e-3)
+    torch.testing.assert_close(ours, x, rtol=1e-4, atol=1e-4)
 
 
 @pytest.mark.parametrize("prediction", ["x0", "epsilon", "velocity"])
@@ -303,9 +307,10 @@ def test_ddim_agrees_with_diffusers(eta, prediction):
         denoise, noise, mask, NO_CONDITION, sampler="ddim", num_inference_steps=20, spacing="stride", eta=eta
     )
     assert steps == process._steps(20, "stride")
-    torch.testing.assert_close(ours, x, rtol=1e-3, atol=1e-3)
+    torch.testing.assert_close(ours, x, rtol=1e-4, atol=1e-4)
 
 
+@pytest.mark.filterwarnings("ignore:__array__ implementation:DeprecationWarning")  # theirs, under numpy 2
 @pytest.mark.parametrize("prediction", ["x0", "epsilon", "velocity"])
 def test_dpm_solver_agrees_with_diffusers(prediction):
     process = GaussianDiffusion(1000, prediction=prediction)
@@ -319,7 +324,7 @@ def test_dpm_solver_agrees_with_diffusers(prediction):
         output = denoise(x, torch.tensor([float(t)]), mask, NO_CONDITION)
         x = scheduler.step(output, t, x).prev_sample
     ours = process.sample(denoise, noise, mask, NO_CONDITION, sampler="dpm_solver_pp_2m", num_inference_steps=steps)
-    torch.testing.assert_close(ours, x, rtol=1e-3, atol=1e-3)
+    torch.testing.assert_close(ours, x, rtol=1e-4, atol=1e-4)
 
 
 @pytest.mark.parametrize("sampler", STEPS)

@@ -19,6 +19,10 @@ class Process(nn.Module, ABC):
         """Channels the denoiser has to return for motions of `features` channels: D, or 2D with learned variance."""
 
     @abstractmethod
+    def training_times(self, u: Tensor) -> Tensor:
+        """Times t (B,) of training samples from uniform numbers (B,) in (0, 1)."""
+
+    @abstractmethod
     def corrupt(self, x: Tensor, noise: Tensor, t: Tensor) -> Tensor:
         """Noisy motion x_t (B, F, D) at times t (B,) from clean `x` and `noise` (B, F, D)."""
 

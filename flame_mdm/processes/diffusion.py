@@ -125,6 +125,9 @@ class GaussianDiffusion(Process):
     def out_features(self, features: int) -> int:
         return 2 * features if self.variance == "learned_range" else features
 
+    def training_times(self, u: Tensor) -> Tensor:
+        return (u * len(self.schedule)).floor().clamp(max=len(self.schedule) - 1)
+
     def corrupt(self, x: Tensor, noise: Tensor, t: Tensor) -> Tensor:
         return self.schedule.corrupt(x, noise, t)
 
@@ -179,7 +182,7 @@ class GaussianDiffusion(Process):
             t, weights = self.timesteps.draw(len(x))
             t = t.to(torch.float32)
         elif t is None:
-            t = torch.randint(len(self.schedule), (len(x),), device=x.device).to(torch.float32)
+            t = self.training_times(torch.rand(len(x), device=x.device))
         if noise is None:
             noise = torch.randn_like(x)
         averaged = mask

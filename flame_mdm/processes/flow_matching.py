@@ -51,6 +51,9 @@ class FlowMatching(Process):
     def out_features(self, features: int) -> int:
         return features
 
+    def training_times(self, u: Tensor) -> Tensor:
+        return u if self.time_distribution == "uniform" else torch.special.ndtri(u).sigmoid()
+
     def corrupt(self, x: Tensor, noise: Tensor, t: Tensor) -> Tensor:
         t = t[:, None, None]
         return t * x + (1 - (1 - self.sigma_min) * t) * noise
@@ -86,10 +89,8 @@ class FlowMatching(Process):
         auxiliary: Auxiliary | None = None,
     ) -> dict[str, Tensor]:
         """Terms "mse" of the velocity (Lipman et al. 2023, eq. 23), those of `auxiliary`, and "loss"."""
-        if t is None and self.time_distribution == "uniform":
-            t = torch.rand(len(x), device=x.device)
-        elif t is None:
-            t = torch.randn(len(x), device=x.device).sigmoid()
+        if t is None:
+            t = self.training_times(torch.rand(len(x), device=x.device))
         if noise is None:
             noise = torch.randn_like(x)
         x_t = self.corrupt(x, noise, t)

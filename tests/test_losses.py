@@ -1,0 +1,152 @@
+"""Masked reconstruction error and geometric losses."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import torch
+from analytic import NO_CONDITION, assert_golden, motions
+from fixtures import golden, groups, meta
+from torch import Tensor
+
+from flame_mdm.losses import MotionLosses, masked_mse
+from flame_mdm.motion import length_mask
+from flame_mdm.processes.diffusion import GaussianDiffusion
+
+FIXTURE = golden("mdm_losses")
+# Which losses of MDM's code are which of ours. It computes the joints' velocity but never adds it.
+OURS = {
+    "rot_mse": "mse",
+    "vel_mse": "velocity",
+    "rcxyz_mse": "joints",
+    "fc": "foot_contact",
+    "vel_xyz_mse": "joint_velocity",
+}
+WEIGHTS = {"vel_mse": "lambda_vel", "rcxyz_mse": "lambda_rcxyz", "fc": "lambda_fc", "vel_xyz_mse": "lambda_vel_rcxyz"}
+SMPL_FEET = [7, 10, 8, 11]
+
+
+def linear_joints(matrix: np.ndarray) -> Callable[[Tensor], Tensor]:
+    """The fixture's stand-in for forward kinematics: joints as a linear function of the features."""
+
+    def to_joints(x: Tensor) -> Tensor:
+        return (x @ torch.from_numpy(matrix).to(x).T).unflatten(-1, (-1, 3))
+
+    return to_joints
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize("case", [pytest.param(name, id=f"mdm_losses-{name}") for name in groups(FIXTURE, "x_t")])
+def test_mdm_losses(case):
+    data, name = case.split("/")
+    config = meta(FIXTURE)["config"]
+    lambdas = config["lambdas"][data][name]
+    x, noise = motions(FIXTURE[f"{data}/x_start"]), motions(FIXTURE[f"{data}/noise"])
+    mask = torch.from_numpy(FIXTURE[f"{data}/mask"]).flatten(1)
+    last_row = FIXTURE[f"{data}/x_start"].shape[2]
+    weights = {OURS[term]: lambdas.get(weight, 0.0) for term, weight in WEIGHTS.items()}
+    losses = MotionLosses(
+        linear_joints(FIXTURE[f"{data}/fk"]), SMPL_FEET, **weights, velocity_features=x.shape[-1] - last_row
+    )
+    process, t = GaussianDiffusion(config["T"]), torch.from_numpy(FIXTURE[f"{data}/t"]).float()
+    seen = []
+
+    def denoise(x_t, t, mask, cond):
+        seen.append(x_t)
+        return motions(FIXTURE[f"{data}/model_output"])
+
+    terms = process.loss(denoise, x, mask, NO_CONDITION, t=t, noise=noise, auxiliary=losses)
+    assert_golden(FIXTURE, f"{case}/x_t", seen[0])
+    loss = terms["loss"] - terms.get("joint_velocity", 0.0)
+    assert_golden(FIXTURE, f"{case}/loss", loss)
+    computed = set(terms) - {"loss"}
+    for term, ours in OURS.items():
+        # The code computes a term under conditions of its own; those of weight 0 are not computed here.
+        weight = 1.0 if term == "rot_mse" else lambdas.get(WEIGHTS[term], 0.0)
+        if f"{case}/{term}" in FIXTURE and weight:
+            assert_golden(FIXTURE, f"{case}/{term}", terms[ours] / weight)
+            computed.remove(ours)
+    assert computed == set()
+
+
+def test_masked_mse_is_the_mean_over_real_frames():
+    torch.manual_seed(0)
+    a, b = torch.randn(2, 3, 5, 4).unbind()
+    lengths = [5, 2, 0]
+    mask = length_mask(torch.tensor(lengths), 5)
+    expected = [((a[i, :n] - b[i, :n]) ** 2).mean().item() if n else 0.0 for i, n in enumerate(lengths)]
+    torch.testing.assert_close(masked_mse(a, b, mask), torch.tensor(expected))
+    torch.testing.assert_close(masked_mse(a.unflatten(2, (2, 2)), b.unflatten(2, (2, 2)), mask), torch.tensor(expected))
+
+
+ALL = {"joints": 1.0, "velocity": 1.0, "joint_velocity": 1.0, "foot_contact": 1.0}
+
+
+def joints_as_features(x: Tensor) -> Tensor:
+    return x.unflatten(-1, (-1, 3))
+
+
+def test_equal_motions_lose_nothing_but_sliding_feet():
+    """One foot stands and slides in the estimate, the other moves in the data and is free to."""
+    x = torch.zeros(1, 4, 9)
+    x[..., 6] = torch.arange(4.0)
+    losses = MotionLosses(joints_as_features, [1, 2], **ALL)
+    mask = torch.ones(1, 4, dtype=torch.bool)
+    assert all(loss == 0 for loss in losses(x, x, mask).values())
+    slid = x.clone()
+    slid[..., 3] = 0.3 * torch.arange(4.0)
+    terms = losses(slid, x, mask)
+    # Means over 3 frames x 2 feet x 3 coordinates, 3 x 3 joints x 3, and 4 x 3 x 3.
+    assert terms["foot_contact"].item() == pytest.approx(0.3**2 / 6)
+    assert terms["velocity"].item() == pytest.approx(0.3**2 / 9)
+    assert terms["joint_velocity"].item() == pytest.approx(0.3**2 / 9)
+    assert terms["joints"].item() == pytest.approx(0.09 * (0 + 1 + 4 + 9) / (4 * 9))
+    other = x.clone()
+    other[..., 6] *= 2
+    assert losses(other, x, mask)["foot_contact"] == 0
+
+
+def test_padding_and_single_frames():
+    torch.manual_seed(0)
+    losses = MotionLosses(joints_as_features, [0], **ALL)
+    a, b = torch.randn(2, 3, 6, 9).unbind()
+    mask = length_mask(torch.tensor([6, 3, 1]))
+    spoiled = torch.where(mask[..., None], a, 1e6), torch.where(mask[..., None], b, -1e6)
+    for name, loss in losses(a, b, mask).items():
+        torch.testing.assert_close(losses(*spoiled, mask)[name], loss)
+        assert loss.isfinite().all()
+        alone = losses(a[1:2, :3], b[1:2, :3], mask[1:2, :3])[name]
+        torch.testing.assert_close(loss[1:2], alone)
+    assert losses(a, b, mask)["velocity"][2] == 0
+
+
+def test_only_what_weighs_is_computed():
+    def unused(x: Tensor) -> Tensor:
+        raise AssertionError("forward kinematics of a loss without weight")
+
+    x, mask = torch.randn(1, 4, 9), torch.ones(1, 4, dtype=torch.bool)
+    assert MotionLosses(unused, [0])(x, x, mask) == {}
+    assert set(MotionLosses(unused, [0], velocity=2.0)(x, x, mask)) == {"velocity"}
+    single, double = (MotionLosses(joints_as_features, [0], joints=weight) for weight in (1.0, 2.0))
+    torch.testing.assert_close(double(x + 1, x, mask)["joints"], 2 * single(x + 1, x, mask)["joints"])
+
+
+def test_root_relative_losses_are_blind_to_translation():
+    torch.manual_seed(0)
+    x, mask = torch.randn(1, 4, 9), torch.ones(1, 4, dtype=torch.bool)
+    moved = x + torch.randn(1, 4, 3).repeat(1, 1, 3)
+    blind = MotionLosses(joints_as_features, [1], joints=1.0, joint_velocity=1.0, root_relative=True)(moved, x, mask)
+    seeing = MotionLosses(joints_as_features, [1], joints=1.0, joint_velocity=1.0)(moved, x, mask)
+    for name in ("joints", "joint_velocity"):
+        assert blind[name] == pytest.approx(0, abs=1e-10)
+        assert seeing[name] > 0.1
+
+
+def test_gradients_reach_the_estimate():
+    x, mask = torch.randn(2, 4, 9), length_mask(torch.tensor([4, 2]))
+    x0_hat = torch.randn(2, 4, 9, requires_grad=True)
+    losses = MotionLosses(joints_as_features, [0, 1], **ALL, contact_speed=100.0)
+    torch.stack(list(losses(x0_hat, x, mask).values())).sum().backward()
+    assert x0_hat.grad is not None
+    assert (x0_hat.grad[mask] != 0).all()
+    assert (x0_hat.grad[~mask] == 0).all()

@@ -1,0 +1,26 @@
+"""Text- and action-conditioned human motion generation: FLAME, MDM and Motion Flow Matching in one framework.
+
+import flame_mdm
+model = flame_mdm.load("runs/quickstart/default/checkpoints/last.ckpt")
+motion = flame_mdm.generate(model, "a person waves with the left hand", seconds=3, seed=0)[0]
+motion.joints  # (F, J, 3) metres, y up
+"""
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from flame_mdm.generation import Generated, generate
+    from flame_mdm.task import MotionGeneration, load
+
+__all__ = ["Generated", "MotionGeneration", "generate", "load"]
+
+_HOMES = {"load": "task", "MotionGeneration": "task", "generate": "generation", "Generated": "generation"}
+
+
+def __getattr__(name: str) -> Any:
+    """Imports the public names when they are first used: commands answer `--help` without waiting for torch."""
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from importlib import import_module
+
+    return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)

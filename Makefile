@@ -1,0 +1,42 @@
+# Everything runs in .venv, which the first target that needs it makes. `make help` lists what there is.
+# Words such as TEXT="..." or trainer.max_steps=10 are make variables. The commands read them from what make hands
+# down (--from-make), not through a shell, so that quotes, brackets and dollar signs in them survive.
+.DEFAULT_GOAL := help
+PYTHON ?= python3
+VENV := .venv
+READY := $(VENV)/.ready
+export MAKEFLAGS
+
+.PHONY: help setup prepare train sample test lint bench
+
+help: ## show this
+	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## /  make \1@/' | column -t -s @
+	@echo "experiments (EXP=...):"
+	@cd experiments && grep -rl "@package _global_" --include=*.yaml . | sed 's|^\./|  |;s|\.yaml$$||' | sort
+
+setup: $(READY) ## install into .venv
+
+$(READY): pyproject.toml constraints.txt
+	$(PYTHON) -m venv $(VENV)
+	$(VENV)/bin/python -m pip install -q -c constraints.txt -e '.[dev,offline]'
+	@touch $@
+
+prepare: $(READY) ## prepare a data set: DATA=bandai SOURCE=/path/to/folder-or-archive [verify=true]
+	@$(VENV)/bin/python -m flame_mdm.prepare --from-make
+
+train: $(READY) ## train or resume: EXP=quickstart [trainer.max_steps=1000 denoiser=mdm_decoder ...]
+	@$(VENV)/bin/python -m flame_mdm.train --from-make
+
+sample: $(READY) ## sample: CKPT=runs/.../last.ckpt TEXT="a person walks in a circle" SECONDS=3
+	@$(VENV)/bin/python -m flame_mdm.sample --from-make
+
+test: $(READY) ## run all tests
+	@$(VENV)/bin/python -m pytest -n 2 --dist worksteal
+
+lint: $(READY) ## check style and types
+	@$(VENV)/bin/ruff check .
+	@$(VENV)/bin/ruff format --check .
+	@$(VENV)/bin/pyright
+
+bench: $(READY) ## measure speed, as ratios in one run
+	@for file in benchmarks/*.py; do echo "== $$file"; $(VENV)/bin/python $$file || exit 1; done

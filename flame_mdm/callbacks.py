@@ -1,0 +1,221 @@
+"""What happens beside the training steps: checkpoints, interruption, progress, samples on the dashboard."""
+
+from __future__ import annotations
+
+import io
+import signal
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import torch
+from lightning import Callback, LightningModule, Trainer
+from lightning.pytorch.callbacks import Checkpoint
+from lightning.pytorch.callbacks.progress import TQDMProgressBar
+from lightning.pytorch.loggers import TensorBoardLogger, WandbLogger
+from torchmetrics import Metric
+
+from flame_mdm.generation import Generated, generate, write_motions
+from flame_mdm.motion import MotionBatch
+from flame_mdm.task import MotionGeneration
+
+
+class Interrupted(Exception):
+    """Training stopped at the end of a step because a signal asked for it; a checkpoint has been written."""
+
+    def __init__(self, signum: int, step: int):
+        super().__init__(f"{signal.Signals(signum).name} at step {step}")
+        self.signum, self.step = signum, step
+
+
+class Checkpoints(Checkpoint):
+    """Writes `last.ckpt` every so often, at the last step and when interrupted, and keeps some for good.
+
+    SIGINT and SIGTERM end training at the end of a step, never inside validation, where averaged and raw weights are
+    swapped; a second SIGINT ends it at once. Files are written under a temporary name, then renamed.
+    """
+
+    def __init__(self, folder: str, every_n_steps: int, keep_every_n_steps: int | None = None):
+        super().__init__()
+        self.folder = Path(folder)
+        self.every_n_steps, self.keep_every_n_steps = every_n_steps, keep_every_n_steps
+        self.signum = 0
+        self.step = -1
+        self.handlers: dict[int, Any] = {}
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        self.step = trainer.global_step
+        for signum in (signal.SIGINT, signal.SIGTERM):
+            self.handlers[signum] = signal.signal(signum, self._note)
+
+    def _note(self, signum: int, frame: FrameType | None) -> None:
+        if self.signum and signum == signal.SIGINT:
+            raise KeyboardInterrupt
+        self.signum = signum
+        print("\nstopping at the end of this step; Ctrl-C again stops at once", flush=True)
+
+    def on_train_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        if trainer.global_step == self.step:  # gradients are still being accumulated
+            return
+        self.step = trainer.global_step
+        signum = self.signum
+        if trainer.world_size > 1:
+            signum = int(trainer.strategy.reduce(torch.tensor(signum, device=pl_module.device), reduce_op="max"))
+        last = bool(signum) or trainer.should_stop or self.step >= trainer.max_steps > 0
+        if last or self.step % self.every_n_steps == 0:
+            self._save(trainer, "last")
+        if self.keep_every_n_steps and self.step % self.keep_every_n_steps == 0:
+            self._save(trainer, f"step={self.step:07d}")
+        if signum:
+            raise Interrupted(signum, self.step)
+
+    def _save(self, trainer: Trainer, name: str) -> None:
+        partial = self.folder / f"{name}.partial"
+        trainer.save_checkpoint(partial)
+        if trainer.is_global_zero:
+            partial.replace(self.folder / f"{name}.ckpt")
+
+    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        self._restore()
+
+    def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
+        self._restore()
+
+    def _restore(self) -> None:
+        for signum, handler in self.handlers.items():
+            signal.signal(signum, handler)
+        self.handlers = {}
+
+
+class Progress(TQDMProgressBar):
+    """A progress bar over all steps of the run, with the time left and samples a second."""
+
+    def __init__(self, refresh_rate: int = 1):
+        super().__init__(refresh_rate)
+        self.since = (0.0, 0)
+
+    @property
+    def total_train_batches(self) -> int | float:
+        return self.trainer.max_steps * self.trainer.accumulate_grad_batches
+
+    def on_train_epoch_start(self, trainer: Trainer, *_: Any) -> None:
+        super().on_train_epoch_start(trainer)
+        done = trainer.global_step * trainer.accumulate_grad_batches
+        self.train_progress_bar.initial = self.train_progress_bar.n = done
+        self.train_progress_bar.set_description("training")
+        self.since = (time.perf_counter(), 0)
+
+    def on_train_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: MotionBatch, batch_idx: int
+    ) -> None:
+        begin, samples = self.since
+        samples += len(batch) * trainer.world_size
+        elapsed = time.perf_counter() - begin
+        self.since = (begin, samples)
+        if trainer.global_step % trainer.log_every_n_steps == 0 and elapsed > 0:  # type: ignore[attr-defined]
+            pl_module.log("train/samples_per_second", samples / elapsed, prog_bar=True)
+            self.since = (time.perf_counter(), 0)
+        super().on_train_batch_end(trainer, pl_module, outputs, batch, batch_idx)
+
+    def get_metrics(self, trainer: Trainer, pl_module: LightningModule) -> dict[str, Any]:
+        items = super().get_metrics(trainer, pl_module)
+        items.pop("v_num", None)
+        return {name.rpartition("/")[2] if name != "val/loss" else name: value for name, value in items.items()}
+
+
+class SampleMotions(Callback):
+    """Samples fixed prompts with fixed noise now and then: files in the run's folder, a video on the dashboard.
+
+    Args:
+        folder: where `step_0001000/player.html` and the like are written.
+        every_n_steps: how often, at validation; the end of training always samples.
+        prompts: texts, action names, or (text, asked attributes) pairs; None = as many unconditioned motions as
+            `unconditioned`.
+        seconds: length of the motions.
+        unconditioned: how many motions to sample where there are no prompts.
+        metrics: torchmetrics by name, updated with (joints (B, F, J, 3), mask (B, F), asked attributes).
+    """
+
+    def __init__(
+        self,
+        folder: str,
+        every_n_steps: int,
+        prompts: Sequence[str | tuple[str, dict[str, Any]]] | None,
+        seconds: float,
+        unconditioned: int = 4,
+        metrics: dict[str, Metric] | None = None,
+    ):
+        self.folder, self.every_n_steps, self.seconds = Path(folder), every_n_steps, seconds
+        self.prompts = [(p, {}) if isinstance(p, str) else (p[0], dict(p[1])) for p in prompts or []]
+        self.unconditioned, self.metrics = unconditioned, metrics or {}
+        self.next = every_n_steps
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        self.next = trainer.global_step + self.every_n_steps
+
+    def on_validation_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        if trainer.global_step >= self.next and trainer.is_global_zero:
+            self.next += self.every_n_steps
+            self.write(trainer, pl_module)
+
+    def on_fit_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        if trainer.is_global_zero:
+            folder, values = self.write(trainer, pl_module)
+            for name, value in values.items():
+                print(f"{name}: {'not asked' if value is None else f'{value:.3f}'}")
+            print(f"see the motions: {folder / 'player.html'} (any browser), {folder / 'motions.gif'}")
+
+    def write(self, trainer: Trainer, pl_module: LightningModule) -> tuple[Path, dict[str, float | None]]:
+        """Samples, measures, writes the files and sends them to the dashboard."""
+        assert isinstance(pl_module, MotionGeneration)
+        texts = [text for text, _ in self.prompts]
+        labels = bool(texts) and texts[0] in pl_module.facts["actions"]
+        motions = generate(
+            pl_module,
+            None if labels or not texts else texts,
+            actions=texts if labels else None,
+            frames=min(round(self.seconds * pl_module.representation.fps), pl_module.facts["max_frames"]),
+            samples=1 if texts else self.unconditioned,
+            seed=0,
+        )
+        step = trainer.global_step
+        folder = self.folder / f"step_{step:07d}"
+        write_motions(folder, pl_module, motions, {"seed": 0, "step": step, "checkpoint": ""})
+        values = self.measure(motions)
+        for logger in trainer.loggers:
+            _log_video(logger, folder / "motions.gif", step)
+            logger.log_metrics({f"samples/{k}": v for k, v in values.items() if v is not None}, step)
+        return folder, values
+
+    def measure(self, motions: Sequence[Generated]) -> dict[str, float | None]:
+        """Values of all metrics on the motions, None where a metric has nothing to say."""
+        values: dict[str, float | None] = {}
+        for name, metric in self.metrics.items():
+            metric.reset()
+            for motion, (_, asked) in zip(motions, self.prompts, strict=True):
+                joints = torch.from_numpy(motion.joints)[None]
+                metric.update(joints, torch.ones(joints.shape[:2], dtype=torch.bool), [asked])
+            result = metric.compute()
+            parts = result if isinstance(result, dict) else {"": result}
+            values |= {f"{name}/{k}".rstrip("/"): None if v is None else float(v) for k, v in parts.items()}
+        return values
+
+
+def _log_video(logger: Any, gif: Path, step: int) -> None:
+    if isinstance(logger, TensorBoardLogger):
+        from PIL import Image
+        from tensorboard.compat.proto.summary_pb2 import Summary
+
+        data = gif.read_bytes()
+        width, height = Image.open(io.BytesIO(data)).size
+        image = Summary.Image(height=height, width=width, colorspace=3, encoded_image_string=data)
+        summary = Summary(value=[Summary.Value(tag="samples", image=image)])
+        logger.experiment._get_file_writer().add_summary(summary, step)
+    elif isinstance(logger, WandbLogger):
+        import wandb
+
+        logger.experiment.log({"samples": wandb.Video(str(gif), format="gif"), "trainer/global_step": step})

@@ -1,0 +1,474 @@
+"""Recipes: composed by Hydra, checked against the signatures of what they name, saved as plain dicts.
+
+Nothing here imports torch or Lightning: signatures are read from source files, so that `--help` and a misspelt key
+answer at once, and so that naming a class in a recipe runs none of its code.
+"""
+
+from __future__ import annotations
+
+import ast
+import difflib
+import functools
+import os
+import re
+import sys
+import traceback
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from hydra import compose as hydra_compose
+from hydra import initialize_config_dir
+from hydra import main as hydra_main
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
+from hydra.errors import HydraException
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+Config = dict[str, Any]
+
+_PACKAGED = Path(__file__).parent / "experiments"
+EXPERIMENTS = _PACKAGED if _PACKAGED.is_dir() else Path(__file__).parent.parent / "experiments"
+"""The recipes: inside the installed package, or beside it in a clone."""
+
+TRUSTED = ("torch", "lightning", "torchmetrics", "flame_mdm", "evaluators")
+"""Packages whose classes a configuration from a checkpoint may name."""
+
+
+class UserError(Exception):
+    """Something the user can mend; commands print its message, one line, and exit with 1."""
+
+
+# Composition ----------------------------------------------------------------------------------------------------------
+
+
+def groups() -> list[str]:
+    """The swappable parts of a recipe: folders of `experiments/` whose files are options, not recipes."""
+    return sorted(p.name for p in EXPERIMENTS.iterdir() if p.is_dir() and not _is_recipe_folder(p))
+
+
+def _is_recipe_folder(folder: Path) -> bool:
+    return any("@package _global_" in file.read_text()[:200] for file in folder.glob("*.yaml"))
+
+
+def recipes() -> list[str]:
+    """Names of all experiments, as `EXP=` takes them."""
+    files = (p for p in EXPERIMENTS.rglob("*.yaml") if "@package _global_" in p.read_text()[:200])
+    return sorted(p.relative_to(EXPERIMENTS).with_suffix("").as_posix() for p in files)
+
+
+def compose(name: str, overrides: Sequence[str] = ()) -> Config:
+    """The recipe `name` with overrides such as `trainer.max_steps=10` or `denoiser=mdm_encoder`, resolved and checked.
+
+    Args:
+        name: a file of `experiments/` without its suffix, or the path of a recipe or of a saved `config.yaml`.
+        overrides: in Hydra's grammar.
+
+    Raises:
+        UserError: an unknown experiment, group, option or key, with the nearest names; or a malformed value.
+    """
+    plan = _plan(name, overrides)
+    config = _hydra(plan)
+    check(config)
+    return config
+
+
+class _Plan(NamedTuple):
+    """What Hydra is asked to compose."""
+
+    folder: Path
+    stem: str
+    overrides: list[str]
+
+
+def _plan(name: str, overrides: Sequence[str]) -> _Plan:
+    """Checks names and keys. A key that only the signature of its `_target_` knows is marked as new for Hydra."""
+    folder, stem, saved = _locate_recipe(name)
+    parsed = _parse(overrides)
+    if saved:
+        _refuse_groups(parsed, name)
+    else:
+        _check_groups(parsed)
+    search = [f"hydra.searchpath=[file://{EXPERIMENTS}]"] if folder != EXPERIMENTS else []
+    base = _Plan(folder, stem, [*search, *_name(name, saved), *(_line(o) for o in parsed if _is_group(o))])
+    composed = _hydra(base)
+    return base._replace(overrides=base.overrides + [_legal(composed, o) for o in parsed if not _is_group(o)])
+
+
+def _line(override: Override) -> str:
+    return override.input_line or ""
+
+
+def _name(name: str, saved: bool) -> list[str]:
+    return [] if saved else [f"experiment={Path(name).stem if name.endswith('.yaml') else name}"]
+
+
+def _locate_recipe(name: str) -> tuple[Path, str, bool]:
+    """Folder and stem of a recipe, and whether it is a saved configuration (one with no defaults list)."""
+    if name.endswith((".yaml", ".yml")):
+        path = Path(name).resolve()
+        if not path.is_file():
+            raise UserError(f"{name}: no such file. EXP takes an experiment or the path of a config.yaml")
+        return path.parent, path.stem, "defaults" not in _load_yaml(path)
+    if not (EXPERIMENTS / f"{name}.yaml").is_file() or name not in recipes():
+        raise UserError(f"unknown experiment '{name}'.{_nearest(name, recipes())} `make help` lists them all")
+    return EXPERIMENTS, name, False
+
+
+def _load_yaml(path: Path) -> Any:
+    try:
+        return OmegaConf.load(path)
+    except Exception as error:  # YAML's many errors all mean the same here
+        raise UserError(f"{path}: not a readable YAML file: {_first_line(error)}") from error
+
+
+def _parse(overrides: Sequence[str]) -> list[Override]:
+    try:
+        return OverridesParser.create().parse_overrides(list(overrides))
+    except HydraException as error:
+        raise UserError(
+            f"cannot read the override: {_first_line(error)}; write key=value, quote text as 'a b'"
+        ) from error
+
+
+def _is_group(override: Override) -> bool:
+    return (EXPERIMENTS / override.key_or_group).is_dir()
+
+
+def _check_groups(overrides: Sequence[Override]) -> None:
+    for override in overrides:
+        if not _is_group(override) or override.is_sweep_override() or not isinstance(override.value(), str):
+            continue
+        group, option = override.key_or_group, str(override.value())
+        options = sorted(p.stem for p in (EXPERIMENTS / group).glob("*.yaml"))
+        if option not in options:
+            raise UserError(
+                f"no {group} is called '{option}'.{_nearest(option, options)} There are: {', '.join(options)}"
+            )
+
+
+def _refuse_groups(overrides: Sequence[Override], name: str) -> None:
+    for override in overrides:
+        if _is_group(override):
+            raise UserError(
+                f"{override.key_or_group}={override.value()} swaps a part of a recipe, but {name} is a saved "
+                "configuration whose parts are fixed; start from the experiment, or override single keys"
+            )
+
+
+def _hydra(plan: _Plan) -> Config:
+    GlobalHydra.instance().clear()
+    try:
+        with initialize_config_dir(version_base="1.3", config_dir=str(plan.folder)):
+            config = hydra_compose(plan.stem, plan.overrides)
+            resolved = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+    except (HydraException, OmegaConfBaseException) as error:
+        raise UserError(f"{plan.stem}: {_first_line(error)}") from error
+    return {str(key): value for key, value in resolved.items()}  # type: ignore[union-attr]
+
+
+def _legal(config: Config, override: Override) -> str:
+    """The override as Hydra takes it, if its key is written in the recipe or is a parameter of the `_target_`."""
+    line = _line(override)
+    if override.is_delete() or override.is_force_add() or override.is_add():
+        return line
+    node: Any = config
+    parts = override.key_or_group.split(".")
+    for depth, part in enumerate(parts):
+        if isinstance(node, Mapping) and part in node:
+            node = node[part]
+        elif isinstance(node, Mapping) and "_target_" in node and part in parameters(node["_target_"], exact=False):
+            return "++" + line
+        elif isinstance(node, list) and part.isdigit() and int(part) < len(node):
+            node = node[int(part)]
+        else:
+            raise UserError(_unknown_key(config, parts, depth, node))
+    return line
+
+
+# Checks against signatures --------------------------------------------------------------------------------------------
+
+
+def check(config: Config) -> None:
+    """Every mapping with a `_target_` names something that exists and gives it only arguments it takes.
+
+    Raises:
+        UserError: naming the key and the nearest legal ones.
+    """
+    for path, node in _walk(config):
+        if "_target_" not in node:
+            continue
+        legal = parameters(node["_target_"], where=".".join([*path, "_target_"]))
+        for name in node:
+            if not str(name).startswith("_") and name not in legal and "**" not in legal:
+                raise UserError(_unknown_key(config, [*path, str(name)], len(path), node))
+
+
+def _walk(node: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Mapping[str, Any]]]:
+    if isinstance(node, Mapping):
+        yield path, node
+        for name, child in node.items():
+            yield from _walk(child, (*path, str(name)))
+    elif isinstance(node, list):
+        for index, child in enumerate(node):
+            yield from _walk(child, (*path, str(index)))
+
+
+def _unknown_key(config: Config, parts: Sequence[str], depth: int, node: Any) -> str:
+    """The message for a key that stops being legal at `parts[depth]`, whose parent is `node`."""
+    key = ".".join(parts)
+    known = {".".join([*path, str(name)]) for path, mapping in _walk(config) for name in mapping}
+    if isinstance(node, Mapping) and "_target_" in node:
+        known |= {".".join([*parts[:depth], name]) for name in parameters(node["_target_"]) if name != "**"}
+    known -= {key}
+    siblings = {name for name in known if name.rpartition(".")[0] == ".".join(parts[:depth])}
+    near = difflib.get_close_matches(parts[depth], [s.rpartition(".")[2] for s in siblings], 3, 0.6)
+    names = [".".join([*parts[:depth], n]) for n in near] or difflib.get_close_matches(key, known, 3, 0.6)
+    names = names or [name for name in sorted(known) if name.endswith(f".{parts[-1]}")][:3]
+    return f"unknown config key '{key}'." + (f" Did you mean {', '.join(names)}?" if names else "")
+
+
+def _nearest(name: str, names: Sequence[str]) -> str:
+    near = difflib.get_close_matches(name, names, 3, 0.5)
+    return f" Did you mean {', '.join(near)}?" if near else ""
+
+
+@functools.cache
+def parameters(target: str, *, where: str = "_target_", exact: bool = True) -> frozenset[str]:
+    """Names of the arguments a class or function takes, read from its source; "**" stands for any.
+
+    Raises:
+        UserError: `target` is not found. With `exact=False`, "**" alone does not make every key legal.
+    """
+    module, _, name = target.rpartition(".")
+    found = _definition(module, name)
+    if found is None:
+        raise UserError(f"{where}={target}: no such class or function can be found")
+    names = _arguments(*found)
+    return names if exact else names - {"**"}
+
+
+def _definition(module: str, name: str, seen: frozenset[str] = frozenset()) -> tuple[str, ast.AST] | None:
+    """The module and syntax tree where `module.name` is defined, through re-exports."""
+    tree = _tree(module)
+    if tree is None or module in seen:
+        return None
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ClassDef | ast.FunctionDef) and node.name == name:
+            return module, node
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom):
+            for alias in node.names:
+                if alias.name == "*" or (alias.asname or alias.name) == name:
+                    source = _absolute(module, node)
+                    found = _definition(source, name if alias.name == "*" else alias.name, seen | {module})
+                    if found:
+                        return found
+    return None
+
+
+def _absolute(module: str, node: ast.ImportFrom) -> str:
+    if not node.level:
+        return node.module or ""
+    path = _file(module)
+    parts = module.split(".")
+    keep = len(parts) - node.level + (1 if path is not None and path.name == "__init__.py" else 0)
+    return ".".join([*parts[:keep], *([node.module] if node.module else [])])
+
+
+def _file(module: str) -> Path | None:
+    relative = Path(*module.split("."))
+    for entry in [str(Path(__file__).parent.parent), *sys.path]:
+        for candidate in (Path(entry) / relative / "__init__.py", (Path(entry) / relative).with_suffix(".py")):
+            if candidate.is_file():
+                return candidate
+    return None
+
+
+@functools.cache
+def _tree(module: str) -> ast.Module | None:
+    path = _file(module)
+    return ast.parse(path.read_text(encoding="utf-8")) if path else None
+
+
+def _arguments(module: str, node: ast.AST) -> frozenset[str]:
+    if isinstance(node, ast.FunctionDef):
+        listed = [*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs]
+        names = {a.arg for a in listed} - {"self", "cls"}
+        return frozenset(names | ({"**"} if node.args.kwarg else set()))
+    assert isinstance(node, ast.ClassDef)
+    for item in node.body:
+        if isinstance(item, ast.FunctionDef) and item.name == "__init__":
+            names = _arguments(module, item)
+            return names if "**" not in names else names | _inherited(module, node)
+    fields = {i.target.id for i in node.body if isinstance(i, ast.AnnAssign) and isinstance(i.target, ast.Name)}
+    dataclass = any("dataclass" in ast.unparse(d) for d in node.decorator_list)
+    return _inherited(module, node) | (fields if dataclass else set())
+
+
+def _inherited(module: str, node: ast.ClassDef) -> frozenset[str]:
+    names: frozenset[str] = frozenset()
+    for base in node.bases:
+        found = _definition(module, ast.unparse(base).rpartition(".")[2])
+        if found and found[1] is not node:
+            names |= _arguments(*found)
+    return names
+
+
+# Instances and files --------------------------------------------------------------------------------------------------
+
+
+def instantiate(node: Config, *, trusted: bool = True, **derived: Any) -> Any:
+    """Builds what a mapping with a `_target_` describes, nested ones included.
+
+    Args:
+        node: the mapping.
+        trusted: False for configurations out of a checkpoint: only classes of `TRUSTED` packages, and of those
+            listed in the environment variable FLAME_MDM_TRUST, are built.
+        derived: arguments that follow from other parts of the recipe.
+
+    Raises:
+        UserError: an untrusted `_target_`, or arguments of the wrong kind.
+    """
+    from hydra.utils import instantiate as hydra_instantiate
+
+    if not trusted:
+        allowed = (*TRUSTED, *os.environ.get("FLAME_MDM_TRUST", "").split(","))
+        for path, mapping in _walk(node):
+            target = str(mapping.get("_target_", "flame_mdm"))
+            if target.partition(".")[0] not in allowed:
+                raise UserError(
+                    f"the checkpoint's configuration names {target} at {'.'.join(path)}; such code runs only if you "
+                    f"trust it: set FLAME_MDM_TRUST={target.partition('.')[0]}"
+                )
+    try:
+        return hydra_instantiate(node, **derived, _convert_="all")
+    except HydraException as error:
+        cause = error.__cause__
+        if isinstance(cause, UserError | ValueError | FileNotFoundError):
+            raise cause from None
+        raise UserError(f"{node['_target_']}: {_first_line(cause or error)}") from error
+
+
+def flatten(config: Any, prefix: str = "") -> dict[str, Any]:
+    """Nested mappings as dotted keys; lists are leaves."""
+    if not isinstance(config, Mapping) or not config:
+        return {prefix: config}
+    return {k: v for name, c in config.items() for k, v in flatten(c, f"{prefix}.{name}" if prefix else name).items()}
+
+
+def save(config: Config, path: Path, head: str = "") -> None:
+    """Writes the configuration as YAML, atomically, after the comment lines of `head`."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_suffix(".partial")
+    comment = "".join(f"# {line}\n" for line in head.splitlines())
+    partial.write_text(comment + OmegaConf.to_yaml(OmegaConf.create(config)))
+    partial.replace(path)
+
+
+# Commands -------------------------------------------------------------------------------------------------------------
+
+
+def run(
+    command: Callable[[Config], None],
+    argv: Sequence[str],
+    *,
+    usage: str,
+    name: str | None = None,
+    text: Sequence[str] = (),
+) -> int:
+    """Serves a command line `[NAME] key=value ...` through Hydra and returns the exit code.
+
+    Args:
+        command: does the work, given the resolved configuration.
+        argv: the words after the command. Hydra's own flags (`--multirun`, `--cfg job`) pass through.
+        usage: printed for `--help`.
+        name: the configuration, for commands that have one of their own; otherwise the first word names a recipe.
+        text: keys whose values are taken as they stand, not read in Hydra's grammar.
+    """
+    words = [_quoted(word, text) for word in (_make_variables() if "--from-make" in argv else argv)]
+    if (not words and name is None) or any(word in ("-h", "--help") for word in words):
+        print(usage.strip())
+        if name is None:
+            print("\nexperiments: " + ", ".join(recipes()))
+            print("parts: " + ", ".join(f"{group}=..." for group in groups()))
+        return 0 if words else 2
+    return _guarded(lambda: _serve(command, words, name))
+
+
+def _serve(command: Callable[[Config], None], words: list[str], name: str | None) -> None:
+    if name is None:
+        if words[0].startswith("-") or "=" in words[0]:
+            raise UserError(f"the first word must name an experiment, such as quickstart, not '{words[0]}'")
+        name, words = words[0], words[1:]
+    flags = [w for i, w in enumerate(words) if w.startswith("-") or (i and words[i - 1] in ("--cfg", "--package"))]
+    overrides = [w for w in words if w not in flags]
+    sweep = any(flag in ("-m", "--multirun") for flag in flags)
+    plan = _plan(name, overrides)
+    if not sweep:
+        check(_hydra(plan))
+
+    def job(config: Any) -> None:
+        plain: Config = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)  # type: ignore[assignment]
+        if sweep:
+            plain["run"]["dir"] = HydraConfig.get().runtime.output_dir
+            check(plain)
+        if code := _guarded(lambda: command(plain)):
+            sys.exit(code)
+
+    quiet = ["hydra/job_logging=disabled", "hydra/hydra_logging=disabled", "hydra.output_subdir=null"]
+    output = [
+        "hydra.run.dir=${run.dir}",
+        "hydra.sweep.dir=${run.dir}",
+        "hydra.sweep.subdir=${hydra.job.override_dirname}",
+    ]
+    sys.argv = [sys.argv[0], *flags, *quiet, *output, *plan.overrides]
+    GlobalHydra.instance().clear()
+    hydra_main(version_base="1.3", config_path=str(plan.folder), config_name=plan.stem)(job)()
+
+
+def _make_variables() -> list[str]:
+    """The variables given to make, as words: `EXP` names the recipe, other upper-case names are keys.
+
+    Make hands them down in MAKEFLAGS after ` -- `, latest first, with escaped spaces and doubled dollar signs; read
+    from there, no shell has touched them.
+    """
+    variables = (" " + os.environ.get("MAKEFLAGS", "")).partition(" -- ")[2]
+    words = [re.sub(r"\\(.)", r"\1", w).replace("$$", "$") for w in re.findall(r"(?:\\.|[^\\ ])+", variables)]
+    pairs = [word.partition("=") for word in reversed(words)]
+    names = [value for key, _, value in pairs if key == "EXP"]
+    keys = [(key.lower() if key.isupper() else key, value) for key, _, value in pairs]
+    return names + [f"{key}={value}" for key, value in keys if key not in ("exp", "python", "venv")]
+
+
+def _quoted(word: str, keys: Sequence[str]) -> str:
+    key, separator, value = word.partition("=")
+    if not separator or key not in keys or value in ("", "null"):
+        return word
+    escaped = value.replace("\\", "\\\\").replace("'", "\\'").replace("${", "\\${")
+    return f"{key}='{escaped}'"
+
+
+def _guarded(action: Callable[[], None]) -> int:
+    """Runs `action`; what a user can mend becomes one line and exit code 1, a traceback with FLAME_MDM_TRACEBACK=1."""
+    try:
+        action()
+    except (UserError, ValueError, OSError) as error:
+        if os.environ.get("FLAME_MDM_TRACEBACK") == "1":
+            traceback.print_exc()
+        print(f"error: {_first_line(error)}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        return 130
+    return 0
+
+
+def _first_line(error: BaseException) -> str:
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    if len(lines) > 1 and lines[0].endswith(":"):
+        return f"{lines[0]} {lines[1]}"
+    return lines[0] if lines else type(error).__name__

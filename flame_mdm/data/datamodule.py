@@ -1,0 +1,220 @@
+"""Training and evaluation batches from a packed store.
+
+Every batch is a function of (seed, step, rank): no generator state needs saving, and a resumed run sees the batches
+that the uninterrupted one would have seen.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import torch
+from lightning import LightningDataModule
+from torch import Tensor
+from torch.utils.data import DataLoader, Dataset, Sampler
+
+from flame_mdm.data import MotionSource, Split
+from flame_mdm.data.store import Entry, Store, write_store
+from flame_mdm.motion import MotionBatch, collate
+from flame_mdm.noise import key
+from flame_mdm.representations import Representation
+
+Draw = tuple[int, int]
+"""(index of a clip, number of the batch it is drawn for; -1 in evaluation)."""
+
+
+class Clips(Dataset[tuple[str, Tensor, str | None, int | None]]):
+    """The clips of a split that are long enough, normalized, each cropped anew at every draw.
+
+    The crop is the field's (Guo et al. 2022): a multiple of `crop_unit` frames, one unit shorter for one draw in
+    three, at most `max_frames`, anywhere in the clip. In evaluation it is the longest one from the first frame on.
+    """
+
+    def __init__(self, store: Store, split: Split, *, min_frames: int, max_frames: int, crop_unit: int, seed: int):
+        self.store, self.max_frames, self.crop_unit, self.seed = store, max_frames, crop_unit, seed
+        self.clips = [c for c in store.clips if c.split == split and c.length >= min_frames]
+        self.lengths = np.array([min(c.length, max_frames) for c in self.clips])
+        self.mean, self.std = store.mean.astype(np.float32), store.std.astype(np.float32)
+
+    def __len__(self) -> int:
+        return len(self.clips)
+
+    def __getitem__(self, draw: Draw) -> tuple[str, Tensor, str | None, int | None]:
+        index, batch = draw
+        clip = self.clips[index]
+        start, length = self.crop(index, batch)
+        x = (self.store.motion(clip)[start : start + length] - self.mean) / self.std
+        return clip.id, torch.from_numpy(x), self.caption(clip, batch), clip.action
+
+    def crop(self, index: int, batch: int) -> tuple[int, int]:
+        """First frame and length of the crop of a clip in a batch."""
+        frames, unit = self.clips[index].length, self.crop_unit
+        length = min(frames, self.max_frames) // unit * unit
+        if batch < 0:
+            return 0, length
+        generator = np.random.default_rng((self.seed, batch, index))
+        if generator.integers(3) == 0 and length > unit:
+            length -= unit
+        return int(generator.integers(frames - length + 1)), length
+
+    def caption(self, clip: Entry, batch: int) -> str | None:
+        """The caption of a clip in a batch: any in training, always the same one in evaluation."""
+        if not clip.captions:
+            return None
+        return clip.captions[key("caption", self.seed, max(batch, -1), clip.id) % len(clip.captions)]
+
+
+class TrainingBatches(Sampler[list[Draw]]):
+    """An endless stream of batches; number n is a function of (seed, n), its clips of about the same length.
+
+    Each pass over the data is shuffled, cut into stretches of `BUCKETS` batches, and each stretch sorted by length, so
+    that little is padded. Process `rank` of `world` takes every `world`-th batch.
+    """
+
+    BUCKETS = 16
+
+    def __init__(self, lengths: np.ndarray, batch_size: int, *, seed: int, first: int, rank: int, world: int):
+        self.lengths, self.batch_size, self.seed = lengths, batch_size, seed
+        self.first, self.rank, self.world = first, rank, world
+
+    def __iter__(self) -> Iterator[list[Draw]]:
+        per_pass = max(1, len(self.lengths) // self.batch_size)
+        number = self.first * self.world + self.rank
+        current, batches = -1, []
+        while True:
+            if number // per_pass != current:
+                current = number // per_pass
+                batches = self.batches(current, per_pass)
+            yield [(int(index), number) for index in batches[number % per_pass]]
+            number += self.world
+
+    def batches(self, number: int, per_pass: int) -> list[np.ndarray]:
+        """The batches of one pass over the data."""
+        generator = np.random.default_rng((self.seed, number))
+        order = generator.permutation(len(self.lengths))
+        order = np.resize(order, max(len(order), self.batch_size))[: per_pass * self.batch_size]
+        stretch = self.batch_size * self.BUCKETS
+        batches = []
+        for begin in range(0, len(order), stretch):
+            part = order[begin : begin + stretch]
+            part = part[np.argsort(self.lengths[part], kind="stable")]
+            batches += np.split(part, len(part) // self.batch_size)
+        return [batches[i] for i in generator.permutation(len(batches))]
+
+
+class EvaluationBatches(Sampler[list[Draw]]):
+    """Every clip once over all processes together, longest first, without the repeats of a distributed sampler."""
+
+    def __init__(self, lengths: np.ndarray, batch_size: int, *, rank: int, world: int):
+        mine = np.argsort(-lengths, kind="stable")[rank::world]
+        self.batches = [[(int(i), -1) for i in mine[b : b + batch_size]] for b in range(0, len(mine), batch_size)]
+
+    def __iter__(self) -> Iterator[list[Draw]]:
+        return iter(self.batches)
+
+    def __len__(self) -> int:
+        return len(self.batches)
+
+
+class MotionDataModule(LightningDataModule):
+    """Prepares a data set where that has not been done, and serves its batches.
+
+    Args:
+        source: the data set as its owners hand it out.
+        representation: what clips are encoded as; gets the statistics of the store.
+        root: folder of all prepared data sets.
+        name: folder of this one.
+        batch_size: clips a process and step.
+        num_workers: loading processes; 0 loads in the training process.
+        min_frames, max_frames: shorter clips are left out, longer ones cropped.
+        crop_unit: lengths are multiples of this.
+        seed: of the draws.
+    """
+
+    def __init__(
+        self,
+        source: MotionSource,
+        representation: Representation,
+        *,
+        root: str,
+        name: str,
+        batch_size: int,
+        num_workers: int = 0,
+        min_frames: int = 24,
+        max_frames: int = 196,
+        crop_unit: int = 4,
+        seed: int = 0,
+    ):
+        super().__init__()
+        if not crop_unit <= min_frames <= max_frames:
+            raise ValueError(f"data: needs crop_unit {crop_unit} <= min_frames {min_frames} <= max_frames {max_frames}")
+        self.source, self.representation = source, representation
+        self.folder = Path(root) / f"{name}-{representation.name}"
+        self.batch_size, self.num_workers, self.seed = batch_size, num_workers, seed
+        self.clips = partial(Clips, min_frames=min_frames, max_frames=max_frames, crop_unit=crop_unit, seed=seed)
+
+    def prepare_data(self) -> None:
+        """Writes the store where there is none; Lightning calls this on one process only."""
+        if not (self.folder / "store.json").exists():
+            write_store(self.folder, self.source, self.representation)
+
+    def open(self) -> Store:
+        """The prepared store; its statistics go to the representation.
+
+        Raises:
+            FileNotFoundError: it is not prepared.
+            ValueError: it was prepared with another representation, or is damaged.
+        """
+        store = Store(self.folder)
+        if store.info["representation"] != self.representation.name:
+            raise ValueError(
+                f"{self.folder}: holds {store.info['representation']}, not {self.representation.name}; prepare it again"
+            )
+        self.representation.mean.copy_(torch.from_numpy(store.mean))
+        self.representation.std.copy_(torch.from_numpy(store.std))
+        return store
+
+    def captions(self) -> list[str]:
+        """All distinct captions of the store, sorted."""
+        return sorted({caption for clip in self.open().clips for caption in clip.captions})
+
+    def setup(self, stage: str) -> None:
+        """Opens the store and its splits."""
+        self.store = self.open()
+        self.train, self.val, self.test = (self.clips(self.store, split) for split in ("train", "val", "test"))
+        if not len(self.train):
+            raise ValueError(f"{self.folder}: no training clip has {self.clips.keywords['min_frames']} frames or more")
+
+    def train_dataloader(self) -> DataLoader[MotionBatch]:
+        """Endless; starts at the step the trainer is at, so that a resumed run goes on with the right batch."""
+        trainer = self.trainer
+        first = trainer.global_step * trainer.accumulate_grad_batches if trainer else 0
+        rank, world = (trainer.global_rank, trainer.world_size) if trainer else (0, 1)
+        lengths, size = self.train.lengths, self.batch_size
+        sampler = TrainingBatches(lengths, size, seed=self.seed, first=first, rank=rank, world=world)
+        return self._loader(self.train, sampler)
+
+    def val_dataloader(self) -> DataLoader[MotionBatch]:
+        """Each validation clip once over all processes."""
+        return self._evaluation(self.val)
+
+    def test_dataloader(self) -> DataLoader[MotionBatch]:
+        """Each test clip once over all processes."""
+        return self._evaluation(self.test)
+
+    def _evaluation(self, clips: Clips) -> DataLoader[MotionBatch]:
+        rank, world = (self.trainer.global_rank, self.trainer.world_size) if self.trainer else (0, 1)
+        return self._loader(clips, EvaluationBatches(clips.lengths, self.batch_size, rank=rank, world=world))
+
+    def _loader(self, clips: Clips, sampler: Sampler[list[Draw]]) -> DataLoader[MotionBatch]:
+        return DataLoader(
+            clips,
+            batch_sampler=sampler,
+            num_workers=self.num_workers,
+            collate_fn=collate,
+            pin_memory=torch.cuda.is_available(),
+            persistent_workers=self.num_workers > 0,
+        )

@@ -1,0 +1,219 @@
+"""Prepared data sets: all clips packed in one memory-mapped array, with an index, statistics and hashes.
+
+A store is a folder that is written once and never changed:
+
+    features.npy     (N, D) float32, the frames of all clips one after the other, not normalized
+    clips.jsonl      one clip a line: id, start, length, split, source, captions, action, attributes
+    statistics.npz   mean and std (D,) of the training frames, as the representation normalizes with them
+    store.json       representation, frame rate, counts, hashes of the three files, fingerprint
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from tqdm import tqdm
+
+from flame_mdm.data import Clip, MotionSource, Split
+from flame_mdm.representations import Representation
+
+FORMAT = 1
+CHUNK = 64
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One clip of a store: frames `start` to `start + length` of the packed array; see `Clip` for the rest."""
+
+    id: str
+    start: int
+    length: int
+    split: Split
+    source: str
+    captions: list[str]
+    action: int | None
+    attributes: dict[str, Any] = field(default_factory=dict)
+
+
+class Store:
+    """A prepared data set, opened for reading.
+
+    Raises:
+        FileNotFoundError: there is none in `folder`.
+        ValueError: its files do not belong together or are damaged.
+    """
+
+    def __init__(self, folder: Path):
+        self.folder = Path(folder)
+        self.info: dict[str, Any] = _read_info(self.folder)
+        for name in ("clips.jsonl", "statistics.npz"):
+            if _sha256(self.folder / name) != self.info["sha256"][name]:
+                raise _damaged(self.folder / name, "its hash is not the recorded one")
+        try:
+            self.features: np.ndarray = np.load(self.folder / "features.npy", mmap_mode="r")
+        except (OSError, ValueError) as error:
+            raise _damaged(self.folder / "features.npy", str(error)) from error
+        if list(self.features.shape) != self.info["shape"]:
+            raise _damaged(self.folder / "features.npy", f"it holds {self.features.shape}, not {self.info['shape']}")
+        lines = (self.folder / "clips.jsonl").read_text(encoding="utf-8").splitlines()
+        self.clips = [Entry(**json.loads(line)) for line in lines]
+        with np.load(self.folder / "statistics.npz") as file:
+            self.mean, self.std = file["mean"], file["std"]
+
+    @property
+    def fingerprint(self) -> str:
+        """Names this data in results: the same for the same clips and options, on any machine."""
+        return self.info["fingerprint"]
+
+    def motion(self, clip: Entry) -> np.ndarray:
+        """(F, D) float32, the features of a clip, not normalized; a view of the memory-mapped array."""
+        return self.features[clip.start : clip.start + clip.length]
+
+    def verify(self) -> None:
+        """Hashes the whole store.
+
+        Raises:
+            ValueError: the packed features are not the ones that were written.
+        """
+        if _sha256(self.folder / "features.npy") != self.info["sha256"]["features.npy"]:
+            raise _damaged(self.folder / "features.npy", "its hash is not the recorded one")
+
+
+def write_store(folder: Path, source: MotionSource, representation: Representation) -> Store:
+    """Encodes every clip of a data set and writes the store, under a temporary name until it is whole.
+
+    Raises:
+        FileNotFoundError, ValueError: from the data set, or a clip whose features are not finite; nothing is left.
+    """
+    total = source.count()
+    partial = folder.with_name(folder.name + ".partial")
+    shutil.rmtree(partial, ignore_errors=True)
+    partial.mkdir(parents=True)
+    try:
+        entries: list[Entry] = []
+        frames = 0
+        clips = tqdm(source.clips(representation.fps), f"preparing {source.name}", total, unit=" clips")
+        with (partial / "features.raw").open("wb") as raw:
+            for chunk in _batched(clips, CHUNK):
+                for clip, features in zip(chunk, _encode(chunk, representation), strict=True):
+                    entry = Entry(clip.id, frames, len(features), clip.split, clip.source, clip.captions, clip.action)
+                    entries.append(replace(entry, attributes=dict(clip.attributes)))
+                    frames += len(features)
+                    features.tofile(raw)
+        _check_entries(source.name, entries)
+        packed = np.memmap(partial / "features.raw", np.float32, "r", shape=(frames, representation.features))
+        _save_array(partial / "features.npy", packed)
+        (partial / "features.raw").unlink()
+        lines = [json.dumps(asdict(entry), ensure_ascii=False, sort_keys=True) for entry in entries]
+        (partial / "clips.jsonl").write_text("\n".join(lines) + "\n", encoding="utf-8")
+        training = np.concatenate([packed[e.start : e.start + e.length] for e in entries if e.split == "train"])
+        mean, std = (t.numpy() for t in representation.statistics(torch.from_numpy(training)))
+        np.savez(partial / "statistics.npz", mean=mean, std=std)
+        info = _describe(partial, source, representation, entries, mean, std)
+        (partial / "store.json").write_text(json.dumps(info, indent=2) + "\n")
+        shutil.rmtree(folder, ignore_errors=True)
+        partial.rename(folder)
+    except BaseException:
+        shutil.rmtree(partial, ignore_errors=True)
+        raise
+    return Store(folder)
+
+
+def _encode(clips: Sequence[Clip], representation: Representation) -> list[np.ndarray]:
+    motions = [torch.from_numpy(np.ascontiguousarray(clip.motion)) for clip in clips]
+    try:
+        encoded = representation.encode_many(motions)
+    except ValueError as error:
+        if len(clips) == 1:
+            raise ValueError(f"clip {clips[0].id}: {error}") from error
+        return [features for clip in clips for features in _encode([clip], representation)]  # names the clip
+    arrays = [features.numpy().astype(np.float32) for features in encoded]
+    for clip, features in zip(clips, arrays, strict=True):
+        if not np.isfinite(features).all():
+            frame = int(np.argwhere(~np.isfinite(features).all(1))[0, 0])
+            raise ValueError(f"clip {clip.id}: the features of frame {frame} are not finite; exclude it by name")
+    return arrays
+
+
+def _batched(clips: Iterable[Clip], size: int) -> Iterator[list[Clip]]:
+    iterator = iter(clips)
+    while chunk := list(islice(iterator, size)):
+        yield chunk
+
+
+def _check_entries(name: str, entries: list[Entry]) -> None:
+    seen: dict[str, str] = {}
+    for entry in entries:
+        if seen.setdefault(entry.source, entry.split) != entry.split:
+            raise ValueError(f"{name}: clips of {entry.source} stand in {seen[entry.source]} and in {entry.split}")
+    if len({entry.id for entry in entries}) != len(entries):
+        raise ValueError(f"{name}: two clips have the same id")
+    if not any(entry.split == "train" for entry in entries):
+        raise ValueError(f"{name}: no clip is in the training split")
+
+
+def _save_array(path: Path, array: np.ndarray) -> None:
+    packed = np.lib.format.open_memmap(path, "w+", array.dtype, array.shape)
+    packed[:] = array
+    packed.flush()
+
+
+def _describe(
+    folder: Path,
+    source: MotionSource,
+    representation: Representation,
+    entries: list[Entry],
+    mean: np.ndarray,
+    std: np.ndarray,
+) -> dict[str, Any]:
+    frames = sum(entry.length for entry in entries)
+    splits = {split: sum(e.split == split for e in entries) for split in ("train", "val", "test")}
+    digest = hashlib.sha256((folder / "clips.jsonl").read_bytes())
+    # Features differ in their last bits between processors, so the fingerprint sees them through rounded statistics.
+    rounded = [f"{value:.2e}" for value in np.concatenate([mean, std])]
+    digest.update(json.dumps([representation.name, representation.fps, rounded]).encode())
+    return {
+        "format": FORMAT,
+        "dataset": source.name,
+        "actions": list(source.actions),
+        "representation": representation.name,
+        "fps": representation.fps,
+        "clips": splits,
+        "shape": [frames, representation.features],
+        "hours": round(frames / representation.fps / 3600, 3),
+        "fingerprint": digest.hexdigest()[:16],
+        "sha256": {name: _sha256(folder / name) for name in ("features.npy", "clips.jsonl", "statistics.npz")},
+    }
+
+
+def _read_info(folder: Path) -> dict[str, Any]:
+    try:
+        info = json.loads((folder / "store.json").read_text())
+    except FileNotFoundError:
+        raise FileNotFoundError(f"{folder}: no prepared data set; `make prepare` writes it") from None
+    except (OSError, ValueError) as error:
+        raise _damaged(folder / "store.json", str(error)) from error
+    if not isinstance(info, dict) or info.get("format") != FORMAT:
+        raise ValueError(f"{folder}: not a store of format {FORMAT}, which this version reads; prepare it again")
+    return info
+
+
+def _damaged(path: Path, what: str) -> ValueError:
+    return ValueError(f"{path}: damaged: {what}; delete {path.parent} and prepare again")
+
+
+def _sha256(path: Path) -> str:
+    try:
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        raise _damaged(path, str(error)) from error

@@ -1,0 +1,167 @@
+"""Motions on request: from texts, actions or nothing to joints, features and the files that hold them."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from flame_mdm.config import UserError
+from flame_mdm.motion import MotionBatch, length_mask
+from flame_mdm.task import MotionGeneration
+from flame_mdm.visualize import Motion, contact_sheet, write_gif, write_player
+
+BATCH = 32
+
+
+@dataclass
+class Generated:
+    """One generated motion.
+
+    Attributes:
+        id: what it was asked to be and the number of the sample; with the seed, it decides the noise.
+        joints: (F, J, 3) float32, metres, y up.
+        features: (F, D) float32, in the data's units, as the representation defines them.
+        fps: frames a second.
+        caption: the text or the name of the action; "" where unconditioned.
+    """
+
+    id: str
+    joints: np.ndarray
+    features: np.ndarray
+    fps: float
+    caption: str
+
+
+def generate(
+    model: MotionGeneration,
+    texts: str | Sequence[str] | None = None,
+    *,
+    actions: Sequence[str] | None = None,
+    seconds: float | None = None,
+    frames: int | Sequence[int] | None = None,
+    samples: int = 1,
+    seed: int = 0,
+    guidance_scale: float | None = None,
+    sampler: str | None = None,
+    num_inference_steps: int | None = None,
+) -> list[Generated]:
+    """Motions for texts or actions, `samples` of each; for neither, unconditioned ones.
+
+    A motion depends on its text, its length, the number of the sample and the seed alone, not on the others.
+
+    Args:
+        model: from `flame_mdm.load`.
+        texts, actions: what to do; one of the two, as the model was trained, or neither.
+        seconds, frames: length; frames may differ from motion to motion. Default: 3 seconds, or the longest possible.
+        samples: motions for each text.
+        seed: of the noise.
+        guidance_scale, sampler, num_inference_steps: instead of the recipe's.
+
+    Raises:
+        UserError: an empty text, an unknown action, a length the model was not trained for.
+    """
+    texts = [texts] if isinstance(texts, str) else texts
+    wanted = list(texts or actions or [""])
+    if texts is not None and not all(text.strip() for text in texts):
+        raise UserError("an empty text describes no motion; leave the text out to sample without condition")
+    ids = [f"{text}#{number}" for text in wanted for number in range(samples)]
+    captions = [text for text in wanted for _ in range(samples)]
+    lengths = _lengths(model, len(wanted), samples, seconds, frames)
+    labels = None if actions is None else [_action(model, name) for name in captions]
+    results = []
+    for begin in range(0, len(ids), BATCH):
+        part = slice(begin, begin + BATCH)
+        mask = length_mask(torch.tensor(lengths[part], device=model.device))
+        batch = MotionBatch(
+            x=torch.zeros(*mask.shape, model.representation.features, device=model.device),
+            mask=mask,
+            ids=ids[part],
+            text=captions[part] if texts is not None else None,
+            action=None if labels is None else torch.tensor(labels[part], device=model.device),
+        )
+        x = model.generate(
+            batch,
+            seed=seed,
+            guidance_scale=guidance_scale,
+            sampler=sampler,
+            num_inference_steps=num_inference_steps,
+            unconditioned=texts is None and actions is None,
+        )
+        results += _finish(model, batch, x, captions[part])
+    return results
+
+
+def _finish(model: MotionGeneration, batch: MotionBatch, x: torch.Tensor, captions: Sequence[str]) -> list[Generated]:
+    results = []
+    for row, length in enumerate(batch.lengths.tolist()):
+        features = model.representation.denormalize(x[row, :length].float())
+        joints = model.representation.decode(features)
+        if not torch.isfinite(joints).all():
+            raise UserError(f"the model returned a motion that is not finite for '{captions[row]}'")
+        fps = model.representation.fps
+        results.append(Generated(batch.ids[row], joints.cpu().numpy(), features.cpu().numpy(), fps, captions[row]))
+    return results
+
+
+def _lengths(
+    model: MotionGeneration, wanted: int, samples: int, seconds: float | None, frames: int | Sequence[int] | None
+) -> list[int]:
+    fps, longest = model.representation.fps, model.facts["max_frames"]
+    if frames is None:
+        frames = min(round(3 * fps), longest) if seconds is None else round(seconds * fps)
+    each = [frames] * wanted if isinstance(frames, int) else list(frames)
+    if len(each) != wanted:
+        raise UserError(f"{len(each)} lengths for {wanted} motions")
+    for length in each:
+        if not 2 <= length <= longest:
+            raise UserError(
+                f"{length / fps:g} seconds ({length} frames) cannot be sampled: the model was trained on motions of up "
+                f"to {longest / fps:g} seconds ({longest} frames at {fps:g} a second)"
+            )
+    return [length for length in each for _ in range(samples)]
+
+
+def _action(model: MotionGeneration, name: str) -> int:
+    actions = model.facts["actions"]
+    if name not in actions:
+        raise UserError(f"no action is called '{name}'; there are: {', '.join(actions) or 'none in this model'}")
+    return actions.index(name)
+
+
+def write_motions(folder: Path, model: MotionGeneration, motions: Sequence[Generated], facts: dict[str, Any]) -> None:
+    """Writes `motion_000.npz` ..., `motions.gif`, `motions.png` and `player.html` into a folder, which it makes.
+
+    Each `.npz` holds `joints` (F, J, 3) in metres, y up; `features` (F, D); `fps`, `text`, `representation` and what
+    `facts` adds (seed, checkpoint hash ...).
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    skeleton = model.representation.skeleton
+    scene = [Motion(m.joints, m.fps, skeleton, caption=m.caption or "unconditioned", id=m.id) for m in motions]
+    for number, motion in enumerate(motions):
+        path = folder / f"motion_{number:03d}.npz"
+        partial = path.with_suffix(".partial.npz")
+        np.savez_compressed(
+            partial,
+            joints=motion.joints,
+            features=motion.features,
+            fps=motion.fps,
+            text=motion.caption,
+            representation=model.representation.name,
+            **facts,
+        )
+        partial.replace(path)
+    write_gif(folder / "motions.gif", scene[:8])
+    contact_sheet(folder / "motions.png", scene[:8])
+    write_player(folder / "player.html", scene, title=motions[0].caption or "Motions")
+
+
+def file_sha256(path: str | Path) -> str:
+    """Hash of a file, as it stands in results."""
+    with Path(path).open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -1,0 +1,64 @@
+"""Random numbers that are a function of what they are for, not of the order in which they are drawn.
+
+A sampling run gives every motion the noise of (seed, replication, id), element by element: the same whatever the batch,
+the padding, the number of processes or the device. A counter is hashed (splitmix64: Steele, Lea and Flood 2014,
+"Fast splittable pseudorandom number generators") and mapped to the normal distribution (Box and Muller 1958).
+"""
+
+import hashlib
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from flame_mdm.motion import Noise
+
+
+def key(*parts: str | int) -> int:
+    """A 63-bit number from any parts, the same on every machine."""
+    text = "\x1f".join(str(part) for part in parts)
+    return int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "big") >> 1
+
+
+def _signed(value: int) -> int:
+    return value - (1 << 64) if value >= 1 << 63 else value
+
+
+_GOLDEN, _MIX1, _MIX2 = (_signed(v) for v in (0x9E3779B97F4A7C15, 0xBF58476D1CE4E5B9, 0x94D049BB133111EB))
+
+
+def _shift_right(x: Tensor, bits: int) -> Tensor:
+    return (x >> bits) & ((1 << (64 - bits)) - 1)
+
+
+def _hash(x: Tensor) -> Tensor:
+    x = x + _GOLDEN
+    x = (x ^ _shift_right(x, 30)) * _MIX1
+    x = (x ^ _shift_right(x, 27)) * _MIX2
+    return x ^ _shift_right(x, 31)
+
+
+def uniform(keys: Tensor, shape: Sequence[int]) -> tuple[Tensor, Tensor]:
+    """Two independent uniform draws in (0, 1) for each key (B,) and position: (B, *shape), float32."""
+    positions = torch.arange(math.prod(shape), device=keys.device).reshape(1, *shape)
+    bits = _hash(_hash(keys).reshape(-1, *[1] * len(shape)) + positions * _GOLDEN)
+    scale = 2.0**-24
+    return ((bits & 0xFFFFFF) + 0.5) * scale, ((_shift_right(bits, 40) & 0xFFFFFF) + 0.5) * scale
+
+
+def normal(keys: Tensor, frames: int, features: int) -> Tensor:
+    """Standard normal noise (B, F, D), float32. Element (f, d) of key k does not depend on B or F."""
+    pairs = (features + 1) // 2
+    u, v = uniform(keys, (frames, pairs))
+    radius, angle = torch.sqrt(-2 * torch.log(u)), 2 * math.pi * v
+    return torch.stack([radius * torch.cos(angle), radius * torch.sin(angle)], -1).flatten(2)[..., :features]
+
+
+def seeded_noise(ids: Sequence[str], frames: int, features: int, *, seed: int, replication: int, like: Tensor) -> Noise:
+    """Noise of a sampling run for the motions named `ids`, on the device of `like`.
+
+    Draw n is a function of (seed, replication, id, n) and the position in the motion alone.
+    """
+    keys = torch.tensor([key("noise", seed, replication, name) for name in ids], device=like.device)
+    return lambda draw: normal(_hash(keys + draw), frames, features).to(like.dtype)

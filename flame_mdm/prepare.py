@@ -1,0 +1,61 @@
+"""Prepares a data set: `python -m flame_mdm.prepare data=bandai source=/path/to/the/archive`"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+
+from flame_mdm.config import EXPERIMENTS, Config, UserError, instantiate, run
+
+USAGE = """
+usage: python -m flame_mdm.prepare data=NAME [source=PATH] [representation=NAME] [verify=true] [force=true]
+
+Turns a data set, as its owners hand it out, into a packed store under data/. `verify=true` checks an existing store
+instead; `force=true` writes it anew.
+"""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Runs the command; returns its exit code."""
+    words = sys.argv[1:] if argv is None else argv
+    return run(prepare, words, usage=USAGE, name="prepare", text=("source",))
+
+
+def prepare(config: Config) -> None:
+    """Writes or verifies the store of a data set.
+
+    Raises:
+        UserError: no data set named. FileNotFoundError, ValueError: the raw data is absent or damaged.
+    """
+    if "data" not in config:
+        names = sorted(path.stem for path in (EXPERIMENTS / "data").glob("*.yaml"))
+        raise UserError(f"which data set? data=NAME, one of: {', '.join(names)}")
+    node = config["data"]
+    if config["source"] is not None:
+        if "path" not in node["source"]:
+            raise UserError(f"{node['name']} needs no source: it is made from nothing")
+        node["source"]["path"] = str(config["source"])
+
+    from flame_mdm.data.store import Store, write_store
+
+    representation = instantiate(config["representation"])
+    data = instantiate(node, representation=representation)
+    exists = (data.folder / "store.json").exists()
+    if config["verify"]:
+        data.open().verify()
+        print(f"{data.folder}: whole, every hash is the recorded one")
+    elif exists and not config["force"]:
+        print(f"{data.folder}: already prepared (force=true writes it anew, verify=true checks it)")
+    else:
+        write_store(data.folder, data.source, representation)
+    store = Store(data.folder)
+    info = store.info
+    clips = ", ".join(f"{count} {split}" for split, count in info["clips"].items())
+    print(
+        f"{info['dataset']} as {info['representation']} at {info['fps']:g} frames a second: {clips}; {info['hours']} hours"
+    )
+    print(f"{info['shape'][0]} frames of {info['shape'][1]} features, fingerprint {store.fingerprint}: {data.folder}")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

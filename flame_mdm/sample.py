@@ -1,0 +1,70 @@
+"""Samples from a checkpoint: `python -m flame_mdm.sample ckpt=... text="a person walks" seconds=3`"""
+
+from __future__ import annotations
+
+import re
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from flame_mdm.config import Config, UserError, run
+
+USAGE = """
+usage: python -m flame_mdm.sample ckpt=FILE text="a person walks in a circle" [seconds=6] [key=value ...]
+       python -m flame_mdm.sample ckpt=FILE action=walk
+       python -m flame_mdm.sample ckpt=FILE unconditioned=true
+
+Writes motions (.npz), a GIF and a player for any browser. Keys, with their defaults: experiments/sample.yaml
+"""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Runs the command; returns its exit code."""
+    words = sys.argv[1:] if argv is None else argv
+    return run(sample, words, usage=USAGE, name="sample", text=("text", "ckpt", "out"))
+
+
+def sample(config: Config) -> None:
+    """Samples what the configuration asks for.
+
+    Raises:
+        UserError: nothing, or two things, asked for; or what `generate` refuses.
+    """
+    asked = [key for key in ("text", "action") if config[key] is not None] + ["unconditioned"] * config["unconditioned"]
+    if config["ckpt"] is None:
+        raise UserError("no checkpoint: ckpt=runs/.../checkpoints/last.ckpt")
+    if config["text"] is not None and not str(config["text"]).strip():
+        raise UserError("the text is empty; write what the person does, or ask for unconditioned motions by name")
+    if len(asked) != 1:
+        raise UserError(
+            f"ask for one of text=..., action=... and unconditioned=true, not {' and '.join(asked) or 'none'}"
+        )
+
+    import torch
+
+    from flame_mdm.generation import file_sha256, generate, write_motions
+    from flame_mdm.task import load
+
+    device = config["device"] or ("cuda" if torch.cuda.is_available() else "cpu")
+    model = load(config["ckpt"], device)
+    motions = generate(
+        model,
+        None if config["text"] is None else str(config["text"]),
+        actions=None if config["action"] is None else [str(config["action"])],
+        seconds=config["seconds"],
+        samples=config["samples"],
+        seed=config["seed"],
+        guidance_scale=config["guidance_scale"],
+        sampler=config["sampler"],
+        num_inference_steps=config["num_inference_steps"],
+    )
+    name = re.sub(r"[^a-z0-9]+", "-", (motions[0].caption or "unconditioned").lower()).strip("-")[:60]
+    folder = Path(config["out"] or Path("samples") / str(model.config["experiment"]) / f"{name}-seed{config['seed']}")
+    write_motions(folder, model, motions, {"seed": config["seed"], "checkpoint": file_sha256(config["ckpt"])})
+    print(
+        f"{len(motions)} motions of {len(motions[0].joints)} frames: {folder / 'player.html'}, {folder / 'motions.gif'}"
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,245 @@
+"""The task: the only place where denoiser, process, condition and representation meet."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from lightning import LightningModule
+from torch import Tensor
+from torchmetrics import MeanMetric
+
+from flame_mdm.conditions import ConditionEncoder
+from flame_mdm.config import Config, UserError, instantiate, parameters
+from flame_mdm.data.datamodule import MotionDataModule
+from flame_mdm.denoisers import Denoiser
+from flame_mdm.losses import MotionLosses
+from flame_mdm.motion import Edit, MotionBatch
+from flame_mdm.noise import key, normal, seeded_noise, uniform
+from flame_mdm.processes import Process
+from flame_mdm.processes.guidance import classifier_free_guidance
+from flame_mdm.representations import Representation
+
+
+class MotionGeneration(LightningModule):
+    """Trains any denoiser with any process, and samples from it.
+
+    Args:
+        denoiser, process, condition, representation: the four parts.
+        losses: weights of `MotionLosses` on the clean estimate.
+        optimizer: a mapping with the `_target_` of a torch optimizer and its arguments.
+        cond_drop_prob: probability that a training sample gets the null condition.
+        guidance_scale: default of `generate`; 1 = off.
+        sampler: default of `generate`, one that the process knows.
+        num_inference_steps: default of `generate`.
+        seed: with the step and the rank, decides all draws of a training step.
+        compile: compiles the denoiser with torch.compile.
+    """
+
+    config: Config
+    """The recipe this was built from, saved in checkpoints."""
+    facts: dict[str, Any]
+    """What sampling and evaluation have to know of the training data: actions, longest motion, fingerprint."""
+
+    def __init__(
+        self,
+        denoiser: Denoiser,
+        process: Process,
+        condition: ConditionEncoder,
+        representation: Representation,
+        *,
+        losses: dict[str, float],
+        optimizer: Config,
+        cond_drop_prob: float,
+        guidance_scale: float,
+        sampler: str,
+        num_inference_steps: int,
+        seed: int = 0,
+        compile: bool = False,
+    ):
+        super().__init__()
+        self.denoiser, self.process, self.condition = denoiser, process, condition
+        self.representation = representation
+        self.losses = MotionLosses(representation.to_joints, representation.skeleton.feet, **losses)
+        self.optimizer, self.cond_drop_prob, self.seed = optimizer, cond_drop_prob, seed
+        self.guidance_scale, self.sampler, self.num_inference_steps = guidance_scale, sampler, num_inference_steps
+        self.config, self.facts = {}, {}
+        self.val_losses = torch.nn.ModuleDict()
+        if compile:
+            self.denoiser.compile()
+
+    @classmethod
+    def build(
+        cls, config: Config, representation: Representation, *, actions: Sequence[str] = (), trusted: bool = True
+    ) -> MotionGeneration:
+        """Builds the parts of a recipe and joins them; sizes that follow from other parts are passed on here."""
+
+        def part(name: str, **derived: Any) -> Any:
+            legal = parameters(config[name]["_target_"])
+            derived = {k: v for k, v in derived.items() if k in legal or "**" in legal}
+            return instantiate(config[name], trusted=trusted, **derived)
+
+        process: Process = part("process")
+        condition: ConditionEncoder = part("condition", num_actions=len(actions))
+        width = representation.features
+        denoiser: Denoiser = part(
+            "denoiser",
+            in_features=width,
+            out_features=process.out_features(width),
+            cond_features=condition.features,
+        )
+        options = {k: v for k, v in config["task"].items() if k != "_target_"}
+        task = cls(
+            denoiser,
+            process,
+            condition,
+            representation,
+            losses=config["losses"],
+            optimizer=config["optimizer"],
+            seed=config["seed"],
+            **options,
+        )
+        task.config, task.facts = config, {"actions": list(actions)}
+        return task
+
+    # Training ---------------------------------------------------------------------------------------------------------
+
+    def prepare_data(self) -> None:
+        """Encodes all captions of the data once, on one process, where the text encoder is frozen."""
+        self.condition.precompute(*self._captions())
+
+    def setup(self, stage: str) -> None:
+        """Opens what `prepare_data` encoded."""
+        self.condition.load_cache(*self._captions())
+
+    def _captions(self) -> tuple[list[str], Path]:
+        data: MotionDataModule = self.trainer.datamodule  # type: ignore[attr-defined]
+        return data.captions(), data.folder.parent / "text"
+
+    def training_step(self, batch: MotionBatch, batch_idx: int) -> Tensor:
+        """Loss of one batch; every draw in it is a function of (seed, batch number, rank)."""
+        torch.manual_seed(key("step", self.seed, batch_idx, self.global_rank))
+        cond = self.condition(batch)
+        if cond.null is not None and self.cond_drop_prob > 0:
+            cond = cond.drop(torch.rand(len(batch), device=self.device) < self.cond_drop_prob)
+        terms = self.process.loss(self.denoiser, batch.x, batch.mask, cond, auxiliary=self.losses)
+        means = {f"train/{name}": value.mean() for name, value in terms.items()}
+        self.log_dict(means, batch_size=len(batch))
+        return means["train/loss"]
+
+    def validation_step(self, batch: MotionBatch, batch_idx: int) -> None:
+        """Losses of the validation clips, at times and with noise that belong to each clip."""
+        keys = torch.tensor([key("validation", name) for name in batch.ids], device=self.device)
+        t = self.process.training_times(uniform(keys, (1,))[0][:, 0])
+        noise = normal(keys, *batch.x.shape[1:])
+        terms = self.process.loss(
+            self.denoiser, batch.x, batch.mask, self.condition(batch), t=t, noise=noise, auxiliary=self.losses
+        )
+        for name, value in terms.items():
+            if name not in self.val_losses:
+                self.val_losses[name] = MeanMetric().to(self.device)
+            self.val_losses[name].update(value)
+
+    def on_validation_epoch_end(self) -> None:
+        """Logs the mean over all clips, each of the same weight, over all processes."""
+        for name, metric in self.val_losses.items():
+            self.log(f"val/{name}", metric.compute(), prog_bar=name == "loss", rank_zero_only=False)  # type: ignore[operator]
+            metric.reset()  # type: ignore[operator]
+
+    def configure_optimizers(self) -> torch.optim.Optimizer:
+        """The optimizer of the recipe over all trainable parameters."""
+        return instantiate(self.optimizer, params=[p for p in self.parameters() if p.requires_grad])
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """The checkpoint carries its recipe and the facts of its data, as plain values."""
+        checkpoint["config"], checkpoint["facts"] = self.config, self.facts
+
+    # Sampling ---------------------------------------------------------------------------------------------------------
+
+    @torch.no_grad()
+    def generate(
+        self,
+        batch: MotionBatch,
+        *,
+        seed: int = 0,
+        replication: int = 0,
+        guidance_scale: float | None = None,
+        sampler: str | None = None,
+        num_inference_steps: int | None = None,
+        edit: Edit | None = None,
+        unconditioned: bool = False,
+    ) -> Tensor:
+        """Motions for the conditions, lengths and ids of `batch`; its `x` is not looked at.
+
+        The noise of a motion is a function of (seed, replication, its id): the same motion in any batch.
+        `unconditioned` samples a conditional model with its null condition throughout.
+
+        Returns:
+            (B, F, D) normalized, 0 past the end of each motion.
+        """
+        was_training = self.training
+        self.eval()
+        scale = self.guidance_scale if guidance_scale is None else guidance_scale
+        denoise = self.denoiser
+        if unconditioned and self.condition.features:
+            nothing = torch.zeros(len(batch), dtype=torch.long, device=batch.x.device)
+            cond = self.condition(replace(batch, text=[""] * len(batch), action=nothing)).drop(nothing == 0)
+        else:
+            cond = self.condition(batch)
+        if cond.null is not None and self.condition.features and not unconditioned:
+            denoise = classifier_free_guidance(self.denoiser, scale, self.representation.features)
+        frames, features = batch.mask.shape[1], self.representation.features
+        noise = seeded_noise(batch.ids, frames, features, seed=seed, replication=replication, like=batch.x)
+        x = self.process.sample(
+            denoise,
+            noise,
+            batch.mask,
+            cond,
+            sampler=sampler or self.sampler,
+            num_inference_steps=num_inference_steps or self.num_inference_steps,
+            edit=edit,
+        )
+        self.train(was_training)
+        return x
+
+
+def load(path: str | Path, device: str | torch.device = "cpu") -> MotionGeneration:
+    """A trained model from a checkpoint, ready to sample: the averaged weights where the recipe averages them.
+
+    Raises:
+        FileNotFoundError: no such file.
+        UserError: not a checkpoint of this framework, damaged, or of another shape than its recipe.
+    """
+    checkpoint = read_checkpoint(path)
+    config, facts = checkpoint["config"], checkpoint["facts"]
+    representation = instantiate(config["representation"], trusted=False)
+    task = MotionGeneration.build(config, representation, actions=facts["actions"], trusted=False)
+    task.facts = facts
+    try:
+        task.load_state_dict(checkpoint["state_dict"], strict=True)
+    except RuntimeError as error:
+        lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+        raise UserError(f"{path}: the weights do not fit the recipe saved with them: {lines[1]}") from error
+    return task.eval().to(device)
+
+
+def read_checkpoint(path: str | Path) -> dict[str, Any]:
+    """The contents of a checkpoint, unpickled with plain values and tensors only.
+
+    Raises:
+        FileNotFoundError: no such file.
+        UserError: not a checkpoint of this framework, or damaged.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such checkpoint")
+    try:
+        checkpoint = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # torch raises many kinds for damaged files and foreign pickles
+        raise UserError(f"{path}: damaged, or not a checkpoint of this framework") from error
+    if not isinstance(checkpoint, dict) or not {"config", "facts", "state_dict"} <= checkpoint.keys():
+        raise UserError(f"{path}: not a checkpoint of this framework: it holds no recipe")
+    return checkpoint

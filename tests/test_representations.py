@@ -12,7 +12,9 @@ from torch import Tensor
 
 from flame_mdm.representations import Representation, rotation
 from flame_mdm.representations.humanml import HumanML
-from flame_mdm.representations.skeleton import KIT21, SKELETONS, SMPL22, forward_kinematics
+from flame_mdm.representations.rot6d import Rot6D
+from flame_mdm.representations.skeleton import KIT21, SKELETONS, SMPL22, SMPL24, forward_kinematics
+from flame_mdm.representations.smpl import ADULT, SMPL
 
 HUMANML_TOLERANCE = dict.fromkeys(["turn", "root_velocity", "root_height", "positions", "velocities"], 2e-5) | {
     "rotations": 1e-4,
@@ -436,6 +438,102 @@ def test_bad_motions(motion: Tensor, message: str):
 def test_bad_options(options: dict, message: str):
     with pytest.raises(ValueError, match=message):
         HumanML(**options)
+
+
+# SMPL rotations
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize("stem", ["smpl147"])
+def test_flame_features_of_smplh_poses(stem: str):
+    poses, translation = (torch.from_numpy(golden(stem)[f"prep/{key}"]) for key in ("poses156", "trans"))
+    features = SMPL().encode(torch.cat([translation, poses], 1))
+    assert features.dtype == torch.float32
+    close(features, torch.from_numpy(golden(stem)["prep/feats147"]), 2e-6)
+
+
+@pytest.mark.golden
+@needs_third_party
+@pytest.mark.parametrize("clip", groups(third_party("smpl147"), "feats147"), ids=lambda v: f"smpl147-{v}")
+def test_flame_features_of_published_samples(clip: str):
+    sample = {key: torch.from_numpy(third_party("smpl147")[f"{clip}/{key}"]) for key in ("translation", "axis_angle")}
+    features = SMPL().encode(torch.cat([sample["translation"], sample["axis_angle"].flatten(1)], 1))
+    close(features, torch.from_numpy(third_party("smpl147")[f"{clip}/feats147"]), 4e-4)  # as stored by their authors
+
+
+def action_clips(prefix: str) -> list:
+    keys = [key.removeprefix(f"a2m/{prefix}") for key in golden("smpl147") if key.startswith(f"a2m/{prefix}")]
+    return [pytest.param(number, id=f"smpl147-{prefix}{number}") for number in keys]
+
+
+def action_motion(number: str) -> Tensor:
+    joints, pose = (torch.from_numpy(golden("smpl147")[f"a2m/{key}_{number}"]) for key in ("joints3d", "pose72"))
+    return torch.cat([joints[:, 0], pose], 1)
+
+
+def action_features(key: str) -> Tensor:
+    """(25, 6, F) of the fixture -> (F, 150)."""
+    return torch.from_numpy(golden("smpl147")[f"a2m/{key}"]).permute(2, 0, 1).flatten(1)
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize("number", action_clips("inp_"))
+def test_action_features_of_consecutive_frames(number: str):
+    motion, expected = action_motion(number), action_features(f"inp_{number}")
+    start = max(int(golden("smpl147")[f"a2m/shift_draw_{number}"][2]), 0)
+    frames = (start + torch.arange(len(expected))).clamp(max=len(motion) - 1)
+    close(Rot6D().encode(motion[frames]), expected, 2e-6)
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize("number", action_clips("rc_inp_"))
+def test_action_features_of_skipped_frames(number: str):
+    motion, expected = action_motion(number), action_features(f"rc_inp_{number}")
+    step, start = (int(draw[2]) for draw in golden("smpl147")[f"a2m/rc_draws_{number}"])
+    close(Rot6D().encode(motion[start::step][: len(expected)]), expected, 2e-6)
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize("number", action_clips("full_inp_"))
+def test_action_features_of_whole_clips(number: str):
+    close(Rot6D().encode(action_motion(number)), action_features(f"full_inp_{number}"), 2e-6)
+
+
+@pytest.mark.parametrize("representation", [SMPL(), Rot6D()], ids=lambda r: r.name)
+def test_smpl_bodies_stand_upright(representation: SMPL | Rot6D):
+    upright = {"smpl147": [math.pi / 2, 0, 0], "rot6d-25": [math.pi, 0, 0]}[representation.name]
+    motion = torch.zeros(2, 75)
+    motion[:, 3:6] = torch.tensor(upright)
+    motion[1, 3 + 3 * 18 :][:3] = torch.tensor([0, 0, math.pi / 2])  # bends the left elbow
+    features = representation.encode(motion).requires_grad_()
+    joints = representation.decode(features)
+    at = dict(zip(SMPL24.joints, joints[0].tolist(), strict=True))
+    assert at["head"][1] > at["neck"][1] > at["pelvis"][1] > at["left_knee"][1] > at["left_foot"][1]
+    assert 1.4 < at["head"][1] - at["left_foot"][1] < 1.7
+    facing = torch.linalg.cross(joints[0, 1] - joints[0, 2], joints[0, 12] - joints[0, 0])
+    toes = joints[0, 10] - joints[0, 7]
+    assert (facing * toes).sum() > 0, "mirrored: toes point backwards"
+    lengths = torch.tensor(ADULT).norm(dim=-1)
+    close(SMPL24.bones(joints).norm(dim=-1)[:, 1:], lengths[1:].expand(2, -1), 1e-6)
+    moved = (joints[1] - joints[0]).norm(dim=-1) > 1e-3
+    assert [name for name, m in zip(SMPL24.joints, moved.tolist(), strict=True) if m] == ["left_wrist", "left_hand"]
+    joints.square().sum().backward()
+    assert features.grad is not None
+    assert features.grad.isfinite().all()
+
+
+@pytest.mark.parametrize("representation", [SMPL(), Rot6D()], ids=lambda r: r.name)
+@pytest.mark.parametrize(
+    ("motion", "message"),
+    [
+        (torch.zeros(4, 69), r"\(4, 69\)"),
+        (torch.zeros(0, 75), r"\(0, 75\)"),
+        (torch.zeros(4, 75).index_fill(0, torch.tensor([2]), math.nan), "frame 2"),
+    ],
+)
+def test_bad_poses(representation: SMPL | Rot6D, motion: Tensor, message: str):
+    with pytest.raises(ValueError, match=message):
+        representation.encode(motion)
 
 
 # All representations

@@ -1,0 +1,76 @@
+"""FLAME's features: translation and joint rotations of SMPL."""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from flame_mdm.representations import Representation, rotation
+from flame_mdm.representations.skeleton import SMPL24, forward_kinematics
+
+ADULT = (
+    *((0.0, 0.0, 0.0), (0.06, -0.085, 0.0), (-0.06, -0.085, 0.0), (0.0, 0.125, -0.035)),
+    *((0.035, -0.39, 0.0), (-0.035, -0.39, 0.0), (0.0, 0.14, 0.0)),
+    *((-0.015, -0.425, -0.04), (0.015, -0.425, -0.04), (0.0, 0.055, 0.025)),
+    *((0.02, -0.055, 0.13), (-0.02, -0.055, 0.13), (0.0, 0.215, -0.045)),
+    *((0.075, 0.115, -0.03), (-0.075, 0.115, -0.03), (0.0, 0.085, 0.055)),
+    *((0.12, 0.045, -0.02), (-0.12, 0.045, -0.02), (0.26, -0.015, -0.025), (-0.26, -0.015, -0.025)),
+    *((0.267, 0.01, 0.0), (-0.267, 0.01, 0.0), (0.085, -0.01, -0.015), (-0.085, -0.01, -0.015)),
+)
+"""Where each of SMPL's 24 joints sits relative to its parent in SMPL's rest pose (arms out, facing +z, y up), metres.
+
+A stand-in for the licensed model files: bones as long as HumanML3D's reference clip has them, rounded and symmetric.
+"""
+
+
+def read_pose(motion: Tensor) -> tuple[Tensor, Tensor]:
+    """Translation and joint rotations out of a raw SMPL motion.
+
+    Args:
+        motion: (F, 3 + 3 K) translation in metres, then K >= 24 axis-angle vectors. Of SMPL+H's 52 the first 24 count,
+            as in FLAME's code, so that the hands are its left_index1 and left_index2.
+
+    Returns:
+        Translation (F, 3) and matrices (F, 24, 3, 3), float64.
+
+    Raises:
+        ValueError: no frames, fewer than 24 joints, or numbers that are not finite.
+    """
+    if motion.ndim != 2 or not len(motion) or motion.shape[1] < 75 or motion.shape[1] % 3:
+        raise ValueError(
+            f"motion: shape {tuple(motion.shape)}, expected (frames, 3 + 3 x joints), translation first, "
+            "then axis-angle vectors of 24 joints or more"
+        )
+    if not motion.isfinite().all():
+        frame = int((~motion.isfinite()).any(1).nonzero()[0, 0])
+        raise ValueError(f"motion: numbers in frame {frame} are not finite; leave the motion out")
+    motion = motion.double()
+    return motion[:, :3], rotation.axis_angle_to_matrix(motion[:, 3:75].unflatten(1, (24, 3)))
+
+
+class SMPL(Representation):
+    """147 features of Kim et al. 2023 (FLAME): translation (3), then 24 rotations as 6D rows. Not normalized.
+
+    World coordinates as in AMASS: metres, z up, neither centered nor turned. Raw motions are those of `read_pose`.
+    """
+
+    def __init__(self, fps: float = 20.0, offsets: Sequence[Sequence[float]] = ADULT):
+        """`offsets` (24, 3): the body to show, as `ADULT`; the first is the pelvis relative to the translation."""
+        super().__init__("smpl147", 147, fps, SMPL24)
+        self.offsets = offsets
+
+    def encode(self, motion: Tensor) -> Tensor:
+        """Raw motion (F, 3 + 3 K) -> features (F, 147) float32."""
+        translation, rotations = read_pose(motion)
+        return torch.cat([translation, rotation.matrix_to_rot6d(rotations, "rows").flatten(1)], 1).float()
+
+    def decode(self, features: Tensor) -> Tensor:
+        """Features (..., F, 147) -> joints (..., F, 24, 3) metres, turned to y up as HumanML3D does: (-x, z, y)."""
+        rotations = rotation.rot6d_to_matrix(features[..., 3:].unflatten(-1, (24, 6)), "rows")
+        offsets = features.new_tensor(self.offsets)
+        joints = forward_kinematics(self.skeleton, rotations, offsets, features[..., :3] + offsets[0])
+        return joints[..., [0, 2, 1]] * joints.new_tensor([-1.0, 1.0, 1.0])
+
+    def statistics(self, features: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean 0 and std 1: FLAME trains on the features as they are."""
+        return torch.zeros(self.features), torch.ones(self.features)

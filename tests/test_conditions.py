@@ -330,6 +330,7 @@ class TestPretrained:
     def test_tuned_model_learns_and_is_saved(self, kind: str, models, tmp_path):
         pooling: Pooling = "projection" if kind == "clip" else "pooler" if kind == "roberta" else "mean"
         encoder = PretrainedText(models[kind], WIDTH, 20, pooling, encode_null=True, freeze=False)
+        assert encoder.network.training
         encoder.precompute(CAPTIONS, tmp_path)
         encoder.load_cache(CAPTIONS, tmp_path)
         assert not list(tmp_path.iterdir())

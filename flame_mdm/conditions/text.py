@@ -86,7 +86,7 @@ class PretrainedText(ConditionEncoder):
         self._pretrained = Pretrained(model, revision, package, sha256)
         self._cache: CaptionCache | None = None
         if not freeze:
-            self.network = self._pretrained.load_network()
+            self.network = self._pretrained.load_network().train()
         if pooling == "pooler":
             weight = np.random.default_rng(0).normal(0, 0.02, (features, features)).astype(np.float32)
             for name, value in (("weight", torch.from_numpy(weight)), ("bias", torch.zeros(features))):

@@ -75,7 +75,7 @@ def tolerance(arrays: Arrays, key: str) -> float:
 
 def mdm_cases() -> list:
     names = ("cond", "uncond", "cfg", "train_cond_drop", "cond_last_sample_alone", "legacy_cond", "legacy_uncond")
-    names += ("cond_maskframes", "uncond_maskframes", "cfg_maskframes")
+    names += ("cond_maskframes", "uncond_maskframes", "cfg_maskframes", "cond_scalar_t")
     return [
         pytest.param(stem, name, id=f"{stem}-{name}")
         for stem in MDM
@@ -98,6 +98,8 @@ def test_mdm_outputs(stem: str, case: str, dtype: torch.dtype) -> None:
     # MFM's network takes a row number cut from its time in [0, 1].
     t = (t * 1000).floor() if t.is_floating_point() else t.float()
     mask = torch.from_numpy(arrays["in/mask"])[:, 0, 0]
+    if case == "cond_scalar_t":
+        t = t[:1].expand(len(t))
     if case == "cond_last_sample_alone":
         cond = Condition(cond.pooled[-1:], cond.tokens[-1:], None)
         x_t, t, mask = x_t[-1:], t[-1:], mask[-1:]

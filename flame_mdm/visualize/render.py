@@ -78,7 +78,7 @@ def write_mp4(path: str | Path, motions: Sequence[Motion], size: int = 384) -> N
     with written_whole(path) as temporary:
         command = [ffmpeg, "-loglevel", "error", "-y", "-f", "rawvideo", "-pix_fmt", "rgb24"]
         command += ["-s", f"{width}x{height}", "-r", str(fps), "-i", "-", "-c:v", "libx264", "-pix_fmt", "yuv420p"]
-        command += ["-threads", "1", "-fflags", "+bitexact", "-movflags", "+faststart", str(temporary)]
+        command += ["-threads", "1", "-fflags", "+bitexact", "-movflags", "+faststart", "-f", "mp4", str(temporary)]
         pixels = b"".join(image[:height, :width].tobytes() for image in video)
         run = subprocess.run(command, input=pixels, capture_output=True, check=False)
         if run.returncode:

@@ -115,6 +115,13 @@ TAKES_2 = {
     "raise-up-right-hand": (100, 42, 40, 65, 51, 79, 60),
 }
 
+# Takes that turn to the other side than their name says: their labels and captions follow the motion.
+WRONG_SIDE = (
+    "dataset-2_walk-turn-left_masculine_006",
+    "dataset-2_walk-turn-left_masculine_007",
+    "dataset-2_walk-turn-right_masculine_006",
+    "dataset-2_walk-turn-right_masculine_007",
+)
 SIDES = {"bye": "right", "guide": "right", "respond": "left", "byebye": "both"}  # where the name does not tell
 
 # Captions of a content, {side} where it has one; {how} is where the style goes.
@@ -224,13 +231,13 @@ PHRASES = {
     "raise-up-both-hands": (
         "a person raises both hands {how} and lowers them",
         "someone lifts both arms up {how}, then puts them down",
-        "the person raises both hands above the head {how}",
+        "the person raises both arms {how}",
         "a person puts both hands up {how} and brings them down again",
     ),
     "raise-up-{side}-hand": (
         "a person raises the {side} hand {how} and lowers it",
         "someone lifts the {side} arm up {how}, then puts it down",
-        "the person raises the {side} hand above the head {how}",
+        "the person raises the {side} arm {how}",
         "a person puts the {side} hand up {how} and brings it down again",
     ),
     "wave-both-hands": (
@@ -278,7 +285,7 @@ FILE = re.compile(r"dataset-([12])_([^_]+)_([^_]+)_(\d+)\.bvh")
 
 @dataclass(frozen=True)
 class Take:
-    """One BVH file."""
+    """One BVH file; `content` is what is done, which the name mistakes in the takes of `WRONG_SIDE`."""
 
     id: str
     dataset: int
@@ -453,8 +460,11 @@ def _split_of_blocks(content: str, style: str) -> dict[int, Split]:
     """Blocks of one combination of data set 2 that are not for training: 10 % test, 5 % validation, at least one."""
     takes = TAKES_2[content][STYLES_2.index(style)]
     blocks = sorted(range(-(-takes // 5)), key=lambda block: _hash(f"dataset-2_{content}_{style}_{block}"))
-    splits: list[Split] = ["test"] * max(1, round(0.1 * len(blocks))) + ["val"] * max(1, round(0.05 * len(blocks)))
-    return dict(zip(blocks, splits, strict=False))
+    test, val = max(1, round(0.1 * len(blocks))), max(1, round(0.05 * len(blocks)))
+    ranks: list[Split] = ["train" for _ in blocks]
+    ranks[:test] = ["test"] * test
+    ranks[test : test + val] = ["val"] * val
+    return dict(zip(blocks, ranks, strict=False))
 
 
 def _hash(text: str) -> int:
@@ -467,7 +477,8 @@ def _take(id_: str) -> Take:
     contents, styles = (CONTENTS_1, STYLES_1) if dataset == 1 else (TAKES_2, STYLES_2)
     if content not in contents or style not in styles:
         raise ValueError(f"{id_}.bvh: data set {dataset} has no content {content} in a style {style}")
-    return Take(id_, dataset, content, style, split_of(dataset, content, style, int(number)))
+    split = split_of(dataset, content, style, int(number))
+    return Take(id_, dataset, swap_sides(content) if id_ in WRONG_SIDE else content, style, split)
 
 
 def _files(path: Path, wanted: Container[str]) -> Iterator[tuple[str, bytes]]:

@@ -1,19 +1,21 @@
 """Masked reconstruction error and geometric losses."""
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from analytic import NO_CONDITION, assert_golden, motions
+from analytic import NO_CONDITION, assert_golden, flow_field, motions
 from fixtures import golden, groups, meta
 from torch import Tensor
 
 from flame_mdm.losses import MotionLosses, masked_mse
 from flame_mdm.motion import length_mask
 from flame_mdm.processes.diffusion import GaussianDiffusion
+from flame_mdm.processes.flow_matching import FlowMatching
 
-FIXTURE = golden("mdm_losses")
+FIXTURE, FLOW = golden("mdm_losses"), golden("mfm")
 # Which losses of MDM's code are which of ours. It computes the joints' velocity but never adds it.
 OURS = {
     "rot_mse": "mse",
@@ -44,7 +46,8 @@ def test_mdm_losses(case):
     x, noise = motions(FIXTURE[f"{data}/x_start"]), motions(FIXTURE[f"{data}/noise"])
     mask = torch.from_numpy(FIXTURE[f"{data}/mask"]).flatten(1)
     last_row = FIXTURE[f"{data}/x_start"].shape[2]
-    weights = {OURS[term]: lambdas.get(weight, 0.0) for term, weight in WEIGHTS.items()}
+    used = [term for term in WEIGHTS if f"{case}/{term}" in FIXTURE]  # some data sets leave terms out
+    weights: dict[str, Any] = {OURS[term]: lambdas.get(WEIGHTS[term], 0.0) for term in used}
     losses = MotionLosses(
         linear_joints(FIXTURE[f"{data}/fk"]), SMPL_FEET, **weights, velocity_features=x.shape[-1] - last_row
     )
@@ -69,6 +72,20 @@ def test_mdm_losses(case):
     assert computed == set()
 
 
+@pytest.mark.golden
+@pytest.mark.parametrize("case", ["mfm-field_vel"])
+def test_velocity_loss_of_mfm(case):
+    """Its code compares velocities of the flow as if they were motions; the formula is that of MDM."""
+    process, t = FlowMatching(meta(FLOW)["sigma_min"]), torch.from_numpy(FLOW["loss/t"])
+    x, noise = motions(FLOW["loss/x_start"]), motions(FLOW["loss/noise"])
+    mask = torch.from_numpy(FLOW["in/mask"]).flatten(1)
+    output = flow_field(FLOW)(process.corrupt(x, noise, t), 1000 * t, mask, NO_CONDITION)
+    size = x.shape[-1] - FLOW["loss/x_start"].shape[2]
+    losses = MotionLosses(linear_joints(np.zeros((3, 1))), [], velocity=1.0, velocity_features=size)
+    velocity = losses(output, process.target(x, noise, t), mask)["velocity"]
+    assert_golden(FLOW, "loss/field_vel/vel_mse", velocity)
+
+
 def test_masked_mse_is_the_mean_over_real_frames():
     torch.manual_seed(0)
     a, b = torch.randn(2, 3, 5, 4).unbind()
@@ -79,7 +96,7 @@ def test_masked_mse_is_the_mean_over_real_frames():
     torch.testing.assert_close(masked_mse(a.unflatten(2, (2, 2)), b.unflatten(2, (2, 2)), mask), torch.tensor(expected))
 
 
-ALL = {"joints": 1.0, "velocity": 1.0, "joint_velocity": 1.0, "foot_contact": 1.0}
+ALL: dict[str, Any] = {"joints": 1.0, "velocity": 1.0, "joint_velocity": 1.0, "foot_contact": 1.0}
 
 
 def joints_as_features(x: Tensor) -> Tensor:

@@ -2,6 +2,7 @@
 
 import math
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from flame_mdm.processes.flow_matching import FlowMatching
 from flame_mdm.processes.schedules import build_schedule, timesteps
 
 GAUSSIAN, MFM = golden("gaussian"), golden("mfm")
+T: int = meta(GAUSSIAN)["options"]["T"]
 TABLES = {
     "betas": "betas",
     "alphas_cumprod": "alphas_cumprod",
@@ -30,13 +32,13 @@ TABLES = {
     "sqrt_one_minus_alphas_cumprod": "noise",
 }
 DTYPES = [torch.float32, torch.float64]
-# Options of the four point-wise cases, by what the fixture calls them.
+# Options of the point-wise cases, by what the fixture calls them.
 POINTWISE = {
-    "startx_fixedsmall_clip0": GaussianDiffusion(),
-    "startx_fixedsmall_clip1": GaussianDiffusion(clip_x0=True),
-    "startx_fixedlarge": GaussianDiffusion(variance="fixed_large"),
-    "eps_learnedrange_clip0": GaussianDiffusion(prediction="epsilon", variance="learned_range"),
-    "eps_learnedrange_clip1": GaussianDiffusion(prediction="epsilon", variance="learned_range", clip_x0=True),
+    "startx_fixedsmall_clip0": GaussianDiffusion(T),
+    "startx_fixedsmall_clip1": GaussianDiffusion(T, clip_x0=True),
+    "startx_fixedlarge": GaussianDiffusion(T, variance="fixed_large"),
+    "eps_learnedrange_clip0": GaussianDiffusion(T, prediction="epsilon", variance="learned_range"),
+    "eps_learnedrange_clip1": GaussianDiffusion(T, prediction="epsilon", variance="learned_range", clip_x0=True),
 }
 
 
@@ -98,7 +100,7 @@ def test_impossible_steps_are_refused(count, spacing):
 @pytest.mark.golden
 @pytest.mark.parametrize("dtype", DTYPES, ids=["gaussian-f32", "gaussian-f64"])
 def test_corrupt_and_posterior(dtype):
-    process = GaussianDiffusion(num_train_timesteps=meta(GAUSSIAN)["options"]["T"])
+    process = GaussianDiffusion(T)
     x, noise, t = (
         motions(GAUSSIAN["pw/x0"], dtype),
         motions(GAUSSIAN["pw/noise"], dtype),
@@ -142,8 +144,8 @@ def test_reverse_step(case, dtype):
 @pytest.mark.parametrize("dtype", DTYPES, ids=["f32", "f64"])
 @pytest.mark.parametrize("case", ["gaussian-guided_bits", "gaussian-flame_nats"])
 def test_variational_bound(case, dtype):
-    legacy = {"vlb_units": "bits", "vlb_decoder": "discretized"} if "guided" in case else {}
-    process = GaussianDiffusion(prediction="epsilon", variance="learned_range", **legacy)
+    legacy: dict[str, Any] = {"vlb_units": "bits", "vlb_decoder": "discretized"} if "guided" in case else {}
+    process = GaussianDiffusion(T, prediction="epsilon", variance="learned_range", **legacy)
     x, noise = motions(GAUSSIAN["pw/x0"], dtype), motions(GAUSSIAN["pw/noise"], dtype)
     mask, t = torch.ones(x.shape[:2], dtype=torch.bool), torch.tensor(GAUSSIAN["pw/t"]).float()
     x_t = process.corrupt(x, noise, t)
@@ -161,7 +163,7 @@ def test_variational_bound(case, dtype):
 @pytest.mark.parametrize("dtype", DTYPES, ids=["gaussian-f32", "gaussian-f64"])
 def test_prior(dtype):
     x = motions(GAUSSIAN["pw/x0"], dtype)
-    prior = GaussianDiffusion(vlb_units="bits").prior(x, torch.ones(x.shape[:2], dtype=torch.bool))
+    prior = GaussianDiffusion(T, vlb_units="bits").prior(x, torch.ones(x.shape[:2], dtype=torch.bool))
     # Near 0 the divergence is what rounding leaves; float64 says what it is.
     np.testing.assert_allclose(
         prior.numpy(), GAUSSIAN["f64/pw/prior_bits"], rtol=0, atol=1e-15 if dtype == torch.float64 else 1e-7
@@ -258,7 +260,7 @@ def test_average_padding_gives_short_motions_less_weight():
     def silent(x_t, t, mask, cond):
         return torch.zeros(2, 8, 6)
 
-    options = {"prediction": "epsilon", "variance": "learned_range"}
+    options: dict[str, Any] = {"prediction": "epsilon", "variance": "learned_range"}
     sound = GaussianDiffusion(**options).loss(silent, x, mask, NO_CONDITION, t=t, noise=noise)
     legacy = GaussianDiffusion(**options, average_padding=True).loss(silent, x, mask, NO_CONDITION, t=t, noise=noise)
     torch.testing.assert_close(legacy["mse"], sound["mse"] * torch.tensor([1.0, 0.25]))
@@ -321,7 +323,7 @@ def test_loss_aware_training_is_a_function_of_what_is_saved():
             losses.append(process.loss(constant(0.0, 2), x, torch.ones(64, 3, dtype=torch.bool), NO_CONDITION)["loss"])
         return losses
 
-    options = {"num_train_timesteps": 10, "prediction": "epsilon", "timestep_sampling": "loss_aware"}
+    options: dict[str, Any] = {"num_train_timesteps": 10, "prediction": "epsilon", "timestep_sampling": "loss_aware"}
     whole = GaussianDiffusion(**options)
     expected = trained(whole, range(12))
     half, resumed = GaussianDiffusion(**options), GaussianDiffusion(**options)

@@ -2,19 +2,25 @@
 
 import math
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from analytic import NO_CONDITION, assert_golden, flow_field, linear_denoiser, motions, spaced
-from diffusers import DDIMScheduler, DDPMScheduler, DPMSolverMultistepScheduler  # pyright: ignore[reportPrivateImportUsage]
-from fixtures import golden, groups, meta
+from diffusers.schedulers.scheduling_ddim import DDIMScheduler
+from diffusers.schedulers.scheduling_ddpm import DDPMScheduler
+from diffusers.schedulers.scheduling_dpmsolver_multistep import DPMSolverMultistepScheduler
+from fixtures import Arrays, golden, groups, meta
+from hydra.utils import instantiate
 from torch import Tensor
 from torchdiffeq import odeint
 
-from flame_mdm.motion import Denoise, Edit, Noise, length_mask
+from flame_mdm.checkpoints import Released, import_flame, import_mdm
+from flame_mdm.motion import Condition, Denoise, Edit, Noise, length_mask
 from flame_mdm.processes.diffusion import GaussianDiffusion
 from flame_mdm.processes.flow_matching import STEPS, FlowMatching
+from flame_mdm.processes.guidance import classifier_free_guidance
 from flame_mdm.processes.samplers import CountedDenoise, ancestral_step, ddim_step
 
 GAUSSIAN, MFM = golden("gaussian"), golden("mfm")
@@ -104,17 +110,19 @@ def test_flame_loop(case, dtype):
 def test_one_step(case, dtype):
     process, t = GaussianDiffusion(OPTIONS["T"]), torch.tensor(GAUSSIAN["pw/t"])
     x_t = motions(GAUSSIAN["f64/pw/x_t" if dtype == torch.float64 else "pw/x_t"], dtype)
-    noise = motions(GAUSSIAN["step/noise"][["p_sample", "0.0", "0.5", "1.0"].index(case)], dtype)
+    noise = motions(GAUSSIAN["step/noise"][["p_sample", *DDIM_STEPS].index(case)], dtype)
     denoise = linear_denoiser(GAUSSIAN["lin4/A"], GAUSSIAN["lin4/b"], float(GAUSSIAN["lin4/g"]))
     x0_hat = denoise(x_t, t.float(), ones(x_t), NO_CONDITION)
     if case == "p_sample":
         log_variance = process.log_variance(x0_hat, x_t, t, process.schedule)
         assert_golden(GAUSSIAN, "step/p_sample", ancestral_step(x_t, x0_hat, log_variance, process.schedule, t, noise))
     else:
-        x = ddim_step(x_t, x0_hat, process.schedule, t, noise, eta=float(case))
-        assert_golden(GAUSSIAN, f"step/ddim_eta{case}", x)
+        eta = float(case.removeprefix("ddim_eta"))
+        assert_golden(GAUSSIAN, f"step/{case}", ddim_step(x_t, x0_hat, process.schedule, t, noise, eta))
 
 
+# MFM's own loops, over equal steps; all other methods are torchdiffeq's.
+EULER = {"euler_raw": "euler", "euler_replacement_edit_till": "euler"}
 ANALYTIC_RUNS = [name for name, run in meta(MFM)["config"]["runs"].items() if run["on"] == "field"]
 
 
@@ -122,8 +130,8 @@ ANALYTIC_RUNS = [name for name, run in meta(MFM)["config"]["runs"].items() if ru
 @pytest.mark.parametrize("case", [pytest.param(name, id=f"mfm-{name}") for name in ANALYTIC_RUNS])
 def test_flow_run(case):
     run = meta(MFM)["config"]["runs"][case]
-    method = run.get("method", "euler")
-    process = FlowMatching(sigma_min=meta(MFM)["sigma_min"], odeint_grid=method == "euler")
+    method: str = run.get("method", "euler")
+    process = FlowMatching(sigma_min=meta(MFM)["sigma_min"], odeint_grid=method not in EULER)
     seen = []
 
     def field(x_t, t, mask, cond):
@@ -141,13 +149,122 @@ def test_flow_run(case):
         replay(start, []),
         ones(start),
         NO_CONDITION,
-        sampler={"euler_raw": "euler", "euler_replacement_edit_till": "euler"}.get(method, method),
+        sampler=EULER.get(method, method),
         num_inference_steps=round(1 / run.get("step_size", 0.1)),
         edit=edit,
     )
     assert_golden(MFM, f"run/{case}", x)
     # Adaptive steps follow from errors near the rounding of float32.
     np.testing.assert_allclose(seen, MFM[f"times/{case}"], rtol=0, atol=2e-4 if method == "dopri5" else 1e-6)
+
+
+def released_flow() -> tuple[Denoise, Condition]:
+    """The fixture's network with its random weights, and its conditions with their null."""
+    released = import_mdm(weights(MFM), {"arch": "trans_enc"}, num_heads=meta(MFM)["config"]["heads"])
+    pooled = torch.from_numpy(MFM["in/text_embed"])
+    tokens = torch.zeros(len(pooled), 0, pooled.shape[1])
+    null = Condition(torch.zeros_like(pooled[:1]), tokens[:1], None)
+    return built(released), Condition(pooled, tokens, None, null)
+
+
+def weights(arrays: Arrays) -> dict[str, Tensor]:
+    return {key.removeprefix("state/"): torch.from_numpy(v) for key, v in arrays.items() if key.startswith("state/")}
+
+
+def built(released: Released) -> Denoise:
+    network = instantiate(released.config, *released.features)
+    network.load_state_dict(released.state)
+    return network.eval().requires_grad_(False)
+
+
+NETWORK_RUNS = [name for name, run in meta(MFM)["config"]["runs"].items() if run["on"] != "field"]
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize("case", [pytest.param(name, id=f"mfm-{name}") for name in NETWORK_RUNS])
+def test_flow_run_of_the_network(case):
+    run = meta(MFM)["config"]["runs"][case]
+    method: str = run.get("method", "euler")
+    process = FlowMatching(meta(MFM)["sigma_min"], quantize_time=True, odeint_grid=method not in EULER)
+    denoise, cond = released_flow()
+    start, features = motions(MFM["sample/x_init"]), MFM["sample/x_init"].shape[1] * MFM["sample/x_init"].shape[2]
+    if run["on"] == "cfg":
+        denoise = classifier_free_guidance(denoise, torch.from_numpy(MFM["in/scale"]), features)
+    edit = None
+    if "edit" in method:
+        keep, known = motions(MFM["edit/inpainting_mask"]) > 0, motions(MFM["edit/inpainted_motion"])
+        edit = Edit(known, keep, mode="trajectory", until=run.get("edit_till", 1.0))
+    count = round(1 / run.get("step_size", 0.1))
+    x = process.sample(
+        denoise, replay(start, []), ones(start), cond,
+        sampler=EULER.get(method, method), num_inference_steps=count, edit=edit,
+    )  # fmt: skip
+    assert_golden(MFM, f"run/{case}", x)
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize("case", ["mfm-model"])
+def test_flow_loss_of_the_network(case):
+    denoise, cond = released_flow()
+    x, noise = motions(MFM["loss/x_start"]), motions(MFM["loss/noise"])
+    mask, t = torch.from_numpy(MFM["in/mask"]).flatten(1), torch.from_numpy(MFM["loss/t"])
+    process = FlowMatching(meta(MFM)["sigma_min"], quantize_time=True)
+    terms = process.loss(denoise, x, mask, cond, t=t, noise=noise)
+    assert_golden(MFM, "loss/model/rot_mse", terms["mse"])
+    assert_golden(MFM, "loss/model/loss", terms["loss"])
+
+
+FLAME = golden("flame_text2motion")
+FLAME_LOOPS: dict[str, list] = meta(FLAME)["config"]["loops"]
+FLAME_OPTIONS: dict[str, Any] = {"prediction": "epsilon", "variance": "learned_range"}
+
+
+def released_flame() -> tuple[Denoise, Condition]:
+    """The fixture's network and the conditions of its texts; the last text, "", is their null."""
+    pooled, tokens = torch.from_numpy(FLAME["lm/pooler_output"]), torch.from_numpy(FLAME["lm/last_hidden_state"])
+    seen = torch.ones(tokens.shape[:2], dtype=torch.bool)  # the authors attend to the padding of the text
+    null = Condition(pooled[-1:], tokens[-1:], seen[-1:])
+    denoise = built(import_flame(weights(FLAME), num_heads=meta(FLAME)["config"]["heads"]))
+    return denoise, Condition(pooled[:-1], tokens[:-1], seen[:-1], null)
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize(
+    "case", [pytest.param(name, id=f"flame_text2motion-{name}") for name in [*FLAME_LOOPS, "edit"]]
+)
+def test_flame_loop_of_the_network(case):
+    config = meta(FLAME)["config"]
+    total, section, kind = [*config["edit_T"], "ddpm"] if case == "edit" else FLAME_LOOPS[case]
+    denoise, cond = released_flame()
+    first = Condition(
+        cond.pooled[:1], cond.tokens[:1], cond.token_mask[:1] if cond.token_mask is not None else None, cond.null
+    )
+    # Of the authors' two rows the second repeats the first for guidance.
+    start = motions(FLAME[f"noise/{case}_init"][:1])
+    draws = [motions(noise[:1]) for noise in FLAME[f"noise/{case}_steps"]]
+    edit = None
+    if case == "edit":
+        keep = torch.ones_like(start, dtype=torch.bool)
+        keep[..., :3] = config["keep_trans"]
+        keep[..., 3:].unflatten(-1, (-1, 6))[..., config["edit_joints"], :] = False
+        edit = Edit(motions(FLAME["edit/ref_motion"][None]), keep, mode="x_t", blend="before")
+    x = GaussianDiffusion(total, clip_x0=True, **FLAME_OPTIONS).sample(
+        classifier_free_guidance(denoise, config["scale"], start.shape[-1]), replay(start, draws), ones(start), cond,
+        sampler={"ddpm": "ancestral", "ddim": "ddim"}[kind], num_inference_steps=steps_of(section, total), edit=edit,
+    )  # fmt: skip
+    assert_golden(FLAME, f"out/{case}", x.transpose(1, 2))
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize("case", ["flame_text2motion-loss"])
+def test_flame_loss_of_the_network(case):
+    denoise, cond = released_flame()
+    x, noise = motions(FLAME["loss/x_start"]), motions(FLAME["loss/noise"])
+    mask, t = length_mask(torch.from_numpy(FLAME["in/motion_length"]), x.shape[1]), torch.from_numpy(FLAME["loss/t"])
+    process = GaussianDiffusion(meta(FLAME)["config"]["T_loss"], average_padding=True, **FLAME_OPTIONS)
+    terms = process.loss(denoise, x * mask[..., None], mask, cond, t=t.float(), noise=noise)
+    for name in ("mse", "vlb", "loss"):
+        assert_golden(FLAME, f"out/loss_{name.replace('vlb', 'vb')}", terms[name])
 
 
 # What an oracle returns has to be the data, whatever the sampler and the number of steps.
@@ -280,7 +397,7 @@ def test_ancestral_agrees_with_diffusers(variance, prediction, monkeypatch):
     x = noise(0)
     for t in scheduler.timesteps:
         output = denoise(x, torch.tensor([float(t)]), mask, NO_CONDITION)
-        x = scheduler.step(output, int(t), x).prev_sample
+        x = scheduler.step(output, int(t), x, return_dict=False)[0]
     ours = process.sample(denoise, noise, mask, NO_CONDITION, sampler="ancestral", num_inference_steps=steps)
     # Theirs computes alpha products in float32.
     torch.testing.assert_close(ours, x, rtol=1e-4, atol=1e-4)
@@ -302,7 +419,7 @@ def test_ddim_agrees_with_diffusers(eta, prediction):
     for t in scheduler.timesteps:
         output = denoise(x, torch.tensor([float(t)]), mask, NO_CONDITION)
         variance_noise = noise(next(used)) if eta and t > 0 else torch.zeros_like(x)
-        x = scheduler.step(output, int(t), x, eta=eta, variance_noise=variance_noise).prev_sample
+        x = scheduler.step(output, int(t), x, eta=eta, variance_noise=variance_noise, return_dict=False)[0]
     ours = process.sample(
         denoise, noise, mask, NO_CONDITION, sampler="ddim", num_inference_steps=20, spacing="stride", eta=eta
     )
@@ -322,7 +439,7 @@ def test_dpm_solver_agrees_with_diffusers(prediction):
     x = noise(0)
     for t in scheduler.timesteps:
         output = denoise(x, torch.tensor([float(t)]), mask, NO_CONDITION)
-        x = scheduler.step(output, t, x).prev_sample
+        x = scheduler.step(output, t, x, return_dict=False)[0]
     ours = process.sample(denoise, noise, mask, NO_CONDITION, sampler="dpm_solver_pp_2m", num_inference_steps=steps)
     torch.testing.assert_close(ours, x, rtol=1e-4, atol=1e-4)
 
@@ -330,9 +447,8 @@ def test_dpm_solver_agrees_with_diffusers(prediction):
 @pytest.mark.parametrize("sampler", STEPS)
 def test_fixed_steps_agree_with_torchdiffeq(sampler):
     torch.manual_seed(0)
-    field = flow_field(
-        {"field/A": np.random.default_rng(0).normal(size=(4, 4)), "field/b": np.ones((4, 1)), "field/c": 2.0}
-    )  # type: ignore[dict-item]
+    rng = np.random.default_rng(0)
+    field = linear_denoiser(rng.normal(size=(4, 4)), np.ones((4, 1)), 2.0)
     start, mask = torch.randn(2, 5, 4, dtype=torch.float64), torch.ones(2, 5, dtype=torch.bool)
     ours = FlowMatching().sample(field, replay(start, []), mask, NO_CONDITION, sampler=sampler, num_inference_steps=7)
     theirs = odeint(

@@ -258,8 +258,8 @@ class GaussianDiffusion(Process):
         """
         if sampler not in get_args(Sampler):
             raise ValueError(f"unknown sampler '{sampler}': GaussianDiffusion has {', '.join(get_args(Sampler))}")
-        if eta and sampler != "ddim":
-            raise ValueError(f"eta={eta} is an option of the sampler ddim, not of {sampler}")
+        if eta and (sampler != "ddim" or not 0 <= eta <= 1):
+            raise ValueError(f"eta={eta} with the sampler {sampler}: eta is an option of ddim, from 0 to 1")
         if edit is not None:
             check_edit(edit, mask, ("x0", "x_t"), "GaussianDiffusion")
             if edit.resample > 1 and sampler == "dpm_solver_pp_2m":

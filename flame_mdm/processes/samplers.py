@@ -36,43 +36,32 @@ class CountedDenoise:
 
 
 def ancestral_step(
-    x_t: Tensor,
-    x0_hat: Tensor,
-    log_variance: Tensor | float,
-    schedule: Schedule,
-    i: int | Tensor,
-    noise: Tensor,
+    x_t: Tensor, x0_hat: Tensor, log_variance: Tensor | float, schedule: Schedule, i: int, noise: Tensor | None
 ) -> Tensor:
-    """x_{t-1} drawn from p(x_{t-1} | x_t) (Ho et al. 2020, algorithm 2); nothing is drawn at step 0."""
+    """x_{t-1} drawn from p(x_{t-1} | x_t) (Ho et al. 2020, algorithm 2); its mean where `noise` is None."""
     mean = schedule.posterior_mean(x0_hat, x_t, i)
-    if isinstance(log_variance, Tensor):
-        deviation = (0.5 * log_variance).exp()
-    else:
-        deviation = math.exp(0.5 * log_variance)
-    drawn = float(i > 0) if isinstance(i, int) else (i > 0)[:, None, None]
-    return mean + drawn * deviation * noise
+    if noise is None:
+        return mean
+    deviation = (log_variance / 2).exp() if isinstance(log_variance, Tensor) else math.exp(log_variance / 2)
+    return mean + deviation * noise
 
 
-def ddim_step(
-    x_t: Tensor, x0_hat: Tensor, schedule: Schedule, i: int | Tensor, noise: Tensor | None, eta: float
-) -> Tensor:
+def ddim_step(x_t: Tensor, x0_hat: Tensor, schedule: Schedule, i: int, noise: Tensor | None, eta: float) -> Tensor:
     """x_{t-1} by DDIM (Song et al. 2021, eq. 12 and 16); `noise` is needed where eta > 0."""
     epsilon = (x_t - schedule.at("signal", i, x_t) * x0_hat) / schedule.at("noise", i, x_t)
     # eq. 16: eta = 1 has the variance of the ancestral step.
-    variance = eta**2 * schedule.at("posterior_variance", i, x_t)
-    previous = schedule.at("alphas_cumprod_prev", i, x_t)
+    variance = eta**2 * schedule.tables["posterior_variance"][i].item()
+    previous = schedule.tables["alphas_cumprod_prev"][i].item()
     x = previous**0.5 * x0_hat + (1 - previous - variance) ** 0.5 * epsilon
     return x if noise is None else x + variance**0.5 * noise
 
 
 def ancestral(estimate: Estimate, schedule: Schedule, noise: Noise, edit: Edit | None = None) -> Tensor:
-    """Draws every x_{t-1} from the learned reverse process (Ho et al. 2020, algorithm 2)."""
+    """Draws every x_{t-1} from the learned reverse process (Ho et al. 2020, algorithm 2), at the end its mean."""
 
     def step(x_t: Tensor, i: int, draw: Callable[[], Tensor]) -> Tensor:
         x0_hat, log_variance = estimate(x_t, i)
-        if i == 0:
-            return schedule.posterior_mean(x0_hat, x_t, i)
-        return ancestral_step(x_t, x0_hat, log_variance, schedule, i, draw())
+        return ancestral_step(x_t, x0_hat, log_variance, schedule, i, draw() if i else None)
 
     return _descend(step, schedule, noise, edit)
 

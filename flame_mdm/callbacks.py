@@ -12,8 +12,7 @@ from typing import Any
 
 import torch
 from lightning import Callback, LightningModule, Trainer
-from lightning.pytorch.callbacks import Checkpoint
-from lightning.pytorch.callbacks.progress import TQDMProgressBar
+from lightning.pytorch.callbacks import Checkpoint, TQDMProgressBar
 from lightning.pytorch.loggers import TensorBoardLogger, WandbLogger
 from torchmetrics import Metric
 
@@ -154,6 +153,11 @@ class SampleMotions(Callback):
         self.unconditioned, self.metrics = unconditioned, metrics or {}
         self.next = every_n_steps
 
+    @property
+    def texts(self) -> list[str]:
+        """The prompts without what they ask for."""
+        return [text for text, _ in self.prompts]
+
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         self.next = trainer.global_step + self.every_n_steps
 
@@ -172,7 +176,7 @@ class SampleMotions(Callback):
     def write(self, trainer: Trainer, pl_module: LightningModule) -> tuple[Path, dict[str, float | None]]:
         """Samples, measures, writes the files and sends them to the dashboard."""
         assert isinstance(pl_module, MotionGeneration)
-        texts = [text for text, _ in self.prompts]
+        texts = self.texts
         labels = bool(texts) and texts[0] in pl_module.facts["actions"]
         motions = generate(
             pl_module,
@@ -208,7 +212,7 @@ class SampleMotions(Callback):
 def _log_video(logger: Any, gif: Path, step: int) -> None:
     if isinstance(logger, TensorBoardLogger):
         from PIL import Image
-        from tensorboard.compat.proto.summary_pb2 import Summary
+        from tensorboard.compat.proto.summary_pb2 import Summary  # type: ignore[attr-defined]
 
         data = gif.read_bytes()
         width, height = Image.open(io.BytesIO(data)).size

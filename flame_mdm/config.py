@@ -70,10 +70,20 @@ def compose(name: str, overrides: Sequence[str] = ()) -> Config:
     Raises:
         UserError: an unknown experiment, group, option or key, with the nearest names; or a malformed value.
     """
-    plan = _plan(name, overrides)
-    config = _hydra(plan)
+    config = _hydra(_plan(_find(name), overrides))
     check(config)
     return config
+
+
+class _Recipe(NamedTuple):
+    """Where a configuration stands, and what it is."""
+
+    folder: Path
+    stem: str
+    saved: bool = False
+    """A resolved configuration, whose parts cannot be swapped."""
+    experiment: str | None = None
+    """Name that a recipe gets."""
 
 
 class _Plan(NamedTuple):
@@ -84,16 +94,17 @@ class _Plan(NamedTuple):
     overrides: list[str]
 
 
-def _plan(name: str, overrides: Sequence[str]) -> _Plan:
+def _plan(recipe: _Recipe, overrides: Sequence[str]) -> _Plan:
     """Checks names and keys. A key that only the signature of its `_target_` knows is marked as new for Hydra."""
-    folder, stem, saved = _locate_recipe(name)
     parsed = _parse(overrides)
-    if saved:
-        _refuse_groups(parsed, name)
+    if recipe.saved:
+        _refuse_groups(parsed, recipe)
     else:
         _check_groups(parsed)
-    search = [f"hydra.searchpath=[file://{EXPERIMENTS}]"] if folder != EXPERIMENTS else []
-    base = _Plan(folder, stem, [*search, *_name(name, saved), *(_line(o) for o in parsed if _is_group(o))])
+    first = [f"hydra.searchpath=[file://{EXPERIMENTS}]"] if recipe.folder != EXPERIMENTS else []
+    if recipe.experiment:
+        first.append(f"experiment={recipe.experiment}")
+    base = _Plan(recipe.folder, recipe.stem, [*first, *(_line(o) for o in parsed if _is_group(o))])
     composed = _hydra(base)
     return base._replace(overrides=base.overrides + [_legal(composed, o) for o in parsed if not _is_group(o)])
 
@@ -102,20 +113,16 @@ def _line(override: Override) -> str:
     return override.input_line or ""
 
 
-def _name(name: str, saved: bool) -> list[str]:
-    return [] if saved else [f"experiment={Path(name).stem if name.endswith('.yaml') else name}"]
-
-
-def _locate_recipe(name: str) -> tuple[Path, str, bool]:
-    """Folder and stem of a recipe, and whether it is a saved configuration (one with no defaults list)."""
+def _find(name: str) -> _Recipe:
     if name.endswith((".yaml", ".yml")):
         path = Path(name).resolve()
         if not path.is_file():
             raise UserError(f"{name}: no such file. EXP takes an experiment or the path of a config.yaml")
-        return path.parent, path.stem, "defaults" not in _load_yaml(path)
-    if not (EXPERIMENTS / f"{name}.yaml").is_file() or name not in recipes():
+        saved = "defaults" not in _load_yaml(path)
+        return _Recipe(path.parent, path.stem, saved, None if saved else path.stem)
+    if name not in recipes():
         raise UserError(f"unknown experiment '{name}'.{_nearest(name, recipes())} `make help` lists them all")
-    return EXPERIMENTS, name, False
+    return _Recipe(EXPERIMENTS, name, experiment=name)
 
 
 def _load_yaml(path: Path) -> Any:
@@ -129,9 +136,7 @@ def _parse(overrides: Sequence[str]) -> list[Override]:
     try:
         return OverridesParser.create().parse_overrides(list(overrides))
     except HydraException as error:
-        raise UserError(
-            f"cannot read the override: {_first_line(error)}; write key=value, quote text as 'a b'"
-        ) from error
+        raise UserError(f"cannot read an override, write key=value, text as 'a b': {_first_line(error)}") from error
 
 
 def _is_group(override: Override) -> bool:
@@ -150,12 +155,12 @@ def _check_groups(overrides: Sequence[Override]) -> None:
             )
 
 
-def _refuse_groups(overrides: Sequence[Override], name: str) -> None:
+def _refuse_groups(overrides: Sequence[Override], recipe: _Recipe) -> None:
     for override in overrides:
         if _is_group(override):
             raise UserError(
-                f"{override.key_or_group}={override.value()} swaps a part of a recipe, but {name} is a saved "
-                "configuration whose parts are fixed; start from the experiment, or override single keys"
+                f"{_line(override)} swaps a part of a recipe, but {recipe.stem}.yaml is a saved configuration, "
+                "whose parts are fixed; start from the experiment, or override single keys"
             )
 
 
@@ -396,18 +401,21 @@ def run(
             print("\nexperiments: " + ", ".join(recipes()))
             print("parts: " + ", ".join(f"{group}=..." for group in groups()))
         return 0 if words else 2
-    return _guarded(lambda: _serve(command, words, name))
+    codes = [0]
+    return _guarded(lambda: _serve(command, words, name, codes)) or max(codes)
 
 
-def _serve(command: Callable[[Config], None], words: list[str], name: str | None) -> None:
+def _serve(command: Callable[[Config], None], words: list[str], name: str | None, codes: list[int]) -> None:
     if name is None:
         if words[0].startswith("-") or "=" in words[0]:
             raise UserError(f"the first word must name an experiment, such as quickstart, not '{words[0]}'")
-        name, words = words[0], words[1:]
+        recipe, words = _find(words[0]), words[1:]
+    else:
+        recipe = _Recipe(EXPERIMENTS, name)
     flags = [w for i, w in enumerate(words) if w.startswith("-") or (i and words[i - 1] in ("--cfg", "--package"))]
     overrides = [w for w in words if w not in flags]
     sweep = any(flag in ("-m", "--multirun") for flag in flags)
-    plan = _plan(name, overrides)
+    plan = _plan(recipe, overrides)
     if not sweep:
         check(_hydra(plan))
 
@@ -416,8 +424,7 @@ def _serve(command: Callable[[Config], None], words: list[str], name: str | None
         if sweep:
             plain["run"]["dir"] = HydraConfig.get().runtime.output_dir
             check(plain)
-        if code := _guarded(lambda: command(plain)):
-            sys.exit(code)
+        codes.append(_guarded(lambda: command(plain)))
 
     quiet = ["hydra/job_logging=disabled", "hydra/hydra_logging=disabled", "hydra.output_subdir=null"]
     output = [
@@ -448,7 +455,8 @@ def _quoted(word: str, keys: Sequence[str]) -> str:
     key, separator, value = word.partition("=")
     if not separator or key not in keys or value in ("", "null"):
         return word
-    escaped = value.replace("\\", "\\\\").replace("'", "\\'").replace("${", "\\${")
+    # Hydra takes a backslash as it stands, except right before a quote, where it has to be doubled.
+    escaped = re.sub(r"(\\*)('|$)", lambda m: m[1] * 2 + ("\\'" if m[2] else ""), value).replace("${", "\\${")
     return f"{key}='{escaped}'"
 
 
@@ -461,6 +469,8 @@ def _guarded(action: Callable[[], None]) -> int:
             traceback.print_exc()
         print(f"error: {_first_line(error)}", file=sys.stderr)
         return 1
+    except SystemExit as stop:
+        return int(stop.code or 0)
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return 130

@@ -51,9 +51,7 @@ def prepare(config: Config) -> None:
     store = Store(data.folder)
     info = store.info
     clips = ", ".join(f"{count} {split}" for split, count in info["clips"].items())
-    print(
-        f"{info['dataset']} as {info['representation']} at {info['fps']:g} frames a second: {clips}; {info['hours']} hours"
-    )
+    print(f"{info['dataset']} as {info['representation']} at {info['fps']:g} fps: {clips}; {info['hours']} hours")
     print(f"{info['shape'][0]} frames of {info['shape'][1]} features, fingerprint {store.fingerprint}: {data.folder}")
 
 

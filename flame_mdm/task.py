@@ -51,7 +51,7 @@ class MotionGeneration(LightningModule):
         condition: ConditionEncoder,
         representation: Representation,
         *,
-        losses: dict[str, float],
+        losses: dict[str, Any],
         optimizer: Config,
         cond_drop_prob: float,
         guidance_scale: float,
@@ -117,13 +117,14 @@ class MotionGeneration(LightningModule):
 
     def _captions(self) -> tuple[list[str], Path]:
         data: MotionDataModule = self.trainer.datamodule  # type: ignore[attr-defined]
-        return data.captions(), data.folder.parent / "text"
+        prompts = [text for c in self.trainer.callbacks for text in getattr(c, "texts", ())]  # type: ignore[attr-defined]
+        return sorted({*data.captions(), *prompts}), data.folder.parent / "text"
 
     def training_step(self, batch: MotionBatch, batch_idx: int) -> Tensor:
         """Loss of one batch; every draw in it is a function of (seed, batch number, rank)."""
         torch.manual_seed(key("step", self.seed, batch_idx, self.global_rank))
         cond = self.condition(batch)
-        if cond.null is not None and self.cond_drop_prob > 0:
+        if cond.null is not None:  # at probability 0 too: every parameter then has a gradient, as DDP needs
             cond = cond.drop(torch.rand(len(batch), device=self.device) < self.cond_drop_prob)
         terms = self.process.loss(self.denoiser, batch.x, batch.mask, cond, auxiliary=self.losses)
         means = {f"train/{name}": value.mean() for name, value in terms.items()}
@@ -141,13 +142,16 @@ class MotionGeneration(LightningModule):
         for name, value in terms.items():
             if name not in self.val_losses:
                 self.val_losses[name] = MeanMetric().to(self.device)
-            self.val_losses[name].update(value)
+            metric = self.val_losses[name]
+            assert isinstance(metric, MeanMetric)
+            metric.update(value)
 
     def on_validation_epoch_end(self) -> None:
         """Logs the mean over all clips, each of the same weight, over all processes."""
         for name, metric in self.val_losses.items():
-            self.log(f"val/{name}", metric.compute(), prog_bar=name == "loss", rank_zero_only=False)  # type: ignore[operator]
-            metric.reset()  # type: ignore[operator]
+            assert isinstance(metric, MeanMetric)
+            self.log(f"val/{name}", metric.compute(), prog_bar=name == "loss")
+            metric.reset()
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
         """The optimizer of the recipe over all trainable parameters."""

@@ -70,9 +70,7 @@ def train(config: Config) -> None:
     step = read_checkpoint(checkpoint)["global_step"] if checkpoint.exists() else 0
     most = config["trainer"]["max_steps"]
     if 0 <= most <= step:
-        print(
-            f"{folder} is trained to step {step} already; trainer.max_steps={2 * step} goes on, run.name=... starts anew"
-        )
+        print(f"{folder} is trained to step {step} already: raise trainer.max_steps, or start anew with run.name=...")
         return
     seed_everything(config["seed"], verbose=False)
     representation = instantiate(config["representation"])
@@ -83,8 +81,7 @@ def train(config: Config) -> None:
     task.facts |= {
         "dataset": store.info["dataset"],
         "fingerprint": store.fingerprint,
-        "min_frames": config["data"]["min_frames"],
-        "max_frames": config["data"]["max_frames"],
+        "max_frames": data.crop.longest(),
     }
     callbacks = [instantiate(c) for c in config["callbacks"].values() if c]
     if config["ema"]:
@@ -150,7 +147,9 @@ def _introduce(config: Config, task: MotionGeneration, trainer: Any, data: dict[
     splits = f"{clips['train']} clips to train on, {clips['val']} to validate, {clips['test']} to test"
     epochs = trainer.max_steps * size / clips["train"]
     print(f"{config['experiment']}: {model}, on {device}")
-    print(f"data: {data['dataset']} as {data['representation']}: {splits}; {data['hours']} hours; {data['fingerprint']}")
+    print(
+        f"data: {data['dataset']} as {data['representation']}: {splits}; {data['hours']} hours; {data['fingerprint']}"
+    )
     print(f"steps: {step} to {trainer.max_steps} of {size} clips, about {epochs:.0f} passes over the data")
 
 

@@ -3,7 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -22,7 +22,9 @@ class Clip:
         split: mirrored copies and cuts of a take stand in the split of that take.
         source: the take the clip comes from; clips of one source never stand in two splits.
         action: index into the data set's `actions`, or None.
-        attributes: exact facts about the motion, where the set knows them (side, count, direction, speed ...).
+        attributes: exact facts about the motion, where the set knows them (side, count, direction, speed, tagged words
+            of the captions ...); plain values that JSON can hold.
+        encoded: the owners hand out features; `motion` (F, D) holds them and is stored as it is.
     """
 
     id: str
@@ -31,7 +33,8 @@ class Clip:
     split: Split
     source: str
     action: int | None = None
-    attributes: Mapping[str, str | int | float] = field(default_factory=dict)
+    attributes: Mapping[str, Any] = field(default_factory=dict)
+    encoded: bool = False
 
 
 class MotionSource(ABC):
@@ -48,6 +51,10 @@ class MotionSource(ABC):
         Raises:
             FileNotFoundError: the raw data is not where the recipe says; the message says how to get it.
         """
+
+    def statistics(self) -> tuple[np.ndarray, np.ndarray] | None:
+        """Mean and std (D,) that the owners hand out with encoded features; None = computed from the training clips."""
+        return None
 
     @abstractmethod
     def clips(self, fps: float) -> Iterator[Clip]:

@@ -153,31 +153,31 @@ PHRASES = {
     "walk-{side}": (
         "a person walks to the {side} {how}",
         "someone walks diagonally to the {side} {how}",
-        "the person walks to the {side} {how} with the head turned to the {other}",
-        "a person walks {how} to the {side} with the body half turned and the head to the front",
+        "the person walks to the {side} {how}, the head turned to the {other}",
+        "a person walks to the {side} {how}, the body half turned and the head to the front",
     ),
     "bow": (
         "a person bows {how} with the hands at the waist, then stands up",
-        "someone bends forward {how} in a bow and straightens up again",
+        "someone bends forward {how} to bow and straightens up again",
         "the person takes a bow {how}",
         "a person bows down {how} and comes back up",
     ),
     "bye": (
         "a person waves goodbye {how} with the {side} hand",
         "someone raises the {side} hand and waves goodbye {how}",
-        "the person waves {how} with the {side} hand",
+        "the person waves with the {side} hand {how}",
         "a person says goodbye {how}, waving the {side} hand",
     ),
     "guide": (
         "a person stretches out the {side} arm {how} to show the way",
-        "someone shows the way {how} with the {side} arm",
+        "someone shows the way with the {side} arm {how}",
         "the person extends the {side} arm {how} as if guiding someone",
-        "a person points out the way {how} with the {side} hand",
+        "a person points out the way with the {side} hand {how}",
     ),
     "byebye": (
         "a person waves goodbye {how} with both hands",
         "someone raises both hands and waves goodbye {how}",
-        "the person waves {how} with both hands",
+        "the person waves with both hands {how}",
         "a person says goodbye {how}, waving both hands",
     ),
     "respond": (
@@ -188,7 +188,7 @@ PHRASES = {
     ),
     "call": (
         "a person cups the hands at the mouth and shouts {how}",
-        "someone calls out loud {how} with the hands at the mouth",
+        "someone calls out loud with the hands at the mouth {how}",
         "the person holds both hands to the mouth and calls someone {how}",
         "a person shouts {how} through cupped hands",
     ),
@@ -206,9 +206,9 @@ PHRASES = {
     ),
     "slash": (
         "a person swings a two-handed sword {how}",
-        "someone slashes {how} with a sword in both hands",
-        "the person is fighting {how} with a two-handed sword",
-        "a person strikes {how} with a sword held in both hands",
+        "someone slashes with a sword in both hands {how}",
+        "the person is fighting with a two-handed sword {how}",
+        "a person strikes with a sword held in both hands {how}",
     ),
     "dance-long": (
         "a person dances {how}",
@@ -243,13 +243,13 @@ PHRASES = {
     "wave-both-hands": (
         "a person raises both hands and waves {how}",
         "someone waves both hands {how}",
-        "the person waves {how} with both arms up",
+        "the person waves with both arms up {how}",
         "a person lifts both hands and waves them {how}",
     ),
     "wave-{side}-hand": (
         "a person raises the {side} hand and waves {how}",
         "someone waves the {side} hand {how}",
-        "the person waves {how} with the {side} arm up",
+        "the person waves with the {side} arm up {how}",
         "a person lifts the {side} hand and waves it {how}",
     ),
 }
@@ -452,19 +452,18 @@ def split_of(dataset: int, content: str, style: str, number: int) -> Split:
         return "test" if draw < 2 else "val" if draw == 2 else "train"
     if style == "normal" and content.startswith("walk-turn-"):
         return "train"
-    return _split_of_blocks(content, style).get((number - 1) // 5, "train")
+    test, val = _held_out_blocks(content, style)
+    block = (number - 1) // 5
+    return "test" if block in test else "val" if block in val else "train"
 
 
 @cache
-def _split_of_blocks(content: str, style: str) -> dict[int, Split]:
-    """Blocks of one combination of data set 2 that are not for training: 10 % test, 5 % validation, at least one."""
+def _held_out_blocks(content: str, style: str) -> tuple[list[int], list[int]]:
+    """Test (10 %, at least one) and validation blocks (5 %, at least one) of one combination of data set 2."""
     takes = TAKES_2[content][STYLES_2.index(style)]
     blocks = sorted(range(-(-takes // 5)), key=lambda block: _hash(f"dataset-2_{content}_{style}_{block}"))
     test, val = max(1, round(0.1 * len(blocks))), max(1, round(0.05 * len(blocks)))
-    ranks: list[Split] = ["train" for _ in blocks]
-    ranks[:test] = ["test"] * test
-    ranks[test : test + val] = ["val"] * val
-    return dict(zip(blocks, ranks, strict=False))
+    return blocks[:test], blocks[test : test + val]
 
 
 def _hash(text: str) -> int:

@@ -323,7 +323,7 @@ def _fps(seconds: str) -> float | None:
         return None
     whole = max(round(1 / time), 1)
     last_digit = 10.0 ** int(Decimal(seconds).as_tuple().exponent)
-    return float(whole) if abs(1 / whole - time) < last_digit else 1 / time
+    return float(whole) if abs(1 / whole - time) < min(last_digit, 0.01 * time) else 1 / time
 
 
 def _numbers(row: np.ndarray) -> str:

@@ -7,7 +7,6 @@ that the uninterrupted one would have seen.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -17,8 +16,9 @@ from torch import Tensor
 from torch.utils.data import DataLoader, Dataset, Sampler
 
 from flame_mdm.data import MotionSource, Split
+from flame_mdm.data.crops import Crop
 from flame_mdm.data.store import Entry, Store, write_store
-from flame_mdm.motion import MotionBatch, collate
+from flame_mdm.motion import collate
 from flame_mdm.noise import key
 from flame_mdm.representations import Representation
 
@@ -26,39 +26,32 @@ Draw = tuple[int, int]
 """(index of a clip, number of the batch it is drawn for; -1 in evaluation)."""
 
 
-class Clips(Dataset[tuple[str, Tensor, str | None, int | None]]):
-    """The clips of a split that are long enough, normalized, each cropped anew at every draw.
+Sample = tuple[str, Tensor, str | None, int | None]
+"""(id, x (F, D), caption, action), what `collate` joins."""
 
-    The crop is the field's (Guo et al. 2022): a multiple of `crop_unit` frames, one unit shorter for one draw in
-    three, at most `max_frames`, anywhere in the clip. In evaluation it is the longest one from the first frame on.
-    """
 
-    def __init__(self, store: Store, split: Split, *, min_frames: int, max_frames: int, crop_unit: int, seed: int):
-        self.store, self.max_frames, self.crop_unit, self.seed = store, max_frames, crop_unit, seed
-        self.clips = [c for c in store.clips if c.split == split and c.length >= min_frames]
-        self.lengths = np.array([min(c.length, max_frames) for c in self.clips])
+class Clips(Dataset[Sample]):
+    """The clips of a split that are long enough for the crop rule, cropped anew at every draw, then normalized."""
+
+    def __init__(self, store: Store, split: Split, *, representation: Representation, crop: Crop, seed: int):
+        self.store, self.representation, self.crop, self.seed = store, representation, crop, seed
+        self.clips = [c for c in store.clips if c.split == split and c.length >= crop.shortest()]
+        self.lengths = np.array([min(c.length, crop.longest()) for c in self.clips])
         self.mean, self.std = store.mean.astype(np.float32), store.std.astype(np.float32)
 
     def __len__(self) -> int:
         return len(self.clips)
 
-    def __getitem__(self, draw: Draw) -> tuple[str, Tensor, str | None, int | None]:
+    def __getitem__(self, draw: Draw) -> Sample:
         index, batch = draw
         clip = self.clips[index]
-        start, length = self.crop(index, batch)
-        x = (self.store.motion(clip)[start : start + length] - self.mean) / self.std
-        return clip.id, torch.from_numpy(x), self.caption(clip, batch), clip.action
+        features = self.representation.rebase(self.store.motion(clip)[self.frames(index, batch)])
+        return clip.id, torch.from_numpy((features - self.mean) / self.std), self.caption(clip, batch), clip.action
 
-    def crop(self, index: int, batch: int) -> tuple[int, int]:
-        """First frame and length of the crop of a clip in a batch."""
-        frames, unit = self.clips[index].length, self.crop_unit
-        length = min(frames, self.max_frames) // unit * unit
-        if batch < 0:
-            return 0, length
-        generator = np.random.default_rng((self.seed, batch, index))
-        if generator.integers(3) == 0 and length > unit:
-            length -= unit
-        return int(generator.integers(frames - length + 1)), length
+    def frames(self, index: int, batch: int) -> np.ndarray:
+        """Frames of a clip that a batch takes."""
+        generator = None if batch < 0 else np.random.default_rng((self.seed, batch, index))
+        return self.crop(self.clips[index].length, generator)
 
     def caption(self, clip: Entry, batch: int) -> str | None:
         """The caption of a clip in a batch: any in training, always the same one in evaluation."""
@@ -129,8 +122,7 @@ class MotionDataModule(LightningDataModule):
         name: folder of this one.
         batch_size: clips a process and step.
         num_workers: loading processes; 0 loads in the training process.
-        min_frames, max_frames: shorter clips are left out, longer ones cropped.
-        crop_unit: lengths are multiples of this.
+        crop: which frames of a clip a sample holds, and how long clips must be.
         seed: of the draws.
     """
 
@@ -143,18 +135,14 @@ class MotionDataModule(LightningDataModule):
         name: str,
         batch_size: int,
         num_workers: int = 0,
-        min_frames: int = 24,
-        max_frames: int = 196,
-        crop_unit: int = 4,
+        crop: Crop,
         seed: int = 0,
     ):
         super().__init__()
-        if not crop_unit <= min_frames <= max_frames:
-            raise ValueError(f"data: needs crop_unit {crop_unit} <= min_frames {min_frames} <= max_frames {max_frames}")
         self.source, self.representation = source, representation
         self.folder = Path(root) / f"{name}-{representation.name}"
         self.batch_size, self.num_workers, self.seed = batch_size, num_workers, seed
-        self.clips = partial(Clips, min_frames=min_frames, max_frames=max_frames, crop_unit=crop_unit, seed=seed)
+        self.crop = crop
 
     def prepare_data(self) -> None:
         """Writes the store where there is none; Lightning calls this on one process only."""
@@ -169,10 +157,9 @@ class MotionDataModule(LightningDataModule):
             ValueError: it was prepared with another representation, or is damaged.
         """
         store = Store(self.folder)
-        if store.info["representation"] != self.representation.name:
-            raise ValueError(
-                f"{self.folder}: holds {store.info['representation']}, not {self.representation.name}; prepare it again"
-            )
+        for name, wanted in (("representation", self.representation.name), ("fps", self.representation.fps)):
+            if store.info[name] != wanted:
+                raise ValueError(f"{self.folder}: its {name} is {store.info[name]}, not {wanted}; prepare it again")
         self.representation.mean.copy_(torch.from_numpy(store.mean))
         self.representation.std.copy_(torch.from_numpy(store.std))
         return store
@@ -184,11 +171,15 @@ class MotionDataModule(LightningDataModule):
     def setup(self, stage: str) -> None:
         """Opens the store and its splits."""
         self.store = self.open()
-        self.train, self.val, self.test = (self.clips(self.store, split) for split in ("train", "val", "test"))
+        self.train, self.val, self.test = (self.clips(split) for split in ("train", "val", "test"))
         if not len(self.train):
-            raise ValueError(f"{self.folder}: no training clip has {self.clips.keywords['min_frames']} frames or more")
+            raise ValueError(f"{self.folder}: no training clip has {self.crop.shortest()} frames or more")
 
-    def train_dataloader(self) -> DataLoader[MotionBatch]:
+    def clips(self, split: Split) -> Clips:
+        """The clips of a split, with what samples them."""
+        return Clips(self.store, split, representation=self.representation, crop=self.crop, seed=self.seed)
+
+    def train_dataloader(self) -> DataLoader[Sample]:
         """Endless; starts at the step the trainer is at, so that a resumed run goes on with the right batch."""
         trainer = self.trainer
         first = trainer.global_step * trainer.accumulate_grad_batches if trainer else 0
@@ -197,19 +188,19 @@ class MotionDataModule(LightningDataModule):
         sampler = TrainingBatches(lengths, size, seed=self.seed, first=first, rank=rank, world=world)
         return self._loader(self.train, sampler)
 
-    def val_dataloader(self) -> DataLoader[MotionBatch]:
+    def val_dataloader(self) -> DataLoader[Sample]:
         """Each validation clip once over all processes."""
         return self._evaluation(self.val)
 
-    def test_dataloader(self) -> DataLoader[MotionBatch]:
+    def test_dataloader(self) -> DataLoader[Sample]:
         """Each test clip once over all processes."""
         return self._evaluation(self.test)
 
-    def _evaluation(self, clips: Clips) -> DataLoader[MotionBatch]:
+    def _evaluation(self, clips: Clips) -> DataLoader[Sample]:
         rank, world = (self.trainer.global_rank, self.trainer.world_size) if self.trainer else (0, 1)
         return self._loader(clips, EvaluationBatches(clips.lengths, self.batch_size, rank=rank, world=world))
 
-    def _loader(self, clips: Clips, sampler: Sampler[list[Draw]]) -> DataLoader[MotionBatch]:
+    def _loader(self, clips: Clips, sampler: Sampler[list[Draw]]) -> DataLoader[Sample]:
         return DataLoader(
             clips,
             batch_sampler=sampler,

@@ -115,8 +115,7 @@ def write_store(folder: Path, source: MotionSource, representation: Representati
         (partial / "features.raw").unlink()
         lines = [json.dumps(asdict(entry), ensure_ascii=False, sort_keys=True) for entry in entries]
         (partial / "clips.jsonl").write_text("\n".join(lines) + "\n", encoding="utf-8")
-        training = np.concatenate([packed[e.start : e.start + e.length] for e in entries if e.split == "train"])
-        mean, std = (t.numpy() for t in representation.statistics(torch.from_numpy(training)))
+        mean, std = source.statistics() or _statistics(representation, packed, entries)
         np.savez(partial / "statistics.npz", mean=mean, std=std)
         info = _describe(partial, source, representation, entries, mean, std)
         (partial / "store.json").write_text(json.dumps(info, indent=2) + "\n")
@@ -129,15 +128,17 @@ def write_store(folder: Path, source: MotionSource, representation: Representati
 
 
 def _encode(clips: Sequence[Clip], representation: Representation) -> list[np.ndarray]:
-    motions = [torch.from_numpy(np.ascontiguousarray(clip.motion)) for clip in clips]
+    raw = [torch.from_numpy(np.ascontiguousarray(clip.motion)) for clip in clips if not clip.encoded]
     try:
-        encoded = representation.encode_many(motions)
+        fresh = iter(representation.encode_many(raw) if raw else [])
     except ValueError as error:
         if len(clips) == 1:
             raise ValueError(f"clip {clips[0].id}: {error}") from error
         return [features for clip in clips for features in _encode([clip], representation)]  # names the clip
-    arrays = [features.numpy().astype(np.float32) for features in encoded]
+    arrays = [np.asarray(clip.motion if clip.encoded else next(fresh).numpy(), np.float32) for clip in clips]
     for clip, features in zip(clips, arrays, strict=True):
+        if features.ndim != 2 or features.shape[1] != representation.features:
+            raise ValueError(f"clip {clip.id}: shape {features.shape}, not (frames, {representation.features})")
         if not np.isfinite(features).all():
             frame = int(np.argwhere(~np.isfinite(features).all(1))[0, 0])
             raise ValueError(f"clip {clip.id}: the features of frame {frame} are not finite; exclude it by name")
@@ -148,6 +149,14 @@ def _batched(clips: Iterable[Clip], size: int) -> Iterator[list[Clip]]:
     iterator = iter(clips)
     while chunk := list(islice(iterator, size)):
         yield chunk
+
+
+def _statistics(
+    representation: Representation, packed: np.ndarray, entries: list[Entry]
+) -> tuple[np.ndarray, np.ndarray]:
+    training = np.concatenate([packed[e.start : e.start + e.length] for e in entries if e.split == "train"])
+    mean, std = representation.statistics(torch.from_numpy(training))
+    return mean.numpy(), std.numpy()
 
 
 def _check_entries(name: str, entries: list[Entry]) -> None:

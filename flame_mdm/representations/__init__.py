@@ -3,6 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -24,7 +25,7 @@ class Representation(nn.Module, ABC):
 
     @abstractmethod
     def encode(self, motion: Tensor) -> Tensor:
-        """Raw motion -> features (F', D) in the data's units, float32, not normalised."""
+        """Raw motion -> features (F', D) in the data's units, float32, not normalized."""
 
     def encode_many(self, motions: Sequence[Tensor]) -> list[Tensor]:
         """Encodes several motions."""
@@ -36,16 +37,20 @@ class Representation(nn.Module, ABC):
 
     @abstractmethod
     def statistics(self, features: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean and std (D,) to normalise with, from all training frames (N, D)."""
+        """Mean and std (D,) to normalize with, from all training frames (N, D)."""
+
+    def rebase(self, features: np.ndarray) -> np.ndarray:
+        """Features (F, D) of a cut of a motion, made to start like a whole motion; here, nothing is to be done."""
+        return features
 
     def normalize(self, features: Tensor) -> Tensor:
-        """(..., D) in the data's units -> normalised."""
+        """(..., D) in the data's units -> normalized."""
         return (features - self.mean) / self.std
 
     def denormalize(self, x: Tensor) -> Tensor:
-        """(..., D) normalised -> the data's units."""
+        """(..., D) normalized -> the data's units."""
         return x * self.std + self.mean
 
     def to_joints(self, x: Tensor) -> Tensor:
-        """(..., F, D) normalised -> joints (..., F, J, 3), metres, y up. Differentiable."""
+        """(..., F, D) normalized -> joints (..., F, J, 3), metres, y up. Differentiable."""
         return self.decode(self.denormalize(x))

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
@@ -28,6 +29,12 @@ class Rot6D(Representation):
         translation, rotations = read_pose(motion)
         rows = rotation.matrix_to_rot6d(rotations, "rows").flatten(1)
         return torch.cat([rows, F.pad(translation - translation[:1], (0, 3))], 1).float()
+
+    def rebase(self, features: np.ndarray) -> np.ndarray:
+        """The root's way starts anew at the first frame of the cut."""
+        moved = features.copy()
+        moved[:, 144:147] -= features[:1, 144:147]
+        return moved
 
     def decode(self, features: Tensor) -> Tensor:
         """Features (..., F, 150) -> joints (..., F, 24, 3) metres, y up: half a turn about the camera's x axis."""

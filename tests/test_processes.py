@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 import torch
 from analytic import NO_CONDITION, assert_golden, flow_field, linear_denoiser, motions, spaced
-from fixtures import golden, meta
+from fixtures import ROOT, golden, meta
+from hydra.utils import instantiate
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from omegaconf import OmegaConf
 from torch import Tensor
 
 from flame_mdm.losses import masked_mean, masked_mse
@@ -170,13 +172,15 @@ def test_prior(dtype):
     )
 
 
-PROCESSES = {
+RECIPES = sorted((ROOT / "experiments" / "process").glob("*.yaml"))
+PROCESSES: dict[str, GaussianDiffusion | FlowMatching] = {
+    **{path.stem: instantiate(OmegaConf.load(path)) for path in RECIPES},
     "x0": GaussianDiffusion(prediction="x0"),
     "epsilon": GaussianDiffusion(prediction="epsilon"),
     "velocity": GaussianDiffusion(prediction="velocity", schedule="linear"),
     "learned": GaussianDiffusion(num_train_timesteps=50, prediction="epsilon", variance="learned_range"),
     "flow": FlowMatching(),
-    "flow_sigma": FlowMatching(sigma_min=0.1, quantize_time=True),
+    "flow_sigma": FlowMatching(sigma_min=0.1),
 }
 
 

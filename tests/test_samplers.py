@@ -656,6 +656,25 @@ def test_padding_changes_no_real_frame(build, sampler):
     torch.testing.assert_close(run(9)[:, :4], run(4))
 
 
+RUNS_WITHOUT_DATA = [
+    *((GaussianDiffusion, sampler, mode) for sampler in DIFFUSION for mode in (None, "x0", "x_t")),
+    *((FlowMatching, sampler, mode) for sampler in STEPS for mode in (None, "x0", "trajectory")),
+]
+
+
+@pytest.mark.parametrize(("build", "sampler", "mode"), RUNS_WITHOUT_DATA)
+def test_no_loop_waits_for_the_device(build, sampler, mode):
+    """Tensors on the meta device have no values: a loop that read one would fail."""
+    x = torch.zeros(2, 6, 3, device="meta")
+    mask = torch.ones(2, 6, dtype=torch.bool, device="meta")
+    edit = None if mode is None else Edit(x, x > 0, mode)
+    sample = build().sample(
+        pulled(x), lambda draw: torch.zeros_like(x), mask, NO_CONDITION,
+        sampler=sampler, num_inference_steps=5, edit=edit, trajectory=[],
+    )  # fmt: skip
+    assert sample.shape == x.shape
+
+
 def test_half_precision_denoisers_are_sampled_in_float32():
     process = GaussianDiffusion()
     x = process.sample(

@@ -60,7 +60,7 @@ def read_attributes(joints: np.ndarray, fps: float) -> dict[str, str | int]:
     if squats:
         return {"action": "squat", "count": squats}
     trunk = smooth[:, NECK] - smooth[:, PELVIS]
-    if np.degrees(np.arctan2(np.linalg.norm(trunk[:, [0, 2]], axis=-1), trunk[:, 1])).max() > 33:
+    if np.degrees(np.arctan2(np.linalg.norm(trunk[:, [0, 2]], axis=-1), trunk[:, 1])).max() > 28:
         return {"action": "bow"}
     if abs(turned) > 45:
         return {"action": "turn", "direction": "left" if turned > 0 else "right"}
@@ -93,9 +93,11 @@ def _count(signal: np.ndarray, high: float, low: float) -> int:
 def _locomotion(
     smooth: np.ndarray, forward: np.ndarray, left: np.ndarray, turned: float, fps: float
 ) -> dict[str, str | int]:
-    """Walks and runs go further than 33 cm from where they began."""
+    """Walks and runs go further than 33 cm from where they began, and lift both ankles by 4 cm."""
     ground = gaussian_filter1d(smooth[:, PELVIS][:, [0, 2]], 0.15 * fps, axis=0, mode="nearest")
     if np.linalg.norm(ground - ground[0], axis=-1).max() < 0.33:
+        return {}
+    if np.ptp(np.percentile(smooth[:, ANKLES, 1], (5, 95), axis=0), axis=0).min() < 0.04:
         return {}
     velocity = np.gradient(ground, 1 / fps, axis=0)
     speed = np.percentile(np.linalg.norm(velocity, axis=-1), 80)
@@ -139,9 +141,10 @@ def _arms(smooth: np.ndarray, fps: float) -> dict[str, str | int]:
             continue
         # A wave swings the forearm about the elbow; a raised arm holds still.
         swing = straight[up, side] - gaussian_filter1d(straight[up, side], 0.25 * fps, mode="nearest")
-        if np.percentile(straight[up, side], 20) < 0.88 and swing.std() > 0.02:
+        height = np.percentile(above[up, side], 70)
+        if np.percentile(straight[up, side], 20) < 0.85 and swing.std() > 0.04 and height > 0.25:
             waving.append(name)
-        elif np.percentile(above[up, side], 70) > 0.75 and above[:3, side].mean() < 0:
+        elif height > 0.75 and above[:3, side].mean() < 0:
             raised.append(name)
     for action, sides in (("wave", waving), ("raise", raised)):
         if sides:

@@ -79,6 +79,12 @@ def test_noise_and_frozen_bodies_do_not_score(clips: list[Clip]):
     assert shares["all"] < 0.06, "a single pose shows a bow at best"
 
 
+def test_gliding_is_no_walk(clips: list[Clip]):
+    way = np.linspace(0, 2.5, 50)[:, None, None] * np.array([0, 0, 1])
+    for clip in clips[:20]:
+        assert read_attributes(clip.motion[:1] + way, FPS) == {}
+
+
 def test_asking_for_the_wrong_thing_does_not_score(clips: list[Clip]):
     waves = [clip for clip in clips if clip.attributes["action"] == "wave" and clip.attributes["side"] == "left"]
     shares = accuracy([clip.motion for clip in waves], [{"action": "wave", "side": "right"}] * len(waves))

@@ -1,0 +1,358 @@
+import json
+import multiprocessing
+import os
+import shutil
+import tarfile
+import tempfile
+import zipfile
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from fixtures import SHARED, needs_third_party, third_party
+
+from flame_mdm.data import Clip, bandai, bvh
+from flame_mdm.data.bandai import CONTENTS_1, JOINTS, STYLES_1, STYLES_2, TAKES_2, Bandai, captions, side_of, split_of
+from flame_mdm.representations.skeleton import SKELETONS
+
+ARCHIVE = SHARED / "data" / "bandai-namco-motiondataset-raw.tar.xz"
+
+# Joint, parent and bone (cm, in the parent's axes) of the real files.
+HIERARCHY = """
+joint_Root - 0 0 0
+Hips joint_Root 0 93.9 -3
+Spine Hips 15.74 0 0
+Chest Spine 8.98 -0.41 0
+Neck Chest 16.38 0 0
+Head Neck 6.46 0 0
+Shoulder_L Chest 13.6 2.1 2.0
+UpperArm_L Shoulder_L 5.35 0 0
+LowerArm_L UpperArm_L 24.33 0 0
+Hand_L LowerArm_L 22.29 0 0
+Shoulder_R Chest 13.6 2.1 -2.0
+UpperArm_R Shoulder_R -5.35 0 0
+LowerArm_R UpperArm_R -24.33 0 0
+Hand_R LowerArm_R -22.29 0 0
+UpperLeg_L Hips -2 0 6.53
+LowerLeg_L UpperLeg_L 39.08 0 0
+Foot_L LowerLeg_L 40.98 0 0
+Toes_L Foot_L 11.75 0 0
+UpperLeg_R Hips -2 0 -6.53
+LowerLeg_R UpperLeg_R -39.08 0 0
+Foot_R LowerLeg_R -40.98 0 0
+Toes_R Foot_R -11.75 0 0
+"""
+TAKES = {
+    "dataset-1_walk_happy_001": 28,
+    "dataset-1_walk-left_old_001": 31,
+    "dataset-1_bye_giant_001": 25,
+    "dataset-2_walk-turn-left_normal_001": 34,
+    "dataset-2_walk-turn-right_masculine_006": 22,
+    "dataset-2_raise-up-right-hand_youthful_001": 19,
+    "dataset-2_run_active_017": 40,
+    "dataset-2_wave-both-hands_elderly_003": 23,
+}
+
+
+def synthetic_take(seed: int, frames: int) -> bvh.Bvh:
+    """Smooth random turns of all joints of the real skeleton; the hips wander."""
+    rng = np.random.default_rng(seed)
+    rows = [line.split() for line in HIERARCHY.split("\n") if line]
+    joints = tuple(row[0] for row in rows)
+    offsets = np.array([row[2:] for row in rows], float)
+    time = np.arange(frames)[:, None, None] / 30
+    phase, size = rng.uniform(0, 6, (2, 22, 3))
+    values = np.concatenate([np.tile(offsets, (frames, 1, 1)), 20 * size * np.sin(3 * time + phase)], 2)
+    values[:, 0] = 0
+    values[:, 1, :3] += 30 * np.sin(2 * time[:, 0] + phase[1])
+    channels = ("Xposition", "Yposition", "Zposition", "Zrotation", "Xrotation", "Yrotation")
+    ends = [joints.index(name) for name in ("Head", "Hand_L", "Hand_R", "Toes_L", "Toes_R")]
+    return bvh.Bvh(
+        joints,
+        tuple(-1 if row[1] == "-" else joints.index(row[1]) for row in rows),
+        offsets,
+        (channels,) * 22,
+        tuple(ends),
+        np.zeros((5, 3)),
+        values.reshape(frames, -1),
+        30.0,
+    )
+
+
+@pytest.fixture(scope="module")
+def tiny(tmp_path_factory) -> Path:
+    """A few takes in the layout of the original repository, with a label file whose BVH file is missing."""
+    root = tmp_path_factory.mktemp("bandai") / "Bandai-Namco-Research-Motiondataset"
+    for seed, (name, frames) in enumerate(TAKES.items()):
+        folder = root / "dataset" / f"Bandai-Namco-Research-Motiondataset-{name[8]}" / "data"
+        folder.mkdir(parents=True, exist_ok=True)
+        bvh.write(synthetic_take(seed, frames), folder / f"{name}.bvh")
+        (folder / f"{name}.json").write_text(json.dumps({"content": 0, "style": 0}))
+    (folder.parents[1] / "Bandai-Namco-Research-Motiondataset-1/data/dataset-1_dance-long_normal_001.json").write_text(
+        "{}"
+    )
+    (root / "README.md").write_text("about")
+    return root
+
+
+def clips(path: Path, **options) -> list[Clip]:
+    return list(Bandai(str(path), **{"workers": 1, **options}).clips(20))
+
+
+def same(one: list[Clip], other: list[Clip]) -> None:
+    assert [clip.id for clip in one] == [clip.id for clip in other]
+    for a, b in zip(one, other, strict=True):
+        np.testing.assert_array_equal(a.motion, b.motion)
+        assert {**vars(a), "motion": None} == {**vars(b), "motion": None}
+
+
+def test_clips_of_a_folder(tiny):
+    source = Bandai(str(tiny), workers=1)
+    found = list(source.clips(20))
+    assert source.count() == len(found)
+    ids = [clip.id for clip in found]
+    originals = [clip for clip in found if clip.id[0] != "M"]
+    assert [clip.id for clip in originals] == sorted(TAKES)
+    assert len(set(ids)) == len(ids)
+    for clip in originals:
+        frames = TAKES[clip.id]
+        assert clip.motion.shape == ((frames - 1) * 20 // 30 + 1, 22, 3)
+        assert clip.motion.dtype == np.float32
+        assert clip.source == clip.id
+        assert (f"M{clip.id}" in ids) == (clip.split == "train")
+        assert clip.action is not None
+        assert source.actions[clip.action] == clip.attributes["content"]
+        assert clip.attributes["dataset"] == int(clip.id[8])
+        assert len(set(clip.captions)) == 4
+    assert {clip.split for clip in originals} == {"train", "val", "test"}
+    assert Bandai(str(tiny), mirror=False).count() == len(TAKES)
+    same(clips(tiny, mirror=False), originals)
+
+
+def test_joints_are_those_of_smpl():
+    skeleton = SKELETONS["smpl22"]
+    assert tuple(JOINTS) == skeleton.joints
+    motion = np.random.default_rng(0).normal(size=(3, 22, 3)).astype(np.float32)
+    np.testing.assert_array_equal(bandai.mirror(motion), skeleton.mirror(torch.from_numpy(motion)).numpy())
+
+
+def test_bones_keep_their_length_and_joints_their_place(tiny):
+    parents = SKELETONS["smpl22"].parents[1:]
+    rows = [line.split() for line in HIERARCHY.split("\n") if line]
+    lengths = {row[0]: np.linalg.norm(np.array(row[2:], float)) / 100 for row in rows}
+    bones = [lengths[joint] for joint in list(JOINTS.values())[1:]]
+    bones[2], bones[5] = 0.4 * lengths["Spine"], 0.6 * lengths["Spine"]  # spine1 lies between pelvis and spine2
+    for seed, id_ in enumerate(TAKES):
+        clip = next(clip for clip in clips(tiny, exclude=[k for k in TAKES if k != id_]) if clip.id == id_)
+        got = np.linalg.norm(clip.motion[:, 1:] - clip.motion[:, parents], axis=2)
+        np.testing.assert_allclose(got, np.tile(bones, (len(got), 1)), atol=1e-6)
+        take = synthetic_take(seed, TAKES[id_])
+        places = take.positions()[::3] / 100
+        for joint, name in enumerate(JOINTS.values()):
+            if joint != 3:
+                expected = places[:, take.joints.index(name)]
+                np.testing.assert_allclose(clip.motion[::2, joint][: len(expected)], expected, atol=1e-6)
+
+
+def test_mirrored_copies(tiny):
+    by_id = {clip.id: clip for clip in clips(tiny)}
+    mirrored = [clip for clip in by_id.values() if clip.id[0] == "M"]
+    assert mirrored
+    swapped = {"left": "right", "right": "left"}
+    for clip in mirrored:
+        original = by_id[clip.id[1:]]
+        assert (clip.split, clip.source) == ("train", original.id)
+        np.testing.assert_array_equal(bandai.mirror(clip.motion), original.motion)
+        side = str(original.attributes.get("side", ""))
+        assert clip.attributes.get("side", "") == swapped.get(side, side)
+        words = [
+            [swapped.get(word, word) for word in caption.replace(",", " ,").split()] for caption in original.captions
+        ]
+        assert [caption.replace(",", " ,").split() for caption in clip.captions] == words
+    turn = by_id["Mdataset-2_walk-turn-left_normal_001"]
+    assert turn.attributes["content"] == "walk-turn-right"
+    assert Bandai.actions[turn.action or 0] == "walk-turn-right"
+    assert all("right" in caption and "left" not in caption for caption in turn.captions)
+    wave = by_id["Mdataset-1_bye_giant_001"]
+    assert (wave.attributes["content"], wave.attributes["side"]) == ("bye", "left")
+    assert all("left hand" in caption for caption in wave.captions)
+
+
+def test_takes_that_turn_to_the_other_side_than_named(tiny):
+    clip = next(clip for clip in clips(tiny) if clip.id == "dataset-2_walk-turn-right_masculine_006")
+    assert (clip.attributes["content"], clip.attributes["side"]) == ("walk-turn-left", "left")
+    assert Bandai.actions[clip.action or 0] == "walk-turn-left"
+    assert all("left" in caption for caption in clip.captions)
+    assert clip.split == "test"  # as the name says
+
+
+def published() -> list[tuple[int, str, str, int]]:
+    """Data set, content, style and number of all takes whose BVH file was published."""
+    only_normal = {"call": 2, "punch": 2, "slash": 2, "kick": 1, "respond": 1, "dance-short": 1}
+    takes = [(1, content, "normal", k + 1) for content, count in only_normal.items() for k in range(count)]
+    for content in set(CONTENTS_1) - set(only_normal) - {"dance-long"}:
+        takes += [(1, content, style, k + 1) for style in STYLES_1 for k in range(2 if content == "walk" else 1)]
+    for content, counts in TAKES_2.items():
+        takes += [
+            (2, content, style, k + 1) for style, count in zip(STYLES_2, counts, strict=True) for k in range(count)
+        ]
+    return takes
+
+
+def test_split_of_the_published_takes():
+    takes = published()
+    assert Counter(take[0] for take in takes) == {1: 174, 2: 2902}
+    splits = {take: split_of(*take) for take in takes}
+    assert Counter(splits.values()) == {"train": 2379, "val": 325, "test": 372}
+    combos = {(content, style) for dataset, content, style, _ in takes if dataset == 2}
+    for content, style in combos:
+        found = {split for take, split in splits.items() if take[:3] == (2, content, style)}
+        overlapping = style == "normal" and content.startswith("walk-turn-")
+        assert found == ({"train"} if overlapping else {"train", "val", "test"})
+    for (dataset, content, style, number), split in splits.items():
+        if dataset == 2:  # neighbors in blocks of five
+            assert split == splits[2, content, style, (number - 1) // 5 * 5 + 1]
+
+
+def test_captions_of_all_takes():
+    for dataset, content, style, _ in published():
+        side = side_of(content)
+        assert side in ("", "left", "right", "both")
+        for actual in {side, bandai.swap_sides(side)}:
+            found = captions(content, style, actual)
+            assert len(set(found)) == 4
+            for caption in found:
+                assert caption.startswith(("a person ", "someone ", "the person "))
+                assert "{" not in caption
+                assert "  " not in caption
+                assert " ," not in caption
+                assert caption == caption.strip()
+        if side in ("left", "right"):
+            assert all(side in caption for caption in captions(content, style, side))
+        else:
+            assert not any("left" in caption or "right" in caption for caption in captions(content, style, side))
+        if style != "normal":
+            assert not set(captions(content, style, side)) & set(captions(content, "normal", side)), (dataset, content)
+    assert captions("walk", "happy", "")[0] == "a person walks forward happily"
+    assert len(Bandai.actions) == 25
+
+
+@pytest.mark.parametrize("kind", ["zip", "tar", "tar.gz", "tar.xz"])
+def test_archives_give_the_same_clips_and_leave_no_files(tiny, kind, tmp_path, monkeypatch):
+    path = tmp_path / f"set.{kind}"
+    files = sorted(tiny.rglob("*"), reverse=True)  # another order than that of the clips
+    if kind == "zip":
+        with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+            for file in files:
+                archive.write(file, file.relative_to(tiny.parent))
+            archive.writestr("__MACOSX/._dataset-1_walk_happy_001.bvh", b"\0")
+    else:
+        with tarfile.open(path, "w:" + kind.removeprefix("tar").removeprefix(".")) as archive:  # pyright: ignore
+            for file in files:
+                archive.add(file, f"./{file.relative_to(tiny.parent)}", recursive=False)
+    (tmp_path / "temporary").mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "temporary"))
+    assert Bandai(str(path)).count() == Bandai(str(tiny)).count()
+    same(clips(path), clips(tiny))
+    assert not list((tmp_path / "temporary").iterdir())
+    assert len(list(tmp_path.iterdir())) == 2
+
+
+def test_processes_do_not_change_the_result(tiny):
+    same(clips(tiny, workers=2), clips(tiny, workers=1))
+
+
+def test_stopping_early_ends_the_processes(tiny):
+    iterator = Bandai(str(tiny), workers=2).clips(20)
+    next(iterator)
+    assert multiprocessing.active_children()
+    del iterator
+    assert not multiprocessing.active_children()
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_a_damaged_take_is_named_unless_excluded(tiny, tmp_path, workers):
+    root = tmp_path / "copy"
+    shutil.copytree(tiny, root)
+    id_ = "dataset-2_run_active_017"
+    (path,) = root.rglob(f"{id_}.bvh")
+    os.truncate(path, 9000)
+    with pytest.raises(ValueError, match=rf"{id_}.bvh, line \d+: .*data.source.exclude=\[{id_}\]"):
+        clips(root, workers=workers)
+    rest = clips(root, workers=workers, exclude=[id_])
+    assert {clip.source for clip in rest} == set(TAKES) - {id_}
+    assert Bandai(str(root), exclude=[id_]).count() == len(rest)
+
+
+def test_another_skeleton_is_refused(tmp_path):
+    text = "HIERARCHY\nROOT Hips\n{\nOFFSET 0 0 0\nCHANNELS 1 Xposition\n}\nMOTION\nFrames: 1\nFrame Time: 0.1\n0\n"
+    (tmp_path / "dataset-1_run_sad_001.bvh").write_text(text)
+    with pytest.raises(ValueError, match=r"dataset-1_run_sad_001.bvh: not the skeleton .* Chest"):
+        clips(tmp_path)
+
+
+def test_where_to_get_what_is_missing(tmp_path):
+    for path in (tmp_path / "nowhere", tmp_path):
+        with pytest.raises(
+            FileNotFoundError, match=rf"{path}.*BandaiNamcoResearchInc.*CC BY-NC 4.0.*data.source.path="
+        ):
+            Bandai(str(path)).count()
+
+
+def test_wrong_input_is_explained(tiny, tmp_path):
+    with pytest.raises(ValueError, match=r"data.source.exclude: .* has no dataset-1_walk_hapy_001"):
+        Bandai(str(tiny), exclude=["dataset-1_walk_hapy_001"]).count()
+    (tmp_path / "notes.txt").write_text("walk")
+    with pytest.raises(ValueError, match=r"notes.txt: neither a folder nor a zip or tar archive"):
+        Bandai(str(tmp_path / "notes.txt")).count()
+    (tmp_path / "dataset-1_swim_happy_001.bvh").write_text("")
+    with pytest.raises(ValueError, match=r"dataset-1_swim_happy_001.bvh: .* no content swim in a style happy"):
+        Bandai(str(tmp_path)).count()
+    for name in ("one", "two"):
+        (tmp_path / name).mkdir()
+        shutil.copy(next(tiny.rglob("dataset-1_walk_happy_001.bvh")), tmp_path / name)
+    with pytest.raises(ValueError, match=r"dataset-1_walk_happy_001 is there twice, as .*one/.* and as .*two/"):
+        Bandai(str(tmp_path)).count()
+
+
+def test_a_cut_archive_is_named(tiny, tmp_path):
+    path = tmp_path / "cut.tar.xz"
+    with tarfile.open(path, "w:xz") as archive:
+        archive.add(tiny, "set")
+    os.truncate(path, path.stat().st_size // 2)
+    with pytest.raises(ValueError, match=r"cut.tar.xz: damaged archive: "):
+        Bandai(str(path)).count()
+
+
+CASES = [key.split("/")[0] for key in third_party("hml263_bandai") if key.endswith("/joints_in")]
+
+
+@pytest.fixture(scope="module")
+def originals() -> dict[str, bytes]:
+    """BVH files of the clips in the fixture, by the name of the case."""
+    if not ARCHIVE.exists():
+        pytest.skip(f"{ARCHIVE} is not redistributed and not there")
+    wanted = {f"dataset-{d}_{case.split('_', 1)[1]}": case for case in CASES for d in (1, 2)}
+    found: dict[str, bytes] = {}
+    for name, data in bandai._files(ARCHIVE, wanted):
+        if data:
+            found[wanted[Path(name).stem]] = data
+            if len(found) == len(CASES):
+                break
+    return found
+
+
+@needs_third_party
+@pytest.mark.golden
+@pytest.mark.parametrize("case", CASES, ids=lambda case: f"hml263_bandai-{case}")
+def test_real_takes_against_the_joints_of_the_fixture(case, originals):
+    expected = third_party("hml263_bandai")[f"{case}/joints_in"]
+    _, motion = bandai.convert(f"{case}.bvh", originals[case], 20)
+    # The fixture's clips were cut. It takes the rounded frame time for exact, which is 6e-6 s and 6e-5 m of a fast
+    # joint at its last frame, and it interpolates linearly between frames, where a fast joint leaves the straight line.
+    assert len(motion) >= len(expected)
+    motion = motion[: len(expected)]
+    np.testing.assert_allclose(motion[::2], expected[::2], atol=1e-4)
+    np.testing.assert_allclose(motion, expected, atol=0.03)

@@ -1,0 +1,204 @@
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from flame_mdm.data import bvh
+
+ARM = """HIERARCHY
+ROOT Hips
+{
+  OFFSET 1 2 3
+  CHANNELS 6 Xposition Yposition Zposition Zrotation Xrotation Yrotation
+  JOINT Arm
+  {
+    OFFSET 5 0 0
+    CHANNELS 3 Yrotation Xrotation Zrotation
+    JOINT Hand
+    {
+      OFFSET 0 -2 0
+      End Site
+      {
+        OFFSET 0 0 1
+      }
+    }
+  }
+  JOINT Slider
+  {
+    OFFSET 0 7 9
+    CHANNELS 1 Yposition
+  }
+}
+MOTION
+Frames:\t3
+Frame Time:\t0.0333333
+0 0 0 0 0 0 0 0 0 7
+0 90 -3 90 0 0 0 0 0 8
+4 5 6 10 20 30 40 50 60 9.5
+"""
+
+
+def matrix(axis: str, degrees: float) -> np.ndarray:
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    return np.array(
+        {
+            "X": [[1, 0, 0], [0, c, -s], [0, s, c]],
+            "Y": [[c, 0, s], [0, 1, 0], [-s, 0, c]],
+            "Z": [[c, -s, 0], [s, c, 0], [0, 0, 1]],
+        }[axis]
+    )
+
+
+def arm() -> bvh.Bvh:
+    return bvh.parse(ARM.encode(), "arm.bvh")
+
+
+def tree(seed: int, frames: int = 7) -> bvh.Bvh:
+    """A random skeleton whose joints do not come in depth-first order, with random channels."""
+    rng = np.random.default_rng(seed)
+    parents = (-1, 0, 0, 1, 2, 1, 3)
+    channels = [tuple(rng.permutation(bvh.CHANNELS)) for _ in range(3)]
+    channels += [tuple(rng.permutation(bvh.CHANNELS[3:])) for _ in range(3)] + [()]
+    frames_ = rng.normal(0, 60, (frames, sum(map(len, channels))))
+    return bvh.Bvh(
+        tuple(f"joint{k}" for k in range(7)), parents, rng.normal(size=(7, 3)), tuple(channels), (4, 5, 6),
+        rng.normal(size=(3, 3)), frames_, 29.97,
+    )  # fmt: skip
+
+
+def test_header():
+    motion = arm()
+    assert motion.joints == ("Hips", "Arm", "Hand", "Slider")
+    assert motion.parents == (-1, 0, 1, 0)
+    assert motion.channels[1] == ("Yrotation", "Xrotation", "Zrotation")
+    assert motion.channels[2] == ()
+    assert motion.offsets.tolist() == [[1, 2, 3], [5, 0, 0], [0, -2, 0], [0, 7, 9]]
+    assert motion.end_parents == (2,)
+    assert motion.end_offsets.tolist() == [[0, 0, 1]]
+    assert motion.frames.shape == (3, 10)
+    assert motion.frames.dtype == np.float64
+    assert motion.fps == 30
+
+
+def test_position_channels_replace_the_offset():
+    positions = arm().positions()
+    assert positions[0].tolist() == [[0, 0, 0], [5, 0, 0], [5, -2, 0], [0, 7, 9]]
+    # turned by 90 degrees about z: x goes to y, y to -x
+    np.testing.assert_allclose(positions[1], [[0, 90, -3], [0, 95, -3], [2, 95, -3], [-8, 90, 6]], atol=1e-12)
+
+
+def test_rotations_follow_the_order_of_the_channels():
+    rotations = arm().rotations()[2]
+    hips = matrix("Z", 10) @ matrix("X", 20) @ matrix("Y", 30)
+    shoulder = matrix("Y", 40) @ matrix("X", 50) @ matrix("Z", 60)
+    np.testing.assert_allclose(rotations, [hips, shoulder, np.eye(3), np.eye(3)], atol=1e-12)
+    positions, ends = arm().positions()[2], arm().end_positions()[2]
+    np.testing.assert_allclose(positions[1], np.array([4, 5, 6]) + hips @ [5, 0, 0], atol=1e-12)
+    np.testing.assert_allclose(positions[2], positions[1] + hips @ shoulder @ [0, -2, 0], atol=1e-12)
+    np.testing.assert_allclose(positions[3], np.array([4, 5, 6]) + hips @ [0, 9.5, 9], atol=1e-12)
+    np.testing.assert_allclose(ends[0], positions[2] + hips @ shoulder @ [0, 0, 1], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("time", "fps"),
+    [("0.0333333", 30), ("0.0333", 30), ("0.008333", 120), ("0.0083333", 120), ("0.05", 20), ("0.08", 12.5),
+     ("0.016666", 60), ("8.33333E-03", 120), ("0.01668335", 1 / 0.01668335), ("1", 1), (".25", 4), ("2", 0.5)],
+)  # fmt: skip
+def test_fps_is_the_one_the_rounded_frame_time_stands_for(time, fps):
+    assert bvh.parse(ARM.replace("0.0333333", time).encode(), "arm.bvh").fps == fps
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_what_is_written_reads_back(seed, tmp_path):
+    motion = tree(seed)
+    bvh.write(motion, tmp_path / "tree.bvh")
+    back = bvh.read(tmp_path / "tree.bvh")
+    assert [path.name for path in tmp_path.iterdir()] == ["tree.bvh"]
+    assert back.fps == pytest.approx(motion.fps, rel=1e-15)
+    order = [back.joints.index(name) for name in motion.joints]
+    np.testing.assert_array_equal(back.positions()[:, order], motion.positions())
+    ends = np.lexsort(back.end_positions()[0].T), np.lexsort(motion.end_positions()[0].T)
+    np.testing.assert_array_equal(back.end_positions()[:, ends[0]], motion.end_positions()[:, ends[1]])
+    bvh.write(back, tmp_path / "again.bvh")
+    assert (tmp_path / "again.bvh").read_bytes() == (tmp_path / "tree.bvh").read_bytes()
+
+
+@pytest.mark.parametrize(("frames", "expected"), [(1, 1), (2, 1), (3, 2), (4, 3), (7, 5), (128, 85), (130, 87)])
+def test_resampling_keeps_the_last_frame(frames, expected):
+    motion = tree(0, frames)
+    motion = bvh.Bvh(**{**vars(motion), "fps": 30.0})
+    rotations, translations = motion.resample(20)
+    assert len(rotations) == len(translations) == expected
+    # times 0, 0.1, 0.2, ... are frames of both
+    np.testing.assert_allclose(rotations[::2], motion.rotations()[::3][: len(rotations[::2])], atol=1e-12)
+    np.testing.assert_allclose(translations[::2], motion.translations()[::3][: len(translations[::2])], atol=1e-12)
+
+
+def test_resampling_turns_at_a_constant_rate_and_keeps_bones():
+    frames = (
+        "0 0 0 170 0 0 0 0 0 7\n3 6 9 -170 0 0 0 90 0 7\n"  # 20 degrees the short way about z, 90 about the arm's x
+    )
+    text = ARM[: ARM.index("0 0 0 0 0 0")].replace("Frames:\t3", "Frames:\t2") + frames
+    motion = bvh.parse(text.encode(), "arm.bvh")
+    rotations, translations = motion.resample(120)
+    expected = Rotation.from_euler("z", [[170], [175], [180], [185], [190]], degrees=True).as_matrix()
+    np.testing.assert_allclose(rotations[:, 0], expected, atol=1e-12)
+    np.testing.assert_allclose(rotations[1, 1], matrix("X", 22.5), atol=1e-12)
+    np.testing.assert_allclose(translations[:, 0], [[3 * k, 6 * k, 9 * k] for k in (0, 0.25, 0.5, 0.75, 1)], atol=1e-12)
+    positions, _ = bvh.forward_kinematics(motion.parents, rotations, translations)
+    np.testing.assert_allclose(np.linalg.norm(positions[:, 1] - positions[:, 0], axis=1), 5, rtol=1e-14)
+    np.testing.assert_allclose(np.linalg.norm(positions[:, 2] - positions[:, 1], axis=1), 2, rtol=1e-14)
+
+
+LAST = "4 5 6 10 20 30 40 50 60 9.5"
+
+
+@pytest.mark.parametrize(
+    ("data", "line", "reason"),
+    [
+        (b"", 1, "not a BVH file"),
+        (b"\x00\x01\xff\xfe", 1, "not a BVH file"),
+        (b"HIERARCHY\nROOT \xff", 2, "not UTF-8"),
+        (b"version https://git-lfs.github.com/spec/v1\n", 1, "not a BVH file"),
+        (ARM[:60], 5, "ends inside the hierarchy"),
+        (ARM.replace("OFFSET 5 0 0", "OFFSET 5 x 0"), 8, "expected a number, found x"),
+        (ARM.replace("OFFSET 5 0 0", "OFFSET 5 nan 0"), 8, "expected a number, found nan"),
+        (ARM.replace("    OFFSET 5 0 0\n", ""), 17, "without OFFSET"),
+        (ARM.replace("Yrotation Xrotation Zrotation", "Yrotation Yrotation Zrotation"), 9, "channels"),
+        (ARM.replace("Yrotation Xrotation Zrotation", "Yrotation Wrotation Zrotation"), 9, "channels"),
+        (ARM.replace("  JOINT Arm\n  {", "  JOINT Arm\n"), 8, "expected {"),
+        (ARM.replace("ROOT", "LIMB"), 2, "LIMB has no place"),
+        (ARM.replace("9.5\n", "9.5\n1 2\n"), 31, "2 numbers, but the joints have 10"),
+        (ARM.replace("\n}\nMOTION", "\nMOTION"), 24, "before the end of the hierarchy"),
+        (ARM.replace("Frames:\t3", "Frames: many"), 26, "expected Frames:"),
+        (ARM.replace("0.0333333", "0"), 27, "frame time"),
+        (ARM.replace("0.0333333", "fast"), 27, "expected Frame Time:"),
+        (ARM.replace("Frames:\t3", "Frames:\t4"), 30, "ends after 3 frames"),
+        (ARM.replace("Frames:\t3", "Frames:\t2"), 30, "after 3 frames"),
+        (ARM[: ARM.index(LAST)], 29, "ends after 2 frames"),
+        (ARM[: ARM.index("0 0 0 0")].replace("Frames:\t3", "Frames:\t0"), 27, "ends after 0 frames"),
+        (ARM.replace(LAST, "4 5 6"), 30, "3 numbers, but the joints have 10 channels"),
+        (ARM.replace(LAST, LAST.replace("9.5", "oops")), 30, "oops"),
+        (ARM.replace("0 90 -3 90", "0 90 nan 90"), 29, "not finite"),
+        (ARM.replace("0 90 -3 90", "0 90 inf 90"), 29, "not finite"),
+    ],
+)  # fmt: skip
+def test_damaged_files_are_named_with_the_line(data, line, reason, tmp_path):
+    path = tmp_path / "walk.bvh"
+    path.write_bytes(data if isinstance(data, bytes) else data.encode())
+    with pytest.raises(ValueError, match=reason) as error:
+        bvh.read(path)
+    assert str(error.value).startswith(f"{path}, line {line}: ")
+    assert "\n" not in str(error.value)
+
+
+def test_every_truncation_is_noticed():
+    whole = ARM.rstrip("\n")
+    for end in range(len(whole) - 3):  # what follows could be the shorter number that was meant
+        with pytest.raises(ValueError, match=r"^arm.bvh, line \d+: "):
+            bvh.parse(whole[:end].encode(), "arm.bvh")
+
+
+def test_windows_line_ends_and_byte_order_mark():
+    other = bvh.parse(b"\xef\xbb\xbf" + ARM.replace("\n", "\r\n").encode(), "arm.bvh")
+    np.testing.assert_array_equal(other.frames, arm().frames)
+    assert other.joints == arm().joints

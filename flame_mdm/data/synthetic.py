@@ -161,7 +161,9 @@ class _Gait:
     heel_off: float  # the heel's angle when the foot leaves the floor
     toe_up: float  # the toes' angle when the foot comes down; negative: the toes come down first
     width: float  # half the distance between the tracks
-    bounce: float = 0.0  # of the pelvis, highest between the steps
+    sink: float = 0.03  # of the pelvis under way
+    bounce: float = 0.0  # of the pelvis, highest with both feet in the air
+    behind: float = 0.0  # how much further back the feet come down than they stand
 
 
 def _walk_along(
@@ -207,17 +209,18 @@ def _walk_along(
     raised = np.zeros((2, len(t)))
 
     moving = np.interp(t, fine, pace) / speed
-    body.position[:, 1] += moving * gait.bounce * np.cos(2 * np.pi * ((t - start) / gait.step - gait.swing / 2 + 0.5))
+    flight = (t - start) / gait.step - (gait.swing / gait.step - 1) / 2
+    body.position[:, 1] += moving * (gait.bounce * np.cos(2 * np.pi * flight) - gait.sink)
     side, lift_off = int(rng.integers(2)) if first is None else first, start
     while lift_off < min(end, halt + gait.step):
         down = lift_off + gait.swing
         stance = 2 * gait.step - gait.swing
         px, pz, yaw = (float(v[0]) for v in at(np.array([down + stance / 2])))
-        across = gait.width * SIGN[side]
+        across, along = gait.width * SIGN[side], back - gait.behind
         goal = np.array(
             [
-                px + across * np.cos(yaw) + back * np.sin(yaw),
-                pz - across * np.sin(yaw) + back * np.cos(yaw),
+                px + across * np.cos(yaw) + along * np.sin(yaw),
+                pz - across * np.sin(yaw) + along * np.cos(yaw),
                 yaw + yaw0[side],
             ]
         )
@@ -262,7 +265,15 @@ def _walk(rng: np.random.Generator, t: np.ndarray, asked: Attributes) -> _Body:
         low, high = {"slow": (0.5, 0.7), "normal": (1.0, 1.25), "fast": (1.55, 1.8)}[str(asked["speed"])]
         speed = rng.uniform(low, high)
         step = np.interp(speed, [0.5, 1.2, 1.8], [0.66, 0.52, 0.42]) * rng.uniform(0.95, 1.05)
-        gait = _Gait(step, 0.82 * step, rng.uniform(0.1, 0.13), 0.25 + 0.4 * speed, 0.15 + 0.12 * speed, 0.085)
+        gait = _Gait(
+            step,
+            0.82 * step,
+            rng.uniform(0.1, 0.13),
+            0.25 + 0.4 * speed,
+            0.15 + 0.12 * speed,
+            0.085,
+            0.02 + 0.02 * speed,
+        )
         body.spine[0] += 0.03 * speed
         apart = _walk_along(body, rng, gait, speed, lambda s: (0 * s, s, 0 * s), stops)
     else:
@@ -285,9 +296,8 @@ def _run(rng: np.random.Generator, t: np.ndarray, asked: Attributes) -> _Body:
     body = _Body(rng, t)
     body.spine[0] += 0.12
     body.pelvis[0] += 0.06
-    body.position[:, 1] -= 0.03
     step = rng.uniform(0.34, 0.38)
-    gait = _Gait(step, 1.3 * step, rng.uniform(0.2, 0.26), 1.1, 0.15, 0.07, 0.03)
+    gait = _Gait(step, 1.3 * step, rng.uniform(0.2, 0.26), 1.1, 0.15, 0.07, sink=0.06, bounce=0.035, behind=0.12)
     apart = _walk_along(body, rng, gait, rng.uniform(2.4, 3.0), lambda s: (0 * s, s, 0 * s), False)
     for side in (0, 1):
         body.move_arm(side, _ease(t, 0, 0.5), (-0.1, 0.2, -0.6, rng.uniform(1.4, 1.7)))

@@ -265,15 +265,8 @@ def _walk(rng: np.random.Generator, t: np.ndarray, asked: Attributes) -> _Body:
         low, high = {"slow": (0.5, 0.7), "normal": (1.0, 1.25), "fast": (1.55, 1.8)}[str(asked["speed"])]
         speed = rng.uniform(low, high)
         step = np.interp(speed, [0.5, 1.2, 1.8], [0.66, 0.52, 0.42]) * rng.uniform(0.95, 1.05)
-        gait = _Gait(
-            step,
-            0.82 * step,
-            rng.uniform(0.1, 0.13),
-            0.25 + 0.4 * speed,
-            0.15 + 0.12 * speed,
-            0.085,
-            0.02 + 0.02 * speed,
-        )
+        lift, sink = rng.uniform(0.1, 0.13), 0.02 + 0.01 * speed
+        gait = _Gait(step, 0.82 * step, lift, 0.25 + 0.4 * speed, 0.15 + 0.12 * speed, 0.085, sink)
         body.spine[0] += 0.03 * speed
         apart = _walk_along(body, rng, gait, speed, lambda s: (0 * s, s, 0 * s), stops)
     else:

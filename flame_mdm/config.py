@@ -326,29 +326,37 @@ def _inherited(module: str, node: ast.ClassDef) -> frozenset[str]:
 # Instances and files --------------------------------------------------------------------------------------------------
 
 
-def instantiate(node: Config, *, trusted: bool = True, **derived: Any) -> Any:
+def trust(config: Config) -> None:
+    """Checks a configuration out of a checkpoint: it may name classes of `TRUSTED` packages only.
+
+    The environment variable FLAME_MDM_TRUST adds packages, with commas between them.
+
+    Raises:
+        UserError: it names others.
+    """
+    allowed = (*TRUSTED, *os.environ.get("FLAME_MDM_TRUST", "").split(","))
+    for path, mapping in _walk(config):
+        target = str(mapping.get("_target_", "flame_mdm"))
+        package = target.partition(".")[0]
+        if package not in allowed:
+            raise UserError(
+                f"the checkpoint's configuration names {target} at {'.'.join(path)}; such code runs only if you "
+                f"trust it: set FLAME_MDM_TRUST={package}"
+            )
+
+
+def instantiate(node: Config, **derived: Any) -> Any:
     """Builds what a mapping with a `_target_` describes, nested ones included.
 
     Args:
         node: the mapping.
-        trusted: False for configurations out of a checkpoint: only classes of `TRUSTED` packages, and of those
-            listed in the environment variable FLAME_MDM_TRUST, are built.
         derived: arguments that follow from other parts of the recipe.
 
     Raises:
-        UserError: an untrusted `_target_`, or arguments of the wrong kind.
+        UserError: arguments of the wrong kind.
     """
     from hydra.utils import instantiate as hydra_instantiate
 
-    if not trusted:
-        allowed = (*TRUSTED, *os.environ.get("FLAME_MDM_TRUST", "").split(","))
-        for path, mapping in _walk(node):
-            target = str(mapping.get("_target_", "flame_mdm"))
-            if target.partition(".")[0] not in allowed:
-                raise UserError(
-                    f"the checkpoint's configuration names {target} at {'.'.join(path)}; such code runs only if you "
-                    f"trust it: set FLAME_MDM_TRUST={target.partition('.')[0]}"
-                )
     try:
         return hydra_instantiate(node, **derived, _convert_="all")
     except HydraException as error:
@@ -417,7 +425,9 @@ def _serve(command: Callable[[Config], None], words: list[str], name: str | None
     sweep = any(flag in ("-m", "--multirun") for flag in flags)
     plan = _plan(recipe, overrides)
     if not sweep:
-        check(_hydra(plan))
+        composed = _hydra(plan)
+        check(composed)
+        Path(composed["run"]["dir"]).mkdir(parents=True, exist_ok=True)
 
     def job(config: Any) -> None:
         plain: Config = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)  # type: ignore[assignment]

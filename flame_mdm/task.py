@@ -13,7 +13,7 @@ from torch import Tensor
 from torchmetrics import MeanMetric
 
 from flame_mdm.conditions import ConditionEncoder
-from flame_mdm.config import Config, UserError, instantiate, parameters
+from flame_mdm.config import Config, UserError, instantiate, parameters, trust
 from flame_mdm.data.datamodule import MotionDataModule
 from flame_mdm.denoisers import Denoiser
 from flame_mdm.losses import MotionLosses
@@ -24,7 +24,50 @@ from flame_mdm.processes.guidance import classifier_free_guidance
 from flame_mdm.representations import Representation
 
 
-class MotionGeneration(LightningModule):
+class Task(LightningModule):
+    """What all models share that `make train` trains; a recipe names its class in `task._target_`.
+
+    Subclasses have a classmethod `build(config, representation, *, actions, trusted)` as `MotionGeneration` does.
+    """
+
+    config: Config
+    """The recipe this was built from, saved in checkpoints."""
+    facts: dict[str, Any]
+    """What sampling and evaluation have to know of the training data: actions, longest motion, fingerprint."""
+
+    def __init__(self, condition: ConditionEncoder, representation: Representation, *, optimizer: Config, seed: int):
+        super().__init__()
+        self.condition, self.representation = condition, representation
+        self.optimizer, self.seed = optimizer, seed
+        self.config, self.facts = {}, {}
+
+    def describe(self) -> str:
+        """Name of the network, for the line that opens a run."""
+        return type(self).__name__
+
+    def prepare_data(self) -> None:
+        """Encodes all captions of the data once, on one process, where the text encoder is frozen."""
+        self.condition.precompute(*self._captions())
+
+    def setup(self, stage: str) -> None:
+        """Opens what `prepare_data` encoded."""
+        self.condition.load_cache(*self._captions())
+
+    def _captions(self) -> tuple[list[str], Path]:
+        data: MotionDataModule = self.trainer.datamodule  # type: ignore[attr-defined]
+        prompts = [text for c in self.trainer.callbacks for text in getattr(c, "texts", ())]  # type: ignore[attr-defined]
+        return sorted({*data.captions(), *prompts}), data.folder.parent / "text"
+
+    def configure_optimizers(self) -> torch.optim.Optimizer:
+        """The optimizer of the recipe over all trainable parameters."""
+        return instantiate(self.optimizer, params=[p for p in self.parameters() if p.requires_grad])
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """The checkpoint carries its recipe and the facts of its data, as plain values."""
+        checkpoint["config"], checkpoint["facts"] = self.config, self.facts
+
+
+class MotionGeneration(Task):
     """Trains any denoiser with any process, and samples from it.
 
     Args:
@@ -38,11 +81,6 @@ class MotionGeneration(LightningModule):
         seed: with the step and the rank, decides all draws of a training step.
         compile: compiles the denoiser with torch.compile.
     """
-
-    config: Config
-    """The recipe this was built from, saved in checkpoints."""
-    facts: dict[str, Any]
-    """What sampling and evaluation have to know of the training data: actions, longest motion, fingerprint."""
 
     def __init__(
         self,
@@ -60,27 +98,23 @@ class MotionGeneration(LightningModule):
         seed: int = 0,
         compile: bool = False,
     ):
-        super().__init__()
-        self.denoiser, self.process, self.condition = denoiser, process, condition
-        self.representation = representation
+        super().__init__(condition, representation, optimizer=optimizer, seed=seed)
+        self.denoiser, self.process = denoiser, process
         self.losses = MotionLosses(representation.to_joints, representation.skeleton.feet, **losses)
-        self.optimizer, self.cond_drop_prob, self.seed = optimizer, cond_drop_prob, seed
+        self.cond_drop_prob = cond_drop_prob
         self.guidance_scale, self.sampler, self.num_inference_steps = guidance_scale, sampler, num_inference_steps
-        self.config, self.facts = {}, {}
         self.val_losses = torch.nn.ModuleDict()
         if compile:
             self.denoiser.compile()
 
     @classmethod
-    def build(
-        cls, config: Config, representation: Representation, *, actions: Sequence[str] = (), trusted: bool = True
-    ) -> MotionGeneration:
+    def build(cls, config: Config, representation: Representation, *, actions: Sequence[str] = ()) -> MotionGeneration:
         """Builds the parts of a recipe and joins them; sizes that follow from other parts are passed on here."""
 
         def part(name: str, **derived: Any) -> Any:
             legal = parameters(config[name]["_target_"])
             derived = {k: v for k, v in derived.items() if k in legal or "**" in legal}
-            return instantiate(config[name], trusted=trusted, **derived)
+            return instantiate(config[name], **derived)
 
         process: Process = part("process")
         condition: ConditionEncoder = part("condition", num_actions=len(actions))
@@ -105,20 +139,10 @@ class MotionGeneration(LightningModule):
         task.config, task.facts = config, {"actions": list(actions)}
         return task
 
+    def describe(self) -> str:
+        return type(self.denoiser).__name__
+
     # Training ---------------------------------------------------------------------------------------------------------
-
-    def prepare_data(self) -> None:
-        """Encodes all captions of the data once, on one process, where the text encoder is frozen."""
-        self.condition.precompute(*self._captions())
-
-    def setup(self, stage: str) -> None:
-        """Opens what `prepare_data` encoded."""
-        self.condition.load_cache(*self._captions())
-
-    def _captions(self) -> tuple[list[str], Path]:
-        data: MotionDataModule = self.trainer.datamodule  # type: ignore[attr-defined]
-        prompts = [text for c in self.trainer.callbacks for text in getattr(c, "texts", ())]  # type: ignore[attr-defined]
-        return sorted({*data.captions(), *prompts}), data.folder.parent / "text"
 
     def training_step(self, batch: MotionBatch, batch_idx: int) -> Tensor:
         """Loss of one batch; every draw in it is a function of (seed, batch number, rank)."""
@@ -152,14 +176,6 @@ class MotionGeneration(LightningModule):
             assert isinstance(metric, MeanMetric)
             self.log(f"val/{name}", metric.compute(), prog_bar=name == "loss")
             metric.reset()
-
-    def configure_optimizers(self) -> torch.optim.Optimizer:
-        """The optimizer of the recipe over all trainable parameters."""
-        return instantiate(self.optimizer, params=[p for p in self.parameters() if p.requires_grad])
-
-    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """The checkpoint carries its recipe and the facts of its data, as plain values."""
-        checkpoint["config"], checkpoint["facts"] = self.config, self.facts
 
     # Sampling ---------------------------------------------------------------------------------------------------------
 
@@ -219,8 +235,9 @@ def load(path: str | Path, device: str | torch.device = "cpu") -> MotionGenerati
     """
     checkpoint = read_checkpoint(path)
     config, facts = checkpoint["config"], checkpoint["facts"]
-    representation = instantiate(config["representation"], trusted=False)
-    task = MotionGeneration.build(config, representation, actions=facts["actions"], trusted=False)
+    trust({name: config[name] for name in ("representation", "process", "condition", "denoiser")})
+    representation = instantiate(config["representation"])
+    task = MotionGeneration.build(config, representation, actions=facts["actions"])
     task.facts = facts
     try:
         task.load_state_dict(checkpoint["state_dict"], strict=True)

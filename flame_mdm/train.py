@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from flame_mdm.config import Config, UserError, flatten, instantiate, run, save
 
 if TYPE_CHECKING:
-    from flame_mdm.task import MotionGeneration
+    from flame_mdm.task import Task
 
 USAGE = """
 usage: python -m flame_mdm.train NAME [key=value ...] [--multirun]
@@ -59,11 +59,12 @@ def train(config: Config) -> None:
     _same_run(folder, config)
 
     import torch
+    from hydra.utils import get_class
     from lightning import Trainer, seed_everything
     from lightning.pytorch.callbacks import EMAWeightAveraging
 
     from flame_mdm.callbacks import Interrupted, Progress
-    from flame_mdm.task import MotionGeneration, read_checkpoint
+    from flame_mdm.task import read_checkpoint
 
     _quiet()
     torch.set_float32_matmul_precision("high")
@@ -75,7 +76,7 @@ def train(config: Config) -> None:
     seed_everything(config["seed"], verbose=False)
     representation = instantiate(config["representation"])
     data = instantiate(config["data"], representation=representation, seed=config["seed"])
-    task = MotionGeneration.build(config, representation, actions=data.source.actions)
+    task: Task = get_class(config["task"]["_target_"]).build(config, representation, actions=data.source.actions)
     data.prepare_data()
     store = data.open()
     task.facts |= {
@@ -98,7 +99,7 @@ def train(config: Config) -> None:
         enable_model_summary=False,
     )
     if trainer.is_global_zero:
-        save(config, folder / "config.yaml", head="A saved run: train it again with EXP=path/to/this/file")
+        save(_movable(config), folder / "config.yaml", head="A saved run: train it again with EXP=path/to/this/file")
         (folder / "provenance.json").write_text(json.dumps(_provenance(task), indent=2) + "\n")
         _introduce(config, task, trainer, store.info, step)
     try:
@@ -108,13 +109,23 @@ def train(config: Config) -> None:
         raise SystemExit(128 + stop.signum) from None
 
 
+def _movable(node: Any, folder: str | None = None) -> Any:
+    """The configuration with paths in the run's folder written in terms of `run.dir`, so that it can be changed."""
+    if isinstance(node, dict):
+        inside = folder or node["run"]["dir"]
+        return {k: v if folder is None and k == "run" else _movable(v, inside) for k, v in node.items()}
+    if isinstance(node, str) and folder and node.startswith(folder):
+        return "${run.dir}" + node.removeprefix(folder)
+    return node
+
+
 def _same_run(folder: Path, config: Config) -> None:
     """Refuses a folder that holds a run of another configuration."""
     if not (folder / "config.yaml").exists():
         return
     from omegaconf import OmegaConf
 
-    saved = flatten(OmegaConf.to_container(OmegaConf.load(folder / "config.yaml")))
+    saved = flatten(OmegaConf.to_container(OmegaConf.load(folder / "config.yaml"), resolve=True))
     wanted = flatten(config)
     differing = [
         f"{key} ({saved.get(key, 'absent')} there, {wanted.get(key, 'absent')} here)"
@@ -138,12 +149,12 @@ def _quiet() -> None:
         warnings.filterwarnings("ignore", message)
 
 
-def _introduce(config: Config, task: MotionGeneration, trainer: Any, data: dict[str, Any], step: int) -> None:
+def _introduce(config: Config, task: Task, trainer: Any, data: dict[str, Any], step: int) -> None:
     count = sum(p.numel() for p in task.parameters() if p.requires_grad)
     size = config["data"]["batch_size"] * trainer.world_size * trainer.accumulate_grad_batches
     clips = data["clips"]
     device = f"{trainer.world_size} x {trainer.strategy.root_device.type}"
-    model = f"{type(task.denoiser).__name__}, {count / 1e6:.2f} M trainable parameters"
+    model = f"{task.describe()}, {count / 1e6:.2f} M trainable parameters"
     splits = f"{clips['train']} clips to train on, {clips['val']} to validate, {clips['test']} to test"
     epochs = trainer.max_steps * size / clips["train"]
     print(f"{config['experiment']}: {model}, on {device}")
@@ -153,7 +164,7 @@ def _introduce(config: Config, task: MotionGeneration, trainer: Any, data: dict[
     print(f"steps: {step} to {trainer.max_steps} of {size} clips, about {epochs:.0f} passes over the data")
 
 
-def _provenance(task: MotionGeneration) -> dict[str, Any]:
+def _provenance(task: Task) -> dict[str, Any]:
     import platform
     import subprocess
     from importlib.metadata import version

@@ -23,8 +23,6 @@ TINY = [
     "task.num_inference_steps=5",
     "trainer.accelerator=cpu",
     "trainer.enable_progress_bar=false",
-    "callbacks.samples.prompts=[a person walks forward]",
-    "callbacks.samples.metrics=null",
     "callbacks.samples.seconds=1.5",
 ]
 """Overrides that make the quick-start experiment train in a second."""

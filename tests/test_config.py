@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from flame_mdm import config
-from flame_mdm.config import UserError, check, compose, flatten, instantiate, parameters, recipes
+from flame_mdm.config import UserError, check, compose, flatten, instantiate, parameters, recipes, trust
 
 
 @pytest.mark.parametrize("name", recipes())
@@ -103,9 +103,9 @@ def test_check_finds_unknown_arguments_deep_inside():
 
 def test_untrusted_targets_are_refused(monkeypatch):
     with pytest.raises(UserError, match=r"os\.system at b; such code runs only if you trust it"):
-        instantiate({"_target_": "torch.nn.Identity", "b": {"_target_": "os.system"}}, trusted=False)
+        trust({"_target_": "torch.nn.Identity", "b": {"_target_": "os.system"}})
     monkeypatch.setenv("FLAME_MDM_TRUST", "fractions")
-    assert instantiate({"_target_": "fractions.Fraction", "numerator": 3}, trusted=False) == 3
+    trust({"_target_": "fractions.Fraction", "numerator": 3})
 
 
 def test_wrong_arguments_are_one_line():

@@ -60,7 +60,7 @@ class Store:
                 raise _damaged(self.folder / name, "its hash is not the recorded one")
         try:
             self.features: np.ndarray = np.load(self.folder / "features.npy", mmap_mode="r")
-        except (OSError, ValueError) as error:
+        except (OSError, ValueError, EOFError) as error:
             raise _damaged(self.folder / "features.npy", str(error)) from error
         if list(self.features.shape) != self.info["shape"]:
             raise _damaged(self.folder / "features.npy", f"it holds {self.features.shape}, not {self.info['shape']}")

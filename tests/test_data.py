@@ -1,0 +1,255 @@
+import json
+import shutil
+from itertools import islice
+
+import numpy as np
+import pytest
+import torch
+
+from flame_mdm.data import Clip, MotionSource
+from flame_mdm.data.crops import Fixed, Units, Whole
+from flame_mdm.data.datamodule import Clips, EvaluationBatches, MotionDataModule, TrainingBatches
+from flame_mdm.data.store import Store, write_store
+from flame_mdm.data.synthetic import Synthetic
+from flame_mdm.motion import collate
+from flame_mdm.representations.humanml import HumanML
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("store") / "synthetic"
+    write_store(folder, Synthetic(clips=40, seed=1), HumanML())
+    return folder
+
+
+@pytest.fixture
+def store(folder):
+    return Store(folder)
+
+
+@pytest.fixture
+def copy(folder, tmp_path):
+    return shutil.copytree(folder, tmp_path / "copy")
+
+
+def clips_of(store, crop=None, split="train"):
+    return Clips(store, split, representation=HumanML(), crop=crop or Units(24, 60, 4), seed=0)
+
+
+def test_a_store_holds_what_was_encoded(store):
+    source = Synthetic(clips=40, seed=1)
+    clip = next(iter(source.clips(20.0)))
+    entry = next(e for e in store.clips if e.id == clip.id)
+    expected = HumanML().encode(torch.from_numpy(clip.motion)).numpy()
+    np.testing.assert_allclose(store.motion(entry), expected, atol=1e-6)
+    assert (entry.captions, entry.split, entry.source) == (clip.captions, clip.split, clip.source)
+    assert sum(store.info["clips"].values()) == len(store.clips) == 40
+    store.verify()
+
+
+def test_the_same_input_gives_the_same_fingerprint(store, tmp_path):
+    again = write_store(tmp_path / "again", Synthetic(clips=40, seed=1), HumanML())
+    other = write_store(tmp_path / "other", Synthetic(clips=40, seed=2), HumanML())
+    assert store.fingerprint == again.fingerprint != other.fingerprint
+
+
+def test_a_flipped_byte_is_found_by_verify(copy):
+    path = copy / "features.npy"
+    data = bytearray(path.read_bytes())
+    data[-5] ^= 1
+    path.write_bytes(data)
+    with pytest.raises(ValueError, match=r"features\.npy: damaged: its hash"):
+        Store(copy).verify()
+
+
+@pytest.mark.parametrize("name", ["features.npy", "clips.jsonl", "statistics.npz", "store.json"])
+@pytest.mark.parametrize("damage", ["cut", "empty", "absent"])
+def test_damaged_files_are_named(copy, name, damage):
+    path = copy / name
+    if damage == "absent":
+        path.unlink()
+    else:
+        path.write_bytes(path.read_bytes()[: path.stat().st_size // 2 if damage == "cut" else 0])
+    with pytest.raises((ValueError, FileNotFoundError), match=str(copy)) as error:
+        Store(copy)
+    assert "\n" not in str(error.value)
+
+
+def test_an_older_format_is_refused(copy):
+    info = json.loads((copy / "store.json").read_text())
+    (copy / "store.json").write_text(json.dumps(info | {"format": 0}))
+    with pytest.raises(ValueError, match="not a store of format"):
+        Store(copy)
+
+
+class Broken(MotionSource):
+    """Yields the clips it is given."""
+
+    name = "broken"
+
+    def __init__(self, *clips):
+        self.given = clips
+
+    def count(self):
+        return len(self.given)
+
+    def clips(self, fps):
+        yield from self.given
+
+
+def clip(name, split="train", source=None, motion=None, **options):
+    joints = next(iter(Synthetic(clips=1).clips(20.0))).motion if motion is None else motion
+    return Clip(name, joints, ["a person walks"], split, source or name, **options)
+
+
+@pytest.mark.parametrize(
+    ("clips", "message"),
+    [
+        ([clip("a"), clip("b", motion=np.full((30, 22, 3), np.nan))], "clip b: "),
+        ([clip("a"), clip("b", motion=np.zeros((30, 21, 3)))], "clip b: "),
+        ([clip("a", "train", "take"), clip("Ma", "test", "take")], "clips of take stand in train and in test"),
+        ([clip("a"), clip("a")], "two clips have the same id"),
+        ([clip("a", "test")], "no clip is in the training split"),
+        ([clip("a", motion=np.zeros((9, 5)), encoded=True)], r"clip a: shape \(9, 5\), not \(frames, 263\)"),
+    ],
+)
+def test_bad_clips_stop_preparation_and_leave_nothing(clips, message, tmp_path):
+    with pytest.raises(ValueError, match=message):
+        write_store(tmp_path / "store", Broken(*clips), HumanML())
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_encoded_clips_and_given_statistics_are_stored_as_they_are(tmp_path):
+    features = np.random.default_rng(0).normal(size=(30, 263)).astype(np.float32)
+    source = Broken(clip("a", motion=features, encoded=True))
+    source.statistics = lambda: (np.full(263, 2.0), np.full(263, 3.0))
+    store = write_store(tmp_path / "store", source, HumanML())
+    np.testing.assert_array_equal(store.motion(store.clips[0]), features)
+    assert (store.mean == 2).all()
+    assert (store.std == 3).all()
+
+
+def test_crops_follow_the_rule_of_the_field():
+    crop, generator = Units(40, 196, 4), np.random.default_rng(0)
+    draws = [crop(101, generator) for _ in range(3000)]
+    lengths = [len(d) for d in draws]
+    assert set(lengths) == {100, 96}
+    assert abs(lengths.count(96) / 3000 - 1 / 3) < 0.03
+    assert {d[0] for d in draws if len(d) == 96} == set(range(6))
+    assert all((np.diff(d) == 1).all() and d[-1] <= 100 for d in draws)
+    assert len(crop(500, generator)) in (196, 192)
+    np.testing.assert_array_equal(crop(101, None), np.arange(100))
+
+
+def test_fixed_crops_repeat_the_last_frame_of_short_clips():
+    crop, generator = Fixed(60), np.random.default_rng(0)
+    np.testing.assert_array_equal(crop(3, generator), [0, 1] + [2] * 58)
+    starts = {int(crop(65, generator)[0]) for _ in range(200)}
+    assert starts == set(range(5))
+    np.testing.assert_array_equal(Whole(1, 10)(30, generator), np.arange(10))
+
+
+def test_samples_are_normalized_crops(store):
+    clips = clips_of(store)
+    name, x, text, _ = clips[3, 7]
+    frames = clips.frames(3, 7)
+    entry = clips.clips[3]
+    expected = (store.motion(entry)[frames] - store.mean) / store.std
+    np.testing.assert_allclose(x.numpy(), expected, atol=1e-5)
+    assert (name, text in entry.captions) == (entry.id, True)
+    assert len({len(clips[3, batch][1]) for batch in range(20)}) > 1
+    assert len({clips[3, batch][2] for batch in range(40)}) == len(set(entry.captions))
+
+
+def test_evaluation_samples_never_change(store):
+    clips = clips_of(store)
+    first, second = clips[0, -1], clips[0, -1]
+    assert torch.equal(first[1], second[1])
+    assert first[2] == second[2]
+
+
+def test_batches_are_a_function_of_their_number():
+    lengths = np.random.default_rng(0).integers(24, 60, 103)
+    options = {"seed": 5, "rank": 0, "world": 1}
+    sampler = iter(TrainingBatches(lengths, 8, first=0, **options))
+    stream = [next(sampler) for _ in range(40)]
+    later = iter(TrainingBatches(lengths, 8, first=17, **options))
+    assert [next(later) for _ in range(23)] == stream[17:]
+    one_pass = [index for batch in stream[:12] for index, _ in batch]
+    assert len(set(one_pass)) == len(one_pass) == 96
+    assert all(number == n for n, batch in enumerate(stream) for _, number in batch)
+
+
+def test_processes_share_the_stream_of_batches():
+    lengths = np.random.default_rng(0).integers(24, 60, 103)
+    whole = iter(TrainingBatches(lengths, 8, seed=5, first=0, rank=0, world=1))
+    ranks = [iter(TrainingBatches(lengths, 8, seed=5, first=0, rank=r, world=2)) for r in range(2)]
+    assert [next(whole) for _ in range(10)] == [next(ranks[n % 2]) for n in range(10)]
+
+
+def test_batches_hold_clips_of_about_the_same_length():
+    lengths = np.random.default_rng(0).integers(24, 196, 5000)
+    sampler = iter(TrainingBatches(lengths, 32, seed=0, first=0, rank=0, world=1))
+    padded = real = 0
+    for _ in range(100):
+        batch = lengths[[index for index, _ in next(sampler)]]
+        padded, real = padded + batch.max() * len(batch), real + batch.sum()
+    assert real / padded > 0.9
+
+
+def test_fewer_clips_than_a_batch_are_repeated():
+    sampler = iter(TrainingBatches(np.array([30, 40, 50]), 8, seed=0, first=0, rank=0, world=1))
+    assert {index for index, _ in next(sampler)} == {0, 1, 2}
+
+
+@pytest.mark.parametrize("world", [1, 2, 3])
+def test_evaluation_sees_each_clip_once(world):
+    lengths = np.random.default_rng(0).integers(24, 60, 31)
+    parts = [EvaluationBatches(lengths, 4, rank=rank, world=world) for rank in range(world)]
+    seen = sorted(index for part in parts for batch in part for index, _ in batch)
+    assert seen == list(range(31))
+
+
+def test_collate_pads_with_zeros_and_masks():
+    batch = collate([("a", torch.ones(3, 2), "x", None), ("b", torch.ones(5, 2), "y", None)])
+    assert batch.x.shape == (2, 5, 2)
+    assert batch.mask.sum(1).tolist() == batch.lengths.tolist() == [3, 5]
+    assert (batch.x[0, 3:] == 0).all()
+    assert (batch.text, batch.action) == (["x", "y"], None)
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_workers_change_nothing(folder, workers, tmp_path):
+    shutil.copytree(folder, tmp_path / "synthetic-humanml-clean-smpl22")
+    module = MotionDataModule(
+        Synthetic(clips=40, seed=1),
+        HumanML(),
+        root=str(tmp_path),
+        name="synthetic",
+        batch_size=4,
+        num_workers=workers,
+        crop=Units(24, 60, 4),
+    )
+    module.prepare_data()
+    module.setup("fit")
+    batches = list(islice(module.train_dataloader(), 3))
+    draws = list(islice(TrainingBatches(module.train.lengths, 4, seed=0, first=0, rank=0, world=1), 3))
+    for batch, expected in zip(batches, draws, strict=True):
+        samples = collate([module.train[draw] for draw in expected])
+        assert batch.ids == samples.ids
+        assert batch.text == samples.text
+        assert torch.equal(batch.x, samples.x)
+
+
+def test_a_store_of_another_representation_is_refused(folder, tmp_path):
+    shutil.copytree(folder, tmp_path / "synthetic-humanml-legacy-smpl22")
+    module = MotionDataModule(
+        Synthetic(),
+        HumanML(variant="legacy", bone_lengths=[1.0] * 22),
+        root=str(tmp_path),
+        name="synthetic",
+        batch_size=4,
+        crop=Units(24, 60, 4),
+    )
+    with pytest.raises(ValueError, match="its representation is humanml-clean-smpl22, not humanml-legacy-smpl22"):
+        module.open()

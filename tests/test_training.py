@@ -1,0 +1,256 @@
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import flame_mdm
+from flame_mdm import sample, train
+from flame_mdm.config import UserError, compose, instantiate
+from flame_mdm.generation import generate
+from flame_mdm.motion import MotionBatch, length_mask
+from flame_mdm.task import load, read_checkpoint
+
+STEPS = ["trainer.val_check_interval=4", "callbacks.checkpoints.every_n_steps=4", "callbacks.samples=null"]
+
+
+def weights(path: Path) -> dict[str, torch.Tensor]:
+    return read_checkpoint(path)["state_dict"]
+
+
+def run(overrides: list[str], steps: int, folder: Path | None = None) -> Path:
+    changes = [f"run.dir={folder}"] if folder else []
+    assert train.main(["quickstart", *overrides, *changes, f"trainer.max_steps={steps}"]) == 0
+    directory = folder or Path(next(o for o in overrides if o.startswith("run.dir=")).removeprefix("run.dir="))
+    return directory / "checkpoints" / "last.ckpt"
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory, data_root):
+    """Checkpoint of a tiny experiment after 6 steps."""
+    from conftest import TINY
+
+    folder = tmp_path_factory.mktemp("trained")
+    return run([*TINY, f"data_root={data_root}", f"run.dir={folder}", "trainer.val_check_interval=3"], 6)
+
+
+def test_a_run_leaves_what_a_user_looks_for(trained):
+    folder = trained.parent.parent
+    for name in ("config.yaml", "provenance.json", "samples/step_0000006/player.html", "checkpoints/best.ckpt"):
+        assert (folder / name).is_file(), name
+    assert list((folder / "tensorboard").glob("events*"))
+    checkpoint = read_checkpoint(trained)
+    assert checkpoint["config"]["experiment"] == "quickstart"
+    assert checkpoint["global_step"] == 6
+    facts = json.loads((folder / "provenance.json").read_text())["data"]
+    assert facts == checkpoint["facts"]
+    assert not list(folder.rglob("*.partial"))
+
+
+def test_training_learns(tiny):
+    checkpoint = run([*tiny, *STEPS, "optimizer.lr=0.01", "trainer.log_every_n_steps=1", "logger=csv"], 120)
+    rows = (checkpoint.parent.parent / "csv" / "metrics.csv").read_text().splitlines()
+    column = rows[0].split(",").index("train/loss")
+    losses = [float(row.split(",")[column]) for row in rows[1:] if row.split(",")[column]]
+    assert len(losses) == 120
+    assert np.mean(losses[-20:]) < 0.7 * np.mean(losses[:5])
+
+
+@pytest.mark.parametrize("extra", [[], ["trainer.accumulate_grad_batches=2"], ["ema=null", "data.num_workers=1"]])
+def test_a_resumed_run_is_the_uninterrupted_one(tiny, extra, tmp_path):
+    overrides = [*tiny, *STEPS, "denoiser.dropout=0.1", *extra]
+    run(overrides, 5, tmp_path / "parts")
+    parts = run(overrides, 11, tmp_path / "parts")
+    whole = run(overrides, 11, tmp_path / "whole")
+    for key in ("state_dict", "current_model_state"):
+        a, b = (read_checkpoint(path).get(key, {}) for path in (parts, whole))
+        assert a.keys() == b.keys()
+        assert all(torch.equal(a[name], b[name]) for name in a), key
+
+
+def test_a_folder_of_another_configuration_is_refused(tiny, capsys):
+    run([*tiny, *STEPS], 2)
+    assert train.main(["quickstart", *tiny, *STEPS, "optimizer.lr=0.5", "trainer.max_steps=4"]) == 1
+    message = capsys.readouterr().err
+    assert "optimizer.lr (0.0005 there, 0.5 here)" in message
+    assert "run.name=" in message
+
+
+def test_a_finished_run_says_so(tiny, capsys):
+    run([*tiny, *STEPS], 2)
+    run([*tiny, *STEPS], 2)
+    assert "is trained to step 2 already" in capsys.readouterr().out
+
+
+def test_a_saved_config_repeats_a_run(tiny, tmp_path):
+    first = run([*tiny, *STEPS], 3)
+    config = first.parent.parent / "config.yaml"
+    assert train.main([str(config), f"run.dir={tmp_path / 'again'}"]) == 0
+    second = weights(tmp_path / "again" / "checkpoints" / "last.ckpt")
+    assert all(torch.equal(second[name], value) for name, value in weights(first).items())
+
+
+@pytest.mark.parametrize("signum", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_stops_at_the_end_of_a_step_and_the_run_goes_on(tiny, signum, tmp_path):
+    overrides = [*tiny, *STEPS, "trainer.max_steps=100000"]
+    command = [sys.executable, "-m", "flame_mdm.train", "quickstart", *overrides]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment)
+    checkpoint = tmp_path / "run" / "checkpoints" / "last.ckpt"
+    deadline = time.monotonic() + 120
+    while not checkpoint.exists() and time.monotonic() < deadline and process.poll() is None:
+        time.sleep(0.05)
+    process.send_signal(signum)
+    out, err = process.communicate(timeout=60)
+    assert process.returncode == 128 + signum, err
+    assert "Traceback" not in err
+    step = read_checkpoint(checkpoint)["global_step"]
+    assert f"stopped at step {step}; the same command goes on" in out
+    run([*tiny, *STEPS], step + 2)
+    whole = run([*tiny, *STEPS], step + 2, tmp_path / "whole")
+    a, b = weights(checkpoint), weights(whole)
+    assert all(torch.equal(a[name], b[name]) for name in a)
+
+
+def test_averaged_weights_are_what_is_loaded(trained):
+    checkpoint = read_checkpoint(trained)
+    name = next(n for n in checkpoint["state_dict"] if n.startswith("denoiser.") and n.endswith("weight"))
+    assert not torch.equal(checkpoint["state_dict"][name], checkpoint["current_model_state"][name])
+    assert torch.equal(load(trained).state_dict()[name], checkpoint["state_dict"][name])
+
+
+def test_a_motion_does_not_depend_on_the_others(trained):
+    model = load(trained)
+    texts = ["a person walks", "a person jumps"]
+    together = generate(model, texts, frames=[30, 40], samples=2, seed=3)
+    alone = generate(model, texts[1], frames=40, samples=2, seed=3)
+    for a, b in zip(together[2:], alone, strict=True):
+        np.testing.assert_allclose(a.features, b.features, atol=1e-4)
+    assert np.abs(alone[0].features - alone[1].features).max() > 0.01
+    other = generate(model, texts[1], frames=40, seed=4)[0]
+    assert np.abs(alone[0].features - other.features).max() > 0.01
+
+
+def test_padding_changes_nothing(trained):
+    model = load(trained)
+
+    def motion(frames):
+        mask = length_mask(torch.tensor([24]), frames)
+        batch = MotionBatch(torch.zeros(1, frames, 263), mask, ["a"], ["a person walks"])
+        return model.generate(batch, seed=1)
+
+    assert torch.allclose(motion(24), motion(50)[:, :24], atol=1e-4)
+    assert (motion(50)[:, 24:] == 0).all()
+
+
+def test_validation_does_not_depend_on_the_batch_size(trained, data_root):
+    values = []
+    for size in (3, 8):
+        overrides = ["data.source.clips=60", f"data_root={data_root}", f"data.batch_size={size}"]
+        task = load(trained)
+        data = instantiate(compose("quickstart", overrides)["data"], representation=task.representation)
+        data.setup("fit")
+        with torch.no_grad():
+            for index, batch in enumerate(data.val_dataloader()):
+                task.validation_step(batch, index)
+        values.append(float(task.val_losses["loss"].compute()))
+    assert values[0] == pytest.approx(values[1], rel=1e-5)
+
+
+def test_the_public_api_reads_well(trained):
+    motion = flame_mdm.generate(flame_mdm.load(trained), "a person waves with the left hand", seconds=1.5, seed=0)[0]
+    assert motion.joints.shape == (30, 22, 3)
+    assert motion.features.shape == (30, 263)
+    assert (motion.fps, motion.caption) == (20, "a person waves with the left hand")
+
+
+def test_unconditioned_samples_ignore_guidance(trained):
+    a = generate(load(trained), frames=24, guidance_scale=1.0)[0]
+    b = generate(load(trained), frames=24, guidance_scale=7.0)[0]
+    np.testing.assert_allclose(a.features, b.features, atol=1e-5)
+
+
+def test_sampling_writes_motions_and_a_player(trained, tmp_path, capsys):
+    out = tmp_path / "out"
+    words = [f"ckpt={trained}", "text=a person's walk (slow), 100%", "seconds=1.5", "samples=2", f"out={out}", "seed=9"]
+    assert sample.main(words) == 0
+    with np.load(out / "motion_001.npz") as motion:
+        assert motion["joints"].shape == (30, 22, 3)
+        assert str(motion["text"]) == "a person's walk (slow), 100%"
+        assert (int(motion["seed"]), float(motion["fps"])) == (9, 20.0)
+        assert len(str(motion["checkpoint"])) == 64
+    assert {p.name for p in out.iterdir()} >= {"player.html", "motions.gif", "motions.png", "motion_000.npz"}
+    assert "player.html" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["text="], "the text is empty"),
+        (["text=  "], "the text is empty"),
+        ([], "ask for one of text=..., action=... and unconditioned=true, not none"),
+        (["text=a", "unconditioned=true"], "not text and unconditioned"),
+        (["text=a", "seconds=30"], "up to 3 seconds (60 frames at 20 a second)"),
+        (["text=a", "seconds=0"], "cannot be sampled"),
+        (["text=a", "seconds=-1"], "cannot be sampled"),
+        (["text=a", "sampler=euler"], "unknown sampler 'euler'"),
+        (["text=a", "num_inference_steps=11"], "11"),
+        (["action=wlk"], "no action is called 'wlk'"),
+        (["text=a", "sead=3"], "unknown config key 'sead'. Did you mean seed"),
+    ],
+)
+def test_bad_requests_are_one_line(trained, words, message, tmp_path, capsys):
+    assert sample.main([f"ckpt={trained}", f"out={tmp_path / 'out'}", *words]) == 1
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_bad_checkpoints_are_one_line(trained, tmp_path):
+    with pytest.raises(FileNotFoundError, match="no such checkpoint"):
+        load(tmp_path / "absent.ckpt")
+    data = trained.read_bytes()
+    for name, content in (("cut", data[: len(data) // 2]), ("empty", b""), ("text", b"hello"), ("folder", None)):
+        path = tmp_path / f"{name}.ckpt"
+        path.mkdir() if content is None else path.write_bytes(content)
+        with pytest.raises((UserError, FileNotFoundError), match=str(path)):
+            load(path)
+    torch.save({"state_dict": {}}, tmp_path / "foreign.ckpt")
+    with pytest.raises(UserError, match="holds no recipe"):
+        load(tmp_path / "foreign.ckpt")
+
+
+def test_a_checkpoint_of_another_shape_names_the_weight(trained, tmp_path):
+    checkpoint = read_checkpoint(trained)
+    checkpoint["config"]["denoiser"]["latent_dim"] = 32
+    torch.save(checkpoint, tmp_path / "other.ckpt")
+    with pytest.raises(UserError, match=r"the weights do not fit the recipe .*: size mismatch for denoiser"):
+        load(tmp_path / "other.ckpt")
+
+
+def test_a_checkpoint_cannot_name_foreign_code(trained, tmp_path):
+    checkpoint = read_checkpoint(trained)
+    checkpoint["config"]["denoiser"] = {"_target_": "os.system", "command": f"touch {tmp_path / 'owned'}"}
+    torch.save(checkpoint, tmp_path / "evil.ckpt")
+    with pytest.raises(UserError, match=r"names os\.system at denoiser"):
+        load(tmp_path / "evil.ckpt")
+    assert not (tmp_path / "owned").exists()
+
+
+def test_an_unwritable_folder_is_one_line(tiny, tmp_path, capsys):
+    (tmp_path / "file").write_text("")
+    assert train.main(["quickstart", *tiny, f"run.dir={tmp_path / 'file' / 'run'}"]) == 1
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_training_without_condition(tiny):
+    overrides = [o for o in tiny if not o.startswith("condition.")]
+    checkpoint = run([*overrides, *STEPS, "condition=none"], 2)
+    assert generate(load(checkpoint), frames=24)[0].joints.shape == (24, 22, 3)

@@ -121,6 +121,11 @@ def test_equal_motions_lose_nothing_but_sliding_feet():
     other = x.clone()
     other[..., 6] *= 2
     assert losses(other, x, mask)["foot_contact"] == 0
+    # 1 cm a frame in the data is standing, 1.5 cm is not.
+    for step, stands in ((0.0099, True), (0.015, False)):
+        slow = torch.zeros(1, 4, 9)
+        slow[..., 3] = step * torch.arange(4.0)
+        assert (MotionLosses(joints_as_features, [1], foot_contact=1.0)(slow, slow, mask)["foot_contact"] > 0) == stands
 
 
 def test_padding_and_single_frames():

@@ -1,5 +1,6 @@
 """Schedules, the two processes, their losses and the steps they train on."""
 
+import copy
 import math
 from types import SimpleNamespace
 from typing import Any
@@ -91,6 +92,10 @@ def test_linspace_takes_both_ends_evenly(total, data):
     gaps = np.diff(steps)
     assert gaps.min() >= max(1, math.floor((total - 1) / (count - 1)))
     assert gaps.max() <= math.ceil((total - 1) / (count - 1)) + 1
+
+
+def test_ties_fall_as_the_running_sum_of_the_papers_codes_rounds():
+    assert timesteps(50, 25)[12] == 25  # 12 * 49 / 24 = 24.5; the product would round to 24
 
 
 @pytest.mark.parametrize(("count", "spacing"), [(0, "linspace"), (1001, "linspace"), (400, "stride"), (5, "karras")])
@@ -243,13 +248,13 @@ def constant(value: float, channels: int):
 
 def test_hybrid_loss_trains_the_variance_alone():
     torch.manual_seed(0)
-    process = GaussianDiffusion(prediction="epsilon", variance="learned_range", vlb_weight=0.002)
-    x, mask, t = torch.randn(2, 6, 3), torch.ones(2, 6, dtype=torch.bool), torch.tensor([0.0, 500.0])
+    process = GaussianDiffusion(400, prediction="epsilon", variance="learned_range", vlb_weight=0.002)
+    x, mask, t = torch.randn(2, 6, 3), torch.ones(2, 6, dtype=torch.bool), torch.tensor([0.0, 200.0])
     noise = torch.randn_like(x)
     output = torch.randn(2, 6, 6, requires_grad=True)
     terms = process.loss(lambda *_: output, x, mask, NO_CONDITION, t=t, noise=noise)
     x_t = process.corrupt(x, noise, t)
-    torch.testing.assert_close(terms["vlb"], 0.002 * 1000 * masked_mean(process.vlb(output, x, x_t, t), mask))
+    torch.testing.assert_close(terms["vlb"], 0.002 * 400 * masked_mean(process.vlb(output, x, x_t, t), mask))
     terms["vlb"].sum().backward()
     assert output.grad is not None
     assert (output.grad[..., :3] == 0).all()
@@ -336,6 +341,20 @@ def test_loss_aware_training_is_a_function_of_what_is_saved():
     for a, b in zip(trained(resumed, range(6, 12)), expected[6:], strict=True):
         assert torch.equal(a, b)
     assert whole.timesteps is not None
+    assert whole.timesteps.counts.sum() == 12 * 64
+    # The history holds the losses as they are; what is returned is weighted by 1 / (T p).
+    p = whole.timesteps.probabilities()
+    assert p.max() / p.min() > 1.01
+    x = torch.randn(64, 3, 2)
+    state = torch.get_rng_state()
+    mask = torch.ones(64, 3, dtype=torch.bool)
+    terms = copy.deepcopy(whole).loss(constant(0.0, 2), x, mask, NO_CONDITION)
+    torch.set_rng_state(state)
+    t, weights = whole.timesteps.draw(64)
+    noise = torch.randn_like(x)
+    plain = whole.loss(constant(0.0, 2), x, mask, NO_CONDITION, t=t.float(), noise=noise)
+    torch.testing.assert_close(terms["mse"], weights * plain["mse"])
+    torch.testing.assert_close(terms["loss"], terms["mse"])
     before = whole.timesteps.counts.clone()
     trained(whole.eval(), range(1))
     assert torch.equal(whole.timesteps.counts, before)

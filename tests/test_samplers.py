@@ -560,13 +560,33 @@ def test_blended_parts_are_as_noisy_as_the_rest(blend):
 
     process.sample(
         denoise, drawn((1, 1, 4000)), torch.ones(1, 1, dtype=torch.bool), NO_CONDITION, sampler="ancestral",
-        num_inference_steps=10, edit=Edit(known, torch.ones_like(known, dtype=torch.bool), "x_t", blend=blend),
+        num_inference_steps=[0, 5, 15, 30, 40], edit=Edit(known, torch.ones_like(known, dtype=torch.bool), "x_t", blend=blend),
     )  # fmt: skip
-    assert len(seen) == 10
+    assert len(seen) == 5
     for step, (mean, deviation) in seen.items():
         signal, noise = (process.schedule.tables[name][step].item() for name in ("signal", "noise"))
         assert mean == pytest.approx(2 * signal, abs=0.06)
         assert deviation == pytest.approx(noise, rel=0.05)
+
+
+def test_resampling_goes_back_to_the_noise_of_the_step():
+    """What is not kept, of data all 2 and known to the denoiser, is as noisy at the second visit of a step."""
+    process, data = GaussianDiffusion(100), torch.full((1, 1, 4000), 2.0)
+    seen = []
+
+    def denoise(x_t, t, mask, cond):
+        seen.append((int(t[0]), x_t.mean().item(), x_t.std().item()))
+        return data
+
+    process.sample(
+        denoise, drawn((1, 1, 4000)), torch.ones(1, 1, dtype=torch.bool), NO_CONDITION, sampler="ancestral",
+        num_inference_steps=10, edit=Edit(data, torch.zeros_like(data, dtype=torch.bool), "x_t", resample=2),
+    )  # fmt: skip
+    assert len(seen) == 19
+    for step, mean, deviation in seen:
+        signal, noise = (process.schedule.tables[name][step].item() for name in ("signal", "noise"))
+        assert mean == pytest.approx(2 * signal, abs=0.08)
+        assert deviation == pytest.approx(noise, rel=0.06)
 
 
 @pytest.mark.parametrize("sampler", STEPS)
@@ -675,13 +695,17 @@ def test_no_loop_waits_for_the_device(build, sampler, mode):
     assert sample.shape == x.shape
 
 
-def test_half_precision_denoisers_are_sampled_in_float32():
-    process = GaussianDiffusion()
-    x = process.sample(
-        lambda x_t, t, mask, cond: x_t.bfloat16(), drawn((1, 4, 2)), torch.ones(1, 4, dtype=torch.bool),
-        NO_CONDITION, sampler="ancestral", num_inference_steps=5,
-    )  # fmt: skip
-    assert x.dtype == torch.float32
+@pytest.mark.parametrize("sampler", DIFFUSION)
+def test_half_precision_denoisers_are_sampled_in_float32(sampler):
+    def sample(denoise: Denoise) -> Tensor:
+        mask = torch.ones(1, 4, dtype=torch.bool)
+        return GaussianDiffusion().sample(
+            denoise, drawn((1, 4, 2)), mask, NO_CONDITION, sampler=sampler, num_inference_steps=5
+        )
+
+    half = sample(lambda x_t, t, mask, cond: x_t.bfloat16())
+    assert torch.equal(half, sample(lambda x_t, t, mask, cond: x_t.bfloat16().float()))
+    assert half.dtype == torch.float32
 
 
 def test_fixture_loops_are_all_replayed():

@@ -27,7 +27,7 @@ from flame_mdm.representations import Representation
 class Task(LightningModule):
     """What all models share that `make train` trains; a recipe names its class in `task._target_`.
 
-    Subclasses have a classmethod `build(config, representation, *, actions, trusted)` as `MotionGeneration` does.
+    Subclasses have a classmethod `build(config, representation, *, actions)` as `MotionGeneration` does.
     """
 
     config: Config

@@ -2,6 +2,8 @@ import json
 import multiprocessing
 import os
 import shutil
+import subprocess
+import sys
 import tarfile
 import tempfile
 import zipfile
@@ -270,6 +272,22 @@ def test_stopping_early_ends_the_processes(tiny):
     assert multiprocessing.active_children()
     del iterator
     assert not multiprocessing.active_children()
+
+
+def test_no_process_survives_a_killed_command(tiny):
+    code = f"""
+import time
+from flame_mdm.data.bandai import Bandai
+clips = Bandai({str(tiny)!r}, workers=2).clips(20)
+next(clips)
+print("on", flush=True)
+time.sleep(60)
+"""
+    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == b"on\n"
+        process.kill()
+        process.communicate(timeout=20)  # the workers hold the other end of the pipe
 
 
 @pytest.mark.parametrize("workers", [1, 2])

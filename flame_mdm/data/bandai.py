@@ -12,6 +12,7 @@ import os
 import re
 import signal
 import tarfile
+import threading
 import zipfile
 import zlib
 from collections import deque
@@ -20,7 +21,7 @@ from concurrent.futures import ProcessPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass
 from functools import cache
-from multiprocessing import get_context
+from multiprocessing import get_context, parent_process
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -363,8 +364,7 @@ class Bandai(MotionSource):
             yield from (convert(name, data, fps) for name, data in files)
             return
         # Fresh processes: a fork would copy the threads' locks of a process that may have used torch before.
-        # They leave Ctrl-C to this process, which then ends them.
-        with ProcessPoolExecutor(workers, get_context("spawn"), signal.signal, (signal.SIGINT, signal.SIG_IGN)) as pool:
+        with ProcessPoolExecutor(workers, get_context("spawn"), _start_worker) as pool:
             pending = deque()
             for name, data in files:
                 pending.append(pool.submit(convert, name, data, fps))
@@ -411,6 +411,19 @@ def convert(name: str, data: bytes, fps: float) -> tuple[str, np.ndarray]:
     joints = positions[:, [motion.joints.index(joint) for joint in JOINTS.values()]] / 100
     joints[:, SPINE1] += 0.4 * (joints[:, SPINE2] - joints[:, SPINE1])
     return id_, joints.astype(np.float32)
+
+
+def _start_worker() -> None:
+    """Leaves Ctrl-C to the process that started this one, and ends with it, even when that is killed."""
+
+    def follow() -> None:
+        parent = parent_process()
+        if parent is not None:
+            parent.join()
+            os._exit(1)
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=follow, daemon=True).start()
 
 
 def mirror(motion: np.ndarray) -> np.ndarray:

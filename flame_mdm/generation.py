@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from flame_mdm.config import UserError
-from flame_mdm.motion import MotionBatch, length_mask
+from flame_mdm.motion import Edit, MotionBatch, length_mask
 from flame_mdm.task import MotionGeneration
 from flame_mdm.visualize import Motion, contact_sheet, write_gif, write_player
 
@@ -50,6 +50,7 @@ def generate(
     guidance_scale: float | None = None,
     sampler: str | None = None,
     num_inference_steps: int | None = None,
+    edit: Edit | None = None,
 ) -> list[Generated]:
     """Motions for texts or actions, `samples` of each; for neither, unconditioned ones.
 
@@ -62,6 +63,8 @@ def generate(
         samples: motions for each text.
         seed: of the noise.
         guidance_scale, sampler, num_inference_steps: instead of the recipe's.
+        edit: what to keep of a motion of that length, `known` and `keep` (1, F, D), in every motion; see
+            `flame_mdm.edit`.
 
     Raises:
         UserError: an empty text, an unknown action, a length the model was not trained for.
@@ -91,6 +94,7 @@ def generate(
             guidance_scale=guidance_scale,
             sampler=sampler,
             num_inference_steps=num_inference_steps,
+            edit=edit and replace(edit, known=edit.known.expand_as(batch.x), keep=edit.keep.expand_as(batch.x)),
             unconditioned=texts is None and actions is None,
         )
         results += _finish(model, batch, x, captions[part])

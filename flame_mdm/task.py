@@ -17,7 +17,7 @@ from flame_mdm.config import Config, UserError, instantiate, parameters, trust
 from flame_mdm.data.datamodule import MotionDataModule
 from flame_mdm.denoisers import Denoiser
 from flame_mdm.losses import MotionLosses
-from flame_mdm.motion import Edit, MotionBatch
+from flame_mdm.motion import Edit, MotionBatch, pad_to
 from flame_mdm.noise import key, normal, seeded_noise, uniform
 from flame_mdm.processes import Process
 from flame_mdm.processes.guidance import classifier_free_guidance
@@ -211,19 +211,25 @@ class MotionGeneration(Task):
             cond = self.condition(batch)
         if cond.null is not None and self.condition.features and not unconditioned:
             denoise = classifier_free_guidance(self.denoiser, scale, self.representation.features)
-        frames, features = batch.mask.shape[1], self.representation.features
-        noise = seeded_noise(batch.ids, frames, features, seed=seed, replication=replication, like=batch.x)
+        mask, frames, features = batch.mask, batch.mask.shape[1], self.representation.features
+        if not getattr(self.denoiser, "mask_padding", True):
+            # Frames attend to the padding, which a model knows only at the length that it was trained with.
+            mask = pad_to(mask, max(frames, self.facts.get("max_frames", 0)))
+            if edit is not None:
+                known, keep = pad_to(edit.known, mask.shape[1]), ~pad_to(~edit.keep, mask.shape[1])
+                edit = replace(edit, known=known, keep=keep)
+        noise = seeded_noise(batch.ids, mask.shape[1], features, seed=seed, replication=replication, like=batch.x)
         x = self.process.sample(
             denoise,
             noise,
-            batch.mask,
+            mask,
             cond,
             sampler=sampler or self.sampler,
             num_inference_steps=num_inference_steps or self.num_inference_steps,
             edit=edit,
         )
         self.train(was_training)
-        return x
+        return x[:, :frames]
 
 
 def load(path: str | Path, device: str | torch.device = "cpu") -> MotionGeneration:

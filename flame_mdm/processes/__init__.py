@@ -1,7 +1,7 @@
 """Paths between noise and motion: how motion is corrupted, what the denoiser predicts, and the way back."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from torch import Tensor, nn
 
@@ -13,6 +13,9 @@ Auxiliary = Callable[[Tensor, Tensor, Tensor], dict[str, Tensor]]
 
 class Process(nn.Module, ABC):
     """A path between noise and data. Only the process interprets t; the denoiser merely embeds it."""
+
+    edit_modes: Sequence[str] = ()
+    """Modes of `Edit` that sampling can impose, the authors' own first."""
 
     @abstractmethod
     def out_features(self, features: int) -> int:

@@ -66,6 +66,8 @@ class LossAwareTimesteps(nn.Module):
 class GaussianDiffusion(Process):
     """Gaussian diffusion over T steps. t is the whole step 0 ... T - 1 as a float; the denoiser gets it as it is."""
 
+    edit_modes = ("x0", "x_t")
+
     def __init__(
         self,
         num_train_timesteps: int = 1000,
@@ -261,7 +263,7 @@ class GaussianDiffusion(Process):
         if eta and (sampler != "ddim" or not 0 <= eta <= 1):
             raise ValueError(f"eta={eta} with the sampler {sampler}: eta is an option of ddim, from 0 to 1")
         if edit is not None:
-            check_edit(edit, mask, ("x0", "x_t"), "GaussianDiffusion")
+            check_edit(edit, mask, self.edit_modes, "GaussianDiffusion")
             if edit.resample > 1 and sampler == "dpm_solver_pp_2m":
                 raise ValueError("resample needs a sampler without history: choose ancestral or ddim")
         steps = self._steps(num_inference_steps, spacing)

@@ -17,6 +17,8 @@ STEPS = {"euler": samplers.euler, "midpoint": samplers.midpoint, "heun": sampler
 class FlowMatching(Process):
     """A straight path from noise at t = 0 to motion at t = 1; the denoiser predicts its velocity and gets 1000 t."""
 
+    edit_modes = ("trajectory", "x0")
+
     def __init__(
         self,
         sigma_min: float = 1e-4,
@@ -134,7 +136,7 @@ class FlowMatching(Process):
         if num_inference_steps < 1:
             raise ValueError(f"num_inference_steps is {num_inference_steps}: a flow takes 1 or more")
         if edit is not None:
-            check_edit(edit, mask, ("trajectory", "x0"), "FlowMatching")
+            check_edit(edit, mask, self.edit_modes, "FlowMatching")
             if sampler == "dopri5":
                 raise ValueError(f"dopri5 chooses its own steps and cannot edit: choose from {', '.join(STEPS)}")
         start = noise(0)

@@ -1,7 +1,7 @@
 """Motions as features: what a model sees, and the way back to joints."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 import torch
@@ -38,6 +38,10 @@ class Representation(nn.Module, ABC):
     @abstractmethod
     def statistics(self, features: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and std (D,) to normalize with, from all training frames (N, D)."""
+
+    @abstractmethod
+    def joint_features(self, joints: Iterable[int]) -> Tensor:
+        """(D,) bool, True for the features that describe these joints; those of the root's way belong to joint 0."""
 
     def rebase(self, features: np.ndarray) -> np.ndarray:
         """Features (F, D) of a cut of a motion, made to start like a whole motion; here, nothing is to be done."""

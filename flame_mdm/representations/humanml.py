@@ -180,7 +180,7 @@ class HumanML(Representation):
         return mean.float(), std.float()
 
     def joint_features(self, joints: Iterable[int]) -> Tensor:
-        """(D,) bool, True for the features that describe these joints, to keep or to edit a part of the body.
+        """As the contract: (D,) bool, True for the features that describe these joints.
 
         The root features belong to joint 0. With the lower body, root included, this is MDM's `HML_LOWER_BODY_MASK`.
         """

@@ -1,6 +1,6 @@
 """Features of the action data sets: SMPL rotations, and the way of the root."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 import torch
@@ -42,6 +42,12 @@ class Rot6D(Representation):
         rotations = rotation.rot6d_to_matrix(rows[..., :24, :], "rows")
         joints = forward_kinematics(self.skeleton, rotations, features.new_tensor(self.offsets), rows[..., 24, :3])
         return joints * joints.new_tensor([1.0, -1.0, -1.0])
+
+    def joint_features(self, joints: Iterable[int]) -> Tensor:
+        """As the contract; the last row, the translation, belongs to joint 0."""
+        part = torch.zeros(24, dtype=torch.bool)
+        part[list(joints)] = True
+        return torch.cat([part, part[:1]]).repeat_interleave(6)
 
     def statistics(self, features: Tensor) -> tuple[Tensor, Tensor]:
         """Mean 0 and std 1: ACTOR and MDM train on the features as they are."""

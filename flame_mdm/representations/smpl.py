@@ -1,6 +1,6 @@
 """FLAME's features: translation and joint rotations of SMPL."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import torch
 from torch import Tensor
@@ -70,6 +70,12 @@ class SMPL(Representation):
         offsets = features.new_tensor(self.offsets)
         joints = forward_kinematics(self.skeleton, rotations, offsets, features[..., :3] + offsets[0])
         return joints[..., [0, 2, 1]] * joints.new_tensor([-1.0, 1.0, 1.0])
+
+    def joint_features(self, joints: Iterable[int]) -> Tensor:
+        """As the contract; the translation belongs to joint 0."""
+        part = torch.zeros(24, dtype=torch.bool)
+        part[list(joints)] = True
+        return torch.cat([part[:1].expand(3), part.repeat_interleave(6)])
 
     def statistics(self, features: Tensor) -> tuple[Tensor, Tensor]:
         """Mean 0 and std 1: FLAME trains on the features as they are."""

@@ -52,6 +52,8 @@ def prepare(config: Config) -> None:
     info = store.info
     clips = ", ".join(f"{count} {split}" for split, count in info["clips"].items())
     print(f"{info['dataset']} as {info['representation']} at {info['fps']:g} fps: {clips}; {info['hours']} hours")
+    if info["excluded"]:
+        print("left out: " + ", ".join(f"{count} {reason}" for reason, count in info["excluded"].items()))
     print(f"{info['shape'][0]} frames of {info['shape'][1]} features, fingerprint {store.fingerprint}: {data.folder}")
 
 

@@ -1,9 +1,10 @@
 """Data sets: from what their owners hand out to packed stores and training batches."""
 
+import hashlib
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 
@@ -25,6 +26,8 @@ class Clip:
         attributes: exact facts about the motion, where the set knows them (side, count, direction, speed, tagged words
             of the captions ...); plain values that JSON can hold.
         encoded: the owners hand out features; `motion` (F, D) holds them and is stored as it is.
+        window: (first, length): the clip is this cut of its motion. Clips that follow one another with the very same
+            array share its frames in the store. Only for representations that make one row a frame.
     """
 
     id: str
@@ -35,6 +38,7 @@ class Clip:
     action: int | None = None
     attributes: Mapping[str, Any] = field(default_factory=dict)
     encoded: bool = False
+    window: tuple[int, int] | None = None
 
 
 class MotionSource(ABC):
@@ -43,6 +47,15 @@ class MotionSource(ABC):
     name: str
     actions: tuple[str, ...] = ()
     """Names of the action labels, in the order of their numbers; empty for sets without labels."""
+    published: ClassVar[dict[str, int]] = {}
+    """Figures of the set as its owners or the papers give them, to compare with what is found."""
+    published_split: bool = False
+    """The split is the one that papers use although clips are tested on that training has seen, or so that nothing is
+    left to validate on; the store carries it, and so does every result."""
+
+    def excluded(self) -> dict[str, int]:
+        """How many clips or labels were left out, by reason; known once `clips` is exhausted."""
+        return {}
 
     @abstractmethod
     def count(self) -> int:
@@ -63,3 +76,9 @@ class MotionSource(ABC):
         Raises:
             ValueError: a file is damaged; the message names it.
         """
+
+
+def hashed_split(name: str, val: int, test: int) -> Split:
+    """Holds out `val` and `test` per cent of all names; by the name alone, so that more names do not move any."""
+    share = int(hashlib.sha1(name.encode()).hexdigest()[:8], 16) % 100
+    return "train" if share < 100 - val - test else "val" if share < 100 - test else "test"

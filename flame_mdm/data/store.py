@@ -100,15 +100,20 @@ def write_store(folder: Path, source: MotionSource, representation: Representati
     partial.mkdir(parents=True)
     try:
         entries: list[Entry] = []
-        frames = 0
+        motion, begin, frames = None, 0, 0
         clips = tqdm(source.clips(representation.fps), f"preparing {source.name}", total, unit=" clips")
         with (partial / "features.raw").open("wb") as raw:
             for chunk in _batched(clips, CHUNK):
                 for clip, features in zip(chunk, _encode(chunk, representation), strict=True):
-                    entry = Entry(clip.id, frames, len(features), clip.split, clip.source, clip.captions, clip.action)
+                    if clip.motion is not motion:
+                        motion, begin = clip.motion, frames
+                        frames += len(features)
+                        features.tofile(raw)
+                    first, length = clip.window or (0, len(features))
+                    if first < 0 or length < 1 or first + length > len(features):
+                        raise ValueError(f"clip {clip.id}: no window {clip.window} in {len(features)} frames")
+                    entry = Entry(clip.id, begin + first, length, clip.split, clip.source, clip.captions, clip.action)
                     entries.append(replace(entry, attributes=dict(clip.attributes)))
-                    frames += len(features)
-                    features.tofile(raw)
         _check_entries(source.name, entries)
         packed = np.memmap(partial / "features.raw", np.float32, "r", shape=(frames, representation.features))
         _save_array(partial / "features.npy", packed)
@@ -117,7 +122,7 @@ def write_store(folder: Path, source: MotionSource, representation: Representati
         (partial / "clips.jsonl").write_text("\n".join(lines) + "\n", encoding="utf-8")
         mean, std = source.statistics() or _statistics(representation, packed, entries)
         np.savez(partial / "statistics.npz", mean=mean, std=std)
-        info = _describe(partial, source, representation, entries, mean, std)
+        info = _describe(partial, source, representation, entries, frames, mean, std)
         (partial / "store.json").write_text(json.dumps(info, indent=2) + "\n")
         shutil.rmtree(folder, ignore_errors=True)
         partial.rename(folder)
@@ -128,21 +133,25 @@ def write_store(folder: Path, source: MotionSource, representation: Representati
 
 
 def _encode(clips: Sequence[Clip], representation: Representation) -> list[np.ndarray]:
-    raw = [torch.from_numpy(np.ascontiguousarray(clip.motion)) for clip in clips if not clip.encoded]
+    """Features of each clip's whole motion; a motion that several clips are cut from is encoded once."""
+    whole = {id(clip.motion): clip for clip in clips}
+    raw = [torch.from_numpy(np.ascontiguousarray(clip.motion)) for clip in whole.values() if not clip.encoded]
     try:
         fresh = iter(representation.encode_many(raw) if raw else [])
     except ValueError as error:
         if len(clips) == 1:
             raise ValueError(f"clip {clips[0].id}: {error}") from error
         return [features for clip in clips for features in _encode([clip], representation)]  # names the clip
-    arrays = [np.asarray(clip.motion if clip.encoded else next(fresh).numpy(), np.float32) for clip in clips]
-    for clip, features in zip(clips, arrays, strict=True):
+    arrays: dict[int, np.ndarray] = {}
+    for key, clip in whole.items():
+        features = np.asarray(clip.motion if clip.encoded else next(fresh).numpy(), np.float32)
         if features.ndim != 2 or features.shape[1] != representation.features:
             raise ValueError(f"clip {clip.id}: shape {features.shape}, not (frames, {representation.features})")
         if not np.isfinite(features).all():
             frame = int(np.argwhere(~np.isfinite(features).all(1))[0, 0])
             raise ValueError(f"clip {clip.id}: the features of frame {frame} are not finite; exclude it by name")
-    return arrays
+        arrays[key] = features
+    return [arrays[id(clip.motion)] for clip in clips]
 
 
 def _batched(clips: Iterable[Clip], size: int) -> Iterator[list[Clip]]:
@@ -154,8 +163,10 @@ def _batched(clips: Iterable[Clip], size: int) -> Iterator[list[Clip]]:
 def _statistics(
     representation: Representation, packed: np.ndarray, entries: list[Entry]
 ) -> tuple[np.ndarray, np.ndarray]:
-    training = np.concatenate([packed[e.start : e.start + e.length] for e in entries if e.split == "train"])
-    mean, std = representation.statistics(torch.from_numpy(training))
+    training = np.zeros(len(packed), bool)  # cuts may overlap; each frame counts once
+    for entry in entries:
+        training[entry.start : entry.start + entry.length] |= entry.split == "train"
+    mean, std = representation.statistics(torch.from_numpy(packed[training]))
     return mean.numpy(), std.numpy()
 
 
@@ -181,10 +192,10 @@ def _describe(
     source: MotionSource,
     representation: Representation,
     entries: list[Entry],
+    frames: int,
     mean: np.ndarray,
     std: np.ndarray,
 ) -> dict[str, Any]:
-    frames = sum(entry.length for entry in entries)
     splits = {split: sum(e.split == split for e in entries) for split in ("train", "val", "test")}
     digest = hashlib.sha256((folder / "clips.jsonl").read_bytes())
     # Features differ in their last bits between processors, so the fingerprint sees them through rounded statistics.
@@ -194,6 +205,8 @@ def _describe(
         "format": FORMAT,
         "dataset": source.name,
         "actions": list(source.actions),
+        "published_split": source.published_split,
+        "excluded": source.excluded(),
         "representation": representation.name,
         "fps": representation.fps,
         "clips": splits,

@@ -22,7 +22,8 @@ THIGH, SHIN, UPPER_ARM, FOREARM = 0.393, 0.429, 0.260, 0.268
 ANKLE_HEIGHT, FOOT = 0.06, (0.0, -0.06, 0.134)  # a flat foot: the ankle at 6 cm, the toe joint on the floor
 STAND = 0.97  # height of the pelvis in metres that the legs are asked for and, standing, just do not reach
 
-SIDES = {"left": (0,), "right": (1,), "both": (0, 1)}
+LEFT, RIGHT = 0, 1
+SIDES = {"left": (LEFT,), "right": (RIGHT,), "both": (LEFT, RIGHT)}
 SIGN = np.array([1.0, -1.0])  # left is +x
 TIMES = ("", "once", "twice", "three times")
 NUMBERS = ("", "one", "two", "three")
@@ -172,19 +173,19 @@ def _walk_along(
     gait: _Gait,
     speed: float,
     place: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray, np.ndarray]],
-    stops: bool,
-    first: int | None = None,
+    first: int,
+    stops: bool = False,
 ) -> np.ndarray:
     """Moves the pelvis along a path and puts the feet down beside it.
 
     Args:
         body: standing; its pelvis, heading and feet are replaced.
-        rng: draws the first foot.
+        rng: draws the moment of the first step.
         gait: how.
         speed: along the path, once under way.
         place: way along the path (N,) -> x (N,), z (N,) and heading (N,).
+        first: the side that steps first.
         stops: come to a stand before the clip ends.
-        first: the side that steps first; drawn where not given.
 
     Returns:
         (F,) how far the right foot is in front of the left one, in metres, seen from the pelvis.
@@ -211,7 +212,7 @@ def _walk_along(
     moving = np.interp(t, fine, pace) / speed
     flight = (t - start) / gait.step - (gait.swing / gait.step - 1) / 2
     body.position[:, 1] += moving * (gait.bounce * np.cos(2 * np.pi * flight) - gait.sink)
-    side, lift_off = int(rng.integers(2)) if first is None else first, start
+    side, lift_off = first, start
     while lift_off < min(end, halt + gait.step):
         down = lift_off + gait.swing
         stance = 2 * gait.step - gait.swing
@@ -248,19 +249,19 @@ def _walk_along(
 
 
 def _walk(rng: np.random.Generator, t: np.ndarray, asked: Attributes) -> _Body:
-    direction, stops = asked["direction"], bool(t[-1] > 2.4 and rng.random() < 0.5)
+    direction = asked["direction"]
     sign = 1 if direction in ("left", "counterclockwise") else -1
     sideways = direction in ("left", "right")
     body = _Body(rng, t, 0.15 if sideways else None)
     if sideways:
-        speed, first = rng.uniform(0.45, 0.6), 0 if sign > 0 else 1
+        speed, first = rng.uniform(0.45, 0.6), LEFT if sign > 0 else RIGHT
         gait = _Gait(0.46, 0.38, 0.15, 0.25, 0.05, 0.16)
-        _walk_along(body, rng, gait, speed, lambda s: (sign * s, 0 * s, 0 * s), stops, first)
+        _walk_along(body, rng, gait, speed, lambda s: (sign * s, 0 * s, 0 * s), first)
         return body
     if direction == "backward":
         speed = rng.uniform(0.6, 0.9)
         gait = _Gait(0.54, 0.42, 0.12, -0.2, -0.4, rng.uniform(0.08, 0.1))
-        apart = _walk_along(body, rng, gait, speed, lambda s: (0 * s, -s, 0 * s), stops)
+        apart = _walk_along(body, rng, gait, speed, lambda s: (0 * s, -s, 0 * s), RIGHT)
     elif direction == "forward":
         low, high = {"slow": (0.5, 0.7), "normal": (1.0, 1.25), "fast": (1.55, 1.8)}[str(asked["speed"])]
         speed = rng.uniform(low, high)
@@ -268,7 +269,7 @@ def _walk(rng: np.random.Generator, t: np.ndarray, asked: Attributes) -> _Body:
         lift, sink = rng.uniform(0.1, 0.13), 0.02 + 0.01 * speed
         gait = _Gait(step, 0.82 * step, lift, 0.25 + 0.4 * speed, 0.15 + 0.12 * speed, 0.085, sink)
         body.spine[0] += 0.03 * speed
-        apart = _walk_along(body, rng, gait, speed, lambda s: (0 * s, s, 0 * s), stops)
+        apart = _walk_along(body, rng, gait, speed, lambda s: (0 * s, s, 0 * s), RIGHT)
     else:
         speed = rng.uniform(1.0, 1.2)
         radius = speed * (t[-1] - 0.45) / rng.uniform(np.radians(180), np.radians(220))
@@ -280,7 +281,7 @@ def _walk(rng: np.random.Generator, t: np.ndarray, asked: Attributes) -> _Body:
             angle = s / radius
             return sign * radius * (1 - np.cos(angle)), radius * np.sin(angle), sign * angle
 
-        apart = _walk_along(body, rng, gait, speed, circle, False, 0 if sign > 0 else 1)
+        apart = _walk_along(body, rng, gait, speed, circle, LEFT if sign > 0 else RIGHT)
     _swing_arms(body, apart, rng.uniform(0.5, 0.75))
     return body
 
@@ -291,7 +292,7 @@ def _run(rng: np.random.Generator, t: np.ndarray, asked: Attributes) -> _Body:
     body.pelvis[0] += 0.06
     step = rng.uniform(0.34, 0.38)
     gait = _Gait(step, 1.3 * step, rng.uniform(0.2, 0.26), 1.1, 0.15, 0.07, sink=0.06, bounce=0.035, behind=0.12)
-    apart = _walk_along(body, rng, gait, rng.uniform(2.4, 3.0), lambda s: (0 * s, s, 0 * s), False)
+    apart = _walk_along(body, rng, gait, rng.uniform(2.4, 3.0), lambda s: (0 * s, s, 0 * s), RIGHT)
     for side in (0, 1):
         body.move_arm(side, _ease(t, 0, 0.5), (-0.1, 0.2, -0.6, rng.uniform(1.4, 1.7)))
     _swing_arms(body, apart, rng.uniform(0.7, 0.9))
@@ -311,7 +312,7 @@ def _turn(rng: np.random.Generator, t: np.ndarray, asked: Attributes) -> _Body:
     body, sign = _Body(rng, t), 1 if asked["direction"] == "left" else -1
     speed = rng.uniform(np.radians(85), np.radians(140)) / (t[-1] - 1.2)
     gait = _Gait(0.36, 0.3, 0.07, 0.3, 0.0, 0.1)
-    _walk_along(body, rng, gait, speed, lambda s: (0 * s, 0 * s, sign * s), True, 0 if sign > 0 else 1)
+    _walk_along(body, rng, gait, speed, lambda s: (0 * s, 0 * s, sign * s), LEFT if sign > 0 else RIGHT, stops=True)
     ahead = np.gradient(body.heading, t)
     body.head[1] += 0.2 * ahead  # one looks where one turns
     body.spine[1] += 0.08 * ahead
@@ -321,7 +322,7 @@ def _turn(rng: np.random.Generator, t: np.ndarray, asked: Attributes) -> _Body:
 def _events(rng: np.random.Generator, t: np.ndarray, count: int, slowest: float) -> list[tuple[float, float]]:
     """(start, seconds) of `count` equal repetitions, somewhere inside the clip."""
     seconds = min(rng.uniform(0.85, 1.0) * slowest, (t[-1] - 0.3) / count)
-    start = rng.uniform(0.1, max(0.15, min(0.6, t[-1] - 0.15 - seconds * count)))
+    start = rng.uniform(0.1, max(0.15, min(0.4, t[-1] - 0.15 - seconds * count)))
     return [(start + n * seconds, seconds) for n in range(count)]
 
 
@@ -350,8 +351,8 @@ def _wave(rng: np.random.Generator, t: np.ndarray, asked: Attributes) -> _Body:
     body = _Body(rng, t)
     start, end = rng.uniform(0.1, 0.3), t[-1]
     weight = _pulse(t, start, start + 0.5, end - 0.45, end + 0.05)
-    swing = 2 * np.pi * rng.uniform(1.6, 2.2) * t + rng.uniform(0, 2 * np.pi)
-    forward, sideways, size = rng.uniform(0.2, 0.5), rng.uniform(1.3, 1.7), rng.uniform(0.4, 0.55)
+    swing = 2 * np.pi * rng.uniform(1.4, 1.7) * (t - start)
+    forward, sideways, size = rng.uniform(0.2, 0.5), rng.uniform(1.3, 1.7), rng.uniform(0.45, 0.6)
     for side in SIDES[str(asked["side"])]:
         pose = (forward, sideways + 0.1 * np.sin(swing), np.pi / 2, rng.uniform(1.3, 1.5) + size * np.sin(swing))
         body.move_arm(side, weight, pose)

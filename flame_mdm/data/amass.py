@@ -1,0 +1,341 @@
+"""AMASS, the SMPL+H G release: archives as downloaded or unpacked folders, and joints from the parameters in them.
+
+Mahmood et al., "AMASS: Archive of Motion Capture as Surface Shapes", ICCV 2019; license at amass.is.tue.mpg.de.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import re
+import signal
+import tarfile
+import zipfile
+import zlib
+from collections import defaultdict, deque
+from collections.abc import Callable, Collection, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from functools import cached_property
+from multiprocessing import get_context
+from pathlib import Path, PurePosixPath
+from typing import NamedTuple, TypeVar
+
+import numpy as np
+import torch
+
+from flame_mdm.representations import rotation
+from flame_mdm.representations.skeleton import SMPL22, forward_kinematics
+
+SUBSETS = {
+    "ACCAD": ("ACCD",),
+    "BioMotionLab_NTroje": ("BMLrub",),
+    "BMLhandball": (),
+    "BMLmovi": (),
+    "CMU": (),
+    "DFaust_67": ("DFaust",),
+    "EKUT": (),
+    "Eyes_Japan_Dataset": ("Eyes_Janpan_Dataset",),
+    "HumanEva": (),
+    "KIT": (),
+    "MPI_HDM05": ("HDM05",),
+    "MPI_Limits": ("PosePrior",),
+    "MPI_mosh": ("MoSh",),
+    "SFU": (),
+    "SSM_synced": ("SSM",),
+    "TCD_handMocap": ("TCDHands",),
+    "TotalCapture": (),
+    "Transitions_mocap": ("Transitions",),
+    "CNRS": (),
+    "DanceDB": (),
+    "GRAB": (),
+    "SOMA": (),
+    "WEIZMANN": (),
+}
+"""Folder of each subset in the archives that HumanML3D was made from -> its other names, on the web page and later."""
+
+T = TypeVar("T")
+ARCHIVE_ENDINGS = (".tar.bz2", ".tar.xz", ".tar.gz", ".tar")
+CHUNK = 32
+
+
+def _plain(name: str) -> str:
+    return re.sub("[^a-z0-9]", "", name.lower())
+
+
+_BY_NAME = {_plain(alias): name for name, aliases in SUBSETS.items() for alias in (name, *aliases)}
+
+
+class Recording(NamedTuple):
+    """One file of AMASS: poses (F, 156) axis-angle of SMPL+H's 52 joints, translation (F, 3) in metres, z up."""
+
+    poses: np.ndarray
+    translation: np.ndarray
+    betas: np.ndarray
+    gender: str
+    fps: float
+
+    def every(self, fps: float) -> Recording:
+        """Every int(self.fps / fps)-th frame, as HumanML3D, FLAME and BABEL's users decimate: no interpolation.
+
+        Of 59.94 Hz every second frame is kept, of 250 Hz every twelfth, so that the rate is only about `fps`.
+
+        Raises:
+            ValueError: it was recorded at less than `fps`.
+        """
+        step = int(self.fps / fps)
+        if step < 1:
+            raise ValueError(f"recorded at {self.fps:g} frames a second, less than the {fps:g} asked for")
+        return self._replace(poses=self.poses[::step], translation=self.translation[::step])
+
+
+def key_of(path: str) -> str | None:
+    """Name of a recording whatever its subset is called, such as `bmlrub/rub001/0000_x_poses`; None outside a subset.
+
+    Takes paths of index files (`./pose_data/KIT/3/x_poses.npy`), of archives and of unpacked folders, nested or not.
+    Spaces, which later releases replace by underscores, and capital letters do not count.
+    """
+    *folders, file = PurePosixPath(path).parts
+    for depth in range(len(folders) - 1, -1, -1):
+        subset = _BY_NAME.get(_plain(folders[depth]))
+        if subset:
+            rest = "/".join([*folders[depth + 1 :], PurePosixPath(file).stem])
+            return f"{subset}/{rest.replace(' ', '_').lower()}"
+    return None
+
+
+def subset_of(key: str) -> str:
+    """Folder name of the subset, as in `SUBSETS`, that a key of `key_of` belongs to."""
+    return key.split("/", 1)[0]
+
+
+def read(file: Path | bytes, name: str) -> Recording:
+    """Reads a recording; `name` stands in the errors.
+
+    Raises:
+        ValueError: no SMPL+H file of AMASS, damaged, or with numbers that are not finite.
+    """
+    try:
+        with np.load(io.BytesIO(file) if isinstance(file, bytes) else file, allow_pickle=False) as archive:
+            data = {key: archive[key] for key in archive.files if key not in ("dmpls", "marker_data")}
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+        raise ValueError(f"{name}: damaged or no .npz file of AMASS: {error}; download it again") from error
+    width = data["poses"].shape[-1] if "poses" in data else 0
+    if width == 165 or "surface_model_type" in data:
+        raise ValueError(f"{name}: this is AMASS's SMPL-X release; download the one called SMPL+H G")
+    missing = [key for key in ("poses", "trans", "betas", "gender", "mocap_framerate") if key not in data]
+    if missing:
+        raise ValueError(f"{name}: no motion of AMASS's SMPL+H G release, it lacks {', '.join(missing)}")
+    poses, translation = data["poses"], data["trans"]
+    if poses.ndim != 2 or width != 156 or translation.shape != (len(poses), 3):
+        raise ValueError(f"{name}: poses {poses.shape} and trans {translation.shape}, not (F, 156) and (F, 3)")
+    if not (np.isfinite(poses).all() and np.isfinite(translation).all()):
+        raise ValueError(f"{name}: it holds numbers that are not finite")
+    gender = data["gender"].item()
+    gender = gender.decode() if isinstance(gender, bytes) else str(gender)
+    return Recording(poses, translation, data["betas"], gender, float(data["mocap_framerate"]))
+
+
+class Amass:
+    """A folder that holds AMASS: archives as downloaded, unpacked subsets, or both."""
+
+    def __init__(self, root: Path):
+        self.root = Path(root)
+
+    @cached_property
+    def files(self) -> dict[str, Path]:
+        """Key of each unpacked recording -> its file."""
+        if not self.root.is_dir():
+            raise FileNotFoundError(
+                f"{self.root}: no such folder; register at https://amass.is.tue.mpg.de, download the SMPL+H G "
+                "archives and put them there"
+            )
+        found = {}
+        for folder, _, names in os.walk(self.root):
+            inside = Path(folder).relative_to(self.root).as_posix()
+            for name in names:
+                if name.endswith(".npz") and (key := key_of(f"{inside}/{name}")):
+                    found[key] = Path(folder, name)
+        return found
+
+    @cached_property
+    def archives(self) -> dict[str, Path]:
+        """Subset -> its archive, known by its file name."""
+        found = {}
+        for ending in ARCHIVE_ENDINGS:
+            for path in sorted(self.root.rglob(f"*{ending}")):
+                subset = _BY_NAME.get(_plain(path.name.removesuffix(ending)))
+                if subset:
+                    found[subset] = path
+        return found
+
+    def missing(self, keys: Collection[str]) -> list[str]:
+        """One line for each subset of which recordings are absent; what is in an archive shows when it is read."""
+        lines = []
+        stems = {subset_of(key): key.endswith("_stageii") for key in self.files}
+        for subset, wanted in _by_subset(keys).items():
+            absent = [key for key in wanted if key not in self.files]
+            if not absent or subset in self.archives:
+                continue
+            names = " or ".join((subset, *SUBSETS[subset]))
+            if len(absent) < len(wanted):
+                lines.append(f"{subset}: {len(absent)} of {len(wanted)} recordings are absent, such as {absent[0]}")
+            elif stems.get(subset):
+                lines.append(f"{subset}: this is the SMPL-X release (files end in _stageii); download SMPL+H G")
+            else:
+                lines.append(f"{subset}: absent ({len(wanted)} recordings); the archive is called {names}")
+        return lines
+
+    def each(
+        self, keys: Collection[str], function: Callable[[str, Recording], T], workers: int = 0
+    ) -> Iterator[tuple[str, T]]:
+        """Calls `function(key, recording)` for each key, in processes of its own, and yields (key, result), sorted.
+
+        Args:
+            keys: of `key_of`.
+            function: can be pickled; its errors get the name of the file.
+            workers: processes; 0 = one a core, 1 = none but this one.
+
+        Raises:
+            FileNotFoundError: recordings are absent.
+            ValueError: a damaged file or archive, or what `function` raises.
+        """
+        absent = self.missing(keys)
+        if absent:
+            raise FileNotFoundError(f"{self.root}: {'; '.join(absent)}")
+        tasks: list[tuple[Path | dict[str, Path], list[str]]] = []
+        for subset, wanted in sorted(_by_subset(keys).items()):
+            unpacked = sorted(key for key in wanted if key in self.files)
+            if len(unpacked) < len(wanted):
+                tasks.append((self.archives[subset], sorted(wanted)))
+            else:
+                chunks = (unpacked[begin : begin + CHUNK] for begin in range(0, len(unpacked), CHUNK))
+                tasks += [({key: self.files[key] for key in chunk}, chunk) for chunk in chunks]
+        yield from _in_processes(tasks, function, workers)
+
+
+def _by_subset(keys: Collection[str]) -> dict[str, list[str]]:
+    groups = defaultdict(list)
+    for key in keys:
+        groups[subset_of(key)].append(key)
+    return groups
+
+
+def _in_processes(
+    tasks: Sequence[tuple[Path | dict[str, Path], list[str]]],
+    function: Callable[[str, Recording], T],
+    workers: int,
+) -> Iterator[tuple[str, T]]:
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    workers = min(workers or cores, len(tasks))
+    if workers <= 1:
+        for place, keys in tasks:
+            yield from _run(place, keys, function)
+        return
+    # Fresh processes: a fork would copy the threads' locks of a process that may have used torch before.
+    with ProcessPoolExecutor(workers, get_context("spawn"), _start_worker) as pool:
+        pending = deque()
+        for place, keys in tasks:
+            pending.append(pool.submit(_run, place, keys, function))
+            if len(pending) > 2 * workers:
+                yield from pending.popleft().result()
+        while pending:
+            yield from pending.popleft().result()
+
+
+def _start_worker() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's, which then ends the workers
+    torch.set_num_threads(1)
+
+
+def _run(
+    place: Path | dict[str, Path], keys: list[str], function: Callable[[str, Recording], T]
+) -> list[tuple[str, T]]:
+    results = {}
+    for key, name, file in _contents(place, keys):
+        recording = read(file, name)
+        try:
+            results[key] = function(key, recording)
+        except ValueError as error:
+            raise ValueError(f"{name}: {error}") from error
+    return [(key, results[key]) for key in keys]
+
+
+def _contents(place: Path | dict[str, Path], keys: list[str]) -> Iterator[tuple[str, str, Path | bytes]]:
+    """Key, name and content of the recordings in an archive or among files."""
+    if isinstance(place, dict):
+        yield from ((key, str(path), path) for key, path in place.items())
+        return
+    left = set(keys)
+    releases = set()
+    try:
+        with tarfile.open(place, "r|*") as archive:
+            for member in archive:
+                key = key_of(member.name)
+                releases.add(member.name.endswith("_stageii.npz"))
+                file = archive.extractfile(member) if key in left and member.name.endswith(".npz") else None
+                if key and file:
+                    left.remove(key)
+                    yield key, f"{place}/{member.name}", file.read()
+                if not left:
+                    return
+    except (tarfile.TarError, EOFError, OSError, zlib.error) as error:
+        raise ValueError(f"{place}: damaged or incomplete archive: {error}; download it again") from error
+    if True in releases:
+        raise ValueError(f"{place}: this is AMASS's SMPL-X release (_stageii.npz); download the one called SMPL+H G")
+    raise ValueError(f"{place}: {len(left)} recordings are not in it, such as {min(left)}")
+
+
+class Body(NamedTuple):
+    """Where SMPL+H's first 22 joints rest: `rest` (22, 3) metres for the mean shape, `shape` (22, 3, 10) per beta."""
+
+    rest: torch.Tensor
+    shape: torch.Tensor
+
+    def joints(self, recording: Recording) -> np.ndarray:
+        """Joints (F, 22, 3) float64 in metres, y up as in HumanML3D: AMASS's (-x, z, y).
+
+        The other 30 joints are the fingers', on which these do not depend; soft tissue and pose correctives move the
+        surface only.
+        """
+        betas = torch.from_numpy(recording.betas[:10].astype(np.float64))
+        rest = self.rest + self.shape[..., : len(betas)] @ betas
+        poses = torch.from_numpy(recording.poses[:, :66].astype(np.float64)).unflatten(1, (22, 3))
+        root = torch.from_numpy(recording.translation.astype(np.float64)) + rest[0]
+        turned = rotation.axis_angle_to_matrix(poses)
+        joints = forward_kinematics(SMPL22, turned, SMPL22.bones(rest), root)
+        return (joints[..., [0, 2, 1]] * joints.new_tensor([-1.0, 1.0, 1.0])).numpy()
+
+
+def load_bodies(folder: Path) -> dict[str, Body]:
+    """The bodies `male` and `female` of the extended SMPL+H model, from template, shape and joint regressor alone.
+
+    Args:
+        folder: holds `male/model.npz` and `female/model.npz` (of the model's archive), or `SMPLH_MALE.npz` and
+            `SMPLH_FEMALE.npz`; a folder `smplh` inside it may hold them, too.
+
+    Raises:
+        FileNotFoundError: there is none.
+        ValueError: damaged, or no SMPL+H model.
+    """
+    return {gender: _load_body(Path(folder), gender) for gender in ("male", "female")}
+
+
+def _load_body(folder: Path, gender: str) -> Body:
+    names = (f"{gender}/model.npz", f"SMPLH_{gender.upper()}.npz")
+    candidates = [folder / inner / name for inner in ("", "smplh") for name in names]
+    path = next((path for path in candidates if path.is_file()), None)
+    if path is None:
+        raise FileNotFoundError(
+            f"{folder}: neither {' nor '.join(names)} in it; get the extended SMPL+H model at https://mano.is.tue.mpg.de"
+        )
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            regressor, template, directions = (file[key] for key in ("J_regressor", "v_template", "shapedirs"))
+            parents = file["kintree_table"][0, 1:22]
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+        raise ValueError(f"{path}: damaged or no SMPL+H model: {error}") from error
+    if regressor.shape[0] != 52 or tuple(parents) != SMPL22.parents[1:]:
+        raise ValueError(f"{path}: a model of {regressor.shape[0]} joints, not SMPL+H's 52")
+    regressor = regressor[:22].astype(np.float64)
+    shape = np.einsum("jv,vck->jck", regressor, directions[..., :10].astype(np.float64))
+    return Body(torch.from_numpy(regressor @ template.astype(np.float64)), torch.from_numpy(shape))

@@ -9,12 +9,19 @@ motion.joints  # (F, J, 3) metres, y up
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from flame_mdm.editing import edit
     from flame_mdm.generation import Generated, generate
     from flame_mdm.task import MotionGeneration, load
 
-__all__ = ["Generated", "MotionGeneration", "generate", "load"]
+__all__ = ["Generated", "MotionGeneration", "edit", "generate", "load"]
 
-_HOMES = {"load": "task", "MotionGeneration": "task", "generate": "generation", "Generated": "generation"}
+_HOMES = {
+    "load": "task",
+    "MotionGeneration": "task",
+    "generate": "generation",
+    "Generated": "generation",
+    "edit": "editing",
+}
 
 
 def __getattr__(name: str) -> Any:

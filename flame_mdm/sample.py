@@ -30,15 +30,7 @@ def sample(config: Config) -> None:
     Raises:
         UserError: nothing, or two things, asked for; or what `generate` refuses.
     """
-    asked = [key for key in ("text", "action") if config[key] is not None] + ["unconditioned"] * config["unconditioned"]
-    if config["ckpt"] is None:
-        raise UserError("no checkpoint: ckpt=runs/.../checkpoints/last.ckpt")
-    if config["text"] is not None and not str(config["text"]).strip():
-        raise UserError("the text is empty; write what the person does, or ask for unconditioned motions by name")
-    if len(asked) != 1:
-        raise UserError(
-            f"ask for one of text=..., action=... and unconditioned=true, not {' and '.join(asked) or 'none'}"
-        )
+    check_request(config)
 
     import torch
 
@@ -64,6 +56,23 @@ def sample(config: Config) -> None:
     print(
         f"{len(motions)} motions of {len(motions[0].joints)} frames: {folder / 'player.html'}, {folder / 'motions.gif'}"
     )
+
+
+def check_request(config: Config) -> None:
+    """Checks that a checkpoint and one condition are asked for.
+
+    Raises:
+        UserError: they are not.
+    """
+    asked = [key for key in ("text", "action") if config[key] is not None] + ["unconditioned"] * config["unconditioned"]
+    if config["ckpt"] is None:
+        raise UserError("no checkpoint: ckpt=runs/.../checkpoints/last.ckpt")
+    if config["text"] is not None and not str(config["text"]).strip():
+        raise UserError("the text is empty; write what the person does, or ask for unconditioned motions by name")
+    if len(asked) != 1:
+        raise UserError(
+            f"ask for one of text=..., action=... and unconditioned=true, not {' and '.join(asked) or 'none'}"
+        )
 
 
 if __name__ == "__main__":

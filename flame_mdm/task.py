@@ -50,8 +50,14 @@ class Task(LightningModule):
         self.condition.precompute(*self._captions())
 
     def setup(self, stage: str) -> None:
-        """Opens what `prepare_data` encoded."""
+        """Opens what `prepare_data` encoded, and notes what sampling has to know of the data."""
         self.condition.load_cache(*self._captions())
+        data: MotionDataModule = self.trainer.datamodule  # type: ignore[attr-defined]
+        self.facts |= {
+            "dataset": data.store.info["dataset"],
+            "fingerprint": data.store.fingerprint,
+            "max_frames": data.crop.longest(),
+        }
 
     def _captions(self) -> tuple[list[str], Path]:
         data: MotionDataModule = self.trainer.datamodule  # type: ignore[attr-defined]

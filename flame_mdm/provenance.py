@@ -1,0 +1,78 @@
+"""What a run is made of, written beside it."""
+
+from __future__ import annotations
+
+import json
+import platform
+import subprocess
+import sys
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from lightning import Callback, LightningModule, Trainer
+
+from flame_mdm.config import Config, save
+
+PACKAGES = ("flame-mdm", "torch", "lightning", "torchmetrics", "transformers", "numpy", "scipy")
+
+
+class Provenance(Callback):
+    """At the start of a fit: `config.yaml` and `provenance.json` in the run's folder, and four lines on the screen."""
+
+    def __init__(self, config: Config):
+        self.config = config
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        if not trainer.is_global_zero:
+            return
+        folder = Path(self.config["run"]["dir"])
+        save(_movable(self.config), folder / "config.yaml", head="A saved run; EXP=path/to/this/file repeats it.")
+        facts = {**environment(), "data": pl_module.facts}
+        (folder / "provenance.json").write_text(json.dumps(facts, indent=2) + "\n")
+        self._introduce(trainer, pl_module)
+
+    def _introduce(self, trainer: Trainer, task: Any) -> None:
+        count = sum(p.numel() for p in task.parameters() if p.requires_grad)
+        size = self.config["data"]["batch_size"] * trainer.world_size * trainer.accumulate_grad_batches
+        data = trainer.datamodule.store.info  # type: ignore[attr-defined]
+        clips = data["clips"]
+        splits = f"{clips['train']} clips to train on, {clips['val']} to validate, {clips['test']} to test"
+        print(f"{self.config['experiment']}: {task.describe()}, {count / 1e6:.2f} M trainable parameters")
+        print(f"data: {data['dataset']} as {data['representation']}, {splits}; {data['hours']} hours")
+        print(
+            f"device: {trainer.world_size} x {trainer.strategy.root_device.type}, {self.config['trainer']['precision']}"
+        )
+        passes = trainer.max_steps * size / clips["train"]
+        print(f"steps: {trainer.global_step} to {trainer.max_steps} of {size} clips, {passes:.0f} passes over the data")
+
+
+def _movable(node: Any, folder: str | None = None) -> Any:
+    """The configuration with paths in the run's folder written in terms of `run.dir`, so that it can be changed."""
+    if isinstance(node, dict):
+        inside = folder or node["run"]["dir"]
+        return {k: v if folder is None and k == "run" else _movable(v, inside) for k, v in node.items()}
+    if isinstance(node, str) and folder and node.startswith(folder):
+        return "${run.dir}" + node.removeprefix(folder)
+    return node
+
+
+def environment() -> dict[str, Any]:
+    """Command, code, machine and versions, as they stand beside every run and result."""
+    return {
+        "command": sys.argv,
+        "commit": _git("rev-parse", "HEAD"),
+        "changed": _git("status", "--porcelain", "--untracked-files=no"),
+        "python": platform.python_version(),
+        "machine": platform.platform(),
+        "packages": {name: version(name) for name in PACKAGES},
+    }
+
+
+def _git(*words: str) -> str | None:
+    try:
+        folder = Path(__file__).parent
+        result = subprocess.run(["git", *words], capture_output=True, text=True, cwd=folder, check=False)
+    except FileNotFoundError:  # no git on this machine
+        return None
+    return result.stdout.strip() if result.returncode == 0 else None

@@ -84,8 +84,8 @@ def edit(
         model: from `flame_mdm.load`.
         motion: what `read_motion` reads, or its result, or a generated motion.
         texts, actions: what to do, as in `generate`; neither = without condition.
-        frames: [begin, end) or several such ranges, to sample anew; or a task: "in_between" keeps the first and the last
-            quarter, "prediction" ("prefix") the first, "suffix" the last, "interpolate" every fifth frame.
+        frames: [begin, end) or several such ranges, to sample anew; or a task: "in_between" keeps the first and the
+            last quarter, "prediction" ("prefix") the first, "suffix" the last, "interpolate" every fifth frame.
         seconds: ranges in seconds, in place of `frames`.
         joints: names of joints or of parts of the body (see `part_names`), to sample anew; default all. The root's
             way belongs to joint 0, which is in lower_body.

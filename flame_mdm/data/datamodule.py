@@ -157,7 +157,12 @@ class MotionDataModule(LightningDataModule):
             ValueError: it was prepared with another representation, or is damaged.
         """
         store = Store(self.folder)
-        for name, wanted in (("representation", self.representation.name), ("fps", self.representation.fps)):
+        wanted_info = {
+            "representation": self.representation.name,
+            "fps": self.representation.fps,
+            "published_split": self.source.published_split,
+        }
+        for name, wanted in wanted_info.items():
             if store.info[name] != wanted:
                 raise ValueError(f"{self.folder}: its {name} is {store.info[name]}, not {wanted}; prepare it again")
         self.representation.mean.copy_(torch.from_numpy(store.mean))

@@ -1,0 +1,227 @@
+"""BABEL: labels of what is done when, on the motions of AMASS, cut into clips as FLAME does.
+
+Punnakkal et al., "BABEL: Bodies, Action and Behavior with English Labels", CVPR 2021; Kim et al., "FLAME: Free-form
+Language-based Motion Synthesis & Editing", AAAI 2023, appendix "BABEL". `docs/babel.md` describes the set.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections import Counter, defaultdict
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+from tqdm import tqdm
+
+from flame_mdm.data import Clip, MotionSource, Split, hashed_split
+from flame_mdm.data.amass import Amass, Recording, key_of
+
+FPS = 20.0
+
+PARTS: dict[str, tuple[str, ...]] = {"train": ("train", "extra_train"), "val": ("val", "extra_val")}
+"""The files of a part. Those called extra hold several annotators' labels, of which the first one's count."""
+
+
+@dataclass(frozen=True)
+class Label:
+    """One text for one stretch of a motion.
+
+    Attributes:
+        motion: key of the recording of AMASS, as `amass.key_of` makes it.
+        text: what is done.
+        start, end: seconds; None where BABEL does not know.
+        kind: the annotator's words, or the category of the action.
+    """
+
+    motion: str
+    text: str
+    start: float | None
+    end: float | None
+    kind: Literal["words", "category"]
+
+
+@dataclass(frozen=True)
+class Window:
+    """A clip: `length` frames of a motion from `start` on; `id` is FLAME's number of it in its part."""
+
+    id: str
+    motion: str
+    split: Split
+    start: int
+    label: Label
+
+
+class Babel(MotionSource):
+    """Clips of `length` frames, as raw motions of the SMPL representations, in AMASS's world.
+
+    A longer label gives windows every `stride` frames; a shorter one is extended past its end, or left out where the
+    motion ends before. The stretch of a label is floor(20 start) to floor(20 end) - 1, as FLAME's code has it.
+
+    Ours keeps each motion in one split: 60 % train, 20 % val, 20 % test of the motions of both parts. FLAME's trains on
+    BABEL's train part and takes every fifth clip of the val part for testing, so that overlapping windows of one label
+    stand in val and test.
+    """
+
+    name = "babel"
+    published: ClassVar[dict[str, int]] = {"labels": 63353}
+
+    def __init__(
+        self,
+        path: str,
+        amass: str,
+        published_split: bool = False,
+        length: int = 128,
+        stride: int = 10,
+        workers: int = 0,
+    ):
+        """Reads nothing yet.
+
+        Args:
+            path: folder with `train.json`, `extra_train.json`, `val.json` and `extra_val.json` (BABEL v1.0).
+            amass: folder of AMASS's SMPL+H G release, as archives or unpacked.
+            published_split: FLAME's split, in which clips of val and test overlap.
+            length: frames of a clip at 20 frames a second.
+            stride: frames between the windows of a label.
+            workers: processes that read AMASS; 0 = one a core, 1 = none but this one.
+        """
+        self.path, self.amass, self.published_split = Path(path), Amass(Path(amass)), published_split
+        self.length, self.stride, self.workers = length, stride, workers
+        self._excluded: Counter[str] = Counter()
+        self._windows: list[Window] | None = None
+
+    def excluded(self) -> dict[str, int]:
+        return dict(self._excluded)
+
+    def count(self) -> int:
+        return len(self.windows())
+
+    def clips(self, fps: float) -> Iterator[Clip]:
+        if fps != FPS:
+            raise ValueError(f"babel: its rules are those of {FPS:g} frames a second, set representation.fps={FPS:g}")
+        windows: defaultdict[str, list[Window]] = defaultdict(list)
+        for window in self.windows():
+            windows[window.motion].append(window)
+        for key, motion in self.amass.each(windows, _motion, self.workers):
+            for window in windows[key]:
+                yield Clip(
+                    window.id,
+                    motion,
+                    [window.label.text],
+                    window.split,
+                    window.id if self.published_split else key,
+                    attributes={"motion": key, "start": window.start, "label": window.label.kind},
+                    window=(window.start, self.length),
+                )
+
+    def windows(self) -> list[Window]:
+        """All clips in FLAME's order; reads the labels, and measures the motions.
+
+        Raises:
+            FileNotFoundError, ValueError: a file is absent or damaged.
+        """
+        if self._windows is None:
+            self._excluded = Counter()
+            labels = {part: self.labels(part) for part in PARTS}
+            keys = {label.motion for part in PARTS for label in labels[part]}
+            measured = self.amass.each(keys, _measure, self.workers)
+            lengths = dict(tqdm(measured, "measuring the motions of AMASS", len(keys), unit=" motions"))
+            self._windows = []
+            for part in PARTS:
+                number = 0
+                for label in labels[part]:
+                    for start in self._starts(label, lengths[label.motion]):
+                        split = self._split(part, number, label.motion)
+                        self._windows.append(Window(f"{part}_{number:06d}", label.motion, split, start, label))
+                        number += 1
+        return self._windows
+
+    def labels(self, part: str) -> list[Label]:
+        """The labels of a part in FLAME's order: of each file first the annotators' words, then the categories.
+
+        Labels that say nothing are dropped, and those that say the same of the same stretch of a motion count once.
+        """
+        labels = []
+        for name in PARTS[part]:
+            words, categories = [], []
+            for motion, given in self._annotations(self.path / f"{name}.json"):
+                stretch = given["start_t"], given["end_t"]
+                kinds = given["act_cat"]
+                if kinds is None or kinds:  # FLAME's code loses the words where the list of categories is empty
+                    words.append(Label(motion, given["proc_label"], *stretch, "words"))
+                categories += [Label(motion, kind, *stretch, "category") for kind in kinds or ()]
+            once: dict[tuple, Label] = {}
+            for label in words + categories:
+                once.setdefault((label.motion, label.text, label.start, label.end), label)
+            labels += [label for label in once.values() if label.text]
+        return labels
+
+    def _annotations(self, path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
+        """Path of the motion and label, for every frame label of a file."""
+        try:
+            data = json.loads(path.read_text(encoding="utf-8"))
+        except FileNotFoundError:
+            raise FileNotFoundError(
+                f"{path}: no such file; BABEL v1.0 is published at https://babel.is.tue.mpg.de: unpack it and set "
+                "data.source.path=/path/to/babel_v1.0_release"
+            ) from None
+        except ValueError as error:
+            raise ValueError(f"{path}: not read as JSON: {error}") from error
+        key = "frame_anns" if path.stem.startswith("extra_") else "frame_ann"
+        try:
+            for sequence in data.values():
+                annotation = sequence[key][0] if key == "frame_anns" and sequence[key] else sequence[key]
+                for label in annotation["labels"] if annotation else ():
+                    yield (
+                        self._key(str(sequence["feat_p"])),
+                        {k: label[k] for k in ("proc_label", "act_cat", "start_t", "end_t")},
+                    )
+        except (AttributeError, KeyError, TypeError) as error:
+            raise ValueError(f"{path}: not in the layout of BABEL v1.0: {error!r}") from error
+
+    def _starts(self, label: Label, frames: int) -> range:
+        """First frames of the clips of a label in a motion of so many frames; says why where there is none."""
+        if label.text == "transition":
+            return self._exclude("transitions")
+        if label.start is None or label.end is None:
+            return self._exclude("labels without a time")
+        first, last = math.floor(label.start * FPS), math.floor(label.end * FPS) - 1
+        if label.end < label.start:
+            return self._exclude("labels that end before they start")
+        if first < 0 or last > frames - 1:
+            return self._exclude("labels that reach past the motion")
+        if last <= first:
+            return self._exclude("labels without a frame")
+        if last - first > self.length:
+            return range(first, last - self.length + 1, self.stride)
+        if first + self.length >= frames:
+            return self._exclude("labels too near to the end of the motion")
+        return range(first, first + 1)
+
+    def _exclude(self, reason: str) -> range:
+        self._excluded[reason] += 1
+        return range(0)
+
+    def _split(self, part: str, number: int, motion: str) -> Split:
+        if not self.published_split:
+            return hashed_split(motion, val=20, test=20)
+        return "train" if part == "train" else "test" if number % 5 == 0 else "val"
+
+    def _key(self, motion: str) -> str:
+        key = key_of(motion)
+        if key is None:
+            raise ValueError(f"{self.path}: the labels name {motion}, which is in no subset of AMASS")
+        return key
+
+
+def _measure(key: str, recording: Recording) -> int:
+    return len(recording.every(FPS).translation)
+
+
+def _motion(key: str, recording: Recording) -> np.ndarray:
+    """(F, 75): translation and the 24 joints that FLAME takes."""
+    kept = recording.every(FPS)
+    return np.concatenate([kept.translation, kept.poses[:, :72]], 1).astype(np.float32)

@@ -1,0 +1,165 @@
+"""HumanAct12: 1,191 clips of 12 actions, as the SMPL poses that ACTOR's authors hand out.
+
+Guo et al., "Action2Motion: Conditioned Generation of 3D Human Motions", ACM MM 2020; poses by Petrovich et al.,
+"Action-Conditioned 3D Human Motion Synthesis with Transformer VAE", ICCV 2021. `docs/actions.md` describes the set.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections import defaultdict
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+
+from flame_mdm.data import Clip, MotionSource, Split, restricted_pickle
+
+FPS = 20.0
+"""Frames a second at which the papers' codes play the action sets; no frame is dropped or made."""
+
+BLOCK = 10
+"""Clips that follow one another in the file and go to one split together: they may be cut from one recording."""
+
+
+class HumanAct12(MotionSource):
+    """The clips of `humanact12poses.pkl`, as raw motions of the SMPL representations.
+
+    The file names neither subjects nor recordings. Our split (70 % train, 10 % val, 20 % test of each action) keeps
+    neighboring clips together. The published use has no split: every clip is for training, and tested on.
+    """
+
+    name = "humanact12"
+    actions = (
+        *("warm_up", "walk", "run", "jump", "drink", "lift_dumbbell", "sit", "eat"),
+        *("turn steering wheel", "phone", "boxing", "throw"),
+    )
+    published: ClassVar[dict[str, int]] = {"clips": 1191, "fewest clips an action": 47, "most clips an action": 218}
+
+    def __init__(self, path: str, published_split: bool = False):
+        """Reads nothing yet.
+
+        Args:
+            path: `humanact12poses.pkl`, or the folder that holds it.
+            published_split: all clips are training clips, which are also the test clips.
+        """
+        self.path, self.published_split = Path(path), published_split
+        self._found: list[tuple[np.ndarray, int]] | None = None
+
+    def count(self) -> int:
+        return len(self._clips())
+
+    def clips(self, fps: float) -> Iterator[Clip]:
+        check_fps(self.name, fps)
+        found = self._clips()
+        splits = self._splits([action for _, action in found])
+        for number, ((motion, action), (source, split)) in enumerate(zip(found, splits, strict=True)):
+            yield Clip(f"humanact12_{number:04d}", motion, [], split, source, action)
+
+    def _clips(self) -> list[tuple[np.ndarray, int]]:
+        if self._found is None:
+            self._found = read(find(self.path, "humanact12poses.pkl"), len(self.actions))
+        return self._found
+
+    def _splits(self, actions: list[int]) -> list[tuple[str, Split]]:
+        """Source and split of each clip."""
+        if self.published_split:
+            return [(f"humanact12_{number:04d}", "train") for number in range(len(actions))]
+        seen: defaultdict[int, int] = defaultdict(int)
+        places = []
+        for action in actions:
+            places.append((action, seen[action] // BLOCK))
+            seen[action] += 1
+        splits: dict[tuple[int, int], Split] = {}
+        for action, clips in seen.items():
+            blocks = sorted(range(-(-clips // BLOCK)), key=lambda block: _hash(f"humanact12_{action}_{block}"))
+            test, val = max(1, round(0.2 * len(blocks))), max(1, round(0.1 * len(blocks)))
+            for rank, block in enumerate(blocks):
+                splits[action, block] = "test" if rank < test else "val" if rank < test + val else "train"
+        return [(f"{self.actions[action]} {block}", splits[action, block]) for action, block in places]
+
+
+def read(path: Path, actions: int = len(HumanAct12.actions)) -> list[tuple[np.ndarray, int]]:
+    """Motion and action of each clip of `humanact12poses.pkl`, in the order of the file.
+
+    Returns:
+        Pairs of (F, 75) float32 and a label in [0, `actions`): the root joint's place (metres, the camera's axes), then
+        24 axis-angle vectors, the root's in the camera's axes.
+
+    Raises:
+        FileNotFoundError, ValueError: the file is absent, damaged or another one.
+    """
+    data = restricted_pickle.read(path)
+    poses, joints, labels = columns(path, data, "poses", "joints3D", "y")
+    clips = []
+    for number, (pose, joint, label) in enumerate(zip(poses, joints, labels, strict=True)):
+        pose, joint = np.asarray(pose, np.float32), np.asarray(joint, np.float32)
+        if pose.ndim != 2 or pose.shape[1] != 72 or joint.shape != (len(pose), 24, 3) or not len(pose):
+            raise ValueError(
+                f"{path}: clip {number} has poses {pose.shape} and joints {joint.shape}, not (F, 72) and (F, 24, 3)"
+            )
+        if not 0 <= int(label) < actions:
+            raise ValueError(f"{path}: clip {number} has the label {label}, not one of 0 to {actions - 1}")
+        clips.append((np.concatenate([joint[:, 0], pose], 1), int(label)))
+    return clips
+
+
+def read_unconstrained(path: Path) -> np.ndarray:
+    """The reference motions of unconstrained generation (Tevet et al. 2023, section 4.3, after Raab et al. 2022).
+
+    Args:
+        path: `humanact12_unconstrained_modi_struct.npy`, (N, 15 or more, 3, F).
+
+    Returns:
+        (N, F, 15, 3) float32, joints as they stand in the file; of SMPL's joints, these are 15, 12, 16, 18, 20, 17,
+        19, 21, 0, 1, 4, 7, 2, 5, 8.
+
+    Raises:
+        FileNotFoundError, ValueError: the file is absent, damaged or another one.
+    """
+    try:
+        data = np.load(path, allow_pickle=False)
+    except (ValueError, EOFError) as error:
+        raise ValueError(f"{path}: not read as an array: {error}") from error
+    if data.ndim != 4 or data.shape[1] < 15 or data.shape[2] != 3:
+        raise ValueError(f"{path}: shape {data.shape}, not (motions, 15 or more joints, 3, frames)")
+    return np.ascontiguousarray(data[:, :15].transpose(0, 3, 1, 2), np.float32)
+
+
+def find(path: Path, name: str) -> Path:
+    """`path` itself, or the file of this name directly in it or in one folder below.
+
+    Raises:
+        FileNotFoundError: there is none; says where it is published.
+    """
+    if path.is_file():
+        return path
+    for found in (path / name, *sorted(path.glob(f"*/{name}"))):
+        if found.is_file():
+            return found
+    raise FileNotFoundError(
+        f"{path}: no {name}; the set is published with ACTOR (https://github.com/Mathux/ACTOR, prepare/"
+        "download_datasets.sh): unpack it and set data.source.path=/path/to/the/folder"
+    )
+
+
+def columns(path: Path, data: Any, *names: str) -> list[Any]:
+    """The lists of these names in a pickled dictionary, checked to have one length."""
+    if not isinstance(data, dict) or not set(names) <= set(data):
+        kind = f"keys {', '.join(map(str, data))}" if isinstance(data, dict) else type(data).__name__
+        raise ValueError(f"{path}: has to hold {', '.join(names)}; it holds {kind}")
+    lengths = {name: len(data[name]) for name in names}
+    if len(set(lengths.values())) > 1:
+        raise ValueError(f"{path}: as many of each are needed, not {lengths}")
+    return [data[name] for name in names]
+
+
+def check_fps(name: str, fps: float) -> None:
+    """The action sets are not resampled."""
+    if fps != FPS:
+        raise ValueError(f"{name}: its clips are played at {FPS:g} frames a second, set representation.fps={FPS:g}")
+
+
+def _hash(text: str) -> str:
+    return hashlib.sha1(text.encode()).hexdigest()

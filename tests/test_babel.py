@@ -1,0 +1,237 @@
+"""FLAME's clips of BABEL, on folders in the layout of BABEL v1.0 and AMASS."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from fixtures import Arrays, golden
+
+from flame_mdm.data.amass import read
+from flame_mdm.data.babel import FPS, Babel, Window
+from flame_mdm.data.crops import Whole
+from flame_mdm.data.datamodule import MotionDataModule
+from flame_mdm.data.store import write_store
+from flame_mdm.representations.smpl import SMPL
+
+FILES = ("train", "extra_train", "val", "extra_val")
+
+
+def write_amass(path: Path, frames: int, fps: float, seed: int = 0) -> None:
+    """An AMASS file: SMPL+H's 156 numbers, the gender as bytes, keys that nothing here reads."""
+    rng = np.random.default_rng(seed)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    np.savez(
+        path,
+        trans=rng.normal(size=(frames, 3)),
+        gender=np.array(b"female"),
+        mocap_framerate=np.array(fps),
+        betas=np.zeros(16),
+        dmpls=np.zeros((frames, 8)),
+        poses=rng.normal(size=(frames, 156)) * 0.3,
+    )
+
+
+def sequence(name: str, labels: list[dict] | None, extra: bool) -> dict:
+    """One entry of a file of BABEL; `name` is the path of the motion in AMASS."""
+    annotation = None if labels is None else {"babel_lid": "x", "anntr_id": "y", "mul_act": True, "labels": labels}
+    whole = {
+        "babel_lid": "z",
+        "labels": [{"raw_label": "walk", "proc_label": "walk", "seg_id": "s", "act_cat": ["walk"]}],
+    }
+    if extra:
+        other = {"babel_lid": "x", "labels": [label("another annotator", ["jump"], 0, 9)]}
+        annotations = None if annotation is None else [annotation, other]
+        kept = {"seq_anns": [whole], "frame_anns": annotations}
+    else:
+        kept = {"seq_ann": whole, "frame_ann": annotation}
+    return {"babel_sid": 0, "url": "https://", "feat_p": f"{name.split('/')[0]}/{name}", "dur": 1.0, **kept}
+
+
+def label(text: str, categories: list[str] | None, start: float | None, end: float | None) -> dict:
+    return {
+        "raw_label": text.upper(),
+        "proc_label": text,
+        "seg_id": "s",
+        "act_cat": categories,
+        "start_t": start,
+        "end_t": end,
+    }
+
+
+def write_babel(folder: Path, sequences: dict[str, dict[str, dict]]) -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
+    for name in FILES:
+        (folder / f"{name}.json").write_text(json.dumps(sequences.get(name, {})))
+    return folder
+
+
+def coded(folder: Path, rules: Arrays) -> Babel:
+    """The coded motions and labels of the fixture as files."""
+
+    def text(code: float) -> str:
+        return "transition" if code == 999 else f"a{int(code)}"
+
+    sequences: dict[str, dict] = {name: {} for name in FILES}
+    for file, part, frames, fps in rules["babel_files"].tolist():
+        write_amass(folder / "amass" / f"CMU/subject/{file:03d}_poses.npz", frames, fps)
+        rows = [row for row in rules["babel_labels"].tolist() if row[0] == file]
+        labels = [label(text(row[4]), [text(c) for c in row[5:] if c >= 0] or None, row[2], row[3]) for row in rows]
+        found = sequence(f"CMU/subject/{file:03d}_poses.npz", labels, FILES[part].startswith("extra"))
+        sequences[FILES[part]][str(file)] = found
+    return open_babel(write_babel(folder / "babel", sequences), folder / "amass", published_split=True)
+
+
+def open_babel(babel: Path, amass: Path, published_split: bool = False) -> Babel:
+    return Babel(str(babel), str(amass), published_split, workers=1)
+
+
+def frames_of(amass: Path, key: str) -> np.ndarray:
+    """(F, 75) of a motion of `small` or `coded`, decimated."""
+    recording = read(amass / f"{key}.npz", key)
+    motion = np.concatenate([recording.translation, recording.poses[:, :72]], 1)
+    return motion[:: int(recording.fps / 20)].astype(np.float32)
+
+
+def row_of(window: Window) -> list[int]:
+    split = ("train", "val", "test").index(window.split)
+    file = int(Path(window.motion).name[:3])
+    return [split, int(window.id.split("_")[1]), file, window.start, int(window.label.text[1:])]
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize("stem", ["rules"])
+def test_clips_are_those_of_flame(stem: str, tmp_path: Path):
+    source = coded(tmp_path, golden(stem))
+    found = sorted(row_of(window) for window in source.windows())
+    assert found == sorted(golden(stem)["babel_clips"].tolist())
+    clips = list(source.clips(FPS))
+    assert source.count() == len(clips) == len(found)
+    for clip in clips[:: len(clips) // 5]:
+        motion = frames_of(tmp_path / "amass", clip.attributes["motion"])
+        assert clip.window is not None
+        first, length = clip.window
+        np.testing.assert_array_equal(clip.motion[first : first + length], motion[first:][:length])
+
+
+LABELS = [
+    label("walk", ["walk", "move"], 0.0, 8.0),
+    label("walk", ["walk"], 0.0, 8.0),  # said twice
+    label("transition", ["transition"], 0.0, 2.0),
+    label("", ["step"], 1.0, 3.0),
+    label("wave", None, 2.0, 4.0),
+    label("backwards", ["mislabeled"], 4.0, 3.0),
+    label("nowhen", None, None, None),
+    label("late", None, 12.0, 14.9),
+    label("too late", None, 12.0, 16.0),
+    label("nothing", None, 3.0, 3.06),
+    label("lost", [], 2.0, 4.0),
+]
+
+
+@pytest.fixture
+def small(tmp_path: Path) -> tuple[Path, Path]:
+    """BABEL with a few motions of 15 s in both parts, and one without frame labels."""
+    names = [f"CMU/{k:02d}/{k:02d}_01_poses.npz" for k in range(24)]
+    for seed, name in enumerate(names):
+        write_amass(tmp_path / "amass" / name, 900, 60.0, seed)
+    sequences = {
+        "train": {str(k): sequence(name, LABELS if k else None, False) for k, name in enumerate(names[:12])},
+        "extra_train": {str(k): sequence(name, LABELS[:1], True) for k, name in enumerate(names[12:14])},
+        "val": {str(k): sequence(name, LABELS, False) for k, name in enumerate(names[14:])},
+    }
+    return write_babel(tmp_path / "babel", sequences), tmp_path / "amass"
+
+
+def test_labels_become_texts_and_bad_ones_are_counted(small: tuple[Path, Path]):
+    babel, amass = small
+    source = open_babel(babel, amass)
+    texts = [(w.label.text, w.start) for w in source.windows() if w.motion.endswith("/01_01_poses")]
+    walks = [("walk", 0), ("walk", 10), ("walk", 20), ("walk", 30)]
+    moves = [("move", start) for _, start in walks]
+    assert sorted(texts) == sorted([*walks, *moves, ("step", 20), ("wave", 40)])
+    assert "another annotator" not in {window.label.text for window in source.windows()}
+    assert source.excluded() == {
+        "transitions": 21,
+        "labels that end before they start": 42,
+        "labels without a time": 21,
+        "labels too near to the end of the motion": 21,
+        "labels that reach past the motion": 21,
+        "labels without a frame": 21,
+    }
+
+
+def test_one_batch_from_raw_files(small: tuple[Path, Path], tmp_path: Path):
+    source = open_babel(*small)
+    representation = SMPL()
+    data = MotionDataModule(
+        source, representation, root=str(tmp_path), name="babel", batch_size=4, crop=Whole(max_frames=128)
+    )
+    data.prepare_data()
+    data.setup("fit")
+    batch = next(iter(data.train_dataloader()))
+    assert batch.x.shape == (4, 128, 147)
+    assert batch.mask.all()
+    assert batch.text is not None
+    assert set(batch.text) <= {"walk", "move", "step", "wave"}
+    splits = {split: {c.source for c in data.store.clips if c.split == split} for split in ("train", "val", "test")}
+    assert all(splits.values())
+    assert len(set().union(*splits.values())) == sum(map(len, splits.values())), "a motion in two splits"
+    # overlapping windows share their frames
+    assert len(data.store.features) == 300 * 23 < sum(clip.length for clip in data.store.clips)
+    assert data.store.info["excluded"]["transitions"] == 21
+    clip = data.store.clips[-1]
+    expected = representation.encode(torch.from_numpy(frames_of(small[1], clip.source)))
+    start = clip.attributes["start"]
+    np.testing.assert_allclose(data.store.motion(clip), expected[start : start + 128].numpy(), atol=1e-6)
+
+
+def test_flames_split_is_marked(small: tuple[Path, Path], tmp_path: Path):
+    source = open_babel(*small, published_split=True)
+    store = write_store(tmp_path / "store", source, SMPL())
+    assert store.info["published_split"] is True
+    held_out = [clip for clip in store.clips if clip.id.startswith("val")]
+    assert {clip.split for clip in held_out} == {"val", "test"}
+    assert all((int(c.id[4:]) % 5 == 0) == (c.split == "test") for c in held_out)
+    ours = MotionDataModule(open_babel(*small), SMPL(), root=str(tmp_path), name="x", batch_size=1, crop=Whole())
+    ours.folder = store.folder
+    with pytest.raises(ValueError, match="published_split is True, not False"):
+        ours.open()
+
+
+def test_absent_and_damaged_motions_are_named(small: tuple[Path, Path]):
+    path = small[1] / "CMU/03/03_01_poses.npz"
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    path.write_bytes(data)
+    with pytest.raises(ValueError, match=r"03_01_poses\.npz: damaged"):
+        open_babel(*small).count()
+    shutil.rmtree(small[1] / "CMU/03")
+    with pytest.raises(FileNotFoundError, match=r"CMU: 1 of 23 recordings are absent, such as CMU/03/03_01_poses"):
+        open_babel(*small).count()
+    with pytest.raises(FileNotFoundError, match=r"register at https://amass"):
+        open_babel(small[0], small[0] / "none").count()
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("{", r"val\.json: not read as JSON"),
+        ("[1]", r"val\.json: not in the layout of BABEL"),
+        ('{"1": {"feat_p": "a/b"}}', r"val\.json: not in the layout of BABEL v1\.0: KeyError\('frame_ann'\)"),
+    ],
+)
+def test_damaged_labels_are_named(content: str, message: str, small: tuple[Path, Path]):
+    (small[0] / "val.json").write_text(content)
+    with pytest.raises(ValueError, match=message):
+        open_babel(*small).count()
+    (small[0] / "val.json").unlink()
+    with pytest.raises(FileNotFoundError, match=r"BABEL v1\.0 is published at"):
+        open_babel(*small).count()
+
+
+def test_another_frame_rate_is_refused(small: tuple[Path, Path]):
+    with pytest.raises(ValueError, match=r"representation\.fps=20"):
+        next(open_babel(*small).clips(30.0))

@@ -8,10 +8,10 @@ from collections.abc import Sequence
 from flame_mdm.config import EXPERIMENTS, Config, UserError, instantiate, run
 
 USAGE = """
-usage: python -m flame_mdm.prepare data=NAME [source=PATH] [representation=NAME] [verify=true] [force=true]
+usage: python -m flame_mdm.prepare data=NAME [source=PATH] [representation=NAME] [check|verify|force=true]
 
-Turns a data set, as its owners hand it out, into a packed store under data/. `verify=true` checks an existing store
-instead; `force=true` writes it anew.
+Turns a data set, as its owners hand it out, into a packed store under data/. `check=true` only tells what is there to
+prepare and what is missing; `verify=true` checks an existing store; `force=true` writes it anew.
 """
 
 
@@ -40,6 +40,9 @@ def prepare(config: Config) -> None:
 
     representation = instantiate(config["representation"])
     data = instantiate(node, representation=representation)
+    if config["check"]:
+        print("\n".join(data.source.check()))
+        return
     exists = (data.folder / "store.json").exists()
     if config["verify"]:
         data.open().verify()

@@ -65,6 +65,10 @@ class MotionSource(ABC):
             FileNotFoundError: the raw data is not where the recipe says; the message says how to get it.
         """
 
+    def check(self) -> list[str]:
+        """What is there and what is missing, in lines to print; nothing is prepared."""
+        return [f"{self.name}: {self.count()} clips can be prepared"]
+
     def statistics(self) -> tuple[np.ndarray, np.ndarray] | None:
         """Mean and std (D,) that the owners hand out with encoded features; None = computed from the training clips."""
         return None

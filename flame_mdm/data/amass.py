@@ -8,21 +8,19 @@ from __future__ import annotations
 import io
 import os
 import re
-import signal
 import tarfile
 import zipfile
 import zlib
-from collections import defaultdict, deque
-from collections.abc import Callable, Collection, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from functools import cached_property
-from multiprocessing import get_context
+from collections import defaultdict
+from collections.abc import Callable, Collection, Iterator, Mapping
+from functools import cached_property, partial
 from pathlib import Path, PurePosixPath
 from typing import NamedTuple, TypeVar
 
 import numpy as np
 import torch
 
+from flame_mdm.data.parallel import in_order
 from flame_mdm.representations import rotation
 from flame_mdm.representations.skeleton import SMPL22, forward_kinematics
 
@@ -53,9 +51,12 @@ SUBSETS = {
 }
 """Folder of each subset in the archives that HumanML3D was made from -> its other names, on the web page and later."""
 
-T = TypeVar("T")
+Wanted = TypeVar("Wanted")
+Result = TypeVar("Result")
 ARCHIVE_ENDINGS = (".tar.bz2", ".tar.xz", ".tar.gz", ".tar")
 CHUNK = 32
+_Place = Path | dict[str, Path]
+"""An archive, or files by key."""
 
 
 def _plain(name: str) -> str:
@@ -186,31 +187,31 @@ class Amass:
         return lines
 
     def each(
-        self, keys: Collection[str], function: Callable[[str, Recording], T], workers: int = 0
-    ) -> Iterator[tuple[str, T]]:
-        """Calls `function(key, recording)` for each key, in processes of its own, and yields (key, result), sorted.
+        self, wanted: Mapping[str, Wanted], function: Callable[[Wanted, Recording], Result], workers: int = 0
+    ) -> Iterator[tuple[str, Result]]:
+        """Calls `function(wanted[key], recording)` for each key, in processes of its own; yields (key, result), sorted.
 
         Args:
-            keys: of `key_of`.
-            function: can be pickled; its errors get the name of the file.
+            wanted: key of `key_of` -> what the function is to know; both it and the function can be pickled.
+            function: its errors get the name of the file.
             workers: processes; 0 = one a core, 1 = none but this one.
 
         Raises:
             FileNotFoundError: recordings are absent.
             ValueError: a damaged file or archive, or what `function` raises.
         """
-        absent = self.missing(keys)
+        absent = self.missing(wanted)
         if absent:
             raise FileNotFoundError(f"{self.root}: {'; '.join(absent)}")
-        tasks: list[tuple[Path | dict[str, Path], list[str]]] = []
-        for subset, wanted in sorted(_by_subset(keys).items()):
-            unpacked = sorted(key for key in wanted if key in self.files)
-            if len(unpacked) < len(wanted):
-                tasks.append((self.archives[subset], sorted(wanted)))
+        tasks: list[tuple[_Place, dict[str, Wanted]]] = []
+        for subset, keys in sorted(_by_subset(wanted).items()):
+            if all(key in self.files for key in keys):
+                chunks = [sorted(keys)[begin : begin + CHUNK] for begin in range(0, len(keys), CHUNK)]
+                tasks += [({k: self.files[k] for k in chunk}, {k: wanted[k] for k in chunk}) for chunk in chunks]
             else:
-                chunks = (unpacked[begin : begin + CHUNK] for begin in range(0, len(unpacked), CHUNK))
-                tasks += [({key: self.files[key] for key in chunk}, chunk) for chunk in chunks]
-        yield from _in_processes(tasks, function, workers)
+                tasks.append((self.archives[subset], {key: wanted[key] for key in sorted(keys)}))
+        for results in in_order(partial(_run, function), tasks, min(workers, len(tasks))):
+            yield from results
 
 
 def _by_subset(keys: Collection[str]) -> dict[str, list[str]]:
@@ -220,47 +221,21 @@ def _by_subset(keys: Collection[str]) -> dict[str, list[str]]:
     return groups
 
 
-def _in_processes(
-    tasks: Sequence[tuple[Path | dict[str, Path], list[str]]],
-    function: Callable[[str, Recording], T],
-    workers: int,
-) -> Iterator[tuple[str, T]]:
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    workers = min(workers or cores, len(tasks))
-    if workers <= 1:
-        for place, keys in tasks:
-            yield from _run(place, keys, function)
-        return
-    # Fresh processes: a fork would copy the threads' locks of a process that may have used torch before.
-    with ProcessPoolExecutor(workers, get_context("spawn"), _start_worker) as pool:
-        pending = deque()
-        for place, keys in tasks:
-            pending.append(pool.submit(_run, place, keys, function))
-            if len(pending) > 2 * workers:
-                yield from pending.popleft().result()
-        while pending:
-            yield from pending.popleft().result()
-
-
-def _start_worker() -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's, which then ends the workers
-    torch.set_num_threads(1)
-
-
 def _run(
-    place: Path | dict[str, Path], keys: list[str], function: Callable[[str, Recording], T]
-) -> list[tuple[str, T]]:
+    function: Callable[[Wanted, Recording], Result], task: tuple[_Place, dict[str, Wanted]]
+) -> list[tuple[str, Result]]:
+    place, wanted = task
     results = {}
-    for key, name, file in _contents(place, keys):
+    for key, name, file in _contents(place, wanted):
         recording = read(file, name)
         try:
-            results[key] = function(key, recording)
+            results[key] = function(wanted[key], recording)
         except ValueError as error:
             raise ValueError(f"{name}: {error}") from error
-    return [(key, results[key]) for key in keys]
+    return [(key, results[key]) for key in wanted]
 
 
-def _contents(place: Path | dict[str, Path], keys: list[str]) -> Iterator[tuple[str, str, Path | bytes]]:
+def _contents(place: _Place, keys: Collection[str]) -> Iterator[tuple[str, str, Path | bytes]]:
     """Key, name and content of the recordings in an archive or among files."""
     if isinstance(place, dict):
         yield from ((key, str(path), path) for key, path in place.items())

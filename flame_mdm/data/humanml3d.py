@@ -1,0 +1,386 @@
+"""HumanML3D: motions of AMASS and HumanAct12 with descriptions, as features and as SMPL parameters.
+
+Guo et al., "Generating Diverse and Natural 3D Human Motions From Text", CVPR 2022. `docs/humanml3d.md` tells what to
+download and how the set is prepared.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import zipfile
+from collections import Counter, defaultdict
+from collections.abc import Iterator, Sequence
+from functools import cached_property, partial
+from pathlib import Path, PurePosixPath
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from tqdm import tqdm
+
+from flame_mdm.data import Clip, MotionSource, restricted_pickle
+from flame_mdm.data.amass import Amass, Body, Recording, key_of, load_bodies, subset_of
+from flame_mdm.data.t2m import T2MFolder
+from flame_mdm.representations.humanml import HumanML
+
+FPS = 20
+
+TRIMMED = {"Eyes_Japan_Dataset": 60, "MPI_HDM05": 60, "TotalCapture": 20, "MPI_Limits": 20, "Transitions_mocap": 10}
+"""Frames at 20 fps that recordings of a subset lose at their start (T poses); `index.csv` counts from there."""
+
+GET_IT = (
+    "clone https://github.com/EricGuo5513/HumanML3D and use its folder HumanML3D; the motions have to be made from "
+    "AMASS: docs/humanml3d.md"
+)
+
+
+class Row(NamedTuple):
+    """A clip in `index.csv`: frames `start` to `end` of a recording at 20 fps; `key` of `key_of`."""
+
+    name: str
+    key: str
+    start: int
+    end: int
+
+    @property
+    def humanact12(self) -> bool:
+        """Of HumanAct12, whose clips are taken as they are; `key` is the name of its file."""
+        return "/" not in self.key
+
+    def frames(self, count: int) -> range:
+        """The frames that the clip takes out of so many."""
+        if self.humanact12:
+            return range(count)
+        trimmed = TRIMMED.get(subset_of(self.key), 0)
+        return range(count)[trimmed:][self.start : self.end]
+
+
+def read_index(path: Path) -> list[Row]:
+    """The clips of HumanML3D's `index.csv`.
+
+    Raises:
+        FileNotFoundError: there is none.
+        ValueError: it is no such file; the line is named.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file; it is index.csv of https://github.com/EricGuo5513/HumanML3D")
+    rows = []
+    with path.open(encoding="utf-8", newline="") as file:
+        for number, line in enumerate(csv.DictReader(file), 2):
+            try:
+                source, name = line["source_path"], PurePosixPath(line["new_name"]).stem
+                key = PurePosixPath(source).stem if "humanact12" in source.lower() else key_of(source)
+                if key is None:
+                    raise ValueError(f"{source} is in no subset of AMASS")
+                rows.append(Row(name, key, int(line["start_frame"]), int(line["end_frame"])))
+            except (KeyError, TypeError, ValueError) as error:
+                raise ValueError(f"{path}, line {number}: not a clip of HumanML3D's index: {error}") from error
+    return rows
+
+
+class HumanML3D(T2MFolder):
+    """The processed folder with 263 features; made first, where it is not there, if `amass` is given."""
+
+    name = "humanml3d"
+    fps = 20.0
+    shortest = 40
+    get_it = GET_IT
+    published = {"motions": 14616, "texts": 44970, "train": 23384, "val": 1460, "test": 4384}  # noqa: RUF012
+
+    def __init__(
+        self,
+        path: str,
+        exclude: Sequence[str] = (),
+        *,
+        amass: str | None = None,
+        body_models: str | None = None,
+        humanact12: str | None = None,
+        index: str | None = None,
+        bone_lengths: Sequence[float] | None = None,
+        workers: int = 0,
+    ):
+        """Reads nothing yet. All but `path` and `exclude` serve to make the folder from AMASS.
+
+        Args:
+            path: the folder; texts and splits must be there.
+            exclude: names to leave out; a mirrored copy has its own name.
+            amass: folder of AMASS's SMPL+H G archives, packed or unpacked.
+            body_models: folder of the extended SMPL+H model.
+            humanact12: folder or zip of HumanAct12's joints; default `humanact12` or `pose_data/humanact12.zip` beside
+                `path`.
+            index: default `index.csv` in `path` or beside it.
+            bone_lengths: 22 lengths of the skeleton that all motions get, metres.
+            workers: processes; 0 = one a core, 1 = none but this one.
+        """
+        super().__init__(path, exclude)
+        self.amass, self.body_models = amass and Amass(Path(amass)), body_models and Path(body_models)
+        self.humanact12 = (
+            Path(humanact12) if humanact12 else _beside(self.path, "humanact12", "pose_data/humanact12.zip")
+        )
+        self.index = Path(index) if index else _beside(self.path, "index.csv")
+        self.bone_lengths, self.workers = bone_lengths, workers
+
+    def count(self) -> int:
+        if self.amass:
+            self._make(self.amass)
+        return super().count()
+
+    def check(self) -> list[str]:
+        """What is there, and what is still to be done or missing."""
+        if not self.amass:
+            return super().check()
+        todo = self._todo()
+        done = 2 * len(self.rows) - len(todo)
+        missing = self._missing(self.amass, todo)
+        return [f"{done} of {2 * len(self.rows)} motions are made", *(f"missing: {line}" for line in missing)]
+
+    @cached_property
+    def rows(self) -> list[Row]:
+        """The clips of the index that are not excluded."""
+        return [row for row in read_index(self.index) if row.name not in self.exclude]
+
+    def _todo(self) -> list[Row]:
+        made = self._motions()
+        return [row for row in self.rows if not {row.name, f"M{row.name}"} <= made]
+
+    def _missing(self, amass: Amass, todo: Sequence[Row]) -> list[str]:
+        missing = []
+        for needed in (lambda: self.names, lambda: self.texts, lambda: amass.files, self._bodies):
+            try:
+                needed()
+            except FileNotFoundError as error:
+                missing.append(str(error))
+        if amass.root.is_dir():
+            missing += amass.missing({row.key for row in todo if not row.humanact12})
+        absent = {row.key for row in todo if row.humanact12} - _humanact12_files(self.humanact12).keys()
+        if absent:
+            missing.append(f"{self.humanact12}: {len(absent)} clips of HumanAct12 are absent, such as {min(absent)}")
+        return missing
+
+    def _bodies(self) -> dict[str, Body]:
+        if not self.body_models:
+            raise FileNotFoundError("data.source.body_models: not given; the folder of the extended SMPL+H model")
+        return load_bodies(self.body_models)
+
+    def _make(self, amass: Amass) -> None:
+        """Makes the motions that are not there yet, so that an interrupted run is taken up."""
+        todo = self._todo()
+        if todo:
+            missing = self._missing(amass, todo)
+            if missing:
+                raise FileNotFoundError(f"{self.name} cannot be made: {'; '.join(missing)}")
+            folder = self.path / "new_joint_vecs"
+            folder.mkdir(exist_ok=True)
+            write = partial(_write_features, folder, HumanML("smpl22", "legacy", bone_lengths=self.bone_lengths))
+            recordings: dict[str, list[Row]] = defaultdict(list)
+            for row in todo:
+                recordings[row.key].append(row)
+            joints = _humanact12_files(self.humanact12)
+            with tqdm(desc=f"making {self.name}", total=len(todo), unit=" motions") as progress:
+                from_amass = {key: rows for key, rows in recordings.items() if not rows[0].humanact12}
+                for _, done in amass.each(from_amass, partial(_from_amass, write, self._bodies()), self.workers):
+                    progress.update(done)
+                for key in sorted(recordings.keys() - from_amass.keys()):
+                    for row in recordings[key]:
+                        write(row, _read_joints(joints[key]))
+                        progress.update()
+        if not (self.path / "Mean.npy").is_file():
+            self._write_statistics()
+
+    def _write_statistics(self) -> None:
+        """Mean and std over all motions, mirrored ones too, whatever their length and split."""
+        names = sorted(self._motions())
+        lengths = [len(self._load(name, mmap=True)) for name in names]
+        representation = HumanML("smpl22", "legacy")
+        packed = self.path / "all_motions.partial"  # more than fits in memory
+        try:
+            rows = np.memmap(packed, np.float32, "w+", shape=(sum(lengths), representation.features))
+            for name, end in zip(names, np.cumsum(lengths), strict=True):
+                motion = self._load(name)
+                rows[end - len(motion) : end] = motion
+            mean, std = representation.statistics(torch.from_numpy(rows))
+        finally:
+            packed.unlink(missing_ok=True)
+        _save(self.path / "Std.npy", std.numpy())
+        _save(self.path / "Mean.npy", mean.numpy())
+
+
+def _from_amass(write: partial[None], bodies: dict[str, Body], rows: Sequence[Row], recording: Recording) -> int:
+    """Writes the clips of a recording; anything but "male" uses the female body, as published."""
+    recording = recording.every(FPS)
+    body = bodies["male" if recording.gender == "male" else "female"]
+    for row in rows:
+        frames = row.frames(len(recording.poses))
+        part = slice(frames.start, frames.stop)
+        cut = recording._replace(poses=recording.poses[part], translation=recording.translation[part])
+        write(row, body.joints(cut))
+    return len(rows)
+
+
+def _write_features(folder: Path, representation: HumanML, row: Row, joints: np.ndarray) -> None:
+    """Writes the features of a clip and of its mirror image, each under a temporary name first."""
+    motion = torch.from_numpy(joints).double()
+    try:
+        features = representation.encode_many([motion, representation.skeleton.mirror(motion)])
+    except ValueError as error:
+        raise ValueError(f"clip {row.name}: {error}, by data.source.exclude=[{row.name}]") from error
+    for name, array in zip((row.name, f"M{row.name}"), features, strict=True):
+        _save(folder / f"{name}.npy", array.numpy())
+
+
+def _save(path: Path, array: np.ndarray) -> None:
+    partial_path = path.with_suffix(".partial")
+    with partial_path.open("wb") as file:
+        np.save(file, array)
+    partial_path.replace(path)
+
+
+def _beside(path: Path, *names: str) -> Path:
+    """The first of these that is in a folder or beside it; else the first, in it."""
+    candidates = [folder / name for name in names for folder in (path, path.parent)]
+    return next((candidate for candidate in candidates if candidate.exists()), candidates[0])
+
+
+def _humanact12_files(path: Path) -> dict[str, Path | zipfile.Path]:
+    """Name -> file of joints, in a folder or a zip."""
+    if path.is_dir():
+        return {file.stem: file for file in path.rglob("*.npy")}
+    if not path.is_file():
+        return {}
+    try:
+        with zipfile.ZipFile(path) as archive:
+            names = [name for name in archive.namelist() if name.endswith(".npy") and "__MACOSX" not in name]
+        return {PurePosixPath(name).stem: zipfile.Path(path, name) for name in names}
+    except zipfile.BadZipFile as error:
+        raise ValueError(f"{path}: damaged archive: {error}; download it again") from error
+
+
+def _read_joints(file: Path | zipfile.Path) -> np.ndarray:
+    try:
+        joints = np.load(io.BytesIO(file.read_bytes()), allow_pickle=False)
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise ValueError(f"{file}: damaged: {error}") from error
+    if joints.ndim != 3 or joints.shape[1] < 22 or joints.shape[2] != 3:
+        raise ValueError(f"{file}: shape {joints.shape}, not (frames, 22 joints or more, 3)")
+    return joints[:, :22]
+
+
+class HumanML3DSMPL(MotionSource):
+    """FLAME's form of the set (Kim et al., AAAI 2023): SMPL parameters, whole clips, each caption a clip of its own.
+
+    No mirrored copies, no limits of length, no cuts: a caption of a part is a caption of the whole, as in FLAME's code.
+    A clip is named NAME#0, NAME#1 ...; those of one motion share its frames. Of `index.csv`'s frames FLAME's code does
+    not count those that five subsets lose at their start; here it does, so that motion and caption fit.
+    """
+
+    name = "humanml3d-smpl"
+    published = {"train": 34936, "test": 6557}  # noqa: RUF012
+
+    def __init__(
+        self,
+        path: str,
+        amass: str,
+        humanact12: str | None = None,
+        index: str | None = None,
+        *,
+        final: bool = False,
+        exclude: Sequence[str] = (),
+        workers: int = 0,
+    ):
+        """Reads nothing yet.
+
+        Args:
+            path: folder with the texts and splits of HumanML3D; no motions are needed.
+            amass: folder of AMASS's SMPL+H G archives, packed or unpacked.
+            humanact12: FLAME's `humanact12_processed.pkl`; without it, the clips of HumanAct12 are left out.
+            index: default `index.csv` in `path` or beside it.
+            final: train on the validation clips, too, as FLAME does; nothing is left to validate on.
+            exclude: names to leave out.
+            workers: processes; 0 = one a core, 1 = none but this one.
+        """
+        self.folder, self.amass = HumanML3D(path, exclude, index=index), Amass(Path(amass))
+        self.humanact12 = Path(humanact12) if humanact12 else None
+        self.published_split, self.workers = final, workers
+        self._excluded: Counter[str] = Counter()
+
+    @cached_property
+    def rows(self) -> list[Row]:
+        """The clips to read, in the order of the index."""
+        rows = [row for row in self.folder.rows if row.name in self.folder.names]
+        absent = [row.name for row in rows if not self.folder.texts.get(row.name)]
+        if absent:
+            raise FileNotFoundError(
+                f"{self.folder.path}: {len(absent)} clips have no text, such as {absent[0]}; unpack texts.zip again"
+            )
+        return rows if self.humanact12 else [row for row in rows if not row.humanact12]
+
+    def count(self) -> int:
+        missing = self.amass.missing({row.key for row in self.rows if not row.humanact12})
+        if missing:
+            raise FileNotFoundError(f"{self.amass.root}: {'; '.join(missing)}")
+        return sum(len(self.folder.texts[row.name]) for row in self.rows)
+
+    def check(self) -> list[str]:
+        """What is there and what is missing."""
+        missing = self.amass.missing({row.key for row in self.rows if not row.humanact12})
+        return [f"{len(self.rows)} motions in the index", *(f"missing: {line}" for line in missing)]
+
+    def excluded(self) -> dict[str, int]:
+        """Motions that were left out."""
+        return dict(self._excluded)
+
+    def clips(self, fps: float) -> Iterator[Clip]:
+        if fps != FPS:
+            raise ValueError(f"{self.name} has {FPS} frames a second, the representation asks for {fps:g}")
+        left_out = sum(row.humanact12 for row in self.folder.rows if row.name in self.folder.names)
+        self._excluded = Counter()
+        if left_out and not self.humanact12:
+            self._excluded["motions of HumanAct12, as data.source.humanact12 is not given"] = left_out
+        recordings: dict[str, list[Row]] = defaultdict(list)
+        for row in self.rows:
+            recordings[row.key].append(row)
+        from_amass = {key: rows for key, rows in recordings.items() if not rows[0].humanact12}
+        for key, motions in self.amass.each(from_amass, _parameters, self.workers):
+            for row, motion in zip(recordings.pop(key), motions, strict=True):
+                yield from self._clips(row, motion)
+        if self.humanact12:
+            yield from self._from_humanact12(self.humanact12, recordings)
+
+    def _from_humanact12(self, path: Path, recordings: dict[str, list[Row]]) -> Iterator[Clip]:
+        """SMPL poses of HumanAct12; the root's place stands for SMPL's translation, as in FLAME's code."""
+        data = restricted_pickle.read(path)
+        for key in sorted(recordings):
+            entry = data.get(f"{key}.npy", data.get(key)) if isinstance(data, dict) else None
+            if entry is None:
+                self._excluded[f"motions of HumanAct12 that {path.name} lacks"] += len(recordings[key])
+                continue
+            try:
+                poses = np.asarray(entry["poses"], np.float32)
+                motion = np.concatenate([np.asarray(entry["joints3D"], np.float32)[:, 0], poses.reshape(-1, 72)], 1)
+            except (KeyError, TypeError, ValueError) as error:
+                raise ValueError(f"{path}: {key} holds no poses (F, 72) and joints3D (F, 24, 3): {error}") from error
+            for row in recordings[key]:
+                yield from self._clips(row, motion)
+
+    def _clips(self, row: Row, motion: np.ndarray) -> Iterator[Clip]:
+        if not len(motion):
+            self._excluded["motions without a frame"] += 1
+            return
+        split = self.folder.names[row.name]
+        for number, description in enumerate(self.folder.texts[row.name]):
+            yield Clip(
+                id=f"{row.name}#{number}",
+                motion=motion,
+                captions=[description.caption.removesuffix(".") + "."],
+                split="train" if self.published_split and split == "val" else split,
+                source=row.name,
+            )
+
+
+def _parameters(rows: Sequence[Row], recording: Recording) -> list[np.ndarray]:
+    """Translation and poses (F, 3 + 156) float32 of the clips of a recording."""
+    recording = recording.every(FPS)
+    motion = np.concatenate([recording.translation, recording.poses], 1).astype(np.float32)
+    cuts = [row.frames(len(motion)) for row in rows]
+    return [motion[frames.start : frames.stop] for frames in cuts]

@@ -1,0 +1,58 @@
+"""Work on many files in processes of their own, results in order."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context, parent_process
+from typing import TypeVar
+
+import torch
+
+Task = TypeVar("Task")
+Result = TypeVar("Result")
+
+
+def in_order(function: Callable[[Task], Result], tasks: Iterable[Task], workers: int = 0) -> Iterator[Result]:
+    """`function(task)` of each task, in the order of the tasks, of which only a few are read ahead.
+
+    Args:
+        function: can be pickled, as the tasks and results can.
+        tasks: what to do.
+        workers: processes; 0 = one a core, 1 = none but this one.
+    """
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    workers = workers or cores
+    if workers == 1:
+        yield from map(function, tasks)
+        return
+    # Fresh processes: a fork would copy the threads' locks of a process that may have used torch before.
+    with ProcessPoolExecutor(workers, get_context("spawn"), _start_worker) as pool:
+        pending = deque()
+        try:
+            for task in tasks:
+                pending.append(pool.submit(function, task))
+                if len(pending) > 2 * workers:
+                    yield pending.popleft().result()
+            while pending:
+                yield pending.popleft().result()
+        finally:
+            pool.shutdown(wait=False, cancel_futures=True)
+
+
+def _start_worker() -> None:
+    """Leaves Ctrl-C to the process that started this one, and ends with it, even when that is killed."""
+
+    def follow() -> None:
+        parent = parent_process()
+        if parent is not None:
+            parent.join()
+            os._exit(1)
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=follow, daemon=True).start()
+    torch.set_num_threads(1)

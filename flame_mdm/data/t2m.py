@@ -1,0 +1,302 @@
+"""The folder layout and sample rules that HumanML3D and KIT-ML share (Guo et al., CVPR 2022).
+
+new_joint_vecs/NAME.npy     (F, D) features
+texts/NAME.txt              one description a line: caption#word/POS word/POS#from#to, seconds; or texts.zip
+train.txt val.txt test.txt  names; the mirrored copy of NAME is MNAME
+Mean.npy Std.npy            (D,)
+"""
+
+from __future__ import annotations
+
+import io
+import math
+import zipfile
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
+from functools import cached_property
+from pathlib import Path, PurePosixPath
+from typing import NamedTuple
+
+import numpy as np
+
+from flame_mdm.data import Clip, MotionSource, Split
+from flame_mdm.data.store import Store
+
+TAG_FPS = 20
+"""Frames a second of the tags `from` and `to`, in KIT-ML too, whose motions have 12.5."""
+
+LIMIT = 200
+"""Motions of so many frames or more are left out, and so are cuts."""
+
+MAX_TOKENS = 20
+SPLITS: tuple[Split, ...] = ("train", "val", "test")
+
+
+class Description(NamedTuple):
+    """One line of a text file: seconds `begin` to `end` of the motion, both 0 for the whole of it."""
+
+    caption: str
+    tokens: list[str]
+    begin: float = 0.0
+    end: float = 0.0
+
+
+class Cut(NamedTuple):
+    """One item of the data set: frames `start` to `start + length` of a motion, and what is said about them."""
+
+    id: str
+    start: int
+    length: int
+    descriptions: list[Description]
+
+
+def parse(text: str, where: str) -> list[Description]:
+    """The descriptions in a text file; a tag that is not a number means 0, as published.
+
+    Raises:
+        ValueError: a line without the four parts; `where` and its number are named.
+    """
+    found = []
+    for number, line in enumerate(text.splitlines(), 1):
+        if not line.strip():
+            continue
+        try:
+            caption, tokens, *tags = line.strip().rsplit("#", 3)
+            begin, end = (0.0 if math.isnan(float(tag)) else float(tag) for tag in tags)
+        except ValueError:
+            raise ValueError(f"{where}, line {number}: not caption#words#from#to, but {line.strip()[:60]!r}") from None
+        found.append(Description(caption, tokens.split(" "), begin, end))
+    return found
+
+
+def cuts(name: str, frames: int, descriptions: Sequence[Description], shortest: int) -> list[Cut]:
+    """The items that a motion of so many frames gives, in the published order.
+
+    A description of a part makes an item of its own, named NAME@from-to, and NAME@from-to#2 for the second of the same
+    part. As published, a motion that is too short or too long gives nothing, although parts of it would fit.
+    """
+    if not shortest <= frames < LIMIT:
+        return []
+    found: list[Cut] = []
+    seen: Counter[str] = Counter()
+    for description in descriptions:
+        if description.begin == description.end == 0:
+            continue
+        start = int(description.begin * TAG_FPS)
+        length = min(int(description.end * TAG_FPS), frames) - start
+        if shortest <= length < LIMIT:
+            id_ = f"{name}@{description.begin:g}-{description.end:g}"
+            seen[id_] += 1
+            found.append(Cut(id_ if seen[id_] == 1 else f"{id_}#{seen[id_]}", start, length, [description]))
+    whole = [d for d in descriptions if d.begin == d.end == 0]
+    return [*found, Cut(name, 0, frames, whole)] if whole else found
+
+
+def frame_tokens(tokens: Sequence[str]) -> tuple[list[str], int]:
+    """The first 20 tokens between sos and eos, filled up to 22 with unk; and how many of the 22 are no filling."""
+    framed = ["sos/OTHER", *tokens[:MAX_TOKENS], "eos/OTHER"]
+    return framed + ["unk/OTHER"] * (MAX_TOKENS + 2 - len(framed)), len(framed)
+
+
+class T2MFolder(MotionSource):
+    """A processed folder. Cuts and mirrored copies belong to the split of their motion and have it as their source.
+
+    The words with their parts of speech stand in the attribute `tokens`, one list a caption.
+    """
+
+    fps: float
+    shortest: int
+    get_it: str
+
+    def __init__(self, path: str, exclude: Sequence[str] = ()):
+        """Reads nothing yet.
+
+        Args:
+            path: the folder.
+            exclude: names to leave out; a mirrored copy has its own name.
+        """
+        self.path, self.exclude = Path(path), frozenset(exclude)
+        self._excluded: Counter[str] = Counter()
+
+    @cached_property
+    def names(self) -> dict[str, Split]:
+        """Names in the lists of the splits, and their split; in the order of the lists.
+
+        Raises:
+            FileNotFoundError: the folder or a list is not there.
+            ValueError: a name is in two splits, or `exclude` has a name that is in none.
+        """
+        if not self.path.is_dir():
+            raise FileNotFoundError(f"{self.path}: no such folder; {self.get_it}")
+        found: dict[str, Split] = {}
+        for split in SPLITS:
+            file = self.path / f"{split}.txt"
+            if not file.is_file():
+                raise FileNotFoundError(f"{file}: no such list of names; {self.get_it}")
+            for name in file.read_text(encoding="utf-8").split():
+                if found.setdefault(name, split) != split:
+                    raise ValueError(f"{file}: {name} is in {found[name]}.txt, too")
+        unknown = self.exclude - found.keys()
+        if unknown:
+            raise ValueError(f"data.source.exclude: no split has {_some(unknown)}")
+        return {name: split for name, split in found.items() if name not in self.exclude}
+
+    @cached_property
+    def texts(self) -> dict[str, list[Description]]:
+        """Descriptions of each motion, from the folder `texts` or from `texts.zip`."""
+        return {name: parse(text, where) for name, where, text in _texts(self.path)}
+
+    @cached_property
+    def frames(self) -> dict[str, int]:
+        """Number of frames of each motion in the splits.
+
+        Raises:
+            FileNotFoundError: motions or texts of names in the splits are absent.
+            ValueError: a file is damaged.
+        """
+        for what, kind in ((self._motions(), "new_joint_vecs/*.npy"), (self.texts, "texts/*.txt")):
+            absent = [name for name in self.names if name not in what]
+            if absent:
+                raise FileNotFoundError(
+                    f"{self.path}: {kind} lacks {len(absent)} of the names in the splits: {_some(absent)}; process "
+                    f"them again, or leave them out: {_exclusion(absent)}"
+                )
+        return {name: len(self._load(name, mmap=True)) for name in self.names}
+
+    def count(self) -> int:
+        self.statistics()
+        return sum(len(cuts(name, length, self.texts[name], self.shortest)) for name, length in self.frames.items())
+
+    def clips(self, fps: float) -> Iterator[Clip]:
+        """All items, at the frame rate of the folder.
+
+        Raises:
+            ValueError: another rate is asked for, a file is damaged, or motions are not finite: all of these are named
+                at the end, to be excluded at once.
+        """
+        if fps != self.fps:
+            raise ValueError(f"{self.name} has {self.fps:g} frames a second, the representation asks for {fps:g}")
+        self._excluded = Counter({"names by data.source.exclude": len(self.exclude)} if self.exclude else {})
+        orphans = self.texts.keys() - self._motions() - self.exclude
+        if orphans:
+            self._excluded[f"texts without a motion ({_some(orphans)})"] = len(orphans)
+        damaged = []
+        for name, length in self.frames.items():
+            found = cuts(name, length, self.texts[name], self.shortest)
+            self._account(name, length, found)
+            motion = self._load(name) if found else np.zeros(0)
+            if not np.isfinite(motion).all():
+                damaged.append(name)
+                continue
+            for cut in found:
+                yield Clip(
+                    id=cut.id,
+                    motion=motion,
+                    captions=[description.caption for description in cut.descriptions],
+                    split=self.names[name],
+                    source=name.removeprefix("M"),
+                    attributes={"tokens": [description.tokens for description in cut.descriptions]},
+                    encoded=True,
+                    window=(cut.start, cut.length),
+                )
+        if damaged:
+            raise ValueError(
+                f"{self.path}: {len(damaged)} motions hold numbers that are not finite: {_some(damaged)}; process them "
+                f"again, or leave them out: {_exclusion(damaged)}"
+            )
+
+    def excluded(self) -> dict[str, int]:
+        """Names without any clip, one reason each, by split; and descriptions of parts that make no clip."""
+        return dict(self._excluded)
+
+    def statistics(self) -> tuple[np.ndarray, np.ndarray]:
+        """Mean and std as they are handed out, over all motions of all splits.
+
+        Raises:
+            FileNotFoundError: there are none.
+            ValueError: they are damaged, or a std is not positive.
+        """
+        mean, std = (self._array(self.path / f"{name}.npy") for name in ("Mean", "Std"))
+        if mean.shape != std.shape or mean.ndim != 1 or not np.isfinite(mean).all() or not (std > 0).all():
+            raise ValueError(f"{self.path}: Mean.npy {mean.shape} and Std.npy {std.shape} are no mean and positive std")
+        return mean.astype(np.float32), std.astype(np.float32)
+
+    def counts(self) -> dict[str, int]:
+        """What is in the folder under the names of `published`."""
+        originals = {name.removeprefix("M") for name in self._motions()}
+        texts = sum(len(lines) for name, lines in self.texts.items() if not name.startswith("M"))
+        splits = Counter(self.names.values())
+        return {"motions": len(originals), "texts": texts, **{split: splits[split] for split in SPLITS}}
+
+    def _motions(self) -> set[str]:
+        return {path.stem for path in (self.path / "new_joint_vecs").glob("*.npy")}
+
+    def _load(self, name: str, mmap: bool = False) -> np.ndarray:
+        motion = self._array(self.path / "new_joint_vecs" / f"{name}.npy", mmap)
+        if motion.ndim != 2:
+            raise ValueError(f"{self.path}/new_joint_vecs/{name}.npy: shape {motion.shape}, not (frames, features)")
+        return motion
+
+    def _array(self, path: Path, mmap: bool = False) -> np.ndarray:
+        try:
+            return np.load(path, mmap_mode="r" if mmap else None, allow_pickle=False)
+        except FileNotFoundError:
+            raise FileNotFoundError(f"{path}: no such file; {self.get_it}") from None
+        except (OSError, ValueError, EOFError) as error:
+            raise ValueError(f"{path}: damaged: {error}; process it again, or exclude it by name") from error
+
+    def _account(self, name: str, frames: int, found: Sequence[Cut]) -> None:
+        """Notes what a motion loses."""
+        lost = len(self.texts[name]) - sum(len(cut.descriptions) for cut in found)
+        reason = ""
+        if frames < self.shortest:
+            reason = f"shorter than {self.shortest} frames"
+        elif frames >= LIMIT:
+            reason = f"of {LIMIT} frames or more"
+        elif not self.texts[name]:
+            reason = "without a caption"
+        elif not found:
+            reason = "with captions of unfit parts only"
+        elif lost:
+            self._excluded["captions of parts that are too short or too long"] += lost
+        if reason:
+            self._excluded[f"names of {self.names[name]} {reason}"] += 1
+
+
+def stored_names(store: Store) -> dict[str, int]:
+    """Names a split has, from a prepared store: those that gave clips and those that were left out."""
+    totals = {split: len({c.id.split("@")[0] for c in store.clips if c.split == split}) for split in SPLITS}
+    for reason, number in store.info["excluded"].items():
+        for split in SPLITS:
+            if reason.startswith(f"names of {split} "):
+                totals[split] += number
+    return totals
+
+
+def _texts(path: Path) -> Iterator[tuple[str, str, str]]:
+    """Name, file and content of all text files, sorted."""
+    if (path / "texts").is_dir():
+        for file in sorted((path / "texts").glob("*.txt")):
+            yield file.stem, str(file), file.read_text(encoding="utf-8")
+        return
+    archive = path / "texts.zip"
+    if not archive.is_file():
+        raise FileNotFoundError(f"{path}: neither a folder texts nor texts.zip in it")
+    try:
+        with zipfile.ZipFile(archive) as file:
+            for member in sorted(file.namelist()):
+                inside = PurePosixPath(member)
+                if inside.suffix == ".txt" and "__MACOSX" not in inside.parts:
+                    yield inside.stem, f"{archive}/{member}", io.TextIOWrapper(file.open(member), "utf-8").read()
+    except (zipfile.BadZipFile, EOFError, OSError) as error:
+        raise ValueError(f"{archive}: damaged archive: {error}; download it again") from error
+
+
+def _some(names: Iterable[str]) -> str:
+    first = sorted(names)
+    return ", ".join(first[:5]) + (f" and {len(first) - 5} more" if len(first) > 5 else "")
+
+
+def _exclusion(names: Sequence[str]) -> str:
+    """The override that leaves these names out, where it can be typed."""
+    return f"'data.source.exclude=[{','.join(names)}]'" if len(names) <= 100 else "data.source.exclude"

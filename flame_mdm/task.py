@@ -5,13 +5,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Self, TypeVar
 
 import torch
+from hydra.utils import get_class
 from lightning import LightningModule
 from torch import Tensor
 from torchmetrics import MeanMetric
 
+from flame_mdm import checkpoints
 from flame_mdm.conditions import ConditionEncoder
 from flame_mdm.config import Config, UserError, instantiate, parameters, trust
 from flame_mdm.data.datamodule import MotionDataModule
@@ -25,10 +27,7 @@ from flame_mdm.representations import Representation
 
 
 class Task(LightningModule):
-    """What all models share that `make train` trains; a recipe names its class in `task._target_`.
-
-    Subclasses have a classmethod `build(config, representation, *, actions)` as `MotionGeneration` does.
-    """
+    """What all models share that `make train` trains; a recipe names its class in `task._target_`."""
 
     config: Config
     """The recipe this was built from, saved in checkpoints."""
@@ -40,6 +39,11 @@ class Task(LightningModule):
         self.condition, self.representation = condition, representation
         self.optimizer, self.seed = optimizer, seed
         self.config, self.facts = {}, {}
+
+    @classmethod
+    def build(cls, config: Config, representation: Representation, *, actions: Sequence[str] = ()) -> Self:
+        """Builds the parts of a recipe and joins them; sizes that follow from other parts are passed on here."""
+        raise NotImplementedError
 
     def describe(self) -> str:
         """Name of the network, for the line that opens a run."""
@@ -114,7 +118,7 @@ class MotionGeneration(Task):
             self.denoiser.compile()
 
     @classmethod
-    def build(cls, config: Config, representation: Representation, *, actions: Sequence[str] = ()) -> MotionGeneration:
+    def build(cls, config: Config, representation: Representation, *, actions: Sequence[str] = ()) -> Self:
         """Builds the parts of a recipe and joins them; sizes that follow from other parts are passed on here."""
 
         def part(name: str, **derived: Any) -> Any:
@@ -239,17 +243,29 @@ class MotionGeneration(Task):
 
 
 def load(path: str | Path, device: str | torch.device = "cpu") -> MotionGeneration:
-    """A trained model from a checkpoint, ready to sample: the averaged weights where the recipe averages them.
+    """A trained model from a checkpoint, ready to sample: see `load_task`."""
+    return load_task(path, MotionGeneration, device)
+
+
+Trained = TypeVar("Trained", bound=Task)
+
+
+def load_task(path: str | Path, kind: type[Trained], device: str | torch.device = "cpu") -> Trained:
+    """What a checkpoint holds, in evaluation mode: the averaged weights where the recipe averages them.
 
     Raises:
         FileNotFoundError: no such file.
-        UserError: not a checkpoint of this framework, damaged, or of another shape than its recipe.
+        UserError: not a checkpoint of this framework, not of this kind, damaged, or of another shape than its recipe.
     """
     checkpoint = read_checkpoint(path)
     config, facts = checkpoint["config"], checkpoint["facts"]
-    trust({name: config[name] for name in ("representation", "process", "condition", "denoiser")})
+    parts = ("task", "representation", "process", "condition", "denoiser")
+    trust({name: config[name] for name in parts if name in config})
+    built = get_class(config["task"]["_target_"])
+    if not issubclass(built, kind):
+        raise UserError(f"{path}: holds a {built.__name__}, not a {kind.__name__}")
     representation = instantiate(config["representation"])
-    task = MotionGeneration.build(config, representation, actions=facts["actions"])
+    task = built.build(config, representation, actions=facts["actions"])
     task.facts = facts
     try:
         task.load_state_dict(checkpoint["state_dict"], strict=True)
@@ -260,15 +276,18 @@ def load(path: str | Path, device: str | torch.device = "cpu") -> MotionGenerati
 
 
 def read_checkpoint(path: str | Path) -> dict[str, Any]:
-    """The contents of a checkpoint, unpickled with plain values and tensors only.
+    """The contents of a checkpoint or model file, unpickled with plain values and tensors only.
+
+    Args:
+        path: what `flame_mdm.checkpoints.find` finds: a file, a folder with a model file, or a name on the hub.
 
     Raises:
         FileNotFoundError: no such file.
-        UserError: not a checkpoint of this framework, or damaged.
+        UserError: not a checkpoint of this framework, or damaged; or the hub does not give it.
     """
-    path = Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such checkpoint")
+    path = checkpoints.find(path)
+    if path.suffix == ".safetensors":
+        return checkpoints.read(path)
     try:
         checkpoint = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # torch raises many kinds for damaged files and foreign pickles

@@ -114,10 +114,10 @@ class HumanML3D(T2MFolder):
             workers: processes; 0 = one a core, 1 = none but this one.
         """
         super().__init__(path, exclude)
-        self.amass, self.body_models = amass and Amass(Path(amass)), body_models and Path(body_models)
-        self.humanact12 = (
-            Path(humanact12) if humanact12 else _beside(self.path, "humanact12", "pose_data/humanact12.zip")
-        )
+        self.amass = Amass(Path(amass)) if amass else None
+        self.body_models = Path(body_models) if body_models else None
+        joints = ("humanact12", "pose_data/humanact12", "pose_data/humanact12.zip")
+        self.humanact12 = Path(humanact12) if humanact12 else _beside(self.path, *joints)
         self.index = Path(index) if index else _beside(self.path, "index.csv")
         self.bone_lengths, self.workers = bone_lengths, workers
 
@@ -284,7 +284,7 @@ class HumanML3DSMPL(MotionSource):
         humanact12: str | None = None,
         index: str | None = None,
         *,
-        final: bool = False,
+        published_split: bool = False,
         exclude: Sequence[str] = (),
         workers: int = 0,
     ):
@@ -295,13 +295,13 @@ class HumanML3DSMPL(MotionSource):
             amass: folder of AMASS's SMPL+H G archives, packed or unpacked.
             humanact12: FLAME's `humanact12_processed.pkl`; without it, the clips of HumanAct12 are left out.
             index: default `index.csv` in `path` or beside it.
-            final: train on the validation clips, too, as FLAME does; nothing is left to validate on.
+            published_split: train on the validation clips, too (FLAME's "final"); none are left to validate on.
             exclude: names to leave out.
             workers: processes; 0 = one a core, 1 = none but this one.
         """
         self.folder, self.amass = HumanML3D(path, exclude, index=index), Amass(Path(amass))
         self.humanact12 = Path(humanact12) if humanact12 else None
-        self.published_split, self.workers = final, workers
+        self.published_split, self.workers = published_split, workers
         self._excluded: Counter[str] = Counter()
 
     @cached_property

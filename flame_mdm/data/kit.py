@@ -1,0 +1,191 @@
+"""KIT Motion-Language: as 251 features of a processed folder, and as joints the way TEMOS reads them.
+
+Plappert, Mandery, Asfour, "The KIT Motion-Language Dataset", Big Data 2016. `docs/kit.md` tells what to download.
+"""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from functools import cached_property
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from flame_mdm.data import Clip, MotionSource, Split
+from flame_mdm.data.t2m import SPLITS, T2MFolder
+
+UNITS_PER_METRE = 640
+MMM_FPS = 100
+
+
+class KIT(T2MFolder):
+    """The processed folder with 251 features (Guo et al., CVPR 2022)."""
+
+    name = "kit"
+    fps = 12.5
+    shortest = 24
+    get_it = "get KIT-ML as processed for text-to-motion, linked at https://github.com/EricGuo5513/HumanML3D"
+    published = {"motions": 3911, "texts": 6278}  # noqa: RUF012
+
+
+class KITTemos(MotionSource):
+    """Joints of the MMM model at 100 frames a second, of which every eighth counts; TEMOS's splits and limits.
+
+    Petrovich, Black, Varol, "TEMOS", ECCV 2022, whose rules FLAME takes over. Training and validation leave out motions
+    of fewer than 10 or more than 500 frames; the test split keeps all. There, the first caption counts alone; the clips
+    of Ghosh et al.'s test split have the attribute `ghosh_test`.
+    """
+
+    name = "kit-temos"
+    published = {"motions": 3911, "texts": 6353, "train": 1784, "val": 566, "test": 587, "ghosh_test": 520}  # noqa: RUF012
+    shortest, longest = 10, 500
+
+    def __init__(self, path: str, splits: str, exclude: Sequence[str] = ()):
+        """Reads nothing yet.
+
+        Args:
+            path: folder with `NUMBER_fke.csv`, `NUMBER_annotations.json` and `NUMBER_meta.json`.
+            splits: folder `datasets/kit-splits` of https://github.com/Mathux/TEMOS.
+            exclude: numbers to leave out.
+        """
+        self.path, self.splits, self.exclude = Path(path), Path(splits), frozenset(str(name) for name in exclude)
+        self._excluded: Counter[str] = Counter()
+
+    @cached_property
+    def names(self) -> dict[str, Split]:
+        """The motions of each split.
+
+        Raises:
+            FileNotFoundError: no splits.
+            ValueError: a motion is in two splits.
+        """
+        found: dict[str, Split] = {}
+        for split in SPLITS:
+            for name in self._list(split):
+                if found.setdefault(name, split) != split:
+                    raise ValueError(f"{self.splits}/{split}: {name} is in {found[name]}, too")
+        unknown = self.exclude - found.keys()
+        if unknown:
+            raise ValueError(f"data.source.exclude: no split has {', '.join(sorted(unknown))}")
+        return {name: split for name, split in found.items() if name not in self.exclude}
+
+    @cached_property
+    def texts(self) -> dict[str, list[str]]:
+        """Captions of each motion in the splits; motions without any are not in it.
+
+        Raises:
+            FileNotFoundError: files are absent.
+            ValueError: a file is damaged, or the two files of a motion disagree.
+        """
+        wanted = [f"{name}_{kind}" for name in self.names for kind in ("fke.csv", "annotations.json", "meta.json")]
+        there = {path.name for path in self.path.glob("*_*")}
+        absent = [name for name in wanted if name not in there]
+        if absent:
+            raise FileNotFoundError(
+                f"{self.path}: {len(absent)} of {len(wanted)} files are absent, such as {absent[0]}; get KIT-ML at "
+                "https://motion-annotation.humanoids.kit.edu/dataset and the joints as docs/kit.md says"
+            )
+        found = {}
+        for name in self.names:
+            captions, meta = (_json(self.path / f"{name}_{kind}.json") for kind in ("annotations", "meta"))
+            if not isinstance(captions, list) or len(captions) != meta.get("nb_annotations"):
+                raise ValueError(f"{self.path}/{name}_meta.json: nb_annotations does not count {name}_annotations.json")
+            if captions:
+                found[name] = captions
+        return found
+
+    @cached_property
+    def frames(self) -> dict[str, int]:
+        """Number of frames at 12.5 a second of each motion with captions."""
+        return {name: -(-_rows(self.path / f"{name}_fke.csv") // 8) for name in self.texts}
+
+    def count(self) -> int:
+        return sum(self._fits(name) for name in self.frames)
+
+    def clips(self, fps: float) -> Iterator[Clip]:
+        """All motions, in the order of the splits.
+
+        Raises:
+            ValueError: another rate than a whole part of 100 frames a second; a damaged file.
+        """
+        if fps * 8 != MMM_FPS:
+            raise ValueError(f"{self.name} has 12.5 frames a second, the representation asks for {fps:g}")
+        ghosh = set(self._list("ghosh-test")) if (self.splits / "ghosh-test").is_file() else set()
+        self._excluded = Counter({"motions by data.source.exclude": len(self.exclude)} if self.exclude else {})
+        self._excluded.update(f"motions of {split} without a caption" for split in self._without_caption())
+        for name, frames in self.frames.items():
+            split = self.names[name]
+            if not self._fits(name):
+                limit = f"shorter than {self.shortest}" if frames < self.shortest else f"longer than {self.longest}"
+                self._excluded[f"motions of {split} {limit} frames"] += 1
+                continue
+            yield Clip(
+                id=name,
+                motion=read_joints(self.path / f"{name}_fke.csv"),
+                captions=self.texts[name][:1] if split == "test" else self.texts[name],
+                split=split,
+                source=name,
+                attributes={"ghosh_test": name in ghosh},
+            )
+
+    def excluded(self) -> dict[str, int]:
+        """Motions that were left out."""
+        return dict(self._excluded)
+
+    def counts(self) -> dict[str, int]:
+        """What is in the folder under the names of `published`."""
+        files = [path for path in self.path.glob("*_annotations.json") if _json(path)]
+        texts = sum(len(_json(path)) for path in files)
+        splits = {split.replace("-", "_"): len(self._list(split)) for split in (*SPLITS, "ghosh-test")}
+        return {"motions": len(list(self.path.glob("*_fke.csv"))), "texts": texts, **splits}
+
+    def _fits(self, name: str) -> bool:
+        return self.names[name] == "test" or self.shortest <= self.frames[name] <= self.longest
+
+    def _without_caption(self) -> list[str]:
+        return [split for name, split in self.names.items() if name not in self.texts]
+
+    def _list(self, split: str) -> list[str]:
+        file = self.splits / split
+        if not file.is_file():
+            raise FileNotFoundError(
+                f"{file}: no such list of motions; it is in datasets/kit-splits of https://github.com/Mathux/TEMOS"
+            )
+        return file.read_text().split()
+
+
+def read_joints(path: Path) -> np.ndarray:
+    """Every eighth frame of `NUMBER_fke.csv`: joints (F, 21, 3) float32 in metres, y up.
+
+    A row has its number and 63 coordinates in KIT's unit, about 1/640 of a metre.
+
+    Raises:
+        ValueError: the file is damaged.
+    """
+    with path.open(encoding="utf-8") as file:
+        try:
+            rows = np.loadtxt(islice(file, 1, None, 8), delimiter=",", ndmin=2)
+        except ValueError as error:
+            raise ValueError(f"{path}: damaged: {error}; exclude the motion by its number") from error
+    if rows.shape[1] != 64 or not len(rows):
+        raise ValueError(f"{path}: {rows.shape[1]} columns, not a number and 63 coordinates")
+    if not np.isfinite(rows).all():
+        raise ValueError(f"{path}: it holds numbers that are not finite; exclude the motion by its number")
+    return (rows[:, 1:].reshape(-1, 21, 3) / UNITS_PER_METRE).astype(np.float32)
+
+
+def _rows(path: Path) -> int:
+    """Lines of a table without its head."""
+    data = path.read_bytes()
+    return data.count(b"\n") + (not data.endswith(b"\n")) - 1
+
+
+def _json(path: Path) -> Any:
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise ValueError(f"{path}: damaged: {error}") from error

@@ -1,0 +1,100 @@
+"""TEMOS's features: root height, local joints, and how the heading and the root move."""
+
+from collections.abc import Iterable
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from flame_mdm.representations import Representation, rotation
+from flame_mdm.representations.skeleton import KIT21
+
+KNEES_AND_ELBOWS = [KIT21.joints.index(f"{side}_{part}") for part in ("knee", "elbow") for side in ("left", "right")]
+"""Where the published code finds hips and shoulders: it looks their indices up once the root is gone."""
+
+
+class Rifke(Representation):
+    """64 features of Petrovich et al. 2022 (TEMOS) for KIT's 21 joints, FLAME's for KIT; T rows for T frames.
+
+    | columns | content |
+    |---|---|
+    | 0 | y of the root above the floor |
+    | 1:61 | joints but the root, seen by the body: root at x = z = 0, facing +z; y above the floor |
+    | 61 | heading change since the frame before, radians, 0 in the first frame |
+    | 62:64 | x and z of the root's way since the frame before, seen by the body |
+
+    Kept as published: the floor is a soft minimum, which depends on the unit of length; heading changes are not
+    unwrapped; and the heading is that of knees and elbows, where that of hips and shoulders is meant.
+    """
+
+    def __init__(self, fps: float = 12.5, units_per_metre: float = 640.0):
+        """Joints come in and go out in metres; features are in KIT's unit, 1 / `units_per_metre` metres."""
+        super().__init__("rifke", 64, fps, KIT21)
+        self.units_per_metre = units_per_metre
+
+    def encode(self, motion: Tensor) -> Tensor:
+        """Joints (T, 21, 3) in metres, y up -> features (T, 64) float32.
+
+        Raises:
+            ValueError: no frames, another number of joints, or coordinates that are not finite.
+        """
+        if motion.ndim != 3 or motion.shape[1:] != (21, 3) or not len(motion):
+            raise ValueError(f"motion: shape {tuple(motion.shape)}, but {self.name} takes (frames, 21, 3)")
+        if not motion.isfinite().all():
+            frame = int((~motion.isfinite()).flatten(1).any(1).nonzero()[0, 0])
+            raise ValueError(f"motion: coordinates in frame {frame} are not finite; leave the motion out")
+        joints = motion.double() * self.units_per_metre
+        joints[..., 1] -= self.floor(joints)
+        root, others = joints[:, 0], joints[:, 1:]
+        heading = self.heading(joints)
+        ground = root * root.new_tensor([1.0, 0.0, 1.0])
+        local = rotation.rotate_y(others - ground[:, None], -heading[:, None])
+        turn = F.pad(heading.diff(), (1, 0))
+        way = rotation.rotate_y(F.pad(root.diff(dim=0), (0, 0, 1, 0)), -heading)
+        return torch.cat([root[:, 1:2], local.flatten(1), turn[:, None], way[:, ::2]], 1).float()
+
+    def decode(self, features: Tensor) -> Tensor:
+        """Features (..., T, 64) -> joints (..., T, 21, 3) in metres; the first frame's root is at x = z = 0, facing +z.
+
+        Differentiable.
+        """
+        turned, way = features[..., 61].cumsum(-1), features[..., 62:]
+        heading = turned - turned[..., :1]
+        way = torch.stack([way[..., 0], torch.zeros_like(heading), way[..., 1]], -1)
+        moved = rotation.rotate_y(way, heading).cumsum(-2)
+        ground = moved - moved[..., :1, :]
+        root = ground + F.pad(features[..., :1], (1, 1))
+        local = rotation.rotate_y(features[..., 1:61].unflatten(-1, (20, 3)), heading[..., None])
+        return torch.cat([root[..., None, :], local + ground[..., None, :]], -2) / self.units_per_metre
+
+    def floor(self, joints: Tensor) -> Tensor:
+        """Height of the floor, from joints (T, 21, 3) in KIT's unit: a soft minimum of the lowest foot over time."""
+        lowest = joints[:, list(KIT21.feet), 1].amin(1)
+        least, most = lowest.min(), lowest.max()
+        return least - torch.log(0.5 + torch.exp(least - most))
+
+    def heading(self, joints: Tensor) -> Tensor:
+        """(T, 21, 3) -> (T,) radians, 0 = +z, positive towards +x, in (-pi, pi]."""
+        left_knee, right_knee, left_elbow, right_elbow = (joints[:, joint] for joint in KNEES_AND_ELBOWS)
+        across = right_knee - left_knee + right_elbow - left_elbow
+        return torch.atan2(-across[:, 2], across[:, 0])
+
+    def joint_features(self, joints: Iterable[int]) -> Tensor:
+        """As the contract."""
+        part = torch.zeros(21, dtype=torch.bool)
+        part[list(joints)] = True
+        return torch.cat([part[:1], part[1:].repeat_interleave(3), part[:1].expand(3)])
+
+    def statistics(self, features: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean and unbiased std of each feature; 1 where it does not vary."""
+        features = features.double()
+        std = features.std(0)
+        return features.mean(0).float(), torch.where(std > 0, std, 1.0).float()
+
+
+def upsample(joints: Tensor, factor: int = 8) -> Tensor:
+    """(T, ...) -> ((T - 1) * factor + 1, ...), linear: from 12.5 to 100 frames a second, as TEMOS evaluates."""
+    steps = torch.arange((len(joints) - 1) * factor + 1)
+    begin = (steps // factor).clamp(max=max(len(joints) - 2, 0))
+    weight = ((steps - begin * factor) / factor).to(joints).reshape(-1, *[1] * (joints.ndim - 1))
+    return torch.lerp(joints[begin], joints[(begin + 1).clamp(max=len(joints) - 1)], weight)

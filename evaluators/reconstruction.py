@@ -1,0 +1,248 @@
+"""How far generated motions are from the real motion of the same text, or from the motion they were to continue."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from evaluators.samples import SampleMetric, real_frames
+
+PARTS = ("root", "trajectory", "mean_local", "mean_global")
+
+FEET = (14, 15, 19, 20)
+TURNED_BY = (17, 12, 9, 6)
+"""Right and left knee, right and left elbow, of MMM's 21 joints."""
+
+
+def temos_parts(joints: Tensor) -> dict[str, Tensor]:
+    """Root (F, 3), trajectory (F, 2), local (F, 20, 3) and global (F, 21, 3) positions as TEMOS compares them.
+
+    The motion is put on a floor, its first root to x = z = 0, its first heading to +z. Local positions are those of all
+    joints but the root seen by the body in each frame: root at x = z = 0, heading +z, y above the floor. The floor is
+    the soft minimum over time of the lowest foot, min - log(0.5 + exp(min - max)). It has a scale: in KIT's units it is
+    the lowest foot + 0.69. The heading is that of knees and elbows, where hips and shoulders are meant: TEMOS indexes
+    joints of which the root has been taken away.
+
+    Args:
+        joints: (F, 21, 3) MMM's joints in KIT's units, y up; float64.
+    """
+    low = joints[:, FEET, 1].amin(1)
+    floor = low.min() - torch.log(0.5 + torch.exp(low.min() - low.max()))
+    joints = torch.stack([joints[..., 0], joints[..., 1] - floor, joints[..., 2]], -1)
+    right, left, right_arm, left_arm = TURNED_BY
+    across = (joints[:, right] - joints[:, left] + joints[:, right_arm] - joints[:, left_arm])[:, [0, 2]]
+    across = across / across.norm(dim=-1, keepdim=True)
+    cos, sin = across[:, 0], -across[:, 1]  # forward is (-across z, across x)
+    root = joints[:, :1] * joints.new_tensor([1.0, 0.0, 1.0])
+    placed = _turn(joints - root[:1], cos[:1], sin[:1])
+    return {
+        "root": placed[:, 0],
+        "trajectory": placed[:, 0, [0, 2]],
+        "mean_local": _turn(joints - root, cos, sin)[:, 1:],
+        "mean_global": placed,
+    }
+
+
+def _turn(points: Tensor, cos: Tensor, sin: Tensor) -> Tensor:
+    """Turns points (F, J, 3) about y so that the heading (sin, cos) in (x, z), each (F,), comes to +z."""
+    x, y, z = points.unbind(-1)
+    cos, sin = cos[:, None], sin[:, None]
+    return torch.stack([x * cos - z * sin, y, x * sin + z * cos], -1)
+
+
+def flame_parts(joints: Tensor, root: Tensor, parents: Sequence[int]) -> dict[str, Tensor]:
+    """Root (F, 3), trajectory (F, 2), bones (F, J - 1, 3) and joints (F, J, 3) as FLAME's code compares them.
+
+    Args:
+        joints: (F, J, 3) positions, y up.
+        root: (F, 3) translation of the body.
+        parents: parent of each joint, -1 for the root.
+    """
+    bones = joints[:, 1:] - joints[:, list(parents[1:])]
+    return {"root": root, "trajectory": root[:, [0, 2]], "mean_local": bones, "mean_global": joints}
+
+
+class _PositionErrors(SampleMetric):
+    """APE and AVE by part; a clip adds a sum of position errors, its frames and its variance errors."""
+
+    higher_is_better = False
+
+    def __init__(self, **kwargs: Any):
+        super().__init__(("keys", "position", "variance", "frames"), **kwargs)
+
+    def update(self, joints: Tensor, mask: Tensor, real_joints: Tensor, real_mask: Tensor, keys: Tensor) -> None:
+        """Adds generated motions (B, F, J, 3) and the real ones in the same order (B, F', J, 3), with their masks.
+
+        Both are compared up to the end of the shorter.
+
+        Raises:
+            ValueError: a motion has fewer than two frames.
+        """
+        rows, name = [], type(self).__name__
+        motions = zip(real_frames(name, joints, mask), real_frames(name, real_joints, real_mask), strict=True)
+        for motion, real in motions:
+            a, b = self.parts(motion.double()), self.parts(real.double())
+            length = min(len(a["root"]), len(b["root"]))
+            self.need(length, 2, "frames of a motion")
+            a, b = ({part: values[:length] for part, values in x.items()} for x in (a, b))
+            rows.append(torch.stack([self.position_errors(a, b), self.variance_errors(a, b)]))
+            rows[-1] = torch.cat([rows[-1], rows[-1].new_full((2, 1), length)], 1)
+        if rows:
+            values = torch.stack(rows)
+            self.keep(keys=keys, position=values[:, 0, :4], variance=values[:, 1, :4], frames=values[:, :1, 4])
+
+    def compute(self) -> dict[str, float | None]:
+        """`ape_root`, `ape_trajectory`, `ape_mean_local`, `ape_mean_global`, and `ave_` of each."""
+        rows = self.rows("keys", "position", "variance", "frames")
+        names = [f"{error}_{part}" for error in ("ape", "ave") for part in PARTS]
+        if rows is None:
+            return dict.fromkeys(names)
+        position, variance, frames = rows
+        values = torch.cat([self.average(position, frames), variance.mean(0)])
+        return dict(zip(names, values.tolist(), strict=True))
+
+    def parts(self, joints: Tensor) -> dict[str, Tensor]:
+        """What is compared, from the joints (F, J, 3) of a whole motion, by the names of `PARTS`."""
+        raise NotImplementedError
+
+    def position_errors(self, a: Mapping[str, Tensor], b: Mapping[str, Tensor]) -> Tensor:
+        """Sum over the frames of a clip of the error of each part, (4,)."""
+        raise NotImplementedError
+
+    def variance_errors(self, a: Mapping[str, Tensor], b: Mapping[str, Tensor]) -> Tensor:
+        """Error of the variances of a clip in each part, (4,)."""
+        raise NotImplementedError
+
+    def average(self, position: Tensor, frames: Tensor) -> Tensor:
+        """Position errors (4,) of all clips from their sums (N, 4) and frames (N, 1)."""
+        raise NotImplementedError
+
+
+class TemosPositionErrors(_PositionErrors):
+    """APE and AVE of TEMOS (Petrovich et al. 2022), used by FLAME on KIT (eq. 16 to 18, Table 2).
+
+    APE: distance of `temos_parts`, joints averaged; mean over all frames of all clips. AVE: distance of variances over
+    time (n - 1 in the denominator) of each coordinate, joints averaged; mean over clips. Both are in units of 1000 KIT
+    units, which the tables call metres and which are 1.56 m. TEMOS compares at 100 frames a second.
+
+    Args:
+        units_per_metre: KIT's units in the metres of `joints`, as the KIT representations have it.
+        kwargs: options of `torchmetrics.Metric`.
+    """
+
+    def __init__(self, units_per_metre: float = 640.0, **kwargs: Any):
+        super().__init__(**kwargs)
+        self.units_per_metre = units_per_metre
+
+    def parts(self, joints: Tensor) -> dict[str, Tensor]:
+        """`temos_parts` in thousands of KIT's units."""
+        if joints.shape[1] != 21:
+            raise ValueError(f"TemosPositionErrors: {joints.shape[1]} joints, defined for KIT's 21 (MMM) only")
+        return {part: values / 1000 for part, values in temos_parts(joints * self.units_per_metre).items()}
+
+    def position_errors(self, a: Mapping[str, Tensor], b: Mapping[str, Tensor]) -> Tensor:
+        """Sum over the frames of the distance of each part, joints averaged."""
+        distance = [(a[part] - b[part]).norm(dim=-1) for part in PARTS]
+        return torch.stack([d.sum() if d.ndim == 1 else d.mean(1).sum() for d in distance])
+
+    def variance_errors(self, a: Mapping[str, Tensor], b: Mapping[str, Tensor]) -> Tensor:
+        """Distance of the variances of each part, joints averaged."""
+        return torch.stack([(a[part].var(0) - b[part].var(0)).norm(dim=-1).mean() for part in PARTS])
+
+    def average(self, position: Tensor, frames: Tensor) -> Tensor:
+        """Each frame counts alike."""
+        return position.sum(0) / frames.sum(0)
+
+
+class FlamePositionErrors(_PositionErrors):
+    """APE and AVE as in FLAME's code, which its tables do not use. In metres and square metres.
+
+    Compares `flame_parts`: the trajectory by the sum of the two distances along the axes; local is the error of bones.
+    Variances of global positions are averaged over joints before they are compared. Each clip counts alike. FLAME's
+    joints lack the orientation of the root and start from its translation; here `joints` are as they are, and their
+    first is the root.
+
+    Args:
+        parents: parent of each joint, -1 for the root; those of the skeleton.
+        kwargs: options of `torchmetrics.Metric`.
+    """
+
+    def __init__(self, parents: Sequence[int], **kwargs: Any):
+        super().__init__(**kwargs)
+        self.parents = tuple(parents)
+
+    def parts(self, joints: Tensor) -> dict[str, Tensor]:
+        """`flame_parts`, the first joint being the root."""
+        return flame_parts(joints, joints[:, 0], self.parents)
+
+    def position_errors(self, a: Mapping[str, Tensor], b: Mapping[str, Tensor]) -> Tensor:
+        """Sum over the frames of the distance of each part."""
+        along_axes = (a["trajectory"] - b["trajectory"]).abs().sum(-1)
+        root, local, all_joints = ((a[p] - b[p]).norm(dim=-1) for p in ("root", "mean_local", "mean_global"))
+        return torch.stack([root.sum(), along_axes.sum(), local.mean(1).sum(), all_joints.mean(1).sum()])
+
+    def variance_errors(self, a: Mapping[str, Tensor], b: Mapping[str, Tensor]) -> Tensor:
+        """Distance of the variances of each part."""
+        root, trajectory, local, all_joints = (a[part].var(0) - b[part].var(0) for part in PARTS)
+        return torch.stack([root.norm(), trajectory.norm(), local.norm(dim=-1).mean(), all_joints.mean(0).norm()])
+
+    def average(self, position: Tensor, frames: Tensor) -> Tensor:
+        """Each clip counts alike."""
+        return (position / frames).mean(0)
+
+
+class DisplacementErrors(SampleMetric):
+    """ADE and FDE: mean distance of the joints, in all predicted frames and in the last of them. In metres.
+
+    The usual definition of motion prediction (Yuan and Kitani 2020): joints and frames of a clip averaged, then clips.
+    MFM (Table 3) gives no formula, no code and no unit for its numbers, which are too large for metres: not comparable.
+    """
+
+    higher_is_better = False
+
+    def __init__(self, **kwargs: Any):
+        super().__init__(("keys", "errors"), **kwargs)
+
+    def update(
+        self,
+        joints: Tensor,
+        mask: Tensor,
+        real_joints: Tensor,
+        keys: Tensor,
+        predicted: Tensor | None = None,
+    ) -> None:
+        """Adds motions and the real ones in the same order, each (B, F, J, 3), and the keys of the motions (B,).
+
+        Args:
+            joints: edited motions.
+            mask: (B, F), True = real frame.
+            real_joints: the motions they were made from.
+            keys: of the motions.
+            predicted: (B, F), True = this frame was generated, not given; None = all were.
+
+        Raises:
+            ValueError: other shapes than those of the real motions, or a motion of which no frame was generated.
+        """
+        if joints.shape != real_joints.shape:
+            raise ValueError(f"DisplacementErrors: joints {tuple(joints.shape)}, real {tuple(real_joints.shape)}")
+        asked = mask if predicted is None else mask & predicted
+        if not asked.any(1).all():
+            raise ValueError("DisplacementErrors: a motion has no generated frame to compare")
+        errors, name = [], type(self).__name__
+        motions = zip(real_frames(name, joints, asked), real_frames(name, real_joints, asked), strict=True)
+        for motion, real in motions:
+            distance = (motion.double() - real.double()).norm(dim=-1).mean(1)
+            errors.append(torch.stack([distance.mean(), distance[-1]]))
+        if errors:
+            self.keep(keys=keys, errors=torch.stack(errors))
+
+    def compute(self) -> dict[str, float | None]:
+        """`ade` and `fde`."""
+        rows = self.rows("keys", "errors")
+        if rows is None:
+            return {"ade": None, "fde": None}
+        ade, fde = rows[0].mean(0).tolist()
+        return {"ade": ade, "fde": fde}

@@ -1,0 +1,835 @@
+"""Metrics: against the authors' code, against closed forms, and the same whoever computes them."""
+
+import math
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from distributed import GlooPool
+from fixtures import golden, groups
+from torch import Tensor
+from torchmetrics import Metric
+
+from evaluators import feed
+from evaluators.accuracy import ActionAccuracy
+from evaluators.alignment import (
+    MotionCLIPScore,
+    MotionsForText,
+    MultimodalDistance,
+    MutualInformationDivergence,
+    TextsForMotion,
+    WholeSetRetrieval,
+    mutual_information_divergence,
+    retrieval_ranks,
+    whole_set_retrieval,
+)
+from evaluators.confidence import mean_ci
+from evaluators.distribution import (
+    FrechetMotionDistance,
+    KernelMotionDistance,
+    PrecisionRecall,
+    frechet_distance,
+    polynomial_mmd2,
+)
+from evaluators.diversity import (
+    ActionMultimodality,
+    Diversity,
+    JointVariance,
+    PairedMultimodality,
+    TextMultimodality,
+    pair_distance,
+)
+from evaluators.physics import Floating, FootSkating, Jitter, Penetration, StaticShare
+from evaluators.reconstruction import (
+    DisplacementErrors,
+    FlamePositionErrors,
+    TemosPositionErrors,
+    flame_parts,
+    temos_parts,
+)
+from flame_mdm.motion import length_mask
+from flame_mdm.noise import key
+from flame_mdm.representations.skeleton import KIT21, SMPL22
+
+FIXTURE = golden("metrics")
+
+
+def array(name: str) -> np.ndarray:
+    return FIXTURE[name]
+
+
+def tensor(name: str) -> Tensor:
+    """A fixture's array; floating numbers as float64."""
+    values = torch.from_numpy(FIXTURE[name])
+    return values.double() if values.is_floating_point() else values.long()
+
+
+def keys(count: int, *name: str | int) -> Tensor:
+    return torch.tensor([key(*name, i) for i in range(count)], dtype=torch.long)
+
+
+def cases(suffix: str, under: str) -> list[Any]:
+    return [pytest.param(case, id=f"metrics-{case}") for case in groups(FIXTURE, suffix) if case.startswith(under)]
+
+
+one = pytest.mark.parametrize("stem", ["metrics"])
+"""Gives a test on a single case an id with the fixture's name."""
+
+
+# The authors' code ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize("case", cases("exact_f64", "fid/"))
+def test_frechet_distance_equals_the_authors(case: str):
+    metric = FrechetMotionDistance()
+    a, b = torch.from_numpy(array(f"{case}/a")), torch.from_numpy(array(f"{case}/b"))
+    metric.update(generated=a, keys=keys(len(a)), real=b, real_keys=keys(len(b)))
+    value = metric.compute()
+    # the square roots of eigenvalues that should be 0 leave 1e-8 in the reference
+    assert value == pytest.approx(float(array(f"{case}/exact_f64")), rel=1e-7, abs=1e-9)
+    for official in ("official_scipy117", "official_scipy110"):  # takes means in float32
+        assert value == pytest.approx(float(array(f"{case}/{official}")), rel=1e-6, abs=1e-9)
+
+
+@pytest.mark.golden
+@one
+def test_text_metrics_equal_guos(stem: str):
+    text, motion, real = tensor("t2m/text"), tensor("t2m/motion"), tensor("t2m/gt_motion")
+    for size, expected in (
+        (int(array("t2m/batch")), array("t2m/R_precision_top123")),
+        (len(text), array("t2m/R_precision_one_batch_of_160")),
+    ):
+        ranks = []
+        for own in torch.arange(len(text)).split(size):
+            places = torch.arange(len(own))
+            ranks.append(retrieval_ranks(text[own], motion, own.expand(len(own), -1), places))
+            if not int(own[0]) and size == int(array("t2m/batch")):
+                hits = ranks[0][:, None] < torch.arange(1, 4)
+                np.testing.assert_array_equal(hits.numpy(), array("t2m/topk_batch0"))
+        rank = torch.cat(ranks)
+        np.testing.assert_allclose([(rank < k).double().mean().item() for k in (1, 2, 3)], expected, rtol=1e-12)
+    ids = keys(len(text))
+    distance = MultimodalDistance()
+    distance.update(generated=motion, text=text, keys=ids)
+    assert distance.compute() == pytest.approx(float(array("t2m/matching_score")), rel=1e-5)
+    frechet = FrechetMotionDistance()
+    frechet.update(motion, ids, real, keys(len(real)))
+    assert frechet.compute() == pytest.approx(float(array("t2m/fid")), rel=1e-6)
+    first, second = array("t2m/diversity_first"), array("t2m/diversity_second")
+    assert pair_distance(motion[first], motion[second]) == pytest.approx(float(array("t2m/diversity")), rel=1e-5)
+    embedded, first, second = tensor("t2m/mm_emb"), array("t2m/mm_first"), array("t2m/mm_second")
+    value = pair_distance(embedded[:, first], embedded[:, second])
+    assert value == pytest.approx(float(array("t2m/multimodality")), rel=1e-5)
+
+
+@pytest.mark.golden
+@one
+def test_interval_equals_guos(stem: str):
+    np.testing.assert_allclose(mean_ci(array("ci/values").tolist()), array("ci/mean_ci"), rtol=1e-12)
+    columns = [mean_ci(column.tolist()) for column in array("ci/values3").T]
+    np.testing.assert_allclose(np.transpose(columns), array("ci/mean_ci3"), rtol=1e-12)
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize("case", cases("mm_pairs", "a2m/"))
+def test_action_metrics_equal_the_authors(case: str):
+    features = tensor("a2m/features")
+    value = pair_distance(features[tensor(f"{case}/div_first")], features[tensor(f"{case}/div_second")])
+    assert value == pytest.approx(float(array(f"{case}/diversity")), rel=1e-5)
+    first, second = tensor(f"{case}/mm_pairs").T
+    labels = tensor(f"{case}/labels")
+    assert torch.equal(labels[first], labels[second])
+    share = len(labels.unique()) / int(array(f"{case}/num_labels"))  # theirs divides by classes without motions too
+    expected = float(array(f"{case}/multimodality"))
+    assert pair_distance(features[first], features[second]) * share == pytest.approx(expected, rel=1e-5)
+
+
+@pytest.mark.golden
+@one
+def test_accuracy_and_unconstrained_diversity_equal_the_authors(stem: str):
+    accuracy = ActionAccuracy()
+    for logits, labels in zip(tensor("a2m/logits").split(7), tensor("a2m/logit_labels").split(7), strict=True):
+        accuracy.update(logits=logits, labels=labels)
+    assert accuracy.compute() == pytest.approx(float(array("a2m/accuracy")), rel=1e-6)
+    features = tensor("a2m/features")
+    value = pair_distance(features[tensor("uncond/div_first")], features[tensor("uncond/div_second")])
+    assert value == pytest.approx(float(array("uncond/diversity")), rel=1e-5)
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize("case", cases("idx_g", "kid/"))
+def test_kernel_distance_equals_the_authors(case: str):
+    a, b = tensor("kid/codes_g"), tensor("kid/codes_r")
+    subsets = zip(tensor(f"{case}/idx_g"), tensor(f"{case}/idx_r"), strict=True)
+    mmd = torch.stack([polynomial_mmd2(a[i], b[j]) for i, j in subsets]).numpy()
+    np.testing.assert_allclose(mmd, array(f"{case}_float64/mmd"), rtol=1e-11)
+    np.testing.assert_allclose(mmd, array(f"{case}_float32/mmd"), rtol=1e-4, atol=2e-6)
+    np.testing.assert_allclose([mmd.mean(), mmd.std()], array(f"{case}_float64/mean_std"), rtol=1e-11, atol=1e-12)
+
+
+@pytest.mark.golden
+@one
+def test_kernel_distance_of_whole_sets_equals_the_authors(stem: str):
+    """Their draws: of the real motions first, with replacement where these are more than a subset."""
+    real, fake = tensor("kid/full/real"), tensor("kid/full/gen")
+    generator = np.random.RandomState(int(array("kid/full/np_seed")))
+    size, replace = 1000, len(real) > 1000
+    mmd = []
+    for _ in range(100):
+        i, j = generator.choice(len(real), size, replace), generator.choice(len(fake), size, replace)
+        mmd.append(polynomial_mmd2(real[i], fake[j]).item())
+    np.testing.assert_allclose([np.mean(mmd), np.std(mmd)], array("kid/full/mean_std"), rtol=1e-5)
+
+
+@pytest.mark.golden
+@one
+def test_precision_and_recall_equal_the_authors(stem: str):
+    fake, real = tensor("pr/gen"), tensor("pr/real")
+    metric = PrecisionRecall()
+    metric.update(fake, torch.arange(len(fake)), real, torch.arange(len(real)))
+    expected = {"precision": float(array("pr/precision")), "recall": float(array("pr/recall"))}
+    assert metric.compute() == pytest.approx(expected, rel=1e-12)
+
+
+MID_EPS = {"mid": 0.0, "eps0": 0.0, "eps5e-4": 5e-4, "real_as_fake_eps5e-4": 5e-4}
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize("case", [*cases("eps5e-4", "mid/"), *cases("mid", "mid/")])
+def test_mid_equals_the_authors(case: str):
+    names = ("x", "y", "x0") if f"{case}/x" in FIXTURE else ("real_x", "text_y", "fake_x0")
+    real, text, fake = (tensor(f"{case}/{name}") for name in names)
+    ours, theirs = {}, {}
+    for option in (option for option in MID_EPS if f"{case}/{option}" in FIXTURE):
+        motions = real[: len(fake)] if option.startswith("real_as_fake") else fake
+        ours[option] = mutual_information_divergence(real, text, motions, MID_EPS[option]).item()
+        theirs[option] = float(array(f"{case}/{option}"))
+    if len(real) > real.shape[1] + text.shape[1]:
+        assert ours == pytest.approx(theirs, rel=1e-6)
+    else:  # the log-determinant of the joint covariance is noise, there and here, but the same with other motions
+        (a, b), (c, d) = (x.values() for x in (ours, theirs))
+        assert b - a == pytest.approx(d - c, rel=1e-6)
+        assert a == pytest.approx(c, rel=5e-3)
+
+
+@pytest.mark.golden
+@one
+def test_flame_metrics_equal_the_authors(stem: str):
+    text, fake, real = tensor("flame/text_feat"), tensor("flame/gen_motion_feat"), tensor("flame/gt_motion_feat")
+    own = torch.arange(len(text))
+    pools = torch.cat([own[:, None], tensor("flame/wrong_idx")], 1)
+    rank = retrieval_ranks(fake, text, pools, torch.zeros_like(own))
+    shares = [(rank < k).double().mean().item() for k in (1, 2, 3)]
+    np.testing.assert_allclose(shares, array("flame/r_precision_top123"), rtol=1e-6)
+    metrics = {"mclip": MotionCLIPScore(), "mm_distance": MultimodalDistance(), "fd": FrechetMotionDistance()}
+    feed(metrics, generated=fake, text=text, keys=own, real=real, real_keys=own)
+    for name, metric in metrics.items():
+        assert metric.compute() == pytest.approx(float(array(f"flame/{name}")), rel=2e-6)
+
+
+@pytest.mark.golden
+@one
+def test_flame_position_errors_equal_the_authors(stem: str):
+    metric = FlamePositionErrors(SMPL22.parents)
+    rows = []
+    for clip in groups({k: v for k, v in FIXTURE.items() if k.startswith("flame_ape/clip")}, "translation"):
+        sides = []
+        for motion, way in (("gen_joints_xyz", "translation"), ("gt_joints_xyz", "gt_translation")):
+            root = tensor(f"{clip}/{way}")[:, [0, 2, 1]]  # z up -> y up
+            sides.append(flame_parts(tensor(f"{clip}/{motion}") + root[:, None], root, SMPL22.parents))
+        frames = len(sides[0]["root"])
+        rows.append((metric.position_errors(*sides), metric.variance_errors(*sides), frames))
+    position, variance = torch.stack([r[0] for r in rows]), torch.stack([r[1] for r in rows])
+    frames = torch.tensor([[r[2]] for r in rows])
+    values = [*metric.average(position, frames), *variance.mean(0)]
+    official = ("root_joint", "global_traj", "local_joint", "global_joint")
+    names = [f"flame_ape/{error}_{part}_error" for error in ("ape", "ave") for part in official]
+    np.testing.assert_allclose(values, [float(array(name)) for name in names], rtol=1e-6)
+
+
+def temos_names(case: str) -> list[str]:
+    return [f"{case}/{e}_{part}" for e in ("APE", "AVE") for part in ("root", "traj", "mean_pose", "mean_joints")]
+
+
+@pytest.mark.golden
+@one
+def test_temos_position_errors_equal_the_authors(stem: str):
+    fake, real = tensor("temos_ape/padded_text"), tensor("temos_ape/padded_ref")
+    lengths = tensor("temos_ape/single/len_text_ref")
+    metric = TemosPositionErrors(units_per_metre=1000.0)
+    metric.update(
+        fake / 1000,
+        length_mask(lengths[:, 0], fake.shape[1]),
+        real / 1000,
+        length_mask(lengths[:, 1], real.shape[1]),
+        keys(len(fake)),
+    )
+    expected = [float(array(name)) for name in temos_names("temos_ape/single")]
+    assert list(metric.compute().values()) == pytest.approx(expected, rel=2e-6)
+
+
+@pytest.mark.golden
+@one
+def test_temos_position_errors_of_padded_batches_equal_the_authors(stem: str):
+    """Their floor sees the padding of a batch; the parts of padded motions reproduce it."""
+    metric = TemosPositionErrors(units_per_metre=1.0)
+    rows = []
+    for a, b, length in zip(
+        tensor("temos_ape/padded_text"), tensor("temos_ape/padded_ref"), array("temos_ape/lengths"), strict=True
+    ):
+        sides = [{k: v[:length] for k, v in metric.parts(x).items()} for x in (a, b)]
+        rows.append((metric.position_errors(*sides), metric.variance_errors(*sides), int(length)))
+    position = metric.average(torch.stack([r[0] for r in rows]), torch.tensor([[r[2]] for r in rows]))
+    variance = torch.stack([r[1] for r in rows]).mean(0)
+    expected = [float(array(name)) for name in temos_names("temos_ape/padded")]
+    np.testing.assert_allclose([*position, *variance], expected, rtol=2e-6)
+
+
+@pytest.mark.golden
+@one
+def test_temos_parts_equal_the_authors(stem: str):
+    length = int(array("temos_ape/lengths")[0])
+    parts = temos_parts(tensor("temos_ape/padded_text")[0])
+    names = {"root": "root", "trajectory": "traj", "mean_local": "pose_local", "mean_global": "joints"}
+    for part, name in names.items():
+        expected = array(f"temos_ape/transform0/{name}")
+        np.testing.assert_allclose(parts[part][:length] / 1000, expected[:length], atol=2e-6)
+
+
+@pytest.mark.golden
+@one
+def test_whole_set_retrieval_equals_the_authors(stem: str):
+    values = whole_set_retrieval(tensor("tmr/sims"), WholeSetRetrieval.TOP)
+    for way in ("t2m", "m2t"):
+        for k in WholeSetRetrieval.TOP:
+            assert values[f"{way}_top{k}"] == pytest.approx(float(array(f"tmr/{way}_R{k:02}")) / 100, rel=1e-12)
+        assert values[f"{way}_median"] == float(array(f"tmr/{way}_MedR"))
+
+
+# Closed forms and other implementations -------------------------------------------------------------------------------
+
+
+def exactly_normal(mean: np.ndarray, covariance: np.ndarray, count: int, seed: int) -> Tensor:
+    """Rows (N, E) whose mean and covariance (N - 1 in the denominator) are exactly these."""
+    x = np.random.default_rng(seed).normal(size=(count, len(mean)))
+    x -= x.mean(0)
+    x = x @ np.linalg.inv(np.linalg.cholesky(np.cov(x.T))).T
+    return torch.from_numpy(x @ np.linalg.cholesky(covariance).T + mean)
+
+
+def covariance(size: int, seed: int) -> np.ndarray:
+    a = np.random.default_rng(seed).normal(size=(size, size))
+    return a @ a.T / size + 0.1 * np.eye(size)
+
+
+def test_frechet_distance_of_normal_distributions():
+    """Of commuting covariances: |m - m'|^2 + sum (s - s')^2; of any, scipy's matrix square root."""
+    deviations, other = np.array([0.5, 1.0, 3.0]), np.array([2.0, 0.1, 3.5])
+    a = exactly_normal(np.array([1.0, 2.0, 3.0]), np.diag(deviations**2), 50, 0)
+    b = exactly_normal(np.array([0.0, 2.0, 5.0]), np.diag(other**2), 70, 1)
+    assert frechet_distance(a, b).item() == pytest.approx(5 + ((deviations - other) ** 2).sum(), rel=1e-12)
+
+    from scipy.linalg import sqrtm
+
+    s, t = covariance(20, 0), covariance(20, 1)
+    a, b = exactly_normal(np.zeros(20), s, 100, 2), exactly_normal(np.ones(20), t, 60, 3)
+    expected = 20 + np.trace(s + t) - 2 * np.trace(np.real(np.asarray(sqrtm(s @ t))))
+    assert frechet_distance(a, b).item() == pytest.approx(expected, rel=1e-10)
+
+
+def test_frechet_distance_without_full_rank():
+    generator = torch.Generator().manual_seed(0)
+    a, b = (torch.randn(n, 12, generator=generator, dtype=torch.float64) for n in (40, 30))
+    dead = torch.ones(1, 5, dtype=torch.float64)
+    padded = frechet_distance(*(torch.cat([x, dead.expand(len(x), -1)], 1) for x in (a, b)))
+    assert padded.item() == pytest.approx(frechet_distance(a, b).item(), rel=1e-13)
+    few = frechet_distance(a[:5], b[:5])  # a rotation of a thin set: only the means and the trace remain
+    eigenvalues = np.linalg.eigvals(np.cov(a[:5].T.numpy()) @ np.cov(b[:5].T.numpy())).real.clip(0)
+    trace = a[:5].var(0).sum() + b[:5].var(0).sum() - 2 * np.sqrt(eigenvalues).sum()
+    assert few.item() == pytest.approx(((a[:5].mean(0) - b[:5].mean(0)) ** 2).sum().item() + trace.item(), rel=1e-6)
+
+
+def test_frechet_distance_of_a_set_to_itself_is_not_negative():
+    x = torch.randn(64, 32, generator=torch.Generator().manual_seed(0))
+    metric = FrechetMotionDistance()
+    metric.update(x, torch.arange(64), x.flip(0), torch.arange(64))
+    assert 0 <= float(metric.compute() or 0) < 1e-10
+
+
+def test_kernel_distance_by_loops():
+    generator = np.random.default_rng(0)
+    a, b = generator.normal(size=(7, 3)), generator.normal(size=(7, 3)) + 1
+
+    def kernel(x: np.ndarray, y: np.ndarray) -> float:
+        return float((x @ y / 3 + 1) ** 3)
+
+    within = sum(kernel(x[i], x[j]) for x in (a, b) for i in range(7) for j in range(7) if i != j) / 42
+    across = sum(kernel(x, y) for x in a for y in b) / 49
+    value = polynomial_mmd2(torch.from_numpy(a), torch.from_numpy(b)).item()
+    assert value == pytest.approx(within - 2 * across, rel=1e-12)
+
+
+def test_kernel_distance_of_whole_sets_is_one_value():
+    """Subsets without replacement as large as the sets are permutations; with replacement, equal samples meet."""
+    generator = torch.Generator().manual_seed(0)
+    a, b = (torch.randn(50, 6, generator=generator) for _ in range(2))
+    values = {}
+    for replace in (False, True):
+        metric = KernelMotionDistance(subsets=20, subset_size=50, replace=replace)
+        metric.update(a, torch.arange(50), b, torch.arange(50))
+        values[replace] = metric.compute()
+    assert values[False]["mean"] == pytest.approx(polynomial_mmd2(a.double(), b.double()).item(), rel=1e-12)
+    assert values[False]["std"] < 1e-12 < values[True]["std"]
+    assert values[True]["mean"] > values[False]["mean"]
+
+
+def test_precision_and_recall_by_loops():
+    generator = np.random.default_rng(0)
+    real, fake = generator.normal(size=(40, 2)), generator.normal(size=(55, 2)) * [2, 0.5]
+    metric = PrecisionRecall(neighbors=2)
+    metric.update(torch.from_numpy(fake), torch.arange(55), torch.from_numpy(real), torch.arange(40))
+
+    def coverage(points: np.ndarray, samples: np.ndarray) -> float:
+        covered = 0
+        for p in points:
+            reaches = [sorted(np.linalg.norm(samples - s, axis=1))[2] for s in samples]
+            covered += any(np.linalg.norm(p - s) <= r for s, r in zip(samples, reaches, strict=True))
+        return covered / len(points)
+
+    assert metric.compute() == {"precision": coverage(fake[:40], real), "recall": coverage(real, fake[:40])}
+
+
+def test_mid_of_normal_distributions():
+    """Of the real motions themselves: the mutual information of two correlated normal variables, -log(1 - r^2) / 2."""
+    r = 0.8
+    both = exactly_normal(np.array([1.0, -2.0]), np.array([[4.0, 2 * r], [2 * r, 1.0]]), 500, 0)
+    real, text = both[:, :1], both[:, 1:]
+    metric = MutualInformationDivergence(eps=0.0)
+    metric.update(generated=real, text=text, real=real, keys=torch.arange(500))
+    assert metric.compute() == pytest.approx(-math.log(1 - r**2) / 2, rel=1e-12)
+    shuffled = mutual_information_divergence(real, text, real.roll(1, 0), 0.0).item()
+    assert shuffled < 0 < float(metric.compute() or 0)
+
+
+@pytest.mark.parametrize("metric", [TextsForMotion(), MotionsForText()])
+def test_r_precision_of_perfect_random_and_blind_features(metric: Metric):
+    count, generator = 1000, torch.Generator().manual_seed(0)
+    text = torch.randn(count, 8, generator=generator)
+    ids = keys(count)
+    given = {"text": text, "text_keys": ids, "keys": ids}
+    values = {}
+    for name, motion, seen in (
+        ("perfect", text.clone(), text),
+        ("random", torch.randn(count, 8, generator=generator), text),
+        ("blind", torch.ones(count, 8), torch.ones(count, 8)),
+    ):
+        metric.reset()
+        metric.update(**given | {"generated": motion, "text": seen})
+        values[name] = metric.compute()
+    assert values["perfect"] == {"top1": 1.0, "top2": 1.0, "top3": 1.0}
+    for name in ("random", "blind"):
+        for k in (1, 2, 3):
+            chance = k / 32
+            tolerance = 4 * (chance * (1 - chance) / count) ** 0.5
+            assert values[name][f"top{k}"] == pytest.approx(chance, abs=tolerance)
+
+
+def test_texts_for_motion_never_draw_the_own_caption():
+    """Two captions, far from one another; each motion lies on its own, so a pool of 2 must never hold it twice."""
+    captions = torch.tensor([[0.0], [10.0]])
+    which = torch.arange(40) % 2
+    metric = TextsForMotion(pool=2, top=1)
+    metric.update(generated=captions[which], text=captions[which], text_keys=which, keys=keys(40))
+    assert metric.compute() == {"top1": 1.0}
+    metric.reset()
+    metric.update(generated=captions[1 - which], text=captions[which], text_keys=which, keys=keys(40))
+    assert metric.compute() == {"top1": 0.0}
+
+
+def test_motions_for_text_count_every_text_once():
+    """33 motions that are mixed up in pairs but for one: whatever the pools, at most the one is found."""
+    text = torch.arange(33.0)[:, None]
+    motion = text.clone()
+    motion[:32] = text[:32] + torch.tensor([1.0, -1.0]).repeat(16)[:, None]
+    metric = MotionsForText(top=1)
+    metric.update(generated=motion, text=text, text_keys=torch.arange(33), keys=torch.arange(33))
+    found = 33 * (metric.compute()["top1"] or 0)
+    assert found == pytest.approx(round(found))
+    assert 1 <= round(found) <= 2  # the one, and one whose partner an incomplete pool may leave out
+
+
+def test_retrieval_ranks_of_ties_and_neighbors():
+    candidates = torch.tensor([[0.0], [1.0], [1.0], [2.0]])
+    query = torch.tensor([[1.0], [1.0], [0.4]])
+    pools = torch.tensor([[0, 1, 2, 3]]).expand(3, -1)
+    assert retrieval_ranks(query, candidates, pools, torch.tensor([1, 2, 3])).tolist() == [0, 1, 3]
+
+
+def test_whole_set_retrieval_counts_ties_by_half():
+    perfect = torch.eye(4)
+    assert whole_set_retrieval(perfect, (1,)) == {"t2m_top1": 1, "t2m_median": 1, "m2t_top1": 1, "m2t_median": 1}
+    assert whole_set_retrieval(torch.ones(4, 4), (1, 2))["t2m_median"] == 2.5
+
+
+def test_diversity_of_two_points():
+    features = torch.tensor([[0.0, 0.0], [3.0, 4.0]]).repeat(500, 1)
+    for replace in (False, True):
+        metric = Diversity(pairs=1000, replace=replace)
+        metric.update(features, keys(1000))
+        assert metric.compute() == pytest.approx(2.5, abs=0.4)  # half of the pairs are 5 apart
+    whole = Diversity(pairs=1000, replace=False)
+    whole.update(torch.arange(1000.0)[:, None], torch.arange(1000))
+    assert whole.compute() == pytest.approx(1000 / 3, rel=0.1)
+
+
+def multimodality(metric: Metric, distances: Tensor, samples: int, kind: str = "groups") -> float | None:
+    """Of prompts whose motions stand on two points, so many apart."""
+    steps = torch.arange(samples) % 2
+    features = (distances[:, None] * steps).flatten()[:, None]
+    prompts = torch.arange(len(distances)).repeat_interleave(samples)
+    order = torch.randperm(len(prompts), generator=torch.Generator().manual_seed(0))
+    metric.update(generated=features[order], keys=order, **{kind: prompts[order]})
+    return metric.compute()
+
+
+def test_multimodality_in_each_definition():
+    distances = torch.tensor([1.0, 3.0])
+    value = multimodality(TextMultimodality(), distances, 30)
+    assert value is not None
+    assert 0 < value < 2
+    assert (value * 10 / 2) % 1 == pytest.approx(0, abs=1e-9)  # the same pairs for all texts
+    # sample i of the first set and of the second: 10 apart, thus on the same point for 10, on the other for 5
+    assert multimodality(PairedMultimodality(samples=10), distances, 20) == 0
+    assert multimodality(PairedMultimodality(samples=5), distances, 10) == 2
+    value = multimodality(ActionMultimodality(pairs=4000), distances, 30, "labels")
+    assert value == pytest.approx(1, abs=0.05)  # a pair is apart every second time
+
+
+def test_joint_variance_of_known_spread():
+    """Motions of a text stand at x = -1 and x = 1: variance 4 / 3 of four; a second text has none."""
+    still = torch.zeros(4, 6, 2, 3)
+    still[::2, ..., 0], still[1::2, ..., 0] = -1, 1
+    metric = JointVariance(samples=4)
+    mask = length_mask(torch.full((4,), 5), 6)
+    metric.update(joints=still, mask=mask, groups=torch.full((4,), 1), keys=keys(4, "a"))
+    still[..., 0] = 7
+    metric.update(joints=still, mask=mask, groups=torch.full((4,), 2), keys=keys(4, "b"))
+    assert metric.compute() == pytest.approx(2 / 3)
+
+
+def test_temos_parts_do_not_see_where_a_motion_stands():
+    joints = walk(21, 30, 0).double() * 640
+    turn = torch.tensor(2.1, dtype=torch.float64)
+    cos, sin = turn.cos(), turn.sin()
+    rotation = torch.stack(
+        [torch.stack([cos, 0 * cos, sin]), torch.tensor([0.0, 1, 0]), torch.stack([-sin, 0 * cos, cos])]
+    )
+    moved = joints @ rotation.T + joints.new_tensor([300.0, 50.0, -20.0])
+    for name, values in temos_parts(joints).items():
+        torch.testing.assert_close(temos_parts(moved)[name], values, rtol=0, atol=1e-9)
+    assert temos_parts(joints)["root"][0, [0, 2]].abs().max() < 1e-9
+
+
+def test_displacement_of_shifted_frames():
+    """Shifted by (3, 0, 4) in every frame after the fourth, and by twice that in the last: 5 and 10 metres."""
+    real = walk(22, 10, 0)[None]
+    fake = real.clone()
+    fake[:, 4:] += torch.tensor([3.0, 0.0, 4.0])
+    fake[:, 7] += torch.tensor([3.0, 0.0, 4.0])
+    mask = length_mask(torch.tensor([8]), 10)
+    predicted = torch.arange(10)[None] >= 4
+    for asked, ade in ((predicted, 25 / 4), (None, 25 / 8)):
+        metric = DisplacementErrors()
+        metric.update(joints=fake, mask=mask, real_joints=real, keys=torch.tensor([1]), predicted=asked)
+        assert metric.compute() == pytest.approx({"ade": ade, "fde": 10.0}, rel=1e-6)
+
+
+def test_physics_of_simple_motions():
+    frames, fps = 30, 20.0
+    still = torch.rand(1, frames, 22, 3, generator=torch.Generator().manual_seed(0))[:, :1].repeat(1, frames, 1, 1)
+    still[..., 1] -= still[..., 1].amin()
+    mask, ids = torch.ones(1, frames, dtype=torch.bool), torch.tensor([1])
+    time = torch.arange(frames).double() / fps
+    cubic = still.double().clone()
+    cubic[..., 0] += time[:, None] ** 3  # jerk 6 m/s^3
+
+    def physics(joints: Tensor) -> dict[str, Any]:
+        metrics = {
+            "below": Penetration(),
+            "above": Floating(),
+            "jerk": Jitter(fps),
+            "static": StaticShare(fps),
+            "skating": FootSkating(fps),
+        }
+        feed(metrics, joints=joints, mask=mask, keys=ids)
+        return {name: metric.compute() for name, metric in metrics.items()}
+
+    values = physics(still)
+    assert (values["below"], values["above"], values["jerk"], values["static"]) == (0, 0, 0, 1)
+    assert physics(cubic)["jerk"] == pytest.approx(6, rel=1e-6)
+    assert physics(cubic)["static"] == 0
+    lift = torch.tensor([0.0, 1.0, 0.0])
+    assert physics(still + 0.1 * lift)["above"] == pytest.approx(0.1, rel=1e-6)
+    assert physics(still - 0.1 * lift)["below"] == pytest.approx(0.1, rel=1e-6)
+    near = physics(still + 0.004 * lift) | physics(still - 0.004 * lift)
+    assert (near["above"], near["below"]) == (0, 0)
+    half = still.clone()
+    half[:, : frames // 2] -= 0.1 * lift
+    assert physics(half)["below"] == pytest.approx(0.05, rel=1e-6)
+
+
+# The same whoever computes them ---------------------------------------------------------------------------------------
+
+
+def walk(joints: int, frames: int, seed: int) -> Tensor:
+    """(F, J, 3): smooth motion of random joints, in metres."""
+    generator = torch.Generator().manual_seed(seed)
+    pose = torch.rand(joints, 3, generator=generator)
+    return pose + torch.randn(frames, joints, 3, generator=generator).cumsum(0) * 0.02
+
+
+def all_metrics() -> dict[str, Metric]:
+    """Every metric, with numbers small enough for the samples of `evaluation`."""
+    return {
+        "fid": FrechetMotionDistance(),
+        "kid": KernelMotionDistance(subsets=5, subset_size=20),
+        "kid_replace": KernelMotionDistance(subsets=5, subset_size=20, replace=True),
+        "precision_recall": PrecisionRecall(),
+        "texts_for_motion": TextsForMotion(pool=8),
+        "motions_for_text": MotionsForText(pool=8),
+        "mm_dist": MultimodalDistance(),
+        "mclip": MotionCLIPScore(),
+        "retrieval": WholeSetRetrieval(),
+        "mid": MutualInformationDivergence(),
+        "diversity_text": Diversity(pairs=30, replace=False),
+        "diversity_action": Diversity(pairs=50, replace=True),
+        "multimodality_text": TextMultimodality(samples=5, pairs=3),
+        "multimodality_class": ActionMultimodality(),
+        "joint_variance": JointVariance(samples=5),
+        "accuracy": ActionAccuracy(),
+        "temos": TemosPositionErrors(),
+        "flame": FlamePositionErrors(KIT21.parents),
+        "displacement": DisplacementErrors(),
+        "penetration": Penetration(),
+        "floating": Floating(),
+        "jitter": Jitter(20.0),
+        "static": StaticShare(20.0),
+        "skating": FootSkating(20.0),
+    }
+
+
+PROMPTS, SAMPLES, WIDTH = 9, 5, 6
+COUNT = PROMPTS * SAMPLES
+
+
+def evaluation(count: int = COUNT) -> dict[str, Tensor]:
+    """Features of 45 motions and of as many real ones: 9 prompts with 5 motions each."""
+    generator = torch.Generator().manual_seed(0)
+    prompts = torch.arange(COUNT) // SAMPLES
+    lengths = 10 + 3 * prompts
+    motions = [walk(21, int(n), i) for i, n in enumerate(lengths)]
+    frames = int(lengths.max())
+    joints = torch.stack([torch.cat([m, torch.zeros(frames - len(m), 21, 3)]) for m in motions])
+    values = {
+        "generated": torch.randn(COUNT, WIDTH, generator=generator),
+        "text": torch.randn(COUNT, WIDTH, generator=generator),
+        "text_keys": torch.tensor([key("text", i) for i in range(COUNT)]),
+        "logits": torch.randn(COUNT, 4, generator=generator),
+        "labels": torch.arange(COUNT) % 4,
+        "groups": torch.tensor([key("prompt", int(p)) for p in prompts]),
+        "joints": joints,
+        "mask": length_mask(lengths, frames),
+        "keys": torch.tensor([key("motion", i) for i in range(COUNT)]),
+        "real": torch.randn(COUNT, WIDTH, generator=generator) + 0.5,
+        "real_joints": joints + 0.01 * torch.randn(joints.shape, generator=generator).cumsum(1),
+        "real_mask": length_mask(lengths, frames),
+        "real_keys": torch.tensor([key("real", i) for i in range(COUNT)]),
+    }
+    return {name: value[:count] for name, value in values.items()}
+
+
+def batches(values: dict[str, Tensor], indices: list[Tensor]) -> list[dict[str, Tensor]]:
+    """Rows in batches, each cut to its longest motion."""
+    result = []
+    for index in indices:
+        batch = {name: value[index] for name, value in values.items()}
+        longest = int(batch["mask"].sum(1).max())
+        for name in ("joints", "mask", "real_joints", "real_mask"):
+            batch[name] = batch[name][:, :longest].contiguous()
+        result.append(batch)
+    return result
+
+
+def measure(metrics: dict[str, Metric], given: list[dict[str, Tensor]]) -> dict[str, Any]:
+    for batch in given:
+        feed(metrics, **batch)
+    return {name: metric.compute() for name, metric in metrics.items()}
+
+
+@pytest.fixture(scope="module")
+def expected() -> dict[str, Any]:
+    """Values of all metrics from one batch."""
+    values = measure(all_metrics(), batches(evaluation(), [torch.arange(COUNT)]))
+    assert None not in values.values()
+    return values
+
+
+@pytest.mark.parametrize("size", [7, 32])
+def test_values_do_not_depend_on_the_batch_size(size: int, expected: dict[str, Any]):
+    assert measure(all_metrics(), batches(evaluation(), list(torch.arange(COUNT).split(size)))) == expected
+
+
+def test_values_do_not_depend_on_the_order(expected: dict[str, Any]):
+    order = torch.randperm(COUNT, generator=torch.Generator().manual_seed(1))
+    assert measure(all_metrics(), batches(evaluation(), list(order.split(4)))) == expected
+
+
+def test_sets_may_come_one_after_the_other(expected: dict[str, Any]):
+    metric, values = FrechetMotionDistance(), evaluation()
+    metric.update(real=values["real"], real_keys=values["real_keys"])
+    assert metric.compute() is None
+    metric.update(generated=values["generated"], keys=values["keys"])
+    assert metric.compute() == expected["fid"]
+
+
+def test_draws_depend_on_the_seed(expected: dict[str, Any]):
+    metrics = all_metrics()
+    for metric in metrics.values():
+        if hasattr(metric, "seed"):
+            metric.seed = 1  # type: ignore[assignment]
+    values = measure(metrics, batches(evaluation(), [torch.arange(COUNT)]))
+    drawn = {name for name, metric in metrics.items() if hasattr(metric, "seed")}
+    assert {name for name in values if values[name] != expected[name]} == drawn
+    assert len(drawn) == 8
+
+
+@pytest.fixture(scope="module")
+def pool() -> Iterator[GlooPool]:
+    with GlooPool() as pool:
+        yield pool
+
+
+@pytest.mark.parametrize("first", [range(0, COUNT, 2), range(30), range(COUNT), range(0)])
+def test_values_do_not_depend_on_the_number_of_processes(first: range, pool: GlooPool, expected: dict[str, Any]):
+    """Samples dealt in turn, unevenly, and all to one of the two."""
+    shares = [list(first), [i for i in range(COUNT) if i not in first]]
+    values = evaluation()
+    given = [batches(values, list(torch.tensor(share, dtype=torch.long).split(7)) if share else []) for share in shares]
+    results = pool.run(measure, *[(all_metrics(), batch) for batch in given])
+    assert results == [expected, expected]
+
+
+def test_processes_without_samples_have_no_values(pool: GlooPool):
+    first, second = pool.run(measure, (all_metrics(), []), (all_metrics(), []))
+    assert first == second == nothing()
+
+
+def test_a_failing_process_fails_the_test(pool: GlooPool):
+    with pytest.raises(RuntimeError, match=r"process 1: [^$]*no values"):
+        pool.run(mean_ci, ([1.0],), ([],))
+
+
+# What is no number ----------------------------------------------------------------------------------------------------
+
+
+def nothing() -> dict[str, Any]:
+    """The values of metrics that were given nothing."""
+    tops = ("top1", "top2", "top3")
+    recalls = (*tops, "top5", "top10", "median")
+    parts = ("root", "trajectory", "mean_local", "mean_global")
+    errors = tuple(f"{error}_{part}" for error in ("ape", "ave") for part in parts)
+    names = {
+        "kid": ("mean", "std"),
+        "kid_replace": ("mean", "std"),
+        "precision_recall": ("precision", "recall"),
+        "texts_for_motion": tops,
+        "motions_for_text": tops,
+        "retrieval": tuple(f"{way}_{name}" for way in ("t2m", "m2t") for name in recalls),
+        "temos": errors,
+        "flame": errors,
+        "displacement": ("ade", "fde"),
+    }
+    return {name: dict.fromkeys(names[name]) if name in names else None for name in all_metrics()}
+
+
+@pytest.mark.filterwarnings("ignore:The ``compute`` method of metric")
+def test_nothing_given_is_none_never_0():
+    assert measure(all_metrics(), []) == nothing()
+
+
+@pytest.mark.parametrize(
+    ("metric", "count", "message"),
+    [
+        (FrechetMotionDistance(), 1, "got 1 generated motions, needs at least 2"),
+        (KernelMotionDistance(), 45, "got 45 generated motions for subsets of 1000, needs at least 1000"),
+        (PrecisionRecall(), 3, "got 3 motions in the smaller set, needs at least 4"),
+        (TextsForMotion(), 31, "got 31 different captions, needs at least 32"),
+        (MotionsForText(), 31, "got 31 motions, needs at least 32"),
+        (
+            MutualInformationDivergence(),
+            12,
+            "got 12 samples, one more than features of motion and text, needs at least 13",
+        ),
+        (Diversity(pairs=300, replace=False), 45, "got 45 motions for 300 pairs, needs at least 300"),
+        (Diversity(pairs=200, replace=True), 1, "got 1 motions for 200 pairs, needs at least 2"),
+        (TextMultimodality(), 45, "9 of 9 prompts have not 30 motions but 5 to 5; generate 30 for each"),
+        (PairedMultimodality(), 45, "9 of 9 prompts have not 20 motions"),
+        (ActionMultimodality(), 5, "got 1 motions of class 1, needs at least 2"),
+        (JointVariance(), 45, "9 of 9 prompts have not 10 motions"),
+    ],
+)
+def test_too_few_samples_are_an_error(metric: Metric, count: int, message: str):
+    feed({"metric": metric}, **evaluation(count))
+    with pytest.raises(ValueError, match=f"{type(metric).__name__}: {message}"):
+        metric.compute()
+
+
+def test_a_sample_given_twice_is_an_error():
+    values = evaluation()
+    metrics = {n: m for n, m in all_metrics().items() if hasattr(m, "keys")}
+    for batch in batches(values, [torch.arange(COUNT), torch.tensor([3])]):
+        feed(metrics, **batch)
+    for metric in metrics.values():
+        with pytest.raises(ValueError, match="1 samples were given twice"):
+            metric.compute()
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf])
+def test_features_that_are_not_finite_are_an_error(bad: float):
+    values = evaluation()
+    for name in ("generated", "text", "real", "joints", "logits"):
+        values[name] = values[name].clone()
+        values[name][3, 0] = bad
+    for name, metric in all_metrics().items():
+        with pytest.raises(ValueError, match="not finite"):
+            measure({name: metric}, [values])
+
+
+def wrong_inputs() -> list[tuple[Metric, Callable[[dict[str, Tensor]], dict[str, Tensor]], str]]:
+    return [
+        (MultimodalDistance(), lambda v: v | {"text": v["text"][:-1]}, "45 keys, 45 generated, 44 text"),
+        (FrechetMotionDistance(), lambda v: {"generated": v["generated"]}, "'generated' came without 'keys'"),
+        (
+            FrechetMotionDistance(),
+            lambda v: v | {"real": v["real"][:, :3]},
+            "features are 6 wide if generated, 3 if real",
+        ),
+        (DisplacementErrors(), lambda v: v | {"real_joints": v["real_joints"][:, :5]}, "joints .*, real"),
+        (DisplacementErrors(), lambda v: v | {"predicted": v["mask"] & False}, "no generated frame"),
+        (TemosPositionErrors(), lambda v: v | {"joints": v["joints"][:, :, :20]}, "20 joints, defined for KIT's 21"),
+        (FlamePositionErrors(KIT21.parents), lambda v: v | {"mask": v["mask"] & (torch.arange(34) < 1)}, "1 frames"),
+    ]
+
+
+@pytest.mark.parametrize(("metric", "change", "message"), wrong_inputs())
+def test_wrong_inputs_are_told(metric: Metric, change: Callable[..., dict[str, Tensor]], message: str):
+    with pytest.raises(ValueError, match=f"{type(metric).__name__}: .*{message}"):
+        measure({"metric": metric}, [change(evaluation())])
+
+
+def test_confidence_of_nothing_is_an_error():
+    with pytest.raises(ValueError, match="no values"):
+        mean_ci([])

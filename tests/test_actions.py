@@ -1,0 +1,366 @@
+"""HumanAct12 and UESTC, on pickles in the layout of ACTOR's, and the reader of pickles."""
+
+import contextlib
+import os
+import pickle
+import pickletools
+from collections import Counter, OrderedDict
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from fixtures import golden
+
+from flame_mdm.data import humanact12, restricted_pickle, uestc
+from flame_mdm.data.crops import Fixed
+from flame_mdm.data.datamodule import MotionDataModule
+from flame_mdm.data.humanact12 import HumanAct12, read_unconstrained
+from flame_mdm.data.store import write_store
+from flame_mdm.data.uestc import TRAIN_SUBJECTS, UESTC, front_view
+from flame_mdm.representations import rotation
+from flame_mdm.representations.rot6d import Rot6D
+
+# Pickles
+
+
+class Attack:
+    """What a hostile pickle does: calls a function when it is read."""
+
+    def __init__(self, function, *arguments):
+        self.call = function, arguments
+
+    def __reduce__(self):
+        return self.call
+
+
+def written(path: Path, content: object, protocol: int = 4) -> Path:
+    path.write_bytes(pickle.dumps(content, protocol))
+    return path
+
+
+ragged = np.empty(2, object)
+ragged[:] = [np.arange(6, dtype=np.float32).reshape(2, 3), np.zeros((1, 3), np.float16)]
+CONTENT = {
+    "poses": [np.arange(6.0).reshape(2, 3), np.asfortranarray(np.arange(6).reshape(2, 3))],
+    "ragged": ragged,
+    "y": [np.int64(3), 2, True],
+    "number": (np.float32(0.5), 1.5, None, 2 + 1j),
+    "names": {"a", "ä"},
+    "raw": b"\x00\xff",
+    "big": np.arange(3, dtype=">i2"),
+    "texts": np.array(["a", "bc"]),
+}
+
+
+@pytest.mark.parametrize("protocol", range(6))
+@pytest.mark.parametrize("core", ["core", "_core"])
+def test_arrays_and_plain_values_are_read(protocol: int, core: str, tmp_path: Path):
+    data = pickle.dumps(CONTENT, protocol)
+    if protocol < 4:  # where names are lines, and not counted
+        data = data.replace(b"numpy._core.", f"numpy.{core}.".encode())
+    (tmp_path / "x.pkl").write_bytes(data)
+    found = restricted_pickle.read(tmp_path / "x.pkl")
+    assert found["number"] == CONTENT["number"]
+    assert found["names"] == CONTENT["names"]
+    assert found["raw"] == CONTENT["raw"]
+    assert found["y"] == CONTENT["y"]
+    assert found["big"].tolist() == [0, 1, 2]
+    assert found["texts"].tolist() == ["a", "bc"]
+    for one, other in zip([*found["poses"], *found["ragged"]], [*CONTENT["poses"], *ragged], strict=True):
+        np.testing.assert_array_equal(one, other)
+        assert one.dtype == other.dtype
+
+
+def test_pickles_of_old_numpy_are_read(tmp_path: Path):
+    flags = b"I0\nI1\n"  # numpy 1 wrote numbers where numpy 2 writes False and True
+    data = pickle.dumps(np.arange(3.0), 0)
+    assert b"I00\nI01\n" in data
+    data = data.replace(b"I00\nI01\n", flags).replace(b"numpy._core.", b"numpy.core.")
+    (tmp_path / "x.pkl").write_bytes(data)
+    np.testing.assert_array_equal(restricted_pickle.read(tmp_path / "x.pkl"), np.arange(3.0))
+
+
+@pytest.mark.parametrize("protocol", [0, 2, 4, 5])
+@pytest.mark.parametrize(
+    ("attack", "named"),
+    [
+        (lambda path: Attack(os.mkdir, str(path)), "posix.mkdir"),
+        (lambda path: Attack(eval, f"__import__('os').mkdir({str(path)!r})"), r"builtin(s|__)\.eval"),
+        (lambda path: Attack(np.save, str(path), 1), r"numpy\.save"),
+        (lambda path: OrderedDict(a=1), r"collections\.OrderedDict"),
+        (lambda path: {"poses": [Path(path)]}, r"pathlib.*Path"),
+    ],
+    ids=["system", "eval", "numpy", "container", "inside"],
+)
+def test_anything_else_is_refused_before_it_runs(protocol: int, attack, named: str, tmp_path: Path):
+    path = written(tmp_path / "x.pkl", attack(tmp_path / "run"), protocol)
+    with pytest.raises(ValueError, match=rf"x\.pkl: not read as a pickle: it names .*{named}") as error:
+        restricted_pickle.read(path)
+    assert "\n" not in str(error.value)
+    assert os.listdir(tmp_path) == ["x.pkl"]  # noqa: PTH208
+
+
+@pytest.mark.parametrize("size", [0, 1, 40, 400])
+def test_damaged_pickles_are_named(size: int, tmp_path: Path):
+    path = tmp_path / "x.pkl"
+    path.write_bytes(pickle.dumps(CONTENT)[:size])
+    with pytest.raises(ValueError, match=r"x\.pkl: not read as a pickle: "):
+        restricted_pickle.read(path)
+
+
+def test_every_byte_may_be_wrong(tmp_path: Path):
+    """NumPy's own functions end the process on some of these, so this test does."""
+    path = tmp_path / "x.pkl"
+    for protocol in (2, 4):
+        data = pickletools.optimize(pickle.dumps({"y": [1, np.arange(2.0), ragged]}, protocol))
+        for place in range(len(data)):
+            path.write_bytes(data[:place] + bytes([data[place] ^ 1]) + data[place + 1 :])
+            with contextlib.suppress(ValueError):  # and nothing else
+                restricted_pickle.read(path)
+
+
+# HumanAct12
+
+
+def poses(frames: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """SMPL poses (F, 72) and joints (F, 24, 3) that wander."""
+    rng = np.random.default_rng(seed)
+    joints = rng.normal(size=(1, 24, 3)) + 0.02 * rng.normal(size=(frames, 1, 3)).cumsum(0)
+    return 0.3 * rng.normal(size=(frames, 72)).astype(np.float32), joints.astype(np.float32)
+
+
+def write_humanact12(folder: Path, clips: int = 360, **columns) -> Path:
+    """The pickle as ACTOR hands it out: lists of arrays of all lengths, labels in no order."""
+    found = [poses(20 + 7 * (k % 15), k) for k in range(clips)]
+    data = {
+        "poses": [pose for pose, _ in found],
+        "oldposes": [pose for pose, _ in found],
+        "joints3D": [joints for _, joints in found],
+        "y": [k % 12 for k in range(clips)],
+    }
+    folder.mkdir()
+    return written(folder / "humanact12poses.pkl", data | columns)
+
+
+def batch_of(source, tmp_path: Path):
+    data = MotionDataModule(
+        source, Rot6D(), root=str(tmp_path / "stores"), name="x", batch_size=8, crop=Fixed(frames=60), seed=3
+    )
+    data.prepare_data()
+    data.setup("fit")
+    batch = next(iter(data.train_dataloader()))
+    assert batch.x.shape == (8, 60, 150)
+    assert batch.mask.all()
+    assert (batch.x[:, 0, 144:] == 0).all(), "a clip does not start at the origin"
+    assert batch.text is None
+    return data, batch
+
+
+def test_humanact12_from_raw_file_to_batch(tmp_path: Path):
+    write_humanact12(tmp_path / "raw")
+    source = HumanAct12(str(tmp_path / "raw"))
+    data, batch = batch_of(source, tmp_path)
+    assert source.count() == len(data.store.clips) == 360
+    assert data.store.info["actions"] == list(HumanAct12.actions)
+    assert data.store.info["published_split"] is False
+    labels = [clip.action for clip in data.store.clips]
+    assert labels == [k % 12 for k in range(360)]
+    assert batch.action.tolist() == [labels[int(name[-4:])] for name in batch.ids]
+    for split in ("train", "val", "test"):
+        assert {clip.action for clip in data.store.clips if clip.split == split} == set(range(12))
+    assert len(data.test) == 120  # of 30 clips an action, one block of ten
+
+
+def test_neighbors_stay_in_one_split(tmp_path: Path):
+    path = write_humanact12(tmp_path / "raw", 480, y=[0] * 430 + [5] * 50)
+    clips = list(HumanAct12(str(path)).clips(20.0))
+    for start in range(0, 430, 10):
+        assert len({clip.split for clip in clips[start : start + 10]}) == 1
+    counts = Counter(clip.split for clip in clips[:430])
+    assert counts == {"train": 300, "val": 40, "test": 90}
+
+
+def test_the_published_use_tests_on_training_clips(tmp_path: Path):
+    write_humanact12(tmp_path / "raw")
+    data, _ = batch_of(HumanAct12(str(tmp_path / "raw"), published_split=True), tmp_path)
+    assert data.store.info["published_split"] is True
+    assert data.store.info["clips"] == {"train": 360, "val": 0, "test": 0}
+    assert [clip.id for clip in data.test.clips] == [clip.id for clip in data.train.clips]
+    assert len(data.val) == 0
+
+
+def golden_clips() -> list:
+    keys = [key.removeprefix("a2m/inp_") for key in golden("smpl147") if key.startswith("a2m/inp_")]
+    return [pytest.param(number, id=f"smpl147-{number}") for number in keys]
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize("number", golden_clips())
+def test_samples_are_those_of_actor(number: str, tmp_path: Path):
+    """The whole way: pickle, store, crop, sample."""
+    arrays = golden("smpl147")
+    pose, joints = arrays[f"a2m/pose72_{number}"], arrays[f"a2m/joints3d_{number}"]
+    label = int(arrays[f"a2m/label_{number}"])
+    write_humanact12(tmp_path / "raw", poses=[pose], joints3D=[joints], y=[label])
+    source = HumanAct12(str(tmp_path / "raw"), published_split=True)
+    expected = arrays[f"a2m/inp_{number}"].transpose(2, 0, 1).reshape(-1, 150)
+    crop = Fixed(frames=len(expected))
+    data = MotionDataModule(source, Rot6D(), root=str(tmp_path), name="x", batch_size=1, crop=crop)
+    data.prepare_data()
+    data.setup("fit")
+    low, high, drawn = (int(value) for value in arrays[f"a2m/shift_draw_{number}"])
+    starts = {int(data.train.frames(0, batch)[0]) for batch in range(400)}
+    assert starts == set(range(max(low, 0), max(high, 0) + 1))
+    wanted = next(batch for batch in range(400) if data.train.frames(0, batch)[0] == max(drawn, 0))
+    _, sample, _, action = data.train[0, wanted]
+    assert action == label
+    np.testing.assert_allclose(sample.numpy(), expected, atol=2e-6)
+
+
+@pytest.mark.parametrize(
+    ("columns", "message"),
+    [
+        ({"y": [0]}, r"humanact12poses\.pkl: as many of each are needed"),
+        ({"y": [12] * 24}, r"clip 0 has the label 12, not one of 0 to 11"),
+        ({"joints3D": [np.zeros((9, 18, 3))] * 24}, r"clip 0 has poses \(20, 72\) and joints \(9, 18, 3\)"),
+        ({"poses": [np.full((f, 72), np.nan) for _ in range(2) for f in range(20, 104, 7)]}, "clip humanact12_00"),
+    ],
+)
+def test_another_humanact12_file_is_named(columns: dict, message: str, tmp_path: Path):
+    clips = 24
+    found = [poses(20 + 7 * (k % 12), k) for k in range(clips)]
+    full = {"poses": [p for p, _ in found], "joints3D": [j for _, j in found], "y": [k % 12 for k in range(clips)]}
+    path = written(tmp_path / "humanact12poses.pkl", full | columns)
+    with pytest.raises(ValueError, match=message):
+        write_store(tmp_path / "store", HumanAct12(str(path)), Rot6D())
+    with pytest.raises(ValueError, match="it holds list"):
+        HumanAct12(str(written(path, [1]))).count()
+    with pytest.raises(FileNotFoundError, match=r"no humanact12poses\.pkl; the set is published with ACTOR"):
+        HumanAct12(str(tmp_path / "store")).count()
+
+
+def test_the_unconstrained_reference_is_read(tmp_path: Path):
+    data = np.random.default_rng(0).normal(size=(4, 18, 3, 60))
+    np.save(tmp_path / "x.npy", data)
+    found = read_unconstrained(tmp_path / "x.npy")
+    assert found.shape == (4, 60, 15, 3)
+    assert found.dtype == np.float32
+    np.testing.assert_allclose(found[2, 7, 14], data[2, 14, :, 7], atol=1e-6)
+    np.save(tmp_path / "x.npy", data[:, :14])
+    with pytest.raises(ValueError, match=r"x\.npy: shape \(4, 14, 3, 60\)"):
+        read_unconstrained(tmp_path / "x.npy")
+    (tmp_path / "x.npy").write_bytes(b"PK")
+    with pytest.raises(ValueError, match=r"x\.npy: not read as an array"):
+        read_unconstrained(tmp_path / "x.npy")
+
+
+# UESTC
+
+VIDEOS = [
+    *(f"a{k % 40}_d0_p{subject:03d}_c1_color.avi" for k, subject in enumerate([*TRAIN_SUBJECTS, 3, 4, 118])),
+    "a3_d5_p003_c2_color.avi",
+    "a3_d8_p003_c2_color.avi",
+    "a3_d8_p004_c1_color.avi",
+    "a4_d2_p001_c2_color.avi",
+    "a5_d1_p001_c1_color.avi",
+    "a5_d1_p005_c1_color.avi",
+]
+
+
+def write_uestc(folder: Path, **changed) -> Path:
+    """What ACTOR hands out: one pickle of three lists of float32 arrays, and text files beside it."""
+    (folder / "info").mkdir(parents=True)
+    lengths = [60 + 3 * k for k in range(len(VIDEOS) - 2)] + [70, 50]
+    rng = np.random.default_rng(0)
+    data = {
+        "pose": [0.5 * rng.normal(size=(n, 72)).astype(np.float32) for n in lengths],
+        "shape": [np.zeros((n, 10), np.float32) for n in lengths],
+        "joints3d": [rng.normal(size=(n, 49, 3)).astype(np.float32) for n in lengths],
+        "orig_cam": [rng.uniform(0.2, 0.9, size=(n, 4)).astype(np.float32) for n in lengths],
+    }
+    written(folder / "vibe_cache_refined.pkl", data | changed)
+    shown = [*lengths[:-2], 44, 44]
+    (folder / "info" / "names.txt").write_text("\n".join(VIDEOS) + "\n")
+    (folder / "info" / "num_frames_min.txt").write_text("\n".join(map(str, shown)) + "\n")
+    (folder / "info" / "action_classes.txt").write_text("".join(f"exercise-{k}\n" for k in range(40)))
+    return folder
+
+
+def test_uestc_from_raw_files_to_batch(tmp_path: Path):
+    source = UESTC(str(write_uestc(tmp_path / "uestc")))
+    data, batch = batch_of(source, tmp_path)
+    info = data.store.info
+    assert len(info["actions"]) == 40
+    assert info["excluded"] == {"videos of view 8, side 2": 1, "training clips that are too short": 1}
+    clips = {clip.id: clip for clip in data.store.clips}
+    assert len(clips) == len(VIDEOS) - 2
+    assert clips["a5_d1_p005_c1"].length == 44  # the test set is not filtered, but cut to the frames of the video
+    assert {"a3_d8_p003_c2", "a5_d1_p001_c1"}.isdisjoint(clips)
+    assert clips["a3_d8_p004_c1"].attributes == {"subject": 4, "view": 8, "side": 1}
+    assert all(clips[name].action == int(name[1:].split("_")[0]) for name in clips)
+    subjects = {s: {c.attributes["subject"] for c in clips.values() if c.split == s} for s in ("train", "val", "test")}
+    assert len(subjects["val"]) == 5
+    assert subjects["train"] | subjects["val"] == set(TRAIN_SUBJECTS)
+    assert not subjects["train"] & subjects["val"]
+    assert subjects["test"] == {3, 4, 5, 118}
+    assert batch.action is not None
+
+
+def test_uestc_as_published_trains_on_51_subjects(tmp_path: Path):
+    source = UESTC(str(write_uestc(tmp_path / "uestc")), published_split=True)
+    assert len(set(TRAIN_SUBJECTS)) == 51
+    assert Counter(source.split(subject) for subject in range(1, 119)) == {"train": 51, "test": 67}
+
+
+def test_front_view_is_actors_camera():
+    """Against the depth that reproduces the size of the picture, solved from the joints."""
+    rng = np.random.default_rng(1)
+    pose, joints, camera = rng.normal(size=(5, 72)), rng.normal(size=(5, 49, 3)), rng.uniform(0.2, 0.9, (5, 4))
+    place = []
+    for points, (scale, _, x, y) in zip(joints, camera, strict=True):
+        picture = (scale * (points[:, :2] + [x, y]) + 1) / 2 * 540
+        place.append([x, y, 500 * np.linalg.norm(np.ptp(points[:, :2], 0)) / np.linalg.norm(np.ptp(picture, 0))])
+    place = np.array(place) - place[0]
+    for view, side in ((5, 2), (5, 1)):
+        video = uestc.Video(0, "x", 0, view, 1, side)
+        motion = front_view(pose, joints[:, uestc.ROOT], camera, video)
+        turn = rotation.axis_angle_to_matrix(torch.tensor([0.0, -view * np.pi / 4 * (side != 1), 0.0]).double()).numpy()
+        np.testing.assert_allclose(motion[:, :3], (joints[:, uestc.ROOT] + place) @ turn.T, atol=1e-5)
+        turned = rotation.axis_angle_to_matrix(torch.from_numpy(motion[:, 3:6]).double()).numpy()
+        before = rotation.axis_angle_to_matrix(torch.from_numpy(pose[:, :3])).numpy()
+        np.testing.assert_allclose(turned, turn @ before, atol=1e-5)
+        np.testing.assert_allclose(motion[:, 6:], pose[:, 3:], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("file", "text", "message"),
+    [
+        ("names.txt", "a0_p001.avi\n", r"names\.txt, line 1: 'a0_p001\.avi' is not the name of a video"),
+        ("names.txt", "a40_d0_p001_c1_color.avi\n", r"names\.txt, line 1: .* one of the 40 actions"),
+        ("num_frames_min.txt", "3\n", r"num_frames_min\.txt 1 and vibe_cache_refined\.pkl 60 clips"),
+        ("names.txt", None, r"info/names\.txt: it belongs to the set"),
+    ],
+)
+def test_damaged_lists_are_named(file: str, text: str | None, message: str, tmp_path: Path):
+    folder = write_uestc(tmp_path / "uestc")
+    (folder / "info" / file).unlink()
+    if text is not None:
+        (folder / "info" / file).write_text(text)
+    with pytest.raises((ValueError, FileNotFoundError), match=message):
+        list(UESTC(str(folder)).clips(20.0))
+
+
+def test_other_shapes_are_named(tmp_path: Path):
+    folder = write_uestc(tmp_path / "uestc", orig_cam=[np.zeros((9, 3))] * len(VIDEOS))
+    with pytest.raises(
+        ValueError, match=r"a0_d0_p001_c1 has pose \(60, 72\), joints3d \(60, 49, 3\), orig_cam \(9, 3\)"
+    ):
+        list(UESTC(str(folder)).clips(20.0))
+
+
+def test_action_sets_are_not_resampled(tmp_path: Path):
+    write_humanact12(tmp_path / "raw")
+    with pytest.raises(ValueError, match=r"humanact12: .* representation\.fps=20"):
+        next(HumanAct12(str(tmp_path / "raw")).clips(30.0))
+    assert Rot6D().fps == humanact12.FPS

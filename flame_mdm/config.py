@@ -410,7 +410,7 @@ def run(
             print("parts: " + ", ".join(f"{group}=..." for group in groups()))
         return 0 if words else 2
     codes = [0]
-    return _guarded(lambda: _serve(command, words, name, codes)) or max(codes)
+    return guarded(lambda: _serve(command, words, name, codes)) or max(codes)
 
 
 def _serve(command: Callable[[Config], None], words: list[str], name: str | None, codes: list[int]) -> None:
@@ -434,7 +434,7 @@ def _serve(command: Callable[[Config], None], words: list[str], name: str | None
         if sweep:
             plain["run"]["dir"] = HydraConfig.get().runtime.output_dir
             check(plain)
-        codes.append(_guarded(lambda: command(plain)))
+        codes.append(guarded(lambda: command(plain)))
 
     quiet = ["hydra/job_logging=disabled", "hydra/hydra_logging=disabled", "hydra.output_subdir=null"]
     output = [
@@ -470,7 +470,7 @@ def _quoted(word: str, keys: Sequence[str]) -> str:
     return f"{key}='{escaped}'"
 
 
-def _guarded(action: Callable[[], None]) -> int:
+def guarded(action: Callable[[], None]) -> int:
     """Runs `action`; what a user can mend becomes one line and exit code 1, a traceback with FLAME_MDM_TRACEBACK=1."""
     try:
         action()

@@ -41,11 +41,12 @@ def write_edits(config: Config) -> None:
 
     import torch
 
+    from flame_mdm.checkpoints import find
     from flame_mdm.editing import edit, read_motion
     from flame_mdm.generation import file_sha256, write_motions
     from flame_mdm.task import load
 
-    file = config["ckpt"]
+    file = find(config["ckpt"])
     model = load(file, config["device"] or ("cuda" if torch.cuda.is_available() else "cpu"))
     original = read_motion(
         model.representation, str(config["motion"]), cut=config["cut"], data_root=config["data_root"]

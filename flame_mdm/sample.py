@@ -34,11 +34,13 @@ def sample(config: Config) -> None:
 
     import torch
 
+    from flame_mdm.checkpoints import find
     from flame_mdm.generation import file_sha256, generate, write_motions
     from flame_mdm.task import load
 
     device = config["device"] or ("cuda" if torch.cuda.is_available() else "cpu")
-    model = load(config["ckpt"], device)
+    file = find(config["ckpt"])
+    model = load(file, device)
     motions = generate(
         model,
         None if config["text"] is None else str(config["text"]),
@@ -52,7 +54,7 @@ def sample(config: Config) -> None:
     )
     name = re.sub(r"[^a-z0-9]+", "-", (motions[0].caption or "unconditioned").lower()).strip("-")[:60]
     folder = Path(config["out"] or Path("samples") / str(model.config["experiment"]) / f"{name}-seed{config['seed']}")
-    write_motions(folder, model, motions, {"seed": config["seed"], "checkpoint": file_sha256(config["ckpt"])})
+    write_motions(folder, model, motions, {"seed": config["seed"], "checkpoint": file_sha256(file)})
     print(
         f"{len(motions)} motions of {len(motions[0].joints)} frames: {folder / 'player.html'}, {folder / 'motions.gif'}"
     )

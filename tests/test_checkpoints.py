@@ -7,9 +7,9 @@ import torch
 from fixtures import GOLDEN, Arrays, golden, meta
 from hydra.utils import instantiate
 
-from flame_mdm.checkpoints import Released, import_flame, import_mdm, released_state
 from flame_mdm.denoisers import Denoiser
 from flame_mdm.motion import Condition
+from flame_mdm.released import Released, import_flame, import_mdm, released_state
 
 MDM = [
     "mdm_trans_enc",

@@ -105,7 +105,7 @@ class Babel(MotionSource):
         windows: defaultdict[str, list[Window]] = defaultdict(list)
         for window in self.windows():
             windows[window.motion].append(window)
-        for key, motion in self.amass.each(windows, _motion, self.workers):
+        for key, motion in self.amass.each(dict.fromkeys(windows), _motion, self.workers):
             for window in windows[key]:
                 yield Clip(
                     window.id,
@@ -126,7 +126,7 @@ class Babel(MotionSource):
         if self._windows is None:
             self._excluded = Counter()
             labels = {part: self.labels(part) for part in PARTS}
-            keys = {label.motion for part in PARTS for label in labels[part]}
+            keys = dict.fromkeys(label.motion for part in PARTS for label in labels[part])
             measured = self.amass.each(keys, _measure, self.workers)
             lengths = dict(tqdm(measured, "measuring the motions of AMASS", len(keys), unit=" motions"))
             self._windows = []
@@ -217,11 +217,11 @@ class Babel(MotionSource):
         return key
 
 
-def _measure(key: str, recording: Recording) -> int:
+def _measure(_: None, recording: Recording) -> int:
     return len(recording.every(FPS).translation)
 
 
-def _motion(key: str, recording: Recording) -> np.ndarray:
+def _motion(_: None, recording: Recording) -> np.ndarray:
     """(F, 75): translation and the 24 joints that FLAME takes."""
     kept = recording.every(FPS)
     return np.concatenate([kept.translation, kept.poses[:, :72]], 1).astype(np.float32)

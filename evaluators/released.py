@@ -30,7 +30,10 @@ def read_weights(path: str | Path, key: str | None = None) -> dict[str, Tensor]:
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
     except (pickle.UnpicklingError, RuntimeError, EOFError, ValueError) as error:
-        raise ValueError(f"{path}: damaged, or not a file of weights: download it again") from error
+        raise ValueError(
+            f"{path}: damaged, or it holds objects beside plain weights, which are not read: download it again, or "
+            "save its state dict alone"
+        ) from error
     state = content.get(key) if key is not None and isinstance(content, Mapping) else content
     if not isinstance(state, Mapping) or not all(isinstance(value, Tensor) for value in state.values()):
         found = ", ".join(sorted(map(str, content))[:8]) if isinstance(content, Mapping) else type(content).__name__

@@ -1,0 +1,266 @@
+"""Motion-CLIP: the authors' numbers, the contrast over several processes, and training by recipe."""
+
+import math
+
+import pytest
+import torch
+from distributed import GlooPool
+from fixtures import Arrays, golden, meta
+from torch.nn import functional
+
+from evaluators.motion_clip import (
+    MotionCLIP,
+    MotionCLIPTask,
+    PooledLoss,
+    import_mclip,
+    info_nce,
+    load_mclip,
+)
+from flame_mdm import train
+from flame_mdm.conditions.text import PretrainedText
+from flame_mdm.config import UserError
+from flame_mdm.motion import length_mask
+from flame_mdm.noise import key
+from flame_mdm.representations.smpl import SMPL
+from flame_mdm.task import load, load_task, read_checkpoint
+
+SMALL = {"latent_dim": 16, "ff_size": 24, "num_layers": 2, "num_heads": 4, "embedding_dim": 8, "max_frames": 20}
+
+
+def network(in_features: int = 7, **options) -> MotionCLIP:
+    torch.manual_seed(0)
+    return MotionCLIP(in_features, 10, dropout=0.0, **SMALL, **options).eval()
+
+
+def weights(arrays: Arrays) -> dict[str, torch.Tensor]:
+    return {name.removeprefix("state/"): torch.from_numpy(v) for name, v in arrays.items() if name.startswith("state/")}
+
+
+OUTPUTS = ["motion_feat", "motion_feat_shifted_translation", "text_feat", "motion_feat_l2_norm", "text_feat_l2_norm"]
+OUTPUTS += ["logits_per_motion", "logits_per_text", "loss"]
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize("name", [pytest.param(name, id=f"flame_mclip-{name}") for name in OUTPUTS])
+def test_released_weights_give_the_authors_outputs(name):
+    arrays = golden("flame_mclip")
+    options = meta(arrays)
+    clip = import_mclip(weights(arrays), num_heads=options["config"]["heads"])
+    x = torch.from_numpy(arrays["in/motion"]).transpose(1, 2)
+    mask = length_mask(torch.from_numpy(arrays["in/motion_length"]), x.shape[1])
+    with torch.no_grad():
+        motion, text = clip(x, mask), clip.text(torch.from_numpy(arrays["lm/pooler_output"]))
+        shifted = clip(x + torch.arange(x.shape[2]).lt(3) * 5.0, mask)
+        logits = clip.logit_scale.exp() * functional.normalize(motion, dim=1) @ functional.normalize(text, dim=1).T
+        ours = {
+            "motion_feat": motion,
+            "motion_feat_shifted_translation": shifted,
+            "text_feat": text,
+            "motion_feat_l2_norm": functional.normalize(motion, dim=1),
+            "text_feat_l2_norm": functional.normalize(text, dim=1),
+            "logits_per_motion": logits,
+            "logits_per_text": logits.T,
+            "loss": info_nce(motion, text, clip.logit_scale),
+        }[name]
+    tolerance = 10 * options["max_abs_diff_f32_vs_f64"][f"out/{name}"][0]
+    torch.testing.assert_close(ours, torch.from_numpy(arrays[f"out/{name}"]), atol=tolerance, rtol=0)
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize("stem", ["flame_mclip"])
+def test_the_temperature_starts_where_the_authors_start_it(stem):
+    assert network().logit_scale.item() == pytest.approx(float(golden(stem)["state_init/logit_scale"]), abs=1e-6)
+    assert network().logit_scale.item() == pytest.approx(math.log(1 / 0.07))
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize("stem", ["flame_mclip"])
+def test_the_import_takes_every_weight_exactly_once(stem):
+    state = weights(golden(stem))
+    import_mclip({**state, "text_model.encoder.weight": torch.zeros(1)})
+    for name in ("motion_encoder.CLS_TOKEN", "lm_projection.bias", "motion_encoder.motion_encoder.layers.1.norm2.bias"):
+        with pytest.raises(ValueError, match="released"):
+            import_mclip({k: v for k, v in state.items() if k != name})
+    with pytest.raises(ValueError, match="unknown extra"):
+        import_mclip({**state, "extra": torch.zeros(1)})
+
+
+def test_a_released_file_brings_the_pooler_it_was_trained_with(tmp_path):
+    condition = PretrainedText("FacebookAI/roberta-base", features=12, max_tokens=20, pooling="pooler")
+    released = {
+        "net.motion_encoder.CLS_TOKEN": torch.randn(1, 1, 16),
+        "net.motion_encoder.motion_length_emb.weight": torch.randn(20, 16),
+        "net.motion_encoder.input_projection.weight": torch.randn(16, 147),
+        "net.motion_encoder.input_projection.bias": torch.randn(16),
+        "net.motion_encoder.last_projection.weight": torch.randn(8, 16),
+        "net.motion_encoder.last_projection.bias": torch.randn(8),
+        "net.lm_projection.weight": torch.randn(8, 12),
+        "net.lm_projection.bias": torch.randn(8),
+        "net.logit_scale": torch.tensor(3.0),
+        "net.text_model.pooler.dense.weight": torch.randn(12, 12),
+        "net.text_model.pooler.dense.bias": torch.randn(12),
+        "net.text_model.embeddings.word_embeddings.weight": torch.randn(5, 12),
+    }
+    layer = torch.nn.TransformerEncoderLayer(16, 8, 24).state_dict()
+    released |= {f"net.motion_encoder.motion_encoder.layers.0.{name}": value for name, value in layer.items()}
+    torch.save({"state_dict": released, "epoch": 3}, tmp_path / "mclip.ckpt")
+    extractor = load_mclip(tmp_path / "mclip.ckpt", condition, SMPL(fps=20))
+    assert torch.equal(condition.pooler_weight, released["net.text_model.pooler.dense.weight"])
+    assert torch.equal(condition.pooler_bias, released["net.text_model.pooler.dense.bias"])
+    x, mask = torch.randn(2, 9, 147), length_mask(torch.tensor([9, 4]))
+    assert extractor(x, mask).shape == (2, extractor.features)
+    assert not extractor.training
+
+    del released["net.text_model.pooler.dense.bias"]
+    torch.save({"state_dict": released}, tmp_path / "mclip.ckpt")
+    with pytest.raises(ValueError, match=r"mclip\.ckpt: not the weights of PretrainedText: .*pooler_bias"):
+        load_mclip(tmp_path / "mclip.ckpt", condition, SMPL(fps=20))
+
+
+@pytest.mark.parametrize("features", [263, 251, 147, 64])
+def test_padding_and_company_do_not_change_features(features):
+    clip = network(features)
+    x = torch.randn(3, 20, features)
+    lengths = torch.tensor([20, 13, 1])
+    together = clip(x, length_mask(lengths))
+    for row, length in enumerate(lengths.tolist()):
+        alone = clip(x[row : row + 1, :length], torch.ones(1, length, dtype=torch.bool))
+        torch.testing.assert_close(alone[0], together[row], atol=1e-5, rtol=1e-5)
+
+
+def test_blind_features_are_not_seen_and_others_are():
+    x, mask = torch.randn(2, 6, 7), torch.ones(2, 6, dtype=torch.bool)
+    moved = x + torch.tensor([5.0, -2, 1, 0, 0, 0, 0])
+    assert torch.equal(network(blind_features=3)(x, mask), network(blind_features=3)(moved, mask))
+    assert not torch.allclose(network()(x, mask), network()(moved, mask), atol=1e-2)
+    fourth = x + torch.tensor([0.0, 0, 0, 5, 0, 0, 0])
+    assert not torch.allclose(network(blind_features=3)(x, mask), network(blind_features=3)(fourth, mask), atol=1e-2)
+
+
+def test_a_motion_may_be_as_long_as_the_table_and_no_longer():
+    clip = network()
+    clip(torch.zeros(1, 25, 7), length_mask(torch.tensor([20]), 25))
+    with pytest.raises(ValueError, match=r"21 frames is longer than motion-CLIP was built for \(20\)"):
+        clip(torch.zeros(1, 21, 7), length_mask(torch.tensor([21])))
+
+
+# Contrast -------------------------------------------------------------------------------------------------------------
+
+
+def pairs() -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Motions, lengths and text vectors of six pairs."""
+    generator = torch.Generator().manual_seed(3)
+    motions, texts = torch.randn(6, 9, 7, generator=generator), torch.randn(6, 10, generator=generator)
+    return motions, torch.tensor([9, 4, 7, 9, 2, 6]), texts
+
+
+def loss_and_gradients(first: int, last: int) -> tuple[float, dict[str, torch.Tensor]]:
+    """Of the pairs first to last, with those of the other processes as negatives."""
+    clip, (x, lengths, texts) = network(), pairs()
+    x, lengths, texts = x[first:last], lengths[first:last], texts[first:last]
+    loss = info_nce(clip(x, length_mask(lengths, 9)), clip.text(texts), clip.logit_scale)
+    loss.backward()
+    gradients = {name: p.grad for name, p in clip.named_parameters() if p.grad is not None}
+    assert gradients.keys() == dict(clip.named_parameters()).keys()
+    return loss.item(), gradients
+
+
+def test_two_processes_learn_what_one_learns_from_all_pairs():
+    loss, gradients = loss_and_gradients(0, 6)
+    with GlooPool(2) as pool:
+        (loss_a, a), (loss_b, b) = pool.run(loss_and_gradients, (0, 3), (3, 6))
+    assert (loss_a + loss_b) / 2 == pytest.approx(loss, abs=1e-6)
+    for name, gradient in gradients.items():
+        torch.testing.assert_close((a[name] + b[name]) / 2, gradient, atol=1e-6, rtol=1e-4, msg=name)
+    alone, _ = loss_and_gradients(0, 3)
+    assert abs(alone - loss_a) > 0.1  # without the others' negatives the loss is another one
+
+
+def test_the_loss_is_low_for_pairs_and_high_for_exchanged_ones():
+    motion, scale = torch.eye(4), torch.tensor(math.log(1 / 0.07))
+    assert info_nce(motion, 3 * motion, scale) < 1e-5
+    assert info_nce(motion, motion.roll(1, 0), scale) > 10
+    assert info_nce(torch.ones(4, 4), motion, scale) == pytest.approx(math.log(4), abs=1e-5)
+
+
+def test_the_validation_loss_does_not_depend_on_batches_or_order():
+    torch.manual_seed(0)
+    motion, text, keys = 5 * torch.randn(70, 8), torch.randn(70, 8), torch.arange(70)
+    values = set()
+    for order, size in ((torch.arange(70), 70), (torch.randperm(70), 7), (torch.randperm(70), 32)):
+        metric = PooledLoss()
+        for part in order.split(size):
+            metric.update(motion[part], text[part], keys[part])
+        values.add(metric.compute())
+    assert len(values) == 1
+    terms = []
+    for pool, new in ((slice(0, 32), 32), (slice(32, 64), 32), (slice(38, 70), 6)):
+        logits, own = (motion[pool] @ text[pool].T).double(), torch.arange(32)
+        ways = [functional.cross_entropy(table, own, reduction="none")[-new:] for table in (logits, logits.T)]
+        terms.append((ways[0] + ways[1]) / 2)
+    assert values.pop() == pytest.approx(torch.cat(terms).mean().item(), rel=1e-6)
+    assert PooledLoss().compute() is None
+
+
+# Training -------------------------------------------------------------------------------------------------------------
+
+RUN = ["data.source.clips=1100", "data.batch_size=32", "condition=learned", "condition.features=32", "logger=csv"]
+RUN += ["trainer.accelerator=cpu", "trainer.enable_progress_bar=false", "trainer.log_every_n_steps=5"]
+RUN += [f"task.network.{size}" for size in ("latent_dim=32", "ff_size=32", "num_layers=1", "embedding_dim=16")]
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory, data_root):
+    """Checkpoint of a tiny motion-CLIP after 60 steps."""
+    folder = tmp_path_factory.mktemp("motion_clip")
+    options = [f"data_root={data_root}/clip", f"run.dir={folder}", "trainer.max_steps=60"]
+    options += ["trainer.val_check_interval=30", "optimizer.lr=0.003"]
+    assert train.main(["motion_clip/synthetic", *RUN, *options]) == 0
+    return folder / "checkpoints" / "last.ckpt"
+
+
+def test_training_by_recipe_learns_to_retrieve(trained):
+    lines = [line.split(",") for line in (trained.parent.parent / "csv" / "metrics.csv").read_text().splitlines()]
+    rows = [dict(zip(lines[0], line, strict=True)) for line in lines[1:]]
+    last = [row for row in rows if row["val/loss"]][-1]
+    assert float(last["val/loss"]) < 0.8 * math.log(32)
+    for way in ("texts_for_motion", "motions_for_text"):
+        tops = [float(last[f"val/{way}_top{k}"]) for k in (1, 2, 3)]
+        assert tops == sorted(tops)
+        assert tops[0] > 3 / 32, way  # by chance: 1 / 32
+    assert float(rows[0]["train/temperature"]) == pytest.approx(0.07, rel=0.1)
+
+
+def test_a_checkpoint_is_a_feature_extractor(trained):
+    extractor = load_task(trained, MotionCLIPTask)
+    torch.manual_seed(0)
+    x = torch.randn(2, 30, extractor.representation.features)
+    mask = length_mask(torch.tensor([30, 24]))
+    features = extractor(extractor.representation.denormalize(x), mask)
+    assert features.shape == (2, extractor.features)
+    torch.testing.assert_close(features, extractor.network(x, mask), atol=1e-4, rtol=1e-4)
+    texts = extractor.text(["a person walks forward", "a person waves with the left hand", "a person walks forward"])
+    assert texts.shape == (3, extractor.features)
+    assert torch.equal(texts[0], texts[2])
+    assert not torch.allclose(texts[0], texts[1], atol=1e-3)
+    facts = read_checkpoint(trained)["facts"]
+    assert facts["dataset"] == "synthetic"
+    assert facts["fingerprint"]
+
+
+def test_a_feature_extractor_is_not_sampled_from(trained):
+    with pytest.raises(UserError, match=r"last\.ckpt: holds a MotionCLIPTask, not a MotionGeneration"):
+        load(trained)
+
+
+def test_few_captions_train_without_retrieval(tmp_path, capsys):
+    options = ["data.source.clips=60", "data.batch_size=8", f"data_root={tmp_path}/data", f"run.dir={tmp_path}/run"]
+    steps = ["trainer.max_steps=2", "trainer.val_check_interval=2"]
+    assert train.main(["motion_clip/synthetic", *RUN, *options, *steps]) == 0, capsys.readouterr().err
+    header = (tmp_path / "run" / "csv" / "metrics.csv").read_text().splitlines()[0]
+    assert "val/loss" in header
+    assert "top1" not in header
+
+
+def test_keys_of_motions_and_captions_are_unlike():
+    assert key("motion", "a") != key("caption", "a")

@@ -6,7 +6,6 @@ come in the order of the input.
 
 from __future__ import annotations
 
-import pickle
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,14 +16,14 @@ from torch import Tensor, nn
 from torch.nn.utils.rnn import pack_padded_sequence
 
 from evaluators.released import load_strictly, read_weights
+from flame_mdm.data import restricted_pickle
+from flame_mdm.data.t2m import MAX_TOKENS, frame_tokens
 from flame_mdm.motion import pad_to
 
 UNIT = 4
 """Frames that the movement encoder makes one vector of."""
 CONTACTS = 4
 """Features at the end of each frame that the evaluator does not see."""
-MAX_WORDS = 20
-SLOTS = MAX_WORDS + 2
 PARTS_OF_SPEECH = (
     *("VERB", "NOUN", "DET", "ADP", "NUM", "AUX", "PRON", "ADJ", "ADV"),
     *("Loc_VIP", "Body_VIP", "Obj_VIP", "Act_VIP", "Desc_VIP", "OTHER"),
@@ -70,8 +69,7 @@ class WordVectors:
                 raise FileNotFoundError(
                     f"{folder / name}: no such file; give the folder of the GloVe vectors that the authors released"
                 )
-        with (folder / "our_vab_idx.pkl").open("rb") as file:
-            rows = _load_plain(file, folder / "our_vab_idx.pkl")
+        rows = restricted_pickle.read(folder / "our_vab_idx.pkl")
         vectors = np.load(folder / "our_vab_data.npy", allow_pickle=False).astype(np.float32)
         if not isinstance(rows, dict) or vectors.ndim != 2 or not {"sos", "eos", "unk"} <= rows.keys():
             raise ValueError(f"{folder}: not the released GloVe vectors: they need sos, eos, unk, one row a word")
@@ -89,19 +87,19 @@ class WordVectors:
                 slots, which lowers R-precision.
         """
         index = {part: number for number, part in enumerate(PARTS_OF_SPEECH)}
-        rows = torch.full((len(captions), SLOTS), self.rows["unk"])
-        parts = torch.zeros(len(captions), SLOTS, len(PARTS_OF_SPEECH))
-        numbers = torch.full((len(captions), SLOTS), index["OTHER"])
-        lengths = torch.full((len(captions),), SLOTS)
+        rows = torch.full((len(captions), MAX_TOKENS + 2), self.rows["unk"])
+        parts = torch.zeros(len(captions), MAX_TOKENS + 2, len(PARTS_OF_SPEECH))
+        numbers = torch.full((len(captions), MAX_TOKENS + 2), index["OTHER"])
+        lengths = torch.full((len(captions),), MAX_TOKENS + 2)
         for i, caption in enumerate(captions):
-            tokens = ["sos/OTHER", *caption[:MAX_WORDS], "eos/OTHER"]
+            tokens, filled = frame_tokens(caption)
             for j, token in enumerate(tokens):
                 word, _, part = token.rpartition("/")
                 if word in self.rows:
                     rows[i, j] = self.rows[word]
                     numbers[i, j] = index.get(SPECIAL.get(word, part), index["OTHER"])
             if not full_length:
-                lengths[i] = len(tokens)
+                lengths[i] = filled
         return Words(self.vectors[rows], parts.scatter_(2, numbers[..., None], 1), lengths)
 
 
@@ -250,17 +248,3 @@ def load_t2m(path: str | Path, mean: str | Path, std: str | Path, **options: Any
     for name in ("movement_encoder", "text_encoder", "motion_encoder"):
         load_strictly(network.get_submodule(name), read_weights(path, name), path)
     return network.eval()
-
-
-class _Plain(pickle.Unpickler):
-    """Reads numbers, texts, lists and mappings; whatever names code is refused."""
-
-    def find_class(self, module: str, name: str) -> Any:
-        raise pickle.UnpicklingError(f"it names {module}.{name}")
-
-
-def _load_plain(file: Any, path: Path) -> Any:
-    try:
-        return _Plain(file).load()
-    except (pickle.UnpicklingError, EOFError, ValueError, AttributeError) as error:
-        raise ValueError(f"{path}: damaged, or not a plain index of words: {error}") from error

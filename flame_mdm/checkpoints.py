@@ -62,17 +62,17 @@ def find(source: str | Path) -> Path:
             raise UserError(f"{path}: this folder holds {there}; name the file of the model")
         return files[0]
     match = re.fullmatch(r"([\w.-]+/[\w.-]+)(?:@([\w./-]+))?", str(source))
-    if match is None or path.suffix in (".ckpt", ".safetensors", ".pt"):
+    if match is None or path.suffix in (".ckpt", ".safetensors", ".pt") or path.parent.is_dir():
         raise FileNotFoundError(f"{path}: no such checkpoint")
-    from huggingface_hub import hf_hub_download
+    from huggingface_hub import hf_hub_download, logging
 
+    logging.set_verbosity_error()  # else it reports every attempt to reach the hub
     try:
         return Path(hf_hub_download(match[1], FILE, revision=match[2]))
     except Exception as error:  # the client raises many kinds: no network, no such repository, no permission ...
-        why = str(error).strip().splitlines()
         raise UserError(
             f"{source}: no such file or folder, nor can {FILE} of a model of that name be fetched from the hub: "
-            f"{why[0] if why else type(error).__name__}"
+            f"{_first_line(error)}"
         ) from error
 
 
@@ -120,17 +120,21 @@ def write(
         facts: what sampling and evaluation have to know of its data.
         origin: where the weights come from; plain values.
     """
-    from safetensors.torch import save_file
+    from safetensors.torch import save
 
     tensors = {name: value.detach().cpu().clone().contiguous() for name, value in state.items()}
     content = {"format": FORMAT, "sha256": _sha256(tensors), "config": config, "facts": facts, "origin": origin}
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:
-        save_file(tensors, partial, metadata={"format": "pt", KEY: json.dumps(content)})
+        partial.write_bytes(save(tensors, {"format": "pt", KEY: json.dumps(content)}))
         partial.replace(path)
     finally:
         partial.unlink(missing_ok=True)
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).strip().splitlines() or [type(error).__name__])[0]
 
 
 def _sha256(state: Mapping[str, Tensor]) -> str:
@@ -167,8 +171,26 @@ def export(source: str | Path, out: str | Path) -> Path:
         "averaged": "current_model_state" in checkpoint,
     }
     out = out if out.suffix == ".safetensors" else out / FILE
-    write(out, checkpoint["state_dict"], config=checkpoint["config"], facts=checkpoint["facts"], origin=origin)
+    config = _without_own_paths(checkpoint["config"])
+    write(out, checkpoint["state_dict"], config=config, facts=checkpoint["facts"], origin=origin)
     return out
+
+
+def _without_own_paths(config: Mapping[str, Any]) -> dict[str, Any]:
+    """The recipe with the folders of data and of the run where they are by default, not where this machine has them."""
+    default = {
+        config.get("data_root"): "data",
+        config.get("run", {}).get("dir"): f"runs/{config['experiment']}/default",
+    }
+    own = {folder: other for folder, other in default.items() if folder and Path(folder).is_absolute()}
+
+    def moved(node: Any) -> Any:
+        if isinstance(node, dict):
+            return {name: moved(value) for name, value in node.items()}
+        folder = next((f for f in own if isinstance(node, str) and (node == f or node.startswith(f"{f}/"))), None)
+        return node if folder is None else own[folder] + node.removeprefix(folder)
+
+    return moved(dict(config))
 
 
 def import_released(
@@ -225,26 +247,22 @@ def import_released(
 
 
 def _unpickle(path: Path, run_code: bool) -> Any:
-    import pickle
-
     import torch
 
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file")
     try:
         checkpoint = torch.load(path, map_location="cpu", weights_only=not run_code)
-    except pickle.UnpicklingError as error:
-        unsafe = re.search(r"GLOBAL (\S+)", str(error))
+    except ImportError as error:
+        raise UserError(f"{path}: {error}; the objects in this file need it: install it") from error
+    except Exception as error:  # torch raises many kinds for damaged files
+        unsafe = re.search(r"Unsupported global: GLOBAL (\S+)", str(error))
         if unsafe is None:
             raise UserError(f"{path}: damaged, or not a PyTorch file") from error
         raise UserError(
             f"{path}: holds Python objects ({unsafe[1]}) beside the weights, as old Lightning files do; reading them "
             "runs whatever code they name: add --run-code-in-file if you trust those who made the file"
         ) from error
-    except ImportError as error:
-        raise UserError(f"{path}: {error}; the objects in this file need it: install it") from error
-    except (RuntimeError, EOFError, ValueError, AttributeError) as error:
-        raise UserError(f"{path}: damaged, or not a PyTorch file") from error
     if not isinstance(checkpoint, Mapping):
         raise UserError(f"{path}: holds a {type(checkpoint).__name__}, not the weights of a released model")
     return checkpoint
@@ -313,10 +331,7 @@ def push(
                 repo_id=repository, folder_path=file.parent, allow_patterns=[FILE, "config.yaml", "README.md"]
             )
         except Exception as error:  # the client raises many kinds: no network, no token, no permission ...
-            why = str(error).strip().splitlines()
-            raise UserError(
-                f"{repository}: {file.parent} is written but not uploaded: {why[0] if why else type(error).__name__}"
-            ) from error
+            raise UserError(f"{repository}: {file.parent} is written but not uploaded: {_first_line(error)}") from error
     return file.parent
 
 
@@ -329,6 +344,9 @@ def card(model: Mapping[str, Any], repository: str) -> str:
         for name in ("denoiser", "process", "condition", "representation")
         if name in config
     }
+    request = {"ActionLabels": f"actions={facts['actions'][:1]}", "Unconditional": ""}.get(
+        parts.get("condition", ""), '"a person walks forward"'
+    )
     weights = sum(value.numel() for value in model["state_dict"].values())
     rows = [
         ("experiment", config["experiment"]),
@@ -353,7 +371,7 @@ A model of human motion. It generates joints in metres, y up:
 
     import flame_mdm
     model = flame_mdm.load("{repository}")
-    motion = flame_mdm.generate(model, {'actions=["..."]' if facts["actions"] else '"..."'}, seconds=3, seed=0)[0]
+    motion = flame_mdm.generate(model, {request + ", " if request else ""}seconds=3, seed=0)[0]
 
 | | |
 |---|---|

@@ -241,10 +241,15 @@ def _listed(keys: Any) -> str:
 
 Kind = Literal["mdm", "mfm", "flame"]
 
-REPRESENTATIONS = {"humanml": "humanml_legacy", "kit": "kit_legacy", "humanact12": "rot6d", "uestc": "rot6d"}
-"""Of the authors' data sets, for MDM and MFM."""
+DATASETS = {
+    "humanml": ("humanml3d", "humanml_legacy"),
+    "kit": ("kit", "kit_legacy"),
+    "humanact12": ("humanact12", "rot6d"),
+    "uestc": ("uestc", "rot6d"),
+}
+"""Data sets of MDM and MFM by the authors' names: ours, and the representation."""
 
-NORMALIZED = ("humanml", "kit")
+NORMALIZED = ("humanml3d", "kit")
 PADDED_FRAMES = 196
 ACTION_FRAMES = 60
 ENCODERS = {"clip": "clip", "bert": "distilbert"}
@@ -276,6 +281,8 @@ def import_model(
         ValueError: the file is not such a model, `args` names what is not supported, or the statistics do not fit.
     """
     state = released_state(checkpoint, ema=averaged)
+    if args.get("dynamic", "flow") != "flow":
+        raise ValueError(f"dynamic={args['dynamic']}: of MFM's models, only the flows can be imported")
     if kind == "flame":
         released = import_flame(state, num_heads=num_heads or 8)
         config, facts = _flame_recipe(released)
@@ -348,13 +355,14 @@ def _flame_recipe(released: Released) -> tuple[Config, dict[str, Any]]:
     config["optimizer"] |= {"weight_decay": 0.0}
     # The authors' table has one row more than there are lengths.
     longest = released.config["max_frames"] - 1
-    return config, {"actions": [], "dataset": "humanml3d_smpl", "fingerprint": None, "max_frames": longest}
+    return config, {"actions": [], "dataset": "humanml3d-smpl", "fingerprint": None, "max_frames": longest}
 
 
 def _mdm_recipe(kind: Kind, released: Released, args: Mapping[str, Any]) -> tuple[Config, dict[str, Any]]:
-    dataset = args.get("dataset", "humanml")
-    if dataset not in REPRESENTATIONS:
-        raise ValueError(f"dataset={dataset} of the released model: known are {', '.join(REPRESENTATIONS)}")
+    theirs = args.get("dataset", "humanml")
+    if theirs not in DATASETS:
+        raise ValueError(f"dataset={theirs} of the released model: known are {', '.join(DATASETS)}")
+    dataset, representation = DATASETS[theirs]
     actions: list[str] = []
     condition: Config = option("condition", "none")
     if released.action_embedding is not None:
@@ -368,11 +376,10 @@ def _mdm_recipe(kind: Kind, released: Released, args: Mapping[str, Any]) -> tupl
             raise ValueError(f"text_encoder_type={encoder} of the released model: known are {', '.join(ENCODERS)}")
         condition = option("condition", ENCODERS[encoder]) | {"features": released.features[2]}
     drop = float(args.get("cond_mask_prob", 0.1))
-    flow = kind == "mfm" and args.get("dynamic", "flow") == "flow"
-    process = option("process", "flow_matching" if flow else "diffusion")
-    config = _recipe(f"released/{kind}", released, REPRESENTATIONS[dataset], condition, process)
+    process = option("process", "flow_matching" if kind == "mfm" else "diffusion")
+    config = _recipe(f"released/{kind}", released, representation, condition, process)
     config["task"] |= {"cond_drop_prob": drop, "guidance_scale": 2.5 if drop else 1.0}
-    if flow:
+    if kind == "mfm":
         solver = args.get("ode_kwargs") or {}
         method = solver.get("method", "euler")
         # Methods beside dopri5 are Euler's; the plain one takes torchdiffeq's float32 times, the others i / N.

@@ -1,15 +1,24 @@
-"""Released weights in our networks give the authors' outputs."""
+"""Released weights give the authors' outputs through import, file and load; model files are whole or refused."""
 
+import argparse
+import copy
 import json
+import tempfile
+from functools import cache
+from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from fixtures import GOLDEN, Arrays, golden, meta
-from hydra.utils import instantiate
+from safetensors.torch import load_file, save_file
 
-from flame_mdm.denoisers import Denoiser
-from flame_mdm.motion import Condition
-from flame_mdm.released import Released, import_flame, import_mdm, released_state
+from flame_mdm import checkpoints
+from flame_mdm.config import UserError, compose, instantiate
+from flame_mdm.generation import generate
+from flame_mdm.motion import Condition, MotionBatch
+from flame_mdm.released import import_flame, import_mdm, released_state
+from flame_mdm.task import MotionGeneration, load
 
 MDM = [
     "mdm_trans_enc",
@@ -22,33 +31,72 @@ MDM = [
     "mfm",
 ]
 DTYPES = [torch.float32, torch.float64]
+NORMALIZED = ("humanml", "kit")
 
 
 def weights(arrays: Arrays) -> dict[str, torch.Tensor]:
     return {key.removeprefix("state/"): torch.from_numpy(v) for key, v in arrays.items() if key.startswith("state/")}
 
 
-def build(released: Released, dtype: torch.dtype) -> Denoiser:
-    denoiser = instantiate(released.config, *released.features)
-    denoiser.load_state_dict(released.state)
-    return denoiser.to(dtype).eval()
+def statistics_folder(folder: Path, features: int) -> Path:
+    generator = np.random.default_rng(0)
+    np.save(folder / "Mean.npy", generator.normal(size=features))
+    np.save(folder / "Std.npy", generator.uniform(0.5, 2, features))
+    return folder
 
 
-def import_case(arrays: Arrays, case: str) -> Released:
-    """The fixture's network with the flags of `case`: `cond`, `cond_maskframes`, `legacy_cond` ..."""
+@cache
+def imported(stem: str, mask_frames: bool, time_token: bool) -> MotionGeneration:
+    """The fixture's network as a released file, imported by the command, and loaded."""
+    arrays = golden(stem)
     config = meta(arrays)["config"]
-    args = {key: config[key] for key in ("arch", "emb_trans_dec", "text_encoder_type") if key in config}
-    args["mask_frames"] = case.endswith("_maskframes")
-    heads = config.get("num_heads", config.get("heads"))
-    return import_mdm(weights(arrays), args, num_heads=heads, time_token="legacy" not in case)
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        torch.save(weights(arrays), folder / "model.pt")
+        keys = ("arch", "emb_trans_dec", "text_encoder_type", "dataset", "cond_mask_prob")
+        args = {key: config[key] for key in keys if key in config}
+        (folder / "args.json").write_text(json.dumps(args | {"mask_frames": mask_frames}, indent=4))
+        words = ["import", "mfm" if stem == "mfm" else "mdm", f"{folder}/model.pt", f"{folder}/args.json"]
+        words += ["-o", f"{folder}/ours.safetensors", f"--heads={config.get('num_heads', config.get('heads'))}"]
+        words += ["--time-token"] if time_token else []
+        if config["dataset"] in NORMALIZED:
+            words += [
+                "--stats",
+                str(statistics_folder(folder, weights(arrays)["output_process.poseFinal.bias"].numel())),
+            ]
+        assert checkpoints.main(words) == 0
+        return load(folder / "ours.safetensors")
 
 
-def condition(arrays: Arrays, released: Released, dtype: torch.dtype) -> Condition:
+@cache
+def imported_flame() -> MotionGeneration:
+    arrays = golden("flame_text2motion")
+    state, generator = weights(arrays), torch.Generator().manual_seed(0)
+    width = state["text_pooler_proj.weight"].shape[1]
+    state["lm.pooler.dense.weight"] = torch.randn(width, width, generator=generator)
+    state["lm.pooler.dense.bias"] = torch.randn(width, generator=generator)
+    state["lm.embeddings.position_ids"] = torch.arange(5)
+    raw = {f"net.{key}": torch.zeros_like(value) for key, value in state.items()}
+    with tempfile.TemporaryDirectory() as name:
+        file = Path(name) / "released.ckpt"
+        averaged = {f"ema_model.model.{key}": value for key, value in state.items()}
+        torch.save({"epoch": 3, "global_step": 9, "state_dict": raw | averaged}, file)
+        heads = meta(arrays)["config"]["heads"]
+        assert checkpoints.main(["import", "flame", str(file), "-o", name, f"--heads={heads}"]) == 0
+        model = load(name)
+    assert torch.equal(model.condition.get_buffer("pooler_weight"), state["lm.pooler.dense.weight"])
+    assert torch.equal(model.condition.get_buffer("pooler_bias"), state["lm.pooler.dense.bias"])
+    return model
+
+
+def condition(arrays: Arrays, model: MotionGeneration, dtype: torch.dtype) -> Condition:
     """The fixture's condition, its null included: zeros in place of the embedding."""
     batch = len(arrays["in/x_t"])
-    pooled, tokens, token_mask = torch.zeros(batch, released.features[2]), torch.zeros(batch, 0, 0), None
-    if released.action_embedding is not None:
-        pooled = released.action_embedding[torch.from_numpy(arrays["in/action"])[:, 0]]
+    pooled, tokens, token_mask = torch.zeros(batch, model.condition.features), torch.zeros(batch, 0, 0), None
+    if "in/action" in arrays:
+        labels = torch.from_numpy(arrays["in/action"])[:, 0]
+        clips = MotionBatch(torch.zeros(batch, 1, 1), torch.ones(batch, 1, dtype=torch.bool), [], action=labels)
+        pooled = model.condition(clips).pooled
     elif "in/text_mask" in arrays:
         tokens = torch.from_numpy(arrays["in/text_embed"]).transpose(0, 1)
         token_mask = ~torch.from_numpy(arrays["in/text_mask"])
@@ -90,9 +138,9 @@ def mdm_cases() -> list:
 @torch.no_grad()
 def test_mdm_outputs(stem: str, case: str, dtype: torch.dtype) -> None:
     arrays = golden(stem)
-    released = import_case(arrays, case)
-    denoiser = build(released, dtype)
-    cond = condition(arrays, released, dtype)
+    model = imported(stem, case.endswith("_maskframes"), "legacy" not in case)
+    denoiser = copy.deepcopy(model.denoiser).to(dtype)
+    cond = condition(arrays, model, dtype)
     x_t = torch.from_numpy(arrays["in/x_t"]).flatten(1, 2).transpose(1, 2).to(dtype)
     t = torch.from_numpy(arrays["in/t"])
     # MFM's network takes a row number cut from its time in [0, 1].
@@ -122,8 +170,7 @@ def test_mdm_outputs(stem: str, case: str, dtype: torch.dtype) -> None:
 @torch.no_grad()
 def test_flame_outputs(case: str, dtype: torch.dtype) -> None:
     arrays = golden("flame_text2motion")
-    released = import_flame(weights(arrays), num_heads=meta(arrays)["config"]["heads"])
-    denoiser = build(released, dtype)
+    denoiser = copy.deepcopy(imported_flame().denoiser).to(dtype)
     pooled = torch.from_numpy(arrays["lm/pooler_output"]).to(dtype)
     tokens = torch.from_numpy(arrays["lm/last_hidden_state"]).to(dtype)
     everywhere = torch.ones(tokens.shape[:2], dtype=torch.bool)  # the authors attend to the padding of the text
@@ -225,3 +272,264 @@ def test_layouts_of_released_files() -> None:
     assert released_state(lightning, ema=False) == {"w": raw["w"]}
     with pytest.raises(ValueError, match="found epoch, optimizer"):
         released_state({"epoch": 3, "optimizer": {}})
+
+
+# Options of released models -------------------------------------------------------------------------------------------
+
+
+def released_file(folder: Path, state: dict, args: dict | str) -> list[str]:
+    """Words of an import command for a released file of these contents."""
+    torch.save(state, folder / "model.pt")
+    (folder / "args.json").write_text(args if isinstance(args, str) else json.dumps(args))
+    return [str(folder / "model.pt"), str(folder / "args.json"), "-o", str(folder / "ours.safetensors")]
+
+
+def rot6d_state() -> dict[str, torch.Tensor]:
+    state = small_state() | {"input_process.poseEmbedding.weight": torch.ones(8, 150)}
+    return state | {
+        f"output_process.poseFinal.{k}": torch.ones(*s) for k, s in (("weight", (150, 8)), ("bias", (150,)))
+    }
+
+
+def test_options_of_mdm(tmp_path):
+    state = rot6d_state() | {"embed_action.action_embedding": torch.randn(12, 8)}
+    args = {"dataset": "humanact12", "cond_mask_prob": 0, "lambda_vel": 1.0, "diffusion_steps": 50, "num_frames": 40}
+    args |= {"noise_schedule": "linear", "sigma_small": False}
+    assert checkpoints.main(["import", "mdm", *released_file(tmp_path, state, args)]) == 0
+    model = load(tmp_path / "ours.safetensors")
+    assert model.facts["actions"][9] == "phone"
+    assert model.facts["max_frames"] == 40
+    assert (model.guidance_scale, model.num_inference_steps, model.losses.weights["velocity"]) == (1.0, 50, 1.0)
+    process = model.config["process"]
+    assert (process["num_train_timesteps"], process["schedule"], process["variance"]) == (50, "linear", "fixed_large")
+    motions = generate(model, actions=["phone"], frames=24, num_inference_steps=3)
+    assert motions[0].joints.shape == (24, 24, 3)
+
+
+def test_averaged_weights_are_taken_unless_the_last_are_asked_for(tmp_path):
+    averaged = rot6d_state()
+    last = {key: value + 1 for key, value in averaged.items()}
+    words = released_file(tmp_path, {"model": last, "model_avg": averaged}, {"dataset": "uestc"})
+    assert checkpoints.main(["import", "mdm", *words]) == 0
+    before = load(tmp_path).denoiser.get_parameter("output.bias")
+    assert checkpoints.main(["import", "mdm", *words, "--last"]) == 0
+    assert torch.equal(load(tmp_path).denoiser.get_parameter("output.bias"), before + 1)
+
+
+@pytest.mark.parametrize(
+    ("solver", "sampler", "steps", "odeint_grid"),
+    [
+        ({}, "euler", 100, True),
+        ({"method": "euler", "step_size": "2e-2"}, "euler", 50, True),
+        ({"method": "euler_raw", "step_size": 0.1}, "euler", 10, False),
+        ({"method": "dopri5"}, "dopri5", 100, False),
+    ],
+)
+def test_options_of_mfm(tmp_path, solver, sampler, steps, odeint_grid):
+    text = (
+        "log_dir: ./outputs/${name}/${now:%d}\nname: x\nnum_frames: null\ndataset: humanact12\nguidance_param: null\n"
+    )
+    text += "model: {num_heads: 2, cond_mask_prob: 0, lambda_rcxyz: 1}\ntraining: {num_frames: 30}\n"
+    text += f"ode_kwargs: {json.dumps(solver)}\n"
+    assert checkpoints.main(["import", "mfm", *released_file(tmp_path, rot6d_state(), text)]) == 0
+    model = load(tmp_path)
+    assert (model.sampler, model.num_inference_steps) == (sampler, steps)
+    assert (model.config["process"]["odeint_grid"], model.config["process"]["quantize_time"]) == (odeint_grid, True)
+    assert model.config["denoiser"]["num_heads"] == 2
+    assert model.losses.weights["joints"] == 1
+
+
+def test_models_that_attend_to_the_padding_are_sampled_at_their_length(tmp_path):
+    checkpoints.main(["import", "mdm", *released_file(tmp_path, rot6d_state(), {"dataset": "uestc"})])
+    model = load(tmp_path)
+    seen = set()
+    model.denoiser.register_forward_hook(lambda module, inputs, output: seen.add(inputs[0].shape[1]))
+    assert len(generate(model, frames=24, num_inference_steps=2)[0].features) == 24
+    assert seen == {60}
+
+
+@pytest.mark.parametrize(
+    ("kind", "change", "words", "message"),
+    [
+        ("mdm", {}, ["--stats", "."], "model.pt: features of uestc are not normalized: leave out the folder"),
+        ("mdm", {"dataset": "humanml"}, [], "150 features, but humanml-legacy-smpl22"),
+        ("mdm", {"dataset": "amass"}, [], "dataset=amass of the released model: known are humanml, kit, humanact12"),
+        ("mdm", {"arch": "trans_dec"}, [], "unknown seqTransEncoder"),
+        ("mfm", {"dynamic": "diffusion"}, [], "dynamic=diffusion: of MFM's models, only the flows"),
+        ("mfm", {"text_emebed": "t5-large"}, [], "only MFM's models with CLIP"),
+        ("flame", {}, [], "flame takes no file of options"),
+    ],
+)
+def test_imports_that_cannot_be_are_one_line(tmp_path, monkeypatch, capsys, kind, change, words, message):
+    monkeypatch.chdir(statistics_folder(tmp_path, 150))
+    files = released_file(tmp_path, rot6d_state(), {"dataset": "uestc"} | change)
+    assert checkpoints.main(["import", kind, *files, *words]) == 1
+    output = capsys.readouterr().err
+    assert message in output
+    assert output.startswith("error: ")
+    assert output.count("\n") == 1
+    assert not (tmp_path / "ours.safetensors").exists()
+
+
+def test_statistics_have_to_fit(tmp_path, capsys):
+    state = small_state() | {"input_process.poseEmbedding.weight": torch.ones(8, 263)}
+    state |= {"output_process.poseFinal.weight": torch.ones(263, 8), "output_process.poseFinal.bias": torch.ones(263)}
+    words = ["import", "mdm", *released_file(tmp_path, state, {"dataset": "humanml"})]
+    assert checkpoints.main(words) == 1
+    assert "features of humanml3d are normalized: give the folder of Mean.npy, Std.npy" in capsys.readouterr().err
+    assert checkpoints.main([*words, "--stats", str(tmp_path)]) == 1
+    assert "Mean.npy: no such file" in capsys.readouterr().err
+    statistics_folder(tmp_path, 251)
+    assert checkpoints.main([*words, "--stats", str(tmp_path)]) == 1
+    assert "Mean.npy: shape (251,), expected (263,) finite numbers" in capsys.readouterr().err
+    statistics_folder(tmp_path, 263)
+    assert checkpoints.main([*words, "--stats", str(tmp_path)]) == 0
+    assert np.array_equal(load(tmp_path).representation.mean, np.load(tmp_path / "Mean.npy").astype(np.float32))
+    np.save(tmp_path / "Std.npy", np.zeros(263))
+    assert checkpoints.main([*words, "--stats", str(tmp_path)]) == 1
+    assert "Std.npy: 263 entries are not above 0" in capsys.readouterr().err
+
+
+def test_flame_needs_the_pooler_of_its_language_model(tmp_path, capsys):
+    state = {f"net.{key}": value for key, value in weights(golden("flame_text2motion")).items()}
+    torch.save({"state_dict": state}, tmp_path / "a.ckpt")
+    assert checkpoints.main(["import", "flame", str(tmp_path / "a.ckpt"), "-o", str(tmp_path)]) == 1
+    assert "nothing for lm.pooler.dense.weight" in capsys.readouterr().err
+
+
+def test_pickles_of_objects_are_read_on_demand_only(tmp_path, capsys):
+    words = released_file(
+        tmp_path, {"state_dict": rot6d_state(), "hyper": argparse.Namespace(a=1)}, {"dataset": "uestc"}
+    )
+    assert checkpoints.main(["import", "mdm", *words]) == 1
+    output = capsys.readouterr().err
+    assert "holds Python objects (argparse.Namespace)" in output
+    assert "--run-code-in-file" in output
+    assert output.count("\n") == 1
+    assert checkpoints.main(["import", "mdm", *words, "--run-code-in-file"]) == 0
+    for content in (b"", b"not a checkpoint", (tmp_path / "model.pt").read_bytes()[:-500]):
+        (tmp_path / "model.pt").write_bytes(content)
+        assert checkpoints.main(["import", "mdm", *words]) == 1
+        assert "model.pt: damaged, or not a PyTorch file" in capsys.readouterr().err
+    assert checkpoints.main(["import", "mdm", str(tmp_path / "absent.pt"), *words[1:]]) == 1
+    assert "absent.pt: no such file" in capsys.readouterr().err
+
+
+# Model files ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def trained(tmp_path: Path, tiny: list[str]) -> Path:
+    """A checkpoint as training leaves it, of a tiny model with random weights."""
+    config = compose("quickstart", tiny)
+    torch.manual_seed(0)
+    task = MotionGeneration.build(config, instantiate(config["representation"]))
+    facts = {"actions": [], "dataset": "synthetic", "fingerprint": "f00d", "max_frames": 60}
+    state = task.state_dict() | {"representation.mean": torch.randn(263)}
+    content = {"config": config, "facts": facts, "state_dict": state, "global_step": 7}
+    torch.save(content, tmp_path / "last.ckpt")
+    return tmp_path / "last.ckpt"
+
+
+def test_a_model_file_is_the_checkpoint(trained, tmp_path, capsys):
+    file = tmp_path / "model" / "mine.safetensors"
+    assert checkpoints.main(["export", str(trained), "-o", str(file)]) == 0
+    assert str(file) in capsys.readouterr().out
+    before, after, folder = load(trained), load(file), load(file.parent)
+    assert before.state_dict().keys() == after.state_dict().keys() == load_file(file).keys()
+    for name, value in before.state_dict().items():
+        assert torch.equal(value, after.state_dict()[name])
+    assert after.facts == before.facts
+    a, b = (generate(model, "a person waves", frames=24)[0].features for model in (before, folder))
+    assert np.array_equal(a, b)
+    assert list(file.parent.iterdir()) == [file]
+    again = checkpoints.export(file, tmp_path / "again")
+    assert checkpoints.read(again)["origin"] == checkpoints.read(file)["origin"]
+    assert checkpoints.read(again)["origin"]["steps"] == 7
+
+
+def test_a_model_file_does_not_tell_where_it_was_made(trained, tmp_path):
+    file = checkpoints.export(trained, tmp_path / "out")
+    assert str(tmp_path).encode() not in file.read_bytes()
+    assert str(tmp_path.parent).encode() not in file.read_bytes()
+    assert checkpoints.read(file)["config"]["data"]["root"] == "data"
+
+
+def test_damaged_and_foreign_files_are_one_line(trained, tmp_path):
+    file = checkpoints.export(trained, tmp_path)
+    whole = file.read_bytes()
+    flipped = bytearray(whole)
+    flipped[-100] ^= 1
+    for content, message in (
+        (whole[:-10], "damaged, or not a .safetensors file"),
+        (b"", "damaged, or not a .safetensors file"),
+        (bytes(flipped), "its weights are not those that were written"),
+        (whole.replace(b'\\"format\\": 1', b'\\"format\\": 2'), "of format 2, but this version reads 1"),
+        (whole.replace(b'\\"origin\\"', b'\\"oregon\\"'), "its recipe cannot be read"),
+    ):
+        file.write_bytes(content)
+        with pytest.raises(UserError, match=message) as caught:
+            load(file)
+        assert "\n" not in str(caught.value)
+        assert str(file) in str(caught.value)
+    save_file({"w": torch.zeros(1)}, file)
+    with pytest.raises(UserError, match="weights without a recipe; those of MDM"):
+        load(file)
+
+
+def test_what_is_not_there_is_one_line(tmp_path):
+    with pytest.raises(UserError, match=r"this folder holds no \.safetensors file"):
+        load(tmp_path)
+    for name in ("a", "b"):
+        save_file({"w": torch.zeros(1)}, tmp_path / f"{name}.safetensors")
+    with pytest.raises(UserError, match=r"holds a\.safetensors, b\.safetensors; name the file"):
+        load(tmp_path)
+    with pytest.raises(FileNotFoundError, match="no such checkpoint"):
+        load("nobody/model.ckpt")
+    with pytest.raises(UserError, match=r"nobody/model@v1: no such file or folder, nor can .* be fetched") as caught:
+        load("nobody/model@v1")
+    assert "\n" not in str(caught.value)
+
+
+def test_push_writes_a_card_and_uploads_these_files_alone(trained, tmp_path, capsys, monkeypatch):
+    import huggingface_hub
+
+    folder = tmp_path / "mine"
+    words = ["push", str(trained), "me/walker", "--folder", str(folder)]
+    assert checkpoints.main([*words, "--dry-run"]) == 0
+    card = (folder / "README.md").read_text()
+    assert card.startswith("---\nlicense: mit\n")
+    for fact in ('flame_mdm.load("me/walker")', "| experiment | quickstart |", "| data | synthetic |", "f00d"):
+        assert fact in card
+    assert load(folder).facts["fingerprint"] == "f00d"
+    assert {path.name for path in folder.iterdir()} == {"README.md", "config.yaml", "model.safetensors"}
+
+    calls = []
+
+    class Hub:
+        def create_repo(self, name, **options):
+            calls.append((name, options))
+
+        def upload_folder(self, **options):
+            calls.append(options)
+
+    monkeypatch.setattr(huggingface_hub, "HfApi", Hub)
+    (folder / "notes.txt").write_text("private")
+    assert checkpoints.main([*words, "--private"]) == 0
+    assert calls[0] == ("me/walker", {"private": True, "exist_ok": True})
+    assert "notes.txt" not in calls[1]["allow_patterns"]
+    capsys.readouterr()
+    monkeypatch.setattr(Hub, "create_repo", lambda *_, **__: (_ for _ in ()).throw(RuntimeError("no token\nlog in")))
+    assert checkpoints.main(words) == 1
+    assert capsys.readouterr().err == f"error: me/walker: {folder} is written but not uploaded: no token\n"
+    assert checkpoints.main(["push", str(trained), "walker"]) == 1
+    assert "name the model as user/name" in capsys.readouterr().err
+
+
+def test_the_license_follows_the_data(trained, tmp_path):
+    model = checkpoints.read(checkpoints.export(trained, tmp_path))
+    model["facts"]["dataset"] = "bandai"
+    assert "license: cc-by-nc-4.0" in checkpoints.card(model, "me/walker")
+    model["facts"]["dataset"] = "humanml3d"
+    assert "license: other" in checkpoints.card(model, "me/walker")
+    assert "non-commercial" in checkpoints.card(model, "me/walker")

@@ -78,7 +78,7 @@ def test_the_temperature_starts_where_the_authors_start_it(stem):
 def test_the_import_takes_every_weight_exactly_once(stem):
     state = weights(golden(stem))
     import_mclip({**state, "text_model.encoder.weight": torch.zeros(1)})
-    for name in ("motion_encoder.CLS_TOKEN", "lm_projection.bias", "motion_encoder.motion_encoder.layers.1.norm2.bias"):
+    for name in ("motion_encoder.CLS_TOKEN", "lm_projection.bias", "motion_encoder.motion_encoder.layers.0.norm2.bias"):
         with pytest.raises(ValueError, match="released"):
             import_mclip({k: v for k, v in state.items() if k != name})
     with pytest.raises(ValueError, match="unknown extra"):

@@ -116,7 +116,8 @@ def read(file: Path | bytes, name: str) -> Recording:
         ValueError: no SMPL+H file of AMASS, damaged, or with numbers that are not finite.
     """
     try:
-        with np.load(io.BytesIO(file) if isinstance(file, bytes) else file, allow_pickle=False) as archive:
+        opened = io.BytesIO(file) if isinstance(file, bytes) else file.open("rb")  # numpy leaves damaged files open
+        with opened, np.load(opened, allow_pickle=False) as archive:
             data = {key: archive[key] for key in archive.files if key not in ("dmpls", "marker_data")}
     except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
         raise ValueError(f"{name}: damaged or no .npz file of AMASS: {error}; download it again") from error
@@ -173,13 +174,13 @@ class Amass:
         """One line for each subset of which recordings are absent; what is in an archive shows when it is read."""
         lines = []
         stems = {subset_of(key): key.endswith("_stageii") for key in self.files}
-        for subset, wanted in _by_subset(keys).items():
+        for subset, wanted in sorted(_by_subset(keys).items()):
             absent = [key for key in wanted if key not in self.files]
             if not absent or subset in self.archives:
                 continue
             names = " or ".join((subset, *SUBSETS[subset]))
             if len(absent) < len(wanted):
-                lines.append(f"{subset}: {len(absent)} of {len(wanted)} recordings are absent, such as {absent[0]}")
+                lines.append(f"{subset}: {len(absent)} of {len(wanted)} recordings are absent, such as {min(absent)}")
             elif stems.get(subset):
                 lines.append(f"{subset}: this is the SMPL-X release (files end in _stageii); download SMPL+H G")
             else:
@@ -304,7 +305,7 @@ def _load_body(folder: Path, gender: str) -> Body:
             f"{folder}: neither {' nor '.join(names)} in it; get the extended SMPL+H model at https://mano.is.tue.mpg.de"
         )
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
             regressor, template, directions = (file[key] for key in ("J_regressor", "v_template", "shapedirs"))
             parents = file["kintree_table"][0, 1:22]
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:

@@ -131,9 +131,8 @@ class HumanML3D(T2MFolder):
         if not self.amass:
             return super().check()
         todo = self._todo()
-        done = 2 * len(self.rows) - len(todo)
-        missing = self._missing(self.amass, todo)
-        return [f"{done} of {2 * len(self.rows)} motions are made", *(f"missing: {line}" for line in missing)]
+        done = f"{len(self.rows) - len(todo)} of {len(self.rows)} motions and their mirrored copies are made"
+        return [done, *(f"missing: {line}" for line in self._missing(self.amass, todo))]
 
     @cached_property
     def rows(self) -> list[Row]:

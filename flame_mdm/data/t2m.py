@@ -154,18 +154,20 @@ class T2MFolder(MotionSource):
             FileNotFoundError: motions or texts of names in the splits are absent.
             ValueError: a file is damaged.
         """
+        names = self.names
         for what, kind in ((self._motions(), "new_joint_vecs/*.npy"), (self.texts, "texts/*.txt")):
-            absent = [name for name in self.names if name not in what]
+            absent = [name for name in names if name not in what]
             if absent:
                 raise FileNotFoundError(
                     f"{self.path}: {kind} lacks {len(absent)} of the names in the splits: {_some(absent)}; process "
                     f"them again, or leave them out: {_exclusion(absent)}"
                 )
-        return {name: len(self._load(name, mmap=True)) for name in self.names}
+        return {name: len(self._load(name, mmap=True)) for name in names}
 
     def count(self) -> int:
+        total = sum(len(cuts(name, length, self.texts[name], self.shortest)) for name, length in self.frames.items())
         self.statistics()
-        return sum(len(cuts(name, length, self.texts[name], self.shortest)) for name, length in self.frames.items())
+        return total
 
     def clips(self, fps: float) -> Iterator[Clip]:
         """All items, at the frame rate of the folder.

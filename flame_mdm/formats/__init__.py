@@ -119,7 +119,7 @@ def _choose(path: Path, by_ending: dict[str, Callable]) -> Callable:
 
 def _read_npz(path: Path, fps: float | None, unit: float | None) -> MotionFile:
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
             data = {key: file[key] for key in file.files if key != "dmpls"}
     except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
         raise ValueError(f"damaged, or no .npz file of plain arrays: {error}") from error
@@ -200,7 +200,8 @@ def _read_json(path: Path, fps: float | None, unit: float | None) -> MotionFile:
 
 def _read_npy(path: Path, fps: float | None, unit: float | None) -> MotionFile:
     try:
-        joints = np.load(path, allow_pickle=False)
+        with path.open("rb") as raw:
+            joints = np.load(raw, allow_pickle=False)
     except (OSError, ValueError, EOFError) as error:
         raise ValueError(f"damaged, or no .npy file of numbers: {error}") from error
     if joints.ndim == 2 and joints.shape[1] in (263, 251):

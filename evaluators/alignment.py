@@ -61,7 +61,7 @@ class _RPrecision(SampleMetric):
 class TextsForMotion(_RPrecision):
     """R-precision, texts for a motion: is its own text among the k nearest of 32?
 
-    The definition of the papers (FLAME, section 4; MDM, B.2; MFM, 9.1) and of FLAME's code: for every generated motion
+    The definition of the papers (FLAME, "Evaluation Metrics"; MDM, B.2; MFM, 9.1) and of FLAME's code: for every generated motion
     its own text and 31 others, drawn without replacement from the captions that differ from it, at Euclidean distance.
     In FLAME's code a pool is as large as the batch, so that the last ones are smaller; here all have 32 texts. The own
     text stands at a random place, so that an extractor to which all texts are alike gets k / 32.
@@ -142,7 +142,7 @@ class MultimodalDistance(_TextAndMotion):
 
 
 class MotionCLIPScore(_TextAndMotion):
-    """mCLIP score of FLAME (section 4): mean cosine of the features of motion and own text, in [-1, 1]."""
+    """mCLIP score of FLAME ("Evaluation Metrics"): mean cosine of the features of motion and own text, in [-1, 1]."""
 
     higher_is_better = True
 
@@ -153,7 +153,7 @@ class MotionCLIPScore(_TextAndMotion):
 
 
 class WholeSetRetrieval(_TextAndMotion):
-    """Retrieval among all test samples by cosine, protocol "all" of Petrovich et al. 2023 (TMR, section 4.1).
+    """Retrieval among all test samples by cosine, protocol "all" of Petrovich et al. 2023 (TMR).
 
     Ties get their mean rank. Other than R-precision, values fall as the test set grows.
     """

@@ -122,7 +122,7 @@ class TextMultimodality(_PerPrompt):
 class PairedMultimodality(_PerPrompt):
     """Multimodality of FLAME (eq. 19): two sets of 10 motions a text, compared one by one.
 
-    FLAME has no code for it. Its section 4 generates 10 motions a text, eq. 19 takes two sets of 10; here it is the
+    FLAME has no code for it. Its Table 3 has 10 motions a text, eq. 19 takes two sets of 10; here it is the
     latter, 20 motions a text.
 
     Args:

@@ -1,6 +1,7 @@
 """Networks that the papers evaluate with: the authors' outputs, and loading of the authors' files."""
 
 import pickle
+from typing import Any
 
 import numpy as np
 import pytest
@@ -87,7 +88,13 @@ def test_t2m_sees_nothing_past_the_end_unless_asked_to(stem):
 
 def test_t2m_normalizes_with_its_own_statistics():
     torch.manual_seed(0)
-    sizes = {"movement_hidden": 8, "movement_latent": 8, "text_hidden": 8, "motion_hidden": 8, "embedding": 8}
+    sizes: dict[str, Any] = {
+        "movement_hidden": 8,
+        "movement_latent": 8,
+        "text_hidden": 8,
+        "motion_hidden": 8,
+        "embedding": 8,
+    }
     plain = T2MEvaluator(torch.zeros(20), torch.ones(20), **sizes).eval()
     mean, std = torch.randn(20), torch.rand(20) + 0.5
     scaled = T2MEvaluator(mean, std, **sizes).eval()

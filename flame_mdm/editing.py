@@ -313,11 +313,11 @@ def read_motion(
 
 def _read_npz(representation: Representation, path: Path) -> tuple[np.ndarray, str]:
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
             arrays = {key: file[key] for key in file.files}
     except FileNotFoundError:
         raise FileNotFoundError(f"{path}: no such file") from None
-    except (ValueError, OSError, EOFError, AttributeError, zipfile.BadZipFile, zlib.error) as error:
+    except (ValueError, OSError, EOFError, TypeError, zipfile.BadZipFile, zlib.error) as error:
         raise ValueError(f"{path}: damaged, or not an .npz file of numbers") from error
     caption, kind = str(arrays.get("text", "")), str(arrays.get("representation", ""))
     try:

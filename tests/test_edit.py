@@ -1,0 +1,454 @@
+"""Edits keep what they promise to keep, whatever the motion comes from."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from conftest import TINY
+
+import flame_mdm
+from flame_mdm.config import UserError, compose, instantiate
+from flame_mdm.data import bandai, bvh
+from flame_mdm.data.store import write_store
+from flame_mdm.data.synthetic import Synthetic
+from flame_mdm.edit import main
+from flame_mdm.editing import Edited, edit, find_joints, part_names, read_motion, resample
+from flame_mdm.generation import Generated, generate, write_motions
+from flame_mdm.representations.humanml import HumanML
+from flame_mdm.representations.rot6d import Rot6D
+from flame_mdm.representations.skeleton import KIT21, SMPL22, SMPL24
+from flame_mdm.representations.smpl import SMPL
+from flame_mdm.task import MotionGeneration
+
+FLOW = ["process=flow_matching", "task.sampler=euler"]
+
+
+def build(overrides: list[str], max_frames: int = 60) -> MotionGeneration:
+    config = compose("quickstart", overrides)
+    torch.manual_seed(0)
+    model = MotionGeneration.build(config, instantiate(config["representation"]))
+    model.representation.std.uniform_(0.5, 2)
+    model.representation.mean.normal_()
+    model.facts |= {"max_frames": max_frames, "dataset": "synthetic", "fingerprint": "f00d"}
+    return model.eval()
+
+
+@pytest.fixture(scope="module")
+def diffusion() -> MotionGeneration:
+    return build(TINY)
+
+
+@pytest.fixture(scope="module")
+def flow() -> MotionGeneration:
+    return build([*(o for o in TINY if "num_train_timesteps" not in o), *FLOW])
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory) -> Path:
+    """Folder of a small prepared synthetic set."""
+    root = tmp_path_factory.mktemp("stores")
+    representation = HumanML()
+    write_store(root / f"synthetic-{representation.name}", Synthetic(clips=8), representation)
+    return root
+
+
+def walk(fps: float, seconds: float = 2.0, turned: float = 0.0) -> np.ndarray:
+    """Joints (F, 22, 3) of a smooth motion, turned about the vertical by some radians."""
+    clip = next(c for c in Synthetic(clips=20).clips(200) if c.attributes["action"] == "walk")
+    joints = clip.motion[: round(200 * seconds) + 1 : round(200 / fps)]
+    s, c = np.sin(turned), np.cos(turned)
+    return joints @ np.array([[c, 0, -s], [0, 1, 0], [s, 0, c]]) + [turned, 0, 2 * turned]
+
+
+@pytest.fixture(scope="module")
+def motion(diffusion) -> Generated:
+    features = diffusion.representation.encode(torch.from_numpy(walk(20)))
+    joints = diffusion.representation.decode(features)
+    return Generated("walk", joints.numpy(), features.numpy(), 20.0, "a person walks")
+
+
+# What is kept ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("length", [8, 37, 60])
+@pytest.mark.parametrize(
+    ("frames", "kept"),
+    [
+        ("in_between", lambda i, n: i < int(0.25 * n) or i >= int(0.75 * n)),
+        ("prediction", lambda i, n: i < int(0.25 * n)),
+        ("prefix", lambda i, n: i < int(0.25 * n)),
+        ("suffix", lambda i, n: i >= int(0.75 * n)),
+        ("interpolate", lambda i, n: i % 5 == 0),
+        ([2, 5], lambda i, n: not 2 <= i < 5),
+        ([[0, 1], [4, 8]], lambda i, n: not (i < 1 or 4 <= i < 8)),
+    ],
+)
+def test_frames(diffusion, motion, frames, kept, length):
+    part = Generated("", motion.joints[:1].repeat(length, 0), motion.features[:1].repeat(length, 0), 20.0, "")
+    keep = edit(diffusion, part, frames=frames, num_inference_steps=2)[0].keep
+    assert keep.tolist() == [[kept(i, length)] * 263 for i in range(length)]
+
+
+def test_seconds_are_frames(diffusion, motion):
+    a = edit(diffusion, motion, seconds=[0.5, 1.25])[0]
+    b = edit(diffusion, motion, frames=[10, 25])[0]
+    assert np.array_equal(a.keep, b.keep)
+    assert np.array_equal(a.features, b.features)
+
+
+def test_upper_body_keeps_what_mdm_keeps(diffusion, motion):
+    keep = edit(diffusion, motion, joints="upper_body")[0].keep
+    assert (keep == keep[0]).all()
+    lower = np.isin(np.arange(22), (0, 1, 2, 4, 5, 7, 8, 10, 11))
+    positions, rotations = (np.repeat(lower[1:], size) for size in (3, 6))
+    assert keep[0].tolist() == [True] * 4 + [*positions, *rotations, *np.repeat(lower, 3)] + [True] * 4
+
+
+def test_frames_and_joints_meet(diffusion, motion):
+    both = edit(diffusion, motion, frames="in_between", joints=["left_arm", "head"])[0].keep
+    frames = edit(diffusion, motion, frames="in_between")[0].keep
+    joints = edit(diffusion, motion, joints=["left_arm", "head"])[0].keep
+    assert np.array_equal(both, frames | joints)
+
+
+@pytest.mark.parametrize("skeleton", [SMPL22, SMPL24, KIT21], ids=lambda s: s.name)
+def test_parts_of_the_body(skeleton):
+    parts = part_names(skeleton)
+    assert sorted(parts["upper_body"] + parts["lower_body"]) == list(range(len(skeleton)))
+    assert {skeleton.mirrored[joint] for joint in parts["left_arm"]} == set(parts["right_arm"])
+    assert {skeleton.mirrored[joint] for joint in parts["left_leg"]} == set(parts["right_leg"])
+    assert set(skeleton.feet) <= set(parts["legs"]) == set(parts["lower_body"]) - {0}
+    assert {skeleton.joints[j] for j in parts["right_arm"]} >= {"right_shoulder", "right_elbow", "right_wrist"}
+    assert find_joints(skeleton, ["right_leg", "left_elbow"]) == sorted(
+        [*parts["right_leg"], skeleton.joints.index("left_elbow")]
+    )
+
+
+@pytest.mark.parametrize("representation", [SMPL(), Rot6D()], ids=lambda r: r.name)
+def test_features_of_joints_move_these_joints(representation):
+    """A joint's rotation turns what hangs on it, and nothing else; the root's features move all."""
+    torch.manual_seed(0)
+    features = torch.randn(2, representation.features)
+    skeleton = representation.skeleton
+    for joint in range(24):
+        below = {joint}
+        for child, parent in enumerate(skeleton.parents):
+            below |= {child} if parent in below else set()
+        below -= {joint}
+        mask = representation.joint_features([joint])
+        assert mask.shape == (representation.features,)
+        moved = representation.decode(torch.where(mask, torch.randn_like(features), features))
+        distance = (moved - representation.decode(features)).norm(dim=-1).amax(0)
+        expected = set(range(24)) if joint == 0 else below
+        assert {i for i, way in enumerate(distance.tolist()) if way > 1e-3} == expected
+    assert sum(representation.joint_features([j]).int() for j in range(24)).tolist() == [1] * representation.features  # type: ignore[union-attr]
+
+
+# What the methods promise ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("method", ["mdm", "flame"])
+@pytest.mark.parametrize("options", [{"frames": "in_between"}, {"joints": "upper_body"}, {"frames": "suffix"}], ids=str)
+def test_exact_methods_keep_exactly(diffusion, motion, method, options):
+    results = edit(diffusion, motion, "a person jumps", method=method, samples=2, **options)
+    for result in results:
+        assert result.feature_error == 0
+        kept = result.features[result.keep] - motion.features[result.keep]
+        assert np.abs(kept).max() < 1e-5
+        assert np.abs(result.features - motion.features)[~result.keep].mean() > 0.05
+    assert not np.array_equal(results[0].features, results[1].features)
+
+
+def test_other_methods_keep_roughly(diffusion, flow, motion):
+    assert edit(diffusion, motion, frames="in_between", method="flame_code")[0].feature_error > 1e-3
+    assert edit(flow, motion, frames="in_between")[0].feature_error > 1e-3
+    assert edit(flow, motion, frames="in_between", method="mdm")[0].feature_error == 0
+
+
+def test_world_error_tells_of_a_suffix_that_has_moved(diffusion, motion):
+    assert edit(diffusion, motion, frames="prediction")[0].joint_error < 1e-5
+    suffix = edit(diffusion, motion, frames="suffix")[0]
+    begin = int(0.75 * len(motion.joints))
+    expected = np.linalg.norm(suffix.joints[begin:] - motion.joints[begin:], axis=-1).max()
+    assert suffix.joint_error == pytest.approx(expected)
+    assert suffix.joint_error > 0.1
+    upper = edit(diffusion, motion, joints="upper_body")[0]
+    lower = part_names(SMPL22)["lower_body"]
+    assert upper.joint_error < 1e-5
+    assert np.abs(upper.joints[:, lower] - motion.joints[:, lower]).max() < 1e-5
+
+
+def test_flows_are_rewritten_in_25_steps_up_to_a_fifth(flow, motion):
+    """The reading that fits both numbers of MFM's paper: rewritten are the first 6 of 25 steps, up to time 0.2."""
+    times = []
+    hook = flow.denoiser.register_forward_hook(lambda module, inputs, output: times.append(inputs[1][0].item()))
+    default = edit(flow, motion, frames="in_between")[0]
+    hook.remove()
+    assert len(times) == 25
+    six = edit(flow, motion, frames="in_between", until=5 / 25, num_inference_steps=25)[0]
+    assert np.array_equal(default.features, six.features)
+    assert not np.array_equal(default.features, edit(flow, motion, frames="in_between", until=0.19)[0].features)
+
+
+def test_resampling_takes_each_step_more_often(diffusion, motion):
+    calls = []
+    hook = diffusion.denoiser.register_forward_hook(lambda *_: calls.append(1))
+    edit(diffusion, motion, frames="in_between", method="flame", num_inference_steps=4, resample=3)
+    hook.remove()
+    assert len(calls) == 1 + 3 * 3
+
+
+def test_an_edit_depends_on_its_own_seed_alone(diffusion, motion):
+    one = edit(diffusion, motion, "a person jumps", frames="in_between", samples=1, seed=3)[0]
+    many = edit(diffusion, motion, ["a person jumps", "a person bows"], frames="in_between", samples=2, seed=3)
+    np.testing.assert_allclose(one.features, many[0].features, atol=1e-5)
+    assert [m.caption for m in many] == ["a person jumps"] * 2 + ["a person bows"] * 2
+    assert isinstance(one, Edited)
+    assert one.original is motion
+
+
+def test_models_that_attend_to_the_padding_know_it_as_empty(motion):
+    """As MDM's and MFM's code: edited at the padded length, where what lies beyond the motion is kept, as zeros."""
+    model = build([*TINY, "denoiser.mask_padding=false"])
+    seen = []
+    model.denoiser.register_forward_hook(lambda module, inputs, output: seen.append(inputs[0]))
+    result = edit(model, motion, frames="in_between")[0]
+    assert result.feature_error == 0
+    assert result.features.shape == motion.features.shape
+    assert {x.shape[1] for x in seen} == {60}
+    beyond = seen[-1][:, len(motion.features) :]
+    # at step 0, x_t is the kept zeros with the noise of step 1
+    assert beyond.std() < seen[0].std()
+    assert beyond.mean().abs() < 0.1
+
+
+# Where motions come from ----------------------------------------------------------------------------------------------
+
+
+def test_samples_are_read_as_they_are(diffusion, tmp_path):
+    motions = generate(diffusion, "a person waves", frames=24)
+    write_motions(tmp_path, diffusion, motions, {"seed": 0})
+    read = read_motion(diffusion.representation, tmp_path / "motion_000.npz")
+    assert np.array_equal(read.features, motions[0].features)
+    np.testing.assert_allclose(read.joints, motions[0].joints, atol=1e-5)
+    assert read.caption == "a person waves"
+
+
+@pytest.mark.parametrize(("fps", "turned"), [(20, 0.0), (20, 2.0), (50, 0.0), (100, -1.3), (10, 3.0)])
+def test_joints_of_any_rate_and_facing(diffusion, motion, tmp_path, fps, turned):
+    np.savez(tmp_path / "mine.npz", joints=walk(fps, turned=turned), fps=fps)
+    read = read_motion(diffusion.representation, str(tmp_path / "mine.npz"))
+    assert read.features.shape == motion.features.shape
+    # At 10 fps the footsteps themselves are lost between the frames.
+    assert np.abs(read.joints - motion.joints).max() < (0.15 if fps == 10 else 0.01)
+    if fps == 20:
+        np.testing.assert_allclose(read.features, motion.features, atol=1e-4)
+
+
+def test_resampling_keeps_the_time():
+    t = np.arange(61) / 30
+    joints = np.sin(2 * t)[:, None, None] * np.ones((1, 22, 3))
+    new = resample(joints, 30, 20)
+    assert len(new) == 41
+    np.testing.assert_allclose(new[:, 3, 1], np.sin(2 * np.arange(41) / 20), atol=1e-4)
+
+
+def test_a_bvh_file_of_a_known_skeleton(diffusion, tmp_path):
+    joints = 100 * walk(50)
+    names = tuple(dict.fromkeys(("joint_Root", *bandai.JOINTS.values())))
+    places = np.zeros((len(joints), len(names), 3))
+    for joint, name in enumerate(bandai.JOINTS.values()):
+        places[:, names.index(name)] = joints[:, joint]
+    places[:, names.index("Hips")] = joints[:, 0]
+    file = tmp_path / "take.bvh"
+    channels = (("Xposition", "Yposition", "Zposition"),) * len(names)
+    parents = (-1, *[0] * (len(names) - 1))
+    frames = places.reshape(len(joints), -1)
+    skeleton = (names, parents, np.zeros((len(names), 3)), channels, (), np.zeros((0, 3)))
+    bvh.write(bvh.Bvh(*skeleton, frames, 50.0), file)
+    read = read_motion(diffusion.representation, file)
+    expected = read_motion(diffusion.representation, _npz(tmp_path, joints=walk(20), fps=20))
+    assert read.features.shape == expected.features.shape
+    others = [joint for joint in range(22) if joint != bandai.SPINE1]
+    assert np.abs(read.joints - expected.joints)[:, others].max() < 0.02
+
+    bvh.write(bvh.Bvh(("Bip01", *names[1:]), *skeleton[1:], frames, 50.0), file)
+    assert read_motion(diffusion.representation, file).features.shape == expected.features.shape
+    bvh.write(bvh.Bvh((*names[:-1], "Tail"), *skeleton[1:], frames, 50.0), file)
+    with pytest.raises(ValueError, match=rf"not a known skeleton; of Bandai-Namco's it lacks {names[-1]}"):
+        read_motion(diffusion.representation, file)
+
+
+def test_a_clip_of_a_prepared_set_and_a_part_of_it(diffusion, store):
+    stored = read_motion(diffusion.representation, "synthetic:synthetic_0_000003", data_root=store)
+    assert stored.caption
+    part = read_motion(diffusion.representation, "synthetic:synthetic_0_000003", data_root=store, cut=(0.5, 1.5))
+    assert np.array_equal(part.features, stored.features[10:30])
+
+
+def test_cuts_of_world_coordinates_start_anew(tmp_path):
+    representation = Rot6D()
+    features = np.cumsum(np.ones((40, 150), np.float32), 0)
+    file = _npz(tmp_path, features=features, fps=20, representation=representation.name)
+    part = read_motion(representation, file, cut=[1, 2])
+    assert part.features[0, 144:147].tolist() == [0, 0, 0]
+
+
+# Bad requests ---------------------------------------------------------------------------------------------------------
+
+
+def _npz(folder: Path, **arrays) -> Path:
+    np.savez(folder / "motion.npz", **arrays)
+    return folder / "motion.npz"
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({}, "this keeps nothing of the motion: choose frames"),
+        ({"frames": [0, 40]}, "this keeps nothing of the motion"),
+        ({"joints": []}, "this keeps all of the motion"),
+        ({"frames": [5, 5]}, r"frames=\[5, 5\] is no part of this motion, which has 40 frames \(2 seconds\)"),
+        ({"frames": [30, 50]}, "is no part of this motion"),
+        ({"seconds": [1.5, 2.5]}, r"seconds=\[1.5, 2.5\] is no part"),
+        ({"frames": [1, 2, 3]}, r"write \[begin, end\], or several"),
+        ({"frames": [[1, 2], 3]}, r"write \[begin, end\], or several"),
+        ({"frames": []}, r"write \[begin, end\], or several"),
+        ({"frames": [1, 2], "seconds": [1, 2]}, "give frames or seconds, not both"),
+        ({"frames": "inbetween"}, "frames=inbetween is unknown. Did you mean in_between"),
+        ({"joints": "uper_body"}, "no joint or part 'uper_body'. Did you mean upper_body"),
+        ({"joints": ["left_hnad"]}, "Did you mean left_hip"),
+        ({"frames": "suffix", "method": "mfm"}, "method=mfm is not possible with GaussianDiffusion; .* mdm, flame"),
+        ({"frames": "suffix", "method": "repaint"}, "this model takes: mdm, flame, flame_code"),
+        ({"frames": "suffix", "until": 0.3}, "until=0.3 is an option of method=mfm, not of mdm"),
+        ({"frames": "suffix", "resample": 3}, "resample=3 is an option of method=flame"),
+    ],
+)
+def test_bad_edits_are_one_line(diffusion, motion, options, message):
+    with pytest.raises(UserError, match=message) as caught:
+        edit(diffusion, motion, **options)
+    assert "\n" not in str(caught.value)
+
+
+def test_methods_of_diffusion_are_refused_by_flows(flow, motion):
+    with pytest.raises(UserError, match="method=flame is not possible with FlowMatching; this model takes: mdm, mfm"):
+        edit(flow, motion, frames="suffix", method="flame")
+
+
+def test_a_motion_longer_than_those_of_the_training(motion):
+    model = build(TINY, max_frames=36)
+    with pytest.raises(UserError, match=r"walk: 40 frames are more than the 36 \(1.8 seconds\) .*: take a part, cut="):
+        edit(model, motion, frames="suffix")
+
+
+@pytest.mark.parametrize(
+    ("arrays", "message"),
+    [
+        ({"joints": np.zeros((9, 21, 3)), "fps": 20}, r"shape \(9, 21, 3\), but humanml-clean-smpl22 takes"),
+        ({"joints": np.zeros((9, 22)), "fps": 20}, r"joints have shape \(9, 22\), not \(frames, joints, 3\)"),
+        ({"joints": np.full((9, 22, 3), np.nan), "fps": 30}, "or are not finite"),
+        ({"joints": np.zeros((9, 22, 3))}, "needs fps"),
+        ({"joints": np.zeros((9, 22, 3)), "fps": 0}, "fps is 0, not a number above 0"),
+        ({"fps": 20}, "holds neither features and no joints"),
+        (
+            {"features": np.zeros((9, 251)), "fps": 12.5, "representation": "x"},
+            "holds features x at 12.5 fps and no jo",
+        ),
+        ({"features": np.zeros((9, 2)), "fps": 20, "representation": "humanml-clean-smpl22"}, "have shape"),
+        ({"joints": np.array([{}], object), "fps": 20}, "damaged, or not an .npz file of numbers"),
+    ],
+)
+def test_bad_motions_are_one_line(diffusion, tmp_path, arrays, message):
+    file = _npz(tmp_path, **arrays)
+    with pytest.raises(ValueError, match=message) as caught:
+        read_motion(diffusion.representation, file)
+    assert str(file) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_motions_that_are_not_there(diffusion, store, tmp_path):
+    representation = diffusion.representation
+    for name in ("absent.npz", "absent.bvh"):
+        with pytest.raises(FileNotFoundError, match=f"{name}: no such file"):
+            read_motion(representation, tmp_path / name)
+    np.save(tmp_path / "array.npy", np.zeros(3))
+    for content in (b"PK\x03\x04", b"", (tmp_path / "array.npy").read_bytes()):
+        (tmp_path / "bad.npz").write_bytes(content)
+        with pytest.raises(ValueError, match="damaged"):
+            read_motion(representation, tmp_path / "bad.npz")
+    with pytest.raises(UserError, match=r"give an \.npz or \.bvh file, or dataset:id"):
+        read_motion(representation, "walk")
+    with pytest.raises(UserError, match=r"has no clip 'synthetic_0_00003'\. Did you mean synthetic_0_000003"):
+        read_motion(representation, "synthetic:synthetic_0_00003", data_root=store)
+    with pytest.raises(FileNotFoundError, match="no prepared data set"):
+        read_motion(representation, "kit:1", data_root=store)
+    with pytest.raises(UserError, match="is no part of synthetic:synthetic_0_000003, which lasts"):
+        read_motion(representation, "synthetic:synthetic_0_000003", data_root=store, cut=[1, 99])
+    with pytest.raises(ValueError, match=r"motion.npz: motion: shape \(9, 22, 3\), expected \(frames, 3 \+ 3 x joints"):
+        read_motion(SMPL(), _npz(tmp_path, joints=np.zeros((9, 22, 3)), fps=20))
+
+
+# The command ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def checkpoint(diffusion, tmp_path) -> Path:
+    content = {"config": diffusion.config, "facts": diffusion.facts, "state_dict": diffusion.state_dict()}
+    torch.save(content, tmp_path / "last.ckpt")
+    return tmp_path / "last.ckpt"
+
+
+def test_the_command_writes_the_original_beside_the_edits(checkpoint, store, tmp_path, capsys):
+    out = tmp_path / "out"
+    words = [
+        f"ckpt={checkpoint}",
+        "motion=synthetic:synthetic_0_000003",
+        f"data_root={store}",
+        f"out={out}",
+        "samples=2",
+    ]
+    words += ["text=it's a (jump), $5", "frames=in_between", "joints=[left_arm,head]", "seed=4"]
+    assert main(words) == 0
+    printed = capsys.readouterr().out
+    assert "largest change among them: 0 in normalized features" in printed
+    assert "m of the joints in the world" in printed
+    for name in ("player.html", "motions.gif", "motions.png"):
+        assert (out / name).stat().st_size > 1000
+    page = (out / "player.html").read_text()
+    assert "original: " in page
+    assert page.count('"frames":') == 3
+    with np.load(out / "motion_000.npz") as original, np.load(out / "motion_002.npz") as edited:
+        keep = edited["keep"]
+        assert str(edited["text"]) == "it's a (jump), $5"
+        assert int(edited["seed"]) == 4
+        np.testing.assert_allclose(edited["features"][keep], original["features"][keep], atol=1e-5)
+        assert not np.allclose(edited["features"][~keep], original["features"][~keep], atol=1e-2)
+    # what was written can be edited again
+    assert main([f"ckpt={checkpoint}", f"motion={out}/motion_001.npz", f"out={out}/again", *words[5:]]) == 0
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ([], "ask for one of text=..., action=... and unconditioned=true, not none"),
+        (["text=jump", "unconditioned=true"], "not text and unconditioned"),
+        (["unconditioned=true", "motion=null"], "no motion to edit"),
+        (["unconditioned=true", "cut=3"], r"cut=3: write [begin, end]"),
+        (["unconditioned=true", "frames=[1,2", "seed=1"], "cannot read an override"),
+        (["unconditioned=true", "frames=in_between", "methd=mdm"], "Did you mean method"),
+        (["unconditioned=true", "ckpt=nowhere/at.ckpt"], "nowhere/at.ckpt: no such checkpoint"),
+    ],
+)
+def test_bad_words_are_one_line(checkpoint, store, capsys, words, message):
+    first = [f"ckpt={checkpoint}", "motion=synthetic:synthetic_0_000003", f"data_root={store}"]
+    assert main([*first, *words]) == 1
+    output = capsys.readouterr().err
+    assert message in output
+    assert output.startswith("error: ")
+    assert output.count("\n") == 1
+
+
+def test_the_python_api_is_there_though_the_command_is_a_module_of_that_name(diffusion, motion):
+    result = flame_mdm.edit(diffusion, motion, frames="suffix")  # type: ignore[operator]
+    assert result[0].feature_error == 0

@@ -14,7 +14,7 @@ from flame_mdm.visualize.scene import Motion, check_any, written_whole
 MILLIMETRE = 0.001
 
 
-def write_player(path: str | Path, motions: Sequence[Motion], title: str = "Motions") -> None:
+def write_player(path: str | Path, motions: Sequence[Motion], title: str = "Motions", about: str = "") -> None:
     """Writes a self-contained HTML page that plays motions side by side in 3D, under one clock and one camera.
 
     Positions are rounded to millimetres; a motion that spans more than 65 m is rounded to 1/65534 of its span.
@@ -23,6 +23,7 @@ def write_player(path: str | Path, motions: Sequence[Motion], title: str = "Moti
         path: the HTML file to write.
         motions: what to show; skeletons, lengths and frame rates may differ.
         title: heading of the page.
+        about: HTML that the page unfolds below the heading; its texts have to be escaped.
 
     Raises:
         ValueError: there are no motions.
@@ -32,10 +33,11 @@ def write_player(path: str | Path, motions: Sequence[Motion], title: str = "Moti
     # "<" never stands in the data, so no caption can close the script element
     content = {
         "TITLE": html.escape(title),
+        "ABOUT": about and f"<details><summary>About these motions</summary><div>{about}</div></details>",
         "DATA": json.dumps([_packed(motion) for motion in motions], separators=(",", ":")).replace("<", "\\u003c"),
     }
     template = Path(__file__).with_suffix(".html").read_text(encoding="utf-8")
-    page = re.sub("__(TITLE|DATA)__", lambda match: content[match[1]], template)
+    page = re.sub("__(TITLE|ABOUT|DATA)__", lambda match: content[match[1]], template)
     with written_whole(path) as temporary:
         temporary.write_text(page, encoding="utf-8")
 
@@ -47,6 +49,8 @@ def _packed(motion: Motion) -> dict:
     return {
         "id": motion.id,
         "caption": motion.caption,
+        "group": motion.group,
+        "beside": motion.beside,
         "fps": motion.fps,
         "frames": len(motion.joints),
         "parents": list(motion.skeleton.parents),

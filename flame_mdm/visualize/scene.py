@@ -26,6 +26,8 @@ class Motion:
         caption: what the motion is asked to be; shown below it.
         id: name of the motion; shown below it.
         contacts: (F, N) bool, True = this one of the N joints `skeleton.feet` stands on the floor; None = not known.
+        group: what the player can be narrowed down to, such as a split; "" = nothing.
+        beside: id of the motion before this one that it belongs beside, as a mirrored copy to its original.
 
     Raises:
         ValueError: wrong shapes, joints that are not finite, or a frame rate that is no positive number.
@@ -37,6 +39,8 @@ class Motion:
     caption: str = ""
     id: str = ""
     contacts: np.ndarray | None = None
+    group: str = ""
+    beside: str = ""
 
     def __post_init__(self) -> None:
         name, skeleton = f"motion {self.id!r}", self.skeleton

@@ -61,10 +61,10 @@ class _RPrecision(SampleMetric):
 class TextsForMotion(_RPrecision):
     """R-precision, texts for a motion: is its own text among the k nearest of 32?
 
-    The definition of the papers (FLAME, "Evaluation Metrics"; MDM, B.2; MFM, 9.1) and of FLAME's code: for every generated motion
-    its own text and 31 others, drawn without replacement from the captions that differ from it, at Euclidean distance.
-    In FLAME's code a pool is as large as the batch, so that the last ones are smaller; here all have 32 texts. The own
-    text stands at a random place, so that an extractor to which all texts are alike gets k / 32.
+    The definition of the papers (FLAME, "Evaluation Metrics"; MDM, B.2; MFM, 9.1) and of FLAME's code: for every
+    generated motion its own text and 31 others, drawn without replacement from the captions that differ from it, at
+    Euclidean distance. In FLAME's code a pool is as large as the batch, so that the last ones are smaller; here all
+    have 32 texts. The own text stands at a random place, so that an extractor to which all texts are alike gets k / 32.
 
     Args:
         pool: texts in a pool, the own one included.

@@ -9,48 +9,34 @@ import torch
 from torch import Tensor
 
 from evaluators.samples import SampleMetric, real_frames
+from flame_mdm.representations import rotation
+from flame_mdm.representations.rifke import Rifke
 
 PARTS = ("root", "trajectory", "mean_local", "mean_global")
 
-FEET = (14, 15, 19, 20)
-TURNED_BY = (17, 12, 9, 6)
-"""Right and left knee, right and left elbow, of MMM's 21 joints."""
+RIFKE = Rifke()
 
 
 def temos_parts(joints: Tensor) -> dict[str, Tensor]:
     """Root (F, 3), trajectory (F, 2), local (F, 20, 3) and global (F, 21, 3) positions as TEMOS compares them.
 
-    The motion is put on a floor, its first root to x = z = 0, its first heading to +z. Local positions are those of all
-    joints but the root seen by the body in each frame: root at x = z = 0, heading +z, y above the floor. The floor is
-    the soft minimum over time of the lowest foot, min - log(0.5 + exp(min - max)). It has a scale: in KIT's units it is
-    the lowest foot + 0.69. The heading is that of knees and elbows, where hips and shoulders are meant: TEMOS indexes
-    joints of which the root has been taken away.
+    The motion is put on the floor, its first root to x = z = 0, its first heading to +z. Local positions are those of
+    all joints but the root seen by the body in each frame: root at x = z = 0, heading +z, y above the floor. Floor and
+    heading are those of `Rifke`, with their peculiarities.
 
     Args:
         joints: (F, 21, 3) MMM's joints in KIT's units, y up; float64.
     """
-    low = joints[:, FEET, 1].amin(1)
-    floor = low.min() - torch.log(0.5 + torch.exp(low.min() - low.max()))
-    joints = torch.stack([joints[..., 0], joints[..., 1] - floor, joints[..., 2]], -1)
-    right, left, right_arm, left_arm = TURNED_BY
-    across = (joints[:, right] - joints[:, left] + joints[:, right_arm] - joints[:, left_arm])[:, [0, 2]]
-    across = across / across.norm(dim=-1, keepdim=True)
-    cos, sin = across[:, 0], -across[:, 1]  # forward is (-across z, across x)
-    root = joints[:, :1] * joints.new_tensor([1.0, 0.0, 1.0])
-    placed = _turn(joints - root[:1], cos[:1], sin[:1])
+    ground = joints[:, :1] * joints.new_tensor([1.0, 0.0, 1.0])
+    floor = joints.new_tensor([0.0, 1.0, 0.0]) * RIFKE.floor(joints)
+    heading = RIFKE.heading(joints)[:, None]
+    placed = rotation.rotate_y(joints - floor - ground[:1], -heading[:1])
     return {
         "root": placed[:, 0],
         "trajectory": placed[:, 0, [0, 2]],
-        "mean_local": _turn(joints - root, cos, sin)[:, 1:],
+        "mean_local": rotation.rotate_y(joints - floor - ground, -heading)[:, 1:],
         "mean_global": placed,
     }
-
-
-def _turn(points: Tensor, cos: Tensor, sin: Tensor) -> Tensor:
-    """Turns points (F, J, 3) about y so that the heading (sin, cos) in (x, z), each (F,), comes to +z."""
-    x, y, z = points.unbind(-1)
-    cos, sin = cos[:, None], sin[:, None]
-    return torch.stack([x * cos - z * sin, y, x * sin + z * cos], -1)
 
 
 def flame_parts(joints: Tensor, root: Tensor, parents: Sequence[int]) -> dict[str, Tensor]:

@@ -1,0 +1,234 @@
+"""Every denoiser with every process and condition: trains, samples, and keeps what the contracts promise together."""
+
+from collections.abc import Iterator
+from functools import cache
+from typing import Any, get_args
+
+import pytest
+import torch
+from torch import Tensor
+
+from flame_mdm.config import EXPERIMENTS, compose, parameters
+from flame_mdm.denoisers import Denoiser
+from flame_mdm.motion import Condition, MotionBatch, length_mask
+from flame_mdm.processes import Process
+from flame_mdm.processes.diffusion import Sampler
+from flame_mdm.processes.flow_matching import STEPS as SOLVERS
+from flame_mdm.representations import Representation
+from flame_mdm.representations.skeleton import Skeleton
+from flame_mdm.task import MotionGeneration
+
+TINY = {"latent_dim": 16, "ff_size": 16, "num_layers": 1, "num_heads": 2, "channels": [8, 8], "num_groups": 4}
+FLOW = "flow_matching"
+PROCESSES = {
+    "x0": {"process": "diffusion"},
+    "epsilon": {"process": "diffusion", "prediction": "epsilon"},
+    "velocity": {"process": "diffusion", "prediction": "velocity"},
+    "learned_range": {"process": "flame", "clip_x0": False},
+    FLOW: {"process": FLOW},
+}
+CONDITIONS = ("learned", "action", "none")
+CALLS_A_STEP = {"midpoint": 2, "heun": 2, "rk4": 4}
+LENGTHS = [11, 8, 5]
+TEXTS = ["a person walks", "a person jumps twice and turns to the left", ""]
+ACTIONS = ["walk", "jump", "sit"]
+
+
+class TwoJoints(Representation):
+    """Two joints and one more feature, with statistics that are not trivial."""
+
+    def __init__(self):
+        tree = Skeleton(
+            "pair", ("root", "foot"), (-1, 0), ((0, 1),), ((0, 0, 0), (0, -1, 0)), (0, 0, 0, 0), (1,), (0, 1)
+        )
+        super().__init__("two_joints", 7, 20.0, tree)
+        generator = torch.Generator().manual_seed(0)
+        self.mean = torch.randn(7, generator=generator)
+        self.std = 0.5 + torch.rand(7, generator=generator)
+
+    def decode(self, features: Tensor) -> Tensor:
+        return features[..., :6].unflatten(-1, (2, 3))
+
+    def encode(self, motion: Any) -> Any:
+        raise NotImplementedError
+
+    def statistics(self, features: Any) -> Any:
+        raise NotImplementedError
+
+    def joint_features(self, joints: Any) -> Any:
+        raise NotImplementedError
+
+
+class Oracle(Denoiser):
+    """Knows the motions and answers what the process wants to hear."""
+
+    def __init__(self, x: Tensor, process: Process, time_scale: float):
+        super().__init__()
+        self.x, self.process, self.time_scale = x, process, time_scale
+
+    def forward(self, x_t: Tensor, t: Tensor, mask: Tensor, cond: Condition) -> Tensor:
+        x, t = self.x.repeat(len(x_t) // len(self.x), 1, 1), t / self.time_scale
+        zero = torch.zeros_like(x)
+        noise = (x_t - self.process.corrupt(x, zero, t)) / self.process.corrupt(zero, zero + 1, t)
+        output = self.process.target(x, noise, t)
+        return torch.cat([output, zero], -1)[..., : self.process.out_features(x.shape[-1])]
+
+
+@cache
+def recipe(*overrides: str) -> dict[str, Any]:
+    return compose("synthetic/mdm", overrides)
+
+
+def part(group: str, option: str) -> dict[str, Any]:
+    return recipe(f"{group}={option}")[group]
+
+
+def denoisers() -> Iterator[tuple[str, dict[str, Any]]]:
+    """The options of `experiments/denoiser` that differ in more than their sizes."""
+    seen = []
+    for path in sorted((EXPERIMENTS / "denoiser").glob("*.yaml")):
+        config = part("denoiser", path.stem) | {"dropout": 0.0}
+        config |= {key: value for key, value in TINY.items() if key in config}
+        config |= {"max_frames": 20} if "max_frames" in config else {}
+        if config not in seen:
+            seen.append(config)
+            yield path.stem, config
+
+
+DENOISERS = dict(denoisers())
+
+
+def build(denoiser: str, process: str, condition: str = "learned", **process_options: Any) -> MotionGeneration:
+    """A tiny task in float64, so that only real differences show."""
+    config = recipe() | {"denoiser": DENOISERS[denoiser]}
+    options = dict(PROCESSES[process])
+    config["process"] = part("process", str(options.pop("process"))) | options | process_options
+    if "num_train_timesteps" in config["process"]:
+        config["process"]["num_train_timesteps"] = 10
+    config["condition"] = part("condition", condition) | ({} if condition == "none" else {"features": 16})
+    if condition == "action" and "project_condition" in parameters(config["denoiser"]["_target_"]):
+        config["denoiser"] = config["denoiser"] | {"project_condition": False}
+    config["task"] = config["task"] | {"cond_drop_prob": 0.5, "guidance_scale": 2.5, "num_inference_steps": 4}
+    config["task"]["sampler"] = samplers(process)[0]
+    torch.manual_seed(0)
+    return MotionGeneration.build(config, TwoJoints(), actions=ACTIONS).double()
+
+
+def samplers(process: str) -> list[str]:
+    return [*SOLVERS, "dopri5"] if process == FLOW else list(get_args(Sampler))
+
+
+def batch(rows: slice = slice(None), frames: int | None = None) -> MotionBatch:
+    """Motions of mixed lengths; `rows` chooses some, `frames` pads further."""
+    lengths = torch.tensor(LENGTHS)[rows]
+    mask = length_mask(lengths, frames)
+    x = torch.randn(len(LENGTHS), max(LENGTHS), 7, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    x = torch.nn.functional.pad(x, (0, 0, 0, 20))[rows, : mask.shape[1]] * mask[..., None]
+    ids = [f"motion {i}" for i in range(len(LENGTHS))][rows]
+    return MotionBatch(x, mask, ids, TEXTS[rows], torch.arange(len(LENGTHS))[rows])
+
+
+def legal(denoiser: str, condition: str) -> bool:
+    """Denoisers that read tokens in place of the pooled vector need a condition."""
+    return condition != "none" or not DENOISERS[denoiser].get("max_tokens")
+
+
+each_denoiser = pytest.mark.parametrize("denoiser", DENOISERS)
+each_process = pytest.mark.parametrize("process", PROCESSES)
+each_condition = pytest.mark.parametrize("condition", CONDITIONS)
+
+
+@each_condition
+@each_process
+@each_denoiser
+def test_trains_and_samples(denoiser, process, condition, monkeypatch):
+    task = build(denoiser, process, condition)
+    motions = batch()
+    if not legal(denoiser, condition):
+        with pytest.raises(ValueError, match="reads condition tokens, but the condition encoder returns none"):
+            task.generate(motions)
+        return
+    logged: dict[str, Tensor] = {}
+    monkeypatch.setattr(task, "log_dict", lambda values, **_: logged.update(values))
+    optimizer = task.configure_optimizers()
+    reached: set[str] = set()
+    task.train()
+    for step in range(3):
+        optimizer.zero_grad()
+        loss = task.training_step(motions, step)
+        assert loss.isfinite()
+        loss.backward()
+        reached |= {name for name, p in task.named_parameters() if p.grad is not None and p.grad.abs().sum() > 0}
+        optimizer.step()
+    assert {name for name, _ in task.named_parameters()} - reached == set(), "parameters without a gradient"
+    assert {"train/loss", "train/mse"} <= logged.keys()
+    assert ("train/vlb" in logged) == (process == "learned_range")
+    for sampler in samplers(process):
+        if sampler == "dopri5" and condition != "learned":
+            continue  # hundreds of calls
+        x = task.generate(motions, sampler=sampler)
+        assert x.shape == motions.x.shape
+        assert x.isfinite().all()
+        assert (x[~motions.mask] == 0).all()
+        assert x[motions.mask].std() > 0.01
+    assert task.training
+
+
+@pytest.mark.parametrize("process", ["x0", "learned_range", FLOW])
+@each_denoiser
+def test_a_motion_does_not_depend_on_padding_or_neighbors(denoiser, process):
+    task = build(denoiser, process)
+    together = task.generate(batch())
+    longer = task.generate(batch(frames=17))
+    for row, length in enumerate(LENGTHS):
+        alone = task.generate(batch(slice(row, row + 1)))
+        for other in (longer[row, :length], alone[0, :length]):
+            torch.testing.assert_close(other, together[row, :length], rtol=0, atol=1e-8)
+
+
+@each_process
+def test_another_seed_replication_text_or_scale_is_another_motion(process):
+    task, motions = build("mdm_encoder", process), batch()
+    x = task.generate(motions)
+    torch.testing.assert_close(task.generate(motions), x, rtol=0, atol=0)
+    changed = batch()
+    changed.text = TEXTS[::-1]
+    assert (task.generate(motions, seed=1) - x)[0].abs().max() > 0.1
+    assert (task.generate(motions, replication=1) - x)[0].abs().max() > 0.1
+    assert (task.generate(changed) - x)[0].abs().max() > 1e-6
+    assert (task.generate(motions, guidance_scale=1.0) - x)[0].abs().max() > 1e-6
+    assert (task.generate(motions, unconditioned=True) - x)[0].abs().max() > 1e-6
+
+
+@pytest.mark.parametrize(("process", "sampler"), [(p, s) for p in PROCESSES for s in samplers(p)])
+def test_an_oracle_returns_the_data(process, sampler):
+    options: dict[str, Any] = {"quantize_time": False} if process == FLOW else {}
+    task = build("mdm_encoder", process, **options)
+    motions = batch()
+    task.denoiser = Oracle(motions.x, task.process, 1000.0 if process == FLOW else 1.0)
+    x = task.generate(motions, sampler=sampler, num_inference_steps=5)
+    left = 5e-4 if process == FLOW else 1e-6  # a flow keeps sigma_min = 1e-4 times the noise
+    torch.testing.assert_close(x, motions.x, rtol=0, atol=left)
+    joints = task.representation.to_joints(x)
+    torch.testing.assert_close(joints, task.representation.to_joints(motions.x), rtol=0, atol=2 * left)
+
+
+@pytest.mark.parametrize(("guidance_scale", "copies"), [(2.5, 2), (1.0, 1)])
+@pytest.mark.parametrize(("process", "sampler"), [(p, s) for p in ("x0", FLOW) for s in samplers(p)])
+def test_one_encoding_a_run_and_one_forward_a_call(process, sampler, guidance_scale, copies):
+    task, steps = build("mdm_decoder_text", process), 5
+    encodings, forwards = [], []
+    task.condition.register_forward_hook(lambda *_: encodings.append(1))
+    task.denoiser.register_forward_hook(lambda _, inputs, __: forwards.append(len(inputs[0])))
+    task.generate(batch(), sampler=sampler, num_inference_steps=steps, guidance_scale=guidance_scale)
+    assert len(encodings) == 1
+    assert set(forwards) == {copies * len(LENGTHS)}
+    if sampler != "dopri5":
+        assert len(forwards) == steps * CALLS_A_STEP.get(sampler, 1)
+
+
+def test_a_sampler_of_another_process_is_refused():
+    with pytest.raises(ValueError, match="unknown sampler 'euler': GaussianDiffusion has ancestral"):
+        build("mdm_encoder", "x0").generate(batch(), sampler="euler")
+    with pytest.raises(ValueError, match="unknown sampler 'ddim': FlowMatching has euler"):
+        build("mdm_encoder", FLOW).generate(batch(), sampler="ddim")

@@ -32,6 +32,7 @@ MDM = [
 ]
 DTYPES = [torch.float32, torch.float64]
 NORMALIZED = ("humanml", "kit")
+WIDTHS = {263: "humanml", 251: "kit", 150: "humanact12"}
 
 
 def weights(arrays: Arrays) -> dict[str, torch.Tensor]:
@@ -53,16 +54,17 @@ def imported(stem: str, mask_frames: bool, time_token: bool) -> MotionGeneration
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         torch.save(weights(arrays), folder / "model.pt")
-        keys = ("arch", "emb_trans_dec", "text_encoder_type", "dataset", "cond_mask_prob")
-        args = {key: config[key] for key in keys if key in config}
+        keys = ("arch", "emb_trans_dec", "text_encoder_type", "cond_mask_prob")
+        width = weights(arrays)["output_process.poseFinal.bias"].numel()
+        args = {key: config[key] for key in keys if key in config} | {"dataset": WIDTHS[width]}
         (folder / "args.json").write_text(json.dumps(args | {"mask_frames": mask_frames}, indent=4))
         words = ["import", "mfm" if stem == "mfm" else "mdm", f"{folder}/model.pt", f"{folder}/args.json"]
         words += ["-o", f"{folder}/ours.safetensors", f"--heads={config.get('num_heads', config.get('heads'))}"]
         words += ["--time-token"] if time_token else []
-        if config["dataset"] in NORMALIZED:
+        if args["dataset"] in NORMALIZED:
             words += [
                 "--stats",
-                str(statistics_folder(folder, weights(arrays)["output_process.poseFinal.bias"].numel())),
+                str(statistics_folder(folder, width)),
             ]
         assert checkpoints.main(words) == 0
         return load(folder / "ours.safetensors")

@@ -267,7 +267,7 @@ class Folder(MotionSource):
         data = _arrays(path)
         if "poses" in data:
             return self._from_smpl(path, data, fps)
-        rate = float(data.get("fps", self.skeleton.get("fps", 0)))
+        rate = float(data["fps"] if "fps" in data else self.skeleton.get("fps", 0))
         if not rate > 0:
             raise ValueError(f"{path}: it does not tell its frame rate; write `fps: 30` (or yours) into skeleton.yaml")
         joints = data["joints"].astype(float)
@@ -298,10 +298,10 @@ class Folder(MotionSource):
         known = (layout for layout in LAYOUTS.values() if layout.knows(names))
         layout = Layout(self.skeleton["map"]) if "map" in self.skeleton else next(known, None)
         if layout is None or not layout.knows(names):
+            known_ones = f"none of {', '.join(LAYOUTS)} skeletons" if layout is None else "not those of the map"
             raise ValueError(
-                f"{path}: its joints ({', '.join(names)}) are "
-                f"{'none of ' + ', '.join(LAYOUTS) + ' skeletons' if layout is None else 'not those of the map'}; write "
-                "into skeleton.yaml which of them stands for which of SMPL's"
+                f"{path}: its joints ({', '.join(names)}) are {known_ones}; write into skeleton.yaml which of them "
+                "stands for which of SMPL's"
             )
         layout = replace(layout, **self.skeleton)
         joints = layout.apply(positions, names)
@@ -358,8 +358,8 @@ def read_skeleton(path: Path) -> dict[str, Any]:
         positive = key not in ("unit", "fps") or 0 < value < math.inf
         if not isinstance(value, kinds[key]) or not positive or (key == "up" and value not in UP):
             raise ValueError(
-                f"{path}: {key}: {value} does not do; map and joints are a map and a list, unit (metres in a 1) and fps "
-                f"numbers above 0, up one of {', '.join(UP)}, mirrored true or false"
+                f"{path}: {key}: {value} does not do; map and joints are a map and a list, unit (metres in a 1) and "
+                f"fps numbers above 0, up one of {', '.join(UP)}, mirrored true or false"
             )
     if "map" in data:
         missing = sorted(set(SMPL22.joints) - set(data["map"]))

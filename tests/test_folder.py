@@ -1,0 +1,345 @@
+"""Own motions and captions, in every kind of file that the documentation names."""
+
+import csv
+import json
+import re
+import shlex
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from fixtures import ROOT
+
+from flame_mdm import prepare, sample, train
+from flame_mdm.data import bvh
+from flame_mdm.data.crops import Units
+from flame_mdm.data.datamodule import MotionDataModule
+from flame_mdm.data.folder import LAYOUTS, Folder, read_skeleton
+from flame_mdm.data.store import write_store
+from flame_mdm.data.synthetic import Synthetic
+from flame_mdm.representations.humanml import HumanML
+from flame_mdm.representations.skeleton import KIT21, SMPL22
+from flame_mdm.representations.smpl import ADULT, SMPL
+
+WALK = next(c for c in Synthetic(clips=30).clips(30.0) if c.attributes["action"] == "walk").motion.astype(float)
+"""(F, 22, 3) metres, y up, 30 frames a second."""
+AT_20 = np.floor((len(WALK) - 1) * 20 / 30 + 1e-6) + 1
+
+
+def only(folder: Path, fps: float = 30.0, **options) -> np.ndarray:
+    (clip,) = Folder(str(folder), **options).clips(fps)
+    return clip.motion
+
+
+def skeleton(folder: Path, text: str) -> None:
+    (folder / "skeleton.yaml").write_text(text)
+
+
+@pytest.fixture
+def arrays(tmp_path: Path) -> Path:
+    """Three motions in the three kinds of arrays, with captions in text files."""
+    np.save(tmp_path / "one.npy", WALK)
+    (tmp_path / "deep").mkdir()
+    np.savez(tmp_path / "deep" / "two.npz", joints=WALK[:50].astype(np.float32), fps=30)
+    rest = [(0.0, 0.0, 0.0)] * 51
+    poses = np.tile(np.array([(np.pi / 2, 0, 0), *rest]).reshape(1, 156), (60, 1))
+    np.savez(tmp_path / "three.npz", poses=poses, trans=np.linspace((0, 0, 1), (1, 0, 1), 60), mocap_framerate=60.0)
+    skeleton(tmp_path, "fps: 30\n")
+    for name in ("one", "deep/two", "three"):
+        (tmp_path / f"{name}.txt").write_text("a person walks\nsomeone goes ahead#someone/NOUN#0.0#0.0\n\n")
+    return tmp_path
+
+
+def test_arrays_and_text_files(arrays: Path):
+    source = Folder(str(arrays))
+    clips = {clip.id: clip for clip in source.clips(20.0)}
+    assert list(clips) == ["deep_two", "one", "three"]
+    assert source.count() == 3
+    assert all(clip.captions == ["a person walks", "someone goes ahead"] for clip in clips.values())
+    assert len(clips["one"].motion) == AT_20
+    np.testing.assert_allclose(clips["one"].motion[::2], WALK[::3][: len(clips["one"].motion[::2])], atol=1e-6)
+    amass = clips["three"].motion
+    assert amass.shape == (20, 22, 3)
+    at = dict(zip(SMPL22.joints, amass[-1], strict=True))
+    assert at["head"][1] > at["pelvis"][1] > at["left_foot"][1]
+    np.testing.assert_allclose(at["pelvis"], [-57 / 59 - ADULT[0][0], 1, 0], atol=1e-5)
+
+
+def test_smpl_rotations_are_kept(tmp_path: Path):
+    rng = np.random.default_rng(0)
+    turns = np.cumsum(0.1 * rng.normal(size=(31, 52, 3)), 0)
+    np.savez(tmp_path / "x.npz", poses=turns.reshape(31, 156), trans=rng.normal(size=(31, 3)), mocap_framerate=120)
+    motion = only(tmp_path, 60.0, motion="smpl")
+    assert motion.shape == (16, 75)
+    expected = SMPL().encode(torch.from_numpy(motion))
+    with np.load(tmp_path / "x.npz") as file:
+        same = SMPL().encode(torch.from_numpy(np.concatenate([file["trans"], file["poses"]], 1)[::2]))
+    np.testing.assert_allclose(expected.numpy(), same.numpy(), atol=1e-5)
+
+
+def bvh_of(names: tuple[str, ...], positions: np.ndarray, parents: tuple[int, ...], fps: float) -> bvh.Bvh:
+    """A file in which every joint has position channels, so that it shows these positions."""
+    local = positions.copy()
+    for joint, parent in enumerate(parents):
+        if parent >= 0:
+            local[:, joint] -= positions[:, parent]
+    channels = ("Xposition", "Yposition", "Zposition", "Zrotation", "Xrotation", "Yrotation")
+    frames = np.concatenate([local, np.zeros_like(local)], 2).reshape(len(local), -1)
+    size = len(names)
+    return bvh.Bvh(names, parents, np.zeros((size, 3)), (channels,) * size, (), np.zeros((0, 3)), frames, fps)
+
+
+@pytest.mark.parametrize("name", LAYOUTS)
+@pytest.mark.parametrize("prefix", ["", "mixamorig:"])
+def test_known_skeletons_are_recognized(name: str, prefix: str, tmp_path: Path):
+    """Joints that a skeleton has itself come out where they are; the blended ones lie between them."""
+    layout = LAYOUTS[name]
+    own = {place: joint for joint, place in layout.map.items() if isinstance(place, str)}
+    own |= {next(iter(p)): j for j, p in layout.map.items() if not isinstance(p, str) and len(p) == 1}
+    blended = {j for j, p in layout.map.items() if not isinstance(p, str) and len(p) > 1}
+    extra = {n for p in layout.map.values() if not isinstance(p, str) for n in p} - set(own)
+    names = [*own, *sorted(extra)]
+    number = {joint: k for k, joint in enumerate(SMPL22.joints)}
+    place = [number[own[n]] if n in own else number["spine3"] for n in names]
+    positions = WALK[:, place] / layout.unit * [-1 if layout.mirrored else 1, 1, 1]
+    names = tuple(prefix + n for n in names)
+    bvh.write(bvh_of(names, positions, (-1, *(0 for _ in names[1:])), 30.0), tmp_path / "take.bvh")
+    (tmp_path / "captions.csv").write_text("id,text\ntake,a person walks\n")
+    found = only(tmp_path)
+    exact = [k for joint, k in number.items() if joint not in blended]
+    np.testing.assert_allclose(found[:, exact], WALK[:, exact], atol=1e-4)
+    for joint in blended:
+        assert np.abs(found[:, number[joint]] - WALK[:, number[joint]]).max() < 0.25, joint
+
+
+def test_mmm_joints_of_arrays(tmp_path: Path):
+    place = [SMPL22.joints.index(j) for j in ("pelvis", "spine2", "spine3")]
+    middle = WALK[:, place]
+    by_name = {n: WALK[:, SMPL22.joints.index(n)] for n in KIT21.joints if n in SMPL22.joints}
+    by_name |= dict(zip(("root", "belly", "thorax"), middle.transpose(1, 0, 2), strict=True))
+    by_name |= {f"{side}_toes": WALK[:, SMPL22.joints.index(f"{side}_foot")] for side in ("left", "right")}
+    np.save(tmp_path / "x.npy", np.stack([by_name[n] for n in KIT21.joints], 1) * 640 * [-1, 1, 1])
+    skeleton(tmp_path, "fps: 30\n")
+    found = only(tmp_path)
+    for joint in ("pelvis", "left_wrist", "right_foot"):
+        np.testing.assert_allclose(found[:, SMPL22.joints.index(joint)], WALK[:, SMPL22.joints.index(joint)], atol=1e-5)
+
+
+def test_bones_of_bvh_files_keep_their_length(tmp_path: Path):
+    motion = bvh.read(turning(tmp_path / "x.bvh"))
+    joints = only(tmp_path, 20.0)
+    assert len(joints) == np.floor((len(motion.frames) - 1) * 20 / motion.fps) + 1
+    lengths = np.linalg.norm(joints[:, 4] - joints[:, 1], axis=1)
+    np.testing.assert_allclose(lengths, lengths[0], rtol=1e-5)
+
+
+def turning(path: Path) -> Path:
+    """A stiff body that turns fast, so that straight lines between positions would shorten its bones."""
+    offsets = WALK[0].copy() * 100
+    for joint, parent in enumerate(SMPL22.parents):
+        if parent >= 0:
+            offsets[joint] -= WALK[0, parent] * 100
+    names = dict(LAYOUTS["Mixamo"].map)
+    joints = tuple(n if isinstance(n, str) else next(iter(n)) for n in (names[j] for j in SMPL22.joints))
+    root = ("Xposition", "Yposition", "Zposition", "Zrotation", "Xrotation", "Yrotation")
+    frames = np.zeros((40, 6 + 3 * 21))
+    frames[:, :3] = WALK[0, 0] * 100
+    frames[:, 5] = np.arange(40) * 40.0
+    channels = (root, *[root[3:]] * 21)
+    bvh.write(bvh.Bvh(joints, SMPL22.parents, offsets, channels, (), np.zeros((0, 3)), frames, 30.0), path)
+    return path
+
+
+def test_a_skeleton_file_maps_any_joints(tmp_path: Path):
+    """Centimetres, z up, joints in another order with names of their own."""
+    order = np.random.default_rng(0).permutation(22)
+    turned = WALK[:, order][..., [0, 2, 1]] * [100, -100, 100]  # y up -> z up
+    np.save(tmp_path / "x.npy", turned)
+    names = [f"bone {SMPL22.joints[k]}" for k in order]
+    places = {joint: f"bone {joint}" for joint in SMPL22.joints}
+    lines = ["fps: 30", "unit: 0.01", "up: z", f"joints: {json.dumps(names)}", f"map: {json.dumps(places)}"]
+    skeleton(tmp_path, "\n".join(lines))
+    np.testing.assert_allclose(only(tmp_path), WALK, atol=1e-5)
+
+
+def write_table(folder: Path, rows: list[dict], kind: str) -> None:
+    if kind == "csv":
+        with (folder / "captions.csv").open("w", newline="") as file:
+            writer = csv.DictWriter(file, ["id", "text", "action", "split", "source"])
+            writer.writeheader()
+            writer.writerows(rows)
+        return
+    content: dict[str, dict] = {}
+    for row in rows:
+        entry = content.setdefault(row["id"], {**row, "text": []})
+        entry.pop("id", None)
+        entry["text"].append(row["text"])
+    (folder / "captions.json").write_text(json.dumps(content))
+
+
+@pytest.mark.parametrize("kind", ["csv", "json"])
+def test_tables_give_captions_actions_splits_and_sources(kind: str, tmp_path: Path):
+    rows = []
+    for k in range(12):
+        np.savez(tmp_path / f"{k:02d}.npz", joints=WALK + 0.01 * k, fps=30)
+        where = {"action": ("turn left", "turn right", "walk")[k % 3], "split": "val" if k == 11 else "train"}
+        rows += [{"id": f"{k:02d}", "text": text, **where, "source": f"take {k // 2 if k < 10 else k}"}
+                 for text in ("turns Left, clockwise", "is bright")]  # fmt: skip
+    write_table(tmp_path, rows, kind)
+    data = MotionDataModule(
+        Folder(str(tmp_path), mirror=True),
+        HumanML(),
+        root=str(tmp_path / "stores"),
+        name="mine",
+        batch_size=4,
+        crop=Units(24, 60, 4),
+    )
+    data.prepare_data()
+    data.setup("fit")
+    assert data.store.info["actions"] == ["turn left", "turn right", "walk"]
+    assert data.store.info["clips"] == {"train": 22, "val": 1, "test": 0}
+    clips = {clip.id: clip for clip in data.store.clips}
+    assert data.source.count() == len(clips)
+    assert clips["00"].captions == ["turns Left, clockwise", "is bright"]
+    assert clips["M00"].captions == ["turns Right, counterclockwise", "is bright"]
+    assert [clips[i].action for i in ("00", "M00", "02", "M02")] == [0, 1, 2, 2]
+    assert clips["00"].source == clips["M00"].source == clips["01"].source == "take 0"
+    batch = next(iter(data.train_dataloader()))
+    assert batch.x.shape[0::2] == (4, 263)
+    assert batch.action is not None
+    assert batch.text is not None
+
+
+def test_splits_go_by_the_source(tmp_path: Path):
+    rows = []
+    for k in range(60):
+        np.savez(tmp_path / f"{k:02d}.npz", joints=WALK[:30], fps=30)
+        rows.append({"id": f"{k:02d}", "text": "walks", "source": f"take {k // 2}"})
+    write_table(tmp_path, rows, "json")
+    clips = list(Folder(str(tmp_path)).clips(20.0))
+    assert all(a.split == b.split for a, b in zip(clips[::2], clips[1::2], strict=True))
+    assert {clip.split for clip in clips} == {"train", "val", "test"}
+
+
+MAP = json.dumps({joint: f"{joint}?" for joint in SMPL22.joints})
+BAD = {
+    "no motion": (lambda f: [p.unlink() for p in f.rglob("*.np*")], "no motion in it; give a folder"),
+    "twice": (lambda f: np.savez(f / "one.npz", joints=WALK, fps=30), r"one\.npz: there is one\.npy, too"),
+    "no caption": (lambda f: (f / "one.txt").unlink(), "1 of 3 motions have no caption, such as one"),
+    "unknown id": (lambda f: (f / "captions.csv").write_text("id,text\nonce,a\n"), r"captions\.csv, line 2: .*'once'"),
+    "columns": (lambda f: (f / "captions.csv").write_text("id,caption\none,a\n"), r"captions\.csv: its columns are"),
+    "cells": (lambda f: (f / "captions.csv").write_text("id,text\none,a, b\n"), r"line 2: not as many cells"),
+    "split": (lambda f: (f / "captions.csv").write_text("id,split\none,dev\n"), r"line 2: the split 'dev' is none of"),
+    "json": (lambda f: (f / "captions.json").write_text("{"), r"captions\.json: not read as JSON"),
+    "json key": (lambda f: (f / "captions.json").write_text('{"one": {"txt": "a"}}'), "one: unknown key txt"),
+    "json shape": (lambda f: (f / "captions.json").write_text('{"one": "a"}'), r"captions\.json: write {"),
+    "two splits": (
+        lambda f: (f / "captions.csv").write_text("id,split\none,val\none,test\n"),
+        "line 3: one has the split val and test",
+    ),
+    "no rate": (lambda f: (f / "skeleton.yaml").unlink(), r"one\.npy: it does not tell its frame rate"),
+    "cut": (lambda f: (f / "one.npy").write_bytes((f / "one.npy").read_bytes()[:900]), r"one\.npy: damaged"),
+    "objects": (lambda f: np.save(f / "one.npy", np.array([{}])), r"one\.npy: damaged, or not a file of plain arrays"),
+    "keys": (lambda f: np.savez(f / "three.npz", x=1), r"three\.npz: it holds x"),
+    "flat": (lambda f: np.save(f / "one.npy", WALK.reshape(-1, 66)), r"one\.npy: joints of shape \(\d+, 66\)"),
+    "23 joints": (lambda f: np.save(f / "one.npy", np.zeros((9, 23, 3))), r"one\.npy: 23 joints, not the 22, 24 or 52"),
+    "17 joints": (lambda f: np.save(f / "one.npy", np.zeros((9, 17, 3))), r"one\.npy: 17 joints of unknown names"),
+    "nan": (lambda f: np.save(f / "one.npy", WALK * np.nan), r"one\.npy: numbers in frame 0 are not finite"),
+    "unit": (lambda f: np.save(f / "one.npy", WALK * 100), r"one\.npy: a leg of 8\d.* m; say in skeleton\.yaml"),
+    "sides": (lambda f: np.save(f / "one.npy", WALK * [-1, 1, 1]), r"one\.npy: the toes point backwards"),
+    "up": (lambda f: np.savez(f / "deep/two.npz", joints=WALK[..., [0, 2, 1]] * [1, -1, 1], fps=9), "the body lies"),
+    "trans": (lambda f: np.savez(f / "three.npz", poses=np.zeros((9, 72))), r"three\.npz: AMASS's files hold poses"),
+    "yaml": (lambda f: skeleton(f, "fps: [30"), r"skeleton\.yaml: not read as YAML"),
+    "yaml key": (lambda f: skeleton(f, "rate: 30"), r"skeleton\.yaml: unknown key rate; there are map, joints"),
+    "yaml list": (lambda f: skeleton(f, "- 30"), r"skeleton\.yaml: unknown key list"),
+    "yaml value": (lambda f: skeleton(f, "fps: 0"), r"skeleton\.yaml: fps: 0 does not do"),
+    "yaml up": (lambda f: skeleton(f, "up: x"), r"skeleton\.yaml: up: x does not do"),
+    "yaml map": (lambda f: skeleton(f, "map: {pelvis: Hips}"), r"skeleton\.yaml: map: which joint stands for head"),
+    "yaml names": (lambda f: skeleton(f, f"joints: [a]\nmap: {MAP}"), r"map: head\?, .* is not among the joints"),
+    "other map": (lambda f: skeleton(f, f"fps: 30\nmap: {MAP}"), r"two\.npz: its joints .* are not those of the map"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_every_fault_is_named_in_a_line(case: str, arrays: Path):
+    damage, message = BAD[case]
+    if case == "up":
+        for name in ("one.npy", "three.npz"):
+            (arrays / name).unlink()
+    damage(arrays)
+    with pytest.raises((ValueError, FileNotFoundError), match=message) as error:
+        list(Folder(str(arrays)).clips(30.0))
+    assert "\n" not in str(error.value)
+    assert str(arrays) in str(error.value)
+
+
+def test_unknown_joints_are_listed(tmp_path: Path):
+    bvh.write(bvh_of(("root", "tail"), WALK[:, :2], (-1, 0), 30.0), tmp_path / "cat.bvh")
+    with pytest.raises(ValueError, match=r"cat\.bvh: its joints \(root, tail\) are none of SMPL, Mixamo, CMU"):
+        only(tmp_path)
+
+
+def test_motions_are_excluded_by_name(arrays: Path):
+    (arrays / "one.npy").write_bytes(b"")
+    source = Folder(str(arrays), exclude=["one"])
+    assert [clip.id for clip in source.clips(20.0)] == ["deep_two", "three"]
+    assert source.excluded() == {"motions by data.source.exclude": 1}
+    with pytest.raises(ValueError, match="no motion won"):
+        Folder(str(arrays), exclude=["won"]).count()
+    with pytest.raises(ValueError, match=r"one\.npy: damaged"):
+        write_store(arrays / "store", Folder(str(arrays)), HumanML())
+    with pytest.raises(ValueError, match=r"deep/two\.npz: it holds no rotations of SMPL"):
+        list(Folder(str(arrays), motion="smpl").clips(20.0))
+
+
+def test_a_skeleton_file_is_read(tmp_path: Path):
+    skeleton(tmp_path, "up: -y\nmirrored: true\n")
+    assert read_skeleton(tmp_path / "skeleton.yaml") == {"up": "-y", "mirrored": True}
+
+
+QUICK = [
+    "trainer.max_steps=3",
+    "trainer.val_check_interval=3",
+    "trainer.enable_progress_bar=false",
+    "trainer.accelerator=cpu",
+    "callbacks.samples.every_n_steps=100",
+    "data.num_workers=0",
+    "denoiser.num_layers=1",
+    "task.num_inference_steps=2",
+]
+"""What makes the training of the tutorial short."""
+
+
+def make(line: str, environment: pytest.MonkeyPatch) -> int:
+    """Runs a make command as make does: variables are handed down in MAKEFLAGS, latest first."""
+    _, target, *variables = shlex.split(line)
+    variables += QUICK if target == "train" else []
+    escaped = (re.sub(r"([\\ ])", r"\\\1", word).replace("$", "$$") for word in reversed(variables))
+    environment.setenv("MAKEFLAGS", f" -- {' '.join(escaped)}")
+    return {"prepare": prepare, "train": train, "sample": sample}[target].main(["--from-make"])
+
+
+def test_the_tutorial_works_as_it_is_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    """Runs the code blocks of the documentation in their order, in an empty folder."""
+    text = (ROOT / "docs" / "own-data.md").read_text()
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("FLAME_MDM_DATA", str(tmp_path / "data"))
+    ran = 0
+    for language, block in re.findall(r"```(\w+)\n(.*?)```", text, re.DOTALL):
+        if language == "python":
+            exec(block, {})
+        elif language == "yaml":
+            Path(re.findall(r"# (\S+\.yaml)", block)[0]).write_text(block)
+        else:
+            for line in block.splitlines():
+                assert make(line, monkeypatch) == 0, capsys.readouterr()
+                ran += 1
+    assert ran == 4
+    output = capsys.readouterr().out
+    assert "40 clips can be prepared" in output
+    assert "folder as humanml-clean-smpl22 at 20 fps" in output
+    assert list(tmp_path.glob("samples/mine/*/*.html"))
+    assert set(read_skeleton(tmp_path / "mine" / "skeleton.yaml")["map"]) == set(SMPL22.joints)

@@ -8,7 +8,7 @@ import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context, parent_process
+from multiprocessing import active_children, get_context, parent_process
 from typing import TypeVar
 
 import torch
@@ -30,6 +30,7 @@ def in_order(function: Callable[[Task], Result], tasks: Iterable[Task], workers:
     if workers == 1:
         yield from map(function, tasks)
         return
+    others = active_children()
     # Fresh processes: a fork would copy the threads' locks of a process that may have used torch before.
     with ProcessPoolExecutor(workers, get_context("spawn"), _start_worker) as pool:
         pending = deque()
@@ -40,8 +41,12 @@ def in_order(function: Callable[[Task], Result], tasks: Iterable[Task], workers:
                     yield pending.popleft().result()
             while pending:
                 yield pending.popleft().result()
-        finally:
+        except BaseException:  # an error or Ctrl-C shall not wait for tasks that may take half an hour
             pool.shutdown(wait=False, cancel_futures=True)
+            for process in set(active_children()) - set(others):
+                process.terminate()
+                process.join()
+            raise
 
 
 def _start_worker() -> None:

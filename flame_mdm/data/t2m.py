@@ -115,7 +115,7 @@ class T2MFolder(MotionSource):
             path: the folder.
             exclude: names to leave out; a mirrored copy has its own name.
         """
-        self.path, self.exclude = Path(path), frozenset(exclude)
+        self.path, self.exclude = Path(path), frozenset(str(name) for name in exclude)
         self._excluded: Counter[str] = Counter()
 
     @cached_property

@@ -1,0 +1,21 @@
+import math
+import time
+from multiprocessing import active_children
+
+import pytest
+
+from flame_mdm.data.parallel import in_order
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_results_come_in_the_order_of_the_tasks(workers):
+    assert list(in_order(math.sqrt, (float(n * n) for n in range(40)), workers)) == list(range(40))
+
+
+def test_an_error_ends_the_other_tasks():
+    before = active_children()
+    start = time.monotonic()
+    with pytest.raises(ValueError, match="non-negative"):
+        list(in_order(time.sleep, [-1, 100, 100, 100], workers=2))
+    assert time.monotonic() - start < 60
+    assert [child for child in active_children() if child not in before] == []

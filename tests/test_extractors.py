@@ -1,12 +1,13 @@
 """Networks that the papers evaluate with: the authors' outputs, and loading of the authors' files."""
 
+import json
 import pickle
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from fixtures import Arrays, golden, groups, meta, needs_third_party, third_party
+from fixtures import GOLDEN, Arrays, golden, groups, meta, needs_third_party, third_party
 from torch import Tensor, nn
 
 from evaluators.action_gru import NUM_ACTIONS, ActionGRU, load_action_gru
@@ -69,6 +70,21 @@ def test_t2m_gives_the_authors_embeddings(stem):
     assert_within(text[theirs], arrays, "out/text_embedding")
     assert_within(motion[theirs], arrays, "out/motion_embedding")
     assert_within(motion[theirs], arrays, "out/motion_embedding_only")
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize("features", [pytest.param(f, id=f"state_dict_manifest-t2m_{f}") for f in (263, 251)])
+def test_t2m_has_the_sizes_of_the_released_networks(features):
+    manifest = json.loads((GOLDEN / "state_dict_manifest.json").read_text())
+    with torch.device("meta"):
+        network = T2MEvaluator(torch.zeros(features), torch.ones(features))
+    for ours, theirs in (
+        ("movement_encoder", f"t2m_movement_encoder_{features}"),
+        ("text_encoder", "t2m_text_encoder"),
+        ("motion_encoder", "t2m_motion_encoder"),
+    ):
+        shapes = {name: list(value.shape) for name, value in network.get_submodule(ours).state_dict().items()}
+        assert shapes == manifest[theirs]["keys"]
 
 
 @pytest.mark.golden

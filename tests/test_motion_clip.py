@@ -1,11 +1,12 @@
 """Motion-CLIP: the authors' numbers, the contrast over several processes, and training by recipe."""
 
+import json
 import math
 
 import pytest
 import torch
 from distributed import GlooPool
-from fixtures import Arrays, golden, meta
+from fixtures import GOLDEN, Arrays, golden, meta
 from torch.nn import functional
 
 from evaluators.motion_clip import (
@@ -18,7 +19,7 @@ from evaluators.motion_clip import (
 )
 from flame_mdm import train
 from flame_mdm.conditions.text import PretrainedText
-from flame_mdm.config import UserError
+from flame_mdm.config import UserError, compose, instantiate
 from flame_mdm.motion import length_mask
 from flame_mdm.noise import key
 from flame_mdm.representations.smpl import SMPL
@@ -83,6 +84,20 @@ def test_the_import_takes_every_weight_exactly_once(stem):
             import_mclip({k: v for k, v in state.items() if k != name})
     with pytest.raises(ValueError, match="unknown extra"):
         import_mclip({**state, "extra": torch.zeros(1)})
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize("stem", ["state_dict_manifest-flame_mclip_net"])
+def test_the_recipe_has_the_sizes_of_the_released_network(stem):
+    manifest = json.loads((GOLDEN / "state_dict_manifest.json").read_text())["flame_mclip_net"]
+    shapes = {name: shape for name, shape in manifest["keys"].items() if not name.startswith("text_model.")}
+    released = import_mclip({name: torch.zeros(shape) for name, shape in shapes.items()})
+    recipe = compose("motion_clip/humanml3d_smpl")["task"]["network"]
+    ours = instantiate(recipe, in_features=147, text_features=768)
+    assert {n: v.shape for n, v in ours.state_dict().items()} == {n: v.shape for n, v in released.state_dict().items()}
+    assert ours.blind_features == released.blind_features
+    assert ours.transformer.layers[0].self_attention.num_heads == 8
+    assert recipe["dropout"] == 0.1
 
 
 def test_a_released_file_brings_the_pooler_it_was_trained_with(tmp_path):

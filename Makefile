@@ -7,7 +7,7 @@ VENV := .venv
 READY := $(VENV)/.ready
 export MAKEFLAGS
 
-.PHONY: help setup prepare train sample edit test lint bench
+.PHONY: help setup prepare browse train sample edit convert test lint bench
 
 help: ## show this
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## /  make \1@/' | column -t -s @
@@ -24,6 +24,9 @@ $(READY): pyproject.toml constraints.txt
 prepare: $(READY) ## prepare a data set: DATA=bandai SOURCE=/path/to/folder-or-archive [verify=true]
 	@$(VENV)/bin/python -m flame_mdm.prepare --from-make
 
+browse: $(READY) ## one web page of a data set: DATA=bandai [SPLIT=train SEARCH="waves left" CLIPS=200]
+	@$(VENV)/bin/python -m flame_mdm.browse --from-make
+
 train: $(READY) ## train or resume: EXP=quickstart [trainer.max_steps=1000 denoiser=mdm_decoder ...]
 	@$(VENV)/bin/python -m flame_mdm.train --from-make
 
@@ -32,6 +35,9 @@ sample: $(READY) ## sample: CKPT=runs/.../last.ckpt TEXT="a person walks in a ci
 
 edit: $(READY) ## keep a part of a motion, sample the rest: CKPT=... MOTION=walk.npz FRAMES=in_between TEXT="a person jumps"
 	@$(VENV)/bin/python -m flame_mdm.edit --from-make
+
+convert: $(READY) ## motion files for other programs: INPUT=motion.npz OUT=walk.bvh|.glb|.npz|.json|.npy
+	@$(VENV)/bin/python -m flame_mdm.convert --from-make
 
 test: $(READY) ## run all tests
 	@$(VENV)/bin/python -m pytest -n 2 --dist worksteal

@@ -167,13 +167,13 @@ def _lengths(splits: dict[str, list[Entry]], fps: float) -> str:
                 f"style='fill:{COLORS[name]}'><title>{note}</title></rect>"
             )
         base += counts
+    parts.append("<g style='fill:var(--faint);font-size:11px'>")
     for k in range(0, BARS + 1, 5):
-        text = f"{k * last / BARS:.1f} s"
-        parts.append(f"<text x='{k * bar:.0f}' y='{high + 14}' style='fill:var(--faint);font-size:11px'>{text}</text>")
+        anchor = "start" if k == 0 else "end" if k == BARS else "middle"
+        parts.append(f"<text x='{k * bar:.0f}' y='{high + 14}' text-anchor='{anchor}'>{k * last / BARS:.1f} s</text>")
+    parts.append("</g>")
     names = ", ".join(f"<span style='color:{COLORS[name]}'>{name}</span>" for name in bins)
-    chart = (
-        f"<svg viewBox='0 0 {wide + 30} {high + 18}' style='width:100%;max-width:{wide + 30}px'>{''.join(parts)}</svg>"
-    )
+    chart = f"<svg viewBox='0 0 {wide} {high + 18}' style='width:100%;max-width:{wide}px'>{''.join(parts)}</svg>"
     return f"<p>Length of clips ({names}), up to {most} a bar</p>{chart}"
 
 

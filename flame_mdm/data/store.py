@@ -64,8 +64,8 @@ class Store:
             raise _damaged(self.folder / "features.npy", str(error)) from error
         if list(self.features.shape) != self.info["shape"]:
             raise _damaged(self.folder / "features.npy", f"it holds {self.features.shape}, not {self.info['shape']}")
-        lines = (self.folder / "clips.jsonl").read_text(encoding="utf-8").splitlines()
-        self.clips = [Entry(**json.loads(line)) for line in lines]
+        with (self.folder / "clips.jsonl").open(encoding="utf-8") as lines:  # captions may hold other line separators
+            self.clips = [Entry(**json.loads(line)) for line in lines]
         with np.load(self.folder / "statistics.npz") as file:
             self.mean, self.std = file["mean"], file["std"]
 

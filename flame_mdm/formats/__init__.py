@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import zipfile
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from flame_mdm.data import bandai, bvh
+from flame_mdm.data import bvh
+from flame_mdm.data.folder import LAYOUTS
 from flame_mdm.formats import glb
 from flame_mdm.formats.poses import Poses, solve
 from flame_mdm.representations import rotation
@@ -31,12 +32,6 @@ AMASS_AXES = torch.tensor([[-1.0, 0, 0], [0, 0, 1], [0, 1, 0]], dtype=torch.floa
 """Turns AMASS's world, z up, to y up as HumanML3D does: (-x, z, y). It is its own inverse."""
 CAMERA_AXES = torch.diag(torch.tensor([1.0, -1, -1], dtype=torch.float64))
 """Turns the camera's world of the action data sets, y down, to y up."""
-MIXAMO = (
-    *("Hips", "LeftUpLeg", "RightUpLeg", "Spine", "LeftLeg", "RightLeg", "Spine1", "LeftFoot", "RightFoot", "Spine2"),
-    *("LeftToeBase", "RightToeBase", "Neck", "LeftShoulder", "RightShoulder", "Head", "LeftArm", "RightArm"),
-    *("LeftForeArm", "RightForeArm", "LeftHand", "RightHand"),
-)
-"""Mixamo's names of SMPL's 22 joints, in their order; files often put `mixamorig:` before them."""
 END_SITES = {
     **{"head": (0.0, 0.18, 0.0), "left_foot": (0.0, 0.0, 0.06), "right_foot": (0.0, 0.0, 0.06)},
     **{"left_wrist": ADULT[22], "right_wrist": ADULT[23]},
@@ -78,7 +73,8 @@ def read(path: str | Path, fps: float | None = None, unit: float | None = None) 
     Args:
         path: the file.
         fps: frames a second instead of those the file says; an .npy file does not say.
-        unit: metres a unit of the file's lengths, for .bvh (default 0.01, centimetres) and .npy (default 1, metres).
+        unit: metres a unit of the file's lengths, for .bvh (default: what its skeleton comes in, mostly centimetres)
+            and .npy (default 1).
 
     Raises:
         FileNotFoundError: there is no such file. ValueError: damaged, of another kind, or without a frame rate.
@@ -164,23 +160,17 @@ def _of_poses(poses: Poses, fps: float, caption: str, name: str) -> MotionFile:
 
 
 def _read_bvh(path: Path, fps: float | None, unit: float | None) -> MotionFile:
-    data = path.read_bytes()
-    motion = bvh.parse(data, str(path))
-    unit = CENTIMETRE if unit is None else unit
+    motion = bvh.read(path)
     names = [name.rpartition(":")[2] for name in motion.joints]
-    for wanted in (SMPL22.joints, MIXAMO):
-        if set(wanted) <= set(names):
-            joints = unit * motion.positions()[:, [names.index(name) for name in wanted]]
-            break
-    else:
-        if not set(bandai.JOINTS.values()) <= set(names):
-            missing = sorted(set(MIXAMO) - set(names))
-            raise ValueError(
-                f"joints are known by SMPL's, Mixamo's or Bandai-Namco's names; of Mixamo's there is no "
-                f"{', '.join(missing)}; rename the joints of the file (docs/formats.md)"
-            )
-        _, joints = bandai.convert(str(path), data, motion.fps)
-        joints = joints * (unit / CENTIMETRE)
+    layout = next((layout for layout in LAYOUTS.values() if layout.knows(names)), None)
+    if layout is None:
+        raise ValueError(
+            f"its joints ({', '.join(names)}) are those of none of the skeletons {', '.join(LAYOUTS)}; rename them "
+            "(docs/formats.md)"
+        )
+    if unit is None:
+        unit = CENTIMETRE if layout is LAYOUTS["SMPL"] else layout.unit
+    joints = replace(layout, unit=unit).apply(motion.positions(), names)
     tall = float(np.ptp(joints[..., 1], axis=1).max())
     if not 0.3 < tall < 3.5:
         raise ValueError(

@@ -6,6 +6,7 @@ import io
 import signal
 import time
 from collections.abc import Sequence
+from inspect import signature
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -136,7 +137,7 @@ class SampleMotions(Callback):
             `unconditioned`.
         seconds: length of the motions.
         unconditioned: how many motions to sample where there are no prompts.
-        metrics: torchmetrics by name, updated with (joints (B, F, J, 3), mask (B, F), asked attributes).
+        metrics: torchmetrics by name, updated with those of joints (B, F, J, 3), mask (B, F) and asked that they take.
     """
 
     def __init__(
@@ -202,7 +203,9 @@ class SampleMotions(Callback):
             metric.reset()
             for motion, (_, asked) in zip(motions, self.prompts, strict=True):
                 joints = torch.from_numpy(motion.joints)[None]
-                metric.update(joints, torch.ones(joints.shape[:2], dtype=torch.bool), [asked])
+                mask = torch.ones(joints.shape[:2], dtype=torch.bool)
+                known = {"joints": joints, "mask": mask, "asked": [asked]}
+                metric.update(**{k: v for k, v in known.items() if k in signature(metric.update).parameters})
             result = metric.compute()
             parts = result if isinstance(result, dict) else {"": result}
             values |= {f"{name}/{k}".rstrip("/"): None if v is None else float(v) for k, v in parts.items()}

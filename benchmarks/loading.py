@@ -1,8 +1,9 @@
 """Speed of the training loader beside a training step: `python benchmarks/loading.py [clips]`.
 
 A synthetic set is packed into a temporary folder. Loading in the training process, and forward, backward and update of
-the small MDM encoder, are counted in processor time of one core, so that other programs on the machine do not matter. Loading by workers is counted in wall time, which sees what handing batches over costs, and
-what the machine is busy with besides. Medians of the rounds.
+the small MDM encoder, are counted in processor time of one core, so that other programs on the machine do not matter.
+Loading by workers is counted in wall time, which sees what handing batches over costs, and what the machine is busy
+with besides. Medians of the rounds.
 """
 
 import itertools

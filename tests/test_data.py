@@ -110,7 +110,11 @@ def clip(name, split="train", source=None, motion=None, **options):
         ([clip("a", "train", "take"), clip("Ma", "test", "take")], "clips of take stand in train and in test"),
         ([clip("a"), clip("a")], "two clips have the same id"),
         ([clip("a", "test")], "no clip is in the training split"),
-        ([clip("a", motion=np.zeros((9, 5)), encoded=True)], r"clip a: shape \(9, 5\), not \(frames, 263\)"),
+        ([clip("a", motion=np.zeros((9, 263)), encoded="other")], "clip a: handed out as other"),
+        (
+            [clip("a", motion=np.zeros((9, 5)), encoded="humanml-clean-smpl22")],
+            r"clip a: shape \(9, 5\), not \(frames, 263\)",
+        ),
     ],
 )
 def test_bad_clips_stop_preparation_and_leave_nothing(clips, message, tmp_path):
@@ -121,7 +125,7 @@ def test_bad_clips_stop_preparation_and_leave_nothing(clips, message, tmp_path):
 
 def test_encoded_clips_and_given_statistics_are_stored_as_they_are(tmp_path):
     features = np.random.default_rng(0).normal(size=(30, 263)).astype(np.float32)
-    source = Broken(clip("a", motion=features, encoded=True))
+    source = Broken(clip("a", motion=features, encoded="humanml-clean-smpl22"))
     source.statistics = lambda: (np.full(263, 2.0), np.full(263, 3.0))
     store = write_store(tmp_path / "store", source, HumanML())
     np.testing.assert_array_equal(store.motion(store.clips[0]), features)

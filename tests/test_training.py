@@ -78,7 +78,7 @@ def test_a_folder_of_another_configuration_is_refused(tiny, capsys):
     run([*tiny, *STEPS], 2)
     assert train.main(["quickstart", *tiny, *STEPS, "optimizer.lr=0.5", "trainer.max_steps=4"]) == 1
     message = capsys.readouterr().err
-    assert "optimizer.lr (0.0005 there, 0.5 here)" in message
+    assert "optimizer.lr (0.001 there, 0.5 here)" in message
     assert "run.name=" in message
 
 

@@ -25,7 +25,8 @@ class Clip:
         action: index into the data set's `actions`, or None.
         attributes: exact facts about the motion, where the set knows them (side, count, direction, speed, tagged words
             of the captions ...); plain values that JSON can hold.
-        encoded: the owners hand out features; `motion` (F, D) holds them and is stored as it is.
+        encoded: where the owners hand out features, the name of the representation that `motion` (F, D) is in; it is
+            stored as it is. Empty: `motion` is raw.
         window: (first, length): the clip is this cut of its motion. Clips that follow one another with the very same
             array share its frames in the store. Only for representations that make one row a frame.
     """
@@ -37,7 +38,7 @@ class Clip:
     source: str
     action: int | None = None
     attributes: Mapping[str, Any] = field(default_factory=dict)
-    encoded: bool = False
+    encoded: str = ""
     window: tuple[int, int] | None = None
 
 

@@ -199,15 +199,20 @@ class MotionDataModule(LightningDataModule):
         return self._loader(self.train, sampler)
 
     def val_dataloader(self) -> DataLoader[Sample]:
-        """Each validation clip once over all processes."""
-        return self._evaluation(self.val)
+        """Each validation clip once over all processes; all of them on each where some process would have none.
+
+        A process without a batch would skip validation, and the others wait for it.
+        """
+        few = self.trainer is not None and len(self.val) < self.trainer.world_size
+        return self._evaluation(self.val, alone=few)
 
     def test_dataloader(self) -> DataLoader[Sample]:
         """Each test clip once over all processes."""
         return self._evaluation(self.test)
 
-    def _evaluation(self, clips: Clips) -> DataLoader[Sample]:
-        rank, world = (self.trainer.global_rank, self.trainer.world_size) if self.trainer else (0, 1)
+    def _evaluation(self, clips: Clips, alone: bool = False) -> DataLoader[Sample]:
+        trainer = None if alone else self.trainer
+        rank, world = (trainer.global_rank, trainer.world_size) if trainer else (0, 1)
         return self._loader(clips, EvaluationBatches(clips.lengths, self.batch_size, rank=rank, world=world))
 
     def _loader(self, clips: Clips, sampler: Sampler[list[Draw]]) -> DataLoader[Sample]:

@@ -83,6 +83,7 @@ class HumanML3D(T2MFolder):
     """The processed folder with 263 features; made first, where it is not there, if `amass` is given."""
 
     name = "humanml3d"
+    representation = "humanml-legacy-smpl22"
     fps = 20.0
     shortest = 40
     get_it = GET_IT

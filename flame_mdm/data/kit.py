@@ -26,6 +26,7 @@ class KIT(T2MFolder):
     """The processed folder with 251 features (Guo et al., CVPR 2022)."""
 
     name = "kit"
+    representation = "humanml-legacy-kit21"
     fps = 12.5
     shortest = 24
     get_it = "get KIT-ML as processed for text-to-motion, linked at https://github.com/EricGuo5513/HumanML3D"

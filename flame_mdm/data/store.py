@@ -135,6 +135,9 @@ def write_store(folder: Path, source: MotionSource, representation: Representati
 def _encode(clips: Sequence[Clip], representation: Representation) -> list[np.ndarray]:
     """Features of each clip's whole motion; a motion that several clips are cut from is encoded once."""
     whole = {id(clip.motion): clip for clip in clips}
+    for clip in whole.values():
+        if clip.encoded and clip.encoded != representation.name:
+            raise ValueError(f"clip {clip.id}: handed out as {clip.encoded}, it cannot become {representation.name}")
     raw = [torch.from_numpy(np.ascontiguousarray(clip.motion)) for clip in whole.values() if not clip.encoded]
     try:
         fresh = iter(representation.encode_many(raw) if raw else [])

@@ -104,6 +104,8 @@ class T2MFolder(MotionSource):
     The words with their parts of speech stand in the attribute `tokens`, one list a caption.
     """
 
+    representation: str
+    """Name of the features that the folder holds."""
     fps: float
     shortest: int
     get_it: str
@@ -198,7 +200,7 @@ class T2MFolder(MotionSource):
                     split=self.names[name],
                     source=name.removeprefix("M"),
                     attributes={"tokens": [description.tokens for description in cut.descriptions]},
-                    encoded=True,
+                    encoded=self.representation,
                     window=(cut.start, cut.length),
                 )
         if damaged:

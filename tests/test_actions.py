@@ -309,6 +309,7 @@ def test_uestc_from_raw_files_to_batch(tmp_path: Path):
 
 def test_uestc_as_published_trains_on_51_subjects(tmp_path: Path):
     source = UESTC(str(write_uestc(tmp_path / "uestc")), published_split=True)
+    assert len(source.actions) == 40, "a model has to know them before the data is prepared"
     assert len(set(TRAIN_SUBJECTS)) == 51
     assert Counter(source.split(subject) for subject in range(1, 119)) == {"train": 51, "test": 67}
 

@@ -76,7 +76,14 @@ class UESTC(MotionSource):
         """
         self.path, self.published_split, self.min_frames = Path(path), published_split, min_frames
         self._videos: list[Video] | None = None
+        self._actions: tuple[str, ...] = ()
         self._excluded: Counter[str] = Counter()
+
+    @property
+    def actions(self) -> tuple[str, ...]:
+        """Names of the actions, which stand in the files alone: models have to know their number before training."""
+        self.videos()
+        return self._actions
 
     def count(self) -> int:
         """Videos; the few that are left out are known when their poses are read."""
@@ -93,14 +100,14 @@ class UESTC(MotionSource):
         """
         if self._videos is None:
             self._folder = find(self.path, "vibe_cache_refined.pkl").parent
-            self.actions = tuple(_lines(self._folder / "info" / "action_classes.txt"))
+            self._actions = tuple(_lines(self._folder / "info" / "action_classes.txt"))
             videos = []
             for index, name in enumerate(_lines(self._folder / "info" / "names.txt")):
                 match = NAME.fullmatch(name)
-                if match is None or int(match[1]) >= len(self.actions):
+                if match is None or int(match[1]) >= len(self._actions):
                     raise ValueError(
                         f"{self._folder}/info/names.txt, line {index + 1}: {name!r} is not the name of a video such as "
-                        f"a0_d0_p001_c1_color.avi with one of the {len(self.actions)} actions"
+                        f"a0_d0_p001_c1_color.avi with one of the {len(self._actions)} actions"
                     )
                 action, view, subject, side = (int(match[k]) for k in range(1, 5))
                 videos.append(Video(index, name.removesuffix(match[5] or ""), action, view, subject, side))

@@ -7,7 +7,7 @@ VENV := .venv
 READY := $(VENV)/.ready
 export MAKEFLAGS
 
-.PHONY: help setup prepare browse train sample edit convert test lint bench
+.PHONY: help setup prepare browse train sample evaluate edit convert test lint bench
 
 help: ## show this
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## /  make \1@/' | column -t -s @
@@ -32,6 +32,9 @@ train: $(READY) ## train or resume: EXP=quickstart [trainer.max_steps=1000 denoi
 
 sample: $(READY) ## sample: CKPT=runs/.../last.ckpt TEXT="a person walks in a circle" SECONDS=3
 	@$(VENV)/bin/python -m flame_mdm.sample --from-make
+
+evaluate: $(READY) ## measure: CKPT=runs/.../last.ckpt [protocol=synthetic] extractor=runs/motion_clip/... [quick=true]
+	@$(VENV)/bin/python -m flame_mdm.evaluate --from-make
 
 edit: $(READY) ## keep a part of a motion, sample the rest: CKPT=... MOTION=walk.npz FRAMES=in_between TEXT="a person jumps"
 	@$(VENV)/bin/python -m flame_mdm.edit --from-make

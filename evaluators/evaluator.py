@@ -1,0 +1,196 @@
+"""The evaluator: one feature pass over motions, many metrics."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.utils.rnn import pad_sequence
+from torchmetrics import Metric
+
+from evaluators import feed
+from evaluators.attributes import ATTRIBUTES
+from evaluators.extractors import Extractor
+from evaluators.samples import TwoSets
+from flame_mdm.config import Config, UserError, instantiate, parameters
+from flame_mdm.motion import length_mask
+from flame_mdm.noise import key
+from flame_mdm.representations import Representation
+
+
+@dataclass
+class Motions:
+    """Motions, real or generated, with what they were asked to be; N of each.
+
+    Attributes:
+        ids: unique names.
+        features: (F, D) float32 each, in the data's units.
+        captions: of motions with text.
+        tokens: "word/PART" of the captions, where the data has them.
+        labels: classes of motions with action labels.
+        groups: names of the prompts, where several motions have the same one.
+        asked: attributes asked for, where the data has them.
+    """
+
+    ids: list[str]
+    features: list[np.ndarray]
+    captions: list[str] | None = None
+    tokens: list[list[str] | None] | None = None
+    labels: list[int] | None = None
+    groups: list[str] | None = None
+    asked: list[Mapping[str, Any]] | None = None
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+
+@dataclass
+class Extracted:
+    """What metrics see of N motions: `rows` by the names of `evaluators`, tensors or lists, each (N, ...)."""
+
+    rows: dict[str, Any]
+    joints: list[Tensor]
+
+    def __len__(self) -> int:
+        return len(self.joints)
+
+
+class Evaluator:
+    """Measures motions.
+
+    Given the same features, all values are the same to the last bit in whatever batches and order the motions come.
+
+    Args:
+        extractor: None leaves metrics of features without a value.
+        metrics: mappings with the `_target_` of a metric, by name; each replication draws with a seed of its own.
+        representation: of the motions.
+        batch_size: of the extractor.
+        device: where metrics gather their rows; with several processes, that of their communication.
+    """
+
+    CHUNK = 256
+
+    def __init__(
+        self,
+        extractor: Extractor | None,
+        metrics: Mapping[str, Config],
+        representation: Representation,
+        *,
+        batch_size: int = 64,
+        device: str | torch.device = "cpu",
+    ):
+        self.extractor, self.metrics, self.representation = extractor, metrics, representation
+        self.batch_size, self.device = batch_size, torch.device(device)
+
+    @torch.no_grad()
+    def extract(self, motions: Motions) -> Extracted:
+        """The feature pass.
+
+        Raises:
+            UserError: a motion is not finite.
+        """
+        for name, features in zip(motions.ids, motions.features, strict=True):
+            if not np.isfinite(features).all():
+                raise UserError(f"motion {name} is not finite; did the model diverge?")
+        where = self.representation.mean.device
+        joints = [self.representation.decode(torch.from_numpy(x).to(where)).to(self.device) for x in motions.features]
+        rows: dict[str, Any] = {"keys": self._keys(motions.ids)}
+        order = np.argsort([len(x) for x in joints], kind="stable")  # like lengths together, for little padding
+        if self.extractor is not None and len(motions):
+            size = self.batch_size
+            batches = [order[begin : begin + size].tolist() for begin in range(0, len(order), size)]
+            parts = [self._features(motions, joints, indices) for indices in batches]
+            back = torch.from_numpy(np.argsort(order, kind="stable"))
+            rows |= {name: torch.cat([part[name] for part in parts])[back].to(self.device) for name in parts[0]}
+        if motions.captions is not None:
+            rows["text_keys"] = self._keys(motions.captions)
+        if motions.labels is not None:
+            rows["labels"] = torch.tensor(motions.labels, device=self.device)
+        if motions.groups is not None:
+            rows["groups"] = self._keys(motions.groups)
+        if motions.asked is not None and all("action" in asked for asked in motions.asked):
+            rows["asked"] = [{k: v for k, v in asked.items() if k in ATTRIBUTES} for asked in motions.asked]
+        return Extracted(rows, joints)
+
+    def _keys(self, names: Sequence[str]) -> Tensor:
+        return torch.tensor([key(name) for name in names], dtype=torch.long, device=self.device)
+
+    def _features(self, motions: Motions, joints: Sequence[Tensor], indices: Sequence[int]) -> dict[str, Tensor]:
+        assert self.extractor is not None
+        where = self.representation.mean.device
+        x = pad_sequence([torch.from_numpy(motions.features[i]) for i in indices], batch_first=True).to(where)
+        mask = length_mask(torch.tensor([len(motions.features[i]) for i in indices], device=where))
+        padded = pad_sequence([joints[i] for i in indices], batch_first=True).to(where)
+        found = self.extractor.motions(x, padded, mask)
+        rows = {"generated" if name == "features" else name: value.float().cpu() for name, value in found.items()}
+        if motions.captions is not None:
+            tokens = motions.tokens or [None] * len(motions)
+            text = self.extractor.texts([motions.captions[i] for i in indices], [tokens[i] for i in indices])
+            if text is not None:
+                rows["text"] = text.float().cpu()
+        return rows
+
+    def score(
+        self, generated: Extracted, paired: Extracted, real: Extracted, seed: int
+    ) -> tuple[dict[str, float | None], dict[str, str]]:
+        """The values of all metrics.
+
+        Args:
+            generated: motions to measure.
+            paired: the real motion of each of them, in their order.
+            real: real motions to compare with as a set: a draw of its own, or the distance of real motions from
+                themselves is 0.
+            seed: of what metrics draw.
+
+        Returns:
+            Values by name, `metric` or `metric/part`, None where not computable; and the reasons by metric, where the
+            samples are too few.
+
+        Raises:
+            ValueError: motions do not fit a metric that compares them one by one.
+        """
+        metrics = {name: self._metric(config, seed) for name, config in self.metrics.items()}
+        sets = {name: metric for name, metric in metrics.items() if isinstance(metric, TwoSets)}
+        others = {name: metric for name, metric in metrics.items() if name not in sets}
+        for part in self._chunks(len(generated)):
+            rows = {name: values[part] for name, values in generated.rows.items()}
+            feed(sets, **{name: rows[name] for name in ("generated", "keys") if "generated" in rows})
+            joints, mask = _pad(generated.joints[part])
+            real_joints, real_mask = _pad(paired.joints[part])
+            rows |= {"joints": joints, "mask": mask, "real_joints": real_joints, "real_mask": real_mask}
+            if "generated" in paired.rows:
+                rows["real"] = paired.rows["generated"][part]
+            feed(others, **rows)
+        if "generated" in real.rows:
+            feed(sets, real=real.rows["generated"], real_keys=real.rows["keys"])
+        values: dict[str, float | None] = {}
+        reasons: dict[str, str] = {}
+        with warnings.catch_warnings():  # a metric that was given nothing says so by None
+            warnings.filterwarnings("ignore", message=".*was called before the ``update`` method.*")
+            for name, metric in metrics.items():
+                try:
+                    result = metric.compute()
+                except ValueError as error:
+                    reasons[name] = str(error)
+                    metric.reset()
+                    result = metric.compute()
+                parts = result.items() if isinstance(result, dict) else [("", result)]
+                values |= {f"{name}/{part}".rstrip("/"): value for part, value in parts}
+        return values, reasons
+
+    def _metric(self, config: Config, seed: int) -> Metric:
+        drawn = {"seed": key("metric", seed) % 2**32} if "seed" in parameters(config["_target_"]) else {}
+        return instantiate(config, **drawn).to(self.device)
+
+    def _chunks(self, count: int) -> list[slice]:
+        return [slice(begin, begin + self.CHUNK) for begin in range(0, count, self.CHUNK)]
+
+
+def _pad(joints: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
+    lengths = torch.tensor([len(motion) for motion in joints], device=joints[0].device)
+    return pad_sequence(list(joints), batch_first=True), length_mask(lengths)

@@ -1,0 +1,177 @@
+"""Feature extractors as evaluation uses them: opened from what the user gives, asked for features by one name."""
+
+from __future__ import annotations
+
+import hashlib
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from evaluators.action_gru import load_action_gru
+from evaluators.motion_clip import MotionCLIPTask
+from evaluators.stgcn import load_uestc, load_unconstrained
+from evaluators.t2m import WordVectors, load_t2m
+from flame_mdm.checkpoints import find
+from flame_mdm.config import UserError
+from flame_mdm.generation import file_sha256
+from flame_mdm.representations import Representation
+from flame_mdm.task import load_task
+
+
+class Extractor(ABC):
+    """A network that turns motions, and texts where it reads them, into features.
+
+    Attributes:
+        sha256: of what it was loaded from; values of extractors that differ in it are not comparable.
+    """
+
+    sha256: str
+
+    @abstractmethod
+    def check(self, representation: Representation, dataset: str) -> None:
+        """Refuses motions that the network was not made for.
+
+        Raises:
+            UserError: it was made for another representation or data set.
+        """
+
+    @abstractmethod
+    def motions(self, features: Tensor, joints: Tensor, mask: Tensor) -> dict[str, Tensor]:
+        """Features of motions.
+
+        Args:
+            features: (B, F, D) in the data's units.
+            joints: (B, F, J, 3) metres, y up.
+            mask: (B, F), True = real frame.
+
+        Returns:
+            "features" (B, E), and "logits" (B, A) of classifiers.
+        """
+
+    def texts(self, captions: Sequence[str], tokens: Sequence[Sequence[str] | None]) -> Tensor | None:
+        """(B, E) features of captions; None where the network reads no text. `tokens` are "word/PART", if known."""
+        return None
+
+
+class MotionCLIPExtractor(Extractor):
+    """A motion-CLIP that `make train EXP=motion_clip/...` has made.
+
+    Raises:
+        FileNotFoundError, UserError: no such checkpoint, or none of a motion-CLIP.
+    """
+
+    def __init__(self, path: str, device: str | torch.device = "cpu"):
+        file = find(path)
+        self.path, self.sha256 = file, file_sha256(file)
+        self.task = load_task(file, MotionCLIPTask, device)
+        self.known: dict[str, Tensor] = {}
+
+    def check(self, representation: Representation, dataset: str) -> None:
+        """Representation and data set are those that it was trained on."""
+        own = self.task.representation
+        if (own.name, own.fps, own.features) != (representation.name, representation.fps, representation.features):
+            raise UserError(
+                f"extractor {self.path}: trained on {own.name} at {own.fps:g} frames a second, but the motions are "
+                f"{representation.name} at {representation.fps:g}: train one by make train EXP=motion_clip/..."
+            )
+        if self.task.facts.get("dataset", dataset) != dataset:
+            raise UserError(
+                f"extractor {self.path}: trained on the data set {self.task.facts['dataset']}, but the motions are "
+                f"those of {dataset}: train one by make train EXP=motion_clip/..."
+            )
+
+    def motions(self, features: Tensor, joints: Tensor, mask: Tensor) -> dict[str, Tensor]:
+        """Features of motions."""
+        return {"features": self.task(features, mask)}
+
+    def texts(self, captions: Sequence[str], tokens: Sequence[Sequence[str] | None]) -> Tensor:
+        """Features of captions, each encoded once."""
+        new = sorted(set(captions) - self.known.keys())
+        if new:
+            self.known |= dict(zip(new, self.task.text(new), strict=True))
+        return torch.stack([self.known[caption] for caption in captions])
+
+
+class T2MExtractor(Extractor):
+    """The evaluator of Guo et al. 2022 as released, from a folder of five files.
+
+    finest.tar (in text_mot_match/model), mean.npy and std.npy (t2m_mean.npy and t2m_std.npy in MDM, kit_... for KIT),
+    our_vab_data.npy and our_vab_idx.pkl (GloVe).
+
+    Raises:
+        FileNotFoundError, ValueError: a file is not there or is another one.
+    """
+
+    FILES = ("finest.tar", "mean.npy", "std.npy", "our_vab_data.npy", "our_vab_idx.pkl")
+
+    def __init__(self, path: str, device: str | torch.device = "cpu"):
+        folder = Path(path)
+        missing = [name for name in self.FILES if not (folder / name).is_file()]
+        if missing:
+            raise FileNotFoundError(f"{folder}: not a folder of the T2M evaluator, it lacks {', '.join(missing)}")
+        hashes = "".join(file_sha256(folder / name) for name in self.FILES)
+        self.path, self.sha256 = folder, hashlib.sha256(hashes.encode()).hexdigest()
+        self.network = load_t2m(*(folder / name for name in self.FILES[:3])).to(device)
+        self.words = WordVectors(folder)
+
+    def check(self, representation: Representation, dataset: str) -> None:
+        """The features are the published ones, and the data set is the one of that width."""
+        width = len(self.network.mean)
+        wanted = {263: "humanml3d", 251: "kit"}.get(width)
+        if representation.features != width or dataset != wanted:
+            raise UserError(
+                f"extractor {self.path}: made for the {width} features of {wanted}, but the motions are "
+                f"{representation.name} ({representation.features} features) of {dataset}"
+            )
+
+    def motions(self, features: Tensor, joints: Tensor, mask: Tensor) -> dict[str, Tensor]:
+        """Features of motions."""
+        return {"features": self.network(features, mask)}
+
+    def texts(self, captions: Sequence[str], tokens: Sequence[Sequence[str] | None]) -> Tensor:
+        """Features of captions.
+
+        Raises:
+            UserError: a caption comes without its tokens.
+        """
+        known = [words for words in tokens if words is not None]
+        if len(known) < len(tokens):
+            raise UserError(f"extractor {self.path}: reads tagged words, which the data set lacks for its captions")
+        return self.network.text(self.words(known))
+
+
+CLASSIFIERS = {
+    "humanact12": (load_action_gru, "humanact12", "joints"),
+    "humanact12_unconstrained": (load_unconstrained, "humanact12", "joints"),
+    "uestc": (load_uestc, "uestc", "features"),
+}
+"""What loads the released weights, the data set they belong to, and what they read."""
+
+
+class ClassifierExtractor(Extractor):
+    """A released action classifier, one of `CLASSIFIERS`.
+
+    Raises:
+        FileNotFoundError, ValueError: no such file, or of other weights.
+    """
+
+    def __init__(self, kind: str, path: str, device: str | torch.device = "cpu"):
+        read, self.dataset, self.reads = CLASSIFIERS[kind]
+        self.network = read(path).to(device)
+        self.path, self.sha256 = path, file_sha256(path)
+
+    def check(self, representation: Representation, dataset: str) -> None:
+        """Rotations and joints of 24 SMPL joints, of the data set it was trained on."""
+        if representation.name != "rot6d" or dataset != self.dataset:
+            raise UserError(
+                f"extractor {self.path}: made for {self.dataset} as rot6d, but the motions are {representation.name} "
+                f"of {dataset}"
+            )
+
+    def motions(self, features: Tensor, joints: Tensor, mask: Tensor) -> dict[str, Tensor]:
+        """Features and class scores of motions."""
+        x = joints if self.reads == "joints" else features
+        return {"features": self.network(x, mask), "logits": self.network.logits(x, mask)}

@@ -1,0 +1,255 @@
+"""Evaluates a checkpoint: `python -m flame_mdm.evaluate ckpt=... protocol=synthetic extractor=...`"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from flame_mdm.config import EXPERIMENTS, Config, UserError, check, instantiate, run
+
+if TYPE_CHECKING:
+    from flame_mdm.data.datamodule import MotionDataModule
+    from flame_mdm.representations import Representation
+    from flame_mdm.task import MotionGeneration
+
+USAGE = """
+usage: python -m flame_mdm.evaluate ckpt=FILE [protocol=NAME] extractor=FILE [key=value ...]
+       python -m flame_mdm.evaluate from_samples=FOLDER data=NAME protocol=NAME extractor=FILE
+
+Measures real motions and generated ones by a protocol, and writes a JSON file with all values and where they come from.
+The same command goes on where a killed one stopped. quick=true shows in a minute that all works.
+Keys, with their defaults: experiments/evaluate.yaml; protocols: experiments/evaluation
+"""
+
+FORMAT = 1
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Runs the command; returns its exit code."""
+    words = sys.argv[1:] if argv is None else argv
+    text = ("ckpt", "extractor", "from_samples", "protocol", "data_root", "out")
+    return run(evaluate, words, usage=USAGE, name="evaluate", text=text)
+
+
+def evaluate(config: Config) -> None:
+    """Evaluates what the configuration names, and writes the JSON file.
+
+    Raises:
+        UserError, FileNotFoundError, ValueError: nothing to evaluate, or parts that do not fit one another.
+    """
+    if (config["ckpt"] is None) == (config["from_samples"] is None):
+        raise UserError("give one of ckpt=runs/.../checkpoints/last.ckpt and from_samples=<folder of .npz files>")
+    if config["ckpt"] is None and not config.get("data"):
+        raise UserError("from_samples needs the name of the data set, such as data=humanml3d")
+    if config["split"] not in ("train", "val", "test"):
+        raise UserError(f"split={config['split']}: there are train, val and test")
+
+    import torch
+
+    from flame_mdm.checkpoints import find
+    from flame_mdm.generation import file_sha256
+    from flame_mdm.task import load
+
+    device = config["device"] or ("cuda" if torch.cuda.is_available() else "cpu")
+    file = find(config["ckpt"]) if config["ckpt"] is not None else None
+    model = load(file, device) if file is not None else None
+    data = _data(config, model)
+    representation = model.representation if model else data.representation.to(device)
+    name = config["protocol"] or default_protocol(model)
+    protocol = load_protocol(name, representation)
+    clips = data.clips(config["split"])
+    changed = protocol.change(
+        replications=config["replications"], samples=config["samples"], quick=config["quick"], clips=len(clips)
+    )
+    protocol.check_data(clips)
+    extractor = protocol.open_extractor(config["extractor"], representation, data.store.info["dataset"])
+
+    options = {k: config[k] for k in ("seed", "guidance_scale", "sampler", "num_inference_steps")}
+    if model is not None:
+        assert file is not None
+        sha256 = file_sha256(file)
+        kept = {**options, "split": config["split"], "data": data.store.fingerprint, "samples": protocol.samples}
+        kind = f"{protocol.name}-{protocol.version}"
+        folder = run_folder(file) / "evaluation" / kind / f"{sha256[:16]}-{_digest(kept)[:8]}"
+        source = protocol.generator(model, folder, options, batch_size=config["batch_size"], count=len(clips))
+    else:
+        folder = Path(config["from_samples"])
+        source = protocol.given(folder, representation)
+        sha256 = source.sha256
+    result = protocol.evaluate(
+        source, clips, extractor, representation, seed=config["seed"], batch_size=config["batch_size"]
+    )
+    report = _describe(config, protocol, model, data, extractor, sha256) | {"changed": changed} | result
+    for reason in _strangers(model, data):
+        report["valid"] = False
+        report["invalid_because"].append(reason)
+    end = f"-{extractor.sha256[:8]}" if extractor else ""
+    out = Path(config["out"] or folder / f"result{end}{'-quick' if config['quick'] else ''}.json")
+    write_json(out, report)
+    _show(report, out)
+
+
+def load_protocol(name: str, representation: Representation) -> Any:
+    """The protocol of that name in experiments/evaluation, or in a file, for motions of a representation.
+
+    Its file may use ${representation.fps}, ${representation.toes} and ${representation.parents}.
+
+    Raises:
+        UserError: no such protocol, or one that cannot be read.
+    """
+    from omegaconf import OmegaConf
+    from omegaconf.errors import OmegaConfBaseException
+
+    path = Path(name) if name.endswith((".yaml", ".yml")) else EXPERIMENTS / "evaluation" / f"{name}.yaml"
+    if not path.is_file():
+        names = ", ".join(sorted(p.stem for p in path.parent.glob("*.yaml")))
+        raise UserError(f"no protocol is called '{name}'; there are: {names or 'none'}")
+    skeleton = representation.skeleton
+    facts = {"fps": representation.fps, "toes": list(skeleton.feet[1::2]), "parents": list(skeleton.parents)}
+    try:
+        merged = OmegaConf.merge({"representation": facts}, OmegaConf.load(path))
+        config: Config = OmegaConf.to_container(merged, resolve=True)  # type: ignore[assignment]
+    except (OmegaConfBaseException, OSError, ValueError) as error:
+        raise UserError(f"{path}: not a readable protocol: {error}") from error
+    del config["representation"]
+    if "_target_" not in config:
+        raise UserError(f"{path}: not a protocol: it has no _target_, such as evaluators.protocols.Protocol")
+    check(config)
+    return instantiate(config)
+
+
+def default_protocol(model: MotionGeneration | None) -> str:
+    """The protocol for what a model was trained to do.
+
+    Raises:
+        UserError: there is no model.
+    """
+    if model is None:
+        raise UserError("from_samples needs a protocol, such as protocol=text_to_motion")
+    if not model.condition.features:
+        return "unconditioned"
+    if model.config["condition"]["_target_"].endswith("ActionLabels"):
+        return "action_to_motion_uestc" if model.facts["dataset"] == "uestc" else "action_to_motion"
+    return "synthetic" if model.facts["dataset"] == "synthetic" else "text_to_motion"
+
+
+def run_folder(checkpoint: Path) -> Path:
+    """The folder of the run that a checkpoint belongs to; that of the file where it belongs to none."""
+    return checkpoint.parent.parent if checkpoint.parent.name == "checkpoints" else checkpoint.parent
+
+
+def _data(config: Config, model: MotionGeneration | None) -> MotionDataModule:
+    """The prepared data, with a representation of its own: the model keeps the statistics it was trained with."""
+    own = model is not None and not config.get("data")
+    recipe = model.config if own and model is not None else config
+    if "data" not in recipe:
+        raise UserError(f"{config['ckpt']}: its recipe names no data; give data=NAME")
+    root = config["data_root"] or (recipe["data"]["root"] if own else None) or os.environ.get("FLAME_MDM_DATA", "data")
+    representation = instantiate(recipe["representation"])
+    if model is not None and representation.name != model.representation.name:
+        raise UserError(
+            f"the checkpoint makes {model.representation.name}, the data set {config['data']['name']} holds "
+            f"{representation.name}"
+        )
+    data: MotionDataModule = instantiate(recipe["data"] | {"root": root}, representation=representation, seed=0)
+    data.setup("test")
+    return data
+
+
+def _strangers(model: MotionGeneration | None, data: MotionDataModule) -> list[str]:
+    """Why values of the model on this data say little: its training clips may be among those tested."""
+    trained = model.facts.get("fingerprint") if model is not None else None
+    if not trained or trained == data.store.fingerprint:
+        return []
+    return [f"the model was trained on data {trained}, this is {data.store.fingerprint}: splits may overlap"]
+
+
+def _describe(
+    config: Config,
+    protocol: Any,
+    model: MotionGeneration | None,
+    data: MotionDataModule,
+    extractor: Any,
+    sha256: str,
+) -> dict[str, Any]:
+    """Where the values of a result come from."""
+    import torch
+
+    from flame_mdm.provenance import environment
+
+    info = data.store.info
+    report: dict[str, Any] = {
+        "format": FORMAT,
+        "quick": config["quick"],
+        "protocol": {"name": protocol.name, "version": protocol.version, "length_source": "ground truth"},
+        "split": config["split"],
+        "published_split": info["published_split"],
+        "data": {
+            "dataset": info["dataset"],
+            "representation": info["representation"],
+            "fingerprint": info["fingerprint"],
+        },
+        "seed": config["seed"],
+        "extractor": {"path": str(config["extractor"]), "sha256": extractor.sha256} if extractor else None,
+        "samples_sha256": sha256 if model is None else None,
+        "checkpoint": None,
+        "device": torch.cuda.get_device_name() if (config["device"] or "").startswith("cuda") else "cpu",
+        "precision": f"float32, matmul {torch.get_float32_matmul_precision()}",
+        "environment": environment(),
+    }
+    if model is not None:
+        guidance = model.guidance_scale if config["guidance_scale"] is None else config["guidance_scale"]
+        report["device"] = torch.cuda.get_device_name(model.device) if model.device.type == "cuda" else "cpu"
+        report["checkpoint"] = {
+            "path": str(config["ckpt"]),
+            "sha256": sha256,
+            "experiment": model.config.get("experiment"),
+            "config_sha256": _digest(model.config),
+            "averaged_weights": bool(model.config.get("ema")),
+            "parameters": sum(p.numel() for p in model.parameters() if p.requires_grad),
+            "guidance_scale": guidance,
+            "sampler": config["sampler"] or model.sampler,
+            "num_inference_steps": config["num_inference_steps"] or model.num_inference_steps,
+        }
+    return report
+
+
+def _digest(values: Any) -> str:
+    return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
+
+
+def write_json(path: Path, report: Mapping[str, Any]) -> None:
+    """Writes a result, under a temporary name until it is whole."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_suffix(".partial")
+    partial.write_text(json.dumps(report, indent=2, allow_nan=False) + "\n")
+    partial.replace(path)
+
+
+def _show(report: Mapping[str, Any], out: Path) -> None:
+    """Prints the values beside those of real motions."""
+    protocol = report["protocol"]
+    mark = " QUICK, NOT A RESULT" if report["quick"] else ""
+    print(f"{protocol['name']} version {protocol['version']}, {report['data']['dataset']} {report['split']}{mark}")
+    print(f"{'':32}{'real motions':>24}{'generated':>24}")
+    for name, value in report["values"].items():
+        real = report["ground_truth"].get(name)
+        print(f"{name:32}{_cell(real):>24}{_cell(value):>24}")
+    for name, reason in report["not_computed"].items():
+        print(f"not computed: {name}: {reason}")
+    for reason in report["invalid_because"]:
+        print(f"NOT VALID: {reason}")
+    print(f"written: {out}")
+
+
+def _cell(value: Mapping[str, Any] | None) -> str:
+    return "-" if value is None or value["mean"] is None else f"{value['mean']:.4g} +- {value['ci']:.2g}"
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -7,6 +7,7 @@ import signal
 import time
 from collections.abc import Sequence
 from inspect import signature
+from itertools import zip_longest
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -34,7 +35,7 @@ class Checkpoints(Checkpoint):
     """Writes `last.ckpt` every so often, at the last step and when interrupted, and keeps some for good.
 
     SIGINT and SIGTERM end training at the end of a step, never inside validation, where averaged and raw weights are
-    swapped; a second SIGINT ends it at once. Files are written under a temporary name, then renamed.
+    swapped; a second SIGINT ends it at once.
     """
 
     def __init__(self, folder: str, every_n_steps: int, keep_every_n_steps: int | None = None):
@@ -67,17 +68,11 @@ class Checkpoints(Checkpoint):
             signum = int(trainer.strategy.reduce(torch.tensor(signum, device=pl_module.device), reduce_op="max"))
         last = bool(signum) or trainer.should_stop or self.step >= trainer.max_steps > 0
         if last or self.step % self.every_n_steps == 0:
-            self._save(trainer, "last")
+            trainer.save_checkpoint(self.folder / "last.ckpt")
         if self.keep_every_n_steps and self.step % self.keep_every_n_steps == 0:
-            self._save(trainer, f"step={self.step:07d}")
+            trainer.save_checkpoint(self.folder / f"step={self.step:07d}.ckpt")
         if signum:
             raise Interrupted(signum, self.step)
-
-    def _save(self, trainer: Trainer, name: str) -> None:
-        partial = self.folder / f"{name}.partial"
-        trainer.save_checkpoint(partial)
-        if trainer.is_global_zero:
-            partial.replace(self.folder / f"{name}.ckpt")
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         self._restore()
@@ -162,39 +157,58 @@ class SampleMotions(Callback):
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         self.next = trainer.global_step + self.every_n_steps
 
+    def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
+        if not len(trainer.datamodule.val):  # type: ignore[attr-defined]  # a set published without validation clips
+            self._write_if_due(trainer, pl_module)
+
     def on_validation_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        if trainer.global_step >= self.next and trainer.is_global_zero:
+        self._write_if_due(trainer, pl_module)
+
+    def _write_if_due(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        if trainer.global_step >= self.next:
             self.next += self.every_n_steps
             self.write(trainer, pl_module)
 
     def on_fit_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        folder, values = self.write(trainer, pl_module)
         if trainer.is_global_zero:
-            folder, values = self.write(trainer, pl_module)
             for name, value in values.items():
                 print(f"{name}: {'not asked' if value is None else f'{value:.3f}'}")
             print(f"see the motions: {folder / 'player.html'} (any browser), {folder / 'motions.gif'}")
 
     def write(self, trainer: Trainer, pl_module: LightningModule) -> tuple[Path, dict[str, float | None]]:
-        """Samples, measures, writes the files and sends them to the dashboard."""
+        """Samples on all processes, a part on each; the first measures, writes files and tells the dashboard."""
         assert isinstance(pl_module, MotionGeneration)
-        texts = self.texts
-        labels = bool(texts) and texts[0] in pl_module.facts["actions"]
-        motions = generate(
-            pl_module,
-            None if labels or not texts else texts,
-            actions=texts if labels else None,
-            frames=min(round(self.seconds * pl_module.representation.fps), pl_module.facts["max_frames"]),
-            samples=1 if texts else self.unconditioned,
-            seed=0,
-        )
         step = trainer.global_step
         folder = self.folder / f"step_{step:07d}"
+        motions = self._sample(pl_module, trainer.global_rank, trainer.world_size)
+        if trainer.world_size > 1:
+            parts: list[Any] = [None] * trainer.world_size
+            torch.distributed.all_gather_object(parts, motions)
+            motions = [motion for row in zip_longest(*parts) for motion in row if motion is not None]
+        if not trainer.is_global_zero:
+            return folder, {}
         write_motions(folder, pl_module, motions, {"seed": 0, "step": step, "checkpoint": ""})
         values = self.measure(motions)
         for logger in trainer.loggers:
             _log_video(logger, folder / "motions.gif", step)
             logger.log_metrics({f"samples/{k}": v for k, v in values.items() if v is not None}, step)
         return folder, values
+
+    def _sample(self, model: MotionGeneration, rank: int, world: int) -> list[Generated]:
+        """The motions of every `world`-th prompt; the first process samples all that have none."""
+        texts = self.texts[rank::world]
+        if not texts and (self.texts or rank):
+            return []
+        labels = bool(texts) and texts[0] in model.facts["actions"]
+        return generate(
+            model,
+            None if labels or not texts else texts,
+            actions=texts if labels else None,
+            frames=min(round(self.seconds * model.representation.fps), model.facts["max_frames"]),
+            samples=1 if texts else self.unconditioned,
+            seed=0,
+        )
 
     def measure(self, motions: Sequence[Generated]) -> dict[str, float | None]:
         """Values of all metrics on the motions, None where a metric has nothing to say."""

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import signal
 import sys
 from collections.abc import Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -54,21 +56,29 @@ def train(config: Config) -> None:
         SystemExit: interrupted; the checkpoint is written and the code is 128 + the signal's number.
     """
     folder = Path(config["run"]["dir"])
-    checkpoint = folder / "checkpoints" / "last.ckpt"
     _same_run(folder, config)
 
+    from lightning.pytorch.utilities import rank_zero_only
+
+    from flame_mdm.guards import only_run
+
+    with only_run(folder) if rank_zero_only.rank == 0 else nullcontext():
+        _fit(folder, config)
+
+
+def _fit(folder: Path, config: Config) -> None:
     import torch
     from hydra.utils import get_class
     from lightning import Callback, Trainer, seed_everything
     from lightning.pytorch.callbacks import EMAWeightAveraging
 
     from flame_mdm.callbacks import Interrupted, Progress
+    from flame_mdm.guards import WholeCheckpoints, newest, out_of_memory
     from flame_mdm.provenance import Provenance
-    from flame_mdm.task import read_checkpoint
 
     _quiet()
     torch.set_float32_matmul_precision("high")
-    step = read_checkpoint(checkpoint)["global_step"] if checkpoint.exists() else 0
+    checkpoint, step = newest(folder / "checkpoints")
     most = config["trainer"]["max_steps"]
     if 0 <= most <= step:
         print(f"{folder} is trained to step {step} already: raise trainer.max_steps, or start anew with run.name=...")
@@ -76,7 +86,7 @@ def train(config: Config) -> None:
     seed_everything(config["seed"], verbose=False)
     representation = instantiate(config["representation"])
     data = instantiate(config["data"], representation=representation, seed=config["seed"])
-    task: Task = get_class(config["task"]["_target_"]).build(config, representation, actions=data.source.actions)
+    task: Task = get_class(config["task"]["_target_"]).build(config, representation, actions=data.actions)
     callbacks: list[Callback] = [Provenance(config)]
     if config["ema"]:
         # Before those that look at averaged weights in validation. Buffers are copied, not averaged.
@@ -89,14 +99,25 @@ def train(config: Config) -> None:
         config["trainer"],
         logger=logger,
         callbacks=callbacks,
+        plugins=[WholeCheckpoints()],
         default_root_dir=str(folder),
         enable_model_summary=False,
     )
     try:
-        trainer.fit(task, data, ckpt_path=str(checkpoint) if step else None, weights_only=True)
+        trainer.fit(task, data, ckpt_path=checkpoint, weights_only=True)
     except Interrupted as stop:
+        if (
+            not trainer.is_global_zero
+        ):  # the first process tells; what starts processes takes any other code for a crash
+            return
         print(f"stopped at step {stop.step}; the same command goes on from there")
         raise SystemExit(128 + stop.signum) from None
+    except Exception as error:
+        if trainer.strategy.launcher is not None:  # else the processes it started wait for this one for half an hour
+            trainer.strategy.launcher.kill(signal.SIGKILL)
+        if told := out_of_memory(error, callbacks, trainer.global_step):
+            raise told from error
+        raise
 
 
 def _same_run(folder: Path, config: Config) -> None:

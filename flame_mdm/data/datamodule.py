@@ -6,7 +6,7 @@ that the uninterrupted one would have seen.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -148,6 +148,12 @@ class MotionDataModule(LightningDataModule):
         """Writes the store where there is none; Lightning calls this on one process only."""
         if not (self.folder / "store.json").exists():
             write_store(self.folder, self.source, self.representation)
+
+    @property
+    def actions(self) -> Sequence[str]:
+        """Names of the action labels; from the store, where there is one, so that it is enough to train."""
+        prepared = (self.folder / "store.json").exists()
+        return Store(self.folder).info["actions"] if prepared else self.source.actions
 
     def open(self) -> Store:
         """The prepared store; its statistics go to the representation.

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from types import FrameType
+from typing import NoReturn
 
 from flame_mdm.config import EXPERIMENTS, Config, UserError, instantiate, run
 
@@ -37,20 +41,30 @@ def prepare(config: Config) -> None:
         node["source"]["path"] = str(config["source"])
 
     from flame_mdm.data.store import Store, write_store
+    from flame_mdm.data.verify import lines, report
 
     representation = instantiate(config["representation"])
     data = instantiate(node, representation=representation)
     if config["check"]:
         print("\n".join(data.source.check()))
         return
-    exists = (data.folder / "store.json").exists()
     if config["verify"]:
-        data.open().verify()
-        print(f"{data.folder}: whole, every hash is the recorded one")
-    elif exists and not config["force"]:
+        found = report(data)
+        print("\n".join(lines(found)))
+        differ = [
+            f"{f['found']} {name}, not {f['published']}"
+            for name, f in found["figures"].items()
+            if f["state"] == "differs"
+        ]
+        if differ:
+            print(f"DIFFERS from the published figures: {'; '.join(differ)}")
+        print(f"{data.folder}: whole, every hash is the recorded one; the report is in verify.json")
+        return
+    if (data.folder / "store.json").exists() and not config["force"]:
         print(f"{data.folder}: already prepared (force=true writes it anew, verify=true checks it)")
     else:
-        write_store(data.folder, data.source, representation)
+        with _stoppable():
+            write_store(data.folder, data.source, representation)
     store = Store(data.folder)
     info = store.info
     clips = ", ".join(f"{count} {split}" for split, count in info["clips"].items())
@@ -58,6 +72,20 @@ def prepare(config: Config) -> None:
     if info["excluded"]:
         print("left out: " + ", ".join(f"{count} {reason}" for reason, count in info["excluded"].items()))
     print(f"{info['shape'][0]} frames of {info['shape'][1]} features, fingerprint {store.fingerprint}: {data.folder}")
+
+
+@contextmanager
+def _stoppable() -> Iterator[None]:
+    """SIGTERM ends the work as an exception would, so that nothing half done stays behind."""
+
+    def stop(number: int, frame: FrameType | None) -> NoReturn:
+        raise SystemExit(128 + number)
+
+    before = signal.signal(signal.SIGTERM, stop)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 if __name__ == "__main__":

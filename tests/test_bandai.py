@@ -367,7 +367,7 @@ def originals() -> dict[str, bytes]:
 @pytest.mark.parametrize("case", CASES, ids=lambda case: f"hml263_bandai-{case}")
 def test_real_takes_against_the_joints_of_the_fixture(case, originals):
     expected = third_party("hml263_bandai")[f"{case}/joints_in"]
-    _, motion = bandai.convert(f"{case}.bvh", originals[case], 20)
+    _, motion = bandai.convert((f"{case}.bvh", originals[case]), 20)
     # The fixture's clips were cut. It takes the rounded frame time for exact, which is 6e-6 s and 6e-5 m of a fast
     # joint at its last frame, and it interpolates linearly between frames, where a fast joint leaves the straight line.
     assert len(motion) >= len(expected)

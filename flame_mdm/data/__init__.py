@@ -58,6 +58,10 @@ class MotionSource(ABC):
         """How many clips or labels were left out, by reason; known once `clips` is exhausted."""
         return {}
 
+    def counts(self) -> dict[str, int]:
+        """What is in the raw data under the names of `published`; the store keeps it, once `clips` is exhausted."""
+        return {}
+
     @abstractmethod
     def count(self) -> int:
         """Number of clips that `clips` yields, known without reading motions, for the progress bar.

@@ -96,6 +96,10 @@ class Babel(MotionSource):
     def excluded(self) -> dict[str, int]:
         return dict(self._excluded)
 
+    def counts(self) -> dict[str, int]:
+        files = (self.path / f"{name}.json" for part in PARTS for name in PARTS[part])
+        return {"labels": sum(1 for file in files for _ in self._annotations(file))}
+
     def count(self) -> int:
         return len(self.windows())
 

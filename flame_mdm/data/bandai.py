@@ -8,25 +8,21 @@ from __future__ import annotations
 
 import hashlib
 import lzma
-import os
 import re
-import signal
 import tarfile
-import threading
 import zipfile
 import zlib
-from collections import deque
 from collections.abc import Container, Generator, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass
-from functools import cache
-from multiprocessing import get_context, parent_process
+from functools import cache, partial
 from pathlib import Path, PurePosixPath
+from typing import ClassVar
 
 import numpy as np
 
 from flame_mdm.data import Clip, MotionSource, Split, bvh
+from flame_mdm.data.parallel import in_order
 
 # The joint of the BVH files that stands for each of the 22 joints of SMPL, in the order of SMPL. The files have two
 # joints between hips and neck where SMPL has three: spine1 is put at 40 % of the way from Hips to Spine.
@@ -304,6 +300,7 @@ class Bandai(MotionSource):
 
     name = "bandai"
     actions = tuple(dict.fromkeys([*CONTENTS_1, *TAKES_2]))
+    published: ClassVar[dict[str, int]] = {"takes": 3077, "takes of data set 1": 175, "takes of data set 2": 2902}
 
     def __init__(self, path: str, mirror: bool = True, workers: int = 0, exclude: Sequence[str] = ()):
         """Reads nothing yet.
@@ -319,6 +316,17 @@ class Bandai(MotionSource):
 
     def count(self) -> int:
         return sum(1 + (self.mirror and take.split == "train") for take in self.takes())
+
+    def counts(self) -> dict[str, int]:
+        takes = [take.dataset for take in self.takes()]
+        return {
+            "takes": len(takes),
+            "takes of data set 1": takes.count(1),
+            "takes of data set 2": takes.count(2),
+        }
+
+    def excluded(self) -> dict[str, int]:
+        return {"takes by data.source.exclude": len(self.exclude)} if self.exclude else {}
 
     def clips(self, fps: float) -> Iterator[Clip]:
         takes = self.takes()
@@ -358,20 +366,7 @@ class Bandai(MotionSource):
     def _motions(self, ids: set[str], fps: float) -> Generator[tuple[str, np.ndarray]]:
         """Id and joints of these takes in the order of the folder or archive."""
         files = ((name, data) for name, data in _files(self.path, ids) if PurePosixPath(name).stem in ids)
-        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-        workers = min(self.workers or cores, len(ids))
-        if workers == 1:
-            yield from (convert(name, data, fps) for name, data in files)
-            return
-        # Fresh processes: a fork would copy the threads' locks of a process that may have used torch before.
-        with ProcessPoolExecutor(workers, get_context("spawn"), _start_worker) as pool:
-            pending = deque()
-            for name, data in files:
-                pending.append(pool.submit(convert, name, data, fps))
-                if len(pending) > 4 * workers:
-                    yield pending.popleft().result()
-            while pending:
-                yield pending.popleft().result()
+        yield from in_order(partial(convert, fps=fps), files, self.workers)
 
     def _clip(self, take: Take, motion: np.ndarray, mirrored: bool) -> Clip:
         content, side = take.content, side_of(take.content)
@@ -391,14 +386,15 @@ class Bandai(MotionSource):
         )
 
 
-def convert(name: str, data: bytes, fps: float) -> tuple[str, np.ndarray]:
-    """A BVH file of the data sets -> its id and joints (F, 22, 3) float32 in metres, y up, at `fps`.
+def convert(file: tuple[str, bytes], fps: float) -> tuple[str, np.ndarray]:
+    """Name and content of a BVH file -> its id and joints (F, 22, 3) float32 in metres, y up, at `fps`.
 
     Local rotations and the place of the hips are interpolated, so bones keep their length.
 
     Raises:
         ValueError: the file is damaged or has another skeleton; the message names it.
     """
+    name, data = file
     id_ = PurePosixPath(name).stem
     try:
         motion = bvh.parse(data, name)
@@ -411,19 +407,6 @@ def convert(name: str, data: bytes, fps: float) -> tuple[str, np.ndarray]:
     joints = positions[:, [motion.joints.index(joint) for joint in JOINTS.values()]] / 100
     joints[:, SPINE1] += 0.4 * (joints[:, SPINE2] - joints[:, SPINE1])
     return id_, joints.astype(np.float32)
-
-
-def _start_worker() -> None:
-    """Leaves Ctrl-C to the process that started this one, and ends with it, even when that is killed."""
-
-    def follow() -> None:
-        parent = parent_process()
-        if parent is not None:
-            parent.join()
-            os._exit(1)
-
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=follow, daemon=True).start()
 
 
 def mirror(motion: np.ndarray) -> np.ndarray:

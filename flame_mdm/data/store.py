@@ -82,10 +82,13 @@ class Store:
         """Hashes the whole store.
 
         Raises:
-            ValueError: the packed features are not the ones that were written.
+            ValueError: the packed features, or what the fingerprint is made of, are not the ones that were written.
         """
         if _sha256(self.folder / "features.npy") != self.info["sha256"]["features.npy"]:
             raise _damaged(self.folder / "features.npy", "its hash is not the recorded one")
+        name, fps = self.info["representation"], self.info["fps"]
+        if _fingerprint(self.folder, name, fps, self.mean, self.std) != self.fingerprint:
+            raise _damaged(self.folder / "store.json", "its fingerprint is not that of the clips")
 
 
 def write_store(folder: Path, source: MotionSource, representation: Representation) -> Store:
@@ -200,24 +203,29 @@ def _describe(
     std: np.ndarray,
 ) -> dict[str, Any]:
     splits = {split: sum(e.split == split for e in entries) for split in ("train", "val", "test")}
-    digest = hashlib.sha256((folder / "clips.jsonl").read_bytes())
-    # Features differ in their last bits between processors, so the fingerprint sees them through rounded statistics.
-    rounded = [f"{value:.2e}" for value in np.concatenate([mean, std])]
-    digest.update(json.dumps([representation.name, representation.fps, rounded]).encode())
     return {
         "format": FORMAT,
         "dataset": source.name,
         "actions": list(source.actions),
         "published_split": source.published_split,
         "excluded": source.excluded(),
+        "counts": source.counts(),
         "representation": representation.name,
         "fps": representation.fps,
         "clips": splits,
         "shape": [frames, representation.features],
         "hours": round(frames / representation.fps / 3600, 3),
-        "fingerprint": digest.hexdigest()[:16],
+        "fingerprint": _fingerprint(folder, representation.name, representation.fps, mean, std),
         "sha256": {name: _sha256(folder / name) for name in ("features.npy", "clips.jsonl", "statistics.npz")},
     }
+
+
+def _fingerprint(folder: Path, representation: str, fps: float, mean: np.ndarray, std: np.ndarray) -> str:
+    digest = hashlib.sha256((folder / "clips.jsonl").read_bytes())
+    # Features differ in their last bits between processors, so the fingerprint sees them through rounded statistics.
+    rounded = [f"{value:.2e}" for value in np.concatenate([mean, std])]
+    digest.update(json.dumps([representation, fps, rounded]).encode())
+    return digest.hexdigest()[:16]
 
 
 def _read_info(folder: Path) -> dict[str, Any]:

@@ -7,13 +7,12 @@ skeleton (Guo et al. 2022). The grammar of the captions and the limits of the se
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from flame_mdm.data import Clip, MotionSource, Split
+from flame_mdm.data import Clip, MotionSource, hashed_split
 
 # Offsets from the parent in metres, standing with hanging arms, facing +z; x for the left side, mirrored on the right.
 HIP, SPINE1, SPINE2, SPINE3 = (0.075, -0.075, 0.0), (0.0, 0.131, -0.015), (0.0, 0.142, 0.0), (0.0, 0.057, 0.01)
@@ -641,17 +640,11 @@ class Synthetic(MotionSource):
             id=name,
             motion=MOTIONS[str(asked["action"])](rng, t, asked).joints().astype(np.float32),
             captions=texts,
-            split=_split(name),
+            split=hashed_split(name, val=5, test=10),
             source=name,
             action=self.actions.index(str(asked["action"])),
             attributes=asked,
         )
-
-
-def _split(name: str) -> Split:
-    """85 % train, 5 % val, 10 % test, by the name alone: more clips do not move any."""
-    share = int(hashlib.sha1(name.encode()).hexdigest()[:8], 16) % 100
-    return "train" if share < 85 else "val" if share < 90 else "test"
 
 
 def prompts() -> list[tuple[str, Attributes]]:

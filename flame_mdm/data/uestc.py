@@ -92,6 +92,9 @@ class UESTC(MotionSource):
     def excluded(self) -> dict[str, int]:
         return dict(self._excluded)
 
+    def counts(self) -> dict[str, int]:
+        return {"videos": self._size, "subjects": len({video.subject for video in self.videos()})}
+
     def videos(self) -> list[Video]:
         """The videos that are used: of side 2, those of views 0 to 7. Reads the names of the actions, too.
 

@@ -1,0 +1,233 @@
+"""A full report on a prepared data set: what is in it, how that compares with the published figures, what is odd."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections import Counter, defaultdict
+from hashlib import sha1
+from typing import Any, get_args
+
+import numpy as np
+import torch
+from tqdm import tqdm
+
+from flame_mdm.data import Split
+from flame_mdm.data.datamodule import MotionDataModule
+from flame_mdm.data.store import Entry, Store
+from flame_mdm.representations import Representation
+
+SPLITS: tuple[Split, ...] = get_args(Split)
+STILL = 0.01
+"""Metres; a clip in which no joint leaves its first place by more shows no movement."""
+
+FRAMES = 500_000
+"""Training frames that statistics are computed anew from, at most; they all fit in memory."""
+
+
+def report(data: MotionDataModule) -> dict[str, Any]:
+    """Hashes and scans the store, and writes what it finds into its folder as `verify.json`.
+
+    Returns:
+        Plain values: files (SHA-256), figures (name -> found, published or None, state), captions, actions (clips by
+        split), frames, still (ids), duplicates (groups of ids), duplicates_across_splits, statistics, excluded.
+
+    Raises:
+        FileNotFoundError: nothing is prepared.
+        ValueError: the store is damaged: hashes, numbers that are not finite, a source in two splits.
+    """
+    store = data.open()
+    store.verify()
+    _check_frames(store)
+    _check_sources(store)
+    needed = data.crop.shortest()
+    lengths = [clip.length for clip in store.clips]
+    captions = [caption for clip in store.clips for caption in clip.captions]
+    duplicates = _duplicates(store)
+    split_of = {clip.id: clip.split for clip in store.clips}
+    found = {
+        **{key: store.info[key] for key in ("dataset", "representation", "fps", "fingerprint", "published_split")},
+        "files": store.info["sha256"],
+        "figures": _figures(store, data.source.published),
+        "captions": {
+            "captions": len(captions),
+            "different captions": len(set(captions)),
+            "different words": len({word for text in set(captions) for word in re.findall(r"[^\W_]+", text.lower())}),
+            "clips without a caption": sum(not clip.captions for clip in store.clips),
+        },
+        "actions": {
+            name: {split: sum(c.action == number and c.split == split for c in store.clips) for split in SPLITS}
+            for number, name in enumerate(store.info["actions"])
+        },
+        "frames": {
+            "frames": store.info["shape"][0],
+            "features": store.info["shape"][1],
+            "shortest clip": min(lengths),
+            "median clip": float(np.median(lengths)),
+            "longest clip": max(lengths),
+            f"clips below the {needed} frames that cropping needs": sum(length < needed for length in lengths),
+        },
+        "still": _still(store, data.representation),
+        "duplicates": duplicates,
+        "duplicates_across_splits": sum(len({split_of[name] for name in group}) > 1 for group in duplicates),
+        "statistics": _deviation(store, data.representation),
+        "excluded": store.info["excluded"],
+    }
+    path = store.folder / "verify.json"
+    partial = path.with_suffix(".partial")
+    partial.write_text(json.dumps(found, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
+    partial.replace(path)
+    return found
+
+
+def lines(found: dict[str, Any]) -> list[str]:
+    """A report as an aligned table."""
+    rows: list[tuple[str, ...]] = []
+
+    def section(title: str, *head: str) -> None:
+        rows.extend([(), (title, *head)])
+
+    rows.append(("data set", f"{found['dataset']} as {found['representation']} at {found['fps']:g} fps"))
+    rows.append(("fingerprint", found["fingerprint"]))
+    rows.append(
+        ("split", "the published one" if found["published_split"] else "without leaks: a source is in one only")
+    )
+    rows.extend((f"sha256 {name}", digest) for name, digest in found["files"].items())
+    section("figures", "found", "published", "")
+    for name, figure in found["figures"].items():
+        numbers = ("-" if figure[key] is None else str(figure[key]) for key in ("found", "published"))
+        rows.append(
+            (f"  {name}", *numbers, figure["state"].upper() if figure["state"] == "differs" else figure["state"])
+        )
+    section("captions")
+    rows.extend((f"  {name}", str(number)) for name, number in found["captions"].items())
+    if found["actions"]:
+        section("clips by action", *SPLITS)
+        rows.extend((f"  {name}", *map(str, splits.values())) for name, splits in found["actions"].items())
+    section("frames")
+    rows.extend(
+        (f"  {name}", f"{number:g}" if isinstance(number, float) else str(number))
+        for name, number in found["frames"].items()
+    )
+    section("faults")
+    rows.append(("  numbers that are not finite", "0"))
+    rows.append(("  clips without movement", str(len(found["still"])), _some(found["still"])))
+    groups = [" = ".join(group) for group in found["duplicates"]]
+    rows.append(("  motions that are there twice", str(len(groups)), _some(groups)))
+    rows.append(("  of these in two splits", str(found["duplicates_across_splits"])))
+    section("mean and std, off from the training frames'")
+    rows.extend((f"  {name}", f"{number:.2g}") for name, number in found["statistics"].items())
+    section("left out")
+    rows.extend((f"  {reason}", str(number)) for reason, number in found["excluded"].items())
+    if not found["excluded"]:
+        rows.append(("  nothing", ""))
+    return _aligned(rows)
+
+
+def _figures(store: Store, published: dict[str, int]) -> dict[str, dict[str, Any]]:
+    """Counts of the store and, before those of the same name, of the raw data as it was when the store was written."""
+    by_split = store.info["clips"]
+    of_action = Counter(clip.action for clip in store.clips if clip.action is not None)
+    training = Counter(clip.action for clip in store.clips if clip.action is not None and clip.split != "test")
+    counted: dict[str, int] = {"clips": len(store.clips), **by_split}
+    if of_action:
+        counted["actions"] = len(of_action)
+        counted["fewest clips an action"] = min(of_action.values())
+        counted["most clips an action"] = max(of_action.values())
+    if training:
+        counted["fewest training clips an action"] = min(training.values())
+        counted["most training clips an action"] = max(training.values())
+    raw: dict[str, int] = store.info.get("counts", {})
+    counted = {f"{name} of the store" if name in raw else name: number for name, number in counted.items()} | raw
+    figures = {}
+    for name in [*published, *(name for name in counted if name not in published)]:
+        given, number = published.get(name), counted.get(name)
+        if given is None:
+            state = "not published"
+        elif number is None:
+            state = "not counted"
+        else:
+            state = "ok" if number == given else "differs"
+        figures[name] = {"found": number, "published": given, "state": state}
+    return figures
+
+
+def _check_frames(store: Store) -> None:
+    """Every number of every clip is finite, and clips lie within the packed frames."""
+    finite = np.concatenate(
+        [np.isfinite(store.features[begin : begin + 65536]).all(1) for begin in range(0, len(store.features), 65536)]
+    )
+    for clip in store.clips:
+        frames = finite[clip.start : clip.start + clip.length]
+        if len(frames) < clip.length or not frames.all():
+            what = "is not finite" if len(frames) == clip.length else "is missing"
+            frame = int(np.argmin(frames)) if len(frames) == clip.length else len(frames)
+            raise ValueError(f"{store.folder}: damaged: frame {frame} of clip {clip.id} {what}; prepare it again")
+
+
+def _check_sources(store: Store) -> None:
+    splits: defaultdict[str, set[str]] = defaultdict(set)
+    for clip in store.clips:
+        splits[clip.source].add(clip.split)
+    leaks = {source: sorted(found) for source, found in splits.items() if len(found) > 1}
+    if leaks:
+        source, found = next(iter(leaks.items()))
+        raise ValueError(
+            f"{store.folder}: damaged: {len(leaks)} sources stand in two splits, such as {source} in "
+            f"{' and '.join(found)}; prepare it again"
+        )
+
+
+def _motions(store: Store) -> list[list[Entry]]:
+    """Clips that share their very frames (one a caption), together."""
+    groups: defaultdict[tuple[int, int], list[Entry]] = defaultdict(list)
+    for clip in store.clips:
+        groups[clip.start, clip.length].append(clip)
+    return list(groups.values())
+
+
+def _still(store: Store, representation: Representation) -> list[str]:
+    """Ids of the clips without movement."""
+    found = []
+    for group in tqdm(_motions(store), "looking for movement", unit=" motions"):
+        joints = representation.decode(torch.from_numpy(np.array(store.motion(group[0]))))
+        if float((joints - joints[:1]).norm(dim=-1).max()) < STILL:
+            found += [clip.id for clip in group]
+    return found
+
+
+def _duplicates(store: Store) -> list[list[str]]:
+    """Ids of motions that are there more than once, number for number; captions of one motion do not count."""
+    groups: defaultdict[bytes, list[str]] = defaultdict(list)
+    for group in _motions(store):
+        groups[sha1(np.ascontiguousarray(store.motion(group[0])).tobytes()).digest()].append(group[0].id)
+    return [ids for ids in groups.values() if len(ids) > 1]
+
+
+def _deviation(store: Store, representation: Representation) -> dict[str, float]:
+    """How far the statistics, which may be handed out with the set, are from those of its training frames."""
+    training = np.zeros(len(store.features), bool)
+    for clip in store.clips:
+        training[clip.start : clip.start + clip.length] |= clip.split == "train"
+    frames = np.flatnonzero(training)
+    frames = frames[:: -(-len(frames) // FRAMES)]
+    mean, std = (part.double().numpy() for part in representation.statistics(torch.from_numpy(store.features[frames])))
+    return {
+        "largest difference of a mean, in std": float((np.abs(store.mean - mean) / std).max()),
+        "largest relative difference of a std": float(np.abs(store.std / std - 1).max()),
+    }
+
+
+def _some(names: list[str]) -> str:
+    return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
+
+
+def _aligned(rows: list[tuple[str, ...]]) -> list[str]:
+    """Columns as wide as their widest cell, but for last cells, which may be long."""
+    widths: Counter[int] = Counter()
+    for row in rows:
+        for column, cell in enumerate(row[:-1]):
+            widths[column] = max(widths[column], len(cell))
+    return [
+        "  ".join([*(cell.ljust(widths[i]) for i, cell in enumerate(row[:-1])), *row[-1:]]).rstrip() for row in rows
+    ]

@@ -1,0 +1,240 @@
+"""The command that prepares and verifies data sets: reports, misuse, interruption, the same result on any machine."""
+
+import hashlib
+import json
+import os
+import signal
+from collections.abc import Callable
+from multiprocessing import active_children
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from t2m_folder import line, write_folder
+from test_bandai import TAKES, synthetic_take
+
+from flame_mdm.config import EXPERIMENTS
+from flame_mdm.data import Clip, bvh
+from flame_mdm.data.bandai import Bandai
+from flame_mdm.data.store import Store
+from flame_mdm.data.synthetic import Synthetic
+from flame_mdm.prepare import main
+
+SYNTHETIC = ("data=synthetic", "data.source.clips=30")
+
+
+@pytest.fixture(scope="module")
+def takes(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder in the layout of Bandai-Namco's."""
+    folder = tmp_path_factory.mktemp("takes")
+    for seed, (name, frames) in enumerate(TAKES.items()):
+        bvh.write(synthetic_take(seed, frames), folder / f"{name}.bvh")
+    return folder
+
+
+def only_store(root: Path) -> Store:
+    """The one store under a data root, beside which nothing stands."""
+    (folder,) = root.iterdir()
+    return Store(folder)
+
+
+def humanml(root: Path, width: int = 263) -> Path:
+    motions = {name: (frames, [line(f"a person walks {name}")]) for name, frames in {"a": 50, "b": 60, "c": 70}.items()}
+    return write_folder(root, motions, {"train": ["a"], "val": ["b"], "test": ["c"]}, width)
+
+
+def test_verify_reports_what_is_there(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    root = tmp_path / "data"
+    assert main([*SYNTHETIC, f"data_root={root}"]) == 0
+    store = only_store(root)
+    capsys.readouterr()
+    assert main([*SYNTHETIC, f"data_root={root}", "verify=true"]) == 0
+    output = capsys.readouterr().out
+    report = json.loads((store.folder / "verify.json").read_text())
+    assert not (store.folder / "verify.partial").exists()
+    assert report["fingerprint"] == store.fingerprint and store.fingerprint in output
+    assert report["files"] == store.info["sha256"]
+    for split, number in store.info["clips"].items():
+        assert report["figures"][split] == {"found": number, "published": None, "state": "not published"}
+    texts = {caption for clip in store.clips for caption in clip.captions}
+    assert report["captions"]["different captions"] == len(texts)
+    assert 20 < report["captions"]["different words"] < len(" ".join(texts).split())
+    assert sum(sum(splits.values()) for splits in report["actions"].values()) == len(store.clips) == 30
+    assert report["frames"]["shortest clip"] == min(clip.length for clip in store.clips)
+    assert report["frames"]["clips below the 24 frames that cropping needs"] == 0
+    assert report["still"] == report["duplicates"] == []
+    assert max(report["statistics"].values()) < 1e-4
+    figures = output.splitlines()[output.splitlines().index("") + 1 :][:5]
+    assert len({row.index(word) for row, word in zip(figures[1:], ["-"] * 4, strict=True)}) == 1, "columns are aligned"
+    assert main([*SYNTHETIC, f"data_root={root}", "verify=true"]) == 0, "the report itself is not part of the store"
+
+
+def test_differences_from_published_figures_are_loud_but_not_fatal(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    folder = humanml(tmp_path / "HumanML3D")
+    words = ["data=humanml3d", f"source={folder}", f"data_root={tmp_path / 'data'}"]
+    assert main(words) == 0
+    assert main([*words, "verify=true"]) == 0
+    output = capsys.readouterr().out
+    assert "DIFFERS from the published figures: 3 motions, not 14616; 3 texts, not 44970; 2 train" in output
+    report = json.loads((only_store(tmp_path / "data").folder / "verify.json").read_text())
+    assert report["figures"]["motions"] == {"found": 3, "published": 14616, "state": "differs"}
+    frames = np.load(folder / "new_joint_vecs" / "a.npy")[:, 0], np.load(folder / "new_joint_vecs" / "Ma.npy")[:, 0]
+    mean = np.concatenate(frames).mean()
+    given = np.load(folder / "Mean.npy")
+    off = np.abs(given - mean).max() / np.concatenate(frames).std()
+    assert report["statistics"]["largest difference of a mean, in std"] == pytest.approx(off, rel=1e-3)
+
+
+def test_still_clips_duplicates_and_short_clips_are_listed(tmp_path: Path):
+    folder = tmp_path / "own"
+    folder.mkdir()
+    walk = next(clip for clip in Synthetic(clips=30).clips(20.0) if clip.attributes["action"] == "walk").motion
+    for name, motion in {"a": walk, "b": walk, "c": np.tile(walk[:1], (40, 1, 1)), "d": walk[5:20]}.items():
+        np.savez(folder / f"{name}.npz", joints=motion, fps=20)
+    rows = [f"{name},a person,{split}" for name, split in zip("abcd", ("train", "test", "train", "val"), strict=True)]
+    (folder / "captions.csv").write_text("\n".join(["id,text,split", *rows]) + "\n")
+    words = ["data=folder", f"source={folder}", f"data_root={tmp_path / 'data'}"]
+    assert main(words) == 0
+    assert main([*words, "verify=true"]) == 0
+    report = json.loads((only_store(tmp_path / "data").folder / "verify.json").read_text())
+    assert report["still"] == ["c"]
+    assert report["duplicates"] == [["a", "b"]]
+    assert report["duplicates_across_splits"] == 1
+    assert report["frames"]["clips below the 24 frames that cropping needs"] == 1
+
+
+@pytest.mark.parametrize("name", ["features.npy", "clips.jsonl", "statistics.npz", "store.json"])
+def test_damage_is_one_line(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    words = [*SYNTHETIC, f"data_root={tmp_path}"]
+    assert main(words) == 0
+    path = only_store(tmp_path).folder / name
+    data = bytearray(path.read_bytes())
+    where = data.index(b'"fingerprint": "') + 17 if name == "store.json" else len(data) // 2
+    data[where] = ord("1") if data[where] != ord("1") else ord("2")
+    path.write_bytes(data)
+    capsys.readouterr()
+    assert main([*words, "verify=true"]) == 1
+    (message,) = capsys.readouterr().err.splitlines()
+    assert message.startswith(f"error: {path}: damaged: ")
+    assert not (path.parent / "verify.json").exists()
+
+
+def resealed(store: Store, change: Callable[[Path], None]) -> Store:
+    """The store with changed files, and hashes that fit them."""
+    change(store.folder)
+    info = store.info
+    info["sha256"] = {name: hashlib.sha256((store.folder / name).read_bytes()).hexdigest() for name in info["sha256"]}
+    (store.folder / "store.json").write_text(json.dumps(info))
+    return Store(store.folder)
+
+
+def test_numbers_that_are_not_finite_are_damage(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    words = [*SYNTHETIC, f"data_root={tmp_path}"]
+    assert main(words) == 0
+    store = only_store(tmp_path)
+    clip = store.clips[7]
+
+    def spoil(folder: Path) -> None:
+        features = np.load(folder / "features.npy", mmap_mode="r+")
+        features[clip.start + 3, 5] = np.nan
+        features.flush()
+
+    resealed(store, spoil)
+    assert main([*words, "verify=true"]) == 1
+    assert f"frame 3 of clip {clip.id} is not finite" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("data", ["bandai", "synthetic"])
+def test_the_fingerprint_does_not_depend_on_the_number_of_workers(data: str, takes: Path, tmp_path: Path):
+    stores = []
+    for workers in (1, 2):
+        own = [f"source={takes}", f"data.source.workers={workers}"] if data == "bandai" else [f"num_workers={workers}"]
+        own = [word if not word.startswith("num_workers") else f"data.{word}" for word in own]
+        name = [] if data == "bandai" else ["data.source.clips=30"]
+        assert main([f"data={data}", *own, *name, f"data_root={tmp_path / str(workers)}"]) == 0
+        stores.append(only_store(tmp_path / str(workers)))
+    assert stores[0].fingerprint == stores[1].fingerprint
+    assert stores[0].info["sha256"]["features.npy"] == stores[1].info["sha256"]["features.npy"]
+
+
+@pytest.mark.parametrize(("how", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
+def test_an_interrupted_preparation_leaves_nothing(
+    how: signal.Signals, code: int, takes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    words = ["data=bandai", f"source={takes}", "data.source.workers=2"]
+    assert main([*words, f"data_root={tmp_path / 'whole'}"]) == 0
+    clips = 0
+    make = Bandai._clip
+
+    def interrupted(self: Bandai, *arguments: Any, **options: Any) -> Clip:
+        nonlocal clips
+        clips += 1
+        if clips == 5:
+            os.kill(os.getpid(), how)
+        return make(self, *arguments, **options)
+
+    root = tmp_path / "data"
+    before = signal.getsignal(signal.SIGTERM)
+    with monkeypatch.context() as patch:
+        patch.setattr(Bandai, "_clip", interrupted)
+        assert main([*words, f"data_root={root}"]) == code
+    assert list(root.iterdir()) == []
+    assert active_children() == []
+    assert signal.getsignal(signal.SIGTERM) is before
+    assert main([*words, f"data_root={root}"]) == 0
+    assert only_store(root).fingerprint == only_store(tmp_path / "whole").fingerprint
+
+
+def test_an_unknown_set_gets_the_nearest_name(capsys: pytest.CaptureFixture[str]):
+    assert main(["data=humanl3d"]) == 1
+    assert "no data is called 'humanl3d'. Did you mean humanml3d" in capsys.readouterr().err
+    assert main([]) == 2 or "which data set? data=NAME, one of: babel, bandai" in capsys.readouterr().err
+
+
+WHERE = {
+    "babel": "babel.is.tue.mpg.de",
+    "bandai": "github.com/BandaiNamcoResearchInc",
+    "folder": "give a folder of .bvh, .npz, .npy files",
+    "humanact12": "github.com/Mathux/ACTOR",
+    "humanml3d": "github.com/EricGuo5513/HumanML3D",
+    "humanml3d_smpl": "github.com/EricGuo5513/HumanML3D",
+    "kit": "github.com/EricGuo5513/HumanML3D",
+    "kit_temos": "github.com/Mathux/TEMOS",
+    "uestc": "github.com/Mathux/ACTOR",
+}
+
+
+def test_every_set_is_covered_here():
+    sets = {path.stem for path in (EXPERIMENTS / "data").glob("*.yaml")}
+    assert sets == {*WHERE, "synthetic", "humanact12_unconstrained"}
+
+
+@pytest.mark.parametrize("data", WHERE)
+def test_a_missing_source_says_where_to_get_the_set(data: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    for words in ([], [f"source={tmp_path / 'nowhere'}"]):
+        assert main([f"data={data}", f"data_root={tmp_path / 'data'}", *words]) == 1
+        (message,) = capsys.readouterr().err.splitlines()
+        assert message.startswith("error: ") and WHERE[data] in message
+    assert not any((tmp_path / "data").glob("*"))
+
+
+def test_a_set_without_a_source_refuses_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    assert main(["data=synthetic", f"source={tmp_path}"]) == 1
+    assert capsys.readouterr().err == "error: synthetic needs no source: it is made from nothing\n"
+
+
+@pytest.mark.parametrize("data", sorted({*WHERE} - {"folder", "bandai"}))
+def test_another_set_as_source_is_refused(data: str, takes: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    assert main([f"data={data}", f"source={takes}", f"data_root={tmp_path / 'data'}"]) == 1
+    (message,) = capsys.readouterr().err.splitlines()
+    assert str(takes) in message or data == "kit_temos"
+    assert not any((tmp_path / "data").glob("*"))
+
+
+def test_features_of_another_set_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    assert main(["data=kit", f"source={humanml(tmp_path / 'set')}", f"data_root={tmp_path / 'data'}"]) == 1
+    assert "(50, 263), not (frames, 251)" in capsys.readouterr().err
+    assert main(["data=bandai", f"source={tmp_path / 'set'}", f"data_root={tmp_path / 'data'}"]) == 1
+    assert "no file dataset-1_*.bvh" in capsys.readouterr().err
+    assert not any((tmp_path / "data").glob("*"))

@@ -417,9 +417,10 @@ def _serve(command: Callable[[Config], None], words: list[str], name: str | None
     if name is None:
         if words[0].startswith("-") or "=" in words[0]:
             raise UserError(f"the first word must name an experiment, such as quickstart, not '{words[0]}'")
-        recipe, words = _find(words[0]), words[1:]
+        first, words = words[0], words[1:]
+        recipe = _find(first)
     else:
-        recipe = _Recipe(EXPERIMENTS, name)
+        first, recipe = name, _Recipe(EXPERIMENTS, name)
     flags = [w for i, w in enumerate(words) if w.startswith("-") or (i and words[i - 1] in ("--cfg", "--package"))]
     overrides = [w for w in words if w not in flags]
     sweep = any(flag in ("-m", "--multirun") for flag in flags)
@@ -434,6 +435,11 @@ def _serve(command: Callable[[Config], None], words: list[str], name: str | None
         if sweep:
             plain["run"]["dir"] = HydraConfig.get().runtime.output_dir
             check(plain)
+        if name is None:  # what Lightning starts further processes with
+            task = [str(word) for word in HydraConfig.get().overrides.task]
+            folder = _quoted(f"run.dir={plain['run']['dir']}", ("run.dir",))
+            sys.argv = [sys.argv[0], first, *task, folder]
+            HydraConfig.instance().cfg = None  # else it adds words for Hydra's own command line
         codes.append(guarded(lambda: command(plain)))
 
     quiet = ["hydra/job_logging=disabled", "hydra/hydra_logging=disabled", "hydra.output_subdir=null"]

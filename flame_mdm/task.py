@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zipfile
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -56,6 +57,9 @@ class Task(LightningModule):
     def setup(self, stage: str) -> None:
         """Opens what `prepare_data` encoded, and notes what sampling has to know of the data."""
         self.condition.load_cache(*self._captions())
+        # Buffers are the same on all processes. Sent at each forward pass, they would keep processes waiting that have
+        # more validation batches than others.
+        self._ddp_params_and_buffers_to_ignore = [name for name, _ in self.named_buffers()]
         data: MotionDataModule = self.trainer.datamodule  # type: ignore[attr-defined]
         self.facts |= {
             "dataset": data.store.info["dataset"],
@@ -289,6 +293,9 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
     if path.suffix == ".safetensors":
         return checkpoints.read(path)
     try:
+        with zipfile.ZipFile(path) as file:
+            if (spoiled := file.testzip()) is not None:  # torch does not look at the checksums
+                raise ValueError(spoiled)
         checkpoint = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # torch raises many kinds for damaged files and foreign pickles
         raise UserError(f"{path}: damaged, or not a checkpoint of this framework") from error

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -179,8 +180,11 @@ class Evaluator:
                     reasons[name] = str(error)
                     metric.reset()
                     result = metric.compute()
-                parts = result.items() if isinstance(result, dict) else [("", result)]
-                values |= {f"{name}/{part}".rstrip("/"): value for part, value in parts}
+                for part, value in result.items() if isinstance(result, dict) else [("", result)]:
+                    if value is not None and not math.isfinite(value):
+                        reasons[name] = f"{type(metric).__name__}: the value is {value}: too few or degenerate samples"
+                        value = None
+                    values[f"{name}/{part}".rstrip("/")] = value
         return values, reasons
 
     def _metric(self, config: Config, seed: int) -> Metric:

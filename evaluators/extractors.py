@@ -26,9 +26,11 @@ class Extractor(ABC):
 
     Attributes:
         sha256: of what it was loaded from; values of extractors that differ in it are not comparable.
+        fingerprint: of the data it was trained on, where that is known.
     """
 
     sha256: str
+    fingerprint: str | None = None
 
     @abstractmethod
     def check(self, representation: Representation, dataset: str) -> None:
@@ -67,6 +69,7 @@ class MotionCLIPExtractor(Extractor):
         file = find(path)
         self.path, self.sha256 = file, file_sha256(file)
         self.task = load_task(file, MotionCLIPTask, device)
+        self.fingerprint = self.task.facts.get("fingerprint")
         self.known: dict[str, Tensor] = {}
 
     def check(self, representation: Representation, dataset: str) -> None:

@@ -18,6 +18,8 @@ from lightning.pytorch.callbacks import Checkpoint, TQDMProgressBar
 from lightning.pytorch.loggers import TensorBoardLogger, WandbLogger
 from torchmetrics import Metric
 
+from flame_mdm.data.datamodule import MotionDataModule
+from flame_mdm.evaluate import check_condition, load_protocol
 from flame_mdm.generation import Generated, generate, write_motions
 from flame_mdm.motion import MotionBatch
 from flame_mdm.task import MotionGeneration
@@ -224,6 +226,74 @@ class SampleMotions(Callback):
             parts = result if isinstance(result, dict) else {"": result}
             values |= {f"{name}/{k}".rstrip("/"): None if v is None else float(v) for k, v in parts.items()}
         return values
+
+
+class Evaluate(Callback):
+    """Evaluates by a protocol on the validation split: val/<protocol>/<metric> on the dashboard, to select by, too.
+
+    It runs at the first validation and then every so often, with averaged weights where the recipe averages them. All
+    processes take their share of the motions.
+
+    Args:
+        protocol: a name of experiments/evaluation, or the path of a file.
+        extractor: what the protocol's extractor is loaded from; "none" leaves metrics of features without values.
+        every_n_steps: how often, at validation.
+        samples: motions; None = as the protocol has it.
+        replications: how often they are drawn.
+        batch_size: motions at once.
+    """
+
+    def __init__(
+        self,
+        protocol: str,
+        extractor: str | None,
+        every_n_steps: int,
+        samples: int | None = 256,
+        replications: int = 1,
+        batch_size: int = 64,
+    ):
+        self.name, self.path, self.every_n_steps = protocol, extractor, every_n_steps
+        self.samples, self.replications, self.batch_size = samples, replications, batch_size
+        self.next = 0
+        self.values: dict[str, float] = {}
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        assert isinstance(pl_module, MotionGeneration)
+        data: MotionDataModule = trainer.datamodule  # type: ignore[attr-defined]
+        self.clips = data.clips("val")
+        self.protocol = load_protocol(self.name, pl_module.representation)
+        self.protocol.change(replications=self.replications, samples=self.samples, quick=False, clips=len(self.clips))
+        self.protocol.multimodality = None
+        check_condition(self.protocol, pl_module)
+        self.protocol.check_data(self.clips)
+        dataset = data.store.info["dataset"]
+        self.extractor = self.protocol.open_extractor(self.path, pl_module.representation, dataset)
+        self.next = trainer.global_step
+
+    def on_validation_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        if trainer.global_step < self.next or not hasattr(self, "protocol"):
+            return
+        assert isinstance(pl_module, MotionGeneration)
+        self.next = trainer.global_step + self.every_n_steps
+        source = self.protocol.generator(
+            pl_module, None, {"seed": 0}, batch_size=self.batch_size, count=len(self.clips), progress=False
+        )
+        result = self.protocol.evaluate(
+            source,
+            self.clips,
+            self.extractor,
+            pl_module.representation,
+            batch_size=self.batch_size,
+            rank=trainer.global_rank,
+            world=trainer.world_size,
+            ground_truth=False,
+        )
+        means = {name: value["mean"] for name, value in result["values"].items()}
+        self.values = {f"val/{self.protocol.name}/{k}": mean for k, mean in means.items() if mean is not None}
+
+    def on_validation_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        pl_module.log_dict(self.values)  # averaged weights are gone by now, so values were taken at the start
+        self.values = {}
 
 
 def _log_video(logger: Any, gif: Path, step: int) -> None:

@@ -46,6 +46,8 @@ def evaluate(config: Config) -> None:
         raise UserError("give one of ckpt=runs/.../checkpoints/last.ckpt and from_samples=<folder of .npz files>")
     if config["ckpt"] is None and not config.get("data"):
         raise UserError("from_samples needs the name of the data set, such as data=humanml3d")
+    if config["ckpt"] is None and (config["quick"] or config["samples"] or config["replications"]):
+        raise UserError("from_samples measures all motions of the files: leave out quick, samples and replications")
     if config["split"] not in ("train", "val", "test"):
         raise UserError(f"split={config['split']}: there are train, val and test")
 
@@ -67,20 +69,23 @@ def evaluate(config: Config) -> None:
         replications=config["replications"], samples=config["samples"], quick=config["quick"], clips=len(clips)
     )
     protocol.check_data(clips)
+    if model is not None:
+        check_condition(protocol, model)
     extractor = protocol.open_extractor(config["extractor"], representation, data.store.info["dataset"])
 
-    options = {k: config[k] for k in ("seed", "guidance_scale", "sampler", "num_inference_steps")}
+    kind = f"{protocol.name}-{protocol.version}"
     if model is not None:
         assert file is not None
+        options = {"seed": config["seed"], **_sampling(config, model)}
         sha256 = file_sha256(file)
         kept = {**options, "split": config["split"], "data": data.store.fingerprint, "samples": protocol.samples}
-        kind = f"{protocol.name}-{protocol.version}"
         folder = run_folder(file) / "evaluation" / kind / f"{sha256[:16]}-{_digest(kept)[:8]}"
         source = protocol.generator(model, folder, options, batch_size=config["batch_size"], count=len(clips))
+        name = "result"
     else:
         folder = Path(config["from_samples"])
         source = protocol.given(folder, representation)
-        sha256 = source.sha256
+        sha256, name = source.sha256, kind
     result = protocol.evaluate(
         source, clips, extractor, representation, seed=config["seed"], batch_size=config["batch_size"]
     )
@@ -88,8 +93,9 @@ def evaluate(config: Config) -> None:
     for reason in _strangers(model, data):
         report["valid"] = False
         report["invalid_because"].append(reason)
-    end = f"-{extractor.sha256[:8]}" if extractor else ""
-    out = Path(config["out"] or folder / f"result{end}{'-quick' if config['quick'] else ''}.json")
+    name += f"-{extractor.sha256[:8]}" if extractor else ""
+    name += "-quick" if config["quick"] else f"-{protocol.replications}x" if "replications" in changed else ""
+    out = Path(config["out"] or folder / f"{name}.json")
     write_json(out, report)
     _show(report, out)
 
@@ -131,11 +137,38 @@ def default_protocol(model: MotionGeneration | None) -> str:
     """
     if model is None:
         raise UserError("from_samples needs a protocol, such as protocol=text_to_motion")
-    if not model.condition.features:
+    condition = _condition(model)
+    if condition == "none":
         return "unconditioned"
-    if model.config["condition"]["_target_"].endswith("ActionLabels"):
+    if condition == "action":
         return "action_to_motion_uestc" if model.facts["dataset"] == "uestc" else "action_to_motion"
     return "synthetic" if model.facts["dataset"] == "synthetic" else "text_to_motion"
+
+
+def _condition(model: MotionGeneration) -> str:
+    """What a model was trained to generate motions for."""
+    if not model.condition.features:
+        return "none"
+    return "action" if model.config["condition"]["_target_"].endswith("ActionLabels") else "text"
+
+
+def check_condition(protocol: Any, model: MotionGeneration) -> None:
+    """Refuses a protocol whose motions are generated for what the model was not trained with.
+
+    Raises:
+        UserError: so it is.
+    """
+    if protocol.condition not in ("none", _condition(model)):
+        raise UserError(
+            f"protocol {protocol.name} generates motions for {protocol.condition}, but the checkpoint was trained with "
+            f"condition {_condition(model)}: choose another protocol, such as {default_protocol(model)}"
+        )
+
+
+def _sampling(config: Config, model: MotionGeneration) -> dict[str, Any]:
+    """How the model is sampled: as asked, or by its recipe."""
+    names = ("guidance_scale", "sampler", "num_inference_steps")
+    return {name: getattr(model, name) if config[name] is None else config[name] for name in names}
 
 
 def run_folder(checkpoint: Path) -> Path:
@@ -183,6 +216,7 @@ def _describe(
     from flame_mdm.provenance import environment
 
     info = data.store.info
+    where = (model.representation if model else data.representation).mean.device
     report: dict[str, Any] = {
         "format": FORMAT,
         "quick": config["quick"],
@@ -195,16 +229,15 @@ def _describe(
             "fingerprint": info["fingerprint"],
         },
         "seed": config["seed"],
-        "extractor": {"path": str(config["extractor"]), "sha256": extractor.sha256} if extractor else None,
+        "extractor": extractor
+        and {"path": str(config["extractor"]), "sha256": extractor.sha256, "data": extractor.fingerprint},
         "samples_sha256": sha256 if model is None else None,
         "checkpoint": None,
-        "device": torch.cuda.get_device_name() if (config["device"] or "").startswith("cuda") else "cpu",
+        "device": torch.cuda.get_device_name(where) if where.type == "cuda" else "cpu",
         "precision": f"float32, matmul {torch.get_float32_matmul_precision()}",
         "environment": environment(),
     }
     if model is not None:
-        guidance = model.guidance_scale if config["guidance_scale"] is None else config["guidance_scale"]
-        report["device"] = torch.cuda.get_device_name(model.device) if model.device.type == "cuda" else "cpu"
         report["checkpoint"] = {
             "path": str(config["ckpt"]),
             "sha256": sha256,
@@ -212,11 +245,16 @@ def _describe(
             "config_sha256": _digest(model.config),
             "averaged_weights": bool(model.config.get("ema")),
             "parameters": sum(p.numel() for p in model.parameters() if p.requires_grad),
-            "guidance_scale": guidance,
-            "sampler": config["sampler"] or model.sampler,
-            "num_inference_steps": config["num_inference_steps"] or model.num_inference_steps,
+            "selected_by": _selection(model, Path(str(config["ckpt"]))),
+            **_sampling(config, model),
         }
     return report
+
+
+def _selection(model: MotionGeneration, file: Path) -> str:
+    """By which rule a checkpoint was chosen among those of its run, as far as its name tells."""
+    best = (model.config.get("callbacks") or {}).get("best") or {}
+    return f"best {best['monitor']}" if file.stem == "best" and "monitor" in best else f"none: {file.stem}"
 
 
 def _digest(values: Any) -> str:

@@ -1,0 +1,383 @@
+"""Evaluation by protocol: what stands in the result, what is kept, what is refused."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from conftest import TINY
+from distributed import GlooPool
+
+from evaluators.evaluator import Evaluator, Extracted
+from evaluators.extractors import MotionCLIPExtractor
+from evaluators.protocols import Generator, read_samples
+from flame_mdm import evaluate, train
+from flame_mdm.config import EXPERIMENTS, UserError, instantiate
+from flame_mdm.data.datamodule import MotionDataModule
+from flame_mdm.evaluate import load_protocol
+from flame_mdm.task import load, read_checkpoint
+
+GENERATOR = ["data.source.clips=400", *TINY[1:], "callbacks.samples=null", "trainer.val_check_interval=2"]
+CLIP = [
+    "data.source.clips=400",
+    "data.batch_size=16",
+    "condition=learned",
+    "condition.features=16",
+    *(f"task.network.{size}" for size in ("latent_dim=16", "ff_size=16", "num_layers=1", "num_heads=2")),
+    "task.network.embedding_dim=4",
+    "trainer.accelerator=cpu",
+    "trainer.enable_progress_bar=false",
+    "trainer.val_check_interval=2",
+]
+
+
+class Runs:
+    """A tiny model and a tiny motion-CLIP on the same 400 clips."""
+
+    def __init__(self, folder: Path):
+        self.folder = folder
+        data = [f"data_root={folder / 'data'}", "trainer.max_steps=2"]
+        assert train.main(["quickstart", *GENERATOR, *data, f"run.dir={folder / 'model'}"]) == 0
+        assert train.main(["motion_clip/synthetic", *CLIP, *data, f"run.dir={folder / 'clip'}"]) == 0
+        self.model, self.clip = (folder / name / "checkpoints" / "last.ckpt" for name in ("model", "clip"))
+
+    def evaluate(self, out: Path, *words: str, model: Path | None = None) -> int:
+        """The exit code of the command; the model is copied beside `out`, so that no test sees another's motions."""
+        if model is None:
+            model = out.parent / "model" / "checkpoints" / "last.ckpt"
+            model.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy(self.model, model)
+        extractor = [] if any(word.startswith("extractor=") for word in words) else [f"extractor={self.clip}"]
+        return evaluate.main([f"ckpt={model}", *extractor, f"out={out}", "device=cpu", *words])
+
+    def result(self, out: Path, *words: str) -> dict:
+        assert self.evaluate(out, *words) == 0
+        return json.loads(out.read_text())
+
+    def data(self) -> MotionDataModule:
+        config = read_checkpoint(self.model)["config"]
+        representation = instantiate(config["representation"])
+        data = instantiate(config["data"], representation=representation)
+        data.setup("test")
+        return data
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory) -> Runs:
+    return Runs(tmp_path_factory.mktemp("runs"))
+
+
+@pytest.fixture(scope="module")
+def full(runs, tmp_path_factory) -> tuple[dict, Path]:
+    """The result of an evaluation that was not disturbed, and where it stands."""
+    out = tmp_path_factory.mktemp("full") / "result.json"
+    return runs.result(out, "replications=2"), out
+
+
+def motions(out: Path) -> Path:
+    """Where the motions of a result are kept."""
+    (folder,) = (out.parent / "model" / "evaluation").glob("*/*")
+    return folder
+
+
+def comparable(result: dict) -> dict:
+    """A result without times and places."""
+    same = {key: value for key, value in result.items() if key not in ("environment", "cost")}
+    same["checkpoint"] = {key: value for key, value in same["checkpoint"].items() if key != "path"}
+    return same
+
+
+def test_a_result_says_what_it_is_and_where_it_comes_from(runs, full):
+    result, out = full
+    protocol = load_protocol("synthetic", load(runs.model).representation)
+    names = {*protocol.metrics, *protocol.multimodality["metrics"]}
+    assert {name.split("/")[0] for name in result["values"]} == names
+    assert {name.split("/")[0] for name in result["ground_truth"]} == set(protocol.metrics)
+    count = len(runs.data().test)
+    for name, value in result["values"].items():
+        assert value["replications"] == 2
+        assert value["n"] == (count if name != "multimodality" else 20 * 20)
+    assert result["values"]["attributes/action"]["ci"] is not None
+    assert result["protocol"] == {"name": "synthetic", "version": 1, "length_source": "ground truth"}
+    assert (result["split"], result["published_split"], result["quick"], result["seed"]) == ("test", False, False, 0)
+    assert result["changed"] == {"replications": 2}
+    assert result["valid"]
+    assert result["data"]["fingerprint"] == runs.data().store.fingerprint == result["extractor"]["data"]
+    checkpoint = result["checkpoint"]
+    assert len(checkpoint["sha256"]) == len(checkpoint["config_sha256"]) == len(result["extractor"]["sha256"]) == 64
+    assert checkpoint["averaged_weights"]
+    assert checkpoint["selected_by"] == "none: last"
+    assert (checkpoint["guidance_scale"], checkpoint["num_inference_steps"]) == (2.5, 5)
+    assert result["cost"]["nfe"] == 5
+    assert result["cost"]["seconds_per_sample"] > 0
+    assert result["environment"]["packages"]["torch"] == torch.__version__
+    assert result["device"] == "cpu"
+    assert not list(out.parent.rglob("*.partial"))
+
+
+def test_real_motions_show_what_was_asked_and_an_untrained_model_does_not(full):
+    result, _ = full
+    assert result["ground_truth"]["attributes/all"]["mean"] > 0.95
+    assert result["values"]["attributes/all"]["mean"] < 0.5
+    assert result["values"]["fid"]["mean"] > 5 * result["ground_truth"]["fid"]["mean"] > 0
+    assert result["values"]["multimodality"]["mean"] > 0
+
+
+def test_a_killed_evaluation_goes_on_to_the_same_result(runs, full, tmp_path, monkeypatch):
+    generate = Generator._generate
+
+    def killed(self, rows, replication):
+        if replication == 1:
+            raise KeyboardInterrupt
+        return generate(self, rows, replication)
+
+    out = tmp_path / "result.json"
+    monkeypatch.setattr(Generator, "_generate", killed)
+    assert runs.evaluate(out, "replications=2") == 130
+    assert [path.name for path in motions(out).iterdir()] == ["rep_0.npz"]
+    assert not out.exists()
+    stamp = (motions(out) / "rep_0.npz").stat().st_mtime_ns
+    monkeypatch.setattr(Generator, "_generate", generate)
+    assert comparable(runs.result(out, "replications=2")) == comparable(full[0])
+    assert (motions(out) / "rep_0.npz").stat().st_mtime_ns == stamp
+
+
+def test_other_metrics_need_no_new_motions(runs, full, tmp_path, monkeypatch):
+    monkeypatch.setattr(Generator, "_generate", lambda *_: pytest.fail("sampled again"))
+    model = full[1].parent / "model" / "checkpoints" / "last.ckpt"
+    out = tmp_path / "result.json"
+    assert runs.evaluate(out, "replications=2", "extractor=none", model=model) == 0
+    result = json.loads(out.read_text())
+    of_joints = ("attributes", "foot_skating", "penetration", "floating", "jitter", "static_share")
+    for name, value in result["values"].items():
+        if name.startswith(of_joints):
+            assert value == full[0]["values"][name]
+        else:
+            assert (value["mean"], value["ci"]) == (None, None), name
+    assert "extractor" in result["not_computed"]
+
+
+def test_the_batch_size_does_not_matter(runs, full, tmp_path):
+    result = runs.result(tmp_path / "result.json", "replications=2", "batch_size=7")
+    for kind in ("ground_truth", "values"):
+        for name, value in result[kind].items():
+            expected = full[0][kind][name]["mean"]
+            # Shares may move by one sample in 40 where two distances are all but equal.
+            assert value["mean"] == (expected and pytest.approx(expected, rel=2e-3, abs=0.03)), name
+
+
+def test_what_cannot_be_computed_is_null_with_its_reason(full):
+    result, _ = full
+    assert result["values"]["diversity"]["mean"] is None
+    assert "300" in result["not_computed"]["diversity"]
+
+
+def test_quick_results_are_marked(runs, tmp_path, capsys):
+    result = runs.result(tmp_path / "result.json", "quick=true", "samples=33")
+    assert result["quick"]
+    assert result["changed"] == {"replications": 2, "samples": 33}
+    assert result["values"]["multimodality"]["mean"] is None
+    assert "QUICK, NOT A RESULT" in capsys.readouterr().out
+
+
+def test_motions_of_others_are_measured_alike(runs, full, tmp_path):
+    given, out = tmp_path / "given", tmp_path / "result.json"
+    given.mkdir()
+    for path in motions(full[1]).glob("rep_*.npz"):
+        content = read_samples(path)
+        order = np.random.default_rng(0).permutation(len(content["ids"]))
+        parts = np.split(content["features"], np.cumsum(content["lengths"])[:-1])
+        features = np.concatenate([parts[i] for i in order])
+        np.savez(given / path.name, ids=content["ids"][order], lengths=content["lengths"][order], features=features)
+    words = [f"from_samples={given}", "data=synthetic", f"data_root={runs.folder / 'data'}", "protocol=synthetic"]
+    assert evaluate.main([*words, f"extractor={runs.clip}", f"out={out}"]) == 0
+    result = json.loads(out.read_text())
+    assert result["checkpoint"] is None
+    assert len(result["samples_sha256"]) == 64
+    for name, value in result["values"].items():
+        if name != "multimodality":
+            assert value == full[0]["values"][name], name
+    assert result["values"]["multimodality"]["mean"] is None
+
+    path = given / "rep_0.npz"
+    content = read_samples(path)
+    np.savez(
+        path, ids=[f"other{i}" for i in range(len(content["ids"]))], **{k: content[k] for k in ("lengths", "features")}
+    )
+    assert evaluate.main([*words, f"extractor={runs.clip}", f"out={out}"]) == 1
+
+
+def test_joints_of_others_are_encoded(runs, tmp_path):
+    data = runs.data()
+    clips, given = data.test, tmp_path / "given"
+    given.mkdir()
+    shown = [data.representation.decode(torch.from_numpy(data.store.motion(c).copy())).numpy() for c in clips.clips]
+    ids, lengths = [clip.id for clip in clips.clips], [len(x) for x in shown]
+    np.savez(given / "a.npz", ids=ids, lengths=lengths, joints=np.concatenate(shown))
+    words = [f"from_samples={given}", "data=synthetic", f"data_root={runs.folder / 'data'}", "protocol=synthetic"]
+    assert evaluate.main([*words, "extractor=none", f"out={tmp_path / 'result.json'}"]) == 0
+    result = json.loads((tmp_path / "result.json").read_text())
+    assert result["values"]["attributes/all"]["mean"] > 0.95
+
+
+def test_the_same_features_give_the_same_bits_in_any_order(runs):
+    data = runs.data()
+    protocol = load_protocol("synthetic", data.representation)
+    rows = protocol.rows(data.test, 0, 0)
+    extractor = protocol.open_extractor(str(runs.clip), data.representation, "synthetic")
+    evaluator = Evaluator(extractor, protocol.metrics, data.representation)
+    one = evaluator.extract(protocol.asked(rows, protocol.real(data.test, rows)))
+    values, _ = evaluator.score(one, one, one, 3)
+
+    def shuffled(extracted: Extracted) -> Extracted:
+        order = torch.randperm(len(extracted), generator=torch.Generator().manual_seed(1)).tolist()
+        picked = {
+            n: v[order] if isinstance(v, torch.Tensor) else [v[i] for i in order] for n, v in extracted.rows.items()
+        }
+        return Extracted(picked, [extracted.joints[i] for i in order])
+
+    evaluator.CHUNK = 7
+    again, _ = evaluator.score(shuffled(one), shuffled(one), one, 3)
+    assert again == values
+    other, _ = evaluator.score(one, one, one, 4)
+    assert other != values, "pools are drawn from the seed"
+
+
+def test_captions_crops_and_second_draws_are_functions_of_seed_replication_and_id(runs):
+    data = runs.data()
+    protocol = load_protocol("synthetic", data.representation)
+    rows = {row.id: row for row in protocol.rows(data.test, 0, 1)}
+    protocol.samples = 10
+    few = protocol.rows(data.test, 0, 1)
+    assert [row.caption for row in few] == [rows[row.id].caption for row in few]
+    assert all((row.frames == rows[row.id].frames).all() for row in few)
+    protocol.samples = None
+    for other in (
+        protocol.rows(data.test, 1, 1),
+        protocol.rows(data.test, 0, 2),
+        protocol.rows(data.test, 0, 1, purpose="real"),
+    ):
+        assert any(row.caption != rows[row.id].caption for row in other)
+    protocol.samples = len(data.test) + 5
+    many = protocol.rows(data.test, 0, 1)
+    assert len({row.id for row in many}) == len(many) == len(data.test) + 5
+
+
+def test_off_ground_truth_makes_the_values_invalid(runs, tmp_path):
+    text = (EXPERIMENTS / "evaluation" / "synthetic.yaml").read_text()
+    for expected, valid in (("[1.0, 0.05]", True), ("[0.5, 0.05]", False)):
+        file = tmp_path / "mine.yaml"
+        file.write_text(f"{text}expected:\n  synthetic:\n    attributes/all: {expected}\n")
+        result = runs.result(tmp_path / "result.json", f"protocol={file}", "replications=1", "extractor=none")
+        assert result["valid"] is valid
+        assert bool(result["invalid_because"]) is not valid
+
+
+def refused(runs: Runs, capsys, tmp_path: Path, *words: str) -> str:
+    assert runs.evaluate(tmp_path / "result.json", *words) == 1
+    lines = [line for line in capsys.readouterr().err.splitlines() if "error:" in line]
+    assert len(lines) == 1
+    return lines[0]
+
+
+def test_what_does_not_fit_is_refused_in_one_line(runs, capsys, tmp_path):
+    assert "needs a feature extractor" in refused(runs, capsys, tmp_path, "extractor=null")
+    assert "not a MotionCLIPTask" in refused(runs, capsys, tmp_path, f"extractor={runs.model}")
+    assert "no such checkpoint" in refused(runs, capsys, tmp_path, f"extractor={tmp_path / 'none.ckpt'}")
+    assert "synthetic" in refused(runs, capsys, tmp_path, "protocol=synthetical")
+    assert "condition text" in refused(runs, capsys, tmp_path, "protocol=action_to_motion")
+    assert "at least 1" in refused(runs, capsys, tmp_path, "samples=0")
+    broken = tmp_path / "broken.ckpt"
+    broken.write_bytes(runs.model.read_bytes()[:1000])
+    assert runs.evaluate(tmp_path / "result.json", model=broken) == 1
+    assert "damaged" in capsys.readouterr().err
+    assert evaluate.main(["protocol=synthetic"]) == 1
+    assert not (tmp_path / "result.json").exists()
+
+
+def test_damaged_motions_are_named(runs, capsys, tmp_path):
+    out = tmp_path / "result.json"
+    runs.result(out, "quick=true")
+    path = motions(out) / "rep_1.npz"
+    path.write_bytes(path.read_bytes()[:500])
+    assert f"{path}: damaged" in refused(runs, capsys, tmp_path, "quick=true")
+
+
+def test_an_extractor_of_other_motions_is_refused(runs):
+    data, extractor = runs.data(), MotionCLIPExtractor(str(runs.clip))
+    extractor.check(data.representation, "synthetic")
+    with pytest.raises(UserError, match="data set synthetic"):
+        extractor.check(data.representation, "bandai")
+    data.representation.name = "other"
+    with pytest.raises(UserError, match="other"):
+        extractor.check(data.representation, "synthetic")
+
+
+def test_a_model_of_other_data_is_marked(runs, tmp_path):
+    config, other = read_checkpoint(runs.model)["config"], tmp_path / "data"
+    config["data"] |= {"root": str(other), "source": config["data"]["source"] | {"clips": 60}}
+    instantiate(config["data"], representation=instantiate(config["representation"])).prepare_data()
+    out = tmp_path / "result.json"
+    result = runs.result(out, f"data_root={other}", "quick=true", "extractor=none")
+    assert not result["valid"]
+    assert "splits may overlap" in result["invalid_because"][0]
+
+
+@pytest.mark.parametrize("name", sorted(path.stem for path in (EXPERIMENTS / "evaluation").glob("*.yaml")))
+def test_every_protocol_can_be_read(runs, name):
+    protocol = load_protocol(name, runs.data().representation)
+    assert protocol.name == name
+    assert protocol.version >= 1
+    evaluator = Evaluator(None, protocol.metrics, runs.data().representation)
+    nothing = Extracted({"keys": torch.zeros(0, dtype=torch.long)}, [])
+    values, reasons = evaluator.score(nothing, nothing, nothing, 0)
+    assert set(values.values()) == {None}
+    assert not reasons
+    for table in protocol.expected.values():
+        assert set(table) <= set(values)
+
+
+def test_training_logs_the_values_of_the_validation_split(runs, tmp_path):
+    recipe = tmp_path / "mine.yaml"
+    recipe.write_text(
+        "# @package _global_\ndefaults:\n  - /quickstart\n  - override /logger: csv\n  - _self_\ncallbacks:\n"
+        "  evaluate: {_target_: flame_mdm.callbacks.Evaluate, protocol: synthetic, "
+        f"extractor: {runs.clip}, every_n_steps: 4, samples: 33}}\n"
+    )
+    words = [*GENERATOR, f"data_root={runs.folder / 'data'}", f"run.dir={tmp_path / 'run'}", "trainer.max_steps=8"]
+    assert train.main([str(recipe), *words, "callbacks.best.monitor=val/synthetic/fid"]) == 0
+    lines = [line.split(",") for line in (tmp_path / "run" / "csv" / "metrics.csv").read_text().splitlines()]
+    rows = [dict(zip(lines[0], line, strict=True)) for line in lines[1:]]
+    logged = [int(row["step"]) for row in rows if row["val/synthetic/fid"]]
+    assert len(logged) == 2, "at the first validation and 4 steps later"
+    assert "val/synthetic/attributes/all" in rows[0]
+    assert "val/synthetic/diversity" not in rows[0], "too few motions"
+    assert (tmp_path / "run" / "checkpoints" / "best.ckpt").exists()
+
+
+def shares(rank: int, world: int, model_file: str, clip: str) -> dict:
+    """Values as one of several processes gets them."""
+    model = load(model_file)
+    representation = instantiate(model.config["representation"])
+    data = instantiate(model.config["data"], representation=representation)
+    data.setup("test")
+    protocol = load_protocol("synthetic", model.representation)
+    protocol.change(replications=1, samples=33, quick=False, clips=len(data.test))
+    protocol.multimodality = None
+    extractor = protocol.open_extractor(clip, model.representation, "synthetic")
+    source = protocol.generator(model, None, {"seed": 0}, batch_size=8, count=33, progress=False)
+    result = protocol.evaluate(source, data.test, extractor, model.representation, rank=rank, world=world)
+    return {kind: {name: v["mean"] for name, v in result[kind].items()} for kind in ("ground_truth", "values")}
+
+
+def test_two_processes_measure_what_one_does(runs):
+    files = (str(runs.model), str(runs.clip))
+    alone = shares(0, 1, *files)
+    with GlooPool(2) as pool:
+        both = pool.run(shares, *((rank, 2, *files) for rank in range(2)))
+    assert both[0] == both[1]
+    for kind, values in alone.items():
+        for name, value in values.items():
+            assert both[0][kind][name] == (value and pytest.approx(value, rel=2e-3, abs=0.04)), name

@@ -17,7 +17,7 @@ from scipy.interpolate import CubicSpline
 from torch import Tensor
 
 from flame_mdm.config import UserError
-from flame_mdm.data import bandai, bvh
+from flame_mdm.data.folder import read_bvh
 from flame_mdm.data.store import Store
 from flame_mdm.generation import Generated, generate
 from flame_mdm.motion import Edit
@@ -279,7 +279,7 @@ def read_motion(
     Args:
         representation: of the model.
         source: an .npz of `make sample`; an .npz with `joints` (F, J, 3) in metres, y up, and `fps`; a .bvh file of a
-            known skeleton (Bandai-Namco's); or `dataset:id`, a clip of a prepared data set. Joints are brought to the
+            known skeleton; or `dataset:id`, a clip of a prepared data set. Joints are brought to the
             frame rate of the model and turned as its features have them.
         cut: begin and end in seconds, of the part that counts.
         data_root: folder of the prepared data sets.
@@ -294,7 +294,7 @@ def read_motion(
     if suffix == ".npz":
         features, caption = _read_npz(representation, Path(source))
     elif suffix == ".bvh":
-        features = _encode(representation, _read_bvh(Path(source), representation.fps), name)
+        features = _encode(representation, read_bvh(Path(source), representation.fps)[0], name)
     elif ":" in name:
         features, caption = _read_clip(representation, name, Path(data_root))
     else:
@@ -357,15 +357,6 @@ def _encode(representation: Representation, joints: np.ndarray, name: str) -> np
         return representation.encode(torch.from_numpy(joints)).numpy()
     except ValueError as error:
         raise ValueError(f"{name}: {error}") from error
-
-
-def _read_bvh(path: Path, fps: float) -> np.ndarray:
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file")
-    missing = sorted(set(bandai.JOINTS.values()) - set(bvh.read(path).joints))
-    if missing:
-        raise ValueError(f"{path}: not a known skeleton; of Bandai-Namco's it lacks {', '.join(missing)}")
-    return bandai.convert(str(path), path.read_bytes(), fps)[1]
 
 
 def _read_clip(representation: Representation, source: str, data_root: Path) -> tuple[np.ndarray, str]:

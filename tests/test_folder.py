@@ -102,7 +102,8 @@ def test_known_skeletons_are_recognized(name: str, prefix: str, tmp_path: Path):
     names = [*own, *sorted(extra)]
     number = {joint: k for k, joint in enumerate(SMPL22.joints)}
     place = [number[own[n]] if n in own else number["spine3"] for n in names]
-    positions = WALK[:, place] / layout.unit * [-1 if layout.mirrored else 1, 1, 1]
+    unit = 0.01 if name == "SMPL" else layout.unit
+    positions = WALK[:, place] / unit * [-1 if layout.mirrored else 1, 1, 1]
     names = tuple(prefix + n for n in names)
     bvh.write(bvh_of(names, positions, (-1, *(0 for _ in names[1:])), 30.0), tmp_path / "take.bvh")
     (tmp_path / "captions.csv").write_text("id,text\ntake,a person walks\n")
@@ -276,7 +277,9 @@ def test_every_fault_is_named_in_a_line(case: str, arrays: Path):
 
 def test_unknown_joints_are_listed(tmp_path: Path):
     bvh.write(bvh_of(("root", "tail"), WALK[:, :2], (-1, 0), 30.0), tmp_path / "cat.bvh")
-    with pytest.raises(ValueError, match=r"cat\.bvh: its joints \(root, tail\) are none of SMPL, Mixamo, CMU"):
+    with pytest.raises(
+        ValueError, match=r"cat\.bvh: its joints \(root, tail\) are those of none of the skeletons SMPL, Mixamo, CMU"
+    ):
         only(tmp_path)
 
 

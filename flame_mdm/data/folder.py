@@ -260,10 +260,7 @@ class Folder(MotionSource):
 
     def _read(self, path: Path, fps: float) -> np.ndarray:
         if path.suffix.lower() == ".bvh":
-            file = bvh.read(path)
-            names = [name.rpartition(":")[2] for name in file.joints]
-            positions, _ = bvh.forward_kinematics(file.parents, *file.resample(fps))
-            return self._joints(path, positions, names)
+            return self._checked(path, read_bvh(path, fps, self.skeleton)[0])
         data = _arrays(path)
         if "poses" in data:
             return self._from_smpl(path, data, fps)
@@ -293,18 +290,11 @@ class Folder(MotionSource):
         return (*SMPL22.joints, *(f"joint{number}" for number in range(len(SMPL22), joints)))
 
     def _joints(self, path: Path, positions: np.ndarray, names: Sequence[str]) -> np.ndarray:
+        return self._checked(path, _layout(path, names, self.skeleton).apply(positions, names))
+
+    def _checked(self, path: Path, joints: np.ndarray) -> np.ndarray:
         if self.motion == "smpl":
             raise ValueError(f"{path}: it holds no rotations of SMPL; AMASS's .npz files do, or take motion=joints")
-        known = (layout for layout in LAYOUTS.values() if layout.knows(names))
-        layout = Layout(self.skeleton["map"]) if "map" in self.skeleton else next(known, None)
-        if layout is None or not layout.knows(names):
-            known_ones = f"none of {', '.join(LAYOUTS)} skeletons" if layout is None else "not those of the map"
-            raise ValueError(
-                f"{path}: its joints ({', '.join(names)}) are {known_ones}; write into skeleton.yaml which of them "
-                "stands for which of SMPL's"
-            )
-        layout = replace(layout, **self.skeleton)
-        joints = layout.apply(positions, names)
         _check_body(path, joints)
         trunk = joints[:, SMPL22.joints.index("neck")] - joints[:, 0]
         self._upright.append(float((trunk[:, 1] / np.linalg.norm(trunk, axis=1)).mean()))
@@ -337,6 +327,47 @@ class Folder(MotionSource):
             action = self.actions.index(_swapped(note.action))
         motion = SMPL22.mirror(torch.from_numpy(clip.motion)).numpy()
         return Clip(f"M{clip.id}", motion, [_swapped(text) for text in clip.captions], clip.split, clip.source, action)
+
+
+def read_bvh(path: Path, fps: float | None = None, given: Mapping[str, Any] = {}) -> tuple[np.ndarray, float]:
+    """The joints of SMPL in a BVH file of a known skeleton.
+
+    Args:
+        path: the file.
+        fps: frames a second wanted; None = those of the file. Rotations are interpolated, so bones keep their length.
+        given: fields of `Layout` in place of the known ones. Joints with SMPL's own names are in centimetres, as
+            `flame_mdm.formats` writes them.
+
+    Returns:
+        (F, 22, 3) float32 in metres, y up; frames a second.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: damaged, or an unknown skeleton.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file")
+    file = bvh.read(path)
+    names = [name.rpartition(":")[2] for name in file.joints]
+    layout = _layout(path, names, given)
+    if layout.map is LAYOUTS["SMPL"].map and "unit" not in given:
+        layout = replace(layout, unit=0.01)
+    if fps is None:
+        return layout.apply(file.positions(), names), file.fps
+    return layout.apply(bvh.forward_kinematics(file.parents, *file.resample(fps))[0], names), fps
+
+
+def _layout(path: Path, names: Sequence[str], given: Mapping[str, Any]) -> Layout:
+    """The layout of joints with these names: a known one, with the fields that are given in place of its own."""
+    known = (layout for layout in LAYOUTS.values() if layout.knows(names))
+    layout = Layout(given["map"]) if "map" in given else next(known, None)
+    if layout is None or not layout.knows(names):
+        which = "not those of the map" if "map" in given else f"those of none of the skeletons {', '.join(LAYOUTS)}"
+        raise ValueError(
+            f"{path}: its joints ({', '.join(names)}) are {which}; rename them, or in a folder of own data write into "
+            "skeleton.yaml which of them stands for which of SMPL's"
+        )
+    return replace(layout, **given)
 
 
 def read_skeleton(path: Path) -> dict[str, Any]:

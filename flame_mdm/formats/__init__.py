@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import zipfile
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from flame_mdm.data import bvh
-from flame_mdm.data.folder import LAYOUTS
+from flame_mdm.data.folder import read_bvh
 from flame_mdm.formats import glb
 from flame_mdm.formats.poses import Poses, solve
 from flame_mdm.representations import rotation
@@ -160,23 +160,13 @@ def _of_poses(poses: Poses, fps: float, caption: str, name: str) -> MotionFile:
 
 
 def _read_bvh(path: Path, fps: float | None, unit: float | None) -> MotionFile:
-    motion = bvh.read(path)
-    names = [name.rpartition(":")[2] for name in motion.joints]
-    layout = next((layout for layout in LAYOUTS.values() if layout.knows(names)), None)
-    if layout is None:
-        raise ValueError(
-            f"its joints ({', '.join(names)}) are those of none of the skeletons {', '.join(LAYOUTS)}; rename them "
-            "(docs/formats.md)"
-        )
-    if unit is None:
-        unit = CENTIMETRE if layout is LAYOUTS["SMPL"] else layout.unit
-    joints = replace(layout, unit=unit).apply(motion.positions(), names)
+    joints, rate = read_bvh(path, given={} if unit is None else {"unit": unit})
     tall = float(np.ptp(joints[..., 1], axis=1).max())
     if not 0.3 < tall < 3.5:
         raise ValueError(
-            f"the body is {tall:.3g} m tall with {unit:g} m a unit; say unit=1 for metres, 0.0254 for inches"
+            f"the body is {tall:.3g} m tall; say how many metres a unit of the file is: unit=1, 0.01 or 0.0254 (inches)"
         )
-    return MotionFile(joints, fps or motion.fps, SMPL22, id=path.stem)
+    return MotionFile(joints, fps or rate, SMPL22, id=path.stem)
 
 
 def _read_json(path: Path, fps: float | None, unit: float | None) -> MotionFile:

@@ -23,6 +23,9 @@ from flame_mdm.motion import length_mask
 from flame_mdm.noise import key
 from flame_mdm.representations import Representation
 
+CHUNK = 256
+"""Motions that metrics get at once."""
+
 
 @dataclass
 class Motions:
@@ -73,8 +76,6 @@ class Evaluator:
         batch_size: of the extractor.
         device: where metrics gather their rows; with several processes, that of their communication.
     """
-
-    CHUNK = 256
 
     def __init__(
         self,
@@ -158,7 +159,7 @@ class Evaluator:
         metrics = {name: self._metric(config, seed) for name, config in self.metrics.items()}
         sets = {name: metric for name, metric in metrics.items() if isinstance(metric, TwoSets)}
         others = {name: metric for name, metric in metrics.items() if name not in sets}
-        for part in self._chunks(len(generated)):
+        for part in _chunks(len(generated)):
             rows = {name: values[part] for name, values in generated.rows.items()}
             feed(sets, **{name: rows[name] for name in ("generated", "keys") if "generated" in rows})
             joints, mask = _pad(generated.joints[part])
@@ -191,8 +192,9 @@ class Evaluator:
         drawn = {"seed": key("metric", seed) % 2**32} if "seed" in parameters(config["_target_"]) else {}
         return instantiate(config, **drawn).to(self.device)
 
-    def _chunks(self, count: int) -> list[slice]:
-        return [slice(begin, begin + self.CHUNK) for begin in range(0, count, self.CHUNK)]
+
+def _chunks(count: int) -> list[slice]:
+    return [slice(begin, begin + CHUNK) for begin in range(0, count, CHUNK)]
 
 
 def _pad(joints: Sequence[Tensor]) -> tuple[Tensor, Tensor]:

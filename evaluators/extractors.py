@@ -121,13 +121,13 @@ class T2MExtractor(Extractor):
         self.words = WordVectors(folder)
 
     def check(self, representation: Representation, dataset: str) -> None:
-        """The features are the published ones, and the data set is the one of that width."""
-        width = len(self.network.mean)
-        wanted = {263: "humanml3d", 251: "kit"}.get(width)
-        if representation.features != width or dataset != wanted:
+        """Only the features as published, of the data set of that width."""
+        made_for = {263: ("humanml-legacy-smpl22", "humanml3d"), 251: ("humanml-legacy-kit21", "kit")}
+        wanted = made_for.get(len(self.network.mean), ("unknown features", "an unknown data set"))
+        if (representation.name, dataset) != wanted:
             raise UserError(
-                f"extractor {self.path}: made for the {width} features of {wanted}, but the motions are "
-                f"{representation.name} ({representation.features} features) of {dataset}"
+                f"extractor {self.path}: made for {wanted[0]} of {wanted[1]}, but the motions are "
+                f"{representation.name} of {dataset}"
             )
 
     def motions(self, features: Tensor, joints: Tensor, mask: Tensor) -> dict[str, Tensor]:
@@ -168,10 +168,10 @@ class ClassifierExtractor(Extractor):
 
     def check(self, representation: Representation, dataset: str) -> None:
         """Rotations and joints of 24 SMPL joints, of the data set it was trained on."""
-        if representation.name != "rot6d" or dataset != self.dataset:
+        if representation.name != "rot6d-25" or dataset != self.dataset:
             raise UserError(
-                f"extractor {self.path}: made for {self.dataset} as rot6d, but the motions are {representation.name} "
-                f"of {dataset}"
+                f"extractor {self.path}: made for {self.dataset} as rot6d-25, but the motions are "
+                f"{representation.name} of {dataset}"
             )
 
     def motions(self, features: Tensor, joints: Tensor, mask: Tensor) -> dict[str, Tensor]:

@@ -1,6 +1,7 @@
 """Evaluation by protocol: what stands in the result, what is kept, what is refused."""
 
 import json
+import pickle
 import shutil
 from pathlib import Path
 
@@ -10,13 +11,18 @@ import torch
 from conftest import TINY
 from distributed import GlooPool
 
+from evaluators.action_gru import ActionGRU
 from evaluators.evaluator import Evaluator, Extracted
-from evaluators.extractors import MotionCLIPExtractor
+from evaluators.extractors import ClassifierExtractor, MotionCLIPExtractor, T2MExtractor
 from evaluators.protocols import Generator, read_samples
+from evaluators.stgcn import UESTC, Unconstrained
+from evaluators.t2m import T2MEvaluator
 from flame_mdm import evaluate, train
-from flame_mdm.config import EXPERIMENTS, UserError, instantiate
+from flame_mdm.config import EXPERIMENTS, UserError, compose, instantiate
 from flame_mdm.data.datamodule import MotionDataModule
 from flame_mdm.evaluate import load_protocol
+from flame_mdm.motion import length_mask
+from flame_mdm.representations.rot6d import Rot6D
 from flame_mdm.task import load, read_checkpoint
 
 GENERATOR = ["data.source.clips=400", *TINY[1:], "callbacks.samples=null", "trainer.val_check_interval=2"]
@@ -203,9 +209,8 @@ def test_motions_of_others_are_measured_alike(runs, full, tmp_path):
 
     path = given / "rep_0.npz"
     content = read_samples(path)
-    np.savez(
-        path, ids=[f"other{i}" for i in range(len(content["ids"]))], **{k: content[k] for k in ("lengths", "features")}
-    )
+    ids = [f"other{number}" for number in range(len(content["ids"]))]
+    np.savez(path, ids=ids, lengths=content["lengths"], features=content["features"])
     assert evaluate.main([*words, f"extractor={runs.clip}", f"out={out}"]) == 1
 
 
@@ -222,7 +227,7 @@ def test_joints_of_others_are_encoded(runs, tmp_path):
     assert result["values"]["attributes/all"]["mean"] > 0.95
 
 
-def test_the_same_features_give_the_same_bits_in_any_order(runs):
+def test_the_same_features_give_the_same_bits_in_any_order(runs, monkeypatch):
     data = runs.data()
     protocol = load_protocol("synthetic", data.representation)
     rows = protocol.rows(data.test, 0, 0)
@@ -238,7 +243,7 @@ def test_the_same_features_give_the_same_bits_in_any_order(runs):
         }
         return Extracted(picked, [extracted.joints[i] for i in order])
 
-    evaluator.CHUNK = 7
+    monkeypatch.setattr("evaluators.evaluator.CHUNK", 7)
     again, _ = evaluator.score(shuffled(one), shuffled(one), one, 3)
     assert again == values
     other, _ = evaluator.score(one, one, one, 4)
@@ -313,6 +318,67 @@ def test_an_extractor_of_other_motions_is_refused(runs):
     data.representation.name = "other"
     with pytest.raises(UserError, match="other"):
         extractor.check(data.representation, "synthetic")
+
+
+def test_released_classifiers_give_features_and_scores_of_their_data_alone(tmp_path):
+    representation = Rot6D()
+    x = torch.randn(3, 20, 150)
+    joints, mask = representation.decode(x), torch.ones(3, 20, dtype=torch.bool)
+    made = {"humanact12": ({"model": ActionGRU().state_dict()}, 12), "uestc": (UESTC().state_dict(), 40)}
+    made["humanact12_unconstrained"] = (Unconstrained().state_dict(), 12)
+    for kind, (content, actions) in made.items():
+        torch.save(content, tmp_path / kind)
+        extractor = ClassifierExtractor(kind, str(tmp_path / kind))
+        extractor.check(representation, extractor.dataset)
+        with torch.no_grad():
+            found = extractor.motions(x, joints, mask)
+        assert found["logits"].shape == (3, actions)
+        assert found["features"].shape[0] == 3
+        assert extractor.texts(["walk"], [None]) is None
+        with pytest.raises(UserError, match="bandai"):
+            extractor.check(representation, "bandai")
+
+
+def test_the_t2m_evaluator_is_read_from_a_folder(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"lacks finest\.tar, mean\.npy"):
+        T2MExtractor(str(tmp_path))
+    network = T2MEvaluator(torch.zeros(251), torch.ones(251))
+    parts = ("movement_encoder", "text_encoder", "motion_encoder")
+    torch.save({part: network.get_submodule(part).state_dict() for part in parts}, tmp_path / "finest.tar")
+    np.save(tmp_path / "mean.npy", np.zeros(251, np.float32))
+    np.save(tmp_path / "std.npy", np.ones(251, np.float32))
+    np.save(tmp_path / "our_vab_data.npy", np.random.default_rng(0).normal(size=(4, 300)))
+    words = {word: row for row, word in enumerate(("sos", "eos", "unk", "walk"))}
+    (tmp_path / "our_vab_idx.pkl").write_bytes(pickle.dumps(words))
+    extractor = T2MExtractor(str(tmp_path))
+    kit = instantiate(compose("kit/mdm")["representation"])
+    with torch.no_grad():
+        mask = length_mask(torch.tensor([40, 24]))
+        assert extractor.motions(torch.randn(2, 40, 251), torch.zeros(0), mask)["features"].shape == (2, 512)
+        texts = extractor.texts(["walk", "run"], [["walk/VERB"], ["run/VERB"]])
+    assert texts.shape == (2, 512)
+    assert not torch.allclose(texts[0], texts[1])
+    with pytest.raises(UserError, match="tagged words"):
+        extractor.texts(["walk"], [None])
+    extractor.check(kit, "kit")
+    with pytest.raises(UserError, match="bandai"):
+        extractor.check(kit, "bandai")
+
+
+@pytest.mark.parametrize(("condition", "protocol"), [("action", "action_to_motion"), ("none", "unconditioned")])
+def test_models_without_text_are_measured_by_protocols_of_their_own(runs, tmp_path, condition, protocol):
+    words = [w for w in GENERATOR if not w.startswith("condition")]
+    words += [f"condition={condition}", *(["condition.features=16"] if condition == "action" else [])]
+    folder = [f"data_root={runs.folder / 'data'}", f"run.dir={tmp_path / 'run'}", "trainer.max_steps=1"]
+    assert train.main(["quickstart", *words, *folder]) == 0
+    model, out = tmp_path / "run" / "checkpoints" / "last.ckpt", tmp_path / "result.json"
+    options = ["quick=true", "num_inference_steps=2", "extractor=none"]
+    assert runs.evaluate(out, *options, model=model) == 0
+    result = json.loads(out.read_text())
+    assert result["protocol"]["name"] == protocol
+    assert {value["mean"] for value in result["values"].values()} >= {None}
+    assert (tmp_path / "run" / "evaluation" / f"{protocol}-1").is_dir()
+    assert runs.evaluate(out, *options, "protocol=text_to_motion", model=model) == 1
 
 
 def test_a_model_of_other_data_is_marked(runs, tmp_path):

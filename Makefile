@@ -21,7 +21,7 @@ $(READY): pyproject.toml constraints.txt
 	$(VENV)/bin/python -m pip install -q -c constraints.txt -e '.[dev,offline]'
 	@touch $@
 
-prepare: $(READY) ## prepare a data set: DATA=bandai SOURCE=/path/to/folder-or-archive [verify=true]
+prepare: $(READY) ## prepare a data set, or report on it: DATA=bandai SOURCE=/path/to/folder-or-archive [verify=true]
 	@$(VENV)/bin/python -m flame_mdm.prepare --from-make
 
 browse: $(READY) ## one web page of a data set: DATA=bandai [SPLIT=train SEARCH="waves left" CLIPS=200]

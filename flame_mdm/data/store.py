@@ -6,6 +6,8 @@ A store is a folder that is written once and never changed:
     clips.jsonl      one clip a line: id, start, length, split, source, captions, action, attributes
     statistics.npz   mean and std (D,) of the training frames, as the representation normalizes with them
     store.json       representation, frame rate, counts, hashes of the three files, fingerprint
+
+Verifying it leaves a report beside them, `verify.json`.
 """
 
 from __future__ import annotations

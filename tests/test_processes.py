@@ -186,6 +186,7 @@ PROCESSES: dict[str, GaussianDiffusion | FlowMatching] = {
     "learned": GaussianDiffusion(num_train_timesteps=50, prediction="epsilon", variance="learned_range"),
     "flow": FlowMatching(),
     "flow_sigma": FlowMatching(sigma_min=0.1),
+    "flow_x0": FlowMatching(prediction="x0"),
 }
 
 
@@ -287,7 +288,7 @@ def test_unknown_options_are_refused(options):
         GaussianDiffusion(**options)
 
 
-@pytest.mark.parametrize("options", [{"time_distribution": "beta"}, {"sigma_min": 1.0}])
+@pytest.mark.parametrize("options", [{"time_distribution": "beta"}, {"sigma_min": 1.0}, {"prediction": "epsilon"}])
 def test_unknown_flow_options_are_refused(options):
     with pytest.raises(ValueError, match=str(next(iter(options.values())))):
         FlowMatching(**options)

@@ -314,11 +314,12 @@ def test_oracle_diffusion_returns_the_data(variance, prediction, sampler, count)
     torch.testing.assert_close(estimates[-1], data, rtol=0, atol=1e-6)
 
 
+@pytest.mark.parametrize("prediction", ["velocity", "x0"])
 @pytest.mark.parametrize("count", [1, 10])
 @pytest.mark.parametrize("sampler", [*STEPS, "dopri5"])
-def test_oracle_flow_returns_the_data(sampler, count):
+def test_oracle_flow_returns_the_data(sampler, count, prediction):
     torch.manual_seed(0)
-    process = FlowMatching(sigma_min=1e-3)
+    process = FlowMatching(sigma_min=1e-3, prediction=prediction)
     mask = length_mask(torch.tensor([6, 3]))
     data, noise = torch.randn(2, 2, 6, 4, dtype=torch.float64)
     data = data * mask[..., None]

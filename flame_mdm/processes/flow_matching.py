@@ -22,6 +22,7 @@ class FlowMatching(Process):
     def __init__(
         self,
         sigma_min: float = 1e-4,
+        prediction: Literal["velocity", "x0"] = "velocity",
         time_distribution: TimeDistribution = "uniform",
         quantize_time: bool = False,
         odeint_grid: bool = False,
@@ -30,6 +31,8 @@ class FlowMatching(Process):
 
         Args:
             sigma_min: deviation of the noise left at t = 1 (Lipman et al. 2023, eq. 20-23).
+            prediction: what the denoiser returns: the velocity of the path (MFM), or the clean motion, from which the
+                velocity follows. A network narrower than the motion cannot carry the noise that the velocity holds.
             time_distribution: of training times: even on [0, 1), or the logistic of a normal variable, which favors
                 the middle (Esser et al. 2024, eq. 19).
             quantize_time: legacy of MFM's code: the denoiser gets floor(1000 t), a row of its time table.
@@ -37,15 +40,18 @@ class FlowMatching(Process):
                 1 / N, at some N one row of the table lower than N equal steps (never at 10, 20 or 30).
 
         Raises:
-            ValueError: an unknown time distribution, or sigma_min not in [0, 1).
+            ValueError: an unknown prediction or time distribution, or sigma_min not in [0, 1).
         """
         super().__init__()
+        if prediction not in ("velocity", "x0"):
+            raise ValueError(f"unknown prediction '{prediction}': choose from velocity, x0")
         if time_distribution not in get_args(TimeDistribution):
             known = ", ".join(get_args(TimeDistribution))
             raise ValueError(f"unknown time_distribution '{time_distribution}': choose from {known}")
         if not 0 <= sigma_min < 1:
             raise ValueError(f"sigma_min is {sigma_min}: choose a number in [0, 1)")
         self.sigma_min = sigma_min
+        self.prediction = prediction
         self.time_distribution = time_distribution
         self.quantize_time = quantize_time
         self.odeint_grid = odeint_grid
@@ -61,10 +67,12 @@ class FlowMatching(Process):
         return t * x + (1 - (1 - self.sigma_min) * t) * noise
 
     def target(self, x: Tensor, noise: Tensor, t: Tensor) -> Tensor:
-        return x - (1 - self.sigma_min) * noise
+        return x if self.prediction == "x0" else x - (1 - self.sigma_min) * noise
 
     def to_x0(self, output: Tensor, x_t: Tensor, t: Tensor) -> Tensor:
         """As the contract, exactly: x_t + (1 - t) u, which MFM's code uses, leaves sigma_min times the noise."""
+        if self.prediction == "x0":
+            return output
         return (1 - (1 - self.sigma_min) * t[:, None, None]) * output + (1 - self.sigma_min) * x_t
 
     def table_time(self, t: Tensor) -> Tensor:
@@ -146,13 +154,17 @@ class FlowMatching(Process):
             precision = torch.promote_types(x.dtype, torch.float32)
             time = t.expand(len(x)) if isinstance(t, Tensor) else x.new_full((len(x),), t, dtype=precision)
             output = denoise(x, self.table_time(time), mask, cond).to(x.dtype)
-            if trajectory is None and (edit is None or edit.mode != "x0"):
+            imposed = edit if edit is not None and edit.mode == "x0" else None
+            if self.prediction == "velocity" and trajectory is None and imposed is None:
                 return output
             x0_hat = self.to_x0(output, x, time)
-            if edit is not None and edit.mode == "x0":
-                x0_hat = torch.where(edit.keep, edit.known, x0_hat)
-                known_velocity = (x0_hat - (1 - self.sigma_min) * x) / (1 - (1 - self.sigma_min) * time[:, None, None])
-                output = torch.where(edit.keep, known_velocity, output)
+            if imposed is not None:
+                x0_hat = torch.where(imposed.keep, imposed.known, x0_hat)
+            straight = (x0_hat - (1 - self.sigma_min) * x) / (1 - (1 - self.sigma_min) * time[:, None, None])
+            if self.prediction == "x0":
+                output = straight
+            elif imposed is not None:
+                output = torch.where(imposed.keep, straight, output)
             if trajectory is not None:
                 trajectory.append(x0_hat * mask[..., None])
             return output

@@ -12,6 +12,17 @@ def test_results_come_in_the_order_of_the_tasks(workers):
     assert list(in_order(math.sqrt, (float(n * n) for n in range(40)), workers)) == list(range(40))
 
 
+def threads(_: int) -> int:
+    import torch
+
+    return torch.get_num_threads()
+
+
+def test_each_process_has_one_thread(monkeypatch):
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    assert list(in_order(threads, [0], workers=2)) == [1]
+
+
 def test_an_error_ends_the_other_tasks():
     before = active_children()
     start = time.monotonic()

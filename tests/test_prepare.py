@@ -3,6 +3,7 @@
 import hashlib
 import json
 import os
+import shutil
 import signal
 from collections.abc import Callable
 from multiprocessing import active_children
@@ -11,12 +12,18 @@ from typing import Any
 
 import numpy as np
 import pytest
+from conftest import TINY
 from t2m_folder import line, write_folder
+from test_actions import write_humanact12, write_uestc
+from test_babel import small  # noqa: F401  a fixture
 from test_bandai import TAKES, synthetic_take
+from test_humanml3d import downloads  # noqa: F401  a fixture
+from test_kit import mmm  # noqa: F401  a fixture
 
-from flame_mdm.config import EXPERIMENTS
+from flame_mdm import train
+from flame_mdm.config import EXPERIMENTS, compose, instantiate
 from flame_mdm.data import Clip, bvh
-from flame_mdm.data.bandai import Bandai
+from flame_mdm.data.bandai import Bandai, split_of
 from flame_mdm.data.store import Store
 from flame_mdm.data.synthetic import Synthetic
 from flame_mdm.prepare import main
@@ -28,9 +35,18 @@ SYNTHETIC = ("data=synthetic", "data.source.clips=30")
 def takes(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder in the layout of Bandai-Namco's."""
     folder = tmp_path_factory.mktemp("takes")
-    for seed, (name, frames) in enumerate(TAKES.items()):
+    held_out = next(number for number in range(1, 33) if split_of(2, "walk", "active", number) == "val")
+    for seed, (name, frames) in enumerate([*TAKES.items(), (f"dataset-2_walk_active_{held_out:03d}", 45)]):
         bvh.write(synthetic_take(seed, frames), folder / f"{name}.bvh")
     return folder
+
+
+@pytest.fixture(scope="module")
+def fingerprint(takes: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
+    """Of the takes prepared without a break by one process."""
+    root = tmp_path_factory.mktemp("whole")
+    assert main(["data=bandai", f"source={takes}", "data.source.workers=1", f"data_root={root}"]) == 0
+    return only_store(root).fingerprint
 
 
 def only_store(root: Path) -> Store:
@@ -53,7 +69,8 @@ def test_verify_reports_what_is_there(tmp_path: Path, capsys: pytest.CaptureFixt
     output = capsys.readouterr().out
     report = json.loads((store.folder / "verify.json").read_text())
     assert not (store.folder / "verify.partial").exists()
-    assert report["fingerprint"] == store.fingerprint and store.fingerprint in output
+    assert report["fingerprint"] == store.fingerprint
+    assert store.fingerprint in output
     assert report["files"] == store.info["sha256"]
     for split, number in store.info["clips"].items():
         assert report["figures"][split] == {"found": number, "published": None, "state": "not published"}
@@ -145,25 +162,30 @@ def test_numbers_that_are_not_finite_are_damage(tmp_path: Path, capsys: pytest.C
     assert f"frame 3 of clip {clip.id} is not finite" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("data", ["bandai", "synthetic"])
-def test_the_fingerprint_does_not_depend_on_the_number_of_workers(data: str, takes: Path, tmp_path: Path):
+@pytest.mark.parametrize("data", ["bandai", "humanml3d"])
+def test_the_fingerprint_does_not_depend_on_the_number_of_workers(
+    data: str, request: pytest.FixtureRequest, tmp_path: Path
+):
     stores = []
     for workers in (1, 2):
-        own = [f"source={takes}", f"data.source.workers={workers}"] if data == "bandai" else [f"num_workers={workers}"]
-        own = [word if not word.startswith("num_workers") else f"data.{word}" for word in own]
-        name = [] if data == "bandai" else ["data.source.clips=30"]
-        assert main([f"data={data}", *own, *name, f"data_root={tmp_path / str(workers)}"]) == 0
-        stores.append(only_store(tmp_path / str(workers)))
+        words = [f"source={request.getfixturevalue('takes')}"]
+        if data == "humanml3d":
+            root = shutil.copytree(request.getfixturevalue("downloads"), tmp_path / f"downloads_{workers}")
+            amass = f"data.source.amass={root / 'amass'}", f"data.source.body_models={root / 'bodies'}"
+            words = [f"source={root / 'HumanML3D/HumanML3D'}", *amass]
+        root = tmp_path / str(workers)
+        assert main([f"data={data}", *words, f"data.source.workers={workers}", f"data_root={root}"]) == 0
+        stores.append(only_store(root))
     assert stores[0].fingerprint == stores[1].fingerprint
     assert stores[0].info["sha256"]["features.npy"] == stores[1].info["sha256"]["features.npy"]
 
 
 @pytest.mark.parametrize(("how", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
 def test_an_interrupted_preparation_leaves_nothing(
-    how: signal.Signals, code: int, takes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    how: signal.Signals, code: int, takes: Path, fingerprint: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    words = ["data=bandai", f"source={takes}", "data.source.workers=2"]
-    assert main([*words, f"data_root={tmp_path / 'whole'}"]) == 0
+    root = tmp_path / "data"
+    words = ["data=bandai", f"source={takes}", f"data_root={root}"]
     clips = 0
     make = Bandai._clip
 
@@ -174,22 +196,24 @@ def test_an_interrupted_preparation_leaves_nothing(
             os.kill(os.getpid(), how)
         return make(self, *arguments, **options)
 
-    root = tmp_path / "data"
     before = signal.getsignal(signal.SIGTERM)
+    ignored = signal.signal(signal.SIGINT, signal.default_int_handler)  # it is, where the tests run in the background
     with monkeypatch.context() as patch:
         patch.setattr(Bandai, "_clip", interrupted)
-        assert main([*words, f"data_root={root}"]) == code
+        assert main([*words, "data.source.workers=2"]) == code
+    signal.signal(signal.SIGINT, ignored)
     assert list(root.iterdir()) == []
     assert active_children() == []
     assert signal.getsignal(signal.SIGTERM) is before
-    assert main([*words, f"data_root={root}"]) == 0
-    assert only_store(root).fingerprint == only_store(tmp_path / "whole").fingerprint
+    assert main([*words, "data.source.workers=1"]) == 0
+    assert only_store(root).fingerprint == fingerprint
 
 
 def test_an_unknown_set_gets_the_nearest_name(capsys: pytest.CaptureFixture[str]):
     assert main(["data=humanl3d"]) == 1
     assert "no data is called 'humanl3d'. Did you mean humanml3d" in capsys.readouterr().err
-    assert main([]) == 2 or "which data set? data=NAME, one of: babel, bandai" in capsys.readouterr().err
+    assert main([]) == 1
+    assert "which data set? data=NAME, one of: babel, bandai" in capsys.readouterr().err
 
 
 WHERE = {
@@ -215,7 +239,8 @@ def test_a_missing_source_says_where_to_get_the_set(data: str, tmp_path: Path, c
     for words in ([], [f"source={tmp_path / 'nowhere'}"]):
         assert main([f"data={data}", f"data_root={tmp_path / 'data'}", *words]) == 1
         (message,) = capsys.readouterr().err.splitlines()
-        assert message.startswith("error: ") and WHERE[data] in message
+        assert message.startswith("error: ")
+        assert WHERE[data] in message
     assert not any((tmp_path / "data").glob("*"))
 
 
@@ -238,3 +263,71 @@ def test_features_of_another_set_are_refused(tmp_path: Path, capsys: pytest.Capt
     assert main(["data=bandai", f"source={tmp_path / 'set'}", f"data_root={tmp_path / 'data'}"]) == 1
     assert "no file dataset-1_*.bvh" in capsys.readouterr().err
     assert not any((tmp_path / "data").glob("*"))
+
+
+def words_of(data: str, request: pytest.FixtureRequest, tmp_path: Path) -> list[str]:
+    """What names a small generated set on the command line."""
+    if data == "bandai":
+        return [f"source={request.getfixturevalue('takes')}"]
+    if data in ("humanml3d", "kit"):
+        return [f"source={humanml(tmp_path / 'set', 263 if data == 'humanml3d' else 251)}"]
+    if data == "humanml3d_smpl":
+        root = request.getfixturevalue("downloads")
+        return [
+            f"source={root / 'HumanML3D/HumanML3D'}",
+            f"data.source.amass={root / 'amass'}",
+            "data.source.workers=1",
+        ]
+    if data == "kit_temos":
+        path = request.getfixturevalue("mmm")
+        return [f"source={path}", f"data.source.splits={path.parent / 'kit-splits'}"]
+    if data == "babel":
+        path, amass = request.getfixturevalue("small")
+        return [f"source={path}", f"data.source.amass={amass}", "data.source.workers=1"]
+    if data == "humanact12":
+        return [f"source={write_humanact12(tmp_path / 'set')}"]
+    return [f"source={write_uestc(tmp_path / 'set')}"]
+
+
+@pytest.mark.parametrize("data", sorted({*WHERE} - {"folder"}))  # own data goes this way in the tests of its tutorial
+def test_every_set_from_raw_files_to_a_training_step(data: str, request: pytest.FixtureRequest, tmp_path: Path):
+    root = f"data_root={tmp_path / 'data'}"
+    words = [f"data={data}", root, *words_of(data, request, tmp_path)]
+    assert main(words) == 0
+    assert main([*words, "verify=true"]) == 0
+    store = only_store(tmp_path / "data")
+
+    condition = "action" if data in ("humanact12", "uestc") else "learned"
+    tiny = [word for word in TINY if "clips" not in word and "samples" not in word and "features" not in word]
+    few = [
+        "data.batch_size=4",
+        "data.num_workers=0",
+        "trainer.max_steps=1",
+        "callbacks.samples=null",
+        f"condition={condition}",
+    ]
+    recipe = [f"data={data}", root, *tiny, *few, f"run.dir={tmp_path / 'run'}"]
+    config = compose("quickstart", recipe)
+    module = instantiate(config["data"], representation=instantiate(config["representation"]))
+    module.setup("fit")
+    batch = next(iter(module.train_dataloader()))
+    places = {clip.id: number for number, clip in enumerate(module.train.clips)}
+    for number, name in enumerate(batch.ids):
+        clip = module.train.clips[places[name]]
+        frames = module.train.frames(places[name], 0)
+        length = int(batch.mask[number].sum())
+        assert clip.split == "train"
+        assert length == len(frames) <= module.crop.longest()
+        assert set(np.diff(frames)) <= {0, 1}
+        wanted = module.representation.rebase(np.array(store.motion(clip)[frames]))
+        found = batch.x[number, :length].numpy() * store.std + store.mean
+        np.testing.assert_allclose(found, wanted, rtol=1e-3, atol=1e-3)
+        assert (batch.x[number, length:] == 0).all()
+        if batch.text is not None:
+            assert batch.text[number] in clip.captions
+        if batch.action is not None:
+            assert batch.action[number] == clip.action
+    assert (batch.action if condition == "action" else batch.text) is not None
+
+    assert train.main(["quickstart", *recipe]) == 0
+    assert (tmp_path / "run" / "checkpoints" / "last.ckpt").is_file()

@@ -11,8 +11,6 @@ from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import active_children, get_context, parent_process
 from typing import TypeVar
 
-import torch
-
 Task = TypeVar("Task")
 Result = TypeVar("Result")
 
@@ -50,7 +48,8 @@ def in_order(function: Callable[[Task], Result], tasks: Iterable[Task], workers:
 
 
 def _start_worker() -> None:
-    """Leaves Ctrl-C to the process that started this one, and ends with it, even when that is killed."""
+    """Leaves Ctrl-C to the process that started this one, and ends with it, even when that is killed; one thread."""
+    os.environ["OMP_NUM_THREADS"] = "1"  # read when a task imports torch; importing it for tasks that do not takes long
 
     def follow() -> None:
         parent = parent_process()
@@ -60,4 +59,3 @@ def _start_worker() -> None:
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=follow, daemon=True).start()
-    torch.set_num_threads(1)

@@ -166,16 +166,19 @@ class BadLoss(Callback):
         """
         if not self.seen:
             return
-        losses = trainer.strategy.all_gather(torch.stack([s[-1].float() for s in self.seen]))
-        losses = losses.reshape(-1, len(self.seen)).cpu()
+        mine = torch.stack([s[-1].float() for s in self.seen])
+        parts = [torch.empty_like(mine) for _ in range(trainer.world_size)]
+        if trainer.world_size > 1:
+            torch.distributed.all_gather(parts, mine)
+        losses = torch.stack(parts if trainer.world_size > 1 else [mine]).cpu()
         bad = ~losses.isfinite() | (losses > self.factor * self.usual)
         if bad.any():
             first = int(bad.any(0).nonzero()[0])
             step, number, ids, _ = self.seen[first]
             everyone: list[Any] = [{"rank": trainer.global_rank, "batch": number, "ids": list(ids)}]
             if trainer.world_size > 1:
-                mine, everyone = everyone[0], [None] * trainer.world_size
-                torch.distributed.all_gather_object(everyone, mine)
+                own, everyone = everyone[0], [None] * trainer.world_size
+                torch.distributed.all_gather_object(everyone, own)
             values = losses[:, first].tolist()
             for part, value in zip(everyone, values, strict=True):
                 part["loss"] = str(value)

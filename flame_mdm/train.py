@@ -146,7 +146,11 @@ def _quiet() -> None:
     import warnings
 
     logging.getLogger("lightning.pytorch").setLevel(logging.ERROR)
-    for message in (".*does not have many workers.*", ".*Checkpoint directory .* exists and is not empty.*"):
+    for message in (
+        ".*does not have many workers.*",
+        ".*Checkpoint directory .* exists and is not empty.*",
+        ".*sync_dist=True.*",  # the metrics are means over all processes already
+    ):
         warnings.filterwarnings("ignore", message)
 
 

@@ -217,6 +217,7 @@ class SampleMotions(Callback):
         values: dict[str, float | None] = {}
         for name, metric in self.metrics.items():
             metric.reset()
+            metric.distributed_available_fn = bool  # False: the first process has all motions, and no other computes
             for motion, (_, asked) in zip(motions, self.prompts, strict=True):
                 joints = torch.from_numpy(motion.joints)[None]
                 mask = torch.ones(joints.shape[:2], dtype=torch.bool)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -117,6 +118,8 @@ def _lengths(
     model: MotionGeneration, wanted: int, samples: int, seconds: float | None, frames: int | Sequence[int] | None
 ) -> list[int]:
     fps, longest = model.representation.fps, model.facts["max_frames"]
+    if seconds is not None and not (isinstance(seconds, int | float) and math.isfinite(seconds)):
+        raise UserError(f"seconds={seconds} is no length of a motion")
     if frames is None:
         frames = min(round(3 * fps), longest) if seconds is None else round(seconds * fps)
     each = [frames] * wanted if isinstance(frames, int) else list(frames)

@@ -139,6 +139,8 @@ class MotionDataModule(LightningDataModule):
         seed: int = 0,
     ):
         super().__init__()
+        if batch_size < 1:
+            raise ValueError(f"data.batch_size={batch_size}: a batch has at least one clip")
         self.source, self.representation = source, representation
         self.folder = Path(root) / f"{name}-{representation.name}"
         self.batch_size, self.num_workers, self.seed = batch_size, num_workers, seed

@@ -15,7 +15,7 @@ from flame_mdm.guards import LAST, PREVIOUS, WholeCheckpoints, newest, only_run
 from flame_mdm.processes.diffusion import GaussianDiffusion
 from flame_mdm.task import read_checkpoint
 
-QUICK = ["callbacks.samples=null", "callbacks.best=null", "logger=csv", "callbacks.checkpoints.every_n_steps=2"]
+QUICK = ["callbacks.samples=null", "callbacks.best=null", "callbacks.checkpoints.every_n_steps=2"]
 
 
 @pytest.fixture(autouse=True)

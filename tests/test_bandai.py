@@ -14,10 +14,14 @@ import numpy as np
 import pytest
 import torch
 from fixtures import SHARED, needs_third_party, third_party
+from scipy.spatial.transform import Rotation
 
 from flame_mdm.data import Clip, bandai, bvh
 from flame_mdm.data.bandai import CONTENTS_1, JOINTS, STYLES_1, STYLES_2, TAKES_2, Bandai, captions, side_of, split_of
-from flame_mdm.representations.skeleton import SKELETONS
+from flame_mdm.data.store import Store
+from flame_mdm.prepare import main
+from flame_mdm.representations.skeleton import SKELETONS, SMPL22, SMPL24
+from flame_mdm.representations.smpl import ADULT, SMPL
 
 ARCHIVE = SHARED / "data" / "bandai-namco-motiondataset-raw.tar.xz"
 
@@ -29,19 +33,19 @@ Spine Hips 15.74 0 0
 Chest Spine 8.98 -0.41 0
 Neck Chest 16.38 0 0
 Head Neck 6.46 0 0
-Shoulder_L Chest 13.6 2.1 2.0
+Shoulder_L Chest 12.99 -0.24 4.98
 UpperArm_L Shoulder_L 5.35 0 0
 LowerArm_L UpperArm_L 24.33 0 0
 Hand_L LowerArm_L 22.29 0 0
-Shoulder_R Chest 13.6 2.1 -2.0
+Shoulder_R Chest 12.99 -0.24 -4.98
 UpperArm_R Shoulder_R -5.35 0 0
 LowerArm_R UpperArm_R -24.33 0 0
 Hand_R LowerArm_R -22.29 0 0
-UpperLeg_L Hips -2 0 6.53
+UpperLeg_L Hips -2.19 -6.47 0
 LowerLeg_L UpperLeg_L 39.08 0 0
 Foot_L LowerLeg_L 40.98 0 0
 Toes_L Foot_L 11.75 0 0
-UpperLeg_R Hips -2 0 -6.53
+UpperLeg_R Hips -2.19 6.47 0
 LowerLeg_R UpperLeg_R -39.08 0 0
 Foot_R LowerLeg_R -40.98 0 0
 Toes_R Foot_R -11.75 0 0
@@ -188,6 +192,102 @@ def test_takes_that_turn_to_the_other_side_than_named(tiny):
     assert Bandai.actions[clip.action or 0] == "walk-turn-left"
     assert all("left" in caption for caption in clip.captions)
     assert clip.split == "test"  # as the name says
+
+
+def decoded(motion: np.ndarray, offsets=ADULT) -> np.ndarray:
+    body = SMPL(offsets=offsets)
+    return body.decode(body.encode(torch.from_numpy(motion))).numpy()
+
+
+def resting_offsets() -> np.ndarray:
+    """Bones (24, 3) of the files in metres, as they lie in the rest pose; spine1 is 40 % of the way to spine2."""
+    rows = {row[0]: row[1:] for row in (line.split() for line in HIERARCHY.split("\n") if line)}
+    offsets = np.zeros((24, 3))
+    for joint, name in enumerate(JOINTS.values()):
+        if name != "Hips":
+            offsets[joint] = bandai.REST[rows[name][0]] @ np.array(rows[name][1:], float) / 100
+    offsets[bandai.SPINE1], offsets[bandai.SPINE2] = 0.4 * offsets[bandai.SPINE2], 0.6 * offsets[bandai.SPINE2]
+    return offsets
+
+
+def bent(**degrees: float) -> np.ndarray:
+    """SMPL motion of one frame in the rest pose, in which some of the files' joints are turned about their own y."""
+    take = synthetic_take(0, 1)
+    turned = {name: bandai.REST.get(name, np.eye(3)) for name in take.joints}
+    above = [take.joints[max(parent, 0)] for parent in take.parents]
+    local = np.stack([turned[parent].T @ turned[name] for parent, name in zip(above, take.joints, strict=True)])
+    for name, angle in degrees.items():
+        local[take.joints.index(name)] @= Rotation.from_euler("y", angle, degrees=True).as_matrix()
+    return bandai.smpl_motion(take, local[None], take.offsets[None])
+
+
+def test_smpl_rotations_show_the_joints(tiny):
+    """Posed by SMPL's kinematics, the skeleton of the files has its joints where the files have them."""
+    for joints, rotations in zip(clips(tiny), clips(tiny, motion="smpl"), strict=True):
+        assert (rotations.motion.shape, rotations.motion.dtype) == ((len(joints.motion), 75), np.float32)
+        same([Clip(**{**vars(rotations), "motion": joints.motion})], [joints])
+        np.testing.assert_allclose(decoded(rotations.motion, resting_offsets())[:, :22], joints.motion, atol=1e-5)
+        assert not rotations.motion[:, -6:].any()
+
+
+def test_the_rest_pose_is_that_of_smpl():
+    motion = bent()
+    np.testing.assert_allclose(motion[0, :3], [0, -0.03, 0.939], atol=1e-6)
+    upright = Rotation.from_matrix(bandai.AXES).as_matrix()
+    np.testing.assert_allclose(Rotation.from_rotvec(motion[0, 3:6]).as_matrix(), upright, atol=1e-6)
+    np.testing.assert_allclose(motion[0, 6:], 0, atol=1e-6)
+    bones, expected = resting_offsets(), np.array(ADULT)
+    for name in ("shoulder", "elbow", "wrist", "knee", "ankle"):
+        for side in ("left", "right"):
+            joint = SMPL24.joints.index(f"{side}_{name}")
+            cosine = bones[joint] @ expected[joint] / np.linalg.norm(bones[joint]) / np.linalg.norm(expected[joint])
+            assert cosine > 1 - 1e-6, (side, name)
+    for joint in map(SMPL24.joints.index, ("left_foot", "right_foot")):
+        assert np.arctan2(*bones[joint, [0, 2]]) == pytest.approx(np.arctan2(*expected[joint, [0, 2]]), abs=1e-3)
+    at = dict(zip(SMPL24.joints, decoded(motion)[0] - decoded(motion)[0, 0], strict=True))
+    assert at["left_wrist"][0] > 0.6 > -0.6 > at["right_wrist"][0]
+    assert at["head"][1] > 0.5 > -0.8 > at["left_ankle"][1]
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_joints_bend_the_way_bodies_do(side):
+    """In the files elbows bend by negative, knees by positive angles."""
+    mark = side[0].upper()
+    before = dict(zip(SMPL24.joints, decoded(bent())[0], strict=True))
+
+    def moved(joint: str, **degrees: float) -> np.ndarray:
+        return decoded(bent(**degrees))[0, SMPL24.joints.index(joint)] - before[joint]
+
+    inward = np.array([-1.0 if side == "left" else 1.0, 0, 0])
+    elbow = moved(f"{side}_wrist", **{f"LowerArm_{mark}": -90})
+    assert elbow[2] > 0.2
+    assert elbow @ inward > 0.2
+    assert abs(elbow[1]) < 0.05
+    knee = moved(f"{side}_ankle", **{f"LowerLeg_{mark}": 90})
+    assert knee[2] < -0.3
+    assert knee[1] > 0.3
+    assert abs(knee[0]) < 0.1
+    assert moved(f"{side}_ankle", **{f"UpperLeg_{mark}": -45})[2] > 0.4
+    assert moved(f"{side}_foot", **{f"Foot_{mark}": 30})[1] < -0.05
+
+
+def test_mirrored_smpl_rotations(tiny):
+    by_id = {clip.id: clip for clip in clips(tiny, motion="smpl")}
+    mirrored = [clip for clip in by_id.values() if clip.id[0] == "M"]
+    assert mirrored
+    for clip in mirrored:
+        original = decoded(by_id[clip.id[1:]].motion)
+        expected = SMPL24.mirror(torch.from_numpy(original)).numpy()
+        np.testing.assert_allclose(decoded(clip.motion), expected, atol=1e-6)
+
+
+def test_preparing_smpl_rotations(tiny, tmp_path, capsys):
+    words = ["data=bandai", "representation=smpl", f"source={tiny}", f"data_root={tmp_path}", "data.source.workers=1"]
+    assert main([*words, "data.source.motion=smpl"]) == 0
+    store = Store(tmp_path / "bandai-smpl147")
+    assert store.info["shape"][1] == 147
+    with pytest.raises(ValueError, match=r"data.source.motion=smplx: give joints or smpl"):
+        Bandai(str(tiny), motion="smplx")  # pyright: ignore[reportArgumentType]
 
 
 def published() -> list[tuple[int, str, str, int]]:
@@ -374,3 +474,25 @@ def test_real_takes_against_the_joints_of_the_fixture(case, originals):
     motion = motion[: len(expected)]
     np.testing.assert_allclose(motion[::2], expected[::2], atol=1e-4)
     np.testing.assert_allclose(motion, expected, atol=0.03)
+
+
+@needs_third_party
+@pytest.mark.golden
+@pytest.mark.parametrize("case", CASES, ids=lambda case: f"hml263_bandai-{case}")
+def test_limbs_of_real_takes_point_the_same_way_on_smpls_body(case, originals):
+    """Bones of arms and legs keep their directions, elbows and knees bend about their one axis alone."""
+    _, joints = bandai.convert((f"{case}.bvh", originals[case]), 20)
+    _, motion = bandai.convert((f"{case}.bvh", originals[case]), 20, "smpl")
+    print(case)
+    for name in ("shoulder", "elbow", "wrist", "knee", "ankle"):
+        for side in ("left", "right"):
+            joint = SMPL22.joints.index(f"{side}_{name}")
+            one, other = (
+                found[:, joint] - found[:, SMPL22.parents[joint]] for found in (joints, decoded(motion)[:, :22])
+            )
+            cosines = (one * other).sum(1) / np.linalg.norm(one, axis=1) / np.linalg.norm(other, axis=1)
+            assert cosines.min() > 1 - 1e-5, (side, name)
+    for name in ("elbow", "knee"):
+        for side in ("left", "right"):
+            v = motion[:, 3:].reshape(-1, 24, 3)[:, SMPL22.joints.index(f"{side}_{name}")]
+            print(name, side, np.degrees(v.mean(0)), np.degrees(np.linalg.norm(v, axis=1)).mean())

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from flame_mdm.data import Clip, MotionSource
+from flame_mdm.data import Clip, MotionSource, Split
 from flame_mdm.data.crops import Fixed, Units, Whole
 from flame_mdm.data.datamodule import Clips, EvaluationBatches, MotionDataModule, TrainingBatches
 from flame_mdm.data.store import Store, write_store
@@ -32,7 +32,7 @@ def copy(folder, tmp_path):
     return shutil.copytree(folder, tmp_path / "copy")
 
 
-def clips_of(store, crop=None, split="train"):
+def clips_of(store, crop=None, split: Split = "train"):
     return Clips(store, split, representation=HumanML(), crop=crop or Units(24, 60, 4), seed=0)
 
 
@@ -97,7 +97,7 @@ class Broken(MotionSource):
         yield from self.given
 
 
-def clip(name, split="train", source=None, motion=None, **options):
+def clip(name, split: Split = "train", source=None, motion=None, **options):
     joints = next(iter(Synthetic(clips=1).clips(20.0))).motion if motion is None else motion
     return Clip(name, joints, ["a person walks"], split, source or name, **options)
 

@@ -10,9 +10,11 @@ import sys
 import time
 from pathlib import Path
 from types import SimpleNamespace
+from typing import cast
 
 import pytest
 import torch
+from torchmetrics import MeanMetric
 
 from flame_mdm import train
 from flame_mdm.config import compose, instantiate
@@ -108,7 +110,9 @@ def test_two_processes_are_one_with_both_batches(tiny, tmp_path):
         for index, batch in enumerate(data.val_dataloader()):
             task.eval().validation_step(batch, index)
     assert len(data.val) == 3
-    assert values(tmp_path / "run")[-1] == pytest.approx(float(task.val_losses["loss"].compute()), rel=1e-4)
+    assert values(tmp_path / "run")[-1] == pytest.approx(
+        float(cast(MeanMetric, task.val_losses["loss"]).compute()), rel=1e-4
+    )
 
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))

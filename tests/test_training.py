@@ -5,10 +5,12 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import pytest
 import torch
+from torchmetrics import MeanMetric
 
 import flame_mdm
 from flame_mdm import sample, train
@@ -159,7 +161,7 @@ def test_validation_does_not_depend_on_the_batch_size(trained, data_root):
         with torch.no_grad():
             for index, batch in enumerate(data.val_dataloader()):
                 task.validation_step(batch, index)
-        values.append(float(task.val_losses["loss"].compute()))
+        values.append(float(cast(MeanMetric, task.val_losses["loss"]).compute()))
     assert values[0] == pytest.approx(values[1], rel=1e-5)
 
 

@@ -17,9 +17,10 @@ from contextlib import closing
 from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path, PurePosixPath
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from flame_mdm.data import Clip, MotionSource, Split, bvh
 from flame_mdm.data.parallel import in_order
@@ -51,6 +52,45 @@ JOINTS = {
     "right_wrist": "Hand_R",
 }
 SPINE1, SPINE2 = list(JOINTS).index("spine1"), list(JOINTS).index("spine2")
+
+_LEFT, _UP, _FORWARD = np.eye(3)
+_TOES = np.array([np.sin(0.153), 0.0, np.cos(0.153)])  # where SMPL's left foot points
+
+
+def _axes(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Columns: the direction of x, then that of y as far as x leaves it free, then what is perpendicular to both."""
+    first = x / np.linalg.norm(x)
+    third = np.cross(first, y) / np.linalg.norm(np.cross(first, y))
+    return np.stack([first, np.cross(third, first), third], 1)
+
+
+def _limb(name: str, bone: Sequence[float] | np.ndarray, y: np.ndarray) -> dict[str, np.ndarray]:
+    """The left and the right joint; the right one has its bone on -x, all its axes being the left's, in a mirror."""
+    left = _axes(np.asarray(bone), y)
+    return {f"{name}_L": left, f"{name}_R": np.diag([1.0, -1.0, -1.0]) @ left}
+
+
+def _sloping(degrees: float) -> np.ndarray:
+    return np.cos(np.radians(degrees)) * _TOES - np.sin(np.radians(degrees)) * _UP
+
+
+# Where each joint's own axes point (columns) when the body is in SMPL's rest pose, in which all rotations of SMPL are
+# the identity: standing straight, feet flat, arms out, palms down. The bones of arms and legs lie on x and point where
+# those of SMPL's rest pose do; knees and elbows bend about y. `docs/bandai.md` tells how the axes were measured.
+REST = {
+    "Hips": _axes(_UP, -_LEFT),
+    **dict.fromkeys(("Spine", "Chest", "Neck", "Head"), _axes(_UP, _FORWARD)),
+    **_limb("Shoulder", (0.12, 0.045, -0.02), _UP),
+    **_limb("UpperArm", (0.26, -0.015, -0.025), _UP),
+    **_limb("LowerArm", (0.267, 0.01, 0.0), _UP),
+    **_limb("Hand", (0.267, 0.01, 0.0), _UP),
+    **_limb("UpperLeg", (0.035, -0.39, 0.0), _LEFT),
+    **_limb("LowerLeg", (-0.015, -0.425, -0.04), _LEFT),
+    **_limb("Foot", _sloping(39.8), np.cross(_UP, _TOES)),
+    **_limb("Toes", _sloping(23.0), np.cross(_UP, _TOES)),
+}
+# y up -> AMASS's z up and back: (-x, z, y), so that motions look the same once the SMPL representation decodes them.
+AXES = np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 1.0, 0.0]])
 
 CONTENTS_1 = (
     "walk",
@@ -292,7 +332,7 @@ class Take:
 
 
 class Bandai(MotionSource):
-    """Both data sets as joint positions of SMPL's 22 joints, with captions made from content and style.
+    """Both data sets on SMPL's skeleton, with captions made from content and style.
 
     Mirrored copies belong to the split of their take, and only those of the training split are yielded: validation
     and test hold originals alone.
@@ -302,16 +342,30 @@ class Bandai(MotionSource):
     actions = tuple(dict.fromkeys([*CONTENTS_1, *TAKES_2]))
     published: ClassVar[dict[str, int]] = {"takes": 3077, "takes of data set 1": 175, "takes of data set 2": 2902}
 
-    def __init__(self, path: str, mirror: bool = True, workers: int = 0, exclude: Sequence[str] = ()):
+    def __init__(
+        self,
+        path: str,
+        motion: Literal["joints", "smpl"] = "joints",
+        mirror: bool = True,
+        workers: int = 0,
+        exclude: Sequence[str] = (),
+    ):
         """Reads nothing yet.
 
         Args:
             path: the folder of the original repository or any folder above the BVH files, or a zip or tar of one.
+            motion: "joints" for representations of joint positions, "smpl" for those of SMPL's rotations.
             mirror: yield a mirrored copy after each clip of the training split.
             workers: processes that read and convert; 0 = one a core, 1 = none but this one.
             exclude: takes to leave out, by the name of the BVH file without its ending.
+
+        Raises:
+            ValueError: another `motion`.
         """
+        if motion not in ("joints", "smpl"):
+            raise ValueError(f"data.source.motion={motion}: give joints or smpl")
         self.path, self.mirror, self.workers, self.exclude = Path(path), mirror, workers, tuple(exclude)
+        self.motion: Literal["joints", "smpl"] = motion
         self._found: list[Take] | None = None
 
     def count(self) -> int:
@@ -364,14 +418,15 @@ class Bandai(MotionSource):
         return self._found
 
     def _motions(self, ids: set[str], fps: float) -> Generator[tuple[str, np.ndarray]]:
-        """Id and joints of these takes in the order of the folder or archive."""
+        """Id and motion of these takes in the order of the folder or archive."""
         files = ((name, data) for name, data in _files(self.path, ids) if PurePosixPath(name).stem in ids)
-        yield from in_order(partial(convert, fps=fps), files, self.workers)
+        yield from in_order(partial(convert, fps=fps, kind=self.motion), files, self.workers)
 
     def _clip(self, take: Take, motion: np.ndarray, mirrored: bool) -> Clip:
         content, side = take.content, side_of(take.content)
         if mirrored:
-            content, side, motion = swap_sides(content), swap_sides(side), mirror(motion)
+            content, side = swap_sides(content), swap_sides(side)
+            motion = mirror_smpl(motion) if self.motion == "smpl" else mirror(motion)
         attributes: dict[str, str | int | float] = {"content": content, "style": take.style, "dataset": take.dataset}
         if side:
             attributes["side"] = side
@@ -386,10 +441,11 @@ class Bandai(MotionSource):
         )
 
 
-def convert(file: tuple[str, bytes], fps: float) -> tuple[str, np.ndarray]:
-    """Name and content of a BVH file -> its id and joints (F, 22, 3) float32 in metres, y up, at `fps`.
+def convert(file: tuple[str, bytes], fps: float, kind: Literal["joints", "smpl"] = "joints") -> tuple[str, np.ndarray]:
+    """Name and content of a BVH file -> its id and motion, float32, at `fps`.
 
-    Local rotations and the place of the hips are interpolated, so bones keep their length.
+    The motion is joints (F, 22, 3) in metres, y up, or the SMPL motion (F, 75) that `smpl_motion` tells about. Local
+    rotations and the place of the hips are interpolated, so bones keep their length.
 
     Raises:
         ValueError: the file is damaged or has another skeleton; the message names it.
@@ -403,16 +459,55 @@ def convert(file: tuple[str, bytes], fps: float) -> tuple[str, np.ndarray]:
             raise ValueError(f"{name}: not the skeleton of this data set, there is no joint {', '.join(missing)}")
     except ValueError as error:
         raise ValueError(f"{error}; to go on without it: data.source.exclude=[{id_}]") from error
-    positions, _ = bvh.forward_kinematics(motion.parents, *motion.resample(fps))
+    rotations, translations = motion.resample(fps)
+    if kind == "smpl":
+        return id_, smpl_motion(motion, rotations, translations)
+    positions, _ = bvh.forward_kinematics(motion.parents, rotations, translations)
     joints = positions[:, [motion.joints.index(joint) for joint in JOINTS.values()]] / 100
     joints[:, SPINE1] += 0.4 * (joints[:, SPINE2] - joints[:, SPINE1])
     return id_, joints.astype(np.float32)
+
+
+def smpl_motion(skeleton: bvh.Bvh, rotations: np.ndarray, translations: np.ndarray) -> np.ndarray:
+    """A take as SMPL's parameters in the convention of AMASS: z up, pelvis and axis-angle vectors of 24 joints.
+
+    SMPL's parent of a joint is the parent in the file, but for spine1, which lies between two of its joints and turns
+    with the pelvis. So a rotation of SMPL is the file's, seen in the axes of the rest pose: B_parent R B_joint^-1.
+
+    Args:
+        skeleton: the file.
+        rotations: (F, J, 3, 3) of its joints in the frame of the parent.
+        translations: (F, J, 3) in the frame of the parent, centimetres.
+
+    Returns:
+        (F, 3 + 72) float32: place of the pelvis in metres, then rotations. Hands (22 and 23) do not turn.
+    """
+    positions, turned = bvh.forward_kinematics(skeleton.parents, rotations, translations)
+    local = np.tile(np.eye(3), (len(rotations), 24, 1, 1))
+    hips = skeleton.joints.index("Hips")
+    for joint, name in enumerate(JOINTS.values()):
+        if name != "Hips":
+            index = skeleton.joints.index(name)
+            parent = skeleton.joints[skeleton.parents[index]]
+            local[:, joint] = REST[parent] @ rotations[:, index] @ REST[name].T
+    local[:, 0] = AXES @ turned[:, hips] @ REST["Hips"].T
+    vectors = Rotation.from_matrix(local.reshape(-1, 3, 3)).as_rotvec().reshape(len(local), -1)
+    return np.concatenate([positions[:, hips] @ AXES / 100, vectors], 1).astype(np.float32)
 
 
 def mirror(motion: np.ndarray) -> np.ndarray:
     """Joints (F, 22, 3) of the same motion done with the other side: x -> -x, left and right joints swapped."""
     names = list(JOINTS)
     return motion[:, [names.index(swap_sides(name)) for name in names]] * np.array([-1, 1, 1], motion.dtype)
+
+
+def mirror_smpl(motion: np.ndarray) -> np.ndarray:
+    """The same for an SMPL motion (F, 75): left and right joints swapped, turns about y and z the other way round."""
+    names = [*JOINTS, "left_hand", "right_hand"]
+    vectors = motion[:, 3:].reshape(len(motion), len(names), 3)
+    vectors = vectors[:, [names.index(swap_sides(name)) for name in names]] * np.array([1, -1, -1], motion.dtype)
+    translation = motion[:, :3] * np.array([-1, 1, 1], motion.dtype)
+    return np.concatenate([translation, vectors.reshape(len(motion), -1)], 1)
 
 
 def swap_sides(text: str) -> str:

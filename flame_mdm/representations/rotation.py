@@ -138,13 +138,19 @@ def rotate(quaternion: Tensor, vector: Tensor) -> Tensor:
     return vector + quaternion[..., :1] * twice + torch.linalg.cross(xyz, twice)
 
 
+def _scaled(vectors: Tensor) -> Tensor:
+    """Vectors of largest entry 1, so that squares of tiny ones do not vanish; 0 stays 0."""
+    largest = vectors.abs().amax(-1, keepdim=True)
+    return vectors / torch.where(largest > 0, largest, 1.0)
+
+
 def between(a: Tensor, b: Tensor) -> Tensor:
     """The shortest rotation from the direction of `a` to that of `b`: (..., 3), (..., 3) -> (..., 4) with w >= 0.
 
     Of opposite directions, where every half turn about a perpendicular axis is shortest, one is picked; where a vector
     is 0 the rotation is the identity.
     """
-    a, b = torch.broadcast_tensors(a, b)
+    a, b = torch.broadcast_tensors(_scaled(a), _scaled(b))
     lengths = torch.linalg.vector_norm(a, dim=-1, keepdim=True) * torch.linalg.vector_norm(b, dim=-1, keepdim=True)
     quaternion = torch.cat([lengths + (a * b).sum(-1, keepdim=True), torch.linalg.cross(a, b)], -1)
     size = torch.linalg.vector_norm(quaternion, dim=-1, keepdim=True)

@@ -165,7 +165,11 @@ def write_motions(folder: Path, model: MotionGeneration, motions: Sequence[Gener
         partial.replace(path)
     write_gif(folder / "motions.gif", scene[:8])
     contact_sheet(folder / "motions.png", scene[:8])
-    write_player(folder / "player.html", scene, title=motions[0].caption or "Motions")
+    write_player(
+        folder / "player.html",
+        scene,
+        title=motions[0].caption if len({m.caption for m in motions}) == 1 and motions[0].caption else "Motions",
+    )
 
 
 def file_sha256(path: str | Path) -> str:

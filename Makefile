@@ -51,5 +51,5 @@ lint: $(READY) ## check style and types
 	@$(VENV)/bin/pyright
 
 bench: $(READY) ## measure speed, as ratios in one run
-	@for name in features bvh loading text sampling; do \
+	@for name in features loading text sampling; do \
 		echo "== $$name"; $(VENV)/bin/python benchmarks/$$name.py || exit 1; done

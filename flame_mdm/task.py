@@ -74,7 +74,12 @@ class Task(LightningModule):
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
         """The optimizer of the recipe over all trainable parameters."""
-        return instantiate(self.optimizer, params=[p for p in self.parameters() if p.requires_grad])
+        optimizer = instantiate(self.optimizer, params=[p for p in self.parameters() if p.requires_grad])
+        if self.trainer.precision == "bf16-mixed":
+            # Lightning clips no gradients for fused optimizers under mixed precision, as these may hold scaled ones; in
+            # bfloat16 nothing is scaled.
+            optimizer._step_supports_amp_scaling = False
+        return optimizer
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """The checkpoint carries its recipe and the facts of its data, as plain values."""

@@ -76,6 +76,13 @@ def test_a_resumed_run_is_the_uninterrupted_one(tiny, extra, tmp_path):
         assert all(torch.equal(a[name], b[name]) for name in a), key
 
 
+def test_bfloat16_is_one_switch(tiny):
+    checkpoint = run([*tiny, *STEPS, "trainer.precision=bf16-mixed"], 2)
+    values = [value for value in weights(checkpoint).values() if value.is_floating_point()]
+    assert all(value.dtype == torch.float32 for value in values)
+    assert all(torch.isfinite(value).all() for value in values)
+
+
 def test_a_folder_of_another_configuration_is_refused(tiny, capsys):
     run([*tiny, *STEPS], 2)
     assert train.main(["quickstart", *tiny, *STEPS, "optimizer.lr=0.5", "trainer.max_steps=4"]) == 1

@@ -74,12 +74,16 @@ class Task(LightningModule):
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
         """The optimizer of the recipe over all trainable parameters."""
-        optimizer = instantiate(self.optimizer, params=[p for p in self.parameters() if p.requires_grad])
+        return instantiate(self.optimizer, params=[p for p in self.parameters() if p.requires_grad])
+
+    def on_train_start(self) -> None:
+        """Lets fused optimizers be clipped in bfloat16.
+
+        Lightning clips no gradients for them under mixed precision, as they may hold scaled ones; bfloat16 scales none.
+        """
         if self.trainer.precision == "bf16-mixed":
-            # Lightning clips no gradients for fused optimizers under mixed precision, as these may hold scaled ones; in
-            # bfloat16 nothing is scaled.
-            optimizer._step_supports_amp_scaling = False
-        return optimizer
+            for optimizer in self.trainer.optimizers:
+                optimizer._step_supports_amp_scaling = False  # type: ignore[attr-defined]
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """The checkpoint carries its recipe and the facts of its data, as plain values."""

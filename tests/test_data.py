@@ -9,7 +9,7 @@ import torch
 from flame_mdm.data import Clip, MotionSource, Split
 from flame_mdm.data.crops import Fixed, Units, Whole
 from flame_mdm.data.datamodule import Clips, EvaluationBatches, MotionDataModule, TrainingBatches
-from flame_mdm.data.store import Store, write_store
+from flame_mdm.data.store import Store, _fingerprint, write_store
 from flame_mdm.data.synthetic import Synthetic
 from flame_mdm.motion import collate
 from flame_mdm.representations.humanml import HumanML
@@ -51,6 +51,15 @@ def test_the_same_input_gives_the_same_fingerprint(store, tmp_path):
     again = write_store(tmp_path / "again", Synthetic(clips=40, seed=1), HumanML())
     other = write_store(tmp_path / "other", Synthetic(clips=40, seed=2), HumanML())
     assert store.fingerprint == again.fingerprint != other.fingerprint
+
+
+def test_noise_of_rounding_does_not_move_the_fingerprint(store):
+    names = (store.folder, store.info["representation"], store.info["fps"])
+    noisy = [values + scale * 1e-9 for values, scale in ((store.mean, -1), (store.std, 1))]
+    zero = np.zeros_like(store.mean)
+    assert _fingerprint(*names, store.mean, store.std) == _fingerprint(*names, *noisy) == store.fingerprint
+    assert _fingerprint(*names, zero + 4e-23, store.std) == _fingerprint(*names, zero - 3e-22, store.std)
+    assert _fingerprint(*names, store.mean + 0.01, store.std) != store.fingerprint
 
 
 def test_a_flipped_byte_is_found_by_verify(copy):

@@ -224,8 +224,9 @@ def _describe(
 
 def _fingerprint(folder: Path, representation: str, fps: float, mean: np.ndarray, std: np.ndarray) -> str:
     digest = hashlib.sha256((folder / "clips.jsonl").read_bytes())
-    # Features differ in their last bits between processors, so the fingerprint sees them through rounded statistics.
-    rounded = [f"{value:.2e}" for value in np.concatenate([mean, std])]
+    # Features differ in their last bits between processors and thread counts, so the fingerprint sees them through
+    # statistics rounded to a fixed place: what should be 0 is not told apart by its noise, nor by its sign.
+    rounded = [round(float(value), 4) + 0.0 for value in np.concatenate([mean, std])]
     digest.update(json.dumps([representation, fps, rounded]).encode())
     return digest.hexdigest()[:16]
 

@@ -425,22 +425,27 @@ def _serve(command: Callable[[Config], None], words: list[str], name: str | None
     overrides = [w for w in words if w not in flags]
     sweep = any(flag in ("-m", "--multirun") for flag in flags)
     plan = _plan(recipe, overrides)
+
+    def start(plain: Config, task: Sequence[str]) -> None:
+        if name is None:  # what Lightning starts further processes with
+            sys.argv = [sys.argv[0], first, *task, _quoted(f"run.dir={plain['run']['dir']}", ("run.dir",))]
+        codes.append(guarded(lambda: command(plain)))
+
     if not sweep:
         composed = _hydra(plan)
         check(composed)
-        Path(composed["run"]["dir"]).mkdir(parents=True, exist_ok=True)
+        if not flags:
+            start(composed, [word for word in plan.overrides if not word.startswith("hydra.")])
+            return
 
     def job(config: Any) -> None:
         plain: Config = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)  # type: ignore[assignment]
+        task = [str(word) for word in HydraConfig.get().overrides.task]
         if sweep:
             plain["run"]["dir"] = HydraConfig.get().runtime.output_dir
             check(plain)
-        if name is None:  # what Lightning starts further processes with
-            task = [str(word) for word in HydraConfig.get().overrides.task]
-            folder = _quoted(f"run.dir={plain['run']['dir']}", ("run.dir",))
-            sys.argv = [sys.argv[0], first, *task, folder]
-            HydraConfig.instance().cfg = None  # else it adds words for Hydra's own command line
-        codes.append(guarded(lambda: command(plain)))
+        HydraConfig.instance().cfg = None  # else Lightning adds words for Hydra's own command line
+        start(plain, task)
 
     quiet = ["hydra/job_logging=disabled", "hydra/hydra_logging=disabled", "hydra.output_subdir=null"]
     output = [

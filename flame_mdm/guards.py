@@ -8,7 +8,7 @@ import json
 import os
 import socket
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +34,7 @@ def only_run(folder: Path) -> Iterator[None]:
     Raises:
         UserError: another process, here or on another host of a shared file system, holds it.
     """
+    made = [part for part in (folder, *folder.parents) if not part.exists()]
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / "run.lock"
     with path.open("a+") as file:
@@ -57,6 +58,9 @@ def only_run(folder: Path) -> Iterator[None]:
             yield
         finally:
             path.unlink(missing_ok=True)
+            with suppress(OSError):  # a run that wrote nothing leaves no folders behind
+                for part in made:
+                    part.rmdir()
 
 
 class WholeCheckpoints(TorchCheckpointIO):

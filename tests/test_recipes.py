@@ -10,6 +10,7 @@ import torch
 from fixtures import ROOT
 
 from flame_mdm.config import compose, instantiate, recipes
+from flame_mdm.hyperparameters import value
 from flame_mdm.motion import Condition
 from flame_mdm.processes.diffusion import Sampler
 from flame_mdm.processes.flow_matching import STEPS as SOLVERS
@@ -55,9 +56,9 @@ def test_no_two_recipes_are_the_same():
 def test_values_come_from_the_class_where_the_recipe_is_silent():
     config = recipe("humanml3d/mdm")
     assert "betas" not in config["optimizer"]
-    assert generate.value(config, "optimizer.betas") == (0.9, 0.999)
-    assert generate.value(config, "denoiser.mask_padding") is True
-    assert generate.value(config, "denoiser.max_frames") is None
+    assert value(config, "optimizer.betas") == (0.9, 0.999)
+    assert value(config, "denoiser.mask_padding") is True
+    assert value(config, "denoiser.max_frames") is None
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,92 @@
+"""Hyper-parameters of recipes, as tables show them."""
+
+from __future__ import annotations
+
+import inspect
+from functools import cache
+from typing import Any
+
+import torch
+from hydra.utils import get_class
+
+from flame_mdm.config import Config, compose, instantiate, parameters
+
+LABELS = {
+    "optimizer._target_": "optimizer",
+    "optimizer.lr": "learning rate",
+    "optimizer.weight_decay": "weight decay",
+    "optimizer.betas": "β1, β2",
+    "data.batch_size": "batch",
+    "trainer.max_steps": "training steps",
+    "process.num_train_timesteps": "diffusion steps T",
+    "process.schedule": "β schedule",
+    "process.timestep_sampling": "schedule sampler",
+    "process.prediction": "prediction",
+    "process.variance": "variance",
+    "features": "motion width",
+    "denoiser.latent_dim": "latent width",
+    "denoiser.ff_size": "feed-forward width",
+    "denoiser.num_layers": "layers",
+    "denoiser.num_heads": "heads",
+    "denoiser.dropout": "dropout",
+    "denoiser.max_frames": "longest motion, frames",
+    "condition.max_tokens": "longest text, tokens",
+    "condition.freeze": "language model frozen",
+    "denoiser.length_token": "motion-length token",
+    "denoiser.cross_attention": "cross-attention",
+    "task.cond_drop_prob": "p of the null condition",
+    "task.guidance_scale": "guidance scale s",
+    "task.sampler": "sampler",
+    "task.num_inference_steps": "sampling steps",
+    "ema.update_every_n_steps": "EMA update, steps",
+    "ema.decay": "EMA decay",
+    "losses.joints": "λ position",
+    "losses.velocity": "λ velocity",
+    "losses.foot_contact": "λ foot contact",
+    "task.network.latent_dim": "motion encoder, latent width",
+    "task.network.ff_size": "motion encoder, feed-forward width",
+    "task.network.num_layers": "motion encoder, layers",
+    "task.network.num_heads": "motion encoder, heads",
+    "task.network.dropout": "motion encoder, dropout",
+    "task.network.max_frames": "longest motion, frames",
+    "task.network.embedding_dim": "width of the common space",
+    "parameters": "parameters, M",
+}
+"""The hyper-parameters that tables show, by dotted key; `features` and `parameters` are counted."""
+
+
+@cache
+def values(name: str) -> dict[str, Any]:
+    """The hyper-parameters of a recipe by the keys of `LABELS`; what it leaves open is the default of the class."""
+    config = compose(name)
+    found = {key: value(config, key) for key in LABELS if "." in key}
+    found["features"] = instantiate(config["representation"]).features
+    if "denoiser" in config:
+        found["parameters"] = count_parameters(config, found["features"]) / 1e6
+    return {key: value for key, value in found.items() if value is not None}
+
+
+def value(config: Config, key: str) -> Any:
+    """The value of a dotted key; the default of the class where the recipe does not say; None where there is none."""
+    *path, name = key.split(".")
+    node: Any = config
+    for part in path:
+        node = node.get(part) or {}
+    if name in node:
+        return node[name].rpartition(".")[2] if name == "_target_" else node[name]
+    if "_target_" in node and name in parameters(node["_target_"]):
+        return inspect.signature(get_class(node["_target_"])).parameters[name].default
+    return None
+
+
+def count_parameters(config: Config, features: int) -> int:
+    """Parameters of the denoiser; a language model has its own."""
+    process = instantiate(config["process"])
+    with torch.device("meta"):
+        denoiser = instantiate(
+            config["denoiser"],
+            in_features=features,
+            out_features=process.out_features(features),
+            cond_features=config["condition"].get("features", 0),
+        )
+    return sum(p.numel() for p in denoiser.parameters())

@@ -7,7 +7,7 @@ VENV := .venv
 READY := $(VENV)/.ready
 export MAKEFLAGS
 
-.PHONY: help setup prepare browse train sample evaluate edit convert test lint bench
+.PHONY: help setup prepare browse train sample evaluate tables benchmark edit convert test lint bench
 
 help: ## show this
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## /  make \1@/' | column -t -s @
@@ -35,6 +35,12 @@ sample: $(READY) ## sample: CKPT=runs/.../last.ckpt TEXT="a person walks in a ci
 
 evaluate: $(READY) ## measure: CKPT=runs/.../last.ckpt [protocol=synthetic] extractor=runs/motion_clip/... [quick=true]
 	@$(VENV)/bin/python -m flame_mdm.evaluate --from-make
+
+tables: $(READY) ## tables and figures from checkpoints: [TABLE="mdm_1 synthetic"] [evaluate=false]
+	@$(VENV)/bin/python -m flame_mdm.tables --from-make
+
+benchmark: $(READY) ## train and measure small models of all kinds, write a report: EXP=synthetic (or bandai)
+	@$(VENV)/bin/python -m flame_mdm.benchmark --from-make
 
 edit: $(READY) ## keep a part of a motion, sample the rest: CKPT=... MOTION=walk.npz FRAMES=in_between TEXT="a person jumps"
 	@$(VENV)/bin/python -m flame_mdm.edit --from-make

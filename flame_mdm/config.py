@@ -23,7 +23,7 @@ from hydra import main as hydra_main
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import Override
+from hydra.core.override_parser.types import Glob, Override
 from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -36,6 +36,10 @@ EXPERIMENTS = _PACKAGED if _PACKAGED.is_dir() else Path(__file__).parent.parent 
 
 TRUSTED = ("torch", "lightning", "torchmetrics", "flame_mdm", "evaluators")
 """Packages whose classes a configuration from a checkpoint may name."""
+
+
+LAUNCH = "launch"
+"""The group of `experiments/` whose options start jobs elsewhere."""
 
 
 class UserError(Exception):
@@ -75,6 +79,17 @@ def compose(name: str, overrides: Sequence[str] = ()) -> Config:
     return config
 
 
+def settings(name: str, overrides: Sequence[str] = ()) -> Config:
+    """The keys of a command that has a configuration of its own, such as evaluate, with overrides.
+
+    Raises:
+        UserError: as for `compose`.
+    """
+    config = _hydra(_plan(_Recipe(EXPERIMENTS, name), overrides))
+    check(config)
+    return config
+
+
 class _Recipe(NamedTuple):
     """Where a configuration stands, and what it is."""
 
@@ -99,18 +114,34 @@ def _plan(recipe: _Recipe, overrides: Sequence[str]) -> _Plan:
     parsed = _parse(overrides)
     if recipe.saved:
         _refuse_groups(parsed, recipe)
-    else:
-        _check_groups(parsed)
+    _check_groups(parsed)
     first = [f"hydra.searchpath=[file://{EXPERIMENTS}]"] if recipe.folder != EXPERIMENTS else []
     if recipe.experiment:
         first.append(f"experiment={recipe.experiment}")
-    base = _Plan(recipe.folder, recipe.stem, [*first, *(_line(o) for o in parsed if _is_group(o))])
-    composed = _hydra(base)
-    return base._replace(overrides=base.overrides + [_legal(composed, o) for o in parsed if not _is_group(o)])
+    parts = [o for o in parsed if _is_group(o)]
+    composed = _hydra(_Plan(recipe.folder, recipe.stem, [*first, *map(_first_choice, parts)]))
+    keys = [_legal(composed, o) for o in parsed if not _is_group(o)]
+    return _Plan(recipe.folder, recipe.stem, [*first, *map(_line, parts), *keys])
 
 
 def _line(override: Override) -> str:
-    return override.input_line or ""
+    line = override.input_line or ""
+    return f"+{line}" if override.key_or_group == LAUNCH and not override.is_add() else line
+
+
+def _first_choice(override: Override) -> str:
+    """The override; of a sweep, that to its first value."""
+    if not override.is_sweep_override():
+        return _line(override)
+    if isinstance(value := override.value(), Glob):
+        choice = next(iter(value.filter(_options(override.key_or_group))), "none")
+    else:
+        choice = next(override.sweep_string_iterator())
+    return f"{override.get_key_element()}={choice}"
+
+
+def _options(group: str) -> list[str]:
+    return sorted(p.stem for p in (EXPERIMENTS / group).glob("*.yaml"))
 
 
 def _find(name: str) -> _Recipe:
@@ -148,16 +179,18 @@ def _check_groups(overrides: Sequence[Override]) -> None:
         if not _is_group(override) or override.is_sweep_override() or not isinstance(override.value(), str):
             continue
         group, option = override.key_or_group, str(override.value())
-        options = sorted(p.stem for p in (EXPERIMENTS / group).glob("*.yaml"))
+        options = _options(group)
         if option not in options:
             raise UserError(
                 f"no {group} is called '{option}'.{_nearest(option, options)} There are: {', '.join(options)}"
             )
+        if group == LAUNCH and _file("submitit") is None:
+            raise UserError(f"{LAUNCH}={option} needs hydra-submitit-launcher: pip install flame-mdm[slurm]")
 
 
 def _refuse_groups(overrides: Sequence[Override], recipe: _Recipe) -> None:
     for override in overrides:
-        if _is_group(override):
+        if _is_group(override) and override.key_or_group != LAUNCH:
             raise UserError(
                 f"{_line(override)} swaps a part of a recipe, but {recipe.stem}.yaml is a saved configuration, "
                 "whose parts are fixed; start from the experiment, or override single keys"
@@ -178,7 +211,7 @@ def _hydra(plan: _Plan) -> Config:
 def _legal(config: Config, override: Override) -> str:
     """The override as Hydra takes it, if its key is written in the recipe or is a parameter of the `_target_`."""
     line = _line(override)
-    if override.is_delete() or override.is_force_add() or override.is_add():
+    if override.is_delete() or override.is_force_add() or override.is_add() or line.startswith("hydra."):
         return line
     node: Any = config
     parts = override.key_or_group.split(".")
@@ -397,12 +430,15 @@ def run(
 
     Args:
         command: does the work, given the resolved configuration.
-        argv: the words after the command. Hydra's own flags (`--multirun`, `--cfg job`) pass through.
+        argv: the words after the command. Hydra's own flags (`--multirun`, `--cfg job`) pass through. `launch=...`
+            hands each job of a sweep, or the only one, to that launcher, and waits for them.
         usage: printed for `--help`.
         name: the configuration, for commands that have one of their own; otherwise the first word names a recipe.
         text: keys whose values are taken as they stand, not read in Hydra's grammar.
     """
     words = [_quoted(word, text) for word in (_make_variables() if "--from-make" in argv else argv)]
+    if name is not None and words and not words[0].startswith("-") and "=" not in words[0]:
+        words[0] = f"exp={words[0]}"  # EXP of make, or the first word, where it names no recipe
     if (not words and name is None) or any(word in ("-h", "--help") for word in words):
         print(usage.strip())
         if name is None:
@@ -423,36 +459,47 @@ def _serve(command: Callable[[Config], None], words: list[str], name: str | None
         first, recipe = name, _Recipe(EXPERIMENTS, name)
     flags = [w for i, w in enumerate(words) if w.startswith("-") or (i and words[i - 1] in ("--cfg", "--package"))]
     overrides = [w for w in words if w not in flags]
-    sweep = any(flag in ("-m", "--multirun") for flag in flags)
     plan = _plan(recipe, overrides)
+    parsed = _parse(plan.overrides)
+    launch = [str(o.value()) for o in parsed if o.key_or_group == LAUNCH]
+    sweep = bool(launch) or any(flag in ("-m", "--multirun") for flag in flags)
+    composed = _hydra(plan._replace(overrides=[_first_choice(o) for o in parsed] if sweep else plan.overrides))
+    check(composed)
+    if "local" in launch and composed.get("trainer", {}).get("devices", 1) != 1:
+        raise UserError("launch=local runs each job in one process: leave out launch, or trainer.devices")
 
-    def start(plain: Config, task: Sequence[str]) -> None:
+    def start(plain: Config, task: Sequence[str]) -> int:
         if name is None:  # what Lightning starts further processes with
             sys.argv = [sys.argv[0], first, *task, _quoted(f"run.dir={plain['run']['dir']}", ("run.dir",))]
-        codes.append(guarded(lambda: command(plain)))
+        code = guarded(lambda: command(plain))
+        codes.append(code)
+        return code
 
-    if not sweep:
-        composed = _hydra(plan)
-        check(composed)
-        if not flags:
-            start(composed, [word for word in plan.overrides if not word.startswith("hydra.")])
-            return
+    if not flags and not sweep:
+        start(composed, [word for word in plan.overrides if not word.startswith("hydra.")])
+        return
 
     def job(config: Any) -> None:
+        hydra = HydraConfig.get()
+        if sweep and name is None:
+            config = OmegaConf.merge(config, {"run": {"dir": hydra.runtime.output_dir}})
         plain: Config = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)  # type: ignore[assignment]
-        task = [str(word) for word in HydraConfig.get().overrides.task]
-        if sweep:
-            plain["run"]["dir"] = HydraConfig.get().runtime.output_dir
-            check(plain)
+        check(plain)
         HydraConfig.instance().cfg = None  # else Lightning adds words for Hydra's own command line
-        start(plain, task)
+        code = start(plain, [str(word) for word in hydra.overrides.task if not str(word).startswith(f"+{LAUNCH}=")])
+        if launch and code:  # else the job counts as done
+            raise SystemExit(code)
 
     quiet = ["hydra/job_logging=disabled", "hydra/hydra_logging=disabled", "hydra.output_subdir=null"]
+    fixed = [repr(o.key_or_group) for o in parsed if not o.is_sweep_override()]
     output = [
         "hydra.run.dir=${run.dir}",
-        "hydra.sweep.dir=${run.dir}",
+        "hydra.sweep.dir=${run.dir}" if name is None else f"hydra.sweep.dir=runs/sweeps/{name}",
         "hydra.sweep.subdir=${hydra.job.override_dirname}",
+        f"hydra.job.config.override_dirname.exclude_keys=[{','.join(fixed)}]",
     ]
+    if sweep and not {"-m", "--multirun"} & set(flags):
+        flags.append("--multirun")
     sys.argv = [sys.argv[0], *flags, *quiet, *output, *plan.overrides]
     GlobalHydra.instance().clear()
     hydra_main(version_base="1.3", config_path=str(plan.folder), config_name=plan.stem)(job)()

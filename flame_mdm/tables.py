@@ -1,0 +1,631 @@
+"""Tables and figures of results: `python -m flame_mdm.tables table="mdm_1 synthetic"`"""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import json
+import math
+import re
+import string
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from flame_mdm.config import EXPERIMENTS, Config, UserError, run, settings
+from flame_mdm.visualize.table import (
+    WRITERS,
+    Cell,
+    Figure,
+    Line,
+    Part,
+    Table,
+    draw,
+    figure_names,
+    fragment,
+    page,
+    places,
+)
+
+USAGE = """
+usage: python -m flame_mdm.tables [table="NAME ..."] [evaluate=false] [out=FOLDER]
+
+Renders tables and figures as Markdown, LaTeX, CSV and HTML. A table is a file of experiments/tables, or of your own: it
+names checkpoints, a protocol and columns. Checkpoints that have not been evaluated are evaluated first; evaluate=false
+takes what is there. Without table=, all tables. The same results give the same bytes.
+Keys, with their defaults: experiments/tables.yaml
+"""
+
+SPECS = EXPERIMENTS / "tables"
+PUBLISHED = SPECS / "published.yaml"
+SWEPT = ("sampler", "num_inference_steps", "guidance_scale", "until")
+"""Options of a row that may be lists: one row for each."""
+ABOUT = {
+    "num_inference_steps": "sampling steps",
+    "guidance_scale": "guidance scale",
+    "sampler": "sampler",
+    "until": "share of sampling that is rewritten",
+    "nfe": "network calls a motion",
+    "seconds_per_sample": "seconds a motion",
+    "parameters": "parameters, M",
+}
+"""What a column may show beside metrics, and figures may be drawn over."""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Runs the command; returns its exit code."""
+    words = sys.argv[1:] if argv is None else argv
+    return run(tables, words, usage=USAGE, name="tables", text=("table", "out", "results", "data_root"))
+
+
+def tables(config: Config) -> None:
+    """Evaluates what is missing and renders the tables.
+
+    Raises:
+        UserError: a malformed spec, or an evaluation that failed; the tables are written all the same.
+    """
+    names = str(config["table"]).split() if config["table"] is not None else spec_names()
+    specs = {Path(name).stem: load_spec(name) for name in names}
+    results = Path(config["results"])
+    failed = evaluate_missing(specs, results, config) if config["evaluate"] else []
+    out = Path(config["out"])
+    for name, spec in specs.items():
+        table = build(name, spec, results)
+        write(table, out)
+        lines = [line for part in table.parts for line in part.lines if line.kind == "measured"]
+        measured = sum(not line.state for line in lines)
+        print(f"{name}: {measured} of {len(lines)} rows measured: {out / name}.html, .md, .tex, .csv")
+    if len(specs) > 1:
+        links = "".join(f'<li><a href="{name}.html">{name}</a>: {spec["title"]}</li>' for name, spec in specs.items())
+        _write_text(out / "index.html", page("Tables", f"<h1>Tables</h1><ul>{links}</ul>\n"))
+    if failed:
+        raise UserError(f"{len(failed)} evaluations failed: {'; '.join(failed)}")
+
+
+# Specs ----------------------------------------------------------------------------------------------------------------
+
+
+def spec_names() -> list[str]:
+    """Names of all tables."""
+    return sorted(path.stem for path in SPECS.glob("*.yaml") if path != PUBLISHED)
+
+
+def load_spec(name: str) -> Config:
+    """A table's spec, a file of experiments/tables or any other.
+
+    Raises:
+        UserError: no such file, or one that is not a spec.
+    """
+    path = Path(name) if name.endswith((".yaml", ".yml")) else SPECS / f"{name}.yaml"
+    if not path.is_file() or path == PUBLISHED:
+        raise UserError(f"no table is called '{name}'; there are: {', '.join(spec_names())}")
+    spec = _load(path)
+    if not isinstance(spec.get("title"), str) or not isinstance(spec.get("parts"), dict) or not spec["parts"]:
+        raise UserError(f"{path}: a table needs a title and parts")
+    for part_name, part in spec["parts"].items():
+        _check_part(f"{path}: part {part_name}", part)
+    for figure in spec.get("figures", []):
+        part = spec["parts"].get(figure.get("part"))
+        if part is None or figure.get("x") not in ABOUT:
+            raise UserError(f"{path}: a figure needs a part of the table and x, one of {', '.join(ABOUT)}")
+        for column in _list(figure.get("y")):
+            if column not in part["columns"]:
+                raise UserError(f"{path}: figure: y={column} is not a column of {figure['part']}")
+    return spec
+
+
+def _check_part(where: str, part: Any) -> None:
+    kinds = [{"columns", "rows"}, {"recipes", "keys"}, {"lengths"}, {"ratings"}]
+    if not isinstance(part, dict) or sum(kind <= part.keys() for kind in kinds) != 1:
+        raise UserError(f"{where}: needs columns and rows, or recipes and keys, or lengths, or ratings")
+    for label, column in part.get("columns", {}).items():
+        if not isinstance(column, dict) or "value" not in column:
+            raise UserError(f"{where}: column {label}: needs a value, such as fid")
+        if column.get("better", "none") not in ("higher", "lower", "real", "none"):
+            raise UserError(f"{where}: column {label}: better is higher, lower, real or none, not {column['better']}")
+    for row in part.get("rows", []):
+        if not isinstance(row, dict) or "label" not in row or not {"ckpt", "baseline", "from_samples"} & row.keys():
+            raise UserError(f"{where}: a row needs a label and one of ckpt, baseline and from_samples: {row}")
+    if "columns" in part and part.get("rows") and "protocol" not in part:
+        raise UserError(f"{where}: needs a protocol")
+
+
+def _load(path: Path) -> Config:
+    from omegaconf import OmegaConf
+
+    try:
+        content = OmegaConf.to_container(OmegaConf.load(path), resolve=True)
+    except Exception as error:  # YAML's many errors all mean the same here
+        raise UserError(f"{path}: not a readable YAML file: {str(error).splitlines()[0]}") from error
+    if not isinstance(content, dict):
+        raise UserError(f"{path}: not a mapping")
+    return {str(key): value for key, value in content.items()}
+
+
+def _list(value: Any) -> list[Any]:
+    return value if isinstance(value, list) else [value]
+
+
+# Evaluations ----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Request:
+    """One evaluation: the keys of `make evaluate` that differ from their defaults, and the row it is for."""
+
+    label: str
+    keys: Mapping[str, Any]
+
+    def path(self, results: Path) -> Path:
+        """Its result: a function of the keys alone, so that tables share results and need no checkpoint to be drawn."""
+        digest = hashlib.sha256(json.dumps(dict(self.keys), sort_keys=True).encode()).hexdigest()
+        name = re.sub(r"[^A-Za-z0-9]+", "-", self.label).strip("-").lower()
+        return results / Path(str(self.keys["protocol"])).stem / f"{name}-{digest[:10]}.json"
+
+    @property
+    def lacking(self) -> str:
+        """Which file is not there; "" where the evaluation can be made."""
+        for key, what in (("ckpt", "checkpoint"), ("from_samples", "samples"), ("extractor", "extractor")):
+            path = self.keys.get(key)
+            if path not in (None, "none") and not Path(str(path)).exists():
+                return f"no {what}"
+        return ""
+
+
+def requests(part: Mapping[str, Any]) -> Iterator[tuple[dict[str, Any], list[Request]]]:
+    """The rows of a part, lists of options spread out, each with the evaluation of each column."""
+    for row in part.get("rows", []):
+        for values in itertools.product(*(_list(row[name]) for name in SWEPT if name in row)):
+            single = row | dict(zip((name for name in SWEPT if name in row), values, strict=True))
+            single["label"] = _spread_label(part, row, single)
+            yield single, [_request(part, single, column) for column in part["columns"].values()]
+
+
+def _spread_label(part: Mapping[str, Any], row: Mapping[str, Any], single: Mapping[str, Any]) -> str:
+    """The label of a row, with the options that its lists leave open and no column shows."""
+    shown = {column["value"] for column in part["columns"].values()}
+    told = [f"{ABOUT[name]} {single[name]}" for name in SWEPT if isinstance(row.get(name), list) and name not in shown]
+    return f"{row['label']} ({', '.join(told)})" if told else row["label"]
+
+
+def _request(part: Mapping[str, Any], row: Mapping[str, Any], column: Mapping[str, Any]) -> Request:
+    keys = {name: row[name] for name in row if name not in ("label", "note")}
+    for name in ("protocol", "split", "extractor", "seed", "data", "replications", "samples"):
+        for place in (part, row, column):
+            if name in place:
+                keys[name] = place[name]
+    if "ckpt" in keys:
+        keys.pop("data", None)  # a checkpoint knows its own
+    return Request(row["label"], keys)
+
+
+def evaluate_missing(specs: Mapping[str, Config], results: Path, config: Config) -> list[str]:
+    """Evaluates what specs ask for and is not there, or was made of another checkpoint; returns what failed."""
+    wanted: dict[Path, Request] = {}
+    for spec in specs.values():
+        for part in spec["parts"].values():
+            for dataset in part.get("lengths", []):
+                count_lengths(dataset, results, config)
+            for _, row in requests(part) if "columns" in part else ():
+                wanted |= {request.path(results): request for request in row if not request.lacking}
+    missing = {path: request for path, request in wanted.items() if not path.exists() or _outdated(path, request)}
+    failed = []
+    for number, (path, request) in enumerate(missing.items()):
+        print(f"evaluating {number + 1} of {len(missing)}: {request.label}", flush=True)
+        keys = dict(request.keys)
+        from flame_mdm.evaluate import evaluate
+
+        try:
+            options = settings("evaluate", [f"data={keys.pop('data')}"] if "data" in keys else [])
+            general = {name: config[name] for name in ("device", "batch_size", "data_root") if config[name] is not None}
+            evaluate(options | general | keys | {"out": str(path)})
+        except (UserError, ValueError, OSError) as error:
+            failed.append(f"{request.label}: {str(error).splitlines()[0]}")
+            print(f"failed: {failed[-1]}", flush=True)
+    return failed
+
+
+def _outdated(path: Path, request: Request) -> bool:
+    """Whether a result was made of another checkpoint than the one that is there now."""
+    if "ckpt" not in request.keys:
+        return False
+    from flame_mdm.generation import file_sha256
+
+    return read_result(path)["checkpoint"]["sha256"] != file_sha256(Path(str(request.keys["ckpt"])))
+
+
+def read_result(path: Path) -> Config:
+    """A result of `make evaluate`.
+
+    Raises:
+        UserError: it is damaged.
+    """
+    try:
+        result = json.loads(path.read_text())
+        if not {"values", "ground_truth", "protocol", "data"} <= result.keys():
+            raise ValueError("something is missing in it")
+    except (ValueError, AttributeError) as error:
+        raise UserError(f"{path}: not a result of make evaluate: {error}; delete it, and it is made again") from error
+    return result
+
+
+# From results to tables -----------------------------------------------------------------------------------------------
+
+
+def build(name: str, spec: Config, results: Path) -> Table:
+    """The table of a spec, from the results that are there and the published numbers.
+
+    Raises:
+        UserError: a published number or a result that does not fit the spec.
+    """
+    published = _load(PUBLISHED).get(name, {}) if PUBLISHED.exists() else {}
+    strangers = published.keys() - spec["parts"].keys()
+    if strangers:
+        raise UserError(f"{PUBLISHED}: {name} has parts that its spec lacks: {', '.join(sorted(strangers))}")
+    parts = []
+    for part_name, part in spec["parts"].items():
+        figures = [
+            Figure(f["x"], _list(f["y"]), f.get("log", False), f.get("points", False))
+            for f in spec.get("figures", [])
+            if f["part"] == part_name
+        ]
+        reported = published.get(part_name)
+        if "recipes" in part:
+            parts.append(_hyperparameters(part_name, part, reported))
+        elif "lengths" in part:
+            parts.append(_lengths(part_name, part, results))
+        elif "ratings" in part:
+            parts.append(_ratings(part_name, part, reported))
+        else:
+            parts.append(_measured(part_name, part, reported, results, figures))
+    return Table(name, spec["title"], parts, list(spec.get("notes", [])))
+
+
+@dataclass
+class _Marks:
+    """Footnote letters by what they stand for."""
+
+    notes: dict[str, str] = field(default_factory=dict)
+
+    def of(self, text: str) -> str:
+        return self.notes.setdefault(text, string.ascii_lowercase[len(self.notes) % 26] * (1 + len(self.notes) // 26))
+
+
+def _measured(name: str, part: Config, reported: Config | None, results: Path, figures: list[Figure]) -> Part:
+    columns = {label: column.get("better", "none") for label, column in part["columns"].items()}
+    values = [column["value"] for column in part["columns"].values()]
+    marks = _Marks()
+    lines: list[Line] = []
+    truths: dict[str, Line] = {}
+    todo: dict[str, str] = {}
+    for row, asked in requests(part):
+        found = [_result(request, results) for request in asked]
+        line = _line(row, found, values)
+        if all(result is None for result in found):
+            line.state = asked[0].lacking or "not evaluated"
+            todo |= _todo(asked[0])
+        own = dict.fromkeys(marks.of(_evaluation(result)) for result in found if result is not None)
+        line.marks = ",".join(own)
+        lines.append(line)
+        if line.marks and line.marks not in truths:
+            truth = Line("Real motions", "real", [_truth(r, v) for r, v in zip(found, values, strict=True)], line.marks)
+            truths[line.marks] = truth
+    lines = [line for line in truths.values() if any(line.cells)] + lines
+    notes = [(mark, text) for text, mark in marks.notes.items()]
+    notes += [("", f"{label}: {text}") for label, text in todo.items()]
+    for line in lines:
+        if line.facts.get("not valid because"):
+            notes.append(("", f"{line.label}: NOT VALID: {line.facts['not valid because']}"))
+    if reported is not None:
+        more, sources = _reported(reported, columns, values, name)
+        lines, notes = lines + more, notes + sources
+    _print_cells(lines, len(columns))
+    _rank(lines, columns)
+    return Part(name, columns, lines, notes, figures)
+
+
+def _result(request: Request, results: Path) -> Config | None:
+    path = request.path(results)
+    return read_result(path) | {"file": path.name} if path.exists() else None
+
+
+def _todo(request: Request) -> dict[str, str]:
+    """By which command a missing row is had."""
+    lacking = request.lacking
+    if lacking in ("no checkpoint", "no extractor"):
+        file = Path(str(request.keys["ckpt" if lacking == "no checkpoint" else "extractor"]))
+        recipe = re.fullmatch(r"runs/(.+)/default/checkpoints/.+", file.as_posix())
+        how = f"make train EXP={recipe[1]}" if recipe else f"{file} is not there"
+        return {request.label: how}
+    return {request.label: "make tables evaluates it"} if not lacking else {request.label: lacking}
+
+
+def _evaluation(result: Config) -> str:
+    """What values of different rows must share to be compared."""
+    protocol, data = result["protocol"], result["data"]
+    counts = [v["n"] for v in (result["values"] or {}).values() if v]
+    repeats = [v["replications"] for v in (result["values"] or {}).values() if v]
+    extractor = result["extractor"]
+    text = f"protocol {protocol['name']} version {protocol['version']}"
+    text += f", {result['split']} split of {data['dataset']} (fingerprint {data['fingerprint']})"
+    text += f", N = {max(counts, default=0)}, {max(repeats, default=0)} replications, seed {result['seed']}"
+    text += f", extractor sha256 {extractor['sha256'][:12]}" if extractor else ", no extractor"
+    if result.get("changed"):
+        text += "; not as the protocol has it: " + ", ".join(f"{k} = {v}" for k, v in result["changed"].items())
+    if result.get("published_split"):
+        text += "; the published split: test clips that training has seen, or no validation clips"
+    text += "".join(f"; {warning}" for warning in result.get("warnings", []))
+    return text + ("; QUICK, NOT A RESULT" if result["quick"] else "")
+
+
+def _line(row: Mapping[str, Any], found: Sequence[Config | None], values: Sequence[str]) -> Line:
+    cells = [_cell(result, value, row) for result, value in zip(found, values, strict=True)]
+    line = Line(row["label"], "measured", cells)
+    line.options = {name: float(row[name]) for name in SWEPT if isinstance(row.get(name), int | float)}
+    first = next((result for result in found if result is not None), None)
+    if first is None:
+        return line
+    for name in ABOUT:
+        value = _about(first, name)
+        if isinstance(value, int | float):
+            line.options.setdefault(name, float(value))
+    reasons = list(dict.fromkeys(reason for r in found if r is not None for reason in r["invalid_because"]))
+    line.state = "NOT VALID" if reasons else "QUICK" if first["quick"] else ""
+    checkpoint = first["checkpoint"] or {}
+    fewer = {
+        column: f"{entry['replications']} x {entry['n']}"
+        for column, result, name in zip(values, found, values, strict=True)
+        if result and (entry := (result["values"] or {}).get(name)) and entry["n"] is not None
+    }
+    line.facts = {
+        "checkpoint sha256": str(checkpoint.get("sha256", first.get("samples_sha256") or ""))[:16],
+        "recipe": str(checkpoint.get("experiment") or ""),
+        "baseline": str(first.get("baseline") or ""),
+        "chosen by": str(checkpoint.get("selected_by", "")),
+        "weights": {True: "averaged", False: "raw", None: ""}[checkpoint.get("averaged_weights")],
+        "guidance": _text(checkpoint.get("guidance_scale")),
+        "sampler": _text(checkpoint.get("sampler")),
+        "steps": _text(checkpoint.get("num_inference_steps")),
+        "replications x motions": "; ".join(f"{n}: {count}" for n, count in fewer.items()),
+        "seed": _text(first["seed"]),
+        "device": _text(first.get("device")),
+        "result": " ".join(dict.fromkeys(r["file"] for r in found if r is not None)),
+        "not valid because": "; ".join(reasons),
+    }
+    return line
+
+
+def _text(value: Any) -> str:
+    return "" if value is None else f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def _about(result: Config, name: str) -> Any:
+    """What a result says of the model and its cost, by the names of `ABOUT`."""
+    value = (result.get("cost") or {}).get(name, (result["checkpoint"] or {}).get(name))
+    return value / 1e6 if name == "parameters" and value is not None else value
+
+
+def _cell(result: Config | None, value: str, row: Mapping[str, Any]) -> Cell | None:
+    if value in ABOUT:
+        found = row.get(value) if result is None else _about(result, value)
+        if found is None:
+            return None
+        return Cell(_text(found), float(found) if isinstance(found, int | float) else None)
+    return None if result is None else _entry((result["values"] or {}).get(value))
+
+
+def _truth(result: Config | None, value: str) -> Cell | None:
+    return None if result is None or value in ABOUT else _entry((result["ground_truth"] or {}).get(value))
+
+
+def _entry(entry: Mapping[str, Any] | None) -> Cell | None:
+    if entry is None or entry["mean"] is None:
+        return None
+    return Cell("", entry["mean"], entry["ci"] if entry["replications"] > 1 else None)
+
+
+def _print_cells(lines: Sequence[Line], columns: int) -> None:
+    """Numbers as text, with the same decimals in a column, about three digits of the largest."""
+    for index in range(columns):
+        cells = [c for line in lines if not line.kind.startswith("reported") and (c := line.cells[index]) is not None]
+        numbers = [abs(cell.value) for cell in cells if cell.value is not None]
+        decimals = _decimals(max(numbers, default=0.0))
+        whole = all(cell.value == round(cell.value) for cell in cells if cell.value is not None and cell.ci is None)
+        for cell in cells:
+            if cell.value is not None and not (cell.ci is None and cell.text and whole):
+                cell.text = f"{cell.value:.{decimals}f}" + (f" ±{cell.ci:.{decimals}f}" if cell.ci is not None else "")
+
+
+def _decimals(largest: float) -> int:
+    if largest == 0 or 0.1 <= largest < 10:
+        return 3
+    return min(max(2 - math.floor(math.log10(largest)), 1), 6)
+
+
+def _rank(lines: Sequence[Line], columns: Mapping[str, str]) -> None:
+    """Best and second best among rows of one kind with the same marks."""
+    for kind in ("measured", "reported"):
+        for marks in {line.marks for line in lines}:
+            rows = [x for x in lines if x.kind == kind and x.marks == marks and not x.state]
+            rows = [x for x in rows if not x.facts.get("baseline")]
+            truths = [x for x in lines if x.kind == {"measured": "real", "reported": "reported real"}[kind]]
+            truths = [x for x in truths if kind == "reported" or x.marks == marks]
+            for index, better in enumerate(columns.values()):
+                numbers = [cell.value if (cell := row.cells[index]) else None for row in rows]
+                reals = [c.value for x in truths if (c := x.cells[index]) is not None]
+                found = places(numbers, better, reals[0] if len(reals) == 1 else None)
+                for row, place in zip(rows, found, strict=True):
+                    if (cell := row.cells[index]) is not None:
+                        cell.place = place
+
+
+# Published numbers ----------------------------------------------------------------------------------------------------
+
+
+def _reported(
+    reported: Config, columns: Mapping[str, str], values: Sequence[str], part: str
+) -> tuple[list[Line], list[tuple[str, str]]]:
+    """Rows of a paper, and their footnotes."""
+    notes: dict[str, str] = {}
+    lines = []
+    for row in reported["rows"]:
+        unknown = row["values"].keys() - columns.keys()
+        if unknown:
+            raise UserError(f"{PUBLISHED}: {part}, {row['label']}: no column is called {', '.join(sorted(unknown))}")
+        text = f"as reported: {row.get('source') or reported['source']}; measured with {reported['evaluator']}"
+        mark = notes.setdefault(text, "†" * (len(notes) + 1))
+        cells = [Cell(str(v), _leading(str(v))) if (v := row["values"].get(c)) is not None else None for c in columns]
+        line = Line(row["label"], "reported real" if row.get("real") else "reported", cells, mark)
+        for value, cell in zip(values, cells, strict=True):
+            if value in ABOUT and cell is not None and cell.value is not None:
+                line.options[value] = cell.value
+        lines.append(line)
+    extra = [("", note) for note in reported.get("notes", [])]
+    return lines, [(mark, text) for text, mark in notes.items()] + extra
+
+
+def _leading(text: str) -> float | None:
+    """The number that a printed value begins with; 1,000 is one thousand."""
+    found = re.match(r"[-+]?[\d,]*\.?\d+(?:[eE][-+]?\d+)?", text.strip())
+    return float(found[0].replace(",", "")) if found else None
+
+
+# Other kinds of parts -------------------------------------------------------------------------------------------------
+
+
+def _hyperparameters(name: str, part: Config, reported: Config | None) -> Part:
+    """A table of settings, read from recipes."""
+    from flame_mdm.hyperparameters import values
+
+    found = {label: values(recipe) for label, recipe in part["recipes"].items()}
+    columns: dict[str, str] = dict.fromkeys([*map(str, found), *(["as reported"] if reported else [])], "none")
+    printed = {row["label"]: row["values"] for row in reported["rows"]} if reported else {}
+    lines = []
+    for label, key in part["keys"].items():
+        cells: list[Cell | None] = [
+            Cell(_setting(v)) if (v := f.get(key)) is not None else None for f in found.values()
+        ]
+        if reported:
+            texts = dict.fromkeys(str(v) for v in printed.get(label, {}).values())
+            cells.append(Cell(" / ".join(texts)) if texts else None)
+        lines.append(Line(label, "measured", cells))
+    notes = [("", f"{label}: recipe {recipe}") for label, recipe in part["recipes"].items()]
+    notes += [("", f"as reported: {reported['source']}")] if reported else []
+    return Part(name, columns, lines, notes)
+
+
+def _setting(value: Any) -> str:
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, list | tuple):
+        return ", ".join(map(_setting, value))
+    if isinstance(value, int):
+        return f"{value:,}"
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def count_lengths(dataset: str, results: Path, config: Config) -> None:
+    """Counts the motion lengths of a prepared data set, once; says so where it is not prepared."""
+    from flame_mdm.config import instantiate
+
+    options = settings("browse", [f"data={dataset}"])
+    node = options["data"] | ({"root": config["data_root"]} if config["data_root"] else {})
+    data = instantiate(node, representation=instantiate(options["representation"]))
+    if not (data.folder / "store.json").exists():
+        print(f"{dataset}: not prepared, its lengths are left out (make prepare DATA={dataset})")
+        return
+    store = data.open()
+    lengths = sorted(clip.length for clip in store.clips)
+    content = {"fingerprint": store.fingerprint, "fps": store.info["fps"], "lengths": lengths}
+    _write_text(results / "lengths" / f"{dataset}.json", json.dumps(content) + "\n")
+
+
+def _lengths(name: str, part: Config, results: Path) -> Part:
+    """How long the motions of data sets are."""
+    columns = dict.fromkeys(["motions", "hours", "shortest", "median", "mean", "longest"], "none")
+    lines, histograms = [], {}
+    for dataset in part["lengths"]:
+        path = results / "lengths" / f"{dataset}.json"
+        if not path.exists():
+            lines.append(Line(dataset, "measured", [None] * len(columns), state="not prepared"))
+            continue
+        found = json.loads(path.read_text())
+        lengths, fps = found["lengths"], found["fps"]
+        numbers = [
+            (f"{len(lengths):,}", len(lengths)),
+            (f"{sum(lengths) / fps / 3600:.2f}", sum(lengths) / fps / 3600),
+            *((f"{x:g}", x) for x in (lengths[0], lengths[len(lengths) // 2])),
+            (f"{sum(lengths) / len(lengths):.1f}", sum(lengths) / len(lengths)),
+            (f"{lengths[-1]}", lengths[-1]),
+        ]
+        facts = {"fingerprint": found["fingerprint"], "frames a second": _text(float(fps))}
+        lines.append(Line(dataset, "measured", [Cell(t, float(v)) for t, v in numbers], facts=facts))
+        step = max(1, math.ceil(lengths[-1] / 40))
+        counts = [0] * (lengths[-1] // step + 1)
+        for length in lengths:
+            counts[length // step] += 1
+        histograms[dataset] = ([float(i * step) for i in range(len(counts) + 1)], counts)
+    return Part(name, columns, lines, [("", "lengths in frames of the data set")], histograms=histograms)
+
+
+def _ratings(name: str, part: Config, reported: Config | None) -> Part:
+    """A user study: how often one model was preferred to another."""
+    columns = {"Preferred": "none", "votes": "none", "raters": "none"}
+    lines = []
+    path = Path(part["ratings"])
+    if path.exists():
+        for pair in json.loads(path.read_text())["pairs"]:
+            votes = pair["wins_a"] + pair["wins_b"]
+            share, low, high = wilson(pair["wins_a"], votes)
+            cells = [
+                Cell(f"{share:.1%} [{low:.1%}, {high:.1%}]", share),
+                Cell(str(votes), votes),
+                Cell(str(pair["raters"])),
+            ]
+            lines.append(Line(f"{pair['a']} over {pair['b']}", "measured", list(cells)))
+    notes = [("", "share of votes, with its 95 % interval (Wilson)")]
+    if not lines:
+        notes = [("", f'{path} is not there: make compare RUNS="a b" RATE=true writes a page to rate motions on')]
+    if reported:
+        more, sources = _reported(reported, columns, ["", "", ""], name)
+        lines, notes = lines + more, notes + sources
+    return Part(name, columns, lines, notes)
+
+
+def wilson(wins: int, votes: int) -> tuple[float, float, float]:
+    """Share of wins and its 95 % interval (Wilson 1927)."""
+    if not votes:
+        return 0.0, 0.0, 1.0
+    z, share = 1.96, wins / votes
+    center = (share + z * z / (2 * votes)) / (1 + z * z / votes)
+    half = z * math.sqrt(share * (1 - share) / votes + z * z / (4 * votes * votes)) / (1 + z * z / votes)
+    return share, center - half, center + half
+
+
+# Files ----------------------------------------------------------------------------------------------------------------
+
+
+def write(table: Table, out: Path) -> str:
+    """Writes a table in all forms and its figures; returns its HTML, without the head of the page."""
+    for part, figure, name in figure_names(table):
+        if drawn := draw(part, figure, ABOUT):
+            table.drawn[name] = drawn
+            _write_text(out / f"{name}.svg", drawn)
+    for suffix, writer in WRITERS.items():
+        _write_text(out / f"{table.name}.{suffix}", writer(table))
+    body = fragment(table)
+    _write_text(out / f"{table.name}.html", page(table.title, body))
+    return body
+
+
+def _write_text(path: Path, text: str) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(path.name + ".partial")
+    partial.write_text(text, encoding="utf-8")
+    partial.replace(path)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

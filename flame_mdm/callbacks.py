@@ -36,8 +36,8 @@ class Interrupted(Exception):
 class Checkpoints(Checkpoint):
     """Writes `last.ckpt` every so often, at the last step and when interrupted, and keeps some for good.
 
-    SIGINT and SIGTERM end training at the end of a step, never inside validation, where averaged and raw weights are
-    swapped; a second SIGINT ends it at once.
+    SIGINT, SIGTERM, SIGUSR1 and SIGUSR2 end training at the end of a step, never inside validation, where averaged and
+    raw weights are swapped; a second SIGINT ends it at once.
     """
 
     def __init__(self, folder: str, every_n_steps: int, keep_every_n_steps: int | None = None):
@@ -50,7 +50,7 @@ class Checkpoints(Checkpoint):
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         self.step = trainer.global_step
-        for signum in (signal.SIGINT, signal.SIGTERM):
+        for signum in (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGUSR2):
             self.handlers[signum] = signal.signal(signum, self._note)
 
     def _note(self, signum: int, frame: FrameType | None) -> None:

@@ -498,6 +498,9 @@ def _serve(command: Callable[[Config], None], words: list[str], name: str | None
         "hydra.sweep.subdir=${hydra.job.override_dirname}",
         f"hydra.job.config.override_dirname.exclude_keys=[{','.join(fixed)}]",
     ]
+    if launch:
+        logs = f"{composed['run']['dir'] if name is None else f'runs/sweeps/{name}'}/.submitit"
+        print(f"waiting for the jobs; what they print stands in {logs}", flush=True)
     if sweep and not {"-m", "--multirun"} & set(flags):
         flags.append("--multirun")
     sys.argv = [sys.argv[0], *flags, *quiet, *output, *plan.overrides]

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import os
 import signal
+import subprocess
 import sys
 from collections.abc import Sequence
 from contextlib import nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from flame_mdm.config import Config, UserError, flatten, instantiate, run
 
@@ -70,9 +72,11 @@ def _fit(folder: Path, config: Config) -> None:
     import torch
     from hydra.utils import get_class
     from lightning import Callback, Trainer, seed_everything
+    from lightning.fabric.plugins.environments import SLURMEnvironment, TorchElasticEnvironment
     from lightning.pytorch.callbacks import EMAWeightAveraging
 
-    from flame_mdm.callbacks import Interrupted, Progress
+    from flame_mdm.callbacks import Interrupted, Measurements, Progress, Report
+    from flame_mdm.dashboards import History
     from flame_mdm.guards import WholeCheckpoints, newest, out_of_memory
     from flame_mdm.provenance import Provenance
 
@@ -94,12 +98,17 @@ def _fit(folder: Path, config: Config) -> None:
     callbacks += [instantiate(c) for c in config["callbacks"].values() if c]
     if config["trainer"].get("enable_progress_bar", True):
         callbacks.append(Progress())
-    logger = instantiate(config["logger"]) if config["logger"] else False
+    callbacks += [Measurements(), Report(folder)]
+    loggers = [instantiate(config["logger"])] if config["logger"] else []
+    plugins: list[Any] = [WholeCheckpoints()]
+    if SLURMEnvironment.detect() and not TorchElasticEnvironment.detect():
+        # Lightning would save in the middle of a step, to a file that it then prefers to ours.
+        plugins.append(SLURMEnvironment(auto_requeue=False))
     trainer: Trainer = instantiate(
         config["trainer"],
-        logger=logger,
+        logger=[*loggers, History(folder, step)],
         callbacks=callbacks,
-        plugins=[WholeCheckpoints()],
+        plugins=plugins,
         default_root_dir=str(folder),
         enable_model_summary=False,
     )
@@ -111,6 +120,8 @@ def _fit(folder: Path, config: Config) -> None:
         ):  # the first process tells; what starts processes takes any other code for a crash
             return
         print(f"stopped at step {stop.step}; the same command goes on from there")
+        if stop.signum in (signal.SIGUSR1, signal.SIGUSR2):
+            _requeue()
         raise SystemExit(128 + stop.signum) from None
     except Exception as error:
         if trainer.strategy.launcher is not None:  # else the processes it started wait for this one for half an hour
@@ -118,6 +129,23 @@ def _fit(folder: Path, config: Config) -> None:
         if told := out_of_memory(error, callbacks, trainer.global_step):
             raise told from error
         raise
+
+
+def _requeue() -> None:
+    """Puts the SLURM job that this is back into the queue."""
+    job = os.environ.get("SLURM_JOB_ID")
+    if job is None:
+        return
+    command = ["scontrol", "requeue", job]
+    try:
+        result = subprocess.run(command, capture_output=True, text=True, check=False)
+        failure = result.stderr.strip() if result.returncode else None
+    except OSError as error:
+        failure = str(error)
+    if failure is None:
+        print(f"job {job} is in the queue again")
+    else:
+        print(f"error: {' '.join(command)}: {failure}; submit the job again", file=sys.stderr)
 
 
 def _same_run(folder: Path, config: Config) -> None:

@@ -1,0 +1,365 @@
+"""Tables: from results alone, the same bytes each time, and no comparison of what cannot be compared."""
+
+import csv
+import io
+import json
+import math
+import re
+from pathlib import Path
+
+import pytest
+from conftest import TINY
+
+from flame_mdm import tables, train
+from flame_mdm.config import UserError
+from flame_mdm.tables import Request, build, load_spec, requests, wilson, write
+from flame_mdm.visualize.table import Line, Table, latex, markdown, places
+
+SPEC = """
+title: "A table, 50 % & more_of_it"
+notes: ["A note."]
+parts:
+  Text-to-motion:
+    protocol: synthetic
+    extractor: {folder}/clip.ckpt
+    columns:
+      FID: {{value: fid, better: lower}}
+      "R precision (top 3)": {{value: texts_for_motion/top3, better: higher}}
+      Diversity: {{value: diversity, better: real}}
+      NFE: {{value: nfe, better: lower}}
+    rows:
+      - {{label: MDM, ckpt: {folder}/mdm.ckpt}}
+      - {{label: MFM, ckpt: {folder}/mfm.ckpt}}
+      - {{label: FLAME <b>, ckpt: {folder}/flame.ckpt}}
+      - {{label: missing, ckpt: {folder}/missing.ckpt}}
+  Steps:
+    protocol: synthetic
+    extractor: {folder}/clip.ckpt
+    columns: {{Steps: {{value: num_inference_steps}}, FID: {{value: fid, better: lower}}}}
+    rows:
+      - {{label: MDM, ckpt: {folder}/mdm.ckpt, num_inference_steps: [5, 10], guidance_scale: [1.0, 2.5]}}
+figures:
+  - {{part: Steps, x: num_inference_steps, y: FID, log: true}}
+  - {{part: Steps, x: guidance_scale, y: [FID]}}
+"""
+
+
+def result(fid: float, top3: float, diversity: float, **other) -> dict:
+    """A result as `make evaluate` writes it, as far as tables read it."""
+
+    def entry(mean, n=400):
+        return {"mean": mean, "ci": 0.0123, "replications": 5, "n": n}
+
+    values = {"fid": entry(fid), "texts_for_motion/top3": entry(top3), "diversity": entry(diversity)}
+    report = {
+        "quick": False,
+        "protocol": {"name": "synthetic", "version": 1},
+        "split": "test",
+        "published_split": False,
+        "data": {"dataset": "synthetic", "fingerprint": "f" * 16},
+        "seed": 0,
+        "extractor": {"sha256": "e" * 64},
+        "samples_sha256": None,
+        "checkpoint": {"sha256": "c" * 64, "experiment": "synthetic/mdm", "selected_by": "none: last"}
+        | {"averaged_weights": True, "guidance_scale": 2.5, "sampler": "ddpm", "num_inference_steps": 50}
+        | {"parameters": 12_345_678},
+        "device": "cpu",
+        "changed": {},
+        "ground_truth": {"fid": entry(0.002), "texts_for_motion/top3": entry(0.797), "diversity": entry(9.503)},
+        "values": values,
+        "cost": {"nfe": 50.0, "seconds_per_sample": 0.11, "batch_size": 64.0},
+        "valid": True,
+        "invalid_because": [],
+        "not_computed": {},
+    }
+    return report | other
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    (tmp_path / "spec.yaml").write_text(SPEC.format(folder=tmp_path))
+    for name in ("clip", "mdm", "mfm", "flame"):
+        (tmp_path / f"{name}.ckpt").write_bytes(b"")
+    given = {
+        "MDM": result(0.544, 0.611, 9.559),
+        "MFM": result(0.410, 0.7, 9.4),
+        "FLAME <b>": result(0.6, 0.650, 9.5),
+    }
+    spec = load_spec(str(tmp_path / "spec.yaml"))
+    for row, asked in requests(spec["parts"]["Text-to-motion"]):
+        if row["label"] in given:
+            put(asked[0], tmp_path, given[row["label"]])
+    for row, asked in requests(spec["parts"]["Steps"]):
+        fid = 1 / row["num_inference_steps"] + row["guidance_scale"] / 10
+        checkpoint = given["MDM"]["checkpoint"] | {n: row[n] for n in ("num_inference_steps", "guidance_scale")}
+        put(asked[0], tmp_path, result(fid, 0.6, 9.0) | {"checkpoint": checkpoint})
+    return tmp_path
+
+
+def put(request: Request, folder: Path, content: dict) -> Path:
+    path = request.path(folder / "results")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(content))
+    return path
+
+
+def made(folder: Path) -> Table:
+    return build("spec", load_spec(str(folder / "spec.yaml")), folder / "results")
+
+
+def rows(folder: Path, part: int = 0) -> dict[str, Line]:
+    return {f"{line.kind}: {line.label}": line for line in made(folder).parts[part].lines}
+
+
+def files(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+def render(folder: Path, out: Path) -> dict[str, bytes]:
+    words = [f"table={folder / 'spec.yaml'}", "evaluate=false", f"results={folder / 'results'}", f"out={out}"]
+    assert tables.main(words) == 0
+    return files(out)
+
+
+def test_the_same_results_give_the_same_bytes(folder, capsys):
+    first, second = render(folder, folder / "a"), render(folder, folder / "b")
+    assert first == second
+    assert {"spec.md", "spec.tex", "spec.csv", "spec.html", "spec-steps-figure1.svg"} <= first.keys()
+    assert "3 of 4 rows measured" not in capsys.readouterr().out  # the sweep's four rows count, too
+
+
+def test_deleting_a_result_changes_its_row_alone(folder):
+    before = render(folder, folder / "a")
+    (row,) = [asked[0] for row, asked in requests(_part(folder)) if row["label"] == "MFM"]
+    row.path(folder / "results").unlink()
+    after = render(folder, folder / "b")
+    changed = [
+        (old, new)
+        for old, new in zip(
+            before["spec.csv"].decode().splitlines(), after["spec.csv"].decode().splitlines(), strict=True
+        )
+        if old.split(",")[:2] != new.split(",")[:2] or numbers(old) != numbers(new)
+    ]
+    assert len(changed) == 1
+    assert changed[0][0].startswith("Text-to-motion,MFM,measured,,a")
+    assert changed[0][1].startswith("Text-to-motion,MFM,measured,not evaluated,")
+    assert "| MFM (not evaluated) | – | – | – | – |" in after["spec.md"].decode()
+
+
+def numbers(line: str) -> list[str]:
+    """The cells of a line of CSV without the places, which depend on the other rows."""
+    cells = next(csv.reader(io.StringIO(line)))
+    return [cell for index, cell in enumerate(cells) if (index - 5) % 4 != 3 or index < 5]
+
+
+def _part(folder: Path) -> dict:
+    return load_spec(str(folder / "spec.yaml"))["parts"]["Text-to-motion"]
+
+
+def test_cells_ranks_and_real_motions(folder):
+    lines = rows(folder)
+    assert [c.text if c else None for c in lines["real: Real motions"].cells] == [
+        "0.002 ±0.012",
+        "0.797 ±0.012",
+        "9.503 ±0.012",
+        None,
+    ]
+    places_of = {name: [c.place if c else None for c in line.cells] for name, line in lines.items()}
+    assert places_of["measured: MDM"] == [2, 0, 2, 1]  # 9.559 is 0.056 from real motions, 9.5 only 0.003
+    assert places_of["measured: MFM"] == [1, 1, 0, 1]
+    assert places_of["measured: FLAME <b>"] == [0, 2, 1, 1]
+    assert lines["measured: missing"].state == "no checkpoint"
+    assert "missing: " in markdown(made(folder))
+    sources = lines["measured: MDM"].facts
+    assert (sources["checkpoint sha256"], sources["guidance"], sources["steps"]) == ("c" * 16, "2.5", "50")
+
+
+def test_rows_of_another_evaluator_are_marked_and_not_compared(folder):
+    path = next(asked[0].path(folder / "results") for row, asked in requests(_part(folder)) if row["label"] == "MFM")
+    content = json.loads(path.read_text())
+    for change in (
+        {"extractor": {"sha256": "d" * 64}},
+        {"protocol": {"name": "synthetic", "version": 2}},
+        {"changed": {"samples": 64}},
+        {"split": "val"},
+        {"data": {"dataset": "synthetic", "fingerprint": "0" * 16}},
+        {"seed": 1},
+        {"quick": True},
+    ):
+        path.write_text(json.dumps(content | change))
+        table = made(folder)
+        lines = {line.label: line for line in table.parts[0].lines if line.kind == "measured"}
+        assert lines["MDM"].marks == lines["FLAME <b>"].marks == "a", change
+        assert lines["MFM"].marks == "b", change
+        assert all(cell is None or cell.place == 0 for cell in lines["MFM"].cells), change
+        assert [cell.place for cell in lines["MDM"].cells if cell] == [1, 2, 2, 1], change
+        reals = [line for line in table.parts[0].lines if line.kind == "real"]
+        assert [line.marks for line in reals] == ["a", "b"], change
+
+
+def test_an_invalid_row_says_so_and_is_not_ranked(folder):
+    path = next(asked[0].path(folder / "results") for row, asked in requests(_part(folder)) if row["label"] == "MFM")
+    reason = "real motions have fid 3, expected 0.002 +- 0.02"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"valid": False, "invalid_because": [reason]}))
+    table = made(folder)
+    line = next(line for line in table.parts[0].lines if line.label == "MFM")
+    assert line.state == "NOT VALID"
+    assert all(cell is None or cell.place == 0 for cell in line.cells)
+    assert f"MFM: NOT VALID: {reason}" in markdown(table)
+
+
+def test_sweeps_are_rows_and_lines_of_figures(folder):
+    lines = made(folder).parts[1].lines
+    measured = [line for line in lines if line.kind == "measured"]
+    assert [(line.label, line.cells[0].text) for line in measured if line.cells[0]] == [
+        ("MDM (guidance scale 1.0)", "5"),
+        ("MDM (guidance scale 2.5)", "5"),
+        ("MDM (guidance scale 1.0)", "10"),
+        ("MDM (guidance scale 2.5)", "10"),
+    ]
+    table = made(folder)
+    write(table, folder / "out")
+    assert set(table.drawn) == {"spec-steps-figure1", "spec-steps-figure2"}
+    assert "![Steps](spec-steps-figure1.svg)" in (folder / "out" / "spec.md").read_text()
+
+
+def test_html_and_latex_escape_what_is_written_in_them(folder):
+    written = render(folder, folder / "a")
+    page = written["spec.html"].decode()
+    assert "FLAME &lt;b&gt;" in page
+    assert "FLAME <b>" not in page
+    text = latex(made(folder))
+    assert r"A table, 50 \% \& more\_of\_it" in text
+    assert text.count("{") == text.count("}")
+    assert re.search(r"[^\\]&", text)
+    columns = {line.count(" & ") for line in text.splitlines() if line.endswith(r"\\") and "multicolumn" not in line}
+    assert columns == {4, 2}
+
+
+def test_published_numbers_are_marked_and_ranked_among_themselves(folder, monkeypatch):
+    published = folder / "published.yaml"
+    published.write_text(
+        """
+spec:
+  Text-to-motion:
+    evaluator: an evaluator of theirs
+    source: "Someone, table 1"
+    notes: ["They print percent."]
+    rows:
+      - {label: Real, real: true, values: {FID: "0.002 ±.000", Diversity: "9.503 ±.065"}}
+      - {label: T2M, values: {FID: "1.067 ±.002", NFE: "1,000"}}
+      - {label: "MDM", values: {FID: "0.544 ±.044"}}
+      - {label: "MDM, corrected", source: elsewhere, values: {FID: "0.489"}}
+"""
+    )
+    monkeypatch.setattr(tables, "PUBLISHED", published)
+    lines = rows(folder)
+    assert lines["reported real: Real"].cells[0].text == "0.002 ±.000"
+    reported = [lines[f"reported: {name}"] for name in ("T2M", "MDM", "MDM, corrected")]
+    assert [line.marks for line in reported] == ["†", "†", "††"]
+    assert [line.cells[0].place for line in reported if line.cells[0]] == [2, 1, 0]
+    assert reported[0].options == {"nfe": 1000.0}
+    assert lines["measured: MFM"].cells[0].place == 1
+    text = markdown(made(folder))
+    assert "†: as reported: Someone, table 1; measured with an evaluator of theirs" in text
+    assert "They print percent." in text
+    published.write_text("spec: {Text-to-motion: {evaluator: e, source: s, rows: [{label: x, values: {FDI: 1}}]}}")
+    with pytest.raises(UserError, match="x: no column is called FDI"):
+        made(folder)
+    published.write_text("spec: {Txt: {evaluator: e, source: s, rows: []}}")
+    with pytest.raises(UserError, match="parts that its spec lacks: Txt"):
+        made(folder)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("title: x", "a table needs a title and parts"),
+        ("title: x\nparts: {a: {rows: []}}", "part a: needs columns and rows, or recipes"),
+        ("title: x\nparts: {a: {columns: {F: {value: fid, better: up}}, rows: []}}", "better is higher, lower"),
+        ("title: x\nparts: {a: {columns: {F: fid}, rows: []}}", "column F: needs a value"),
+        ("title: x\nparts: {a: {columns: {}, rows: [{ckpt: x}]}}", "a row needs a label"),
+        ("title: x\nparts: {a: {columns: {}, rows: [{label: x, ckpt: x}]}}", "needs a protocol"),
+        ("title: [", "not a readable YAML file"),
+        ("- 1", "not a mapping"),
+    ],
+)
+def test_malformed_specs_are_told_in_one_line(tmp_path, capsys, text, message):
+    path = tmp_path / "mine.yaml"
+    path.write_text(text)
+    assert tables.main([f"table={path}", f"out={tmp_path / 'out'}"]) == 1
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_an_unknown_table_names_those_there_are(capsys):
+    assert tables.main(["table=mdm_9"]) == 1
+    assert "no table is called 'mdm_9'; there are: " in capsys.readouterr().err
+
+
+def test_a_damaged_result_is_told(folder, capsys):
+    path = next(asked[0].path(folder / "results") for row, asked in requests(_part(folder)) if row["label"] == "MFM")
+    path.write_text(path.read_text()[:100])
+    words = [f"table={folder / 'spec.yaml'}", f"results={folder / 'results'}", f"out={folder / 'out'}"]
+    assert tables.main([*words, "evaluate=false"]) == 1
+    assert "not a result of make evaluate" in capsys.readouterr().err
+
+
+def test_places():
+    assert places([3.0, 1.0, None, 2.0], "lower", None) == [0, 1, 0, 2]
+    assert places([3.0, 1.0, 2.0], "higher", None) == [1, 0, 2]
+    assert places([3.0, 1.0, 2.0], "real", 1.9) == [0, 2, 1]
+    assert places([3.0, 1.0], "real", None) == [0, 0]
+    assert places([3.0, 3.0, 1.0], "higher", None) == [1, 1, 2]
+    assert places([3.0], "higher", None) == [0]
+    assert places([3.0, 4.0], "none", None) == [0, 0]
+
+
+def test_wilson_interval():
+    share, low, high = wilson(42, 100)
+    assert share == 0.42
+    assert math.isclose(low, 0.3280, abs_tol=1e-3)
+    assert math.isclose(high, 0.5179, abs_tol=1e-3)
+    assert wilson(0, 0) == (0.0, 0.0, 1.0)
+
+
+def test_what_is_missing_is_evaluated_once(tmp_path, data_root, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    words = ["data.source.clips=400", *TINY[1:], f"data_root={data_root}", "run.dir=runs/tiny/default"]
+    words += ["callbacks.samples=null", "trainer.val_check_interval=2", "trainer.max_steps=2"]
+    assert train.main(["quickstart", *words]) == 0
+    Path("mine.yaml").write_text(
+        """
+title: mine
+parts:
+  all:
+    protocol: synthetic
+    extractor: none
+    replications: 1
+    samples: 4
+    columns:
+      Action: {value: attributes/action, better: higher}
+      FID: {value: fid}
+      Steps: {value: num_inference_steps}
+    rows:
+      - {label: tiny, ckpt: runs/tiny/default/checkpoints/last.ckpt, num_inference_steps: [2, 3]}
+      - {label: elsewhere, ckpt: runs/synthetic/mdm/default/checkpoints/last.ckpt}
+"""
+    )
+    asked = ["table=mine.yaml", "device=cpu"]
+    assert tables.main(asked) == 0
+    shown = capsys.readouterr().out
+    assert "evaluating 1 of 2: tiny" in shown
+    assert "mine: 2 of 3 rows measured" in shown
+    first = files(Path("runs/tables"))
+    assert b"elsewhere: make train EXP=synthetic/mdm" in first["mine.md"]
+    assert b"not as the protocol has it: replications = 1, samples = 4" in first["mine.md"]
+    assert tables.main(asked) == 0
+    assert "evaluating" not in capsys.readouterr().out
+    assert files(Path("runs/tables")) == first
+    assert train.main(["quickstart", *words[:-1], "trainer.max_steps=3"]) == 0  # another checkpoint under the same name
+    assert tables.main(asked) == 0
+    assert "evaluating 2 of 2" in capsys.readouterr().out
+    assert files(Path("runs/tables"))["mine.md"] != first["mine.md"]

@@ -72,7 +72,8 @@ def _fit(folder: Path, config: Config) -> None:
     import torch
     from hydra.utils import get_class
     from lightning import Callback, Trainer, seed_everything
-    from lightning.fabric.plugins.environments import SLURMEnvironment, TorchElasticEnvironment
+    from lightning.fabric.plugins.environments.slurm import SLURMEnvironment
+    from lightning.fabric.plugins.environments.torchelastic import TorchElasticEnvironment
     from lightning.pytorch.callbacks import EMAWeightAveraging
 
     from flame_mdm.callbacks import Interrupted, Measurements, Progress, Report

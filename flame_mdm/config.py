@@ -34,9 +34,16 @@ _PACKAGED = Path(__file__).parent / "experiments"
 EXPERIMENTS = _PACKAGED if _PACKAGED.is_dir() else Path(__file__).parent.parent / "experiments"
 """The recipes: inside the installed package, or beside it in a clone."""
 
-TRUSTED = ("torch", "lightning", "torchmetrics", "flame_mdm", "evaluators")
-"""Packages whose classes a configuration from a checkpoint may name."""
-
+TRUSTED = (
+    "flame_mdm.task",
+    "flame_mdm.denoisers",
+    "flame_mdm.processes",
+    "flame_mdm.conditions",
+    "flame_mdm.representations",
+    "flame_mdm.data",
+    "evaluators",
+)
+"""Modules whose classes a configuration from a checkpoint may name."""
 
 LAUNCH = "launch"
 """The group of `experiments/` whose options start jobs elsewhere."""
@@ -250,7 +257,7 @@ def _walk(node: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ..
         yield path, node
         for name, child in node.items():
             yield from _walk(child, (*path, str(name)))
-    elif isinstance(node, list):
+    elif isinstance(node, list | tuple):
         for index, child in enumerate(node):
             yield from _walk(child, (*path, str(index)))
 
@@ -360,22 +367,36 @@ def _inherited(module: str, node: ast.ClassDef) -> frozenset[str]:
 
 
 def trust(config: Config) -> None:
-    """Checks a configuration out of a checkpoint: it may name classes of `TRUSTED` packages only.
+    """Checks a configuration out of a checkpoint: it may name classes that `TRUSTED` modules define, and no functions.
 
-    The environment variable FLAME_MDM_TRUST adds packages, with commas between them.
+    The environment variable FLAME_MDM_TRUST adds packages, with commas between them, of which it may name anything.
+    Nothing that it names is imported here.
 
     Raises:
         UserError: it names others.
     """
-    allowed = (*TRUSTED, *os.environ.get("FLAME_MDM_TRUST", "").split(","))
+    added = [name for name in os.environ.get("FLAME_MDM_TRUST", "").split(",") if name]
     for path, mapping in _walk(config):
-        target = str(mapping.get("_target_", "flame_mdm"))
-        package = target.partition(".")[0]
-        if package not in allowed:
+        if "_target_" not in mapping:
+            continue
+        target = mapping["_target_"]
+        package = str(target).partition(".")[0]
+        if not (isinstance(target, str) and (package in added or _is_trusted_class(target))):
             raise UserError(
                 f"the checkpoint's configuration names {target} at {'.'.join(path)}; such code runs only if you "
                 f"trust it: set FLAME_MDM_TRUST={package}"
             )
+
+
+def _is_trusted_class(target: str) -> bool:
+    """Whether the class is defined where it is named to be, or brought there from another trusted module."""
+    module, _, name = target.rpartition(".")
+    found = _definition(module, name) if _is_trusted_module(module) else None
+    return found is not None and isinstance(found[1], ast.ClassDef) and _is_trusted_module(found[0])
+
+
+def _is_trusted_module(name: str) -> bool:
+    return any(name == trusted or name.startswith(f"{trusted}.") for trusted in TRUSTED)
 
 
 def instantiate(node: Config, **derived: Any) -> Any:

@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from flame_mdm.config import EXPERIMENTS, Config, UserError, check, instantiate, run
+from flame_mdm.config import EXPERIMENTS, Config, UserError, check, instantiate, run, trust
 
 if TYPE_CHECKING:
     from flame_mdm.data.datamodule import MotionDataModule
@@ -182,6 +182,8 @@ def _data(config: Config, model: MotionGeneration | None) -> MotionDataModule:
     recipe = model.config if own and model is not None else config
     if "data" not in recipe:
         raise UserError(f"{config['ckpt']}: its recipe names no data; give data=NAME")
+    if own:
+        trust({"data": recipe["data"]})
     root = config["data_root"] or (recipe["data"]["root"] if own else None) or os.environ.get("FLAME_MDM_DATA", "data")
     representation = instantiate(recipe["representation"])
     if model is not None and representation.name != model.representation.name:

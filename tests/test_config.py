@@ -103,9 +103,49 @@ def test_check_finds_unknown_arguments_deep_inside():
 
 def test_untrusted_targets_are_refused(monkeypatch):
     with pytest.raises(UserError, match=r"os\.system at b; such code runs only if you trust it"):
-        trust({"_target_": "torch.nn.Identity", "b": {"_target_": "os.system"}})
+        trust({"_target_": "flame_mdm.denoisers.mdm.MDMEncoder", "b": {"_target_": "os.system"}})
     monkeypatch.setenv("FLAME_MDM_TRUST", "fractions")
     trust({"_target_": "fractions.Fraction", "numerator": 3})
+
+
+@pytest.mark.parametrize(
+    "target",
+    [
+        *("os.system", "builtins.eval", "subprocess.Popen", "torch.load", "torch.hub.load", "torch.nn.Identity"),
+        "torch.utils.collect_env.run",
+        "lightning.pytorch.Trainer",
+        "flame_mdm.config.run",  # a function
+        "flame_mdm.data.restricted_pickle.read",
+        "flame_mdm.data.store.shutil.rmtree",  # what a trusted module imports
+        "flame_mdm.data.store.Path",
+        "flame_mdm.task.torch.load",
+        "flame_mdm.denoisers.mdm",
+        "flame_mdm.callbacks.Checkpoints",  # writes files
+        "evaluators",
+        "evaluators.",
+        ".system",
+        "",
+        "${oc.decode:os.system}",
+        eval,
+        None,
+    ],
+)
+def test_a_checkpoint_names_only_own_classes(target, monkeypatch):
+    monkeypatch.setenv("FLAME_MDM_TRUST", ",")
+    for hidden in (
+        {"_target_": target},
+        {"a": [1, {"b": ({"_target_": target},)}]},  # a tuple, which Hydra takes as a list
+        {"_target_": "flame_mdm.task.MotionGeneration", "_args_": [{"_partial_": True, "_target_": target}]},
+    ):
+        with pytest.raises(UserError, match="such code runs only if you"):
+            trust({"denoiser": hidden})
+
+
+@pytest.mark.parametrize("name", recipes())
+def test_what_checkpoints_of_our_recipes_name_is_trusted(name):
+    composed = compose(name)
+    parts = ("task", "representation", "process", "condition", "denoiser", "data")
+    trust({part: composed[part] for part in parts if part in composed})
 
 
 def test_wrong_arguments_are_one_line():

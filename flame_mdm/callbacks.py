@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import signal
 import time
 from collections.abc import Sequence
@@ -15,13 +14,15 @@ from typing import Any
 import torch
 from lightning import Callback, LightningModule, Trainer
 from lightning.pytorch.callbacks import Checkpoint, TQDMProgressBar
-from lightning.pytorch.loggers import TensorBoardLogger, WandbLogger
+from torch.nn.utils import get_total_norm
 from torchmetrics import Metric
 
+from flame_mdm.dashboards import log_table, log_video
 from flame_mdm.data.datamodule import MotionDataModule
 from flame_mdm.evaluate import check_condition, load_protocol
 from flame_mdm.generation import Generated, generate, write_motions
 from flame_mdm.motion import MotionBatch
+from flame_mdm.report import write_report
 from flame_mdm.task import MotionGeneration
 
 
@@ -88,12 +89,70 @@ class Checkpoints(Checkpoint):
         self.handlers = {}
 
 
+class Measurements(Callback):
+    """What a step does and costs, logged every `trainer.log_every_n_steps` without holding up the steps between.
+
+    Logs `train/grad_norm` (of all gradients together, before they are clipped), `train/lr`, `train/epochs` (passes over
+    the training clips), `train/samples_per_second`, `train/seconds_per_step` (validation does not count) and, on CUDA,
+    `train/gpu_memory_gib` (the most that tensors have held).
+    """
+
+    def __init__(self) -> None:
+        self.step = 0
+        self.since, self.steps, self.samples = 0.0, 0, 0
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        self.step = trainer.global_step
+        self._restart()
+
+    def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        self._restart()
+
+    def _restart(self) -> None:
+        self.since, self.steps, self.samples = time.perf_counter(), 0, 0
+
+    def on_before_optimizer_step(
+        self, trainer: Trainer, pl_module: LightningModule, optimizer: torch.optim.Optimizer
+    ) -> None:
+        if (trainer.global_step + 1) % trainer.log_every_n_steps == 0:  # type: ignore[attr-defined]
+            gradients = [p.grad for p in pl_module.parameters() if p.grad is not None]
+            pl_module.log("train/grad_norm", get_total_norm(gradients))
+            pl_module.log("train/lr", optimizer.param_groups[0]["lr"])
+
+    def on_train_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: MotionBatch, batch_idx: int
+    ) -> None:
+        self.samples += len(batch) * trainer.world_size
+        if trainer.global_step == self.step:  # gradients are still being accumulated
+            return
+        self.step = trainer.global_step
+        self.steps += 1
+        elapsed = time.perf_counter() - self.since
+        if self.step % trainer.log_every_n_steps or elapsed == 0:  # type: ignore[attr-defined]
+            return
+        data: MotionDataModule = trainer.datamodule  # type: ignore[attr-defined]
+        size = data.batch_size * trainer.world_size * trainer.accumulate_grad_batches
+        pl_module.log("train/epochs", self.step * size / len(data.train))
+        pl_module.log("train/samples_per_second", self.samples / elapsed, prog_bar=True)
+        pl_module.log("train/seconds_per_step", elapsed / self.steps)
+        if pl_module.device.type == "cuda":
+            pl_module.log("train/gpu_memory_gib", torch.cuda.max_memory_allocated(pl_module.device) / 2**30)
+        self._restart()
+
+
+class Report(Callback):
+    """Writes `report.html` into the run's folder at the end of training."""
+
+    def __init__(self, folder: Path):
+        self.folder = folder
+
+    def on_fit_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        if trainer.is_global_zero:
+            print(f"the whole run on a page: {write_report(self.folder)}")
+
+
 class Progress(TQDMProgressBar):
     """A progress bar over all steps of the run, with the time left and samples a second."""
-
-    def __init__(self, refresh_rate: int = 1):
-        super().__init__(refresh_rate)
-        self.since = (0.0, 0)
 
     @property
     def total_train_batches(self) -> int | float:
@@ -104,19 +163,6 @@ class Progress(TQDMProgressBar):
         done = trainer.global_step * trainer.accumulate_grad_batches
         self.train_progress_bar.initial = self.train_progress_bar.n = done
         self.train_progress_bar.set_description("training")
-        self.since = (time.perf_counter(), 0)
-
-    def on_train_batch_end(
-        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: MotionBatch, batch_idx: int
-    ) -> None:
-        begin, samples = self.since
-        samples += len(batch) * trainer.world_size
-        elapsed = time.perf_counter() - begin
-        self.since = (begin, samples)
-        if trainer.global_step % trainer.log_every_n_steps == 0 and elapsed > 0:  # type: ignore[attr-defined]
-            pl_module.log("train/samples_per_second", samples / elapsed, prog_bar=True)
-            self.since = (time.perf_counter(), 0)
-        super().on_train_batch_end(trainer, pl_module, outputs, batch, batch_idx)
 
     def get_metrics(self, trainer: Trainer, pl_module: LightningModule) -> dict[str, Any]:
         items = super().get_metrics(trainer, pl_module)
@@ -193,7 +239,7 @@ class SampleMotions(Callback):
         write_motions(folder, pl_module, motions, {"seed": 0, "step": step, "checkpoint": ""})
         values = self.measure(motions)
         for logger in trainer.loggers:
-            _log_video(logger, folder / "motions.gif", step)
+            log_video(logger, "samples", folder / "motions.gif", step)
             logger.log_metrics({f"samples/{k}": v for k, v in values.items() if v is not None}, step)
         return folder, values
 
@@ -231,6 +277,8 @@ class SampleMotions(Callback):
 
 class Evaluate(Callback):
     """Evaluates by a protocol on the validation split: val/<protocol>/<metric> on the dashboard, to select by, too.
+
+    With several replications, val/<protocol>/<metric>/ci is half the width of the 95 % interval. A table shows all.
 
     It runs at the first validation and then every so often, with averaged weights where the recipe averages them. All
     processes take their share of the motions.
@@ -289,25 +337,17 @@ class Evaluate(Callback):
             world=trainer.world_size,
             ground_truth=False,
         )
-        means = {name: value["mean"] for name, value in result["values"].items()}
-        self.values = {f"val/{self.protocol.name}/{k}": mean for k, mean in means.items() if mean is not None}
+        name = f"val/{self.protocol.name}"
+        known = {f"{name}/{k}": value for k, value in result["values"].items() if value["mean"] is not None}
+        self.values = {k: value["mean"] for k, value in known.items()}
+        if self.replications > 1:
+            self.values |= {f"{k}/ci": value["ci"] for k, value in known.items()}
+        if trainer.is_global_zero:
+            columns = ("mean", "ci", "replications", "n")
+            rows = [[metric, *(value[column] for column in columns)] for metric, value in result["values"].items()]
+            for logger in trainer.loggers:
+                log_table(logger, f"evaluation/{self.protocol.name}", ["metric", *columns], rows, trainer.global_step)
 
     def on_validation_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         pl_module.log_dict(self.values)  # averaged weights are gone by now, so values were taken at the start
         self.values = {}
-
-
-def _log_video(logger: Any, gif: Path, step: int) -> None:
-    if isinstance(logger, TensorBoardLogger):
-        from PIL import Image
-        from tensorboard.compat.proto.summary_pb2 import Summary  # type: ignore[attr-defined]
-
-        data = gif.read_bytes()
-        width, height = Image.open(io.BytesIO(data)).size
-        image = Summary.Image(height=height, width=width, colorspace=3, encoded_image_string=data)
-        summary = Summary(value=[Summary.Value(tag="samples", image=image)])
-        logger.experiment._get_file_writer().add_summary(summary, step)
-    elif isinstance(logger, WandbLogger):
-        import wandb
-
-        logger.experiment.log({"samples": wandb.Video(str(gif), format="gif"), "trainer/global_step": step})

@@ -10,15 +10,20 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+import torch
 from lightning import Callback, LightningModule, Trainer
 
 from flame_mdm.config import Config, save
+from flame_mdm.dashboards import log_config
 
 PACKAGES = ("flame-mdm", "torch", "lightning", "torchmetrics", "transformers", "numpy", "scipy")
 
 
 class Provenance(Callback):
-    """At the start of a fit: `config.yaml` and `provenance.json` in the run's folder, and four lines on the screen."""
+    """At the start of a fit: `config.yaml` and `provenance.json` in the run's folder, and four lines on the screen.
+
+    The dashboard gets both files, too.
+    """
 
     def __init__(self, config: Config):
         self.config = config
@@ -28,23 +33,36 @@ class Provenance(Callback):
             return
         folder = Path(self.config["run"]["dir"])
         save(_movable(self.config), folder / "config.yaml", head="A saved run; EXP=path/to/this/file repeats it.")
-        facts = {**environment(), "data": pl_module.facts}
-        (folder / "provenance.json").write_text(json.dumps(facts, indent=2) + "\n")
-        self._introduce(trainer, pl_module)
+        facts = {
+            **environment(),
+            "device": _device(trainer),
+            "parameters": sum(p.numel() for p in pl_module.parameters() if p.requires_grad),
+            "data": pl_module.facts,
+        }
+        partial = folder / "provenance.partial"
+        partial.write_text(json.dumps(facts, indent=2) + "\n")
+        partial.replace(folder / "provenance.json")
+        for logger in trainer.loggers:
+            log_config(logger, self.config, facts)
+        self._introduce(trainer, pl_module, facts)
 
-    def _introduce(self, trainer: Trainer, task: Any) -> None:
-        count = sum(p.numel() for p in task.parameters() if p.requires_grad)
+    def _introduce(self, trainer: Trainer, task: Any, facts: dict[str, Any]) -> None:
+        count = facts["parameters"]
         size = self.config["data"]["batch_size"] * trainer.world_size * trainer.accumulate_grad_batches
         data = trainer.datamodule.store.info  # type: ignore[attr-defined]
         clips = data["clips"]
         splits = f"{clips['train']} clips to train on, {clips['val']} to validate, {clips['test']} to test"
         print(f"{self.config['experiment']}: {task.describe()}, {count / 1e6:.2f} M trainable parameters")
         print(f"data: {data['dataset']} as {data['representation']}, {splits}; {data['hours']} hours")
-        print(
-            f"device: {trainer.world_size} x {trainer.strategy.root_device.type}, {self.config['trainer']['precision']}"
-        )
+        print(f"device: {facts['device']}, {self.config['trainer']['precision']}")
         passes = trainer.max_steps * size / clips["train"]
         print(f"steps: {trainer.global_step} to {trainer.max_steps} of {size} clips, {passes:.0f} passes over the data")
+
+
+def _device(trainer: Trainer) -> str:
+    where = trainer.strategy.root_device
+    name = torch.cuda.get_device_name(where) if where.type == "cuda" else where.type
+    return f"{trainer.world_size} x {name}"
 
 
 def _movable(node: Any, folder: str | None = None) -> Any:

@@ -15,31 +15,38 @@ MILLIMETRE = 0.001
 
 
 def write_player(path: str | Path, motions: Sequence[Motion], title: str = "Motions", about: str = "") -> None:
-    """Writes a self-contained HTML page that plays motions side by side in 3D, under one clock and one camera.
-
-    Positions are rounded to millimetres; a motion that spans more than 65 m is rounded to 1/65534 of its span.
-
-    Args:
-        path: the HTML file to write.
-        motions: what to show; skeletons, lengths and frame rates may differ.
-        title: heading of the page.
-        about: HTML that the page unfolds below the heading; its texts have to be escaped.
+    """Writes the page of `player_page` to a file.
 
     Raises:
         ValueError: there are no motions.
     """
     path = Path(path)
     check_any(motions, path)
+    page = player_page(motions, title, about)
+    with written_whole(path) as temporary:
+        temporary.write_text(page, encoding="utf-8")
+
+
+def player_page(motions: Sequence[Motion], title: str = "Motions", about: str = "", columns: int = 0) -> str:
+    """A self-contained HTML page that plays motions side by side in 3D, under one clock and one camera.
+
+    Positions are rounded to millimetres; a motion that spans more than 65 m is rounded to 1/65534 of its span.
+
+    Args:
+        motions: what to show; skeletons, lengths and frame rates may differ.
+        title: heading of the page.
+        about: HTML that the page unfolds below the heading; its texts have to be escaped.
+        columns: motions in a row; 0 = as the window has room.
+    """
     # "<" never stands in the data, so no caption can close the script element
     content = {
         "TITLE": html.escape(title),
         "ABOUT": about and f"<details><summary>About these motions</summary><div>{about}</div></details>",
+        "COLUMNS": str(columns),
         "DATA": json.dumps([_packed(motion) for motion in motions], separators=(",", ":")).replace("<", "\\u003c"),
     }
     template = Path(__file__).with_suffix(".html").read_text(encoding="utf-8")
-    page = re.sub("__(TITLE|ABOUT|DATA)__", lambda match: content[match[1]], template)
-    with written_whole(path) as temporary:
-        temporary.write_text(page, encoding="utf-8")
+    return re.sub("__(TITLE|ABOUT|COLUMNS|DATA)__", lambda match: content[match[1]], template)
 
 
 def _packed(motion: Motion) -> dict:

@@ -1,0 +1,347 @@
+"""A run on one web page: `python -m flame_mdm.report runs/synthetic/mdm/default`"""
+
+from __future__ import annotations
+
+import json
+import shlex
+import sys
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from html import escape
+from pathlib import Path
+from typing import Any
+
+from flame_mdm.config import Config, UserError, run
+from flame_mdm.visualize.page import Curve, chart, frame, number, page, table
+from flame_mdm.visualize.scene import written_whole
+
+USAGE = """
+usage: python -m flame_mdm.report RUN
+
+Writes report.html into the folder of a run: its curves, newest samples, evaluations, and what it was made of, in one
+page that needs no server and no network. Training writes it at its end, too. runs="A B" does several.
+"""
+
+HISTORY = "metrics.jsonl"
+"""Where `flame_mdm.dashboards.History` keeps the curves of a run, in its folder."""
+TITLES = {"train": "Training", "val": "Validation", "samples": "Samples of the prompts"}
+COST = ("lr", "epochs", "samples_per_second", "seconds_per_step", "gpu_memory_gib")
+"""Curves of training that tell what it costs, not what it learns."""
+
+
+@dataclass
+class Run:
+    """What the folder of a run holds.
+
+    Attributes:
+        folder: of the run.
+        config: the recipe, resolved.
+        provenance: command, code, machine, versions, device, parameters and data; {} before training began.
+        curves: values by step, by name.
+        results: evaluations by the name of their file within the folder.
+    """
+
+    folder: Path
+    config: Config
+    provenance: dict[str, Any]
+    curves: dict[str, dict[int, float]]
+    results: dict[str, dict[str, Any]]
+
+    @property
+    def label(self) -> str:
+        """Recipe and name of the run; the recipe alone for a run without a name of its own."""
+        name = self.config["run"].get("name", "default")
+        return str(self.config["experiment"]) + (f"/{name}" if name != "default" else "")
+
+    @property
+    def samples(self) -> Path | None:
+        """The folder of the newest samples."""
+        return max((path.parent for path in self.folder.glob("samples/step_*/player.html")), default=None)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Runs the command; returns its exit code."""
+    words = list(sys.argv[1:] if argv is None else argv)
+    if words and not words[0].startswith("-") and "=" not in words[0]:
+        words[0] = f"runs={shlex.quote(words[0])}"
+    return run(report, words, usage=USAGE, name="report", text=("runs",))
+
+
+def report(config: Config) -> None:
+    """Writes the report of each run.
+
+    Raises:
+        UserError: no run named, or a folder that holds none.
+    """
+    if config["runs"] is None:
+        raise UserError("which run? python -m flame_mdm.report runs/synthetic/mdm/default")
+    for folder in shlex.split(str(config["runs"])):
+        print(write_report(Path(folder)))
+
+
+def write_report(folder: Path) -> Path:
+    """Writes `report.html` into the folder of a run, and returns its path. The same folder gives the same bytes.
+
+    Raises:
+        UserError: the folder holds no run, or a damaged file.
+    """
+    found = read_run(folder)
+    parts = [_head(found), _fault(folder), _samples(found), _curves(found), _evaluations(found), _provenance(found)]
+    path = folder / "report.html"
+    with written_whole(path) as temporary:
+        temporary.write_text(page(found.label, "\n".join(filter(None, parts))), encoding="utf-8")
+    return path
+
+
+# Reading --------------------------------------------------------------------------------------------------------------
+
+
+def read_run(folder: Path) -> Run:
+    """What the folder of a run holds.
+
+    Raises:
+        UserError: no run, or a damaged file.
+    """
+    from omegaconf import OmegaConf
+
+    if not (folder / "config.yaml").is_file():
+        raise UserError(f"{folder}: no config.yaml there; name the folder of a run, such as runs/synthetic/mdm/default")
+    config: Any = OmegaConf.to_container(OmegaConf.load(folder / "config.yaml"), resolve=True)
+    provenance = read_json(folder / "provenance.json") if (folder / "provenance.json").exists() else {}
+    results = {
+        path.relative_to(folder).as_posix(): read_json(path)
+        for path in sorted(folder.glob("evaluation/**/result*.json"))
+    }
+    return Run(folder, config, provenance, read_history(folder), results)
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """A file of one JSON object.
+
+    Raises:
+        UserError: it is none.
+    """
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise UserError(f"{path}: no such file") from None
+    except ValueError as error:
+        raise UserError(f"{path}: not a JSON file: {error}") from error
+    if not isinstance(content, dict):
+        raise UserError(f"{path}: holds {type(content).__name__}, not a JSON object")
+    return content
+
+
+def read_history(folder: Path) -> dict[str, dict[int, float]]:
+    """Curves of a run: values by step, in their order, by name.
+
+    Args:
+        folder: of the run; one without a history has no curves.
+
+    Raises:
+        UserError: the file is damaged.
+    """
+    curves: dict[str, dict[int, float]] = {}
+    for record in records(folder / HISTORY):
+        for name, value in record.items():
+            if name not in ("step", "epoch"):
+                curves.setdefault(name, {})[record["step"]] = value
+    return {name: dict(sorted(curve.items())) for name, curve in sorted(curves.items())}
+
+
+def records(path: Path) -> list[dict[str, Any]]:
+    """The lines of a history. A last one that a kill has cut does not count.
+
+    Raises:
+        UserError: another line is damaged.
+    """
+    if not path.exists():
+        return []
+    *lines, _ = path.read_text(encoding="utf-8").split("\n")
+    found = []
+    for place, line in enumerate(lines, 1):
+        try:
+            record = json.loads(line)
+            found.append({**record, "step": int(record["step"])})
+        except (ValueError, TypeError, KeyError) as error:
+            raise UserError(f"{path}: line {place} is damaged; delete that line") from error
+    return found
+
+
+# Parts of the page ----------------------------------------------------------------------------------------------------
+
+
+def last(curve: Curve) -> float | None:
+    """The newest value of a curve."""
+    return curve[max(curve)] if curve else None
+
+
+def steps(found: Run) -> int:
+    """Steps of which the run has curves."""
+    return max((max(curve) + 1 for name, curve in found.curves.items() if name.startswith("train/")), default=0)
+
+
+def _head(found: Run) -> str:
+    facts = [f"step {steps(found):,} of {found.config['trainer']['max_steps']:,}"]
+    if (epochs := last(found.curves.get("train/epochs", {}))) is not None:
+        facts.append(f"{number(epochs)} passes over the data")
+    if "parameters" in found.provenance:
+        facts.append(f"{found.provenance['parameters'] / 1e6:.2f} M parameters")
+    if (seconds := last(found.curves.get("train/seconds_per_step", {}))) is not None:
+        facts.append(f"{seconds:.3g} s a step")
+    if "device" in found.provenance:
+        facts.append(found.provenance["device"])
+    return f"<h1>{escape(found.label)}</h1><p class='faint'>{escape(' · '.join(facts))}</p>"
+
+
+def _fault(folder: Path) -> str:
+    path = folder / "bad_batch.json"
+    if not path.exists():
+        return ""
+    fault = read_json(path)
+    rows = [[f"process {b['rank']}, batch {b['batch']}", b["loss"], ", ".join(b["ids"])] for b in fault["batches"]]
+    told = f"Training stopped at step {fault['step']}: a bad loss, where {fault['usual_loss']} was usual"
+    return f"<div class='fault'>{escape(told)}</div>" + table(["", "loss", "clips"], rows)
+
+
+def _samples(found: Run) -> str:
+    if found.samples is None:
+        return ""
+    player = (found.samples / "player.html").read_text(encoding="utf-8")
+    step = int(found.samples.name.removeprefix("step_"))
+    return f"<h2>Samples at step {step:,}</h2>{frame(player, 640)}"
+
+
+def _curves(found: Run) -> str:
+    if not found.curves:
+        return f"<h2>Curves</h2><p class='faint'>None: there is no {HISTORY} in the folder.</p>"
+    parts = []
+    groups, constant = group_curves(found.curves)
+    for title, names in groups.items():
+        charts = [
+            chart(shared, {name.rpartition("/")[0]: found.curves[name] for name in both}, bands(found.curves, both))
+            for shared, both in names.items()
+        ]
+        parts.append(f"<h2>{escape(title)}</h2><div class='charts'>{''.join(charts)}</div>")
+    if constant:
+        told = ", ".join(f"{name} {number(value)}" for name, value in constant.items())
+        parts.append(f"<p class='faint'>Constant: {escape(told)}</p>")
+    return "".join(parts)
+
+
+def group_curves(
+    curves: Mapping[str, Curve],
+) -> tuple[dict[str, dict[str, list[str]]], dict[str, float]]:
+    """Which curves stand in one chart: those of training and validation with the same name.
+
+    Returns:
+        Names of curves by title of the chart, by heading; and curves that have one value all along.
+    """
+    groups: dict[str, dict[str, list[str]]] = {}
+    constant = {}
+    for name, curve in curves.items():
+        if name.endswith("/ci"):
+            continue
+        values = set(curve.values())
+        if len(values) == 1 and len(curve) > 1:
+            constant[name] = values.pop()
+            continue
+        family, _, rest = name.partition("/")
+        part, _, plain = rest.rpartition("/")
+        if family in ("train", "val") and not part:
+            heading = "Cost" if plain in COST else "Losses"
+        else:
+            heading = f"{TITLES.get(family, family)}: {part}" if part else TITLES.get(family, family)
+        groups.setdefault(heading, {}).setdefault(plain or family, []).append(name)
+    first = [h for h in ("Losses",) if h in groups]
+    order = [*first, *(h for h in groups if h not in ("Losses", "Cost")), *(h for h in ("Cost",) if h in groups)]
+    return {heading: groups[heading] for heading in order}, constant
+
+
+def bands(curves: Mapping[str, Curve], names: Iterable[str]) -> dict[str, Curve]:
+    """Half widths of the 95 % intervals of curves that have one, by what a chart calls them."""
+    return {name.rpartition("/")[0]: curves[f"{name}/ci"] for name in names if f"{name}/ci" in curves}
+
+
+def _evaluations(found: Run) -> str:
+    if not found.results:
+        return ""
+    parts = [f"<h2>Evaluations</h2><div class='charts'>{''.join(map(_evaluation, found.results.values()))}</div>"]
+    return "".join(parts)
+
+
+def _evaluation(result: Mapping[str, Any]) -> str:
+    rows = [
+        [name, interval((result["ground_truth"] or {}).get(name)), interval((result["values"] or {}).get(name))]
+        for name in sorted({**(result["values"] or {}), **(result["ground_truth"] or {})})
+    ]
+    notes = "".join(f"<p class='bad'>{escape(mark)}</p>" for mark in marks(result))
+    notes += "".join(
+        f"<p class='faint'>{escape(f'not computed: {name}: {why}')}</p>" for name, why in result["not_computed"].items()
+    )
+    return (
+        f"<div><h3>{escape(evaluation_title(result))}</h3><p class='faint'>{escape(sampling(result))}</p>{notes}"
+        f"{table(['', 'real motions', 'generated'], rows, numbers=True)}</div>"
+    )
+
+
+def evaluation_title(result: Mapping[str, Any]) -> str:
+    """What was evaluated, and by what."""
+    protocol, extractor = result["protocol"], result["extractor"]
+    measured = f", extractor {extractor['sha256'][:8]}" if extractor else ""
+    return f"{protocol['name']} version {protocol['version']}, {result['data']['dataset']} {result['split']}{measured}"
+
+
+def sampling(result: Mapping[str, Any]) -> str:
+    """How the evaluated motions were sampled."""
+    checkpoint, cost = result["checkpoint"], result.get("cost") or {}
+    if checkpoint is None:
+        return "motions of others"
+    words = [
+        f"{Path(checkpoint['path']).name} ({checkpoint['sha256'][:8]})",
+        f"{checkpoint['sampler']}, {checkpoint['num_inference_steps']} steps",
+        f"guidance {checkpoint['guidance_scale']:g}",
+        f"seed {result['seed']}",
+    ]
+    if cost.get("seconds_per_sample") is not None:
+        words.append(f"{cost['seconds_per_sample']:.3g} s a motion on {result['device']}")
+    return ", ".join(words)
+
+
+def marks(result: Mapping[str, Any]) -> list[str]:
+    """Why a result is less than a result."""
+    found = ["quick: not a result"] if result["quick"] else []
+    found += [f"not valid: {reason}" for reason in result["invalid_because"]]
+    changed = ", ".join(f"{name} {value}" for name, value in (result.get("changed") or {}).items())
+    return found + ([f"not as the protocol has it: {changed}"] if changed and not result["quick"] else [])
+
+
+def interval(value: Mapping[str, Any] | None) -> str:
+    """Mean and half of its interval."""
+    if value is None or value["mean"] is None:
+        return "–"
+    return f"{number(value['mean'])} ± {value['ci']:.2g}"
+
+
+def _provenance(found: Run) -> str:
+    from omegaconf import OmegaConf
+
+    facts = found.provenance
+    rows = []
+    if facts:
+        changed = " with changes that were not committed" if facts.get("changed") else ""
+        rows = [
+            ["command", shlex.join(facts["command"])],
+            ["commit", (facts["commit"] or "not from a clone") + changed],
+            ["data", ", ".join(f"{k} {v}" for k, v in facts["data"].items() if k != "actions")],
+            ["device", facts.get("device", "–")],
+            ["machine", f"{facts['machine']}, Python {facts['python']}"],
+            ["packages", ", ".join(f"{name} {version}" for name, version in facts["packages"].items())],
+        ]
+    recipe = escape(OmegaConf.to_yaml(OmegaConf.create(found.config)))
+    known = table(["", ""], rows) if rows else ""
+    return f"<h2>Made of</h2>{known}<details><summary>configuration</summary><pre>{recipe}</pre></details>"
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -68,3 +68,51 @@ def test_modules_and_public_classes_say_what_they_are(path):
 def test_files_are_nouns_not_drawers():
     forbidden = {"utils", "util", "misc", "helpers", "common", "tools"}
     assert not forbidden & {part for path in FILES for part in path.relative_to(ROOT).with_suffix("").parts}
+
+
+def unsafe_calls(path: Path) -> list[str]:
+    """Calls that run code out of files or words out of a shell."""
+    found = []
+    for node in ast.walk(ast.parse(path.read_text())):
+        if not isinstance(node, ast.Call):
+            continue
+        called = ast.unparse(node.func)
+        options = {keyword.arg: ast.unparse(keyword.value) for keyword in node.keywords}
+        unsafe = (
+            called in ("eval", "exec", "os.system", "os.popen", "pickle.load", "pickle.loads", "pickle.Unpickler")
+            or (called == "torch.load" and options.get("weights_only") != "True")
+            or (called in ("np.load", "numpy.load") and options.get("allow_pickle", "False") != "False")
+            or (called in ("yaml.load", "yaml.unsafe_load", "yaml.full_load", "joblib.load", "torch.hub.load"))
+            or options.get("shell", "False") != "False"
+            or options.get("trust_remote_code", "False") != "False"
+        )
+        if unsafe:
+            found.append(ast.unparse(node))
+    return found
+
+
+ON_DEMAND = ["torch.load(path, map_location='cpu', weights_only=not run_code)"]
+"""What `--run-code-in-file` asks for."""
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_no_file_and_no_word_of_strangers_is_run(path):
+    assert unsafe_calls(path) == (ON_DEMAND if path.name == "checkpoints.py" else [])
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        *("torch.load(f)", "torch.load(f, weights_only=False)", "np.load(f, allow_pickle=True)", "yaml.load(f)"),
+        *(
+            "pickle.load(f)",
+            "os.system(f)",
+            "subprocess.run(f, shell=True)",
+            "M.from_pretrained(f, trust_remote_code=f)",
+        ),
+    ],
+)
+def test_the_check_of_calls_can_fail(tmp_path, line):
+    path = tmp_path / "file.py"
+    path.write_text(f"def g(f):\n    return {line}\n")
+    assert unsafe_calls(path) == [line]

@@ -475,8 +475,16 @@ class TestErrors:
             PretrainedText(models["bert"], 4, 20, "mean")(batch_of(CAPTIONS))
 
     def test_missing_hub_model_names_both_remedies(self):
-        encoder = PretrainedText("openai/clip-not-here", 4, 20, "projection", revision="abc")
-        with pytest.raises(FileNotFoundError, match=r"openai/clip-not-here \(revision abc\).*HF_HOME.*minilm_offline"):
+        encoder = PretrainedText("openai/clip-not-here", 4, 20, "projection", revision="abc0" * 10)
+        with pytest.raises(
+            FileNotFoundError, match=r"openai/clip-not-here \(revision (abc0)+\).*HF_HOME.*minilm_offline"
+        ):
+            encoder(batch_of(CAPTIONS))
+
+    @pytest.mark.parametrize("revision", [None, "main", "abc0", "abcg" * 10])
+    def test_models_of_the_hub_need_their_commit(self, revision):
+        encoder = PretrainedText("openai/clip-not-here", 4, 20, "projection", revision=revision)
+        with pytest.raises(ValueError, match=rf"condition\.revision={revision}: openai/clip-not-here .* 40 hex digits"):
             encoder(batch_of(CAPTIONS))
 
     def test_missing_package(self):

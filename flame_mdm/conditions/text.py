@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import importlib.util
 import json
+import re
 import shutil
 import uuid
 import warnings
@@ -49,7 +50,7 @@ class PretrainedText(ConditionEncoder):
         features: int,
         max_tokens: int,
         pooling: Literal["projection", "mean", "pooler"],
-        revision: str = "main",
+        revision: str | None = None,
         package: str | None = None,
         sha256: str | None = None,
         normalize: bool = False,
@@ -65,7 +66,7 @@ class PretrainedText(ConditionEncoder):
             features: C, width of the model's outputs.
             max_tokens: word pieces of a caption that are read, special ones included; the rest is cut off.
             pooling: how the pooled vector is made, see above.
-            revision: commit of the hub.
+            revision: commit of the hub, 40 hex digits; required for models of the hub.
             package: installed Python package whose folder `model` holds the files, in place of the hub.
             sha256: of the package's model.safetensors, checked before it is loaded; required with `package`.
             normalize: scale the pooled vector to length 1.
@@ -218,7 +219,7 @@ class PretrainedText(ConditionEncoder):
 class Pretrained:
     """Where a language model comes from; it is loaded on first use, and copies and pickles leave it behind."""
 
-    def __init__(self, model: str, revision: str, package: str | None, sha256: str | None):
+    def __init__(self, model: str, revision: str | None, package: str | None, sha256: str | None):
         self.model, self.revision, self.package, self.sha256 = model, revision, package, sha256
 
     def __reduce__(self):
@@ -243,7 +244,7 @@ class Pretrained:
 
         Raises:
             FileNotFoundError: the model is neither here nor can it be downloaded.
-            ValueError: the file of weights is not the expected one, or lacks some.
+            ValueError: the file of weights is not the expected one, or lacks some, or a model of the hub has no commit.
         """
         from transformers import AutoConfig, AutoModel, CLIPTextModelWithProjection, T5EncoderModel, logging
 
@@ -271,6 +272,11 @@ class Pretrained:
     def _load(self, loader: Any, **options: Any) -> Any:
         if self.package or Path(self.model).is_dir():
             return loader.from_pretrained(self._folder(), local_files_only=True, **options)
+        if not re.fullmatch("[0-9a-f]{40}", self.revision or ""):
+            raise ValueError(
+                f"condition.revision={self.revision}: {self.model} comes from the hub at one commit, which nobody can "
+                f"change: give the 40 hex digits that stand at https://huggingface.co/{self.model}/commits"
+            )
         try:
             return loader.from_pretrained(self.model, revision=self.revision, **options)
         except OSError as error:

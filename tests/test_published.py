@@ -1,0 +1,262 @@
+"""Published numbers and the tables that they stand in: whole, well formed, and about what the evaluations measure."""
+
+import re
+from collections import Counter
+from functools import cache
+from pathlib import Path
+from typing import Any, get_args
+
+import pytest
+import yaml
+
+from evaluators.evaluator import Evaluator, Motions
+from flame_mdm import tables
+from flame_mdm.config import EXPERIMENTS, Config, UserError, compose, instantiate
+from flame_mdm.evaluate import load_protocol
+from flame_mdm.hyperparameters import values
+from flame_mdm.processes.diffusion import Sampler
+from flame_mdm.processes.flow_matching import STEPS
+from flame_mdm.representations import Representation
+
+PUBLISHED: dict[str, dict[str, Any]] = yaml.safe_load(tables.PUBLISHED.read_text())
+PAPERS = [name for name in tables.spec_names() if name.startswith(("flame_", "mdm_", "mfm_"))]
+SPECS = {name: tables.load_spec(name) for name in PAPERS}
+PARTS = {f"{name}: {label}": part for name, spec in SPECS.items() for label, part in spec["parts"].items()}
+MEASURED = {name: part for name, part in PARTS.items() if "columns" in part}
+SETTINGS = {name: part for name, part in PARTS.items() if "recipes" in part}
+REPORTED = {f"{name}: {label}": part for name, parts in PUBLISHED.items() for label, part in parts.items()}
+NUMBER = re.compile(r"(\d{1,3}(,\d{3})*|\d+)(\.\d+)?(M|%)?( ±\d*\.\d+)?")
+
+recipe = cache(compose)
+
+
+@cache
+def representation(name: str) -> Representation:
+    """Of the motions of a recipe."""
+    return instantiate(recipe(name)["representation"])
+
+
+def trained(row: Config) -> str:
+    """The recipe of the checkpoint of a row."""
+    found = re.fullmatch(r"runs/(.+)/default/checkpoints/(best|last)\.ckpt", row["ckpt"])
+    assert found, row
+    return found[1]
+
+
+@cache
+def measures(protocol: str, name: str) -> tuple[Any, set[str]]:
+    """A protocol for motions of a recipe, and the names of the values it gives."""
+    motions = representation(name)
+    loaded = load_protocol(protocol, motions)
+    several = (loaded.multimodality or {}).get("metrics", {})
+    evaluator = Evaluator(None, loaded.metrics | several, motions)
+    nothing = evaluator.extract(Motions([], []))
+    return loaded, set(evaluator.score(nothing, nothing, nothing, 0)[0])
+
+
+def reported(table: str, part: str) -> dict[str, dict[str, str]]:
+    """Published values by label."""
+    return {row["label"]: row["values"] for row in PUBLISHED[table][part]["rows"]}
+
+
+def test_there_is_a_table_for_each_of_the_papers():
+    wanted = (
+        {f"flame_{n}" for n in range(1, 11)} | {f"mdm_{n}" for n in range(1, 9)} | {f"mfm_{n}" for n in range(1, 6)}
+    )
+    figures = {"flame_figure_4", "flame_figure_7", "mdm_figure_4"} | {f"mfm_figure_{n}" for n in (1, 4, 5, 7)}
+    assert set(PAPERS) == wanted | figures
+
+
+@pytest.mark.parametrize("name", PAPERS)
+def test_a_table_is_made_of_its_spec_and_the_published_numbers(name, tmp_path):
+    table = tables.build(name, SPECS[name], tmp_path)
+    assert [part.name for part in table.parts] == list(SPECS[name]["parts"])
+
+
+@pytest.mark.parametrize("name", REPORTED)
+def test_published_rows_are_whole(name):
+    part = REPORTED[name]
+    assert part.keys() <= {"evaluator", "source", "notes", "rows"}
+    assert part["evaluator"]
+    assert re.search(r"arXiv:(2209.00349|2209.14916|2312.08895), (table|figure|section)", part["source"])
+    for row in part["rows"]:
+        assert row.keys() <= {"label", "values", "real", "source"}
+        assert row["values"]
+        for value in row["values"].values():
+            assert isinstance(value, str), f"{row['label']}: put {value} in quotes, or digits are lost"
+    repeated = Counter(str(sorted(row["values"].items())) + row["label"] for row in part["rows"])
+    assert max(repeated.values()) == 1
+
+
+@pytest.mark.parametrize("name", sorted(REPORTED.keys() - SETTINGS.keys()))
+def test_published_values_are_numbers(name):
+    for row in REPORTED[name]["rows"]:
+        bad = {column: value for column, value in row["values"].items() if not NUMBER.fullmatch(value)}
+        assert not bad, row["label"]
+
+
+@pytest.mark.parametrize("name", sorted(REPORTED.keys() & SETTINGS.keys()))
+def test_published_settings_are_those_of_the_recipes(name):
+    part, rows = SETTINGS[name], REPORTED[name]["rows"]
+    assert [row["label"] for row in rows] == list(part["keys"])
+    for row in rows:
+        for column, printed in row["values"].items():
+            ours = values(part["recipes"][column])[part["keys"][row["label"]]]
+            for one, text in zip(ours if isinstance(ours, list | tuple) else [ours], printed.split(", "), strict=True):
+                if isinstance(one, str):
+                    assert one == text
+                elif column != "U-net":  # of which no code is public
+                    digits = len(text.partition(".")[2])
+                    assert round(one, digits) == float(text.removesuffix(" words").replace(",", "")), (row, column)
+
+
+@pytest.mark.parametrize("name", SETTINGS)
+def test_settings_exist_in_the_recipes(name):
+    for label, key in SETTINGS[name]["keys"].items():
+        for column in SETTINGS[name]["recipes"].values():
+            assert key in values(column), f"{label}: {column} has no {key}"
+
+
+@pytest.mark.parametrize("name", MEASURED)
+def test_columns_are_what_the_protocol_measures(name):
+    part = MEASURED[name]
+    for row in part["rows"]:
+        protocol, found = measures(part["protocol"], trained(row))
+        wanted = {column["value"] for column in part["columns"].values()}
+        assert wanted <= found | tables.ABOUT.keys(), f"{part['protocol']} measures {sorted(found)}"
+        assert (protocol.extractor is None) == ("extractor" not in part)
+
+
+@pytest.mark.parametrize("name", MEASURED)
+def test_rows_are_checkpoints_of_recipes_that_fit(name):
+    part = MEASURED[name]
+    for row in part["rows"]:
+        config = recipe(trained(row))
+        chosen = Path(row["ckpt"]).stem == "best"
+        assert chosen == bool(config["callbacks"]["best"]), f"{row['label']}: best.ckpt only where clips are validated"
+        protocol, _ = measures(part["protocol"], trained(row))
+        labels = config["condition"].get("_target_", "").endswith("ActionLabels")
+        assert protocol.condition in ("none", "action" if labels else "text")
+        if part.get("extractor", "").startswith("runs/"):
+            extractor = recipe(trained({"ckpt": part["extractor"]}))
+            assert extractor["data"]["name"] == config["data"]["name"]
+        elif "t2m" in part.get("extractor", ""):
+            assert Path(part["extractor"]).name == config["data"]["name"]
+        diffusion = config["process"]["_target_"].endswith("GaussianDiffusion")
+        assert row.get("sampler", config["task"]["sampler"]) in (get_args(Sampler) if diffusion else STEPS)
+        steps = row.get("num_inference_steps", 1)
+        if diffusion:
+            assert max(steps if isinstance(steps, list) else [steps]) <= config["process"]["num_train_timesteps"]
+        assert "until" not in row or not diffusion
+
+
+def test_motion_lengths_are_those_of_data_sets():
+    for part in (part for part in PARTS.values() if "lengths" in part):
+        assert all((EXPERIMENTS / "data" / f"{name}.yaml").is_file() for name in part["lengths"])
+
+
+def test_a_published_column_without_a_counterpart_is_refused(tmp_path):
+    spec = SPECS["mdm_2"]
+    columns = {label: column for label, column in spec["parts"]["KIT-ML"]["columns"].items() if label != "FID"}
+    narrow = spec | {"parts": {"KIT-ML": spec["parts"]["KIT-ML"] | {"columns": columns}}}
+    with pytest.raises(UserError, match="no column is called FID"):
+        tables.build("mdm_2", narrow, tmp_path)
+
+
+# What the papers say of themselves, twice or in other places ----------------------------------------------------------
+
+
+def test_no_row_is_missing():
+    counts = {name: len(part["rows"]) for name, part in REPORTED.items() if name not in SETTINGS}
+    assert counts == {
+        "flame_1: HumanML3D": 5,
+        "flame_1: BABEL": 5,
+        "flame_2: KIT-ML": 5,
+        "flame_3: HumanML3D": 2,
+        "flame_4: HumanML3D": 4,
+        "flame_5: HumanML3D": 8,
+        "flame_9: DDPM": 9,
+        "flame_9: DDIM": 9,
+        "flame_10: HumanML3D": 6,
+        "mdm_1: HumanML3D": 13,  # three of them the authors' corrections
+        "mdm_2: KIT-ML": 5,
+        "mdm_3: HumanAct12": 7,
+        "mdm_4: UESTC": 5,
+        "mdm_5: HumanAct12": 3,
+        "mdm_6: HumanML3D": 5,
+        "mdm_7: HumanAct12": 7,
+        "mdm_figure_4: User study": 1,
+        "mfm_1: KIT-ML": 8,
+        "mfm_2: HumanML3D": 8,
+        "mfm_3: Prediction": 2,
+        "mfm_3: Upper body": 2,
+        "mfm_3: In-between": 2,
+        "mfm_figure_4: HumanML3D": 2,
+    }
+
+
+def test_cells_that_are_empty_are_empty_in_the_papers():
+    holes = {}
+    for name, part in REPORTED.items():
+        columns = {column for row in part["rows"] for column in row["values"]}
+        holes[name] = sum(len(columns - row["values"].keys()) for row in part["rows"] if "source" not in row)
+    assert {name: count for name, count in holes.items() if count} == {
+        "mdm_1: HumanML3D": 3 + 2 * 10,  # multimodality of real motions, JL2P, Text2Gesture; top 1 and 2 of all
+        "mdm_2: KIT-ML": 3,
+        "mfm_1: KIT-ML": 3,  # NFE of what generates frame by frame
+        "mfm_2: HumanML3D": 4,
+    }
+
+
+def test_flame_repeats_its_main_row():
+    main = reported("flame_1", "HumanML3D")["FLAME (Ours)"]
+    assert main == reported("flame_4", "HumanML3D")["+ frozen language model"]
+    assert {"Sampling steps": "1,000"} | main == PUBLISHED["flame_9"]["DDPM"]["rows"][0]["values"]
+
+
+def test_mdm_repeats_its_main_rows():
+    text, steps = reported("mdm_1", "HumanML3D"), reported("mdm_6", "HumanML3D")
+    assert steps["Real"] == text["Real"]
+    assert steps["T = 1000"].items() <= text["MDM (ours)"].items()
+    actions, losses = reported("mdm_3", "HumanAct12"), reported("mdm_7", "HumanAct12")
+    assert losses["Real"] == actions["Real (ours)"]
+    for label in ("MDM (ours)", "w/o foot contact"):
+        assert losses[label] == actions[label]
+
+
+def test_real_motions_have_what_protocols_expect():
+    expected = yaml.safe_load((EXPERIMENTS / "evaluation" / "text_to_motion_t2m.yaml").read_text())["expected"]
+    names = {
+        "motions_for_text/top3": "R precision (top 3)",
+        "mm_dist": "MM-Dist",
+        "diversity": "Diversity",
+        "fid": "FID",
+    }
+    for table, part, data in (("mdm_1", "HumanML3D", "humanml3d"), ("mdm_2", "KIT-ML", "kit")):
+        real = reported(table, part)["Real"]
+        assert {n: float(real[c].split()[0]) for n, c in names.items()} == {n: expected[data][n][0] for n in names}
+
+
+def test_mfm_counts_parameters_and_calls_alike_in_its_tables():
+    kit, humanml3d = PUBLISHED["mfm_1"]["KIT-ML"]["rows"], PUBLISHED["mfm_2"]["HumanML3D"]["rows"]
+    assert [row for row in humanml3d if row["label"] != "MotionGPT"] == kit[:-1]
+    assert kit[-1] == {"label": "Our MFM", "values": {"NFE": "50", "Parameters, M": "17.9M"}}
+    assert round(values("humanml3d/mfm")["parameters"], 1) == 17.9
+
+
+def test_fewer_steps_take_less_time_and_give_a_larger_distance():
+    seconds = [float(row["values"]["Seconds a motion"]) for row in PUBLISHED["flame_5"]["HumanML3D"]["rows"]]
+    assert seconds == sorted(seconds)
+    for part in ("DDPM", "DDIM"):
+        distances = [float(row["values"]["FD"]) for row in PUBLISHED["flame_9"][part]["rows"]]
+        assert distances == sorted(distances)
+
+
+def test_r_precision_grows_with_k():
+    for name, part in REPORTED.items():
+        for row in part["rows"]:
+            tops = [row["values"].get(f"R precision (top {k})") for k in (1, 2, 3)]
+            if None not in tops:
+                shares = [float(top) for top in tops]
+                assert shares == sorted(shares), f"{name}, {row['label']}"
+                assert shares[2] <= (100 if name.startswith("flame_10") else 1)

@@ -12,6 +12,7 @@ Every `update` takes some of these tensors by name. A batch holds B generated an
 | groups | (B,) int64 | keys of the prompts, where several motions are generated for one |
 | joints | (B, F, J, 3) | generated motions in metres, y up, floor at y = 0 |
 | mask | (B, F) bool | True = real frame of a generated motion |
+| kept | (B, F, J) bool | True = this joint of this frame was to be kept, where motions are edits |
 | keys | (B,) int64 | keys of generated motions, no two the same |
 | real, real_joints, real_mask, real_keys | as above | the same of real motions |
 

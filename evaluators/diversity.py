@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from evaluators.samples import SampleMetric, real_frames
+from evaluators.samples import SampleMetric, by_group, real_frames
 
 
 def pair_distance(a: Tensor, b: Tensor) -> float:
@@ -73,23 +73,11 @@ class _PerPrompt(SampleMetric):
         if rows is None:
             return None
         features, groups = rows
-        return self.distance(features[_by_group(self, groups, self.samples)])
+        return self.distance(features[by_group(self, groups, self.samples)])
 
     def distance(self, features: Tensor) -> float:
         """Mean distance within (C, S, E) features of S motions of each of C prompts."""
         raise NotImplementedError
-
-
-def _by_group(metric: SampleMetric, groups: Tensor, samples: int) -> Tensor:
-    """Indices (C, S) of the samples of each group; ValueError where one has not S."""
-    names, sizes = groups.unique(return_counts=True)
-    wrong = int((sizes != samples).sum())
-    if wrong:
-        raise ValueError(
-            f"{type(metric).__name__}: {wrong} of {len(names)} prompts have not {samples} motions "
-            f"but {int(sizes.min())} to {int(sizes.max())}; generate {samples} for each"
-        )
-    return groups.argsort(stable=True).unflatten(0, (len(names), samples))
 
 
 class TextMultimodality(_PerPrompt):
@@ -212,7 +200,7 @@ class JointVariance(SampleMetric):
             return None
         motions = [self.motions[index] for index in self.order("keys").tolist()]
         values = []
-        for members in _by_group(self, rows[0], self.samples).tolist():
+        for members in by_group(self, rows[0], self.samples).tolist():
             lengths = {len(motions[index]) for index in members}
             if len(lengths) > 1:
                 raise ValueError(

@@ -19,6 +19,7 @@ from evaluators.attributes import ATTRIBUTES
 from evaluators.extractors import Extractor
 from evaluators.samples import TwoSets
 from flame_mdm.config import Config, UserError, instantiate, parameters
+from flame_mdm.editing import kept_parts
 from flame_mdm.motion import length_mask
 from flame_mdm.noise import key
 from flame_mdm.representations import Representation
@@ -39,6 +40,7 @@ class Motions:
         labels: classes of motions with action labels.
         groups: names of the prompts, where several motions have the same one.
         asked: attributes asked for, where the data has them.
+        edit: what was kept of real motions, as `frames` and `joints` of `flame_mdm.editing.kept_parts`.
     """
 
     ids: list[str]
@@ -48,6 +50,7 @@ class Motions:
     labels: list[int] | None = None
     groups: list[str] | None = None
     asked: list[Mapping[str, Any]] | None = None
+    edit: Mapping[str, Any] | None = None
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -55,10 +58,14 @@ class Motions:
 
 @dataclass
 class Extracted:
-    """What metrics see of N motions: `rows` by the names of `evaluators`, tensors or lists, each (N, ...)."""
+    """What metrics see of N motions: `rows` by the names of `evaluators`, tensors or lists, each (N, ...).
+
+    Joints and what is kept of them, where motions are edits, are (F, J, 3) and (F, J) each.
+    """
 
     rows: dict[str, Any]
     joints: list[Tensor]
+    kept: list[Tensor] | None = None
 
     def __len__(self) -> int:
         return len(self.joints)
@@ -68,13 +75,13 @@ class Evaluator:
     """Measures motions.
 
     Given the same features, all values are the same to the last bit in whatever batches and order the motions come.
+    It measures on this process alone, on the CPU.
 
     Args:
         extractor: None leaves metrics of features without a value.
         metrics: mappings with the `_target_` of a metric, by name; each replication draws with a seed of its own.
         representation: of the motions.
         batch_size: of the extractor.
-        device: where metrics gather their rows; with several processes, that of their communication.
     """
 
     def __init__(
@@ -84,10 +91,9 @@ class Evaluator:
         representation: Representation,
         *,
         batch_size: int = 64,
-        device: str | torch.device = "cpu",
     ):
         self.extractor, self.metrics, self.representation = extractor, metrics, representation
-        self.batch_size, self.device = batch_size, torch.device(device)
+        self.batch_size = batch_size
 
     @torch.no_grad()
     def extract(self, motions: Motions) -> Extracted:
@@ -100,7 +106,7 @@ class Evaluator:
             if not np.isfinite(features).all():
                 raise UserError(f"motion {name} is not finite; did the model diverge?")
         where = self.representation.mean.device
-        joints = [self.representation.decode(torch.from_numpy(x).to(where)).to(self.device) for x in motions.features]
+        joints = [self.representation.decode(torch.from_numpy(x).to(where)).cpu() for x in motions.features]
         rows: dict[str, Any] = {"keys": self._keys(motions.ids)}
         order = np.argsort([len(x) for x in joints], kind="stable")  # like lengths together, for little padding
         if self.extractor is not None and len(motions):
@@ -108,19 +114,22 @@ class Evaluator:
             batches = [order[begin : begin + size].tolist() for begin in range(0, len(order), size)]
             parts = [self._features(motions, joints, indices) for indices in batches]
             back = torch.from_numpy(np.argsort(order, kind="stable"))
-            rows |= {name: torch.cat([part[name] for part in parts])[back].to(self.device) for name in parts[0]}
+            rows |= {name: torch.cat([part[name] for part in parts])[back] for name in parts[0]}
         if motions.captions is not None:
             rows["text_keys"] = self._keys(motions.captions)
         if motions.labels is not None:
-            rows["labels"] = torch.tensor(motions.labels, device=self.device)
+            rows["labels"] = torch.tensor(motions.labels)
         if motions.groups is not None:
             rows["groups"] = self._keys(motions.groups)
         if motions.asked is not None and all("action" in asked for asked in motions.asked):
             rows["asked"] = [{k: v for k, v in asked.items() if k in ATTRIBUTES} for asked in motions.asked]
-        return Extracted(rows, joints)
+        kept = None
+        if motions.edit is not None:
+            kept = [kept_parts(self.representation, len(motion), **motions.edit)[1] for motion in joints]
+        return Extracted(rows, joints, kept)
 
     def _keys(self, names: Sequence[str]) -> Tensor:
-        return torch.tensor([key(name) for name in names], dtype=torch.long, device=self.device)
+        return torch.tensor([key(name) for name in names], dtype=torch.long)
 
     def _features(self, motions: Motions, joints: Sequence[Tensor], indices: Sequence[int]) -> dict[str, Tensor]:
         assert self.extractor is not None
@@ -163,6 +172,8 @@ class Evaluator:
             rows = {name: values[part] for name, values in generated.rows.items()}
             feed(sets, **{name: rows[name] for name in ("generated", "keys") if "generated" in rows})
             joints, mask = _pad(generated.joints[part])
+            if generated.kept is not None:
+                rows["kept"] = pad_sequence(generated.kept[part], batch_first=True)
             real_joints, real_mask = _pad(paired.joints[part])
             rows |= {"joints": joints, "mask": mask, "real_joints": real_joints, "real_mask": real_mask}
             if "generated" in paired.rows:
@@ -190,7 +201,9 @@ class Evaluator:
 
     def _metric(self, config: Config, seed: int) -> Metric:
         drawn = {"seed": key("metric", seed) % 2**32} if "seed" in parameters(config["_target_"]) else {}
-        return instantiate(config, **drawn).to(self.device)
+        metric: Metric = instantiate(config, **drawn)
+        metric.distributed_available_fn = bool  # False: this process has all motions, and no other computes
+        return metric
 
 
 def _chunks(count: int) -> list[slice]:
@@ -198,5 +211,5 @@ def _chunks(count: int) -> list[slice]:
 
 
 def _pad(joints: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
-    lengths = torch.tensor([len(motion) for motion in joints], device=joints[0].device)
+    lengths = torch.tensor([len(motion) for motion in joints])
     return pad_sequence(list(joints), batch_first=True), length_mask(lengths)

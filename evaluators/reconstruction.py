@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from evaluators.samples import SampleMetric, real_frames
+from evaluators.samples import SampleMetric, by_group, real_frames
 from flame_mdm.representations import rotation
 from flame_mdm.representations.rifke import Rifke
 
@@ -52,17 +52,32 @@ def flame_parts(joints: Tensor, root: Tensor, parents: Sequence[int]) -> dict[st
 
 
 class _PositionErrors(SampleMetric):
-    """APE and AVE by part; a clip adds a sum of position errors, its frames and its variance errors."""
+    """APE and AVE by part; a clip adds a sum of position errors, its frames and its variance errors.
+
+    Args:
+        samples: motions a text. Of several, the best and the worst count, as in TEMOS: those with the smallest and the
+            largest APE of the root, from which all other values are taken, too.
+        kwargs: options of `torchmetrics.Metric`.
+    """
 
     higher_is_better = False
 
-    def __init__(self, **kwargs: Any):
-        super().__init__(("keys", "position", "variance", "frames"), **kwargs)
+    def __init__(self, samples: int = 1, **kwargs: Any):
+        super().__init__(("keys", "groups", "position", "variance", "frames"), **kwargs)
+        self.samples = samples
 
-    def update(self, joints: Tensor, mask: Tensor, real_joints: Tensor, real_mask: Tensor, keys: Tensor) -> None:
+    def update(
+        self,
+        joints: Tensor,
+        mask: Tensor,
+        real_joints: Tensor,
+        real_mask: Tensor,
+        keys: Tensor,
+        groups: Tensor | None = None,
+    ) -> None:
         """Adds generated motions (B, F, J, 3) and the real ones in the same order (B, F', J, 3), with their masks.
 
-        Both are compared up to the end of the shorter.
+        Both are compared up to the end of the shorter. `groups` are the keys of the prompts, of several motions each.
 
         Raises:
             ValueError: a motion has fewer than two frames.
@@ -78,17 +93,34 @@ class _PositionErrors(SampleMetric):
             rows[-1] = torch.cat([rows[-1], rows[-1].new_full((2, 1), length)], 1)
         if rows:
             values = torch.stack(rows)
-            self.keep(keys=keys, position=values[:, 0, :4], variance=values[:, 1, :4], frames=values[:, :1, 4])
+            self.keep(
+                keys=keys,
+                groups=keys if groups is None or self.samples == 1 else groups,
+                position=values[:, 0, :4],
+                variance=values[:, 1, :4],
+                frames=values[:, :1, 4],
+            )
 
     def compute(self) -> dict[str, float | None]:
-        """`ape_root`, `ape_trajectory`, `ape_mean_local`, `ape_mean_global`, and `ave_` of each."""
-        rows = self.rows("keys", "position", "variance", "frames")
+        """`ape_root`, `ape_trajectory`, `ape_mean_local`, `ape_mean_global`, and `ave_` of each.
+
+        Of several motions a text, the same after `best_` and `worst_`.
+        """
+        rows = self.rows("keys", "groups", "position", "variance", "frames")
         names = [f"{error}_{part}" for error in ("ape", "ave") for part in PARTS]
+        several = {"best_": False, "worst_": True} if self.samples > 1 else {"": False}
         if rows is None:
-            return dict.fromkeys(names)
-        position, variance, frames = rows
-        values = torch.cat([self.average(position, frames), variance.mean(0)])
-        return dict(zip(names, values.tolist(), strict=True))
+            return {f"{which}{name}": None for which in several for name in names}
+        groups, position, variance, frames = rows
+        texts = by_group(self, groups, self.samples)
+        root = (position[:, 0] / frames[:, 0])[texts]
+        found: dict[str, float | None] = {}
+        for which, descending in several.items():
+            rank = root.argsort(dim=1, descending=descending, stable=True)[:, :1]
+            chosen = texts.gather(1, rank)[:, 0]
+            values = torch.cat([self.average(position[chosen], frames[chosen]), variance[chosen].mean(0)])
+            found |= dict(zip([f"{which}{name}" for name in names], values.tolist(), strict=True))
+        return found
 
     def parts(self, joints: Tensor) -> dict[str, Tensor]:
         """What is compared, from the joints (F, J, 3) of a whole motion, by the names of `PARTS`."""
@@ -116,7 +148,7 @@ class TemosPositionErrors(_PositionErrors):
 
     Args:
         units_per_metre: KIT's units in the metres of `joints`, as the KIT representations have it.
-        kwargs: options of `torchmetrics.Metric`.
+        kwargs: `samples` motions a text, see `_PositionErrors`; options of `torchmetrics.Metric`.
     """
 
     def __init__(self, units_per_metre: float = 640.0, **kwargs: Any):
@@ -153,7 +185,7 @@ class FlamePositionErrors(_PositionErrors):
 
     Args:
         parents: parent of each joint, -1 for the root; those of the skeleton.
-        kwargs: options of `torchmetrics.Metric`.
+        kwargs: `samples` motions a text, see `_PositionErrors`; options of `torchmetrics.Metric`.
     """
 
     def __init__(self, parents: Sequence[int], **kwargs: Any):
@@ -184,7 +216,9 @@ class DisplacementErrors(SampleMetric):
     """ADE and FDE: mean distance of the joints, in all predicted frames and in the last of them. In metres.
 
     The usual definition of motion prediction (Yuan and Kitani 2020): joints and frames of a clip averaged, then clips.
-    MFM (Table 3) gives no formula, no code and no unit for its numbers, which are too large for metres: not comparable.
+    Of an edit, what was kept does not count, neither frames nor joints; motions of other lengths than the real ones are
+    compared up to the end of the shorter. MFM (Table 3) gives no formula, no code and no unit for its numbers, which
+    are too large for metres: not comparable.
     """
 
     higher_is_better = False
@@ -197,31 +231,30 @@ class DisplacementErrors(SampleMetric):
         joints: Tensor,
         mask: Tensor,
         real_joints: Tensor,
+        real_mask: Tensor,
         keys: Tensor,
-        predicted: Tensor | None = None,
+        kept: Tensor | None = None,
     ) -> None:
-        """Adds motions and the real ones in the same order, each (B, F, J, 3), and the keys of the motions (B,).
+        """Adds motions (B, F, J, 3) and the real ones in the same order (B, F', J, 3), with their masks.
 
         Args:
-            joints: edited motions.
+            joints: generated or edited motions.
             mask: (B, F), True = real frame.
-            real_joints: the motions they were made from.
+            real_joints: what they are compared with.
+            real_mask: (B, F').
             keys: of the motions.
-            predicted: (B, F), True = this frame was generated, not given; None = all were.
+            kept: (B, F, J), True = this joint of this frame was given; None = all were generated.
 
         Raises:
-            ValueError: other shapes than those of the real motions, or a motion of which no frame was generated.
+            ValueError: a motion of which nothing was generated.
         """
-        if joints.shape != real_joints.shape:
-            raise ValueError(f"DisplacementErrors: joints {tuple(joints.shape)}, real {tuple(real_joints.shape)}")
-        asked = mask if predicted is None else mask & predicted
-        if not asked.any(1).all():
-            raise ValueError("DisplacementErrors: a motion has no generated frame to compare")
-        errors, name = [], type(self).__name__
-        motions = zip(real_frames(name, joints, asked), real_frames(name, real_joints, asked), strict=True)
-        for motion, real in motions:
-            distance = (motion.double() - real.double()).norm(dim=-1).mean(1)
-            errors.append(torch.stack([distance.mean(), distance[-1]]))
+        errors = []
+        for distance, given in _distances(type(self).__name__, joints, mask, real_joints, real_mask, kept):
+            new = ~given
+            if not new.any():
+                raise ValueError("DisplacementErrors: a motion has no generated frame to compare")
+            last = int(new.any(1).nonzero()[-1])
+            errors.append(torch.stack([distance[new].mean(), distance[last][new[last]].mean()]))
         if errors:
             self.keep(keys=keys, errors=torch.stack(errors))
 
@@ -232,3 +265,48 @@ class DisplacementErrors(SampleMetric):
             return {"ade": None, "fde": None}
         ade, fde = rows[0].mean(0).tolist()
         return {"ade": ade, "fde": fde}
+
+
+class KeptDrift(SampleMetric):
+    """How far what an edit was to keep has moved in the world, in metres. Ours.
+
+    Features that are relative to the root keep steps and poses exactly, and yet let a kept end start wherever the new
+    part before it led.
+    """
+
+    higher_is_better = False
+
+    def __init__(self, **kwargs: Any):
+        super().__init__(("keys", "drift"), **kwargs)
+
+    def update(
+        self, joints: Tensor, mask: Tensor, real_joints: Tensor, real_mask: Tensor, keys: Tensor, kept: Tensor
+    ) -> None:
+        """Adds edits and the motions they were made from; arguments as of `DisplacementErrors`."""
+        drift, of = [], []
+        name = type(self).__name__
+        for number, (distance, given) in enumerate(_distances(name, joints, mask, real_joints, real_mask, kept)):
+            if given.any():
+                drift.append(torch.stack([distance[given].mean(), distance[given].max()]))
+                of.append(number)
+        if drift:
+            self.keep(keys=keys[of], drift=torch.stack(drift))
+
+    def compute(self) -> dict[str, float | None]:
+        """`mean` over the kept joints and frames of a motion, then motions; `largest` of all."""
+        rows = self.rows("keys", "drift")
+        if rows is None:
+            return {"mean": None, "largest": None}
+        return {"mean": rows[0][:, 0].mean().item(), "largest": rows[0][:, 1].max().item()}
+
+
+def _distances(
+    name: str, joints: Tensor, mask: Tensor, real_joints: Tensor, real_mask: Tensor, kept: Tensor | None
+) -> Iterator[tuple[Tensor, Tensor]]:
+    """For each pair of motions, up to the end of the shorter: distances (F, J) in float64, and what was kept (F, J)."""
+    motions = zip(real_frames(name, joints, mask), real_frames(name, real_joints, real_mask), strict=True)
+    for number, (motion, real) in enumerate(motions):
+        length = min(len(motion), len(real))
+        distance = (motion[:length].double() - real[:length].double()).norm(dim=-1)
+        given = torch.zeros_like(distance, dtype=torch.bool) if kept is None else kept[number][mask[number]][:length]
+        yield distance, given

@@ -113,6 +113,18 @@ class SampleMetric(Metric):
             setattr(self, name, [rows.to(self.device) for part in gathered for rows in part[name]])
 
 
+def by_group(metric: SampleMetric, groups: Tensor, samples: int) -> Tensor:
+    """Indices (C, S) of the samples of each group; ValueError where one has not S."""
+    names, sizes = groups.unique(return_counts=True)
+    wrong = int((sizes != samples).sum())
+    if wrong:
+        raise ValueError(
+            f"{type(metric).__name__}: {wrong} of {len(names)} prompts have not {samples} motions "
+            f"but {int(sizes.min())} to {int(sizes.max())}; generate {samples} for each"
+        )
+    return groups.argsort(stable=True).unflatten(0, (len(names), samples))
+
+
 class TwoSets(SampleMetric):
     """A metric that compares the features of generated motions as a set with those of real ones."""
 

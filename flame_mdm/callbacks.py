@@ -325,7 +325,7 @@ class Evaluate(Callback):
         assert isinstance(pl_module, MotionGeneration)
         self.next = trainer.global_step + self.every_n_steps
         source = self.protocol.generator(
-            pl_module, None, {"seed": 0}, batch_size=self.batch_size, count=len(self.clips), progress=False
+            pl_module, None, {"seed": 0}, clips=self.clips, batch_size=self.batch_size, progress=False
         )
         result = self.protocol.evaluate(
             source,

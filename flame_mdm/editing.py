@@ -110,18 +110,12 @@ def edit(
             f"({model.facts['max_frames'] / original.fps:g} seconds) that the model was trained on: take a part, "
             "cut=[begin, end] in seconds"
         )
-    new_frames = _new_frames(length, original.fps, frames, seconds)
-    part = torch.zeros(len(representation.skeleton), dtype=torch.bool)
-    part[list(range(len(part))) if joints is None else find_joints(representation.skeleton, joints)] = True
-    features = (
-        representation.joint_features(part.nonzero()[:, 0].tolist()) if joints is not None else torch.tensor([True])
-    )
-    keep = ~(new_frames[:, None] & features).expand(length, representation.features)
+    keep, still = kept_parts(representation, length, frames=frames, seconds=seconds, joints=joints)
     if not keep.any():
         raise UserError("this keeps nothing of the motion: choose frames=..., seconds=... or joints=...")
     if keep.all():
         raise UserError("this keeps all of the motion: nothing is left to sample")
-    how = _method(model.process, method, until, resample)
+    how = method_options(model.process, method, until, resample)
     if how["mode"] == "trajectory" and num_inference_steps is None:
         num_inference_steps = MFM_STEPS
     known = representation.normalize(torch.from_numpy(original.features).to(model.device))
@@ -139,17 +133,42 @@ def edit(
     )
     # Normalizing rounds, so what is kept is compared with what the sampler was given.
     given, std = representation.denormalize(known).cpu().numpy(), representation.std.cpu().numpy()
-    still = ~(new_frames[:, None] & part).numpy()
     return [
         Edited(
             **vars(result),
             original=original,
             keep=keep.numpy(),
             feature_error=float((np.abs(result.features - given) / std)[keep.numpy()].max()),
-            joint_error=float(np.linalg.norm(result.joints - original.joints, axis=-1)[still].max()),
+            joint_error=float(np.linalg.norm(result.joints - original.joints, axis=-1)[still.numpy()].max()),
         )
         for result in generated
     ]
+
+
+def kept_parts(
+    representation: Representation,
+    length: int,
+    *,
+    frames: str | Ranges | None = None,
+    seconds: Ranges | None = None,
+    joints: str | Sequence[str] | None = None,
+) -> tuple[Tensor, Tensor]:
+    """What an edit of a motion of `length` frames keeps; arguments as of `edit`.
+
+    Returns:
+        (F, D) bool, True = this feature of this frame is kept; (F, J) bool, the same of the joints.
+
+    Raises:
+        UserError: frames outside of the motion, unknown names.
+    """
+    new_frames = _new_frames(length, representation.fps, frames, seconds)
+    part = torch.zeros(len(representation.skeleton), dtype=torch.bool)
+    part[list(range(len(part))) if joints is None else find_joints(representation.skeleton, joints)] = True
+    features = (
+        representation.joint_features(part.nonzero()[:, 0].tolist()) if joints is not None else torch.tensor([True])
+    )
+    keep = ~(new_frames[:, None] & features).expand(length, representation.features)
+    return keep, ~(new_frames[:, None] & part)
 
 
 def _new_frames(length: int, fps: float, frames: str | Ranges | None, seconds: Ranges | None) -> Tensor:
@@ -240,8 +259,14 @@ def find_joints(skeleton: Skeleton, names: str | Sequence[str]) -> list[int]:
     return sorted(found)
 
 
-def _method(process: Process, method: str | None, until: float | None, resample: int) -> dict[str, Any]:
-    """The options of `Edit` for a method, checked against the process."""
+def method_options(
+    process: Process, method: str | None = None, until: float | None = None, resample: int = 1
+) -> dict[str, Any]:
+    """The options of `Edit` for a method, by default the one of the process; arguments as of `edit`.
+
+    Raises:
+        UserError: the process does not allow the method, or the method lacks an option.
+    """
     possible = [name for name, how in METHODS.items() if how["mode"] in process.edit_modes]
     if method is None:
         method = next(name for name in possible if METHODS[name]["mode"] == process.edit_modes[0])

@@ -6,7 +6,9 @@ import hashlib
 import json
 import os
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from datetime import timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,6 +22,8 @@ if TYPE_CHECKING:
 USAGE = """
 usage: python -m flame_mdm.evaluate ckpt=FILE [protocol=NAME] extractor=FILE [key=value ...]
        python -m flame_mdm.evaluate from_samples=FOLDER data=NAME protocol=NAME extractor=FILE
+       python -m flame_mdm.evaluate baseline=shuffled data=NAME protocol=NAME extractor=FILE
+       torchrun --nproc-per-node 8 -m flame_mdm.evaluate ckpt=FILE ...
 
 Measures real motions and generated ones by a protocol, and writes a JSON file with all values and where they come from.
 The same command goes on where a killed one stopped. quick=true shows in a minute that all works.
@@ -42,28 +46,53 @@ def evaluate(config: Config) -> None:
     Raises:
         UserError, FileNotFoundError, ValueError: nothing to evaluate, or parts that do not fit one another.
     """
-    if (config["ckpt"] is None) == (config["from_samples"] is None):
-        raise UserError("give one of ckpt=runs/.../checkpoints/last.ckpt and from_samples=<folder of .npz files>")
-    if config["ckpt"] is None and not config.get("data"):
-        raise UserError("from_samples needs the name of the data set, such as data=humanml3d")
-    if config["ckpt"] is None and (config["quick"] or config["samples"] or config["replications"]):
+    what = [name for name in ("ckpt", "from_samples", "baseline") if config[name] is not None]
+    if len(what) != 1:
+        raise UserError(
+            "give one of ckpt=runs/.../checkpoints/last.ckpt, from_samples=<folder of .npz files> and baseline=shuffled"
+        )
+    if what != ["ckpt"] and not config.get("data"):
+        raise UserError(f"{what[0]} needs the name of the data set, such as data=humanml3d")
+    if what != ["ckpt"] and config["protocol"] is None:
+        raise UserError(f"{what[0]} needs a protocol, such as protocol=text_to_motion")
+    if what == ["from_samples"] and (config["quick"] or config["samples"] or config["replications"]):
         raise UserError("from_samples measures all motions of the files: leave out quick, samples and replications")
     if config["split"] not in ("train", "val", "test"):
         raise UserError(f"split={config['split']}: there are train, val and test")
+    with _processes(config["device"]) as (rank, world, device):
+        _evaluate(config, rank, world, device)
 
+
+@contextmanager
+def _processes(device: str | None) -> Iterator[tuple[int, int, str]]:
+    """Joins the processes that torchrun has started, if it has: number of this one, of all, device of this one."""
     import torch
 
+    rank, world, local = (int(os.environ.get(n, d)) for n, d in (("RANK", 0), ("WORLD_SIZE", 1), ("LOCAL_RANK", 0)))
+    if device is None:
+        device = f"cuda:{local % torch.cuda.device_count()}" if torch.cuda.is_available() else "cpu"
+    if world == 1:
+        yield rank, world, device
+        return
+    # Motions are sent once a replication, by the CPU; a process that is done may wait for hours.
+    torch.distributed.init_process_group("gloo", timeout=timedelta(days=7))
+    try:
+        yield rank, world, device
+    finally:
+        torch.distributed.destroy_process_group()
+
+
+def _evaluate(config: Config, rank: int, world: int, device: str) -> None:
+    from evaluators.sources import Baseline
     from flame_mdm.checkpoints import find
     from flame_mdm.generation import file_sha256
     from flame_mdm.task import load
 
-    device = config["device"] or ("cuda" if torch.cuda.is_available() else "cpu")
     file = find(config["ckpt"]) if config["ckpt"] is not None else None
     model = load(file, device) if file is not None else None
     data = _data(config, model)
     representation = model.representation if model else data.representation.to(device)
-    name = config["protocol"] or default_protocol(model)
-    protocol = load_protocol(name, representation)
+    protocol = load_protocol(config["protocol"] or default_protocol(model), representation)
     clips = data.clips(config["split"])
     changed = protocol.change(
         replications=config["replications"], samples=config["samples"], quick=config["quick"], clips=len(clips)
@@ -74,22 +103,39 @@ def evaluate(config: Config) -> None:
     extractor = protocol.open_extractor(config["extractor"], representation, data.store.info["dataset"])
 
     kind = f"{protocol.name}-{protocol.version}"
+    report = _describe(config, protocol, model, data, extractor)
     if model is not None:
         assert file is not None
-        options = {"seed": config["seed"], **_sampling(config, model)}
-        sha256 = file_sha256(file)
+        names = ("guidance_scale", "sampler", "num_inference_steps", "method", "until")
+        sampling = protocol.sampling(model, **{name: config[name] for name in names})
+        report["checkpoint"] |= {"sha256": file_sha256(file), **sampling}
+        options = {"seed": config["seed"], **sampling}
         kept = {**options, "split": config["split"], "data": data.store.fingerprint, "samples": protocol.samples}
-        folder = run_folder(file) / "evaluation" / kind / f"{sha256[:16]}-{_digest(kept)[:8]}"
-        source = protocol.generator(model, folder, options, batch_size=config["batch_size"], count=len(clips))
+        folder = run_folder(file) / "evaluation" / kind / f"{report['checkpoint']['sha256'][:16]}-{_digest(kept)[:8]}"
+        source = protocol.generator(
+            model, folder, options, clips=clips, batch_size=config["batch_size"], world=world, progress=not rank
+        )
         name = "result"
+    elif config["baseline"] is not None:
+        source = Baseline(config["baseline"], clips, protocol.condition, config["seed"])
+        folder, name = Path("runs/baselines") / data.store.info["dataset"] / kind, config["baseline"]
+        name += "" if config["split"] == "test" else f"-{config['split']}"
     else:
-        folder = Path(config["from_samples"])
+        folder, name = Path(config["from_samples"]), kind
         source = protocol.given(folder, representation)
-        sha256, name = source.sha256, kind
-    result = protocol.evaluate(
-        source, clips, extractor, representation, seed=config["seed"], batch_size=config["batch_size"]
+        report["samples_sha256"] = source.sha256
+    report |= {"changed": changed} | protocol.evaluate(
+        source,
+        clips,
+        extractor,
+        representation,
+        seed=config["seed"],
+        batch_size=config["batch_size"],
+        rank=rank,
+        world=world,
     )
-    report = _describe(config, protocol, model, data, extractor, sha256) | {"changed": changed} | result
+    if rank:
+        return
     for reason in _strangers(model, data):
         report["valid"] = False
         report["invalid_because"].append(reason)
@@ -126,17 +172,14 @@ def load_protocol(name: str, representation: Representation) -> Any:
     if "_target_" not in config:
         raise UserError(f"{path}: not a protocol: it has no _target_, such as evaluators.protocols.Protocol")
     check(config)
-    return instantiate(config)
+    protocol = instantiate(config)
+    protocol.sha256 = _digest(config)
+    return protocol
 
 
 def default_protocol(model: MotionGeneration | None) -> str:
-    """The protocol for what a model was trained to do.
-
-    Raises:
-        UserError: there is no model.
-    """
-    if model is None:
-        raise UserError("from_samples needs a protocol, such as protocol=text_to_motion")
+    """The protocol for what a model was trained to do."""
+    assert model is not None
     condition = _condition(model)
     if condition == "none":
         return "unconditioned"
@@ -163,12 +206,6 @@ def check_condition(protocol: Any, model: MotionGeneration) -> None:
             f"protocol {protocol.name} generates motions for {protocol.condition}, but the checkpoint was trained with "
             f"condition {_condition(model)}: choose another protocol, such as {default_protocol(model)}"
         )
-
-
-def _sampling(config: Config, model: MotionGeneration) -> dict[str, Any]:
-    """How the model is sampled: as asked, or by its recipe."""
-    names = ("guidance_scale", "sampler", "num_inference_steps")
-    return {name: getattr(model, name) if config[name] is None else config[name] for name in names}
 
 
 def run_folder(checkpoint: Path) -> Path:
@@ -210,7 +247,6 @@ def _describe(
     model: MotionGeneration | None,
     data: MotionDataModule,
     extractor: Any,
-    sha256: str,
 ) -> dict[str, Any]:
     """Where the values of a result come from."""
     import torch
@@ -222,7 +258,12 @@ def _describe(
     report: dict[str, Any] = {
         "format": FORMAT,
         "quick": config["quick"],
-        "protocol": {"name": protocol.name, "version": protocol.version, "length_source": "ground truth"},
+        "protocol": {
+            "name": protocol.name,
+            "version": protocol.version,
+            "sha256": protocol.sha256,
+            "length_source": "ground truth",
+        },
         "split": config["split"],
         "published_split": info["published_split"],
         "data": {
@@ -233,7 +274,8 @@ def _describe(
         "seed": config["seed"],
         "extractor": extractor
         and {"path": str(config["extractor"]), "sha256": extractor.sha256, "data": extractor.fingerprint},
-        "samples_sha256": sha256 if model is None else None,
+        "samples_sha256": None,
+        "baseline": config["baseline"],
         "checkpoint": None,
         "device": torch.cuda.get_device_name(where) if where.type == "cuda" else "cpu",
         "precision": f"float32, matmul {torch.get_float32_matmul_precision()}",
@@ -242,13 +284,11 @@ def _describe(
     if model is not None:
         report["checkpoint"] = {
             "path": str(config["ckpt"]),
-            "sha256": sha256,
             "experiment": model.config.get("experiment"),
             "config_sha256": _digest(model.config),
             "averaged_weights": bool(model.config.get("ema")),
             "parameters": sum(p.numel() for p in model.parameters() if p.requires_grad),
             "selected_by": _selection(model, Path(str(config["ckpt"]))),
-            **_sampling(config, model),
         }
     return report
 
@@ -276,12 +316,14 @@ def _show(report: Mapping[str, Any], out: Path) -> None:
     protocol = report["protocol"]
     mark = " QUICK, NOT A RESULT" if report["quick"] else ""
     print(f"{protocol['name']} version {protocol['version']}, {report['data']['dataset']} {report['split']}{mark}")
-    print(f"{'':32}{'real motions':>24}{'generated':>24}")
+    print(f"{'':32}{'real motions':>24}{report['baseline'] or 'generated':>24}")
     for name, value in report["values"].items():
         real = report["ground_truth"].get(name)
         print(f"{name:32}{_cell(real):>24}{_cell(value):>24}")
     for name, reason in report["not_computed"].items():
         print(f"not computed: {name}: {reason}")
+    for reason in report["warnings"]:
+        print(f"warning: {reason}")
     for reason in report["invalid_because"]:
         print(f"NOT VALID: {reason}")
     print(f"written: {out}")

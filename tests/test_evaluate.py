@@ -14,7 +14,7 @@ from distributed import GlooPool
 from evaluators.action_gru import ActionGRU
 from evaluators.evaluator import Evaluator, Extracted
 from evaluators.extractors import ClassifierExtractor, MotionCLIPExtractor, T2MExtractor
-from evaluators.protocols import Generator, read_samples
+from evaluators.sources import Generator, read_samples, real_motions
 from evaluators.stgcn import UESTC, Unconstrained
 from evaluators.t2m import T2MEvaluator
 from flame_mdm import evaluate, train
@@ -106,7 +106,13 @@ def test_a_result_says_what_it_is_and_where_it_comes_from(runs, full):
         assert value["replications"] == 2
         assert value["n"] == (count if name != "multimodality" else 20 * 20)
     assert result["values"]["attributes/action"]["ci"] is not None
-    assert result["protocol"] == {"name": "synthetic", "version": 1, "length_source": "ground truth"}
+    sha256 = protocol.sha256
+    assert result["protocol"] == {"name": "synthetic", "version": 1, "sha256": sha256, "length_source": "ground truth"}
+    assert len(sha256) == 64
+    assert len(set(result["seeds"])) == 2
+    assert result["baseline"] is result["samples_sha256"] is None
+    assert result["precision"].startswith("float32")
+    assert result["checkpoint"]["parameters"] > 0
     assert (result["split"], result["published_split"], result["quick"], result["seed"]) == ("test", False, False, 0)
     assert result["changed"] == {"replications": 2}
     assert result["valid"]
@@ -233,7 +239,7 @@ def test_the_same_features_give_the_same_bits_in_any_order(runs, monkeypatch):
     rows = protocol.rows(data.test, 0, 0)
     extractor = protocol.open_extractor(str(runs.clip), data.representation, "synthetic")
     evaluator = Evaluator(extractor, protocol.metrics, data.representation)
-    one = evaluator.extract(protocol.asked(rows, protocol.real(data.test, rows)))
+    one = evaluator.extract(protocol.asked(rows, real_motions(data.test, rows)))
     values, _ = evaluator.score(one, one, one, 3)
 
     def shuffled(extracted: Extracted) -> Extracted:
@@ -433,7 +439,7 @@ def shares(rank: int, world: int, model_file: str, clip: str) -> dict:
     protocol.change(replications=1, samples=33, quick=False, clips=len(data.test))
     protocol.multimodality = None
     extractor = protocol.open_extractor(clip, model.representation, "synthetic")
-    source = protocol.generator(model, None, {"seed": 0}, batch_size=8, count=33, progress=False)
+    source = protocol.generator(model, None, {"seed": 0}, clips=data.test, batch_size=8, progress=False)
     result = protocol.evaluate(source, data.test, extractor, model.representation, rank=rank, world=world)
     return {kind: {name: v["mean"] for name, v in result[kind].items()} for kind in ("ground_truth", "values")}
 

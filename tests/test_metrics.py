@@ -45,6 +45,7 @@ from evaluators.physics import Floating, FootSkating, Jitter, Penetration, Stati
 from evaluators.reconstruction import (
     DisplacementErrors,
     FlamePositionErrors,
+    KeptDrift,
     TemosPositionErrors,
     flame_parts,
     temos_parts,
@@ -540,11 +541,61 @@ def test_displacement_of_shifted_frames():
     fake[:, 4:] += torch.tensor([3.0, 0.0, 4.0])
     fake[:, 7] += torch.tensor([3.0, 0.0, 4.0])
     mask = length_mask(torch.tensor([8]), 10)
-    predicted = torch.arange(10)[None] >= 4
-    for asked, ade in ((predicted, 25 / 4), (None, 25 / 8)):
+    kept = (torch.arange(10) < 4)[None, :, None].expand(1, 10, 22)
+    motions = {"joints": fake, "mask": mask, "real_joints": real, "real_mask": mask, "keys": torch.tensor([1])}
+    for given, ade in ((kept, 25 / 4), (None, 25 / 8)):
         metric = DisplacementErrors()
-        metric.update(joints=fake, mask=mask, real_joints=real, keys=torch.tensor([1]), predicted=asked)
+        metric.update(**motions, kept=given)
         assert metric.compute() == pytest.approx({"ade": ade, "fde": 10.0}, rel=1e-6)
+    metric = DisplacementErrors()
+    metric.update(**motions | {"real_mask": length_mask(torch.tensor([6]), 10)})
+    assert metric.compute() == pytest.approx({"ade": 10 / 6, "fde": 5.0}, rel=1e-6), "up to the end of the shorter"
+
+
+def test_kept_joints_neither_err_nor_go_unseen_when_they_drift():
+    """Joint 3 is new and 2 m off; of the kept ones joint 5 is 1 m off in one of 10 frames."""
+    real = walk(22, 10, 0)[None]
+    fake = real.clone()
+    fake[:, :, 3, 0] += 2
+    fake[:, 4, 5, 1] += 1
+    mask, keys = torch.ones(1, 10, dtype=torch.bool), torch.tensor([1])
+    kept = torch.ones(1, 10, 22, dtype=torch.bool)
+    kept[:, :, 3] = False
+    motions = {"joints": fake, "mask": mask, "real_joints": real, "real_mask": mask, "keys": keys, "kept": kept}
+    displacement, drift = DisplacementErrors(), KeptDrift()
+    displacement.update(**motions)
+    assert displacement.compute() == pytest.approx({"ade": 2, "fde": 2}, rel=1e-6)
+    drift.update(**motions)
+    assert drift.compute() == pytest.approx({"mean": 1 / 210, "largest": 1}, rel=1e-6)
+    nothing = KeptDrift()
+    nothing.update(**motions | {"kept": ~mask[..., None].expand_as(kept)})
+    assert nothing.compute() == {"mean": None, "largest": None}
+
+
+def test_best_and_worst_of_several_are_chosen_by_the_root():
+    """Three motions for each of two texts, the root off by 1, 2 and 3 m; the others the more, the less the root is."""
+    real = walk(21, 12, 0)
+    off = torch.tensor([2.0, 1.0, 3.0, 3.0, 1.0, 2.0])
+    fake = real.repeat(6, 1, 1, 1)
+    fake[:, :, 0, 0] += off[:, None]
+    fake[:, :, 1:, 0] += (5 - off)[:, None, None]
+    mask = torch.ones(6, 12, dtype=torch.bool)
+    motions = {"joints": fake, "mask": mask, "real_joints": real.repeat(6, 1, 1, 1), "real_mask": mask}
+    groups = torch.tensor([8, 8, 8, 4, 4, 4])
+    values = {}
+    for samples in (3, 1):
+        metric = FlamePositionErrors(KIT21.parents, samples=samples)
+        metric.update(**motions, keys=torch.arange(6), groups=groups)
+        values |= metric.compute()
+    joints = {"best": (1 + 20 * 4) / 21, "worst": (3 + 20 * 2) / 21}
+    for which, root in (("best", 1), ("worst", 3)):
+        assert values[f"{which}_ape_root"] == pytest.approx(root, rel=1e-5)
+        assert values[f"{which}_ape_mean_global"] == pytest.approx(joints[which], rel=1e-5)
+    assert values["ape_root"] == pytest.approx(2, rel=1e-5)
+    metric = FlamePositionErrors(KIT21.parents, samples=2)
+    metric.update(**motions, keys=torch.arange(6), groups=groups)
+    with pytest.raises(ValueError, match="2 of 2 prompts have not 2 motions"):
+        metric.compute()
 
 
 def test_physics_of_simple_motions():
@@ -612,7 +663,9 @@ def all_metrics() -> dict[str, Metric]:
         "accuracy": ActionAccuracy(),
         "temos": TemosPositionErrors(),
         "flame": FlamePositionErrors(KIT21.parents),
+        "temos_best": TemosPositionErrors(samples=5),
         "displacement": DisplacementErrors(),
+        "kept_drift": KeptDrift(),
         "penetration": Penetration(),
         "floating": Floating(),
         "jitter": Jitter(20.0),
@@ -647,6 +700,7 @@ def evaluation(count: int = COUNT) -> dict[str, Tensor]:
         "real_joints": joints + 0.01 * torch.randn(joints.shape, generator=generator).cumsum(1),
         "real_mask": length_mask(lengths, frames),
         "real_keys": torch.tensor([key("real", i) for i in range(COUNT)]),
+        "kept": torch.rand(COUNT, frames, 21, generator=generator) < 0.5,
     }
     return {name: value[:count] for name, value in values.items()}
 
@@ -657,7 +711,7 @@ def batches(values: dict[str, Tensor], indices: list[Tensor]) -> list[dict[str, 
     for index in indices:
         batch = {name: value[index] for name, value in values.items()}
         longest = int(batch["mask"].sum(1).max())
-        for name in ("joints", "mask", "real_joints", "real_mask"):
+        for name in ("joints", "mask", "real_joints", "real_mask", "kept"):
             batch[name] = batch[name][:, :longest].contiguous()
         result.append(batch)
     return result
@@ -817,8 +871,7 @@ def wrong_inputs() -> list[tuple[Metric, Callable[[dict[str, Tensor]], dict[str,
             lambda v: v | {"real": v["real"][:, :3]},
             "features are 6 wide if generated, 3 if real",
         ),
-        (DisplacementErrors(), lambda v: v | {"real_joints": v["real_joints"][:, :5]}, "joints .*, real"),
-        (DisplacementErrors(), lambda v: v | {"predicted": v["mask"] & False}, "no generated frame"),
+        (DisplacementErrors(), lambda v: v | {"kept": v["kept"] | True}, "no generated frame"),
         (TemosPositionErrors(), lambda v: v | {"joints": v["joints"][:, :, :20]}, "20 joints, defined for KIT's 21"),
         (FlamePositionErrors(KIT21.parents), lambda v: v | {"mask": v["mask"] & (torch.arange(34) < 1)}, "1 frames"),
     ]

@@ -7,7 +7,7 @@ VENV := .venv
 READY := $(VENV)/.ready
 export MAKEFLAGS
 
-.PHONY: help setup prepare browse train sample evaluate tables benchmark edit convert test lint bench
+.PHONY: help setup prepare browse train sample evaluate tables benchmark edit convert report compare test lint bench
 
 help: ## show this
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## /  make \1@/' | column -t -s @
@@ -47,6 +47,12 @@ edit: $(READY) ## keep a part of a motion, sample the rest: CKPT=... MOTION=walk
 
 convert: $(READY) ## motion files for other programs: INPUT=motion.npz OUT=walk.bvh|.glb|.npz|.json|.npy
 	@$(VENV)/bin/python -m flame_mdm.convert --from-make
+
+report: $(READY) ## a run on one web page, as training writes it at its end: RUNS=runs/quickstart/default
+	@$(VENV)/bin/python -m flame_mdm.report --from-make
+
+compare: $(READY) ## runs side by side: RUNS="runs/a/default runs/b/default" [RATE=true TEXTS="a person walks; ..."]
+	@$(VENV)/bin/python -m flame_mdm.compare --from-make
 
 test: $(READY) ## run all tests
 	@$(VENV)/bin/python -m pytest -n 2 --dist worksteal

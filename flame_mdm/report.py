@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import shlex
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
@@ -24,9 +24,8 @@ page that needs no server and no network. Training writes it at its end, too. ru
 
 HISTORY = "metrics.jsonl"
 """Where `flame_mdm.dashboards.History` keeps the curves of a run, in its folder."""
-TITLES = {"train": "Training", "val": "Validation", "samples": "Samples of the prompts"}
-COST = ("lr", "epochs", "samples_per_second", "seconds_per_step", "gpu_memory_gib")
-"""Curves of training that tell what it costs, not what it learns."""
+COST = ("lr", "grad_norm", "samples_per_second", "seconds_per_step", "gpu_memory_gib")
+"""Curves of training that tell how it runs, not what it learns."""
 
 
 @dataclass
@@ -35,7 +34,7 @@ class Run:
 
     Attributes:
         folder: of the run.
-        config: the recipe, resolved.
+        config: the recipe, as the run saved it.
         provenance: command, code, machine, versions, device, parameters and data; {} before training began.
         curves: values by step, by name.
         results: evaluations by the name of their file within the folder.
@@ -106,7 +105,7 @@ def read_run(folder: Path) -> Run:
 
     if not (folder / "config.yaml").is_file():
         raise UserError(f"{folder}: no config.yaml there; name the folder of a run, such as runs/synthetic/mdm/default")
-    config: Any = OmegaConf.to_container(OmegaConf.load(folder / "config.yaml"), resolve=True)
+    config: Any = OmegaConf.to_container(OmegaConf.load(folder / "config.yaml"))
     provenance = read_json(folder / "provenance.json") if (folder / "provenance.json").exists() else {}
     results = {
         path.relative_to(folder).as_posix(): read_json(path)
@@ -216,58 +215,54 @@ def _curves(found: Run) -> str:
     if not found.curves:
         return f"<h2>Curves</h2><p class='faint'>None: there is no {HISTORY} in the folder.</p>"
     parts = []
-    groups, constant = group_curves(found.curves)
-    for title, names in groups.items():
-        charts = [
-            chart(shared, {name.rpartition("/")[0]: found.curves[name] for name in both}, bands(found.curves, both))
-            for shared, both in names.items()
-        ]
-        parts.append(f"<h2>{escape(title)}</h2><div class='charts'>{''.join(charts)}</div>")
-    if constant:
+    for title, charts in charted(found.curves).items():
+        drawn = []
+        for name, both in charts.items():
+            lines = {family: found.curves[f"{family}/{name}"] for family in both}
+            widths = {family: found.curves.get(f"{family}/{name}/ci", {}) for family in both}
+            drawn.append(chart(name, lines, widths))
+        parts.append(f"<h2>{title}</h2><div class='charts'>{''.join(drawn)}</div>")
+    if constant := constants(found.curves):
         told = ", ".join(f"{name} {number(value)}" for name, value in constant.items())
         parts.append(f"<p class='faint'>Constant: {escape(told)}</p>")
     return "".join(parts)
 
 
-def group_curves(
-    curves: Mapping[str, Curve],
-) -> tuple[dict[str, dict[str, list[str]]], dict[str, float]]:
+def charted(curves: Mapping[str, Curve]) -> dict[str, dict[str, list[str]]]:
     """Which curves stand in one chart: those of training and validation with the same name.
 
     Returns:
-        Names of curves by title of the chart, by heading; and curves that have one value all along.
+        The first parts of their names (`train`, `val`) by the rest of it (`loss`), by heading.
     """
-    groups: dict[str, dict[str, list[str]]] = {}
-    constant = {}
-    for name, curve in curves.items():
-        if name.endswith("/ci"):
-            continue
-        values = set(curve.values())
-        if len(values) == 1 and len(curve) > 1:
-            constant[name] = values.pop()
-            continue
+    groups: dict[str, dict[str, list[str]]] = {
+        "Losses": {},
+        "Validation": {},
+        "Samples of the prompts": {},
+        "Course": {},
+    }
+    for name in curves.keys() - constants(curves).keys():
         family, _, rest = name.partition("/")
-        part, _, plain = rest.rpartition("/")
-        if family in ("train", "val") and not part:
-            heading = "Cost" if plain in COST else "Losses"
-        else:
-            heading = f"{TITLES.get(family, family)}: {part}" if part else TITLES.get(family, family)
-        groups.setdefault(heading, {}).setdefault(plain or family, []).append(name)
-    first = [h for h in ("Losses",) if h in groups]
-    order = [*first, *(h for h in groups if h not in ("Losses", "Cost")), *(h for h in ("Cost",) if h in groups)]
-    return {heading: groups[heading] for heading in order}, constant
+        if rest.endswith("/ci") or rest == "epochs":
+            continue
+        heading = {"samples": "Samples of the prompts", "val": "Validation"}.get(family, "Course")
+        if f"train/{rest}" in curves and rest not in COST:
+            heading = "Losses"
+        groups[heading].setdefault(rest, []).append(family)
+    return {title: {n: sorted(g[n]) for n in sorted(g)} for title, g in groups.items() if g}
 
 
-def bands(curves: Mapping[str, Curve], names: Iterable[str]) -> dict[str, Curve]:
-    """Half widths of the 95 % intervals of curves that have one, by what a chart calls them."""
-    return {name.rpartition("/")[0]: curves[f"{name}/ci"] for name in names if f"{name}/ci" in curves}
+def constants(curves: Mapping[str, Curve]) -> dict[str, float]:
+    """Values of curves that have one all along."""
+    values = {
+        name: set(curve.values()) for name, curve in curves.items() if len(curve) > 1 and not name.endswith("/ci")
+    }
+    return {name: next(iter(found)) for name, found in values.items() if len(found) == 1}
 
 
 def _evaluations(found: Run) -> str:
     if not found.results:
         return ""
-    parts = [f"<h2>Evaluations</h2><div class='charts'>{''.join(map(_evaluation, found.results.values()))}</div>"]
-    return "".join(parts)
+    return f"<h2>Evaluations</h2><div class='charts'>{''.join(map(_evaluation, found.results.values()))}</div>"
 
 
 def _evaluation(result: Mapping[str, Any]) -> str:
@@ -331,7 +326,7 @@ def _provenance(found: Run) -> str:
     if facts:
         changed = " with changes that were not committed" if facts.get("changed") else ""
         rows = [
-            ["command", shlex.join(facts["command"])],
+            ["command", " ".join(facts["command"])],
             ["commit", (facts["commit"] or "not from a clone") + changed],
             ["data", ", ".join(f"{k} {v}" for k, v in facts["data"].items() if k != "actions")],
             ["device", facts.get("device", "–")],

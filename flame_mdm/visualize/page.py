@@ -11,7 +11,7 @@ WIDE, HIGH = 460, 230
 LEFT, RIGHT, TOP, BOTTOM = 58, 10, 8, 24
 MOST = 300
 """Stretches of a curve that are drawn; of each, its lowest and its highest point."""
-LOG_RANGE = 30
+LOG_RANGE = 15
 """Positive values that span more than this factor get a logarithmic axis."""
 COLORS = 8
 
@@ -158,8 +158,8 @@ def _grid(ticks: Sequence[float], last: float, at: Callable[[float, float], str]
         parts.append(f"<line x1='{LEFT}' x2='{WIDE - RIGHT}' y1='{y}' y2='{y}' style='stroke:var(--line)'/>")
         parts.append(f"<text x='{LEFT - 6}' y='{float(y) + 4:.1f}' text-anchor='end'>{_tick(tick)}</text>")
     step = max(1, _round_step(last / 5))
-    for k in range(math.floor(last / step + 1e-9) + 1):
-        x = LEFT + (WIDE - LEFT - RIGHT) * k * step / last
+    for k in range(math.floor(last / step + 0.02) + 1):  # 2999 steps have a number 3k, too
+        x = LEFT + (WIDE - LEFT - RIGHT) * min(1, k * step / last)
         anchor = "end" if x > WIDE - RIGHT - 12 else "middle"
         parts.append(f"<text x='{x:.1f}' y='{HIGH - 8}' text-anchor='{anchor}'>{short(k * step)}</text>")
     return "".join(parts)

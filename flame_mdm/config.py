@@ -45,6 +45,9 @@ TRUSTED = (
 )
 """Modules whose classes a configuration from a checkpoint may name."""
 
+FLAGS = ("--help", "--multirun", "-m", "--cfg", "--resolve", "--package")
+"""Hydra's own options that commands take."""
+
 LAUNCH = "launch"
 """The group of `experiments/` whose options start jobs elsewhere."""
 
@@ -114,6 +117,8 @@ class _Plan(NamedTuple):
     folder: Path
     stem: str
     overrides: list[str]
+    base: Config | None = None
+    """The recipe before single keys are overridden, whose values tell which kind of value a key takes."""
 
 
 def _plan(recipe: _Recipe, overrides: Sequence[str]) -> _Plan:
@@ -128,7 +133,7 @@ def _plan(recipe: _Recipe, overrides: Sequence[str]) -> _Plan:
     parts = [o for o in parsed if _is_group(o)]
     composed = _hydra(_Plan(recipe.folder, recipe.stem, [*first, *map(_first_choice, parts)]))
     keys = [_legal(composed, o) for o in parsed if not _is_group(o)]
-    return _Plan(recipe.folder, recipe.stem, [*first, *map(_line, parts), *keys])
+    return _Plan(recipe.folder, recipe.stem, [*first, *map(_line, parts), *keys], composed)
 
 
 def _line(override: Override) -> str:
@@ -183,7 +188,7 @@ def _is_group(override: Override) -> bool:
 
 def _check_groups(overrides: Sequence[Override]) -> None:
     for override in overrides:
-        if not _is_group(override) or override.is_sweep_override() or not isinstance(override.value(), str):
+        if not _is_group(override) or override.is_sweep_override() or override.is_delete():
             continue
         group, option = override.key_or_group, str(override.value())
         options = _options(group)
@@ -212,7 +217,9 @@ def _hydra(plan: _Plan) -> Config:
             resolved = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
     except (HydraException, OmegaConfBaseException) as error:
         raise UserError(f"{plan.stem}: {_first_line(error)}") from error
-    return {str(key): value for key, value in resolved.items()}  # type: ignore[union-attr]
+    plain: Config = {str(key): value for key, value in resolved.items()}  # type: ignore[union-attr]
+    _check_same_kinds(plan.base or {}, plain)
+    return plain
 
 
 def _legal(config: Config, override: Override) -> str:
@@ -246,10 +253,61 @@ def check(config: Config) -> None:
     for path, node in _walk(config):
         if "_target_" not in node:
             continue
-        legal = parameters(node["_target_"], where=".".join([*path, "_target_"]))
-        for name in node:
+        where = ".".join([*path, "_target_"])
+        if not isinstance(node["_target_"], str):
+            raise UserError(f"{where}={node['_target_']}: the name of a class or a function is needed")
+        legal = _signature(node["_target_"], where)
+        for name, value in node.items():
             if not str(name).startswith("_") and name not in legal and "**" not in legal:
                 raise UserError(_unknown_key(config, [*path, str(name)], len(path), node))
+            _check_kind(".".join([*path, str(name)]), value, legal.get(name, ""))
+
+
+KINDS: dict[str, tuple[type | tuple[type, ...], str]] = {
+    "bool": (bool, "true or false"),
+    "int": (int, "a whole number"),
+    "float": ((int, float), "a number"),
+    "str": (str, "a text"),
+    "None": (type(None), "null"),
+}
+
+
+def _check_kind(key: str, value: Any, annotation: str) -> None:
+    """Refuses a value that the annotation of its parameter plainly rules out; what is not understood is let through."""
+    needed = []
+    for part in re.sub(r"^Optional\[(.*)\]$", r"\1 | None", annotation).split(" | "):
+        if part in KINDS:
+            kind, words = KINDS[part]
+            if isinstance(value, kind) and (part == "bool" or not isinstance(value, bool)):
+                return
+        elif part.startswith("Literal[") and part.endswith("]"):
+            choices = ast.literal_eval(f"({part[8:-1]},)")
+            words = f"one of {', '.join(map(str, choices))}"
+            if value in choices:
+                return
+        elif re.fullmatch(r"[A-Z]\w+", part) and part != "Any" and (value is None or isinstance(value, int | float)):
+            words = "a part"  # a class
+        else:
+            return
+        needed.append(words)
+    raise UserError(f"{key}={value}: it has to be {' or '.join(needed)}")
+
+
+def _check_same_kinds(base: Config, config: Config, path: str = "") -> None:
+    """Refuses values of another kind than those of the recipe, where no signature tells."""
+    for name, value in base.items():
+        key = f"{path}{name}"
+        if name not in config:
+            if "_target_" not in base and path != "callbacks.":
+                raise UserError(f"{key} cannot be taken out; give it another value")
+        elif isinstance(value, Mapping):
+            if isinstance(config[name], Mapping):
+                _check_same_kinds({k: v for k, v in value.items() if "_target_" not in value}, config[name], f"{key}.")
+            elif config[name] is not None or not (path or "_target_" in value):
+                raise UserError(f"{key}={config[name]}: it has to be a mapping of keys")
+        elif value is not None and not isinstance(value, list):
+            kind = type(value).__name__
+            _check_kind(key, config[name], "str | int | float" if kind == "str" else kind)
 
 
 def _walk(node: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Mapping[str, Any]]]:
@@ -281,19 +339,24 @@ def _nearest(name: str, names: Sequence[str]) -> str:
     return f" Did you mean {', '.join(near)}?" if near else ""
 
 
-@functools.cache
 def parameters(target: str, *, where: str = "_target_", exact: bool = True) -> frozenset[str]:
     """Names of the arguments a class or function takes, read from its source; "**" stands for any.
 
     Raises:
         UserError: `target` is not found. With `exact=False`, "**" alone does not make every key legal.
     """
+    names = frozenset(_signature(target, where))
+    return names if exact else names - {"**"}
+
+
+@functools.cache
+def _signature(target: str, where: str) -> dict[str, str]:
+    """The arguments that a class or function takes: name -> annotation, "" without one."""
     module, _, name = target.rpartition(".")
     found = _definition(module, name)
     if found is None:
         raise UserError(f"{where}={target}: no such class or function can be found")
-    names = _arguments(*found)
-    return names if exact else names - {"**"}
+    return _arguments(*found)
 
 
 def _definition(module: str, name: str, seen: frozenset[str] = frozenset()) -> tuple[str, ast.AST] | None:
@@ -339,23 +402,28 @@ def _tree(module: str) -> ast.Module | None:
     return ast.parse(path.read_text(encoding="utf-8")) if path else None
 
 
-def _arguments(module: str, node: ast.AST) -> frozenset[str]:
+def _arguments(module: str, node: ast.AST) -> dict[str, str]:
     if isinstance(node, ast.FunctionDef):
         listed = [*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs]
-        names = {a.arg for a in listed} - {"self", "cls"}
-        return frozenset(names | ({"**"} if node.args.kwarg else set()))
+        names = {a.arg: ast.unparse(a.annotation) if a.annotation else "" for a in listed}
+        names |= {"**": ""} if node.args.kwarg else {}
+        return {name: kind for name, kind in names.items() if name not in ("self", "cls")}
     assert isinstance(node, ast.ClassDef)
     for item in node.body:
         if isinstance(item, ast.FunctionDef) and item.name == "__init__":
             names = _arguments(module, item)
-            return names if "**" not in names else names | _inherited(module, node)
-    fields = {i.target.id for i in node.body if isinstance(i, ast.AnnAssign) and isinstance(i.target, ast.Name)}
+            return names if "**" not in names else _inherited(module, node) | names
+    fields = {
+        i.target.id: ast.unparse(i.annotation)
+        for i in node.body
+        if isinstance(i, ast.AnnAssign) and isinstance(i.target, ast.Name)
+    }
     dataclass = any("dataclass" in ast.unparse(d) for d in node.decorator_list)
-    return _inherited(module, node) | (fields if dataclass else set())
+    return _inherited(module, node) | (fields if dataclass else {})
 
 
-def _inherited(module: str, node: ast.ClassDef) -> frozenset[str]:
-    names: frozenset[str] = frozenset()
+def _inherited(module: str, node: ast.ClassDef) -> dict[str, str]:
+    names: dict[str, str] = {}
     for base in node.bases:
         found = _definition(module, ast.unparse(base).rpartition(".")[2])
         if found and found[1] is not node:
@@ -446,6 +514,7 @@ def run(
     usage: str,
     name: str | None = None,
     text: Sequence[str] = (),
+    like: Sequence[str] = (),
 ) -> int:
     """Serves a command line `[NAME] key=value ...` through Hydra and returns the exit code.
 
@@ -456,6 +525,7 @@ def run(
         usage: printed for `--help`.
         name: the configuration, for commands that have one of their own; otherwise the first word names a recipe.
         text: keys whose values are taken as they stand, not read in Hydra's grammar.
+        like: functions, by module and name, whose annotations tell which kind of value their arguments' keys take.
     """
     words = [_quoted(word, text) for word in (_make_variables() if "--from-make" in argv else argv)]
     if name is not None and words and not words[0].startswith("-") and "=" not in words[0]:
@@ -467,10 +537,12 @@ def run(
             print("parts: " + ", ".join(f"{group}=..." for group in groups()))
         return 0 if words else 2
     codes = [0]
-    return guarded(lambda: _serve(command, words, name, codes)) or max(codes)
+    return guarded(lambda: _serve(command, words, name, codes, like)) or max(codes)
 
 
-def _serve(command: Callable[[Config], None], words: list[str], name: str | None, codes: list[int]) -> None:
+def _serve(
+    command: Callable[[Config], None], words: list[str], name: str | None, codes: list[int], like: Sequence[str]
+) -> None:
     if name is None:
         if words[0].startswith("-") or "=" in words[0]:
             raise UserError(f"the first word must name an experiment, such as quickstart, not '{words[0]}'")
@@ -479,6 +551,9 @@ def _serve(command: Callable[[Config], None], words: list[str], name: str | None
     else:
         first, recipe = name, _Recipe(EXPERIMENTS, name)
     flags = [w for i, w in enumerate(words) if w.startswith("-") or (i and words[i - 1] in ("--cfg", "--package"))]
+    unknown = [w for w in flags if w.startswith("-") and w.partition("=")[0] not in FLAGS]
+    if unknown:
+        raise UserError(f"unknown option {unknown[0]}; there are {', '.join(FLAGS)}, and keys as key=value")
     overrides = [w for w in words if w not in flags]
     plan = _plan(recipe, overrides)
     parsed = _parse(plan.overrides)
@@ -486,6 +561,12 @@ def _serve(command: Callable[[Config], None], words: list[str], name: str | None
     sweep = bool(launch) or any(flag in ("-m", "--multirun") for flag in flags)
     composed = _hydra(plan._replace(overrides=[_first_choice(o) for o in parsed] if sweep else plan.overrides))
     check(composed)
+    if name is None:
+        _check_whole(composed, first)
+    for function in like:
+        for key, annotation in _signature(function, "like").items():
+            if key in composed:
+                _check_kind(key, composed[key], annotation)
     if "local" in launch and composed.get("trainer", {}).get("devices", 1) != 1:
         raise UserError("launch=local runs each job in one process: leave out launch, or trainer.devices")
 
@@ -527,6 +608,17 @@ def _serve(command: Callable[[Config], None], words: list[str], name: str | None
     sys.argv = [sys.argv[0], *flags, *quiet, *output, *plan.overrides]
     GlobalHydra.instance().clear()
     hydra_main(version_base="1.3", config_path=str(plan.folder), config_name=plan.stem)(job)()
+
+
+def _check_whole(config: Config, name: str) -> None:
+    """Refuses a recipe that lacks what every run needs."""
+    for key in ("run", "trainer", "data", "representation", "task", "optimizer", "callbacks"):
+        node = config.get(key)
+        if not isinstance(node, Mapping) or (key not in ("run", "callbacks") and "_target_" not in node):
+            raise UserError(f"{name}: it has no {key}; begin a recipe with the defaults of another, or with /base")
+    for key in ("experiment", "seed", "ema", "logger"):
+        if key not in config:
+            raise UserError(f"{name}: it has no {key}; begin a recipe with the defaults of another, or with /base")
 
 
 def _make_variables() -> list[str]:

@@ -20,7 +20,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     words = list(sys.argv[1:] if argv is None else argv)
     if words and not words[0].startswith("-") and "=" not in words[0]:
         words[0] = f"input={words[0]}"
-    return run(convert, words, usage=USAGE, name="convert", text=("input", "out"))
+    return run(convert, words, usage=USAGE, name="convert", text=("input", "out"), like=("flame_mdm.formats.read",))
 
 
 def convert(config: Config) -> None:

@@ -26,7 +26,14 @@ any browser. Keys, with their defaults: experiments/edit.yaml
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs the command; returns its exit code."""
     words = sys.argv[1:] if argv is None else argv
-    return run(write_edits, words, usage=USAGE, name="edit", text=("text", "ckpt", "motion", "out"))
+    return run(
+        write_edits,
+        words,
+        usage=USAGE,
+        name="edit",
+        text=("text", "ckpt", "motion", "out"),
+        like=("flame_mdm.editing.edit",),
+    )
 
 
 def write_edits(config: Config) -> None:

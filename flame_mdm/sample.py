@@ -21,7 +21,9 @@ Writes motions (.npz), a GIF and a player for any browser. Keys, with their defa
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs the command; returns its exit code."""
     words = sys.argv[1:] if argv is None else argv
-    return run(sample, words, usage=USAGE, name="sample", text=("text", "ckpt", "out"))
+    return run(
+        sample, words, usage=USAGE, name="sample", text=("text", "ckpt", "out"), like=("flame_mdm.generation.generate",)
+    )
 
 
 def sample(config: Config) -> None:

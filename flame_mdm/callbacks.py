@@ -239,8 +239,9 @@ class SampleMotions(Callback):
         write_motions(folder, pl_module, motions, {"seed": 0, "step": step, "checkpoint": ""})
         values = self.measure(motions)
         for logger in trainer.loggers:
-            log_video(logger, "samples", folder / "motions.gif", step)
-            logger.log_metrics({f"samples/{k}": v for k, v in values.items() if v is not None}, step)
+            # Lightning counts steps from 0 on dashboards: those of this validation stand at step - 1
+            log_video(logger, "samples", folder / "motions.gif", step - 1)
+            logger.log_metrics({f"samples/{k}": v for k, v in values.items() if v is not None}, step - 1)
         return folder, values
 
     def _sample(self, model: MotionGeneration, rank: int, world: int) -> list[Generated]:
@@ -346,7 +347,9 @@ class Evaluate(Callback):
             columns = ("mean", "ci", "replications", "n")
             rows = [[metric, *(value[column] for column in columns)] for metric, value in result["values"].items()]
             for logger in trainer.loggers:
-                log_table(logger, f"evaluation/{self.protocol.name}", ["metric", *columns], rows, trainer.global_step)
+                log_table(
+                    logger, f"evaluation/{self.protocol.name}", ["metric", *columns], rows, trainer.global_step - 1
+                )
 
     def on_validation_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         pl_module.log_dict(self.values)  # averaged weights are gone by now, so values were taken at the start

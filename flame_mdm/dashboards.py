@@ -62,8 +62,9 @@ class History(Logger):
 class WandbRun(WandbLogger):
     """One run on Weights & Biases, however often it is resumed.
 
-    `wandb.json` in the run's folder keeps its id and the step it has come to. Steps that are trained again after a kill
-    have the values they had, and are not told twice, so that `trainer/global_step` never goes back.
+    `wandb.json` in the run's folder keeps its id, the step it has come to, and the number of its rows. Steps that are
+    trained again after a kill have the values they had, and are not told twice, so that `trainer/global_step` never
+    goes back.
 
     Args:
         save_dir: the run's folder.
@@ -73,18 +74,22 @@ class WandbRun(WandbLogger):
     def __init__(self, save_dir: str, **options: Any):
         self.path = Path(save_dir) / "wandb.json"
         kept = json.loads(self.path.read_text()) if self.path.exists() else {}
-        self.told = kept.get("step", -1)
+        self.told, self.rows = kept.get("step", -1), kept.get("rows", 0)
         known: dict[str, Any] = {"id": kept.get("id") or secrets.token_hex(4)}
         super().__init__(save_dir=save_dir, **(known | options))
+        self._wandb_init.pop("anonymous")  # wandb warns of it even where it is not set
 
     @rank_zero_only
     def log_metrics(self, metrics: Mapping[str, Any], step: int | None = None) -> None:
         """Logs numbers, tables and videos at a step, unless an earlier part of the run was further."""
         if step is not None and step < self.told:
             return
+        if self.experiment.step < self.rows:  # wandb numbers the rows of an offline part anew, from 0
+            self.experiment.log({}, step=self.rows)
         super().log_metrics(metrics, step)
         partial = self.path.with_suffix(".partial")
-        partial.write_text(json.dumps({"id": self.experiment.id, "step": step}) + "\n")
+        known = {"id": self.experiment.id, "step": step, "rows": self.experiment.step}
+        partial.write_text(json.dumps(known) + "\n")
         partial.replace(self.path)
 
     @rank_zero_only

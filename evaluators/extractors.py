@@ -10,13 +10,14 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from evaluators.action_gru import load_action_gru
+from evaluators.action_gru import ActionGRU, load_action_gru
 from evaluators.motion_clip import MotionCLIPTask
 from evaluators.stgcn import load_uestc, load_unconstrained
 from evaluators.t2m import WordVectors, load_t2m
 from flame_mdm.checkpoints import find
 from flame_mdm.config import UserError
 from flame_mdm.generation import file_sha256
+from flame_mdm.noise import key
 from flame_mdm.representations import Representation
 from flame_mdm.task import load_task
 
@@ -104,13 +105,18 @@ class T2MExtractor(Extractor):
     finest.tar (in text_mot_match/model), mean.npy and std.npy (t2m_mean.npy and t2m_std.npy in MDM, kit_... for KIT),
     our_vab_data.npy and our_vab_idx.pkl (GloVe).
 
+    Args:
+        path: the folder.
+        device: to compute on.
+        full_length: legacy, see `WordVectors`: captions are said to fill all 22 slots.
+
     Raises:
         FileNotFoundError, ValueError: a file is not there or is another one.
     """
 
     FILES = ("finest.tar", "mean.npy", "std.npy", "our_vab_data.npy", "our_vab_idx.pkl")
 
-    def __init__(self, path: str, device: str | torch.device = "cpu"):
+    def __init__(self, path: str, device: str | torch.device = "cpu", *, full_length: bool = False):
         folder = Path(path)
         missing = [name for name in self.FILES if not (folder / name).is_file()]
         if missing:
@@ -118,7 +124,7 @@ class T2MExtractor(Extractor):
         hashes = "".join(file_sha256(folder / name) for name in self.FILES)
         self.path, self.sha256 = folder, hashlib.sha256(hashes.encode()).hexdigest()
         self.network = load_t2m(*(folder / name for name in self.FILES[:3])).to(device)
-        self.words = WordVectors(folder)
+        self.words, self.full_length = WordVectors(folder), full_length
 
     def check(self, representation: Representation, dataset: str) -> None:
         """Only the features as published, of the data set of that width."""
@@ -143,7 +149,7 @@ class T2MExtractor(Extractor):
         known = [words for words in tokens if words is not None]
         if len(known) < len(tokens):
             raise UserError(f"extractor {self.path}: reads tagged words, which the data set lacks for its captions")
-        return self.network.text(self.words(known))
+        return self.network.text(self.words(known, full_length=self.full_length))
 
 
 CLASSIFIERS = {
@@ -157,14 +163,24 @@ CLASSIFIERS = {
 class ClassifierExtractor(Extractor):
     """A released action classifier, one of `CLASSIFIERS`.
 
+    Args:
+        kind: which one.
+        path: the file.
+        device: to compute on.
+        random_start: legacy of Guo et al. 2020 and all who follow: the recurrence of humanact12 starts from a normal
+            draw, another one for features than for scores. Here it is drawn from the motion, so that it is the same in
+            any batch.
+
     Raises:
-        FileNotFoundError, ValueError: no such file, or of other weights.
+        FileNotFoundError, ValueError: no such file, or of other weights; or no recurrence to start.
     """
 
-    def __init__(self, kind: str, path: str, device: str | torch.device = "cpu"):
+    def __init__(self, kind: str, path: str, device: str | torch.device = "cpu", *, random_start: bool = False):
         read, self.dataset, self.reads = CLASSIFIERS[kind]
         self.network = read(path).to(device)
-        self.path, self.sha256 = path, file_sha256(path)
+        self.path, self.sha256, self.random_start = path, file_sha256(path), random_start
+        if random_start and not isinstance(self.network, ActionGRU):
+            raise ValueError(f"random_start: the classifier {kind} has no recurrence to start")
 
     def check(self, representation: Representation, dataset: str) -> None:
         """Rotations and joints of 24 SMPL joints, of the data set it was trained on."""
@@ -177,4 +193,19 @@ class ClassifierExtractor(Extractor):
     def motions(self, features: Tensor, joints: Tensor, mask: Tensor) -> dict[str, Tensor]:
         """Features and class scores of motions."""
         x = joints if self.reads == "joints" else features
-        return {"features": self.network(x, mask), "logits": self.network.logits(x, mask)}
+        if not self.random_start:
+            return {"features": self.network(x, mask), "logits": self.network.logits(x, mask)}
+        assert isinstance(self.network, ActionGRU)
+        names = [
+            hashlib.sha256(motion[real].cpu().numpy().tobytes()).hexdigest()
+            for motion, real in zip(x, mask, strict=True)
+        ]
+        start = {use: torch.cat([self._start(use, name) for name in names], 1) for use in ("features", "logits")}
+        return {
+            "features": self.network(x, mask, start["features"]),
+            "logits": self.network.logits(x, mask, start["logits"]),
+        }
+
+    def _start(self, use: str, name: str) -> Tensor:
+        assert isinstance(self.network, ActionGRU)
+        return self.network.random_state(1, torch.Generator().manual_seed(key(use, name)))

@@ -803,8 +803,10 @@ def nothing() -> dict[str, Any]:
         "motions_for_text": tops,
         "retrieval": tuple(f"{way}_{name}" for way in ("t2m", "m2t") for name in recalls),
         "temos": errors,
+        "temos_best": tuple(f"{which}_{name}" for which in ("best", "worst") for name in errors),
         "flame": errors,
         "displacement": ("ade", "fde"),
+        "kept_drift": ("mean", "largest"),
     }
     return {name: dict.fromkeys(names[name]) if name in names else None for name in all_metrics()}
 

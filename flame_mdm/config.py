@@ -303,7 +303,7 @@ def _check_same_kinds(base: Config, config: Config, path: str = "") -> None:
         elif isinstance(value, Mapping):
             if isinstance(config[name], Mapping):
                 _check_same_kinds({k: v for k, v in value.items() if "_target_" not in value}, config[name], f"{key}.")
-            elif config[name] is not None or not (path or "_target_" in value):
+            elif config[name] is not None or key in ("run", "callbacks", "losses"):
                 raise UserError(f"{key}={config[name]}: it has to be a mapping of keys")
         elif value is not None and not isinstance(value, list):
             kind = type(value).__name__

@@ -37,7 +37,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Runs the command; returns its exit code."""
     words = sys.argv[1:] if argv is None else argv
     text = ("ckpt", "extractor", "from_samples", "protocol", "data_root", "out")
-    return run(evaluate, words, usage=USAGE, name="evaluate", text=text)
+    like = ("flame_mdm.task.generate", "evaluators.protocols.change")
+    return run(evaluate, words, usage=USAGE, name="evaluate", text=text, like=like)
 
 
 def evaluate(config: Config) -> None:

@@ -18,6 +18,8 @@ from flame_mdm.task import MotionGeneration
 from flame_mdm.visualize import Motion, contact_sheet, write_gif, write_player
 
 BATCH = 32
+MOST = 10_000
+"""Samples of one request; they are kept in memory until all are there."""
 
 
 @dataclass
@@ -70,6 +72,11 @@ def generate(
     Raises:
         UserError: an empty text, an unknown action, a length the model was not trained for.
     """
+    for name, value, most in (("samples", samples, MOST), ("num_inference_steps", num_inference_steps, None)):
+        if value is not None and not 1 <= value <= (most or value):
+            raise UserError(f"{name}={value}: give 1{f' to {most:,}' if most else ' or more'}")
+    if guidance_scale is not None and not math.isfinite(guidance_scale):
+        raise UserError(f"guidance_scale={guidance_scale} is no finite number")
     texts = [texts] if isinstance(texts, str) else texts
     wanted = list(texts or actions or [""])
     if texts is not None and not all(text.strip() for text in texts):

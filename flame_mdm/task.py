@@ -270,7 +270,20 @@ def load_task(path: str | Path, kind: type[Trained], device: str | torch.device 
         FileNotFoundError: no such file.
         UserError: not a checkpoint of this framework, not of this kind, damaged, or of another shape than its recipe.
     """
+    try:
+        torch.empty(0, device=device)
+    except (RuntimeError, AssertionError) as error:  # torch reports an absent device as either
+        raise UserError(f"device={device}: {str(error).splitlines()[0]}") from error
     checkpoint = read_checkpoint(path)
+    try:
+        return _build(path, checkpoint, kind).eval().to(device)
+    except (UserError, FileNotFoundError):
+        raise
+    except Exception as error:  # a recipe of nonsense fails anywhere
+        raise UserError(f"{path}: no model can be built of it: {type(error).__name__}: {error}") from error
+
+
+def _build(path: str | Path, checkpoint: dict[str, Any], kind: type[Trained]) -> Trained:
     config, facts = checkpoint["config"], checkpoint["facts"]
     parts = ("task", "representation", "process", "condition", "denoiser")
     trust({name: config[name] for name in parts if name in config})
@@ -285,7 +298,7 @@ def load_task(path: str | Path, kind: type[Trained], device: str | torch.device 
     except RuntimeError as error:
         lines = [line.strip() for line in str(error).splitlines() if line.strip()]
         raise UserError(f"{path}: the weights do not fit the recipe saved with them: {lines[1]}") from error
-    return task.eval().to(device)
+    return task
 
 
 def read_checkpoint(path: str | Path) -> dict[str, Any]:
@@ -300,7 +313,7 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
     """
     path = checkpoints.find(path)
     if path.suffix == ".safetensors":
-        return checkpoints.read(path)
+        return _sensible(path, checkpoints.read(path))
     try:
         with zipfile.ZipFile(path) as file:
             if (spoiled := file.testzip()) is not None:  # torch does not look at the checksums
@@ -308,6 +321,18 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
         checkpoint = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # torch raises many kinds for damaged files and foreign pickles
         raise UserError(f"{path}: damaged, or not a checkpoint of this framework") from error
-    if not isinstance(checkpoint, dict) or not {"config", "facts", "state_dict"} <= checkpoint.keys():
+    return _sensible(path, checkpoint)
+
+
+def _sensible(path: Path, checkpoint: Any) -> dict[str, Any]:
+    """The checkpoint, if it holds a recipe, facts of the data and weights."""
+    if not isinstance(checkpoint, dict) or not all(
+        isinstance(checkpoint.get(name), dict) for name in ("config", "facts", "state_dict")
+    ):
         raise UserError(f"{path}: not a checkpoint of this framework: it holds no recipe")
+    facts, most = checkpoint["facts"], checkpoint["facts"].get("max_frames", 1)
+    if not isinstance(facts.get("actions"), list | tuple) or not isinstance(most, int) or most < 1:
+        raise UserError(f"{path}: damaged: its facts of the data, actions and max_frames, make no sense")
+    if not all(isinstance(value, Tensor) for value in checkpoint["state_dict"].values()):
+        raise UserError(f"{path}: damaged: its weights are no tensors")
     return checkpoint

@@ -1,5 +1,6 @@
 """Published numbers and the tables that they stand in: whole, well formed, and about what the evaluations measure."""
 
+import json
 import re
 from collections import Counter
 from functools import cache
@@ -16,7 +17,6 @@ from flame_mdm.evaluate import load_protocol
 from flame_mdm.hyperparameters import values
 from flame_mdm.processes.diffusion import Sampler
 from flame_mdm.processes.flow_matching import STEPS
-from flame_mdm.representations import Representation
 
 PUBLISHED: dict[str, dict[str, Any]] = yaml.safe_load(tables.PUBLISHED.read_text())
 PAPERS = [name for name in tables.spec_names() if name.startswith(("flame_", "mdm_", "mfm_"))]
@@ -30,12 +30,6 @@ NUMBER = re.compile(r"(\d{1,3}(,\d{3})*|\d+)(\.\d+)?(M|%)?( ±\d*\.\d+)?")
 recipe = cache(compose)
 
 
-@cache
-def representation(name: str) -> Representation:
-    """Of the motions of a recipe."""
-    return instantiate(recipe(name)["representation"])
-
-
 def trained(row: Config) -> str:
     """The recipe of the checkpoint of a row."""
     found = re.fullmatch(r"runs/(.+)/default/checkpoints/(best|last)\.ckpt", row["ckpt"])
@@ -43,10 +37,14 @@ def trained(row: Config) -> str:
     return found[1]
 
 
-@cache
 def measures(protocol: str, name: str) -> tuple[Any, set[str]]:
     """A protocol for motions of a recipe, and the names of the values it gives."""
-    motions = representation(name)
+    return _measures(protocol, json.dumps(recipe(name)["representation"]))
+
+
+@cache
+def _measures(protocol: str, representation: str) -> tuple[Any, set[str]]:
+    motions = instantiate(json.loads(representation))
     loaded = load_protocol(protocol, motions)
     several = (loaded.multimodality or {}).get("metrics", {})
     evaluator = Evaluator(None, loaded.metrics | several, motions)
@@ -121,10 +119,26 @@ def test_settings_exist_in_the_recipes(name):
 def test_columns_are_what_the_protocol_measures(name):
     part = MEASURED[name]
     for row in part["rows"]:
-        protocol, found = measures(part["protocol"], trained(row))
+        _, found = measures(part["protocol"], trained(row))
         wanted = {column["value"] for column in part["columns"].values()}
         assert wanted <= found | tables.ABOUT.keys(), f"{part['protocol']} measures {sorted(found)}"
-        assert (protocol.extractor is None) == ("extractor" not in part)
+
+
+def extracted(path: str) -> tuple[str, str]:
+    """Kind and data set of an extractor, by its path."""
+    if path.startswith("runs/"):
+        return "MotionCLIPExtractor", recipe(trained({"ckpt": path}))["data"]["name"]
+    if path.startswith("assets/t2m/"):
+        return "T2MExtractor", Path(path).name
+    return ("ClassifierExtractor", Path(path).parent.name) if path else ("", "")
+
+
+def wanted_extractor(protocol: Any, config: Config) -> tuple[str, str]:
+    """Kind and data set of the extractor that a protocol needs for a recipe."""
+    if protocol.extractor is None:
+        return "", ""
+    data = config["data"]["name"].removesuffix("-all")  # stores of published splits
+    return protocol.extractor["_target_"].rpartition(".")[2], data
 
 
 @pytest.mark.parametrize("name", MEASURED)
@@ -137,11 +151,7 @@ def test_rows_are_checkpoints_of_recipes_that_fit(name):
         protocol, _ = measures(part["protocol"], trained(row))
         labels = config["condition"].get("_target_", "").endswith("ActionLabels")
         assert protocol.condition in ("none", "action" if labels else "text")
-        if part.get("extractor", "").startswith("runs/"):
-            extractor = recipe(trained({"ckpt": part["extractor"]}))
-            assert extractor["data"]["name"] == config["data"]["name"]
-        elif "t2m" in part.get("extractor", ""):
-            assert Path(part["extractor"]).name == config["data"]["name"]
+        assert extracted(part.get("extractor", "")) == wanted_extractor(protocol, config)
         diffusion = config["process"]["_target_"].endswith("GaussianDiffusion")
         assert row.get("sampler", config["task"]["sampler"]) in (get_args(Sampler) if diffusion else STEPS)
         steps = row.get("num_inference_steps", 1)

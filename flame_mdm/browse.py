@@ -45,6 +45,8 @@ def browse(config: Config) -> None:
     if "data" not in config:
         names = sorted(path.stem for path in (EXPERIMENTS / "data").glob("*.yaml"))
         raise UserError(f"which data set? data=NAME, one of: {', '.join(names)}")
+    if config["clips"] < 1:
+        raise UserError(f"clips={config['clips']}: a page shows at least 1")
     from flame_mdm.visualize import write_player
 
     representation = instantiate(config["representation"])

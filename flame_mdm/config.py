@@ -290,7 +290,7 @@ def _check_kind(key: str, value: Any, annotation: str) -> None:
         else:
             return
         needed.append(words)
-    raise UserError(f"{key}={value}: it has to be {' or '.join(needed)}")
+    raise UserError(f"{key}={value}: it has to be {' or '.join(dict.fromkeys(needed))}")
 
 
 def _check_same_kinds(base: Config, config: Config, path: str = "") -> None:
@@ -565,7 +565,7 @@ def _serve(
         _check_whole(composed, first)
     for function in like:
         for key, annotation in _signature(function, "like").items():
-            if key in composed:
+            if composed.get(key) is not None:
                 _check_kind(key, composed[key], annotation)
     if "local" in launch and composed.get("trainer", {}).get("devices", 1) != 1:
         raise UserError("launch=local runs each job in one process: leave out launch, or trainer.devices")

@@ -208,15 +208,19 @@ def _new_frames(length: int, fps: float, frames: str | Ranges | None, seconds: R
 
 
 def _pairs(ranges: Ranges, unit: str) -> list[tuple[float, float]]:
-    listed: Any = [ranges] if all(isinstance(value, int | float) for value in ranges) else ranges
-    if not listed or not all(map(is_range, listed)):
+    listed: Any = [ranges] if is_range(ranges) else ranges
+    if not isinstance(listed, list | tuple) or not listed or not all(map(is_range, listed)):
         raise UserError(f"{unit}={ranges}: write [begin, end], or several as [[begin, end], [begin, end]]")
     return [(begin, end) for begin, end in listed]
 
 
 def is_range(value: Any) -> bool:
-    """Whether this is a pair of numbers."""
-    return isinstance(value, list | tuple) and len(value) == 2 and all(isinstance(v, int | float) for v in value)
+    """Whether this is a pair of finite numbers."""
+    return (
+        isinstance(value, list | tuple)
+        and len(value) == 2
+        and all(isinstance(v, int | float) and math.isfinite(v) for v in value)
+    )
 
 
 def part_names(skeleton: Skeleton) -> dict[str, list[int]]:
@@ -249,8 +253,8 @@ def find_joints(skeleton: Skeleton, names: str | Sequence[str]) -> list[int]:
     """
     known = part_names(skeleton) | {name: [i] for i, name in enumerate(skeleton.joints)}
     found: set[int] = set()
-    for name in [names] if isinstance(names, str) else names:
-        if name not in known:
+    for name in names if isinstance(names, list | tuple) else [names]:
+        if not isinstance(name, str) or name not in known:
             raise UserError(
                 f"skeleton {skeleton.name} has no joint or part '{name}'.{_nearest(str(name), list(known))} "
                 f"Parts: {', '.join(part_names(skeleton))}; joints: {', '.join(skeleton.joints)}"
@@ -363,6 +367,8 @@ def _read_npz(representation: Representation, path: Path) -> tuple[np.ndarray, s
             f"{path}: holds {what} and no joints, but the model takes {representation.name} at "
             f"{representation.fps:g} fps"
         )
+    if arrays["joints"].dtype.kind not in "fiu":
+        raise ValueError(f"{path}: joints are no array of real numbers")
     joints = np.asarray(arrays["joints"], np.float64)
     if joints.ndim != 3 or joints.shape[2] != 3 or len(joints) < 2 or not np.isfinite(joints).all():
         raise ValueError(f"{path}: joints have shape {joints.shape}, not (frames, joints, 3), or are not finite")

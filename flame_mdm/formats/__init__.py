@@ -122,14 +122,16 @@ def _read_npz(path: Path, fps: float | None, unit: float | None) -> MotionFile:
     if "joints" in data and "fps" in data:
         joints, text = data["joints"], str(data.get("text", ""))
         poses = _poses_of_features(str(data.get("representation", "")), data.get("features"))
-        return MotionFile(joints, fps or data["fps"], _skeleton(joints), caption=text, id=path.stem, poses=poses)
-    rate = fps or next((data[key] for key in ("mocap_framerate", "mocap_frame_rate") if key in data), None)
-    if "poses" in data and "trans" in data and rate is not None:
+        return MotionFile(joints, _rate(fps, data["fps"]), _skeleton(joints), caption=text, id=path.stem, poses=poses)
+    given = next((data[key] for key in ("mocap_framerate", "mocap_frame_rate") if key in data), None)
+    if "poses" in data and "trans" in data and (fps is not None or given is not None):
+        if {data["poses"].dtype.kind, data["trans"].dtype.kind} - set("fiu"):
+            raise ValueError("poses and trans are no arrays of real numbers")
         if data["poses"].ndim != 2 or data["trans"].shape != (len(data["poses"]), 3):
             raise ValueError(f"poses {data['poses'].shape} and trans {data['trans'].shape}, not (F, 3 K) and (F, 3)")
         motion = torch.from_numpy(np.concatenate([data["trans"], data["poses"]], 1, dtype=np.float64))
         poses = _smpl_poses(*read_pose(motion), AMASS_AXES)
-        return _of_poses(poses, rate, str(data.get("text", "")), path.stem)
+        return _of_poses(poses, _rate(fps, given), str(data.get("text", "")), path.stem)
     raise ValueError(
         f"it holds {', '.join(data) or 'nothing'}; a motion is joints and fps, or poses, trans and mocap_framerate"
     )
@@ -166,14 +168,14 @@ def _read_bvh(path: Path, fps: float | None, unit: float | None) -> MotionFile:
         raise ValueError(
             f"the body is {tall:.3g} m tall; say how many metres a unit of the file is: unit=1, 0.01 or 0.0254 (inches)"
         )
-    return MotionFile(joints, fps or rate, SMPL22, id=path.stem)
+    return MotionFile(joints, _rate(fps, rate), SMPL22, id=path.stem)
 
 
 def _read_json(path: Path, fps: float | None, unit: float | None) -> MotionFile:
     try:
         data = json.loads(path.read_text(encoding="utf-8"))
-        joints, rate, text = np.array(data["joints"], np.float32), fps or data["fps"], str(data.get("caption", ""))
-    except (ValueError, TypeError, KeyError) as error:
+        joints, rate, text = np.array(data["joints"], float), _rate(fps, data["fps"]), str(data.get("caption", ""))
+    except (ValueError, TypeError, KeyError, RecursionError) as error:
         raise ValueError(f"no motion in JSON, an object with joints and fps: {error}") from error
     return MotionFile(joints, rate, _skeleton(joints), caption=text, id=path.stem)
 
@@ -181,7 +183,7 @@ def _read_json(path: Path, fps: float | None, unit: float | None) -> MotionFile:
 def _read_npy(path: Path, fps: float | None, unit: float | None) -> MotionFile:
     try:
         with path.open("rb") as raw:
-            joints = np.load(raw, allow_pickle=False)
+            joints = np.lib.format.read_array(raw, allow_pickle=False)
     except (OSError, ValueError, EOFError) as error:
         raise ValueError(f"damaged, or no .npy file of numbers: {error}") from error
     if joints.ndim == 2 and joints.shape[1] in (263, 251):
@@ -195,8 +197,18 @@ def _read_npy(path: Path, fps: float | None, unit: float | None) -> MotionFile:
     return MotionFile(joints * (1.0 if unit is None else unit), fps, skeleton, id=path.stem)
 
 
+def _rate(asked: float | None, given: Any) -> float:
+    """Frames a second: those asked for, or those that the file gives."""
+    value = np.asarray(given if asked is None else asked)
+    if value.shape or value.dtype.kind not in "fiu" or not 0 < float(value) < float("inf"):
+        raise ValueError(f"{value} frames a second, but it has to be one number above 0")
+    return float(value)
+
+
 def _skeleton(joints: np.ndarray) -> Skeleton:
     """The skeleton of joints (F, J, 3), told by their number."""
+    if joints.dtype.kind not in "fiu" or not (np.abs(joints) < 1e6).all():
+        raise ValueError("joints are no array of real numbers below 1e6")
     for skeleton in SKELETONS.values():
         if joints.ndim == 3 and joints.shape[1:] == (len(skeleton), 3):
             return skeleton

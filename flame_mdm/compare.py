@@ -323,7 +323,7 @@ def rating_page(contestants: Sequence[Contestant], shown: Sequence[Mapping[Promp
             left, right = sides = [("a", shown[0][prompt]), ("b", those[prompt])]
             if draw.random() < 0.5:
                 left, right = reversed(sides)
-            scene = [replace(left[1], id="left", caption=""), replace(right[1], id="right", caption="")]
+            scene = [replace(left[1], id="the left one", caption=""), replace(right[1], id="the right one", caption="")]
             player = player_page(scene, "", columns=2)
             item = {"prompt": prompt[0], "a": first.label, "b": other.label, "left": left[0], "player": player}
             items.append(item)

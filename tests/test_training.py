@@ -44,7 +44,8 @@ def trained(tmp_path_factory, data_root):
 
 def test_a_run_leaves_what_a_user_looks_for(trained):
     folder = trained.parent.parent
-    for name in ("config.yaml", "provenance.json", "samples/step_0000006/player.html", "checkpoints/best.ckpt"):
+    files = ("config.yaml", "provenance.json", "metrics.jsonl", "report.html", "checkpoints/best.ckpt")
+    for name in (*files, "samples/step_0000006/player.html"):
         assert (folder / name).is_file(), name
     assert list((folder / "tensorboard").glob("events*"))
     checkpoint = read_checkpoint(trained)

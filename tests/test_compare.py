@@ -1,0 +1,229 @@
+"""Runs side by side, and people's judgement of their motions."""
+
+import json
+import re
+from html import unescape
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from test_report import a_run, result, run
+
+from flame_mdm import compare
+from flame_mdm.compare import find, read_texts, tally, wilson
+from flame_mdm.config import UserError
+
+PROMPTS = ("a person walks", "a person jumps", "a person <waves> & bows")
+
+
+def motions(folder: Path, prompts: tuple[str, ...] = PROMPTS, at: float = 0.0) -> Path:
+    """A folder of motion files, as `make sample` writes them; all stand at x = `at`."""
+    folder.mkdir(parents=True, exist_ok=True)
+    joints = np.random.default_rng(0).random((8, 22, 3)).astype(np.float32)
+    joints[..., 0] += at
+    for number, text in enumerate(prompts):
+        np.savez(folder / f"motion_{number:03d}.npz", joints=joints, fps=20.0, text=text)
+    (folder / "player.html").write_text("")
+    return folder
+
+
+@pytest.fixture
+def three(tmp_path) -> list[Path]:
+    """Two runs and a folder of motions."""
+    first = a_run(tmp_path / "a", name="one", optimizer={"lr": 0.1, "same": 1})
+    second = a_run(tmp_path / "b", name="two", optimizer={"lr": 0.2, "same": 1}, extra="<em>")
+    motions(first / "samples" / "step_0000009", at=1)
+    motions(second / "samples" / "step_0000009", PROMPTS[::-1], at=2)
+    return [first, second, motions(tmp_path / "real", PROMPTS[1:], at=3)]
+
+
+def put(folder: Path, name: str, **changes: Any) -> None:
+    path = folder / "evaluation" / "p-3" / name / "result.json"
+    path.parent.mkdir(parents=True)
+    path.write_text(json.dumps(result(**changes)))
+
+
+def page(folders: list[Path], out: Path, *words: str) -> str:
+    assert compare.main([f"runs={' '.join(map(str, folders))}", f"out={out}", *words]) == 0
+    return out.read_text()
+
+
+def players(text: str) -> list[list[dict[str, Any]]]:
+    """The motions in each player of a page."""
+    frames = [unescape(source) for source in re.findall(r'srcdoc="([^"]*)"', text)]
+    return [packed(source) for source in frames]
+
+
+def packed(player: str) -> list[dict[str, Any]]:
+    return json.loads(re.findall(r'id="data">(.*?)</script>', player, re.DOTALL)[0])
+
+
+def test_a_page_puts_runs_side_by_side(three, tmp_path):
+    put(three[0], "x")
+    put(three[1], "x", values={"fid": {"mean": 7.5, "ci": 0.5}}, quick=True)
+    put(three[1], "y", split="val")
+    text = page(three, tmp_path / "out.html")
+    table = text[text.index("What the recipes differ in") : text.index("Motions for the same prompts")]
+    assert "<td>optimizer.lr</td><td>0.1</td><td>0.2</td>" in table
+    assert "<td>extra</td><td>–</td><td>&lt;em&gt;</td>" in table
+    assert "same" not in table
+    assert "run.dir" not in table
+    (scene,) = players(text)
+    names = [(motion["caption"], motion["id"]) for motion in scene]
+    labels = ["mine/one", "mine/two", "real"]
+    assert names == [(prompt, label) for prompt in PROMPTS[1:] for label in labels], "prompts that all have"
+    assert [round(motion["center"][0] - 0.5) for motion in scene] == [1, 2, 3] * 2, "each under its own name"
+    assert text.count("<h3>p version 3") == 2, "splits are not compared"
+    assert "7.5 ± 0.5" in text
+    assert "quick: not a result" in text
+    assert "mine/one 0.001953" in text, "curves are overlaid"
+    assert page(three, tmp_path / "again.html") == text
+
+
+def test_runs_of_the_same_name_go_by_their_folders(tmp_path):
+    folders = [a_run(tmp_path / name) for name in ("a", "b")]
+    assert [contestant.label for contestant in find([str(folder) for folder in folders])] == [str(f) for f in folders]
+
+
+def test_runs_without_a_common_prompt_are_compared_and_not_judged(three, tmp_path, capsys):
+    other = motions(tmp_path / "other", ("a person swims",))
+    assert "no prompt in common" in page([three[0], other], tmp_path / "out.html")
+    assert compare.main([f"runs={three[0]} {other}", "rate=true", f"out={tmp_path / 'rate.html'}"]) == 1
+    assert "no prompt in common to be judged by" in capsys.readouterr().err
+    assert not (tmp_path / "rate.html").exists()
+
+
+def test_texts_are_sampled_by_the_last_checkpoints(tmp_path, data_root):
+    first = run(tmp_path / "a", data_root, "trainer.max_steps=2", "callbacks.samples=null")
+    second = run(tmp_path / "b", data_root, "trainer.max_steps=4", "callbacks.samples=null", "run.name=longer")
+    (tmp_path / "prompts.txt").write_text("a person hops\n\na person walks\na person hops\n")
+    folders = [first, second, motions(tmp_path / "real", ("a person walks",))]
+    (scene,) = players(page(folders, tmp_path / "out.html", f"texts={tmp_path / 'prompts.txt'}", "seconds=1.5"))
+    assert [motion["id"] for motion in scene] == ["quickstart", "quickstart/longer", "real"]
+    assert {motion["caption"] for motion in scene} == {"a person walks"}
+    assert scene[0]["frames"] == 30
+    assert scene[0]["joints"] != scene[1]["joints"]
+    assert read_texts("a person walks; a person (jumps), 100%;") == ["a person walks", "a person (jumps), 100%"]
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ([], "give one of runs="),
+        (["runs=a b", "ratings=c"], "give one of runs="),
+        (["runs=a"], "two runs or more"),
+        (["runs=a a"], "two runs or more"),
+        (["runs=/nowhere /nothing"], "/nowhere: neither a run"),
+        (["runs={0} {1}", "texts= ; "], "no text in it"),
+        (["runs={0} {1}", "texts=absent.txt"], "texts=absent.txt: no such file"),
+        (["runs={0} {1}", "texts=a person walks"], "no such checkpoint"),
+        (["runs={0} {1}", "rates=true"], "unknown config key 'rates'. Did you mean rate"),
+    ],
+)
+def test_bad_requests_are_one_line(three, words, message, capsys):
+    assert compare.main([word.format(*three) for word in words]) == 1
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1
+
+
+# Judgement ------------------------------------------------------------------------------------------------------------
+
+
+def questions(text: str) -> list[dict[str, Any]]:
+    """What a rating page asks."""
+    data = json.loads(re.findall(r'id="data">(.*?)</script>', text, re.DOTALL)[0])
+    return data["items"]
+
+
+def test_a_rating_page_hides_whose_motions_it_shows(three, tmp_path):
+    text = page(three, tmp_path / "rate.html", "rate=true")
+    assert "Which animation better fits the following description?" in text
+    items = questions(text)
+    assert sorted((item["b"], item["prompt"]) for item in items) == sorted(
+        [("mine/two", prompt) for prompt in PROMPTS] + [("real", prompt) for prompt in PROMPTS[1:]]
+    )
+    where = {"mine/one": 1, "mine/two": 2, "real": 3}
+    for item in items:
+        scene = packed(item["player"])
+        assert [motion["id"] for motion in scene] == ["the left one", "the right one"]
+        assert not any(motion["caption"] for motion in scene)
+        assert not any(label in item["player"] for label in where)
+        left, right = (motion["center"][0] for motion in scene)
+        assert (left < right) == (item["left"] == "a"), "a is the first run, which stands at the least x"
+    assert page(three, tmp_path / "again.html", "rate=true") == text
+
+
+def test_sides_and_order_are_drawn(tmp_path):
+    prompts = tuple(f"prompt {number}" for number in range(24))
+    folders = [motions(tmp_path / name, prompts, at) for name, at in (("a", 0), ("b", 1))]
+    first, other = (questions(page(folders, tmp_path / "rate.html", "rate=true", f"seed={seed}")) for seed in (0, 1))
+    for items in (first, other):
+        assert 5 < sum(item["left"] == "a" for item in items) < 19
+        assert [item["prompt"] for item in items] != list(prompts)
+    assert [item["prompt"] for item in first] != [item["prompt"] for item in other]
+    assert {item["prompt"]: item["left"] for item in first} != {item["prompt"]: item["left"] for item in other}
+
+
+def ratings(path: Path, choices: str, rater: str = "ann", a: str = "ours", b: str = "real", **changes: Any) -> Path:
+    answers = [{"prompt": f"p{k}", "a": a, "b": b, "choice": choice} for k, choice in enumerate(choices)]
+    path.write_text(json.dumps({"format": 1, "study": "s", "rater": rater, "ratings": answers, **changes}))
+    return path
+
+
+def test_ratings_of_several_people_are_counted(tmp_path, capsys):
+    files = [
+        ratings(tmp_path / "x.json", "aab"),
+        ratings(tmp_path / "y.json", "abb", rater="bob", a="real", b="ours"),
+        ratings(tmp_path / "z.json", "a", rater="bob", b="other", study="t"),
+    ]
+    out = tmp_path / "ratings.json"
+    assert compare.main([f"ratings={' '.join(map(str, files))}", f"out={out}"]) == 0
+    first, second = json.loads(out.read_text())["pairs"]
+    assert {k: first[k] for k in ("a", "b", "wins_a", "wins_b", "raters")} == {
+        **{"a": "ours", "b": "real"},
+        **{"wins_a": 4, "wins_b": 2, "raters": 2},
+    }
+    assert first["share_a"] == pytest.approx(2 / 3)
+    assert (second["b"], second["wins_a"], second["wins_b"], second["raters"]) == ("other", 1, 0, 1)
+    assert "ours over real: 4 of 6 answers, 66.7% (30.0% to 90.3%), 2 raters" in capsys.readouterr().out
+
+
+def test_the_interval_is_wilsons():
+    assert wilson(8, 10) == pytest.approx((0.4902, 0.9433), abs=1e-4)  # as statsmodels and Wikipedia's formula have it
+    assert wilson(0, 10)[0] == 0
+    assert wilson(10, 10)[1] == 1
+    low, high = wilson(423, 1000)
+    assert low < 0.423 < high
+    assert high - low == pytest.approx(2 * 1.96 * (0.423 * 0.577 / 1000) ** 0.5, rel=0.01)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("hello", "not a JSON file"),
+        ("[]", "holds list, not a JSON object"),
+        ('{"rater": "x"}', "the file has no 'study'"),
+        ('{"study": "s", "rater": "", "ratings": []}', "the file has no 'rater'"),
+        ('{"study": "s", "rater": "x", "ratings": []}', "holds no ratings"),
+        ('{"study": "s", "rater": "x", "ratings": [3]}', "rating 1 has no 'a'"),
+        ('{"study": "s", "rater": "x", "ratings": [{"a": "u", "b": "v", "choice": "c"}]}', "rating 1 chooses 'c'"),
+        ('{"study": "s", "rater": "x", "ratings": [{"a": "u", "b": "u", "choice": "a"}]}', "must be a or b of two"),
+    ],
+)
+def test_malformed_ratings_are_one_line(tmp_path, content, message, capsys):
+    path = tmp_path / "ratings.json"
+    path.write_text(content)
+    assert compare.main([f"ratings={path}", f"out={tmp_path / 'out.json'}"]) == 1
+    error = capsys.readouterr().err
+    assert message in error
+    assert str(path) in error
+    assert error.count("\n") == 1
+    assert not (tmp_path / "out.json").exists()
+
+
+def test_nobody_counts_twice(tmp_path):
+    files = [ratings(tmp_path / name, "ab") for name in ("x.json", "copy.json")]
+    with pytest.raises(UserError, match=r"copy\.json: ann has answered the same page in .*x\.json"):
+        tally(files)

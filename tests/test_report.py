@@ -1,0 +1,353 @@
+"""What a run tells while it trains, and the page that shows it."""
+
+import json
+import math
+import re
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import pytest
+import torch
+from conftest import TINY
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from flame_mdm import callbacks, report, train
+from flame_mdm.callbacks import Measurements
+from flame_mdm.config import UserError
+from flame_mdm.dashboards import History
+from flame_mdm.report import charted, constants, read_history, read_run, write_report
+from flame_mdm.visualize.page import chart, number, page, short, table
+
+RUN = [*TINY, "trainer.log_every_n_steps=2", "trainer.val_check_interval=4", "callbacks.checkpoints.every_n_steps=4"]
+EVALUATE = """# @package _global_
+defaults:
+  - /quickstart
+  - _self_
+callbacks:
+  evaluate: {_target_: flame_mdm.callbacks.Evaluate, protocol: synthetic, extractor: none, every_n_steps: 4, samples: 4,
+    replications: 2}
+"""
+
+
+def run(folder: Path, data_root: Path, *words: str, recipe: str = "quickstart") -> Path:
+    assert train.main([recipe, *RUN, f"data_root={data_root}", f"run.dir={folder}", *words]) == 0
+    return folder
+
+
+@pytest.fixture(scope="module")
+def evaluated(tmp_path_factory, data_root):
+    """A run of 8 steps that evaluates while it trains."""
+    folder = tmp_path_factory.mktemp("evaluated")
+    (folder / "mine.yaml").write_text(EVALUATE)
+    return run(folder / "run", data_root, "trainer.max_steps=8", recipe=str(folder / "mine.yaml"))
+
+
+def test_the_history_holds_what_a_step_does_and_costs(evaluated):
+    curves = read_history(evaluated)
+    for name in ("loss", "mse", "grad_norm", "lr", "epochs", "samples_per_second", "seconds_per_step"):
+        assert list(curves[f"train/{name}"]) == [1, 3, 5, 7], name
+    assert list(curves["val/loss"]) == [3, 7]
+    clips = 54  # of 60
+    assert curves["train/epochs"][7] == pytest.approx(8 * 8 / clips, rel=0.1)
+    for step, pace in curves["train/samples_per_second"].items():
+        assert pace * curves["train/seconds_per_step"][step] == pytest.approx(8, rel=1e-4)
+    assert "train/gpu_memory_gib" not in curves
+
+
+def test_values_of_several_replications_have_their_interval(evaluated):
+    curves = read_history(evaluated)
+    name = "val/synthetic/foot_skating"
+    assert curves[name].keys() == curves[f"{name}/ci"].keys() == {3, 7}
+    assert all(width > 0 for width in curves[f"{name}/ci"].values())
+
+
+def test_tensorboard_shows_the_table_the_configuration_and_the_data(evaluated):
+    events = EventAccumulator(str(evaluated / "tensorboard"))
+    events.Reload()
+    text = {
+        name.removesuffix("/text_summary"): events.Tensors(name)[-1].tensor_proto.string_val[0].decode()
+        for name in events.Tags()["tensors"]
+    }
+    assert "| metric | mean | ci | replications | n |" in text["evaluation/synthetic"]
+    assert "| foot_skating |" in text["evaluation/synthetic"]
+    assert "num_train_timesteps: 10" in text["config"]
+    assert "fingerprint: " in text["provenance"]
+    assert events.Tags()["images"] == ["samples"]
+    assert {event.step for event in events.Images("samples")} <= {3, 7}, "the steps of the validations"
+
+
+def test_the_norm_is_that_before_clipping_and_taken_for_the_log_alone(tmp_path, data_root, monkeypatch):
+    norms = []
+
+    def counted(gradients: Any) -> torch.Tensor:
+        norms.append(torch.nn.utils.get_total_norm(gradients))
+        return norms[-1]
+
+    monkeypatch.setattr(callbacks, "get_total_norm", counted)
+    words = ["trainer.max_steps=6", "trainer.gradient_clip_val=1e-6", "trainer.accumulate_grad_batches=2"]
+    curves = read_history(run(tmp_path / "run", data_root, *words, "callbacks.samples=null"))
+    assert list(curves["train/grad_norm"].values()) == pytest.approx([float(norm) for norm in norms])
+    assert list(curves["train/grad_norm"]) == [1, 3, 5]
+    assert min(curves["train/grad_norm"].values()) > 1e-3
+    pace = curves["train/samples_per_second"][5] * curves["train/seconds_per_step"][5]
+    assert pace == pytest.approx(16, rel=1e-4), "samples of a step, not of a batch"
+
+
+def test_memory_is_told_on_cuda(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "max_memory_allocated", lambda device: 3 * 2**29)
+    logged = {}
+    data = SimpleNamespace(batch_size=8, train=range(80))
+    trainer: Any = SimpleNamespace(
+        global_step=9, log_every_n_steps=5, world_size=1, accumulate_grad_batches=1, datamodule=data
+    )
+    model: Any = SimpleNamespace(
+        device=torch.device("cuda"), log=lambda name, value, prog_bar=False: logged.update({name: value})
+    )
+    measurements = Measurements()
+    measurements.on_train_start(trainer, model)
+    trainer.global_step = 10
+    measurements.on_train_batch_end(trainer, model, None, cast(Any, range(8)), 9)
+    assert logged["train/gpu_memory_gib"] == 1.5
+    assert logged["train/epochs"] == 1
+
+
+def test_a_resumed_history_is_that_of_the_uninterrupted_run(tmp_path, data_root):
+    parts = run(tmp_path / "parts", data_root, "trainer.max_steps=4", "callbacks.samples=null")
+    with (parts / "metrics.jsonl").open("a") as file:  # what a killed run leaves behind
+        file.write('{"step": 5, "train/loss": 77.0}\n{"step": 7, "train/lo')
+    run(parts, data_root, "trainer.max_steps=8", "callbacks.samples=null")
+    whole = run(tmp_path / "whole", data_root, "trainer.max_steps=8", "callbacks.samples=null")
+    a, b = read_history(parts), read_history(whole)
+    assert a.keys() == b.keys()
+    for name in ("train/loss", "train/grad_norm", "val/loss", "train/epochs"):
+        assert a[name] == b[name]
+    steps = [json.loads(line)["step"] for line in (parts / "metrics.jsonl").read_text().splitlines()]
+    assert steps == sorted(steps)
+
+
+def test_a_history_of_a_run_that_begins_anew_is_another(tmp_path):
+    (tmp_path / "metrics.jsonl").write_text('{"step": 40, "train/loss": 1.0}\n')
+    History(tmp_path).log_metrics({"train/loss": 2.0}, 3)
+    assert read_history(tmp_path) == {"train/loss": {3: 2.0}}
+
+
+# Weights & Biases -----------------------------------------------------------------------------------------------------
+
+
+def rows(file: Path) -> Iterator[dict[str, Any]]:
+    """The history in a .wandb file: LevelDB's log format, blocks of 32 KiB after 7 bytes, of protocol buffers."""
+    from wandb.proto.wandb_internal_pb2 import Record
+
+    data, place, whole = file.read_bytes(), 7, b""
+    while place + 7 <= len(data):
+        if 32768 - place % 32768 < 7:
+            place += 32768 - place % 32768
+            continue
+        _, size, kind = struct.unpack_from("<IHB", data, place)
+        whole += data[place + 7 : place + 7 + size]
+        place += 7 + size
+        if kind in (1, 4):  # whole, or the last part
+            record = Record()
+            record.ParseFromString(whole)
+            whole = b""
+            if record.HasField("history"):
+                items = record.history.item
+                yield {item.key or "/".join(item.nested_key): json.loads(item.value_json) for item in items}
+
+
+def test_wandb_has_one_run_through_resume(tmp_path, data_root, monkeypatch):
+    monkeypatch.setenv("WANDB_SILENT", "true")
+    monkeypatch.setenv("WANDB_MODE", "offline")
+    words = ["logger=wandb", "logger.offline=true", "callbacks.samples.every_n_steps=4"]
+    folder = run(tmp_path / "run", data_root, *words, "trainer.max_steps=4")
+    known = json.loads((folder / "wandb.json").read_text())
+    run(folder, data_root, *words, "trainer.max_steps=8")
+    assert json.loads((folder / "wandb.json").read_text())["id"] == known["id"]
+    first, second = (list(rows(file)) for file in sorted(folder.glob(f"wandb/offline-run-*-{known['id']}/*.wandb")))
+    together = first + second
+    assert [row["_step"] for row in together] == list(range(len(together))), "else the second part replaces the first"
+    steps = [row["trainer/global_step"] for row in together]
+    assert steps == sorted(steps)
+    assert {row["trainer/global_step"]: row["train/loss"] for row in together if "train/loss" in row} == {
+        step: pytest.approx(loss) for step, loss in read_history(folder)["train/loss"].items()
+    }
+    assert any("samples/_type" in row for row in second)
+
+
+# The page -------------------------------------------------------------------------------------------------------------
+
+
+def a_run(folder: Path, name: str = "default", **changes: Any) -> Path:
+    """The folder of a run that never was."""
+    folder.mkdir(parents=True)
+    config = {"experiment": "mine", "run": {"name": name, "dir": str(folder)}, "trainer": {"max_steps": 20}, **changes}
+    (folder / "config.yaml").write_text(json.dumps(config))
+    lines = [{"step": k, "train/loss": 2.0**-k, "val/p/fid": 3.0 + k, "val/p/fid/ci": 0.5} for k in range(10)]
+    (folder / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    return folder
+
+
+def result(**changes: Any) -> dict[str, Any]:
+    """A result of an evaluation, as far as pages read it."""
+    value = {"ci": 0.25, "replications": 2, "n": 64}
+    return {
+        "quick": False,
+        "invalid_because": [],
+        "changed": {},
+        "protocol": {"name": "p", "version": 3},
+        "split": "test",
+        "data": {"dataset": "synthetic", "fingerprint": "abc"},
+        "seed": 0,
+        "extractor": None,
+        "checkpoint": {
+            **{"path": "last.ckpt", "sha256": "0123456789", "sampler": "ddim"},
+            **{"num_inference_steps": 5, "guidance_scale": 2.5},
+        },
+        "device": "cpu",
+        "values": {"fid": {"mean": 4.5, **value}, "kid": {"mean": None, **value, "ci": None}},
+        "ground_truth": {"fid": {"mean": 0.125, **value}},
+        "not_computed": {"kid": "too few <samples>"},
+        "cost": {"seconds_per_sample": 0.5},
+        **changes,
+    }
+
+
+def test_training_ends_with_a_report_that_needs_nothing_else(evaluated):
+    text = (evaluated / "report.html").read_text()
+    for words in ("Samples at step 8", "Losses", "Validation", "synthetic/foot_skating", "grad_norm", "fingerprint"):
+        assert words in text, words
+    assert not re.findall(r"""(?:src|href)=["'](?!data:)|url\(|@import|https?://(?!www\.w3\.org)""", text)
+    assert "srcdoc=" in text
+    before = (evaluated / "report.html").read_bytes()
+    assert report.main([str(evaluated)]) == 0
+    assert (evaluated / "report.html").read_bytes() == before
+
+
+def test_a_report_shows_evaluations_with_their_marks(tmp_path):
+    folder = a_run(tmp_path / "run")
+    path = folder / "evaluation" / "p-3" / "x" / "result-0.json"
+    path.parent.mkdir(parents=True)
+    path.write_text(json.dumps(result(invalid_because=["real motions are off"], changed={"samples": 64})))
+    text = write_report(folder).read_text()
+    for words in (
+        *("4.5 ± 0.25", "0.125 ± 0.25", "not valid: real motions are off", "not as the protocol has it: samples 64"),
+        *("not computed: kid: too few &lt;samples&gt;", "ddim, 5 steps, guidance 2.5", "p version 3, synthetic test"),
+    ):
+        assert words in text, words
+
+
+def test_a_report_shows_why_training_stopped(tmp_path):
+    folder = a_run(tmp_path / "run")
+    batches = [{"rank": 0, "batch": 7, "ids": ["<b>walk"], "loss": "nan"}]
+    (folder / "bad_batch.json").write_text(json.dumps({"step": 8, "usual_loss": "0.5", "batches": batches}))
+    text = write_report(folder).read_text()
+    assert "Training stopped at step 8" in text
+    assert "&lt;b&gt;walk" in text
+    assert "<b>" not in text
+
+
+def test_names_are_text_not_html(tmp_path):
+    folder = a_run(tmp_path / "run", name="<script>alert(1)</script>", note="</pre><script>")
+    (folder / "metrics.jsonl").write_text('{"step": 1, "train/<i>x": 2.0}\n{"step": 2, "train/<i>x": 3.0}\n')
+    text = write_report(folder).read_text()
+    assert "<script" not in text
+    assert "<i>x" not in text
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("metrics.jsonl", "hello\n", r"metrics.jsonl: line 1 is damaged"),
+        ("metrics.jsonl", '{"step": 1}\n{"stop": 2}\n', r"metrics.jsonl: line 2 is damaged"),
+        ("metrics.jsonl", "[]\n", r"metrics.jsonl: line 1 is damaged"),
+        ("provenance.json", "{", r"provenance.json: not a JSON file"),
+        ("provenance.json", "[]", r"provenance.json: holds list"),
+    ],
+)
+def test_damaged_files_are_named(tmp_path, name, content, message):
+    folder = a_run(tmp_path / "run")
+    (folder / name).write_text(content)
+    with pytest.raises(UserError, match=message):
+        write_report(folder)
+    assert not (folder / "report.html").exists()
+
+
+def test_a_folder_without_a_run_is_one_line(tmp_path, capsys):
+    assert report.main([str(tmp_path)]) == 1
+    assert "no config.yaml there" in capsys.readouterr().err
+    assert report.main([]) == 1
+    assert "which run?" in capsys.readouterr().err
+
+
+def test_a_run_without_a_history_has_a_report(tmp_path):
+    folder = a_run(tmp_path / "run")
+    (folder / "metrics.jsonl").unlink()
+    assert "there is no metrics.jsonl in the folder" in write_report(folder).read_text()
+    assert read_run(folder).label == "mine"
+
+
+# Charts ---------------------------------------------------------------------------------------------------------------
+
+
+def test_curves_of_training_and_validation_share_a_chart():
+    curves = {
+        name: {1: 1.0, 2: 2.0}
+        for name in ("train/loss", "val/loss", "val/p/fid", "val/p/fid/ci", "train/grad_norm", "train/epochs")
+    }
+    curves["train/lr"] = {1: 0.1, 2: 0.1}
+    assert charted(curves) == {
+        "Losses": {"loss": ["train", "val"]},
+        "Validation": {"p/fid": ["val"]},
+        "Course": {"grad_norm": ["train"]},
+    }
+    assert constants(curves) == {"train/lr": 0.1}
+
+
+def points(svg: str) -> list[tuple[float, float]]:
+    line = re.findall(r"<polyline points='([^']*)'", svg)[0]
+    return [(float(x), float(y)) for x, y in (pair.split(",") for pair in line.split())]
+
+
+def test_a_chart_draws_what_it_is_given():
+    straight = points(chart("x", {"a": {0: 1.0, 5: 2.0, 10: 3.0}}))
+    assert straight[1] == pytest.approx(((straight[0][0] + straight[2][0]) / 2, (straight[0][1] + straight[2][1]) / 2))
+    assert straight[0][1] > straight[2][1], "up is more"
+    logarithmic = points(chart("x", {"a": {0: 1.0, 5: 10.0, 10: 100.0}}))
+    assert logarithmic[1][1] == pytest.approx((logarithmic[0][1] + logarithmic[2][1]) / 2, abs=0.1)
+
+
+def test_a_chart_keeps_the_extremes_of_long_curves():
+    long = {step: math.sin(step / 500) for step in range(20_000)} | {7777: 9.0}
+    thin = points(chart("x", {"a": long}))
+    assert len(thin) <= 600
+    assert min(y for _, y in thin) == points(chart("x", {"a": {0: 0.0, 7777: 9.0, 19_999: -1.0}}))[1][1]
+
+
+def test_a_chart_bears_what_runs_log():
+    assert "no value is finite" in chart("x", {"a": {1: math.nan}, "b": {}})
+    for curve in ({1: 5.0}, {1: 0.0, 2: 0.0}, {1: 1e-9, 2: 1e9}, {1: -1e30, 2: 1e30}, {0: 1.0, 10**7: 1.0 + 1e-12}):
+        svg = chart("x", {"a": cast(dict[int, float], curve)}, {"a": {1: math.inf}})
+        assert "nan" not in svg
+        assert "inf" not in svg
+        assert all(0 <= x <= 460 and 0 <= y <= 230 for x, y in points(svg))
+    assert "<polygon" in chart("x", {"a": {1: 1.0, 2: 2.0}}, {"a": {1: 0.1, 2: 0.1}})
+
+
+def test_numbers_are_short_and_true():
+    assert [number(value) for value in (None, 0.0, 1.23456, 0.000012, 123456.0)] == [
+        "–",
+        "0",
+        "1.235",
+        "1.20e-05",
+        "123,456",
+    ]
+    assert [short(step) for step in (0, 950, 1500, 2_000_000)] == ["0", "950", "1.5k", "2M"]
+
+
+def test_pages_escape_what_they_are_given():
+    assert "&lt;i&gt;" in table(["<i>"], [["<b>"]])
+    assert "<b>" not in table(["<i>"], [["<b>"]])
+    assert "<title>a &amp; b</title>" in page("a & b", "")

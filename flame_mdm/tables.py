@@ -403,7 +403,8 @@ def _text(value: Any) -> str:
 
 def _about(result: Config, name: str) -> Any:
     """What a result says of the model and its cost, by the names of `ABOUT`."""
-    value = (result.get("cost") or {}).get(name, (result["checkpoint"] or {}).get(name))
+    checkpoint = result["checkpoint"] or {}
+    value = (checkpoint | checkpoint.get("edit", {}) | (result.get("cost") or {})).get(name)
     return value / 1e6 if name == "parameters" and value is not None else value
 
 
@@ -508,8 +509,8 @@ def _hyperparameters(name: str, part: Config, reported: Config | None) -> Part:
             Cell(_setting(v)) if (v := f.get(key)) is not None else None for f in found.values()
         ]
         if reported:
-            texts = dict.fromkeys(str(v) for v in printed.get(label, {}).values())
-            cells.append(Cell(" / ".join(texts)) if texts else None)
+            texts = [str(v) for v in printed.get(label, {}).values()]
+            cells.append(Cell(" / ".join(texts if len(set(texts)) > 1 else texts[:1])) if texts else None)
         lines.append(Line(label, "measured", cells))
     notes = [("", f"{label}: recipe {recipe}") for label, recipe in part["recipes"].items()]
     notes += [("", f"as reported: {reported['source']}")] if reported else []

@@ -139,7 +139,7 @@ def test_a_history_of_a_run_that_begins_anew_is_another(tmp_path):
 
 def rows(file: Path) -> Iterator[dict[str, Any]]:
     """The history in a .wandb file: LevelDB's log format, blocks of 32 KiB after 7 bytes, of protocol buffers."""
-    from wandb.proto.wandb_internal_pb2 import Record
+    from wandb.proto.wandb_internal_pb2 import Record  # type: ignore[attr-defined]
 
     data, place, whole = file.read_bytes(), 7, b""
     while place + 7 <= len(data):

@@ -226,7 +226,9 @@ class MotionCLIPTask(Task):
         self.measured: dict[str, Any] = dict(self.retrieval.items()) if enough else {}
 
     def validation_step(self, batch: MotionBatch, batch_idx: int) -> None:
-        """Keeps the features of the validation pairs."""
+        """Keeps the features of the validation pairs, each on one process."""
+        if self.global_rank and len(self.trainer.datamodule.val) < self.trainer.world_size:  # type: ignore[attr-defined]
+            return  # all processes have all clips then
         assert batch.text is not None
         motion = F.normalize(self.network(batch.x, batch.mask), dim=-1)
         text = F.normalize(self.network.text(self.condition(batch).pooled), dim=-1)

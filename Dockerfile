@@ -1,0 +1,31 @@
+# The versions of constraints.txt on CUDA. Build and use: docs/clusters.md.
+#   docker build -t flame-mdm .
+#   docker build -t flame-mdm:cpu --build-arg TORCH_INDEX=https://download.pytorch.org/whl/cpu .
+FROM python:3.11-slim-bookworm
+
+# Wheels of torch for other machines; CUDA's libraries come with them.
+ARG TORCH_INDEX=https://download.pytorch.org/whl/cu130
+
+# Compiled kernels of torch.compile need a C compiler.
+# hadolint ignore=DL3008
+RUN apt-get update \
+    && apt-get install -y --no-install-recommends gcc libc6-dev \
+    && rm -rf /var/lib/apt/lists/*
+
+WORKDIR /flame_mdm
+COPY constraints.txt ./
+# The index of torch holds packages of other names in other versions, so it is asked for torch alone.
+RUN pip install --no-cache-dir -c constraints.txt --index-url "$TORCH_INDEX" --extra-index-url https://pypi.org/simple torch
+COPY pyproject.toml README.md LICENSE ./
+COPY flame_mdm flame_mdm
+COPY evaluators evaluators
+COPY experiments experiments
+RUN pip install --no-cache-dir -c constraints.txt ".[offline,slurm]"
+
+# Data and runs are mounted; nobody in there is root.
+RUN useradd --create-home --uid 1000 researcher && mkdir /work && chown researcher /work
+USER 1000
+WORKDIR /work
+ENV FLAME_MDM_DATA=/work/data HF_HOME=/work/.cache/huggingface PYTHONUNBUFFERED=1
+ENTRYPOINT ["python", "-m"]
+CMD ["flame_mdm.train", "--help"]

@@ -1,0 +1,112 @@
+"""Training runs of several processes, and the weights that one process makes of the same batches."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from flame_mdm.config import compose, instantiate
+from flame_mdm.data.datamodule import TrainingBatches
+from flame_mdm.motion import MotionBatch, collate
+from flame_mdm.task import MotionGeneration
+
+SECONDS = 120
+
+# SGD: Adam makes much of gradients that are 0 but for rounding.
+RUN = [
+    *("data.batch_size=1", "ema=null", "logger=csv", "callbacks.best=null", "callbacks.checkpoints.every_n_steps=2"),
+    *("trainer.val_check_interval=2", "trainer.log_every_n_steps=2", "trainer.gradient_clip_val=0.5"),
+    *("optimizer._target_=torch.optim.SGD", "optimizer.lr=0.05"),
+]
+"""Overrides of a run whose weights `reference` computes."""
+
+TWO = ["trainer.devices=2", "trainer.strategy=ddp"]
+
+ALARM = """
+import os
+import signal
+
+from lightning import Callback
+
+
+class Alarm(Callback):
+    def __init__(self, step: int, rank: int, attempt: int, counter: str, signal: str, parent: bool = False):
+        self.step, self.rank, self.attempt, self.counter = step, rank, attempt, counter
+        self.signal, self.parent = signal, parent
+
+    def on_train_batch_end(self, trainer, *_):
+        here = (trainer.global_step, trainer.global_rank, int(os.environ[self.counter]))
+        if here == (self.step, self.rank, self.attempt):
+            os.kill(os.getppid() if self.parent else os.getpid(), getattr(signal, self.signal))
+"""
+"""A module with a callback that sends a signal, to its process or what started it, at the end of a step."""
+
+
+def alarm(folder: Path, name: str, **arguments: object) -> list[str]:
+    """Overrides that add the callback, whose module is written to a folder of the Python path."""
+    (folder / "alarm.py").write_text(ALARM)
+    values = {"_target_": "alarm.Alarm", **arguments}
+    return [f"+callbacks.{name}.{key}={value}" for key, value in values.items()]
+
+
+def reference(words: list[str], steps: int) -> dict[str, torch.Tensor]:
+    """Weights of one process that averages the gradients of both processes' batches."""
+    config = compose("quickstart", words)
+    torch.manual_seed(config["seed"])
+    representation = instantiate(config["representation"])
+    data = instantiate(config["data"], representation=representation, seed=config["seed"])
+    data.setup("fit")
+    torch.manual_seed(config["seed"])
+    task = MotionGeneration.build(config, representation)
+    rank = 0
+    task.__class__ = type("OfRank", (MotionGeneration,), {"global_rank": property(lambda self: rank)})
+    task.log_dict = lambda *_, **__: None  # type: ignore[method-assign]
+    optimizer = task.configure_optimizers()
+    streams = [
+        iter(TrainingBatches(data.train.lengths, data.batch_size, seed=config["seed"], first=0, rank=r, world=2))
+        for r in range(2)
+    ]
+    for step in range(steps):
+        optimizer.zero_grad()
+        for rank, stream in enumerate(streams):  # noqa: B007 (the property above reads it)
+            batch: MotionBatch = collate([data.train[draw] for draw in next(stream)])
+            (task.training_step(batch, step) / 2).backward()
+        torch.nn.utils.clip_grad_norm_(task.parameters(), config["trainer"]["gradient_clip_val"])
+        optimizer.step()
+    return task.state_dict()
+
+
+def free_port() -> int:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        return free.getsockname()[1]
+
+
+def spawn(words: list[str], **environment: str) -> subprocess.Popen[str]:
+    """Starts `python -m words`."""
+    return subprocess.Popen(
+        [sys.executable, "-m", *words],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "OMP_NUM_THREADS": "1", "GLOO_SOCKET_IFNAME": "lo", **environment},
+        start_new_session=True,
+    )
+
+
+def finish(process: subprocess.Popen[str]) -> tuple[int, str, str]:
+    """Exit code and what was printed; processes that hang fail the test."""
+    try:
+        out, err = process.communicate(timeout=SECONDS)
+    except subprocess.TimeoutExpired:
+        os.killpg(process.pid, signal.SIGKILL)
+        out, err = process.communicate()
+        pytest.fail(f"the processes hang\n{out}\n{err}")
+    return process.returncode, out, err

@@ -1,0 +1,130 @@
+"""Jobs by Hydra's submitit launcher: in processes of this machine, and on a SLURM of four small programs."""
+
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+from fixtures import ROOT
+from runs import RUN, TWO, alarm, finish, free_port, reference, spawn
+
+from flame_mdm import train
+from flame_mdm.config import UserError, compose
+from flame_mdm.task import read_checkpoint
+
+SLURM = {
+    "sbatch": """
+        # Runs the job at once, and again when it is put back into the queue.
+        cp "$1" "$CLUSTER/script.sh"
+        echo "Submitted batch job 7"
+        (
+            export SLURM_JOB_ID=7 SLURM_JOB_NAME=quickstart SLURM_RESTART_COUNT=0
+            until bash "$CLUSTER/script.sh"; code=$?; echo "$code" >> "$CLUSTER/codes"; [ ! -e "$CLUSTER/requeue" ]; do
+                rm "$CLUSTER/requeue"
+                SLURM_RESTART_COUNT=$((SLURM_RESTART_COUNT + 1))
+            done
+        ) > "$CLUSTER/log" 2>&1 &
+    """,
+    "srun": """
+        # Starts two tasks; that of rank 0 decides the exit code.
+        while [[ $1 == --* ]]; do
+            if [[ $1 == --output ]]; then output=${2//%j/7}; fi
+            if [[ $1 == --unbuffered ]]; then shift; else shift 2; fi
+        done
+        export SLURM_NTASKS=2 SLURM_NTASKS_PER_NODE=2 SLURM_NNODES=1 SLURM_NODEID=0 SLURM_NODELIST=localhost
+        SLURM_PROCID=1 SLURM_LOCALID=1 "$@" >> "${output//%t/1}" 2>&1 &
+        SLURM_PROCID=0 SLURM_LOCALID=0 "$@" >> "${output//%t/0}" 2>&1
+        code=$?
+        wait
+        exit $code
+    """,
+    "scontrol": 'echo "$*" >> "$CLUSTER/asked"; touch "$CLUSTER/requeue"',
+    "sacct": 'echo "JobID|State|NodeList"; echo "7|RUNNING|localhost"',
+}
+
+
+@pytest.fixture
+def cluster(tmp_path: Path) -> dict[str, str]:
+    """Environment variables with which the programs above are found."""
+    for name, script in SLURM.items():
+        (tmp_path / name).write_text(f"#!/bin/bash\n{script}\n")
+        (tmp_path / name).chmod(0o755)
+    path = os.pathsep.join([str(tmp_path), str(ROOT), os.environ.get("PYTHONPATH", "")]).rstrip(os.pathsep)
+    programs = os.pathsep.join([str(tmp_path), os.environ["PATH"]])
+    address = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(free_port())}
+    return {"CLUSTER": str(tmp_path), "PYTHONPATH": path, "PATH": programs, **address}
+
+
+def test_a_slurm_job_that_runs_out_of_time_is_requeued_and_ends_as_if_it_had_not(tiny, tmp_path, cluster):
+    """Two tasks; SIGUSR2, which submitit asks SLURM for, comes at step 3 of 5."""
+    words = [*tiny, *RUN, "callbacks.samples=null", "trainer.max_steps=5"]
+    words += alarm(tmp_path, "time", step=3, rank=0, attempt=0, counter="SLURM_RESTART_COUNT", signal="SIGUSR2")
+    launch = ["launch=slurm", "hydra.launcher.partition=gpu", "hydra.launcher.timeout_min=90"]
+    code, out, err = finish(spawn(["flame_mdm.train", "quickstart", *words, *TWO, *launch], **cluster))
+    logs = "\n".join(path.read_text() for path in (tmp_path / "run" / ".submitit").rglob("*.out"))
+    assert code == 0, out + err + logs
+    assert "job 7 is in the queue again" in logs
+    assert (tmp_path / "asked").read_text() == "requeue 7\n"
+    deadline = time.monotonic() + 20
+    while len(codes := (tmp_path / "codes").read_text().split()) < 2 and time.monotonic() < deadline:
+        time.sleep(0.1)  # the result of a job stands in its file before the job has ended
+    assert codes == ["140", "0"]  # 128 + SIGUSR2
+    assert "steps: 3 to 5" in logs
+    checkpoints = tmp_path / "run" / "checkpoints"
+    assert sorted(path.name for path in checkpoints.iterdir()) == ["last.ckpt", "previous.ckpt"]
+    checkpoint = read_checkpoint(checkpoints / "last.ckpt")
+    assert checkpoint["global_step"] == 5
+    torch.testing.assert_close(checkpoint["state_dict"], reference(words, 5), rtol=1e-4, atol=1e-6)
+
+    script = tmp_path / "script.sh"
+    asked = {line.removeprefix("#SBATCH --") for line in script.read_text().splitlines() if line.startswith("#SBATCH")}
+    wanted = {"nodes=1", "ntasks-per-node=2", "gpus-per-node=2", "time=90", "partition=gpu", "requeue"}
+    assert wanted | {"job-name=quickstart", "signal=USR2@120"} <= asked
+    linter = Path(sys.executable).parent / "shellcheck"
+    for command in (["bash", "-n", script], [linter, "--severity=warning", script]):
+        linted = subprocess.run(command, capture_output=True, text=True, check=False)
+        assert linted.returncode == 0, linted.stdout + linted.stderr
+
+
+def test_jobs_of_a_sweep_run_beside_one_another_in_folders_of_their_own(tiny, tmp_path):
+    """On this machine; the first one is refused, as its folder holds another run."""
+    words = [*tiny, "callbacks.samples=null", "callbacks.best=null", "trainer.max_steps=1"]
+    (tmp_path / "run" / "seed=1").mkdir(parents=True)
+    (tmp_path / "run" / "seed=1" / "config.yaml").write_text("seed: 5\n")
+    code, out, err = finish(spawn(["flame_mdm.train", "quickstart", *words, "seed=1,2", "launch=local"]))
+    assert code == 1, out + err
+    assert str(tmp_path / "run" / ".submitit") in out
+    logs = "\n".join(path.read_text() for path in (tmp_path / "run" / ".submitit").rglob("*log.err"))
+    assert "seed=1 holds a run of another configuration" in logs
+    assert not (tmp_path / "run" / "seed=1" / "checkpoints").exists()
+    checkpoint = read_checkpoint(tmp_path / "run" / "seed=2" / "checkpoints" / "last.ckpt")
+    assert checkpoint["config"]["seed"] == 2
+    assert "launch" not in checkpoint["config"]
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["launch=slurmm"], "no launch is called 'slurmm'. Did you mean slurm?"),
+        (["launch=local", "trainer.devices=2"], "launch=local runs each job in one process"),
+        (["launch=slurm", "trainer.max_step=1"], "Did you mean trainer.max_steps"),
+        (["launch=slurm", "optimizer.lr=1,2", "denoiser=mdm_gru,mdm_nothing"], "mdm_nothing"),
+        (["launch=slurm", "hydra.launcher.partitionn=gpu"], "partitionn"),
+    ],
+)
+def test_what_is_wrong_is_told_before_anything_is_submitted(words, message, tiny, tmp_path, capsys):
+    assert train.main(["quickstart", *tiny, *words]) == 1
+    told = capsys.readouterr().err
+    assert told.startswith("error: ")
+    assert message in told
+    assert told.count("\n") == 1
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_missing_launcher_names_the_extra(monkeypatch):
+    monkeypatch.setattr("flame_mdm.config._file", lambda module: None)
+    with pytest.raises(UserError, match=r"launch=slurm needs .*: pip install flame-mdm\[slurm\]"):
+        compose("quickstart", ["launch=slurm"])

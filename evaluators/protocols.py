@@ -88,7 +88,8 @@ class Protocol:
         """
         self.quick = quick
         if quick:
-            replications, samples = replications or QUICK_REPLICATIONS, samples or min(QUICK_SAMPLES, clips)
+            replications = QUICK_REPLICATIONS if replications is None else replications
+            samples = min(QUICK_SAMPLES, clips) if samples is None else samples
         changed: dict[str, Any] = {}
         for name, value in (("replications", replications), ("samples", samples)):
             if value is not None and value < 1:

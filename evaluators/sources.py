@@ -184,6 +184,9 @@ class Generator:
                         raise UserError(f"the model returned a motion that is not finite for {rows[i].id}")
                 batches += 1
                 self.bar.update(len(indices))
+        except BaseException:
+            self.bar.close()  # ends its line
+            raise
         finally:
             hook.remove()
         seconds = time.perf_counter() - begin

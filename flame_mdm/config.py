@@ -616,6 +616,11 @@ def _check_whole(config: Config, name: str) -> None:
         node = config.get(key)
         if not isinstance(node, Mapping) or (key not in ("run", "callbacks") and "_target_" not in node):
             raise UserError(f"{name}: it has no {key}; begin a recipe with the defaults of another, or with /base")
+    if not config["run"].get("dir"):
+        raise UserError(f"{name}: run.dir is empty; a run needs a folder")
+    for key in ("denoiser", "process", "condition"):
+        if key in config and not (isinstance(config[key], Mapping) and "_target_" in config[key]):
+            raise UserError(f"{name}: {key} has no _target_; {key}=... swaps it for one of experiments/{key}")
     for key in ("experiment", "seed", "ema", "logger"):
         if key not in config:
             raise UserError(f"{name}: it has no {key}; begin a recipe with the defaults of another, or with /base")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import os
 import sys
 from collections.abc import Iterator, Mapping, Sequence
@@ -60,6 +61,14 @@ def evaluate(config: Config) -> None:
         raise UserError("from_samples measures all motions of the files: leave out quick, samples and replications")
     if config["split"] not in ("train", "val", "test"):
         raise UserError(f"split={config['split']}: there are train, val and test")
+    if config["batch_size"] < 1:
+        raise UserError(f"batch_size={config['batch_size']}: at least 1 is needed")
+    if config["guidance_scale"] is not None and not math.isfinite(config["guidance_scale"]):
+        raise UserError(f"guidance_scale={config['guidance_scale']} is no finite number")
+    if config["out"] is not None:  # before hours of work
+        if Path(config["out"]).is_dir():
+            raise UserError(f"out={config['out']} is a folder; name the JSON file to write")
+        Path(config["out"]).parent.mkdir(parents=True, exist_ok=True)
     with _processes(config["device"]) as (rank, world, device):
         _evaluate(config, rank, world, device)
 
@@ -157,6 +166,7 @@ def load_protocol(name: str, representation: Representation) -> Any:
     """
     from omegaconf import OmegaConf
     from omegaconf.errors import OmegaConfBaseException
+    from yaml import YAMLError
 
     path = Path(name) if name.endswith((".yaml", ".yml")) else EXPERIMENTS / "evaluation" / f"{name}.yaml"
     if not path.is_file():
@@ -167,8 +177,8 @@ def load_protocol(name: str, representation: Representation) -> Any:
     try:
         merged = OmegaConf.merge({"representation": facts}, OmegaConf.load(path))
         config: Config = OmegaConf.to_container(merged, resolve=True)  # type: ignore[assignment]
-    except (OmegaConfBaseException, OSError, ValueError) as error:
-        raise UserError(f"{path}: not a readable protocol: {error}") from error
+    except (OmegaConfBaseException, YAMLError, OSError, ValueError, TypeError) as error:
+        raise UserError(f"{path}: not a readable protocol: {' '.join(str(error).split())}") from error
     del config["representation"]
     if "_target_" not in config:
         raise UserError(f"{path}: not a protocol: it has no _target_, such as evaluators.protocols.Protocol")

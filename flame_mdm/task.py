@@ -248,7 +248,7 @@ class MotionGeneration(Task):
             mask,
             cond,
             sampler=sampler or self.sampler,
-            num_inference_steps=num_inference_steps or self.num_inference_steps,
+            num_inference_steps=self.num_inference_steps if num_inference_steps is None else num_inference_steps,
             edit=edit,
         )
         self.train(was_training)

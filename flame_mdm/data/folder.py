@@ -386,8 +386,8 @@ def read_skeleton(path: Path) -> dict[str, Any]:
         raise ValueError(f"{path}: unknown key {unknown}; there are {', '.join(allowed)}")
     kinds = {"map": dict, "joints": list, "unit": (int, float), "up": str, "mirrored": bool, "fps": (int, float)}
     for key, value in data.items():
-        positive = key not in ("unit", "fps") or 0 < value < math.inf
-        if not isinstance(value, kinds[key]) or not positive or (key == "up" and value not in UP):
+        fits = isinstance(value, kinds[key]) and (key == "mirrored" or not isinstance(value, bool))
+        if not fits or (key in ("unit", "fps") and not 0 < value < math.inf) or (key == "up" and value not in UP):
             raise ValueError(
                 f"{path}: {key}: {value} does not do; map and joints are a map and a list, unit (metres in a 1) and "
                 f"fps numbers above 0, up one of {', '.join(UP)}, mirrored true or false"
@@ -444,6 +444,18 @@ def _arrays(path: Path) -> dict[str, np.ndarray]:
         raise ValueError(f"{path}: damaged, or not a file of plain arrays: {error}") from error
     if not {"joints", "poses"} & set(data):
         raise ValueError(f"{path}: it holds {', '.join(data)}; a motion is joints, or poses, trans and mocap_framerate")
+    for name in {"joints", "poses", "trans"} & set(data):
+        if data[name].dtype.kind not in "fiu":
+            raise ValueError(f"{path}: {name} are no real numbers")
+        if not data[name].ndim or not len(data[name]):
+            raise ValueError(f"{path}: {name} of shape {data[name].shape} have no frames")
+        if (beyond := ~(np.abs(data[name]) < 1e6)).any():
+            raise ValueError(
+                f"{path}: numbers in frame {np.argwhere(beyond)[0][0]} are not finite, or beyond a million"
+            )
+    for name in {"fps", "mocap_framerate", "mocap_frame_rate"} & set(data):
+        if data[name].shape or data[name].dtype.kind not in "fiu":
+            raise ValueError(f"{path}: {name} is not one number")
     return data
 
 
@@ -451,6 +463,8 @@ def _csv_rows(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
     with path.open(encoding="utf-8-sig", newline="") as file:
         reader = csv.DictReader(file, strict=True)
         unknown = set(reader.fieldnames or ()) - set(COLUMNS)
+        if len(set(reader.fieldnames or ())) < len(reader.fieldnames or ()):
+            raise ValueError(f"{path}: a column stands in it twice: {', '.join(reader.fieldnames or ())}")
         if unknown or "id" not in (reader.fieldnames or ()):
             raise ValueError(f"{path}: its columns are {reader.fieldnames}; there are {', '.join(COLUMNS)}, id needed")
         try:
@@ -488,7 +502,9 @@ def _take(notes: dict[str, Note], exclude: Sequence[str], where: str, row: Mappi
         raise ValueError(f"{where}: there is no motion {row['id']!r}; ids are paths in the folder without ending")
     note = notes[row["id"]]
     texts = row.get("text") or []
-    note.texts += [texts] if isinstance(texts, str) else list(map(str, texts))
+    if not isinstance(texts, str | list) or not all(isinstance(text, str) for text in texts):
+        raise ValueError(f"{where}: text is {texts!r}, not a text or a list of texts")
+    note.texts += [texts] if isinstance(texts, str) else texts
     for key in ("action", "split", "source"):
         value = row.get(key)
         if value:

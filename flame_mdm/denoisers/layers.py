@@ -40,7 +40,7 @@ class Attention(nn.Module):
 
     def __init__(self, features: int, num_heads: int, dropout: float):
         super().__init__()
-        if features % num_heads:
+        if num_heads < 1 or features % num_heads:
             raise ValueError(f"latent_dim ({features}) is not a multiple of num_heads ({num_heads})")
         self.num_heads, self.dropout = num_heads, dropout
         self.qkv = nn.Linear(features, 3 * features)

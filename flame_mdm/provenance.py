@@ -55,6 +55,10 @@ class Provenance(Callback):
         print(f"{self.config['experiment']}: {task.describe()}, {count / 1e6:.2f} M trainable parameters")
         print(f"data: {data['dataset']} as {data['representation']}, {splits}; {data['hours']} hours")
         print(f"device: {facts['device']}, {self.config['trainer']['precision']}")
+        if size > self.config["data"]["batch_size"]:
+            times = f"{trainer.world_size} processes x {trainer.accumulate_grad_batches} accumulated"
+            each, lr = self.config["data"]["batch_size"], self.config["optimizer"].get("lr")
+            print(f"batch: {size} clips = {each} x {times}; optimizer.lr={lr} is not scaled with it")
         passes = trainer.max_steps * size / clips["train"]
         print(f"steps: {trainer.global_step} to {trainer.max_steps} of {size} clips, {passes:.0f} passes over the data")
 

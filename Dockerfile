@@ -1,10 +1,10 @@
-# The versions of constraints.txt on CUDA. Build and use: docs/clusters.md.
+# The versions of constraints.txt. Build and use: docs/clusters.md.
 #   docker build -t flame-mdm .
 #   docker build -t flame-mdm:cpu --build-arg TORCH_INDEX=https://download.pytorch.org/whl/cpu .
 FROM python:3.11-slim-bookworm
 
-# Wheels of torch for other machines; CUDA's libraries come with them.
-ARG TORCH_INDEX=https://download.pytorch.org/whl/cu130
+# PyPI has torch for CUDA, whose libraries come with it.
+ARG TORCH_INDEX=https://pypi.org/simple
 
 # Compiled kernels of torch.compile need a C compiler.
 # hadolint ignore=DL3008

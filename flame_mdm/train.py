@@ -37,6 +37,7 @@ FREE = (
     "trainer.devices",
     "trainer.num_nodes",
     "trainer.accelerator",
+    "trainer.strategy",
     "trainer.log_every_n_steps",
     "trainer.val_check_interval",
     "trainer.limit_val_batches",

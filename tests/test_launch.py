@@ -128,3 +128,14 @@ def test_a_missing_launcher_names_the_extra(monkeypatch):
     monkeypatch.setattr("flame_mdm.config._file", lambda module: None)
     with pytest.raises(UserError, match=r"launch=slurm needs .*: pip install flame-mdm\[slurm\]"):
         compose("quickstart", ["launch=slurm"])
+
+
+def test_the_container_file_is_clean_and_copies_what_is_there():
+    linter = Path(sys.executable).parent / "hadolint"
+    linted = subprocess.run([linter, ROOT / "Dockerfile"], capture_output=True, text=True, check=False)
+    assert linted.returncode == 0, linted.stdout + linted.stderr
+    lines = [line.split() for line in (ROOT / "Dockerfile").read_text().splitlines() if line.startswith("COPY")]
+    copied = {name for _, *names, _ in lines for name in names}
+    assert {"flame_mdm", "evaluators", "experiments", "constraints.txt", "pyproject.toml"} <= copied
+    left_out = set((ROOT / ".dockerignore").read_text().split())
+    assert all((ROOT / name).exists() and name not in left_out for name in copied)

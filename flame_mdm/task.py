@@ -40,6 +40,7 @@ class Task(LightningModule):
         self.condition, self.representation = condition, representation
         self.optimizer, self.seed = optimizer, seed
         self.config, self.facts = {}, {}
+        self.prepare_data_per_node = False  # machines share the folder of the data
 
     @classmethod
     def build(cls, config: Config, representation: Representation, *, actions: Sequence[str] = ()) -> Self:

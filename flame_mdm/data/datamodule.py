@@ -145,6 +145,7 @@ class MotionDataModule(LightningDataModule):
         self.folder = Path(root) / f"{name}-{representation.name}"
         self.batch_size, self.num_workers, self.seed = batch_size, num_workers, seed
         self.crop = crop
+        self.prepare_data_per_node = False  # machines share the folder
 
     def prepare_data(self) -> None:
         """Writes the store where there is none; Lightning calls this on one process only."""

@@ -143,13 +143,15 @@ def _line(override: Override) -> str:
 
 def _first_choice(override: Override) -> str:
     """The override; of a sweep, that to its first value."""
-    if not override.is_sweep_override():
-        return _line(override)
-    if isinstance(value := override.value(), Glob):
-        choice = next(iter(value.filter(_options(override.key_or_group))), "none")
-    else:
-        choice = next(override.sweep_string_iterator())
-    return f"{override.get_key_element()}={choice}"
+    return f"{override.get_key_element()}={_choices(override)[0]}" if override.is_sweep_override() else _line(override)
+
+
+def _choices(override: Override) -> list[str]:
+    """What an override gives its key, one value or those of a sweep."""
+    value = override.value()
+    if isinstance(value, Glob):
+        return value.filter(_options(override.key_or_group)) or [str(value)]
+    return list(override.sweep_string_iterator()) if override.is_sweep_override() else [str(value)]
 
 
 def _options(group: str) -> list[str]:
@@ -188,16 +190,19 @@ def _is_group(override: Override) -> bool:
 
 def _check_groups(overrides: Sequence[Override]) -> None:
     for override in overrides:
-        if not _is_group(override) or override.is_sweep_override() or override.is_delete():
+        if not _is_group(override) or override.is_delete():
             continue
-        group, option = override.key_or_group, str(override.value())
+        group = override.key_or_group
         options = _options(group)
-        if option not in options:
-            raise UserError(
-                f"no {group} is called '{option}'.{_nearest(option, options)} There are: {', '.join(options)}"
-            )
+        for option in _choices(override):
+            if option not in options:
+                raise UserError(
+                    f"no {group} is called '{option}'.{_nearest(option, options)} There are: {', '.join(options)}"
+                )
         if group == LAUNCH and _file("submitit") is None:
-            raise UserError(f"{LAUNCH}={option} needs hydra-submitit-launcher: pip install flame-mdm[slurm]")
+            raise UserError(
+                f"{_line(override).lstrip('+')} needs hydra-submitit-launcher: pip install flame-mdm[slurm]"
+            )
 
 
 def _refuse_groups(overrides: Sequence[Override], recipe: _Recipe) -> None:

@@ -28,13 +28,13 @@ def values(folder: Path) -> list[float]:
 
 def test_two_processes_are_one_with_both_batches(tiny, tmp_path):
     """Launched by Lightning."""
-    words = [*tiny, *RUN]
+    words = [*tiny, *RUN, f"data_root={tmp_path / 'data'}"]
     ours = ["callbacks.samples.every_n_steps=2", "trainer.max_steps=4"]
     code, out, err = finish(spawn(["flame_mdm.train", "quickstart", *words, *TWO, *ours]))
     assert code == 0, err
     assert out.count("see the motions") == 1
     assert "batch: 2 clips = 1 x 2 processes x 1 accumulated; optimizer.lr=0.05 is not scaled with it" in out
-    assert out.count("steps: 0 to 4") == err.count("preparing synthetic: 100%") == 1  # the data, too, by one process
+    assert out.count("steps: 0 to 4") == err.count("preparing synthetic:   0%") == 1  # the data, too, by one process
     wanted = reference(words, 4)
     trained = read_checkpoint(tmp_path / "run" / "checkpoints" / "last.ckpt")["state_dict"]
     torch.testing.assert_close(trained, wanted, rtol=1e-4, atol=1e-6)
@@ -87,6 +87,16 @@ def test_no_process_is_without_a_validation_batch(tiny, world, batches):
     assert len(data.val_dataloader()) == batches
     data.trainer.global_rank = world - 1  # type: ignore[union-attr]
     assert len(data.val_dataloader()) >= 1
+
+
+def test_one_process_of_all_machines_prepares(tiny):
+    config = compose("quickstart", tiny)
+    representation = instantiate(config["representation"])
+    for part in (
+        instantiate(config["data"], representation=representation),
+        MotionGeneration.build(config, representation),
+    ):
+        assert part.prepare_data_per_node is False  # by which Lightning asks the first process of the first machine
 
 
 def validate_one_pair(rank: int, world: int) -> dict[str, float]:

@@ -61,9 +61,9 @@ def cluster(tmp_path: Path) -> dict[str, str]:
 def test_a_slurm_job_that_runs_out_of_time_is_requeued_and_ends_as_if_it_had_not(tiny, tmp_path, cluster):
     """Two tasks; SIGUSR2, which submitit asks SLURM for, comes at step 3 of 5."""
     words = [*tiny, *RUN, "callbacks.samples=null", "trainer.max_steps=5"]
-    words += alarm(tmp_path, "time", step=3, rank=0, attempt=0, counter="SLURM_RESTART_COUNT", signal="SIGUSR2")
+    time_over = alarm(tmp_path, "time", step=3, rank=0, attempt=0, counter="SLURM_RESTART_COUNT", signal="SIGUSR2")
     launch = ["launch=slurm", "hydra.launcher.partition=gpu", "hydra.launcher.timeout_min=90"]
-    code, out, err = finish(spawn(["flame_mdm.train", "quickstart", *words, *TWO, *launch], **cluster))
+    code, out, err = finish(spawn(["flame_mdm.train", "quickstart", *words, *time_over, *TWO, *launch], **cluster))
     logs = "\n".join(path.read_text() for path in (tmp_path / "run" / ".submitit").rglob("*.out"))
     assert code == 0, out + err + logs
     assert "job 7 is in the queue again" in logs
@@ -111,7 +111,7 @@ def test_jobs_of_a_sweep_run_beside_one_another_in_folders_of_their_own(tiny, tm
         (["launch=slurmm"], "no launch is called 'slurmm'. Did you mean slurm?"),
         (["launch=local", "trainer.devices=2"], "launch=local runs each job in one process"),
         (["launch=slurm", "trainer.max_step=1"], "Did you mean trainer.max_steps"),
-        (["launch=slurm", "optimizer.lr=1,2", "denoiser=mdm_gru,mdm_nothing"], "mdm_nothing"),
+        (["launch=slurm", "optimizer.lr=1,2", "logger=csv,nothing"], "no logger is called 'nothing'"),
         (["launch=slurm", "hydra.launcher.partitionn=gpu"], "partitionn"),
     ],
 )

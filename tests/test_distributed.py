@@ -55,19 +55,20 @@ def test_two_processes_are_one_with_both_batches(tiny, tmp_path):
 
 
 def test_torchrun_starts_a_killed_group_again(tiny, tmp_path):
-    """The second process dies at step 3; then SIGTERM ends torchrun at step 6."""
+    """The first process dies at step 3 and leaves its lock; then SIGTERM ends torchrun at step 6."""
     words = [*tiny, *RUN, "callbacks.samples=null"]
     counter = "TORCHELASTIC_RESTART_COUNT"
     alarms = [
-        *alarm(tmp_path, "kill", step=3, rank=1, attempt=0, counter=counter, signal="SIGKILL"),
+        *alarm(tmp_path, "kill", step=3, rank=0, attempt=0, counter=counter, signal="SIGKILL"),
         *alarm(tmp_path, "end", step=6, rank=0, attempt=1, counter=counter, signal="SIGTERM", parent=True),
     ]
     torchrun = ["torch.distributed.run", "--nproc-per-node=2", "--max-restarts=1", "--standalone"]
     command = [*torchrun, "-m", "flame_mdm.train", "quickstart", *words, *TWO, *alarms, "trainer.max_steps=100000"]
     path = os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")]).rstrip(os.pathsep)
     # Else torchrun keeps its store, and the new group finds the addresses of the dead one in there.
-    _, out, err = finish(spawn(command, PYTHONPATH=path, TORCH_DISABLE_SHARE_RDZV_TCP_STORE="1"))
+    _, out, err = finish(spawn(command, PYTHONPATH=path, TORCH_DISABLE_SHARE_RDZV_TCP_STORE="1", PYTHONUNBUFFERED="1"))
     assert "steps: 0 to 100000" in out, err
+    assert "ended without a word; its run is taken over" in out
     assert "steps: 2 to 100000" in out
     assert out.count("the same command goes on from there") == 1, err
     step = int(re.findall(r"stopped at step (\d+)", out)[0])

@@ -1,8 +1,13 @@
 """Evaluation by protocol: what stands in the result, what is kept, what is refused."""
 
 import json
+import math
+import os
 import pickle
 import shutil
+import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -14,12 +19,13 @@ from distributed import GlooPool
 from evaluators.action_gru import ActionGRU
 from evaluators.evaluator import Evaluator, Extracted
 from evaluators.extractors import ClassifierExtractor, MotionCLIPExtractor, T2MExtractor
-from evaluators.sources import Generator, read_samples, real_motions
+from evaluators.sources import Baseline, Generator, read_samples, real_motions
 from evaluators.stgcn import UESTC, Unconstrained
 from evaluators.t2m import T2MEvaluator
 from flame_mdm import evaluate, train
 from flame_mdm.config import EXPERIMENTS, UserError, compose, instantiate
 from flame_mdm.data.datamodule import MotionDataModule
+from flame_mdm.editing import find_joints
 from flame_mdm.evaluate import load_protocol
 from flame_mdm.motion import length_mask
 from flame_mdm.representations.rot6d import Rot6D
@@ -88,13 +94,6 @@ def motions(out: Path) -> Path:
     return folder
 
 
-def comparable(result: dict) -> dict:
-    """A result without times and places."""
-    same = {key: value for key, value in result.items() if key not in ("environment", "cost")}
-    same["checkpoint"] = {key: value for key, value in same["checkpoint"].items() if key != "path"}
-    return same
-
-
 def test_a_result_says_what_it_is_and_where_it_comes_from(runs, full):
     result, out = full
     protocol = load_protocol("synthetic", load(runs.model).representation)
@@ -137,23 +136,54 @@ def test_real_motions_show_what_was_asked_and_an_untrained_model_does_not(full):
     assert result["values"]["multimodality"]["mean"] > 0
 
 
-def test_a_killed_evaluation_goes_on_to_the_same_result(runs, full, tmp_path, monkeypatch):
-    generate = Generator._generate
+KILLED = """
+import os, signal, sys
+import numpy
+from flame_mdm import evaluate
+write = numpy.savez
+def half(file, **content):
+    if "rep_1" in file.name:
+        file.write(b"half")
+        file.flush()
+        os.kill(os.getpid(), signal.SIGKILL)
+    write(file, **content)
+numpy.savez = half
+evaluate.main(sys.argv[1:])
+"""
+"""The command, ended by the operating system while it writes the motions of the second replication."""
 
-    def killed(self, rows, replication):
-        if replication == 1:
-            raise KeyboardInterrupt
-        return generate(self, rows, replication)
 
-    out = tmp_path / "result.json"
-    monkeypatch.setattr(Generator, "_generate", killed)
-    assert runs.evaluate(out, "replications=2") == 130
-    assert [path.name for path in motions(out).iterdir()] == ["rep_0.npz"]
-    assert not out.exists()
-    stamp = (motions(out) / "rep_0.npz").stat().st_mtime_ns
-    monkeypatch.setattr(Generator, "_generate", generate)
-    assert comparable(runs.result(out, "replications=2")) == comparable(full[0])
-    assert (motions(out) / "rep_0.npz").stat().st_mtime_ns == stamp
+def test_a_killed_evaluation_goes_on_to_the_same_result(runs, tmp_path, monkeypatch):
+    words = ["ckpt=model/last.ckpt", f"extractor={runs.clip}", "replications=2", "out=result.json", "device=cpu"]
+    folders = [tmp_path / "undisturbed", tmp_path / "killed"]
+    for folder in folders:
+        (folder / "model").mkdir(parents=True)
+        shutil.copy(runs.model, folder / "model" / "last.ckpt")
+    monkeypatch.chdir(folders[0])
+    assert evaluate.main(words) == 0
+    monkeypatch.chdir(folders[1])
+    killed = subprocess.run([sys.executable, "-c", KILLED, *words], capture_output=True, check=False)
+    assert killed.returncode == -signal.SIGKILL, killed.stderr
+    (kept,) = (folders[1] / "model" / "evaluation").glob("*/*")
+    assert sorted(path.name for path in kept.iterdir()) == ["rep_0.npz", "rep_1.partial"]
+    assert not (folders[1] / "result.json").exists()
+    stamp = (kept / "rep_0.npz").stat().st_mtime_ns
+    assert evaluate.main(words) == 0
+    results = [written(folder / "result.json") for folder in folders]
+    assert (kept / "rep_0.npz").stat().st_mtime_ns == stamp
+    assert evaluate.main(words) == 0
+    assert written(tmp_path / "killed" / "result.json") == results[1], "the time of sampling is kept with the motions"
+    undisturbed, gone_on = (json.loads(result) for result in results)
+    for result in (undisturbed, gone_on):
+        del result["cost"]["seconds_per_sample"]
+    assert json.dumps(undisturbed) == json.dumps(gone_on)
+
+
+def written(path: Path) -> str:
+    """A result as it is written, without the state of the working tree, which others may change meanwhile."""
+    result = json.loads(path.read_text())
+    del result["environment"]["changed"], result["environment"]["commit"]
+    return json.dumps(result)
 
 
 def test_other_metrics_need_no_new_motions(runs, full, tmp_path, monkeypatch):
@@ -364,6 +394,12 @@ def test_the_t2m_evaluator_is_read_from_a_folder(tmp_path):
         texts = extractor.texts(["walk", "run"], [["walk/VERB"], ["run/VERB"]])
     assert texts.shape == (2, 512)
     assert not torch.allclose(texts[0], texts[1])
+    legacy = T2MExtractor(str(tmp_path), full_length=True)
+    with torch.no_grad():
+        full = legacy.texts(["walk", "far"], [["walk/VERB"], ["walk/VERB"] * 20])
+        own = extractor.texts(["walk", "far"], [["walk/VERB"], ["walk/VERB"] * 20])
+    assert not torch.allclose(full[0], own[0], atol=1e-3), "the slots behind the caption are read, too"
+    torch.testing.assert_close(full[1], own[1])
     with pytest.raises(UserError, match="tagged words"):
         extractor.texts(["walk"], [None])
     extractor.check(kit, "kit")
@@ -429,27 +465,254 @@ def test_training_logs_the_values_of_the_validation_split(runs, tmp_path):
     assert (tmp_path / "run" / "checkpoints" / "best.ckpt").exists()
 
 
-def shares(rank: int, world: int, model_file: str, clip: str) -> dict:
-    """Values as one of several processes gets them."""
-    model = load(model_file)
-    representation = instantiate(model.config["representation"])
-    data = instantiate(model.config["data"], representation=representation)
-    data.setup("test")
+def shares(rank: int, world: int, runs: Runs, samples: int, kept: Path | None) -> dict:
+    """The result as one of several processes gets it."""
+    model, data = load(runs.model), runs.data()
     protocol = load_protocol("synthetic", model.representation)
-    protocol.change(replications=1, samples=33, quick=False, clips=len(data.test))
-    protocol.multimodality = None
-    extractor = protocol.open_extractor(clip, model.representation, "synthetic")
-    source = protocol.generator(model, None, {"seed": 0}, clips=data.test, batch_size=8, progress=False)
-    result = protocol.evaluate(source, data.test, extractor, model.representation, rank=rank, world=world)
-    return {kind: {name: v["mean"] for name, v in result[kind].items()} for kind in ("ground_truth", "values")}
+    protocol.change(replications=1, samples=samples, quick=False, clips=len(data.test))
+    assert protocol.multimodality is not None
+    protocol.multimodality |= {"prompts": 1}
+    extractor = protocol.open_extractor(str(runs.clip), model.representation, "synthetic")
+    source = protocol.generator(model, kept, {"seed": 0}, clips=data.test, batch_size=8, world=world, progress=False)
+    return protocol.evaluate(source, data.test, extractor, model.representation, rank=rank, world=world)
 
 
-def test_two_processes_measure_what_one_does(runs):
-    files = (str(runs.model), str(runs.clip))
-    alone = shares(0, 1, *files)
+def means(result: dict) -> dict[str, float | None]:
+    return {f"{kind} {name}": v["mean"] for kind in ("ground_truth", "values") for name, v in result[kind].items()}
+
+
+def test_processes_share_the_sampling_and_get_one_result(runs, tmp_path):
+    """Shares of unequal sizes, and shares of nothing."""
     with GlooPool(2) as pool:
-        both = pool.run(shares, *((rank, 2, *files) for rank in range(2)))
-    assert both[0] == both[1]
-    for kind, values in alone.items():
-        for name, value in values.items():
-            assert both[0][kind][name] == (value and pytest.approx(value, rel=2e-3, abs=0.04)), name
+        both = pool.run(shares, *((rank, 2, runs, 33, tmp_path) for rank in range(2)))
+        again = pool.run(shares, *((rank, 2, runs, 33, tmp_path) for rank in range(2)))
+        single = pool.run(shares, *((rank, 2, runs, 1, None) for rank in range(2)))
+    assert both[0] == both[1] == again[0] == again[1]
+    assert shares(0, 1, runs, 33, tmp_path) == both[0], "the same motions have the same values, to the last bit"
+    assert {path.name for path in tmp_path.iterdir()} == {"rep_0.npz", "multimodality_0.npz"}
+    assert single[0] == single[1]
+    assert single[0]["values"]["jitter"]["n"] == 1
+    assert both[0]["cost"]["nfe"] == 5
+    alone = means(shares(0, 1, runs, 33, None))
+    for name, value in means(both[0]).items():
+        assert alone[name] == (value and pytest.approx(value, rel=2e-3, abs=0.04)), name
+
+
+def test_torchrun_writes_one_result(runs, tmp_path):
+    out = tmp_path / "result.json"
+    model = tmp_path / "model" / "checkpoints" / "last.ckpt"
+    model.parent.mkdir(parents=True)
+    shutil.copy(runs.model, model)
+    words = [f"ckpt={model}", "extractor=none", f"out={out}", "device=cpu", "samples=5", "replications=1", "quick=true"]
+    torchrun = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2"]
+    environment = os.environ | {"OMP_NUM_THREADS": "1"}
+    done = subprocess.run(
+        [*torchrun, "-m", "flame_mdm.evaluate", *words], capture_output=True, text=True, check=False, env=environment
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count("written:") == 1
+    result = json.loads(out.read_text())
+    assert result["values"]["jitter"]["n"] == 5
+    assert [path.name for path in motions(out).iterdir()] == ["rep_0.npz"]
+
+
+# Baselines, edits and what old code does ------------------------------------------------------------------------------
+
+
+def baseline(runs: Runs, folder: Path, kind: str, *words: str) -> int:
+    place = ["data=synthetic", f"data_root={runs.folder / 'data'}", "protocol=synthetic", "device=cpu"]
+    out = f"out={folder / f'{kind}.json'}"
+    return evaluate.main([f"baseline={kind}", *place, f"extractor={runs.clip}", "replications=1", out, *words])
+
+
+def test_baselines_show_what_each_metric_sees(runs, tmp_path):
+    found, truth = {}, {}
+    for kind in Baseline.KINDS:
+        assert baseline(runs, tmp_path, kind) == 0
+        result = json.loads((tmp_path / f"{kind}.json").read_text())
+        assert result["baseline"] == kind
+        assert result["checkpoint"] is None
+        found[kind] = {name: value["mean"] for name, value in result["values"].items()}
+        truth = {name: value["mean"] for name, value in result["ground_truth"].items()}
+    assert found["real"]["attributes/all"] > 0.95
+    assert found["real"]["fid"] < 2 * truth["fid"] + 0.1
+    assert found["shuffled"]["fid"] == pytest.approx(truth["fid"], rel=1e-3), "the same motions"
+    assert found["shuffled"]["attributes/all"] < 0.5
+    assert found["noisy"]["jitter"] > 5 * truth["jitter"]
+    assert found["noisy"]["foot_skating"] > 5 * truth["foot_skating"]
+    assert found["static"]["static_share"] == 1
+    assert found["static"]["jitter"] < 0.1
+    assert found["static"]["fid"] > 10 * truth["fid"]
+
+
+def test_baselines_that_make_no_sense_are_refused(runs, tmp_path, capsys):
+    assert baseline(runs, tmp_path, "shufled") == 1
+    assert "real, shuffled, noisy, static" in capsys.readouterr().err
+    assert baseline(runs, tmp_path, "shuffled", "protocol=unconditioned") == 1
+    assert "cannot be given those of others" in capsys.readouterr().err
+    assert baseline(runs, tmp_path, "real", f"ckpt={runs.model}") == 1
+    assert "give one of" in capsys.readouterr().err
+    assert baseline(runs, tmp_path, "real", "protocol=null") == 1
+    assert "needs a protocol" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("condition", ["text", "action"])
+def test_shuffled_motions_are_all_there_and_belong_to_what_others_ask_for(runs, condition):
+    clips = runs.data().test
+    protocol = load_protocol("synthetic", clips.representation)
+    rows = protocol.rows(clips, 0, 0)
+    samples = Baseline("shuffled", clips, condition, 0)("rep_0", rows, 0)
+    assert samples is not None
+    own = [motion.tobytes() for motion in real_motions(clips, rows)]
+    asked = dict(zip(own, (row.text if condition == "text" else row.clip.action for row in rows), strict=True))
+    given = [motion.tobytes() for motion in samples.features]
+    assert sorted(given) == sorted(own)
+    for row, motion in zip(rows, given, strict=True):
+        assert asked[motion] != (row.text if condition == "text" else row.clip.action)
+    with pytest.raises(UserError, match="2 of 3 motions are asked to be the same"):
+        Baseline("shuffled", clips, condition, 0)("rep_0", [rows[0], rows[0], rows[1]], 0)
+
+
+def test_static_motions_of_poses_hold_the_first_frame(runs):
+    clips = runs.data().test
+    rows = load_protocol("synthetic", clips.representation).rows(clips, 0, 0)[:3]
+    clips.representation = Rot6D()
+    clips.store.motion = lambda clip: np.random.default_rng(0).normal(size=(clip.length, 150))
+    samples = Baseline("static", clips, "text", 0)("rep_0", rows, 0)
+    assert samples is not None
+    for motion in samples.features:
+        assert (motion == motion[0]).all()
+
+
+EDITS = {
+    "prediction": lambda length: [frame < length // 4 for frame in range(length)],
+    "in_between": lambda length: [not length // 4 <= frame < int(0.75 * length) for frame in range(length)],
+    "interpolation": lambda length: [frame % 5 == 0 for frame in range(length)],
+}
+
+
+@pytest.mark.parametrize("name", ["prediction", "in_between", "upper_body", "interpolation"])
+def test_edits_keep_what_they_are_to_keep(runs, tmp_path, name):
+    out = tmp_path / "result.json"
+    result = runs.result(out, f"protocol=editing_{name}", "extractor=none", "quick=true", "samples=9")
+    assert result["checkpoint"]["edit"] == {"mode": "x0", "resample": 1}
+    values = {metric: value["mean"] for metric, value in result["values"].items()}
+    assert values["displacement/ade"] > 0.01
+    in_place = name in ("prediction", "upper_body")
+    assert (values["kept_drift/largest"] < 1e-4) is in_place, "behind a new part, kept frames start elsewhere"
+    assert result["ground_truth"]["kept_drift/largest"]["mean"] == 0
+    data = runs.data()
+    protocol = load_protocol(f"editing_{name}", data.representation)
+    protocol.samples = 9
+    rows = protocol.rows(data.test, 0, 0)
+    content = read_samples(motions(out) / "rep_0.npz")
+    made = np.split(content["features"], np.cumsum(content["lengths"])[:-1])
+    lower = data.representation.joint_features(range(22)) & ~data.representation.joint_features(
+        find_joints(data.representation.skeleton, "upper_body")
+    )
+    for row, motion, real in zip(rows, made, real_motions(data.test, rows), strict=True):
+        assert len(row.frames) == len(motion)
+        kept = np.ones_like(real, bool) & (
+            lower.numpy() if name == "upper_body" else np.array(EDITS[name](len(real)))[:, None]
+        )
+        np.testing.assert_allclose(motion[kept], real[kept], atol=1e-4)
+        assert np.abs(motion - real)[~kept].max() > 0.1
+
+
+def test_methods_of_editing_are_chosen_and_checked(runs, tmp_path, capsys):
+    words = ("protocol=editing_prediction", "extractor=none", "quick=true", "samples=2", "replications=1")
+    result = runs.result(tmp_path / "flame" / "result.json", *words, "method=flame")
+    assert result["checkpoint"]["edit"]["mode"] == "x_t"
+    assert "option of method=mfm" in refused(runs, capsys, tmp_path, *words, "until=0.3")
+    assert "edits no motions" in refused(runs, capsys, tmp_path, "method=mdm")
+
+
+def test_smoothing_takes_each_motion_for_itself(runs, tmp_path):
+    text = (EXPERIMENTS / "evaluation" / "text_to_motion_flame.yaml").read_text()
+    words = ("extractor=none", "quick=true", "replications=1", "samples=8")
+    rough = runs.result(tmp_path / "rough.json", "protocol=text_to_motion", *words)
+    smooth = runs.result(tmp_path / "smooth.json", "protocol=text_to_motion_flame", *words)
+    assert smooth["values"]["jitter"]["mean"] < 0.5 * rough["values"]["jitter"]["mean"]
+    assert smooth["ground_truth"] == rough["ground_truth"]
+    assert "smoothing: 1.0" in text
+    protocol = load_protocol("text_to_motion_flame", runs.data().representation)
+    step = np.repeat([[0.0], [1.0]], 20, axis=0)
+    (smoothed,) = protocol._smoothed([step])
+    expected = 0.5 * (1 + 2 * math.exp(-0.5) + 2 * math.exp(-2)) / (1 + 2 * math.exp(-0.5) + 2 * math.exp(-2))
+    assert smoothed[0, 0] == pytest.approx(0, abs=1e-9)
+    assert smoothed[19:21].mean() == pytest.approx(expected)
+    assert 0.25 < smoothed[19, 0] < 0.35
+
+
+def test_the_best_of_several_is_no_worse_than_all(runs, tmp_path, monkeypatch):
+    text = (EXPERIMENTS / "evaluation" / "reconstruction_best_of_10.yaml").read_text()
+    file = tmp_path / "mine.yaml"
+    file.write_text(text.replace("prompts: 500", "prompts: 3").replace("samples: 10", "samples: 4"))
+    result = runs.result(tmp_path / "result.json", f"protocol={file}", "samples=6")
+    values = {name: value["mean"] for name, value in result["values"].items()}
+    assert values["flame_of_10/best_ape_root"] < values["flame_of_10/worst_ape_root"]
+    assert result["values"]["flame_of_10/best_ape_root"]["n"] == 12
+
+
+def test_few_samples_are_warned_of(runs, tmp_path, capsys):
+    result = runs.result(tmp_path / "result.json", "quick=true", "samples=7", "replications=1", "protocol=synthetic")
+    count = len(runs.data().test)
+    assert result["warnings"] == [
+        "fid: 7 motions for 4 features, fewer than twice as many: biased upwards",
+        f"fid: 7 generated motions and {count} real ones; compare it with values of the same two numbers only",
+    ]
+    assert result["warnings"][0] in capsys.readouterr().out
+
+
+def test_real_motions_of_a_set_without_test_clips_are_checked(runs, tmp_path, monkeypatch):
+    """HumanAct12 is tested on its training clips; its gate holds all the same."""
+    data = runs.data()
+    clips = data.clips("train")
+    protocol = load_protocol("synthetic", data.representation)
+    protocol.change(replications=1, samples=40, quick=False, clips=len(clips))
+    protocol.expected = {"synthetic": {"attributes/all": [0.1, 0.05]}}
+    assert protocol.evaluate(None, clips, None, data.representation)["valid"]
+    data.store.info["clips"]["test"] = 0
+    assert not protocol.evaluate(None, clips, None, data.representation)["valid"]
+
+
+def test_as_many_real_motions_as_asked_for(runs):
+    data = runs.data()
+    protocol = load_protocol("synthetic", data.representation)
+    protocol.real_samples = 12
+    real = protocol.rows(data.test, 0, 0, purpose="real")
+    assert len(real) == 12
+    assert {row.id for row in real} != {row.id for row in protocol.rows(data.test, 0, 0)[:12]}, "a draw of their own"
+
+
+def test_the_classifier_of_old_code_starts_at_random_but_the_same_in_any_batch(tmp_path):
+    torch.save({"model": ActionGRU().state_dict()}, tmp_path / "gru")
+    plain, legacy = (
+        ClassifierExtractor("humanact12", str(tmp_path / "gru"), random_start=start) for start in (False, True)
+    )
+    x = torch.randn(3, 20, 150)
+    joints, mask = Rot6D().decode(x), length_mask(torch.tensor([20, 9, 20]))
+    with torch.no_grad():
+        found, again = legacy.motions(x, joints, mask), legacy.motions(x.flip(0), joints.flip(0), mask.flip(0))
+        alone = legacy.motions(x[1:2, :9], joints[1:2, :9], mask[1:2, :9])
+        start = plain.motions(x, joints, mask)
+    for name in ("features", "logits"):
+        torch.testing.assert_close(found[name], again[name].flip(0))
+        torch.testing.assert_close(found[name][1:2], alone[name])
+        assert not torch.allclose(found[name], start[name], atol=1e-3)
+    assert not torch.allclose(legacy.network.linear2(found["features"]), found["logits"], atol=1e-3), "two draws"
+    torch.save(UESTC().state_dict(), tmp_path / "uestc")
+    with pytest.raises(ValueError, match="no recurrence"):
+        ClassifierExtractor("uestc", str(tmp_path / "uestc"), random_start=True)
+
+
+def test_old_protocols_differ_from_the_present_ones_by_their_quirk(runs):
+    representation = runs.data().representation
+    for name, quirk in (
+        ("text_to_motion_t2m", lambda p: p.extractor["full_length"]),
+        ("action_to_motion", lambda p: p.extractor["random_start"]),
+        ("unconditioned_humanact12", lambda p: p.metrics["kid"]["replace"]),
+    ):
+        assert quirk(load_protocol(f"{name}_legacy", representation)) is True
+        with pytest.raises(KeyError):
+            quirk(load_protocol(name, representation))

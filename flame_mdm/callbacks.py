@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import time
 from collections.abc import Sequence
@@ -58,7 +59,8 @@ class Checkpoints(Checkpoint):
         if self.signum and signum == signal.SIGINT:
             raise KeyboardInterrupt
         self.signum = signum
-        print("\nstopping at the end of this step; Ctrl-C again stops at once", flush=True)
+        # print could find itself interrupted here, which Python refuses
+        os.write(1, b"\nstopping at the end of this step; Ctrl-C again stops at once\n")
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int

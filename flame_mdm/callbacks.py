@@ -198,6 +198,7 @@ class SampleMotions(Callback):
         self.prompts = [(p, {}) if isinstance(p, str) else (p[0], dict(p[1])) for p in prompts or []]
         self.unconditioned, self.metrics = unconditioned, metrics or {}
         self.next = every_n_steps
+        self.written: tuple[int, Path, dict[str, float | None]] = (-1, self.folder, {})
 
     @property
     def texts(self) -> list[str]:
@@ -220,13 +221,15 @@ class SampleMotions(Callback):
             self.write(trainer, pl_module)
 
     def on_fit_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        folder, values = self.write(trainer, pl_module)
+        if self.written[0] != trainer.global_step:  # the last validation may have written them
+            self.write(trainer, pl_module)
+        _, folder, values = self.written
         if trainer.is_global_zero:
             for name, value in values.items():
                 print(f"{name}: {'not asked' if value is None else f'{value:.3f}'}")
             print(f"see the motions: {folder / 'player.html'} (any browser), {folder / 'motions.gif'}")
 
-    def write(self, trainer: Trainer, pl_module: LightningModule) -> tuple[Path, dict[str, float | None]]:
+    def write(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Samples on all processes, a part on each; the first measures, writes files and tells the dashboard."""
         assert isinstance(pl_module, MotionGeneration)
         step = trainer.global_step
@@ -236,15 +239,16 @@ class SampleMotions(Callback):
             parts: list[Any] = [None] * trainer.world_size
             torch.distributed.all_gather_object(parts, motions)
             motions = [motion for row in zip_longest(*parts) for motion in row if motion is not None]
+        self.written = (step, folder, {})
         if not trainer.is_global_zero:
-            return folder, {}
+            return
         write_motions(folder, pl_module, motions, {"seed": 0, "step": step, "checkpoint": ""})
         values = self.measure(motions)
         for logger in trainer.loggers:
             # Lightning counts steps from 0 on dashboards: those of this validation stand at step - 1
             log_video(logger, "samples", folder / "motions.gif", step - 1)
             logger.log_metrics({f"samples/{k}": v for k, v in values.items() if v is not None}, step - 1)
-        return folder, values
+        self.written = (step, folder, values)
 
     def _sample(self, model: MotionGeneration, rank: int, world: int) -> list[Generated]:
         """The motions of every `world`-th prompt; the first process samples all that have none."""

@@ -1,25 +1,34 @@
-"""Kills training at random moments and resumes it: `python benchmarks/kill_resume.py [kills]`, 20 by default.
+"""Kills training, preparation and evaluation at random moments: `python benchmarks/kill_resume.py [kills]`, 20 of each.
 
-Each kill is SIGKILL, every fourth one while a checkpoint is being written. The weights at the end must be those of an
-uninterrupted run, bit for bit; exit code 1 otherwise. Processes are forked off one that has imported everything.
+Kills are SIGKILL and SIGTERM by turns; every fourth of training is SIGKILL in the middle of a checkpoint's bytes.
+Moments of training count from its first step. What the runs make at the end must be what uninterrupted ones make:
+weights bit for bit, the fingerprint of the data, the evaluation's JSON but for measured seconds; exit code 1 otherwise.
+Processes are forked off one that has imported everything.
 """
+
+from __future__ import annotations
 
 import contextlib
 import io
+import json
 import multiprocessing
 import os
 import random
+import shutil
 import signal
 import sys
 import tempfile
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import torch
 
-from flame_mdm import callbacks, guards, train
-from flame_mdm.task import read_checkpoint
+from flame_mdm import callbacks, evaluate, guards, prepare, train
+from flame_mdm.data.store import Store
+from flame_mdm.task import MotionGeneration, read_checkpoint
 
 STEPS = 400
 RECIPE = [
@@ -29,75 +38,202 @@ RECIPE = [
     *("trainer.enable_progress_bar=false", "trainer.val_check_interval=50", "callbacks.samples=null"),
     *("callbacks.best=null", "callbacks.checkpoints.every_n_steps=10", f"trainer.max_steps={STEPS}"),
 ]
+STORE = "synthetic-humanml-clean-smpl22"
 
 
-def run(words: list[str], seconds: float, writing: bool, out: Path) -> None:
-    """Trains in this process, which kills itself after so many seconds; if `writing`, inside the next checkpoint."""
-    with out.open("w") as log, contextlib.redirect_stdout(log), contextlib.redirect_stderr(log):
-        if writing:
-            save = torch.save
+class Kill:
+    """A signal to this process after so many seconds; `writing`, in the middle of the checkpoint that comes then."""
 
-            def half(checkpoint: object, file: io.BufferedWriter) -> None:
-                if time.monotonic() < begin + seconds:
-                    save(checkpoint, file)
-                    return
-                whole = io.BytesIO()
-                save(checkpoint, whole)
-                file.write(whole.getvalue()[: len(whole.getvalue()) // 2])
-                file.flush()
-                os.kill(os.getpid(), signal.SIGKILL)
+    def __init__(self, seconds: float, signum: int, writing: bool = False):
+        self.seconds, self.signum, self.writing = seconds, signum, writing
 
-            guards.torch.save = half
-        elif seconds < float("inf"):
-            timer = threading.Timer(seconds, os.kill, (os.getpid(), signal.SIGKILL))
-            timer.daemon = True
-            timer.start()
-        begin = time.monotonic()
-        code = train.main(["quickstart", *words])
-        log.flush()
+    def __str__(self) -> str:
+        return f"{signal.Signals(self.signum).name} | {self.seconds:.2f} s" + ", writing" * self.writing
+
+    def start(self) -> None:
+        if self.writing:
+            self._break_writing(time.monotonic() + self.seconds)
+            return
+        timer = threading.Timer(self.seconds, os.kill, (os.getpid(), self.signum))
+        timer.daemon = True
+        timer.start()
+
+    def _break_writing(self, when: float) -> None:
+        save = torch.save
+
+        def half(checkpoint: object, file: io.BufferedWriter) -> None:
+            if time.monotonic() < when:
+                save(checkpoint, file)
+                return
+            whole = io.BytesIO()
+            save(checkpoint, whole)
+            file.write(whole.getvalue()[: len(whole.getvalue()) // 2])
+            file.flush()
+            os.kill(os.getpid(), self.signum)
+
+        guards.torch.save = half
+
+
+def work(main: Callable[[list[str]], int], words: list[str], kill: Kill | None, log: Path) -> None:
+    """Runs a command in this process, until the kill."""
+    with log.open("w") as file, contextlib.redirect_stdout(file), contextlib.redirect_stderr(file):
+        if kill is not None and main is train.main:
+            MotionGeneration.on_train_start = lambda self: kill.start()
+        elif kill is not None:
+            kill.start()
+        code = main(words)
+        file.flush()
     os._exit(code)
 
 
+class Trials:
+    """Runs of commands in a folder, each in a process of its own; prints a table, and keeps whether all was well."""
+
+    def __init__(self, folder: Path):
+        self.folder, self.good = folder, True
+        self.draw = random.Random(0)
+
+    def run(self, main: Callable[[list[str]], int], words: list[str], kill: Kill | None = None) -> tuple[int, float]:
+        """Exit code and seconds; without a kill, the command has to succeed."""
+        begin = time.monotonic()
+        arguments = (main, words, kill, self.folder / "log")
+        process = multiprocessing.get_context("fork").Process(target=work, args=arguments)
+        process.start()
+        process.join()
+        code = process.exitcode or 0
+        if code and kill is None:
+            print((self.folder / "log").read_text())
+            raise SystemExit(1)
+        return code, time.monotonic() - begin
+
+    def kill(self, number: int, longest: float, writing: bool = False) -> Kill:
+        seconds = self.draw.uniform(0.0, longest)
+        return (
+            Kill(seconds, signal.SIGTERM if number % 2 else signal.SIGKILL)
+            if not writing
+            else Kill(seconds, signal.SIGKILL, writing=True)
+        )
+
+    def row(self, number: int, kill: Kill, code: int, found: str, good: bool = True) -> None:
+        names = {-signal.SIGKILL: "killed", -signal.SIGTERM: "ended", 128 + signal.SIGTERM: "stopped", 0: "was done"}
+        good = good and code in names
+        self.good &= good
+        print(f"| {number + 1} | {kill} | {names.get(code, f'exit code {code}')} | {found} |" + " WRONG" * (not good))
+
+    def verdict(self, what: str, good: bool) -> None:
+        self.good &= good
+        print(f"\n{what}: {good}\n")
+
+
+def head(title: str, found: str) -> None:
+    print(f"{title}\n\n| kill | signal | when | outcome | {found} |\n|---|---|---|---|---|")
+
+
+def training(trials: Trials, kills: int) -> None:
+    folder = trials.folder
+
+    def words(name: str) -> list[str]:
+        return ["quickstart", *RECIPE, f"data_root={folder / 'data'}", f"run.dir={folder / name}"]
+
+    _, seconds = trials.run(train.main, words("whole"))
+    head(f"Training, {STEPS} steps in {seconds:.1f} s without a break", "goes on from")
+    for number in range(kills):
+        # So short that all kills come before the end: as long as a few checkpoints take.
+        kill = trials.kill(number, 2 * seconds / (kills + 2) + 0.3, writing=number % 4 == 2)
+        code, _ = trials.run(train.main, words("killed"), kill)
+        with contextlib.redirect_stdout(io.StringIO()) as said:
+            step = guards.newest(folder / "killed" / "checkpoints")[1]
+        trials.row(number, kill, code, f"step {step} {said.getvalue().strip()}")
+    trials.run(train.main, words("killed"))
+    ends = [read_checkpoint(folder / name / "checkpoints" / "last.ckpt") for name in ("whole", "killed")]
+    equal = ends[0]["global_step"] == ends[1]["global_step"] and all(
+        torch.equal(ends[0][part][key], value)
+        for part in ("state_dict", "current_model_state")
+        for key, value in ends[1][part].items()
+    )
+    trials.verdict("resumed to the end; weights equal bit for bit", equal)
+
+
+def preparation(trials: Trials, kills: int) -> None:
+    def words(root: Path) -> list[str]:
+        return ["data=synthetic", "data.source.clips=150", f"data_root={root}"]
+
+    _, seconds = trials.run(prepare.main, words(trials.folder / "prepared"))
+    wanted = Store(trials.folder / "prepared" / STORE).info
+    head(f"Preparation, {seconds:.1f} s without a break", "left behind; after the next run")
+    for number in range(kills):
+        root = trials.folder / f"prepared{number}"
+        kill = trials.kill(number, 1.1 * seconds)
+        code, _ = trials.run(prepare.main, words(root), kill)
+        left = sorted(path.name for path in root.iterdir()) if root.exists() else []
+        # What has the name of the store is whole.
+        whole = STORE not in left or Store(root / STORE).info == wanted
+        trials.run(prepare.main, words(root))
+        same = Store(root / STORE).info == wanted and [path.name for path in root.iterdir()] == [STORE]
+        trials.row(
+            number, kill, code, f"{', '.join(left) or 'nothing'}; {'the same' if same else 'ANOTHER'}", whole and same
+        )
+        shutil.rmtree(root)
+    print()
+
+
+def evaluation(trials: Trials, kills: int) -> None:
+    checkpoint = trials.folder / "whole" / "checkpoints" / "last.ckpt"
+
+    def words(name: str) -> list[str]:
+        run = trials.folder / name
+        if not run.exists():
+            run.mkdir()
+            shutil.copy(checkpoint, run)
+        options = [
+            "protocol=synthetic",
+            "extractor=none",
+            "replications=3",
+            "split=train",
+            "batch_size=4",
+            "samples=16",
+        ]
+        return [
+            f"ckpt={run / 'last.ckpt'}",
+            *options,
+            f"data_root={trials.folder / 'data'}",
+            f"out={run / 'result.json'}",
+        ]
+
+    def result(name: str) -> dict[str, Any]:
+        report = json.loads((trials.folder / name / "result.json").read_text())
+        report["checkpoint"].pop("path")
+        report["environment"].pop("command")
+        report["cost"].pop("seconds_per_sample")
+        return report
+
+    _, seconds = trials.run(evaluate.main, words("evaluated"))
+    wanted = result("evaluated")
+    head(f"Evaluation, {seconds:.1f} s without a break", "replications kept")
+    equal, name = True, ""
+    for number in range(kills):
+        if number % 4 == 0:  # anew, after three runs that went on with what a killed one had made
+            name = f"evaluated{number}"
+        kill = trials.kill(number, 0.9 * seconds)
+        code, _ = trials.run(evaluate.main, words(name), kill)
+        kept = [path.name for path in (trials.folder / name).rglob("*.npz") if path.name.startswith("rep_")]
+        trials.row(number, kill, code, str(len(kept)))
+        if number % 4 == 3 or number == kills - 1:
+            trials.run(evaluate.main, words(name))
+            equal &= result(name) == wanted
+    trials.verdict("evaluated to the end; results equal but for measured seconds", equal)
+
+
 def main(kills: int) -> int:
-    """Prints the table of outcomes; returns the exit code."""
+    """Prints the tables of outcomes; returns the exit code."""
     torch.set_num_threads(1)
     assert callbacks  # imported here, so that no fork imports it again
-    fork, draw = multiprocessing.get_context("fork"), random.Random(0)
     with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-
-        def train_in(run_dir: str, seconds: float = float("inf"), writing: bool = False) -> tuple[int | None, float]:
-            words = [*RECIPE, f"data_root={folder / 'data'}", f"run.dir={folder / run_dir}"]
-            begin = time.monotonic()
-            process = fork.Process(target=run, args=(words, seconds, writing, folder / "log"))
-            process.start()
-            process.join()
-            return process.exitcode, time.monotonic() - begin
-
-        code, whole = train_in("whole")
-        if code:
-            print((folder / "log").read_text())
-            return 1
-        print(f"uninterrupted: {STEPS} steps in {whole:.1f} s\n")
-        print("| kill | when | outcome | goes on from |\n|---|---|---|---|")
-        for number in range(kills):
-            # As long as a few checkpoints take on average, so that all kills come before the end.
-            writing, seconds = number % 4 == 3, draw.uniform(0.0, 2 * whole / (kills + 2) + 0.5)
-            code, _ = train_in("killed", seconds, writing)
-            with contextlib.redirect_stdout(io.StringIO()) as said:
-                step = guards.newest(folder / "killed" / "checkpoints")[1]
-            outcome = {-signal.SIGKILL: "killed", 0: "was done before"}.get(code or 0, f"exit code {code}")
-            when = f"{seconds:.2f} s" + ", writing" * writing
-            print(f"| {number + 1} | {when} | {outcome} | step {step} {said.getvalue().strip()} |")
-        code, _ = train_in("killed")
-        ends = [read_checkpoint(folder / run_dir / "checkpoints" / "last.ckpt") for run_dir in ("whole", "killed")]
-        equal = ends[0]["global_step"] == ends[1]["global_step"] and all(
-            torch.equal(ends[0][part][key], value)
-            for part in ("state_dict", "current_model_state")
-            for key, value in ends[1][part].items()
-        )
-        print(f"\nresumed to the end: exit code {code}; equal bit for bit: {equal}")
-        return 0 if equal and code == 0 else 1
+        trials = Trials(Path(name))
+        for part in (training, preparation, evaluation):
+            part(trials, kills)
+    print("all as without a break" if trials.good else "NOT AS WITHOUT A BREAK")
+    return 0 if trials.good else 1
 
 
 if __name__ == "__main__":

@@ -623,9 +623,14 @@ def _check_whole(config: Config, name: str) -> None:
             raise UserError(f"{name}: it has no {key}; begin a recipe with the defaults of another, or with /base")
     if not config["run"].get("dir"):
         raise UserError(f"{name}: run.dir is empty; a run needs a folder")
+    if "max_steps" not in config["trainer"]:
+        raise UserError(f"{name}: trainer.max_steps is missing; -1 trains without end")
     for key in ("denoiser", "process", "condition"):
         if key in config and not (isinstance(config[key], Mapping) and "_target_" in config[key]):
             raise UserError(f"{name}: {key} has no _target_; {key}=... swaps it for one of experiments/{key}")
+    for key, value in config.get("denoiser", {}).items():
+        if isinstance(value, int) and value < 0:
+            raise UserError(f"denoiser.{key}={value}: a size is not negative")
     for key in ("experiment", "seed", "ema", "logger"):
         if key not in config:
             raise UserError(f"{name}: it has no {key}; begin a recipe with the defaults of another, or with /base")

@@ -85,7 +85,7 @@ def _fit(folder: Path, config: Config) -> None:
     _quiet()
     torch.set_float32_matmul_precision("high")
     checkpoint, step = newest(folder / "checkpoints")
-    most = config["trainer"].get("max_steps", -1)
+    most = config["trainer"]["max_steps"]
     if 0 <= most <= step:
         print(f"{folder} is trained to step {step} already: raise trainer.max_steps, or start anew with run.name=...")
         return

@@ -163,6 +163,7 @@ def _of_poses(poses: Poses, fps: float, caption: str, name: str) -> MotionFile:
 
 def _read_bvh(path: Path, fps: float | None, unit: float | None) -> MotionFile:
     joints, rate = read_bvh(path, given={} if unit is None else {"unit": unit})
+    _skeleton(joints)
     tall = float(np.ptp(joints[..., 1], axis=1).max())
     if not 0.3 < tall < 3.5:
         raise ValueError(

@@ -1,0 +1,76 @@
+"""What a second process costs: seconds a step of two gloo processes against one, `python benchmarks/ddp.py [runs]`.
+
+Both train the same batches of 16 clips, one process all 16 and two processes 8 each, with one thread each. With a core
+for each process, the ratio is 0.5 where nothing is lost; two processes on one core cannot go below 1. The loss is what
+gathering the gradients costs, and that both wait for the slower one. Seconds are between steps, so without imports.
+"""
+
+import json
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+STEPS, WARM = 60, 20
+SMALL = [
+    *("data.source.clips=60", "denoiser.latent_dim=128", "denoiser.ff_size=256", "denoiser.num_layers=4"),
+    *("denoiser.num_heads=4", "trainer.accelerator=cpu", "trainer.enable_progress_bar=false", "logger=csv"),
+    *("callbacks.samples=null", "callbacks.best=null", f"trainer.max_steps={STEPS}", "data_root=data"),
+    *("trainer.val_check_interval=1000", f"callbacks.checkpoints.every_n_steps={STEPS}"),
+    f"+callbacks.clock={{_target_: clock.Clock, warm: {WARM}}}",
+]
+CLOCK = """
+import json
+import time
+
+from lightning import Callback
+
+
+class Clock(Callback):
+    def __init__(self, warm: int):
+        self.warm, self.times = warm, []
+
+    def on_train_batch_end(self, trainer, *_):
+        self.times.append(time.perf_counter())
+
+    def on_train_end(self, trainer, *_):
+        if trainer.is_global_zero:
+            steps = [b - a for a, b in zip(self.times[self.warm :], self.times[self.warm + 1 :])]
+            open("steps.json", "w").write(json.dumps(steps))
+"""
+
+
+def step_seconds(folder: Path, processes: int, run: int) -> float:
+    """Median of the seconds between steps."""
+    words = ["quickstart", *SMALL, f"data.batch_size={16 // processes}", f"run.dir=run{processes}-{run}"]
+    words += ["trainer.devices=2", "trainer.strategy=ddp"] if processes == 2 else []
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(folder), "GLOO_SOCKET_IFNAME": "lo"}
+    done = subprocess.run(
+        [sys.executable, "-m", "flame_mdm.train", *words],
+        capture_output=True,
+        text=True,
+        cwd=folder,
+        env=environment,
+        check=False,
+    )
+    if done.returncode:
+        raise SystemExit(done.stdout + done.stderr)
+    return statistics.median(json.loads((folder / "steps.json").read_text()))
+
+
+def main(runs: int) -> None:
+    """Prints the medians over runs, taken by turns, and their ratio."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        (folder / "clock.py").write_text(CLOCK)
+        pairs = [(step_seconds(folder, 1, run), step_seconds(folder, 2, run)) for run in range(runs)]
+    one, two = (statistics.median(values) for values in zip(*pairs, strict=True))
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    print(f"{cores} cores; milliseconds a step of 16 clips: one process {1000 * one:.1f}, two {1000 * two:.1f}")
+    print(f"ratio {statistics.median(two / one for one, two in pairs):.2f}")
+
+
+if __name__ == "__main__":
+    main(int(sys.argv[1]) if len(sys.argv) > 1 else 3)

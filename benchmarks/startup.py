@@ -1,0 +1,62 @@
+"""Seconds until commands answer: `python benchmarks/startup.py [runs]`, medians of 3.
+
+`--help` and a misspelt key answer without importing torch. The work itself is the smallest there is: one step of
+training, one motion, one replication of eight motions, so that what is measured is imports and preparation. Ratios are
+to `python -c "import torch"`, so that machines compare.
+"""
+
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+TINY = [
+    *("data.source.clips=60", "data.batch_size=8", "denoiser.latent_dim=16", "denoiser.ff_size=16"),
+    *("denoiser.num_layers=1", "denoiser.num_heads=2", "condition.features=16", "process.num_train_timesteps=10"),
+    *("task.num_inference_steps=5", "trainer.accelerator=cpu", "trainer.enable_progress_bar=false", "logger=csv"),
+    *("callbacks.samples=null", "callbacks.best=null", "trainer.max_steps=1", "data_root=data"),
+]
+CKPT = "ckpt=first/checkpoints/last.ckpt"
+
+
+def seconds(folder: Path, *words: str) -> float:
+    """Of one process from start to end."""
+    begin = time.monotonic()
+    done = subprocess.run([sys.executable, *words], capture_output=True, text=True, cwd=folder, check=False)
+    if "Traceback" in done.stderr:
+        raise SystemExit(done.stderr)
+    return time.monotonic() - begin
+
+
+def main(runs: int) -> None:
+    """Prints a table."""
+    os.environ["OMP_NUM_THREADS"] = "1"
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        seconds(folder, "-m", "flame_mdm.train", "quickstart", *TINY, "run.dir=first")  # prepares the data, too
+        evaluation = ["protocol=synthetic", "extractor=none", "quick=true", "replications=1", "samples=8"]
+        work: dict[str, tuple[list[str], list[str]]] = {  # with the words that differ from run to run
+            "train": (["quickstart", *TINY], ["run.dir=run{}"]),
+            "sample": ([CKPT, "text=a person walks", "samples=1", "seconds=0.5"], ["out=samples{}"]),
+            "evaluate": ([CKPT, *evaluation, "data_root=data"], ["seed={}", "out=result{}.json"]),
+        }
+        rows = {"python -c 'import torch'": (["-c", "import torch"], list[str]())}
+        for command, (words, varying) in work.items():
+            module = ["-m", f"flame_mdm.{command}"]
+            rows[f"{command} --help"] = ([*module, "--help"], [])
+            rows[f"{command}, misspelt key"] = ([*module, *words[: command == "train"], "seeed=1"], [])
+            rows[f"{command}, smallest work"] = ([*module, *words], varying)
+        print("| | seconds | ratio |\n|---|---|---|")
+        base = 0.0
+        for row, (words, varying) in rows.items():
+            runs_of = ([*words, *(word.format(number) for word in varying)] for number in range(runs))
+            median = statistics.median(seconds(folder, *run) for run in runs_of)
+            base = base or median
+            print(f"| {row} | {median:.2f} | {median / base:.2f} |", flush=True)
+
+
+if __name__ == "__main__":
+    main(int(sys.argv[1]) if len(sys.argv) > 1 else 3)

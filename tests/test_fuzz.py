@@ -1,0 +1,932 @@
+"""Malformed input of every kind through every command: one line `error: ...`, nothing written, no traceback, no hang.
+
+The slow groups take a share of their cases, always the same one; FLAME_MDM_FUZZ=all takes all of them.
+"""
+
+import io
+import json
+import os
+import pickle
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import zipfile
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from conftest import TINY
+
+from flame_mdm import train
+from flame_mdm.formats import END_SITES
+from flame_mdm.representations.skeleton import SMPL22
+from flame_mdm.task import read_checkpoint
+
+COMMANDS = ("train", "sample", "edit", "evaluate", "prepare", "browse", "convert", "checkpoints")
+SECONDS = 30
+TEXT = "text=a person walks"
+
+
+class Refused:
+    """Runs commands on input that they have to refuse, and collects where they do not do so well."""
+
+    def __init__(self, folder: Path, capture: pytest.CaptureFixture[str], watched: Sequence[Path]):
+        self.folder, self.capture, self.watched = folder, capture, [folder, *watched]
+        self.count, self.every, self.faults = 0, 1, list[str]()
+
+    def __call__(self, command: str, *words: str) -> None:
+        self.count += 1
+        if self.count % self.every and os.environ.get("FLAME_MDM_FUZZ") != "all":
+            return
+        before = self._tree()
+        self.capture.readouterr()
+
+        def late(*_: object) -> None:
+            raise TimeoutError
+
+        handler = signal.signal(signal.SIGALRM, late)
+        signal.alarm(SECONDS)
+        try:
+            code: object = import_module(f"flame_mdm.{command}").main(list(words))
+        except TimeoutError:
+            code = f"no end after {SECONDS} s"
+        except BaseException as error:
+            place = error.__traceback__
+            while place and place.tb_next:
+                place = place.tb_next
+            code = f"{type(error).__name__}: {error}" + (
+                f" ({place.tb_frame.f_code.co_filename}:{place.tb_lineno})" if place else ""
+            )
+        finally:
+            signal.alarm(0)
+            signal.signal(signal.SIGALRM, handler)
+        out, err = self.capture.readouterr()
+        told = [
+            f"it ended with {code}" if code not in (1, 2) else "",
+            f"it left {sorted(map(str, self._tree() ^ before))}" if self._tree() != before else "",
+            "a traceback" if "Traceback" in out + err else "",
+            f"it said {err!r}" if not one_line(err, command) else "",
+        ]
+        if any(told):
+            self.faults.append(f"{command} {str(words)[-200:]}: {'; '.join(filter(None, told))}")
+
+    def _tree(self) -> set[Path]:
+        return {path for folder in self.watched for path in folder.rglob("*")}
+
+
+def one_line(err: str, command: str) -> bool:
+    """Whether a refusal is one clear line; argparse, which `checkpoints` uses, shows the usage before it.
+
+    What goes before an error in the middle of work are its progress bars, on lines of their own.
+    """
+    lines = [line for line in err.splitlines() if line and not re.match(r"\r?(generating|preparing \w+): ", line)]
+    if command == "checkpoints" and lines and lines[0].startswith("usage: "):
+        return ": error: " in lines[-1]
+    return len(lines) == 1 and lines[0].startswith("error: ") and len(lines[0]) > len("error: ") + 8
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory, data_root) -> Path:
+    """A checkpoint of a tiny model; its data is prepared."""
+    folder = tmp_path_factory.mktemp("trained")
+    words = [*TINY, f"data_root={data_root}", f"run.dir={folder}", "callbacks.samples=null", "callbacks.best=null"]
+    assert train.main(["quickstart", *words, "trainer.max_steps=2", "logger=csv"]) == 0
+    return folder / "checkpoints" / "last.ckpt"
+
+
+@pytest.fixture
+def bad(tmp_path) -> Path:
+    """Where the malformed files lie."""
+    folder = tmp_path / "bad"
+    folder.mkdir()
+    return folder
+
+
+@pytest.fixture
+def refused(tmp_path, monkeypatch, capfd, trained, data_root) -> Iterator[Refused]:
+    folder = tmp_path / "here"
+    folder.mkdir()
+    monkeypatch.chdir(folder)
+    monkeypatch.setenv("FLAME_MDM_DATA", str(data_root))
+    monkeypatch.delenv("FLAME_MDM_TRACEBACK", raising=False)
+    refused = Refused(folder, capfd, [trained.parent.parent, data_root])
+    yield refused
+    assert refused.count > 0
+    assert not refused.faults, f"{len(refused.faults)} of {refused.count}:\n" + "\n".join(refused.faults)
+
+
+def mangled(data: bytes, count: int, seed: int) -> Iterator[bytes]:
+    """The data cut at, with bytes changed at, or with garbage at random places."""
+    draw = np.random.default_rng(seed)
+    yield from (b"", b"\0" * 100, data[:1], data[:-1], data[: len(data) // 2], b"PK\3\4" + data)
+    for number in range(count - 6):
+        at = int(draw.integers(len(data)))
+        if number % 3 == 0:
+            yield data[:at]
+        elif number % 3 == 1:
+            changed = bytearray(data)
+            changed[at] ^= int(draw.integers(1, 256))
+            yield bytes(changed)
+        else:
+            yield data[:at] + draw.bytes(int(draw.integers(1, 50))) + data[at + 20 :]
+
+
+KEYS = {
+    "train": ("seed", "data.batch_size", "trainer.max_steps", "denoiser.latent_dim", "optimizer.lr", "run.dir"),
+    "sample": ("ckpt", "seconds", "samples", "seed", "guidance_scale", "sampler"),
+    "edit": ("ckpt", "motion", "frames", "joints", "cut", "until"),
+    "evaluate": ("ckpt", "protocol", "extractor", "split", "samples", "batch_size"),
+    "prepare": ("source", "check", "verify", "force", "data_root"),
+    "browse": ("split", "search", "clips", "out", "data_root"),
+    "convert": ("input", "out", "fps", "unit"),
+}
+BROKEN = (
+    "[",
+    "{a",
+    "'",
+    '"x',
+    "${nothing}",
+    "${oc.env:NOT_SET_ANYWHERE}",
+    "[1,",
+    "${",
+    "}",
+    "a}b",
+    "(",
+    "x{",
+    "${a.b}",
+)
+WORDS = ("=", "=1", "==", "no", "-x", "--nope", "é=1", "a..b=1", ".=1", "a.=1", "~", "~nothing", "+=1", "\x1b[31m=1")
+WORDS += ("\u202e=1", "seed", "seed=1=", "seed=${seed}", "data=", "data=../base", "data=[a]", "seed=[${seed}]", "@a=1")
+
+
+def words(command: str, seed: int, count: int) -> Iterator[list[str]]:
+    """Misspelt keys, broken values, words that are no overrides."""
+    draw = np.random.default_rng(seed)
+    keys = KEYS[command]
+    yield from ([word] for word in WORDS)
+    for number in range(count):
+        key = str(draw.choice(keys))
+        if number % 3 == 0:
+            at = int(draw.integers(1, len(key)))
+            yield [f"{key[:at]}{draw.choice(list('qxzéß'))}{key[at:]}=1"]
+        elif number % 3 == 1:
+            yield [f"seed={draw.choice(BROKEN)}"]
+        else:
+            yield [f"~{key}"] if number % 2 else [f"{key}.deeper=1"]
+
+
+@pytest.mark.parametrize("command", KEYS)
+def test_words(refused, command):
+    first = ["quickstart"] if command == "train" else []
+    for number, bad_words in enumerate(words(command, 1, 21)):
+        refused(command, *first, *bad_words)
+        if number % 7 == 0 and first:
+            refused(command, *bad_words)
+
+
+def test_recipes(refused, bad):
+    whole = "# @package _global_\ndefaults:\n  - /quickstart\n  - _self_\ntrainer: {max_steps: 5}\n"
+    broken = [
+        "",
+        "[",
+        "{",
+        "a: b: c",
+        "\t- x",
+        "- a\n- b",
+        "text",
+        "3",
+        "null",
+        "a: &x [*x]",
+        "a: *nothing",
+        "? [",
+        "!!python/object:os.system {}",
+    ]
+    broken += [
+        "defaults: 3",
+        "defaults: [3]",
+        "defaults: [/none_such]",
+        "defaults: [/data: none_such]",
+        "defaults: [[a]]",
+    ]
+    broken += [
+        "seed: ${seed}",
+        "a: ${b}\nb: ${a}",
+        "a: ${oc.env:NOT_SET_ANYWHERE}",
+        "a: ${no_resolver:1}",
+        "run: null",
+        "trainer: 3",
+    ]
+    broken += [
+        f"{whole}{line}\n" for line in ("trainer: {max_steps: 7}\n  x", "trainer: [1]", "denoiser: null", "data: 3")
+    ]
+    broken += [
+        f"{whole}{line}\n"
+        for line in ("denoiser: {_target_: os.system}", "denoiser: {_target_: 3}", "denoiser: {_target_: null}")
+    ]
+    broken += [
+        f"{whole}{line}\n"
+        for line in (
+            "process: {_target_: flame_mdm.none.Such}",
+            "callbacks: {x: {_target_: torch.nn.Linear}}",
+            "callbacks: 3",
+            "data: {source: null}",
+            "condition: {_target_: }",
+            "representation: text",
+            "a: '\x00'",
+        )
+    ]
+    for number, text in enumerate(broken):
+        path = bad / f"recipe{number}.yaml"
+        path.write_bytes(text.encode())
+        refused("train", str(path))
+    (bad / "latin.yaml").write_bytes(b"seed: \xe9\xff\n")
+    (bad / "folder.yaml").mkdir()
+    for path in ("latin.yaml", "folder.yaml", "none.yaml"):
+        refused("train", str(bad / path))
+    for name in (
+        "none_such",
+        "",
+        "quick start",
+        "../base",
+        "base",
+        "data/synthetic",
+        "\0",
+        "é",
+        "/",
+        ".",
+        "quickstart.yaml",
+        "x" * 5000,
+    ):
+        refused("train", name)
+
+
+def test_settings_of_training(refused, tmp_path, data_root):
+    refused.every = 3
+    values = {
+        "data.batch_size": ("0", "-3", "many", "null", "1.5", "[1]", "{a:1}"),
+        "trainer.max_steps": ("soon", "null", "1.5", "[1]"),
+        "seed": ("zero", "null", "-1", "1.5", "[1]", "1e400"),
+        "denoiser.num_heads": ("3", "0", "-1", "two", "null"),
+        "denoiser.latent_dim": ("-1", "0", "1.5", "null"),
+        "denoiser.num_layers": ("-1", "x", "null"),
+        "denoiser.dropout": ("2", "-1", "x"),
+        "process.num_train_timesteps": ("0", "-1", "x", "null", "1.5"),
+        "process.schedule": ("none_such", "3", "null"),
+        "process.prediction": ("none_such", "null"),
+        "optimizer.lr": ("-1", "fast", "null"),
+        "optimizer": ("null", "3", "{}"),
+        "trainer.accelerator": ("abacus", "3"),
+        "trainer.precision": ("7", "x"),
+        "trainer.devices": ("0", "-2", "x", "null"),
+        "trainer.val_check_interval": ("-1", "x"),
+        "trainer.log_every_n_steps": ("-1", "x"),
+        "task.num_inference_steps": ("99", "0", "-1", "x"),
+        "task.sampler": ("none_such", "3"),
+        "task.cond_drop_prob": ("2", "-1", "x"),
+        "task.guidance_scale": ("x", "null", "nan"),
+        "data.num_workers": ("-1", "x"),
+        "data.source.clips": ("0", "-1", "x", "null"),
+        "data.crop": ("null", "3", "{}"),
+        "data.name": ("null", "''"),
+        "data_root": ("null", "/dev/null/x"),
+        "run.dir": ("null", "/dev/null/x", "/proc/none", "''"),
+        "run": ("null", "3"),
+        "callbacks": ("3", "[]"),
+        "callbacks.samples.prompts": ("3", "[1]", "['']"),
+        "callbacks.samples.seconds": ("-1", "x", "1000"),
+        "callbacks.checkpoints.every_n_steps": ("0", "-1", "x"),
+        "ema": ("3", "{decay: 2}", "{x: 1}"),
+        "losses": ("null", "{joints: x}", "{none: 1}"),
+        "denoiser": ("none_such", "null", "3"),
+        "data": ("none_such", "null"),
+        "logger": ("none_such", "3"),
+        "condition": ("none_such", "action"),
+        "representation": ("none_such",),
+    }
+    tiny = [
+        *TINY,
+        f"data_root={data_root}",
+        f"run.dir={tmp_path / 'here' / 'run'}",
+        "callbacks.best=null",
+        "trainer.max_steps=1",
+        "logger=csv",
+    ]
+    for key, broken in values.items():
+        for value in broken:
+            refused("train", "quickstart", *[word for word in tiny if not word.startswith(f"{key}=")], f"{key}={value}")
+
+
+def test_requests(refused, trained):
+    values = {
+        "seconds": ("-1", "0", "1e9", "nan", "inf", "long", "[1,2]", "null2", "0.01"),
+        "samples": ("0", "-1", "two", "1.5", "null", "1000000000000"),
+        "seed": ("x", "null", "1.5", "[1]"),
+        "sampler": ("none_such", "3", "[a]"),
+        "num_inference_steps": ("-1", "0", "x", "1.5", "99", "1000000000"),
+        "guidance_scale": ("big", "nan", "inf", "[1]"),
+        "device": ("abacus", "3", "cuda:99"),
+        "action": ("walk",),
+        "unconditioned": ("true", "maybe"),
+        "ckpt": ("/none/such.ckpt", "", ".", "/", "null", "/dev/null", "\0", "x" * 5000),
+        "out": ("/dev/null/x", "/proc/none"),
+        "text": ("", " ", "\t", "\n", "null"),
+    }
+    for key, broken in values.items():
+        for value in broken:
+            refused("sample", f"ckpt={trained}", TEXT, f"{key}={value}")
+    for word in ("action=walk", "action=3", "text=null", "unconditioned=false"):
+        refused("sample", f"ckpt={trained}", word)
+
+
+@pytest.fixture
+def walk(tmp_path) -> Path:
+    """A motion to edit."""
+    path = tmp_path / "walk.npz"
+    np.savez(path, joints=body(30), fps=20.0)
+    return path
+
+
+def body(frames: int) -> np.ndarray:
+    """(F, 22, 3), somebody who stands and sways."""
+    from flame_mdm.representations.smpl import ADULT
+
+    offsets = np.array(ADULT)
+    joints = np.zeros((frames, 22, 3))
+    for joint, parent in enumerate(SMPL22.parents):
+        joints[:, joint] = offsets[joint] + (joints[:, parent] if parent >= 0 else 0)
+    joints[..., 1] -= joints[..., 1].min()
+    return (joints + 0.01 * np.sin(np.arange(frames) / 5)[:, None, None]).astype(np.float32)
+
+
+def test_edits(refused, trained, walk):
+    refused.every = 2
+    values = {
+        "frames": (
+            "none_such",
+            "[1]",
+            "[5,2]",
+            "[-3,2]",
+            "[0,9999]",
+            "[a,b]",
+            "3",
+            "[]",
+            "[[1,2],3]",
+            "[0,0]",
+            "{a:1}",
+            "[nan,2]",
+            "true",
+        ),
+        "seconds": ("[1]", "[5,2]", "[a,b]", "3", "[0,inf]", "x"),
+        "joints": ("none_such", "[none_such]", "3", "[]", "[1]", "[[a]]", "{a:1}"),
+        "cut": ("[1]", "[2,1]", "[0,99]", "x", "3", "[nan,1]", "[0,inf]"),
+        "method": ("none_such", "3", "mfm"),
+        "until": ("2", "x", "0.1"),
+        "resample": ("0", "-1", "x", "2"),
+        "samples": ("0", "x"),
+        "motion": (
+            "none.npz",
+            "",
+            "/",
+            "x",
+            "synthetic:none",
+            ":",
+            "a:b:c",
+            "../x:y",
+            ".npz",
+            "none.bvh",
+            "x.fbx",
+            "\0.npz",
+            "/dev/null",
+        ),
+        "data_root": ("null",),
+    }
+    for key, broken in values.items():
+        for value in broken:
+            extra = [] if key in ("frames", "seconds", "joints") else ["frames=in_between"]
+            extra += ["motion=synthetic:000000"] if key == "data_root" else []
+            refused("edit", f"ckpt={trained}", f"motion={walk}", TEXT, *extra, f"{key}={value}")
+
+
+def test_evaluations(refused, trained, bad):
+    refused.every = 2
+    (bad / "empty").mkdir()
+    (bad / "list.yaml").write_text("- 1\n")
+    (bad / "broken.yaml").write_text("a: [\n")
+    (bad / "bare.yaml").write_text("name: x\n")
+    (bad / "foreign.yaml").write_text("_target_: os.system\ncommand: ls\n")
+    (bad / "part.yaml").write_text("_target_: evaluators.protocols.Protocol\nname: x\n")
+    (bad / "folder.yaml").mkdir()
+    values = {
+        "ckpt": ("", "none.ckpt", "/", "null", str(bad / "empty")),
+        "protocol": (
+            "none_such",
+            "../base",
+            str(bad / "none.yaml"),
+            *(str(bad / f"{name}.yaml") for name in ("list", "broken", "bare", "foreign", "part", "folder")),
+            "action_to_motion",
+        ),
+        "extractor": ("none.ckpt", str(trained), str(bad / "list.yaml"), str(bad / "empty"), "/dev/null"),
+        "split": ("none_such", "null", "3", "[test]"),
+        "seed": ("x", "null"),
+        "replications": ("0", "-1", "x", "1.5"),
+        "samples": ("0", "-1", "x"),
+        "quick": ("maybe", "3", "null"),
+        "sampler": ("none_such",),
+        "num_inference_steps": ("0", "99", "x"),
+        "guidance_scale": ("x", "nan"),
+        "batch_size": ("0", "-1", "x", "null"),
+        "device": ("abacus",),
+        "data_root": ("/none/such", "/dev/null"),
+        "data": ("none_such", "bandai", "null"),
+        "out": ("/dev/null/x.json", "/"),
+        "from_samples": (str(bad / "empty"), "none"),
+    }
+    for key, broken in values.items():
+        for value in broken:
+            extra = [] if key == "extractor" else ["extractor=none"]
+            extra += ["ckpt=null", "data=synthetic", "protocol=synthetic"] if key == "from_samples" else []
+            refused("evaluate", f"ckpt={trained}", "quick=true", *extra, f"{key}={value}")
+
+
+class Bomb:
+    """What a pickle of strangers may hold: unpickled, it makes a file in the current folder."""
+
+    def __reduce__(self):
+        return os.system, ("touch owned",)
+
+
+def foreign(content: dict[str, Any]) -> Iterator[Any]:
+    """Checkpoints that PyTorch can write and that are none of this framework, or hold nonsense."""
+    yield from ([], 3, "text", None, {}, {"state_dict": {}}, torch.zeros(3), Bomb())
+    yield {"config": Bomb(), "facts": {}, "state_dict": {}}
+    for key in ("config", "facts", "state_dict"):
+        for value in ([], 3, "text", None, {}, {"a": "b"}, {1: 2}):
+            yield content | {key: value}
+    for part in ("task", "denoiser", "process", "condition", "representation"):
+        for value in (None, 3, {}, {"_target_": "os.system"}, {"_target_": "torch.nn.Linear"}, {"_target_": 3}):
+            yield content | {"config": content["config"] | {part: value}}
+    name = next(iter(content["state_dict"]))
+    for value in (torch.zeros(3), "x", None, torch.zeros(0)):
+        yield content | {"state_dict": content["state_dict"] | {name: value}}
+    yield content | {"state_dict": {f"x{key}": value for key, value in content["state_dict"].items()}}
+    for key, value in (
+        ("actions", None),
+        ("actions", 3),
+        ("max_frames", None),
+        ("max_frames", "x"),
+        ("max_frames", -1),
+    ):
+        yield content | {"facts": content["facts"] | {key: value}}
+
+
+def test_foreign_checkpoints(refused, trained, bad):
+    refused.every = 2
+    path = bad / "bad.ckpt"
+    for number, value in enumerate(foreign(read_checkpoint(trained))):
+        torch.save(value, path)
+        refused("sample", f"ckpt={path}", TEXT)
+        if number % 10 == 0:
+            refused("evaluate", f"ckpt={path}", "extractor=none", "quick=true")
+            refused("checkpoints", "import", "mdm", str(path), str(trained), "-o", "out.safetensors")
+    path.write_bytes(pickle.dumps(Bomb()))
+    refused("sample", f"ckpt={path}", TEXT)
+    refused("checkpoints", "export", str(path), "-o", "x")
+    refused("checkpoints", "import", "flame", str(path), "-o", "x")
+    with zipfile.ZipFile(path, "w") as file:
+        file.writestr("readme.txt", "hello")
+    refused("sample", f"ckpt={path}", TEXT)
+
+
+def test_damaged_checkpoints(refused, trained, bad, walk):
+    whole = trained.read_bytes()
+    path = bad / "bad.ckpt"
+    for number, content in enumerate(mangled(whole, 60, 2)):
+        path.write_bytes(content)
+        refused("checkpoints", "export", str(path), "-o", "out.safetensors")
+        if number % 6 == 0:
+            refused("sample", f"ckpt={path}", TEXT)
+            refused("edit", f"ckpt={path}", f"motion={walk}", "frames=in_between", TEXT)
+            refused("evaluate", f"ckpt={path}", "extractor=none", "quick=true")
+            refused("checkpoints", "push", str(path), "a/b", "--dry-run")
+
+
+def test_damaged_model_files(refused, trained, bad):
+    from flame_mdm.checkpoints import export
+
+    file = export(trained, bad / "whole.safetensors")
+    whole = file.read_bytes()
+    file.unlink()
+    path = bad / "bad.safetensors"
+    for number, content in enumerate(mangled(whole, 50, 3)):
+        path.write_bytes(content)
+        refused("checkpoints", "export", str(path), "-o", "out.safetensors")
+        if number % 10 == 0:
+            refused("sample", f"ckpt={path}", TEXT)
+    size = int.from_bytes(whole[:8], "little")
+    head = json.loads(whole[8 : 8 + size])
+    recipe = json.loads(head["__metadata__"]["flame_mdm"])
+    for change in ({}, {"format": 2}, {"config": None}, {"config": {}}, {"facts": 3}, {"sha256": ""}, {"origin": None}):
+        text = json.dumps(recipe | change) if change else "{"
+        changed = json.dumps(head | {"__metadata__": {"flame_mdm": text}}).encode()
+        path.write_bytes(len(changed).to_bytes(8, "little") + changed + whole[8 + size :])
+        if change not in ({"origin": None},):  # not looked at to sample
+            refused("sample", f"ckpt={path}", TEXT)
+
+
+def test_words_of_checkpoints(refused, trained, bad):
+    for arguments in (
+        *(
+            [],
+            ["none"],
+            ["export"],
+            ["export", "a"],
+            ["export", "none.ckpt", "-o", "x"],
+            ["import", "x", "y", "-o", "z"],
+        ),
+        *(["import", "mdm", "none.pt", "-o", "x"], ["import", "mdm", "none.pt", "args.json", "-o", "x"]),
+        *(["import", "flame", str(trained), "-o", "x"], ["import", "mdm", str(trained), str(trained), "-o", "x"]),
+        *(["push", str(trained), "noslash", "--dry-run"], ["push", "none.ckpt", "a/b", "--dry-run"]),
+        *(["export", str(bad), "-o", "x"], ["export", str(trained), "-o", "/dev/null/x.safetensors"]),
+        *(
+            ["export", "\0", "-o", "x"],
+            ["export", "", "-o", "x"],
+            ["import", "mdm", str(trained), "--heads", "x", "-o", "y"],
+        ),
+    ):
+        refused("checkpoints", *arguments)
+
+
+def bvh(frames: int = 3) -> str:
+    """A whole BVH file of SMPL's joints, in centimetres."""
+    lines: list[str] = []
+
+    def joint(index: int) -> None:
+        from flame_mdm.representations.smpl import ADULT
+
+        offset = " ".join(f"{100 * x:.3f}" for x in ADULT[index])
+        kind = "Xposition Yposition Zposition " if index == 0 else ""
+        lines.extend([f"{'JOINT' if index else 'ROOT'} {SMPL22.joints[index]}", "{", f"OFFSET {offset}"])
+        lines.append(f"CHANNELS {6 if index == 0 else 3} {kind}Zrotation Xrotation Yrotation")
+        for child, parent in enumerate(SMPL22.parents):
+            if parent == index:
+                joint(child)
+        if SMPL22.joints[index] in END_SITES:
+            lines.extend(["End Site", "{", "OFFSET 0 1 0", "}"])
+        lines.append("}")
+
+    joint(0)
+    row = " ".join(["0 90 0", *["0"] * 66])
+    return "\n".join(["HIERARCHY", *lines, "MOTION", f"Frames: {frames}", "Frame Time: 0.05", *[row] * frames]) + "\n"
+
+
+def broken_bvh() -> Iterator[str]:
+    whole = bvh()
+    yield from ("", "HIERARCHY", "HIERARCHY\nMOTION\nFrames: 0\nFrame Time: 0.05\n", "x", "\0", whole.replace("}", ""))
+    changes = [
+        ("ROOT pelvis", "JOINT pelvis"),
+        ("ROOT pelvis", "ROOT"),
+        ("CHANNELS 6", "CHANNELS 5"),
+        ("CHANNELS 3", "CHANNELS 99999999999"),
+    ]
+    changes += [
+        ("CHANNELS 6", "CHANNELS -1"),
+        ("CHANNELS 6", "CHANNELS x"),
+        ("CHANNELS 3", "CHANNELS 2.5"),
+        ("CHANNELS 6", "CHANNELS 1e300"),
+        ("OFFSET", "OFFSET nan"),
+        ("OFFSET 0", "OFFSET x"),
+    ]
+    changes += [("Zrotation", "Zturn"), ("Zrotation", "Xrotation")]
+    changes += [
+        ("Frames: 3", f"Frames: {value}") for value in ("4", "2", "0", "-3", "x", "3.5", "9" * 30, "9" * 5000, "")
+    ]
+    changes += [
+        ("Frame Time: 0.05", f"Frame Time: {value}") for value in ("0", "-1", "nan", "inf", "x", "1e-300", "1e300", "")
+    ]
+    changes += [("0 90 0", f"{value} 90 0") for value in ("nan", "inf", "1e400", "x", "0 0", "", "1e38", "1_0 0")]
+    changes += [
+        ("JOINT left_hip", "JOINT other"),
+        ("JOINT left_hip", "JOINT right_hip"),
+        ("JOINT neck", "JOINT head"),
+        ("MOTION", "motion x"),
+        ("End Site", "End"),
+        ("HIERARCHY", "HIERARCHY HIERARCHY"),
+    ]
+    changes += [("ROOT pelvis\n{", "ROOT pelvis\n{\nROOT again\n{"), ("OFFSET 0", "OFFSET 0 0"), ("JOINT", "joint \0")]
+    for old, new in changes:
+        changed = whole.replace(old, new, 1)
+        if changed != whole:
+            yield changed
+    draw = np.random.default_rng(4)
+    for _ in range(12):
+        yield whole[: draw.integers(len(whole) - 140)]
+    for _ in range(8):
+        at = int(draw.integers(len(whole.partition("MOTION")[0])))
+        yield whole[:at] + str(draw.choice(["{", "}", " x{ ", "\x1b"])) + whole[at:]
+    yield "HIERARCHY\n" + "".join(f"{'JOINT' if n else 'ROOT'} j{n}\n{{\nOFFSET 0 0 0\n" for n in range(5000))
+
+
+def test_damaged_bvh(refused, bad, trained):
+    refused.every = 3
+    path = bad / "bad.bvh"
+    for number, text in enumerate(broken_bvh()):
+        path.write_text(text)
+        refused("convert", str(path), "out=out.json")
+        if number % 10 == 0:
+            refused("edit", f"ckpt={trained}", f"motion={path}", "frames=in_between", TEXT)
+    path.write_bytes(b"HIERARCHY\n\xff\xfe")
+    refused("convert", str(path), "out=out.json")
+
+
+def arrays(**changes: Any) -> dict[str, Any]:
+    content = {"joints": body(4), "fps": np.float32(20)} | changes
+    return {name: value for name, value in content.items() if value is not None}
+
+
+def broken_arrays() -> Iterator[dict[str, Any]]:
+    shapes = ((), (0,), (4,), (4, 22), (4, 21, 3), (4, 22, 2), (0, 22, 3), (4, 0, 3), (2, 4, 22, 3))
+    yield from (arrays(joints=np.ones(shape)) for shape in shapes)
+    yield from (arrays(joints=np.full((4, 22, 3), value)) for value in (np.nan, np.inf, -np.inf, "x", 1e300))
+    yield arrays(joints=np.full((4, 22, 3), 1j))
+    yield arrays(joints=np.array({"a": 1}, dtype=object))
+    yield arrays(joints=np.array("text"))
+    yield arrays(joints=np.zeros((4, 22, 3), "datetime64[s]"))
+    yield from (arrays(fps=np.array(value)) for value in (0, -1, np.nan, np.inf, "x", [20, 20], [], 1j))
+    yield arrays(joints=None)
+    yield arrays(fps=None)
+    yield {}
+    poses, trans = np.zeros((4, 156)), np.zeros((4, 3))
+    amass = {"joints": None, "fps": None, "poses": poses, "trans": trans, "mocap_framerate": 60.0}
+    yield from (
+        arrays(**amass | {"poses": np.ones(shape)}) for shape in ((), (4,), (4, 5), (3, 156), (4, 52, 3), (4, 2))
+    )
+    yield from (arrays(**amass | {"trans": np.ones(shape)}) for shape in ((), (3,), (4, 2)))
+    yield from (arrays(**amass | {"mocap_framerate": np.array(rate)}) for rate in (0, -1, np.nan, "x", [1, 2]))
+    yield arrays(**amass | {"poses": np.full((4, 156), np.nan)})
+    yield arrays(**amass | {"poses": np.full((4, 156), "x")})
+    yield arrays(**amass | {"poses": np.zeros((0, 156)), "trans": np.zeros((0, 3))})
+
+
+def test_damaged_arrays(refused, bad, trained):
+    refused.every = 3
+    path = bad / "bad.npz"
+    for content in broken_arrays():
+        np.savez(path, **content)
+        refused("convert", str(path), "out=out.bvh")
+        if "poses" not in content:
+            refused("edit", f"ckpt={trained}", f"motion={path}", "frames=in_between", TEXT)
+    for suffix in ("npz", "npy"):
+        stream = io.BytesIO()
+        np.savez(stream, **arrays()) if suffix == "npz" else np.save(stream, body(4))
+        path = bad / f"bad.{suffix}"
+        for number, data in enumerate(mangled(stream.getvalue(), 24, 5)):
+            if suffix == "npy" and number > 5 and number % 3 != 0:  # nothing tells that other numbers were meant
+                continue
+            path.write_bytes(data)
+            refused("convert", str(path), "out=out.json", *(["fps=20"] if suffix == "npy" else []))
+
+
+def test_damaged_json(refused, bad):
+    path = bad / "bad.json"
+    texts = [
+        "",
+        "{",
+        "[]",
+        "3",
+        "null",
+        "[" * 100000,
+        '{"joints": []}',
+        '{"joints": [], "fps": 20}',
+        '{"joints": "x", "fps": 20}',
+        '{"joints": [[[1]]], "fps": 20}',
+        '{"joints": [[1], [1, 2]], "fps": 20}',
+        "\ufeff{}",
+        "NaN",
+    ]
+    texts += [
+        json.dumps({"joints": body(4).tolist(), "fps": fps}) for fps in (0, -1, "x", None, [], {}, float("nan"), True)
+    ]
+    texts += [
+        json.dumps({"joints": np.full((4, 22, 3), x).tolist(), "fps": 20}) for x in (float("nan"), float("inf"), 1e300)
+    ]
+    for text in texts:
+        path.write_text(text)
+        refused("convert", str(path), "out=out.bvh")
+    path.write_bytes(b"\xff\xfe{}")
+    refused("convert", str(path), "out=out.bvh")
+
+
+def test_arguments_of_convert(refused, bad, walk):
+    os.mkfifo(bad / "pipe.npz")
+    (bad / "folder.npz").mkdir()
+    for arguments in (
+        *([], ["out=x.glb"], [str(walk)], ["none.bvh", "out=x.glb"], [str(walk), "out=x.fbx"], [str(walk), "out=x"]),
+        *([str(walk), "out=x.bvh", f"fps={fps}"] for fps in ("-2", "0", "nan", "inf", "x", "[1]", "1e400")),
+        *([str(walk), "out=x.bvh", f"unit={unit}"] for unit in ("-2", "0", "nan", "x", "1")),
+        *([str(bad / name), "out=x.bvh"] for name in ("pipe.npz", "folder.npz", "", "none.npz")),
+        *(
+            [str(walk), f"out={out}"]
+            for out in ("/dev/null/x.bvh", "/none/such/x.bvh", "", ".bvh/", str(bad / "folder.npz"))
+        ),
+        *(["x" * 5000 + ".npz", "out=x.bvh"], ["\0.npz", "out=x.bvh"], [str(walk), str(walk), "out=x.bvh"]),
+    ):
+        refused("convert", *arguments)
+
+
+def own_data(folder: Path) -> None:
+    """Three motions with captions, well formed."""
+    folder.mkdir()
+    for name in "abc":
+        np.savez(folder / f"{name}.npz", joints=body(60), fps=20.0)
+        (folder / f"{name}.txt").write_text("a person stands\n")
+
+
+def test_damaged_own_data(refused, bad, tmp_path):
+    refused.every = 3
+
+    def case(change: Callable[[Path], Any], *more: str) -> None:
+        folder = bad / f"data{refused.count}"
+        own_data(folder)
+        change(folder)
+        root = tmp_path / f"prepared{refused.count}"
+        refused.watched.append(root)
+        refused("prepare", "data=folder", f"source={folder}", f"data_root={root}", *more)
+
+    for name in "abc":
+        case(lambda folder, name=name: (folder / f"{name}.txt").unlink())
+    for content in ("", "\n\n", "# x\n", "   "):
+        case(lambda folder, content=content: (folder / "b.txt").write_text(content))
+    case(lambda folder: (folder / "b.txt").write_bytes(b"\xff\xfe\xff"))
+    case(lambda folder: [path.unlink() for path in folder.glob("*.npz")])
+    case(lambda folder: (folder / "b.npy").write_bytes(b"x"))
+    tables = (
+        "",
+        "x\n",
+        "id\n",
+        "id,text\n",
+        "id,text\nz,stands\n",
+        "id,text\na,b,c\n",
+        'id,text\na,"x\n',
+        "id,split\na,none\n",
+        "id,id\na,b\n",
+        "id,text,bogus\na,b,c\n",
+        "id,text\n\0,b\n",
+    )
+    for table in tables:
+        if table not in ("id\n", "id,text\n"):
+            case(lambda folder, table=table: (folder / "captions.csv").write_text(table))
+    case(lambda folder: (folder / "captions.csv").write_bytes(b"id,text\na,\xff\n"))
+    for text in (
+        "",
+        "{",
+        "[]",
+        "3",
+        '{"z": {"text": "x"}}',
+        '{"a": 3}',
+        '{"a": {"bogus": 1}}',
+        '{"a": {"text": 3}}',
+        '{"a": {"split": 3}}',
+        '{"a": {"text": {"b": 1}}}',
+        '{"a": {"action": ["x"]}}',
+    ):
+        case(lambda folder, text=text: (folder / "captions.json").write_text(text))
+    for text in (
+        "[",
+        "- a",
+        "bogus: 1",
+        "up: w",
+        "unit: 0",
+        "unit: x",
+        "unit: .nan",
+        "fps: -1",
+        "map: {pelvis: x}",
+        "map: 3",
+        "joints: [a]",
+        "mirrored: 3",
+        "!!python/object:os.system {}",
+        "fps: true",
+        "up: [y]",
+        "3",
+    ):
+        case(lambda folder, text=text: (folder / "skeleton.yaml").write_text(text))
+    for content in list(broken_arrays())[::3]:
+        case(lambda folder, content=content: np.savez(folder / "b.npz", **content))
+    for text in list(broken_bvh())[::7]:
+        case(lambda folder, text=text: ((folder / "b.npz").unlink(), (folder / "b.bvh").write_text(text)))
+    for word in (
+        "data.source.exclude=[none]",
+        "data.source.motion=none",
+        "data.source.mirror=maybe",
+        "data.source.motion=smpl",
+        "representation=none",
+        "data.source.path=null",
+        "data.name=null",
+    ):
+        case(lambda folder: None, word)
+
+
+def test_arguments_of_prepare_and_browse(refused, bad):
+    refused.every = 3
+    (bad / "file.zip").write_bytes(b"x")
+    for arguments in (
+        *([], ["data=none_such"], ["data=bandai"], ["data=synthetic", "source=x"], ["data=null"], ["data=bandai,kit"]),
+        *(
+            [f"data={data}", f"source={source}"]
+            for data in ("bandai", "humanml3d", "kit", "babel", "humanact12", "uestc", "folder")
+            for source in ("/none/such", bad, bad / "file.zip", "/dev/null", "\0")
+        ),
+        *(["data=synthetic", f"data.source.clips={n}", "force=true"] for n in ("0", "-1", "x", "null", "1.5")),
+        *(
+            ["data=synthetic", "data_root=/dev/null"],
+            ["data=synthetic", "verify=true", "data_root=none"],
+            ["data=synthetic", "check=maybe"],
+        ),
+    ):
+        refused("prepare", *map(str, arguments))
+    for arguments in (
+        *(
+            [],
+            ["data=none_such"],
+            ["data=folder"],
+            ["data=synthetic", "split=none"],
+            ["data=synthetic", "search=no such words"],
+        ),
+        *(["data=synthetic", f"clips={n}"] for n in ("0", "-1", "x", "null", "1.5")),
+        *(["data=synthetic", f"out={out}"] for out in ("/dev/null/x.html", "/proc/none/x.html", "/")),
+        *(["data=synthetic", "split=[a]"], ["data=synthetic", "split=3"]),
+    ):
+        refused("browse", *arguments)
+
+
+def test_damaged_stores(refused, bad, data_root, trained):
+    refused.every = 2
+    whole = data_root / "synthetic-humanml-clean-smpl22"
+    for name in ("store.json", "clips.jsonl", "statistics.npz", "features.npy"):
+        content = (whole / name).read_bytes()
+        for number, data in enumerate([*mangled(content, 9, 6), None]):
+            if data is not None and ((name == "features.npy" and number > 4) or (name == "store.json" and number != 4)):
+                continue  # store.json holds the checksums of the others, not its own
+            root = bad / f"{name}{number}"
+            shutil.copytree(whole, root / whole.name)
+            file = root / whole.name / name
+            file.unlink() if data is None else file.write_bytes(data)
+            refused("evaluate", f"ckpt={trained}", "extractor=none", "quick=true", f"data_root={root}")
+            if name != "store.json" or data is not None:
+                refused("browse", "data=synthetic", f"data_root={root}")
+
+
+def test_strange_texts_are_legal(trained, tmp_path, monkeypatch, capfd):
+    monkeypatch.chdir(tmp_path)
+    sample = import_module("flame_mdm.sample").main
+    texts = [
+        "walk " * 10_000,
+        "a\x07b\x1b[31m c\x7f",
+        "<script>alert(1)</script> & </style>",
+        "走る ü \u202e x",
+        "'; $(rm) `x` \\",
+        "{a: [b",
+    ]
+    for number, text in enumerate(texts):
+        assert sample([f"ckpt={trained}", f"text={text}", "samples=1", "seconds=0.5", f"out=out{number}"]) == 0, text[
+            :50
+        ]
+        page = (tmp_path / f"out{number}" / "player.html").read_text(encoding="utf-8")
+        assert "<script>alert(1)" not in page
+        with np.load(tmp_path / f"out{number}" / "motion_000.npz") as file:
+            assert str(file["text"]) == text
+    capfd.readouterr()
+
+
+PROCESSES = [
+    *[("train", *words) for words in (["none_such"], ["quickstart", "seeed=1"], ["quickstart", "seed=["], ["a.yaml"])],
+    *[("sample", *words) for words in ([], ["ckpt=none.ckpt", "text=a"], ["text="], ["sead=1"], ["ckpt=x", "seed='"])],
+    *[("edit", *words) for words in ([], ["frmes=x"], ["~seed"])],
+    *[("evaluate", *words) for words in ([], ["split=none"])],
+    *[("prepare", *words) for words in ([], ["data=bandai", "sorce=x"])],
+    *[("convert", *words) for words in (["out=x.bvh"], ["a.bvh", "unt=2"])],
+    *[("browse", "data=none_such"), ("checkpoints", "export", "none.ckpt", "-o", "x")],
+]
+
+
+def test_real_processes(tmp_path):
+    assert len(PROCESSES) == 20
+
+    def run(words: Sequence[str]) -> subprocess.CompletedProcess[str]:
+        command = [sys.executable, "-m", f"flame_mdm.{words[0]}", *words[1:]]
+        environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+        return subprocess.run(
+            command, capture_output=True, text=True, env=environment, cwd=tmp_path, check=False, timeout=120
+        )
+
+    with ThreadPoolExecutor(2) as pool:
+        for words, done in zip(PROCESSES, pool.map(run, PROCESSES), strict=True):
+            assert done.returncode in (1, 2), (words, done)
+            assert one_line(done.stderr, words[0]), (words, done.stderr)
+    assert not list(tmp_path.iterdir())

@@ -39,7 +39,7 @@ class Checkpoints(Checkpoint):
     """Writes `last.ckpt` every so often, at the last step and when interrupted, and keeps some for good.
 
     SIGINT, SIGTERM, SIGUSR1 and SIGUSR2 end training at the end of a step, never inside validation, where averaged and
-    raw weights are swapped; a second SIGINT ends it at once.
+    raw weights are swapped, or of the next step where there are several processes; a second SIGINT ends it at once.
     """
 
     def __init__(self, folder: str, every_n_steps: int, keep_every_n_steps: int | None = None):
@@ -47,6 +47,7 @@ class Checkpoints(Checkpoint):
         self.folder = Path(folder)
         self.every_n_steps, self.keep_every_n_steps = every_n_steps, keep_every_n_steps
         self.signum = 0
+        self.exchanged = torch.tensor(0)
         self.step = -1
         self.handlers: dict[int, Any] = {}
 
@@ -70,7 +71,10 @@ class Checkpoints(Checkpoint):
         self.step = trainer.global_step
         signum = self.signum
         if trainer.world_size > 1:
-            signum = int(trainer.strategy.reduce(torch.tensor(signum, device=pl_module.device), reduce_op="max"))
+            # What all processes know of is what was exchanged a step ago: so that none waits for this step to end.
+            signum, known = int(self.exchanged), torch.tensor(signum, device=pl_module.device)
+            torch.distributed.all_reduce(known, torch.distributed.ReduceOp.MAX)
+            self.exchanged = known
         last = bool(signum) or trainer.should_stop or self.step >= trainer.max_steps > 0
         if last or self.step % self.every_n_steps == 0:
             trainer.save_checkpoint(self.folder / "last.ckpt")

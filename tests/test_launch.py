@@ -72,7 +72,7 @@ def test_a_slurm_job_that_runs_out_of_time_is_requeued_and_ends_as_if_it_had_not
     while len(codes := (tmp_path / "codes").read_text().split()) < 2 and time.monotonic() < deadline:
         time.sleep(0.1)  # the result of a job stands in its file before the job has ended
     assert codes == ["140", "0"]  # 128 + SIGUSR2
-    assert "steps: 3 to 5" in logs
+    assert "steps: 4 to 5" in logs
     checkpoints = tmp_path / "run" / "checkpoints"
     assert sorted(path.name for path in checkpoints.iterdir()) == ["last.ckpt", "previous.ckpt"]
     checkpoint = read_checkpoint(checkpoints / "last.ckpt")

@@ -15,7 +15,7 @@ from evaluators.confidence import mean_ci
 from evaluators.distribution import FrechetMotionDistance
 from evaluators.evaluator import Evaluator, Extracted, Motions
 from evaluators.extractors import Extractor
-from evaluators.sources import Generator, Given, Row, Samples, Source, real_motions
+from evaluators.sources import Baseline, Generator, Given, Row, Samples, Source, real_motions
 from flame_mdm.config import Config, UserError, instantiate
 from flame_mdm.data.datamodule import Clips
 from flame_mdm.editing import MFM_STEPS, method_options
@@ -238,6 +238,10 @@ class Protocol:
             total=total // world,
             progress=progress,
         )
+
+    def baseline(self, kind: str, clips: Clips, seed: int) -> Baseline:
+        """The source of motions that no model made; see `Baseline`."""
+        return Baseline(kind, clips, self.condition, seed)
 
     def given(self, folder: Path, representation: Representation) -> Given:
         """The source of motions that others made, a replication a file, of any clips of the split; see `Given`."""

@@ -93,7 +93,6 @@ def _processes(device: str | None) -> Iterator[tuple[int, int, str]]:
 
 
 def _evaluate(config: Config, rank: int, world: int, device: str) -> None:
-    from evaluators.sources import Baseline
     from flame_mdm.checkpoints import find
     from flame_mdm.generation import file_sha256
     from flame_mdm.task import load
@@ -127,7 +126,7 @@ def _evaluate(config: Config, rank: int, world: int, device: str) -> None:
         )
         name = "result"
     elif config["baseline"] is not None:
-        source = Baseline(config["baseline"], clips, protocol.condition, config["seed"])
+        source = protocol.baseline(config["baseline"], clips, config["seed"])
         folder, name = Path("runs/baselines") / data.store.info["dataset"] / kind, config["baseline"]
         name += "" if config["split"] == "test" else f"-{config['split']}"
     else:

@@ -23,9 +23,9 @@ COPY experiments experiments
 RUN pip install --no-cache-dir -c constraints.txt ".[offline,slurm]"
 
 # Data and runs are mounted; nobody in there is root.
-RUN useradd --create-home --uid 1000 researcher && mkdir /work && chown researcher /work
+RUN useradd --create-home --uid 1000 researcher && mkdir /workspace && chown researcher /workspace
 USER 1000
-WORKDIR /work
-ENV FLAME_MDM_DATA=/work/data HF_HOME=/work/.cache/huggingface PYTHONUNBUFFERED=1
+WORKDIR /workspace
+ENV FLAME_MDM_DATA=/workspace/data HF_HOME=/workspace/.cache/huggingface PYTHONUNBUFFERED=1
 ENTRYPOINT ["python", "-m"]
 CMD ["flame_mdm.train", "--help"]

@@ -85,7 +85,7 @@ def write_report(folder: Path) -> Path:
         UserError: the folder holds no run, or a damaged file.
     """
     found = read_run(folder)
-    parts = [_head(found), _fault(folder), _samples(found), _curves(found), _evaluations(found), _provenance(found)]
+    parts = [_head(found), _fault(folder), _samples(found), _evaluations(found), _curves(found), _provenance(found)]
     path = folder / "report.html"
     with written_whole(path) as temporary:
         temporary.write_text(page(found.label, "\n".join(filter(None, parts))), encoding="utf-8")
@@ -262,7 +262,7 @@ def constants(curves: Mapping[str, Curve]) -> dict[str, float]:
 def _evaluations(found: Run) -> str:
     if not found.results:
         return ""
-    return f"<h2>Evaluations</h2><div class='charts'>{''.join(map(_evaluation, found.results.values()))}</div>"
+    return f"<h2>Evaluations</h2><div class='results'>{''.join(map(_evaluation, found.results.values()))}</div>"
 
 
 def _evaluation(result: Mapping[str, Any]) -> str:

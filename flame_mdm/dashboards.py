@@ -14,7 +14,7 @@ from lightning.pytorch.utilities import rank_zero_only
 from omegaconf import OmegaConf
 
 from flame_mdm.config import Config
-from flame_mdm.report import HISTORY, records
+from flame_mdm.report import HISTORY, read_json, records
 
 
 class History(Logger):
@@ -73,7 +73,7 @@ class WandbRun(WandbLogger):
 
     def __init__(self, save_dir: str, **options: Any):
         self.path = Path(save_dir) / "wandb.json"
-        kept = json.loads(self.path.read_text()) if self.path.exists() else {}
+        kept = read_json(self.path) if self.path.exists() else {}
         self.told, self.rows = kept.get("step", -1), kept.get("rows", 0)
         known: dict[str, Any] = {"id": kept.get("id") or secrets.token_hex(4)}
         super().__init__(save_dir=save_dir, **(known | options))

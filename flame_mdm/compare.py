@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import math
 import random
 import shlex
 import statistics
@@ -29,6 +28,7 @@ from flame_mdm.report import (
     sampling,
     steps,
 )
+from flame_mdm.tables import wilson
 from flame_mdm.visualize.page import chart, frame, number, page, table
 from flame_mdm.visualize.scene import written_whole
 
@@ -377,20 +377,11 @@ def _known(path: Path, content: Any, key: str, where: str = "the file") -> str:
 
 
 def _pair(a: str, b: str, wins_a: int, wins_b: int, raters: int) -> dict[str, Any]:
-    low, high = wilson(wins_a, wins_a + wins_b)
+    share, low, high = wilson(wins_a, wins_a + wins_b)
     return {
         **{"a": a, "b": b, "wins_a": wins_a, "wins_b": wins_b, "raters": raters},
-        **{"share_a": wins_a / (wins_a + wins_b), "interval_a": [low, high]},
+        **{"share_a": share, "interval_a": [max(0.0, low), min(1.0, high)]},
     }
-
-
-def wilson(wins: int, answers: int) -> tuple[float, float]:
-    """The 95 % interval of a share (Wilson 1927)."""
-    z = 1.96
-    share = wins / answers
-    middle = (share + z**2 / (2 * answers)) / (1 + z**2 / answers)
-    half = z * math.sqrt(share * (1 - share) / answers + z**2 / (4 * answers**2)) / (1 + z**2 / answers)
-    return max(0.0, middle - half), min(1.0, middle + half)
 
 
 if __name__ == "__main__":

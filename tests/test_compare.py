@@ -11,7 +11,7 @@ import pytest
 from test_report import a_run, result, run
 
 from flame_mdm import compare
-from flame_mdm.compare import find, read_texts, tally, wilson
+from flame_mdm.compare import find, read_texts, tally
 from flame_mdm.config import UserError
 
 PROMPTS = ("a person walks", "a person jumps", "a person <waves> & bows")
@@ -187,16 +187,8 @@ def test_ratings_of_several_people_are_counted(tmp_path, capsys):
     }
     assert first["share_a"] == pytest.approx(2 / 3)
     assert (second["b"], second["wins_a"], second["wins_b"], second["raters"]) == ("other", 1, 0, 1)
+    assert second["interval_a"] == [pytest.approx(0.2065, abs=1e-4), 1.0]
     assert "ours over real: 4 of 6 answers, 66.7% (30.0% to 90.3%), 2 raters" in capsys.readouterr().out
-
-
-def test_the_interval_is_wilsons():
-    assert wilson(8, 10) == pytest.approx((0.4902, 0.9433), abs=1e-4)  # as statsmodels and Wikipedia's formula have it
-    assert wilson(0, 10)[0] == 0
-    assert wilson(10, 10)[1] == 1
-    low, high = wilson(423, 1000)
-    assert low < 0.423 < high
-    assert high - low == pytest.approx(2 * 1.96 * (0.423 * 0.577 / 1000) ** 0.5, rel=0.01)
 
 
 @pytest.mark.parametrize(

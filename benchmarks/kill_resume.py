@@ -1,9 +1,10 @@
 """Kills training, preparation and evaluation at random moments: `python benchmarks/kill_resume.py [kills]`, 20 of each.
 
 Kills are SIGKILL and SIGTERM by turns; every fourth of training is SIGKILL in the middle of a checkpoint's bytes.
-Moments of training count from its first step. What the runs make at the end must be what uninterrupted ones make:
-weights bit for bit, the fingerprint of the data, the evaluation's JSON but for measured seconds; exit code 1 otherwise.
-Processes are forked off one that has imported everything.
+Moments of training are so many steps and up to 50 ms after its start, others up to the seconds of an uninterrupted run;
+kills that come too late do not count. What the runs make at the end must be what uninterrupted ones make: weights bit
+for bit, the fingerprint of the data, the evaluation's JSON but for measured seconds; exit code 1 otherwise. Processes
+are forked off one that has imported everything.
 """
 
 from __future__ import annotations
@@ -42,29 +43,29 @@ STORE = "synthetic-humanml-clean-smpl22"
 
 
 class Kill:
-    """A signal to this process after so many seconds; `writing`, in the middle of the checkpoint that comes then."""
+    """A signal to this process after so many steps of training and seconds; `writing`, inside the next checkpoint."""
 
-    def __init__(self, seconds: float, signum: int, writing: bool = False):
-        self.seconds, self.signum, self.writing = seconds, signum, writing
+    def __init__(self, seconds: float, signum: int, steps: int = 0, writing: bool = False):
+        self.seconds, self.signum, self.steps, self.writing = seconds, signum, steps, writing
 
     def __str__(self) -> str:
-        return f"{signal.Signals(self.signum).name} | {self.seconds:.2f} s" + ", writing" * self.writing
+        when = f"{self.steps} steps, {1000 * self.seconds:.0f} ms" if self.steps else f"{self.seconds:.2f} s"
+        return f"{signal.Signals(self.signum).name} | {when}" + ", writing" * self.writing
 
     def start(self) -> None:
-        if self.writing:
-            self._break_writing(time.monotonic() + self.seconds)
-            return
         timer = threading.Timer(self.seconds, os.kill, (os.getpid(), self.signum))
         timer.daemon = True
         timer.start()
 
-    def _break_writing(self, when: float) -> None:
+    def step(self) -> None:
+        self.steps -= 1
+        if self.steps == 0:
+            self._break_writing() if self.writing else self.start()
+
+    def _break_writing(self) -> None:
         save = torch.save
 
         def half(checkpoint: object, file: io.BufferedWriter) -> None:
-            if time.monotonic() < when:
-                save(checkpoint, file)
-                return
             whole = io.BytesIO()
             save(checkpoint, whole)
             file.write(whole.getvalue()[: len(whole.getvalue()) // 2])
@@ -76,13 +77,15 @@ class Kill:
 
 def work(main: Callable[[list[str]], int], words: list[str], kill: Kill | None, log: Path) -> None:
     """Runs a command in this process, until the kill."""
-    with log.open("w") as file, contextlib.redirect_stdout(file), contextlib.redirect_stderr(file):
+    with log.open("w") as file:
+        os.dup2(file.fileno(), 1)
+        os.dup2(file.fileno(), 2)
         if kill is not None and main is train.main:
-            MotionGeneration.on_train_start = lambda self: kill.start()
+            MotionGeneration.on_train_batch_end = lambda self, outputs, batch, batch_idx: kill.step()
         elif kill is not None:
             kill.start()
         code = main(words)
-        file.flush()
+        sys.stdout.flush()
     os._exit(code)
 
 
@@ -106,16 +109,14 @@ class Trials:
             raise SystemExit(1)
         return code, time.monotonic() - begin
 
-    def kill(self, number: int, longest: float, writing: bool = False) -> Kill:
+    def kill(self, number: int, longest: float, steps: int = 0, writing: bool = False) -> Kill:
+        """The next one: after up to so many seconds, or 1 to `steps` steps of training."""
         seconds = self.draw.uniform(0.0, longest)
-        return (
-            Kill(seconds, signal.SIGTERM if number % 2 else signal.SIGKILL)
-            if not writing
-            else Kill(seconds, signal.SIGKILL, writing=True)
-        )
+        signum = signal.SIGTERM if number % 2 else signal.SIGKILL
+        return Kill(seconds, signum, self.draw.randint(1, steps) if steps else 0, writing)
 
     def row(self, number: int, kill: Kill, code: int, found: str, good: bool = True) -> None:
-        names = {-signal.SIGKILL: "killed", -signal.SIGTERM: "ended", 128 + signal.SIGTERM: "stopped", 0: "was done"}
+        names = {-signal.SIGKILL: "killed", -signal.SIGTERM: "ended", 128 + signal.SIGTERM: "stopped"}
         good = good and code in names
         self.good &= good
         print(f"| {number + 1} | {kill} | {names.get(code, f'exit code {code}')} | {found} |" + " WRONG" * (not good))
@@ -138,8 +139,8 @@ def training(trials: Trials, kills: int) -> None:
     _, seconds = trials.run(train.main, words("whole"))
     head(f"Training, {STEPS} steps in {seconds:.1f} s without a break", "goes on from")
     for number in range(kills):
-        # So short that all kills come before the end: as long as a few checkpoints take.
-        kill = trials.kill(number, 2 * seconds / (kills + 2) + 0.3, writing=number % 4 == 2)
+        # So few steps that all kills come before the end.
+        kill = trials.kill(number, 0.05, 2 * STEPS // (kills + 6), writing=number % 4 == 2)
         code, _ = trials.run(train.main, words("killed"), kill)
         with contextlib.redirect_stdout(io.StringIO()) as said:
             step = guards.newest(folder / "killed" / "checkpoints")[1]
@@ -163,8 +164,11 @@ def preparation(trials: Trials, kills: int) -> None:
     head(f"Preparation, {seconds:.1f} s without a break", "left behind; after the next run")
     for number in range(kills):
         root = trials.folder / f"prepared{number}"
-        kill = trials.kill(number, 1.1 * seconds)
-        code, _ = trials.run(prepare.main, words(root), kill)
+        code = 0
+        while code == 0:
+            shutil.rmtree(root, ignore_errors=True)
+            kill = trials.kill(number, seconds)
+            code, _ = trials.run(prepare.main, words(root), kill)
         left = sorted(path.name for path in root.iterdir()) if root.exists() else []
         # What has the name of the store is whole.
         whole = STORE not in left or Store(root / STORE).info == wanted
@@ -214,8 +218,12 @@ def evaluation(trials: Trials, kills: int) -> None:
     for number in range(kills):
         if number % 4 == 0:  # anew, after three runs that went on with what a killed one had made
             name = f"evaluated{number}"
-        kill = trials.kill(number, 0.9 * seconds)
-        code, _ = trials.run(evaluate.main, words(name), kill)
+        code = 0
+        while code == 0:
+            kill = trials.kill(number, 0.7 * seconds)
+            code, _ = trials.run(evaluate.main, words(name), kill)
+            if code == 0:
+                shutil.rmtree(trials.folder / name)
         kept = [path.name for path in (trials.folder / name).rglob("*.npz") if path.name.startswith("rep_")]
         trials.row(number, kill, code, str(len(kept)))
         if number % 4 == 3 or number == kills - 1:

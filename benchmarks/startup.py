@@ -1,4 +1,4 @@
-"""Seconds until commands answer: `python benchmarks/startup.py [runs]`, medians of 3.
+"""Seconds until commands answer: `python benchmarks/startup.py [runs]`, means of 2 by default.
 
 `--help` and a misspelt key answer without importing torch. The work itself is the smallest there is: one step of
 training, one motion, one replication of eight motions, so that what is measured is imports and preparation. Ratios are
@@ -59,4 +59,4 @@ def main(runs: int) -> None:
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]) if len(sys.argv) > 1 else 3)
+    main(int(sys.argv[1]) if len(sys.argv) > 1 else 2)

@@ -44,6 +44,8 @@ class Checkpoints(Checkpoint):
 
     def __init__(self, folder: str, every_n_steps: int, keep_every_n_steps: int | None = None):
         super().__init__()
+        if every_n_steps < 1:
+            raise ValueError(f"callbacks.checkpoints.every_n_steps={every_n_steps}: at least 1 is needed")
         self.folder = Path(folder)
         self.every_n_steps, self.keep_every_n_steps = every_n_steps, keep_every_n_steps
         self.signum = 0
@@ -198,6 +200,8 @@ class SampleMotions(Callback):
         unconditioned: int = 4,
         metrics: dict[str, Metric] | None = None,
     ):
+        if not seconds > 0:
+            raise ValueError(f"callbacks.samples.seconds={seconds}: motions last longer than 0 seconds")
         self.folder, self.every_n_steps, self.seconds = Path(folder), every_n_steps, seconds
         self.prompts = [(p, {}) if isinstance(p, str) else (p[0], dict(p[1])) for p in prompts or []]
         self.unconditioned, self.metrics = unconditioned, metrics or {}

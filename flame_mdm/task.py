@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import zipfile
 from collections.abc import Sequence
 from dataclasses import replace
@@ -20,7 +21,7 @@ from flame_mdm.config import Config, UserError, instantiate, parameters, trust
 from flame_mdm.data.datamodule import MotionDataModule
 from flame_mdm.denoisers import Denoiser
 from flame_mdm.losses import MotionLosses
-from flame_mdm.motion import Edit, MotionBatch, pad_to
+from flame_mdm.motion import Condition, Edit, MotionBatch, pad_to
 from flame_mdm.noise import key, normal, seeded_noise, uniform
 from flame_mdm.processes import Process
 from flame_mdm.processes.guidance import classifier_free_guidance
@@ -123,6 +124,10 @@ class MotionGeneration(Task):
         compile: bool = False,
     ):
         super().__init__(condition, representation, optimizer=optimizer, seed=seed)
+        if not 0 <= cond_drop_prob <= 1:
+            raise UserError(f"task.cond_drop_prob={cond_drop_prob}: a probability lies between 0 and 1")
+        if not math.isfinite(guidance_scale):
+            raise UserError(f"task.guidance_scale={guidance_scale} is no finite number")
         self.denoiser, self.process = denoiser, process
         self.losses = MotionLosses(representation.to_joints, representation.skeleton.feet, **losses)
         self.cond_drop_prob = cond_drop_prob
@@ -167,6 +172,19 @@ class MotionGeneration(Task):
         return type(self.denoiser).__name__
 
     # Training ---------------------------------------------------------------------------------------------------------
+
+    def on_fit_start(self) -> None:
+        """Takes the sampler's steps with a denoiser that returns 0: one that cannot run fails here, not after hours."""
+        like = torch.zeros(1, 2, self.representation.features, device=self.device)
+        mask = torch.ones(1, 2, dtype=torch.bool, device=self.device)
+        self.process.sample(
+            lambda x_t, *_: x_t.new_zeros(1, 2, self.process.out_features(x_t.shape[-1])),
+            seeded_noise(["trial"], 2, like.shape[-1], seed=0, replication=0, like=like),
+            mask,
+            Condition(like[:, 0], like, mask),
+            sampler=self.sampler,
+            num_inference_steps=self.num_inference_steps,
+        )
 
     def training_step(self, batch: MotionBatch, batch_idx: int) -> Tensor:
         """Loss of one batch; every draw in it is a function of (seed, batch number, rank)."""

@@ -141,6 +141,8 @@ class MotionDataModule(LightningDataModule):
         super().__init__()
         if batch_size < 1:
             raise ValueError(f"data.batch_size={batch_size}: a batch has at least one clip")
+        if num_workers < 0 or not name:
+            raise ValueError(f"data.num_workers={num_workers}, data.name='{name}': give 0 or more, and a name")
         self.source, self.representation = source, representation
         self.folder = Path(root) / f"{name}-{representation.name}"
         self.batch_size, self.num_workers, self.seed = batch_size, num_workers, seed

@@ -63,5 +63,5 @@ lint: $(READY) ## check style and types
 	@$(VENV)/bin/pyright
 
 bench: $(READY) ## measure speed, as ratios in one run
-	@for name in features loading text sampling; do \
+	@for name in features loading text sampling startup ddp; do \
 		echo "== $$name"; $(VENV)/bin/python benchmarks/$$name.py || exit 1; done

@@ -13,7 +13,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-STEPS, WARM = 60, 20
+STEPS, WARM = 50, 10
 SMALL = [
     *("data.source.clips=60", "denoiser.latent_dim=128", "denoiser.ff_size=256", "denoiser.num_layers=4"),
     *("denoiser.num_heads=4", "trainer.accelerator=cpu", "trainer.enable_progress_bar=false", "logger=csv"),
@@ -73,4 +73,4 @@ def main(runs: int) -> None:
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]) if len(sys.argv) > 1 else 3)
+    main(int(sys.argv[1]) if len(sys.argv) > 1 else 2)

@@ -4,7 +4,6 @@ import resource
 import subprocess
 import sys
 import textwrap
-from pathlib import Path
 
 import pytest
 import torch
@@ -150,13 +149,3 @@ def test_the_lock_ends_with_an_error(tmp_path):
     with pytest.raises(ValueError, match="inside"), only_run(tmp_path):
         raise ValueError("inside")
     assert list(tmp_path.iterdir()) == []
-
-
-def test_kills_at_random_moments_change_nothing():
-    script = Path(__file__).parent.parent / "benchmarks" / "kill_resume.py"
-    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    done = subprocess.run(
-        [sys.executable, str(script), "4"], capture_output=True, text=True, env=environment, check=False
-    )
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert "equal bit for bit: True" in done.stdout

@@ -100,12 +100,20 @@ class MotionsForText(_RPrecision):
         pool: motions in a pool.
         top: largest k.
         seed: of the draws.
+        normalize: scales features to length 1 first, which ranks by cosine. An extractor trained by cosines, such as
+            motion-CLIP, leaves lengths open, and the shortest motions would be nearest to every text.
         kwargs: options of `torchmetrics.Metric`.
     """
+
+    def __init__(self, pool: int = 32, top: int = 3, seed: int = 0, normalize: bool = False, **kwargs: Any):
+        super().__init__(pool, top, seed, **kwargs)
+        self.normalize = normalize
 
     def ranks(self, generated: Tensor, text: Tensor, text_keys: Tensor, generator: np.random.Generator) -> Tensor:
         """Place of the own motion in a pool of motions, for each text."""
         count = len(generated)
+        if self.normalize:
+            generated, text = F.normalize(generated, dim=-1), F.normalize(text, dim=-1)
         self.need(count, self.pool, "motions")
         order = generator.permutation(count)
         start = np.minimum(np.arange(count) // self.pool * self.pool, count - self.pool)
@@ -131,14 +139,25 @@ class MultimodalDistance(_TextAndMotion):
     """MM-Dist, "matching score" in the code of Guo et al. 2022: mean Euclidean distance of motion and own text.
 
     MFM, eq. 10. The authors' code takes distances in float32 and leaves out an incomplete last batch.
+
+    Args:
+        normalize: scales features to length 1 first, as for `MotionsForText`; in [0, 2] then.
+        kwargs: options of `torchmetrics.Metric`.
     """
 
     higher_is_better = False
 
+    def __init__(self, normalize: bool = False, **kwargs: Any):
+        super().__init__(**kwargs)
+        self.normalize = normalize
+
     def compute(self) -> float | None:
         """The mean distance, in units of the features."""
         rows = self.rows("keys", "generated", "text")
-        return None if rows is None else torch.linalg.vector_norm(rows[0] - rows[1], dim=-1).mean().item()
+        if rows is None:
+            return None
+        motion, text = (F.normalize(x, dim=-1) for x in rows) if self.normalize else rows
+        return torch.linalg.vector_norm(motion - text, dim=-1).mean().item()
 
 
 class MotionCLIPScore(_TextAndMotion):

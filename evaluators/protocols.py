@@ -77,8 +77,10 @@ class Protocol:
         self.edit, self.smoothing = edit, smoothing
         self.quick, self.sha256 = False, ""
 
-    def change(self, *, replications: int | None, samples: int | None, quick: bool, clips: int) -> dict[str, Any]:
-        """Makes the protocol cheaper, for a split of so many clips.
+    def change(
+        self, *, replications: int | None, samples: int | None, quick: bool, clips: int, multimodality: bool = True
+    ) -> dict[str, Any]:
+        """Makes the protocol cheaper, for a split of so many clips; `multimodality` False leaves that out.
 
         Returns:
             What is no longer as published, to stand in the result.
@@ -100,6 +102,8 @@ class Protocol:
         if self.multimodality and replications is not None:
             fewer = min(replications, self.multimodality["replications"])
             self.multimodality = {**self.multimodality, "replications": fewer}
+        if self.multimodality and not multimodality:
+            self.multimodality, changed["multimodality"] = None, False
         return changed
 
     def open_extractor(self, path: str | None, representation: Representation, dataset: str) -> Extractor | None:

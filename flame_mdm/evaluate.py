@@ -103,9 +103,8 @@ def _evaluate(config: Config, rank: int, world: int, device: str) -> None:
     representation = model.representation if model else data.representation.to(device)
     protocol = load_protocol(config["protocol"] or default_protocol(model), representation)
     clips = data.clips(config["split"])
-    changed = protocol.change(
-        replications=config["replications"], samples=config["samples"], quick=config["quick"], clips=len(clips)
-    )
+    changes = {name: config[name] for name in ("replications", "samples", "quick", "multimodality")}
+    changed = protocol.change(**changes, clips=len(clips))
     protocol.check_data(clips)
     if model is not None:
         check_condition(protocol, model)
@@ -231,7 +230,7 @@ def _data(config: Config, model: MotionGeneration | None) -> MotionDataModule:
         raise UserError(f"{config['ckpt']}: its recipe names no data; give data=NAME")
     if own:
         trust({"data": recipe["data"]})
-    root = config["data_root"] or (recipe["data"]["root"] if own else None) or os.environ.get("FLAME_MDM_DATA", "data")
+    root = config["data_root"] or os.environ.get("FLAME_MDM_DATA") or (recipe["data"]["root"] if own else "data")
     representation = instantiate(recipe["representation"])
     if model is not None and representation.name != model.representation.name:
         raise UserError(

@@ -161,7 +161,9 @@ class Request:
     def path(self, results: Path) -> Path:
         """Its result: a function of the keys alone, so that tables share results and need no checkpoint to be drawn."""
         digest = hashlib.sha256(json.dumps(dict(self.keys), sort_keys=True).encode()).hexdigest()
-        name = re.sub(r"[^A-Za-z0-9]+", "-", self.label).strip("-").lower()
+        what = self.keys.get("baseline") or self.keys.get("ckpt") or self.keys["from_samples"]
+        name = re.sub(r"^runs-|-checkpoints-|-ckpt$|-default", "-", re.sub(r"[^A-Za-z0-9]+", "-", str(what))).strip("-")
+        name = re.sub(r"-+", "-", name)[-60:]
         return results / Path(str(self.keys["protocol"])).stem / f"{name}-{digest[:10]}.json"
 
     @property
@@ -192,7 +194,7 @@ def _spread_label(part: Mapping[str, Any], row: Mapping[str, Any], single: Mappi
 
 def _request(part: Mapping[str, Any], row: Mapping[str, Any], column: Mapping[str, Any]) -> Request:
     keys = {name: row[name] for name in row if name not in ("label", "note")}
-    for name in ("protocol", "split", "extractor", "seed", "data", "replications", "samples"):
+    for name in ("protocol", "split", "extractor", "seed", "data", "replications", "samples", "multimodality"):
         for place in (part, row, column):
             if name in place:
                 keys[name] = place[name]

@@ -888,3 +888,18 @@ def test_wrong_inputs_are_told(metric: Metric, change: Callable[..., dict[str, T
 def test_confidence_of_nothing_is_an_error():
     with pytest.raises(ValueError, match="no values"):
         mean_ci([])
+
+
+def test_normalized_features_compare_directions_alone():
+    generator = torch.Generator().manual_seed(0)
+    text = torch.nn.functional.normalize(torch.randn(64, 8, generator=generator), dim=-1)
+    lengths = torch.linspace(1, 10, 64)[:, None]
+    rows = {"generated": lengths * text, "text": text, "text_keys": torch.arange(64), "keys": torch.arange(64)}
+    metrics = {"retrieval": MotionsForText(normalize=True), "distance": MultimodalDistance(normalize=True)}
+    feed(metrics, **rows)
+    assert metrics["retrieval"].compute()["top1"] == 1.0
+    assert metrics["distance"].compute() == pytest.approx(0.0, abs=1e-6)
+    plain = {"retrieval": MotionsForText(), "distance": MultimodalDistance()}
+    feed(plain, **rows)
+    assert plain["retrieval"].compute()["top1"] < 0.9
+    assert plain["distance"].compute() == pytest.approx(float((lengths - 1).mean()), rel=1e-6)

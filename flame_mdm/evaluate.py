@@ -279,6 +279,7 @@ def _describe(
             "dataset": info["dataset"],
             "representation": info["representation"],
             "fingerprint": info["fingerprint"],
+            "frames": [data.crop.shortest(), data.crop.longest()],
         },
         "seed": config["seed"],
         "extractor": extractor

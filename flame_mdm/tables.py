@@ -220,7 +220,8 @@ def evaluate_missing(specs: Mapping[str, Config], results: Path, config: Config)
         from flame_mdm.evaluate import evaluate
 
         try:
-            options = settings("evaluate", [f"data={keys.pop('data')}"] if "data" in keys else [])
+            dotted = [f"{name}={keys.pop(name)}" for name in list(keys) if name == "data" or "." in name]
+            options = settings("evaluate", dotted)
             general = {name: config[name] for name in ("device", "batch_size", "data_root") if config[name] is not None}
             evaluate(options | general | keys | {"out": str(path)})
         except (UserError, ValueError, OSError) as error:
@@ -352,6 +353,7 @@ def _evaluation(result: Config) -> str:
     extractor = result["extractor"]
     text = f"protocol {protocol['name']} version {protocol['version']}"
     text += f", {result['split']} split of {data['dataset']} (fingerprint {data['fingerprint']})"
+    text += ", {} to {} frames".format(*data["frames"]) if "frames" in data else ""
     text += f", N = {max(counts, default=0)}, {max(repeats, default=0)} replications, seed {result['seed']}"
     text += f", extractor sha256 {extractor['sha256'][:12]}" if extractor else ", no extractor"
     if result.get("changed"):

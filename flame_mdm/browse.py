@@ -20,9 +20,11 @@ if TYPE_CHECKING:
 
 USAGE = """
 usage: python -m flame_mdm.browse data=NAME [split=train] [search="waves left"] [clips=200] [out=FILE.html]
+       python -m flame_mdm.browse data=NAME split=test clips=10 motions=FOLDER
 
 Writes one web page that opens from disk: clips of a data set with their captions, mirrored copies beside their
-originals, a search, a choice of splits, the distribution of lengths and other statistics.
+originals, a search, a choice of splits, the distribution of lengths and other statistics. motions= writes the clips of
+the page as motion files, too, so that generated motions can be compared with them.
 """
 
 SECONDS = 15
@@ -33,14 +35,17 @@ COLORS = {"train": "var(--left)", "val": "var(--right)", "test": "var(--contact)
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs the command; returns its exit code."""
-    return run(browse, sys.argv[1:] if argv is None else argv, usage=USAGE, name="browse", text=("search", "out"))
+    return run(
+        browse, sys.argv[1:] if argv is None else argv, usage=USAGE, name="browse", text=("search", "out", "motions")
+    )
 
 
 def browse(config: Config) -> None:
     """Writes the page, after the data set is prepared where that has not been done.
 
     Raises:
-        UserError: no data set named, or no clip fits. FileNotFoundError, ValueError: the raw data is absent or damaged.
+        UserError: no data set named, no clip fits, or other motions in the folder `motions`.
+        FileNotFoundError, ValueError: the raw data is absent or damaged.
     """
     if "data" not in config:
         names = sorted(path.stem for path in (EXPERIMENTS / "data").glob("*.yaml"))
@@ -66,6 +71,9 @@ def browse(config: Config) -> None:
     out = Path(config["out"] or Path("runs") / "browse" / f"{data.folder.name}.html")
     write_player(out, [motion(store, representation, clip) for clip in clips], title, about=describe(store))
     print(f"{out}: {len(clips)} of {fitting} clips, {out.stat().st_size / 1e6:.1f} MB")
+    if config["motions"] is not None:
+        write_clips(Path(config["motions"]), store, representation, clips, data.crop.longest())
+        print(f"{config['motions']}: {len(clips)} motions")
 
 
 def find(clips: Sequence[Entry], split: str | None, search: str) -> list[list[Entry]]:
@@ -110,6 +118,39 @@ def motion(store: Store, representation: Representation, clip: Entry) -> Motion:
     return Motion(
         joints, representation.fps, representation.skeleton, caption, clip.id, group=clip.split, beside=original
     )
+
+
+def write_clips(
+    folder: Path, store: Store, representation: Representation, clips: Sequence[Entry], longest: int
+) -> None:
+    """Writes clips as `motion_000.npz` ..., in the form of generated motions, each with one caption.
+
+    A clip of several captions gets the first that no clip before it has, so that a caption names a motion where it can.
+
+    Args:
+        longest: frames after which clips are cut, as they are for training and evaluation.
+
+    Raises:
+        UserError: the folder holds other motions, which would be taken for motions of this choice.
+    """
+    import torch
+
+    from flame_mdm.generation import Generated, write_motion
+
+    paths = [folder / f"motion_{number:03d}.npz" for number in range(len(clips))]
+    if others := sorted(set(folder.glob("*.npz")) - set(paths)):
+        raise UserError(f"motions={folder}: holds other motions, such as {others[0].name}; delete it, or name another")
+    given: set[str] = set()
+    for path, clip in zip(paths, clips, strict=True):
+        names = clip.captions or ([] if clip.action is None else [store.info["actions"][clip.action]])
+        caption = next((name for name in names if name not in given), names[0] if names else "")
+        given.add(caption)
+        features = representation.rebase(store.motion(clip)[:longest])
+        joints = representation.decode(torch.from_numpy(features.copy())).numpy()
+        facts = {"clip": clip.id, "split": clip.split, "data": store.fingerprint}
+        write_motion(
+            path, Generated(clip.id, joints, features, representation.fps, caption), representation.name, facts
+        )
 
 
 def describe(store: Store) -> str:

@@ -37,12 +37,13 @@ if TYPE_CHECKING:
 
 USAGE = """
 usage: python -m flame_mdm.compare runs="A B C" [texts="a person walks; a person jumps"]
-       python -m flame_mdm.compare runs="A B" rate=true [texts=prompts.txt]
+       python -m flame_mdm.compare runs="A B FOLDER" rate=true [texts=prompts.txt]
        python -m flame_mdm.compare ratings="ann.json bob.json" out=ratings.json
 
 Puts runs side by side on one page: what their recipes differ in, curves, evaluations and motions for the same prompts.
 rate=true writes a page that asks which of two motions fits a text better, without saying whose they are; ratings=
-counts the answers. A run may be a folder of motion files, such as real ones. Keys: experiments/compare.yaml
+counts the answers. FOLDER holds motion files, such as real ones: without texts=, the runs sample for its captions at
+its lengths. Keys: experiments/compare.yaml
 """
 
 QUESTION = "Which animation better fits the following description?"
@@ -88,7 +89,7 @@ def compare(config: Config) -> None:
         print(f"written: {out}")
         return
     contestants = find(shlex.split(str(config["runs"])))
-    shown = [motions(contestant, config) for contestant in contestants]
+    shown = motions(contestants, config)
     if config["rate"]:
         out, content = Path(config["out"] or "runs/rate.html"), rating_page(contestants, shown, config["seed"])
     else:
@@ -120,18 +121,38 @@ def find(folders: Sequence[str]) -> list[Contestant]:
     return [replace(c, label=str(c.folder)) if labels.count(c.label) > 1 else c for c in found]
 
 
-def motions(contestant: Contestant, config: Config) -> dict[Prompt, Motion]:
-    """Motions by prompt: the newest samples of a run, or for `texts` those of its last checkpoint.
+def motions(contestants: Sequence[Contestant], config: Config) -> list[dict[Prompt, Motion]]:
+    """Motions by prompt of each contestant.
+
+    Runs show what their last checkpoint makes of `texts`, or else of the captions of the first folder of motions, at
+    the lengths of its motions; where there is neither, their newest samples.
 
     Raises:
         UserError: no texts in the file, or what `generate` refuses. ValueError: a damaged file.
     """
-    if contestant.run is not None and config["texts"] is not None:
-        return _sampled(contestant.folder / "checkpoints" / "last.ckpt", read_texts(str(config["texts"])), config)
+    given = {c.label: _read(c.folder) for c in contestants if c.run is None}
+    wanted: dict[Prompt, float | None] = {}
+    if config["texts"] is not None:
+        wanted = {(text, 0): None for text in read_texts(str(config["texts"]))}
+    elif given:
+        first = next(iter(given.values()))
+        wanted = {p: None if config["seconds"] else shown.seconds for p, shown in first.items() if p[0]}
+    found = []
+    for contestant in contestants:
+        if contestant.run is None:
+            found.append(given[contestant.label])
+        elif wanted:
+            found.append(_sampled(contestant, wanted, config))
+        else:
+            found.append(_read(contestant.run.samples) if contestant.run.samples else {})
+    return found
+
+
+def _read(folder: Path) -> dict[Prompt, Motion]:
+    """Motions of a folder, whose equal captions are counted."""
     from flame_mdm.formats import read
 
-    folder = contestant.run.samples if contestant.run is not None else contestant.folder
-    return _by_prompt([read(path) for path in sorted(folder.glob("*.npz"))] if folder is not None else [])
+    return _by_prompt([read(path) for path in sorted(folder.glob("*.npz"))])
 
 
 def read_texts(given: str) -> list[str]:
@@ -149,24 +170,40 @@ def read_texts(given: str) -> list[str]:
     return list(dict.fromkeys(texts))
 
 
-def _sampled(checkpoint: Path, texts: Sequence[str], config: Config) -> dict[Prompt, Motion]:
+def _sampled(contestant: Contestant, wanted: Mapping[Prompt, float | None], config: Config) -> dict[Prompt, Motion]:
+    """Motions of a run's last checkpoint for texts or labels, each of so many seconds; None = as `generate` has it.
+
+    Motions that would be longer than the run samples are made as long as it does. Those of a text that is wanted more
+    than once have the seeds that follow the configuration's.
+    """
     import torch
 
     from flame_mdm.generation import generate
     from flame_mdm.task import load
     from flame_mdm.visualize import Motion
 
-    model = load(checkpoint, "cuda" if torch.cuda.is_available() else "cpu")
-    labels = texts[0] in model.facts["actions"]
-    made = generate(
-        model,
-        None if labels else texts,
-        actions=texts if labels else None,
-        seconds=config["seconds"],
-        seed=config["seed"],
-    )
-    skeleton = model.representation.skeleton
-    return _by_prompt([Motion(m.joints, m.fps, skeleton, caption=m.caption) for m in made])
+    model = load(contestant.folder / "checkpoints" / "last.ckpt", "cuda" if torch.cuda.is_available() else "cpu")
+    fps, longest = model.representation.fps, model.facts["max_frames"]
+    lengths = {prompt: round(seconds * fps) for prompt, seconds in wanted.items() if seconds is not None}
+    if over := sum(length > longest for length in lengths.values()):
+        told = f"made {longest / fps:g} seconds long, the most that {contestant.label} samples"
+        print(f"{over} of {len(lengths)} motions are {told}")
+    found: dict[Prompt, Motion] = {}
+    for count in sorted({count for _, count in wanted}):
+        prompts = [prompt for prompt in wanted if prompt[1] == count]
+        texts = [text for text, _ in prompts]
+        labels = texts[0] in model.facts["actions"]
+        made = generate(
+            model,
+            None if labels else texts,
+            actions=texts if labels else None,
+            seconds=config["seconds"],
+            frames=[min(lengths[prompt], longest) for prompt in prompts if prompt in lengths] or None,
+            seed=config["seed"] + count,
+        )
+        for prompt, shown in zip(prompts, made, strict=True):
+            found[prompt] = Motion(shown.joints, shown.fps, model.representation.skeleton, caption=shown.caption)
+    return {prompt: found[prompt] for prompt in wanted}
 
 
 def _by_prompt(found: Sequence[Motion]) -> dict[Prompt, Motion]:

@@ -16,6 +16,7 @@ from flame_mdm.config import UserError
 from flame_mdm.motion import Edit, MotionBatch, length_mask
 from flame_mdm.task import MotionGeneration
 from flame_mdm.visualize import Motion, contact_sheet, write_gif, write_player
+from flame_mdm.visualize.scene import written_whole
 
 BATCH = 32
 MOST = 10_000
@@ -24,10 +25,10 @@ MOST = 10_000
 
 @dataclass
 class Generated:
-    """One generated motion.
+    """One motion, generated or real.
 
     Attributes:
-        id: what it was asked to be and the number of the sample; with the seed, it decides the noise.
+        id: what it was asked to be and the number of the sample, which decide the noise with the seed; or the clip.
         joints: (F, J, 3) float32, metres, y up.
         features: (F, D) float32, in the data's units, as the representation defines them.
         fps: frames a second.
@@ -151,25 +152,13 @@ def _action(model: MotionGeneration, name: str) -> int:
 def write_motions(folder: Path, model: MotionGeneration, motions: Sequence[Generated], facts: dict[str, Any]) -> None:
     """Writes `motion_000.npz` ..., `motions.gif`, `motions.png` and `player.html` into a folder, which it makes.
 
-    Each `.npz` holds `joints` (F, J, 3) in metres, y up; `features` (F, D); `fps`, `text`, `representation` and what
-    `facts` adds (seed, checkpoint hash ...).
+    `facts` are added to each `.npz`: seed, checkpoint hash ...
     """
     folder.mkdir(parents=True, exist_ok=True)
     skeleton = model.representation.skeleton
     scene = [Motion(m.joints, m.fps, skeleton, caption=m.caption or "unconditioned", id=m.id) for m in motions]
     for number, motion in enumerate(motions):
-        path = folder / f"motion_{number:03d}.npz"
-        partial = path.with_suffix(".partial.npz")
-        np.savez_compressed(
-            partial,
-            joints=motion.joints,
-            features=motion.features,
-            fps=motion.fps,
-            text=motion.caption,
-            representation=model.representation.name,
-            **facts,
-        )
-        partial.replace(path)
+        write_motion(folder / f"motion_{number:03d}.npz", motion, model.representation.name, facts)
     write_gif(folder / "motions.gif", scene[:8])
     contact_sheet(folder / "motions.png", scene[:8])
     write_player(
@@ -177,6 +166,23 @@ def write_motions(folder: Path, model: MotionGeneration, motions: Sequence[Gener
         scene,
         title=motions[0].caption if len({m.caption for m in motions}) == 1 and motions[0].caption else "Motions",
     )
+
+
+def write_motion(path: Path, motion: Generated, representation: str, facts: dict[str, Any]) -> None:
+    """Writes an `.npz` that `flame_mdm.formats.read` takes.
+
+    It holds `joints` (F, J, 3) in metres, y up; `features` (F, D); `fps`, `text`, `representation` and `facts`.
+    """
+    with written_whole(path) as temporary:
+        np.savez_compressed(
+            temporary,
+            joints=motion.joints,
+            features=motion.features,
+            fps=motion.fps,
+            text=motion.caption,
+            representation=representation,
+            **facts,
+        )
 
 
 def file_sha256(path: str | Path) -> str:

@@ -2,6 +2,7 @@ import json
 import shutil
 import subprocess
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,10 +10,11 @@ import pytest
 import torch
 from test_visualize import HOSTILE, Page, unpacked
 
-from flame_mdm.browse import choose, describe, find, main, motion
+from flame_mdm.browse import choose, describe, find, main, motion, write_clips
 from flame_mdm.data import Clip, MotionSource
 from flame_mdm.data.store import Entry, Store, write_store
 from flame_mdm.data.synthetic import Synthetic
+from flame_mdm.formats import read
 from flame_mdm.representations.humanml import HumanML
 from flame_mdm.representations.rot6d import Rot6D
 from flame_mdm.visualize import write_player
@@ -169,6 +171,36 @@ def test_command_prepares_and_shows(tmp_path, data_root, capsys):
     page = Page(tmp_path / "page.html")
     assert page.motions
     assert all("walks" in m["caption"] and m["group"] == "train" for m in page.motions)
+
+
+def test_shown_clips_are_written_as_motion_files(tmp_path, data_root, capsys):
+    folder = tmp_path / "real motions"
+    assert run(tmp_path, data_root, "split=test", "clips=4", f"motions={folder}") == 0
+    page = Page(tmp_path / "page.html")
+    files = sorted(folder.glob("*.npz"))
+    assert [path.name for path in files] == [f"motion_{number:03d}.npz" for number in range(len(page.motions))]
+    for path, shown in zip(files, page.motions, strict=True):
+        found = read(path)
+        assert found.fps == 20
+        assert len(found.joints) == min(shown["frames"], 60), "cut as for evaluation"
+        assert found.caption
+        assert found.caption in shown["caption"].split(" · ")
+        with np.load(path) as file:
+            assert str(file["clip"]) == shown["id"]
+            np.testing.assert_allclose(
+                HumanML().decode(torch.from_numpy(file["features"])).numpy(), file["joints"], atol=1e-6
+            )
+    assert run(tmp_path, data_root, "split=test", "clips=1", f"motions={folder}") == 1
+    assert "holds other motions, such as motion_001.npz" in capsys.readouterr().err
+
+
+def test_a_caption_names_one_motion_where_it_can(store, tmp_path):
+    by_id = {clip.id: clip for clip in store.clips}
+    clips = [by_id[f"{number}{HOSTILE}"] for number in range(3)]
+    copy = by_id[f"M3{HOSTILE}"]  # has a label only
+    write_clips(tmp_path, store, HumanML(), [*clips, copy, replace(copy, action=None)], 30)
+    captions = [read(path).caption for path in sorted(tmp_path.glob("*.npz"))]
+    assert captions == [HOSTILE, "walks", HOSTILE, HOSTILE, ""]
 
 
 @pytest.mark.parametrize(

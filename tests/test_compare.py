@@ -30,12 +30,14 @@ def motions(folder: Path, prompts: tuple[str, ...] = PROMPTS, at: float = 0.0) -
 
 @pytest.fixture
 def three(tmp_path) -> list[Path]:
-    """Two runs and a folder of motions."""
+    """Three runs, the last with other prompts."""
     first = a_run(tmp_path / "a", name="one", optimizer={"lr": 0.1, "same": 1})
     second = a_run(tmp_path / "b", name="two", optimizer={"lr": 0.2, "same": 1}, extra="<em>")
     motions(first / "samples" / "step_0000009", at=1)
     motions(second / "samples" / "step_0000009", PROMPTS[::-1], at=2)
-    return [first, second, motions(tmp_path / "real", PROMPTS[1:], at=3)]
+    third = a_run(tmp_path / "c", name="three", optimizer={"lr": 0.2, "same": 1})
+    motions(third / "samples" / "step_0000009", PROMPTS[1:], at=3)
+    return [first, second, third]
 
 
 def put(folder: Path, name: str, **changes: Any) -> None:
@@ -71,7 +73,7 @@ def test_a_page_puts_runs_side_by_side(three, tmp_path):
     assert "run.dir" not in table
     (scene,) = players(text)
     names = [(motion["caption"], motion["id"]) for motion in scene]
-    labels = ["mine/one", "mine/two", "real"]
+    labels = ["mine/one", "mine/two", "mine/three"]
     assert names == [(prompt, label) for prompt in PROMPTS[1:] for label in labels], "prompts that all have"
     assert [round(motion["center"][0] - 0.5) for motion in scene] == [1, 2, 3] * 2, "each under its own name"
     assert text.count("<h3>p version 3") == 2, "splits are not compared"
@@ -87,7 +89,8 @@ def test_runs_of_the_same_name_go_by_their_folders(tmp_path):
 
 
 def test_runs_without_a_common_prompt_are_compared_and_not_judged(three, tmp_path, capsys):
-    other = motions(tmp_path / "other", ("a person swims",))
+    other = a_run(tmp_path / "other", name="other")
+    motions(other / "samples" / "step_0000009", ("a person swims",))
     assert "no prompt in common" in page([three[0], other], tmp_path / "out.html")
     assert compare.main([f"runs={three[0]} {other}", "rate=true", f"out={tmp_path / 'rate.html'}"]) == 1
     assert "no prompt in common to be judged by" in capsys.readouterr().err
@@ -107,6 +110,34 @@ def test_texts_are_sampled_by_the_last_checkpoints(tmp_path, data_root):
     assert read_texts("a person walks; a person (jumps), 100%;") == ["a person walks", "a person (jumps), 100%"]
 
 
+def test_runs_sample_what_a_folder_of_motions_shows(tmp_path, data_root, capsys):
+    model = run(tmp_path / "a", data_root, "trainer.max_steps=2", "callbacks.samples=null")
+    real = tmp_path / "real"
+    real.mkdir()
+    wanted = [("a person walks", 20), ("a person jumps", 25), ("a person walks", 20), ("", 20), ("a person turns", 90)]
+    joints = np.random.default_rng(0).random((90, 22, 3)).astype(np.float32)
+    for number, (text, frames) in enumerate(wanted):
+        np.savez(real / f"motion_{number:03d}.npz", joints=joints[:frames], fps=10.0, text=text)
+    (scene,) = players(page([model, real], tmp_path / "out.html"))
+    assert [(motion["caption"], motion["id"]) for motion in scene] == [
+        (text, label)
+        for text in ("a person walks", "a person jumps", "a person walks", "a person turns")
+        for label in ("quickstart", "real")
+    ]
+    made, shown = scene[::2], scene[1::2]
+    assert [motion["frames"] for motion in shown] == [20, 25, 20, 90]
+    assert [motion["frames"] for motion in made] == [40, 50, 40, 60], (
+        "as long at 20 frames a second, to what is sampled"
+    )
+    assert made[0]["joints"] != made[2]["joints"], "two motions for a prompt that is there twice"
+    assert "1 of 4 motions are made 3 seconds long, the most that quickstart samples" in capsys.readouterr().out
+    items = questions(page([model, real], tmp_path / "rate.html", "rate=true"))
+    assert sorted(item["prompt"] for item in items) == sorted(text for text, _ in wanted if text)
+    again = players(page([model, real], tmp_path / "seed.html", "seed=1", "seconds=1"))[0]
+    assert [motion["frames"] for motion in again[::2]] == [20] * 4
+    assert again[0]["joints"] != made[0]["joints"]
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [
@@ -118,6 +149,7 @@ def test_texts_are_sampled_by_the_last_checkpoints(tmp_path, data_root):
         (["runs={0} {1}", "texts= ; "], "no text in it"),
         (["runs={0} {1}", "texts=absent.txt"], "texts=absent.txt: no such file"),
         (["runs={0} {1}", "texts=a person walks"], "no such checkpoint"),
+        (["runs={0} {0}/samples/step_0000009"], "no such checkpoint"),
         (["runs={0} {1}", "rates=true"], "unknown config key 'rates'. Did you mean rate"),
     ],
 )
@@ -142,9 +174,9 @@ def test_a_rating_page_hides_whose_motions_it_shows(three, tmp_path):
     assert "Which animation better fits the following description?" in text
     items = questions(text)
     assert sorted((item["b"], item["prompt"]) for item in items) == sorted(
-        [("mine/two", prompt) for prompt in PROMPTS] + [("real", prompt) for prompt in PROMPTS[1:]]
+        [("mine/two", prompt) for prompt in PROMPTS] + [("mine/three", prompt) for prompt in PROMPTS[1:]]
     )
-    where = {"mine/one": 1, "mine/two": 2, "real": 3}
+    where = {"mine/one": 1, "mine/two": 2, "mine/three": 3}
     for item in items:
         scene = packed(item["player"])
         assert [motion["id"] for motion in scene] == ["the left one", "the right one"]

@@ -405,6 +405,9 @@ def _write(
     if condition == "text":
         content["captions"] = np.array([row.text for row in rows])
     partial = path.with_suffix(".partial")
-    with partial.open("wb") as file:
-        np.savez(file, **content)
-    partial.replace(path)
+    try:
+        with partial.open("wb") as file:
+            np.savez(file, **content)
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)

@@ -11,11 +11,14 @@ import difflib
 import functools
 import os
 import re
+import signal
 import sys
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
-from typing import Any, NamedTuple
+from types import FrameType
+from typing import Any, NamedTuple, NoReturn
 
 from hydra import compose as hydra_compose
 from hydra import initialize_config_dir
@@ -542,7 +545,22 @@ def run(
             print("parts: " + ", ".join(f"{group}=..." for group in groups()))
         return 0 if words else 2
     codes = [0]
-    return guarded(lambda: _serve(command, words, name, codes, like)) or max(codes)
+    with _stoppable() if name is not None else nullcontext():  # training stops at the end of a step, by itself
+        return guarded(lambda: _serve(command, words, name, codes, like)) or max(codes)
+
+
+@contextmanager
+def _stoppable() -> Iterator[None]:
+    """SIGTERM ends the work as an exception would, so that nothing half done stays behind; the exit code is 143."""
+
+    def stop(number: int, frame: FrameType | None) -> NoReturn:
+        raise SystemExit(128 + number)
+
+    before = signal.signal(signal.SIGTERM, stop)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def _serve(

@@ -317,8 +317,11 @@ def write_json(path: Path, report: Mapping[str, Any]) -> None:
     """Writes a result, under a temporary name until it is whole."""
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_suffix(".partial")
-    partial.write_text(json.dumps(report, indent=2, allow_nan=False) + "\n")
-    partial.replace(path)
+    try:
+        partial.write_text(json.dumps(report, indent=2, allow_nan=False) + "\n")
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)
 
 
 def _show(report: Mapping[str, Any], out: Path) -> None:

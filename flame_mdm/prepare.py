@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-import signal
 import sys
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from types import FrameType
-from typing import NoReturn
+from collections.abc import Sequence
 
 from flame_mdm.config import EXPERIMENTS, Config, UserError, instantiate, run
 
@@ -63,8 +59,7 @@ def prepare(config: Config) -> None:
     if (data.folder / "store.json").exists() and not config["force"]:
         print(f"{data.folder}: already prepared (force=true writes it anew, verify=true checks it)")
     else:
-        with _stoppable():
-            write_store(data.folder, data.source, representation)
+        write_store(data.folder, data.source, representation)
     store = Store(data.folder)
     info = store.info
     clips = ", ".join(f"{count} {split}" for split, count in info["clips"].items())
@@ -72,20 +67,6 @@ def prepare(config: Config) -> None:
     if info["excluded"]:
         print("left out: " + ", ".join(f"{count} {reason}" for reason, count in info["excluded"].items()))
     print(f"{info['shape'][0]} frames of {info['shape'][1]} features, fingerprint {store.fingerprint}: {data.folder}")
-
-
-@contextmanager
-def _stoppable() -> Iterator[None]:
-    """SIGTERM ends the work as an exception would, so that nothing half done stays behind."""
-
-    def stop(number: int, frame: FrameType | None) -> NoReturn:
-        raise SystemExit(128 + number)
-
-    before = signal.signal(signal.SIGTERM, stop)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
 
 
 if __name__ == "__main__":

@@ -12,14 +12,18 @@ Verifying it leaves a report beside them, `verify.json`.
 
 from __future__ import annotations
 
+import errno
+import fcntl
 import hashlib
 import json
+import os
 import shutil
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 import torch
@@ -96,10 +100,53 @@ class Store:
 def write_store(folder: Path, source: MotionSource, representation: Representation) -> Store:
     """Encodes every clip of a data set and writes the store, under a temporary name until it is whole.
 
+    Where another process is at it, this one waits, and opens what the other has written.
+
     Raises:
         FileNotFoundError, ValueError: from the data set, or a clip whose features are not finite; nothing is left.
     """
-    total = source.count()
+    total, before = source.count(), (folder / "store.json").exists()
+    with _only_writer(folder):
+        if before or not (folder / "store.json").exists():
+            _write(folder, source, representation, total)
+    return Store(folder)
+
+
+@contextmanager
+def _only_writer(folder: Path) -> Iterator[None]:
+    """Waits until no other process, here or on another host of a shared file system, writes the store.
+
+    The operating system lets go of the lock of a process that dies; what such a one leaves, the next one removes.
+    """
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    path = folder.with_name(folder.name + ".lock")
+    while True:
+        with path.open("w") as file:
+            try:
+                fcntl.lockf(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError as error:
+                if error.errno in (errno.EACCES, errno.EAGAIN):
+                    print(f"{folder}: another process prepares it; waiting for it", flush=True)
+                    fcntl.lockf(file, fcntl.LOCK_EX)
+                else:
+                    print(f"{path}: this file system has no locks ({error.strerror}); prepare in one process at a time")
+            if not _is_at(file, path):  # the process before has removed it, and another may hold a new one
+                continue
+            try:
+                yield
+            finally:
+                path.unlink(missing_ok=True)
+            return
+
+
+def _is_at(file: IO[str], path: Path) -> bool:
+    try:
+        return os.path.samestat(os.fstat(file.fileno()), path.stat())
+    except FileNotFoundError:
+        return False
+
+
+def _write(folder: Path, source: MotionSource, representation: Representation, total: int) -> None:
     partial = folder.with_name(folder.name + ".partial")
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir(parents=True)
@@ -134,7 +181,6 @@ def write_store(folder: Path, source: MotionSource, representation: Representati
     except BaseException:
         shutil.rmtree(partial, ignore_errors=True)
         raise
-    return Store(folder)
 
 
 def _encode(clips: Sequence[Clip], representation: Representation) -> list[np.ndarray]:

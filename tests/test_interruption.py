@@ -1,0 +1,100 @@
+"""Commands that are told to stop, and two that prepare the same data at once, as real processes."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from conftest import TINY
+
+from flame_mdm import train
+from flame_mdm.data.store import Store
+
+STORE = "synthetic-humanml-clean-smpl22"
+
+
+def start(command: str, *words: str) -> subprocess.Popen[str]:
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    line = [sys.executable, "-m", f"flame_mdm.{command}", *words]
+    return subprocess.Popen(line, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment)
+
+
+def wait_for(condition: Callable[[], object], process: subprocess.Popen[str]) -> None:
+    end = time.monotonic() + 60
+    while not condition():
+        assert process.poll() is None, process.communicate()
+        assert time.monotonic() < end, "it never came to that"
+        time.sleep(0.002)
+
+
+def stopped(process: subprocess.Popen[str]) -> None:
+    process.send_signal(signal.SIGTERM)
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == 143, err
+    assert "Traceback" not in err
+    assert "error" not in err
+
+
+def words(root: Path, clips: int = 100) -> list[str]:
+    return ["data=synthetic", f"data.source.clips={clips}", f"data_root={root}"]
+
+
+def test_a_preparation_that_is_stopped_leaves_nothing(tmp_path):
+    process = start("prepare", *words(tmp_path))
+    wait_for(lambda: (tmp_path / f"{STORE}.partial").exists(), process)
+    stopped(process)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_evaluation_that_is_stopped_leaves_whole_replications(tmp_path, data_root):
+    run = [*TINY, f"data_root={data_root}", f"run.dir={tmp_path / 'run'}", "callbacks.samples=null", "logger=csv"]
+    assert train.main(["quickstart", *run, "callbacks.best=null", "trainer.max_steps=1"]) == 0
+    checkpoint = tmp_path / "run" / "checkpoints" / "last.ckpt"
+    options = [f"ckpt={checkpoint}", "extractor=none", "split=train", f"data_root={data_root}", "batch_size=4"]
+    process = start("evaluate", *options, "replications=20", "samples=20")
+    wait_for(lambda: list(tmp_path.rglob("rep_0.npz")), process)
+    stopped(process)
+    left = [path.name for path in tmp_path.rglob("evaluation/**/*") if path.is_file()]
+    assert left
+    assert all(name.startswith("rep_") and name.endswith(".npz") for name in left)
+
+
+@pytest.fixture
+def both(tmp_path) -> Iterator[tuple[subprocess.Popen[str], subprocess.Popen[str]]]:
+    """One process that is halted while it prepares, and another that waits for it."""
+    first = start("prepare", *words(tmp_path))
+    wait_for(lambda: (tmp_path / f"{STORE}.partial").exists(), first)
+    first.send_signal(signal.SIGSTOP)
+    second = start("prepare", *words(tmp_path))
+    assert second.stdout is not None
+    assert "another process prepares it" in second.stdout.readline()
+    yield first, second
+    for process in (first, second):
+        process.kill()
+        process.communicate()
+
+
+def test_two_processes_prepare_the_same_data_once(both, tmp_path):
+    first, second = both
+    first.send_signal(signal.SIGCONT)
+    told = [process.communicate(timeout=120) for process in both]
+    assert [first.returncode, second.returncode] == [0, 0], told
+    assert [path.name for path in tmp_path.iterdir()] == [STORE]
+    assert "preparing" in told[0][1]
+    assert "preparing" not in told[1][1], "it opens what the other has written"
+    assert told[0][0].splitlines()[-1] == told[1][0].splitlines()[-1], "the fingerprint is the same"
+    Store(tmp_path / STORE).verify()
+
+
+def test_the_second_process_takes_over_from_one_that_is_killed(both, tmp_path):
+    first, second = both
+    first.kill()
+    out, err = second.communicate(timeout=120)
+    assert second.returncode == 0, err
+    assert "preparing" in err
+    assert [path.name for path in tmp_path.iterdir()] == [STORE], out
+    Store(tmp_path / STORE).verify()

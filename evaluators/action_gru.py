@@ -1,4 +1,4 @@
-"""The action classifier of HumanAct12: a GRU over joint positions (Guo et al. 2020, "Action2Motion")."""
+"""An action classifier, that of HumanAct12: a GRU over joint positions (Guo et al. 2020, "Action2Motion")."""
 
 from __future__ import annotations
 
@@ -22,19 +22,28 @@ class ActionGRU(nn.Module):
 
     features = 30
 
-    def __init__(self, num_joints: int = 24, hidden: int = 128, num_layers: int = 2, *, recenter: bool = True):
+    def __init__(
+        self,
+        num_joints: int = 24,
+        hidden: int = 128,
+        num_layers: int = 2,
+        *,
+        num_actions: int = NUM_ACTIONS,
+        recenter: bool = True,
+    ):
         """Sizes are those of the released weights; `recenter` moves the pelvis of the first frame to the origin."""
         super().__init__()
         self.recenter = recenter
         self.recurrent = nn.GRU(3 * num_joints, hidden, num_layers, batch_first=True)
         self.linear1 = nn.Linear(hidden, self.features)
-        self.linear2 = nn.Linear(self.features, NUM_ACTIONS)
+        self.linear2 = nn.Linear(self.features, num_actions)
 
     def forward(self, joints: Tensor, mask: Tensor, state: Tensor | None = None) -> Tensor:
         """Features of motions.
 
         Args:
-            joints: (B, F, 24, 3) metres, y up, SMPL's joints; the network sees them y down, as published.
+            joints: (B, F, J, 3) metres, y up, SMPL's 24 joints for the released weights; the network sees them y down,
+                as published.
             mask: (B, F) bool, True = real frame; every motion has one at least.
             state: (layers, B, hidden) where the recurrence starts; None = zeros.
 
@@ -49,7 +58,7 @@ class ActionGRU(nn.Module):
         return torch.tanh(self.linear1(outputs[torch.arange(len(last), device=last.device), last]))
 
     def logits(self, joints: Tensor, mask: Tensor, state: Tensor | None = None) -> Tensor:
-        """(B, 12) unnormalized log-probabilities of the actions; arguments as of `forward`."""
+        """(B, actions) unnormalized log-probabilities of the actions; arguments as of `forward`."""
         return self.linear2(self(joints, mask, state))
 
     def random_state(self, batch: int, generator: torch.Generator) -> Tensor:

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from evaluators.action_gru import ActionGRU, load_action_gru
+from evaluators.classifier import ClassifierTask
 from evaluators.motion_clip import MotionCLIPTask
 from evaluators.stgcn import load_uestc, load_unconstrained
 from evaluators.t2m import WordVectors, load_t2m
@@ -19,7 +20,7 @@ from flame_mdm.config import UserError
 from flame_mdm.generation import file_sha256
 from flame_mdm.noise import key
 from flame_mdm.representations import Representation
-from flame_mdm.task import load_task
+from flame_mdm.task import Task, load_task
 
 
 class Extractor(ABC):
@@ -59,6 +60,21 @@ class Extractor(ABC):
         return None
 
 
+def _check_trained(path: Path, task: Task, recipes: str, representation: Representation, dataset: str) -> None:
+    """Refuses motions of another representation or data set than a checkpoint of our own was trained on."""
+    own, advice = task.representation, f"train one by make train EXP={recipes}/..."
+    if (own.name, own.fps, own.features) != (representation.name, representation.fps, representation.features):
+        raise UserError(
+            f"extractor {path}: trained on {own.name} at {own.fps:g} frames a second, but the motions are "
+            f"{representation.name} at {representation.fps:g}: {advice}"
+        )
+    if task.facts.get("dataset", dataset) != dataset:
+        raise UserError(
+            f"extractor {path}: trained on the data set {task.facts['dataset']}, but the motions are those of "
+            f"{dataset}: {advice}"
+        )
+
+
 class MotionCLIPExtractor(Extractor):
     """A motion-CLIP that `make train EXP=motion_clip/...` has made.
 
@@ -75,17 +91,7 @@ class MotionCLIPExtractor(Extractor):
 
     def check(self, representation: Representation, dataset: str) -> None:
         """Representation and data set are those that it was trained on."""
-        own = self.task.representation
-        if (own.name, own.fps, own.features) != (representation.name, representation.fps, representation.features):
-            raise UserError(
-                f"extractor {self.path}: trained on {own.name} at {own.fps:g} frames a second, but the motions are "
-                f"{representation.name} at {representation.fps:g}: train one by make train EXP=motion_clip/..."
-            )
-        if self.task.facts.get("dataset", dataset) != dataset:
-            raise UserError(
-                f"extractor {self.path}: trained on the data set {self.task.facts['dataset']}, but the motions are "
-                f"those of {dataset}: train one by make train EXP=motion_clip/..."
-            )
+        _check_trained(self.path, self.task, "motion_clip", representation, dataset)
 
     def motions(self, features: Tensor, joints: Tensor, mask: Tensor) -> dict[str, Tensor]:
         """Features of motions."""
@@ -172,12 +178,17 @@ class ClassifierExtractor(Extractor):
             any batch.
 
     Raises:
-        FileNotFoundError, ValueError: no such file, or of other weights; or no recurrence to start.
+        FileNotFoundError, UserError, ValueError: no such file, or of other weights; or no recurrence to start.
     """
 
     def __init__(self, kind: str, path: str, device: str | torch.device = "cpu", *, random_start: bool = False):
         read, self.dataset, self.reads = CLASSIFIERS[kind]
-        self.network = read(path).to(device)
+        try:
+            self.network = read(path).to(device)
+        except ValueError as error:
+            raise UserError(
+                f"{error}; protocol=action_to_motion_own takes classifiers of make train EXP=classifier/..."
+            ) from error
         self.path, self.sha256, self.random_start = path, file_sha256(path), random_start
         if random_start and not isinstance(self.network, ActionGRU):
             raise ValueError(f"random_start: the classifier {kind} has no recurrence to start")
@@ -209,3 +220,25 @@ class ClassifierExtractor(Extractor):
     def _start(self, use: str, name: str) -> Tensor:
         assert isinstance(self.network, ActionGRU)
         return self.network.random_state(1, torch.Generator().manual_seed(key(use, name)))
+
+
+class OwnClassifierExtractor(Extractor):
+    """An action classifier that `make train EXP=classifier/...` has made.
+
+    Raises:
+        FileNotFoundError, UserError: no such checkpoint, or none of a classifier.
+    """
+
+    def __init__(self, path: str, device: str | torch.device = "cpu"):
+        file = find(path)
+        self.path, self.sha256 = file, file_sha256(file)
+        self.task = load_task(file, ClassifierTask, device)
+        self.fingerprint = self.task.facts.get("fingerprint")
+
+    def check(self, representation: Representation, dataset: str) -> None:
+        """Representation and data set are those that it was trained on."""
+        _check_trained(self.path, self.task, "classifier", representation, dataset)
+
+    def motions(self, features: Tensor, joints: Tensor, mask: Tensor) -> dict[str, Tensor]:
+        """Features and class scores of motions."""
+        return {"features": self.task(joints, mask), "logits": self.task.logits(joints, mask)}

@@ -41,11 +41,10 @@ def adjacency(parents: Sequence[int]) -> Tensor:
 class STGCN(nn.Module):
     """A stack of graph convolutions with temporal ones of 9 frames, averaged over frames and joints, and classified.
 
-    A network to evaluate with: the dropout of its training is left out. All frames of a motion are taken as real, as
-    published: the action sets have motions of 60 frames, where short clips repeat their last one.
+    A network to evaluate with: the dropout of its training is left out. Past the end of a motion the convolutions see
+    zeros, as at the end of the longest, so that its features do not depend on the other motions of a batch. The
+    published action sets have motions of 60 frames only, where short clips repeat their last one.
     """
-
-    features = 256
 
     def __init__(
         self,
@@ -65,6 +64,7 @@ class STGCN(nn.Module):
             strides: temporal stride of each block.
         """
         super().__init__()
+        self.features = widths[-1]
         graph = adjacency(parents)
         self.register_buffer("A", graph)
         self.A: Tensor
@@ -78,17 +78,12 @@ class STGCN(nn.Module):
         self.fcn = nn.Conv2d(widths[-1], num_actions, 1)
 
     def forward(self, x: Tensor, mask: Tensor) -> Tensor:
-        """Features (B, 256) of what each joint does (B, F, V, C).
-
-        Raises:
-            ValueError: a motion is shorter than the others.
-        """
-        if not mask.all():
-            raise ValueError("ST-GCN takes every frame as real: give motions of one length, such as data.crop=Fixed")
+        """(B, E) features of what each joint does (B, F, V, C), with mask (B, F); E is the width of the last block."""
         x = self.data_bn(x.flatten(2).transpose(1, 2)).unflatten(1, x.shape[2:]).permute(0, 2, 3, 1)
         for block, importance in zip(self.st_gcn_networks, self.edge_importance, strict=True):
-            x = block(x, self.A * importance)
-        return x.mean((2, 3))
+            x = block(x, self.A * importance, mask)
+            mask = mask[:, :: block.stride]
+        return x.mean(3).masked_fill(~mask[:, None], 0).sum(2) / mask.sum(1, keepdim=True)
 
     def logits(self, x: Tensor, mask: Tensor) -> Tensor:
         """(B, actions) unnormalized log-probabilities; arguments as of `forward`."""
@@ -96,10 +91,11 @@ class STGCN(nn.Module):
 
 
 class _Block(nn.Module):
-    """Gathers over the graph, then convolves over time; works on (B, C, V, F)."""
+    """Gathers over the graph, then convolves over time; works on (B, C, F, V)."""
 
     def __init__(self, in_channels: int, width: int, partitions: int, stride: int, residual: bool):
         super().__init__()
+        self.stride = stride
         self.gcn = nn.ModuleDict({"conv": nn.Conv2d(in_channels, width * partitions, 1)})
         self.tcn = nn.Sequential(
             nn.BatchNorm2d(width),
@@ -113,9 +109,11 @@ class _Block(nn.Module):
             project = nn.Conv2d(in_channels, width, 1, (stride, 1))
             self.residual = nn.Identity() if same else nn.Sequential(project, nn.BatchNorm2d(width))
 
-    def forward(self, x: Tensor, graph: Tensor) -> Tensor:
+    def forward(self, x: Tensor, graph: Tensor, mask: Tensor) -> Tensor:
         y = self.gcn["conv"](x).unflatten(1, (len(graph), -1))
-        y = self.tcn(torch.einsum("bkcfv,kvw->bcfw", y, graph))
+        normalize, activate, convolve, normalize_again = self.tcn
+        y = activate(normalize(torch.einsum("bkcfv,kvw->bcfw", y, graph)))
+        y = normalize_again(convolve(y.masked_fill(~mask[:, None, :, None], 0)))
         return torch.relu(y if self.residual is None else y + self.residual(x))
 
 
@@ -141,6 +139,18 @@ class Unconstrained(STGCN):
         """(B, 256) features of joints (B, F, 24, 3), metres, y up; seen from the pelvis, and y down as published."""
         x = (x - x[:, :, :1])[:, :, list(UNCONSTRAINED_JOINTS)]
         return super().forward(x * x.new_tensor([1.0, -1.0, -1.0]), mask)
+
+
+class JointSTGCN(STGCN):
+    """A classifier to train on the joints of any skeleton, which it sees from where the root stands at first."""
+
+    def __init__(self, parents: Sequence[int], num_actions: int, widths: Sequence[int], strides: Sequence[int]):
+        """`parents` of the joints, -1 for the root; `widths` and `strides` of the blocks."""
+        super().__init__(3, num_actions, parents, widths, strides)
+
+    def forward(self, x: Tensor, mask: Tensor) -> Tensor:
+        """(B, E) features of joints (B, F, J, 3), metres, y up, with mask (B, F)."""
+        return super().forward(x - x[:, :1, :1], mask)
 
 
 def load_uestc(path: str | Path) -> UESTC:

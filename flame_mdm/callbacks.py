@@ -18,6 +18,7 @@ from lightning.pytorch.callbacks import Checkpoint, TQDMProgressBar
 from torch.nn.utils import get_total_norm
 from torchmetrics import Metric
 
+from flame_mdm.conditions.action import ActionLabels
 from flame_mdm.dashboards import log_table, log_video
 from flame_mdm.data.datamodule import MotionDataModule
 from flame_mdm.evaluate import check_condition, load_protocol
@@ -185,7 +186,7 @@ class SampleMotions(Callback):
         folder: where `step_0001000/player.html` and the like are written.
         every_n_steps: how often, at validation; the end of training always samples.
         prompts: texts, action names, or (text, asked attributes) pairs; None = as many unconditioned motions as
-            `unconditioned`.
+            `unconditioned`. A model of actions is asked for as many actions instead where none of them is one.
         seconds: length of the motions.
         unconditioned: how many motions to sample where there are no prompts.
         metrics: torchmetrics by name, updated with those of joints (B, F, J, 3), mask (B, F) and asked that they take.
@@ -215,6 +216,11 @@ class SampleMotions(Callback):
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         self.next = trainer.global_step + self.every_n_steps
+        assert isinstance(pl_module, MotionGeneration)
+        actions = pl_module.facts["actions"]
+        if isinstance(pl_module.condition, ActionLabels) and not set(self.texts) & set(actions):
+            # those of a recipe for texts, under condition=action
+            self.prompts = [(action, {"action": action}) for action in actions[: len(self.prompts)]]
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
         if not len(trainer.datamodule.val):  # type: ignore[attr-defined]  # a set published without validation clips

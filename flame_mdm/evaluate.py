@@ -193,7 +193,8 @@ def default_protocol(model: MotionGeneration | None) -> str:
     if condition == "none":
         return "unconditioned"
     if condition == "action":
-        return "action_to_motion_uestc" if model.facts["dataset"] == "uestc" else "action_to_motion"
+        released = {"humanact12": "action_to_motion", "uestc": "action_to_motion_uestc"}
+        return released.get(model.facts["dataset"], "action_to_motion_own")
     return "synthetic" if model.facts["dataset"] == "synthetic" else "text_to_motion"
 
 

@@ -407,7 +407,7 @@ def test_the_t2m_evaluator_is_read_from_a_folder(tmp_path):
         extractor.check(kit, "bandai")
 
 
-@pytest.mark.parametrize(("condition", "protocol"), [("action", "action_to_motion"), ("none", "unconditioned")])
+@pytest.mark.parametrize(("condition", "protocol"), [("action", "action_to_motion_own"), ("none", "unconditioned")])
 def test_models_without_text_are_measured_by_protocols_of_their_own(runs, tmp_path, condition, protocol):
     words = [w for w in GENERATOR if not w.startswith("condition")]
     words += [f"condition={condition}", *(["condition.features=16"] if condition == "action" else [])]

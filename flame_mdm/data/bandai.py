@@ -610,6 +610,18 @@ def _files(path: Path, wanted: Container[str]) -> Iterator[tuple[str, bytes]]:
         raise ValueError(f"{path}: neither a folder nor a zip or tar archive")
 
 
+def prompts() -> list[str]:
+    """Fixed prompts in the words of the captions, shown on the dashboard by recipes over those of the synthetic set."""
+    return [
+        "a person walks forward",
+        "a person walks forward like an old person",
+        "a person runs forward energetically",
+        "a person walks forward, then turns left and walks on",
+        "a person raises the left hand and waves",
+        "a person kicks",
+    ]
+
+
 def _not_found(what: str) -> FileNotFoundError:
     return FileNotFoundError(
         f"{what}; the data sets are published at "

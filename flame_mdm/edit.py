@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
@@ -11,7 +10,7 @@ from types import ModuleType
 from typing import Any
 
 from flame_mdm.config import Config, UserError, run
-from flame_mdm.sample import check_request
+from flame_mdm.sample import check_request, default_folder
 
 USAGE = """
 usage: python -m flame_mdm.edit ckpt=FILE motion=walk.npz frames=in_between text="a person jumps" [key=value ...]
@@ -67,10 +66,10 @@ def write_edits(config: Config) -> None:
         actions=None if config["action"] is None else [str(config["action"])],
         **{key: config[key] for key in keys},
     )
-    name = re.sub(r"[^a-z0-9]+", "-", f"{Path(original.id).stem} {edits[0].caption}".lower()).strip("-")[:60]
-    folder = Path(
-        config["out"] or Path("samples") / str(model.config["experiment"]) / f"edit-{name}-seed{config['seed']}"
-    )
+    asked = {key: config[key] for key in keys if key not in ("resample", "samples", "seed")} | {"cut": config["cut"]}
+    asked["resample"] = config["resample"] if config["resample"] != 1 else None
+    what = f"edit {Path(original.id).stem} {edits[0].caption}"
+    folder = Path(config["out"] or default_folder(model, what, config["seed"], asked))
     shown = replace(original, caption=f"original: {original.caption or original.id}")
     facts = {"seed": config["seed"], "checkpoint": file_sha256(file), "keep": edits[0].keep}
     write_motions(folder, model, [shown, *edits], facts)

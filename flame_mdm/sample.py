@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from flame_mdm.config import Config, UserError, run
+
+if TYPE_CHECKING:
+    from flame_mdm.task import MotionGeneration
 
 USAGE = """
 usage: python -m flame_mdm.sample ckpt=FILE text="a person walks in a circle" [seconds=6] [key=value ...]
@@ -54,12 +58,24 @@ def sample(config: Config) -> None:
         sampler=config["sampler"],
         num_inference_steps=config["num_inference_steps"],
     )
-    name = re.sub(r"[^a-z0-9]+", "-", (motions[0].caption or "unconditioned").lower()).strip("-")[:60]
-    folder = Path(config["out"] or Path("samples") / str(model.config["experiment"]) / f"{name}-seed{config['seed']}")
+    asked = {key: config[key] for key in ("seconds", "guidance_scale", "sampler", "num_inference_steps")}
+    folder = Path(config["out"] or default_folder(model, motions[0].caption or "unconditioned", config["seed"], asked))
     write_motions(folder, model, motions, {"seed": config["seed"], "checkpoint": file_sha256(file)})
     print(
         f"{len(motions)} motions of {len(motions[0].joints)} frames: {folder / 'player.html'}, {folder / 'motions.gif'}"
     )
+
+
+def default_folder(model: MotionGeneration, what: str, seed: int, options: Mapping[str, Any]) -> Path:
+    """`samples/<experiment>/<what>-seed<seed>`, and the options that are not None: other motions, another folder.
+
+    The experiment is a word of the checkpoint, which may be a stranger's: the folder is within `samples` all the same.
+    """
+    experiment = re.findall(r"[\w-][\w.-]*", str(model.config["experiment"]))
+    name = re.sub(r"[^a-z0-9]+", "-", what.lower()).strip("-")[:60]
+    values = {key: re.sub(r"[^\w.,-]+", "", str(value)) for key, value in options.items() if value is not None}
+    told = "".join(f"-{key}={value}" for key, value in values.items())[:150]
+    return Path("samples", *experiment, f"{name}-seed{seed}{told}")
 
 
 def check_request(config: Config) -> None:

@@ -1,0 +1,47 @@
+"""Where samples go when nobody says where."""
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from conftest import TINY
+
+from flame_mdm import sample, train
+from flame_mdm.sample import default_folder
+
+
+def folder(experiment: Any, what: str = "a person walks", seed: int = 0, **options: Any) -> str:
+    model: Any = SimpleNamespace(config={"experiment": experiment})
+    return default_folder(model, what, seed, options).as_posix()
+
+
+def test_other_options_are_another_folder():
+    assert folder("humanml3d/mdm") == "samples/humanml3d/mdm/a-person-walks-seed0"
+    assert folder("a", guidance_scale=2.5, sampler=None) == "samples/a/a-person-walks-seed0-guidance_scale=2.5"
+    names = [folder("a", guidance_scale=scale) for scale in (-1, 1, 1.5, None)]
+    names += [folder("a", frames=frames) for frames in ("in_between", [1, 2], [12])]
+    names += [folder("a", sampler="ddim"), folder("a", seed=1)]
+    assert len(set(names)) == len(names)
+
+
+@pytest.mark.parametrize(
+    "experiment",
+    ["../../x", "/etc/x", "..", "a/../../../b", ".x", "a\0b", "~/x", "-/..", None, 3, "", "\\..\\x", ". ."],
+)
+def test_no_checkpoint_leads_out_of_the_folder(experiment, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    path = Path(folder(experiment, "../../../etc passwd\0", 0, sampler="../../x", joints=["/a", ".."]))
+    assert ".." not in path.parts
+    assert "\0" not in str(path)
+    assert path.resolve().is_relative_to(tmp_path / "samples")
+
+
+def test_a_sweep_writes_a_folder_for_each_value(tmp_path, data_root, monkeypatch):
+    words = [*TINY, f"data_root={data_root}", f"run.dir={tmp_path / 'run'}", "callbacks.samples=null"]
+    assert train.main(["quickstart", *words, "callbacks.best=null", "trainer.max_steps=1", "logger=csv"]) == 0
+    monkeypatch.chdir(tmp_path)
+    asked = [f"ckpt={tmp_path / 'run/checkpoints/last.ckpt'}", "text=a person walks", "samples=1", "seconds=1"]
+    assert sample.main([*asked, "guidance_scale=1,2.5", "--multirun"]) == 0
+    made = sorted(path.parent.name for path in tmp_path.glob("samples/quickstart/*/motion_000.npz"))
+    assert made == [f"a-person-walks-seed0-seconds=1-guidance_scale={scale}" for scale in ("1", "2.5")]

@@ -12,8 +12,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from flame_mdm.config import EXPERIMENTS, Config, UserError, run, settings
+from flame_mdm.results import read_json
 from flame_mdm.tables import build, evaluate_missing, load_spec, write
-from flame_mdm.visualize.table import Table, page
+from flame_mdm.visualize.page import page
+from flame_mdm.visualize.page import table as small_table
+from flame_mdm.visualize.scene import written_whole
+from flame_mdm.visualize.table import Table
 
 USAGE = """
 usage: python -m flame_mdm.benchmark NAME [out=FOLDER]
@@ -44,6 +48,7 @@ def benchmark(config: Config) -> None:
     plan = OmegaConf.to_container(OmegaConf.load(EXPERIMENTS / "benchmark" / f"{config['exp']}.yaml"), resolve=True)
     assert isinstance(plan, dict)
     out = Path(config["out"] or Path("runs") / "benchmark" / config["exp"])
+    out.mkdir(parents=True, exist_ok=True)  # before hours of work
     times = Times(out / "times.json")
     if config["evaluate"]:
         for words in plan["train"]:
@@ -58,7 +63,9 @@ def benchmark(config: Config) -> None:
     body = write(table, out)
     checks = check(table, plan.get("expected", {}))
     report = out / "report.html"
-    report.write_text(page(table.title, _report(config["exp"], body, times, checks, plan["train"])))
+    with written_whole(report) as temporary:
+        content = page(table.title, _report(config["exp"], body, times, checks, plan["train"]))
+        temporary.write_text(content, encoding="utf-8")
     print(f"{sum(times.seconds.values()) / 60:.0f} minutes in all; see {report}")
     wrong = [line for line, right in checks if not right]
     if failed or wrong:
@@ -70,12 +77,14 @@ class Times:
 
     def __init__(self, path: Path):
         self.path = path
-        self.seconds: dict[str, float] = json.loads(path.read_text()) if path.exists() else {}
+        self.seconds: dict[str, float] = {}
+        if path.exists():
+            self.seconds = read_json(path, dict[str, float], "delete it, and the time before is not counted")
 
     def add(self, name: str, seconds: float) -> None:
         self.seconds[name] = self.seconds.get(name, 0.0) + seconds
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        self.path.write_text(json.dumps(self.seconds, indent=1) + "\n")
+        with written_whole(self.path) as temporary:
+            temporary.write_text(json.dumps(self.seconds, indent=1) + "\n")
 
 
 def train(words: Sequence[str], times: Times, data_root: str | None) -> None:
@@ -120,7 +129,7 @@ def check(table: Table, expected: Mapping[str, Mapping[str, Mapping[str, Sequenc
 def _report(
     name: str, body: str, times: Times, checks: Sequence[tuple[str, bool]], trained: Sequence[Sequence[str]]
 ) -> str:
-    rows = "".join(f"<tr><td>{html.escape(what)}</td><td>{s / 60:.1f}</td></tr>" for what, s in times.seconds.items())
+    minutes = small_table(["", ""], [[what, f"{s / 60:.1f}"] for what, s in times.seconds.items()], numbers=True)
     lines = "".join(f"<li>{'✓' if right else '✗'} {html.escape(line)}</li>" for line, right in checks)
     out = f"<p>Made by <code>make benchmark EXP={html.escape(name)}</code>.</p>\n{body}"
     out += "<h2>Generated motions</h2>\n"
@@ -132,7 +141,7 @@ def _report(
             data = base64.b64encode(movies[-1].read_bytes()).decode()
             out += f'<h3>{html.escape(words[0])}</h3><img alt="motions" src="data:image/gif;base64,{data}">\n'
     out += f"<h2>As good as expected?</h2><ul>{lines}</ul>\n" if lines else ""
-    return out + f"<h2>Minutes</h2><table><tbody>{rows}</tbody></table>\n"
+    return out + f"<h2>Minutes</h2>{minutes}\n"
 
 
 if __name__ == "__main__":

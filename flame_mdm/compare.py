@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import random
-import shlex
 import statistics
 import sys
 from collections.abc import Mapping, Sequence
@@ -23,11 +22,12 @@ from flame_mdm.report import (
     interval,
     last,
     marks,
-    read_json,
+    paths,
     read_run,
     sampling,
     steps,
 )
+from flame_mdm.results import read_json, read_text
 from flame_mdm.tables import wilson
 from flame_mdm.visualize.page import chart, frame, number, page, table
 from flame_mdm.visualize.scene import written_whole
@@ -77,8 +77,7 @@ def compare(config: Config) -> None:
     if (config["runs"] is None) == (config["ratings"] is None):
         raise UserError('give one of runs="A B" to compare and ratings="x.json y.json" to count')
     if config["ratings"] is not None:
-        files = [Path(name) for name in shlex.split(str(config["ratings"]))]
-        out, pairs = Path(config["out"] or "runs/ratings.json"), tally(files)
+        out, pairs = Path(config["out"] or "runs/ratings.json"), tally(paths("ratings", str(config["ratings"])))
         write_json(out, {"format": 1, "question": QUESTION, "pairs": pairs})
         for pair in pairs:
             low, high = pair["interval_a"]
@@ -88,7 +87,7 @@ def compare(config: Config) -> None:
             )
         print(f"written: {out}")
         return
-    contestants = find(shlex.split(str(config["runs"])))
+    contestants = find(paths("runs", str(config["runs"])))
     shown = motions(contestants, config)
     if config["rate"]:
         out, content = Path(config["out"] or "runs/rate.html"), rating_page(contestants, shown, config["seed"])
@@ -99,17 +98,16 @@ def compare(config: Config) -> None:
     print(out)
 
 
-def find(folders: Sequence[str]) -> list[Contestant]:
+def find(folders: Sequence[Path]) -> list[Contestant]:
     """The runs in some folders, by recipe and name, or by folder where two have the same.
 
     Raises:
         UserError: fewer than two; a folder that holds neither a run nor motions.
     """
     if len(set(folders)) < 2:
-        raise UserError(f'comparing takes two runs or more: runs="A B", not {" ".join(folders) or "none"}')
+        raise UserError(f'comparing takes two runs or more: runs="A B", not {" ".join(map(str, folders))}')
     found = []
-    for name in folders:
-        folder = Path(name)
+    for folder in folders:
         if (folder / "config.yaml").is_file():
             content = read_run(folder)
             found.append(Contestant(content.label, folder, content))
@@ -163,7 +161,7 @@ def read_texts(given: str) -> list[str]:
     """
     if given.endswith(".txt") and not Path(given).is_file():
         raise UserError(f"texts={given}: no such file")
-    parts = Path(given).read_text(encoding="utf-8").splitlines() if given.endswith(".txt") else given.split(";")
+    parts = read_text(Path(given)).splitlines() if given.endswith(".txt") else given.split(";")
     texts = [part.strip() for part in parts if part.strip()]
     if not texts:
         raise UserError(f'texts={given}: no text in it; texts="a person walks; a person jumps", or a .txt file')

@@ -9,6 +9,7 @@ from __future__ import annotations
 import ast
 import difflib
 import functools
+import math
 import os
 import re
 import signal
@@ -20,6 +21,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any, NamedTuple, NoReturn
 
+import yaml
 from hydra import compose as hydra_compose
 from hydra import initialize_config_dir
 from hydra import main as hydra_main
@@ -50,6 +52,9 @@ TRUSTED = (
 
 FLAGS = ("--help", "--multirun", "-m", "--cfg", "--resolve", "--package")
 """Hydra's own options that commands take."""
+
+MOST_NODES = 100_000
+"""Values and keys of a YAML file, its aliases written out."""
 
 LAUNCH = "launch"
 """The group of `experiments/` whose options start jobs elsewhere."""
@@ -166,18 +171,39 @@ def _find(name: str) -> _Recipe:
         path = Path(name).resolve()
         if not path.is_file():
             raise UserError(f"{name}: no such file. EXP takes an experiment or the path of a config.yaml")
-        saved = "defaults" not in _load_yaml(path)
+        saved = "defaults" not in load_yaml(path)
         return _Recipe(path.parent, path.stem, saved, None if saved else path.stem)
     if name not in recipes():
         raise UserError(f"unknown experiment '{name}'.{_nearest(name, recipes())} `make help` lists them all")
     return _Recipe(EXPERIMENTS, name, experiment=name)
 
 
-def _load_yaml(path: Path) -> Any:
+def load_yaml(path: Path) -> Any:
+    """A YAML file, as OmegaConf reads it.
+
+    Raises:
+        UserError: it cannot be read, or aliases make it endless.
+    """
     try:
+        with path.open(encoding="utf-8") as file:
+            size = _size(yaml.compose(file, yaml.SafeLoader), {})
+        if size > MOST_NODES:
+            raise ValueError("its aliases, written out, are endless or nearly so")
         return OmegaConf.load(path)
     except Exception as error:  # YAML's many errors all mean the same here
         raise UserError(f"{path}: not a readable YAML file: {_first_line(error)}") from error
+
+
+def _size(node: yaml.Node | None, known: dict[int, float]) -> float:
+    """Nodes of a YAML file with its aliases written out; infinite where one contains itself."""
+    if id(node) not in known:
+        known[id(node)] = math.inf
+        content = node.value if node is not None else ""
+        if isinstance(content, str):
+            content.encode()  # half a character cannot be written again
+        parts = [part for pair in content for part in (pair if isinstance(pair, tuple) else [pair])]
+        known[id(node)] = 1 + sum(_size(part, known) for part in parts if isinstance(part, yaml.Node))
+    return known[id(node)]
 
 
 def _parse(overrides: Sequence[str]) -> list[Override]:

@@ -7,14 +7,15 @@ import json
 import secrets
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
 from lightning.pytorch.loggers import Logger, TensorBoardLogger, WandbLogger
 from lightning.pytorch.utilities import rank_zero_only
 from omegaconf import OmegaConf
 
 from flame_mdm.config import Config
-from flame_mdm.report import HISTORY, read_json, records
+from flame_mdm.report import HISTORY, records
+from flame_mdm.results import read_json
 
 
 class History(Logger):
@@ -59,6 +60,14 @@ class History(Logger):
             file.write(json.dumps({"step": step, **metrics}) + "\n")
 
 
+class Kept(TypedDict, total=False):
+    """What `wandb.json` keeps."""
+
+    id: str
+    step: int | None
+    rows: int
+
+
 class WandbRun(WandbLogger):
     """One run on Weights & Biases, however often it is resumed.
 
@@ -73,8 +82,9 @@ class WandbRun(WandbLogger):
 
     def __init__(self, save_dir: str, **options: Any):
         self.path = Path(save_dir) / "wandb.json"
-        kept = read_json(self.path) if self.path.exists() else {}
-        self.told, self.rows = kept.get("step", -1), kept.get("rows", 0)
+        kept = read_json(self.path, Kept, "delete it, and wandb gets a new run") if self.path.exists() else {}
+        told = kept.get("step")
+        self.told, self.rows = -1 if told is None else told, kept.get("rows", 0)
         known: dict[str, Any] = {"id": kept.get("id") or secrets.token_hex(4)}
         super().__init__(save_dir=save_dir, **(known | options))
         self._wandb_init.pop("anonymous")  # wandb warns of it even where it is not set

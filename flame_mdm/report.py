@@ -9,9 +9,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
-from flame_mdm.config import Config, UserError, run
+from flame_mdm.config import Config, UserError, load_yaml, run
+from flame_mdm.results import check_shape, read_json, read_result, read_text
 from flame_mdm.visualize.page import Curve, chart, frame, number, page, table
 from flame_mdm.visualize.scene import written_whole
 
@@ -55,7 +56,8 @@ class Run:
     @property
     def samples(self) -> Path | None:
         """The folder of the newest samples."""
-        return max((path.parent for path in self.folder.glob("samples/step_*/player.html")), default=None)
+        found = (path.parent for path in self.folder.glob("samples/step_*/player.html"))
+        return max((folder for folder in found if folder.name.removeprefix("step_").isdecimal()), default=None)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -74,8 +76,23 @@ def report(config: Config) -> None:
     """
     if config["runs"] is None:
         raise UserError("which run? python -m flame_mdm.report runs/synthetic/mdm/default")
-    for folder in shlex.split(str(config["runs"])):
-        print(write_report(Path(folder)))
+    for folder in paths("runs", str(config["runs"])):
+        print(write_report(folder))
+
+
+def paths(key: str, given: str) -> list[Path]:
+    """The files or folders that a key names, with spaces between them, and quotes around names with spaces.
+
+    Raises:
+        UserError: none, or a quote without its end.
+    """
+    try:
+        names = shlex.split(given)
+    except ValueError as error:
+        raise UserError(f"{key}={given}: {error}; put names with spaces in quotes") from error
+    if not all(names) or not names:
+        raise UserError(f"{key}={given}: name at least one, with spaces between several")
+    return [Path(name) for name in names]
 
 
 def write_report(folder: Path) -> Path:
@@ -95,6 +112,58 @@ def write_report(folder: Path) -> Path:
 # Reading --------------------------------------------------------------------------------------------------------------
 
 
+class _Name(TypedDict, total=False):
+    name: str | int | float
+
+
+class _Steps(TypedDict):
+    max_steps: int
+
+
+class Recipe(TypedDict):
+    """The configuration of a run, as far as pages read it."""
+
+    experiment: str | None
+    run: _Name
+    trainer: _Steps
+
+
+class _Trained(TypedDict, total=False):
+    fingerprint: str
+
+
+class _Provenance(TypedDict):
+    command: list[str]
+    commit: str | None
+    python: str
+    machine: str
+    packages: dict[str, str]
+    data: _Trained
+
+
+class Provenance(_Provenance, total=False):
+    """What a run was made of, as `flame_mdm.provenance` writes it."""
+
+    changed: str | None
+    device: str
+    parameters: int
+
+
+class _Part(TypedDict):
+    rank: int
+    batch: int
+    loss: str
+    ids: list[str]
+
+
+class Fault(TypedDict):
+    """The batch that stopped a run, as `flame_mdm.guards.BadLoss` writes it."""
+
+    step: int
+    usual_loss: str
+    batches: list[_Part]
+
+
 def read_run(folder: Path) -> Run:
     """What the folder of a run holds.
 
@@ -103,32 +172,22 @@ def read_run(folder: Path) -> Run:
     """
     from omegaconf import OmegaConf
 
-    if not (folder / "config.yaml").is_file():
+    path = folder / "config.yaml"
+    if not path.is_file():
         raise UserError(f"{folder}: no config.yaml there; name the folder of a run, such as runs/synthetic/mdm/default")
-    config: Any = OmegaConf.to_container(OmegaConf.load(folder / "config.yaml"))
-    provenance = read_json(folder / "provenance.json") if (folder / "provenance.json").exists() else {}
+    config: Any = OmegaConf.to_container(load_yaml(path))
+    try:
+        check_shape(config, Recipe)
+    except ValueError as error:
+        raise UserError(f"{path}: not the configuration of a run: {error}") from error
+    made_of = folder / "provenance.json"
+    remedy = "delete it, and the page leaves out what it told"
     results = {
-        path.relative_to(folder).as_posix(): read_json(path)
+        path.relative_to(folder).as_posix(): read_result(path)
         for path in sorted(folder.glob("evaluation/**/result*.json"))
     }
+    provenance = read_json(made_of, Provenance, remedy) if made_of.exists() else {}
     return Run(folder, config, provenance, read_history(folder), results)
-
-
-def read_json(path: Path) -> dict[str, Any]:
-    """A file of one JSON object.
-
-    Raises:
-        UserError: it is none.
-    """
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise UserError(f"{path}: no such file") from None
-    except ValueError as error:
-        raise UserError(f"{path}: not a JSON file: {error}") from error
-    if not isinstance(content, dict):
-        raise UserError(f"{path}: holds {type(content).__name__}, not a JSON object")
-    return content
 
 
 def read_history(folder: Path) -> dict[str, dict[int, float]]:
@@ -156,15 +215,24 @@ def records(path: Path) -> list[dict[str, Any]]:
     """
     if not path.exists():
         return []
-    *lines, _ = path.read_text(encoding="utf-8").split("\n")
+    *lines, _ = read_text(path).split("\n")
     found = []
     for place, line in enumerate(lines, 1):
         try:
             record = json.loads(line)
-            found.append({**record, "step": int(record["step"])})
-        except (ValueError, TypeError, KeyError) as error:
-            raise UserError(f"{path}: line {place} is damaged; delete that line") from error
+            check_shape(record, _Record)
+            wrong = [name for name, value in record.items() if type(value) not in (int, float)]
+            if wrong or record["step"] < 0:
+                raise ValueError(f"{', '.join(wrong) or 'step'} should be a number")
+            json.dumps(record, ensure_ascii=False).encode()  # half a character cannot be written again
+        except (ValueError, RecursionError) as error:
+            raise UserError(f"{path}: line {place} is damaged; delete that line ({error})") from error
+        found.append(record)
     return found
+
+
+class _Record(TypedDict):
+    step: int
 
 
 # Parts of the page ----------------------------------------------------------------------------------------------------
@@ -197,7 +265,7 @@ def _fault(folder: Path) -> str:
     path = folder / "bad_batch.json"
     if not path.exists():
         return ""
-    fault = read_json(path)
+    fault = read_json(path, Fault, "delete it, and the page leaves it out")
     rows = [[f"process {b['rank']}, batch {b['batch']}", b["loss"], ", ".join(b["ids"])] for b in fault["batches"]]
     told = f"Training stopped at step {fault['step']}: a bad loss, where {fault['usual_loss']} was usual"
     return f"<div class='fault'>{escape(told)}</div>" + table(["", "loss", "clips"], rows)
@@ -206,7 +274,7 @@ def _fault(folder: Path) -> str:
 def _samples(found: Run) -> str:
     if found.samples is None:
         return ""
-    player = (found.samples / "player.html").read_text(encoding="utf-8")
+    player = read_text(found.samples / "player.html")
     step = int(found.samples.name.removeprefix("step_"))
     return f"<h2>Samples at step {step:,}</h2>{frame(player, 640)}"
 
@@ -315,7 +383,7 @@ def interval(value: Mapping[str, Any] | None) -> str:
     """Mean and half of its interval."""
     if value is None or value["mean"] is None:
         return "–"
-    return f"{number(value['mean'])} ± {value['ci']:.2g}"
+    return number(value["mean"]) + (f" ± {value['ci']:.2g}" if value["ci"] is not None else "")
 
 
 def _provenance(found: Run) -> str:

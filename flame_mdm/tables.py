@@ -11,10 +11,14 @@ import string
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from html import escape
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
+from urllib.parse import quote
 
-from flame_mdm.config import EXPERIMENTS, Config, UserError, run, settings
+from flame_mdm.config import EXPERIMENTS, Config, UserError, load_yaml, run, settings
+from flame_mdm.results import check_shape, read_json, read_result
+from flame_mdm.visualize.page import page
 from flame_mdm.visualize.table import (
     WRITERS,
     Cell,
@@ -25,7 +29,6 @@ from flame_mdm.visualize.table import (
     draw,
     figure_names,
     fragment,
-    page,
     places,
 )
 
@@ -67,24 +70,94 @@ def tables(config: Config) -> None:
         UserError: a malformed spec, or an evaluation that failed; the tables are written all the same.
     """
     names = str(config["table"]).split() if config["table"] is not None else spec_names()
+    if not names:
+        raise UserError("table= names no table")
     specs = {Path(name).stem: load_spec(name) for name in names}
     results = Path(config["results"])
     failed = evaluate_missing(specs, results, config) if config["evaluate"] else []
     out = Path(config["out"])
-    for name, spec in specs.items():
-        table = build(name, spec, results)
+    built = {name: build(name, spec, results) for name, spec in specs.items()}
+    for name, table in built.items():
         write(table, out)
         lines = [line for part in table.parts for line in part.lines if line.kind == "measured"]
         measured = sum(not line.state for line in lines)
         print(f"{name}: {measured} of {len(lines)} rows measured: {out / name}.html, .md, .tex, .csv")
     if len(specs) > 1:
-        links = "".join(f'<li><a href="{name}.html">{name}</a>: {spec["title"]}</li>' for name, spec in specs.items())
+        links = "".join(
+            f'<li><a href="{escape(quote(name))}.html">{escape(name)}</a>: {escape(table.title)}</li>'
+            for name, table in built.items()
+        )
         _write_text(out / "index.html", page("Tables", f"<h1>Tables</h1><ul>{links}</ul>\n"))
     if failed:
         raise UserError(f"{len(failed)} evaluations failed: {'; '.join(failed)}")
 
 
 # Specs ----------------------------------------------------------------------------------------------------------------
+
+
+class Options(TypedDict, total=False):
+    """Keys of `make evaluate` that a part, a row or a column may give."""
+
+    protocol: str
+    extractor: str
+    data: str
+    split: str
+    seed: int
+    replications: int
+    samples: int
+    multimodality: bool
+
+
+class Column(Options, total=False):
+    """A metric, or a key of `ABOUT`; which values of it are better."""
+
+    value: str
+    better: str
+
+
+class Row(Options, total=False):
+    """What is measured, and how it is sampled. Keys with a dot in them override those of the data."""
+
+    label: str
+    note: str
+    ckpt: str
+    baseline: str
+    from_samples: str
+    method: str
+    sampler: str | list[str]
+    num_inference_steps: int | list[int]
+    guidance_scale: float | list[float]
+    until: float | list[float]
+
+
+class PartSpec(Options, total=False):
+    """One of columns and rows, recipes and keys, lengths, and ratings."""
+
+    columns: dict[str, Column]
+    rows: list[Row]
+    recipes: dict[str, str]
+    keys: dict[str, str]
+    lengths: list[str]
+    ratings: str
+
+
+class FigureSpec(TypedDict, total=False):
+    """Columns of a part over an option of its rows."""
+
+    part: str
+    x: str
+    y: str | list[str]
+    log: bool
+    points: bool
+
+
+class Spec(TypedDict, total=False):
+    """A file of experiments/tables."""
+
+    title: str
+    notes: list[str]
+    parts: dict[str, PartSpec]
+    figures: list[FigureSpec]
 
 
 def spec_names() -> list[str]:
@@ -102,7 +175,11 @@ def load_spec(name: str) -> Config:
     if not path.is_file() or path == PUBLISHED:
         raise UserError(f"no table is called '{name}'; there are: {', '.join(spec_names())}")
     spec = _load(path)
-    if not isinstance(spec.get("title"), str) or not isinstance(spec.get("parts"), dict) or not spec["parts"]:
+    try:
+        check_shape(spec, Spec, closed=True)
+    except ValueError as error:
+        raise UserError(f"{path}: {error}") from error
+    if "title" not in spec or not spec.get("parts"):
         raise UserError(f"{path}: a table needs a title and parts")
     for part_name, part in spec["parts"].items():
         _check_part(f"{path}: part {part_name}", part)
@@ -111,22 +188,22 @@ def load_spec(name: str) -> Config:
         if part is None or figure.get("x") not in ABOUT:
             raise UserError(f"{path}: a figure needs a part of the table and x, one of {', '.join(ABOUT)}")
         for column in _list(figure.get("y")):
-            if column not in part["columns"]:
+            if column not in part.get("columns", {}):
                 raise UserError(f"{path}: figure: y={column} is not a column of {figure['part']}")
     return spec
 
 
 def _check_part(where: str, part: Any) -> None:
     kinds = [{"columns", "rows"}, {"recipes", "keys"}, {"lengths"}, {"ratings"}]
-    if not isinstance(part, dict) or sum(kind <= part.keys() for kind in kinds) != 1:
+    if sum(kind <= part.keys() for kind in kinds) != 1:
         raise UserError(f"{where}: needs columns and rows, or recipes and keys, or lengths, or ratings")
     for label, column in part.get("columns", {}).items():
-        if not isinstance(column, dict) or "value" not in column:
+        if "value" not in column:
             raise UserError(f"{where}: column {label}: needs a value, such as fid")
         if column.get("better", "none") not in ("higher", "lower", "real", "none"):
             raise UserError(f"{where}: column {label}: better is higher, lower, real or none, not {column['better']}")
     for row in part.get("rows", []):
-        if not isinstance(row, dict) or "label" not in row or not {"ckpt", "baseline", "from_samples"} & row.keys():
+        if "label" not in row or len({"ckpt", "baseline", "from_samples"} & row.keys()) != 1:
             raise UserError(f"{where}: a row needs a label and one of ckpt, baseline and from_samples: {row}")
     if "columns" in part and part.get("rows") and "protocol" not in part:
         raise UserError(f"{where}: needs a protocol")
@@ -134,11 +211,12 @@ def _check_part(where: str, part: Any) -> None:
 
 def _load(path: Path) -> Config:
     from omegaconf import OmegaConf
+    from omegaconf.errors import OmegaConfBaseException
 
     try:
-        content = OmegaConf.to_container(OmegaConf.load(path), resolve=True)
-    except Exception as error:  # YAML's many errors all mean the same here
-        raise UserError(f"{path}: not a readable YAML file: {str(error).splitlines()[0]}") from error
+        content = OmegaConf.to_container(load_yaml(path), resolve=True)
+    except OmegaConfBaseException as error:
+        raise UserError(f"{path}: {str(error).splitlines()[0]}") from error
     if not isinstance(content, dict):
         raise UserError(f"{path}: not a mapping")
     return {str(key): value for key, value in content.items()}
@@ -236,22 +314,8 @@ def _outdated(path: Path, request: Request) -> bool:
         return False
     from flame_mdm.generation import file_sha256
 
-    return read_result(path)["checkpoint"]["sha256"] != file_sha256(Path(str(request.keys["ckpt"])))
-
-
-def read_result(path: Path) -> Config:
-    """A result of `make evaluate`.
-
-    Raises:
-        UserError: it is damaged.
-    """
-    try:
-        result = json.loads(path.read_text())
-        if not {"values", "ground_truth", "protocol", "data"} <= result.keys():
-            raise ValueError("something is missing in it")
-    except (ValueError, AttributeError) as error:
-        raise UserError(f"{path}: not a result of make evaluate: {error}; delete it, and it is made again") from error
-    return result
+    made_of = read_result(path)["checkpoint"] or {}
+    return made_of.get("sha256") != file_sha256(Path(str(request.keys["ckpt"])))
 
 
 # From results to tables -----------------------------------------------------------------------------------------------
@@ -348,8 +412,8 @@ def _todo(request: Request) -> dict[str, str]:
 def _evaluation(result: Config) -> str:
     """What values of different rows must share to be compared."""
     protocol, data = result["protocol"], result["data"]
-    counts = [v["n"] for v in (result["values"] or {}).values() if v]
-    repeats = [v["replications"] for v in (result["values"] or {}).values() if v]
+    counts = [v["n"] for v in (result["values"] or {}).values() if v and v["n"] is not None]
+    repeats = [v["replications"] for v in (result["values"] or {}).values() if v and v["replications"] is not None]
     extractor = result["extractor"]
     text = f"protocol {protocol['name']} version {protocol['version']}"
     text += f", {result['split']} split of {data['dataset']} (fingerprint {data['fingerprint']})"
@@ -417,7 +481,7 @@ def _cell(result: Config | None, value: str, row: Mapping[str, Any]) -> Cell | N
         found = row.get(value) if result is None else _about(result, value)
         if found is None:
             return None
-        return Cell(_text(found), float(found) if isinstance(found, int | float) else None)
+        return Cell(f"{float(found):,g}", float(found)) if isinstance(found, int | float) else Cell(str(found))
     return None if result is None else _entry((result["values"] or {}).get(value))
 
 
@@ -428,18 +492,18 @@ def _truth(result: Config | None, value: str) -> Cell | None:
 def _entry(entry: Mapping[str, Any] | None) -> Cell | None:
     if entry is None or entry["mean"] is None:
         return None
-    return Cell("", entry["mean"], entry["ci"] if entry["replications"] > 1 else None)
+    return Cell("", entry["mean"], entry["ci"] if (entry["replications"] or 0) > 1 else None)
 
 
 def _print_cells(lines: Sequence[Line], columns: int) -> None:
-    """Numbers as text, with the same decimals in a column, about three digits of the largest."""
+    """Numbers as text, with the same decimals in a column, about three digits of the largest; short settings stay."""
     for index in range(columns):
         cells = [c for line in lines if not line.kind.startswith("reported") and (c := line.cells[index]) is not None]
         numbers = [abs(cell.value) for cell in cells if cell.value is not None]
         decimals = _decimals(max(numbers, default=0.0))
-        whole = all(cell.value == round(cell.value) for cell in cells if cell.value is not None and cell.ci is None)
+        short = all(cell.value == round(cell.value, 1) for cell in cells if cell.value is not None and cell.ci is None)
         for cell in cells:
-            if cell.value is not None and not (cell.ci is None and cell.text and whole):
+            if cell.value is not None and not (cell.ci is None and cell.text and short):
                 cell.text = f"{cell.value:.{decimals}f}" + (f" ±{cell.ci:.{decimals}f}" if cell.ci is not None else "")
 
 
@@ -501,24 +565,33 @@ def _leading(text: str) -> float | None:
 
 
 def _hyperparameters(name: str, part: Config, reported: Config | None) -> Part:
-    """A table of settings, read from recipes."""
+    """A table of settings, read from recipes, each with the reported one beside it; keys or recipes, what is more
+    stands in rows.
+    """
     from flame_mdm.hyperparameters import values
 
     found = {label: values(recipe) for label, recipe in part["recipes"].items()}
-    columns: dict[str, str] = dict.fromkeys([*map(str, found), *(["as reported"] if reported else [])], "none")
     printed = {row["label"]: row["values"] for row in reported["rows"]} if reported else {}
-    lines = []
+    ours: dict[tuple[str, str], Cell | None] = {}
+    theirs: dict[tuple[str, str], Cell | None] = {}
     for label, key in part["keys"].items():
-        cells: list[Cell | None] = [
-            Cell(_setting(v)) if (v := f.get(key)) is not None else None for f in found.values()
-        ]
-        if reported:
-            texts = [str(v) for v in printed.get(label, {}).values()]
-            cells.append(Cell(" / ".join(texts if len(set(texts)) > 1 else texts[:1])) if texts else None)
-        lines.append(Line(label, "measured", cells))
+        for recipe, known in found.items():
+            place = (label, recipe) if len(part["keys"]) >= len(found) else (recipe, label)
+            ours[place] = Cell(_setting(known[key])) if key in known else None
+            theirs[place] = Cell(text) if (text := printed.get(label, {}).get(recipe)) is not None else None
+    rows, columns = (list(dict.fromkeys(names)) for names in zip(*ours, strict=True))
+    lines = [Line(row, "measured", []) for row in rows]
+    heads: list[str] = []
+    for column in columns:
+        for head, cells in ((column, ours), (f"{column}, reported", theirs)):
+            if any(cells[row, column] for row in rows):
+                heads.append(head)
+                for line in lines:
+                    line.cells.append(cells[line.label, column])
     notes = [("", f"{label}: recipe {recipe}") for label, recipe in part["recipes"].items()]
-    notes += [("", f"as reported: {reported['source']}")] if reported else []
-    return Part(name, columns, lines, notes)
+    if reported:
+        notes += [("", f"reported: {reported['source']}"), *(("", note) for note in reported.get("notes", []))]
+    return Part(name, dict.fromkeys(heads, "none"), lines, notes)
 
 
 def _setting(value: Any) -> str:
@@ -547,6 +620,14 @@ def count_lengths(dataset: str, results: Path, config: Config) -> None:
     _write_text(results / "lengths" / f"{dataset}.json", json.dumps(content) + "\n")
 
 
+class Counted(TypedDict):
+    """What `count_lengths` keeps."""
+
+    fingerprint: str
+    fps: float
+    lengths: list[int]
+
+
 def _lengths(name: str, part: Config, results: Path) -> Part:
     """How long the motions of data sets are."""
     columns = dict.fromkeys(["motions", "hours", "shortest", "median", "mean", "longest"], "none")
@@ -556,8 +637,12 @@ def _lengths(name: str, part: Config, results: Path) -> Part:
         if not path.exists():
             lines.append(Line(dataset, "measured", [None] * len(columns), state="not prepared"))
             continue
-        found = json.loads(path.read_text())
+        found = read_json(path, Counted, "delete it, and make tables counts again")
         lengths, fps = found["lengths"], found["fps"]
+        if not lengths or min(lengths) < 1 or fps <= 0:
+            raise UserError(
+                f"{path}: damaged: lengths and fps above 0 are needed; delete it, and make tables counts again"
+            )
         numbers = [
             (f"{len(lengths):,}", len(lengths)),
             (f"{sum(lengths) / fps / 3600:.2f}", sum(lengths) / fps / 3600),
@@ -575,13 +660,31 @@ def _lengths(name: str, part: Config, results: Path) -> Part:
     return Part(name, columns, lines, [("", "lengths in frames of the data set")], histograms=histograms)
 
 
+class Pair(TypedDict):
+    """How often one of two was preferred."""
+
+    a: str
+    b: str
+    wins_a: int
+    wins_b: int
+    raters: int
+
+
+class Ratings(TypedDict):
+    """What `make compare RATINGS=...` writes."""
+
+    pairs: list[Pair]
+
+
 def _ratings(name: str, part: Config, reported: Config | None) -> Part:
     """A user study: how often one model was preferred to another."""
     columns = {"Preferred": "none", "votes": "none", "raters": "none"}
     lines = []
     path = Path(part["ratings"])
     if path.exists():
-        for pair in json.loads(path.read_text())["pairs"]:
+        for pair in read_json(path, Ratings, "make compare RATINGS=... counts again")["pairs"]:
+            if pair["wins_a"] < 0 or pair["wins_b"] < 0:
+                raise UserError(f"{path}: damaged: fewer than no votes for {pair['a']} or {pair['b']}")
             votes = pair["wins_a"] + pair["wins_b"]
             share, low, high = wilson(pair["wins_a"], votes)
             cells = [

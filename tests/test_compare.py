@@ -63,7 +63,7 @@ def packed(player: str) -> list[dict[str, Any]]:
 
 def test_a_page_puts_runs_side_by_side(three, tmp_path):
     put(three[0], "x")
-    put(three[1], "x", values={"fid": {"mean": 7.5, "ci": 0.5}}, quick=True)
+    put(three[1], "x", values={"fid": {"mean": 7.5, "ci": 0.5, "replications": 2, "n": 64}}, quick=True)
     put(three[1], "y", split="val")
     text = page(three, tmp_path / "out.html")
     table = text[text.index("What the recipes differ in") : text.index("Motions for the same prompts")]
@@ -85,7 +85,7 @@ def test_a_page_puts_runs_side_by_side(three, tmp_path):
 
 def test_runs_of_the_same_name_go_by_their_folders(tmp_path):
     folders = [a_run(tmp_path / name) for name in ("a", "b")]
-    assert [contestant.label for contestant in find([str(folder) for folder in folders])] == [str(f) for f in folders]
+    assert [contestant.label for contestant in find(folders)] == [str(f) for f in folders]
 
 
 def test_runs_without_a_common_prompt_are_compared_and_not_judged(three, tmp_path, capsys):
@@ -227,7 +227,7 @@ def test_ratings_of_several_people_are_counted(tmp_path, capsys):
     ("content", "message"),
     [
         ("hello", "not a JSON file"),
-        ("[]", "holds list, not a JSON object"),
+        ("[]", "the file is [], not a mapping"),
         ('{"rater": "x"}', "the file has no 'study'"),
         ('{"study": "s", "rater": "", "ratings": []}', "the file has no 'rater'"),
         ('{"study": "s", "rater": "x", "ratings": []}', "holds no ratings"),

@@ -264,7 +264,7 @@ def test_names_are_text_not_html(tmp_path):
         ("metrics.jsonl", '{"step": 1}\n{"stop": 2}\n', r"metrics.jsonl: line 2 is damaged"),
         ("metrics.jsonl", "[]\n", r"metrics.jsonl: line 1 is damaged"),
         ("provenance.json", "{", r"provenance.json: not a JSON file"),
-        ("provenance.json", "[]", r"provenance.json: holds list"),
+        ("provenance.json", "[]", r"provenance.json: damaged: the file is \[\], not a mapping"),
     ],
 )
 def test_damaged_files_are_named(tmp_path, name, content, message):

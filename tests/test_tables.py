@@ -60,7 +60,12 @@ def result(fid: float, top3: float, diversity: float, **other) -> dict:
         "seed": 0,
         "extractor": {"sha256": "e" * 64},
         "samples_sha256": None,
-        "checkpoint": {"sha256": "c" * 64, "experiment": "synthetic/mdm", "selected_by": "none: last"}
+        "checkpoint": {
+            "path": "mdm.ckpt",
+            "sha256": "c" * 64,
+            "experiment": "synthetic/mdm",
+            "selected_by": "none: last",
+        }
         | {"averaged_weights": True, "guidance_scale": 2.5, "sampler": "ddpm", "num_inference_steps": 50}
         | {"parameters": 12_345_678},
         "device": "cpu",
@@ -277,7 +282,7 @@ spec:
         ("title: x", "a table needs a title and parts"),
         ("title: x\nparts: {a: {rows: []}}", "part a: needs columns and rows, or recipes"),
         ("title: x\nparts: {a: {columns: {F: {value: fid, better: up}}, rows: []}}", "better is higher, lower"),
-        ("title: x\nparts: {a: {columns: {F: fid}, rows: []}}", "column F: needs a value"),
+        ("title: x\nparts: {a: {columns: {F: fid}, rows: []}}", 'parts.a.columns.F is "fid", not a mapping'),
         ("title: x\nparts: {a: {columns: {}, rows: [{ckpt: x}]}}", "a row needs a label"),
         ("title: x\nparts: {a: {columns: {}, rows: [{label: x, ckpt: x}]}}", "needs a protocol"),
         ("title: [", "not a readable YAML file"),
@@ -304,7 +309,8 @@ def test_a_damaged_result_is_told(folder, capsys):
     path.write_text(path.read_text()[:100])
     words = [f"table={folder / 'spec.yaml'}", f"results={folder / 'results'}", f"out={folder / 'out'}"]
     assert tables.main([*words, "evaluate=false"]) == 1
-    assert "not a result of make evaluate" in capsys.readouterr().err
+    assert "not a JSON file" in (error := capsys.readouterr().err)
+    assert "delete it, and make evaluate or make tables makes it again" in error
 
 
 def test_places():

@@ -281,3 +281,28 @@ def test_r_precision_grows_with_k():
                 shares = [float(top) for top in tops]
                 assert shares == sorted(shares), f"{name}, {row['label']}"
                 assert shares[2] <= (100 if name.startswith("flame_10") else 1)
+
+
+# How settings stand beside reported ones ------------------------------------------------------------------------------
+
+
+def test_each_setting_stands_beside_the_reported_one(tmp_path):
+    (part,) = tables.build("flame_6", SPECS["flame_6"], tmp_path).parts
+    assert list(part.columns) == ["HumanML3D", "HumanML3D, reported", "BABEL", "BABEL, reported"]
+    lines = {line.label: [cell and cell.text for cell in line.cells] for line in part.lines}
+    assert lines["Maximum text length"] == ["20", "20 words", "20", "20 words"]
+    assert list(lines) == list(SPECS["flame_6"]["parts"]["HumanML3D and BABEL"]["keys"])
+
+
+def test_recipes_stand_in_rows_where_there_are_more_of_them(tmp_path):
+    (part,) = tables.build("mdm_8", SPECS["mdm_8"], tmp_path).parts
+    assert list(part.columns) == ["Parameters, M", "Parameters, M, reported"]
+    lines = {line.label: [cell and cell.text for cell in line.cells] for line in part.lines}
+    assert lines["U-net"] == ["23.57", "23.47"]
+    assert "Action-to-motion has 512 more a class." in [text for _, text in part.notes]
+
+
+def test_settings_that_no_paper_reports_stand_alone(tmp_path, monkeypatch):
+    monkeypatch.setattr(tables, "PUBLISHED", tmp_path / "absent.yaml")
+    (part,) = tables.build("flame_6", SPECS["flame_6"], tmp_path).parts
+    assert list(part.columns) == ["HumanML3D", "BABEL"]

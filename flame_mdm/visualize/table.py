@@ -18,6 +18,8 @@ KINDS = {
     "reported real": "Real motions, as reported",
     "reported": "As reported",
 }
+NO_RESULTS = ("NOT VALID", "QUICK")
+"""States of rows whose values must not be taken for results."""
 LEGEND = (
     "↑ higher is better, ↓ lower is better, → closer to real motions is better. **Best** and <u>second best</u> of the "
     "rows with the same mark."
@@ -99,6 +101,14 @@ def _label(line: Line) -> str:
     return f"{line.label} ({line.state})" if line.state else line.label
 
 
+def _head(column: str, better: str) -> str:
+    return f"{column}\u00a0{ARROWS[better]}" if ARROWS[better] else column
+
+
+def _is_ranked(table: Table) -> bool:
+    return any(better != "none" for part in table.parts for better in part.columns.values())
+
+
 def _number(part: Part, index: int) -> str:
     return f"{index + 1}" if len(part.figures) + len(part.histograms) > 1 else ""
 
@@ -125,7 +135,7 @@ def markdown(table: Table) -> str:
     page = f"# {table.title}\n"
     for part in table.parts:
         page += f"\n## {part.name}\n\n" if len(table.parts) > 1 else "\n"
-        page += "| | " + " | ".join(f"{_md(c)} {ARROWS[b]}".strip() for c, b in part.columns.items()) + " |\n"
+        page += "| | " + " | ".join(_md(_head(c, b)) for c, b in part.columns.items()) + " |\n"
         page += "|---" * (len(part.columns) + 1) + "|\n"
         blocks = _blocks(part)
         for title, lines in blocks:
@@ -140,7 +150,7 @@ def markdown(table: Table) -> str:
             if owner is part and name in table.drawn:
                 page += f"\n![{part.name}]({name}.svg)\n"
     page += "".join(f"\n- {_md(note)}" for note in table.notes) + "\n" * bool(table.notes)
-    page += f"\n{LEGEND}\n"
+    page += f"\n{LEGEND}\n" if _is_ranked(table) else ""
     rows = _sources(table)
     if rows:
         page += "\n<details><summary>Where the rows come from</summary>\n\n" + "\n".join(
@@ -237,59 +247,44 @@ def _plain(value: float | None) -> str:
 
 # HTML -----------------------------------------------------------------------------------------------------------------
 
-STYLE = """
-body { font: 15px/1.5 system-ui, sans-serif; margin: 2rem auto; max-width: 80rem; padding: 0 1rem; color: #1b1f24 }
-h1 { font-size: 1.4rem } h2 { font-size: 1.15rem; margin-top: 2rem } code { font-size: 90% }
-table { border-collapse: collapse; margin: 1rem 0 } .wide { overflow-x: auto }
-th, td { padding: .3rem .6rem; text-align: right; font-variant-numeric: tabular-nums } td { white-space: nowrap }
-th:first-child, td:first-child { text-align: left }
-thead th { border-bottom: 2px solid; vertical-align: bottom }
-tr.block td { border-top: 1px solid #8888; font-style: italic; padding-top: .6rem }
-tr.reported td { color: #57606a } tr.off td { color: #9a3412 }
-.notes { font-size: 13px; color: #57606a } .notes p { margin: .2rem 0 } figure { margin: 1rem 0 }
-svg, img { max-width: 100%; height: auto }
-"""
-
-
-def page(title: str, body: str) -> str:
-    """A whole HTML page that needs nothing else."""
-    return (
-        f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><title>{html.escape(title)}</title>'
-        f'<meta name="viewport" content="width=device-width"><style>{STYLE}</style></head>\n'
-        f"<body>\n{body}</body></html>\n"
-    )
-
 
 def fragment(table: Table) -> str:
-    """The table as HTML, to stand in a page."""
+    """The table as HTML, to stand in a page of `flame_mdm.visualize.page`."""
     out = f"<h1>{html.escape(table.title)}</h1>\n"
     for part in table.parts:
         out += f"<h2>{html.escape(part.name)}</h2>\n" if len(table.parts) > 1 else ""
-        head = "".join(f"<th>{html.escape(f'{c} {ARROWS[b]}'.strip())}</th>" for c, b in part.columns.items())
-        out += f'<div class="wide"><table><thead><tr><th></th>{head}</tr></thead><tbody>\n'
+        head = "".join(f'<th class="number">{html.escape(_head(c, b))}</th>' for c, b in part.columns.items())
+        out += f'<div class="card scroll"><table class="values"><thead><tr><th></th>{head}</tr></thead><tbody>\n'
         blocks = _blocks(part)
         for title, lines in blocks:
             if len(blocks) > 1:
                 out += f'<tr class="block"><td colspan="{len(part.columns) + 1}">{html.escape(title)}</td></tr>\n'
             for line in lines:
-                name = "off" if line.state else "reported" if line.kind.startswith("reported") else ""
+                bad, faint = line.state in NO_RESULTS, line.state or line.kind.startswith("reported")
+                name = "bad" if bad else "faint" if faint else ""
                 marks = f"<sup>{html.escape(line.marks)}</sup>" if line.marks else ""
-                cells = "".join(f"<td>{_styled(c, html.escape, '<b>{}</b>', '<u>{}</u>')}</td>" for c in line.cells)
+                cells = "".join(
+                    f'<td class="number">{_styled(c, html.escape, "<b>{}</b>", "<u>{}</u>")}</td>' for c in line.cells
+                )
                 out += f'<tr class="{name}"><td>{html.escape(_label(line))}{marks}</td>{cells}</tr>\n'
         out += "</tbody></table></div>\n"
         notes = "".join(
             f"<p>{f'<sup>{html.escape(mark)}</sup> ' if mark else ''}{html.escape(text)}</p>"
             for mark, text in part.notes
         )
-        out += f'<div class="notes">{notes}</div>\n'
+        out += f'<div class="notes faint">{notes}</div>\n' if notes else ""
         for owner, _, name in figure_names(table):
             if owner is part:
-                out += f"<figure>{table.drawn.get(name, '<p>The figure has no points yet.</p>')}</figure>\n"
-    legend = LEGEND.replace("**Best**", "<b>Best</b>")
-    out += "".join(f"<p>{html.escape(note)}</p>" for note in table.notes) + f'<p class="notes">{legend}</p>\n'
+                empty = "<p class='faint'>The figure has no points yet.</p>"
+                out += f"<figure>{table.drawn[name]}</figure>\n" if name in table.drawn else f"{empty}\n"
+    out += "".join(f"<p>{html.escape(note)}</p>" for note in table.notes)
+    if _is_ranked(table):
+        out += f'<p class="notes faint">{LEGEND.replace("**Best**", "<b>Best</b>")}</p>\n'
     rows = "".join(f"<li>{html.escape(row)}</li>" for row in _sources(table))
     return out + (
-        f'<details class="notes"><summary>Where the rows come from</summary><ul>{rows}</ul></details>\n' if rows else ""
+        f'<details class="notes faint"><summary>Where the rows come from</summary><ul>{rows}</ul></details>\n'
+        if rows
+        else ""
     )
 
 

@@ -24,7 +24,7 @@ $(READY): pyproject.toml constraints.txt
 prepare: $(READY) ## prepare a data set, or report on it: DATA=bandai SOURCE=/path/to/folder-or-archive [verify=true]
 	@$(VENV)/bin/python -m flame_mdm.prepare --from-make
 
-browse: $(READY) ## one web page of a data set: DATA=bandai [SPLIT=train SEARCH="waves left" CLIPS=200]
+browse: $(READY) ## one web page of a data set: DATA=bandai [SPLIT=train SEARCH="waves left" CLIPS=200 MOTIONS=folder]
 	@$(VENV)/bin/python -m flame_mdm.browse --from-make
 
 train: $(READY) ## train or resume: EXP=quickstart [trainer.max_steps=1000 denoiser=mdm_decoder ...]

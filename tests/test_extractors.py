@@ -11,7 +11,7 @@ from fixtures import GOLDEN, Arrays, golden, groups, meta, needs_third_party, th
 from torch import Tensor, nn
 
 from evaluators.action_gru import NUM_ACTIONS, ActionGRU, load_action_gru
-from evaluators.stgcn import STGCN, UESTC, Unconstrained, load_uestc, load_unconstrained
+from evaluators.stgcn import STGCN, UESTC, JointSTGCN, Unconstrained, load_uestc, load_unconstrained
 from evaluators.t2m import PARTS_OF_SPEECH, T2MEvaluator, Words, WordVectors, load_t2m
 from flame_mdm.motion import length_mask
 
@@ -312,9 +312,29 @@ def test_stgcn_classifies(make, shape, actions):
     torch.testing.assert_close(logits, network(x, mask) @ network.fcn.weight.flatten(1).T + network.fcn.bias)
 
 
-def test_stgcn_takes_motions_of_one_length_only():
-    with pytest.raises(ValueError, match="give motions of one length"):
-        UESTC()(torch.zeros(2, 60, 150), length_mask(torch.tensor([60, 50])))
+def small() -> JointSTGCN:
+    return JointSTGCN((-1, 0, 1, 0), 5, widths=(4, 6), strides=(1, 2))
+
+
+@pytest.mark.parametrize(("make", "shape"), [(UESTC, (150,)), (Unconstrained, (24, 3)), (small, (4, 3))])
+def test_stgcn_sees_nothing_past_the_end(make, shape):
+    torch.manual_seed(0)
+    network = make().eval()
+    lengths = torch.tensor([20, 13, 1])
+    mask, x = length_mask(lengths), torch.randn(3, 20, *shape)
+    with torch.no_grad():
+        together = network.logits(x, mask)
+        for row, length in enumerate(lengths.tolist()):
+            alone = network.logits(x[row : row + 1, :length], torch.ones(1, length, dtype=torch.bool))
+            torch.testing.assert_close(alone[0], together[row], atol=1e-5, rtol=1e-4)
+
+
+def test_a_classifier_of_joints_does_not_see_where_the_motion_stands():
+    network = small().eval()
+    x, mask = torch.randn(2, 9, 4, 3), torch.ones(2, 9, dtype=torch.bool)
+    torch.testing.assert_close(network(x + torch.tensor([5.0, 1, -3]), mask), network(x, mask), atol=1e-5, rtol=1e-4)
+    way = torch.linspace(0, 1, 9)[:, None, None]
+    assert not torch.allclose(network(x + way, mask), network(x, mask), atol=1e-3), "but which way it goes"
 
 
 # Files ----------------------------------------------------------------------------------------------------------------

@@ -1,0 +1,174 @@
+"""Classifiers to train: what they learn, over several processes too, and action-to-motion measured with them."""
+
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from conftest import TINY
+from distributed import GlooPool
+
+from evaluators.action_gru import ActionGRU
+from evaluators.classifier import ClassifierTask
+from evaluators.extractors import OwnClassifierExtractor
+from evaluators.stgcn import JointSTGCN
+from flame_mdm import evaluate, train
+from flame_mdm.config import UserError, compose, instantiate
+from flame_mdm.data.synthetic import Synthetic
+from flame_mdm.motion import MotionBatch, length_mask
+from flame_mdm.representations.humanml import HumanML
+from flame_mdm.representations.rot6d import Rot6D
+
+RUN = ["data.source.clips=600", "data.batch_size=32", "logger=csv", "trainer.accelerator=cpu"]
+RUN += ["trainer.enable_progress_bar=false", "trainer.log_every_n_steps=5"]
+
+
+@pytest.fixture(scope="module")
+def data(data_root) -> str:
+    return f"data_root={data_root}/classifier"
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory, data) -> Path:
+    """Checkpoint of a small classifier after 120 steps."""
+    folder = tmp_path_factory.mktemp("classifier")
+    options = [data, f"run.dir={folder}", "trainer.max_steps=120", "trainer.val_check_interval=60"]
+    options += ["task.network.hidden=48", "task.network.num_layers=1", "optimizer.lr=0.004"]
+    assert train.main(["classifier/synthetic", *RUN, *options]) == 0
+    return folder / "checkpoints" / "last.ckpt"
+
+
+def measure(out: Path, *words: str) -> dict:
+    assert evaluate.main([f"out={out}", "device=cpu", "replications=1", "samples=150", *words]) == 0
+    return json.loads(out.read_text())
+
+
+def validated(trained: Path) -> list[float]:
+    lines = (trained.parent.parent / "metrics.jsonl").read_text().splitlines()
+    return [row["val/accuracy"] for row in map(json.loads, lines) if "val/accuracy" in row]
+
+
+def test_training_by_recipe_learns_the_actions(trained, data, tmp_path):
+    assert validated(trained)[-1] > 0.5  # by chance: about 1 in 11
+    result = measure(
+        tmp_path / "real.json",
+        *("baseline=shuffled", "data=synthetic", data, "protocol=action_to_motion_own", f"extractor={trained}"),
+    )
+    assert result["ground_truth"]["accuracy"]["mean"] > 0.5, "motions that were not trained on"
+    assert result["values"]["accuracy"]["mean"] < 0.2, "those of other actions"
+    assert all(value["mean"] is not None for value in result["values"].values())
+    assert result["extractor"]["data"] == result["data"]["fingerprint"]
+
+
+def test_a_model_of_actions_is_measured_by_it(trained, data, tmp_path):
+    words = [word for word in TINY if not word.startswith(("condition", "data.source"))]
+    words += ["condition=action", "condition.features=16", data, f"run.dir={tmp_path / 'run'}", "trainer.max_steps=1"]
+    assert train.main(["quickstart", *words]) == 0
+    shown = sorted((tmp_path / "run" / "samples" / "step_0000001").glob("*.npz"))
+    texts = [str(np.load(file)["text"]) for file in shown]
+    assert texts == list(Synthetic.actions)[: len(texts)], "actions in place of the prompts of the recipe"
+    model = tmp_path / "run" / "checkpoints" / "last.ckpt"
+    result = measure(tmp_path / "result.json", f"ckpt={model}", f"extractor={trained}", "num_inference_steps=2")
+    assert result["protocol"]["name"] == "action_to_motion_own"
+    assert result["values"]["accuracy"]["mean"] < result["ground_truth"]["accuracy"]["mean"]
+    assert result["values"]["fid"]["mean"] > 2 * result["ground_truth"]["fid"]["mean"]
+
+
+def test_what_was_not_made_for_one_another_is_refused(trained, data, tmp_path, capsys):
+    extractor = OwnClassifierExtractor(str(trained))
+    own = extractor.task.representation
+    extractor.check(own, "synthetic")
+    with pytest.raises(UserError, match=r"trained on the data set synthetic, but the motions are those of bandai"):
+        extractor.check(own, "bandai")
+    with pytest.raises(UserError, match=r"the motions are rot6d-25 at 20: train one by make train EXP=classifier"):
+        extractor.check(Rot6D(), "synthetic")
+
+    released = tmp_path / "released.tar"
+    torch.save({"model": ActionGRU().state_dict()}, released)
+    for protocol, file, told in (
+        ("action_to_motion", trained, "protocol=action_to_motion_own takes classifiers of make train"),
+        ("action_to_motion_own", released, f"{released}: not a checkpoint of this framework"),
+    ):
+        words = ["baseline=real", "data=synthetic", data, f"protocol={protocol}", f"extractor={file}"]
+        assert evaluate.main(words) == 1
+        assert told in capsys.readouterr().err
+
+
+def test_a_set_without_actions_is_refused():
+    config = compose("classifier/synthetic")
+    representation = instantiate(config["representation"])
+    for actions in ([], ["walk"]):
+        with pytest.raises(UserError, match=rf"needs a data set of two actions or more; this one has {len(actions)}"):
+            ClassifierTask.build(config, representation, actions=actions)
+
+
+def test_a_clip_without_label_is_named(monkeypatch, tmp_path, capsys):
+    whole = Synthetic.clips
+
+    def bare(self, fps):
+        return (replace(clip, action=None if clip.id.endswith("7") else clip.action) for clip in whole(self, fps))
+
+    monkeypatch.setattr(Synthetic, "clips", bare)
+    words = ["data.source.clips=40", "data.batch_size=8", f"data_root={tmp_path}", f"run.dir={tmp_path / 'run'}"]
+    assert train.main(["classifier/synthetic", *RUN, *words]) == 1
+    assert re.search(r"\d clips have no action label, such as synthetic_0_0000\d7;", capsys.readouterr().err)
+
+
+@pytest.mark.parametrize("recipe", ["classifier/synthetic", "classifier/humanact12", "classifier/uestc"])
+def test_recipes_build_the_sizes_of_their_data(recipe):
+    config = compose(recipe)
+    task = ClassifierTask.build(config, instantiate(config["representation"]), actions=list("abcdefg"))
+    joints = len(task.representation.skeleton.parents)
+    logits = task.logits(torch.randn(2, 12, joints, 3), length_mask(torch.tensor([12, 7])))
+    assert logits.shape == (2, 7)
+    assert task(torch.randn(2, 12, joints, 3), torch.ones(2, 12, dtype=torch.bool)).shape == (2, task.network.features)
+
+
+def test_st_gcn_trains_by_the_same_recipe(data, tmp_path):
+    sizes = ["task=classifier_stgcn", "task.network.widths=[8,8]", "task.network.strides=[1,2]"]
+    options = [
+        data,
+        f"run.dir={tmp_path}",
+        "trainer.max_steps=40",
+        "trainer.val_check_interval=40",
+        "optimizer.lr=0.01",
+    ]
+    assert train.main(["classifier/synthetic", *RUN, *sizes, *options]) == 0
+    assert validated(tmp_path / "checkpoints" / "last.ckpt")[-1] > 0.25
+    OwnClassifierExtractor(str(tmp_path / "checkpoints" / "last.ckpt"))
+
+
+# Several processes ----------------------------------------------------------------------------------------------------
+
+
+def validate(rank: int, world: int) -> tuple[float, float | None]:
+    """Loss and accuracy of a classifier over all clips, of which this process sees every `world`-th.
+
+    Each process has normalized batches of its own in training: its running statistics are others.
+    """
+    torch.manual_seed(0)
+    representation = HumanML("smpl22", "clean", 20)
+    network = JointSTGCN(representation.skeleton.parents, 3, widths=(4,), strides=(1,))
+    task = ClassifierTask(network, representation, optimizer={}).eval()
+    x, labels = torch.randn(10, 8, representation.features), torch.arange(10) % 3
+    for name, buffer in network.named_buffers():
+        if "running" in name:
+            buffer += rank + 0.5
+    task.on_validation_epoch_start()
+    mine = slice(rank, None, world)
+    mask = torch.ones(10, 8, dtype=torch.bool)
+    with torch.no_grad():
+        task.validation_step(MotionBatch(x[mine], mask[mine], ["a"] * len(x[mine]), action=labels[mine]), 0)
+    return float(task.val_loss.compute()), task.accuracy.compute()
+
+
+def test_two_processes_validate_as_one():
+    loss, accuracy = validate(0, 1)
+    with GlooPool(2) as pool:
+        results = pool.run(validate, (0, 2), (1, 2))
+    assert results[0] == results[1]
+    assert results[0][0] == pytest.approx(loss, rel=1e-5)
+    assert results[0][1] == accuracy

@@ -65,7 +65,8 @@ class Contestant:
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs the command; returns its exit code."""
     words = sys.argv[1:] if argv is None else argv
-    return run(compare, words, usage=USAGE, name="compare", text=("runs", "texts", "ratings", "out"))
+    text, like = ("runs", "texts", "ratings", "out"), ("flame_mdm.generation.generate",)
+    return run(compare, words, usage=USAGE, name="compare", text=text, like=like)
 
 
 def compare(config: Config) -> None:

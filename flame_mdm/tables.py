@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import itertools
 import json
@@ -327,7 +328,7 @@ def build(name: str, spec: Config, results: Path) -> Table:
     Raises:
         UserError: a published number or a result that does not fit the spec.
     """
-    published = _load(PUBLISHED).get(name, {}) if PUBLISHED.exists() else {}
+    published = _published(PUBLISHED).get(name, {}) if PUBLISHED.exists() else {}
     strangers = published.keys() - spec["parts"].keys()
     if strangers:
         raise UserError(f"{PUBLISHED}: {name} has parts that its spec lacks: {', '.join(sorted(strangers))}")
@@ -348,6 +349,11 @@ def build(name: str, spec: Config, results: Path) -> Table:
         else:
             parts.append(_measured(part_name, part, reported, results, figures))
     return Table(name, spec["title"], parts, list(spec.get("notes", [])))
+
+
+@functools.cache
+def _published(path: Path) -> Config:
+    return _load(path)
 
 
 @dataclass

@@ -23,13 +23,13 @@ import numpy as np
 import pytest
 import torch
 from conftest import TINY
+from test_report import a_run
 
 from flame_mdm import train
 from flame_mdm.formats import END_SITES
 from flame_mdm.representations.skeleton import SMPL22
 from flame_mdm.task import read_checkpoint
 
-COMMANDS = ("train", "sample", "edit", "evaluate", "prepare", "browse", "convert", "checkpoints")
 SECONDS = 30
 TEXT = "text=a person walks"
 
@@ -146,6 +146,10 @@ KEYS = {
     "prepare": ("source", "check", "verify", "force", "data_root"),
     "browse": ("split", "search", "clips", "out", "data_root"),
     "convert": ("input", "out", "fps", "unit"),
+    "tables": ("table", "evaluate", "out", "results"),
+    "benchmark": ("evaluate", "out", "device", "batch_size"),
+    "compare": ("runs", "texts", "ratings", "rate"),
+    "report": ("runs",),
 }
 BROKEN = (
     "[",
@@ -909,6 +913,387 @@ def test_strange_texts_are_legal(trained, tmp_path, monkeypatch, capfd):
     capfd.readouterr()
 
 
+Place = tuple[str | int, ...]
+"""The keys that lead to a value in what a file holds."""
+
+
+def places(content: Any, place: Place = ()) -> Iterator[tuple[Place, Any]]:
+    """All values, those that hold others before these."""
+    yield place, content
+    for key, value in content.items() if isinstance(content, dict) else enumerate(content or ()):
+        if isinstance(value, dict | list):
+            yield from places(value, (*place, key))
+        else:
+            yield (*place, key), value
+
+
+def replaced(content: Any, place: Place, value: Any) -> Any:
+    """A copy with another value in a place."""
+    if not place:
+        return value
+    copy: Any = dict(content) if isinstance(content, dict) else list(content)
+    copy[place[0]] = replaced(content[place[0]], place[1:], value)
+    return copy
+
+
+WRONG: dict[type, list[Any]] = {
+    dict: [3, "x", [1], True],
+    list: [3, "x", {"a": 1}],
+    str: [3, [], {}, False],
+    bool: ["x", 3, []],
+    int: ["x", [], {}, 10**400, 0.5, True],
+    float: ["x", [1], {}, 10**400, True],
+    type(None): [3.5, [], {"a": 3}],
+}
+"""Values of other kinds than the one in a place."""
+
+
+def misfits(content: Any, each: int, seed: int, without: Sequence[Place] = ()) -> Iterator[Any]:
+    """Copies of what a file holds with a wrong value in a place, `each` of them a place."""
+    draw = np.random.default_rng(seed)
+    for place, value in places(content):
+        if place not in without:
+            choices = WRONG[type(value)]
+            for index in draw.permutation(len(choices))[:each]:
+                yield replaced(content, place, choices[index])
+
+
+def lacking(content: Any, names: Sequence[Place]) -> Iterator[Any]:
+    """Copies without a key."""
+    for *place, name in names:
+        found = content
+        for key in place:
+            found = found[key]
+        yield replaced(content, tuple(place), {key: value for key, value in found.items() if key != name})
+
+
+NO_JSON = (
+    "",
+    " ",
+    "{",
+    "[]",
+    "3",
+    "null",
+    "NaN",
+    '"x"',
+    "[" * 100_000,
+    "\ufeff{}",
+    "{'a': 1}",
+    '{"a": 1} {"b": 2}',
+    "\0",
+)
+NO_JSON += ('{"x": "\\ud800"}', "{" + '"a":{' * 5000, "1" * 5000)
+
+
+def cut(text: str, count: int, seed: int) -> Iterator[str]:
+    """A text that ends too soon, at random places."""
+    whole = len(text.rstrip()) - 1
+    yield from (text[: int(at)] for at in np.random.default_rng(seed).integers(1, whole, count))
+
+
+SPEC: dict[str, Any] = {
+    "title": "x",
+    "notes": ["a note"],
+    "parts": {
+        "A": {
+            "protocol": "synthetic",
+            "seed": 0,
+            "columns": {"FID": {"value": "fid", "better": "lower"}, "Steps": {"value": "num_inference_steps"}},
+            "rows": [{"label": "MDM", "ckpt": "mdm.ckpt", "num_inference_steps": [5, 10]}],
+        },
+        "B": {"recipes": {"MDM": "humanml3d/mdm"}, "keys": {"batch": "data.batch_size"}},
+        "C": {"lengths": ["synthetic"]},
+        "D": {"ratings": "ratings.json"},
+    },
+    "figures": [{"part": "A", "x": "num_inference_steps", "y": ["FID"], "log": True}],
+}
+"""A table of each kind of part."""
+
+SPECS = (
+    *("", "[", "- a", "3", "text", "null", "a: b: c", "title: x", "parts: {}", "\t- x", "a: &x [*x]", "a: *nothing"),
+    *("title: &x {a: *x}", "title: x\nparts: &x {A: *x}", "!!python/object:os.system {}", "title: x\ntitle: y", "? ["),
+    *("title: ${nothing}", "title: ${oc.env:NOT_SET_ANYWHERE}", "title: '\0'", 'title: "\\ud800"', "title: ${title}"),
+    *("title: x\nparts: {1: {lengths: [a]}}", "title: x\nparts: {A: {lengths: [a], ratings: b}}", "title: ???"),
+    *("title: x\nparts: {A: {recipes: {a: none_such}, keys: {b: data.batch_size}}}", "é: ü", "title: x\npart: {}"),
+    "a: &a [x,x,x,x,x,x,x,x,x]\n" + "".join(f"a{n + 1}: &a{n + 1} [{f'*a{n or str()},' * 9}]\n" for n in range(9)),
+    "[" * 3000,
+)
+"""YAML that is none, is not the spec of a table, or never ends."""
+
+
+def test_specs_of_tables(refused, bad):
+    refused.every = 4
+    found: Any
+    path = bad / "mine.yaml"
+    words = [f"table={path}", "evaluate=false", "results=none"]
+    path.write_text(json.dumps(SPEC))
+    assert import_module("flame_mdm.tables").main([*words, f"out={bad / 'out'}"]) == 0, "but for what is changed below"
+    sweep = ("parts", "A", "rows", 0, "num_inference_steps")
+    one_or_more = [sweep, ("figures", 0, "y"), ("notes",), ("parts", "A", "rows")]
+    cases = [json.dumps(content) for content in misfits(SPEC, 2, 7, one_or_more)]
+    for place in one_or_more:
+        cases += [json.dumps(replaced(SPEC, place, value)) for value in ({"a": 1}, True)]
+    part, row = ("parts", "A"), ("parts", "A", "rows", 0)
+    required: list[Place] = [("title",), ("parts",), (*part, "protocol"), (*part, "columns"), (*part, "rows")]
+    required += [(*part, "columns", "FID", "value"), (*row, "label"), (*row, "ckpt")]
+    required += [("figures", 0, name) for name in ("part", "x", "y")]
+    cases += [json.dumps(content) for content in lacking(SPEC, required)]
+    for place, key in (((), "tittle"), (part, "protcol"), (row, "guidence_scale"), (("figures", 0), "z")):
+        found = SPEC
+        for name in place:
+            found = found[name]
+        cases.append(json.dumps(replaced(SPEC, place, {**found, key: 1})))
+    for place, value in (
+        ((*part, "columns", "FID", "better"), "up"),
+        ((*row, "baseline"), "static"),
+        (("figures", 0, "part"), "none"),
+        (("figures", 0, "part"), "D"),
+        (("figures", 0, "x"), "none"),
+        (("figures", 0, "y"), ["none"]),
+        (("parts", "B", "recipes", "MDM"), "../base"),
+        (("parts", "B", "keys", "batch"), "none_such"),
+    ):
+        *inside, name = place
+        found = SPEC
+        for key in inside:
+            found = found[key]
+        cases.append(json.dumps(replaced(SPEC, tuple(inside), {**found, name: value})))
+    for text in (*cases, *SPECS, *cut(json.dumps(SPEC), 10, 8)):
+        path.write_text(text)
+        refused("tables", *words)
+    path.write_bytes(b"title: \xff\n")
+    refused("tables", *words)
+    for name in ("none_such", "published", "", " ", "synthetic none", "\0", "é", "../base", "/", "x" * 5000, str(bad)):
+        refused("tables", f"table={name}", "evaluate=false")
+
+
+RESULT: dict[str, Any] = {
+    "quick": False,
+    "protocol": {"name": "synthetic", "version": 1},
+    "split": "test",
+    "published_split": False,
+    "data": {"dataset": "synthetic", "fingerprint": "f", "frames": [24, 60]},
+    "seed": 0,
+    "extractor": {"sha256": "e" * 64},
+    "samples_sha256": None,
+    "baseline": None,
+    "checkpoint": {
+        **{"path": "mdm.ckpt", "sha256": "c" * 64, "sampler": "ddim", "num_inference_steps": 5, "guidance_scale": 2.5},
+        **{"experiment": "synthetic/mdm", "selected_by": "none: last", "averaged_weights": True, "parameters": 123},
+    },
+    "device": "cpu",
+    "changed": {},
+    "values": {"fid": {"mean": 4.5, "ci": 0.25, "replications": 2, "n": 64}},
+    "ground_truth": {"fid": {"mean": 0.5, "ci": 0.25, "replications": 2, "n": 64}},
+    "not_computed": {"kid": "too few"},
+    "invalid_because": ["real motions are off"],
+    "warnings": ["of something"],
+    "cost": {"nfe": 5.0, "seconds_per_sample": 0.5},
+}
+"""A result, as far as it is read."""
+
+
+def broken_results() -> Iterator[str]:
+    required: list[Place] = [(name,) for name in ("quick", "protocol", "split", "data", "seed", "extractor", "values")]
+    required += [("protocol", "name"), ("data", "fingerprint"), ("checkpoint", "sha256"), ("values", "fid", "mean")]
+    text = json.dumps(RESULT)
+    yield from map(json.dumps, misfits(RESULT, 2, 9))
+    yield from map(json.dumps, lacking(RESULT, required))
+    yield from (text.replace("4.5", number) for number in ("NaN", "Infinity", "-Infinity", "1e999", "4.5.5", "1_0"))
+    yield from NO_JSON
+    yield from cut(text, 10, 10)
+
+
+def test_damaged_results(refused, bad):
+    from flame_mdm.tables import load_spec, requests
+
+    refused.every = 3
+    spec, run = bad / "mine.yaml", a_run(bad / "run")
+    spec.write_text(json.dumps({**SPEC, "parts": {"A": SPEC["parts"]["A"]}}))
+    ((_, (request, _)), _) = requests(load_spec(str(spec))["parts"]["A"])
+    in_table, in_run = request.path(bad / "results"), run / "evaluation" / "p-1" / "x" / "result.json"
+    words = [f"table={spec}", "evaluate=false", f"results={bad / 'results'}"]
+    for path in (in_table, in_run):
+        path.parent.mkdir(parents=True)
+        path.write_text(json.dumps(RESULT))
+    assert import_module("flame_mdm.tables").main([*words, f"out={bad / 'out'}"]) == 0
+    assert import_module("flame_mdm.report").main([str(run)]) == 0
+    (run / "report.html").unlink()
+    refused.watched.append(run)
+    for number, text in enumerate(broken_results()):
+        for path in (in_table, in_run):
+            path.write_text(text)
+        if number % 4 < 2:
+            refused("tables", *words)
+        else:
+            refused("report", str(run))
+    in_run.write_bytes(b"\xff")
+    refused("report", str(run))
+
+
+PROVENANCE: dict[str, Any] = {
+    "command": ["train"],
+    "commit": None,
+    "changed": "",
+    "python": "3.11",
+    "machine": "x",
+    "packages": {"torch": "2"},
+    "data": {"fingerprint": "f", "max_frames": 60},
+    "device": "cpu",
+    "parameters": 5,
+}
+FAULT: dict[str, Any] = {
+    "step": 5,
+    "usual_loss": "0.5",
+    "batches": [{"rank": 0, "batch": 5, "ids": ["a"], "loss": "nan"}],
+}
+
+
+def test_damaged_runs(refused, bad):
+    refused.every = 4
+    run, other = a_run(bad / "run"), a_run(bad / "other")
+    refused.watched.append(run)
+
+    def case(name: str, text: str) -> None:
+        whole = (run / name).read_bytes() if (run / name).exists() else None
+        (run / name).write_text(text, encoding="utf-8")
+        refused("report", str(run))
+        if refused.count % 6 == 0 and name != "bad_batch.json":  # which comparisons do not read
+            refused("compare", f"runs={run} {other}")
+        (run / name).unlink() if whole is None else (run / name).write_bytes(whole)
+
+    free = [("data", "max_frames")]
+    for name, content, without in (("provenance.json", PROVENANCE, free), ("bad_batch.json", FAULT, [])):
+        for broken in misfits(content, 2, 11, without):
+            case(name, json.dumps(broken))
+        for text in (*NO_JSON, *cut(json.dumps(content), 5, 12)):
+            case(name, text)
+    config = json.loads((run / "config.yaml").read_text())
+    for broken in misfits(config, 3, 13, [("run", "name"), ("run", "dir")]):
+        case("config.yaml", json.dumps(broken))
+    for broken in lacking(config, [("experiment",), ("run",), ("trainer",), ("trainer", "max_steps")]):
+        case("config.yaml", json.dumps(broken))
+    for text in (*SPECS, *cut(json.dumps(config), 5, 14)):
+        case("config.yaml", text)
+    line = '{"step": 3, "train/loss": 1.5}\n'
+    values = ('"x"', "null", "[]", "{}", "true", "1_0", "'1'")
+    broken_lines = [line.replace("1.5", value) for value in values]
+    broken_lines += [line.replace("3", step) for step in (*values, "-1", "1.5", "NaN", "1e999", "9" * 400)]
+    broken_lines += ["\n", *(f"{text}\n" for text in NO_JSON if text != "null"), line.replace("step", "stop")]
+    for number, text in enumerate((*broken_lines, line[:-9] + "\n")):
+        case("metrics.jsonl", [text, line + text, text + line][number % 3])
+    for name in ("provenance.json", "metrics.jsonl", "config.yaml"):
+        folder = a_run(bad / f"bytes-{name}")
+        (folder / name).write_bytes(b"\xff\xfe{}\n")
+        refused("report", str(folder))
+    for runs in (
+        "",
+        " ",
+        "'",
+        '"a b',
+        "none",
+        "/",
+        "\0",
+        "x" * 5000,
+        str(bad),
+        f"{run} none",
+        "''",
+        str(run / "config.yaml"),
+    ):
+        refused("report", f"runs={runs}")
+
+
+def test_arguments_of_compare(refused, bad):
+    first, second = a_run(bad / "a"), a_run(bad / "b", name="two")
+    both = f"runs={first} {second}"
+    (bad / "empty").mkdir()
+    (bad / "motions").mkdir()
+    (bad / "latin.txt").write_bytes(b"a person \xe9\n")
+    (bad / "empty.txt").write_text("\n \n")
+    (bad / "folder.txt").mkdir()
+    for runs in (
+        "",
+        " ",
+        "'",
+        "a",
+        f"{first}",
+        f"{first} {first}",
+        f"{first} none",
+        f"{first} {bad / 'empty'}",
+        "\0 a",
+    ):
+        refused("compare", f"runs={runs}")
+    for texts in (
+        "",
+        ";",
+        " ; ",
+        "a person walks",
+        *(str(bad / f"{n}.txt") for n in ("none", "latin", "empty", "folder")),
+    ):
+        if texts:
+            refused("compare", both, f"texts={texts}")
+    for word in ("seed=x", "rate=maybe", "rate=3", "seconds=x", "ratings=a", "out=/dev/null/x.html", "rate=true"):
+        refused("compare", both, word)
+    for content in list(broken_arrays())[1::4]:
+        np.savez(bad / "motions" / "motion.npz", **content)
+        refused("compare", f"runs={first} {bad / 'motions'}")
+    (bad / "motions" / "motion.npz").write_bytes(b"PK\3\4x")
+    refused("compare", f"runs={first} {bad / 'motions'}")
+
+
+def test_damaged_ratings_and_lengths(refused, bad):
+    refused.every = 4
+    path = bad / "ratings.json"
+    answers = {"study": "s", "rater": "ann", "ratings": [{"prompt": "p", "a": "x", "b": "y", "choice": "a"}]}
+    texts = [json.dumps(content) for content in misfits(answers, 2, 15, [("ratings", 0, "prompt")])]
+    texts += [json.dumps(replaced(answers, place, "")) for place in (("study",), ("rater",), ("ratings", 0, "a"))]
+    texts += [json.dumps(replaced(answers, ("ratings", 0, "choice"), choice)) for choice in ("c", "A", "ab")]
+    for text in (*texts, *NO_JSON, *cut(json.dumps(answers), 5, 16)):
+        path.write_text(text)
+        refused("compare", f"ratings={path}")
+    path.write_text(json.dumps(answers))
+    for files in (f"{path} {path}", "none.json", "'", "", "/", str(bad), f"{path} none.json"):
+        refused("compare", f"ratings={files}")
+    spec = bad / "mine.yaml"
+    spec.write_text(json.dumps({"title": "x", "parts": {"C": {"lengths": ["a"]}, "D": {"ratings": str(path)}}}))
+    words = [f"table={spec}", "evaluate=false", f"results={bad}"]
+    counted = {"pairs": [{"a": "x", "b": "y", "wins_a": 1, "wins_b": 2, "raters": 1}]}
+    lengths = {"fingerprint": "f", "fps": 20.0, "lengths": [10, 30]}
+    (bad / "lengths").mkdir()
+    for file, whole in ((path, counted), (bad / "lengths" / "a.json", lengths)):
+        texts = [json.dumps(content) for content in misfits(whole, 2, 17)]
+        for place, value in ((("pairs", 0, "wins_a"), -1), (("fps",), 0), (("lengths",), []), (("lengths",), [-5, 3])):
+            if place[0] in whole:
+                texts.append(json.dumps(replaced(whole, place, value)))
+        for text in (*texts, *NO_JSON[::2]):
+            file.write_text(text)
+            refused("tables", *words)
+        file.write_text(json.dumps(whole))
+    assert import_module("flame_mdm.tables").main([*words, f"out={bad / 'out'}"]) == 0
+
+
+def test_arguments_of_benchmark(refused, bad):
+    refused.every = 3
+    for name in ("none_such", "", "synthetic.yaml", "../base", "bandai synthetic", "\0", "é", "null", "x" * 5000):
+        refused("benchmark", f"exp={name}", "evaluate=false")
+    for word in ("evaluate=maybe", "batch_size=x", "batch_size=null", "out=/dev/null/x", "steps=3", "Out=x"):
+        refused("benchmark", "synthetic", "evaluate=false", word)
+    for text in (*NO_JSON, '{"a": "x"}', '{"a": null}', '{"a": [1]}', '{"a": true}'):
+        (bad / "times.json").write_text(text)
+        refused("benchmark", "synthetic", "evaluate=false", f"out={bad}")
+
+
+def test_damaged_notes_for_wandb(tmp_path):
+    from flame_mdm.config import UserError
+    from flame_mdm.dashboards import WandbRun
+
+    content = {"id": "abc", "step": 3, "rows": 5}
+    for text in (*map(json.dumps, misfits(content, 3, 18)), *NO_JSON, *cut(json.dumps(content), 4, 19)):
+        (tmp_path / "wandb.json").write_text(text)
+        with pytest.raises(UserError, match=r"wandb\.json"):
+            WandbRun(str(tmp_path), offline=True)
+
+
 PROCESSES = [
     *[("train", *words) for words in (["none_such"], ["quickstart", "seeed=1"], ["quickstart", "seed=["], ["a.yaml"])],
     *[("sample", *words) for words in ([], ["ckpt=none.ckpt", "text=a"], ["text="], ["sead=1"], ["ckpt=x", "seed='"])],
@@ -916,12 +1301,13 @@ PROCESSES = [
     *[("evaluate", *words) for words in ([], ["split=none"])],
     *[("prepare", *words) for words in ([], ["data=bandai", "sorce=x"])],
     *[("convert", *words) for words in (["out=x.bvh"], ["a.bvh", "unt=2"])],
+    *[("tables", "table=none"), ("report", "none"), ("compare", "runs=a"), ("benchmark", "none")],
     *[("browse", "data=none_such"), ("checkpoints", "export", "none.ckpt", "-o", "x")],
 ]
 
 
 def test_real_processes(tmp_path):
-    assert len(PROCESSES) == 20
+    assert len(PROCESSES) == 24
 
     def run(words: Sequence[str]) -> subprocess.CompletedProcess[str]:
         command = [sys.executable, "-m", f"flame_mdm.{words[0]}", *words[1:]]

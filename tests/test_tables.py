@@ -331,9 +331,9 @@ def test_wilson_interval():
     assert wilson(0, 0) == (0.0, 0.0, 1.0)
 
 
-def test_what_is_missing_is_evaluated_once(tmp_path, data_root, capsys, monkeypatch):
+def test_what_is_missing_is_evaluated_once(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    words = ["data.source.clips=400", *TINY[1:], f"data_root={data_root}", "run.dir=runs/tiny/default"]
+    words = ["data.source.clips=400", *TINY[1:], f"data_root={tmp_path / 'data'}", "run.dir=runs/tiny/default"]
     words += ["callbacks.samples=null", "trainer.val_check_interval=2", "trainer.max_steps=2"]
     assert train.main(["quickstart", *words]) == 0
     Path("mine.yaml").write_text(

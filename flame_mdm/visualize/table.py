@@ -258,7 +258,8 @@ def fragment(table: Table) -> str:
         blocks = _blocks(part)
         for title, lines in blocks:
             if len(blocks) > 1:
-                out += f'<tr class="block"><td colspan="{len(part.columns) + 1}">{html.escape(title)}</td></tr>\n'
+                span = len(part.columns) + 1
+                out += f'<tr class="block"><td colspan="{span}"><i>{html.escape(title)}</i></td></tr>\n'
             for line in lines:
                 bad, faint = line.state in NO_RESULTS, line.state or line.kind.startswith("reported")
                 name = "bad" if bad else "faint" if faint else ""

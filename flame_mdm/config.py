@@ -638,7 +638,7 @@ def _serve(
         check(plain)
         HydraConfig.instance().cfg = None  # else Lightning adds words for Hydra's own command line
         code = start(plain, [str(word) for word in hydra.overrides.task if not str(word).startswith(f"+{LAUNCH}=")])
-        if launch and code:  # else the job counts as done
+        if code > 128 or (launch and code):  # else a signal ends one job of a sweep, or a launched one counts as done
             raise SystemExit(code)
 
     quiet = ["hydra/job_logging=disabled", "hydra/hydra_logging=disabled", "hydra.output_subdir=null"]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any, Self
 
 import torch
@@ -14,7 +13,7 @@ from torch import Tensor, nn
 from torch.distributed.nn.functional import all_gather
 
 from evaluators.alignment import MotionsForText, TextsForMotion
-from evaluators.released import load_strictly, read_weights
+from evaluators.released import load_strictly
 from evaluators.samples import SampleMetric
 from flame_mdm.conditions import ConditionEncoder
 from flame_mdm.config import Config, instantiate
@@ -189,6 +188,29 @@ class MotionCLIPTask(Task):
         task.config, task.facts = config, {"actions": list(actions)}
         return task
 
+    @classmethod
+    def import_released(cls, checkpoint: Mapping[str, Any], config: Config) -> Self:
+        """FLAME's released motion-CLIP, as a recipe of its sizes would have trained it.
+
+        Args:
+            checkpoint: what the authors' file holds. Its pooler, a random draw that the network was trained upon, goes
+                to the text encoder.
+            config: `experiments/motion_clip/humanml3d_smpl.yaml`, composed.
+
+        Raises:
+            ValueError: other weights or sizes, or no pooler.
+        """
+        representation: Representation = instantiate(config["representation"])
+        task = cls.build(config, representation)
+        state = released_state(checkpoint, ema=False)
+        theirs = "text_model.pooler.dense."
+        pooler = {f"pooler_{name.removeprefix(theirs)}": state[name] for name in state if name.startswith(theirs)}
+        load_strictly(task.condition, pooler, "released motion-CLIP")
+        network = import_mclip(state, num_heads=config["task"]["network"]["num_heads"])
+        load_strictly(task.network, network.state_dict(), "released motion-CLIP")
+        task.facts |= {"fingerprint": None, "max_frames": network.max_frames}
+        return task.eval()
+
     # Feature extraction -----------------------------------------------------------------------------------------------
 
     def forward(self, x: Tensor, mask: Tensor) -> Tensor:
@@ -292,22 +314,3 @@ def import_mclip(state: Mapping[str, Tensor], *, num_heads: int = 8) -> MotionCL
         blind_features=3,
     )
     return load_strictly(network, ours, "released motion-CLIP")
-
-
-def load_mclip(path: str | Path, condition: ConditionEncoder, representation: Representation) -> MotionCLIPTask:
-    """FLAME's released motion-CLIP as a feature extractor.
-
-    Args:
-        path: the authors' checkpoint. Its pooler, a random draw that the network was trained upon, goes to `condition`.
-        condition: RoBERTa, `experiments/condition/roberta.yaml`.
-        representation: the 147 features.
-
-    Raises:
-        FileNotFoundError: no such file.
-        ValueError: it holds other weights, or lacks the pooler.
-    """
-    state = released_state(read_weights(path, "state_dict"), ema=False)
-    theirs = "text_model.pooler.dense."
-    pooler = {f"pooler_{name.removeprefix(theirs)}": state[name] for name in state if name.startswith(theirs)}
-    load_strictly(condition, pooler, path)
-    return MotionCLIPTask(import_mclip(state), condition, representation, optimizer={}).eval()

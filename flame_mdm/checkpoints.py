@@ -205,12 +205,12 @@ def import_released(
     time_token: bool = False,
     run_code: bool = False,
 ) -> Path:
-    """Writes a released checkpoint of MDM, MFM or FLAME as a model file; returns the file.
+    """Writes a released checkpoint of MDM, MFM, FLAME or FLAME's motion-CLIP as a model file; returns the file.
 
     Args:
-        kind: "mdm", "mfm" or "flame".
+        kind: "mdm", "mfm", "flame" or "mclip".
         file: the released file.
-        args: args.json beside it (MDM), or the Hydra configuration of its run (MFM); not for FLAME.
+        args: args.json beside it (MDM), or the Hydra configuration of its run (MFM); not for FLAME's.
         out: as in `export`.
         stats: folder with Mean.npy and Std.npy of the data that the model was trained on, where it is normalized.
         averaged, num_heads, time_token: see `flame_mdm.released.import_model`.
@@ -224,26 +224,40 @@ def import_released(
     from flame_mdm.released import import_model
 
     file, out = Path(file), Path(out)
-    if (args is None) != (kind == "flame"):
+    if (args is None) != (kind in ("flame", "mclip")):
         needs = {"mdm": "the args.json beside the checkpoint", "mfm": "the run's .hydra/config.yaml"}
-        raise UserError(f"{kind} needs {needs[kind]}" if kind in needs else "flame takes no file of options")
+        raise UserError(f"{kind} needs {needs[kind]}" if kind in needs else f"{kind} takes no file of options")
     checkpoint = _unpickle(file, run_code)
     try:
-        model = import_model(
-            kind,  # type: ignore[arg-type]
-            checkpoint,
-            {} if args is None else _options(Path(args)),
-            statistics=None if stats is None else _statistics(Path(stats)),
-            averaged=averaged,
-            num_heads=num_heads,
-            time_token=time_token,
-        )
+        if kind == "mclip":
+            model = _motion_clip(checkpoint, num_heads)
+        else:
+            model = import_model(
+                kind,  # type: ignore[arg-type]
+                checkpoint,
+                {} if args is None else _options(Path(args)),
+                statistics=None if stats is None else _statistics(Path(stats)),
+                averaged=averaged,
+                num_heads=num_heads,
+                time_token=time_token,
+            )
     except ValueError as error:
         raise UserError(f"{file}: {error}") from error
     out = out if out.suffix == ".safetensors" else out / FILE
     origin = {"made": f"released by the authors of {kind.upper()}", "file": file.name, "sha256": file_sha256(file)}
     write(out, model.state_dict(), config=model.config, facts=model.facts, origin=origin | {"averaged": averaged})
     return out
+
+
+def _motion_clip(checkpoint: Mapping[str, Any], num_heads: int | None) -> Any:
+    """FLAME's motion-CLIP, by the class that its recipe names."""
+    from hydra.utils import get_class
+
+    from flame_mdm.config import compose
+
+    sizes = [] if num_heads is None else [f"task.network.num_heads={num_heads}"]
+    config = compose("motion_clip/humanml3d_smpl", sizes)
+    return get_class(config["task"]["_target_"]).import_released(checkpoint, _without_own_paths(config))
 
 
 def _unpickle(path: Path, run_code: bool) -> Any:
@@ -397,7 +411,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     out = {"required": True, "metavar": "FILE", "help": "a .safetensors file, or a folder for model.safetensors"}
 
     importing = commands.add_parser("import", help="a checkpoint that the authors of a paper released")
-    importing.add_argument("kind", choices=("mdm", "mfm", "flame"))
+    importing.add_argument("kind", choices=("mdm", "mfm", "flame", "mclip"), help="mclip: FLAME's motion-CLIP")
     importing.add_argument("file", help="model000475000.pt, or FLAME's .ckpt")
     importing.add_argument("args", nargs="?", help="MDM's args.json, or MFM's .hydra/config.yaml")
     importing.add_argument("-o", "--out", **out)

@@ -348,7 +348,10 @@ def _sensible(path: Path, checkpoint: Any) -> dict[str, Any]:
     if not isinstance(checkpoint, dict) or not all(
         isinstance(checkpoint.get(name), dict) for name in ("config", "facts", "state_dict")
     ):
-        raise UserError(f"{path}: not a checkpoint of this framework: it holds no recipe")
+        raise UserError(
+            f"{path}: not a checkpoint of this framework: it holds no recipe; those that authors released are imported "
+            "by `python -m flame_mdm.checkpoints import`"
+        )
     facts, most = checkpoint["facts"], checkpoint["facts"].get("max_frames", 1)
     if not isinstance(facts.get("actions"), list | tuple) or not isinstance(most, int) or most < 1:
         raise UserError(f"{path}: damaged: its facts of the data, actions and max_frames, make no sense")

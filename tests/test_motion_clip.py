@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 
 import pytest
 import torch
@@ -9,15 +10,15 @@ from distributed import GlooPool
 from fixtures import GOLDEN, Arrays, golden, meta
 from torch.nn import functional
 
+from evaluators.extractors import MotionCLIPExtractor
 from evaluators.motion_clip import (
     MotionCLIP,
     MotionCLIPTask,
     PooledLoss,
     import_mclip,
     info_nce,
-    load_mclip,
 )
-from flame_mdm import train
+from flame_mdm import checkpoints, train
 from flame_mdm.conditions.text import PretrainedText
 from flame_mdm.config import UserError, compose, instantiate
 from flame_mdm.motion import length_mask
@@ -100,36 +101,51 @@ def test_the_recipe_has_the_sizes_of_the_released_network(stem):
     assert recipe["dropout"] == 0.1
 
 
-def test_a_released_file_brings_the_pooler_it_was_trained_with(tmp_path):
-    condition = PretrainedText("FacebookAI/roberta-base", features=12, max_tokens=20, pooling="pooler")
-    released = {
-        "net.motion_encoder.CLS_TOKEN": torch.randn(1, 1, 16),
-        "net.motion_encoder.motion_length_emb.weight": torch.randn(20, 16),
-        "net.motion_encoder.input_projection.weight": torch.randn(16, 147),
-        "net.motion_encoder.input_projection.bias": torch.randn(16),
-        "net.motion_encoder.last_projection.weight": torch.randn(8, 16),
-        "net.motion_encoder.last_projection.bias": torch.randn(8),
-        "net.lm_projection.weight": torch.randn(8, 12),
-        "net.lm_projection.bias": torch.randn(8),
-        "net.logit_scale": torch.tensor(3.0),
-        "net.text_model.pooler.dense.weight": torch.randn(12, 12),
-        "net.text_model.pooler.dense.bias": torch.randn(12),
-        "net.text_model.embeddings.word_embeddings.weight": torch.randn(5, 12),
-    }
-    layer = torch.nn.TransformerEncoderLayer(16, 8, 24).state_dict()
-    released |= {f"net.motion_encoder.motion_encoder.layers.0.{name}": value for name, value in layer.items()}
-    torch.save({"state_dict": released, "epoch": 3}, tmp_path / "mclip.ckpt")
-    extractor = load_mclip(tmp_path / "mclip.ckpt", condition, SMPL(fps=20))
+@pytest.fixture
+def released() -> dict[str, torch.Tensor]:
+    """Random weights by the names and sizes of the released file."""
+    manifest = json.loads((GOLDEN / "state_dict_manifest.json").read_text())["flame_mclip_net"]
+    torch.manual_seed(0)
+    shapes = {name: shape for name, shape in manifest["keys"].items() if not name.startswith("text_model.")}
+    shapes |= {"text_model.pooler.dense.weight": [768, 768], "text_model.pooler.dense.bias": [768]}
+    state = {f"net.{name}": 0.05 * torch.randn(shape) for name, shape in shapes.items()}
+    return state | {"net.text_model.embeddings.word_embeddings.weight": torch.randn(5, 768)}
+
+
+@pytest.mark.parametrize("stem", ["state_dict_manifest-flame_mclip_net"])
+def test_the_released_file_becomes_an_extractor(stem, released, tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("FLAME_MDM_DATA", str(tmp_path / "own"))
+    file, out = tmp_path / "mclip.ckpt", tmp_path / "mclip.safetensors"
+    torch.save({"state_dict": released, "epoch": 3}, file)
+    with pytest.raises(UserError, match=r"mclip\.ckpt: not a checkpoint .* `python -m flame_mdm\.checkpoints import`"):
+        MotionCLIPExtractor(str(file))
+    assert checkpoints.main(["import", "mclip", str(file), "-o", str(out)]) == 0, capsys.readouterr().err
+    assert str(tmp_path).encode() not in out.read_bytes()
+    extractor = MotionCLIPExtractor(str(out))
+    for dataset in ("humanml3d", "babel"):
+        extractor.check(SMPL(fps=20), dataset)
+    with pytest.raises(UserError, match="trained on smpl"):
+        extractor.check(instantiate(compose("kit/mdm")["representation"]), "kit")
+
+    condition = extractor.task.condition
+    assert isinstance(condition, PretrainedText)
     assert torch.equal(condition.pooler_weight, released["net.text_model.pooler.dense.weight"])
     assert torch.equal(condition.pooler_bias, released["net.text_model.pooler.dense.bias"])
     x, mask = torch.randn(2, 9, 147), length_mask(torch.tensor([9, 4]))
-    assert extractor(x, mask).shape == (2, extractor.features)
-    assert not extractor.training
+    network = import_mclip({name.removeprefix("net."): value for name, value in released.items()})
+    with torch.no_grad():
+        features = extractor.motions(x, torch.zeros(0), mask)["features"]
+        torch.testing.assert_close(features, network.eval()(x, mask))
 
-    del released["net.text_model.pooler.dense.bias"]
-    torch.save({"state_dict": released}, tmp_path / "mclip.ckpt")
-    with pytest.raises(ValueError, match=r"mclip\.ckpt: not the weights of PretrainedText: .*pooler_bias"):
-        load_mclip(tmp_path / "mclip.ckpt", condition, SMPL(fps=20))
+    for name, told in (
+        ("text_model.pooler.dense.bias", "not the weights of PretrainedText: .*pooler_bias"),
+        ("lm_projection.bias", "text_projection.bias"),
+    ):
+        torch.save({"state_dict": {k: v for k, v in released.items() if k != f"net.{name}"}}, file)
+        assert checkpoints.main(["import", "mclip", str(file), "-o", str(out)]) == 1
+        assert re.search(rf"mclip\.ckpt: .*{told}", capsys.readouterr().err)
+    assert checkpoints.main(["import", "mclip", str(file), str(file), "-o", str(out)]) == 1
+    assert "mclip takes no file of options" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("features", [263, 251, 147, 64])

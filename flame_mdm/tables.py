@@ -310,13 +310,15 @@ def evaluate_missing(specs: Mapping[str, Config], results: Path, config: Config)
 
 
 def _outdated(path: Path, request: Request) -> bool:
-    """Whether a result was made of another checkpoint than the one that is there now."""
-    if "ckpt" not in request.keys:
-        return False
+    """Whether a result was made of another checkpoint or by another extractor than those that are there now."""
     from flame_mdm.generation import file_sha256
 
-    made_of = read_result(path)["checkpoint"] or {}
-    return made_of.get("sha256") != file_sha256(Path(str(request.keys["ckpt"])))
+    result = read_result(path)
+    for part, key in (("checkpoint", "ckpt"), ("extractor", "extractor")):
+        file = Path(str(request.keys.get(key)))
+        if file.is_file() and (result[part] or {}).get("sha256") != file_sha256(file):
+            return True
+    return False
 
 
 # From results to tables -----------------------------------------------------------------------------------------------

@@ -10,6 +10,7 @@ import math
 import re
 import string
 import sys
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from html import escape
@@ -421,13 +422,13 @@ def _todo(request: Request) -> dict[str, str]:
 def _evaluation(result: Config) -> str:
     """What values of different rows must share to be compared."""
     protocol, data = result["protocol"], result["data"]
-    counts = [v["n"] for v in (result["values"] or {}).values() if v and v["n"] is not None]
-    repeats = [v["replications"] for v in (result["values"] or {}).values() if v and v["replications"] is not None]
+    first = next((v for v in (result["values"] or {}).values() if v and v["n"]), None)  # others may be of fewer motions
     extractor = result["extractor"]
     text = f"protocol {protocol['name']} version {protocol['version']}"
     text += f", {result['split']} split of {data['dataset']} (fingerprint {data['fingerprint']})"
     text += ", {} to {} frames".format(*data["frames"]) if "frames" in data else ""
-    text += f", N = {max(counts, default=0)}, {max(repeats, default=0)} replications, seed {result['seed']}"
+    text += f", N = {first['n']}, {first['replications']} replications" if first else ", nothing measured"
+    text += f", seed {result['seed']}"
     text += f", extractor sha256 {extractor['sha256'][:12]}" if extractor else ", no extractor"
     if result.get("changed"):
         text += "; not as the protocol has it: " + ", ".join(f"{k} = {v}" for k, v in result["changed"].items())
@@ -451,11 +452,13 @@ def _line(row: Mapping[str, Any], found: Sequence[Config | None], values: Sequen
     reasons = list(dict.fromkeys(reason for r in found if r is not None for reason in r["invalid_because"]))
     line.state = "NOT VALID" if reasons else "QUICK" if first["quick"] else ""
     checkpoint = first["checkpoint"] or {}
-    fewer = {
-        column: f"{entry['replications']} x {entry['n']}"
-        for column, result, name in zip(values, found, values, strict=True)
-        if result and (entry := (result["values"] or {}).get(name)) and entry["n"] is not None
+    counts = {
+        name: f"{entry['replications']} x {entry['n']}"
+        for result, name in zip(found, values, strict=True)
+        if result and (entry := (result["values"] or {}).get(name)) and entry["n"]
     }
+    most = Counter(counts.values()).most_common(1)[0][0] if counts else ""
+    others = "".join(f"; {name} {count}" for name, count in counts.items() if count != most)
     line.facts = {
         "checkpoint sha256": str(checkpoint.get("sha256", first.get("samples_sha256") or ""))[:16],
         "recipe": str(checkpoint.get("experiment") or ""),
@@ -465,7 +468,7 @@ def _line(row: Mapping[str, Any], found: Sequence[Config | None], values: Sequen
         "guidance": _text(checkpoint.get("guidance_scale")),
         "sampler": _text(checkpoint.get("sampler")),
         "steps": _text(checkpoint.get("num_inference_steps")),
-        "replications x motions": "; ".join(f"{n}: {count}" for n, count in fewer.items()),
+        "replications x motions": most + others,
         "seed": _text(first["seed"]),
         "device": _text(first.get("device")),
         "result": " ".join(dict.fromkeys(r["file"] for r in found if r is not None)),
@@ -505,7 +508,10 @@ def _entry(entry: Mapping[str, Any] | None) -> Cell | None:
 
 
 def _print_cells(lines: Sequence[Line], columns: int) -> None:
-    """Numbers as text, with the same decimals in a column, about three digits of the largest; short settings stay."""
+    """Numbers as text, with the same decimals in a column, about three digits of the largest; short settings stay.
+
+    Numbers that would show one digit or none have more decimals.
+    """
     for index in range(columns):
         cells = [c for line in lines if not line.kind.startswith("reported") and (c := line.cells[index]) is not None]
         numbers = [abs(cell.value) for cell in cells if cell.value is not None]
@@ -513,7 +519,9 @@ def _print_cells(lines: Sequence[Line], columns: int) -> None:
         short = all(cell.value == round(cell.value, 1) for cell in cells if cell.value is not None and cell.ci is None)
         for cell in cells:
             if cell.value is not None and not (cell.ci is None and cell.text and short):
-                cell.text = f"{cell.value:.{decimals}f}" + (f" ±{cell.ci:.{decimals}f}" if cell.ci is not None else "")
+                small = 0 < abs(cell.value) < 10 ** (1 - decimals)
+                digits = _decimals(abs(cell.value)) if small else decimals
+                cell.text = f"{cell.value:.{digits}f}" + (f" ±{cell.ci:.{digits}f}" if cell.ci is not None else "")
 
 
 def _decimals(largest: float) -> int:

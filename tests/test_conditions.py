@@ -146,7 +146,7 @@ def test_every_recipe_constructs_without_network(path: Path, monkeypatch):
     )
     if isinstance(encoder, PretrainedText):
         assert not list(encoder.parameters())
-        assert len(encoder._pretrained.revision) == 40
+        assert len(encoder._pretrained.revision or "") == 40
 
 
 class TestNone:

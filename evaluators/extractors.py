@@ -15,6 +15,7 @@ from evaluators.classifier import ClassifierTask
 from evaluators.motion_clip import MotionCLIPTask
 from evaluators.stgcn import load_uestc, load_unconstrained
 from evaluators.t2m import WordVectors, load_t2m
+from evaluators.t2m_training import T2MTask
 from flame_mdm.checkpoints import find
 from flame_mdm.config import UserError
 from flame_mdm.generation import file_sha256
@@ -152,10 +153,45 @@ class T2MExtractor(Extractor):
         Raises:
             UserError: a caption comes without its tokens.
         """
-        known = [words for words in tokens if words is not None]
-        if len(known) < len(tokens):
-            raise UserError(f"extractor {self.path}: reads tagged words, which the data set lacks for its captions")
-        return self.network.text(self.words(known, full_length=self.full_length))
+        return self.network.text(self.words(_tagged(self.path, tokens), full_length=self.full_length))
+
+
+class OwnT2MExtractor(Extractor):
+    """An evaluator of Guo et al. 2022 that `make train EXP=t2m/...` has made.
+
+    Raises:
+        FileNotFoundError, UserError: no such checkpoint, or none of this evaluator.
+    """
+
+    def __init__(self, path: str, device: str | torch.device = "cpu"):
+        file = find(path)
+        self.path, self.sha256 = file, file_sha256(file)
+        self.task = load_task(file, T2MTask, device)
+        self.fingerprint = self.task.facts.get("fingerprint")
+
+    def check(self, representation: Representation, dataset: str) -> None:
+        """Representation and data set are those that it was trained on."""
+        _check_trained(self.path, self.task, "t2m", representation, dataset)
+
+    def motions(self, features: Tensor, joints: Tensor, mask: Tensor) -> dict[str, Tensor]:
+        """Features of motions."""
+        return {"features": self.task(features, mask)}
+
+    def texts(self, captions: Sequence[str], tokens: Sequence[Sequence[str] | None]) -> Tensor:
+        """Features of captions.
+
+        Raises:
+            UserError: a caption comes without its tokens.
+        """
+        return self.task.text(_tagged(self.path, tokens))
+
+
+def _tagged(path: Path, tokens: Sequence[Sequence[str] | None]) -> list[Sequence[str]]:
+    """The tokens of captions, refused where one has none."""
+    known = [words for words in tokens if words is not None]
+    if len(known) < len(tokens):
+        raise UserError(f"extractor {path}: reads tagged words, which the data set lacks for its captions")
+    return known
 
 
 CLASSIFIERS = {

@@ -1,0 +1,182 @@
+"""Guo et al.'s evaluator to train: its two parts, what it learns, and text-to-motion measured with it."""
+
+import json
+import pickle
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from t2m_folder import line, write_folder
+
+from evaluators.extractors import OwnT2MExtractor
+from evaluators.t2m_training import MatchingLoss, T2MTask, matching_loss
+from flame_mdm import evaluate, train
+from flame_mdm.config import UserError, compose, instantiate
+from flame_mdm.data.t2m import T2MFolder
+
+VERBS = ["walks", "runs", "hops", "bows", "waves", "kicks"]
+MANNERS = ["slowly", "quickly", "left", "right", "happily", "sadly"]
+MOVEMENT = 40
+SIZES = {"movement_hidden": 32, "movement_latent": 32, "text_hidden": 32, "motion_hidden": 32, "embedding": 16}
+RUN = ["data.num_workers=0", "data.batch_size=16", "trainer.accelerator=cpu", "trainer.enable_progress_bar=false"]
+RUN += ["trainer.log_every_n_steps=10", "optimizer.lr=0.003", f"task.movement_steps={MOVEMENT}"]
+RUN += [*(f"task.network.{name}={size}" for name, size in SIZES.items()), "task.network.max_frames=40"]
+
+
+def write_words(folder: Path) -> Path:
+    """Word vectors of all captions, random ones."""
+    folder.mkdir(parents=True)
+    words = ["unk", "sos", "eos", *VERBS, *MANNERS]
+    np.save(folder / "our_vab_data.npy", np.random.default_rng(0).normal(size=(len(words), 300)))
+    (folder / "our_vab_idx.pkl").write_bytes(pickle.dumps({word: row for row, word in enumerate(words)}))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def words(tmp_path_factory) -> list[str]:
+    """Overrides of a run on 36 captions, each with a motion in every split, which its two words decide."""
+    root = tmp_path_factory.mktemp("t2m")
+    generator = np.random.default_rng(1)
+    patterns = {word: generator.normal(size=251) for word in VERBS + MANNERS}
+    texts, captions, splits = {}, {}, {"train": [], "val": [], "test": []}
+    for number, (verb, manner) in enumerate((v, m) for v in VERBS for m in MANNERS):
+        for split, names in splits.items():
+            name = f"{number:02}{split}"
+            names.append(name)
+            texts[name], captions[name] = (32, [line(f"{verb} {manner}")]), (verb, manner)
+    folder = write_folder(root / "KIT-ML", texts, splits, 251, mirror=False)
+    np.save(folder / "Mean.npy", np.full(251, 2.0))
+    np.save(folder / "Std.npy", np.full(251, 3.0))
+    for name, (verb, manner) in captions.items():
+        x = patterns[verb] + patterns[manner] + generator.normal(size=(32, 251)) / 3
+        np.save(folder / "new_joint_vecs" / f"{name}.npy", (2 + 3 * x).astype(np.float32))
+    return [*RUN, f"data.source.path={folder}", f"data_root={root}", f"task.words={write_words(root / 'glove')}"]
+
+
+def fit(folder: Path, words: list[str], *more: str) -> Path:
+    assert train.main(["t2m/kit", *words, f"run.dir={folder}", *more]) == 0
+    return folder / "checkpoints" / "last.ckpt"
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory, words) -> Path:
+    """Checkpoint of a small evaluator after 200 steps."""
+    folder = tmp_path_factory.mktemp("run")
+    return fit(folder, words, "trainer.max_steps=200", f"trainer.val_check_interval={MOVEMENT}")
+
+
+def history(checkpoint: Path) -> list[dict[str, float]]:
+    return [json.loads(row) for row in (checkpoint.parent.parent / "metrics.jsonl").read_text().splitlines()]
+
+
+def logged(checkpoint: Path, name: str) -> dict[int, float]:
+    return {int(row["step"]): row[name] for row in history(checkpoint) if name in row}
+
+
+def test_training_by_recipe_matches_texts_and_motions(trained):
+    loss, top3 = logged(trained, "val/loss"), logged(trained, "val/motions_for_text_top3")
+    assert list(loss) == list(logged(trained, "val/mm_dist")) == [39, 79, 119, 159, 199]
+    assert loss[199] < loss[39] / 4
+    assert top3[199] > 0.5  # by chance 3 in 32
+    reconstruction = logged(trained, "val/reconstruction")
+    assert reconstruction[39] < 0.95 * logged(trained, "train/loss")[9]
+    assert reconstruction[39] == reconstruction[199], "the second part leaves it alone"
+    network = OwnT2MExtractor(str(trained)).task.network
+    assert torch.equal(network.mean, torch.full((251,), 2.0))
+    assert torch.equal(network.std, torch.full((251,), 3.0))
+
+
+def weights(path: Path) -> dict[str, torch.Tensor]:
+    return torch.load(path, weights_only=True)["state_dict"]
+
+
+def same(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor], *parts: str) -> set[bool]:
+    """Whether the weights whose names begin so agree, all or none."""
+    return {torch.equal(a[name], b[name]) for name in a if name.startswith(parts) and "bias" not in name}
+
+
+def test_a_resumed_run_is_the_uninterrupted_one_and_changes_parts_at_its_step(words, tmp_path):
+    options = [*words, "task.movement_steps=3", "trainer.val_check_interval=2"]
+    whole = weights(fit(tmp_path / "whole", options, "trainer.max_steps=6"))
+    at = {most: weights(fit(tmp_path / "run", options, f"trainer.max_steps={most}")) for most in (2, 3, 4, 6)}
+    assert whole.keys() == at[6].keys()
+    assert same(whole, at[6], "") == {True}
+    movement, matching = ("decoder", "network.movement"), ("network.text", "network.motion")
+    assert same(at[2], at[3], *movement) == same(at[3], at[4], *matching) == {False}
+    assert same(at[2], at[3], *matching) == same(at[3], at[4], *movement) == same(at[4], at[6], *movement) == {True}
+
+
+def test_it_measures_text_to_motion(trained, words, tmp_path, monkeypatch):
+    where = [word for word in words if word.startswith(("data.source", "data_root"))]
+    out = tmp_path / "result.json"
+    monkeypatch.chdir(tmp_path)
+    options = ["baseline=shuffled", "data=kit", "protocol=text_to_motion_t2m_own", f"extractor={trained}"]
+    options += [f"out={out}", "device=cpu", "replications=1", "data.crop.max_frames=40", "multimodality=false"]
+    assert evaluate.main([*options, *where]) == 0
+    result = json.loads(out.read_text())
+    assert result["valid"], result["invalid_because"]
+    assert result["ground_truth"]["motions_for_text/top3"]["mean"] > 0.5
+    assert result["values"]["motions_for_text/top3"]["mean"] < 0.3
+    assert result["values"]["mm_dist"]["mean"] > result["ground_truth"]["mm_dist"]["mean"]
+    assert result["extractor"]["data"] == result["data"]["fingerprint"]
+
+
+def test_the_checkpoint_needs_no_word_vectors_beside_it(trained):
+    extractor = OwnT2MExtractor(str(trained))
+    tokens = [["walks/VERB", "slowly/ADV"], ["runs/VERB", "unheard/ADV"]]
+    features = extractor.texts(["", ""], tokens)
+    assert features.shape == (2, 16)
+    assert torch.allclose(extractor.texts([""], tokens[:1]), features[:1], atol=1e-5)
+    with pytest.raises(UserError, match="reads tagged words, which the data set lacks"):
+        extractor.texts(["walks"], [None])
+    with pytest.raises(UserError, match=r"trained on the data set kit, but the motions are those of humanml3d"):
+        extractor.check(extractor.task.representation, "humanml3d")
+
+
+def test_what_is_missing_is_told_in_a_line(words, tmp_path, monkeypatch, capsys):
+    def refused(*more: str) -> str:
+        assert train.main(["t2m/kit", *words, f"run.dir={tmp_path / 'run'}", *more]) == 1
+        return capsys.readouterr().err
+
+    assert "task.words=nowhere: no such folder" in refused("task.words=nowhere")
+    assert f"{tmp_path / 'our_vab_data.npy'}: no such file" in refused(f"task.words={tmp_path}")
+    assert "data.batch_size=1: texts are matched" in refused("data.batch_size=1")
+
+    whole = T2MFolder.clips
+    monkeypatch.setattr(T2MFolder, "clips", lambda self, fps: (replace(c, attributes={}) for c in whole(self, fps)))
+    told = refused(f"data_root={tmp_path}")
+    assert "72 clips have no captions with tagged words, such as 00train" in told
+
+
+def test_the_loss_is_the_published_one():
+    motion, text = torch.zeros(2, 4), torch.zeros(2, 4)
+    motion[1, 0], text[1, 0] = 3.0, 4.0
+    # own pairs at 0 and 1; wrong ones at 3 and 4, of a margin of 3.5
+    assert matching_loss(motion, text, 3.5).item() == pytest.approx((0 + 1 + 0.5**2 + 0) / 2)
+
+
+def test_the_loss_of_validation_does_not_depend_on_batches():
+    motion, text, keys = torch.randn(11, 4), torch.randn(11, 4), torch.randperm(11)
+    values = []
+    for size in (11, 3):
+        metric = MatchingLoss(2.0)
+        for rows in torch.randperm(11).split(size):
+            metric.update(motion[rows], text[rows], keys[rows])
+        values.append(metric.compute())
+    order = keys.argsort()
+    assert values[0] == values[1] == pytest.approx(matching_loss(motion[order], text[order], 2.0).item())
+    assert MatchingLoss(2.0).compute() is None
+
+
+@pytest.mark.parametrize("recipe", ["t2m/humanml3d", "t2m/kit"])
+def test_recipes_build_the_sizes_of_the_released_one(recipe):
+    config = compose(recipe)
+    representation = instantiate(config["representation"])
+    with torch.device("meta"):
+        task = T2MTask.build(config, representation)
+    encoder = task.network.movement_encoder
+    assert encoder.main[0].weight.shape == (512, representation.features - 4, 4)
+    assert task.network.motion_encoder.hidden.shape == (2, 1, 1024)
+    assert task.network.text_encoder.hidden.shape == (2, 1, 512)

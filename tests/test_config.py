@@ -14,7 +14,7 @@ from flame_mdm.config import UserError, check, compose, flatten, instantiate, pa
 def test_every_recipe_composes_and_is_legal(name):
     composed = compose(name)
     assert composed["experiment"] == name
-    assert {"data", "condition", "representation", "task", "trainer"} <= composed.keys()
+    assert {"data", "representation", "task", "trainer"} <= composed.keys()
 
 
 @pytest.mark.parametrize("name", recipes())

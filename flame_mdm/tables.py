@@ -510,7 +510,7 @@ def _entry(entry: Mapping[str, Any] | None) -> Cell | None:
 def _print_cells(lines: Sequence[Line], columns: int) -> None:
     """Numbers as text, with the same decimals in a column, about three digits of the largest; short settings stay.
 
-    Numbers that would show one digit or none have more decimals.
+    Numbers that would be all zeros show two digits.
     """
     for index in range(columns):
         cells = [c for line in lines if not line.kind.startswith("reported") and (c := line.cells[index]) is not None]
@@ -519,8 +519,8 @@ def _print_cells(lines: Sequence[Line], columns: int) -> None:
         short = all(cell.value == round(cell.value, 1) for cell in cells if cell.value is not None and cell.ci is None)
         for cell in cells:
             if cell.value is not None and not (cell.ci is None and cell.text and short):
-                small = 0 < abs(cell.value) < 10 ** (1 - decimals)
-                digits = _decimals(abs(cell.value)) if small else decimals
+                small = 0 < abs(cell.value) < 10**-decimals
+                digits = 1 - math.floor(math.log10(abs(cell.value))) if small else decimals
                 cell.text = f"{cell.value:.{digits}f}" + (f" ±{cell.ci:.{digits}f}" if cell.ci is not None else "")
 
 

@@ -14,7 +14,7 @@ from conftest import TINY
 from flame_mdm import tables, train
 from flame_mdm.config import UserError
 from flame_mdm.tables import Request, build, load_spec, requests, wilson, write
-from flame_mdm.visualize.table import Line, Table, latex, markdown, places
+from flame_mdm.visualize.table import Cell, Line, Table, latex, markdown, places
 
 SPEC = """
 title: "A table, 50 % & more_of_it"
@@ -324,6 +324,12 @@ def test_places():
     assert places([3.0, 3.0, 1.0], "higher", None) == [1, 1, 2]
     assert places([3.0], "higher", None) == [0]
     assert places([3.0, 4.0], "none", None) == [0, 0]
+
+
+def test_numbers_have_the_decimals_of_their_column_and_are_never_all_zeros():
+    lines = [Line("", "measured", [Cell("", value, 0.0021)]) for value in (103.6, 0.016, 0.0)]
+    tables._print_cells(lines, 1)
+    assert [cell.text for line in lines if (cell := line.cells[0])] == ["103.6 ±0.0", "0.016 ±0.002", "0.0 ±0.0"]
 
 
 def test_wilson_interval():

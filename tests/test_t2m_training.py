@@ -129,6 +129,8 @@ def test_the_checkpoint_needs_no_word_vectors_beside_it(trained):
     features = extractor.texts(["", ""], tokens)
     assert features.shape == (2, 16)
     assert torch.allclose(extractor.texts([""], tokens[:1]), features[:1], atol=1e-5)
+    with pytest.raises(UserError, match="other word vectors than those that this run began with"):
+        extractor.task.set_extra_state(torch.zeros(15, 300))
     with pytest.raises(UserError, match="reads tagged words, which the data set lacks"):
         extractor.texts(["walks"], [None])
     with pytest.raises(UserError, match=r"trained on the data set kit, but the motions are those of humanml3d"):

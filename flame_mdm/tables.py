@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import functools
 import hashlib
 import itertools
@@ -585,8 +586,13 @@ def _hyperparameters(name: str, part: Config, reported: Config | None) -> Part:
     """A table of settings, read from recipes, each with the reported one beside it; keys or recipes, what is more
     stands in rows.
     """
-    from flame_mdm.hyperparameters import values
+    from flame_mdm.hyperparameters import LABELS, values
 
+    for key in part["keys"].values():
+        if key not in LABELS:
+            near = difflib.get_close_matches(key, LABELS, 3)
+            hint = f"Did you mean {', '.join(near)}?" if near else f"there are: {', '.join(LABELS)}"
+            raise UserError(f"part {name}: no setting is called '{key}'; {hint}")
     found = {label: values(recipe) for label, recipe in part["recipes"].items()}
     printed = {row["label"]: row["values"] for row in reported["rows"]} if reported else {}
     ours: dict[tuple[str, str], Cell | None] = {}

@@ -207,7 +207,8 @@ def evaluation(trials: Trials, kills: int) -> None:
     def result(name: str) -> dict[str, Any]:
         report = json.loads((trials.folder / name / "result.json").read_text())
         report["checkpoint"].pop("path")
-        report["environment"].pop("command")
+        for name in ("command", "commit", "changed"):  # somebody may edit the code meanwhile
+            report["environment"].pop(name)
         report["cost"].pop("seconds_per_sample")
         return report
 

@@ -29,4 +29,7 @@ def test_an_error_ends_the_other_tasks():
     with pytest.raises(ValueError, match="non-negative"):
         list(in_order(time.sleep, [-1, 100, 100, 100], workers=2))
     assert time.monotonic() - start < 60
-    assert [child for child in active_children() if child not in before] == []
+    while left := [child for child in active_children() if child not in before]:
+        # Ended, but the pool's thread may be about to note it.
+        assert time.monotonic() - start < 60, left
+        time.sleep(0.01)

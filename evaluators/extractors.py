@@ -61,38 +61,47 @@ class Extractor(ABC):
         return None
 
 
-def _check_trained(path: Path, task: Task, recipes: str, representation: Representation, dataset: str) -> None:
-    """Refuses motions of another representation or data set than a checkpoint of our own was trained on."""
-    own, advice = task.representation, f"train one by make train EXP={recipes}/..."
-    if (own.name, own.fps, own.features) != (representation.name, representation.fps, representation.features):
-        raise UserError(
-            f"extractor {path}: trained on {own.name} at {own.fps:g} frames a second, but the motions are "
-            f"{representation.name} at {representation.fps:g}: {advice}"
-        )
-    if task.facts.get("dataset", dataset) != dataset:
-        raise UserError(
-            f"extractor {path}: trained on the data set {task.facts['dataset']}, but the motions are those of "
-            f"{dataset}: {advice}"
-        )
+class _OwnExtractor(Extractor):
+    """A network that `make train` has made, from its checkpoint."""
+
+    trained: type[Task]
+    recipes: str
+    """Folder of the recipes that make it."""
+
+    def __init__(self, path: str, device: str | torch.device = "cpu"):
+        file = find(path)
+        self.path, self.sha256 = file, file_sha256(file)
+        self.task = load_task(file, self.trained, device)
+        self.fingerprint = self.task.facts.get("fingerprint")
+
+    def check(self, representation: Representation, dataset: str) -> None:
+        """Representation and data set are those that it was trained on."""
+        own, advice = self.task.representation, f"train one by make train EXP={self.recipes}/..."
+        if (own.name, own.fps, own.features) != (representation.name, representation.fps, representation.features):
+            raise UserError(
+                f"extractor {self.path}: trained on {own.name} at {own.fps:g} frames a second, but the motions are "
+                f"{representation.name} at {representation.fps:g}: {advice}"
+            )
+        if self.task.facts.get("dataset", dataset) != dataset:
+            raise UserError(
+                f"extractor {self.path}: trained on the data set {self.task.facts['dataset']}, but the motions are "
+                f"those of {dataset}: {advice}"
+            )
 
 
-class MotionCLIPExtractor(Extractor):
+class MotionCLIPExtractor(_OwnExtractor):
     """A motion-CLIP that `make train EXP=motion_clip/...` has made.
 
     Raises:
         FileNotFoundError, UserError: no such checkpoint, or none of a motion-CLIP.
     """
 
-    def __init__(self, path: str, device: str | torch.device = "cpu"):
-        file = find(path)
-        self.path, self.sha256 = file, file_sha256(file)
-        self.task = load_task(file, MotionCLIPTask, device)
-        self.fingerprint = self.task.facts.get("fingerprint")
-        self.known: dict[str, Tensor] = {}
+    trained, recipes = MotionCLIPTask, "motion_clip"
+    task: MotionCLIPTask
 
-    def check(self, representation: Representation, dataset: str) -> None:
-        """Representation and data set are those that it was trained on."""
-        _check_trained(self.path, self.task, "motion_clip", representation, dataset)
+    def __init__(self, path: str, device: str | torch.device = "cpu"):
+        super().__init__(path, device)
+        self.known: dict[str, Tensor] = {}
 
     def motions(self, features: Tensor, joints: Tensor, mask: Tensor) -> dict[str, Tensor]:
         """Features of motions."""
@@ -156,22 +165,15 @@ class T2MExtractor(Extractor):
         return self.network.text(self.words(_tagged(self.path, tokens), full_length=self.full_length))
 
 
-class OwnT2MExtractor(Extractor):
+class OwnT2MExtractor(_OwnExtractor):
     """An evaluator of Guo et al. 2022 that `make train EXP=t2m/...` has made.
 
     Raises:
         FileNotFoundError, UserError: no such checkpoint, or none of this evaluator.
     """
 
-    def __init__(self, path: str, device: str | torch.device = "cpu"):
-        file = find(path)
-        self.path, self.sha256 = file, file_sha256(file)
-        self.task = load_task(file, T2MTask, device)
-        self.fingerprint = self.task.facts.get("fingerprint")
-
-    def check(self, representation: Representation, dataset: str) -> None:
-        """Representation and data set are those that it was trained on."""
-        _check_trained(self.path, self.task, "t2m", representation, dataset)
+    trained, recipes = T2MTask, "t2m"
+    task: T2MTask
 
     def motions(self, features: Tensor, joints: Tensor, mask: Tensor) -> dict[str, Tensor]:
         """Features of motions."""
@@ -258,22 +260,15 @@ class ClassifierExtractor(Extractor):
         return self.network.random_state(1, torch.Generator().manual_seed(key(use, name)))
 
 
-class OwnClassifierExtractor(Extractor):
+class OwnClassifierExtractor(_OwnExtractor):
     """An action classifier that `make train EXP=classifier/...` has made.
 
     Raises:
         FileNotFoundError, UserError: no such checkpoint, or none of a classifier.
     """
 
-    def __init__(self, path: str, device: str | torch.device = "cpu"):
-        file = find(path)
-        self.path, self.sha256 = file, file_sha256(file)
-        self.task = load_task(file, ClassifierTask, device)
-        self.fingerprint = self.task.facts.get("fingerprint")
-
-    def check(self, representation: Representation, dataset: str) -> None:
-        """Representation and data set are those that it was trained on."""
-        _check_trained(self.path, self.task, "classifier", representation, dataset)
+    trained, recipes = ClassifierTask, "classifier"
+    task: ClassifierTask
 
     def motions(self, features: Tensor, joints: Tensor, mask: Tensor) -> dict[str, Tensor]:
         """Features and class scores of motions."""

@@ -22,10 +22,10 @@ COPY evaluators evaluators
 COPY experiments experiments
 RUN pip install --no-cache-dir -c constraints.txt ".[offline,slurm]"
 
-# Data and runs are mounted; nobody in there is root.
+# Data and runs are mounted; the container does not run as root.
 RUN useradd --create-home --uid 1000 researcher && mkdir /workspace && chown researcher /workspace
 USER 1000
 WORKDIR /workspace
 ENV FLAME_MDM_DATA=/workspace/data HF_HOME=/workspace/.cache/huggingface PYTHONUNBUFFERED=1
-ENTRYPOINT ["python", "-m"]
-CMD ["flame_mdm.train", "--help"]
+ENTRYPOINT ["flame-mdm"]
+CMD ["--help"]

@@ -1,4 +1,4 @@
-"""Reading BVH files with `flame_mdm.data.bvh` and with the packages of PyPI, in one run.
+"""Reading BVH files with `flame_mdm.formats.bvh` and with the packages of PyPI, in one run.
 
     pip install bvhio bvhsdk
     python benchmarks/bvh.py FOLDER [number of files]
@@ -14,7 +14,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from flame_mdm.data import bvh
+from flame_mdm.formats import bvh
 
 
 def measure(name: str, read: Callable[[str], Any], paths: list[str]) -> None:

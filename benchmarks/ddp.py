@@ -48,7 +48,7 @@ def step_seconds(folder: Path, processes: int, run: int) -> float:
     words += ["trainer.devices=2", "trainer.strategy=ddp"] if processes == 2 else []
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(folder), "GLOO_SOCKET_IFNAME": "lo"}
     done = subprocess.run(
-        [sys.executable, "-m", "flame_mdm.train", *words],
+        [sys.executable, "-m", "flame_mdm", "train", *words],
         capture_output=True,
         text=True,
         cwd=folder,

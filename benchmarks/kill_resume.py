@@ -27,9 +27,11 @@ from typing import Any
 
 import torch
 
-from flame_mdm import callbacks, evaluate, guards, prepare, train
+from flame_mdm.checkpoints.files import read_checkpoint
+from flame_mdm.commands import evaluate, prepare, train
 from flame_mdm.data.store import Store
-from flame_mdm.task import MotionGeneration, read_checkpoint
+from flame_mdm.task import MotionGeneration
+from flame_mdm.training import callbacks, guards
 
 STEPS = 400
 RECIPE = [

@@ -36,7 +36,7 @@ def main(runs: int) -> None:
     os.environ["OMP_NUM_THREADS"] = "1"
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        seconds(folder, "-m", "flame_mdm.train", "quickstart", *TINY, "run.dir=first")  # prepares the data, too
+        seconds(folder, "-m", "flame_mdm", "train", "quickstart", *TINY, "run.dir=first")  # prepares the data, too
         evaluation = ["protocol=synthetic", "extractor=none", "quick=true", "replications=1", "samples=8"]
         work: dict[str, tuple[list[str], list[str]]] = {  # with the words that differ from run to run
             "train": (["quickstart", *TINY], ["run.dir=run{}"]),
@@ -45,7 +45,7 @@ def main(runs: int) -> None:
         }
         rows = {"python -c 'import torch'": (["-c", "import torch"], list[str]())}
         for command, (words, varying) in work.items():
-            module = ["-m", f"flame_mdm.{command}"]
+            module = ["-m", "flame_mdm", command]
             rows[f"{command} --help"] = ([*module, "--help"], [])
             rows[f"{command}, misspelt key"] = ([*module, *words[: command == "train"], "seeed=1"], [])
             rows[f"{command}, smallest work"] = ([*module, *words], varying)

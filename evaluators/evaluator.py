@@ -14,18 +14,22 @@ from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 from torchmetrics import Metric
 
-from evaluators import feed
-from evaluators.attributes import ATTRIBUTES
 from evaluators.extractors import Extractor
-from evaluators.samples import TwoSets
-from flame_mdm.config import Config, UserError, instantiate, parameters
+from evaluators.metrics import make_metrics, missing_input, required_inputs, update_metrics
+from evaluators.metrics.attributes import ATTRIBUTES
+from evaluators.metrics.samples import TwoSets
+from flame_mdm.config import Config
 from flame_mdm.editing import kept_parts
+from flame_mdm.errors import UserError
 from flame_mdm.motion import length_mask
-from flame_mdm.noise import key
 from flame_mdm.representations import Representation
+from flame_mdm.seeds import key
 
 CHUNK = 256
 """Motions that metrics get at once."""
+
+FEATURES = {"generated", "real", "text", "logits"}
+"""Inputs of metrics that an extractor provides."""
 
 
 @dataclass
@@ -40,7 +44,7 @@ class Motions:
         labels: classes of motions with action labels.
         groups: names of the prompts, where several motions have the same one.
         asked: attributes asked for, where the data has them.
-        edit: what was kept of real motions, as `frames` and `joints` of `flame_mdm.editing.kept_parts`.
+        edit: what was kept of real motions, as `region` and `joints` of `flame_mdm.editing.kept_parts`.
     """
 
     ids: list[str]
@@ -78,10 +82,11 @@ class Evaluator:
     It measures on this process alone, on the CPU.
 
     Args:
-        extractor: None leaves metrics of features without a value.
+        extractor: of the features that metrics compare; None = no features.
         metrics: mappings with the `_target_` of a metric, by name; each replication draws with a seed of its own.
         representation: of the motions.
         batch_size: of the extractor.
+        skip_features: leaves metrics of features without a value, instead of raising because they have no input.
     """
 
     def __init__(
@@ -91,9 +96,10 @@ class Evaluator:
         representation: Representation,
         *,
         batch_size: int = 64,
+        skip_features: bool = False,
     ):
         self.extractor, self.metrics, self.representation = extractor, metrics, representation
-        self.batch_size = batch_size
+        self.batch_size, self.skip_features = batch_size, skip_features
 
     @torch.no_grad()
     def extract(self, motions: Motions) -> Extracted:
@@ -163,14 +169,19 @@ class Evaluator:
             samples are too few.
 
         Raises:
+            UserError: the motions lack an input that a metric needs.
             ValueError: motions do not fit a metric that compares them one by one.
         """
-        metrics = {name: self._metric(config, seed) for name, config in self.metrics.items()}
-        sets = {name: metric for name, metric in metrics.items() if isinstance(metric, TwoSets)}
-        others = {name: metric for name, metric in metrics.items() if name not in sets}
+        metrics = make_metrics(self.metrics, seed=key("metric", seed) % 2**32)
+        usable = self.check(generated, metrics) if len(generated) else {}
+        sets = {name: metric for name, metric in usable.items() if isinstance(metric, TwoSets)}
+        others = {name: metric for name, metric in usable.items() if name not in sets}
+        for metric in metrics.values():
+            metric.distributed_available_fn = bool  # False: this process has all motions, and no other computes
         for part in _chunks(len(generated)):
             rows = {name: values[part] for name, values in generated.rows.items()}
-            feed(sets, **{name: rows[name] for name in ("generated", "keys") if "generated" in rows})
+            if sets:
+                update_metrics(sets, generated=rows["generated"], keys=rows["keys"])
             joints, mask = _pad(generated.joints[part])
             if generated.kept is not None:
                 rows["kept"] = pad_sequence(generated.kept[part], batch_first=True)
@@ -178,9 +189,9 @@ class Evaluator:
             rows |= {"joints": joints, "mask": mask, "real_joints": real_joints, "real_mask": real_mask}
             if "generated" in paired.rows:
                 rows["real"] = paired.rows["generated"][part]
-            feed(others, **rows)
+            update_metrics(others, **rows)
         if "generated" in real.rows:
-            feed(sets, real=real.rows["generated"], real_keys=real.rows["keys"])
+            update_metrics(sets, real=real.rows["generated"], real_keys=real.rows["keys"])
         values: dict[str, float | None] = {}
         reasons: dict[str, str] = {}
         with warnings.catch_warnings():  # a metric that was given nothing says so by None
@@ -199,11 +210,24 @@ class Evaluator:
                     values[f"{name}/{part}".rstrip("/")] = value
         return values, reasons
 
-    def _metric(self, config: Config, seed: int) -> Metric:
-        drawn = {"seed": key("metric", seed) % 2**32} if "seed" in parameters(config["_target_"]) else {}
-        metric: Metric = instantiate(config, **drawn)
-        metric.distributed_available_fn = bool  # False: this process has all motions, and no other computes
-        return metric
+    def check(self, motions: Extracted, metrics: Mapping[str, Metric] | None = None) -> dict[str, Metric]:
+        """Returns the metrics that can measure the motions: all of them, or those without features.
+
+        Raises:
+            UserError: the motions lack an input that a metric needs.
+        """
+        given = {*motions.rows, "joints", "mask", "real_joints", "real_mask"}
+        given |= {"real"} if "generated" in motions.rows else set()
+        given |= {"kept"} if motions.kept is not None else set()
+        usable = {}
+        for name, metric in (make_metrics(self.metrics) if metrics is None else metrics).items():
+            needed = ["generated", "keys"] if isinstance(metric, TwoSets) else required_inputs(metric)
+            missing = [row for row in needed if row not in given]
+            if not missing:
+                usable[name] = metric
+            elif not (self.skip_features and FEATURES.intersection(missing)):
+                raise UserError(missing_input(name, metric, missing[0]))
+        return usable
 
 
 def _chunks(count: int) -> list[slice]:

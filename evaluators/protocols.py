@@ -4,26 +4,39 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
 import numpy as np
 import torch
 from scipy.ndimage import gaussian_filter1d
 from torch import Tensor
 
-from evaluators.confidence import mean_ci
-from evaluators.distribution import FrechetMotionDistance
 from evaluators.evaluator import Evaluator, Extracted, Motions
 from evaluators.extractors import Extractor
-from evaluators.sources import Baseline, Generator, Given, Row, Samples, Source, real_motions
-from flame_mdm.config import Config, UserError, instantiate
+from evaluators.metrics import make_metrics
+from evaluators.metrics.confidence import mean_ci
+from evaluators.metrics.distribution import FrechetMotionDistance
+from evaluators.sources import Baseline, Generator, Row, SampleFolder, Samples, Source, real_motions
+from flame_mdm.config import Config, instantiate
 from flame_mdm.data.datamodule import Clips
 from flame_mdm.editing import MFM_STEPS, method_options
-from flame_mdm.noise import key
+from flame_mdm.errors import UserError
 from flame_mdm.representations import Representation
+from flame_mdm.seeds import key
 from flame_mdm.task import MotionGeneration
 
+REGION = {"frames": "region"}
+"""Argument of `flame_mdm.editing.kept_parts` as named in protocol files, which are never changed -> its name today."""
 QUICK_REPLICATIONS, QUICK_SAMPLES = 2, 64
+
+
+class Multimodality(TypedDict):
+    """A second evaluation with several motions per prompt; `prompts` None = all of the split."""
+
+    prompts: int | None
+    samples: int
+    replications: int
+    metrics: dict[str, Config]
 
 
 class Protocol:
@@ -43,14 +56,17 @@ class Protocol:
         samples: motions a replication; clips are drawn, and taken repeatedly where there are fewer. None = each clip of
             the split once.
         real_samples: real motions a replication that sets are compared with, drawn alike; None = each clip once.
-        multimodality: `prompts` (None = all), `samples` a prompt, `replications` and `metrics` of an evaluation of its
-            own, in which several motions are generated for each of some prompts; None = none.
-        edit: `frames` and `joints` as of `flame_mdm.editing.kept_parts`: motions are not generated whole, but as edits
-            of the real ones; None = whole.
+        multimodality: a second evaluation with several motions per prompt; None = none.
+        edit: `frames` (the region) and `joints` as of `flame_mdm.editing.kept_parts`: motions are not generated whole,
+            but as edits of the real ones; None = whole.
         smoothing: standard deviation, in frames, of a Gaussian over time that features of generated motions go through
             before they are measured, mirrored at the ends; None = none.
         expected: by data set or sha256 of the extractor, the values that real motions of the test split must have:
             metric -> [value, tolerance]. Where they have others, the model's values are not valid.
+
+    Raises:
+        UserError: an option of `multimodality` or of a metric is missing or unknown.
+        ValueError: an unknown condition.
     """
 
     def __init__(
@@ -64,17 +80,24 @@ class Protocol:
         replications: int,
         samples: int | None = None,
         real_samples: int | None = None,
-        multimodality: dict[str, Any] | None = None,
+        multimodality: Multimodality | None = None,
         edit: dict[str, Any] | None = None,
         smoothing: float | None = None,
         expected: dict[str, dict[str, list[float]]] | None = None,
     ):
         if condition not in ("text", "action", "none"):
             raise ValueError(f"protocol {name}: condition is text, action or none, not {condition}")
+        if multimodality is not None and multimodality.keys() != Multimodality.__annotations__.keys():
+            raise UserError(
+                f"protocol {name}: multimodality has the options {', '.join(multimodality)}. It needs "
+                f"{', '.join(Multimodality.__annotations__)}"
+            )
+        make_metrics(metrics | (multimodality["metrics"] if multimodality else {}))  # refuses unknown options
         self.name, self.version, self.condition = name, version, condition
         self.extractor, self.metrics, self.replications, self.samples = extractor, metrics, replications, samples
         self.real_samples, self.multimodality, self.expected = real_samples, multimodality, expected or {}
-        self.edit, self.smoothing = edit, smoothing
+        self.edit = edit and {REGION.get(key, key): value for key, value in edit.items()}
+        self.smoothing = smoothing
         self.quick, self.sha256 = False, ""
 
     def change(
@@ -153,8 +176,8 @@ class Protocol:
             for number in range(self.multimodality["samples"])
         ]
 
-    def asked(self, rows: Sequence[Row], features: list[np.ndarray], captions: list[str] | None = None) -> Motions:
-        """Motions for the rows, with what the rows ask for; `captions` replace theirs."""
+    def motions(self, rows: Sequence[Row], features: list[np.ndarray], captions: list[str] | None = None) -> Motions:
+        """Returns the motions of the rows, with what the rows request; `captions` replace theirs."""
         texts = captions or [row.text for row in rows] if self.condition == "text" else None
         labels = [row.clip.action for row in rows]
         return Motions(
@@ -247,9 +270,9 @@ class Protocol:
         """The source of motions that no model made; see `Baseline`."""
         return Baseline(kind, clips, self.condition, seed)
 
-    def given(self, folder: Path, representation: Representation) -> Given:
-        """The source of motions that others made, a replication a file, of any clips of the split; see `Given`."""
-        source = Given(folder, representation)
+    def sample_folder(self, folder: Path, representation: Representation) -> SampleFolder:
+        """Returns the source of motions in files, one per replication; see `SampleFolder`."""
+        source = SampleFolder(folder, representation)
         self.replications, self.samples = len(source.files), None
         return source
 
@@ -293,12 +316,19 @@ class Protocol:
                 assert source is not None
                 source(name, rows, replication, rank, world)
         else:
-            evaluator = Evaluator(extractor, self.metrics, representation, batch_size=batch_size)
+            evaluator = self._evaluator(self.metrics, extractor, representation, batch_size)
             box[0] = self._measure(source, clips, evaluator, seed, world, ground_truth)
         if world > 1:
             torch.distributed.broadcast_object_list(box)
         assert box[0] is not None
         return box[0]
+
+    def _evaluator(
+        self, metrics: Mapping[str, Config], extractor: Extractor | None, representation: Representation, size: int
+    ) -> Evaluator:
+        """Returns the evaluator of some metrics; `extractor=none` leaves those of features without a value."""
+        skip = extractor is None and self.extractor is not None
+        return Evaluator(extractor, metrics, representation, batch_size=size, skip_features=skip)
 
     def _jobs(self, source: Source | None, clips: Clips, seed: int) -> Iterator[tuple[str, list[Row], int]]:
         """What is asked of the source, in order: the name of a file, the rows, the replication."""
@@ -306,12 +336,12 @@ class Protocol:
             return
         for replication in range(self.replications):
             yield f"rep_{replication}", self.rows(clips, seed, replication), replication
-        if self._asks_for_several(source):
+        if self._has_several_per_prompt(source):
             assert self.multimodality is not None
             for replication in range(self.multimodality["replications"]):
                 yield f"multimodality_{replication}", self.prompts(clips, seed, replication), replication
 
-    def _asks_for_several(self, source: Source | None) -> bool:
+    def _has_several_per_prompt(self, source: Source | None) -> bool:
         return self.multimodality is not None and isinstance(source, Generator) and not self.quick
 
     def _measure(
@@ -336,41 +366,43 @@ class Protocol:
             reasons.update(why)
 
         def extract(rows: Sequence[Row], features: list[np.ndarray], captions: list[str] | None = None) -> Extracted:
-            return evaluator.extract(self.asked(rows, features, captions))
+            return evaluator.extract(self.motions(rows, features, captions))
 
         jobs = self._jobs(source, clips, seed)
+        several = None
+        if self.multimodality and source is not None:
+            several = self._evaluator(
+                self.multimodality["metrics"], evaluator.extractor, evaluator.representation, evaluator.batch_size
+            )
         for replication in range(self.replications):
             rows = self.rows(clips, seed, replication)
             again = self.rows(clips, seed, replication, purpose="real")
             paired = extract(rows, real_motions(clips, rows))
             real = extract(again, real_motions(clips, again))
+            for each in (evaluator, several):  # before motions are generated
+                if each is not None and not replication:
+                    each.check(paired)
             if ground_truth:
                 score("ground_truth", paired, paired, real, replication)
             if source is None:
                 continue
-            samples = _first(source, next(jobs), world)
+            samples = _samples(source, next(jobs), world)
             costs.append(samples.cost)
             if len(samples.rows) != len(rows):  # motions of others, not one for each clip
                 wanted = {row.id for row in samples.rows}
-                paired = _take(paired, [i for i, row in enumerate(rows) if row.id in wanted])
+                paired = _select(paired, [i for i, row in enumerate(rows) if row.id in wanted])
             generated = extract(samples.rows, self._smoothed(samples.features), samples.captions)
             score("values", generated, paired, real, replication)
             if not replication:
                 warnings = self._warnings(generated, real)
         results = {kind: _summary(values) for kind, values in found.items()}
-        if self.multimodality and source is not None:
-            several = Evaluator(
-                evaluator.extractor,
-                self.multimodality["metrics"],
-                evaluator.representation,
-                batch_size=evaluator.batch_size,
-            )
-            results["values"] |= self._several(source, jobs, clips, several, seed, world, reasons)
+        if several is not None and source is not None:
+            results["values"] |= self._measure_multimodality(source, jobs, clips, several, seed, world, reasons)
         if evaluator.extractor is None and self.extractor is not None:
             reasons["extractor"] = "none was given, metrics of its features have no values"
         tested = clips.clips[0].split == "test" or not clips.store.info["clips"]["test"]  # HumanAct12 has no test clips
         gate = ground_truth and not self.quick and tested
-        invalid = self._off(results["ground_truth"], clips, evaluator.extractor) if gate else []
+        invalid = self._unexpected(results["ground_truth"], clips, evaluator.extractor) if gate else []
         return {
             "ground_truth": results["ground_truth"] if ground_truth else None,
             "values": results["values"] if source is not None else None,
@@ -382,7 +414,7 @@ class Protocol:
             "invalid_because": invalid,
         }
 
-    def _several(
+    def _measure_multimodality(
         self,
         source: Source,
         jobs: Iterator[tuple[str, list[Row], int]],
@@ -395,20 +427,20 @@ class Protocol:
         """Multimodality: values of the metrics that need several motions a prompt."""
         assert self.multimodality is not None
         found = []
-        nothing = evaluator.extract(self.asked([], []))
+        nothing = evaluator.extract(self.motions([], []))
         for replication in range(self.multimodality["replications"]):
             motions = paired = nothing
-            if self._asks_for_several(source):
+            if self._has_several_per_prompt(source):
                 _, rows, _ = job = next(jobs)
-                samples = _first(source, job, world)
-                motions = evaluator.extract(self.asked(rows, self._smoothed(samples.features)))
+                samples = _samples(source, job, world)
+                motions = evaluator.extract(self.motions(rows, self._smoothed(samples.features)))
                 prompts = rows[:: self.multimodality["samples"]]
-                real = evaluator.extract(self.asked(prompts, real_motions(clips, prompts)))
-                paired = _take(real, [i // self.multimodality["samples"] for i in range(len(rows))])
+                real = evaluator.extract(self.motions(prompts, real_motions(clips, prompts)))
+                paired = _select(real, [i // self.multimodality["samples"] for i in range(len(rows))])
             values, why = evaluator.score(motions, paired, nothing, key("draws", seed, replication))
             found.append((values, len(motions)))
             reasons |= why
-        if not self._asks_for_several(source):
+        if not self._has_several_per_prompt(source):
             why_not = "left out of a quick evaluation" if self.quick else "the samples are one a clip"
             reasons["multimodality"] = f"{why_not}, but it takes several motions for each of some prompts"
         return _summary(found)
@@ -435,7 +467,7 @@ class Protocol:
                 )
         return lines
 
-    def _off(self, values: Mapping[str, Any], clips: Clips, extractor: Extractor | None) -> list[str]:
+    def _unexpected(self, values: Mapping[str, Any], clips: Clips, extractor: Extractor | None) -> list[str]:
         """In which expected values real motions fail."""
         names = [clips.store.info["dataset"], *([extractor.sha256] if extractor else [])]
         lines = []
@@ -452,14 +484,14 @@ def _tokens(row: Row, caption: str) -> list[str] | None:
     return tagged[row.clip.captions.index(caption)] if tagged and caption in row.clip.captions else None
 
 
-def _first(source: Source, job: tuple[str, list[Row], int], world: int) -> Samples:
+def _samples(source: Source, job: tuple[str, list[Row], int], world: int) -> Samples:
     """What the first of several processes gets."""
     samples = source(*job, 0, world)
     assert samples is not None
     return samples
 
 
-def _take(extracted: Extracted, indices: list[int]) -> Extracted:
+def _select(extracted: Extracted, indices: list[int]) -> Extracted:
     rows = {n: v[indices] if isinstance(v, Tensor) else [v[i] for i in indices] for n, v in extracted.rows.items()}
     kept = None if extracted.kept is None else [extracted.kept[i] for i in indices]
     return Extracted(rows, [extracted.joints[i] for i in indices], kept)

@@ -1,4 +1,4 @@
-"""Where the motions come from that are measured: a model, files of others, or baselines that no model made."""
+"""Sources of the motions to evaluate: a model, files of another system, or sanity-check baselines."""
 
 from __future__ import annotations
 
@@ -14,13 +14,14 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
-from flame_mdm.config import UserError
 from flame_mdm.data.datamodule import Clips
 from flame_mdm.data.store import Entry
 from flame_mdm.editing import kept_parts
+from flame_mdm.errors import UserError
+from flame_mdm.files import atomic_write, read_npz, regular_file
 from flame_mdm.motion import Edit, MotionBatch, length_mask, pad_to
-from flame_mdm.noise import key, normal
 from flame_mdm.representations import Representation
+from flame_mdm.seeds import key, normal
 from flame_mdm.task import MotionGeneration
 
 NOISE = 0.5
@@ -88,13 +89,13 @@ class Generator:
 
     Args:
         model: the model, on its device.
-        folder: of the motions, `rep_0.npz` and so on, as `Given` reads them; None = not kept.
+        folder: of the motions, `rep_0.npz` and so on, as `SampleFolder` reads them; None = not kept.
         options: for `MotionGeneration.generate`: guidance_scale, sampler, num_inference_steps, seed; with `parts`,
             also `edit`, the options of `Edit`.
         clips: the split.
         condition: "text", "action" or "none".
         batch_size: motions at once.
-        parts: `frames` and `joints` as of `flame_mdm.editing.kept_parts`: the motions are edits of the real ones.
+        parts: `region` and `joints` as of `flame_mdm.editing.kept_parts`: the motions are edits of the real ones.
         total: motions of the whole evaluation, for the time left.
         progress: whether to show it.
     """
@@ -124,7 +125,7 @@ class Generator:
             UserError: the folder holds other motions, or a damaged file; or the model returns what is not finite.
         """
         path = self.folder / f"{name}.npz" if self.folder else None
-        if _first_says(path is not None and path.exists(), rank, world):
+        if _agree(path is not None and path.exists(), rank, world):
             return self._read(path, rows) if path is not None and not rank else None
         features, counts = self._generate(rows[rank::world], replication)
         if world > 1:
@@ -216,7 +217,7 @@ class Generator:
         return Edit(torch.cat(known), torch.cat(keep), **self.how)
 
 
-def _first_says(value: bool, rank: int, world: int) -> bool:
+def _agree(value: bool, rank: int, world: int) -> bool:
     """The value of the first process, on all of them."""
     if world == 1:
         return value
@@ -225,8 +226,8 @@ def _first_says(value: bool, rank: int, world: int) -> bool:
     return bool(box[0])
 
 
-class Given:
-    """Motions that others made: a folder of .npz files, one a replication, in the order of their names.
+class SampleFolder:
+    """Motions from another system: a folder of .npz files, one per replication, in the order of their names.
 
     Each holds `ids` (N,), names of clips of the split; `lengths` (N,); `features` (sum of lengths, D) in the data's
     units, or `joints` (sum of lengths, J, 3) in metres, y up, at the data's frame rate; and, where they were not made
@@ -239,9 +240,11 @@ class Given:
     def __init__(self, folder: Path, representation: Representation):
         self.representation = representation
         self.files = sorted(folder.glob("*.npz"), key=lambda path: (len(path.name), path.name))
-        self.files = [path for path in self.files if not path.name.startswith("multimodality_")]
+        self.files = [path for path in self.files if not path.name.startswith((".", "multimodality_"))]
         if not self.files:
             raise UserError(f"from_samples={folder}: no .npz file there")
+        for path in self.files:
+            regular_file(path)
 
     @property
     def sha256(self) -> str:
@@ -280,14 +283,14 @@ class Given:
                 f"{self.representation.features}"
             )
         place = {name: index for index, name in enumerate(ids)}
-        asked = [row for row in rows if row.id in place]
+        requested = [row for row in rows if row.id in place]
         captions = content.get("captions")
-        given = None if captions is None else [str(captions[place[row.id]]) for row in asked]
-        return Samples(asked, [features[place[row.id]] for row in asked], captions=given)
+        texts = None if captions is None else [str(captions[place[row.id]]) for row in requested]
+        return Samples(requested, [features[place[row.id]] for row in requested], captions=texts)
 
 
 class Baseline:
-    """Motions that no model made, to see that each metric sees what it is for.
+    """Sanity-check baselines: motions without a model, which show what each metric detects.
 
     | kind | motions | what should be bad |
     |---|---|---|
@@ -370,21 +373,27 @@ class Baseline:
 
 
 def read_samples(path: Path) -> dict[str, np.ndarray]:
-    """A file of generated motions: see `Given`.
+    """A file of generated motions: see `SampleFolder`.
 
     Raises:
         UserError: it is damaged, or lacks something.
     """
     try:
-        with path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
-            content = {name: file[name] for name in file.files}
-    except Exception as error:  # numpy raises many kinds for damaged archives
-        raise UserError(f"{path}: damaged, or not an .npz file of plain arrays; delete it or write it again") from error
-    frames = content.get("features", content.get("joints"))
-    if not {"ids", "lengths"} <= content.keys() or frames is None:
+        content = read_npz(path)
+    except ValueError as error:
+        raise UserError(f"{path}: {error}; delete it or write it again") from error
+    frames = {name: content[name] for name in ("features", "joints") if name in content}
+    if not {"ids", "lengths"} <= content.keys() or not frames:
         raise UserError(f"{path}: needs ids, lengths and features or joints, holds {', '.join(content) or 'nothing'}")
-    if len(content["ids"]) != len(content["lengths"]) or len(frames) != content["lengths"].sum() or not len(frames):
-        raise UserError(f"{path}: ids, lengths and frames do not belong together")
+    ids, lengths, captions = content["ids"], content["lengths"], content.get("captions", content["ids"])
+    numbers = lengths.dtype.kind in "iu" and ids.dtype.kind == captions.dtype.kind == "U"
+    whole = numbers and ids.ndim == 1 and ids.shape == lengths.shape == captions.shape and len(ids)
+    if not whole or lengths.min() < 1 or any(len(x) != sum(lengths.tolist()) for x in frames.values() if x.ndim):
+        raise UserError(f"{path}: ids, lengths, captions and frames do not belong together; write it again")
+    for name, array in frames.items():
+        if array.dtype.kind not in "fiu" or array.dtype.itemsize > 8 or array.ndim != 2 + (name == "joints"):
+            shape = "(frames, joints, 3)" if name == "joints" else "(frames, features)"
+            raise UserError(f"{path}: {name} are not an array {shape} of real numbers; write it again")
     return content
 
 
@@ -395,7 +404,6 @@ def _split(content: Mapping[str, np.ndarray], name: str = "features") -> list[np
 def _write(
     path: Path, rows: Sequence[Row], features: Sequence[np.ndarray], cost: Mapping[str, float], condition: str
 ) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
     content: dict[str, Any] = {
         "ids": np.array([row.id for row in rows]),
         "lengths": np.array([len(x) for x in features]),
@@ -404,10 +412,5 @@ def _write(
     }
     if condition == "text":
         content["captions"] = np.array([row.text for row in rows])
-    partial = path.with_suffix(".partial")
-    try:
-        with partial.open("wb") as file:
-            np.savez(file, **content)
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)
+    with atomic_write(path) as temporary:
+        np.savez(temporary, **content)

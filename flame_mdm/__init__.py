@@ -1,25 +1,28 @@
 """Text- and action-conditioned human motion generation: FLAME, MDM and Motion Flow Matching in one framework.
 
 import flame_mdm
-model = flame_mdm.load("runs/quickstart/default/checkpoints/last.ckpt")
+model = flame_mdm.load("runs/quickstart/default")
 motion = flame_mdm.generate(model, "a person waves with the left hand", seconds=3, seed=0)[0]
 motion.joints  # (F, J, 3) metres, y up
+motion.save("wave.glb")
 """
 
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from flame_mdm.checkpoints.loading import load
     from flame_mdm.editing import edit
-    from flame_mdm.generation import Generated, generate
-    from flame_mdm.task import MotionGeneration, load
+    from flame_mdm.formats.motion import Motion
+    from flame_mdm.generation import generate
+    from flame_mdm.task import MotionGeneration
 
-__all__ = ["Generated", "MotionGeneration", "edit", "generate", "load"]
+__all__ = ["Motion", "MotionGeneration", "edit", "generate", "load"]
 
 _HOMES = {
-    "load": "task",
+    "load": "checkpoints.loading",
     "MotionGeneration": "task",
     "generate": "generation",
-    "Generated": "generation",
+    "Motion": "formats.motion",
     "edit": "editing",
 }
 

@@ -1,25 +1,23 @@
-"""Editing without training: a part of a motion is kept, the rest is sampled anew."""
+"""Editing without training: a part of a motion is kept, the rest is resampled."""
 
 from __future__ import annotations
 
-import difflib
 import math
-import zipfile
-import zlib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from scipy.interpolate import CubicSpline
 from torch import Tensor
 
-from flame_mdm.config import UserError
-from flame_mdm.data.folder import read_bvh
 from flame_mdm.data.store import Store
-from flame_mdm.generation import Generated, generate
+from flame_mdm.errors import UserError, did_you_mean
+from flame_mdm.formats.files import ENDINGS, read
+from flame_mdm.formats.motion import Motion
+from flame_mdm.formats.resampling import resample as resample_joints
+from flame_mdm.generation import generate
 from flame_mdm.motion import Edit
 from flame_mdm.processes import Process
 from flame_mdm.representations import Representation
@@ -42,8 +40,8 @@ LEG, ARM = ("hip", "knee", "ankle", "foot", "toes"), ("collar", "shoulder", "elb
 Ranges = Sequence[float] | Sequence[Sequence[float]]
 
 
-@dataclass
-class Edited(Generated):
+@dataclass(eq=False, repr=False, kw_only=True)
+class Edited(Motion):
     """A motion of which a part was kept.
 
     Attributes:
@@ -54,7 +52,7 @@ class Edited(Generated):
             are relative to the root do not pin it: behind a new part, kept frames start where that part ends.
     """
 
-    original: Generated
+    original: Motion
     keep: np.ndarray
     feature_error: float
     joint_error: float
@@ -62,12 +60,12 @@ class Edited(Generated):
 
 def edit(
     model: MotionGeneration,
-    motion: str | Path | Generated,
+    motion: str | Path | Motion,
     texts: str | Sequence[str] | None = None,
     *,
     actions: Sequence[str] | None = None,
-    frames: str | Ranges | None = None,
-    seconds: Ranges | None = None,
+    region: str | Ranges | None = None,
+    region_seconds: Ranges | None = None,
     joints: str | Sequence[str] | None = None,
     method: str | None = None,
     until: float | None = None,
@@ -78,17 +76,17 @@ def edit(
     sampler: str | None = None,
     num_inference_steps: int | None = None,
 ) -> list[Edited]:
-    """Samples a part of a motion anew: `joints` in `frames` or `seconds`, each by default all.
+    """Resamples a part of a motion: `joints` in `region`, each by default all.
 
     Args:
         model: from `flame_mdm.load`.
         motion: what `read_motion` reads, or its result, or a generated motion.
         texts, actions: what to do, as in `generate`; neither = without condition.
-        frames: [begin, end) or several such ranges, to sample anew; or a task: "in_between" keeps the first and the
-            last quarter, "prediction" ("prefix") the first, "suffix" the last, "interpolate" every fifth frame.
-        seconds: ranges in seconds, in place of `frames`.
-        joints: names of joints or of parts of the body (see `part_names`), to sample anew; default all. The root's
-            way belongs to joint 0, which is in lower_body.
+        region: frames to resample, [begin, end) or several such ranges; or a task: "in_between" keeps the first and
+            the last quarter, "prediction" ("prefix") the first, "suffix" the last, "interpolate" every fifth frame.
+        region_seconds: ranges in seconds instead of `region`.
+        joints: names of joints or of parts of the body (see `part_names`), to resample; default all. The root
+            trajectory belongs to joint 0, which is in lower_body.
         method: "mdm" overwrites the clean estimate (exact); "flame" blends after each step as the paper says (exact);
             "flame_code" before each call as the paper's code; "mfm" rewrites the path early on. Default: "mdm" on
             diffusion, "mfm" on flows.
@@ -102,23 +100,25 @@ def edit(
         FileNotFoundError, ValueError: from `read_motion`.
     """
     representation = model.representation
-    original = motion if isinstance(motion, Generated) else read_motion(representation, motion)
-    length = len(original.features)
+    given = motion if isinstance(motion, Motion) else read_motion(representation, motion)
+    original = with_features(representation, given)
+    features = original.features
+    length = len(features)
     if length > model.facts["max_frames"]:
         raise UserError(
             f"{original.id}: {length} frames are more than the {model.facts['max_frames']} "
             f"({model.facts['max_frames'] / original.fps:g} seconds) that the model was trained on: take a part, "
             "cut=[begin, end] in seconds"
         )
-    keep, still = kept_parts(representation, length, frames=frames, seconds=seconds, joints=joints)
+    keep, still = kept_parts(representation, length, region=region, region_seconds=region_seconds, joints=joints)
     if not keep.any():
-        raise UserError("this keeps nothing of the motion: choose frames=..., seconds=... or joints=...")
+        raise UserError("this keeps nothing of the motion: choose region=..., region_seconds=... or joints=...")
     if keep.all():
         raise UserError("this keeps all of the motion: nothing is left to sample")
     how = method_options(model.process, method, until, resample)
     if how["mode"] == "trajectory" and num_inference_steps is None:
         num_inference_steps = MFM_STEPS
-    known = representation.normalize(torch.from_numpy(original.features).to(model.device))
+    known = representation.normalize(torch.from_numpy(features).to(model.device))
     generated = generate(
         model,
         texts,
@@ -132,13 +132,13 @@ def edit(
         edit=Edit(known[None], keep[None].to(model.device), **how),
     )
     # Normalizing rounds, so what is kept is compared with what the sampler was given.
-    given, std = representation.denormalize(known).cpu().numpy(), representation.std.cpu().numpy()
+    exact, std = representation.denormalize(known).cpu().numpy(), representation.std.cpu().numpy()
     return [
         Edited(
             **vars(result),
             original=original,
             keep=keep.numpy(),
-            feature_error=float((np.abs(result.features - given) / std)[keep.numpy()].max()),
+            feature_error=float((np.abs(result.features - exact) / std)[keep.numpy()].max()),
             joint_error=float(np.linalg.norm(result.joints - original.joints, axis=-1)[still.numpy()].max()),
         )
         for result in generated
@@ -149,8 +149,8 @@ def kept_parts(
     representation: Representation,
     length: int,
     *,
-    frames: str | Ranges | None = None,
-    seconds: Ranges | None = None,
+    region: str | Ranges | None = None,
+    region_seconds: Ranges | None = None,
     joints: str | Sequence[str] | None = None,
 ) -> tuple[Tensor, Tensor]:
     """What an edit of a motion of `length` frames keeps; arguments as of `edit`.
@@ -161,7 +161,7 @@ def kept_parts(
     Raises:
         UserError: frames outside of the motion, unknown names.
     """
-    new_frames = _new_frames(length, representation.fps, frames, seconds)
+    new_frames = _new_frames(length, representation.fps, region, region_seconds)
     part = torch.zeros(len(representation.skeleton), dtype=torch.bool)
     part[list(range(len(part))) if joints is None else find_joints(representation.skeleton, joints)] = True
     features = (
@@ -171,11 +171,11 @@ def kept_parts(
     return keep, ~(new_frames[:, None] & part)
 
 
-def _new_frames(length: int, fps: float, frames: str | Ranges | None, seconds: Ranges | None) -> Tensor:
-    """(F,) bool, True = this frame is sampled anew."""
-    if frames is not None and seconds is not None:
-        raise UserError("give frames or seconds, not both")
-    if isinstance(frames, str):
+def _new_frames(length: int, fps: float, region: str | Ranges | None, seconds: Ranges | None) -> Tensor:
+    """(F,) bool, True = this frame is resampled."""
+    if region is not None and seconds is not None:
+        raise UserError("give region or region_seconds, not both")
+    if isinstance(region, str):
         frame = torch.arange(length)
         first, last = int(0.25 * length), int(0.75 * length)
         kept = {
@@ -185,32 +185,32 @@ def _new_frames(length: int, fps: float, frames: str | Ranges | None, seconds: R
             "suffix": frame >= last,
             "interpolate": frame % 5 == 0,
         }
-        if frames not in kept:
+        if region not in kept:
             raise UserError(
-                f"frames={frames} is unknown.{_nearest(frames, list(kept))} Give ranges [begin, end], or one of: "
+                f"region={region} is unknown.{did_you_mean(region, list(kept))} Give ranges [begin, end], or one of: "
                 f"{', '.join(kept)}"
             )
-        return ~kept[frames]
-    ranges = frames if frames is not None else seconds
-    if ranges is None:  # no frames are chosen: all of them
+        return ~kept[region]
+    ranges = region if region is not None else seconds
+    if ranges is None:  # no region is chosen: all frames
         return torch.ones(length, dtype=torch.bool)
-    unit, scale = ("frames", 1.0) if seconds is None else ("seconds", fps)
+    name, scale = ("region", 1.0) if seconds is None else ("region_seconds", fps)
     new = torch.zeros(length, dtype=torch.bool)
-    for begin, end in _pairs(ranges, unit):
+    for begin, end in _pairs(ranges, name):
         first, last = round(begin * scale), round(end * scale)
         if not 0 <= first < last <= length:
             raise UserError(
-                f"{unit}=[{begin:g}, {end:g}] is no part of this motion, which has {length} frames "
+                f"{name}=[{begin:g}, {end:g}] is no part of this motion, which has {length} frames "
                 f"({length / fps:g} seconds)"
             )
         new[first:last] = True
     return new
 
 
-def _pairs(ranges: Ranges, unit: str) -> list[tuple[float, float]]:
+def _pairs(ranges: Ranges, name: str) -> list[tuple[float, float]]:
     listed: Any = [ranges] if is_range(ranges) else ranges
     if not isinstance(listed, list | tuple) or not listed or not all(map(is_range, listed)):
-        raise UserError(f"{unit}={ranges}: write [begin, end], or several as [[begin, end], [begin, end]]")
+        raise UserError(f"{name}={ranges}: write [begin, end], or several as [[begin, end], [begin, end]]")
     return [(begin, end) for begin, end in listed]
 
 
@@ -256,7 +256,7 @@ def find_joints(skeleton: Skeleton, names: str | Sequence[str]) -> list[int]:
     for name in names if isinstance(names, list | tuple) else [names]:
         if not isinstance(name, str) or name not in known:
             raise UserError(
-                f"skeleton {skeleton.name} has no joint or part '{name}'.{_nearest(str(name), list(known))} "
+                f"skeleton {skeleton.name} has no joint or part '{name}'.{did_you_mean(str(name), list(known))} "
                 f"Parts: {', '.join(part_names(skeleton))}; joints: {', '.join(skeleton.joints)}"
             )
         found.update(known[name])
@@ -288,11 +288,6 @@ def method_options(
     return how | {"resample": resample}
 
 
-def _nearest(name: str, names: Sequence[str]) -> str:
-    near = difflib.get_close_matches(name, names, 3, 0.5)
-    return f" Did you mean {', '.join(near)}?" if near else ""
-
-
 # Reading motions ------------------------------------------------------------------------------------------------------
 
 
@@ -300,16 +295,19 @@ def read_motion(
     representation: Representation,
     source: str | Path,
     *,
+    fps: float | None = None,
+    unit: float | None = None,
     cut: Sequence[float] | None = None,
     data_root: str | Path = "data",
-) -> Generated:
+) -> Motion:
     """Reads a motion to edit, in the features of a model.
 
     Args:
         representation: of the model.
-        source: an .npz of `make sample`; an .npz with `joints` (F, J, 3) in metres, y up, and `fps`; a .bvh file of a
-            known skeleton; or `dataset:id`, a clip of a prepared data set. Joints are brought to the
+        source: a motion file, of any kind that `flame_mdm.formats.files.read` reads; or `dataset:id`, a clip of a
+            prepared data set. Features of the same representation and frame rate are kept; joints are brought to the
             frame rate of the model and turned as its features have them.
+        fps, unit: of the file, as in `flame_mdm.formats.files.read`.
         cut: begin and end in seconds, of the part that counts.
         data_root: folder of the prepared data sets.
 
@@ -318,85 +316,65 @@ def read_motion(
         ValueError: a damaged file, or a motion whose features this representation cannot compute.
         UserError: an unknown clip, or a `cut` outside of the motion.
     """
-    name, suffix = str(source), Path(source).suffix.lower()
-    caption = ""
-    if suffix == ".npz":
-        features, caption = _read_npz(representation, Path(source))
-    elif suffix == ".bvh":
-        features = _encode(representation, read_bvh(Path(source), representation.fps)[0], name)
+    name = str(source)
+    if Path(source).suffix.lower() in ENDINGS:
+        motion = replace(read(source, fps, unit, resample_to=representation.fps), id=name)
+        motion = with_features(representation, motion)
     elif ":" in name:
-        features, caption = _read_clip(representation, name, Path(data_root))
+        motion = _read_clip(representation, name, Path(data_root))
     else:
-        raise UserError(f"motion={name}: give an .npz or .bvh file, or dataset:id for a clip of a prepared data set")
+        raise UserError(
+            f"motion={name}: not a motion. Give a {', '.join(ENDINGS)} file, or dataset:id for a clip of a prepared "
+            "data set"
+        )
     if cut is not None:
         if not is_range(cut):
             raise UserError(f"cut={cut}: write [begin, end], in seconds")
         begin, end = (round(second * representation.fps) for second in cut)
-        if not 0 <= begin < end <= len(features):
-            seconds = len(features) / representation.fps
+        if not 0 <= begin < end <= len(motion.features):
+            seconds = len(motion.features) / representation.fps
             raise UserError(f"cut=[{cut[0]:g}, {cut[1]:g}] is no part of {name}, which lasts {seconds:g} seconds")
-        features = representation.rebase(features[begin:end])
-    joints = representation.decode(torch.from_numpy(features)).numpy()
-    return Generated(name, joints, features, representation.fps, caption)
+        motion = _decoded(representation, representation.rebase(motion.features[begin:end]), motion.text, name)
+    return motion
 
 
-def _read_npz(representation: Representation, path: Path) -> tuple[np.ndarray, str]:
+def with_features(representation: Representation, motion: Motion) -> Motion:
+    """Returns a motion with features of this representation: as it is if it has them, otherwise computed from joints.
+
+    Raises:
+        ValueError: features of another shape, too many frames, or joints that the representation does not take.
+    """
+    fits = motion.representation == representation.name and math.isclose(motion.fps, representation.fps)
+    if fits:
+        shape, size = motion.features.shape, representation.features
+        if shape[1:] != (size,) or not np.isfinite(motion.features).all():
+            raise ValueError(f"{motion.id}: features of shape {shape}, not (frames, {size}), or not finite")
+        return motion
+    joints, skeleton = motion.joints.astype(float), representation.skeleton
+    if skeleton.joints == motion.skeleton.joints[: len(skeleton)]:
+        joints = joints[:, : len(skeleton)]  # without the hands
     try:
-        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
-            arrays = {key: file[key] for key in file.files}
-    except FileNotFoundError:
-        raise FileNotFoundError(f"{path}: no such file") from None
-    except (ValueError, OSError, EOFError, TypeError, zipfile.BadZipFile, zlib.error) as error:
-        raise ValueError(f"{path}: damaged, or not an .npz file of numbers") from error
-    caption, kind = str(arrays.get("text", "")), str(arrays.get("representation", ""))
-    try:
-        fps = float(arrays["fps"])
-    except (KeyError, TypeError, ValueError):
-        raise ValueError(f"{path}: needs fps, the frames a second, as one number") from None
-    if not 0 < fps < math.inf:
-        raise ValueError(f"{path}: fps is {fps:g}, not a number above 0")
-    if kind == representation.name and math.isclose(fps, representation.fps) and "features" in arrays:
-        features = np.asarray(arrays["features"], np.float32)
-        if features.ndim != 2 or features.shape[1] != representation.features or not np.isfinite(features).all():
-            shape = f"(frames, {representation.features})"
-            raise ValueError(f"{path}: features have shape {features.shape}, not {shape}, or are not finite")
-        return features, caption
-    if "joints" not in arrays:
-        what = f"features {kind or '(unnamed)'} at {fps:g} fps" if "features" in arrays else "neither features"
-        raise ValueError(
-            f"{path}: holds {what} and no joints, but the model takes {representation.name} at "
-            f"{representation.fps:g} fps"
-        )
-    if arrays["joints"].dtype.kind not in "fiu":
-        raise ValueError(f"{path}: joints are no array of real numbers")
-    joints = np.asarray(arrays["joints"], np.float64)
-    if joints.ndim != 3 or joints.shape[2] != 3 or len(joints) < 2 or not (np.abs(joints) < 1e6).all():
-        raise ValueError(f"{path}: joints have shape {joints.shape}, not (frames, joints, 3), or are not finite")
-    return _encode(representation, resample(joints, fps, representation.fps), str(path)), caption
-
-
-def resample(joints: np.ndarray, fps: float, to: float) -> np.ndarray:
-    """Joints (F, J, 3) at another frame rate, by cubic splines from the first frame on; bones change by about 0.1 %."""
-    if math.isclose(fps, to):
-        return joints
-    count = math.floor((len(joints) - 1) * to / fps + 1e-9) + 1
-    return CubicSpline(np.arange(len(joints)), joints)(np.arange(count) * fps / to)
-
-
-def _encode(representation: Representation, joints: np.ndarray, name: str) -> np.ndarray:
-    try:
-        return representation.encode(torch.from_numpy(joints)).numpy()
+        joints = resample_joints(joints, motion.fps, representation.fps, cubic=True)
+        features = representation.encode(torch.from_numpy(joints)).numpy()
     except ValueError as error:
-        raise ValueError(f"{name}: {error}") from error
+        raise ValueError(f"{motion.id}: {error}") from error
+    return _decoded(representation, features, motion.text, motion.id)
 
 
-def _read_clip(representation: Representation, source: str, data_root: Path) -> tuple[np.ndarray, str]:
+def _decoded(representation: Representation, features: np.ndarray, text: str, name: str) -> Motion:
+    joints = representation.decode(torch.from_numpy(features)).numpy()
+    skeleton, known = representation.skeleton, representation.name
+    return Motion(joints, representation.fps, skeleton, text, name, features=features, representation=known)
+
+
+def _read_clip(representation: Representation, source: str, data_root: Path) -> Motion:
     dataset, _, clip_id = source.partition(":")
     store = Store(data_root / f"{dataset}-{representation.name}")
     if store.info["fps"] != representation.fps:
         raise ValueError(f"{store.folder}: prepared at {store.info['fps']:g} fps, the model has {representation.fps:g}")
     clips = {clip.id: clip for clip in store.clips}
     if clip_id not in clips:
-        raise UserError(f"{store.folder} has no clip '{clip_id}'.{_nearest(clip_id, list(clips))}")
+        raise UserError(f"{store.folder} has no clip '{clip_id}'.{did_you_mean(clip_id, list(clips))}")
     clip = clips[clip_id]
-    return np.array(store.motion(clip)), clip.captions[0] if clip.captions else ""
+    text = clip.captions[0] if clip.captions else ""
+    return _decoded(representation, np.array(store.motion(clip)), text, source)

@@ -1,45 +1,29 @@
-"""Motions on request: from texts, actions or nothing to joints, features and the files that hold them."""
+"""Sampling of motions for texts, actions or nothing, and the files of one request."""
 
 from __future__ import annotations
 
-import hashlib
 import math
+from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 
-from flame_mdm.config import UserError
+from flame_mdm.errors import UserError
+from flame_mdm.files import atomic_folder
+from flame_mdm.formats.motion import Motion
 from flame_mdm.motion import Edit, MotionBatch, length_mask
 from flame_mdm.task import MotionGeneration
-from flame_mdm.visualize import Motion, contact_sheet, write_gif, write_player
-from flame_mdm.visualize.scene import written_whole
+from flame_mdm.visualize import contact_sheet, write_gif, write_player
+from flame_mdm.visualize.scene import shortened
 
 BATCH = 32
 MOST = 10_000
 """Samples of one request; they are kept in memory until all are there."""
-
-
-@dataclass
-class Generated:
-    """One motion, generated or real.
-
-    Attributes:
-        id: what it was asked to be and the number of the sample, which decide the noise with the seed; or the clip.
-        joints: (F, J, 3) float32, metres, y up.
-        features: (F, D) float32, in the data's units, as the representation defines them.
-        fps: frames a second.
-        caption: the text or the name of the action; "" where unconditioned.
-    """
-
-    id: str
-    joints: np.ndarray
-    features: np.ndarray
-    fps: float
-    caption: str
+LONGEST_TEXT = 2000
+"""Characters of a text, far more than any caption of the data sets has."""
 
 
 def generate(
@@ -55,10 +39,11 @@ def generate(
     sampler: str | None = None,
     num_inference_steps: int | None = None,
     edit: Edit | None = None,
-) -> list[Generated]:
+) -> list[Motion]:
     """Motions for texts or actions, `samples` of each; for neither, unconditioned ones.
 
-    A motion depends on its text, its length, the number of the sample and the seed alone, not on the others.
+    A motion depends on its text, its length, the number of the sample and the seed alone, not on other texts. If a text
+    is given several times, its samples are numbered on, so that they differ.
 
     Args:
         model: from `flame_mdm.load`.
@@ -68,10 +53,10 @@ def generate(
         seed: of the noise.
         guidance_scale, sampler, num_inference_steps: instead of the recipe's.
         edit: what to keep of a motion of that length, `known` and `keep` (1, F, D), in every motion; see
-            `flame_mdm.edit`.
+            `flame_mdm.commands.edit`.
 
     Raises:
-        UserError: an empty text, an unknown action, a length the model was not trained for.
+        UserError: an empty or endless text, an unknown action, a length the model was not trained for.
     """
     for name, value, most in (("samples", samples, MOST), ("num_inference_steps", num_inference_steps, None)):
         if value is not None and not 1 <= value <= (most or value):
@@ -82,8 +67,19 @@ def generate(
     wanted = list(texts or actions or [""])
     if texts is not None and not all(text.strip() for text in texts):
         raise UserError("an empty text describes no motion; leave the text out to sample without condition")
-    ids = [f"{text}#{number}" for text in wanted for number in range(samples)]
+    for text in wanted:
+        if len(text) > LONGEST_TEXT:
+            raise UserError(
+                f"{shortened(text, 60)}: {len(text):,} characters are too many. Give at most {LONGEST_TEXT:,}"
+            )
+    if len(wanted) * samples > MOST:
+        raise UserError(f"{len(wanted):,} texts with samples={samples}: at most {MOST:,} motions are sampled at once")
     captions = [text for text in wanted for _ in range(samples)]
+    numbers: Counter[str] = Counter()
+    ids = []
+    for text in captions:
+        ids.append(f"{text}#{numbers[text]}")
+        numbers[text] += 1
     lengths = _lengths(model, len(wanted), samples, seconds, frames)
     labels = None if actions is None else [_action(model, name) for name in captions]
     results = []
@@ -110,15 +106,16 @@ def generate(
     return results
 
 
-def _finish(model: MotionGeneration, batch: MotionBatch, x: torch.Tensor, captions: Sequence[str]) -> list[Generated]:
-    results = []
+def _finish(model: MotionGeneration, batch: MotionBatch, x: torch.Tensor, captions: Sequence[str]) -> list[Motion]:
+    known, results = model.representation, []
     for row, length in enumerate(batch.lengths.tolist()):
-        features = model.representation.denormalize(x[row, :length].float())
-        joints = model.representation.decode(features)
+        features = known.denormalize(x[row, :length].float())
+        joints = known.decode(features)
         if not torch.isfinite(joints).all():
             raise UserError(f"the model returned a motion that is not finite for '{captions[row]}'")
-        fps = model.representation.fps
-        results.append(Generated(batch.ids[row], joints.cpu().numpy(), features.cpu().numpy(), fps, captions[row]))
+        motion = Motion(joints.cpu().numpy(), known.fps, known.skeleton, captions[row], batch.ids[row])
+        motion.features, motion.representation = features.cpu().numpy(), known.name
+        results.append(motion)
     return results
 
 
@@ -128,6 +125,8 @@ def _lengths(
     fps, longest = model.representation.fps, model.facts["max_frames"]
     if seconds is not None and not (isinstance(seconds, int | float) and math.isfinite(seconds)):
         raise UserError(f"seconds={seconds} is no length of a motion")
+    if seconds is not None and frames is not None:
+        raise UserError("give seconds or frames, not both")
     if frames is None:
         frames = min(round(3 * fps), longest) if seconds is None else round(seconds * fps)
     each = [frames] * wanted if isinstance(frames, int) else list(frames)
@@ -149,43 +148,16 @@ def _action(model: MotionGeneration, name: str) -> int:
     return actions.index(name)
 
 
-def write_motions(folder: Path, model: MotionGeneration, motions: Sequence[Generated], facts: dict[str, Any]) -> None:
-    """Writes `motion_000.npz` ..., `motions.gif`, `motions.png` and `player.html` into a folder, which it makes.
+def write_motions(folder: Path, motions: Sequence[Motion], facts: dict[str, Any]) -> None:
+    """Writes `motion_000.npz` ..., `motions.gif`, `motions.png` and `player.html` into a folder, all of them or none.
 
     `facts` are added to each `.npz`: seed, checkpoint hash ...
     """
-    folder.mkdir(parents=True, exist_ok=True)
-    skeleton = model.representation.skeleton
-    scene = [Motion(m.joints, m.fps, skeleton, caption=m.caption or "unconditioned", id=m.id) for m in motions]
-    for number, motion in enumerate(motions):
-        write_motion(folder / f"motion_{number:03d}.npz", motion, model.representation.name, facts)
-    write_gif(folder / "motions.gif", scene[:8])
-    contact_sheet(folder / "motions.png", scene[:8])
-    write_player(
-        folder / "player.html",
-        scene,
-        title=motions[0].caption if len({m.caption for m in motions}) == 1 and motions[0].caption else "Motions",
-    )
-
-
-def write_motion(path: Path, motion: Generated, representation: str, facts: dict[str, Any]) -> None:
-    """Writes an `.npz` that `flame_mdm.formats.read` takes.
-
-    It holds `joints` (F, J, 3) in metres, y up; `features` (F, D); `fps`, `text`, `representation` and `facts`.
-    """
-    with written_whole(path) as temporary:
-        np.savez_compressed(
-            temporary,
-            joints=motion.joints,
-            features=motion.features,
-            fps=motion.fps,
-            text=motion.caption,
-            representation=representation,
-            **facts,
-        )
-
-
-def file_sha256(path: str | Path) -> str:
-    """Hash of a file, as it stands in results."""
-    with Path(path).open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+    scene = [replace(motion, text=motion.text or "unconditioned") for motion in motions]
+    with atomic_folder(folder) as made:
+        for number, motion in enumerate(motions):
+            motion.save(made / f"motion_{number:03d}.npz", **facts)
+        write_gif(made / "motions.gif", scene[:8])
+        contact_sheet(made / "motions.png", scene[:8])
+        title = motions[0].text if len({motion.text for motion in motions}) == 1 else ""
+        write_player(made / "player.html", scene, title or "Motions")

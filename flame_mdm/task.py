@@ -3,29 +3,27 @@
 from __future__ import annotations
 
 import math
-import zipfile
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Self, TypeVar
+from typing import Any, Self
 
 import torch
-from hydra.utils import get_class
 from lightning import LightningModule
 from torch import Tensor
 from torchmetrics import MeanMetric
 
-from flame_mdm import checkpoints
 from flame_mdm.conditions import ConditionEncoder
-from flame_mdm.config import Config, UserError, instantiate, parameters, trust
+from flame_mdm.config import Config, instantiate, parameters
 from flame_mdm.data.datamodule import MotionDataModule
 from flame_mdm.denoisers import Denoiser
+from flame_mdm.errors import UserError
 from flame_mdm.losses import MotionLosses
 from flame_mdm.motion import Condition, Edit, MotionBatch, pad_to
-from flame_mdm.noise import key, normal, seeded_noise, uniform
-from flame_mdm.processes import Process
+from flame_mdm.processes import MOST_STEPS, Process
 from flame_mdm.processes.guidance import classifier_free_guidance
 from flame_mdm.representations import Representation
+from flame_mdm.seeds import key, normal, seeded_noise, uniform
 
 
 class Task(LightningModule):
@@ -128,6 +126,8 @@ class MotionGeneration(Task):
             raise UserError(f"task.cond_drop_prob={cond_drop_prob}: a probability lies between 0 and 1")
         if not math.isfinite(guidance_scale):
             raise UserError(f"task.guidance_scale={guidance_scale} is no finite number")
+        if type(num_inference_steps) is not int or not 1 <= num_inference_steps <= MOST_STEPS:
+            raise UserError(f"task.num_inference_steps={num_inference_steps}: give a number from 1 to {MOST_STEPS:,}")
         self.denoiser, self.process = denoiser, process
         self.losses = MotionLosses(representation.to_joints, representation.skeleton.feet, **losses)
         self.cond_drop_prob = cond_drop_prob
@@ -272,89 +272,3 @@ class MotionGeneration(Task):
         )
         self.train(was_training)
         return x[:, :frames]
-
-
-def load(path: str | Path, device: str | torch.device = "cpu") -> MotionGeneration:
-    """A trained model from a checkpoint, ready to sample: see `load_task`."""
-    return load_task(path, MotionGeneration, device)
-
-
-Trained = TypeVar("Trained", bound=Task)
-
-
-def load_task(path: str | Path, kind: type[Trained], device: str | torch.device = "cpu") -> Trained:
-    """What a checkpoint holds, in evaluation mode: the averaged weights where the recipe averages them.
-
-    Raises:
-        FileNotFoundError: no such file.
-        UserError: not a checkpoint of this framework, not of this kind, damaged, or of another shape than its recipe.
-    """
-    try:
-        torch.empty(0, device=device)
-    except (RuntimeError, AssertionError) as error:  # torch reports an absent device as either
-        raise UserError(f"device={device}: {str(error).splitlines()[0]}") from error
-    checkpoint = read_checkpoint(path)
-    try:
-        return _build(path, checkpoint, kind).eval().to(device)
-    except (UserError, FileNotFoundError):
-        raise
-    except Exception as error:  # a recipe of nonsense fails anywhere
-        raise UserError(f"{path}: no model can be built of it: {type(error).__name__}: {error}") from error
-
-
-def _build(path: str | Path, checkpoint: dict[str, Any], kind: type[Trained]) -> Trained:
-    config, facts = checkpoint["config"], checkpoint["facts"]
-    parts = ("task", "representation", "process", "condition", "denoiser")
-    trust({name: config[name] for name in parts if name in config})
-    built = get_class(config["task"]["_target_"])
-    if not issubclass(built, kind):
-        raise UserError(f"{path}: holds a {built.__name__}, not a {kind.__name__}")
-    representation = instantiate(config["representation"])
-    task = built.build(config, representation, actions=facts["actions"])
-    task.facts = facts
-    try:
-        task.load_state_dict(checkpoint["state_dict"], strict=True)
-    except RuntimeError as error:
-        lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-        raise UserError(f"{path}: the weights do not fit the recipe saved with them: {lines[1]}") from error
-    return task
-
-
-def read_checkpoint(path: str | Path) -> dict[str, Any]:
-    """The contents of a checkpoint or model file, unpickled with plain values and tensors only.
-
-    Args:
-        path: what `flame_mdm.checkpoints.find` finds: a file, a folder with a model file, or a name on the hub.
-
-    Raises:
-        FileNotFoundError: no such file.
-        UserError: not a checkpoint of this framework, or damaged; or the hub does not give it.
-    """
-    path = checkpoints.find(path)
-    if path.suffix == ".safetensors":
-        return _sensible(path, checkpoints.read(path))
-    try:
-        with zipfile.ZipFile(path) as file:
-            if (spoiled := file.testzip()) is not None:  # torch does not look at the checksums
-                raise ValueError(spoiled)
-        checkpoint = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # torch raises many kinds for damaged files and foreign pickles
-        raise UserError(f"{path}: damaged, or not a checkpoint of this framework") from error
-    return _sensible(path, checkpoint)
-
-
-def _sensible(path: Path, checkpoint: Any) -> dict[str, Any]:
-    """The checkpoint, if it holds a recipe, facts of the data and weights."""
-    if not isinstance(checkpoint, dict) or not all(
-        isinstance(checkpoint.get(name), dict) for name in ("config", "facts", "state_dict")
-    ):
-        raise UserError(
-            f"{path}: not a checkpoint of this framework: it holds no recipe; those that authors released are imported "
-            "by `python -m flame_mdm.checkpoints import`"
-        )
-    facts, most = checkpoint["facts"], checkpoint["facts"].get("max_frames", 1)
-    if not isinstance(facts.get("actions"), list | tuple) or not isinstance(most, int) or most < 1:
-        raise UserError(f"{path}: damaged: its facts of the data, actions and max_frames, make no sense")
-    if not all(isinstance(value, Tensor) for value in checkpoint["state_dict"].values()):
-        raise UserError(f"{path}: damaged: its weights are no tensors")
-    return checkpoint

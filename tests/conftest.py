@@ -4,11 +4,15 @@ import os
 
 os.environ["HF_HUB_OFFLINE"] = "1"  # before transformers is imported
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 import torch
 from hypothesis import settings
+from refusals import Refused
+
+from flame_mdm.__main__ import main
 
 torch.set_num_threads(1)
 settings.register_profile("repeatable", derandomize=True, deadline=None)
@@ -41,3 +45,40 @@ def data_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def tiny(tmp_path: Path, data_root: Path) -> list[str]:
     """Overrides of a tiny experiment with a run folder of its own, `tmp_path / "run"`."""
     return [*TINY, f"data_root={data_root}", f"run.dir={tmp_path / 'run'}"]
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory, data_root) -> Path:
+    """A checkpoint of a tiny model; its data is prepared."""
+    folder = tmp_path_factory.mktemp("trained")
+    words = [*TINY, f"data_root={data_root}", f"run.dir={folder}", "callbacks.samples=null", "callbacks.best=null"]
+    assert main(["train", "quickstart", *words, "trainer.max_steps=2", "logger=csv"]) == 0
+    return folder / "checkpoints" / "last.ckpt"
+
+
+@pytest.fixture
+def bad(tmp_path) -> Path:
+    """Where the malformed files lie."""
+    folder = tmp_path / "bad"
+    folder.mkdir()
+    return folder
+
+
+@pytest.fixture
+def refused(tmp_path, monkeypatch, capfd, trained, data_root) -> Iterator[Refused]:
+    folder = tmp_path / "here"
+    folder.mkdir()
+    monkeypatch.chdir(folder)
+    monkeypatch.setenv("FLAME_MDM_DATA", str(data_root))
+    monkeypatch.delenv("FLAME_MDM_TRACEBACK", raising=False)
+    refused = Refused(folder, capfd, [trained.parent.parent, data_root])
+    yield refused
+    assert refused.count > 0
+    assert not refused.faults, f"{len(refused.faults)} of {refused.count}:\n" + "\n".join(refused.faults)
+
+
+@pytest.fixture
+def attacked(refused) -> Refused:
+    """`refused` for crafted input: 5 seconds and 1 GiB of memory for each command."""
+    refused.seconds, refused.memory = 5, 2**30
+    return refused

@@ -5,8 +5,8 @@ import pytest
 import torch
 from scipy.ndimage import gaussian_filter1d
 
-from evaluators.attributes import AttributeAccuracy, read_attributes
-from evaluators.physics import FootSkating
+from evaluators.metrics.attributes import AttributeAccuracy, read_attributes
+from evaluators.metrics.physics import FootSkating
 from flame_mdm.data import Clip
 from flame_mdm.data.synthetic import Synthetic, prompts
 

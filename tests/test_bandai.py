@@ -16,10 +16,11 @@ import torch
 from fixtures import SHARED, needs_third_party, third_party
 from scipy.spatial.transform import Rotation
 
-from flame_mdm.data import Clip, bandai, bvh
+from flame_mdm.__main__ import main
+from flame_mdm.data import Clip, bandai
 from flame_mdm.data.bandai import CONTENTS_1, JOINTS, STYLES_1, STYLES_2, TAKES_2, Bandai, captions, side_of, split_of
 from flame_mdm.data.store import Store
-from flame_mdm.prepare import main
+from flame_mdm.formats import bvh
 from flame_mdm.representations.skeleton import SKELETONS, SMPL22, SMPL24
 from flame_mdm.representations.smpl import ADULT, SMPL
 
@@ -283,7 +284,7 @@ def test_mirrored_smpl_rotations(tiny):
 
 def test_preparing_smpl_rotations(tiny, tmp_path, capsys):
     words = ["data=bandai", "representation=smpl", f"source={tiny}", f"data_root={tmp_path}", "data.source.workers=1"]
-    assert main([*words, "data.source.motion=smpl"]) == 0
+    assert main(["prepare", *words, "data.source.motion=smpl"]) == 0
     store = Store(tmp_path / "bandai-smpl147")
     assert store.info["shape"][1] == 147
     with pytest.raises(ValueError, match=r"data.source.motion=smplx: give joints or smpl"):

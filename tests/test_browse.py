@@ -10,14 +10,14 @@ import pytest
 import torch
 from test_visualize import HOSTILE, Page, unpacked
 
-from flame_mdm.browse import choose, describe, find, main, motion, write_clips
+from flame_mdm.__main__ import main
 from flame_mdm.data import Clip, MotionSource
 from flame_mdm.data.store import Entry, Store, write_store
 from flame_mdm.data.synthetic import Synthetic
-from flame_mdm.formats import read
+from flame_mdm.formats.files import read
+from flame_mdm.reporting.browse import choose, describe, find, motion, write_clips, write_page
 from flame_mdm.representations.humanml import HumanML
 from flame_mdm.representations.rot6d import Rot6D
-from flame_mdm.visualize import write_player
 
 SYNTHETIC = ["data=synthetic", "data.source.clips=60"]
 
@@ -99,8 +99,7 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Store:
 
 def page_of(store: Store, path: Path) -> Page:
     families = find(store.clips, None, "")
-    motions = [motion(store, HumanML(), clip) for family in families for clip in family]
-    write_player(path, motions, HOSTILE, about=describe(store))
+    write_page(path, store, HumanML(), [clip for family in families for clip in family], HOSTILE)
     return Page(path)
 
 
@@ -131,8 +130,8 @@ def test_statistics_count_all_clips_whether_shown_or_not(store):
     lengths = [clip.length for clip in store.clips if clip.split == "train"]
     minutes = f"{sum(lengths) / 20 / 60:.1f}"
     cells = [4, minutes, min(lengths), f"{np.median(lengths):g}", max(lengths), 6, 2]
-    assert "<tr><td>train</td>" + "".join(f"<td>{cell}</td>" for cell in cells) in about
-    assert "<tr><td>val</td><td>1</td>" in about
+    assert "<tr><td>train</td>" + "".join(f'<td class="number">{cell}</td>' for cell in cells) in about
+    assert '<tr><td>val</td><td class="number">1</td>' in about
     bars = [note.split("</title>")[0] for note in about.split("<title>")[1:]]
     for split, count in (("train", 4), ("val", 1)):
         assert sum(int(bar.split(": ")[1].split()[0]) for bar in bars if bar.endswith(split)) == count
@@ -157,7 +156,9 @@ def test_motions_without_a_floor_stand_on_one(tmp_path):
 
 
 def run(tmp_path: Path, data_root: Path, *words: str) -> int:
-    return main([*SYNTHETIC, f"data_root={data_root}", f"run.dir={tmp_path}", f"out={tmp_path / 'page.html'}", *words])
+    return main(
+        ["browse", *SYNTHETIC, f"data_root={data_root}", f"run.dir={tmp_path}", f"out={tmp_path / 'page.html'}", *words]
+    )
 
 
 def test_command_prepares_and_shows(tmp_path, data_root, capsys):
@@ -183,8 +184,8 @@ def test_shown_clips_are_written_as_motion_files(tmp_path, data_root, capsys):
         found = read(path)
         assert found.fps == 20
         assert len(found.joints) == min(shown["frames"], 60), "cut as for evaluation"
-        assert found.caption
-        assert found.caption in shown["caption"].split(" · ")
+        assert found.text
+        assert found.text in shown["caption"].split(" · ")
         with np.load(path) as file:
             assert str(file["clip"]) == shown["id"]
             np.testing.assert_allclose(
@@ -199,7 +200,7 @@ def test_a_caption_names_one_motion_where_it_can(store, tmp_path):
     clips = [by_id[f"{number}{HOSTILE}"] for number in range(3)]
     copy = by_id[f"M3{HOSTILE}"]  # has a label only
     write_clips(tmp_path, store, HumanML(), [*clips, copy, replace(copy, action=None)], 30)
-    captions = [read(path).caption for path in sorted(tmp_path.glob("*.npz"))]
+    captions = [read(path).text for path in sorted(tmp_path.glob("*.npz"))]
     assert captions == [HOSTILE, "walks", HOSTILE, HOSTILE, ""]
 
 
@@ -217,10 +218,18 @@ def test_command_says_what_is_wrong(tmp_path, data_root, capsys, words, message)
 
 
 def test_command_names_the_data_sets(capsys):
-    assert main([]) == 1
+    assert (
+        main(
+            [
+                "browse",
+            ]
+        )
+        == 1
+    )
     assert "data=NAME, one of: " in capsys.readouterr().err
 
 
+@pytest.mark.tools
 @pytest.mark.skipif(shutil.which("chromium") is None, reason="chromium is not installed")
 def test_page_narrows_down_in_a_browser(store, tmp_path):
     page_of(store, tmp_path / "page.html")

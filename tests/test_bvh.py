@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from flame_mdm.data import bvh
+from flame_mdm.formats import bvh
 
 ARM = """HIERARCHY
 ROOT Hips

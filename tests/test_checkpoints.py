@@ -13,12 +13,15 @@ import torch
 from fixtures import GOLDEN, Arrays, golden, meta
 from safetensors.torch import load_file, save_file
 
-from flame_mdm import checkpoints
-from flame_mdm.config import UserError, compose, instantiate
+from flame_mdm.__main__ import main
+from flame_mdm.checkpoints import files, hub
+from flame_mdm.checkpoints.loading import load
+from flame_mdm.checkpoints.released import import_flame, import_mdm, released_state
+from flame_mdm.config import compose, instantiate
+from flame_mdm.errors import UserError
 from flame_mdm.generation import generate
 from flame_mdm.motion import Condition, MotionBatch
-from flame_mdm.released import import_flame, import_mdm, released_state
-from flame_mdm.task import MotionGeneration, load
+from flame_mdm.task import MotionGeneration
 
 MDM = [
     "mdm_trans_enc",
@@ -59,14 +62,11 @@ def imported(stem: str, mask_frames: bool, time_token: bool) -> MotionGeneration
         args = {key: config[key] for key in keys if key in config} | {"dataset": WIDTHS[width]}
         (folder / "args.json").write_text(json.dumps(args | {"mask_frames": mask_frames}, indent=4))
         words = ["import", "mfm" if stem == "mfm" else "mdm", f"{folder}/model.pt", f"{folder}/args.json"]
-        words += ["-o", f"{folder}/ours.safetensors", f"--heads={config.get('num_heads', config.get('heads'))}"]
-        words += ["--time-token"] if time_token else []
+        words += [f"out={folder}/ours.safetensors", f"num_heads={config.get('num_heads', config.get('heads'))}"]
+        words += ["time_token=true"] if time_token else []
         if args["dataset"] in NORMALIZED:
-            words += [
-                "--stats",
-                str(statistics_folder(folder, width)),
-            ]
-        assert checkpoints.main(words) == 0
+            words.append(f"stats={statistics_folder(folder, width)}")
+        assert main([*words]) == 0
         return load(folder / "ours.safetensors")
 
 
@@ -84,7 +84,7 @@ def imported_flame() -> MotionGeneration:
         averaged = {f"ema_model.model.{key}": value for key, value in state.items()}
         torch.save({"epoch": 3, "global_step": 9, "state_dict": raw | averaged}, file)
         heads = meta(arrays)["config"]["heads"]
-        assert checkpoints.main(["import", "flame", str(file), "-o", name, f"--heads={heads}"]) == 0
+        assert main(["import", "flame", str(file), f"out={name}", f"num_heads={heads}"]) == 0
         model = load(name)
     assert torch.equal(model.condition.get_buffer("pooler_weight"), state["lm.pooler.dense.weight"])
     assert torch.equal(model.condition.get_buffer("pooler_bias"), state["lm.pooler.dense.bias"])
@@ -283,7 +283,7 @@ def released_file(folder: Path, state: dict, args: dict | str) -> list[str]:
     """Words of an import command for a released file of these contents."""
     torch.save(state, folder / "model.pt")
     (folder / "args.json").write_text(args if isinstance(args, str) else json.dumps(args))
-    return [str(folder / "model.pt"), str(folder / "args.json"), "-o", str(folder / "ours.safetensors")]
+    return [str(folder / "model.pt"), str(folder / "args.json"), f"out={folder / 'ours.safetensors'}"]
 
 
 def rot6d_state() -> dict[str, torch.Tensor]:
@@ -297,7 +297,7 @@ def test_options_of_mdm(tmp_path):
     state = rot6d_state() | {"embed_action.action_embedding": torch.randn(12, 8)}
     args = {"dataset": "humanact12", "cond_mask_prob": 0, "lambda_vel": 1.0, "diffusion_steps": 50, "num_frames": 40}
     args |= {"noise_schedule": "linear", "sigma_small": False}
-    assert checkpoints.main(["import", "mdm", *released_file(tmp_path, state, args)]) == 0
+    assert main(["import", "mdm", *released_file(tmp_path, state, args)]) == 0
     model = load(tmp_path / "ours.safetensors")
     assert model.facts["actions"][9] == "phone"
     assert model.facts["max_frames"] == 40
@@ -312,9 +312,9 @@ def test_averaged_weights_are_taken_unless_the_last_are_asked_for(tmp_path):
     averaged = rot6d_state()
     last = {key: value + 1 for key, value in averaged.items()}
     words = released_file(tmp_path, {"model": last, "model_avg": averaged}, {"dataset": "uestc"})
-    assert checkpoints.main(["import", "mdm", *words]) == 0
+    assert main(["import", "mdm", *words]) == 0
     before = load(tmp_path).denoiser.get_parameter("output.bias")
-    assert checkpoints.main(["import", "mdm", *words, "--last"]) == 0
+    assert main(["import", "mdm", *words, "averaged=false"]) == 0
     assert torch.equal(load(tmp_path).denoiser.get_parameter("output.bias"), before + 1)
 
 
@@ -333,7 +333,7 @@ def test_options_of_mfm(tmp_path, solver, sampler, steps, odeint_grid):
     )
     text += "model: {num_heads: 2, cond_mask_prob: 0, lambda_rcxyz: 1}\ntraining: {num_frames: 30}\n"
     text += f"ode_kwargs: {json.dumps(solver)}\n"
-    assert checkpoints.main(["import", "mfm", *released_file(tmp_path, rot6d_state(), text)]) == 0
+    assert main(["import", "mfm", *released_file(tmp_path, rot6d_state(), text)]) == 0
     model = load(tmp_path)
     assert (model.sampler, model.num_inference_steps) == (sampler, steps)
     assert (model.config["process"]["odeint_grid"], model.config["process"]["quantize_time"]) == (odeint_grid, True)
@@ -342,7 +342,7 @@ def test_options_of_mfm(tmp_path, solver, sampler, steps, odeint_grid):
 
 
 def test_models_that_attend_to_the_padding_are_sampled_at_their_length(tmp_path):
-    checkpoints.main(["import", "mdm", *released_file(tmp_path, rot6d_state(), {"dataset": "uestc"})])
+    main(["import", "mdm", *released_file(tmp_path, rot6d_state(), {"dataset": "uestc"})])
     model = load(tmp_path)
     seen = set()
     model.denoiser.register_forward_hook(lambda module, inputs, output: seen.add(inputs[0].shape[1]))
@@ -353,7 +353,7 @@ def test_models_that_attend_to_the_padding_are_sampled_at_their_length(tmp_path)
 @pytest.mark.parametrize(
     ("kind", "change", "words", "message"),
     [
-        ("mdm", {}, ["--stats", "."], "model.pt: features of uestc are not normalized: leave out the folder"),
+        ("mdm", {}, ["stats=."], "model.pt: features of uestc are not normalized: leave out the folder"),
         ("mdm", {"dataset": "humanml"}, [], "150 features, but humanml-legacy-smpl22"),
         ("mdm", {"dataset": "amass"}, [], "dataset=amass of the released model: known are humanml, kit, humanact12"),
         ("mdm", {"arch": "trans_dec"}, [], "unknown seqTransEncoder"),
@@ -365,7 +365,7 @@ def test_models_that_attend_to_the_padding_are_sampled_at_their_length(tmp_path)
 def test_imports_that_cannot_be_are_one_line(tmp_path, monkeypatch, capsys, kind, change, words, message):
     monkeypatch.chdir(statistics_folder(tmp_path, 150))
     files = released_file(tmp_path, rot6d_state(), {"dataset": "uestc"} | change)
-    assert checkpoints.main(["import", kind, *files, *words]) == 1
+    assert main(["import", kind, *files, *words]) == 1
     output = capsys.readouterr().err
     assert message in output
     assert output.startswith("error: ")
@@ -377,25 +377,25 @@ def test_statistics_have_to_fit(tmp_path, capsys):
     state = small_state() | {"input_process.poseEmbedding.weight": torch.ones(8, 263)}
     state |= {"output_process.poseFinal.weight": torch.ones(263, 8), "output_process.poseFinal.bias": torch.ones(263)}
     words = ["import", "mdm", *released_file(tmp_path, state, {"dataset": "humanml"})]
-    assert checkpoints.main(words) == 1
+    assert main([*words]) == 1
     assert "features of humanml3d are normalized: give the folder of Mean.npy, Std.npy" in capsys.readouterr().err
-    assert checkpoints.main([*words, "--stats", str(tmp_path)]) == 1
+    assert main([*words, f"stats={tmp_path}"]) == 1
     assert "Mean.npy: no such file" in capsys.readouterr().err
     statistics_folder(tmp_path, 251)
-    assert checkpoints.main([*words, "--stats", str(tmp_path)]) == 1
+    assert main([*words, f"stats={tmp_path}"]) == 1
     assert "Mean.npy: shape (251,), expected (263,) finite numbers" in capsys.readouterr().err
     statistics_folder(tmp_path, 263)
-    assert checkpoints.main([*words, "--stats", str(tmp_path)]) == 0
+    assert main([*words, f"stats={tmp_path}"]) == 0
     assert np.array_equal(load(tmp_path).representation.mean, np.load(tmp_path / "Mean.npy").astype(np.float32))
     np.save(tmp_path / "Std.npy", np.zeros(263))
-    assert checkpoints.main([*words, "--stats", str(tmp_path)]) == 1
+    assert main([*words, f"stats={tmp_path}"]) == 1
     assert "Std.npy: 263 entries are not above 0" in capsys.readouterr().err
 
 
 def test_flame_needs_the_pooler_of_its_language_model(tmp_path, capsys):
     state = {f"net.{key}": value for key, value in weights(golden("flame_text2motion")).items()}
     torch.save({"state_dict": state}, tmp_path / "a.ckpt")
-    assert checkpoints.main(["import", "flame", str(tmp_path / "a.ckpt"), "-o", str(tmp_path)]) == 1
+    assert main(["import", "flame", str(tmp_path / "a.ckpt"), f"out={tmp_path}"]) == 1
     assert "nothing for lm.pooler.dense.weight" in capsys.readouterr().err
 
 
@@ -403,17 +403,17 @@ def test_pickles_of_objects_are_read_on_demand_only(tmp_path, capsys):
     words = released_file(
         tmp_path, {"state_dict": rot6d_state(), "hyper": argparse.Namespace(a=1)}, {"dataset": "uestc"}
     )
-    assert checkpoints.main(["import", "mdm", *words]) == 1
+    assert main(["import", "mdm", *words]) == 1
     output = capsys.readouterr().err
     assert "holds Python objects (argparse.Namespace)" in output
-    assert "--run-code-in-file" in output
+    assert "run_code=true" in output
     assert output.count("\n") == 1
-    assert checkpoints.main(["import", "mdm", *words, "--run-code-in-file"]) == 0
+    assert main(["import", "mdm", *words, "run_code=true"]) == 0
     for content in (b"", b"not a checkpoint", (tmp_path / "model.pt").read_bytes()[:-500]):
         (tmp_path / "model.pt").write_bytes(content)
-        assert checkpoints.main(["import", "mdm", *words]) == 1
+        assert main(["import", "mdm", *words]) == 1
         assert "model.pt: damaged, or not a PyTorch file" in capsys.readouterr().err
-    assert checkpoints.main(["import", "mdm", str(tmp_path / "absent.pt"), *words[1:]]) == 1
+    assert main(["import", "mdm", str(tmp_path / "absent.pt"), *words[1:]]) == 1
     assert "absent.pt: no such file" in capsys.readouterr().err
 
 
@@ -435,7 +435,7 @@ def trained(tmp_path: Path, tiny: list[str]) -> Path:
 
 def test_a_model_file_is_the_checkpoint(trained, tmp_path, capsys):
     file = tmp_path / "model" / "mine.safetensors"
-    assert checkpoints.main(["export", str(trained), "-o", str(file)]) == 0
+    assert main(["export", str(trained), f"out={file}"]) == 0
     assert str(file) in capsys.readouterr().out
     before, after, folder = load(trained), load(file), load(file.parent)
     assert before.state_dict().keys() == after.state_dict().keys() == load_file(file).keys()
@@ -445,20 +445,20 @@ def test_a_model_file_is_the_checkpoint(trained, tmp_path, capsys):
     a, b = (generate(model, "a person waves", frames=24)[0].features for model in (before, folder))
     assert np.array_equal(a, b)
     assert list(file.parent.iterdir()) == [file]
-    again = checkpoints.export(file, tmp_path / "again")
-    assert checkpoints.read(again)["origin"] == checkpoints.read(file)["origin"]
-    assert checkpoints.read(again)["origin"]["steps"] == 7
+    again = hub.export(file, tmp_path / "again")
+    assert files.read_model_file(again)["origin"] == files.read_model_file(file)["origin"]
+    assert files.read_model_file(again)["origin"]["steps"] == 7
 
 
 def test_a_model_file_does_not_tell_where_it_was_made(trained, tmp_path):
-    file = checkpoints.export(trained, tmp_path / "out")
+    file = hub.export(trained, tmp_path / "out")
     assert str(tmp_path).encode() not in file.read_bytes()
     assert str(tmp_path.parent).encode() not in file.read_bytes()
-    assert checkpoints.read(file)["config"]["data"]["root"] == "data"
+    assert files.read_model_file(file)["config"]["data"]["root"] == "data"
 
 
 def test_damaged_and_foreign_files_are_one_line(trained, tmp_path):
-    file = checkpoints.export(trained, tmp_path)
+    file = hub.export(trained, tmp_path)
     whole = file.read_bytes()
     flipped = bytearray(whole)
     flipped[-100] ^= 1
@@ -497,8 +497,8 @@ def test_push_writes_a_card_and_uploads_these_files_alone(trained, tmp_path, cap
     import huggingface_hub
 
     folder = tmp_path / "mine"
-    words = ["push", str(trained), "me/walker", "--folder", str(folder)]
-    assert checkpoints.main([*words, "--dry-run"]) == 0
+    words = ["push", str(trained), "me/walker", f"folder={folder}"]
+    assert main([*words, "dry_run=true"]) == 0
     card = (folder / "README.md").read_text()
     assert card.startswith("---\nlicense: mit\n")
     for fact in ('flame_mdm.load("me/walker")', "| experiment | quickstart |", "| data | synthetic |", "f00d"):
@@ -517,21 +517,21 @@ def test_push_writes_a_card_and_uploads_these_files_alone(trained, tmp_path, cap
 
     monkeypatch.setattr(huggingface_hub, "HfApi", Hub)
     (folder / "notes.txt").write_text("private")
-    assert checkpoints.main([*words, "--private"]) == 0
+    assert main([*words, "private=true"]) == 0
     assert calls[0] == ("me/walker", {"private": True, "exist_ok": True})
     assert "notes.txt" not in calls[1]["allow_patterns"]
     capsys.readouterr()
     monkeypatch.setattr(Hub, "create_repo", lambda *_, **__: (_ for _ in ()).throw(RuntimeError("no token\nlog in")))
-    assert checkpoints.main(words) == 1
+    assert main([*words]) == 1
     assert capsys.readouterr().err == f"error: me/walker: {folder} is written but not uploaded: no token\n"
-    assert checkpoints.main(["push", str(trained), "walker"]) == 1
+    assert main(["push", str(trained), "walker"]) == 1
     assert "name the model as user/name" in capsys.readouterr().err
 
 
 def test_the_license_follows_the_data(trained, tmp_path):
-    model = checkpoints.read(checkpoints.export(trained, tmp_path))
+    model = files.read_model_file(hub.export(trained, tmp_path))
     model["facts"]["dataset"] = "bandai"
-    assert "license: cc-by-nc-4.0" in checkpoints.card(model, "me/walker")
+    assert "license: cc-by-nc-4.0" in hub.card(model, "me/walker")
     model["facts"]["dataset"] = "humanml3d"
-    assert "license: other" in checkpoints.card(model, "me/walker")
-    assert "non-commercial" in checkpoints.card(model, "me/walker")
+    assert "license: other" in hub.card(model, "me/walker")
+    assert "non-commercial" in hub.card(model, "me/walker")

@@ -11,17 +11,19 @@ import torch
 from conftest import TINY
 from distributed import GlooPool
 
-from evaluators.action_gru import ActionGRU
-from evaluators.classifier import ClassifierTask
 from evaluators.extractors import OwnClassifierExtractor
-from evaluators.stgcn import JointSTGCN
-from flame_mdm import evaluate, train
-from flame_mdm.config import UserError, compose, instantiate
+from evaluators.extractors.action_gru import ActionGRU
+from evaluators.extractors.classifier import ClassifierTask
+from evaluators.extractors.stgcn import JointSTGCN
+from flame_mdm.__main__ import main
+from flame_mdm.config import compose, instantiate
 from flame_mdm.data.synthetic import Synthetic
+from flame_mdm.errors import UserError
 from flame_mdm.motion import MotionBatch, length_mask
 from flame_mdm.representations.humanml import HumanML
 from flame_mdm.representations.rot6d import Rot6D
 
+DATA = ("data=synthetic", "data.source.clips=600")
 RUN = ["data.source.clips=600", "data.batch_size=32", "logger=csv", "trainer.accelerator=cpu"]
 RUN += ["trainer.enable_progress_bar=false", "trainer.log_every_n_steps=5"]
 
@@ -37,12 +39,12 @@ def trained(tmp_path_factory, data) -> Path:
     folder = tmp_path_factory.mktemp("classifier")
     options = [data, f"run.dir={folder}", "trainer.max_steps=120", "trainer.val_check_interval=60"]
     options += ["task.network.hidden=48", "task.network.num_layers=1", "optimizer.lr=0.004"]
-    assert train.main(["classifier/synthetic", *RUN, *options]) == 0
+    assert main(["train", "classifier/synthetic", *RUN, *options]) == 0
     return folder / "checkpoints" / "last.ckpt"
 
 
 def measure(out: Path, *words: str) -> dict:
-    assert evaluate.main([f"out={out}", "device=cpu", "replications=1", "samples=150", *words]) == 0
+    assert main(["evaluate", f"out={out}", "device=cpu", "replications=1", "samples=150", *words]) == 0
     return json.loads(out.read_text())
 
 
@@ -55,7 +57,7 @@ def test_training_by_recipe_learns_the_actions(trained, data, tmp_path):
     assert validated(trained)[-1] > 0.5  # by chance: about 1 in 11
     result = measure(
         tmp_path / "real.json",
-        *("baseline=shuffled", "data=synthetic", data, "protocol=action_to_motion_own", f"extractor={trained}"),
+        *("baseline=shuffled", *DATA, data, "protocol=action_to_motion_own", f"extractor={trained}"),
     )
     assert result["ground_truth"]["accuracy"]["mean"] > 0.5, "motions that were not trained on"
     assert result["values"]["accuracy"]["mean"] < 0.2, "those of other actions"
@@ -65,8 +67,15 @@ def test_training_by_recipe_learns_the_actions(trained, data, tmp_path):
 
 def test_a_model_of_actions_is_measured_by_it(trained, data, tmp_path):
     words = [word for word in TINY if not word.startswith(("condition", "data.source"))]
-    words += ["condition=action", "condition.features=16", data, f"run.dir={tmp_path / 'run'}", "trainer.max_steps=1"]
-    assert train.main(["quickstart", *words]) == 0
+    words += [
+        RUN[0],
+        "condition=action",
+        "condition.features=16",
+        data,
+        f"run.dir={tmp_path / 'run'}",
+        "trainer.max_steps=1",
+    ]
+    assert main(["train", "quickstart", *words]) == 0
     shown = sorted((tmp_path / "run" / "samples" / "step_0000001").glob("*.npz"))
     texts = [str(np.load(file)["text"]) for file in shown]
     assert texts == list(Synthetic.actions)[: len(texts)], "actions in place of the prompts of the recipe"
@@ -92,8 +101,8 @@ def test_what_was_not_made_for_one_another_is_refused(trained, data, tmp_path, c
         ("action_to_motion", trained, "protocol=action_to_motion_own takes classifiers of make train"),
         ("action_to_motion_own", released, f"{released}: not a checkpoint of this framework"),
     ):
-        words = ["baseline=real", "data=synthetic", data, f"protocol={protocol}", f"extractor={file}"]
-        assert evaluate.main(words) == 1
+        words = ["baseline=real", *DATA, data, f"protocol={protocol}", f"extractor={file}"]
+        assert main(["evaluate", *words]) == 1
         assert told in capsys.readouterr().err
 
 
@@ -113,7 +122,7 @@ def test_a_clip_without_label_is_named(monkeypatch, tmp_path, capsys):
 
     monkeypatch.setattr(Synthetic, "clips", bare)
     words = ["data.source.clips=40", "data.batch_size=8", f"data_root={tmp_path}", f"run.dir={tmp_path / 'run'}"]
-    assert train.main(["classifier/synthetic", *RUN, *words]) == 1
+    assert main(["train", "classifier/synthetic", *RUN, *words]) == 1
     assert re.search(r"\d clips have no action label, such as synthetic_0_0000\d7;", capsys.readouterr().err)
 
 
@@ -136,7 +145,7 @@ def test_st_gcn_trains_by_the_same_recipe(data, tmp_path):
         "trainer.val_check_interval=40",
         "optimizer.lr=0.01",
     ]
-    assert train.main(["classifier/synthetic", *RUN, *sizes, *options]) == 0
+    assert main(["train", "classifier/synthetic", *RUN, *sizes, *options]) == 0
     assert validated(tmp_path / "checkpoints" / "last.ckpt")[-1] > 0.25
     OwnClassifierExtractor(str(tmp_path / "checkpoints" / "last.ckpt"))
 

@@ -10,9 +10,11 @@ import numpy as np
 import pytest
 from test_report import a_run, result, run
 
-from flame_mdm import compare
-from flame_mdm.compare import find, read_texts, tally
-from flame_mdm.config import UserError
+from flame_mdm.__main__ import main
+from flame_mdm.commands.compare import read_texts
+from flame_mdm.errors import UserError
+from flame_mdm.reporting.compare import find
+from flame_mdm.reporting.study import tally
 
 PROMPTS = ("a person walks", "a person jumps", "a person <waves> & bows")
 
@@ -47,7 +49,7 @@ def put(folder: Path, name: str, **changes: Any) -> None:
 
 
 def page(folders: list[Path], out: Path, *words: str) -> str:
-    assert compare.main([f"runs={' '.join(map(str, folders))}", f"out={out}", *words]) == 0
+    assert main(["compare", f"runs={' '.join(map(str, folders))}", f"out={out}", *words]) == 0
     return out.read_text()
 
 
@@ -66,7 +68,7 @@ def test_a_page_puts_runs_side_by_side(three, tmp_path):
     put(three[1], "x", values={"fid": {"mean": 7.5, "ci": 0.5, "replications": 2, "n": 64}}, quick=True)
     put(three[1], "y", split="val")
     text = page(three, tmp_path / "out.html")
-    table = text[text.index("What the recipes differ in") : text.index("Motions for the same prompts")]
+    table = text[text.index("Configuration differences") : text.index("Motions for the same prompts")]
     assert "<td>optimizer.lr</td><td>0.1</td><td>0.2</td>" in table
     assert "<td>extra</td><td>–</td><td>&lt;em&gt;</td>" in table
     assert "same" not in table
@@ -78,21 +80,21 @@ def test_a_page_puts_runs_side_by_side(three, tmp_path):
     assert [round(motion["center"][0] - 0.5) for motion in scene] == [1, 2, 3] * 2, "each under its own name"
     assert text.count("<h3>p version 3") == 2, "splits are not compared"
     assert "7.5 ± 0.5" in text
-    assert "quick: not a result" in text
+    assert "Quick run — not for publication" in text
     assert "mine/one 0.001953" in text, "curves are overlaid"
     assert page(three, tmp_path / "again.html") == text
 
 
 def test_runs_of_the_same_name_go_by_their_folders(tmp_path):
     folders = [a_run(tmp_path / name) for name in ("a", "b")]
-    assert [contestant.label for contestant in find(folders)] == [str(f) for f in folders]
+    assert [compared.label for compared in find(folders)] == [str(f) for f in folders]
 
 
 def test_runs_without_a_common_prompt_are_compared_and_not_judged(three, tmp_path, capsys):
     other = a_run(tmp_path / "other", name="other")
     motions(other / "samples" / "step_0000009", ("a person swims",))
     assert "no prompt in common" in page([three[0], other], tmp_path / "out.html")
-    assert compare.main([f"runs={three[0]} {other}", "rate=true", f"out={tmp_path / 'rate.html'}"]) == 1
+    assert main(["compare", f"runs={three[0]} {other}", "rate=true", f"out={tmp_path / 'rate.html'}"]) == 1
     assert "no prompt in common to be judged by" in capsys.readouterr().err
     assert not (tmp_path / "rate.html").exists()
 
@@ -154,7 +156,7 @@ def test_runs_sample_what_a_folder_of_motions_shows(tmp_path, data_root, capsys)
     ],
 )
 def test_bad_requests_are_one_line(three, words, message, capsys):
-    assert compare.main([word.format(*three) for word in words]) == 1
+    assert main(["compare", *(word.format(*three) for word in words)]) == 1
     error = capsys.readouterr().err
     assert message in error
     assert error.count("\n") == 1
@@ -211,7 +213,7 @@ def test_ratings_of_several_people_are_counted(tmp_path, capsys):
         ratings(tmp_path / "z.json", "a", rater="bob", b="other", study="t"),
     ]
     out = tmp_path / "ratings.json"
-    assert compare.main([f"ratings={' '.join(map(str, files))}", f"out={out}"]) == 0
+    assert main(["compare", f"ratings={' '.join(map(str, files))}", f"out={out}"]) == 0
     first, second = json.loads(out.read_text())["pairs"]
     assert {k: first[k] for k in ("a", "b", "wins_a", "wins_b", "raters")} == {
         **{"a": "ours", "b": "real"},
@@ -228,18 +230,24 @@ def test_ratings_of_several_people_are_counted(tmp_path, capsys):
     [
         ("hello", "not a JSON file"),
         ("[]", "the file is [], not a mapping"),
-        ('{"rater": "x"}', "the file has no 'study'"),
-        ('{"study": "s", "rater": "", "ratings": []}', "the file has no 'rater'"),
-        ('{"study": "s", "rater": "x", "ratings": []}', "holds no ratings"),
-        ('{"study": "s", "rater": "x", "ratings": [3]}', "rating 1 has no 'a'"),
-        ('{"study": "s", "rater": "x", "ratings": [{"a": "u", "b": "v", "choice": "c"}]}', "rating 1 chooses 'c'"),
-        ('{"study": "s", "rater": "x", "ratings": [{"a": "u", "b": "u", "choice": "a"}]}', "must be a or b of two"),
+        ('{"rater": "x"}', "the file has no study"),
+        ('{"study": "s", "rater": "", "ratings": []}', 'rater is "", not a non-empty text'),
+        ('{"study": "s", "rater": "x", "ratings": []}', "ratings is [], not a longer list"),
+        ('{"study": "s", "rater": "x", "ratings": [3]}', "ratings.0 is 3, not a mapping"),
+        (
+            '{"study": "s", "rater": "x", "ratings": [{"a": "u", "b": "v", "choice": "c"}]}',
+            'ratings.0.choice is "c", not',
+        ),
+        (
+            '{"study": "s", "rater": "x", "ratings": [{"a": "u", "b": "u", "choice": "a"}]}',
+            "rating 1 compares u with itself",
+        ),
     ],
 )
 def test_malformed_ratings_are_one_line(tmp_path, content, message, capsys):
     path = tmp_path / "ratings.json"
     path.write_text(content)
-    assert compare.main([f"ratings={path}", f"out={tmp_path / 'out.json'}"]) == 1
+    assert main(["compare", f"ratings={path}", f"out={tmp_path / 'out.json'}"]) == 1
     error = capsys.readouterr().err
     assert message in error
     assert str(path) in error

@@ -7,7 +7,9 @@ import pytest
 import torch
 
 from flame_mdm import config
-from flame_mdm.config import UserError, check, compose, flatten, instantiate, parameters, recipes, trust
+from flame_mdm.__main__ import main
+from flame_mdm.config import check, command_line, compose, flatten, instantiate, parameters, recipes, trust
+from flame_mdm.errors import UserError
 
 
 @pytest.mark.parametrize("name", recipes())
@@ -120,7 +122,7 @@ def test_untrusted_targets_are_refused(monkeypatch):
         "flame_mdm.data.store.Path",
         "flame_mdm.task.torch.load",
         "flame_mdm.denoisers.mdm",
-        "flame_mdm.callbacks.Checkpoints",  # writes files
+        "flame_mdm.training.callbacks.Checkpoints",  # writes files
         "evaluators",
         "evaluators.",
         ".system",
@@ -162,9 +164,9 @@ def test_what_make_hands_down_is_read_without_a_shell(monkeypatch):
     flags = r"""s -- q=#hash UNCONDITIONED=1 TEXT=100%\ a\ --\ b\ $$5 x.y=a\ "c"\ (d)\ ;$$HOME a.b=[1,\ 2] EXP=q"""
     monkeypatch.setenv("MAKEFLAGS", flags)
     words = ["q", "a.b=[1, 2]", 'x.y=a "c" (d) ;$HOME', "text=100% a -- b $5", "unconditioned=1", "q=#hash"]
-    assert config._make_variables() == words
+    assert command_line._make_variables() == words
     monkeypatch.setenv("MAKEFLAGS", "")
-    assert config._make_variables() == []
+    assert command_line._make_variables() == []
 
 
 @pytest.mark.parametrize("text", ["it's ${a} (b), c=d; \\ [e]", "plain", '"quoted" ünïcode'])
@@ -177,11 +179,11 @@ def test_free_text_survives_hydra(text, capsys):
 def test_help_and_a_misspelt_key_do_not_wait_for_torch():
     program = """
         import sys
-        from flame_mdm import train, sample, prepare
-        assert train.main(["--help"]) == 0
-        assert train.main(["quickstart", "trainer.max_step=1"]) == 1
-        assert sample.main(["text=a"]) == 1
-        assert prepare.main([]) == 1
+        from flame_mdm.__main__ import main
+        assert main(["train", "--help"]) == 0
+        assert main(["train", "quickstart", "trainer.max_step=1"]) == 1
+        assert main(["sample", "text=a"]) == 1
+        assert main(["prepare"]) == 1
         assert "torch" not in sys.modules and "lightning" not in sys.modules, "heavy imports"
     """
     result = subprocess.run(
@@ -204,3 +206,10 @@ def test_own_classes_outside_the_repository_need_no_registration(tmp_path, monke
 
 def test_the_experiments_folder_is_found():
     assert (Path(config.EXPERIMENTS) / "base.yaml").is_file()
+
+
+def test_an_unknown_command_is_one_line(capsys):
+    assert main(["trian"]) == 1
+    assert capsys.readouterr().err == (
+        "error: unknown command: trian. Did you mean train? `flame-mdm --help` lists the commands\n"
+    )

@@ -264,5 +264,5 @@ def test_a_store_of_another_representation_is_refused(folder, tmp_path):
         batch_size=4,
         crop=Units(24, 60, 4),
     )
-    with pytest.raises(ValueError, match="its representation is humanml-clean-smpl22, not humanml-legacy-smpl22"):
+    with pytest.raises(ValueError, match="the recipe says representation=humanml-legacy-smpl22"):
         module.open()

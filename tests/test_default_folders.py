@@ -7,8 +7,8 @@ from typing import Any
 import pytest
 from conftest import TINY
 
-from flame_mdm import sample, train
-from flame_mdm.sample import default_folder
+from flame_mdm.__main__ import main
+from flame_mdm.commands.sample import default_folder
 
 
 def folder(experiment: Any, what: str = "a person walks", seed: int = 0, **options: Any) -> str:
@@ -39,9 +39,9 @@ def test_no_checkpoint_leads_out_of_the_folder(experiment, tmp_path, monkeypatch
 
 def test_a_sweep_writes_a_folder_for_each_value(tmp_path, data_root, monkeypatch):
     words = [*TINY, f"data_root={data_root}", f"run.dir={tmp_path / 'run'}", "callbacks.samples=null"]
-    assert train.main(["quickstart", *words, "callbacks.best=null", "trainer.max_steps=1", "logger=csv"]) == 0
+    assert main(["train", "quickstart", *words, "callbacks.best=null", "trainer.max_steps=1", "logger=csv"]) == 0
     monkeypatch.chdir(tmp_path)
     asked = [f"ckpt={tmp_path / 'run/checkpoints/last.ckpt'}", "text=a person walks", "samples=1", "seconds=1"]
-    assert sample.main([*asked, "guidance_scale=1,2.5", "--multirun"]) == 0
+    assert main(["sample", *asked, "guidance_scale=1,2.5", "--multirun"]) == 0
     made = sorted(path.parent.name for path in tmp_path.glob("samples/quickstart/*/motion_000.npz"))
     assert made == [f"a-person-walks-seed0-seconds=1-guidance_scale={scale}" for scale in ("1", "2.5")]

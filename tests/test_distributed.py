@@ -13,11 +13,15 @@ import torch
 from runs import RUN, TWO, alarm, finish, reference, spawn
 from torchmetrics import MeanMetric
 
-from evaluators.motion_clip import MotionCLIPTask
-from flame_mdm import train
+from evaluators.extractors.motion_clip import MotionCLIPTask
+from flame_mdm.__main__ import main
+from flame_mdm.checkpoints.files import read_checkpoint
+from flame_mdm.commands import train
 from flame_mdm.config import compose, instantiate
 from flame_mdm.motion import collate
-from flame_mdm.task import MotionGeneration, read_checkpoint
+from flame_mdm.task import MotionGeneration
+
+pytestmark = pytest.mark.slow
 
 
 def values(folder: Path) -> list[float]:
@@ -29,7 +33,7 @@ def test_two_processes_are_one_with_both_batches(tiny, tmp_path):
     """Launched by Lightning."""
     words = [*tiny, *RUN, f"data_root={tmp_path / 'data'}"]
     ours = ["callbacks.samples.every_n_steps=2", "trainer.max_steps=4"]
-    code, out, err = finish(spawn(["flame_mdm.train", "quickstart", *words, *TWO, *ours]))
+    code, out, err = finish(spawn(["flame_mdm.commands.train", "quickstart", *words, *TWO, *ours]))
     assert code == 0, err
     assert out.count("see the motions") == 1
     assert "batch: 2 clips = 1 x 2 processes x 1 accumulated; optimizer.lr=0.05 is not scaled with it" in out
@@ -62,7 +66,7 @@ def test_torchrun_starts_a_killed_group_again(tiny, tmp_path):
         *alarm(tmp_path, "end", step=6, rank=0, attempt=1, counter=counter, signal="SIGTERM", parent=True),
     ]
     torchrun = ["torch.distributed.run", "--nproc-per-node=2", "--max-restarts=1", "--standalone"]
-    command = [*torchrun, "-m", "flame_mdm.train", "quickstart", *words, *TWO, *alarms, "trainer.max_steps=100000"]
+    command = [*torchrun, "-m", "flame_mdm", "train", "quickstart", *words, *TWO, *alarms, "trainer.max_steps=100000"]
     path = os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")]).rstrip(os.pathsep)
     # Else torchrun keeps its store, and the new group finds the addresses of the dead one in there.
     _, out, err = finish(spawn(command, PYTHONPATH=path, TORCH_DISABLE_SHARE_RDZV_TCP_STORE="1", PYTHONUNBUFFERED="1"))
@@ -120,7 +124,7 @@ def test_processes_are_started_with_the_words_of_one_job(tiny, tmp_path, monkeyp
     monkeypatch.setattr(train, "train", lambda config: seen.append((sys.argv[1:], config["run"]["dir"], config)))
     monkeypatch.setattr(sys, "argv", ["train"])
     folder = f"run.dir={tmp_path / 'sweep'}"
-    assert train.main(["quickstart", *tiny[:-1], folder, "seed=1,2", "--multirun"]) == 0
+    assert main(["train", "quickstart", *tiny[:-1], folder, "seed=1,2", "--multirun"]) == 0
     assert len(seen) == 2
     for number, (words, directory, config) in enumerate(seen, 1):
         assert words[0] == "quickstart"

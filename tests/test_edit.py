@@ -1,5 +1,6 @@
 """Edits keep what they promise to keep, whatever the motion comes from."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,13 +9,17 @@ import torch
 from conftest import TINY
 
 import flame_mdm
-from flame_mdm.config import UserError, compose, instantiate
-from flame_mdm.data import bandai, bvh
+from flame_mdm.__main__ import main
+from flame_mdm.config import compose, instantiate
+from flame_mdm.data import bandai
 from flame_mdm.data.store import write_store
 from flame_mdm.data.synthetic import Synthetic
-from flame_mdm.edit import main
-from flame_mdm.editing import Edited, edit, find_joints, part_names, read_motion, resample
-from flame_mdm.generation import Generated, generate, write_motions
+from flame_mdm.editing import Edited, edit, find_joints, part_names, read_motion
+from flame_mdm.errors import UserError
+from flame_mdm.formats import bvh
+from flame_mdm.formats.motion import Motion
+from flame_mdm.formats.resampling import resample
+from flame_mdm.generation import generate, write_motions
 from flame_mdm.representations.humanml import HumanML
 from flame_mdm.representations.rot6d import Rot6D
 from flame_mdm.representations.skeleton import KIT21, SMPL22, SMPL24
@@ -62,10 +67,12 @@ def walk(fps: float, seconds: float = 2.0, turned: float = 0.0) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def motion(diffusion) -> Generated:
+def motion(diffusion) -> Motion:
     features = diffusion.representation.encode(torch.from_numpy(walk(20)))
     joints = diffusion.representation.decode(features)
-    return Generated("walk", joints.numpy(), features.numpy(), 20.0, "a person walks")
+    motion = Motion(joints.numpy(), 20.0, SMPL22, "a person walks", "walk")
+    motion.features, motion.representation = features.numpy(), diffusion.representation.name
+    return motion
 
 
 # What is kept ---------------------------------------------------------------------------------------------------------
@@ -73,7 +80,7 @@ def motion(diffusion) -> Generated:
 
 @pytest.mark.parametrize("length", [8, 37, 60])
 @pytest.mark.parametrize(
-    ("frames", "kept"),
+    ("region", "kept"),
     [
         ("in_between", lambda i, n: i < int(0.25 * n) or i >= int(0.75 * n)),
         ("prediction", lambda i, n: i < int(0.25 * n)),
@@ -84,15 +91,15 @@ def motion(diffusion) -> Generated:
         ([[0, 1], [4, 8]], lambda i, n: not (i < 1 or 4 <= i < 8)),
     ],
 )
-def test_frames(diffusion, motion, frames, kept, length):
-    part = Generated("", motion.joints[:1].repeat(length, 0), motion.features[:1].repeat(length, 0), 20.0, "")
-    keep = edit(diffusion, part, frames=frames, num_inference_steps=2)[0].keep
+def test_regions(diffusion, motion, region, kept, length):
+    part = replace(motion, joints=motion.joints[:1].repeat(length, 0), features=motion.features[:1].repeat(length, 0))
+    keep = edit(diffusion, part, region=region, num_inference_steps=2)[0].keep
     assert keep.tolist() == [[kept(i, length)] * 263 for i in range(length)]
 
 
 def test_seconds_are_frames(diffusion, motion):
-    a = edit(diffusion, motion, seconds=[0.5, 1.25])[0]
-    b = edit(diffusion, motion, frames=[10, 25])[0]
+    a = edit(diffusion, motion, region_seconds=[0.5, 1.25])[0]
+    b = edit(diffusion, motion, region=[10, 25])[0]
     assert np.array_equal(a.keep, b.keep)
     assert np.array_equal(a.features, b.features)
 
@@ -106,8 +113,8 @@ def test_upper_body_keeps_what_mdm_keeps(diffusion, motion):
 
 
 def test_frames_and_joints_meet(diffusion, motion):
-    both = edit(diffusion, motion, frames="in_between", joints=["left_arm", "head"])[0].keep
-    frames = edit(diffusion, motion, frames="in_between")[0].keep
+    both = edit(diffusion, motion, region="in_between", joints=["left_arm", "head"])[0].keep
+    frames = edit(diffusion, motion, region="in_between")[0].keep
     joints = edit(diffusion, motion, joints=["left_arm", "head"])[0].keep
     assert np.array_equal(both, frames | joints)
 
@@ -149,7 +156,7 @@ def test_features_of_joints_move_these_joints(representation):
 
 
 @pytest.mark.parametrize("method", ["mdm", "flame"])
-@pytest.mark.parametrize("options", [{"frames": "in_between"}, {"joints": "upper_body"}, {"frames": "suffix"}], ids=str)
+@pytest.mark.parametrize("options", [{"region": "in_between"}, {"joints": "upper_body"}, {"region": "suffix"}], ids=str)
 def test_exact_methods_keep_exactly(diffusion, motion, method, options):
     results = edit(diffusion, motion, "a person jumps", method=method, samples=2, **options)
     for result in results:
@@ -161,14 +168,14 @@ def test_exact_methods_keep_exactly(diffusion, motion, method, options):
 
 
 def test_other_methods_keep_roughly(diffusion, flow, motion):
-    assert edit(diffusion, motion, frames="in_between", method="flame_code")[0].feature_error > 1e-3
-    assert edit(flow, motion, frames="in_between")[0].feature_error > 1e-3
-    assert edit(flow, motion, frames="in_between", method="mdm")[0].feature_error == 0
+    assert edit(diffusion, motion, region="in_between", method="flame_code")[0].feature_error > 1e-3
+    assert edit(flow, motion, region="in_between")[0].feature_error > 1e-3
+    assert edit(flow, motion, region="in_between", method="mdm")[0].feature_error == 0
 
 
 def test_world_error_tells_of_a_suffix_that_has_moved(diffusion, motion):
-    assert edit(diffusion, motion, frames="prediction")[0].joint_error < 1e-5
-    suffix = edit(diffusion, motion, frames="suffix")[0]
+    assert edit(diffusion, motion, region="prediction")[0].joint_error < 1e-5
+    suffix = edit(diffusion, motion, region="suffix")[0]
     begin = int(0.75 * len(motion.joints))
     expected = np.linalg.norm(suffix.joints[begin:] - motion.joints[begin:], axis=-1).max()
     assert suffix.joint_error == pytest.approx(expected)
@@ -183,27 +190,27 @@ def test_flows_are_rewritten_in_25_steps_up_to_a_fifth(flow, motion):
     """The reading that fits both numbers of MFM's paper: rewritten are the first 6 of 25 steps, up to time 0.2."""
     times = []
     hook = flow.denoiser.register_forward_hook(lambda module, inputs, output: times.append(inputs[1][0].item()))
-    default = edit(flow, motion, frames="in_between")[0]
+    default = edit(flow, motion, region="in_between")[0]
     hook.remove()
     assert len(times) == 25
-    six = edit(flow, motion, frames="in_between", until=5 / 25, num_inference_steps=25)[0]
+    six = edit(flow, motion, region="in_between", until=5 / 25, num_inference_steps=25)[0]
     assert np.array_equal(default.features, six.features)
-    assert not np.array_equal(default.features, edit(flow, motion, frames="in_between", until=0.19)[0].features)
+    assert not np.array_equal(default.features, edit(flow, motion, region="in_between", until=0.19)[0].features)
 
 
 def test_resampling_takes_each_step_more_often(diffusion, motion):
     calls = []
     hook = diffusion.denoiser.register_forward_hook(lambda *_: calls.append(1))
-    edit(diffusion, motion, frames="in_between", method="flame", num_inference_steps=4, resample=3)
+    edit(diffusion, motion, region="in_between", method="flame", num_inference_steps=4, resample=3)
     hook.remove()
     assert len(calls) == 1 + 3 * 3
 
 
 def test_an_edit_depends_on_its_own_seed_alone(diffusion, motion):
-    one = edit(diffusion, motion, "a person jumps", frames="in_between", samples=1, seed=3)[0]
-    many = edit(diffusion, motion, ["a person jumps", "a person bows"], frames="in_between", samples=2, seed=3)
+    one = edit(diffusion, motion, "a person jumps", region="in_between", samples=1, seed=3)[0]
+    many = edit(diffusion, motion, ["a person jumps", "a person bows"], region="in_between", samples=2, seed=3)
     np.testing.assert_allclose(one.features, many[0].features, atol=1e-5)
-    assert [m.caption for m in many] == ["a person jumps"] * 2 + ["a person bows"] * 2
+    assert [m.text for m in many] == ["a person jumps"] * 2 + ["a person bows"] * 2
     assert isinstance(one, Edited)
     assert one.original is motion
 
@@ -213,7 +220,7 @@ def test_models_that_attend_to_the_padding_know_it_as_empty(motion):
     model = build([*TINY, "denoiser.mask_padding=false"])
     seen = []
     model.denoiser.register_forward_hook(lambda module, inputs, output: seen.append(inputs[0]))
-    result = edit(model, motion, frames="in_between")[0]
+    result = edit(model, motion, region="in_between")[0]
     assert result.feature_error == 0
     assert result.features.shape == motion.features.shape
     assert {x.shape[1] for x in seen} == {60}
@@ -228,11 +235,11 @@ def test_models_that_attend_to_the_padding_know_it_as_empty(motion):
 
 def test_samples_are_read_as_they_are(diffusion, tmp_path):
     motions = generate(diffusion, "a person waves", frames=24)
-    write_motions(tmp_path, diffusion, motions, {"seed": 0})
+    write_motions(tmp_path, motions, {"seed": 0})
     read = read_motion(diffusion.representation, tmp_path / "motion_000.npz")
     assert np.array_equal(read.features, motions[0].features)
     np.testing.assert_allclose(read.joints, motions[0].joints, atol=1e-5)
-    assert read.caption == "a person waves"
+    assert read.text == "a person waves"
 
 
 @pytest.mark.parametrize(("fps", "turned"), [(20, 0.0), (20, 2.0), (50, 0.0), (100, -1.3), (10, 3.0)])
@@ -249,7 +256,7 @@ def test_joints_of_any_rate_and_facing(diffusion, motion, tmp_path, fps, turned)
 def test_resampling_keeps_the_time():
     t = np.arange(61) / 30
     joints = np.sin(2 * t)[:, None, None] * np.ones((1, 22, 3))
-    new = resample(joints, 30, 20)
+    new = resample(joints, 30, 20, cubic=True)
     assert len(new) == 41
     np.testing.assert_allclose(new[:, 3, 1], np.sin(2 * np.arange(41) / 20), atol=1e-4)
 
@@ -282,7 +289,7 @@ def test_a_bvh_file_of_a_known_skeleton(diffusion, tmp_path):
 
 def test_a_clip_of_a_prepared_set_and_a_part_of_it(diffusion, store):
     stored = read_motion(diffusion.representation, "synthetic:synthetic_0_000003", data_root=store)
-    assert stored.caption
+    assert stored.text
     part = read_motion(diffusion.representation, "synthetic:synthetic_0_000003", data_root=store, cut=(0.5, 1.5))
     assert np.array_equal(part.features, stored.features[10:30])
 
@@ -290,7 +297,7 @@ def test_a_clip_of_a_prepared_set_and_a_part_of_it(diffusion, store):
 def test_cuts_of_world_coordinates_start_anew(tmp_path):
     representation = Rot6D()
     features = np.cumsum(np.ones((40, 150), np.float32), 0)
-    file = _npz(tmp_path, features=features, fps=20, representation=representation.name)
+    file = _npz(tmp_path, joints=np.zeros((40, 24, 3)), features=features, fps=20, representation=representation.name)
     part = read_motion(representation, file, cut=[1, 2])
     assert part.features[0, 144:147].tolist() == [0, 0, 0]
 
@@ -306,23 +313,23 @@ def _npz(folder: Path, **arrays) -> Path:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({}, "this keeps nothing of the motion: choose frames"),
-        ({"frames": [0, 40]}, "this keeps nothing of the motion"),
+        ({}, "this keeps nothing of the motion: choose region"),
+        ({"region": [0, 40]}, "this keeps nothing of the motion"),
         ({"joints": []}, "this keeps all of the motion"),
-        ({"frames": [5, 5]}, r"frames=\[5, 5\] is no part of this motion, which has 40 frames \(2 seconds\)"),
-        ({"frames": [30, 50]}, "is no part of this motion"),
-        ({"seconds": [1.5, 2.5]}, r"seconds=\[1.5, 2.5\] is no part"),
-        ({"frames": [1, 2, 3]}, r"write \[begin, end\], or several"),
-        ({"frames": [[1, 2], 3]}, r"write \[begin, end\], or several"),
-        ({"frames": []}, r"write \[begin, end\], or several"),
-        ({"frames": [1, 2], "seconds": [1, 2]}, "give frames or seconds, not both"),
-        ({"frames": "inbetween"}, "frames=inbetween is unknown. Did you mean in_between"),
+        ({"region": [5, 5]}, r"region=\[5, 5\] is no part of this motion, which has 40 frames \(2 seconds\)"),
+        ({"region": [30, 50]}, "is no part of this motion"),
+        ({"region_seconds": [1.5, 2.5]}, r"region_seconds=\[1.5, 2.5\] is no part"),
+        ({"region": [1, 2, 3]}, r"write \[begin, end\], or several"),
+        ({"region": [[1, 2], 3]}, r"write \[begin, end\], or several"),
+        ({"region": []}, r"write \[begin, end\], or several"),
+        ({"region": [1, 2], "region_seconds": [1, 2]}, "give region or region_seconds, not both"),
+        ({"region": "inbetween"}, "region=inbetween is unknown. Did you mean in_between"),
         ({"joints": "uper_body"}, "no joint or part 'uper_body'. Did you mean upper_body"),
         ({"joints": ["left_hnad"]}, "Did you mean left_hip"),
-        ({"frames": "suffix", "method": "mfm"}, "method=mfm is not possible with GaussianDiffusion; .* mdm, flame"),
-        ({"frames": "suffix", "method": "repaint"}, "this model takes: mdm, flame, flame_code"),
-        ({"frames": "suffix", "until": 0.3}, "until=0.3 is an option of method=mfm, not of mdm"),
-        ({"frames": "suffix", "resample": 3}, "resample=3 is an option of method=flame"),
+        ({"region": "suffix", "method": "mfm"}, "method=mfm is not possible with GaussianDiffusion; .* mdm, flame"),
+        ({"region": "suffix", "method": "repaint"}, "this model takes: mdm, flame, flame_code"),
+        ({"region": "suffix", "until": 0.3}, "until=0.3 is an option of method=mfm, not of mdm"),
+        ({"region": "suffix", "resample": 3}, "resample=3 is an option of method=flame"),
     ],
 )
 def test_bad_edits_are_one_line(diffusion, motion, options, message):
@@ -333,30 +340,38 @@ def test_bad_edits_are_one_line(diffusion, motion, options, message):
 
 def test_methods_of_diffusion_are_refused_by_flows(flow, motion):
     with pytest.raises(UserError, match="method=flame is not possible with FlowMatching; this model takes: mdm, mfm"):
-        edit(flow, motion, frames="suffix", method="flame")
+        edit(flow, motion, region="suffix", method="flame")
 
 
 def test_a_motion_longer_than_those_of_the_training(motion):
     model = build(TINY, max_frames=36)
     with pytest.raises(UserError, match=r"walk: 40 frames are more than the 36 \(1.8 seconds\) .*: take a part, cut="):
-        edit(model, motion, frames="suffix")
+        edit(model, motion, region="suffix")
 
 
 @pytest.mark.parametrize(
     ("arrays", "message"),
     [
         ({"joints": np.zeros((9, 21, 3)), "fps": 20}, r"shape \(9, 21, 3\), but humanml-clean-smpl22 takes"),
-        ({"joints": np.zeros((9, 22)), "fps": 20}, r"joints have shape \(9, 22\), not \(frames, joints, 3\)"),
-        ({"joints": np.full((9, 22, 3), np.nan), "fps": 30}, "or are not finite"),
-        ({"joints": np.zeros((9, 22, 3))}, "needs fps"),
-        ({"joints": np.zeros((9, 22, 3)), "fps": 0}, "fps is 0, not a number above 0"),
-        ({"fps": 20}, "holds neither features and no joints"),
+        ({"joints": np.zeros((9, 22)), "fps": 20}, r"joints of shape \(9, 22\), not \(frames, joints, 3\)"),
+        ({"joints": np.full((9, 22, 3), np.nan), "fps": 30}, "are not finite"),
+        ({"joints": np.zeros((9, 22, 3))}, "does not give its frame rate"),
+        ({"joints": np.zeros((9, 22, 3)), "fps": 0}, "fps is 0, not a number"),
+        ({"fps": 20}, "it holds fps; a motion is joints and fps"),
         (
             {"features": np.zeros((9, 251)), "fps": 12.5, "representation": "x"},
-            "holds features x at 12.5 fps and no jo",
+            "it holds features, fps, representation; a motion",
         ),
-        ({"features": np.zeros((9, 2)), "fps": 20, "representation": "humanml-clean-smpl22"}, "have shape"),
-        ({"joints": np.array([{}], object), "fps": 20}, "damaged, or not an .npz file of numbers"),
+        (
+            {
+                "joints": np.zeros((9, 22, 3)),
+                "features": np.zeros((9, 2)),
+                "fps": 20,
+                "representation": "humanml-clean-smpl22",
+            },
+            r"features of shape \(9, 2\), not \(frames, 263\)",
+        ),
+        ({"joints": np.array([{}], object), "fps": 20}, "damaged, or not a file of plain arrays"),
     ],
 )
 def test_bad_motions_are_one_line(diffusion, tmp_path, arrays, message):
@@ -377,7 +392,7 @@ def test_motions_that_are_not_there(diffusion, store, tmp_path):
         (tmp_path / "bad.npz").write_bytes(content)
         with pytest.raises(ValueError, match="damaged"):
             read_motion(representation, tmp_path / "bad.npz")
-    with pytest.raises(UserError, match=r"give an \.npz or \.bvh file, or dataset:id"):
+    with pytest.raises(UserError, match=r"Give a \.npz, \.bvh, \.json, \.npy file, or dataset:id"):
         read_motion(representation, "walk")
     with pytest.raises(UserError, match=r"has no clip 'synthetic_0_00003'\. Did you mean synthetic_0_000003"):
         read_motion(representation, "synthetic:synthetic_0_00003", data_root=store)
@@ -408,8 +423,8 @@ def test_the_command_writes_the_original_beside_the_edits(checkpoint, store, tmp
         f"out={out}",
         "samples=2",
     ]
-    words += ["text=it's a (jump), $5", "frames=in_between", "joints=[left_arm,head]", "seed=4"]
-    assert main(words) == 0
+    words += ["text=it's a (jump), $5", "region=in_between", "joints=[left_arm,head]", "seed=4"]
+    assert main(["edit", *words]) == 0
     printed = capsys.readouterr().out
     assert "largest change among them: 0 in normalized features" in printed
     assert "m of the joints in the world" in printed
@@ -425,7 +440,7 @@ def test_the_command_writes_the_original_beside_the_edits(checkpoint, store, tmp
         np.testing.assert_allclose(edited["features"][keep], original["features"][keep], atol=1e-5)
         assert not np.allclose(edited["features"][~keep], original["features"][~keep], atol=1e-2)
     # what was written can be edited again
-    assert main([f"ckpt={checkpoint}", f"motion={out}/motion_001.npz", f"out={out}/again", *words[5:]]) == 0
+    assert main(["edit", f"ckpt={checkpoint}", f"motion={out}/motion_001.npz", f"out={out}/again", *words[5:]]) == 0
 
 
 @pytest.mark.parametrize(
@@ -435,14 +450,14 @@ def test_the_command_writes_the_original_beside_the_edits(checkpoint, store, tmp
         (["text=jump", "unconditioned=true"], "not text and unconditioned"),
         (["unconditioned=true", "motion=null"], "no motion to edit"),
         (["unconditioned=true", "cut=3"], r"cut=3: write [begin, end]"),
-        (["unconditioned=true", "frames=[1,2", "seed=1"], "cannot read an override"),
-        (["unconditioned=true", "frames=in_between", "methd=mdm"], "Did you mean method"),
+        (["unconditioned=true", "region=[1,2", "seed=1"], "cannot read an override"),
+        (["unconditioned=true", "region=in_between", "methd=mdm"], "Did you mean method"),
         (["unconditioned=true", "ckpt=nowhere/at.ckpt"], "nowhere/at.ckpt: no such checkpoint"),
     ],
 )
 def test_bad_words_are_one_line(checkpoint, store, capsys, words, message):
     first = [f"ckpt={checkpoint}", "motion=synthetic:synthetic_0_000003", f"data_root={store}"]
-    assert main([*first, *words]) == 1
+    assert main(["edit", *first, *words]) == 1
     output = capsys.readouterr().err
     assert message in output
     assert output.startswith("error: ")
@@ -450,5 +465,5 @@ def test_bad_words_are_one_line(checkpoint, store, capsys, words, message):
 
 
 def test_the_python_api_is_there_though_the_command_is_a_module_of_that_name(diffusion, motion):
-    result = flame_mdm.edit(diffusion, motion, frames="suffix")  # type: ignore[operator]
+    result = flame_mdm.edit(diffusion, motion, region="suffix")
     assert result[0].feature_error == 0

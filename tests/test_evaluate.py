@@ -16,21 +16,24 @@ import torch
 from conftest import TINY
 from distributed import GlooPool
 
-from evaluators.action_gru import ActionGRU
 from evaluators.evaluator import Evaluator, Extracted
 from evaluators.extractors import ClassifierExtractor, MotionCLIPExtractor, T2MExtractor
+from evaluators.extractors.action_gru import ActionGRU
+from evaluators.extractors.stgcn import UESTC, Unconstrained
+from evaluators.extractors.t2m import T2MEvaluator
+from evaluators.run import load_protocol
 from evaluators.sources import Baseline, Generator, read_samples, real_motions
-from evaluators.stgcn import UESTC, Unconstrained
-from evaluators.t2m import T2MEvaluator
-from flame_mdm import evaluate, train
-from flame_mdm.config import EXPERIMENTS, UserError, compose, instantiate
+from flame_mdm.__main__ import main
+from flame_mdm.checkpoints.files import read_checkpoint
+from flame_mdm.checkpoints.loading import load
+from flame_mdm.config import EXPERIMENTS, compose, instantiate
 from flame_mdm.data.datamodule import MotionDataModule
 from flame_mdm.editing import find_joints
-from flame_mdm.evaluate import load_protocol
+from flame_mdm.errors import UserError
 from flame_mdm.motion import length_mask
 from flame_mdm.representations.rot6d import Rot6D
-from flame_mdm.task import load, read_checkpoint
 
+DATA = ("data=synthetic", "data.source.clips=400")
 GENERATOR = ["data.source.clips=400", *TINY[1:], "callbacks.samples=null", "trainer.val_check_interval=2"]
 CLIP = [
     "data.source.clips=400",
@@ -51,8 +54,8 @@ class Runs:
     def __init__(self, folder: Path):
         self.folder = folder
         data = [f"data_root={folder / 'data'}", "trainer.max_steps=2"]
-        assert train.main(["quickstart", *GENERATOR, *data, f"run.dir={folder / 'model'}"]) == 0
-        assert train.main(["motion_clip/synthetic", *CLIP, *data, f"run.dir={folder / 'clip'}"]) == 0
+        assert main(["train", "quickstart", *GENERATOR, *data, f"run.dir={folder / 'model'}"]) == 0
+        assert main(["train", "motion_clip/synthetic", *CLIP, *data, f"run.dir={folder / 'clip'}"]) == 0
         self.model, self.clip = (folder / name / "checkpoints" / "last.ckpt" for name in ("model", "clip"))
 
     def evaluate(self, out: Path, *words: str, model: Path | None = None) -> int:
@@ -62,7 +65,7 @@ class Runs:
             model.parent.mkdir(parents=True, exist_ok=True)
             shutil.copy(self.model, model)
         extractor = [] if any(word.startswith("extractor=") for word in words) else [f"extractor={self.clip}"]
-        return evaluate.main([f"ckpt={model}", *extractor, f"out={out}", "device=cpu", *words])
+        return main(["evaluate", f"ckpt={model}", *extractor, f"out={out}", "device=cpu", *words])
 
     def result(self, out: Path, *words: str) -> dict:
         assert self.evaluate(out, *words) == 0
@@ -97,6 +100,7 @@ def motions(out: Path) -> Path:
 def test_a_result_says_what_it_is_and_where_it_comes_from(runs, full):
     result, out = full
     protocol = load_protocol("synthetic", load(runs.model).representation)
+    assert protocol.multimodality is not None
     names = {*protocol.metrics, *protocol.multimodality["metrics"]}
     assert {name.split("/")[0] for name in result["values"]} == names
     assert {name.split("/")[0] for name in result["ground_truth"]} == set(protocol.metrics)
@@ -139,20 +143,20 @@ def test_real_motions_show_what_was_asked_and_an_untrained_model_does_not(full):
 KILLED = """
 import os, signal, sys
 import numpy
-from flame_mdm import evaluate
+from flame_mdm.__main__ import main
 write = numpy.savez
 def half(file, **content):
     if "rep_1" in file.name:
-        file.write(b"half")
-        file.flush()
+        file.write_bytes(b"half")
         os.kill(os.getpid(), signal.SIGKILL)
     write(file, **content)
 numpy.savez = half
-evaluate.main(sys.argv[1:])
+main(["evaluate", *sys.argv[1:]])
 """
 """The command, ended by the operating system while it writes the motions of the second replication."""
 
 
+@pytest.mark.slow
 def test_a_killed_evaluation_goes_on_to_the_same_result(runs, tmp_path, monkeypatch):
     words = ["ckpt=model/last.ckpt", f"extractor={runs.clip}", "replications=2", "out=result.json", "device=cpu"]
     folders = [tmp_path / "undisturbed", tmp_path / "killed"]
@@ -160,18 +164,20 @@ def test_a_killed_evaluation_goes_on_to_the_same_result(runs, tmp_path, monkeypa
         (folder / "model").mkdir(parents=True)
         shutil.copy(runs.model, folder / "model" / "last.ckpt")
     monkeypatch.chdir(folders[0])
-    assert evaluate.main(words) == 0
+    assert main(["evaluate", *words]) == 0
     monkeypatch.chdir(folders[1])
     killed = subprocess.run([sys.executable, "-c", KILLED, *words], capture_output=True, check=False)
     assert killed.returncode == -signal.SIGKILL, killed.stderr
     (kept,) = (folders[1] / "model" / "evaluation").glob("*/*")
-    assert sorted(path.name for path in kept.iterdir()) == ["rep_0.npz", "rep_1.partial"]
+    partial, whole = sorted(path.name for path in kept.iterdir())
+    assert partial.startswith(".rep_1.")
+    assert whole == "rep_0.npz"
     assert not (folders[1] / "result.json").exists()
     stamp = (kept / "rep_0.npz").stat().st_mtime_ns
-    assert evaluate.main(words) == 0
+    assert main(["evaluate", *words]) == 0
     results = [written(folder / "result.json") for folder in folders]
     assert (kept / "rep_0.npz").stat().st_mtime_ns == stamp
-    assert evaluate.main(words) == 0
+    assert main(["evaluate", *words]) == 0
     assert written(tmp_path / "killed" / "result.json") == results[1], "the time of sampling is kept with the motions"
     undisturbed, gone_on = (json.loads(result) for result in results)
     for result in (undisturbed, gone_on):
@@ -201,6 +207,7 @@ def test_other_metrics_need_no_new_motions(runs, full, tmp_path, monkeypatch):
     assert "extractor" in result["not_computed"]
 
 
+@pytest.mark.slow
 def test_the_batch_size_does_not_matter(runs, full, tmp_path):
     result = runs.result(tmp_path / "result.json", "replications=2", "batch_size=7")
     for kind in ("ground_truth", "values"):
@@ -233,8 +240,8 @@ def test_motions_of_others_are_measured_alike(runs, full, tmp_path):
         parts = np.split(content["features"], np.cumsum(content["lengths"])[:-1])
         features = np.concatenate([parts[i] for i in order])
         np.savez(given / path.name, ids=content["ids"][order], lengths=content["lengths"][order], features=features)
-    words = [f"from_samples={given}", "data=synthetic", f"data_root={runs.folder / 'data'}", "protocol=synthetic"]
-    assert evaluate.main([*words, f"extractor={runs.clip}", f"out={out}"]) == 0
+    words = [f"from_samples={given}", *DATA, f"data_root={runs.folder / 'data'}", "protocol=synthetic"]
+    assert main(["evaluate", *words, f"extractor={runs.clip}", f"out={out}"]) == 0
     result = json.loads(out.read_text())
     assert result["checkpoint"] is None
     assert len(result["samples_sha256"]) == 64
@@ -247,7 +254,7 @@ def test_motions_of_others_are_measured_alike(runs, full, tmp_path):
     content = read_samples(path)
     ids = [f"other{number}" for number in range(len(content["ids"]))]
     np.savez(path, ids=ids, lengths=content["lengths"], features=content["features"])
-    assert evaluate.main([*words, f"extractor={runs.clip}", f"out={out}"]) == 1
+    assert main(["evaluate", *words, f"extractor={runs.clip}", f"out={out}"]) == 1
 
 
 def test_joints_of_others_are_encoded(runs, tmp_path):
@@ -257,8 +264,8 @@ def test_joints_of_others_are_encoded(runs, tmp_path):
     shown = [data.representation.decode(torch.from_numpy(data.store.motion(c).copy())).numpy() for c in clips.clips]
     ids, lengths = [clip.id for clip in clips.clips], [len(x) for x in shown]
     np.savez(given / "a.npz", ids=ids, lengths=lengths, joints=np.concatenate(shown))
-    words = [f"from_samples={given}", "data=synthetic", f"data_root={runs.folder / 'data'}", "protocol=synthetic"]
-    assert evaluate.main([*words, "extractor=none", f"out={tmp_path / 'result.json'}"]) == 0
+    words = [f"from_samples={given}", *DATA, f"data_root={runs.folder / 'data'}", "protocol=synthetic"]
+    assert main(["evaluate", *words, "extractor=none", f"out={tmp_path / 'result.json'}"]) == 0
     result = json.loads((tmp_path / "result.json").read_text())
     assert result["values"]["attributes/all"]["mean"] > 0.95
 
@@ -269,7 +276,7 @@ def test_the_same_features_give_the_same_bits_in_any_order(runs, monkeypatch):
     rows = protocol.rows(data.test, 0, 0)
     extractor = protocol.open_extractor(str(runs.clip), data.representation, "synthetic")
     evaluator = Evaluator(extractor, protocol.metrics, data.representation)
-    one = evaluator.extract(protocol.asked(rows, real_motions(data.test, rows)))
+    one = evaluator.extract(protocol.motions(rows, real_motions(data.test, rows)))
     values, _ = evaluator.score(one, one, one, 3)
 
     def shuffled(extracted: Extracted) -> Extracted:
@@ -334,8 +341,45 @@ def test_what_does_not_fit_is_refused_in_one_line(runs, capsys, tmp_path):
     broken.write_bytes(runs.model.read_bytes()[:1000])
     assert runs.evaluate(tmp_path / "result.json", model=broken) == 1
     assert "damaged" in capsys.readouterr().err
-    assert evaluate.main(["protocol=synthetic"]) == 1
+    assert main(["evaluate", "protocol=synthetic"]) == 1
     assert not (tmp_path / "result.json").exists()
+
+
+def protocol_file(folder: Path, old: str, new: str) -> str:
+    """The words that evaluate by the protocol `synthetic` with one replacement."""
+    text = (EXPERIMENTS / "evaluation" / "synthetic.yaml").read_text()
+    assert old in text
+    (folder / "mine.yaml").write_text(text.replace(old, new))
+    return f"protocol={folder / 'mine.yaml'}"
+
+
+def test_misspelt_options_of_metrics_are_refused_before_anything_is_generated(runs, capsys, tmp_path, monkeypatch):
+    monkeypatch.setattr(Generator, "_generate", lambda *_: pytest.fail("sampled"))
+    for old, new, message in (
+        ("normalize: true", "normalise: true", "unknown option: normalise. Did you mean normalize"),
+        ("FrechetMotionDistance", "FrechetMotionDistance, epz: 1", "metric fid: unknown option: epz"),
+        ("samples: 20, pairs: 10", "samples: 20, pair: 10", "Did you mean pairs"),
+        ("  prompts: 20", "  promts: 20", "promts"),
+    ):
+        assert message in refused(runs, capsys, tmp_path, protocol_file(tmp_path, old, new))
+
+
+def test_missing_inputs_of_metrics_are_refused_before_anything_is_generated(runs, capsys, tmp_path, monkeypatch):
+    monkeypatch.setattr(Generator, "_generate", lambda *_: pytest.fail("sampled"))
+    metrics = "evaluators.metrics"
+    for old, new, message in (
+        ("diversity.Diversity, pairs: 300, replace: false", "accuracy.ActionAccuracy", "diversity (ActionAccuracy)"),
+        ("diversity.TextMultimodality, samples: 20, pairs: 10", "accuracy.ActionAccuracy", "missing input: logits"),
+        ("physics.Floating", "reconstruction.KeptDrift", "metric floating (KeptDrift): missing input: kept"),
+    ):
+        words = protocol_file(tmp_path, f"{metrics}.{old}", f"{metrics}.{new}")
+        assert message in refused(runs, capsys, tmp_path, words, "quick=false")
+    words = protocol_file(
+        tmp_path, "extractor: {_target_: evaluators.extractors.MotionCLIPExtractor}", "extractor: null"
+    )
+    assert "missing input: generated" in refused(runs, capsys, tmp_path, words)
+    words = protocol_file(tmp_path, f"{metrics}.physics.Floating", f"{metrics}.reconstruction.KeptDrift")
+    assert "missing input: kept" in refused(runs, capsys, tmp_path, words, "extractor=none")
 
 
 def test_damaged_motions_are_named(runs, capsys, tmp_path):
@@ -412,7 +456,7 @@ def test_models_without_text_are_measured_by_protocols_of_their_own(runs, tmp_pa
     words = [w for w in GENERATOR if not w.startswith("condition")]
     words += [f"condition={condition}", *(["condition.features=16"] if condition == "action" else [])]
     folder = [f"data_root={runs.folder / 'data'}", f"run.dir={tmp_path / 'run'}", "trainer.max_steps=1"]
-    assert train.main(["quickstart", *words, *folder]) == 0
+    assert main(["train", "quickstart", *words, *folder]) == 0
     model, out = tmp_path / "run" / "checkpoints" / "last.ckpt", tmp_path / "result.json"
     options = ["quick=true", "num_inference_steps=2", "extractor=none"]
     assert runs.evaluate(out, *options, model=model) == 0
@@ -428,7 +472,8 @@ def test_a_model_of_other_data_is_marked(runs, tmp_path):
     config["data"] |= {"root": str(other), "source": config["data"]["source"] | {"clips": 60}}
     instantiate(config["data"], representation=instantiate(config["representation"])).prepare_data()
     out = tmp_path / "result.json"
-    result = runs.result(out, f"data_root={other}", "quick=true", "extractor=none")
+    data = ["data=synthetic", "data.source.clips=60", f"data_root={other}"]
+    result = runs.result(out, *data, "quick=true", "extractor=none")
     assert not result["valid"]
     assert "splits may overlap" in result["invalid_because"][0]
 
@@ -451,11 +496,11 @@ def test_training_logs_the_values_of_the_validation_split(runs, tmp_path):
     recipe = tmp_path / "mine.yaml"
     recipe.write_text(
         "# @package _global_\ndefaults:\n  - /quickstart\n  - override /logger: csv\n  - _self_\ncallbacks:\n"
-        "  evaluate: {_target_: flame_mdm.callbacks.Evaluate, protocol: synthetic, "
+        "  evaluate: {_target_: evaluators.callback.Evaluate, protocol: synthetic, "
         f"extractor: {runs.clip}, every_n_steps: 4, samples: 33}}\n"
     )
     words = [*GENERATOR, f"data_root={runs.folder / 'data'}", f"run.dir={tmp_path / 'run'}", "trainer.max_steps=8"]
-    assert train.main([str(recipe), *words, "callbacks.best.monitor=val/synthetic/fid"]) == 0
+    assert main(["train", str(recipe), *words, "callbacks.best.monitor=val/synthetic/fid"]) == 0
     lines = [line.split(",") for line in (tmp_path / "run" / "csv" / "metrics.csv").read_text().splitlines()]
     rows = [dict(zip(lines[0], line, strict=True)) for line in lines[1:]]
     logged = [int(row["step"]) for row in rows if row["val/synthetic/fid"]]
@@ -481,6 +526,7 @@ def means(result: dict) -> dict[str, float | None]:
     return {f"{kind} {name}": v["mean"] for kind in ("ground_truth", "values") for name, v in result[kind].items()}
 
 
+@pytest.mark.slow
 def test_processes_share_the_sampling_and_get_one_result(runs, tmp_path):
     """Shares of unequal sizes, and shares of nothing."""
     with GlooPool(2) as pool:
@@ -498,6 +544,7 @@ def test_processes_share_the_sampling_and_get_one_result(runs, tmp_path):
         assert alone[name] == (value and pytest.approx(value, rel=2e-3, abs=0.04)), name
 
 
+@pytest.mark.slow
 def test_torchrun_writes_one_result(runs, tmp_path):
     out = tmp_path / "result.json"
     model = tmp_path / "model" / "checkpoints" / "last.ckpt"
@@ -507,7 +554,7 @@ def test_torchrun_writes_one_result(runs, tmp_path):
     torchrun = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2"]
     environment = os.environ | {"OMP_NUM_THREADS": "1"}
     done = subprocess.run(
-        [*torchrun, "-m", "flame_mdm.evaluate", *words], capture_output=True, text=True, check=False, env=environment
+        [*torchrun, "-m", "flame_mdm", "evaluate", *words], capture_output=True, text=True, check=False, env=environment
     )
     assert done.returncode == 0, done.stderr
     assert done.stdout.count("written:") == 1
@@ -520,9 +567,9 @@ def test_torchrun_writes_one_result(runs, tmp_path):
 
 
 def baseline(runs: Runs, folder: Path, kind: str, *words: str) -> int:
-    place = ["data=synthetic", f"data_root={runs.folder / 'data'}", "protocol=synthetic", "device=cpu"]
+    place = [*DATA, f"data_root={runs.folder / 'data'}", "protocol=synthetic", "device=cpu"]
     out = f"out={folder / f'{kind}.json'}"
-    return evaluate.main([f"baseline={kind}", *place, f"extractor={runs.clip}", "replications=1", out, *words])
+    return main(["evaluate", f"baseline={kind}", *place, f"extractor={runs.clip}", "replications=1", out, *words])
 
 
 def test_baselines_show_what_each_metric_sees(runs, tmp_path):

@@ -10,9 +10,9 @@ import torch
 from fixtures import GOLDEN, Arrays, golden, groups, meta, needs_third_party, third_party
 from torch import Tensor, nn
 
-from evaluators.action_gru import NUM_ACTIONS, ActionGRU, load_action_gru
-from evaluators.stgcn import STGCN, UESTC, JointSTGCN, Unconstrained, load_uestc, load_unconstrained
-from evaluators.t2m import PARTS_OF_SPEECH, T2MEvaluator, Words, WordVectors, load_t2m
+from evaluators.extractors.action_gru import NUM_ACTIONS, ActionGRU, load_action_gru
+from evaluators.extractors.stgcn import STGCN, UESTC, JointSTGCN, Unconstrained, load_uestc, load_unconstrained
+from evaluators.extractors.t2m import PARTS_OF_SPEECH, T2MEvaluator, Words, WordVectors, load_t2m
 from flame_mdm.motion import length_mask
 
 FLIP = torch.tensor([1.0, -1.0, -1.0])

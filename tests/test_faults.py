@@ -27,14 +27,12 @@ def test_kills_at_random_moments_change_nothing():
     assert "SIGTERM" in done.stdout
 
 
-@pytest.mark.parametrize(
-    "command", ["train", "sample", "edit", "evaluate", "prepare", "browse", "convert", "checkpoints"]
-)
+@pytest.mark.parametrize("command", ["train", "sample", "edit", "evaluate", "prepare", "browse", "convert", "export"])
 def test_help_and_misspelt_keys_do_not_wait_for_torch(command, tmp_path):
-    words = {"train": ["quickstart", "seeed=1"], "checkpoints": ["exprt"]}.get(command, ["seeed=1"])
+    words = {"train": ["quickstart", "seeed=1"]}.get(command, ["seeed=1"])
     code = f"""
 import sys
-from flame_mdm.{command} import main
+from flame_mdm.commands.{command} import main
 def run(words):
     try:
         return main(words)

@@ -11,13 +11,15 @@ import pytest
 import torch
 from fixtures import ROOT
 
-from flame_mdm import prepare, sample, train
-from flame_mdm.data import bvh
+from flame_mdm.__main__ import main
 from flame_mdm.data.crops import Units
 from flame_mdm.data.datamodule import MotionDataModule
-from flame_mdm.data.folder import LAYOUTS, Folder, read_skeleton
+from flame_mdm.data.folder import Folder
 from flame_mdm.data.store import write_store
 from flame_mdm.data.synthetic import Synthetic
+from flame_mdm.errors import UserError
+from flame_mdm.formats import bvh
+from flame_mdm.formats.layouts import LAYOUTS, read_skeleton
 from flame_mdm.representations.humanml import HumanML
 from flame_mdm.representations.skeleton import KIT21, SMPL22
 from flame_mdm.representations.smpl import ADULT, SMPL
@@ -232,30 +234,30 @@ BAD = {
     "columns": (lambda f: (f / "captions.csv").write_text("id,caption\none,a\n"), r"captions\.csv: its columns are"),
     "cells": (lambda f: (f / "captions.csv").write_text("id,text\none,a, b\n"), r"line 2: not as many cells"),
     "split": (lambda f: (f / "captions.csv").write_text("id,split\none,dev\n"), r"line 2: the split 'dev' is none of"),
-    "json": (lambda f: (f / "captions.json").write_text("{"), r"captions\.json: not read as JSON"),
+    "json": (lambda f: (f / "captions.json").write_text("{"), r"captions\.json: not a JSON file"),
     "json key": (lambda f: (f / "captions.json").write_text('{"one": {"txt": "a"}}'), "one: unknown key txt"),
     "json shape": (lambda f: (f / "captions.json").write_text('{"one": "a"}'), r"captions\.json: write {"),
     "two splits": (
         lambda f: (f / "captions.csv").write_text("id,split\none,val\none,test\n"),
         "line 3: one has the split val and test",
     ),
-    "no rate": (lambda f: (f / "skeleton.yaml").unlink(), r"one\.npy: it does not tell its frame rate"),
+    "no rate": (lambda f: (f / "skeleton.yaml").unlink(), r"one\.npy: it does not give its frame rate"),
     "cut": (lambda f: (f / "one.npy").write_bytes((f / "one.npy").read_bytes()[:900]), r"one\.npy: damaged"),
     "objects": (lambda f: np.save(f / "one.npy", np.array([{}])), r"one\.npy: damaged, or not a file of plain arrays"),
     "keys": (lambda f: np.savez(f / "three.npz", x=1), r"three\.npz: it holds x"),
     "flat": (lambda f: np.save(f / "one.npy", WALK.reshape(-1, 66)), r"one\.npy: joints of shape \(\d+, 66\)"),
     "23 joints": (lambda f: np.save(f / "one.npy", np.zeros((9, 23, 3))), r"one\.npy: 23 joints, not the 22, 24 or 52"),
     "17 joints": (lambda f: np.save(f / "one.npy", np.zeros((9, 17, 3))), r"one\.npy: 17 joints of unknown names"),
-    "nan": (lambda f: np.save(f / "one.npy", WALK * np.nan), r"one\.npy: numbers in frame 0 are not finite"),
+    "nan": (lambda f: np.save(f / "one.npy", WALK * np.nan), r"one\.npy: numbers of joints in frame 0 are not finite"),
     "unit": (lambda f: np.save(f / "one.npy", WALK * 100), r"one\.npy: a leg of 8\d.* m; say in skeleton\.yaml"),
     "sides": (lambda f: np.save(f / "one.npy", WALK * [-1, 1, 1]), r"one\.npy: the toes point backwards"),
     "up": (lambda f: np.savez(f / "deep/two.npz", joints=WALK[..., [0, 2, 1]] * [1, -1, 1], fps=9), "the body lies"),
     "trans": (lambda f: np.savez(f / "three.npz", poses=np.zeros((9, 72))), r"three\.npz: AMASS's files hold poses"),
-    "yaml": (lambda f: skeleton(f, "fps: [30"), r"skeleton\.yaml: not read as YAML"),
+    "yaml": (lambda f: skeleton(f, "fps: [30"), r"skeleton\.yaml: not a readable YAML file"),
     "yaml key": (lambda f: skeleton(f, "rate: 30"), r"skeleton\.yaml: unknown key rate; there are map, joints"),
     "yaml list": (lambda f: skeleton(f, "- 30"), r"skeleton\.yaml: unknown key list"),
-    "yaml value": (lambda f: skeleton(f, "fps: 0"), r"skeleton\.yaml: fps: 0 does not do"),
-    "yaml up": (lambda f: skeleton(f, "up: x"), r"skeleton\.yaml: up: x does not do"),
+    "yaml value": (lambda f: skeleton(f, "fps: 0"), r"skeleton\.yaml: fps: 0 is not valid"),
+    "yaml up": (lambda f: skeleton(f, "up: x"), r"skeleton\.yaml: up: x is not valid"),
     "yaml map": (lambda f: skeleton(f, "map: {pelvis: Hips}"), r"skeleton\.yaml: map: which joint stands for head"),
     "yaml names": (lambda f: skeleton(f, f"joints: [a]\nmap: {MAP}"), r"map: head\?, .* is not among the joints"),
     "other map": (lambda f: skeleton(f, f"fps: 30\nmap: {MAP}"), r"two\.npz: its joints .* are not those of the map"),
@@ -269,7 +271,7 @@ def test_every_fault_is_named_in_a_line(case: str, arrays: Path):
         for name in ("one.npy", "three.npz"):
             (arrays / name).unlink()
     damage(arrays)
-    with pytest.raises((ValueError, FileNotFoundError), match=message) as error:
+    with pytest.raises((ValueError, UserError, FileNotFoundError), match=message) as error:
         list(Folder(str(arrays)).clips(30.0))
     assert "\n" not in str(error.value)
     assert str(arrays) in str(error.value)
@@ -320,7 +322,7 @@ def make(line: str, environment: pytest.MonkeyPatch) -> int:
     variables += QUICK if target == "train" else []
     escaped = (re.sub(r"([\\ ])", r"\\\1", word).replace("$", "$$") for word in reversed(variables))
     environment.setenv("MAKEFLAGS", f" -- {' '.join(escaped)}")
-    return {"prepare": prepare, "train": train, "sample": sample}[target].main(["--from-make"])
+    return main([target, "--from-make"])
 
 
 def test_the_tutorial_works_as_it_is_written(

@@ -8,11 +8,12 @@ import textwrap
 import pytest
 import torch
 
-from flame_mdm import train
-from flame_mdm.config import UserError, compose, instantiate
-from flame_mdm.guards import LAST, PREVIOUS, WholeCheckpoints, newest, only_run
+from flame_mdm.__main__ import main
+from flame_mdm.checkpoints.files import read_checkpoint
+from flame_mdm.config import compose, instantiate
+from flame_mdm.errors import UserError
 from flame_mdm.processes.diffusion import GaussianDiffusion
-from flame_mdm.task import read_checkpoint
+from flame_mdm.training.guards import LAST, PREVIOUS, WholeCheckpoints, newest, only_run
 
 QUICK = ["callbacks.samples=null", "callbacks.best=null", "callbacks.checkpoints.every_n_steps=2"]
 
@@ -47,7 +48,7 @@ def break_loss(monkeypatch: pytest.MonkeyPatch, step: int, change) -> None:
 def test_a_bad_loss_stops_before_a_checkpoint_is_spoiled(tiny, tmp_path, monkeypatch, capsys, change, told):
     break_loss(monkeypatch, 7, change)
     capsys.readouterr()
-    assert train.main(words(tiny, 20)) == 1
+    assert main(["train", *words(tiny, 20)]) == 1
     message = capsys.readouterr().err
     assert message.startswith("error: the loss of step 7 ")
     assert told in message
@@ -70,15 +71,16 @@ def test_out_of_memory_names_the_batch(tiny, monkeypatch, capsys, error):
 
     break_loss(monkeypatch, 3, fail)
     capsys.readouterr()
-    assert train.main(words(tiny, 5)) == 1
+    assert main(["train", *words(tiny, 5)]) == 1
     message = capsys.readouterr().err
     assert message.startswith("error: out of memory at step 2 with a batch of 8 clips, ")
     assert "263 features: lower data.batch_size" in message
     assert message.count("\n") == 1
 
 
+@pytest.mark.slow
 def test_a_damaged_checkpoint_gives_way_to_the_one_before(tiny, tmp_path, capsys):
-    assert train.main(words(tiny, 6)) == 0
+    assert main(["train", *words(tiny, 6)]) == 0
     folder = tmp_path / "run" / "checkpoints"
     whole = (folder / LAST).read_bytes()
     assert newest(folder) == (folder / LAST, 6)
@@ -89,7 +91,7 @@ def test_a_damaged_checkpoint_gives_way_to_the_one_before(tiny, tmp_path, capsys
         capsys.readouterr()
         assert newest(folder) == (folder / PREVIOUS, 4)
         assert f"{folder / LAST}: damaged" in capsys.readouterr().out
-    assert train.main(words(tiny, 6)) == 0
+    assert main(["train", *words(tiny, 6)]) == 0
     resumed = read_checkpoint(folder / LAST)
     (tmp_path / "whole.ckpt").write_bytes(whole)
     once = read_checkpoint(tmp_path / "whole.ckpt")
@@ -117,13 +119,14 @@ def test_a_full_disk_leaves_the_checkpoint_before(tmp_path):
 
 HOLD = """
 import sys, pathlib
-from flame_mdm.guards import only_run
+from flame_mdm.training.guards import only_run
 with only_run(pathlib.Path(sys.argv[1])):
     print("held", flush=True)
     sys.stdin.read()
 """
 
 
+@pytest.mark.slow
 def test_a_second_run_in_the_folder_is_refused_and_a_dead_one_taken_over(tiny, tmp_path, capsys):
     folder = tmp_path / "run"
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
@@ -133,14 +136,14 @@ def test_a_second_run_in_the_folder_is_refused_and_a_dead_one_taken_over(tiny, t
         assert other.stdout is not None
         assert other.stdout.readline() == "held\n"
         capsys.readouterr()
-        assert train.main(words(tiny, 2)) == 1
+        assert main(["train", *words(tiny, 2)]) == 1
         message = capsys.readouterr().err
         assert f"process {other.pid} on " in message
         assert "trains here now" in message
         assert message.count("\n") == 1
         assert not (folder / "config.yaml").exists()
         other.kill()
-    assert train.main(words(tiny, 2)) == 0
+    assert main(["train", *words(tiny, 2)]) == 0
     assert f"process {other.pid} on " in capsys.readouterr().out
     assert not (folder / "run.lock").exists()
 

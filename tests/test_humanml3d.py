@@ -12,12 +12,12 @@ import torch
 from fixtures import golden, groups
 from t2m_folder import line, write_folder
 
+from flame_mdm.commands.prepare import main as prepare
 from flame_mdm.data import amass, humanml3d, t2m
 from flame_mdm.data.amass import Amass, Recording, key_of, load_bodies
 from flame_mdm.data.crops import Units
 from flame_mdm.data.humanml3d import HumanML3D, HumanML3DSMPL, Row, read_index
 from flame_mdm.data.store import write_store
-from flame_mdm.prepare import main as prepare
 from flame_mdm.representations.humanml import HumanML
 from flame_mdm.representations.skeleton import SMPL22
 from flame_mdm.representations.smpl import SMPL
@@ -529,19 +529,22 @@ def body_of_55_joints(root):
     [
         (smplx, r"kick_high_left02_poses\.npz: this is AMASS's SMPL-X release; download the one called SMPL\+H G"),
         (rename_as_smplx, r"KIT: this is the SMPL-X release \(files end in _stageii\); download SMPL\+H G"),
-        (truncate_archive, r"KIT\.tar\.bz2: damaged or incomplete archive: .*; download it again"),
+        (truncate_archive, r"KIT\.tar\.bz2: damaged archive: .*; download it again"),
         (
             archive_without_recording,
             r"BMLrub\.tar\.bz2: 1 recordings are not in it, such as BioMotionLab",
         ),
         (
             lambda r: truncate(r / "amass/CMU/80/80_63_poses.npz"),
-            r"80_63_poses\.npz: damaged or no \.npz file",
+            r"80_63_poses\.npz: damaged, or not a file of plain arrays",
         ),
         (lambda r: set_in_file(r, trans=np.full((360, 3), np.nan)), r"80_63_poses\.npz: it holds numbers that are not"),
         (lambda r: set_in_file(r, poses=np.zeros((360, 72))), r"80_63_poses\.npz: poses \(360, 72\)"),
         (lambda r: set_in_file(r, mocap_framerate=np.array(15.0)), r"80_63_poses\.npz: recorded at 15 frames a second"),
-        (lambda r: set_in_file(r, gender=np.array({"a": 1})), r"80_63_poses\.npz: damaged or no \.npz file"),
+        (
+            lambda r: set_in_file(r, gender=np.array({"a": 1})),
+            r"80_63_poses\.npz: damaged, or not a file of plain arrays",
+        ),
         (
             lambda r: shutil.rmtree(r / "amass" / "BMLrub"),
             r"cannot be made: BioMotionLab_NTroje: absent \(1 recordings\); .* BioMotionLab_NTroje or BMLrub",

@@ -11,15 +11,17 @@ from pathlib import Path
 import pytest
 from conftest import TINY
 
-from flame_mdm import train
+from flame_mdm.__main__ import main
 from flame_mdm.data.store import Store
+
+pytestmark = pytest.mark.slow
 
 STORE = "synthetic-humanml-clean-smpl22"
 
 
 def start(command: str, *words: str) -> subprocess.Popen[str]:
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    line = [sys.executable, "-m", f"flame_mdm.{command}", *words]
+    line = [sys.executable, "-m", "flame_mdm", command, *words]
     return subprocess.Popen(line, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment)
 
 
@@ -52,7 +54,7 @@ def test_a_preparation_that_is_stopped_leaves_nothing(tmp_path):
 
 def test_an_evaluation_that_is_stopped_leaves_whole_replications(tmp_path, data_root):
     run = [*TINY, f"data_root={data_root}", f"run.dir={tmp_path / 'run'}", "callbacks.samples=null", "logger=csv"]
-    assert train.main(["quickstart", *run, "callbacks.best=null", "trainer.max_steps=1"]) == 0
+    assert main(["train", "quickstart", *run, "callbacks.best=null", "trainer.max_steps=1"]) == 0
     checkpoint = tmp_path / "run" / "checkpoints" / "last.ckpt"
     options = [f"ckpt={checkpoint}", "extractor=none", "split=train", f"data_root={data_root}", "batch_size=4"]
     process = start("evaluate", *options, "replications=20", "samples=20")

@@ -11,6 +11,7 @@ from t2m_folder import line, write_folder
 from flame_mdm.config import compose, instantiate
 from flame_mdm.data.kit import KIT, KITTemos, read_joints
 from flame_mdm.data.store import write_store
+from flame_mdm.errors import UserError
 from flame_mdm.representations.humanml import HumanML
 from flame_mdm.representations.rifke import Rifke
 from flame_mdm.representations.skeleton import KIT21
@@ -152,7 +153,7 @@ def rewrite(path, change):
         (lambda f: (f / "00003_fke.csv").unlink(), r"1 of 24 files are absent, such as 00003_fke\.csv"),
         (lambda f: (f / "00006_meta.json").unlink(), r"such as 00006_meta\.json"),
         (lambda f: (f / "00001_annotations.json").write_text("[]"), r"00001_meta\.json: nb_annotations does not count"),
-        (lambda f: (f / "00001_annotations.json").write_text('["a'), r"00001_annotations\.json: damaged"),
+        (lambda f: (f / "00001_annotations.json").write_text('["a'), r"00001_annotations\.json: not a JSON file"),
         (lambda f: rewrite(f / "00001_fke.csv", lambda x: [*x[:9], "a,b", *x[10:]]), r"00001_fke\.csv: damaged"),
         (lambda f: rewrite(f / "00001_fke.csv", lambda x: [y[: y.rindex(",")] for y in x]), "63 columns, not a number"),
         (lambda f: np.savetxt(f / "00001_fke.csv", np.full((90, 64), math.nan), delimiter=","), "are not finite"),
@@ -162,7 +163,7 @@ def rewrite(path, change):
 )
 def test_a_damaged_folder_is_named(mmm, tmp_path, damage, message):
     damage(mmm)
-    with pytest.raises((ValueError, FileNotFoundError), match=message) as error:
+    with pytest.raises((ValueError, UserError, FileNotFoundError), match=message) as error:
         write_store(tmp_path / "store", source(mmm), Rifke())
     assert "\n" not in str(error.value)
 

@@ -11,9 +11,10 @@ import torch
 from fixtures import ROOT
 from runs import RUN, TWO, alarm, finish, free_port, reference, spawn
 
-from flame_mdm import train
-from flame_mdm.config import UserError, compose
-from flame_mdm.task import read_checkpoint
+from flame_mdm.__main__ import main
+from flame_mdm.checkpoints.files import read_checkpoint
+from flame_mdm.config import compose
+from flame_mdm.errors import UserError
 
 SLURM = {
     "sbatch": """
@@ -58,12 +59,15 @@ def cluster(tmp_path: Path) -> dict[str, str]:
     return {"CLUSTER": str(tmp_path), "PYTHONPATH": path, "PATH": programs, **address}
 
 
+@pytest.mark.slow
 def test_a_slurm_job_that_runs_out_of_time_is_requeued_and_ends_as_if_it_had_not(tiny, tmp_path, cluster):
     """Two tasks; SIGUSR2, which submitit asks SLURM for, comes at step 3 of 5."""
     words = [*tiny, *RUN, "callbacks.samples=null", "trainer.max_steps=5"]
     time_over = alarm(tmp_path, "time", step=3, rank=0, attempt=0, counter="SLURM_RESTART_COUNT", signal="SIGUSR2")
     launch = ["launch=slurm", "hydra.launcher.partition=gpu", "hydra.launcher.timeout_min=90"]
-    code, out, err = finish(spawn(["flame_mdm.train", "quickstart", *words, *time_over, *TWO, *launch], **cluster))
+    code, out, err = finish(
+        spawn(["flame_mdm.commands.train", "quickstart", *words, *time_over, *TWO, *launch], **cluster)
+    )
     logs = "\n".join(path.read_text() for path in (tmp_path / "run" / ".submitit").rglob("*.out"))
     assert code == 0, out + err + logs
     assert "job 7 is in the queue again" in logs
@@ -89,16 +93,17 @@ def test_a_slurm_job_that_runs_out_of_time_is_requeued_and_ends_as_if_it_had_not
         assert linted.returncode == 0, linted.stdout + linted.stderr
 
 
+@pytest.mark.slow
 def test_jobs_of_a_sweep_run_beside_one_another_in_folders_of_their_own(tiny, tmp_path):
     """On this machine; the first one is refused, as its folder holds another run."""
     words = [*tiny, "callbacks.samples=null", "callbacks.best=null", "trainer.max_steps=1"]
     (tmp_path / "run" / "seed=1").mkdir(parents=True)
     (tmp_path / "run" / "seed=1" / "config.yaml").write_text("seed: 5\n")
-    code, out, err = finish(spawn(["flame_mdm.train", "quickstart", *words, "seed=1,2", "launch=local"]))
+    code, out, err = finish(spawn(["flame_mdm.commands.train", "quickstart", *words, "seed=1,2", "launch=local"]))
     assert code == 1, out + err
     assert str(tmp_path / "run" / ".submitit") in out
     logs = "\n".join(path.read_text() for path in (tmp_path / "run" / ".submitit").rglob("*log.err"))
-    assert "seed=1 holds a run of another configuration" in logs
+    assert "seed=1/config.yaml: not the configuration" in logs
     assert not (tmp_path / "run" / "seed=1" / "checkpoints").exists()
     checkpoint = read_checkpoint(tmp_path / "run" / "seed=2" / "checkpoints" / "last.ckpt")
     assert checkpoint["config"]["seed"] == 2
@@ -116,7 +121,7 @@ def test_jobs_of_a_sweep_run_beside_one_another_in_folders_of_their_own(tiny, tm
     ],
 )
 def test_what_is_wrong_is_told_before_anything_is_submitted(words, message, tiny, tmp_path, capsys):
-    assert train.main(["quickstart", *tiny, *words]) == 1
+    assert main(["train", "quickstart", *tiny, *words]) == 1
     told = capsys.readouterr().err
     assert told.startswith("error: ")
     assert message in told
@@ -125,7 +130,7 @@ def test_what_is_wrong_is_told_before_anything_is_submitted(words, message, tiny
 
 
 def test_a_missing_launcher_names_the_extra(monkeypatch):
-    monkeypatch.setattr("flame_mdm.config._file", lambda module: None)
+    monkeypatch.setattr("flame_mdm.config.composition.source_file", lambda module: None)
     with pytest.raises(UserError, match=r"launch=slurm needs .*: pip install flame-mdm\[slurm\]"):
         compose("quickstart", ["launch=slurm"])
 

@@ -12,9 +12,9 @@ from fixtures import golden, groups
 from torch import Tensor
 from torchmetrics import Metric
 
-from evaluators import feed
-from evaluators.accuracy import ActionAccuracy
-from evaluators.alignment import (
+from evaluators.metrics import update_metrics
+from evaluators.metrics.accuracy import ActionAccuracy
+from evaluators.metrics.alignment import (
     MotionCLIPScore,
     MotionsForText,
     MultimodalDistance,
@@ -25,15 +25,15 @@ from evaluators.alignment import (
     retrieval_ranks,
     whole_set_retrieval,
 )
-from evaluators.confidence import mean_ci
-from evaluators.distribution import (
+from evaluators.metrics.confidence import mean_ci
+from evaluators.metrics.distribution import (
     FrechetMotionDistance,
     KernelMotionDistance,
     PrecisionRecall,
     frechet_distance,
     polynomial_mmd2,
 )
-from evaluators.diversity import (
+from evaluators.metrics.diversity import (
     ActionMultimodality,
     Diversity,
     JointVariance,
@@ -41,8 +41,8 @@ from evaluators.diversity import (
     TextMultimodality,
     pair_distance,
 )
-from evaluators.physics import Floating, FootSkating, Jitter, Penetration, StaticShare
-from evaluators.reconstruction import (
+from evaluators.metrics.physics import Floating, FootSkating, Jitter, Penetration, StaticShare
+from evaluators.metrics.reconstruction import (
     DisplacementErrors,
     FlamePositionErrors,
     KeptDrift,
@@ -51,8 +51,8 @@ from evaluators.reconstruction import (
     temos_parts,
 )
 from flame_mdm.motion import length_mask
-from flame_mdm.noise import key
 from flame_mdm.representations.skeleton import KIT21, SMPL22
+from flame_mdm.seeds import key
 
 FIXTURE = golden("metrics")
 
@@ -226,7 +226,7 @@ def test_flame_metrics_equal_the_authors(stem: str):
     shares = [(rank < k).double().mean().item() for k in (1, 2, 3)]
     np.testing.assert_allclose(shares, array("flame/r_precision_top123"), rtol=1e-6)
     metrics = {"mclip": MotionCLIPScore(), "mm_distance": MultimodalDistance(), "fd": FrechetMotionDistance()}
-    feed(metrics, generated=fake, text=text, keys=own, real=real, real_keys=own)
+    update_metrics(metrics, generated=fake, text=text, keys=own, real=real, real_keys=own)
     for name, metric in metrics.items():
         assert metric.compute() == pytest.approx(float(array(f"flame/{name}")), rel=2e-6)
 
@@ -615,7 +615,7 @@ def test_physics_of_simple_motions():
             "static": StaticShare(fps),
             "skating": FootSkating(fps),
         }
-        feed(metrics, joints=joints, mask=mask, keys=ids)
+        update_metrics(metrics, joints=joints, mask=mask, keys=ids)
         return {name: metric.compute() for name, metric in metrics.items()}
 
     values = physics(still)
@@ -719,7 +719,7 @@ def batches(values: dict[str, Tensor], indices: list[Tensor]) -> list[dict[str, 
 
 def measure(metrics: dict[str, Metric], given: list[dict[str, Tensor]]) -> dict[str, Any]:
     for batch in given:
-        feed(metrics, **batch)
+        update_metrics(metrics, **batch)
     return {name: metric.compute() for name, metric in metrics.items()}
 
 
@@ -766,6 +766,7 @@ def pool() -> Iterator[GlooPool]:
         yield pool
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("first", [range(0, COUNT, 2), range(30), range(COUNT), range(0)])
 def test_values_do_not_depend_on_the_number_of_processes(first: range, pool: GlooPool, expected: dict[str, Any]):
     """Samples dealt in turn, unevenly, and all to one of the two."""
@@ -838,7 +839,7 @@ def test_nothing_given_is_none_never_0():
     ],
 )
 def test_too_few_samples_are_an_error(metric: Metric, count: int, message: str):
-    feed({"metric": metric}, **evaluation(count))
+    update_metrics({"metric": metric}, **evaluation(count))
     with pytest.raises(ValueError, match=f"{type(metric).__name__}: {message}"):
         metric.compute()
 
@@ -847,7 +848,7 @@ def test_a_sample_given_twice_is_an_error():
     values = evaluation()
     metrics = {n: m for n, m in all_metrics().items() if hasattr(m, "keys")}
     for batch in batches(values, [torch.arange(COUNT), torch.tensor([3])]):
-        feed(metrics, **batch)
+        update_metrics(metrics, **batch)
     for metric in metrics.values():
         with pytest.raises(ValueError, match="1 samples were given twice"):
             metric.compute()
@@ -896,10 +897,10 @@ def test_normalized_features_compare_directions_alone():
     lengths = torch.linspace(1, 10, 64)[:, None]
     rows = {"generated": lengths * text, "text": text, "text_keys": torch.arange(64), "keys": torch.arange(64)}
     metrics = {"retrieval": MotionsForText(normalize=True), "distance": MultimodalDistance(normalize=True)}
-    feed(metrics, **rows)
+    update_metrics(metrics, **rows)
     assert metrics["retrieval"].compute()["top1"] == 1.0
     assert metrics["distance"].compute() == pytest.approx(0.0, abs=1e-6)
     plain = {"retrieval": MotionsForText(), "distance": MultimodalDistance()}
-    feed(plain, **rows)
+    update_metrics(plain, **rows)
     assert plain["retrieval"].compute()["top1"] < 0.9
     assert plain["distance"].compute() == pytest.approx(float((lengths - 1).mean()), rel=1e-6)

@@ -11,20 +11,22 @@ from fixtures import GOLDEN, Arrays, golden, meta
 from torch.nn import functional
 
 from evaluators.extractors import MotionCLIPExtractor
-from evaluators.motion_clip import (
+from evaluators.extractors.motion_clip import (
     MotionCLIP,
     MotionCLIPTask,
     PooledLoss,
     import_mclip,
     info_nce,
 )
-from flame_mdm import checkpoints, train
+from flame_mdm.__main__ import main
+from flame_mdm.checkpoints.files import read_checkpoint
+from flame_mdm.checkpoints.loading import load, load_task
 from flame_mdm.conditions.text import PretrainedText
-from flame_mdm.config import UserError, compose, instantiate
+from flame_mdm.config import compose, instantiate
+from flame_mdm.errors import UserError
 from flame_mdm.motion import length_mask
-from flame_mdm.noise import key
 from flame_mdm.representations.smpl import SMPL
-from flame_mdm.task import load, load_task, read_checkpoint
+from flame_mdm.seeds import key
 
 SMALL = {"latent_dim": 16, "ff_size": 24, "num_layers": 2, "num_heads": 4, "embedding_dim": 8, "max_frames": 20}
 
@@ -117,9 +119,9 @@ def test_the_released_file_becomes_an_extractor(stem, released, tmp_path, monkey
     monkeypatch.setenv("FLAME_MDM_DATA", str(tmp_path / "own"))
     file, out = tmp_path / "mclip.ckpt", tmp_path / "mclip.safetensors"
     torch.save({"state_dict": released, "epoch": 3}, file)
-    with pytest.raises(UserError, match=r"mclip\.ckpt: not a checkpoint .* `python -m flame_mdm\.checkpoints import`"):
+    with pytest.raises(UserError, match=r"mclip\.ckpt: not a checkpoint .* `flame-mdm import`"):
         MotionCLIPExtractor(str(file))
-    assert checkpoints.main(["import", "mclip", str(file), "-o", str(out)]) == 0, capsys.readouterr().err
+    assert main(["import", "mclip", str(file), f"out={out}"]) == 0, capsys.readouterr().err
     assert str(tmp_path).encode() not in out.read_bytes()
     extractor = MotionCLIPExtractor(str(out))
     for dataset in ("humanml3d", "babel"):
@@ -142,9 +144,9 @@ def test_the_released_file_becomes_an_extractor(stem, released, tmp_path, monkey
         ("lm_projection.bias", "text_projection.bias"),
     ):
         torch.save({"state_dict": {k: v for k, v in released.items() if k != f"net.{name}"}}, file)
-        assert checkpoints.main(["import", "mclip", str(file), "-o", str(out)]) == 1
+        assert main(["import", "mclip", str(file), f"out={out}"]) == 1
         assert re.search(rf"mclip\.ckpt: .*{told}", capsys.readouterr().err)
-    assert checkpoints.main(["import", "mclip", str(file), str(file), "-o", str(out)]) == 1
+    assert main(["import", "mclip", str(file), str(file), f"out={out}"]) == 1
     assert "mclip takes no file of options" in capsys.readouterr().err
 
 
@@ -246,7 +248,7 @@ def trained(tmp_path_factory, data_root):
     folder = tmp_path_factory.mktemp("motion_clip")
     options = [f"data_root={data_root}/clip", f"run.dir={folder}", "trainer.max_steps=60"]
     options += ["trainer.val_check_interval=30", "optimizer.lr=0.003"]
-    assert train.main(["motion_clip/synthetic", *RUN, *options]) == 0
+    assert main(["train", "motion_clip/synthetic", *RUN, *options]) == 0
     return folder / "checkpoints" / "last.ckpt"
 
 
@@ -287,7 +289,7 @@ def test_a_feature_extractor_is_not_sampled_from(trained):
 def test_few_captions_train_without_retrieval(tmp_path, capsys):
     options = ["data.source.clips=60", "data.batch_size=8", f"data_root={tmp_path}/data", f"run.dir={tmp_path}/run"]
     steps = ["trainer.max_steps=2", "trainer.val_check_interval=2"]
-    assert train.main(["motion_clip/synthetic", *RUN, *options, *steps]) == 0, capsys.readouterr().err
+    assert main(["train", "motion_clip/synthetic", *RUN, *options, *steps]) == 0, capsys.readouterr().err
     header = (tmp_path / "run" / "csv" / "metrics.csv").read_text().splitlines()[0]
     assert "val/loss" in header
     assert "top1" not in header

@@ -2,7 +2,7 @@ import pytest
 import torch
 from scipy import stats
 
-from flame_mdm.noise import key, normal, seeded_noise, uniform
+from flame_mdm.seeds import key, normal, seeded_noise, uniform
 
 
 def test_noise_is_standard_normal_and_uncorrelated():

@@ -10,10 +10,10 @@ import torch
 from fixtures import ROOT
 
 from flame_mdm.config import compose, instantiate, recipes
-from flame_mdm.hyperparameters import value
 from flame_mdm.motion import Condition
 from flame_mdm.processes.diffusion import Sampler
 from flame_mdm.processes.flow_matching import STEPS as SOLVERS
+from flame_mdm.reporting.settings import value
 
 SPEC = importlib.util.spec_from_file_location("generate", ROOT / "docs" / "generate.py")
 assert SPEC is not None

@@ -14,12 +14,15 @@ import torch
 from conftest import TINY
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from flame_mdm import callbacks, report, train
-from flame_mdm.callbacks import Measurements
-from flame_mdm.config import UserError
-from flame_mdm.dashboards import History
-from flame_mdm.report import charted, constants, read_history, read_run, write_report
-from flame_mdm.visualize.page import chart, number, page, short, table
+from flame_mdm.__main__ import main
+from flame_mdm.errors import UserError
+from flame_mdm.reporting.page import number, page, short
+from flame_mdm.reporting.plots import chart
+from flame_mdm.reporting.report import charted, constants, write_report
+from flame_mdm.runs import read_history, read_run
+from flame_mdm.training import callbacks
+from flame_mdm.training.callbacks import Measurements
+from flame_mdm.training.loggers import History
 
 RUN = [*TINY, "trainer.log_every_n_steps=2", "trainer.val_check_interval=4", "callbacks.checkpoints.every_n_steps=4"]
 EVALUATE = """# @package _global_
@@ -27,13 +30,13 @@ defaults:
   - /quickstart
   - _self_
 callbacks:
-  evaluate: {_target_: flame_mdm.callbacks.Evaluate, protocol: synthetic, extractor: none, every_n_steps: 4, samples: 4,
+  evaluate: {_target_: evaluators.callback.Evaluate, protocol: synthetic, extractor: none, every_n_steps: 4, samples: 4,
     replications: 2}
 """
 
 
 def run(folder: Path, data_root: Path, *words: str, recipe: str = "quickstart") -> Path:
-    assert train.main([recipe, *RUN, f"data_root={data_root}", f"run.dir={folder}", *words]) == 0
+    assert main(["train", recipe, *RUN, f"data_root={data_root}", f"run.dir={folder}", *words]) == 0
     return folder
 
 
@@ -222,7 +225,7 @@ def test_training_ends_with_a_report_that_needs_nothing_else(evaluated):
     assert not re.findall(r"""(?:src|href)=["'](?!data:)|url\(|@import|https?://(?!www\.w3\.org)""", text)
     assert "srcdoc=" in text
     before = (evaluated / "report.html").read_bytes()
-    assert report.main([str(evaluated)]) == 0
+    assert main(["report", str(evaluated)]) == 0
     assert (evaluated / "report.html").read_bytes() == before
 
 
@@ -233,7 +236,7 @@ def test_a_report_shows_evaluations_with_their_marks(tmp_path):
     path.write_text(json.dumps(result(invalid_because=["real motions are off"], changed={"samples": 64})))
     text = write_report(folder).read_text()
     for words in (
-        *("4.5 ± 0.25", "0.125 ± 0.25", "not valid: real motions are off", "not as the protocol has it: samples 64"),
+        *("4.5 ± 0.25", "0.125 ± 0.25", "not valid: real motions are off", "differs from the protocol: samples 64"),
         *("not computed: kid: too few &lt;samples&gt;", "ddim, 5 steps, guidance 2.5", "p version 3, synthetic test"),
     ):
         assert words in text, words
@@ -276,9 +279,9 @@ def test_damaged_files_are_named(tmp_path, name, content, message):
 
 
 def test_a_folder_without_a_run_is_one_line(tmp_path, capsys):
-    assert report.main([str(tmp_path)]) == 1
+    assert main(["report", str(tmp_path)]) == 1
     assert "no config.yaml there" in capsys.readouterr().err
-    assert report.main([]) == 1
+    assert main(["report"]) == 1
     assert "which run?" in capsys.readouterr().err
 
 
@@ -301,13 +304,13 @@ def test_curves_of_training_and_validation_share_a_chart():
     assert charted(curves) == {
         "Losses": {"loss": ["train", "val"]},
         "Validation": {"p/fid": ["val"]},
-        "Course": {"grad_norm": ["train"]},
+        "Training curves": {"grad_norm": ["train"]},
     }
     assert constants(curves) == {"train/lr": 0.1}
 
 
 def points(svg: str) -> list[tuple[float, float]]:
-    line = re.findall(r"<polyline points='([^']*)'", svg)[0]
+    line = re.findall(r'<polyline class="c0 line" points="([^"]*)"', svg)[0]
     return [(float(x), float(y)) for x, y in (pair.split(",") for pair in line.split())]
 
 
@@ -348,6 +351,8 @@ def test_numbers_are_short_and_true():
 
 
 def test_pages_escape_what_they_are_given():
-    assert "&lt;i&gt;" in table(["<i>"], [["<b>"]])
-    assert "<b>" not in table(["<i>"], [["<b>"]])
-    assert "<title>a &amp; b</title>" in page("a & b", "")
+    text = page("a & b", chart("<i>", {"<b>": {1: 2.0}}) + "<u>")
+    assert "<title>a &amp; b</title>" in text
+    assert "&lt;i&gt;" in text
+    assert "&lt;u&gt;" in text
+    assert not re.search("<[ibu]>", text)

@@ -11,10 +11,11 @@ import torch
 from t2m_folder import line, write_folder
 
 from evaluators.extractors import OwnT2MExtractor
-from evaluators.t2m_training import MatchingLoss, T2MTask, matching_loss
-from flame_mdm import evaluate, train
-from flame_mdm.config import UserError, compose, instantiate
+from evaluators.extractors.t2m_training import MatchingLoss, T2MTask, matching_loss
+from flame_mdm.__main__ import main
+from flame_mdm.config import compose, instantiate
 from flame_mdm.data.t2m import T2MFolder
+from flame_mdm.errors import UserError
 
 VERBS = ["walks", "runs", "hops", "bows", "waves", "kicks"]
 MANNERS = ["slowly", "quickly", "left", "right", "happily", "sadly"]
@@ -56,7 +57,7 @@ def words(tmp_path_factory) -> list[str]:
 
 
 def fit(folder: Path, words: list[str], *more: str) -> Path:
-    assert train.main(["t2m/kit", *words, f"run.dir={folder}", *more]) == 0
+    assert main(["train", "t2m/kit", *words, f"run.dir={folder}", *more]) == 0
     return folder / "checkpoints" / "last.ckpt"
 
 
@@ -114,7 +115,7 @@ def test_it_measures_text_to_motion(trained, words, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     options = ["baseline=shuffled", "data=kit", "protocol=text_to_motion_t2m_own", f"extractor={trained}"]
     options += [f"out={out}", "device=cpu", "replications=1", "data.crop.max_frames=40", "multimodality=false"]
-    assert evaluate.main([*options, *where]) == 0
+    assert main(["evaluate", *options, *where]) == 0
     result = json.loads(out.read_text())
     assert result["valid"], result["invalid_because"]
     assert result["ground_truth"]["motions_for_text/top3"]["mean"] > 0.5
@@ -139,7 +140,7 @@ def test_the_checkpoint_needs_no_word_vectors_beside_it(trained):
 
 def test_what_is_missing_is_told_in_a_line(words, tmp_path, monkeypatch, capsys):
     def refused(*more: str) -> str:
-        assert train.main(["t2m/kit", *words, f"run.dir={tmp_path / 'run'}", *more]) == 1
+        assert main(["train", "t2m/kit", *words, f"run.dir={tmp_path / 'run'}", *more]) == 1
         return capsys.readouterr().err
 
     assert "task.words=nowhere: no such folder" in refused("task.words=nowhere")

@@ -11,10 +11,13 @@ from pathlib import Path
 import pytest
 from conftest import TINY
 
-from flame_mdm import tables, train
-from flame_mdm.config import UserError
-from flame_mdm.tables import Request, build, load_spec, requests, wilson, write
-from flame_mdm.visualize.table import Cell, Line, Table, latex, markdown, places
+from evaluators.run import _outdated
+from flame_mdm.__main__ import main
+from flame_mdm.errors import UserError
+from flame_mdm.reporting import tables
+from flame_mdm.reporting.rendering import Cell, Line, Table, latex, markdown, places
+from flame_mdm.reporting.study import wilson
+from flame_mdm.reporting.tables import Request, build, load_spec, requests, write
 
 SPEC = """
 title: "A table, 50 % & more_of_it"
@@ -123,7 +126,7 @@ def files(folder: Path) -> dict[str, bytes]:
 
 def render(folder: Path, out: Path) -> dict[str, bytes]:
     words = [f"table={folder / 'spec.yaml'}", "evaluate=false", f"results={folder / 'results'}", f"out={out}"]
-    assert tables.main(words) == 0
+    assert main(["tables", *words]) == 0
     return files(out)
 
 
@@ -282,12 +285,17 @@ spec:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("title: x", "a table needs a title and parts"),
-        ("title: x\nparts: {a: {rows: []}}", "part a: needs columns and rows, or recipes"),
-        ("title: x\nparts: {a: {columns: {F: {value: fid, better: up}}, rows: []}}", "better is higher, lower"),
+        ("title: x", "the file has no parts"),
+        ("title: x\nparts: {}", "parts is {}, not a longer list"),
+        ("title: x\nprats: {}", "unknown key: prats. Did you mean parts?"),
+        ("title: x\nparts: {a: {rows: []}}", "parts.a: needs columns and rows, or recipes"),
+        (
+            "title: x\nparts: {a: {columns: {F: {value: fid, better: up}}, rows: []}}",
+            "better is \"up\", not 'higher', 'lower', 'real' or 'none'",
+        ),
         ("title: x\nparts: {a: {columns: {F: fid}, rows: []}}", 'parts.a.columns.F is "fid", not a mapping'),
-        ("title: x\nparts: {a: {columns: {}, rows: [{ckpt: x}]}}", "a row needs a label"),
-        ("title: x\nparts: {a: {columns: {}, rows: [{label: x, ckpt: x}]}}", "needs a protocol"),
+        ("title: x\nparts: {a: {columns: {A: {value: fid}}, rows: [{ckpt: x}]}}", "parts.a.rows.0 has no label"),
+        ("title: x\nparts: {a: {columns: {A: {value: fid}}, rows: [{label: x, ckpt: x}]}}", "needs a protocol"),
         ("title: [", "not a readable YAML file"),
         ("- 1", "not a mapping"),
     ],
@@ -295,7 +303,7 @@ spec:
 def test_malformed_specs_are_told_in_one_line(tmp_path, capsys, text, message):
     path = tmp_path / "mine.yaml"
     path.write_text(text)
-    assert tables.main([f"table={path}", f"out={tmp_path / 'out'}"]) == 1
+    assert main(["tables", f"table={path}", f"out={tmp_path / 'out'}"]) == 1
     error = capsys.readouterr().err
     assert message in error
     assert error.count("\n") == 1
@@ -303,7 +311,7 @@ def test_malformed_specs_are_told_in_one_line(tmp_path, capsys, text, message):
 
 
 def test_an_unknown_table_names_those_there_are(capsys):
-    assert tables.main(["table=mdm_9"]) == 1
+    assert main(["tables", "table=mdm_9"]) == 1
     assert "no table is called 'mdm_9'; there are: " in capsys.readouterr().err
 
 
@@ -311,9 +319,9 @@ def test_a_damaged_result_is_told(folder, capsys):
     path = next(asked[0].path(folder / "results") for row, asked in requests(_part(folder)) if row["label"] == "MFM")
     path.write_text(path.read_text()[:100])
     words = [f"table={folder / 'spec.yaml'}", f"results={folder / 'results'}", f"out={folder / 'out'}"]
-    assert tables.main([*words, "evaluate=false"]) == 1
+    assert main(["tables", *words, "evaluate=false"]) == 1
     assert "not a JSON file" in (error := capsys.readouterr().err)
-    assert "delete it, and make evaluate or make tables makes it again" in error
+    assert "delete it, and `flame-mdm evaluate` or `flame-mdm tables` evaluates again" in error
 
 
 def test_places():
@@ -344,7 +352,7 @@ def test_what_is_missing_is_evaluated_once(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     words = ["data.source.clips=400", *TINY[1:], f"data_root={tmp_path / 'data'}", "run.dir=runs/tiny/default"]
     words += ["callbacks.samples=null", "trainer.val_check_interval=2", "trainer.max_steps=2"]
-    assert train.main(["quickstart", *words]) == 0
+    assert main(["train", "quickstart", *words]) == 0
     Path("mine.yaml").write_text(
         """
 title: mine
@@ -364,18 +372,20 @@ parts:
 """
     )
     asked = ["table=mine.yaml", "device=cpu"]
-    assert tables.main(asked) == 0
+    assert main(["tables", *asked]) == 0
     shown = capsys.readouterr().out
     assert "evaluating 1 of 2: tiny" in shown
     assert "mine: 2 of 3 rows measured" in shown
     first = files(Path("runs/tables"))
     assert b"elsewhere: make train EXP=synthetic/mdm" in first["mine.md"]
     assert b"not as the protocol has it: replications = 1, samples = 4" in first["mine.md"]
-    assert tables.main(asked) == 0
+    assert main(["tables", *asked]) == 0
     assert "evaluating" not in capsys.readouterr().out
     assert files(Path("runs/tables")) == first
-    assert train.main(["quickstart", *words[:-1], "trainer.max_steps=3"]) == 0  # another checkpoint under the same name
-    assert tables.main(asked) == 0
+    assert (
+        main(["train", "quickstart", *words[:-1], "trainer.max_steps=3"]) == 0
+    )  # another checkpoint under the same name
+    assert main(["tables", *asked]) == 0
     assert "evaluating 2 of 2" in capsys.readouterr().out
     assert files(Path("runs/tables"))["mine.md"] != first["mine.md"]
 
@@ -390,8 +400,8 @@ def test_a_result_is_outdated_when_checkpoint_or_extractor_are_others_now(folder
     for part, value in hashes.items():
         content[part]["sha256"] = value
     path = put(request, folder, content)
-    assert not tables._outdated(path, request)
+    assert not _outdated(path, request)
     for name in ("mdm.ckpt", "clip.ckpt"):
         (folder / name).write_bytes(b"trained anew")
-        assert tables._outdated(path, request)
+        assert _outdated(path, request)
         (folder / name).write_bytes(b"")

@@ -13,11 +13,13 @@ import torch
 from torchmetrics import MeanMetric
 
 import flame_mdm
-from flame_mdm import sample, train
-from flame_mdm.config import UserError, compose, instantiate
+from flame_mdm.__main__ import main
+from flame_mdm.checkpoints.files import read_checkpoint
+from flame_mdm.checkpoints.loading import load
+from flame_mdm.config import compose, instantiate
+from flame_mdm.errors import UserError
 from flame_mdm.generation import generate
 from flame_mdm.motion import MotionBatch, length_mask
-from flame_mdm.task import load, read_checkpoint
 
 STEPS = ["trainer.val_check_interval=4", "callbacks.checkpoints.every_n_steps=4", "callbacks.samples=null"]
 
@@ -28,7 +30,7 @@ def weights(path: Path) -> dict[str, torch.Tensor]:
 
 def run(overrides: list[str], steps: int, folder: Path | None = None) -> Path:
     changes = [f"run.dir={folder}"] if folder else []
-    assert train.main(["quickstart", *overrides, *changes, f"trainer.max_steps={steps}"]) == 0
+    assert main(["train", "quickstart", *overrides, *changes, f"trainer.max_steps={steps}"]) == 0
     directory = folder or Path(next(o for o in overrides if o.startswith("run.dir=")).removeprefix("run.dir="))
     return directory / "checkpoints" / "last.ckpt"
 
@@ -86,7 +88,7 @@ def test_bfloat16_is_one_switch(tiny):
 
 def test_a_folder_of_another_configuration_is_refused(tiny, capsys):
     run([*tiny, *STEPS], 2)
-    assert train.main(["quickstart", *tiny, *STEPS, "optimizer.lr=0.5", "trainer.max_steps=4"]) == 1
+    assert main(["train", "quickstart", *tiny, *STEPS, "optimizer.lr=0.5", "trainer.max_steps=4"]) == 1
     message = capsys.readouterr().err
     assert "optimizer.lr (0.001 there, 0.5 here)" in message
     assert "run.name=" in message
@@ -101,7 +103,7 @@ def test_a_finished_run_says_so(tiny, capsys):
 def test_a_saved_config_repeats_a_run(tiny, tmp_path):
     first = run([*tiny, *STEPS], 3)
     config = first.parent.parent / "config.yaml"
-    assert train.main([str(config), f"run.dir={tmp_path / 'again'}"]) == 0
+    assert main(["train", str(config), f"run.dir={tmp_path / 'again'}"]) == 0
     second = weights(tmp_path / "again" / "checkpoints" / "last.ckpt")
     assert all(torch.equal(second[name], value) for name, value in weights(first).items())
 
@@ -109,7 +111,7 @@ def test_a_saved_config_repeats_a_run(tiny, tmp_path):
 @pytest.mark.parametrize("signum", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_stops_at_the_end_of_a_step_and_the_run_goes_on(tiny, signum, tmp_path):
     overrides = [*tiny, *STEPS, "trainer.max_steps=100000"]
-    command = [sys.executable, "-m", "flame_mdm.train", "quickstart", *overrides]
+    command = [sys.executable, "-m", "flame_mdm", "train", "quickstart", *overrides]
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment)
     checkpoint = tmp_path / "run" / "checkpoints" / "last.ckpt"
@@ -177,7 +179,7 @@ def test_the_public_api_reads_well(trained):
     motion = flame_mdm.generate(flame_mdm.load(trained), "a person waves with the left hand", seconds=1.5, seed=0)[0]
     assert motion.joints.shape == (30, 22, 3)
     assert motion.features.shape == (30, 263)
-    assert (motion.fps, motion.caption) == (20, "a person waves with the left hand")
+    assert (motion.fps, motion.text) == (20, "a person waves with the left hand")
 
 
 def test_unconditioned_samples_ignore_guidance(trained):
@@ -189,7 +191,7 @@ def test_unconditioned_samples_ignore_guidance(trained):
 def test_sampling_writes_motions_and_a_player(trained, tmp_path, capsys):
     out = tmp_path / "out"
     words = [f"ckpt={trained}", "text=a person's walk (slow), 100%", "seconds=1.5", "samples=2", f"out={out}", "seed=9"]
-    assert sample.main(words) == 0
+    assert main(["sample", *words]) == 0
     with np.load(out / "motion_001.npz") as motion:
         assert motion["joints"].shape == (30, 22, 3)
         assert str(motion["text"]) == "a person's walk (slow), 100%"
@@ -216,7 +218,7 @@ def test_sampling_writes_motions_and_a_player(trained, tmp_path, capsys):
     ],
 )
 def test_bad_requests_are_one_line(trained, words, message, tmp_path, capsys):
-    assert sample.main([f"ckpt={trained}", f"out={tmp_path / 'out'}", *words]) == 1
+    assert main(["sample", f"ckpt={trained}", f"out={tmp_path / 'out'}", *words]) == 1
     error = capsys.readouterr().err
     assert message in error
     assert error.count("\n") == 1
@@ -256,7 +258,7 @@ def test_a_checkpoint_cannot_name_foreign_code(trained, tmp_path):
 
 def test_an_unwritable_folder_is_one_line(tiny, tmp_path, capsys):
     (tmp_path / "file").write_text("")
-    assert train.main(["quickstart", *tiny, f"run.dir={tmp_path / 'file' / 'run'}"]) == 1
+    assert main(["train", "quickstart", *tiny, f"run.dir={tmp_path / 'file' / 'run'}"]) == 1
     assert capsys.readouterr().err.count("\n") == 1
 
 

@@ -4,21 +4,23 @@ import shutil
 import subprocess
 from html.parser import HTMLParser
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from PIL import Image, ImageSequence
 
+from flame_mdm.files import atomic_write
+from flame_mdm.formats.motion import Motion
 from flame_mdm.representations.skeleton import SKELETONS, Skeleton
-from flame_mdm.visualize import Motion, contact_sheet, frames_array, write_gif, write_mp4, write_player
+from flame_mdm.visualize import contact_sheet, frames_array, write_gif, write_mp4, write_player
 from flame_mdm.visualize.render import SIDE_COLORS
-from flame_mdm.visualize.scene import written_whole
 
 HOSTILE = "</script><img src=x onerror=alert(1)><!-- __TITLE__ \u2028 \"'&amp; &"
 
 
 def walk(
-    frames: int = 30, fps: float = 20, skeleton: Skeleton = SKELETONS["smpl22"], contacts: bool = False, **names: str
+    frames: int = 30, fps: float = 20, skeleton: Skeleton = SKELETONS["smpl22"], contacts: bool = False, **names: Any
 ) -> Motion:
     """A figure that stands on its rest pose, sways and moves forward."""
     bones = 0.2 * np.array(skeleton.raw_offsets, dtype=float)
@@ -93,7 +95,7 @@ def test_player_is_one_file_without_references(tmp_path):
 
 
 def test_player_escapes_captions_ids_and_title(tmp_path):
-    write_player(tmp_path / "p.html", [walk(caption=HOSTILE, id=HOSTILE)], HOSTILE)
+    write_player(tmp_path / "p.html", [walk(text=HOSTILE, id=HOSTILE)], HOSTILE)
     page = Page(tmp_path / "p.html")
     assert page.tags.count("script") == 2
     assert "img" not in page.tags
@@ -106,11 +108,12 @@ def test_player_of_twenty_clips_stays_small(tmp_path):
     assert (tmp_path / "p.html").stat().st_size < 400_000
 
 
+@pytest.mark.tools
 @pytest.mark.skipif(shutil.which("chromium") is None, reason="chromium is not installed")
 @pytest.mark.parametrize("count", [1, 13])
 def test_player_runs_in_a_browser(tmp_path, count):
     page = tmp_path / "p.html"
-    write_player(page, [walk(contacts=True, caption=HOSTILE, id=f"m{k}") for k in range(count)], "t")
+    write_player(page, [walk(contacts=True, text=HOSTILE, id=f"m{k}") for k in range(count)], "t")
     # reports what the page's script made of the data: pixels of both sides in the first panel, clock, filter
     report = """<script>setTimeout(() => {
       goTo(7); redraw();
@@ -146,7 +149,7 @@ def test_player_runs_in_a_browser(tmp_path, count):
     [(20, 30, 30), (30, 30, 30), (12.5, 10, 10), (100, 100, 50), (120, 120, 40)],
 )
 def test_gif_keeps_frames_and_time(tmp_path, fps, frames, shown):
-    write_gif(tmp_path / "m.gif", [walk(frames, fps, caption="walks")], size=64)
+    write_gif(tmp_path / "m.gif", [walk(frames, fps, text="walks")], size=64)
     with Image.open(tmp_path / "m.gif") as image:
         durations = [frame.info["duration"] for frame in ImageSequence.Iterator(image)]
         assert image.info["loop"] == 0
@@ -169,7 +172,7 @@ def test_gif_holds_a_motion_that_ended(tmp_path):
 @pytest.mark.parametrize("write", [write_player, write_gif, contact_sheet])
 def test_same_input_gives_the_same_bytes(tmp_path, write):
     for name in "ab":
-        write(tmp_path / name, [walk(5, contacts=True, caption="walks")])
+        write(tmp_path / name, [walk(5, contacts=True, text="walks")])
     assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
 
 
@@ -191,7 +194,7 @@ def test_frames_show_both_sides_and_height():
 
 
 def test_contact_sheet_shows_first_to_last_pose_of_each_motion(tmp_path):
-    motions = [walk(30, caption="walks"), walk(4, caption="walks briefly")]
+    motions = [walk(30, text="walks"), walk(4, text="walks briefly")]
     contact_sheet(tmp_path / "sheet.png", motions, frames=3, size=96)
     sheet = np.asarray(Image.open(tmp_path / "sheet.png"))
     assert sheet.shape[1:] == (3 * 96, 3)
@@ -200,6 +203,7 @@ def test_contact_sheet_shows_first_to_last_pose_of_each_motion(tmp_path):
     np.testing.assert_array_equal(sheet[sheet.shape[0] // 2 + 24 :][:60, :96], frames_array(motions[1], 96)[0][24:84])
 
 
+@pytest.mark.tools
 @pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="ffmpeg is not installed")
 def test_mp4_keeps_frames(tmp_path):
     write_mp4(tmp_path / "m.mp4", [walk(12, 30)], size=65)
@@ -218,11 +222,11 @@ def test_mp4_without_ffmpeg_says_so(tmp_path, monkeypatch):
 
 def test_a_failure_leaves_the_old_file_and_nothing_else(tmp_path):
     path = tmp_path / "new" / "p.html"
-    with written_whole(path) as temporary:
+    with atomic_write(path) as temporary:
         temporary.write_text("old")
 
     def fail():
-        with written_whole(path) as temporary:
+        with atomic_write(path) as temporary:
             temporary.write_text("half")
             raise OSError("disk full")
 
@@ -232,7 +236,9 @@ def test_a_failure_leaves_the_old_file_and_nothing_else(tmp_path):
     assert list(path.parent.iterdir()) == [path]
 
 
-@pytest.mark.parametrize("write", [write_player, write_gif, write_mp4, contact_sheet])
+@pytest.mark.parametrize(
+    "write", [write_player, write_gif, pytest.param(write_mp4, marks=pytest.mark.tools), contact_sheet]
+)
 def test_every_writer_goes_through_a_temporary_name(tmp_path, monkeypatch, write):
     if write is write_mp4 and shutil.which("ffmpeg") is None:
         pytest.skip("ffmpeg is not installed")

@@ -20,6 +20,7 @@ from torch import Tensor, nn
 from tqdm import tqdm
 
 from flame_mdm.conditions import ConditionEncoder
+from flame_mdm.files import made_folder, sha256, writing
 from flame_mdm.motion import Condition, MotionBatch
 
 CAPTIONS_AT_ONCE = 64
@@ -89,8 +90,9 @@ class PretrainedText(ConditionEncoder):
         if not freeze:
             self.network = self._pretrained.load_network().train()
         if pooling == "pooler":
-            weight = np.random.default_rng(0).normal(0, 0.02, (features, features)).astype(np.float32)
-            for name, value in (("weight", torch.from_numpy(weight)), ("bias", torch.zeros(features))):
+            weight = torch.empty(features, features)  # an absurd size fails here, before anything is drawn
+            weight.copy_(torch.from_numpy(np.random.default_rng(0).normal(0, 0.02, (features, features))))
+            for name, value in (("weight", weight), ("bias", torch.zeros(features))):
                 if freeze:
                     self.register_buffer(f"pooler_{name}", value)
                 else:
@@ -216,6 +218,10 @@ class PretrainedText(ConditionEncoder):
         return first, torch.from_numpy(tokens).to(device).float(), torch.from_numpy(token_mask).to(device)
 
 
+SAFE = {"trust_remote_code": False}
+"""Language models never bring code of their own; without this, transformers asks on the terminal."""
+
+
 class Pretrained:
     """Where a language model comes from; it is loaded on first use, and copies and pickles leave it behind."""
 
@@ -271,14 +277,14 @@ class Pretrained:
 
     def _load(self, loader: Any, **options: Any) -> Any:
         if self.package or Path(self.model).is_dir():
-            return loader.from_pretrained(self._folder(), local_files_only=True, **options)
+            return loader.from_pretrained(self._folder(), local_files_only=True, **SAFE, **options)
         if not re.fullmatch("[0-9a-f]{40}", self.revision or ""):
             raise ValueError(
                 f"condition.revision={self.revision}: {self.model} comes from the hub at one commit, which nobody can "
                 f"change: give the 40 hex digits that stand at https://huggingface.co/{self.model}/commits"
             )
         try:
-            return loader.from_pretrained(self.model, revision=self.revision, **options)
+            return loader.from_pretrained(self.model, revision=self.revision, **SAFE, **options)
         except OSError as error:
             raise FileNotFoundError(
                 f"text encoder {self.model} (revision {self.revision}) is not in the Hugging Face cache and cannot be "
@@ -289,6 +295,8 @@ class Pretrained:
     def _folder(self) -> Path:
         if self.package is None:
             return Path(self.model)
+        if not self.package.isidentifier():  # looking for a.b would import a
+            raise ValueError(f"condition.package={self.package}: give the name of a package, without dots")
         spec = importlib.util.find_spec(self.package)
         if spec is None or spec.origin is None:
             raise FileNotFoundError(
@@ -349,24 +357,32 @@ class CaptionCache:
     ) -> None:
         """Writes a cache beside `folder` and moves it there once it is whole."""
         partial = folder.with_name(f".{folder.name}-{uuid.uuid4().hex}")
-        partial.mkdir(parents=True)
-        try:
-            offsets = [0]
-            with (partial / cls.POOLED).open("wb") as pooled, (partial / cls.TOKENS).open("wb") as tokens:
-                for vector, rows in encoded:
-                    pooled.write(vector.astype(np.float32).tobytes())
-                    tokens.write(rows.astype(np.float16).tobytes())
-                    offsets.append(offsets[-1] + len(rows))
-            hashes = {name: sha256(partial / name) for name in (cls.POOLED, cls.TOKENS)}
-            index = {"captions": list(captions), "offsets": offsets, "features": features, "sha256": hashes}
-            (partial / cls.INDEX).write_text(json.dumps(index))
+        with made_folder(folder.parent):
             try:
-                partial.rename(folder)
-            except OSError:
-                if not folder.exists():  # else another run was faster, with the same content
-                    raise
-        finally:
-            shutil.rmtree(partial, ignore_errors=True)
+                with writing(folder, partial):
+                    partial.mkdir()
+                    cls._write(partial, captions, encoded, features)
+                try:
+                    partial.rename(folder)
+                except OSError:
+                    if not folder.exists():  # else another run was faster, with the same content
+                        raise
+            finally:
+                shutil.rmtree(partial, ignore_errors=True)
+
+    @classmethod
+    def _write(
+        cls, folder: Path, captions: Sequence[str], encoded: Iterable[tuple[np.ndarray, np.ndarray]], features: int
+    ) -> None:
+        offsets = [0]
+        with (folder / cls.POOLED).open("wb") as pooled, (folder / cls.TOKENS).open("wb") as tokens:
+            for vector, rows in encoded:
+                pooled.write(vector.astype(np.float32).tobytes())
+                tokens.write(rows.astype(np.float16).tobytes())
+                offsets.append(offsets[-1] + len(rows))
+        hashes = {name: sha256(folder / name) for name in (cls.POOLED, cls.TOKENS)}
+        index = {"captions": list(captions), "offsets": offsets, "features": features, "sha256": hashes}
+        (folder / cls.INDEX).write_text(json.dumps(index))
 
     def _open(self, name: str, dtype: type, shape: tuple[int, int]) -> np.ndarray:
         path = self.folder / name
@@ -375,8 +391,3 @@ class CaptionCache:
         if size != expected:
             raise ValueError(f"{path} is damaged ({size} bytes in place of {expected})")
         return np.memmap(path, dtype, "r", shape=shape) if expected else np.zeros(shape, dtype)
-
-
-def sha256(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()

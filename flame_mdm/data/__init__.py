@@ -1,10 +1,12 @@
 """Data sets: from what their owners hand out to packed stores and training batches."""
 
 import hashlib
+import inspect
+import json
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
 
@@ -42,10 +44,16 @@ class Clip:
     window: tuple[int, int] | None = None
 
 
+PLACES = frozenset({"path", "amass", "body_models", "humanact12", "index", "splits", "workers"})
+"""Arguments of sources that tell where files are and how to read them. The others define the data."""
+
+
 class MotionSource(ABC):
     """A data set as its owners hand it out."""
 
     name: str
+    options: Mapping[str, Any]
+    """Arguments that define the data, all but `PLACES`, as JSON values. The store keeps them."""
     actions: tuple[str, ...] = ()
     """Names of the action labels, in the order of their numbers; empty for sets without labels."""
     published: ClassVar[dict[str, int]] = {}
@@ -53,6 +61,21 @@ class MotionSource(ABC):
     published_split: bool = False
     """The split is the one that papers use although clips are tested on that training has seen, or so that nothing is
     left to validate on; the store carries it, and so does every result."""
+
+    def __new__(cls, *args: Any, **kwargs: Any) -> Self:
+        """Keeps the arguments of the constructor as `options`."""
+        source = super().__new__(cls)
+        signature = inspect.signature(cls.__init__)
+        bound = signature.bind_partial(source, *args, **kwargs)
+        bound.apply_defaults()
+        variadic = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
+        options = {
+            name: bound.arguments[name]
+            for name, parameter in signature.parameters.items()
+            if name in bound.arguments and name not in {"self", *PLACES} and parameter.kind not in variadic
+        }
+        source.options = json.loads(json.dumps(options, default=str))
+        return source
 
     def excluded(self) -> dict[str, int]:
         """How many clips or labels were left out, by reason; known once `clips` is exhausted."""

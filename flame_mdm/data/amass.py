@@ -8,9 +8,6 @@ from __future__ import annotations
 import io
 import os
 import re
-import tarfile
-import zipfile
-import zlib
 from collections import defaultdict
 from collections.abc import Callable, Collection, Iterator, Mapping
 from functools import cached_property, partial
@@ -20,7 +17,10 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 import torch
 
+from flame_mdm.data import archives
 from flame_mdm.data.parallel import in_order
+from flame_mdm.files import read_npz
+from flame_mdm.formats.resampling import check_frames, frame_rate
 from flame_mdm.representations import rotation
 from flame_mdm.representations.skeleton import SMPL22, forward_kinematics
 
@@ -116,12 +116,10 @@ def read(file: Path | bytes, name: str) -> Recording:
         ValueError: no SMPL+H file of AMASS, damaged, or with numbers that are not finite.
     """
     try:
-        opened = io.BytesIO(file) if isinstance(file, bytes) else file.open("rb")  # numpy leaves damaged files open
-        with opened, np.load(opened, allow_pickle=False) as archive:
-            data = {key: archive[key] for key in archive.files if key not in ("dmpls", "marker_data")}
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
-        raise ValueError(f"{name}: damaged or no .npz file of AMASS: {error}; download it again") from error
-    width = data["poses"].shape[-1] if "poses" in data else 0
+        data = read_npz(io.BytesIO(file) if isinstance(file, bytes) else file, skip=("dmpls", "marker_data"))
+    except ValueError as error:
+        raise ValueError(f"{name}: {error}; download it again") from error
+    width = data["poses"].shape[-1] if "poses" in data and data["poses"].ndim else 0
     if width == 165 or "surface_model_type" in data:
         raise ValueError(f"{name}: this is AMASS's SMPL-X release; download the one called SMPL+H G")
     missing = [key for key in ("poses", "trans", "betas", "gender", "mocap_framerate") if key not in data]
@@ -130,11 +128,18 @@ def read(file: Path | bytes, name: str) -> Recording:
     poses, translation = data["poses"], data["trans"]
     if poses.ndim != 2 or width != 156 or translation.shape != (len(poses), 3):
         raise ValueError(f"{name}: poses {poses.shape} and trans {translation.shape}, not (F, 156) and (F, 3)")
-    if not (np.isfinite(poses).all() and np.isfinite(translation).all()):
+    betas, gender = data["betas"], data["gender"]
+    if {poses.dtype.kind, translation.dtype.kind, betas.dtype.kind} - set("fiu") or betas.ndim != 1 or gender.size != 1:
+        raise ValueError(f"{name}: poses, trans and betas are no arrays of real numbers, or gender is not one word")
+    if not (np.isfinite(poses).all() and np.isfinite(translation).all() and np.isfinite(betas).all()):
         raise ValueError(f"{name}: it holds numbers that are not finite")
-    gender = data["gender"].item()
-    gender = gender.decode() if isinstance(gender, bytes) else str(gender)
-    return Recording(poses, translation, data["betas"], gender, float(data["mocap_framerate"]))
+    try:
+        check_frames(len(poses))
+        fps = frame_rate(data["mocap_framerate"], "mocap_framerate")
+        word = gender.item()
+        return Recording(poses, translation, betas, word.decode() if isinstance(word, bytes) else str(word), fps)
+    except ValueError as error:
+        raise ValueError(f"{name}: {error}") from error
 
 
 class Amass:
@@ -243,19 +248,14 @@ def _contents(place: _Place, keys: Collection[str]) -> Iterator[tuple[str, str, 
         return
     left = set(keys)
     releases = set()
-    try:
-        with tarfile.open(place, "r|*") as archive:
-            for member in archive:
-                key = key_of(member.name)
-                releases.add(member.name.endswith("_stageii.npz"))
-                file = archive.extractfile(member) if key in left and member.name.endswith(".npz") else None
-                if key and file:
-                    left.remove(key)
-                    yield key, f"{place}/{member.name}", file.read()
-                if not left:
-                    return
-    except (tarfile.TarError, EOFError, OSError, zlib.error) as error:
-        raise ValueError(f"{place}: damaged or incomplete archive: {error}; download it again") from error
+    for name, content in archives.members(place):
+        key = key_of(name)
+        releases.add(name.endswith("_stageii.npz"))
+        if key in left and name.endswith(".npz"):
+            left.remove(key)
+            yield key, f"{place}/{name}", content()
+        if not left:
+            return
     if True in releases:
         raise ValueError(f"{place}: this is AMASS's SMPL-X release (_stageii.npz); download the one called SMPL+H G")
     raise ValueError(f"{place}: {len(left)} recordings are not in it, such as {min(left)}")
@@ -296,6 +296,9 @@ def load_bodies(folder: Path) -> dict[str, Body]:
     return {gender: _load_body(Path(folder), gender) for gender in ("male", "female")}
 
 
+_MODEL = ("J_regressor", "v_template", "shapedirs")
+
+
 def _load_body(folder: Path, gender: str) -> Body:
     names = (f"{gender}/model.npz", f"SMPLH_{gender.upper()}.npz")
     candidates = [folder / inner / name for inner in ("", "smplh") for name in names]
@@ -305,11 +308,17 @@ def _load_body(folder: Path, gender: str) -> Body:
             f"{folder}: neither {' nor '.join(names)} in it; get the extended SMPL+H model at https://mano.is.tue.mpg.de"
         )
     try:
-        with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
-            regressor, template, directions = (file[key] for key in ("J_regressor", "v_template", "shapedirs"))
-            parents = file["kintree_table"][0, 1:22]
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+        arrays = read_npz(path, only=(*_MODEL, "kintree_table"))
+        regressor, template, directions = (arrays[key] for key in _MODEL)
+        parents = arrays["kintree_table"][0, 1:22]
+        if {array.dtype.kind for array in arrays.values()} - set("fiu"):
+            raise ValueError("it holds arrays of other things than real numbers")
+    except (ValueError, KeyError, IndexError) as error:
         raise ValueError(f"{path}: damaged or no SMPL+H model: {error}") from error
+    vertices = regressor.shape[1:]
+    if (template.shape, directions.shape[:2], directions.ndim) != ((*vertices, 3), (*vertices, 3), 3):
+        shapes = f"{regressor.shape}, {template.shape} and {directions.shape}"
+        raise ValueError(f"{path}: damaged or no SMPL+H model: its arrays have shapes {shapes}")
     if regressor.shape[0] != 52 or tuple(parents) != SMPL22.parents[1:]:
         raise ValueError(f"{path}: a model of {regressor.shape[0]} joints, not SMPL+H's 52")
     regressor = regressor[:22].astype(np.float64)

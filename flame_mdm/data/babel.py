@@ -6,7 +6,6 @@ Language-based Motion Synthesis & Editing", AAAI 2023, appendix "BABEL". `docs/b
 
 from __future__ import annotations
 
-import json
 import math
 from collections import Counter, defaultdict
 from collections.abc import Iterator
@@ -19,6 +18,7 @@ from tqdm import tqdm
 
 from flame_mdm.data import Clip, MotionSource, Split, hashed_split
 from flame_mdm.data.amass import Amass, Recording, key_of
+from flame_mdm.files import read_json
 
 FPS = 20.0
 
@@ -166,24 +166,21 @@ class Babel(MotionSource):
     def _annotations(self, path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
         """Path of the motion and label, for every frame label of a file."""
         try:
-            data = json.loads(path.read_text(encoding="utf-8"))
+            data = read_json(path)
         except FileNotFoundError:
             raise FileNotFoundError(
                 f"{path}: no such file; BABEL v1.0 is published at https://babel.is.tue.mpg.de: unpack it and set "
                 "data.source.path=/path/to/babel_v1.0_release"
             ) from None
-        except ValueError as error:
-            raise ValueError(f"{path}: not read as JSON: {error}") from error
         key = "frame_anns" if path.stem.startswith("extra_") else "frame_ann"
         try:
             for sequence in data.values():
                 annotation = sequence[key][0] if key == "frame_anns" and sequence[key] else sequence[key]
                 for label in annotation["labels"] if annotation else ():
-                    yield (
-                        self._key(str(sequence["feat_p"])),
-                        {k: label[k] for k in ("proc_label", "act_cat", "start_t", "end_t")},
-                    )
-        except (AttributeError, KeyError, TypeError) as error:
+                    given = {k: label[k] for k in ("proc_label", "act_cat", "start_t", "end_t")}
+                    _check(given)
+                    yield self._key(str(sequence["feat_p"])), given
+        except (AttributeError, KeyError, TypeError, IndexError) as error:
             raise ValueError(f"{path}: not in the layout of BABEL v1.0: {error!r}") from error
 
     def _starts(self, label: Label, frames: int) -> range:
@@ -219,6 +216,18 @@ class Babel(MotionSource):
         if key is None:
             raise ValueError(f"{self.path}: the labels name {motion}, which is in no subset of AMASS")
         return key
+
+
+def _check(label: dict[str, Any]) -> None:
+    """Raises `TypeError` if a value of a label is of the wrong kind."""
+    for key in ("start_t", "end_t"):
+        time = label[key]
+        if time is not None and not (isinstance(time, int | float) and abs(time) < 1e6):
+            raise TypeError(f"{key}: {str(time)[:40]}")
+    kinds = label["act_cat"]
+    texts = [label["proc_label"], *(kinds if isinstance(kinds, list) else [])]
+    if not isinstance(kinds, list | None) or not all(isinstance(text, str | None) for text in texts):
+        raise TypeError(f"act_cat: {str(kinds)[:40]}")
 
 
 def _measure(_: None, recording: Recording) -> int:

@@ -7,11 +7,7 @@ Stylization", arXiv 2306.08861, 2023; CC BY-NC 4.0. `docs/bandai.md` describes t
 from __future__ import annotations
 
 import hashlib
-import lzma
 import re
-import tarfile
-import zipfile
-import zlib
 from collections.abc import Container, Generator, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
@@ -22,35 +18,12 @@ from typing import ClassVar, Literal
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from flame_mdm.data import Clip, MotionSource, Split, bvh
+from flame_mdm.data import Clip, MotionSource, Split, archives
 from flame_mdm.data.parallel import in_order
+from flame_mdm.files import TEXT_LIMIT, read_yaml, regular_file
+from flame_mdm.formats import bvh
+from flame_mdm.formats.layouts import BANDAI as JOINTS
 
-# The joint of the BVH files that stands for each of the 22 joints of SMPL, in the order of SMPL. The files have two
-# joints between hips and neck where SMPL has three: spine1 is put at 40 % of the way from Hips to Spine.
-JOINTS = {
-    "pelvis": "Hips",
-    "left_hip": "UpperLeg_L",
-    "right_hip": "UpperLeg_R",
-    "spine1": "Hips",
-    "left_knee": "LowerLeg_L",
-    "right_knee": "LowerLeg_R",
-    "spine2": "Spine",
-    "left_ankle": "Foot_L",
-    "right_ankle": "Foot_R",
-    "spine3": "Chest",
-    "left_foot": "Toes_L",
-    "right_foot": "Toes_R",
-    "neck": "Neck",
-    "left_collar": "Shoulder_L",
-    "right_collar": "Shoulder_R",
-    "head": "Head",
-    "left_shoulder": "UpperArm_L",
-    "right_shoulder": "UpperArm_R",
-    "left_elbow": "LowerArm_L",
-    "right_elbow": "LowerArm_R",
-    "left_wrist": "Hand_L",
-    "right_wrist": "Hand_R",
-}
 SPINE1, SPINE2 = list(JOINTS).index("spine1"), list(JOINTS).index("spine2")
 
 _LEFT, _UP, _FORWARD = np.eye(3)
@@ -161,161 +134,6 @@ WRONG_SIDE = (
 )
 SIDES = {"bye": "right", "guide": "right", "respond": "left", "byebye": "both"}  # where the name does not tell
 
-# Captions of a content, {side} where it has one; {how} is where the style goes.
-PHRASES = {
-    "walk": (
-        "a person walks forward {how}",
-        "someone is walking straight ahead {how}",
-        "the person takes several steps forward {how}",
-        "a person walks {how}",
-    ),
-    "run": (
-        "a person runs forward {how}",
-        "someone jogs straight ahead {how}",
-        "the person is running {how}",
-        "a person jogs forward {how}",
-    ),
-    "dash": (
-        "a person sprints forward {how}",
-        "someone dashes straight ahead {how}",
-        "the person runs forward very fast {how}",
-        "a person is sprinting {how}",
-    ),
-    "walk-back": (
-        "a person walks backwards {how}",
-        "someone is walking backward {how}",
-        "the person takes several steps back {how}",
-        "a person steps backwards {how}",
-    ),
-    "walk-{side}": (
-        "a person walks to the {side} {how}",
-        "someone walks diagonally to the {side} {how}",
-        "the person walks to the {side} {how}, the head turned to the {other}",
-        "a person walks to the {side} {how}, the body half turned and the head to the front",
-    ),
-    "bow": (
-        "a person bows {how} with the hands at the waist, then stands up",
-        "someone bends forward {how} to bow and straightens up again",
-        "the person takes a bow {how}",
-        "a person bows down {how} and comes back up",
-    ),
-    "bye": (
-        "a person waves goodbye {how} with the {side} hand",
-        "someone raises the {side} hand and waves goodbye {how}",
-        "the person waves with the {side} hand {how}",
-        "a person says goodbye {how}, waving the {side} hand",
-    ),
-    "guide": (
-        "a person stretches out the {side} arm {how} to show the way",
-        "someone shows the way with the {side} arm {how}",
-        "the person extends the {side} arm {how} as if guiding someone",
-        "a person points out the way with the {side} hand {how}",
-    ),
-    "byebye": (
-        "a person waves goodbye {how} with both hands",
-        "someone raises both hands and waves goodbye {how}",
-        "the person waves with both hands {how}",
-        "a person says goodbye {how}, waving both hands",
-    ),
-    "respond": (
-        "a person leans forward and raises the {side} hand {how} as if answering",
-        "someone raises the {side} hand {how} to answer",
-        "the person bends forward a little and puts the {side} hand up {how}",
-        "a person answers {how} with the {side} hand raised",
-    ),
-    "call": (
-        "a person cups the hands at the mouth and shouts {how}",
-        "someone calls out loud with the hands at the mouth {how}",
-        "the person holds both hands to the mouth and calls someone {how}",
-        "a person shouts {how} through cupped hands",
-    ),
-    "punch": (
-        "a person punches {how} in a fighting stance",
-        "someone throws punches {how}",
-        "the person is boxing {how}",
-        "a person takes a fighting stance and punches {how}",
-    ),
-    "kick": (
-        "a person does spinning kicks {how}",
-        "someone spins around and kicks {how}",
-        "the person performs spinning kicks {how}",
-        "a person kicks while spinning {how}",
-    ),
-    "slash": (
-        "a person swings a two-handed sword {how}",
-        "someone slashes with a sword in both hands {how}",
-        "the person is fighting with a two-handed sword {how}",
-        "a person strikes with a sword held in both hands {how}",
-    ),
-    "dance-long": (
-        "a person dances {how}",
-        "someone is dancing {how}",
-        "the person performs a dance {how}",
-        "a person does a long dance {how}",
-    ),
-    "dance-short": (
-        "a person dances {how}",
-        "someone is dancing {how}",
-        "the person performs a dance {how}",
-        "a person does a short dance {how}",
-    ),
-    "walk-turn-{side}": (
-        "a person walks forward {how}, then turns {side} 90 degrees and walks on",
-        "someone walks {how} and makes a turn to the {side}",
-        "the person turns {side} while walking {how}",
-        "a person walks ahead {how}, turns to the {side} and keeps walking",
-    ),
-    "raise-up-both-hands": (
-        "a person raises both hands {how} and lowers them",
-        "someone lifts both arms up {how}, then puts them down",
-        "the person raises both arms {how}",
-        "a person puts both hands up {how} and brings them down again",
-    ),
-    "raise-up-{side}-hand": (
-        "a person raises the {side} hand {how} and lowers it",
-        "someone lifts the {side} arm up {how}, then puts it down",
-        "the person raises the {side} arm {how}",
-        "a person puts the {side} hand up {how} and brings it down again",
-    ),
-    "wave-both-hands": (
-        "a person raises both hands and waves {how}",
-        "someone waves both hands {how}",
-        "the person waves with both arms up {how}",
-        "a person lifts both hands and waves them {how}",
-    ),
-    "wave-{side}-hand": (
-        "a person raises the {side} hand and waves {how}",
-        "someone waves the {side} hand {how}",
-        "the person waves with the {side} arm up {how}",
-        "a person lifts the {side} hand and waves it {how}",
-    ),
-}
-STYLES = {
-    "normal": ("", "", "", ""),
-    "happy": ("happily", "in a happy mood", "cheerfully", "full of joy"),
-    "sad": ("sadly", "in a sad mood", "sorrowfully", "full of sadness"),
-    "angry": ("angrily", "in an angry mood", "in anger", "full of anger"),
-    "proud": ("proudly", "with pride", "in a proud way", "full of pride"),
-    "not-confident": ("timidly", "without confidence", "hesitantly", "in an insecure way"),
-    "masculinity": ("in a masculine way", "in a manly way", "with masculine movements", "in a masculine manner"),
-    "masculine": ("in a masculine way", "in a manly way", "with masculine movements", "in a masculine manner"),
-    "feminine": ("in a feminine way", "in a womanly way", "with feminine movements", "in a feminine manner"),
-    "childish": ("like a child", "in a childish way", "childishly", "like a little kid"),
-    "old": ("like an old person", "like an elderly person", "as if very old", "like a senior"),
-    "elderly": ("like an elderly person", "like an old person", "as if very old", "like a senior"),
-    "tired": ("wearily", "in a tired way", "tiredly", "as if tired"),
-    "exhausted": ("wearily", "as if exhausted", "in an exhausted way", "as if very tired"),
-    "active": ("energetically", "in an active way", "with a lot of energy", "vigorously"),
-    "youthful": ("in a lively way", "like a young person", "in a youthful way", "with youthful energy"),
-    "musical": ("as if dancing to music", "rhythmically", "as if listening to music", "to the beat of music"),
-    "giant": (
-        "heavily like a giant",
-        "like a giant",
-        "ponderously like a giant",
-        "with the heavy movements of a giant",
-    ),
-    "chimpira": ("with a swagger", "like a street thug", "in a swaggering way", "like a thug with a swagger"),
-}
 
 FILE = re.compile(r"dataset-([12])_([^_]+)_([^_]+)_(\d+)\.bvh")
 
@@ -457,15 +275,22 @@ def convert(file: tuple[str, bytes], fps: float, kind: Literal["joints", "smpl"]
         missing = sorted(set(JOINTS.values()) - set(motion.joints))
         if missing:
             raise ValueError(f"{name}: not the skeleton of this data set, there is no joint {', '.join(missing)}")
+        rotations, translations = _resampled(motion, fps, name)
     except ValueError as error:
         raise ValueError(f"{error}; to go on without it: data.source.exclude=[{id_}]") from error
-    rotations, translations = motion.resample(fps)
     if kind == "smpl":
         return id_, smpl_motion(motion, rotations, translations)
     positions, _ = bvh.forward_kinematics(motion.parents, rotations, translations)
     joints = positions[:, [motion.joints.index(joint) for joint in JOINTS.values()]] / 100
     joints[:, SPINE1] += 0.4 * (joints[:, SPINE2] - joints[:, SPINE1])
     return id_, joints.astype(np.float32)
+
+
+def _resampled(motion: bvh.Bvh, fps: float, name: str) -> tuple[np.ndarray, np.ndarray]:
+    try:
+        return motion.resample(fps)
+    except ValueError as error:
+        raise ValueError(f"{name}: {error}") from error
 
 
 def smpl_motion(skeleton: bvh.Bvh, rotations: np.ndarray, translations: np.ndarray) -> np.ndarray:
@@ -523,12 +348,19 @@ def side_of(content: str) -> str:
 
 def captions(content: str, style: str, side: str) -> list[str]:
     """Four descriptions in the manner of HumanML3D; `side` is left or right where the content has one of them."""
-    phrases = PHRASES[re.sub("left|right", "{side}", content)]
+    contents, styles = phrases()
     filled = (
         phrase.format(side=side, other=swap_sides(side), how=how)
-        for phrase, how in zip(phrases, STYLES[style], strict=True)
+        for phrase, how in zip(contents[re.sub("left|right", "{side}", content)], styles[style], strict=True)
     )
     return [" ".join(caption.split()).replace(" ,", ",") for caption in filled]
+
+
+@cache
+def phrases() -> tuple[dict[str, list[str]], dict[str, list[str]]]:
+    """Returns four captions of each content, and four ways to say each style, from `bandai.yaml`."""
+    words = read_yaml(Path(__file__).with_suffix(".yaml"))
+    return words["contents"], words["styles"]
 
 
 def split_of(dataset: int, content: str, style: str, number: int) -> Split:
@@ -586,28 +418,14 @@ def _files(path: Path, wanted: Container[str]) -> Iterator[tuple[str, bytes]]:
     if path.is_dir():
         for file in sorted(path.rglob("dataset-*.bvh")):
             if belongs(file.name):
+                regular_file(file, TEXT_LIMIT)
                 yield file.as_posix(), file.read_bytes() if is_wanted(file.name) else b""
     elif not path.exists():
         raise _not_found(f"{path}: no such folder or archive")
-    elif zipfile.is_zipfile(path):
-        try:
-            with zipfile.ZipFile(path) as archive:
-                for name in archive.namelist():
-                    if belongs(name):
-                        yield f"{path}/{name}", archive.read(name) if is_wanted(name) else b""
-        except (zipfile.BadZipFile, zlib.error, EOFError) as error:
-            raise ValueError(f"{path}: damaged archive: {error}") from error
-    elif tarfile.is_tarfile(path):
-        try:
-            with tarfile.open(path) as archive:
-                for member in archive:
-                    file = archive.extractfile(member) if belongs(member.name) else None
-                    if file is not None:
-                        yield f"{path}/{member.name}", file.read() if is_wanted(member.name) else b""
-        except (tarfile.TarError, lzma.LZMAError, zlib.error, EOFError) as error:
-            raise ValueError(f"{path}: damaged archive: {error}") from error
     else:
-        raise ValueError(f"{path}: neither a folder nor a zip or tar archive")
+        for name, content in archives.members(path):
+            if belongs(name):
+                yield f"{path}/{name}", content() if is_wanted(name) else b""
 
 
 def prompts() -> list[str]:

@@ -19,9 +19,11 @@ from flame_mdm.data import MotionSource, Split
 from flame_mdm.data.crops import Crop
 from flame_mdm.data.store import Entry, Store, write_store
 from flame_mdm.motion import collate
-from flame_mdm.noise import key
 from flame_mdm.representations import Representation
+from flame_mdm.seeds import key
 
+FRAMES = 100_000
+"""Most frames of a sample; an hour at 20 frames per second has 72,000."""
 Draw = tuple[int, int]
 """(index of a clip, number of the batch it is drawn for; -1 in evaluation)."""
 
@@ -112,6 +114,14 @@ class EvaluationBatches(Sampler[list[Draw]]):
         return len(self.batches)
 
 
+def _check_crop(crop: Crop) -> None:
+    if not isinstance(crop, Crop):
+        raise ValueError(f"data.crop={crop!s:.80}: not a rule such as those of flame_mdm.data.crops; give one")
+    for name, frames in (("shortest", crop.shortest()), ("longest", crop.longest())):
+        if type(frames) is not int or not 1 <= frames <= FRAMES:
+            raise ValueError(f"data.crop: its {name} sample has {frames!s:.20} frames; give 1 to {FRAMES:,}")
+
+
 class MotionDataModule(LightningDataModule):
     """Prepares a data set where that has not been done, and serves its batches.
 
@@ -143,6 +153,7 @@ class MotionDataModule(LightningDataModule):
             raise ValueError(f"data.batch_size={batch_size}: a batch has at least one clip")
         if num_workers < 0 or not name:
             raise ValueError(f"data.num_workers={num_workers}, data.name='{name}': give 0 or more, and a name")
+        _check_crop(crop)
         self.source, self.representation = source, representation
         self.folder = Path(root) / f"{name}-{representation.name}"
         self.batch_size, self.num_workers, self.seed = batch_size, num_workers, seed
@@ -158,24 +169,32 @@ class MotionDataModule(LightningDataModule):
     def actions(self) -> Sequence[str]:
         """Names of the action labels; from the store, where there is one, so that it is enough to train."""
         prepared = (self.folder / "store.json").exists()
-        return Store(self.folder).info["actions"] if prepared else self.source.actions
+        return self.open().info["actions"] if prepared else self.source.actions
 
     def open(self) -> Store:
-        """The prepared store; its statistics go to the representation.
+        """Returns the prepared store; its statistics go to the representation.
 
         Raises:
             FileNotFoundError: it is not prepared.
-            ValueError: it was prepared with another representation, or is damaged.
+            ValueError: it was prepared with other options or another representation, or is damaged.
         """
         store = Store(self.folder)
-        wanted_info = {
+        wanted = {
+            "dataset": self.source.name,
             "representation": self.representation.name,
             "fps": self.representation.fps,
             "published_split": self.source.published_split,
         }
-        for name, wanted in wanted_info.items():
-            if store.info[name] != wanted:
-                raise ValueError(f"{self.folder}: its {name} is {store.info[name]}, not {wanted}; prepare it again")
+        # Stores of earlier versions do not have their options.
+        found = {name: store.info[name] for name in wanted} | store.info.get("source", {})
+        wanted |= self.source.options
+        differing = [name for name in wanted if name in found and found[name] != wanted[name]]
+        if differing:
+            there, here = (", ".join(f"{name}={of[name]}" for name in differing) for of in (found, wanted))
+            raise ValueError(
+                f"{self.folder}: was prepared with {there}, the recipe says {here}. Prepare it again with force=true, "
+                "choose another data_root or data.name, or change the recipe"
+            )
         self.representation.mean.copy_(torch.from_numpy(store.mean))
         self.representation.std.copy_(torch.from_numpy(store.std))
         return store

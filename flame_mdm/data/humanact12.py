@@ -15,6 +15,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from flame_mdm.data import Clip, MotionSource, Split, restricted_pickle
+from flame_mdm.files import read_npy
 
 FPS = 20.0
 """Frames a second at which the papers' codes play the action sets; no frame is dropped or made."""
@@ -94,14 +95,17 @@ def read(path: Path, actions: int = len(HumanAct12.actions)) -> list[tuple[np.nd
     poses, joints, labels = columns(path, data, "poses", "joints3D", "y")
     clips = []
     for number, (pose, joint, label) in enumerate(zip(poses, joints, labels, strict=True)):
-        pose, joint = np.asarray(pose, np.float32), np.asarray(joint, np.float32)
+        try:
+            pose, joint, label = np.asarray(pose, np.float32), np.asarray(joint, np.float32), int(label)
+        except (TypeError, ValueError, OverflowError) as error:
+            raise ValueError(f"{path}: clip {number} does not consist of numbers: {error}") from error
         if pose.ndim != 2 or pose.shape[1] != 72 or joint.shape != (len(pose), 24, 3) or not len(pose):
             raise ValueError(
                 f"{path}: clip {number} has poses {pose.shape} and joints {joint.shape}, not (F, 72) and (F, 24, 3)"
             )
-        if not 0 <= int(label) < actions:
+        if not 0 <= label < actions:
             raise ValueError(f"{path}: clip {number} has the label {label}, not one of 0 to {actions - 1}")
-        clips.append((np.concatenate([joint[:, 0], pose], 1), int(label)))
+        clips.append((np.concatenate([joint[:, 0], pose], 1), label))
     return clips
 
 
@@ -119,10 +123,10 @@ def read_unconstrained(path: Path) -> np.ndarray:
         FileNotFoundError, ValueError: the file is absent, damaged or another one.
     """
     try:
-        data = np.load(path, allow_pickle=False)
-    except (ValueError, EOFError) as error:
-        raise ValueError(f"{path}: not read as an array: {error}") from error
-    if data.ndim != 4 or data.shape[1] < 15 or data.shape[2] != 3:
+        data = read_npy(path)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+    if data.dtype.kind not in "fiu" or data.ndim != 4 or data.shape[1] < 15 or data.shape[2] != 3:
         raise ValueError(f"{path}: shape {data.shape}, not (motions, 15 or more joints, 3, frames)")
     return np.ascontiguousarray(data[:, :15].transpose(0, 3, 1, 2), np.float32)
 
@@ -149,6 +153,10 @@ def columns(path: Path, data: Any, *names: str) -> list[Any]:
     if not isinstance(data, dict) or not set(names) <= set(data):
         kind = f"keys {', '.join(map(str, data))}" if isinstance(data, dict) else type(data).__name__
         raise ValueError(f"{path}: has to hold {', '.join(names)}; it holds {kind}")
+    for name in names:
+        values = data[name]
+        if not isinstance(values, list | tuple | np.ndarray) or (isinstance(values, np.ndarray) and not values.ndim):
+            raise ValueError(f"{path}: {name} is no list, but {type(values).__name__}")
     lengths = {name: len(data[name]) for name in names}
     if len(set(lengths.values())) > 1:
         raise ValueError(f"{path}: as many of each are needed, not {lengths}")

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import csv
 import io
-import zipfile
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
 from functools import cached_property, partial
@@ -19,9 +18,10 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
-from flame_mdm.data import Clip, MotionSource, restricted_pickle
+from flame_mdm.data import Clip, MotionSource, archives, restricted_pickle
 from flame_mdm.data.amass import Amass, Body, Recording, key_of, load_bodies, subset_of
 from flame_mdm.data.t2m import T2MFolder
+from flame_mdm.files import atomic_write, read_npy, read_text
 from flame_mdm.representations.humanml import HumanML
 
 FPS = 20
@@ -66,8 +66,10 @@ def read_index(path: Path) -> list[Row]:
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file; it is index.csv of https://github.com/EricGuo5513/HumanML3D")
     rows = []
-    with path.open(encoding="utf-8", newline="") as file:
-        for number, line in enumerate(csv.DictReader(file), 2):
+    lines = csv.DictReader(io.StringIO(read_text(path), newline=""))
+    number = 1
+    try:
+        for number, line in enumerate(lines, 2):
             try:
                 source, name = line["source_path"], PurePosixPath(line["new_name"]).stem
                 key = PurePosixPath(source).stem if "humanact12" in source.lower() else key_of(source)
@@ -76,6 +78,8 @@ def read_index(path: Path) -> list[Row]:
                 rows.append(Row(name, key, int(line["start_frame"]), int(line["end_frame"])))
             except (KeyError, TypeError, ValueError) as error:
                 raise ValueError(f"{path}, line {number}: not a clip of HumanML3D's index: {error}") from error
+    except csv.Error as error:
+        raise ValueError(f"{path}, line {number + 1}: {error}") from error
     return rows
 
 
@@ -171,20 +175,28 @@ class HumanML3D(T2MFolder):
             if missing:
                 raise FileNotFoundError(f"{self.name} cannot be made: {'; '.join(missing)}")
             folder = self.path / "new_joint_vecs"
+            made = not folder.exists()
             folder.mkdir(exist_ok=True)
             write = partial(_write_features, folder, HumanML("smpl22", "legacy", bone_lengths=self.bone_lengths))
             recordings: dict[str, list[Row]] = defaultdict(list)
             for row in todo:
                 recordings[row.key].append(row)
             joints = _humanact12_files(self.humanact12)
-            with tqdm(desc=f"making {self.name}", total=len(todo), unit=" motions") as progress:
-                from_amass = {key: rows for key, rows in recordings.items() if not rows[0].humanact12}
-                for _, done in amass.each(from_amass, partial(_from_amass, write, self._bodies()), self.workers):
-                    progress.update(done)
-                for key in sorted(recordings.keys() - from_amass.keys()):
-                    for row in recordings[key]:
-                        write(row, _read_joints(joints[key]))
-                        progress.update()
+            try:
+                with tqdm(desc=f"making {self.name}", total=len(todo), unit=" motions") as progress:
+                    from_amass = {key: rows for key, rows in recordings.items() if not rows[0].humanact12}
+                    for _, done in amass.each(from_amass, partial(_from_amass, write, self._bodies()), self.workers):
+                        progress.update(done)
+                    for key in sorted(recordings.keys() - from_amass.keys()):
+                        for row in recordings[key]:
+                            write(row, _read_joints(joints[key]))
+                            progress.update()
+            except BaseException:
+                for unfinished in folder.glob(".*.npy"):  # of workers that were stopped
+                    unfinished.unlink(missing_ok=True)
+                if made and not any(folder.iterdir()):
+                    folder.rmdir()
+                raise
         if not (self.path / "Mean.npy").is_file():
             self._write_statistics()
 
@@ -195,10 +207,13 @@ class HumanML3D(T2MFolder):
         representation = HumanML("smpl22", "legacy")
         packed = self.path / "all_motions.partial"  # more than fits in memory
         try:
-            rows = np.memmap(packed, np.float32, "w+", shape=(sum(lengths), representation.features))
-            for name, end in zip(names, np.cumsum(lengths), strict=True):
-                motion = self._load(name)
-                rows[end - len(motion) : end] = motion
+            with packed.open("wb") as file:
+                for name in names:
+                    motion = self._load(name)
+                    if motion.shape[1] != representation.features:
+                        raise ValueError(f"{self.path}: {name} has {motion.shape[1]} features; make it again")
+                    motion.astype(np.float32).tofile(file)
+            rows = np.memmap(packed, np.float32, "r+", shape=(sum(lengths), representation.features))
             mean, std = representation.statistics(torch.from_numpy(rows))
         finally:
             packed.unlink(missing_ok=True)
@@ -230,10 +245,8 @@ def _write_features(folder: Path, representation: HumanML, row: Row, joints: np.
 
 
 def _save(path: Path, array: np.ndarray) -> None:
-    partial_path = path.with_suffix(".partial")
-    with partial_path.open("wb") as file:
-        np.save(file, array)
-    partial_path.replace(path)
+    with atomic_write(path) as temporary:
+        np.save(temporary, array)
 
 
 def _beside(path: Path, *names: str) -> Path:
@@ -242,25 +255,24 @@ def _beside(path: Path, *names: str) -> Path:
     return next((candidate for candidate in candidates if candidate.exists()), candidates[0])
 
 
-def _humanact12_files(path: Path) -> dict[str, Path | zipfile.Path]:
-    """Name -> file of joints, in a folder or a zip."""
+def _humanact12_files(path: Path) -> dict[str, Path | tuple[Path, str]]:
+    """Name -> file of joints, in a folder or a zip; in a zip, its path and the name of the member."""
     if path.is_dir():
         return {file.stem: file for file in path.rglob("*.npy")}
     if not path.is_file():
         return {}
-    try:
-        with zipfile.ZipFile(path) as archive:
-            names = [name for name in archive.namelist() if name.endswith(".npy") and "__MACOSX" not in name]
-        return {PurePosixPath(name).stem: zipfile.Path(path, name) for name in names}
-    except zipfile.BadZipFile as error:
-        raise ValueError(f"{path}: damaged archive: {error}; download it again") from error
+    names = [name for name, _ in archives.members(path) if name.endswith(".npy") and "__MACOSX" not in name]
+    return {PurePosixPath(name).stem: (path, name) for name in names}
 
 
-def _read_joints(file: Path | zipfile.Path) -> np.ndarray:
+def _read_joints(source: Path | tuple[Path, str]) -> np.ndarray:
+    file = source if isinstance(source, Path) else "/".join(map(str, source))
     try:
-        joints = np.load(io.BytesIO(file.read_bytes()), allow_pickle=False)
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise ValueError(f"{file}: damaged: {error}") from error
+        joints = read_npy(source if isinstance(source, Path) else io.BytesIO(archives.read_member(*source)))
+    except ValueError as error:
+        raise ValueError(f"{file}: {error}") from error
+    if joints.dtype.kind not in "fiu":
+        raise ValueError(f"{file}: an array of {joints.dtype}, not of numbers")
     if joints.ndim != 3 or joints.shape[1] < 22 or joints.shape[2] != 3:
         raise ValueError(f"{file}: shape {joints.shape}, not (frames, 22 joints or more, 3)")
     return joints[:, :22]
@@ -358,7 +370,7 @@ class HumanML3DSMPL(MotionSource):
             try:
                 poses = np.asarray(entry["poses"], np.float32)
                 motion = np.concatenate([np.asarray(entry["joints3D"], np.float32)[:, 0], poses.reshape(-1, 72)], 1)
-            except (KeyError, TypeError, ValueError) as error:
+            except (KeyError, TypeError, ValueError, IndexError) as error:
                 raise ValueError(f"{path}: {key} holds no poses (F, 72) and joints3D (F, 24, 3): {error}") from error
             for row in recordings[key]:
                 yield from self._clips(row, motion)

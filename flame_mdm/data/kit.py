@@ -5,7 +5,6 @@ Plappert, Mandery, Asfour, "The KIT Motion-Language Dataset", Big Data 2016. `do
 
 from __future__ import annotations
 
-import json
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from functools import cached_property
@@ -17,6 +16,7 @@ import numpy as np
 
 from flame_mdm.data import Clip, MotionSource, Split
 from flame_mdm.data.t2m import SPLITS, T2MFolder
+from flame_mdm.files import TEXT_LIMIT, read_json, read_text, regular_file
 
 UNITS_PER_METRE = 640
 MMM_FPS = 100
@@ -93,7 +93,7 @@ class KITTemos(MotionSource):
         found = {}
         for name in self.names:
             captions, meta = (_json(self.path / f"{name}_{kind}.json") for kind in ("annotations", "meta"))
-            if not isinstance(captions, list) or len(captions) != meta.get("nb_annotations"):
+            if len(captions) != meta.get("nb_annotations"):
                 raise ValueError(f"{self.path}/{name}_meta.json: nb_annotations does not count {name}_annotations.json")
             if captions:
                 found[name] = captions
@@ -156,7 +156,7 @@ class KITTemos(MotionSource):
             raise FileNotFoundError(
                 f"{file}: no such list of motions; it is in datasets/kit-splits of https://github.com/Mathux/TEMOS"
             )
-        return file.read_text().split()
+        return read_text(file).split()
 
 
 def read_joints(path: Path) -> np.ndarray:
@@ -167,6 +167,7 @@ def read_joints(path: Path) -> np.ndarray:
     Raises:
         ValueError: the file is damaged.
     """
+    regular_file(path, TEXT_LIMIT)
     with path.open(encoding="utf-8") as file:
         try:
             rows = np.loadtxt(islice(file, 1, None, 8), delimiter=",", ndmin=2)
@@ -181,12 +182,14 @@ def read_joints(path: Path) -> np.ndarray:
 
 def _rows(path: Path) -> int:
     """Lines of a table without its head."""
+    regular_file(path, TEXT_LIMIT)
     data = path.read_bytes()
     return data.count(b"\n") + (not data.endswith(b"\n")) - 1
 
 
 def _json(path: Path) -> Any:
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise ValueError(f"{path}: damaged: {error}") from error
+    content = read_json(path)
+    kind = list if path.name.endswith("_annotations.json") else dict
+    if not isinstance(content, kind) or (kind is list and not all(isinstance(text, str) for text in content)):
+        raise ValueError(f"{path}: damaged: not {'a list of texts' if kind is list else 'an object'}")
+    return content

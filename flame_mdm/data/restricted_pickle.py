@@ -3,6 +3,9 @@
 Two action data sets are handed out as pickles, a format in which a file can name any function and have it called. Even
 NumPy's own functions are not safe to call with what a stranger wrote (a wrong byte in a dtype crashes the interpreter),
 so arrays are put together here, from their bytes.
+
+Python's reader in C reserves whatever memory a file of ten bytes asks for, so this one builds on the reader in Python:
+no read may ask for more than is left of the file, and what a file repeats counts each time.
 """
 
 from __future__ import annotations
@@ -10,13 +13,23 @@ from __future__ import annotations
 import math
 import pickle
 import re
-from collections.abc import Sequence
+import struct
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 
-DTYPE = re.compile(r"[biufcSU]\d+|O8?")
+from flame_mdm.errors import first_line
+from flame_mdm.files import ARRAYS_LIMIT, INFLATION, regular_file
+
+DTYPE = re.compile(r"[biufcSU]\d{1,9}|O8?")
+NODE = 32
+"""Bytes that a value in a container takes at least."""
+MAX_NODES = 200_000
+"""Values that a pickle may always hold. Larger ones hold no more than they have bytes, unless they repeat some."""
+MAX_DEPTH = 20
+"""Tuples within tuples. Hashing a tuple that is nested 100,000 times ends the process."""
 
 
 class _DType:
@@ -24,23 +37,12 @@ class _DType:
 
     def __init__(self, code: str, align: bool = False, copy: bool = False):
         if not DTYPE.fullmatch(code):
-            raise pickle.UnpicklingError(f"an array of dtype {code!r}")
+            raise pickle.UnpicklingError(f"an array of dtype {code[:40]!r}")
         self.dtype = np.dtype(code)
 
     def __setstate__(self, state: tuple) -> None:
         if state[1] in ("<", ">"):
             self.dtype = self.dtype.newbyteorder(state[1])
-
-    def array(self, data: Any, shape: Sequence[int], order: Any) -> np.ndarray:
-        """The array of this type and shape out of bytes, or out of a list of objects."""
-        if self.dtype != object:
-            return np.frombuffer(data, self.dtype).reshape(shape, order=order).copy()
-        if math.prod(shape) != len(data):
-            raise pickle.UnpicklingError(f"{len(data)} objects in an array of shape {tuple(shape)}")
-        array = np.empty(len(data), object)
-        for index, value in enumerate(data):
-            array[index] = _plain(value)
-        return array.reshape(shape, order=order)
 
 
 class _Array:
@@ -52,70 +54,182 @@ class _Array:
     def __setstate__(self, state: tuple) -> None:
         self.state = state
 
-    def array(self) -> np.ndarray:
-        _, shape, dtype, is_fortran, data = self.state
-        return dtype.array(data, shape, "F" if is_fortran else "C")
-
-
-def _from_buffer(data: bytes, dtype: _DType, shape: Sequence[int], order: Any) -> np.ndarray:
-    return dtype.array(data, shape, order)
-
-
-def _scalar(dtype: _DType, data: bytes) -> Any:
-    return dtype.array(data, (1,), "C")[0]
-
-
-def _encode(text: str, encoding: str) -> bytes:
-    """How protocols below 3 write bytes."""
-    if encoding != "latin1":
-        raise pickle.UnpicklingError(f"bytes encoded as {encoding!r}")
-    return text.encode("latin1")
-
 
 ALLOWED: dict[str, Any] = {
     "numpy.ndarray": None,
     "numpy.dtype": _DType,
     **{f"numpy.{core}.multiarray._reconstruct": _Array for core in ("core", "_core")},
-    **{f"numpy.{core}.multiarray.scalar": _scalar for core in ("core", "_core")},
-    **{f"numpy.{core}.numeric._frombuffer": _from_buffer for core in ("core", "_core")},
-    "_codecs.encode": _encode,
-    **{f"{builtins}.{kind.__name__}": kind for builtins in ("builtins", "__builtin__") for kind in (set, frozenset)},
+    **{f"numpy.{core}.multiarray.scalar": "scalar" for core in ("core", "_core")},
+    **{f"numpy.{core}.numeric._frombuffer": "from_buffer" for core in ("core", "_core")},
+    "_codecs.encode": "encode",
+    **{f"{builtins}.{kind}": kind for builtins in ("builtins", "__builtin__") for kind in ("set", "frozenset")},
     **{f"{builtins}.complex": complex for builtins in ("builtins", "__builtin__")},
 }
-"""Everything a pickle may name: arrays and numbers under NumPy's old and new paths, and plain values."""
+"""Everything a pickle may name: arrays and numbers under NumPy's old and new paths, and plain values. A text names a
+method of `_ArrayUnpickler`, after `make_`."""
 
 
-class _ArrayUnpickler(pickle.Unpickler):
+class _File:
+    """A file whose reads may not ask for more than is left of it."""
+
+    def __init__(self, file: IO[bytes], size: int):
+        self.file, self.left = file, size
+
+    def read(self, size: int) -> bytes:
+        if size > self.left:
+            raise EOFError("it ends too early")
+        self.left -= size
+        return self.file.read(size)
+
+    def readline(self) -> bytes:
+        line = self.file.readline()
+        self.left -= len(line)
+        return line
+
+
+class _ArrayUnpickler(pickle._Unpickler):
+    """Reads the pickle in a file of `size` bytes."""
+
+    dispatch = dict(pickle._Unpickler.dispatch)  # noqa: RUF012
+    stack: list[Any]
+    memo: dict[int, Any]
+    append: Callable[[Any], None]
+    read: Callable[[int], bytes]
+
+    def __init__(self, file: IO[bytes], size: int):
+        super().__init__(_File(file, size))
+        self.size, self.budget = size, max(ARRAYS_LIMIT, INFLATION * size)
+        self.nodes = max(MAX_NODES, size)
+        self.depths: dict[int, tuple[int, tuple]] = {}
+
+    def content(self) -> Any:
+        """Returns what the pickle holds, with arrays in place of what stands for them."""
+        value = self.load()
+        self.memo.clear()
+        self.depths.clear()
+        return self._plain(value)
+
     def find_class(self, module_name: str, global_name: str, /) -> Any:
         name = f"{module_name}.{global_name}"
         if name not in ALLOWED:
             raise pickle.UnpicklingError(
-                f"it names {name}, but only arrays, numbers, text and plain containers are read (anything else could "
-                "run code); take the file from its owners"
+                f"it names {name[:200]}, but only arrays, numbers, text and plain containers are read (anything else "
+                "could run code); take the file from its owners"
             )
-        return ALLOWED[name]
+        allowed = ALLOWED[name]
+        return getattr(self, f"make_{allowed}") if isinstance(allowed, str) else allowed
+
+    def make_scalar(self, dtype: _DType, data: bytes) -> Any:
+        """Returns a number of NumPy."""
+        return self._array(dtype, data, (1,), "C")[0]
+
+    def make_from_buffer(self, data: bytes, dtype: _DType, shape: Sequence[int], order: Any) -> np.ndarray:
+        """Returns an array, as protocol 5 writes them."""
+        return self._array(dtype, data, shape, order)
+
+    def make_encode(self, text: str, encoding: str) -> bytes:
+        """Returns bytes, as protocols below 3 write them."""
+        if encoding != "latin1":
+            raise pickle.UnpicklingError(f"bytes encoded as {encoding[:40]!r}")
+        self._spend(len(text))
+        return text.encode("latin1")
+
+    def make_set(self, items: Sequence[Any] = ()) -> set:
+        """Returns a set."""
+        self._spend(NODE * len(items))
+        return set(items)
+
+    def make_frozenset(self, items: Sequence[Any] = ()) -> frozenset:
+        """Returns a set that can be part of another."""
+        self._spend(NODE * len(items))
+        return frozenset(items)
+
+    def _spend(self, size: int) -> None:
+        self.budget -= size
+        if self.budget < 0:
+            raise pickle.UnpicklingError("it unpacks to far more than its size, which no motion data does")
+
+    def _array(self, dtype: _DType, data: Any, shape: Sequence[int], order: Any) -> np.ndarray:
+        """Returns the array of this type and shape out of bytes, or out of a list of objects."""
+        if dtype.dtype != object:
+            self._spend(len(data))
+            return np.frombuffer(data, dtype.dtype).reshape(shape, order=order).copy()
+        if math.prod(shape) != len(data):
+            raise pickle.UnpicklingError(f"{len(data)} objects in an array of shape {tuple(shape)}")
+        self._spend(NODE * len(data))
+        array = np.empty(len(data), object)
+        for index, value in enumerate(data):
+            array[index] = self._plain(value)
+        return array.reshape(shape, order=order)
+
+    def _plain(self, value: Any) -> Any:
+        """Returns the same with arrays in place of what stands for them."""
+        self.nodes -= 1
+        if self.nodes < 0:
+            self._spend(self.budget + 1)
+        if isinstance(value, _Array):
+            _, shape, dtype, is_fortran, data = value.state
+            return self._array(dtype, data, shape, "F" if is_fortran else "C")
+        if isinstance(value, dict):
+            return {self._plain(key): self._plain(item) for key, item in value.items()}
+        if isinstance(value, (list, tuple)):
+            return type(value)(self._plain(item) for item in value)
+        return value
+
+    def _load_build(self) -> None:
+        if not isinstance(self.stack[-2], (_DType, _Array)):
+            raise pickle.UnpicklingError("it sets attributes of other things than arrays")
+        super().load_build()  # pyright: ignore[reportAttributeAccessIssue]
+
+    def _load_bytearray8(self) -> None:
+        self.append(bytearray(self.read(struct.unpack("<Q", self.read(8))[0])))
+
+    def _check_tuple(self) -> None:
+        made = self.stack[-1]
+        depth = 1 + max((self.depths.get(id(part), (0,))[0] for part in made if isinstance(part, tuple)), default=0)
+        if depth > MAX_DEPTH:
+            raise pickle.UnpicklingError("nested too deeply")
+        self.depths[id(made)] = depth, made  # which also keeps its id
+
+    def _check_integer(self) -> None:
+        if self.stack[-1].bit_length() > 64:  # any number of larger ones may have the same hash
+            raise pickle.UnpicklingError("an integer of more than 64 bits")
 
 
-def _plain(value: Any) -> Any:
-    """The same with arrays in place of what stands for them."""
-    if isinstance(value, _Array):
-        return value.array()
-    if isinstance(value, dict):
-        return {_plain(key): _plain(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return type(value)(_plain(item) for item in value)
-    return value
+def _then_check(
+    load: Callable[[Any], None], check: Callable[[_ArrayUnpickler], None]
+) -> Callable[[_ArrayUnpickler], None]:
+    """Returns how an opcode is read whose value is checked."""
+
+    def checked(self: _ArrayUnpickler) -> None:
+        load(self)
+        check(self)
+
+    return checked
+
+
+_dispatch: Any = _ArrayUnpickler.dispatch
+for _code in (pickle.TUPLE, pickle.TUPLE1, pickle.TUPLE2, pickle.TUPLE3):
+    _dispatch[_code[0]] = _then_check(_dispatch[_code[0]], _ArrayUnpickler._check_tuple)
+for _code in (pickle.LONG1, pickle.LONG4, pickle.LONG, pickle.INT):
+    _dispatch[_code[0]] = _then_check(_dispatch[_code[0]], _ArrayUnpickler._check_integer)
+_dispatch[pickle.BUILD[0]] = _ArrayUnpickler._load_build
+_dispatch[pickle.BYTEARRAY8[0]] = _ArrayUnpickler._load_bytearray8
 
 
 def read(path: Path) -> Any:
-    """What a pickle of arrays, numbers, text and builtin containers holds; protocols 0 to 5.
+    """Returns what a pickle of arrays, numbers, text and builtin containers holds; protocols 0 to 5.
 
     Raises:
         FileNotFoundError: there is no such file.
+        UserError: it is not a regular file.
         ValueError: it is damaged, or names anything else; the message names the file and the global.
     """
+    size = regular_file(path)
     with path.open("rb") as file:
         try:
-            return _plain(_ArrayUnpickler(file).load())
-        except Exception as error:  # a damaged pickle can fail in any way, and can ask for any amount of memory
-            raise ValueError(f"{path}: not read as a pickle: {error or type(error).__name__}") from error
+            return _ArrayUnpickler(file, size).content()
+        except RecursionError as error:
+            raise ValueError(f"{path}: not read as a pickle: nested too deeply") from error
+        except Exception as error:  # a damaged pickle can fail in any way
+            raise ValueError(f"{path}: not read as a pickle: {first_line(error)}") from error

@@ -5,7 +5,7 @@ A store is a folder that is written once and never changed:
     features.npy     (N, D) float32, the frames of all clips one after the other, not normalized
     clips.jsonl      one clip a line: id, start, length, split, source, captions, action, attributes
     statistics.npz   mean and std (D,) of the training frames, as the representation normalizes with them
-    store.json       representation, frame rate, counts, hashes of the three files, fingerprint
+    store.json       representation, frame rate, options of the source, counts, hashes of the three files, fingerprint
 
 Verifying it leaves a report beside them, `verify.json`.
 """
@@ -15,6 +15,7 @@ from __future__ import annotations
 import errno
 import fcntl
 import hashlib
+import io
 import json
 import os
 import shutil
@@ -23,17 +24,20 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from itertools import islice
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, get_args
 
 import numpy as np
 import torch
 from tqdm import tqdm
 
 from flame_mdm.data import Clip, MotionSource, Split
+from flame_mdm.errors import UserError, first_line, say
+from flame_mdm.files import made_folder, parse_json, read_json, read_npy, read_npz, regular_file, sha256, writing
 from flame_mdm.representations import Representation
 
 FORMAT = 1
 CHUNK = 64
+SPLITS = get_args(Split)
 
 
 @dataclass(frozen=True)
@@ -62,18 +66,26 @@ class Store:
         self.folder = Path(folder)
         self.info: dict[str, Any] = _read_info(self.folder)
         for name in ("clips.jsonl", "statistics.npz"):
-            if _sha256(self.folder / name) != self.info["sha256"][name]:
+            if _sha256(self.folder / name) != self.info["sha256"].get(name):
                 raise _damaged(self.folder / name, "its hash is not the recorded one")
+        shape: list[int] = self.info["shape"]
         try:
-            self.features: np.ndarray = np.load(self.folder / "features.npy", mmap_mode="r")
-        except (OSError, ValueError, EOFError) as error:
+            self.features: np.ndarray = read_npy(self.folder / "features.npy", mmap=True)
+        except (UserError, OSError, ValueError) as error:
             raise _damaged(self.folder / "features.npy", str(error)) from error
-        if list(self.features.shape) != self.info["shape"]:
-            raise _damaged(self.folder / "features.npy", f"it holds {self.features.shape}, not {self.info['shape']}")
-        with (self.folder / "clips.jsonl").open(encoding="utf-8") as lines:  # captions may hold other line separators
-            self.clips = [Entry(**json.loads(line)) for line in lines]
-        with np.load(self.folder / "statistics.npz") as file:
-            self.mean, self.std = file["mean"], file["std"]
+        if list(self.features.shape) != shape or len(shape) != 2 or self.features.dtype != np.float32:
+            raise _damaged(self.folder / "features.npy", f"it holds {self.features.shape}, not {shape} numbers")
+        self.clips = _entries(self.folder / "clips.jsonl", shape[0], len(self.info["actions"]))
+        try:
+            statistics = read_npz(self.folder / "statistics.npz")
+            self.mean, self.std = (statistics[name] for name in ("mean", "std"))
+        except (ValueError, KeyError) as error:
+            raise _damaged(self.folder / "statistics.npz", str(error)) from error
+        if not self.mean.shape == self.std.shape == (shape[1],) or {self.mean.dtype.kind, self.std.dtype.kind} != {"f"}:
+            raise _damaged(self.folder / "statistics.npz", f"no mean and std of {shape[1]} features")
+        name, fps = self.info["representation"], self.info["fps"]
+        if _fingerprint(self.folder, name, fps, self.mean, self.std) != self.fingerprint:
+            raise _damaged(self.folder / "store.json", "its fingerprint is not that of the clips")
 
     @property
     def fingerprint(self) -> str:
@@ -85,16 +97,13 @@ class Store:
         return self.features[clip.start : clip.start + clip.length]
 
     def verify(self) -> None:
-        """Hashes the whole store.
+        """Hashes the packed features, which opening does not; what the fingerprint is made of is checked there.
 
         Raises:
-            ValueError: the packed features, or what the fingerprint is made of, are not the ones that were written.
+            ValueError: they are not the ones that were written.
         """
-        if _sha256(self.folder / "features.npy") != self.info["sha256"]["features.npy"]:
+        if _sha256(self.folder / "features.npy") != self.info["sha256"].get("features.npy"):
             raise _damaged(self.folder / "features.npy", "its hash is not the recorded one")
-        name, fps = self.info["representation"], self.info["fps"]
-        if _fingerprint(self.folder, name, fps, self.mean, self.std) != self.fingerprint:
-            raise _damaged(self.folder / "store.json", "its fingerprint is not that of the clips")
 
 
 def write_store(folder: Path, source: MotionSource, representation: Representation) -> Store:
@@ -118,18 +127,17 @@ def _only_writer(folder: Path) -> Iterator[None]:
 
     The operating system lets go of the lock of a process that dies; what such a one leaves, the next one removes.
     """
-    folder.parent.mkdir(parents=True, exist_ok=True)
     path = folder.with_name(folder.name + ".lock")
     while True:
-        with path.open("w") as file:
+        with made_folder(folder.parent), path.open("w") as file:
             try:
                 fcntl.lockf(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except OSError as error:
                 if error.errno in (errno.EACCES, errno.EAGAIN):
-                    print(f"{folder}: another process prepares it; waiting for it", flush=True)
+                    say(f"{folder}: another process prepares it; waiting for it")
                     fcntl.lockf(file, fcntl.LOCK_EX)
                 else:
-                    print(f"{path}: this file system has no locks ({error.strerror}); prepare in one process at a time")
+                    say(f"{path}: this file system has no locks ({error.strerror}); prepare in one process at a time")
             if not _is_at(file, path):  # the process before has removed it, and another may hold a new one
                 continue
             try:
@@ -149,35 +157,38 @@ def _is_at(file: IO[str], path: Path) -> bool:
 def _write(folder: Path, source: MotionSource, representation: Representation, total: int) -> None:
     partial = folder.with_name(folder.name + ".partial")
     shutil.rmtree(partial, ignore_errors=True)
-    partial.mkdir(parents=True)
     try:
+        with writing(folder, partial):
+            partial.mkdir(parents=True)
         entries: list[Entry] = []
         motion, begin, frames = None, 0, 0
-        clips = tqdm(source.clips(representation.fps), f"preparing {source.name}", total, unit=" clips")
-        with (partial / "features.raw").open("wb") as raw:
+        bar = tqdm(source.clips(representation.fps), f"preparing {source.name}", total, unit=" clips")
+        with bar as clips, (partial / "features.npy").open("wb", buffering=0) as file:
+            _append(file, folder, _header(frames, representation.features))
             for chunk in _batched(clips, CHUNK):
                 for clip, features in zip(chunk, _encode(chunk, representation), strict=True):
                     if clip.motion is not motion:
                         motion, begin = clip.motion, frames
                         frames += len(features)
-                        features.tofile(raw)
+                        _append(file, folder, features.tobytes())
                     first, length = clip.window or (0, len(features))
                     if first < 0 or length < 1 or first + length > len(features):
                         raise ValueError(f"clip {clip.id}: no window {clip.window} in {len(features)} frames")
                     entry = Entry(clip.id, begin + first, length, clip.split, clip.source, clip.captions, clip.action)
                     entries.append(replace(entry, attributes=dict(clip.attributes)))
-        _check_entries(source.name, entries)
-        packed = np.memmap(partial / "features.raw", np.float32, "r", shape=(frames, representation.features))
-        _save_array(partial / "features.npy", packed)
-        (partial / "features.raw").unlink()
-        lines = [json.dumps(asdict(entry), ensure_ascii=False, sort_keys=True) for entry in entries]
-        (partial / "clips.jsonl").write_text("\n".join(lines) + "\n", encoding="utf-8")
+            _check_entries(source.name, entries)
+            file.seek(0)
+            _append(file, folder, _header(frames, representation.features))
+        packed = np.load(partial / "features.npy", mmap_mode="r")
         mean, std = source.statistics() or _statistics(representation, packed, entries)
-        np.savez(partial / "statistics.npz", mean=mean, std=std)
-        info = _describe(partial, source, representation, entries, frames, mean, std)
-        (partial / "store.json").write_text(json.dumps(info, indent=2) + "\n")
-        shutil.rmtree(folder, ignore_errors=True)
-        partial.rename(folder)
+        lines = [json.dumps(asdict(entry), ensure_ascii=False, sort_keys=True) for entry in entries]
+        with writing(folder, partial):
+            (partial / "clips.jsonl").write_text("\n".join(lines) + "\n", encoding="utf-8")
+            np.savez(partial / "statistics.npz", mean=mean, std=std)
+            info = _describe(partial, source, representation, entries, frames, mean, std)
+            (partial / "store.json").write_text(json.dumps(info, indent=2) + "\n")
+            shutil.rmtree(folder, ignore_errors=True)
+            partial.rename(folder)
     except BaseException:
         shutil.rmtree(partial, ignore_errors=True)
         raise
@@ -235,10 +246,21 @@ def _check_entries(name: str, entries: list[Entry]) -> None:
         raise ValueError(f"{name}: no clip is in the training split")
 
 
-def _save_array(path: Path, array: np.ndarray) -> None:
-    packed = np.lib.format.open_memmap(path, "w+", array.dtype, array.shape)
-    packed[:] = array
-    packed.flush()
+def _header(frames: int, features: int) -> bytes:
+    """Returns the header of features.npy. NumPy pads it to the same size for any number of frames."""
+    header = io.BytesIO()
+    array = np.empty((0, features), np.float32)
+    content = np.lib.format.header_data_from_array_1_0(array) | {"shape": (frames, features)}
+    np.lib.format.write_array_header_1_0(header, content)
+    return header.getvalue()
+
+
+def _append(file: io.RawIOBase, folder: Path, content: bytes) -> None:
+    """Writes all bytes of a part of features.npy. Through a memory map, a full disk would end the process (SIGBUS)."""
+    left = memoryview(content)
+    with writing(folder / "features.npy", folder):
+        while left:
+            left = left[file.write(left) or 0 :]
 
 
 def _describe(
@@ -254,6 +276,7 @@ def _describe(
     return {
         "format": FORMAT,
         "dataset": source.name,
+        "source": dict(source.options),
         "actions": list(source.actions),
         "published_split": source.published_split,
         "excluded": source.excluded(),
@@ -277,16 +300,69 @@ def _fingerprint(folder: Path, representation: str, fps: float, mean: np.ndarray
     return digest.hexdigest()[:16]
 
 
+INFO: dict[str, type | tuple[type, ...]] = {
+    **dict.fromkeys(("dataset", "representation", "fingerprint"), str),
+    **dict.fromkeys(("actions", "shape"), list),
+    **dict.fromkeys(("excluded", "clips", "sha256"), dict),
+    **dict.fromkeys(("fps", "hours"), (int, float)),
+    "published_split": bool,
+}
+"""Kinds of the values of store.json that commands rely on."""
+
+
 def _read_info(folder: Path) -> dict[str, Any]:
     try:
-        info = json.loads((folder / "store.json").read_text())
+        info = read_json(folder / "store.json")
     except FileNotFoundError:
         raise FileNotFoundError(f"{folder}: no prepared data set; `make prepare` writes it") from None
-    except (OSError, ValueError) as error:
+    except UserError as error:
         raise _damaged(folder / "store.json", str(error)) from error
     if not isinstance(info, dict) or info.get("format") != FORMAT:
         raise ValueError(f"{folder}: not a store of format {FORMAT}, which this version reads; prepare it again")
+    wrong = [name for name, kind in INFO.items() if not isinstance(info.get(name), kind)]
+    if not wrong:
+        counts, numbers = info["clips"], {"fps": info["fps"], "hours": info["hours"]}
+        usable = {name: 0 <= number < 1e9 for name, number in numbers.items()}
+        usable["clips"] = counts.keys() == set(SPLITS) and all(type(n) is int for n in counts.values())
+        usable["actions"] = all(isinstance(name, str) for name in info["actions"])
+        usable["source"] = isinstance(info.get("source", {}), dict)
+        wrong = [name for name, good in usable.items() if not good]
+    if wrong:
+        raise _damaged(folder / "store.json", f"no usable {wrong[0]}")
     return info
+
+
+def _entries(path: Path, frames: int, actions: int) -> list[Entry]:
+    clips: list[Entry] = []
+    try:
+        with path.open(encoding="utf-8") as lines:  # captions may hold other line separators
+            for line in lines:
+                clip = Entry(**parse_json(line))
+                if wrong := _wrong_field(clip, actions):
+                    raise ValueError(f"no usable {wrong}: {getattr(clip, wrong)!r:.80}")
+                if clip.start < 0 or clip.length < 1 or clip.start + clip.length > frames:
+                    raise ValueError(f"{clip.id}: frames {clip.start} to {clip.start + clip.length} of {frames}")
+                clips.append(clip)
+    except UnicodeDecodeError as error:
+        raise _damaged(path, "not a UTF-8 text file") from error
+    except (TypeError, ValueError) as error:
+        raise _damaged(path, f"line {len(clips) + 1}: {first_line(error)}") from error
+    return clips
+
+
+def _wrong_field(clip: Entry, actions: int) -> str | None:
+    """Returns the first field of a clip that has another kind of value than `Entry` says; None = all are right."""
+    good = {
+        "id": isinstance(clip.id, str) and clip.id != "",
+        "start": type(clip.start) is int,
+        "length": type(clip.length) is int,
+        "split": clip.split in SPLITS,
+        "source": isinstance(clip.source, str),
+        "captions": isinstance(clip.captions, list) and all(isinstance(text, str) for text in clip.captions),
+        "action": clip.action is None or (type(clip.action) is int and 0 <= clip.action < actions),
+        "attributes": isinstance(clip.attributes, dict),
+    }
+    return next((name for name, right in good.items() if not right), None)
 
 
 def _damaged(path: Path, what: str) -> ValueError:
@@ -295,7 +371,7 @@ def _damaged(path: Path, what: str) -> ValueError:
 
 def _sha256(path: Path) -> str:
     try:
-        with path.open("rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
-    except OSError as error:
+        regular_file(path)
+        return sha256(path)
+    except (UserError, OSError) as error:
         raise _damaged(path, str(error)) from error

@@ -648,7 +648,7 @@ class Synthetic(MotionSource):
 
 
 def prompts() -> list[tuple[str, Attributes]]:
-    """Fixed prompts with what they ask for: shown on the dashboard, read back by `evaluators.attributes`."""
+    """Fixed prompts with what they ask for: shown on the dashboard, read back by `evaluators.metrics.attributes`."""
     asked: list[Attributes] = [
         {"action": "walk", "direction": "forward"},
         {"action": "walk", "direction": "forward", "speed": "slow"},

@@ -8,9 +8,7 @@ Mean.npy Std.npy            (D,)
 
 from __future__ import annotations
 
-import io
 import math
-import zipfile
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from functools import cached_property
@@ -19,8 +17,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from flame_mdm.data import Clip, MotionSource, Split
+from flame_mdm.data import Clip, MotionSource, Split, archives
 from flame_mdm.data.store import Store
+from flame_mdm.files import read_npy, read_text
 
 TAG_FPS = 20
 """Frames a second of the tags `from` and `to`, in KIT-ML too, whose motions have 12.5."""
@@ -135,7 +134,7 @@ class T2MFolder(MotionSource):
             file = self.path / f"{split}.txt"
             if not file.is_file():
                 raise FileNotFoundError(f"{file}: no such list of names; {self.get_it}")
-            for name in file.read_text(encoding="utf-8").split():
+            for name in read_text(file).split():
                 if found.setdefault(name, split) != split:
                     raise ValueError(f"{file}: {name} is in {found[name]}.txt, too")
         unknown = self.exclude - found.keys()
@@ -221,6 +220,8 @@ class T2MFolder(MotionSource):
             ValueError: they are damaged, or a std is not positive.
         """
         mean, std = (self._array(self.path / f"{name}.npy") for name in ("Mean", "Std"))
+        if {mean.dtype.kind, std.dtype.kind} - set("fiu"):
+            raise ValueError(f"{self.path}: Mean.npy and Std.npy are no arrays of real numbers")
         if mean.shape != std.shape or mean.ndim != 1 or not np.isfinite(mean).all() or not (std > 0).all():
             raise ValueError(f"{self.path}: Mean.npy {mean.shape} and Std.npy {std.shape} are no mean and positive std")
         return mean.astype(np.float32), std.astype(np.float32)
@@ -233,21 +234,23 @@ class T2MFolder(MotionSource):
         return {"motions": len(originals), "texts": texts, **{split: splits[split] for split in SPLITS}}
 
     def _motions(self) -> set[str]:
-        return {path.stem for path in (self.path / "new_joint_vecs").glob("*.npy")}
+        files = (self.path / "new_joint_vecs").glob("*.npy")
+        return {path.stem for path in files if not path.name.startswith(".")}  # an unfinished one of a killed process
 
     def _load(self, name: str, mmap: bool = False) -> np.ndarray:
         motion = self._array(self.path / "new_joint_vecs" / f"{name}.npy", mmap)
-        if motion.ndim != 2:
-            raise ValueError(f"{self.path}/new_joint_vecs/{name}.npy: shape {motion.shape}, not (frames, features)")
+        if motion.ndim != 2 or motion.dtype.kind not in "fiu":
+            what = f"shape {motion.shape} of {motion.dtype}"
+            raise ValueError(f"{self.path}/new_joint_vecs/{name}.npy: {what}, not numbers (frames, features)")
         return motion
 
     def _array(self, path: Path, mmap: bool = False) -> np.ndarray:
         try:
-            return np.load(path, mmap_mode="r" if mmap else None, allow_pickle=False)
+            return read_npy(path, mmap=mmap)
         except FileNotFoundError:
             raise FileNotFoundError(f"{path}: no such file; {self.get_it}") from None
-        except (OSError, ValueError, EOFError) as error:
-            raise ValueError(f"{path}: damaged: {error}; process it again, or exclude it by name") from error
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}; process it again, or exclude it by name") from error
 
     def _account(self, name: str, frames: int, found: Sequence[Cut]) -> None:
         """Notes what a motion loses."""
@@ -281,19 +284,22 @@ def _texts(path: Path) -> Iterator[tuple[str, str, str]]:
     """Name, file and content of all text files, sorted."""
     if (path / "texts").is_dir():
         for file in sorted((path / "texts").glob("*.txt")):
-            yield file.stem, str(file), file.read_text(encoding="utf-8")
+            yield file.stem, str(file), read_text(file)
         return
     archive = path / "texts.zip"
     if not archive.is_file():
         raise FileNotFoundError(f"{path}: neither a folder texts nor texts.zip in it")
-    try:
-        with zipfile.ZipFile(archive) as file:
-            for member in sorted(file.namelist()):
-                inside = PurePosixPath(member)
-                if inside.suffix == ".txt" and "__MACOSX" not in inside.parts:
-                    yield inside.stem, f"{archive}/{member}", io.TextIOWrapper(file.open(member), "utf-8").read()
-    except (zipfile.BadZipFile, EOFError, OSError) as error:
-        raise ValueError(f"{archive}: damaged archive: {error}; download it again") from error
+    contents = {
+        member: content()
+        for member, content in archives.members(archive)
+        if member.endswith(".txt") and "__MACOSX" not in PurePosixPath(member).parts
+    }
+    for member, content in sorted(contents.items()):
+        try:
+            text = content.decode("utf-8").replace("\r\n", "\n").replace("\r", "\n")
+        except UnicodeDecodeError as error:
+            raise ValueError(f"{archive}/{member}: not a UTF-8 text file: {error}") from error
+        yield PurePosixPath(member).stem, f"{archive}/{member}", text
 
 
 def _some(names: Iterable[str]) -> str:

@@ -20,6 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from flame_mdm.data import Clip, MotionSource, Split, restricted_pickle
 from flame_mdm.data.humanact12 import check_fps, columns, find
+from flame_mdm.files import read_text
 
 TRAIN_SUBJECTS = (
     *(1, 2, 6, 12, 13, 16, 21, 24, 28, 29, 30, 31, 33, 35, 39, 41, 42, 45, 47, 50, 52, 54, 55, 57, 59, 61, 63),
@@ -133,13 +134,17 @@ class UESTC(MotionSource):
         if self._size > len(videos):
             self._excluded["videos of view 8, side 2"] = self._size - len(videos)
         for video in videos:
-            pose, joint, camera = (np.asarray(part[video.index], np.float64) for part in (poses, joints, cameras))
+            try:
+                pose, joint, camera = (np.asarray(part[video.index], np.float64) for part in (poses, joints, cameras))
+                limit = int(frames[video.index])
+            except (TypeError, ValueError, OverflowError) as error:
+                raise ValueError(f"{path}: {video.id} does not consist of numbers: {error}") from error
             if pose.shape[1:] != (72,) or joint.shape != (len(pose), 49, 3) or camera.shape != (len(pose), 4):
                 raise ValueError(
                     f"{path}: {video.id} has pose {pose.shape}, joints3d {joint.shape}, orig_cam {camera.shape}, not "
                     "(F, 72), (F, 49, 3), (F, 4)"
                 )
-            split, length = self.split(video.subject), min(len(pose), int(frames[video.index]))
+            split, length = self.split(video.subject), min(len(pose), limit)
             if length < (1 if split == "test" else self.min_frames):
                 self._excluded[f"{'test' if split == 'test' else 'training'} clips that are too short"] += 1
                 continue
@@ -188,7 +193,7 @@ def front_view(pose: np.ndarray, root: np.ndarray, camera: np.ndarray, video: Vi
 
 def _lines(path: Path) -> list[str]:
     try:
-        return path.read_text(encoding="utf-8").splitlines()
+        return read_text(path).splitlines()
     except FileNotFoundError:
         raise FileNotFoundError(
             f"{path}: it belongs to the set as ACTOR publishes it; unpack the archive again"

@@ -15,6 +15,7 @@ from tqdm import tqdm
 from flame_mdm.data import Split
 from flame_mdm.data.datamodule import MotionDataModule
 from flame_mdm.data.store import Entry, Store
+from flame_mdm.files import write_text
 from flame_mdm.representations import Representation
 
 SPLITS: tuple[Split, ...] = get_args(Split)
@@ -73,10 +74,7 @@ def report(data: MotionDataModule) -> dict[str, Any]:
         "statistics": _deviation(store, data.representation),
         "excluded": store.info["excluded"],
     }
-    path = store.folder / "verify.json"
-    partial = path.with_suffix(".partial")
-    partial.write_text(json.dumps(found, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
-    partial.replace(path)
+    write_text(store.folder / "verify.json", json.dumps(found, indent=2, ensure_ascii=False) + "\n")
     return found
 
 

@@ -12,11 +12,11 @@ from typing import Any
 
 import numpy as np
 
+from flame_mdm.files import atomic_write
 from flame_mdm.formats.poses import Poses
 from flame_mdm.representations.skeleton import SMPL22
-from flame_mdm.visualize import Motion
 from flame_mdm.visualize.render import SIDE_COLORS
-from flame_mdm.visualize.scene import written_whole
+from flame_mdm.visualize.scene import radii, sides
 
 UNSIGNED_BYTE, UNSIGNED_SHORT, FLOAT = 5121, 5123, 5126
 VERTICES, INDICES = 34962, 34963
@@ -25,15 +25,15 @@ SIDES = 10
 """Corners of the section of a limb."""
 
 
-def write(path: Path, poses: Poses, motion: Motion) -> None:
+def write(path: Path, poses: Poses, fps: float, text: str, name: str) -> None:
     """Writes metres, y up; the rest pose faces +z, as the format asks for.
 
-    One node a joint, named as in SMPL, with one animation that turns all of them and moves the root, at the frames'
+    One node per joint, named as in SMPL, with one animation that turns all of them and moves the root, at the frames'
     own times in seconds; one mesh of rounded limbs, skinned to the joints.
     """
     binary = _Binary()
     rest = poses.rest().numpy()
-    position, normal, color, joint, index = _figure(rest, motion)
+    position, normal, color, joint, index = _figure(rest)
     weight = np.tile(np.array([1, 0, 0, 0], np.float32), (len(joint), 1))
     bind = np.tile(np.eye(4, dtype=np.float32), (len(rest), 1, 1))
     bind[:, 3, :3] = -rest  # matrices stand in the file column by column
@@ -46,7 +46,7 @@ def write(path: Path, poses: Poses, motion: Motion) -> None:
     }
     indices = binary.add(index, INDICES)
     matrices = binary.add(bind.reshape(-1, 16))
-    times = binary.add(np.arange(len(poses.root), dtype=np.float32) / np.float32(motion.fps), bounds=True)
+    times = binary.add(np.arange(len(poses.root), dtype=np.float32) / np.float32(fps), bounds=True)
     turns = poses.quaternions()[..., [1, 2, 3, 0]].float().numpy()
     curves = [("rotation", node, turns[:, node]) for node in range(len(rest))]
     curves.append(("translation", 0, poses.root.float().numpy()))
@@ -61,7 +61,7 @@ def write(path: Path, poses: Poses, motion: Motion) -> None:
         "asset": {
             "version": "2.0",
             "generator": "flame_mdm",
-            "extras": {"fps": motion.fps, "text": motion.caption, "unit": "metre", "up": "y"},
+            "extras": {"fps": fps, "text": text, "unit": "metre", "up": "y"},
         },
         "scene": 0,
         "scenes": [{"nodes": [0, len(rest)]}],
@@ -71,7 +71,7 @@ def write(path: Path, poses: Poses, motion: Motion) -> None:
         "skins": [{"joints": list(range(len(rest))), "skeleton": 0, "inverseBindMatrices": matrices}],
         "animations": [
             {
-                "name": motion.caption or motion.id or "motion",
+                "name": text or name or "motion",
                 "samplers": [{"input": times, "output": binary.add(values)} for _, _, values in curves],
                 "channels": [
                     {"sampler": sampler, "target": {"node": node, "path": kind}}
@@ -83,11 +83,11 @@ def write(path: Path, poses: Poses, motion: Motion) -> None:
         "bufferViews": binary.views,
         "buffers": [{"byteLength": len(binary.data)}],
     }
-    text = json.dumps(document, separators=(",", ":")).encode()
-    text += b" " * (-len(text) % 4)
-    chunks = struct.pack("<I4s", len(text), b"JSON") + text
+    head = json.dumps(document, separators=(",", ":")).encode()
+    head += b" " * (-len(head) % 4)
+    chunks = struct.pack("<I4s", len(head), b"JSON") + head
     chunks += struct.pack("<I4s", len(binary.data), b"BIN\0") + bytes(binary.data)
-    with written_whole(path) as temporary:
+    with atomic_write(path) as temporary:
         temporary.write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks)
 
 
@@ -115,15 +115,15 @@ class _Binary:
         return len(self.accessors) - 1
 
 
-def _figure(rest: np.ndarray, motion: Motion) -> tuple[np.ndarray, ...]:
+def _figure(rest: np.ndarray) -> tuple[np.ndarray, ...]:
     """Limbs of the rest pose: positions, normals, linear colors, the joint (N, 4) each vertex moves with, triangles."""
-    radii, sides, parents = motion.radii, motion.sides, SMPL22.parents
+    thickness, side_of, parents = radii(SMPL22), sides(SMPL22), SMPL22.parents
     limbs = []
     for joint, parent in enumerate(parents):
         if parent >= 0:
-            side = sides[joint] if sides[joint] == sides[parent] else 0
-            thick = min(radii[parent], 1.35 * radii[joint])
-            limbs.append((parent, side, *_limb(rest[parent], rest[joint], thick, radii[joint])))
+            side = side_of[joint] if side_of[joint] == side_of[parent] else 0
+            thick = min(thickness[parent], 1.35 * thickness[joint])
+            limbs.append((parent, side, *_limb(rest[parent], rest[joint], thick, thickness[joint])))
             if SMPL22.joints[joint] == "head":
                 up = rest[joint] - rest[parent]
                 up /= np.linalg.norm(up)

@@ -11,6 +11,10 @@ Auxiliary = Callable[[Tensor, Tensor, Tensor], dict[str, Tensor]]
 """(x0_hat (B, F, D), x (B, F, D), mask (B, F)) -> weighted per-sample losses (B,) on the clean estimate, by name."""
 
 
+MOST_STEPS = 100_000
+"""Most steps of a diffusion, or of a sampler."""
+
+
 class Process(nn.Module, ABC):
     """A path between noise and data. Only the process interprets t; the denoiser merely embeds it."""
 

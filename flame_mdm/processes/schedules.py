@@ -6,6 +6,8 @@ from typing import Literal, get_args
 import torch
 from torch import Tensor
 
+from flame_mdm.processes import MOST_STEPS
+
 ScheduleName = Literal["cosine", "linear"]
 Spacing = Literal["linspace", "stride"]
 
@@ -95,8 +97,8 @@ def build_schedule(name: ScheduleName, num_train_timesteps: int) -> Schedule:
     """
     if name not in get_args(ScheduleName):
         raise ValueError(f"unknown schedule '{name}': choose from {', '.join(get_args(ScheduleName))}")
-    if num_train_timesteps < 2:
-        raise ValueError(f"num_train_timesteps is {num_train_timesteps}: a diffusion has at least 2 steps")
+    if not 2 <= num_train_timesteps <= MOST_STEPS:
+        raise ValueError(f"num_train_timesteps is {num_train_timesteps}: a diffusion has 2 to {MOST_STEPS:,} steps")
     return Schedule({"cosine": cosine_betas, "linear": linear_betas}[name](num_train_timesteps))
 
 

@@ -19,6 +19,8 @@ class Representation(nn.Module, ABC):
     def __init__(self, name: str, features: int, fps: float, skeleton: Skeleton):
         """`name` stands in the store and in checkpoints: features of different names are never mixed."""
         super().__init__()
+        if not isinstance(fps, int | float) or not 1 <= fps <= 1000:
+            raise ValueError(f"representation.fps={fps}: frames per second have to be a number from 1 to 1000")
         self.name, self.features, self.fps, self.skeleton = name, features, fps, skeleton
         self.register_buffer("mean", torch.zeros(features))
         self.register_buffer("std", torch.ones(features))

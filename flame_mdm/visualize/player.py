@@ -6,28 +6,35 @@ import json
 import re
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from flame_mdm.visualize.scene import Motion, check_any, written_whole
+from flame_mdm.files import write_text
+from flame_mdm.visualize.scene import Shown, check_any, head, radii, shortened, sides
 
 MILLIMETRE = 0.001
 
 
-def write_player(path: str | Path, motions: Sequence[Motion], title: str = "Motions", about: str = "") -> None:
-    """Writes the page of `player_page` to a file.
+def write_player(path: str | Path, motions: Sequence[Shown], title: str = "Motions", **options: Any) -> None:
+    """Writes the page of `player_page`, which has the same arguments, to a file.
 
     Raises:
         ValueError: there are no motions.
     """
     path = Path(path)
     check_any(motions, path)
-    page = player_page(motions, title, about)
-    with written_whole(path) as temporary:
-        temporary.write_text(page, encoding="utf-8")
+    write_text(path, player_page(motions, title, **options))
 
 
-def player_page(motions: Sequence[Motion], title: str = "Motions", about: str = "", columns: int = 0) -> str:
+def player_page(
+    motions: Sequence[Shown],
+    title: str = "Motions",
+    about: str = "",
+    columns: int = 0,
+    groups: Sequence[str] = (),
+    beside: Sequence[str] = (),
+) -> str:
     """A self-contained HTML page that plays motions side by side in 3D, under one clock and one camera.
 
     Positions are rounded to millimetres; a motion that spans more than 65 m is rounded to 1/65534 of its span.
@@ -36,34 +43,39 @@ def player_page(motions: Sequence[Motion], title: str = "Motions", about: str = 
         motions: what to show; skeletons, lengths and frame rates may differ.
         title: heading of the page.
         about: HTML that the page unfolds below the heading; its texts have to be escaped.
-        columns: motions in a row; 0 = as the window has room.
+        columns: motions per row; 0 = as many as fit into the window.
+        groups: for each motion what the page can be narrowed down to, such as its split; "" = nothing.
+        beside: for each motion the id of an earlier one that it is shown next to, such as the original of a mirrored
+            copy; "" = none.
     """
+    blank = [""] * len(motions)
+    packed = [_packed(*each) for each in zip(motions, groups or blank, beside or blank, strict=True)]
     # "<" never stands in the data, so no caption can close the script element
     content = {
-        "TITLE": html.escape(title),
+        "TITLE": html.escape(shortened(title)),
         "ABOUT": about and f"<details><summary>About these motions</summary><div>{about}</div></details>",
         "COLUMNS": str(columns),
-        "DATA": json.dumps([_packed(motion) for motion in motions], separators=(",", ":")).replace("<", "\\u003c"),
+        "DATA": json.dumps(packed, separators=(",", ":")).replace("<", "\\u003c"),
     }
     template = Path(__file__).with_suffix(".html").read_text(encoding="utf-8")
     return re.sub("__(TITLE|ABOUT|COLUMNS|DATA)__", lambda match: content[match[1]], template)
 
 
-def _packed(motion: Motion) -> dict:
+def _packed(motion: Shown, group: str, beside: str) -> dict[str, Any]:
     low, high = motion.joints.min((0, 1)).astype(float), motion.joints.max((0, 1)).astype(float)
     center = (low + high) / 2
     step = max(MILLIMETRE, float((high - low).max()) / 65534)
     return {
         "id": motion.id,
-        "caption": motion.caption,
-        "group": motion.group,
-        "beside": motion.beside,
+        "caption": shortened(motion.text),
+        "group": group,
+        "beside": beside,
         "fps": motion.fps,
         "frames": len(motion.joints),
         "parents": list(motion.skeleton.parents),
-        "sides": motion.sides,
-        "radii": motion.radii,
-        "head": motion.head,
+        "sides": sides(motion.skeleton),
+        "radii": radii(motion.skeleton),
+        "head": head(motion.skeleton),
         "center": center.tolist(),
         "step": step,
         "joints": _base64(np.rint((motion.joints - center) / step).astype("<i2")),

@@ -10,7 +10,8 @@ from typing import NamedTuple
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from flame_mdm.visualize.scene import Motion, check_any, written_whole
+from flame_mdm.files import atomic_write
+from flame_mdm.visualize.scene import Shown, check_any, frame_at, head, radii, shortened, sides
 
 Color = tuple[int, int, int]
 SIDE_COLORS: dict[int, Color] = {1: (47, 127, 209), -1: (226, 112, 42), 0: (140, 149, 163)}
@@ -23,18 +24,18 @@ SMOOTH = 2
 """Images are drawn this many times larger and then reduced."""
 
 
-def frames_array(motion: Motion, size: int = 256) -> np.ndarray:
+def frames_array(motion: Shown, size: int = 256) -> np.ndarray:
     """Draws each frame of a motion: (F, size, size, 3) uint8, for the video panels of loggers."""
     return np.stack([np.asarray(_figure(motion, frame, size)) for frame in range(len(motion.joints))])
 
 
-def write_gif(path: str | Path, motions: Sequence[Motion], size: int = 256) -> None:
+def write_gif(path: str | Path, motions: Sequence[Shown], size: int = 256) -> None:
     """Writes an animation of motions side by side, captions below; it plays at their frame rate and loops.
 
     Args:
         path: the GIF to write.
         motions: drawn under one clock, that of the highest frame rate; a motion that ends earlier stays at its last
-            frame. The format shows at most 50 frames a second: of faster motions frames are left out.
+            frame. The format shows at most 50 frames per second: of faster motions frames are left out.
         size: width and height of a panel in pixels.
 
     Raises:
@@ -48,7 +49,7 @@ def write_gif(path: str | Path, motions: Sequence[Motion], size: int = 256) -> N
     images = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in _video(motions, fps, size)]
     # GIF counts in hundredths of a second: round the times, not the durations, so that errors do not add up
     times = np.rint(100 * np.arange(len(images) + 1) / fps).astype(int)
-    with written_whole(path) as temporary:
+    with atomic_write(path) as temporary:
         images[0].save(
             temporary,
             format="GIF",
@@ -59,7 +60,7 @@ def write_gif(path: str | Path, motions: Sequence[Motion], size: int = 256) -> N
         )
 
 
-def write_mp4(path: str | Path, motions: Sequence[Motion], size: int = 384) -> None:
+def write_mp4(path: str | Path, motions: Sequence[Shown], size: int = 384) -> None:
     """Writes the animation of `write_gif` as H.264 video, by the program ffmpeg.
 
     Raises:
@@ -75,7 +76,7 @@ def write_mp4(path: str | Path, motions: Sequence[Motion], size: int = 384) -> N
     fps = max(motion.fps for motion in motions)
     video = [np.asarray(image) for image in _video(motions, fps, size)]
     height, width = (length // 2 * 2 for length in video[0].shape[:2])  # H.264 codes even sizes only
-    with written_whole(path) as temporary:
+    with atomic_write(path) as temporary:
         command = [ffmpeg, "-loglevel", "error", "-y", "-f", "rawvideo", "-pix_fmt", "rgb24"]
         command += ["-s", f"{width}x{height}", "-r", str(fps), "-i", "-", "-c:v", "libx264", "-pix_fmt", "yuv420p"]
         command += ["-threads", "1", "-fflags", "+bitexact", "-movflags", "+faststart", "-f", "mp4", str(temporary)]
@@ -85,7 +86,7 @@ def write_mp4(path: str | Path, motions: Sequence[Motion], size: int = 384) -> N
             raise RuntimeError(f"{path}: ffmpeg failed: {run.stderr.decode(errors='replace').strip()}")
 
 
-def contact_sheet(path: str | Path, motions: Sequence[Motion], frames: int = 6, size: int = 192) -> None:
+def contact_sheet(path: str | Path, motions: Sequence[Shown], frames: int = 6, size: int = 192) -> None:
     """Writes one PNG with a row for each motion: its poses at equally spaced times from first to last, and its caption.
 
     Args:
@@ -108,13 +109,13 @@ def contact_sheet(path: str | Path, motions: Sequence[Motion], frames: int = 6, 
         for k, frame in enumerate(np.rint(np.linspace(0, len(motion.joints) - 1, frames)).astype(int).tolist()):
             row.paste(_figure(motion, frame, size), (k * size, 0))
             pen.text((k * size + 8, 6), f"{frame / motion.fps:.2f} s", FAINT, _font(size))
-        rows.append(_captioned(row, motion, _caption_lines([motion], row.width, size), size))
+        rows.append(_below(row, _caption(motion, row.width, _caption_lines([motion], row.width, size), size)))
     sheet = Image.new("RGB", (frames * size, sum(row.height for row in rows)), PAPER)
     top = 0
     for row in rows:
         sheet.paste(row, (0, top))
         top += row.height
-    with written_whole(path) as temporary:
+    with atomic_write(path) as temporary:
         sheet.save(temporary, format="PNG", optimize=True)
 
 
@@ -129,19 +130,20 @@ def _palette() -> Image.Image:
     return image
 
 
-def _video(motions: Sequence[Motion], fps: float, size: int) -> Iterator[Image.Image]:
+def _video(motions: Sequence[Shown], fps: float, size: int) -> Iterator[Image.Image]:
     """Images of the panels side by side, one every 1 / fps seconds, with a bar that shows the time."""
-    seconds = max(motion.seconds for motion in motions)
+    seconds = max(len(motion.joints) / motion.fps for motion in motions)
     columns = len(motions) if len(motions) < 4 else min(4, math.ceil(math.sqrt(len(motions))))
     lines = _caption_lines(motions, size, size)
+    captions = [_caption(motion, size, lines, size) for motion in motions]
     frames = [-1] * len(motions)
     panels = [Image.new("RGB", (0, 0))] * len(motions)
     count = max(1, math.ceil(seconds * fps - 1e-6))
     for tick in range(count):
         for k, motion in enumerate(motions):
-            if motion.frame_at(tick / fps) != frames[k]:
-                frames[k] = motion.frame_at(tick / fps)
-                panels[k] = _captioned(_figure(motion, frames[k], size), motion, lines, size)
+            if frame_at(motion, tick / fps) != frames[k]:
+                frames[k] = frame_at(motion, tick / fps)
+                panels[k] = _below(_figure(motion, frames[k], size), captions[k])
         height = panels[0].height
         image = Image.new("RGB", (columns * size, math.ceil(len(motions) / columns) * height + 3), PAPER)
         for k, panel in enumerate(panels):
@@ -151,7 +153,7 @@ def _video(motions: Sequence[Motion], fps: float, size: int) -> Iterator[Image.I
         yield image
 
 
-def _figure(motion: Motion, frame: int, size: int) -> Image.Image:
+def _figure(motion: Shown, frame: int, size: int) -> Image.Image:
     """One pose on the ground, (size, size) pixels; the camera follows the root smoothed over a second."""
     side = size * SMOOTH
     image = Image.new("RGB", (side, side), PAPER)
@@ -226,18 +228,19 @@ class Limb(NamedTuple):
         return float(self.a[3] + self.b[3]) / 2
 
 
-def _body(motion: Motion, joints: np.ndarray, project: Callable[[np.ndarray], np.ndarray]) -> list[Limb]:
-    at, radii, sides, parents = project(joints), motion.radii, motion.sides, motion.skeleton.parents
+def _body(motion: Shown, joints: np.ndarray, project: Callable[[np.ndarray], np.ndarray]) -> list[Limb]:
+    at, skeleton, parents = project(joints), motion.skeleton, motion.skeleton.parents
+    thickness, side_of, top = radii(skeleton), sides(skeleton), head(skeleton)
     limbs = []
     for joint, parent in enumerate(parents):
         if parent >= 0:
-            color = SIDE_COLORS[sides[joint] if sides[parent] == sides[joint] else 0]
-            thick = min(radii[parent], 1.35 * radii[joint])
-            limbs.append(Limb(at[parent], at[joint], thick, radii[joint], color))
-    if motion.head is not None:
-        up = joints[motion.head] - joints[parents[motion.head]]
+            color = SIDE_COLORS[side_of[joint] if side_of[parent] == side_of[joint] else 0]
+            thick = min(thickness[parent], 1.35 * thickness[joint])
+            limbs.append(Limb(at[parent], at[joint], thick, thickness[joint], color))
+    if top is not None:
+        up = joints[top] - joints[parents[top]]
         up /= np.linalg.norm(up) or 1
-        chin, crown = project(joints[motion.head] + np.array([[0.05], [0.11]]) * up)
+        chin, crown = project(joints[top] + np.array([[0.05], [0.11]]) * up)
         limbs.append(Limb(chin, crown, 0.08, 0.09, SIDE_COLORS[0]))
     return limbs
 
@@ -285,7 +288,7 @@ def _font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
 def _wrapped(text: str, width: int, size: int) -> list[str]:
     """Breaks a caption between words so that each line fits; the third line ends in dots where more is left."""
     lines, font = [""], _font(size)
-    for word in text.split():
+    for word in shortened(text, width).split():  # more does not fit into three lines
         longer = f"{lines[-1]} {word}".strip()
         if font.getlength(longer) <= width - 16:
             lines[-1] = longer
@@ -295,16 +298,23 @@ def _wrapped(text: str, width: int, size: int) -> list[str]:
     return [*lines[:2], f"{lines[2]} …"] if len(lines) > 3 else lines
 
 
-def _caption_lines(motions: Sequence[Motion], width: int, size: int) -> int:
-    return max(len(_wrapped(motion.caption or motion.id, width, size)) for motion in motions)
+def _caption_lines(motions: Sequence[Shown], width: int, size: int) -> int:
+    return max(len(_wrapped(motion.text or motion.id, width, size)) for motion in motions)
 
 
-def _captioned(image: Image.Image, motion: Motion, lines: int, size: int) -> Image.Image:
-    """The image with `lines` lines of caption below."""
+def _caption(motion: Shown, width: int, lines: int, size: int) -> Image.Image:
+    """The caption of a motion on paper, with room for `lines` lines; drawn once for all frames."""
     line = round(max(10, size // 18) * 1.35)
-    taller = Image.new("RGB", (image.width, image.height + lines * line + 10), PAPER)
+    image = Image.new("RGB", (width, lines * line + 10), PAPER)
+    pen = ImageDraw.Draw(image)
+    for k, text in enumerate(_wrapped(motion.text or motion.id, width, size)):
+        pen.text((8, 4 + k * line), text, TEXT, _font(size))
+    return image
+
+
+def _below(image: Image.Image, caption: Image.Image) -> Image.Image:
+    """The image with its caption below."""
+    taller = Image.new("RGB", (image.width, image.height + caption.height), PAPER)
     taller.paste(image)
-    pen = ImageDraw.Draw(taller)
-    for k, text in enumerate(_wrapped(motion.caption or motion.id, image.width, size)):
-        pen.text((8, image.height + 4 + k * line), text, TEXT, _font(size))
+    taller.paste(caption, (0, image.height))
     return taller

@@ -1,0 +1,87 @@
+"""Evaluation during training."""
+
+from __future__ import annotations
+
+from lightning import Callback, LightningModule, Trainer
+
+from evaluators.run import open_protocol
+from flame_mdm.data.datamodule import MotionDataModule
+from flame_mdm.task import MotionGeneration
+from flame_mdm.training.loggers import log_table
+
+
+class Evaluate(Callback):
+    """Evaluates by a protocol on the validation split: val/<protocol>/<metric> on the dashboard, to select by, too.
+
+    With several replications, val/<protocol>/<metric>/ci is half the width of the 95 % interval. A table shows all.
+
+    It runs at the first validation and then every so often, with averaged weights where the recipe averages them. All
+    processes take their share of the motions.
+
+    Args:
+        protocol: a name of experiments/evaluation, or the path of a file.
+        extractor: what the protocol's extractor is loaded from; "none" leaves metrics of features without values.
+        every_n_steps: how often, at validation.
+        samples: motions; None = as the protocol has it.
+        replications: how often they are drawn.
+        batch_size: motions at once.
+    """
+
+    def __init__(
+        self,
+        protocol: str,
+        extractor: str | None,
+        every_n_steps: int,
+        samples: int | None = 256,
+        replications: int = 1,
+        batch_size: int = 64,
+    ):
+        self.name, self.path, self.every_n_steps = protocol, extractor, every_n_steps
+        self.samples, self.replications, self.batch_size = samples, replications, batch_size
+        self.next = 0
+        self.values: dict[str, float] = {}
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        assert isinstance(pl_module, MotionGeneration)
+        data: MotionDataModule = trainer.datamodule  # type: ignore[attr-defined]
+        self.clips = data.clips("val")
+        size = {"replications": self.replications, "samples": self.samples, "quick": False, "multimodality": False}
+        self.protocol, _ = open_protocol(self.name, self.clips, pl_module.representation, pl_module, **size)
+        dataset = data.store.info["dataset"]
+        self.extractor = self.protocol.open_extractor(self.path, pl_module.representation, dataset)
+        self.next = trainer.global_step
+
+    def on_validation_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        if trainer.global_step < self.next or not hasattr(self, "protocol"):
+            return
+        assert isinstance(pl_module, MotionGeneration)
+        self.next = trainer.global_step + self.every_n_steps
+        source = self.protocol.generator(
+            pl_module, None, {"seed": 0}, clips=self.clips, batch_size=self.batch_size, progress=False
+        )
+        result = self.protocol.evaluate(
+            source,
+            self.clips,
+            self.extractor,
+            pl_module.representation,
+            batch_size=self.batch_size,
+            rank=trainer.global_rank,
+            world=trainer.world_size,
+            ground_truth=False,
+        )
+        name = f"val/{self.protocol.name}"
+        known = {f"{name}/{k}": value for k, value in result["values"].items() if value["mean"] is not None}
+        self.values = {k: value["mean"] for k, value in known.items()}
+        if self.replications > 1:
+            self.values |= {f"{k}/ci": value["ci"] for k, value in known.items()}
+        if trainer.is_global_zero:
+            columns = ("mean", "ci", "replications", "n")
+            rows = [[metric, *(value[column] for column in columns)] for metric, value in result["values"].items()]
+            for logger in trainer.loggers:
+                log_table(
+                    logger, f"evaluation/{self.protocol.name}", ["metric", *columns], rows, trainer.global_step - 1
+                )
+
+    def on_validation_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        pl_module.log_dict(self.values)  # averaged weights are gone by now, so values were taken at the start
+        self.values = {}

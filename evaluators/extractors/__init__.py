@@ -1,0 +1,275 @@
+"""Feature extractors as evaluation uses them: opened from what the user gives, asked for features by one name."""
+
+from __future__ import annotations
+
+import hashlib
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from evaluators.extractors.action_gru import ActionGRU, load_action_gru
+from evaluators.extractors.classifier import ClassifierTask
+from evaluators.extractors.motion_clip import MotionCLIPTask
+from evaluators.extractors.stgcn import load_uestc, load_unconstrained
+from evaluators.extractors.t2m import WordVectors, load_t2m
+from evaluators.extractors.t2m_training import T2MTask
+from flame_mdm.checkpoints.loading import find, load_task
+from flame_mdm.errors import UserError
+from flame_mdm.files import sha256
+from flame_mdm.representations import Representation
+from flame_mdm.seeds import key
+from flame_mdm.task import Task
+
+
+class Extractor(ABC):
+    """A network that turns motions, and texts where it reads them, into features.
+
+    Attributes:
+        sha256: of what it was loaded from; values of extractors that differ in it are not comparable.
+        fingerprint: of the data it was trained on, where that is known.
+    """
+
+    sha256: str
+    fingerprint: str | None = None
+
+    @abstractmethod
+    def check(self, representation: Representation, dataset: str) -> None:
+        """Refuses motions that the network was not made for.
+
+        Raises:
+            UserError: it was made for another representation or data set.
+        """
+
+    @abstractmethod
+    def motions(self, features: Tensor, joints: Tensor, mask: Tensor) -> dict[str, Tensor]:
+        """Features of motions.
+
+        Args:
+            features: (B, F, D) in the data's units.
+            joints: (B, F, J, 3) metres, y up.
+            mask: (B, F), True = real frame.
+
+        Returns:
+            "features" (B, E), and "logits" (B, A) of classifiers.
+        """
+
+    def texts(self, captions: Sequence[str], tokens: Sequence[Sequence[str] | None]) -> Tensor | None:
+        """(B, E) features of captions; None where the network reads no text. `tokens` are "word/PART", if known."""
+        return None
+
+
+class _OwnExtractor(Extractor):
+    """A network that `make train` has made, from its checkpoint."""
+
+    trained: type[Task]
+    recipes: str
+    """Folder of the recipes that make it."""
+
+    def __init__(self, path: str, device: str | torch.device = "cpu"):
+        file = find(path)
+        self.path, self.sha256 = file, sha256(file)
+        self.task = load_task(file, self.trained, device)
+        self.fingerprint = self.task.facts.get("fingerprint")
+
+    def check(self, representation: Representation, dataset: str) -> None:
+        """Representation and data set are those that it was trained on."""
+        own, advice = self.task.representation, f"train one by make train EXP={self.recipes}/..."
+        if (own.name, own.fps, own.features) != (representation.name, representation.fps, representation.features):
+            raise UserError(
+                f"extractor {self.path}: trained on {own.name} at {own.fps:g} frames a second, but the motions are "
+                f"{representation.name} at {representation.fps:g}: {advice}"
+            )
+        if self.task.facts.get("dataset", dataset) != dataset:
+            raise UserError(
+                f"extractor {self.path}: trained on the data set {self.task.facts['dataset']}, but the motions are "
+                f"those of {dataset}: {advice}"
+            )
+
+
+class MotionCLIPExtractor(_OwnExtractor):
+    """A motion-CLIP that `make train EXP=motion_clip/...` has made.
+
+    Raises:
+        FileNotFoundError, UserError: no such checkpoint, or none of a motion-CLIP.
+    """
+
+    trained, recipes = MotionCLIPTask, "motion_clip"
+    task: MotionCLIPTask
+
+    def __init__(self, path: str, device: str | torch.device = "cpu"):
+        super().__init__(path, device)
+        self.known: dict[str, Tensor] = {}
+
+    def motions(self, features: Tensor, joints: Tensor, mask: Tensor) -> dict[str, Tensor]:
+        """Features of motions."""
+        return {"features": self.task(features, mask)}
+
+    def texts(self, captions: Sequence[str], tokens: Sequence[Sequence[str] | None]) -> Tensor:
+        """Features of captions, each encoded once."""
+        new = sorted(set(captions) - self.known.keys())
+        if new:
+            self.known |= dict(zip(new, self.task.text(new), strict=True))
+        return torch.stack([self.known[caption] for caption in captions])
+
+
+class T2MExtractor(Extractor):
+    """The evaluator of Guo et al. 2022 as released, from a folder of five files.
+
+    finest.tar (in text_mot_match/model), mean.npy and std.npy (t2m_mean.npy and t2m_std.npy in MDM, kit_... for KIT),
+    our_vab_data.npy and our_vab_idx.pkl (GloVe).
+
+    Args:
+        path: the folder.
+        device: to compute on.
+        full_length: legacy, see `WordVectors`: captions are said to fill all 22 slots.
+
+    Raises:
+        FileNotFoundError, ValueError: a file is not there or is another one.
+    """
+
+    FILES = ("finest.tar", "mean.npy", "std.npy", "our_vab_data.npy", "our_vab_idx.pkl")
+
+    def __init__(self, path: str, device: str | torch.device = "cpu", *, full_length: bool = False):
+        folder = Path(path)
+        missing = [name for name in self.FILES if not (folder / name).is_file()]
+        if missing:
+            raise FileNotFoundError(f"{folder}: not a folder of the T2M evaluator, it lacks {', '.join(missing)}")
+        hashes = "".join(sha256(folder / name) for name in self.FILES)
+        self.path, self.sha256 = folder, hashlib.sha256(hashes.encode()).hexdigest()
+        self.network = load_t2m(*(folder / name for name in self.FILES[:3])).to(device)
+        self.words, self.full_length = WordVectors(folder), full_length
+
+    def check(self, representation: Representation, dataset: str) -> None:
+        """Only the features as published, of the data set of that width."""
+        made_for = {263: ("humanml-legacy-smpl22", "humanml3d"), 251: ("humanml-legacy-kit21", "kit")}
+        wanted = made_for.get(len(self.network.mean), ("unknown features", "an unknown data set"))
+        if (representation.name, dataset) != wanted:
+            raise UserError(
+                f"extractor {self.path}: made for {wanted[0]} of {wanted[1]}, but the motions are "
+                f"{representation.name} of {dataset}"
+            )
+
+    def motions(self, features: Tensor, joints: Tensor, mask: Tensor) -> dict[str, Tensor]:
+        """Features of motions."""
+        return {"features": self.network(features, mask)}
+
+    def texts(self, captions: Sequence[str], tokens: Sequence[Sequence[str] | None]) -> Tensor:
+        """Features of captions.
+
+        Raises:
+            UserError: a caption comes without its tokens.
+        """
+        return self.network.text(self.words(_tagged(self.path, tokens), full_length=self.full_length))
+
+
+class OwnT2MExtractor(_OwnExtractor):
+    """An evaluator of Guo et al. 2022 that `make train EXP=t2m/...` has made.
+
+    Raises:
+        FileNotFoundError, UserError: no such checkpoint, or none of this evaluator.
+    """
+
+    trained, recipes = T2MTask, "t2m"
+    task: T2MTask
+
+    def motions(self, features: Tensor, joints: Tensor, mask: Tensor) -> dict[str, Tensor]:
+        """Features of motions."""
+        return {"features": self.task(features, mask)}
+
+    def texts(self, captions: Sequence[str], tokens: Sequence[Sequence[str] | None]) -> Tensor:
+        """Features of captions.
+
+        Raises:
+            UserError: a caption comes without its tokens.
+        """
+        return self.task.text(_tagged(self.path, tokens))
+
+
+def _tagged(path: Path, tokens: Sequence[Sequence[str] | None]) -> list[Sequence[str]]:
+    """The tokens of captions, refused where one has none."""
+    known = [words for words in tokens if words is not None]
+    if len(known) < len(tokens):
+        raise UserError(f"extractor {path}: reads tagged words, which the data set lacks for its captions")
+    return known
+
+
+CLASSIFIERS = {
+    "humanact12": (load_action_gru, "humanact12", "joints"),
+    "humanact12_unconstrained": (load_unconstrained, "humanact12", "joints"),
+    "uestc": (load_uestc, "uestc", "features"),
+}
+"""What loads the released weights, the data set they belong to, and what they read."""
+
+
+class ClassifierExtractor(Extractor):
+    """A released action classifier, one of `CLASSIFIERS`.
+
+    Args:
+        kind: which one.
+        path: the file.
+        device: to compute on.
+        random_start: legacy of Guo et al. 2020 and all who follow: the recurrence of humanact12 starts from a normal
+            draw, another one for features than for scores. Here it is drawn from the motion, so that it is the same in
+            any batch.
+
+    Raises:
+        FileNotFoundError, UserError, ValueError: no such file, or of other weights; or no recurrence to start.
+    """
+
+    def __init__(self, kind: str, path: str, device: str | torch.device = "cpu", *, random_start: bool = False):
+        read, self.dataset, self.reads = CLASSIFIERS[kind]
+        try:
+            self.network = read(path).to(device)
+        except ValueError as error:
+            raise UserError(
+                f"{error}; protocol=action_to_motion_own takes classifiers of make train EXP=classifier/..."
+            ) from error
+        self.path, self.sha256, self.random_start = path, sha256(path), random_start
+        if random_start and not isinstance(self.network, ActionGRU):
+            raise ValueError(f"random_start: the classifier {kind} has no recurrence to start")
+
+    def check(self, representation: Representation, dataset: str) -> None:
+        """Rotations and joints of 24 SMPL joints, of the data set it was trained on."""
+        if representation.name != "rot6d-25" or dataset != self.dataset:
+            raise UserError(
+                f"extractor {self.path}: made for {self.dataset} as rot6d-25, but the motions are "
+                f"{representation.name} of {dataset}"
+            )
+
+    def motions(self, features: Tensor, joints: Tensor, mask: Tensor) -> dict[str, Tensor]:
+        """Features and class scores of motions."""
+        x = joints if self.reads == "joints" else features
+        if not self.random_start:
+            return {"features": self.network(x, mask), "logits": self.network.logits(x, mask)}
+        assert isinstance(self.network, ActionGRU)
+        names = [
+            hashlib.sha256(motion[real].cpu().numpy().tobytes()).hexdigest()
+            for motion, real in zip(x, mask, strict=True)
+        ]
+        start = {use: torch.cat([self._start(use, name) for name in names], 1) for use in ("features", "logits")}
+        return {
+            "features": self.network(x, mask, start["features"]),
+            "logits": self.network.logits(x, mask, start["logits"]),
+        }
+
+    def _start(self, use: str, name: str) -> Tensor:
+        assert isinstance(self.network, ActionGRU)
+        return self.network.random_state(1, torch.Generator().manual_seed(key(use, name)))
+
+
+class OwnClassifierExtractor(_OwnExtractor):
+    """An action classifier that `make train EXP=classifier/...` has made.
+
+    Raises:
+        FileNotFoundError, UserError: no such checkpoint, or none of a classifier.
+    """
+
+    trained, recipes = ClassifierTask, "classifier"
+    task: ClassifierTask
+
+    def motions(self, features: Tensor, joints: Tensor, mask: Tensor) -> dict[str, Tensor]:
+        """Features and class scores of motions."""
+        return {"features": self.task(joints, mask), "logits": self.task.logits(joints, mask)}

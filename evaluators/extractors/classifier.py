@@ -1,0 +1,140 @@
+"""Action classifiers to train, for sets without a released one; action-to-motion is measured by their features."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Self
+
+import torch
+import torch.distributed
+import torch.nn.functional as F
+from torch import Tensor
+from torchmetrics import MeanMetric
+
+from evaluators.extractors.action_gru import ActionGRU
+from evaluators.extractors.stgcn import JointSTGCN
+from evaluators.metrics.accuracy import ActionAccuracy
+from flame_mdm.conditions import Unconditional
+from flame_mdm.config import Config, instantiate, parameters
+from flame_mdm.data.datamodule import MotionDataModule
+from flame_mdm.errors import UserError
+from flame_mdm.motion import MotionBatch
+from flame_mdm.representations import Representation
+from flame_mdm.seeds import key
+from flame_mdm.task import Task
+
+
+class ClassifierTask(Task):
+    """Trains an action classifier by `make train EXP=classifier/...`, and is the extractor that comes out of it.
+
+    It reads joint positions, whatever the representation.
+
+    Args:
+        network: the classifier.
+        representation: of the motions; an extractor of one representation measures no other.
+        optimizer: a mapping with the `_target_` of a torch optimizer and its arguments.
+        seed: with the step and the rank, decides the draws of a training step.
+    """
+
+    def __init__(
+        self,
+        network: ActionGRU | JointSTGCN,
+        representation: Representation,
+        *,
+        optimizer: Config,
+        seed: int = 0,
+    ):
+        super().__init__(Unconditional(), representation, optimizer=optimizer, seed=seed)
+        self.network = network
+        self.val_loss, self.accuracy = MeanMetric(), ActionAccuracy()
+
+    @classmethod
+    def build(cls, config: Config, representation: Representation, *, actions: Sequence[str] = ()) -> Self:
+        """Builds the network of a recipe for the skeleton and the actions of the data.
+
+        Raises:
+            UserError: fewer than two actions.
+        """
+        if len(actions) < 2:
+            raise UserError(f"a classifier needs a data set of two actions or more; this one has {len(actions)}")
+        parents = representation.skeleton.parents
+        sizes = {"num_joints": len(parents), "parents": parents, "num_actions": len(actions)}
+        settings = config["task"]["network"]
+        legal = parameters(settings["_target_"])
+        network = instantiate(settings, **{name: value for name, value in sizes.items() if name in legal})
+        task = cls(network, representation, optimizer=config["optimizer"], seed=config["seed"])
+        task.config, task.facts = config, {"actions": list(actions)}
+        return task
+
+    def describe(self) -> str:
+        return type(self.network).__name__
+
+    def setup(self, stage: str) -> None:
+        """As all tasks.
+
+        Raises:
+            UserError: a clip to train or validate on has no label.
+        """
+        super().setup(stage)
+        data: MotionDataModule = self.trainer.datamodule  # type: ignore[attr-defined]
+        bare = [clip.id for clip in (*data.train.clips, *data.val.clips) if clip.action is None]
+        if bare:
+            raise UserError(
+                f"{data.folder}: {len(bare)} clips have no action label, such as {bare[0]}; a classifier learns from "
+                "labeled clips: prepare the data without the others"
+            )
+
+    # Feature extraction -----------------------------------------------------------------------------------------------
+
+    def forward(self, joints: Tensor, mask: Tensor) -> Tensor:
+        """(B, E) features of motions (B, F, J, 3), metres, y up, with mask (B, F)."""
+        return self.network(joints, mask)
+
+    def logits(self, joints: Tensor, mask: Tensor) -> Tensor:
+        """(B, actions) unnormalized log-probabilities; arguments as of `forward`."""
+        return self.network.logits(joints, mask)
+
+    # Training ---------------------------------------------------------------------------------------------------------
+
+    def training_step(self, batch: MotionBatch, batch_idx: int) -> Tensor:
+        """Cross-entropy of one batch, in nats."""
+        torch.manual_seed(key("step", self.seed, batch_idx, self.global_rank))
+        logits, labels = self._classified(batch)
+        loss = F.cross_entropy(logits, labels)
+        accuracy = (logits.argmax(1) == labels).float().mean()
+        self.log_dict({"train/loss": loss, "train/accuracy": accuracy}, batch_size=len(batch))
+        return loss
+
+    def _classified(self, batch: MotionBatch) -> tuple[Tensor, Tensor]:
+        """Scores and labels of a batch."""
+        assert batch.action is not None
+        joints = self.representation.to_joints(batch.x)
+        past_end = ~batch.mask[..., None, None]  # where features of 0 need not be a pose
+        return self.logits(joints.masked_fill(past_end, 0), batch.mask), batch.action
+
+    def on_validation_epoch_start(self) -> None:
+        """Gives all processes the running statistics of the first, those that checkpoints hold.
+
+        Each has those of its own batches.
+        """
+        if torch.distributed.is_initialized() and torch.distributed.get_world_size() > 1:
+            for buffer in self.network.buffers():
+                torch.distributed.broadcast(buffer, 0)
+
+    def validation_step(self, batch: MotionBatch, batch_idx: int) -> None:
+        """Adds the clips of a batch to what is measured.
+
+        Where there are fewer clips than processes, each process has all of them, which changes neither mean nor share.
+        """
+        logits, labels = self._classified(batch)
+        self.val_loss.update(F.cross_entropy(logits, labels, reduction="none"))
+        self.accuracy.update(logits, labels)
+
+    def on_validation_epoch_end(self) -> None:
+        """Logs the mean cross-entropy and the accuracy over all clips, over all processes."""
+        self.log("val/loss", self.val_loss.compute(), prog_bar=True)
+        accuracy = self.accuracy.compute()
+        assert accuracy is not None
+        self.log("val/accuracy", accuracy)
+        self.val_loss.reset()
+        self.accuracy.reset()

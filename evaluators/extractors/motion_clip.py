@@ -1,0 +1,323 @@
+"""Motion-CLIP (Kim et al. 2023, "FLAME", table 8): motions and texts in one space, learned by contrast."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, Self
+
+import torch
+import torch.distributed
+import torch.nn.functional as F
+from torch import Tensor, nn
+from torch.distributed.nn.functional import all_gather
+
+from evaluators.extractors.released import load_strictly
+from evaluators.metrics.alignment import MotionsForText, TextsForMotion
+from evaluators.metrics.samples import SampleMetric
+from flame_mdm.checkpoints.released import (
+    _ENCODER_LAYER,
+    _count_layers,
+    _layer_names,
+    _renamed,
+    _shape,
+    released_state,
+)
+from flame_mdm.conditions import ConditionEncoder
+from flame_mdm.config import Config, instantiate
+from flame_mdm.denoisers.flame import cosine_first_sinusoid
+from flame_mdm.denoisers.layers import Transformer, with_prefix
+from flame_mdm.motion import MotionBatch
+from flame_mdm.representations import Representation
+from flame_mdm.seeds import key
+from flame_mdm.task import Task
+
+POOL = 32
+"""Pairs among which validation ranks, as R-precision does."""
+
+
+class MotionCLIP(nn.Module):
+    """A transformer over [CLS, length, frame 1, frame 2, ...] and a linear map of the text encoder's pooled vector.
+
+    The features are not scaled to length 1: Frechet distance and MID take them so. The temperature is learned and
+    starts at 0.07.
+    """
+
+    def __init__(
+        self,
+        in_features: int,
+        text_features: int,
+        *,
+        latent_dim: int,
+        ff_size: int,
+        num_layers: int,
+        num_heads: int,
+        dropout: float,
+        max_frames: int,
+        embedding_dim: int,
+        blind_features: int = 0,
+    ):
+        """Builds the network.
+
+        Args:
+            in_features: D of the motions.
+            text_features: C, width of the pooled condition.
+            latent_dim: width of the transformer.
+            ff_size: hidden width of its feed-forward layers.
+            num_layers: number of its layers.
+            num_heads: attention heads.
+            dropout: probability inside the layers.
+            max_frames: longest motion that the length token knows.
+            embedding_dim: E, width of the common space.
+            blind_features: as many features at the beginning of a frame are set to 0. 3 in FLAME's code, whose motions
+                begin with the root's translation: its scores do not see where the body is or how high.
+        """
+        super().__init__()
+        self.max_frames, self.blind_features, self.embedding_dim = max_frames, blind_features, embedding_dim
+        self.cls = nn.Parameter(torch.randn(latent_dim))
+        # Row 0, which no length reads in the authors' code, is that of the longest motion: see the FLAME denoiser.
+        self.length_embedding = nn.Embedding(max_frames, latent_dim)
+        self.input = nn.Linear(in_features, latent_dim)
+        self.transformer = Transformer(latent_dim, ff_size, num_layers, num_heads, dropout, nn.ReLU)
+        self.output = nn.Linear(latent_dim, embedding_dim)
+        self.text_projection = nn.Linear(text_features, embedding_dim)
+        self.logit_scale = nn.Parameter(torch.tensor(math.log(1 / 0.07)))
+
+    def forward(self, x: Tensor, mask: Tensor) -> Tensor:
+        """(B, E) features of normalized motions (B, F, D) with mask (B, F).
+
+        Raises:
+            ValueError: a motion is longer than `max_frames`.
+        """
+        lengths = mask.sum(1)
+        if x.shape[1] > self.max_frames and lengths.max() > self.max_frames:
+            raise ValueError(
+                f"a motion of {int(lengths.max())} frames is longer than motion-CLIP was built for ({self.max_frames})"
+            )
+        x = self.input(F.pad(x[..., self.blind_features :], (self.blind_features, 0)))
+        length = self.length_embedding(lengths % self.max_frames)
+        x = torch.cat([self.cls.expand(len(x), 1, -1), length[:, None], x], 1)
+        x = x + cosine_first_sinusoid(torch.arange(x.shape[1], device=x.device), x.shape[-1]).to(x.dtype)
+        return self.output(self.transformer(x, with_prefix(mask, 2))[:, 0])
+
+    def text(self, pooled: Tensor) -> Tensor:
+        """(B, E) features of texts, from what the text encoder makes of them (B, C)."""
+        return self.text_projection(pooled)
+
+
+def info_nce(motion: Tensor, text: Tensor, logit_scale: Tensor) -> Tensor:
+    """Contrastive loss over the pairs of all processes (Oord et al. 2018, eq. 4; both ways as Radford et al. 2021).
+
+    Every process takes the part of its own pairs against all motions and texts. Averaged over processes of equally many
+    pairs, as DDP averages gradients, loss and gradients are those of one process with all pairs.
+
+    Args:
+        motion: (B, E) features.
+        text: (B, E) features.
+        logit_scale: (), logarithm of the inverse temperature.
+
+    Returns:
+        (), the mean of both cross-entropies.
+    """
+    motion, text = F.normalize(motion, dim=-1), F.normalize(text, dim=-1)
+    motions, texts, first = motion, text, 0
+    if torch.distributed.is_initialized() and torch.distributed.get_world_size() > 1:
+        motions, texts = torch.cat(all_gather(motion)), torch.cat(all_gather(text))
+        first = torch.distributed.get_rank() * len(motion)
+    own = torch.arange(len(motion), device=motion.device) + first
+    scale = logit_scale.exp()
+    return (F.cross_entropy(scale * motion @ texts.T, own) + F.cross_entropy(scale * text @ motions.T, own)) / 2
+
+
+class PooledLoss(SampleMetric):
+    """InfoNCE in pools of 32, formed by key, so that batch size and number of processes do not matter.
+
+    The pairs of an incomplete last pool meet the last 32 pairs; with fewer pairs than 32 there is one smaller pool.
+    """
+
+    higher_is_better = False
+
+    def __init__(self, **kwargs: Any):
+        super().__init__(("keys", "motion", "text"), **kwargs)
+
+    def update(self, motion: Tensor, text: Tensor, keys: Tensor) -> None:
+        """Adds features (B, E) of motions, scaled by the inverse temperature, and of texts, with keys (B,)."""
+        self.keep(keys=keys, motion=motion, text=text)
+
+    def compute(self) -> float | None:
+        """Mean loss of a pair, in nats."""
+        rows = self.rows("keys", "motion", "text")
+        if rows is None:
+            return None
+        motion, text = rows
+        losses = []
+        for begin in range(0, len(motion), POOL):
+            pool = slice(max(0, min(begin, len(motion) - POOL)), begin + POOL)
+            logits = motion[pool] @ text[pool].T
+            pair = -(logits.log_softmax(0).diagonal() + logits.log_softmax(1).diagonal()) / 2
+            losses.append(pair[begin - pool.start :])
+        return torch.cat(losses).mean().item()
+
+
+class MotionCLIPTask(Task):
+    """Trains motion-CLIP by `make train EXP=motion_clip/...`, and is the feature extractor that comes out of it.
+
+    Args:
+        network: motion encoder and text projection.
+        condition: text encoder; frozen in FLAME, whatever the evaluated model uses.
+        representation: of the motions; an extractor of one representation measures no other.
+        optimizer: a mapping with the `_target_` of a torch optimizer and its arguments.
+        seed: with the step and the rank, decides the dropout of a training step.
+    """
+
+    def __init__(
+        self,
+        network: MotionCLIP,
+        condition: ConditionEncoder,
+        representation: Representation,
+        *,
+        optimizer: Config,
+        seed: int = 0,
+    ):
+        super().__init__(condition, representation, optimizer=optimizer, seed=seed)
+        self.network = network
+        self.features = network.embedding_dim
+        self.val_loss = PooledLoss()
+        self.retrieval = nn.ModuleDict({"texts_for_motion": TextsForMotion(), "motions_for_text": MotionsForText()})
+
+    @classmethod
+    def build(cls, config: Config, representation: Representation, *, actions: Sequence[str] = ()) -> Self:
+        """Builds the parts of a recipe and joins them; the widths of motions and texts are passed on here."""
+        condition: ConditionEncoder = instantiate(config["condition"])
+        widths = {"in_features": representation.features, "text_features": condition.features}
+        network: MotionCLIP = instantiate(config["task"]["network"], **widths)
+        task = cls(network, condition, representation, optimizer=config["optimizer"], seed=config["seed"])
+        task.config, task.facts = config, {"actions": list(actions)}
+        return task
+
+    @classmethod
+    def import_released(cls, checkpoint: Mapping[str, Any], config: Config) -> Self:
+        """FLAME's released motion-CLIP, as a recipe of its sizes would have trained it.
+
+        Args:
+            checkpoint: what the authors' file holds. Its pooler, a random draw that the network was trained upon, goes
+                to the text encoder.
+            config: `experiments/motion_clip/humanml3d_smpl.yaml`, composed.
+
+        Raises:
+            ValueError: other weights or sizes, or no pooler.
+        """
+        representation: Representation = instantiate(config["representation"])
+        task = cls.build(config, representation)
+        state = released_state(checkpoint, ema=False)
+        theirs = "text_model.pooler.dense."
+        pooler = {f"pooler_{name.removeprefix(theirs)}": state[name] for name in state if name.startswith(theirs)}
+        load_strictly(task.condition, pooler, "released motion-CLIP")
+        network = import_mclip(state, num_heads=config["task"]["network"]["num_heads"])
+        load_strictly(task.network, network.state_dict(), "released motion-CLIP")
+        task.facts |= {"fingerprint": None, "max_frames": network.max_frames}
+        return task.eval()
+
+    # Feature extraction -----------------------------------------------------------------------------------------------
+
+    def forward(self, x: Tensor, mask: Tensor) -> Tensor:
+        """(B, E) features of motions (B, F, D) in the data's units, with mask (B, F)."""
+        return self.network(self.representation.normalize(x), mask)
+
+    def text(self, captions: Sequence[str]) -> Tensor:
+        """(B, E) features of captions."""
+        return self.network.text(self._pooled(list(captions)))
+
+    def _pooled(self, captions: list[str]) -> Tensor:
+        x = torch.zeros(len(captions), 1, self.representation.features, device=self.device)
+        mask = torch.ones(len(captions), 1, dtype=torch.bool, device=self.device)
+        return self.condition(MotionBatch(x, mask, ids=captions, text=captions)).pooled
+
+    # Training ---------------------------------------------------------------------------------------------------------
+
+    def training_step(self, batch: MotionBatch, batch_idx: int) -> Tensor:
+        """Loss of one batch, with the pairs of the other processes as negatives."""
+        torch.manual_seed(key("step", self.seed, batch_idx, self.global_rank))
+        cond = self.condition(batch)
+        if cond.null is not None:  # a learned null, which is not used here, then has a gradient, as DDP needs
+            cond = cond.drop(torch.zeros(len(batch), dtype=torch.bool, device=self.device))
+        motion, text = self.network(batch.x, batch.mask), self.network.text(cond.pooled)
+        loss = info_nce(motion, text, self.network.logit_scale)
+        self.log_dict(
+            {"train/loss": loss, "train/temperature": (-self.network.logit_scale).exp()}, batch_size=len(batch)
+        )
+        return loss
+
+    def on_validation_epoch_start(self) -> None:
+        """Chooses what is measured: R-precision needs 32 different captions, and small sets go without."""
+        clips = self.trainer.datamodule.val  # type: ignore[attr-defined]
+        enough = len({clips.caption(clip, -1) for clip in clips.clips}) >= POOL
+        self.measured: dict[str, Any] = dict(self.retrieval.items()) if enough else {}
+
+    def validation_step(self, batch: MotionBatch, batch_idx: int) -> None:
+        """Keeps the features of the validation pairs, each on one process."""
+        if self.global_rank and len(self.trainer.datamodule.val) < self.trainer.world_size:  # type: ignore[attr-defined]
+            return  # all processes have all clips then
+        assert batch.text is not None
+        motion = F.normalize(self.network(batch.x, batch.mask), dim=-1)
+        text = F.normalize(self.network.text(self.condition(batch).pooled), dim=-1)
+        keys, text_keys = (
+            torch.tensor([key(kind, name) for name in names], device=self.device)
+            for kind, names in (("motion", batch.ids), ("caption", batch.text))
+        )
+        self.val_loss.update(motion * self.network.logit_scale.exp(), text, keys)
+        for metric in self.measured.values():
+            metric.update(motion, text, text_keys, keys)
+
+    def on_validation_epoch_end(self) -> None:
+        """Logs the loss in pools of 32, and R-precision by cosine both ways."""
+        loss = self.val_loss.compute()
+        if loss is not None:
+            self.log("val/loss", loss, prog_bar=True)
+        self.val_loss.reset()
+        for name, metric in self.measured.items():
+            self.log_dict({f"val/{name}_{top}": value for top, value in metric.compute().items()})
+            metric.reset()
+
+
+_MCLIP = {
+    "motion_encoder.motion_length_emb.": "length_embedding.",
+    "motion_encoder.input_projection.": "input.",
+    "motion_encoder.last_projection.": "output.",
+    "motion_encoder.CLS_TOKEN": "cls",
+    "lm_projection.": "text_projection.",
+    "logit_scale": "logit_scale",
+}
+
+
+def import_mclip(state: Mapping[str, Tensor], *, num_heads: int = 8) -> MotionCLIP:
+    """FLAME's released network; its RoBERTa (`text_model.*`) is left.
+
+    Args:
+        state: weights by the authors' names, as `flame_mdm.checkpoints.files.released_state` gives them.
+        num_heads: attention heads, 8 in the released model; the weights do not tell.
+
+    Raises:
+        ValueError: a weight is missing, unknown or of another shape.
+    """
+    learned = {name: value for name, value in state.items() if not name.startswith("text_model.")}
+    stack = "motion_encoder.motion_encoder"
+    layers = _count_layers(learned, stack)
+    ours = _renamed(learned, {**_layer_names(stack, _ENCODER_LAYER, layers), **_MCLIP})
+    _shape(ours, "cls")
+    ours["cls"] = ours["cls"].flatten()
+    latent_dim, in_features = _shape(ours, "input.weight")
+    embedding_dim, text_features = _shape(ours, "text_projection.weight")
+    network = MotionCLIP(
+        in_features,
+        text_features,
+        latent_dim=latent_dim,
+        ff_size=_shape(ours, "transformer.layers.0.feed_forward.0.weight")[0],
+        num_layers=layers,
+        num_heads=num_heads,
+        dropout=0.1,
+        max_frames=_shape(ours, "length_embedding.weight")[0],
+        embedding_dim=embedding_dim,
+        blind_features=3,
+    )
+    return load_strictly(network, ours, "released motion-CLIP")

@@ -1,0 +1,173 @@
+"""Action classifiers by graph convolution over the skeleton and time (Yan et al. 2018, "ST-GCN")."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
+
+from evaluators.extractors.released import load_strictly, read_weights
+from flame_mdm.representations.skeleton import SMPL24
+
+UNCONSTRAINED_JOINTS = (15, 12, 16, 18, 20, 17, 19, 21, 0, 1, 4, 7, 2, 5, 8)
+"""The 15 of the 24 SMPL joints that MDM's unconstrained evaluation sees; entry 8 is the pelvis."""
+UNCONSTRAINED_PARENTS = (1, -1, 1, 2, 3, 1, 5, 6, 1, 8, 9, 10, 8, 12, 13)
+"""Their tree, rooted in the neck."""
+TEMPORAL_KERNEL = 9
+
+
+def adjacency(parents: Sequence[int]) -> Tensor:
+    """(3, V, V) matrices by which a vertex gathers from itself, from neighbors, and from neighbors near the center.
+
+    Entry (v, w) is what v gives to w, divided by the number of vertices that give to w. The center is the root of the
+    tree. Legacy of the authors' code: distances from the center are known up to 1 only, all vertices beyond are equally
+    far; the spatial partition of Yan et al. 2018 (section 3.3) thus concerns the vertices beside the center alone.
+    """
+    size, root = len(parents), parents.index(-1)
+    linked = torch.eye(size)
+    for child, parent in enumerate(parents):
+        if parent >= 0:
+            linked[child, parent] = linked[parent, child] = 1
+    gathered = linked / linked.sum(0)
+    distance = torch.where(linked[root] > 0, 1, 2)
+    distance[root] = 0
+    inwards = distance[:, None] < distance
+    itself = torch.eye(size, dtype=torch.bool)
+    return torch.stack([gathered * itself, gathered * ~(itself | inwards), gathered * inwards])
+
+
+class STGCN(nn.Module):
+    """A stack of graph convolutions with temporal ones of 9 frames, averaged over frames and joints, and classified.
+
+    A network to evaluate with: the dropout of its training is left out. Past the end of a motion the convolutions see
+    zeros, as at the end of the longest, so that its features do not depend on the other motions of a batch. The
+    published action sets have motions of 60 frames only, where short clips repeat their last one.
+    """
+
+    def __init__(
+        self,
+        in_channels: int,
+        num_actions: int,
+        parents: Sequence[int],
+        widths: Sequence[int],
+        strides: Sequence[int],
+    ):
+        """Builds the network.
+
+        Args:
+            in_channels: C, channels of a joint.
+            num_actions: classes.
+            parents: parent of each joint, -1 for the center.
+            widths: channels after each block.
+            strides: temporal stride of each block.
+        """
+        super().__init__()
+        self.features = widths[-1]
+        graph = adjacency(parents)
+        self.register_buffer("A", graph)
+        self.A: Tensor
+        self.data_bn = nn.BatchNorm1d(in_channels * len(parents))
+        channels = [in_channels, *widths]
+        self.st_gcn_networks = nn.ModuleList(
+            _Block(channels[i], width, len(graph), stride, residual=i > 0)
+            for i, (width, stride) in enumerate(zip(widths, strides, strict=True))
+        )
+        self.edge_importance = nn.ParameterList([nn.Parameter(torch.ones_like(graph)) for _ in widths])
+        self.fcn = nn.Conv2d(widths[-1], num_actions, 1)
+
+    def forward(self, x: Tensor, mask: Tensor) -> Tensor:
+        """(B, E) features of what each joint does (B, F, V, C), with mask (B, F); E is the width of the last block."""
+        x = self.data_bn(x.flatten(2).transpose(1, 2)).unflatten(1, x.shape[2:]).permute(0, 2, 3, 1)
+        for block, importance in zip(self.st_gcn_networks, self.edge_importance, strict=True):
+            x = block(x, self.A * importance, mask)
+            mask = mask[:, :: block.stride]
+        return x.mean(3).masked_fill(~mask[:, None], 0).sum(2) / mask.sum(1, keepdim=True)
+
+    def logits(self, x: Tensor, mask: Tensor) -> Tensor:
+        """(B, actions) unnormalized log-probabilities; arguments as of `forward`."""
+        return self.fcn(self(x, mask)[..., None, None])[..., 0, 0]
+
+
+class _Block(nn.Module):
+    """Gathers over the graph, then convolves over time; works on (B, C, F, V)."""
+
+    def __init__(self, in_channels: int, width: int, partitions: int, stride: int, residual: bool):
+        super().__init__()
+        self.stride = stride
+        self.gcn = nn.ModuleDict({"conv": nn.Conv2d(in_channels, width * partitions, 1)})
+        self.tcn = nn.Sequential(
+            nn.BatchNorm2d(width),
+            nn.ReLU(),
+            nn.Conv2d(width, width, (TEMPORAL_KERNEL, 1), (stride, 1), (TEMPORAL_KERNEL // 2, 0)),
+            nn.BatchNorm2d(width),
+        )
+        self.residual: nn.Module | None = None
+        if residual:
+            same = in_channels == width and stride == 1
+            project = nn.Conv2d(in_channels, width, 1, (stride, 1))
+            self.residual = nn.Identity() if same else nn.Sequential(project, nn.BatchNorm2d(width))
+
+    def forward(self, x: Tensor, graph: Tensor, mask: Tensor) -> Tensor:
+        y = self.gcn["conv"](x).unflatten(1, (len(graph), -1))
+        normalize, activate, convolve, normalize_again = self.tcn
+        y = activate(normalize(torch.einsum("bkcfv,kvw->bcfw", y, graph)))
+        y = normalize_again(convolve(y.masked_fill(~mask[:, None, :, None], 0)))
+        return torch.relu(y if self.residual is None else y + self.residual(x))
+
+
+class UESTC(STGCN):
+    """The classifier of UESTC's 40 actions, that ACTOR, MDM and MFM report: it reads the rotations of 24 joints."""
+
+    def __init__(self):
+        widths = (64,) * 4 + (128,) * 3 + (256,) * 3
+        super().__init__(6, 40, SMPL24.parents, widths, (1, 1, 1, 1, 2, 1, 1, 2, 1, 1))
+
+    def forward(self, x: Tensor, mask: Tensor) -> Tensor:
+        """(B, 256) features of motions (B, F, 150) in the 25 x 6 representation; the root's way is not looked at."""
+        return super().forward(x.unflatten(-1, (25, 6))[:, :, :24], mask)
+
+
+class Unconstrained(STGCN):
+    """The classifier behind MDM's unconstrained evaluation (Raab et al. 2022, "MoDi"): 15 joints, 12 actions."""
+
+    def __init__(self):
+        super().__init__(3, 12, UNCONSTRAINED_PARENTS, (64, 64, 64, 128, 128, 256), (1, 1, 1, 2, 1, 2))
+
+    def forward(self, x: Tensor, mask: Tensor) -> Tensor:
+        """(B, 256) features of joints (B, F, 24, 3), metres, y up; seen from the pelvis, and y down as published."""
+        x = (x - x[:, :, :1])[:, :, list(UNCONSTRAINED_JOINTS)]
+        return super().forward(x * x.new_tensor([1.0, -1.0, -1.0]), mask)
+
+
+class JointSTGCN(STGCN):
+    """A classifier to train on the joints of any skeleton, which it sees from where the root stands at first."""
+
+    def __init__(self, parents: Sequence[int], num_actions: int, widths: Sequence[int], strides: Sequence[int]):
+        """`parents` of the joints, -1 for the root; `widths` and `strides` of the blocks."""
+        super().__init__(3, num_actions, parents, widths, strides)
+
+    def forward(self, x: Tensor, mask: Tensor) -> Tensor:
+        """(B, E) features of joints (B, F, J, 3), metres, y up, with mask (B, F)."""
+        return super().forward(x - x[:, :1, :1], mask)
+
+
+def load_uestc(path: str | Path) -> UESTC:
+    """The classifier with the authors' weights (uestc_rot6d_stgcn.tar).
+
+    Raises:
+        FileNotFoundError: no such file.
+        ValueError: it holds other weights.
+    """
+    return load_strictly(UESTC(), read_weights(path), path)
+
+
+def load_unconstrained(path: str | Path) -> Unconstrained:
+    """The classifier with the authors' weights (humanact12_gru_modi_struct.pth.tar, no GRU despite its name).
+
+    Raises:
+        FileNotFoundError: no such file.
+        ValueError: it holds other weights.
+    """
+    return load_strictly(Unconstrained(), read_weights(path), path)

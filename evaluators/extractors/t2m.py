@@ -1,0 +1,264 @@
+"""The evaluator of HumanML3D and KIT-ML (Guo et al. 2022, "Generating Diverse and Natural 3D Human Motions from Text").
+
+Networks that load the released weights. The authors' code returns embeddings ordered by descending length; here they
+come in the order of the input.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.nn.utils.rnn import pack_padded_sequence
+
+from evaluators.extractors.released import load_strictly, read_weights
+from flame_mdm.data import restricted_pickle
+from flame_mdm.data.t2m import MAX_TOKENS, frame_tokens
+from flame_mdm.files import read_npy
+from flame_mdm.motion import pad_to
+
+UNIT = 4
+"""Frames that the movement encoder makes one vector of."""
+CONTACTS = 4
+"""Features at the end of each frame that the evaluator does not see."""
+PARTS_OF_SPEECH = (
+    *("VERB", "NOUN", "DET", "ADP", "NUM", "AUX", "PRON", "ADJ", "ADV"),
+    *("Loc_VIP", "Body_VIP", "Obj_VIP", "Act_VIP", "Desc_VIP", "OTHER"),
+)
+_SPECIAL_WORDS = {
+    "Loc_VIP": "left right clockwise counterclockwise anticlockwise forward back backward up down straight curve",
+    "Body_VIP": "arm chin foot feet face hand mouth leg waist eye knee shoulder thigh",
+    "Obj_VIP": "stair dumbbell chair window floor car ball handrail baseball basketball",
+    "Act_VIP": "walk run swing pick bring kick put squat throw hop dance jump turn stumble stop sit lift lower raise "
+    "wash stand kneel stroll rub bend balance flap jog shuffle lean rotate spin spread climb",
+    "Desc_VIP": "slowly carefully fast careful slow quickly happy angry sad happily angrily sadly",
+}
+SPECIAL = {word: part for part, words in _SPECIAL_WORDS.items() for word in words.split()}
+"""Words that have a part of speech of their own, whatever the tagger said."""
+
+
+class Words(NamedTuple):
+    """Captions as the text encoder reads them.
+
+    Attributes:
+        vectors: (B, 22, 300) GloVe vectors.
+        parts: (B, 22, 15) one-hot parts of speech.
+        lengths: (B,) int64, slots up to the end mark, which is included.
+    """
+
+    vectors: Tensor
+    parts: Tensor
+    lengths: Tensor
+
+
+class WordVectors:
+    """GloVe vectors of the words that HumanML3D's and KIT-ML's captions are made of: our_vab_data.npy, our_vab_idx.pkl.
+
+    Raises:
+        FileNotFoundError: a file is not in `folder`.
+        ValueError: it is not what it should be.
+    """
+
+    def __init__(self, folder: str | Path):
+        folder = Path(folder)
+        for name in ("our_vab_data.npy", "our_vab_idx.pkl"):
+            if not (folder / name).is_file():
+                raise FileNotFoundError(
+                    f"{folder / name}: no such file; give the folder of the GloVe vectors that the authors released"
+                )
+        rows = restricted_pickle.read(folder / "our_vab_idx.pkl")
+        vectors = _read(folder / "our_vab_data.npy").astype(np.float32)
+        if not isinstance(rows, dict) or vectors.ndim != 2 or not {"sos", "eos", "unk"} <= rows.keys():
+            raise ValueError(f"{folder}: not the released GloVe vectors: they need sos, eos, unk, one row a word")
+        if not all(isinstance(row, int | np.integer) and row >= 0 for row in rows.values()):
+            raise ValueError(f"{folder / 'our_vab_idx.pkl'}: not words and their rows")
+        if max(rows.values()) >= len(vectors):
+            raise ValueError(f"{folder / 'our_vab_data.npy'}: {len(vectors)} rows, but the index names more")
+        self.rows: dict[str, int] = rows
+        self.vectors = torch.from_numpy(vectors)
+
+    def __call__(self, captions: Sequence[Sequence[str]], *, full_length: bool = False) -> Words:
+        """Captions as lists of "word/PART" tokens, as the data sets' files hold them, without start and end marks.
+
+        Args:
+            captions: tokens after the 20th are dropped. A word without a vector is unknown, and so is its part.
+            full_length: legacy of MDM's code before January 2024 and of MFM's: every caption is said to fill all 22
+                slots, which lowers R-precision.
+        """
+        index = {part: number for number, part in enumerate(PARTS_OF_SPEECH)}
+        rows = torch.full((len(captions), MAX_TOKENS + 2), self.rows["unk"])
+        parts = torch.zeros(len(captions), MAX_TOKENS + 2, len(PARTS_OF_SPEECH))
+        numbers = torch.full((len(captions), MAX_TOKENS + 2), index["OTHER"])
+        lengths = torch.full((len(captions),), MAX_TOKENS + 2)
+        for i, caption in enumerate(captions):
+            tokens, filled = frame_tokens(caption)
+            for j, token in enumerate(tokens):
+                word, _, part = token.rpartition("/")
+                if word in self.rows:
+                    rows[i, j] = self.rows[word]
+                    numbers[i, j] = index.get(SPECIAL.get(word, part), index["OTHER"])
+            if not full_length:
+                lengths[i] = filled
+        return Words(self.vectors[rows], parts.scatter_(2, numbers[..., None], 1), lengths)
+
+
+class T2MEvaluator(nn.Module):
+    """Embeds motions and captions in one space; R-precision, MM-Dist, FID and diversity of HumanML3D and KIT use it.
+
+    Features come in the data's units and are normalized with the statistics that belong to the released weights, not
+    with those of the data set. Past its end, a motion is zero after normalization, up to `max_frames`, as the authors'
+    real motions are; the convolutions see 3 frames past the end.
+    """
+
+    mean: Tensor
+    std: Tensor
+
+    def __init__(
+        self,
+        mean: Tensor,
+        std: Tensor,
+        *,
+        movement_hidden: int = 512,
+        movement_latent: int = 512,
+        text_hidden: int = 512,
+        motion_hidden: int = 1024,
+        embedding: int = 512,
+        max_frames: int = 196,
+        keep_padding: bool = False,
+    ):
+        """Builds the networks; widths are those of the released weights.
+
+        Args:
+            mean: (D,) the evaluator's mean: 263 or 251 features.
+            std: (D,) its standard deviation.
+            movement_hidden: channels after the first convolution.
+            movement_latent: channels of a movement vector.
+            text_hidden: width of the text GRU.
+            motion_hidden: width of the motion GRU.
+            embedding: E, width of the common space.
+            max_frames: frames that every motion is padded to.
+            keep_padding: legacy of MDM's code, which samples 196 frames whatever the length: what stands past the end
+                of a motion is seen.
+        """
+        super().__init__()
+        self.features, self.max_frames, self.keep_padding = embedding, max_frames, keep_padding
+        self.register_buffer("mean", mean.float())
+        self.register_buffer("std", std.float())
+        self.movement_encoder = _MovementEncoder(len(mean) - CONTACTS, movement_hidden, movement_latent)
+        self.text_encoder = _TextEncoder(text_hidden, embedding)
+        self.motion_encoder = _Recurrent(movement_latent, motion_hidden, embedding)
+
+    def forward(self, x: Tensor, mask: Tensor) -> Tensor:
+        """(B, E) embeddings of motions (B, F, D) in the data's units, with mask (B, F).
+
+        Raises:
+            ValueError: a motion is shorter than 4 frames or longer than `max_frames`.
+        """
+        lengths = mask.sum(1)
+        if lengths.min() < UNIT or lengths.max() > self.max_frames:
+            raise ValueError(
+                f"the T2M evaluator takes motions of {UNIT} to {self.max_frames} frames, "
+                f"not of {int(lengths.min())} to {int(lengths.max())}"
+            )
+        x = (x - self.mean) / self.std
+        if not self.keep_padding:
+            x = x * mask[..., None]
+        x = pad_to(x[:, : self.max_frames], self.max_frames)
+        return self.motion_encoder(self.movement_encoder(x[..., :-CONTACTS]), lengths // UNIT)
+
+    def text(self, words: Words) -> Tensor:
+        """(B, E) embeddings of captions, as `WordVectors` gives them."""
+        weight = self.text_encoder.input_emb.weight
+        return self.text_encoder(words.vectors.to(weight), words.parts.to(weight), words.lengths)
+
+
+class _MovementEncoder(nn.Module):
+    """Two convolutions over time: 4 frames become one vector."""
+
+    def __init__(self, in_features: int, hidden: int, latent: int):
+        super().__init__()
+        self.main = nn.Sequential(
+            nn.Conv1d(in_features, hidden, 4, 2, 1),
+            nn.Dropout(0.2),
+            nn.LeakyReLU(0.2),
+            nn.Conv1d(hidden, latent, 4, 2, 1),
+            nn.Dropout(0.2),
+            nn.LeakyReLU(0.2),
+        )
+        self.out_net = nn.Linear(latent, latent)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(B, F, D) -> (B, F // 4, latent)."""
+        return self.out_net(self.main(x.transpose(1, 2)).transpose(1, 2))
+
+
+class _Recurrent(nn.Module):
+    """A GRU in both directions from a learned state; its two last states become the embedding."""
+
+    def __init__(self, in_features: int, hidden: int, embedding: int):
+        super().__init__()
+        self.input_emb = nn.Linear(in_features, hidden)
+        self.gru = nn.GRU(hidden, hidden, batch_first=True, bidirectional=True)
+        self.output_net = nn.Sequential(
+            nn.Linear(2 * hidden, hidden), nn.LayerNorm(hidden), nn.LeakyReLU(0.2), nn.Linear(hidden, embedding)
+        )
+        self.hidden = nn.Parameter(torch.randn(2, 1, hidden))
+
+    def forward(self, x: Tensor, lengths: Tensor) -> Tensor:
+        """(B, N, in_features) of which the first `lengths` (B,) are real -> (B, embedding)."""
+        packed = pack_padded_sequence(self.input_emb(x), lengths.cpu(), batch_first=True, enforce_sorted=False)
+        _, last = self.gru(packed, self.hidden.expand(-1, len(x), -1).contiguous())
+        return self.output_net(torch.cat([last[0], last[1]], -1))
+
+
+class _TextEncoder(_Recurrent):
+    """Reads word vectors with the parts of speech added to them."""
+
+    WORD = 300
+
+    def __init__(self, hidden: int, embedding: int):
+        super().__init__(self.WORD, hidden, embedding)
+        self.pos_emb = nn.Linear(len(PARTS_OF_SPEECH), self.WORD)
+
+    def forward(self, vectors: Tensor, parts: Tensor, lengths: Tensor) -> Tensor:
+        """(B, N, 300) and (B, N, 15), of which the first `lengths` (B,) are real -> (B, embedding)."""
+        return super().forward(vectors + self.pos_emb(parts), lengths)
+
+
+def _read(path: Path) -> np.ndarray:
+    """Returns the array of an .npy file of real numbers; errors name the file."""
+    try:
+        array = read_npy(path)
+        if array.dtype.kind not in "fiu":
+            raise ValueError(f"an array of {array.dtype}, not of numbers")
+        return array
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+
+
+def load_t2m(path: str | Path, mean: str | Path, std: str | Path, **options: Any) -> T2MEvaluator:
+    """The evaluator with the authors' weights.
+
+    Args:
+        path: text_mot_match/model/finest.tar of t2m or kit.
+        mean: the evaluator's mean.npy, in MDM t2m_mean.npy or kit_mean.npy.
+        std: its std.npy.
+        options: of `T2MEvaluator`.
+
+    Raises:
+        FileNotFoundError: a file is not there.
+        ValueError: a file is damaged, or belongs to another data set.
+    """
+    statistics = []
+    for file in (mean, std):
+        if not Path(file).is_file():
+            raise FileNotFoundError(f"{file}: no such file; the evaluator needs the statistics it was released with")
+        statistics.append(torch.from_numpy(_read(Path(file))))
+    network = T2MEvaluator(*statistics, **options)
+    for name in ("movement_encoder", "text_encoder", "motion_encoder"):
+        load_strictly(network.get_submodule(name), read_weights(path, name), path)
+    return network.eval()

@@ -1,0 +1,285 @@
+"""Training of Guo et al.'s evaluator (evaluators/t2m.py), for those who cannot or will not use the released one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Self
+
+import torch
+from torch import Tensor, nn
+from torchmetrics import MeanMetric
+
+from evaluators.extractors.t2m import CONTACTS, UNIT, T2MEvaluator, WordVectors
+from evaluators.metrics.alignment import MotionsForText, MultimodalDistance
+from evaluators.metrics.samples import SampleMetric
+from flame_mdm.conditions import Unconditional
+from flame_mdm.config import Config, instantiate
+from flame_mdm.data.datamodule import MotionDataModule
+from flame_mdm.errors import UserError
+from flame_mdm.motion import MotionBatch
+from flame_mdm.representations import Representation
+from flame_mdm.seeds import key
+from flame_mdm.task import Task
+
+POOL = 32
+"""Pairs among which validation ranks, as R-precision does."""
+
+
+class _MovementDecoder(nn.Module):
+    """The counterpart of the movement encoder: one vector becomes 4 frames, by two transposed convolutions."""
+
+    def __init__(self, latent: int, hidden: int, out_features: int):
+        super().__init__()
+        self.in_net = nn.Linear(latent, latent)
+        self.main = nn.Sequential(
+            nn.ConvTranspose1d(latent, hidden, 4, 2, 1),
+            nn.LeakyReLU(0.2),
+            nn.ConvTranspose1d(hidden, out_features, 4, 2, 1),
+            nn.LeakyReLU(0.2),
+        )
+        self.out_net = nn.Linear(out_features, out_features)
+
+    def forward(self, latents: Tensor) -> Tensor:
+        """(B, N, latent) -> (B, 4 N, out_features)."""
+        return self.out_net(self.main(self.in_net(latents).transpose(1, 2)).transpose(1, 2))
+
+
+class _SavedWords(WordVectors):
+    """Word vectors out of a checkpoint."""
+
+    def __init__(self, rows: dict[str, int], vectors: Tensor):
+        self.rows, self.vectors = rows, vectors
+
+
+def matching_loss(motion: Tensor, text: Tensor, margin: float) -> Tensor:
+    """Contrastive loss of Guo et al. 2022 (Hadsell et al. 2006, eq. 4, without its factor 1/2).
+
+    Each text meets its own motion and that of the pair before. The authors draw by how many places the motions are
+    shifted; a draw of 0 pushes pairs apart that belong together.
+
+    Args:
+        motion: (B, E) embeddings.
+        text: (B, E) embeddings.
+        margin: Euclidean distance beyond which a wrong pair costs nothing.
+
+    Returns:
+        (), squared distance.
+    """
+    near = torch.linalg.vector_norm(motion - text, dim=-1)
+    far = torch.linalg.vector_norm(motion.roll(1, 0) - text, dim=-1)
+    return (near.square() + (margin - far).clamp(min=0).square()).mean()
+
+
+class MatchingLoss(SampleMetric):
+    """`matching_loss` over all pairs in the order of their keys, whatever the batches and the number of processes."""
+
+    higher_is_better = False
+
+    def __init__(self, margin: float, **kwargs: Any):
+        super().__init__(("keys", "motion", "text"), **kwargs)
+        self.margin = margin
+
+    def update(self, motion: Tensor, text: Tensor, keys: Tensor) -> None:
+        """Adds embeddings (B, E) of motions and of their texts, with keys (B,)."""
+        self.keep(keys=keys, motion=motion, text=text)
+
+    def compute(self) -> float | None:
+        """The loss; None of fewer than two pairs."""
+        rows = self.rows("keys", "motion", "text")
+        if rows is None or len(rows[0]) < 2:
+            return None
+        motion, text = rows
+        return matching_loss(motion, text, self.margin).item()
+
+
+class T2MTask(Task):
+    """Trains the evaluator by `make train EXP=t2m/...`, and is the feature extractor that comes out of it.
+
+    Up to step `movement_steps` the movement encoder learns with a decoder to give back the motions; from then on it
+    stays as it is, and the encoders of text and motion learn to match. Checkpoints hold the word vectors.
+
+    Args:
+        network: the evaluator; its statistics become those of the data.
+        representation: of the motions, whose last 4 features are contacts.
+        words: folder of our_vab_data.npy and our_vab_idx.pkl, see `WordVectors`; read in training alone.
+        movement_steps: steps of the first part.
+        sparsity: weight of the mean magnitude of movement vectors.
+        smoothness: weight of the mean magnitude of differences of successive movement vectors.
+        margin: of `matching_loss`.
+        optimizer: a mapping with the `_target_` of a torch optimizer and its arguments.
+        seed: with the step and the rank, decides the dropout of a training step.
+    """
+
+    def __init__(
+        self,
+        network: T2MEvaluator,
+        representation: Representation,
+        *,
+        words: str,
+        movement_steps: int,
+        sparsity: float,
+        smoothness: float,
+        margin: float,
+        optimizer: Config,
+        seed: int = 0,
+    ):
+        super().__init__(Unconditional(), representation, optimizer=optimizer, seed=seed)
+        self.network = network
+        linear = network.movement_encoder.out_net
+        first = network.movement_encoder.main[0]
+        assert isinstance(first, nn.Conv1d)
+        self.decoder = _MovementDecoder(linear.out_features, first.out_channels, first.in_channels)
+        self.word_folder, self.movement_steps = words, movement_steps
+        self.sparsity, self.smoothness, self.margin = sparsity, smoothness, margin
+        self.words: WordVectors | None = None
+        self.tokens: dict[tuple[str, str], list[str]] = {}
+        self.val_loss, self.val_reconstruction = MatchingLoss(margin), MeanMetric()
+        self.retrieval, self.distance = MotionsForText(POOL), MultimodalDistance()
+
+    @classmethod
+    def build(cls, config: Config, representation: Representation, *, actions: Sequence[str] = ()) -> Self:
+        """Builds the network of a recipe for the features of the data."""
+        options = {name: value for name, value in config["task"].items() if name not in ("_target_", "network")}
+        statistics = {"mean": representation.mean.clone(), "std": representation.std.clone()}
+        network: T2MEvaluator = instantiate(config["task"]["network"], **statistics)
+        task = cls(network, representation, **options, optimizer=config["optimizer"], seed=config["seed"])
+        task.config, task.facts = config, {"actions": list(actions)}
+        return task
+
+    def describe(self) -> str:
+        return type(self.network).__name__
+
+    def setup(self, stage: str) -> None:
+        """As all tasks; reads the word vectors, and notes the tagged words of all captions.
+
+        Raises:
+            FileNotFoundError, ValueError: no such word vectors, or damaged.
+            UserError: captions lack their tagged words, or a batch has no second motion to tell the first from.
+        """
+        super().setup(stage)
+        data: MotionDataModule = self.trainer.datamodule  # type: ignore[attr-defined]
+        if data.batch_size < 2:
+            raise UserError(f"data.batch_size={data.batch_size}: texts are matched with two motions or more")
+        if not Path(self.word_folder).is_dir():
+            raise FileNotFoundError(
+                f"task.words={self.word_folder}: no such folder; give that of our_vab_data.npy and our_vab_idx.pkl"
+            )
+        self.words = WordVectors(self.word_folder)
+        self.facts["words"] = {str(word): int(row) for word, row in self.words.rows.items()}
+        self.network.mean.copy_(self.representation.mean)
+        self.network.std.copy_(self.representation.std)
+        clips = [*data.train.clips, *data.val.clips]
+        bare = [clip.id for clip in clips if not clip.captions or not clip.attributes.get("tokens")]
+        if bare:
+            raise UserError(
+                f"{data.folder}: {len(bare)} clips have no captions with tagged words, such as {bare[0]}; this "
+                "evaluator learns from sets that tag them, as HumanML3D and KIT-ML do"
+            )
+        for clip in clips:
+            for caption, tokens in zip(clip.captions, clip.attributes["tokens"], strict=True):
+                self.tokens.setdefault((clip.id, caption), tokens)
+
+    def get_extra_state(self) -> Tensor:
+        """(words, 300) word vectors; `facts` tells which is whose."""
+        return self.words.vectors if self.words else torch.zeros(0)
+
+    def set_extra_state(self, state: Tensor) -> None:
+        """Takes the word vectors of a checkpoint.
+
+        Raises:
+            UserError: a run that is resumed has been given others.
+        """
+        if self.words is not None and not torch.equal(self.words.vectors, state.cpu()):
+            raise UserError(f"task.words={self.word_folder}: other word vectors than those that this run began with")
+        self.words = _SavedWords(self.facts["words"], state.cpu())
+
+    # Feature extraction -----------------------------------------------------------------------------------------------
+
+    def forward(self, x: Tensor, mask: Tensor) -> Tensor:
+        """(B, E) features of motions (B, F, D) in the data's units, with mask (B, F)."""
+        return self.network(x, mask)
+
+    def text(self, tokens: Sequence[Sequence[str]]) -> Tensor:
+        """(B, E) features of captions, as "word/PART" tokens."""
+        assert self.words is not None
+        return self.network.text(self.words(tokens))
+
+    # Training ---------------------------------------------------------------------------------------------------------
+
+    def training_step(self, batch: MotionBatch, batch_idx: int) -> Tensor:
+        """Loss of one batch: of reconstruction up to `movement_steps`, of matching from then on."""
+        torch.manual_seed(key("step", self.seed, batch_idx, self.global_rank))
+        self.network.movement_encoder.train(self._learns_movement)
+        if self._learns_movement:
+            terms = {name: value.mean() for name, value in self._reconstruct(batch).items()}
+            loss = terms["reconstruction"] + self.sparsity * terms["sparsity"] + self.smoothness * terms["smoothness"]
+        else:
+            loss = matching_loss(*self._embed(batch), self.margin)
+        self.log("train/loss", loss, batch_size=len(batch))
+        return loss + 0 * sum(parameter.sum() for parameter in self._idle())  # all have a gradient, as DDP needs
+
+    def on_before_optimizer_step(self, optimizer: torch.optim.Optimizer) -> None:
+        """Keeps the optimizer off what this part of training leaves alone; a gradient of 0 moves it by its momentum."""
+        for parameter in self._idle():
+            parameter.grad = None
+
+    @property
+    def _learns_movement(self) -> bool:
+        return self.trainer.global_step < self.movement_steps
+
+    def _idle(self) -> list[nn.Parameter]:
+        """What the present part of training does not train."""
+        movement = [*self.network.movement_encoder.parameters(), *self.decoder.parameters()]
+        matching = [*self.network.text_encoder.parameters(), *self.network.motion_encoder.parameters()]
+        return matching if self._learns_movement else movement
+
+    def _reconstruct(self, batch: MotionBatch) -> dict[str, Tensor]:
+        """Terms (B,) of the movement autoencoder, over the real frames and movement vectors of each motion."""
+        frames = batch.x.shape[1] // UNIT * UNIT
+        x, mask = batch.x[:, :frames, :-CONTACTS], batch.mask[:, :frames]
+        latents = self.network.movement_encoder(x)
+        units = mask[:, UNIT - 1 :: UNIT]
+
+        def mean(values: Tensor, real: Tensor) -> Tensor:
+            return (values.mean(-1) * real).sum(1) / real.sum(1).clamp(min=1)
+
+        return {
+            "reconstruction": mean((self.decoder(latents) - x).abs(), mask),
+            "sparsity": mean(latents.abs(), units),
+            "smoothness": mean(latents.diff(dim=1).abs(), units[:, 1:]),
+        }
+
+    def _embed(self, batch: MotionBatch) -> tuple[Tensor, Tensor]:
+        """Embeddings (B, E) of motions and of their captions."""
+        assert batch.text is not None
+        tokens = [self.tokens[pair] for pair in zip(batch.ids, batch.text, strict=True)]
+        return self(self.representation.denormalize(batch.x), batch.mask), self.text(tokens)
+
+    def validation_step(self, batch: MotionBatch, batch_idx: int) -> None:
+        """Keeps the embeddings of the validation pairs, each on one process."""
+        if self.global_rank and len(self.trainer.datamodule.val) < self.trainer.world_size:  # type: ignore[attr-defined]
+            return  # all processes have all clips then
+        keys = torch.tensor([key("motion", name) for name in batch.ids], device=self.device)
+        texts = torch.tensor([key("caption", text) for text in batch.text or ()], device=self.device)
+        motion, text = self._embed(batch)
+        self.val_loss.update(motion, text, keys)
+        self.retrieval.update(motion, text, texts, keys)
+        self.distance.update(motion, text, keys)
+        self.val_reconstruction.update(self._reconstruct(batch)["reconstruction"])
+
+    def on_validation_epoch_end(self) -> None:
+        """Logs the loss of matching in both parts of training, so that the best checkpoint is one of the second.
+
+        R-precision needs 32 motions, and small sets go without.
+        """
+        values: dict[str, float | None] = {"loss": self.val_loss.compute(), "mm_dist": self.distance.compute()}
+        if len(self.trainer.datamodule.val) >= POOL:  # type: ignore[attr-defined]
+            values |= {f"motions_for_text_{top}": value for top, value in self.retrieval.compute().items()}
+        for name, value in values.items():
+            if value is not None:
+                self.log(f"val/{name}", value, prog_bar=name == "loss")
+        if values["mm_dist"] is not None:
+            self.log("val/reconstruction", self.val_reconstruction.compute())
+        for metric in (self.val_loss, self.retrieval, self.distance, self.val_reconstruction):
+            metric.reset()

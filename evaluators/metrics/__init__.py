@@ -1,0 +1,86 @@
+"""Metrics of generated motions, as torchmetrics classes that share one vocabulary.
+
+Every `update` takes some of these tensors by name. A batch holds B generated and R real motions, B and R of any size.
+
+| name | shape | what |
+|---|---|---|
+| generated | (B, E) | features of generated motions |
+| text | (B, E) | features of the texts they were generated for |
+| text_keys | (B,) int64 | keys of those captions; equal captions have equal keys |
+| logits | (B, A) | class scores of generated motions |
+| labels | (B,) int64 | classes they were generated for |
+| groups | (B,) int64 | keys of the prompts, where several motions are generated for one |
+| joints | (B, F, J, 3) | generated motions in metres, y up, floor at y = 0 |
+| mask | (B, F) bool | True = real frame of a generated motion |
+| kept | (B, F, J) bool | True = this joint of this frame was to be kept, where motions are edits |
+| keys | (B,) int64 | keys of generated motions, no two the same |
+| real, real_joints, real_mask, real_keys | as above | the same of real motions |
+
+A key is `flame_mdm.seeds.key` of an id (and the number of the sample, where there are several). Metrics that compare
+motion by motion (MID, position and displacement errors) take real motions in the order of the generated ones.
+
+`compute()` gives a number, or a dict of numbers by name, or None where the metric was given nothing; it raises
+ValueError where a number would mean nothing, as with too few samples. For the same features the values are the same to
+the last bit in whatever batches, order and processes the samples came; draws depend on `seed` alone.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+from flame_mdm.config import Config, instantiate, parameters
+from flame_mdm.errors import UserError, did_you_mean
+
+if TYPE_CHECKING:
+    from torchmetrics import Metric
+
+
+def make_metrics(configs: Mapping[str, Config], **options: Any) -> dict[str, Metric]:
+    """Returns the metrics that mappings with a `_target_` describe, by name.
+
+    Args:
+        configs: the mappings, by name.
+        options: further arguments, for those metrics that take them.
+
+    Raises:
+        UserError: a mapping has no `_target_`, or an option that its metric does not take.
+    """
+    metrics = {}
+    for name, config in configs.items():
+        if not isinstance(config, Mapping) or "_target_" not in config:
+            raise UserError(f"metric {name}: no _target_. Name the class of the metric")
+        legal = parameters(config["_target_"], exact=False)
+        unknown = [option for option in config if not option.startswith("_") and option not in legal]
+        if unknown:
+            raise UserError(f"metric {name}: unknown option: {unknown[0]}.{did_you_mean(unknown[0], legal)}")
+        metrics[name] = instantiate(config, **{option: options[option] for option in options if option in legal})
+    return metrics
+
+
+def required_inputs(metric: Metric) -> list[str]:
+    """Returns the names of the inputs that each update needs."""
+    return [p.name for p in inspect.signature(metric.update).parameters.values() if p.default is p.empty]
+
+
+def update_metrics(metrics: Mapping[str, Metric], **features: Any) -> None:
+    """Updates each metric with the inputs that it takes.
+
+    Raises:
+        UserError: a required input is missing.
+    """
+    for name, metric in metrics.items():
+        missing = [needed for needed in required_inputs(metric) if needed not in features]
+        if missing:
+            raise UserError(missing_input(name, metric, missing[0]))
+        taken = inspect.signature(metric.update).parameters.keys() & features
+        metric.update(**{name: features[name] for name in taken})
+
+
+def missing_input(name: str, metric: Metric, needed: str) -> str:
+    """Returns the message about a metric that lacks an input."""
+    return (
+        f"metric {name} ({type(metric).__name__}): missing input: {needed}. Remove the metric from the protocol, or "
+        "choose data, an extractor or a protocol with this input"
+    )

@@ -1,0 +1,258 @@
+"""How well generated motions fit their texts."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from evaluators.metrics.samples import SampleMetric
+
+
+def retrieval_ranks(queries: Tensor, candidates: Tensor, pools: Tensor, own: Tensor) -> Tensor:
+    """How many candidates stand before the right one, by Euclidean distance.
+
+    Args:
+        queries: (N, E) features.
+        candidates: (M, E) features.
+        pools: (N, P) indices of the candidates of each query.
+        own: (N,) where in its pool the right one stands.
+
+    Returns:
+        (N,) int64: candidates that are nearer, or as near and earlier in the pool.
+    """
+    ranks = []
+    for query, pool, right in zip(queries.split(256), pools.split(256), own.split(256), strict=True):
+        distance = torch.linalg.vector_norm(query[:, None] - candidates[pool], dim=-1)
+        at = distance.gather(1, right[:, None])
+        earlier = torch.arange(pool.shape[1], device=pool.device) < right[:, None]
+        ranks.append(((distance < at) | ((distance == at) & earlier)).sum(1))
+    return torch.cat(ranks)
+
+
+class _RPrecision(SampleMetric):
+    higher_is_better = True
+
+    def __init__(self, pool: int = 32, top: int = 3, seed: int = 0, **kwargs: Any):
+        super().__init__(("keys", "generated", "text", "text_keys"), **kwargs)
+        self.pool, self.top, self.seed = pool, top, seed
+
+    def update(self, generated: Tensor, text: Tensor, text_keys: Tensor, keys: Tensor) -> None:
+        """Adds features of motions and of their texts, each (B, E), with the keys of captions and motions (B,)."""
+        self.keep(keys=keys, generated=generated, text=text, text_keys=text_keys)
+
+    def compute(self) -> dict[str, float | None]:
+        """`top1`, `top2`, ...: the share, in [0, 1], of queries with fewer than k candidates before the right one."""
+        rows = self.rows("keys", "generated", "text", "text_keys")
+        if rows is None:
+            return {f"top{k}": None for k in range(1, self.top + 1)}
+        generated, text, text_keys = rows
+        ranks = self.ranks(generated, text, text_keys, np.random.default_rng(self.seed))
+        return {f"top{k}": int((ranks < k).sum()) / len(ranks) for k in range(1, self.top + 1)}
+
+    def ranks(self, generated: Tensor, text: Tensor, text_keys: Tensor, generator: np.random.Generator) -> Tensor:
+        """Place (N,) of the right candidate for each query, 0 = first."""
+        raise NotImplementedError
+
+
+class TextsForMotion(_RPrecision):
+    """R-precision, texts for a motion: is its own text among the k nearest of 32?
+
+    The definition of the papers (FLAME, "Evaluation Metrics"; MDM, B.2; MFM, 9.1) and of FLAME's code: for every
+    generated motion its own text and 31 others, drawn without replacement from the captions that differ from it, at
+    Euclidean distance. In FLAME's code a pool is as large as the batch, so that the last ones are smaller; here all
+    have 32 texts. The own text stands at a random place, so that an extractor to which all texts are alike gets k / 32.
+
+    Args:
+        pool: texts in a pool, the own one included.
+        top: largest k.
+        seed: of the draws.
+        kwargs: options of `torchmetrics.Metric`.
+    """
+
+    def ranks(self, generated: Tensor, text: Tensor, text_keys: Tensor, generator: np.random.Generator) -> Tensor:
+        """Place of the own text in a pool of texts, for each motion."""
+        _, first, own = np.unique(text_keys.cpu().numpy(), return_index=True, return_inverse=True)
+        self.need(len(first), self.pool, "different captions")
+        others = self.pool - 1
+        drawn = np.stack([generator.choice(len(first) - 1, others, replace=False) for _ in own])
+        pools = np.concatenate([drawn + (drawn >= own[:, None]), own[:, None]], 1)
+        place = generator.integers(self.pool, size=len(own))
+        rows = np.arange(len(own))
+        pools[rows, others], pools[rows, place] = pools[rows, place], own
+        texts = text[torch.from_numpy(first).to(text.device)]
+        return retrieval_ranks(generated, texts, _tensor(pools, text), _tensor(place, text))
+
+
+class MotionsForText(_RPrecision):
+    """R-precision, motions for a text: is its own motion among the k nearest of 32?
+
+    The definition of the code of Guo et al. 2022, which MDM's and MFM's tables use: test pairs in random order, cut
+    into pools of 32; each text ranks the motions of its pool by Euclidean distance. Equal captions may meet in a pool.
+    In that code a pool is a batch of the loader, an incomplete last batch is left out, distances are float32, and a
+    motion exactly at its text may come last (square root of a negative number); here pools are drawn, and the texts of
+    an incomplete last pool rank the last 32 motions, so that every text counts once.
+
+    Args:
+        pool: motions in a pool.
+        top: largest k.
+        seed: of the draws.
+        normalize: scales features to length 1 first, which ranks by cosine. An extractor trained by cosines, such as
+            motion-CLIP, leaves lengths open, and the shortest motions would be nearest to every text.
+        kwargs: options of `torchmetrics.Metric`.
+    """
+
+    def __init__(self, pool: int = 32, top: int = 3, seed: int = 0, normalize: bool = False, **kwargs: Any):
+        super().__init__(pool, top, seed, **kwargs)
+        self.normalize = normalize
+
+    def ranks(self, generated: Tensor, text: Tensor, text_keys: Tensor, generator: np.random.Generator) -> Tensor:
+        """Place of the own motion in a pool of motions, for each text."""
+        count = len(generated)
+        if self.normalize:
+            generated, text = F.normalize(generated, dim=-1), F.normalize(text, dim=-1)
+        self.need(count, self.pool, "motions")
+        order = generator.permutation(count)
+        start = np.minimum(np.arange(count) // self.pool * self.pool, count - self.pool)
+        pools = order[start[:, None] + np.arange(self.pool)]
+        queries = text[_tensor(order, text)]
+        return retrieval_ranks(queries, generated, _tensor(pools, text), _tensor(np.arange(count) - start, text))
+
+
+def _tensor(indices: np.ndarray, like: Tensor) -> Tensor:
+    return torch.from_numpy(indices).to(like.device)
+
+
+class _TextAndMotion(SampleMetric):
+    def __init__(self, **kwargs: Any):
+        super().__init__(("keys", "generated", "text"), **kwargs)
+
+    def update(self, generated: Tensor, text: Tensor, keys: Tensor) -> None:
+        """Adds features of motions and of their texts, each (B, E), with the keys of the motions (B,)."""
+        self.keep(keys=keys, generated=generated, text=text)
+
+
+class MultimodalDistance(_TextAndMotion):
+    """MM-Dist, "matching score" in the code of Guo et al. 2022: mean Euclidean distance of motion and own text.
+
+    MFM, eq. 10. The authors' code takes distances in float32 and leaves out an incomplete last batch.
+
+    Args:
+        normalize: scales features to length 1 first, as for `MotionsForText`; in [0, 2] then.
+        kwargs: options of `torchmetrics.Metric`.
+    """
+
+    higher_is_better = False
+
+    def __init__(self, normalize: bool = False, **kwargs: Any):
+        super().__init__(**kwargs)
+        self.normalize = normalize
+
+    def compute(self) -> float | None:
+        """The mean distance, in units of the features."""
+        rows = self.rows("keys", "generated", "text")
+        if rows is None:
+            return None
+        motion, text = (F.normalize(x, dim=-1) for x in rows) if self.normalize else rows
+        return torch.linalg.vector_norm(motion - text, dim=-1).mean().item()
+
+
+class MotionCLIPScore(_TextAndMotion):
+    """mCLIP score of FLAME ("Evaluation Metrics"): mean cosine of the features of motion and own text, in [-1, 1]."""
+
+    higher_is_better = True
+
+    def compute(self) -> float | None:
+        """The mean cosine."""
+        rows = self.rows("keys", "generated", "text")
+        return None if rows is None else F.cosine_similarity(rows[0], rows[1]).mean().item()
+
+
+class WholeSetRetrieval(_TextAndMotion):
+    """Retrieval among all test samples by cosine, protocol "all" of Petrovich et al. 2023 (TMR).
+
+    Ties get their mean rank. Other than R-precision, values fall as the test set grows.
+    """
+
+    higher_is_better = True
+    TOP = (1, 2, 3, 5, 10)
+
+    def compute(self) -> dict[str, float | None]:
+        """Recall `t2m_top1`, ... in [0, 1] and median rank `t2m_median` (1 = best); `m2t_` the other way."""
+        rows = self.rows("keys", "generated", "text")
+        if rows is None:
+            return {
+                f"{way}_{name}": None for way in ("t2m", "m2t") for name in (*(f"top{k}" for k in self.TOP), "median")
+            }
+        motion, text = (F.normalize(x, dim=-1) for x in rows)
+        return whole_set_retrieval(text @ motion.T, self.TOP)
+
+
+def whole_set_retrieval(similarity: Tensor, top: tuple[int, ...]) -> dict[str, float | None]:
+    """Recall and median rank from similarities (N, N), rows texts, columns motions: see `WholeSetRetrieval`."""
+    values: dict[str, float | None] = {}
+    for way, table in (("t2m", similarity), ("m2t", similarity.T)):
+        own = table.diagonal()[:, None]
+        rank = (table > own).sum(1) + ((table == own).sum(1) - 1) / 2
+        values |= {f"{way}_top{k}": (rank < k).double().mean().item() for k in top}
+        values[f"{way}_median"] = rank.double().quantile(0.5).item() + 1
+    return values
+
+
+def mutual_information_divergence(real: Tensor, text: Tensor, generated: Tensor, eps: float) -> Tensor:
+    """MID of generated motions (M, E) for the first M of the texts (N, T) that real motions (N, E) belong to, float64.
+
+    Kim et al. 2022, "Mutual Information Divergence": the mean pointwise mutual information of generated motions and
+    their texts under a normal distribution fitted to the real pairs,
+
+        (log det S_x + log det S_y - log det S_z) / 2 + (tr S_x^-1 S_x' + tr S_y^-1 S_y - tr S_z^-1 S_z') / 2
+
+    with x real, y text, z both; covariances of generated motions (') are about the means of the real ones; inverses are
+    those of S + eps I. N - 1 and M - 1 in the denominators.
+    """
+    count = len(generated)
+    both = torch.cat([real, text], 1)
+    fake = torch.cat([generated, text[:count]], 1)
+    value = real.new_zeros(())
+    for sign, true, seen in ((1, real, generated), (1, text, text), (-1, both, fake)):
+        center = true.mean(0)
+        a, b = true - center, seen - center
+        covariance, seen_covariance = a.T @ a / (len(a) - 1), b.T @ b / (len(b) - 1)
+        inverse = torch.linalg.inv(covariance + eps * torch.eye(len(covariance)).to(covariance))
+        value += sign / 2 * torch.linalg.svdvals(covariance).log().sum()
+        value += sign / 2 * (inverse * seen_covariance.T).sum()
+    return value
+
+
+class MutualInformationDivergence(SampleMetric):
+    """MID, in nats: `mutual_information_divergence` of generated motions, their texts and the real motions.
+
+    Needs the real motion of each generated one, and more samples than motion and text have features together: below,
+    the joint covariance is singular and the value arbitrary (the authors' code asks for half as many).
+
+    Args:
+        eps: added to the diagonal of covariances before they are inverted. 5e-4 in FLAME, 0 in the authors' release.
+        kwargs: options of `torchmetrics.Metric`.
+    """
+
+    higher_is_better = True
+
+    def __init__(self, eps: float = 5e-4, **kwargs: Any):
+        super().__init__(("keys", "generated", "text", "real"), **kwargs)
+        self.eps = eps
+
+    def update(self, generated: Tensor, text: Tensor, real: Tensor, keys: Tensor) -> None:
+        """Adds features (B, E) of generated motions, of their texts and of the real motions, with keys (B,)."""
+        self.keep(keys=keys, generated=generated, text=text, real=real)
+
+    def compute(self) -> float | None:
+        """The divergence."""
+        rows = self.rows("keys", "generated", "text", "real")
+        if rows is None:
+            return None
+        generated, text, real = rows
+        self.need(len(text), real.shape[1] + text.shape[1] + 1, "samples, one more than features of motion and text")
+        return mutual_information_divergence(real, text, generated, self.eps).item()

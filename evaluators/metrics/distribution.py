@@ -1,0 +1,139 @@
+"""How close the features of generated motions are to those of real ones, as sets."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from evaluators.metrics.samples import TwoSets
+
+
+def frechet_distance(a: Tensor, b: Tensor) -> Tensor:
+    """Fréchet distance of the normal distributions fitted to the rows of a (N, E) and b (M, E), float64.
+
+    |m_a - m_b|^2 + tr S_a + tr S_b - 2 tr (S_a S_b)^(1/2) (Dowson and Landau 1982). With centered rows
+    A / sqrt(N - 1) = Q_a R_a, and so for b, the last trace is the sum of the singular values of R_a R_b^T: no square
+    root of a matrix is taken, and covariances without full rank need no special care.
+    """
+    r_a, r_b = (torch.linalg.qr((x - x.mean(0)) / (len(x) - 1) ** 0.5, mode="r").R for x in (a, b))
+    shared = torch.linalg.svdvals(r_a @ r_b.T).sum()
+    return ((a.mean(0) - b.mean(0)) ** 2).sum() + (r_a**2).sum() + (r_b**2).sum() - 2 * shared
+
+
+class FrechetMotionDistance(TwoSets):
+    """Fréchet distance of motion features, "FID" (Heusel et al. 2017) or "FD" (FLAME): `frechet_distance`.
+
+    Covariances have N - 1 in the denominator, as in the authors' code (numpy.cov). That code takes means in float32,
+    scipy's `sqrtm` of the product, and adds 1e-6 to the diagonals where that fails: relative differences of 1e-8. The
+    value is biased upwards, the more so the fewer samples: compare values of equal N only.
+    """
+
+    higher_is_better = False
+
+    def compute(self) -> float | None:
+        """The distance, at least 0."""
+        sets = self.sets()
+        if sets is None:
+            return None
+        for name, features in zip(("generated", "real"), sets, strict=True):
+            self.need(len(features), 2, f"{name} motions")
+        return max(frechet_distance(*sets).item(), 0.0)  # rounding may end a little below 0
+
+
+def polynomial_mmd2(a: Tensor, b: Tensor) -> Tensor:
+    """Unbiased squared maximum mean discrepancy of a (n, E) and b (n, E) under the kernel (x . y / E + 1)^3.
+
+    Bińkowski et al. 2018, eq. 4, as in the authors' code: for sets of equal size, with pairs (i, i) across the sets.
+    """
+    n, width = a.shape
+    inner_a, inner_b, cross = ((x @ y.T / width + 1) ** 3 for x, y in ((a, a), (b, b), (a, b)))
+    within = inner_a.sum() - inner_a.trace() + inner_b.sum() - inner_b.trace()
+    return within / (n * (n - 1)) - 2 * cross.mean()
+
+
+class KernelMotionDistance(TwoSets):
+    """Kernel distance of motion features, "KID" (Bińkowski et al. 2018): mean `polynomial_mmd2` of random subsets.
+
+    Args:
+        subsets: number of subsets.
+        subset_size: samples in each, from either set.
+        replace: draw subsets with replacement, as MoDi's and MDM's code does for more real motions than `subset_size`.
+            Samples drawn twice then raise the value.
+        seed: of the draws.
+        kwargs: options of `torchmetrics.Metric`.
+    """
+
+    higher_is_better = False
+
+    def __init__(
+        self, subsets: int = 100, subset_size: int = 1000, replace: bool = False, seed: int = 0, **kwargs: Any
+    ):
+        super().__init__(**kwargs)
+        self.subsets, self.subset_size, self.replace, self.seed = subsets, subset_size, replace, seed
+
+    def compute(self) -> dict[str, float | None]:
+        """`mean` over the subsets, and `std` (N in the denominator) among them."""
+        sets = self.sets()
+        if sets is None:
+            return {"mean": None, "std": None}
+        for name, features in zip(("generated", "real"), sets, strict=True):
+            self.need(len(features), self.subset_size, f"{name} motions for subsets of {self.subset_size}")
+        generator = np.random.default_rng(self.seed)
+        values = []
+        for _ in range(self.subsets):
+            a, b = (
+                x[torch.from_numpy(generator.choice(len(x), self.subset_size, replace=self.replace)).to(x.device)]
+                for x in sets
+            )
+            values.append(polynomial_mmd2(a, b))
+        mmd2 = torch.stack(values)
+        return {"mean": mmd2.mean().item(), "std": mmd2.std(unbiased=False).item()}
+
+
+def manifold_coverage(points: Tensor, samples: Tensor, neighbors: int) -> Tensor:
+    """Share of the points (M, E) that lie within reach of a sample (N, E): no further than its k-th nearest neighbor.
+
+    Kynkäänniemi et al. 2019, eq. 1 and 2; a sample is no neighbor of its own.
+    """
+    reach = _squared_distances(samples, samples).kthvalue(neighbors + 1, dim=1).values
+    return (_squared_distances(points, samples) <= reach).any(1).double().mean()
+
+
+def _squared_distances(a: Tensor, b: Tensor) -> Tensor:
+    return (a**2).sum(1)[:, None] + (b**2).sum(1) - 2 * a @ b.T
+
+
+class PrecisionRecall(TwoSets):
+    """Precision and recall of generated motions (Kynkäänniemi et al. 2019), in [0, 1].
+
+    Precision is the share of generated motions within the manifold of the real ones, recall the share of real motions
+    within that of the generated ones: `manifold_coverage`. Both sets are cut to the size of the smaller, to the first
+    in the order of the keys, as reaches shrink with the number of samples; the authors' code cuts in the order of the
+    files.
+
+    Args:
+        neighbors: k, 3 in MoDi and MDM.
+        kwargs: options of `torchmetrics.Metric`.
+    """
+
+    higher_is_better = True
+
+    def __init__(self, neighbors: int = 3, **kwargs: Any):
+        super().__init__(**kwargs)
+        self.neighbors = neighbors
+
+    def compute(self) -> dict[str, float | None]:
+        """`precision` and `recall`."""
+        sets = self.sets()
+        if sets is None:
+            return {"precision": None, "recall": None}
+        size = min(len(features) for features in sets)
+        self.need(size, self.neighbors + 1, "motions in the smaller set")
+        generated, real = (features[:size] for features in sets)
+        return {
+            "precision": manifold_coverage(generated, real, self.neighbors).item(),
+            "recall": manifold_coverage(real, generated, self.neighbors).item(),
+        }

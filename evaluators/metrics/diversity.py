@@ -1,0 +1,211 @@
+"""How much generated motions differ from one another."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from evaluators.metrics.samples import SampleMetric, by_group, real_frames
+
+
+def pair_distance(a: Tensor, b: Tensor) -> float:
+    """Mean Euclidean distance of features a (..., E) and b (..., E)."""
+    return torch.linalg.vector_norm(a - b, dim=-1).mean().item()
+
+
+class Diversity(SampleMetric):
+    """Mean distance of random pairs of motions (Guo et al. 2020; MDM, eq. 6). Best where it is that of real motions.
+
+    Published are 300 pairs, drawn as two sets without replacement, for text-to-motion, and 200 pairs with replacement
+    for action-to-motion and unconstrained synthesis. In both a motion may be paired with itself, which counts as 0.
+
+    Args:
+        pairs: number of pairs.
+        replace: whether a motion may be drawn twice for the same side.
+        seed: of the draws.
+        kwargs: options of `torchmetrics.Metric`.
+    """
+
+    higher_is_better = None
+
+    def __init__(self, pairs: int, replace: bool, seed: int = 0, **kwargs: Any):
+        super().__init__(("keys", "generated"), **kwargs)
+        self.pairs, self.replace, self.seed = pairs, replace, seed
+
+    def update(self, generated: Tensor, keys: Tensor) -> None:
+        """Adds features (B, E) of motions, with keys (B,)."""
+        self.keep(keys=keys, generated=generated)
+
+    def compute(self) -> float | None:
+        """The mean distance, in units of the features."""
+        rows = self.rows("keys", "generated")
+        if rows is None:
+            return None
+        (features,) = rows
+        self.need(len(features), 2 if self.replace else self.pairs, f"motions for {self.pairs} pairs")
+        generator = np.random.default_rng(self.seed)
+        first, second = (
+            torch.from_numpy(generator.choice(len(features), self.pairs, replace=self.replace)).to(features.device)
+            for _ in range(2)
+        )
+        return pair_distance(features[first], features[second])
+
+
+class _PerPrompt(SampleMetric):
+    """Multimodality of several motions a prompt; the metric needs the same number for each."""
+
+    higher_is_better = None
+
+    def __init__(self, samples: int, seed: int = 0, **kwargs: Any):
+        super().__init__(("keys", "generated", "groups"), **kwargs)
+        self.samples, self.seed = samples, seed
+
+    def update(self, generated: Tensor, groups: Tensor, keys: Tensor) -> None:
+        """Adds features (B, E) of motions, with the keys of their prompts and their own (B,)."""
+        self.keep(keys=keys, generated=generated, groups=groups)
+
+    def compute(self) -> float | None:
+        """The mean distance, in units of the features."""
+        rows = self.rows("keys", "generated", "groups")
+        if rows is None:
+            return None
+        features, groups = rows
+        return self.distance(features[by_group(self, groups, self.samples)])
+
+    def distance(self, features: Tensor) -> float:
+        """Mean distance within (C, S, E) features of S motions of each of C prompts."""
+        raise NotImplementedError
+
+
+class TextMultimodality(_PerPrompt):
+    """Multimodality of Guo et al. 2022 (MDM, B.2; MFM, eq. 12): of 30 motions a text, 10 random pairs.
+
+    As in their code, two sets of 10 are drawn without replacement out of the 30, the same numbers for all texts; a
+    motion that is in both may meet itself. Published for 100 texts; MDM's and MFM's code takes whole batches, 128.
+
+    Args:
+        samples: motions a text.
+        pairs: pairs a text.
+        seed: of the draws.
+        kwargs: options of `torchmetrics.Metric`.
+    """
+
+    def __init__(self, samples: int = 30, pairs: int = 10, seed: int = 0, **kwargs: Any):
+        super().__init__(samples, seed, **kwargs)
+        self.pairs = pairs
+
+    def distance(self, features: Tensor) -> float:
+        """Mean distance of the drawn pairs."""
+        generator = np.random.default_rng(self.seed)
+        first, second = (
+            torch.from_numpy(generator.choice(self.samples, self.pairs, replace=False)).to(features.device)
+            for _ in range(2)
+        )
+        return pair_distance(features[:, first], features[:, second])
+
+
+class PairedMultimodality(_PerPrompt):
+    """Multimodality of FLAME (eq. 19): two sets of 10 motions a text, compared one by one.
+
+    FLAME has no code for it. Its Table 3 has 10 motions a text, eq. 19 takes two sets of 10; here it is the
+    latter, 20 motions a text.
+
+    Args:
+        samples: motions in each of the two sets.
+        kwargs: options of `torchmetrics.Metric`.
+    """
+
+    def __init__(self, samples: int = 10, **kwargs: Any):
+        super().__init__(2 * samples, **kwargs)
+
+    def distance(self, features: Tensor) -> float:
+        """Mean distance of the first half of each prompt's motions from the second."""
+        first, second = features.chunk(2, dim=1)
+        return pair_distance(first, second)
+
+
+class ActionMultimodality(SampleMetric):
+    """Multimodality of Guo et al. 2020 (MDM, eq. 7): 20 random pairs of the same class, for each class.
+
+    As in the authors' code a motion may be drawn repeatedly, and be paired with itself. There the sum is divided by the
+    number of all classes, those without a motion too; here by the number of classes that have motions.
+
+    Args:
+        pairs: pairs a class.
+        seed: of the draws.
+        kwargs: options of `torchmetrics.Metric`.
+    """
+
+    higher_is_better = None
+
+    def __init__(self, pairs: int = 20, seed: int = 0, **kwargs: Any):
+        super().__init__(("keys", "generated", "labels"), **kwargs)
+        self.pairs, self.seed = pairs, seed
+
+    def update(self, generated: Tensor, labels: Tensor, keys: Tensor) -> None:
+        """Adds features (B, E) of motions, with their classes and keys (B,)."""
+        self.keep(keys=keys, generated=generated, labels=labels)
+
+    def compute(self) -> float | None:
+        """The mean distance, in units of the features."""
+        rows = self.rows("keys", "generated", "labels")
+        if rows is None:
+            return None
+        features, labels = rows
+        generator = np.random.default_rng(self.seed)
+        pairs = []
+        for label in labels.unique():
+            members = (labels == label).nonzero()[:, 0]
+            self.need(len(members), 2, f"motions of class {int(label)}")
+            drawn = generator.integers(len(members), size=(2, self.pairs))
+            pairs.append(members[torch.from_numpy(drawn).to(members.device)])
+        first, second = torch.cat(pairs, 1)
+        return pair_distance(features[first], features[second])
+
+
+class JointVariance(SampleMetric):
+    """Variance of joint positions among the motions of a text, in square metres.
+
+    FLAME (Table 3) averages "the variance of joints for the 10 generated motions" and says that eq. 18, a variance over
+    the frames of one motion, is used; there is no code. Here it is, at each frame and joint, the variance over the
+    motions of a text (n - 1 in the denominator), summed over x, y and z, then averaged over joints, frames and texts.
+    Not comparable with FLAME's numbers. The motions of a text have the same length.
+
+    Args:
+        samples: motions a text.
+        kwargs: options of `torchmetrics.Metric`.
+    """
+
+    higher_is_better = None
+    motions: list[Tensor]
+
+    def __init__(self, samples: int = 10, **kwargs: Any):
+        super().__init__(("keys", "groups", "motions"), **kwargs)
+        self.samples = samples
+
+    def update(self, joints: Tensor, mask: Tensor, groups: Tensor, keys: Tensor) -> None:
+        """Adds motions (B, F, J, 3) with masks (B, F), and the keys of their prompts and their own (B,)."""
+        motions = real_frames("JointVariance", joints, mask)
+        for _, motion in zip(keys, motions, strict=True):
+            self.motions.append(motion)
+        self.keep(keys=keys, groups=groups)
+
+    def compute(self) -> float | None:
+        """The variance."""
+        rows = self.rows("keys", "groups")
+        if rows is None:
+            return None
+        motions = [self.motions[index] for index in self.order("keys").tolist()]
+        values = []
+        for members in by_group(self, rows[0], self.samples).tolist():
+            lengths = {len(motions[index]) for index in members}
+            if len(lengths) > 1:
+                raise ValueError(
+                    f"JointVariance: motions of one text have {sorted(lengths)} frames; generate them alike"
+                )
+            joints = torch.stack([motions[index] for index in members]).double()
+            values.append(joints.var(0).sum(-1).mean())
+        return torch.stack(values).mean().item()

@@ -1,0 +1,445 @@
+"""Evaluations: from a request to a result file."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import os
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, fields
+from datetime import timedelta
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from flame_mdm.config import (
+    EXPERIMENTS,
+    Config,
+    check,
+    current_names,
+    instantiate,
+    original_names,
+    plain,
+    settings,
+    trust,
+)
+from flame_mdm.errors import UserError, first_line, say
+from flame_mdm.files import read_yaml, sha256, write_json
+from flame_mdm.reporting.tables import Request, count_lengths, requests
+from flame_mdm.runs import read_result
+
+if TYPE_CHECKING:  # commands check their keys before torch is imported
+    from evaluators.extractors import Extractor
+    from evaluators.protocols import Protocol
+    from flame_mdm.checkpoints.loading import Which
+    from flame_mdm.data import Split
+    from flame_mdm.data.datamodule import Clips, MotionDataModule
+    from flame_mdm.representations import Representation
+    from flame_mdm.task import MotionGeneration
+
+FORMAT = 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluationRequest:
+    """What to evaluate, and how: the keys that experiments/evaluate.yaml explains.
+
+    Raises:
+        UserError: keys that do not fit one another, or a value out of range.
+    """
+
+    ckpt: str | None = None
+    which: Which = "last"
+    from_samples: str | None = None
+    baseline: str | None = None
+    data: Config | None = None
+    representation: Config | None = None
+    protocol: str | None = None
+    extractor: str | None = None
+    split: Split = "test"
+    seed: int = 0
+    replications: int | None = None
+    samples: int | None = None
+    multimodality: bool = True
+    quick: bool = False
+    guidance_scale: float | None = None
+    sampler: str | None = None
+    num_inference_steps: int | None = None
+    method: str | None = None
+    until: float | None = None
+    batch_size: int = 64
+    device: str | None = None
+    data_root: str | None = None
+    out: str | None = None
+
+    @classmethod
+    def of(cls, config: Config) -> EvaluationRequest:
+        """Returns the request that a composed configuration describes."""
+        return cls(**{field.name: config[field.name] for field in fields(cls) if field.name in config})
+
+    def __post_init__(self) -> None:
+        what = [name for name in ("ckpt", "from_samples", "baseline") if getattr(self, name) is not None]
+        if len(what) != 1:
+            raise UserError(
+                "give one of ckpt=runs/.../checkpoints/last.ckpt, from_samples=<folder of .npz files> and "
+                "baseline=shuffled"
+            )
+        if what != ["ckpt"] and not self.data:
+            raise UserError(f"{what[0]} needs the name of the data set, such as data=humanml3d")
+        if what != ["ckpt"] and self.protocol is None:
+            raise UserError(f"{what[0]} needs a protocol, such as protocol=text_to_motion")
+        if what == ["from_samples"] and (self.quick or self.samples or self.replications):
+            raise UserError("from_samples measures all motions of the files: leave out quick, samples and replications")
+        if self.split not in ("train", "val", "test"):
+            raise UserError(f"unknown split: {self.split}. Choose train, val or test")
+        if self.batch_size < 1:
+            raise UserError(f"batch_size={self.batch_size}: at least 1 is needed")
+        if self.guidance_scale is not None and not math.isfinite(self.guidance_scale):
+            raise UserError(f"guidance_scale={self.guidance_scale} is not a finite number")
+
+
+def evaluate(request: EvaluationRequest) -> None:
+    """Evaluates a checkpoint, files of motions or a baseline, and writes the JSON file.
+
+    Raises:
+        UserError, FileNotFoundError, ValueError: a file is missing, or parts do not fit one another.
+    """
+    if request.out is not None:  # before hours of work
+        if Path(request.out).is_dir():
+            raise UserError(f"out={request.out} is a folder; name the JSON file to write")
+        Path(request.out).parent.mkdir(parents=True, exist_ok=True)
+    with _processes(request.device) as (rank, world, device):
+        _evaluate(request, rank, world, device)
+
+
+@contextmanager
+def _processes(device: str | None) -> Iterator[tuple[int, int, str]]:
+    """Joins the processes that torchrun has started, if it has: number of this one, of all, device of this one."""
+    import torch
+
+    rank, world, local = (int(os.environ.get(n, d)) for n, d in (("RANK", 0), ("WORLD_SIZE", 1), ("LOCAL_RANK", 0)))
+    if device is None:
+        device = f"cuda:{local % torch.cuda.device_count()}" if torch.cuda.is_available() else "cpu"
+    if world == 1:
+        yield rank, world, device
+        return
+    # Motions are sent once a replication, by the CPU; a process that is done may wait for hours.
+    torch.distributed.init_process_group("gloo", timeout=timedelta(days=7))
+    try:
+        yield rank, world, device
+    finally:
+        torch.distributed.destroy_process_group()
+
+
+def _evaluate(request: EvaluationRequest, rank: int, world: int, device: str) -> None:
+    from flame_mdm.checkpoints.loading import find, load
+
+    file = find(request.ckpt, request.which) if request.ckpt is not None else None
+    model = load(file, device) if file is not None else None
+    data = _data(request, model)
+    representation = model.representation if model else data.representation.to(device)
+    clips = data.clips(request.split)
+    changes = {name: getattr(request, name) for name in ("replications", "samples", "quick", "multimodality")}
+    name = request.protocol or default_protocol(model)
+    protocol, changed = open_protocol(name, clips, representation, model, **changes)
+    extractor = protocol.open_extractor(request.extractor, representation, data.store.info["dataset"])
+    report = _describe(request, protocol, model, data, extractor)
+    if model is not None and file is not None:
+        names = ("guidance_scale", "sampler", "num_inference_steps", "method", "until")
+        sampling = protocol.sampling(model, **{name: getattr(request, name) for name in names})
+        report["checkpoint"] |= {"selected_by": _selection(model, file), "sha256": sha256(file), **sampling}
+        options = {"seed": request.seed, **sampling}
+        folder = _motions_folder(
+            file,
+            _kind(protocol),
+            report["checkpoint"]["sha256"],
+            {**options, "split": request.split, "data": data.store.fingerprint, "samples": protocol.samples},
+        )
+        source = protocol.generator(
+            model, folder, options, clips=clips, batch_size=request.batch_size, world=world, progress=not rank
+        )
+        path = folder / "result"
+    elif request.baseline is not None:
+        source = protocol.baseline(request.baseline, clips, request.seed)
+        path = Path("runs/baselines") / data.store.info["dataset"] / _kind(protocol) / request.baseline
+        path = path if request.split == "test" else path.with_name(f"{path.name}-{request.split}")
+    else:
+        source = protocol.sample_folder(Path(str(request.from_samples)), representation)
+        path = Path(str(request.from_samples)) / _kind(protocol)
+        report["samples_sha256"] = source.sha256
+    report |= {"changed": changed} | protocol.evaluate(
+        source,
+        clips,
+        extractor,
+        representation,
+        seed=request.seed,
+        batch_size=request.batch_size,
+        rank=rank,
+        world=world,
+    )
+    if rank:
+        return
+    for reason in _overlaps(model, data):
+        report["valid"] = False
+        report["invalid_because"].append(reason)
+    name = f"{path.name}-{extractor.sha256[:8]}" if extractor else path.name
+    name += "-quick" if request.quick else f"-{protocol.replications}x" if "replications" in changed else ""
+    out = Path(request.out or path.with_name(f"{name}.json"))
+    write_json(out, report)
+    _show(report, out)
+
+
+def open_protocol(
+    name: str, clips: Clips, representation: Representation, model: MotionGeneration | None, **changes: Any
+) -> tuple[Protocol, dict[str, Any]]:
+    """Returns a protocol for a split and a model, and what `Protocol.change` has changed of it.
+
+    Raises:
+        UserError: no such protocol, or one that does not fit the clips or the model.
+    """
+    protocol = load_protocol(name, representation)
+    changed = protocol.change(**changes, clips=len(clips))
+    protocol.check_data(clips)
+    if model is not None:
+        check_condition(protocol, model)
+    return protocol, changed
+
+
+def _motions_folder(checkpoint: Path, kind: str, digest: str, options: Mapping[str, Any]) -> Path:
+    """Returns where the motions of a checkpoint are kept that are sampled with some options."""
+    return run_folder(checkpoint) / "evaluation" / kind / f"{digest[:16]}-{_digest(options)[:8]}"
+
+
+def _kind(protocol: Protocol) -> str:
+    return f"{protocol.name}-{protocol.version}"
+
+
+def load_protocol(name: str, representation: Representation) -> Protocol:
+    """The protocol of that name in experiments/evaluation, or in a file, for motions of a representation.
+
+    Its file may use ${representation.fps}, ${representation.toes} and ${representation.parents}.
+
+    Raises:
+        UserError: no such protocol, or one that cannot be read.
+    """
+    from evaluators.protocols import Protocol
+
+    path = Path(name) if name.endswith((".yaml", ".yml")) else EXPERIMENTS / "evaluation" / f"{name}.yaml"
+    if not path.exists():
+        names = ", ".join(sorted(p.stem for p in path.parent.glob("*.yaml")))
+        raise UserError(f"no protocol is called '{name}'; there are: {names or 'none'}")
+    skeleton = representation.skeleton
+    facts = {"fps": representation.fps, "toes": list(skeleton.feet[1::2]), "parents": list(skeleton.parents)}
+    known = {f"${{representation.{fact}}}": value for fact, value in facts.items()}
+
+    def filled(node: Any) -> Any:
+        if isinstance(node, dict):
+            return {key: filled(value) for key, value in node.items()}
+        return [filled(value) for value in node] if isinstance(node, list) else known.get(str(node), node)
+
+    config = filled(read_yaml(path))
+    if not isinstance(config, dict) or "_target_" not in config:
+        raise UserError(f"{path}: not a protocol: it has no _target_, such as evaluators.protocols.Protocol")
+    plain(config, path)
+    config = current_names(config)
+    check(config)
+    protocol = instantiate(config)
+    if not isinstance(protocol, Protocol):
+        raise UserError(f"{path}: not a protocol: {config['_target_']}. Name evaluators.protocols.Protocol")
+    protocol.sha256 = _digest(original_names(config))
+    return protocol
+
+
+def default_protocol(model: MotionGeneration | None) -> str:
+    """The protocol for what a model was trained to do."""
+    assert model is not None
+    condition = _condition(model)
+    if condition == "none":
+        return "unconditioned"
+    if condition == "action":
+        released = {"humanact12": "action_to_motion", "uestc": "action_to_motion_uestc"}
+        return released.get(model.facts.get("dataset", ""), "action_to_motion_own")
+    return "synthetic" if model.facts.get("dataset") == "synthetic" else "text_to_motion"
+
+
+def _condition(model: MotionGeneration) -> str:
+    """What a model was trained to generate motions for."""
+    if not model.condition.features:
+        return "none"
+    return "action" if model.config["condition"]["_target_"].endswith("ActionLabels") else "text"
+
+
+def check_condition(protocol: Protocol, model: MotionGeneration) -> None:
+    """Checks that the model was trained with the condition of the protocol.
+
+    Raises:
+        UserError: it was trained with another condition.
+    """
+    if protocol.condition not in ("none", _condition(model)):
+        raise UserError(
+            f"protocol {protocol.name} generates motions for {protocol.condition}, but the checkpoint was trained with "
+            f"condition {_condition(model)}: choose another protocol, such as {default_protocol(model)}"
+        )
+
+
+def run_folder(checkpoint: Path) -> Path:
+    """The folder of the run that a checkpoint belongs to; that of the file where it belongs to none."""
+    return checkpoint.parent.parent if checkpoint.parent.name == "checkpoints" else checkpoint.parent
+
+
+def _data(request: EvaluationRequest, model: MotionGeneration | None) -> MotionDataModule:
+    """Returns the prepared data, with its own representation: the model keeps the statistics of its training."""
+    from flame_mdm.data.datamodule import MotionDataModule
+
+    module, encoding, root = request.data, request.representation, "data"
+    if model is not None and not module:
+        if "data" not in model.config:
+            raise UserError(f"{request.ckpt}: its recipe names no data; give data=NAME")
+        module, encoding = model.config["data"], model.config["representation"]
+        trust({"data": module})
+        root = module.get("root")
+    assert module is not None
+    assert encoding is not None
+    root = request.data_root or os.environ.get("FLAME_MDM_DATA") or root
+    representation: Representation = instantiate(encoding)
+    if model is not None and representation.name != model.representation.name:
+        raise UserError(
+            f"the checkpoint generates {model.representation.name}, but the data set {module['name']} has "
+            f"{representation.name}"
+        )
+    data = instantiate(module | {"root": root}, representation=representation, seed=0)
+    if not isinstance(data, MotionDataModule):
+        raise UserError(f"{request.ckpt}: its recipe names {type(data).__name__} as data; give data=NAME")
+    data.setup("test")
+    return data
+
+
+def _overlaps(model: MotionGeneration | None, data: MotionDataModule) -> list[str]:
+    """Returns why values are not valid: training clips of the model may be among the evaluated ones."""
+    trained = model.facts.get("fingerprint") if model is not None else None
+    if not trained or trained == data.store.fingerprint:
+        return []
+    return [f"the model was trained on data {trained}, this is {data.store.fingerprint}: splits may overlap"]
+
+
+def _describe(
+    request: EvaluationRequest,
+    protocol: Protocol,
+    model: MotionGeneration | None,
+    data: MotionDataModule,
+    extractor: Extractor | None,
+) -> dict[str, Any]:
+    """Returns the provenance of a result."""
+    import torch
+
+    from flame_mdm.training.provenance import environment
+
+    info = data.store.info
+    where = (model.representation if model else data.representation).mean.device
+    report: dict[str, Any] = {
+        "format": FORMAT,
+        "quick": request.quick,
+        "protocol": {
+            "name": protocol.name,
+            "version": protocol.version,
+            "sha256": protocol.sha256,
+            "length_source": "ground truth",
+        },
+        "split": request.split,
+        "published_split": info["published_split"],
+        "data": {
+            "dataset": info["dataset"],
+            "representation": info["representation"],
+            "fingerprint": info["fingerprint"],
+            "frames": [data.crop.shortest(), data.crop.longest()],
+        },
+        "seed": request.seed,
+        "extractor": extractor
+        and {"path": str(request.extractor), "sha256": extractor.sha256, "data": extractor.fingerprint},
+        "samples_sha256": None,
+        "baseline": request.baseline,
+        "checkpoint": None,
+        "device": torch.cuda.get_device_name(where) if where.type == "cuda" else "cpu",
+        "precision": f"float32, matmul {torch.get_float32_matmul_precision()}",
+        "environment": environment(),
+    }
+    if model is not None:
+        report["checkpoint"] = {
+            "path": str(request.ckpt),
+            "experiment": model.config.get("experiment"),
+            "config_sha256": _digest(original_names(model.config)),
+            "averaged_weights": bool(model.config.get("ema")),
+            "parameters": sum(p.numel() for p in model.parameters() if p.requires_grad),
+        }
+    return report
+
+
+def _selection(model: MotionGeneration, file: Path) -> str:
+    """By which rule a checkpoint was chosen among those of its run, as far as its name tells."""
+    best = (model.config.get("callbacks") or {}).get("best") or {}
+    return f"best {best['monitor']}" if file.stem == "best" and "monitor" in best else f"none: {file.stem}"
+
+
+def _digest(values: Any) -> str:
+    return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
+
+
+def _show(report: Mapping[str, Any], out: Path) -> None:
+    """Prints the values beside those of real motions."""
+    protocol = report["protocol"]
+    mark = " QUICK, NOT A RESULT" if report["quick"] else ""
+    say(f"{protocol['name']} version {protocol['version']}, {report['data']['dataset']} {report['split']}{mark}")
+    say(f"{'':32}{'real motions':>24}{report['baseline'] or 'generated':>24}")
+    for name, value in report["values"].items():
+        real = report["ground_truth"].get(name)
+        say(f"{name:32}{_cell(real):>24}{_cell(value):>24}")
+    for name, reason in report["not_computed"].items():
+        say(f"not computed: {name}: {reason}")
+    for reason in report["warnings"]:
+        say(f"warning: {reason}")
+    for reason in report["invalid_because"]:
+        say(f"NOT VALID: {reason}")
+    say(f"written: {out}")
+
+
+def _cell(value: Mapping[str, Any] | None) -> str:
+    return "-" if value is None or value["mean"] is None else f"{value['mean']:.4g} +- {value['ci']:.2g}"
+
+
+# What tables ask for --------------------------------------------------------------------------------------------------
+
+
+def evaluate_missing(specs: Mapping[str, Config], results: Path, config: Config) -> list[str]:
+    """Evaluates what specs ask for and is not there, or was made of another checkpoint; returns what failed."""
+    wanted: dict[Path, Request] = {}
+    for spec in specs.values():
+        for part in spec["parts"].values():
+            for dataset in part.get("lengths", []):
+                count_lengths(dataset, results, config)
+            for _, row in requests(part) if "columns" in part else ():
+                wanted |= {request.path(results): request for request in row if not request.lacking}
+    missing = {path: request for path, request in wanted.items() if not path.exists() or _outdated(path, request)}
+    failed = []
+    for number, (path, request) in enumerate(missing.items()):
+        say(f"evaluating {number + 1} of {len(missing)}: {request.label}")
+        keys = dict(request.keys)
+        try:
+            dotted = [f"{name}={keys.pop(name)}" for name in list(keys) if name == "data" or "." in name]
+            options = settings("evaluate", dotted)
+            general = {name: config[name] for name in ("device", "batch_size", "data_root") if config[name] is not None}
+            evaluate(EvaluationRequest.of(options | general | keys | {"out": str(path)}))
+        except (UserError, ValueError, OSError) as error:
+            failed.append(f"{request.label}: {first_line(error)}")
+            say(f"failed: {failed[-1]}")
+    return failed
+
+
+def _outdated(path: Path, request: Request) -> bool:
+    """Whether a result was made of another checkpoint or by another extractor than those that are there now."""
+    result = read_result(path)
+    for used, key in ((result.checkpoint, "ckpt"), (result.extractor, "extractor")):
+        file = Path(str(request.keys.get(key)))
+        if file.is_file() and (used is None or used.sha256 != sha256(file)):
+            return True
+    return False

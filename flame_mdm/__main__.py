@@ -1,0 +1,60 @@
+"""The command line: `flame-mdm COMMAND OBJECT [OUT] key=value ...`, also `python -m flame_mdm COMMAND ...`."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from importlib import import_module
+
+from flame_mdm.config import guarded
+from flame_mdm.errors import UserError, did_you_mean, say
+
+COMMANDS = {
+    "train": "train or resume a recipe",
+    "sample": "generate motions from a checkpoint",
+    "edit": "keep part of a motion and sample the rest",
+    "evaluate": "measure a checkpoint by a protocol",
+    "tables": "render tables and figures from results",
+    "benchmark": "train, evaluate and tabulate a set of small models",
+    "prepare": "turn a data set into a packed store, or verify one",
+    "browse": "show a prepared data set as a web page",
+    "convert": "convert a motion file",
+    "compare": "put runs side by side, or run a user study",
+    "report": "write a run's report page",
+    "import": "import a checkpoint that the authors of a paper released",
+    "export": "write a checkpoint as a model file",
+    "push": "upload a model file to the Hugging Face hub",
+}
+"""Name of each command -> what it does. `import` lives in `commands/import_released.py`; the others in their name."""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Runs a command and returns its exit code."""
+    words = list(sys.argv[1:] if argv is None else argv)
+    if not words or words[0] in ("-h", "--help"):
+        say(*_help())
+        return 0 if words else 2
+    name, *rest = words
+    if name not in COMMANDS:
+        return guarded(lambda: _unknown(name))
+    module = import_module(f"flame_mdm.commands.{'import_released' if name == 'import' else name}")
+    return module.main(rest)
+
+
+def _help() -> list[str]:
+    return [
+        "usage: flame-mdm COMMAND OBJECT [OUT] [key=value ...]",
+        "",
+        *(f"  {name:10} {purpose}" for name, purpose in COMMANDS.items()),
+        "",
+        "An object is an existing path, the name of a recipe or data set, or a model on the Hugging Face hub.",
+        "`flame-mdm COMMAND --help` explains a command.",
+    ]
+
+
+def _unknown(name: str) -> None:
+    raise UserError(f"unknown command: {name}.{did_you_mean(name, COMMANDS)} `flame-mdm --help` lists the commands")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,1 @@
+"""Checkpoints and model files: reading, writing, loading, import of released weights, the hub."""

@@ -1,0 +1,156 @@
+"""From a path or a name to a model: finding its file, building its parts, loading its weights."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any, Literal, TypeVar, get_args
+
+import torch
+from hydra.utils import get_class
+from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
+
+from flame_mdm.checkpoints.files import FILE, read_checkpoint
+from flame_mdm.config import Config, flatten, instantiate, trust
+from flame_mdm.errors import UserError, first_line
+from flame_mdm.files import (
+    regular_file,
+)
+from flame_mdm.processes import MOST_STEPS
+from flame_mdm.task import MotionGeneration, Task
+
+Which = Literal["last", "best"]
+
+
+def find(source: str | Path, which: Which = "last") -> Path:
+    """Returns the file of a model.
+
+    Args:
+        source: a file; a run directory; a folder with one .safetensors file; or "user/name[@revision]" of the Hugging
+            Face hub.
+        which: of a run directory, the last checkpoint or the one with the best validation result.
+
+    Raises:
+        FileNotFoundError: there is no such file, or the run has no such checkpoint.
+        UserError: the folder holds no or several model files, or the hub does not provide the model.
+    """
+    if which not in get_args(Which):
+        raise UserError(f"which={which}: write last or best")
+    path = Path(source)
+    if path.exists() and not path.is_dir():
+        regular_file(path)
+        return path
+    is_run = (path / "config.yaml").is_file() and not any(path.glob("*.safetensors"))
+    if is_run or (path / "checkpoints").is_dir():
+        file = path / "checkpoints" / f"{which}.ckpt"
+        if not file.exists():
+            there = ", ".join(sorted(found.name for found in file.parent.glob("*.ckpt"))) or "none yet"
+            raise FileNotFoundError(f"{file}: no such checkpoint; the run has {there}")
+        return file
+    if path.is_dir():
+        files = sorted(path.glob("*.safetensors"))
+        if len(files) != 1:
+            there = ", ".join(file.name for file in files) or "no .safetensors file"
+            raise UserError(f"{path}: this folder holds {there}; name the file of the model")
+        regular_file(files[0])
+        return files[0]
+    match = re.fullmatch(r"([\w.-]+/[\w.-]+)(?:@([\w./-]+))?", str(source))
+    if match is None or path.suffix in (".ckpt", ".safetensors", ".pt") or path.parent.is_dir():
+        raise FileNotFoundError(f"{path}: no such checkpoint")
+    from huggingface_hub import hf_hub_download, logging
+
+    logging.set_verbosity_error()  # else it reports every attempt to reach the hub
+    try:
+        return Path(hf_hub_download(match[1], FILE, revision=match[2]))
+    except Exception as error:  # the client raises many kinds: no network, no such repository, no permission ...
+        raise UserError(
+            f"{source}: no such file or folder, nor can {FILE} of a model of that name be fetched from the hub: "
+            f"{first_line(error)}"
+        ) from error
+
+
+def load(source: str | Path, device: str | torch.device = "cpu", *, which: Which = "last") -> MotionGeneration:
+    """Returns a trained model, ready to sample; arguments as of `find`, errors as of `load_task`."""
+    return load_task(find(source, which), MotionGeneration, device)
+
+
+Trained = TypeVar("Trained", bound=Task)
+
+PARTS = ("task", "representation", "process", "condition", "denoiser")
+"""Parts of a recipe that a model is built of."""
+
+
+def load_task(path: Path, kind: type[Trained], device: str | torch.device = "cpu") -> Trained:
+    """What a checkpoint holds, in evaluation mode: the averaged weights where the recipe averages them.
+
+    Raises:
+        FileNotFoundError: no such file.
+        UserError: not a checkpoint of this framework, not of this kind, damaged, or of another shape than its recipe.
+    """
+    try:
+        torch.empty(0, device=device)
+    except (RuntimeError, AssertionError) as error:  # torch reports an absent device as either
+        raise UserError(f"device={device}: {str(error).splitlines()[0]}") from error
+    checkpoint = read_checkpoint(path)
+    try:
+        return _build(path, checkpoint, kind).eval().to(device)
+    except (UserError, FileNotFoundError):
+        raise
+    except Exception as error:  # a recipe of nonsense fails anywhere
+        raise UserError(f"{path}: no model can be built of it: {type(error).__name__}: {error}") from error
+
+
+def _build(path: str | Path, checkpoint: dict[str, Any], kind: type[Trained]) -> Trained:
+    config, facts = checkpoint["config"], checkpoint["facts"]
+    parts = {name: config[name] for name in PARTS if name in config}
+    trust(parts)
+    for name in ("task", "representation", *parts):
+        if "_target_" not in (config[name] if isinstance(config.get(name), dict) else {}):
+            raise UserError(f"{path}: damaged: its recipe has no {name}")
+    built = get_class(config["task"]["_target_"])
+    if not issubclass(built, kind):
+        raise UserError(f"{path}: holds a {built.__name__}, not a {kind.__name__}")
+    with _Sizes(path, checkpoint["state_dict"], parts):
+        representation = instantiate(config["representation"])
+        task = built.build(config, representation, actions=facts["actions"])
+    task.facts = facts
+    try:
+        task.load_state_dict(checkpoint["state_dict"], strict=True)
+    except RuntimeError as error:
+        lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+        raise UserError(f"{path}: the weights do not fit the recipe saved with them: {lines[1]}") from error
+    return task
+
+
+class _Sizes(TorchDispatchMode):
+    """While a model is built, refuses tensors that the weights in its file do not explain, before they are made.
+
+    Args:
+        path: the file, for messages.
+        weights: the state dict in it.
+        parts: the recipe of the model, whose whole numbers are checked at once.
+
+    Raises:
+        UserError: a whole number of the recipe is beyond all sizes of models.
+    """
+
+    def __init__(self, path: str | Path, weights: dict[str, Tensor], parts: Config):
+        super().__init__()
+        largest = max((size for value in weights.values() for size in value.shape), default=0)
+        for name, value in flatten(parts).items():
+            for number in value if isinstance(value, list | tuple) else [value]:
+                if isinstance(number, int) and abs(number) > max(MOST_STEPS, largest):
+                    raise UserError(f"{path}: {name}={number} in its recipe: no model is so large")
+        self.path, self.numbers = path, 4 * sum(value.numel() for value in weights.values()) + 10_000_000
+        self.tensors = 4 * len(weights) + 2_000
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        kwargs = kwargs or {}
+        if not any(isinstance(value, Tensor) for value in tree_leaves((args, kwargs))):
+            self.numbers -= sum(v.numel() for v in tree_leaves(func(*args, **kwargs | {"device": "meta"})))
+            self.tensors -= 1
+            if self.numbers < 0 or self.tensors < 0:
+                raise UserError(f"{self.path}: its recipe asks for a larger model than the weights beside it fill")
+        return func(*args, **kwargs)

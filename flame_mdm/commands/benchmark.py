@@ -1,0 +1,140 @@
+"""Trains and measures small models of all kinds: `flame-mdm benchmark synthetic`"""
+
+from __future__ import annotations
+
+import base64
+import subprocess
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from flame_mdm.config import EXPERIMENTS, Config, run, settings
+from flame_mdm.errors import UserError, say
+from flame_mdm.files import read_yaml, write_json, write_text
+from flame_mdm.reporting.page import page, render
+from flame_mdm.reporting.rendering import Table
+from flame_mdm.reporting.tables import build, load_spec, write
+from flame_mdm.runs import Number, newest_samples, read_json
+
+if TYPE_CHECKING:
+    from markupsafe import Markup
+
+USAGE = """
+usage: flame-mdm benchmark NAME [out=FOLDER]
+
+Trains a motion-CLIP and a small model of each kind, evaluates them, and writes a table and a report page: the whole
+chain in one command. An interrupted command continues where it stopped.
+NAME is a file of experiments/benchmark: synthetic, which needs no download, or bandai.
+"""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Runs the command; returns its exit code."""
+    words = sys.argv[1:] if argv is None else argv
+    return run(benchmark, words, usage=USAGE, name="benchmark", objects=("exp",), text=("exp", "out", "data_root"))
+
+
+def benchmark(config: Config) -> None:
+    """Trains, evaluates and reports what a file of experiments/benchmark lists.
+
+    Raises:
+        UserError: no such file, a training that failed, or a model that is worse than expected.
+    """
+    names = sorted(path.stem for path in (EXPERIMENTS / "benchmark").glob("*.yaml"))
+    if config["exp"] not in names:
+        raise UserError(f"which benchmark? EXP=NAME, one of: {', '.join(names)}")
+    plan = read_yaml(EXPERIMENTS / "benchmark" / f"{config['exp']}.yaml")
+    out = Path(config["out"] or Path("runs") / "benchmark" / config["exp"])
+    out.mkdir(parents=True, exist_ok=True)  # before hours of work
+    times = Times(out / "times.json")
+    if config["evaluate"]:
+        for words in plan["train"]:
+            train(words, times, config["data_root"])
+    spec = load_spec(plan["table"])
+    options = settings("tables") | {name: config[name] for name in ("device", "batch_size", "data_root")}
+    results = Path(options["results"])
+    begin = time.monotonic()
+    from evaluators.run import evaluate_missing
+
+    failed = evaluate_missing({plan["table"]: spec}, results, options) if config["evaluate"] else []
+    times.add("evaluation", time.monotonic() - begin)
+    table = build(plan["table"], spec, results)
+    body = write(table, out)
+    checks = check(table, plan.get("expected", {}))
+    report = out / "report.html"
+    write_text(report, page(table.title, _report(config["exp"], body, times, checks, plan["train"])))
+    say(f"{sum(times.seconds.values()) / 60:.0f} minutes in all; see {report}")
+    wrong = [line for line, right in checks if not right]
+    if failed or wrong:
+        raise UserError("; ".join([*failed, *wrong]))
+
+
+class Times:
+    """Seconds by what they were spent on, kept in a file, so that a benchmark that goes on knows of its beginning."""
+
+    def __init__(self, path: Path):
+        self.path = path
+        self.seconds: dict[str, float] = {}
+        if path.exists():
+            self.seconds = read_json(path, dict[str, Number], "delete it, and the time before is not counted")
+
+    def add(self, name: str, seconds: float) -> None:
+        self.seconds[name] = self.seconds.get(name, 0.0) + seconds
+        write_json(self.path, self.seconds, indent=1)
+
+
+def train(words: Sequence[str], times: Times, data_root: str | None) -> None:
+    """Runs `flame-mdm train` in a separate process.
+
+    Raises:
+        UserError: it failed. SystemExit: it was interrupted.
+    """
+    root = [f"data_root={data_root}"] if data_root else []
+    say(f"== training {' '.join(words)}")
+    begin = time.monotonic()
+    try:
+        code = subprocess.run([sys.executable, "-m", "flame_mdm", "train", *words, *root], check=False).returncode
+    finally:
+        times.add(" ".join(words), time.monotonic() - begin)
+    if code >= 128 or code < 0:
+        raise SystemExit(code if code > 0 else 128 - code)
+    if code:
+        raise UserError(f"training {' '.join(words)} failed, see above; the same command goes on from here")
+
+
+def check(table: Table, expected: Mapping[str, Mapping[str, Mapping[str, Sequence[float]]]]) -> list[tuple[str, bool]]:
+    """Compares values of a table with what is expected of them; one line each, and whether it holds."""
+    found = {
+        (part.name, line.label, column): cell.value if cell is not None and not line.state else None
+        for part in table.parts
+        for line in part.lines
+        if line.kind == "measured"
+        for column, cell in zip(part.columns, line.cells, strict=True)
+    }
+    checks = []
+    for part, rows in expected.items():
+        for row, columns in rows.items():
+            for column, (least, most) in columns.items():
+                value = found.get((part, row, column))
+                measured = "not measured" if value is None else f"{value:.3g}"
+                line = f"{row}: {column} {measured}, expected {least:g} to {most:g}"
+                checks.append((line, value is not None and least <= value <= most))
+    return checks
+
+
+def _report(
+    name: str, body: str, times: Times, checks: Sequence[tuple[str, bool]], trained: Sequence[Sequence[str]]
+) -> Markup:
+    movies = []
+    for words in trained:
+        run_name = next((word.partition("=")[2] for word in words if word.startswith("run.name=")), "default")
+        if folder := newest_samples(Path("runs") / words[0] / run_name, "motions.gif"):
+            movies.append((words[0], base64.b64encode((folder / "motions.gif").read_bytes()).decode()))
+    minutes = [[what, f"{s / 60:.1f}"] for what, s in times.seconds.items()]
+    return render("benchmark.html", name=name, table_body=body, movies=movies, checks=checks, minutes=minutes)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

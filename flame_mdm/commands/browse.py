@@ -1,0 +1,71 @@
+"""`flame-mdm browse DATA`: shows a prepared data set as one web page."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from flame_mdm.config import EXPERIMENTS, Config, instantiate, run
+from flame_mdm.errors import UserError, say
+from flame_mdm.reporting.browse import choose, find, write_clips, write_page
+
+USAGE = """
+usage: flame-mdm browse data=NAME [split=train] [search="waves left"] [clips=200] [out=FILE.html]
+       flame-mdm browse data=NAME split=test clips=10 motions=FOLDER
+
+Writes one web page that opens from disk: clips of a data set with their captions, mirrored copies beside their
+originals, a search, a choice of splits, the distribution of lengths and other statistics. motions= writes the clips of
+the page as motion files, too, so that generated motions can be compared with them.
+"""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Runs the command; returns its exit code."""
+    return run(
+        browse,
+        sys.argv[1:] if argv is None else argv,
+        usage=USAGE,
+        name="browse",
+        objects=("data", "out"),
+        text=("search", "out", "motions"),
+    )
+
+
+def browse(config: Config) -> None:
+    """Writes the page, after the data set is prepared where that has not been done.
+
+    Raises:
+        UserError: no data set named, no clip fits, or other motions in the folder `motions`.
+        FileNotFoundError, ValueError: the raw data is absent or damaged.
+    """
+    if "data" not in config:
+        names = sorted(path.stem for path in (EXPERIMENTS / "data").glob("*.yaml"))
+        raise UserError(f"which data set? data=NAME, one of: {', '.join(names)}")
+    if config["clips"] < 1:
+        raise UserError(f"clips={config['clips']}: a page shows at least 1")
+
+    representation = instantiate(config["representation"])
+    data = instantiate(config["data"], representation=representation)
+    data.prepare_data()
+    store = data.open()
+    if config["split"] not in (None, *store.info["clips"]):
+        raise UserError(f"no split is called {config['split']}; there are {', '.join(store.info['clips'])}")
+    search = "" if config["search"] is None else str(config["search"])
+    families = find(store.clips, config["split"], search)
+    if not families:
+        raise UserError(f"no clip of {data.folder} has '{search}' in its id or its captions")
+    fitting = sum(map(len, families))
+    clips = [clip for family in choose(families, config["clips"]) for clip in family]
+    title = f"{store.info['dataset']}: {len(clips)} of {fitting} clips"
+    title += f" in {config['split']}" * (config["split"] is not None) + f" with '{search}'" * bool(search)
+    out = Path(config["out"] or Path("runs") / "browse" / f"{data.folder.name}.html")
+    write_page(out, store, representation, clips, title)
+    say(f"{out}: {len(clips)} of {fitting} clips, {out.stat().st_size / 1e6:.1f} MB")
+    if config["motions"] is not None:
+        write_clips(Path(config["motions"]), store, representation, clips, data.crop.longest())
+        say(f"{config['motions']}: {len(clips)} motions")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

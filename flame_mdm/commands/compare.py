@@ -1,0 +1,177 @@
+"""`flame-mdm compare RUN RUN ...`: puts runs side by side on one page, or runs a user study."""
+
+from __future__ import annotations
+
+import sys
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from flame_mdm.config import Config, run
+from flame_mdm.errors import UserError, say
+from flame_mdm.files import MEBIBYTE, read_text, write_json, write_text
+from flame_mdm.reporting.compare import (
+    MOTIONS,
+    ComparedRun,
+    Prompt,
+    comparison,
+    find,
+)
+from flame_mdm.reporting.report import paths
+from flame_mdm.reporting.study import QUESTION, rating_page, tally
+
+if TYPE_CHECKING:
+    from flame_mdm.formats.motion import Motion
+
+USAGE = """
+usage: flame-mdm compare runs="A B C" [texts="a person walks; a person jumps"]
+       flame-mdm compare runs="A B FOLDER" rate=true [texts=prompts.txt]
+       flame-mdm compare ratings="ann.json bob.json" out=ratings.json
+
+Puts runs side by side on one page: configuration differences, curves, evaluations and motions for the same prompts.
+rate=true writes a page that asks which of two motions fits a text better, without saying whose they are; ratings=
+counts the answers. FOLDER holds motion files, such as real ones: without texts=, the runs sample for its captions at
+its lengths. Keys: experiments/compare.yaml
+"""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Runs the command; returns its exit code."""
+    words = sys.argv[1:] if argv is None else argv
+    text = ("runs", "texts", "ratings", "out")
+    return run(
+        compare,
+        words,
+        usage=USAGE,
+        name="compare",
+        objects=("runs*",),
+        text=text,
+        kinds={"seconds": "float", "seed": "int"},
+    )
+
+
+def compare(config: Config) -> None:
+    """Writes the page that the configuration asks for, or counts ratings.
+
+    Raises:
+        UserError: not one of both asked for, too few runs, folders without a run, or malformed ratings.
+    """
+    if (config["runs"] is None) == (config["ratings"] is None):
+        raise UserError('give one of runs="A B" to compare and ratings="x.json y.json" to count')
+    if config["ratings"] is not None:
+        out, pairs = Path(config["out"] or "runs/ratings.json"), tally(paths("ratings", str(config["ratings"])))
+        write_json(out, {"format": 1, "question": QUESTION, "pairs": pairs})
+        for pair in pairs:
+            low, high = pair["interval_a"]
+            say(
+                f"{pair['a']} over {pair['b']}: {pair['wins_a']} of {pair['wins_a'] + pair['wins_b']} answers, "
+                f"{pair['share_a']:.1%} ({low:.1%} to {high:.1%}), {pair['raters']} raters"
+            )
+        say(f"written: {out}")
+        return
+    compared = find(paths("runs", str(config["runs"])))
+    shown = motions(compared, config)
+    if config["rate"]:
+        out, content = Path(config["out"] or "runs/rate.html"), rating_page(compared, shown, config["seed"])
+    else:
+        out, content = Path(config["out"] or "runs/compare.html"), comparison(compared, shown)
+    write_text(out, content)
+    say(out)
+
+
+def motions(compared: Sequence[ComparedRun], config: Config) -> list[dict[Prompt, Motion]]:
+    """Motions by prompt of each compared_run.
+
+    Runs show what their last checkpoint makes of `texts`, or else of the captions of the first folder of motions, at
+    the lengths of its motions; where there is neither, their newest samples.
+
+    Raises:
+        UserError: no texts in the file, or what `generate` refuses. ValueError: a damaged file.
+    """
+    given = {c.label: _read(c.folder) for c in compared if c.run is None}
+    wanted: dict[Prompt, float | None] = {}
+    if config["texts"] is not None:
+        wanted = {(text, 0): None for text in read_texts(str(config["texts"]))}
+    elif given:
+        first = next(iter(given.values()))
+        wanted = {p: None if config["seconds"] else len(shown.joints) / shown.fps for p, shown in first.items() if p[0]}
+    found = []
+    for compared_run in compared:
+        if compared_run.run is None:
+            found.append(given[compared_run.label])
+        elif wanted:
+            found.append(_sampled(compared_run, wanted, config))
+        else:
+            found.append(_read(compared_run.run.samples) if compared_run.run.samples else {})
+    return found
+
+
+def _read(folder: Path) -> dict[Prompt, Motion]:
+    """Motions of a folder, whose equal captions are counted."""
+    from flame_mdm.formats.files import read
+
+    files = [path for path in sorted(folder.iterdir()) if path.suffix.lower() in MOTIONS and path.name[0] != "."]
+    return _by_prompt([read(path) for path in files])
+
+
+def read_texts(given: str) -> list[str]:
+    """Texts with semicolons between them, or the lines of a .txt file.
+
+    Raises:
+        UserError: there are none, or no such file.
+    """
+    if given.endswith(".txt") and not Path(given).exists():
+        raise UserError(f"texts={given}: no such file")
+    parts = read_text(given, MEBIBYTE).splitlines() if given.endswith(".txt") else given.split(";")
+    texts = [part.strip() for part in parts if part.strip()]
+    if not texts:
+        raise UserError(f'texts={given}: no text in it; texts="a person walks; a person jumps", or a .txt file')
+    return list(dict.fromkeys(texts))
+
+
+def _sampled(compared_run: ComparedRun, wanted: Mapping[Prompt, float | None], config: Config) -> dict[Prompt, Motion]:
+    """Motions of a run's last checkpoint for texts or labels, each of so many seconds; None = as `generate` has it.
+
+    Motions that would be longer than the run samples are made as long as it does. Those of a text that is wanted more
+    than once have the seeds that follow the configuration's.
+    """
+    import torch
+
+    from flame_mdm.checkpoints.loading import load
+    from flame_mdm.generation import generate
+
+    model = load(compared_run.folder, "cuda" if torch.cuda.is_available() else "cpu")
+    fps, longest = model.representation.fps, model.facts["max_frames"]
+    lengths = {prompt: round(seconds * fps) for prompt, seconds in wanted.items() if seconds is not None}
+    if over := sum(length > longest for length in lengths.values()):
+        limit = f"made {longest / fps:g} seconds long, the most that {compared_run.label} samples"
+        say(f"{over} of {len(lengths)} motions are {limit}")
+    found: dict[Prompt, Motion] = {}
+    for count in sorted({count for _, count in wanted}):
+        prompts = [prompt for prompt in wanted if prompt[1] == count]
+        texts = [text for text, _ in prompts]
+        labels = texts[0] in model.facts["actions"]
+        made = generate(
+            model,
+            None if labels else texts,
+            actions=texts if labels else None,
+            seconds=config["seconds"],
+            frames=[min(lengths[prompt], longest) for prompt in prompts if prompt in lengths] or None,
+            seed=config["seed"] + count,
+        )
+        found |= zip(prompts, made, strict=True)
+    return {prompt: found[prompt] for prompt in wanted}
+
+
+def _by_prompt(found: Sequence[Motion]) -> dict[Prompt, Motion]:
+    counts: Counter[str] = Counter()
+    prompts: dict[Prompt, Motion] = {}
+    for motion in found:
+        prompts[motion.text, counts[motion.text]] = motion
+        counts[motion.text] += 1
+    return prompts
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,88 @@
+"""Edits a motion: `flame-mdm edit ckpt=... motion=walk.npz region=in_between text="a person jumps"`"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from flame_mdm.commands import SAMPLING
+from flame_mdm.commands.sample import check_request, default_folder
+from flame_mdm.config import Config, run
+from flame_mdm.errors import UserError, say
+
+USAGE = """
+usage: flame-mdm edit ckpt=FILE motion=walk.npz region=in_between text="a person jumps" [key=value ...]
+       flame-mdm edit ckpt=FILE motion=take.bvh cut=[0,3] joints=upper_body unconditioned=true
+       flame-mdm edit ckpt=FILE motion=bandai:CLIP region_seconds=[1,2] joints=[left_arm,head] method=flame ...
+
+Keeps a part of a motion and resamples the rest. Writes the original and the results (.npz), a GIF and a player for
+any browser. Keys, with their defaults: experiments/edit.yaml
+"""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Runs the command; returns its exit code."""
+    words = sys.argv[1:] if argv is None else argv
+    return run(
+        write_edits,
+        words,
+        usage=USAGE,
+        name="edit",
+        objects=("ckpt", "out"),
+        text=("text", "ckpt", "motion", "out"),
+        kinds={**SAMPLING, "method": "str", "until": "float", "resample": "int"},
+    )
+
+
+def write_edits(config: Config) -> None:
+    """Edits as the configuration asks, and writes the results.
+
+    Raises:
+        UserError: nothing, or two things, asked for; or what `flame_mdm.editing.edit` refuses.
+    """
+    check_request(config)
+    if config["motion"] is None:
+        raise UserError("no motion to edit: give motion=FILE (.npz, .bvh, .json, .npy) or motion=dataset:id")
+
+    import torch
+
+    from flame_mdm.checkpoints.loading import find, load
+    from flame_mdm.editing import edit, read_motion
+    from flame_mdm.files import sha256
+    from flame_mdm.generation import write_motions
+
+    file = find(config["ckpt"], config["which"])
+    model = load(file, config["device"] or ("cuda" if torch.cuda.is_available() else "cpu"))
+    original = read_motion(
+        model.representation,
+        str(config["motion"]),
+        **{key: config[key] for key in ("fps", "unit", "cut", "data_root")},
+    )
+    keys = ("region", "region_seconds", "joints", "method", "until", "resample", "samples", "seed")
+    keys += ("guidance_scale", "sampler", "num_inference_steps")
+    edits = edit(
+        model,
+        original,
+        None if config["text"] is None else str(config["text"]),
+        actions=None if config["action"] is None else [str(config["action"])],
+        **{key: config[key] for key in keys},
+    )
+    asked = {key: config[key] for key in keys if key not in ("resample", "samples", "seed")} | {"cut": config["cut"]}
+    asked["resample"] = config["resample"] if config["resample"] != 1 else None
+    what = f"edit {Path(original.id).stem} {edits[0].text}"
+    folder = Path(config["out"] or default_folder(model, what, config["seed"], asked))
+    shown = replace(original, text=f"original: {original.text or original.id}")
+    facts = {"seed": config["seed"], "checkpoint": sha256(file), "keep": edits[0].keep}
+    write_motions(folder, [shown, *edits], facts)
+    say(f"{len(edits)} motions of {len(original.joints)} frames: {folder / 'player.html'}, {folder / 'motions.gif'}")
+    say(
+        f"{edits[0].keep.mean():.0%} of the features were to be kept; largest change among them: "
+        f"{max(e.feature_error for e in edits):.3g} in normalized features; "
+        f"{max(e.joint_error for e in edits):.3g} m of the joints in the world"
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())

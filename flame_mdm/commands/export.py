@@ -1,0 +1,34 @@
+"""`flame-mdm export CKPT OUT`: writes the model of a checkpoint as a model file."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+
+from flame_mdm.config import Config, run
+from flame_mdm.errors import UserError, say
+
+USAGE = """
+usage: flame-mdm export CKPT OUT
+
+Writes the averaged weights of a checkpoint, its recipe and the facts of its data as one .safetensors file.
+"""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Runs the command and returns its exit code."""
+    words = sys.argv[1:] if argv is None else argv
+    return run(_export, words, usage=USAGE, name="export", objects=("ckpt", "out"), text=("ckpt", "out"))
+
+
+def _export(config: Config) -> None:
+    if config["ckpt"] is None or config["out"] is None:
+        raise UserError("a checkpoint and a file to write are needed: flame-mdm export CKPT model.safetensors")
+    from flame_mdm.checkpoints.hub import export
+    from flame_mdm.checkpoints.loading import find
+
+    say(f"written: {export(find(config['ckpt'], config['which']), config['out'])}")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,48 @@
+"""`flame-mdm import KIND FILE [ARGS] out=FILE`: imports a checkpoint that the authors of a paper released."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+
+from flame_mdm.config import Config, run
+from flame_mdm.errors import UserError, say
+
+USAGE = """
+usage: flame-mdm import mdm model000475000.pt args.json out=mdm.safetensors stats=FOLDER
+       flame-mdm import mfm model.pt .hydra/config.yaml out=mfm.safetensors stats=FOLDER
+       flame-mdm import flame model.ckpt out=flame.safetensors
+
+Writes a released checkpoint of MDM, MFM, FLAME, or FLAME's motion-CLIP (mclip) as a model file that all commands take.
+Keys, with their defaults: experiments/import.yaml
+"""
+
+KINDS = ("mdm", "mfm", "flame", "mclip")
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Runs the command and returns its exit code."""
+    words = sys.argv[1:] if argv is None else argv
+    return run(
+        _import,
+        words,
+        usage=USAGE,
+        name="import",
+        objects=("kind", "file", "args"),
+        text=("file", "args", "out", "stats"),
+    )
+
+
+def _import(config: Config) -> None:
+    if config["kind"] not in KINDS:
+        raise UserError(f"unknown kind of released model: {config['kind']}. Write {', '.join(KINDS[:-1])} or mclip")
+    if config["file"] is None or config["out"] is None:
+        raise UserError("FILE and out=... are needed: flame-mdm import mdm model.pt args.json out=mdm.safetensors")
+    from flame_mdm.checkpoints.released import import_released
+
+    keys = ("kind", "file", "args", "out", "stats", "averaged", "num_heads", "time_token", "run_code")
+    say(f"written: {import_released(**{key: config[key] for key in keys})}")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,40 @@
+"""`flame-mdm push CKPT user/name`: uploads a model file with its card to the Hugging Face hub."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from flame_mdm.config import Config, run
+from flame_mdm.errors import UserError, say
+
+USAGE = """
+usage: flame-mdm push CKPT user/name [folder=FOLDER] [private=true] [dry_run=true]
+
+Writes model.safetensors, config.yaml and a model card, and uploads them to the Hugging Face hub.
+Keys, with their defaults: experiments/push.yaml
+"""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Runs the command and returns its exit code."""
+    words = sys.argv[1:] if argv is None else argv
+    text = ("ckpt", "repository", "folder")
+    return run(_push, words, usage=USAGE, name="push", objects=("ckpt", "repository"), text=text)
+
+
+def _push(config: Config) -> None:
+    if config["ckpt"] is None or config["repository"] is None:
+        raise UserError("a checkpoint and a repository are needed: flame-mdm push CKPT user/name")
+    from flame_mdm.checkpoints.hub import push
+    from flame_mdm.checkpoints.loading import find
+
+    name, upload = str(config["repository"]), not config["dry_run"]
+    folder = config["folder"] or Path("push") / name.rpartition("/")[2]
+    folder = push(find(config["ckpt"], config["which"]), name, folder, upload=upload, private=config["private"])
+    say(f"{f'uploaded to {name}' if upload else 'not uploaded'}: {folder}")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

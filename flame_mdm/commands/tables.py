@@ -1,0 +1,61 @@
+"""`flame-mdm tables [NAME ...]`: renders tables and figures from results, and evaluates what is missing."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from flame_mdm.config import Config, run
+from flame_mdm.errors import UserError, say
+from flame_mdm.files import write_text
+
+USAGE = """
+usage: flame-mdm tables [table="NAME ..."] [evaluate=false] [out=FOLDER]
+
+Renders tables and figures as Markdown, LaTeX, CSV and HTML. A table is a file of experiments/tables, or of your own: it
+names checkpoints, a protocol and columns. Checkpoints that have not been evaluated are evaluated first; evaluate=false
+takes what is there. Without table=, all tables. The same results give the same bytes.
+Keys, with their defaults: experiments/tables.yaml
+"""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Runs the command; returns its exit code."""
+    words = sys.argv[1:] if argv is None else argv
+    return run(
+        tables, words, usage=USAGE, name="tables", objects=("table*",), text=("table", "out", "results", "data_root")
+    )
+
+
+def tables(config: Config) -> None:
+    """Evaluates what is missing and renders the tables.
+
+    Raises:
+        UserError: a malformed spec, or an evaluation that failed; the tables are written all the same.
+    """
+    from evaluators.run import evaluate_missing
+    from flame_mdm.reporting.page import page, render
+    from flame_mdm.reporting.tables import build, load_spec, spec_names, write
+
+    names = str(config["table"]).split() if config["table"] is not None else spec_names()
+    if not names:
+        raise UserError("table= names no table")
+    specs = {Path(name).stem: load_spec(name) for name in names}
+    results = Path(config["results"])
+    failed = evaluate_missing(specs, results, config) if config["evaluate"] else []
+    out = Path(config["out"])
+    built = {name: build(name, spec, results) for name, spec in specs.items()}
+    for name, table in built.items():
+        write(table, out)
+        lines = [line for part in table.parts for line in part.lines if line.kind == "measured"]
+        measured = sum(not line.state for line in lines)
+        say(f"{name}: {measured} of {len(lines)} rows measured: {out / name}.html, .md, .tex, .csv")
+    if len(specs) > 1:
+        write_text(out / "index.html", page("Tables", render("index.html", tables=built)))
+    if failed:
+        raise UserError(f"{len(failed)} evaluations failed: {'; '.join(failed)}")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

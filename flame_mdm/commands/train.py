@@ -1,0 +1,85 @@
+"""Trains an experiment: `flame-mdm train NAME key=value ...`"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from contextlib import nullcontext
+from pathlib import Path
+
+from flame_mdm.config import Config, flatten, movable, read_saved, run
+from flame_mdm.errors import UserError
+
+USAGE = """
+usage: flame-mdm train NAME [key=value ...] [--multirun]
+
+Trains the experiment NAME (a file of experiments/, or the path of a recipe or of a saved config.yaml).
+key=value changes one key (trainer.max_steps=1000), part=name swaps a part (denoiser=mdm_decoder).
+The same command in the same folder resumes; run.name=other starts another run.
+"""
+
+FREE = (
+    "data.num_workers",
+    "data.root",
+    "data.source.path",
+    "data.source.workers",
+    "data_root",
+    "callbacks",
+    "logger",
+    "trainer.max_steps",
+    "trainer.max_time",
+    "trainer.devices",
+    "trainer.num_nodes",
+    "trainer.accelerator",
+    "trainer.strategy",
+    "trainer.log_every_n_steps",
+    "trainer.val_check_interval",
+    "trainer.limit_val_batches",
+    "trainer.enable_progress_bar",
+)
+"""Keys that may differ when a run is resumed."""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Runs the command; returns its exit code."""
+    return run(train, sys.argv[1:] if argv is None else argv, usage=USAGE)
+
+
+def train(config: Config) -> None:
+    """Trains the composed experiment, resuming what its folder holds.
+
+    Raises:
+        UserError: the folder holds a run of another configuration, or the data or the recipe is unusable.
+        SystemExit: interrupted; the checkpoint is written and the code is 128 + the signal's number.
+    """
+    folder = Path(config["run"]["dir"])
+    _same_run(folder, config)
+
+    from lightning.pytorch.utilities import rank_zero_only
+
+    from flame_mdm.training.fit import fit
+    from flame_mdm.training.guards import only_run
+
+    with only_run(folder) if rank_zero_only.rank == 0 else nullcontext():
+        fit(folder, config)
+
+
+def _same_run(folder: Path, config: Config) -> None:
+    """Refuses a folder that holds a run of another configuration."""
+    if not (folder / "config.yaml").exists():
+        return
+    saved, wanted = flatten(movable(read_saved(folder / "config.yaml"))), flatten(movable(config))
+    differing = [
+        f"{key} ({saved.get(key, 'absent')} there, {wanted.get(key, 'absent')} here)"
+        for key in sorted(saved.keys() | wanted.keys())
+        if saved.get(key) != wanted.get(key) and not key.startswith(FREE)
+    ]
+    if differing:
+        raise UserError(
+            f"{folder} holds a run of another configuration: {'; '.join(differing)}. Give this one a name of its own "
+            "with run.name=..., or delete that folder"
+        )
+
+
+if __name__ == "__main__":
+    sys.exit(main())

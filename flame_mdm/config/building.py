@@ -1,0 +1,221 @@
+"""Building the parts of a configuration, and configurations in files: what may be in them, reading, writing."""
+
+from __future__ import annotations
+
+import ast
+import copy
+import functools
+import importlib
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from omegaconf import OmegaConf
+
+from flame_mdm.config.signatures import Config, definition, walk
+from flame_mdm.errors import UserError, first_line
+from flame_mdm.files import read_yaml, write_text
+
+TRUSTED = (
+    "flame_mdm.task",
+    "flame_mdm.denoisers",
+    "flame_mdm.processes",
+    "flame_mdm.conditions",
+    "flame_mdm.representations",
+    "flame_mdm.data",
+    "evaluators",
+)
+"""Modules whose classes a configuration from a checkpoint may name."""
+
+MOST_VALUES, MOST_LEVELS = 1_000_000, 50
+"""Largest number of values, and of mappings and lists inside one another, in a configuration out of a file."""
+
+RUN_DIR = "${run.dir}"
+"""What a saved `config.yaml` has in place of the folder of its run, so that `run.dir=...` moves all that is in it."""
+
+
+def plain(config: Any, where: str | Path, *, but: str = "") -> None:
+    """Checks what was read from somebody else's file: plain values by name, and no interpolations.
+
+    Hydra and OmegaConf resolve interpolations (`${...}`), which can run any code and read any environment variable.
+
+    Args:
+        config: mappings, lists and values.
+        where: the file, for messages.
+        but: an interpolation that may stand at the beginning of a text.
+
+    Raises:
+        UserError: it holds an interpolation or another kind of value, or is nested too deeply, or into itself.
+    """
+    count = 0
+
+    def check_value(value: Any, path: tuple[str, ...]) -> None:
+        nonlocal count
+        count += 1
+        if count > MOST_VALUES or len(path) > MOST_LEVELS:
+            raise UserError(f"{where}: not a configuration: too many values, or nested too deeply")
+        if isinstance(value, dict):
+            for name, child in value.items():
+                if not isinstance(name, str | int):
+                    raise UserError(f"{where}: {'.'.join(path)} has a key that is a {type(name).__name__}, not a text")
+                check_value(name, path)
+                check_value(child, (*path, str(name)))
+        elif isinstance(value, list | tuple):
+            for number, child in enumerate(value):
+                check_value(child, (*path, str(number)))
+        elif isinstance(value, str):
+            text = value.removeprefix(but)
+            if "${" in text:
+                text = text if len(text) < 60 else f"{text[:56]} ..."
+                raise UserError(
+                    f"{where}: {'.'.join(path) or 'a key'} holds an interpolation, {text}. Such files may hold plain "
+                    "values only: write the value itself"
+                )
+        elif not isinstance(value, int | float | None):
+            raise UserError(f"{where}: {'.'.join(path)} is a {type(value).__name__}, not a plain value")
+
+    check_value(config, ())
+
+
+def read_saved(path: Path) -> Config:
+    """Returns the configuration of a run as saved in its folder, with `RUN_DIR` where it names the folder.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        UserError: it is damaged, or not the configuration of a run.
+    """
+    config = read_yaml(path)
+    if not isinstance(config, dict) or not isinstance(config.get("run"), dict):
+        raise UserError(f"{path}: not the configuration of a run: it has no run")
+    plain(config, path, but=RUN_DIR)
+    return current_names(config)
+
+
+def movable(config: Config) -> Config:
+    """Returns a configuration with `RUN_DIR` for the run's folder, so that `run.dir` moves all that is in it."""
+    folder = str(config["run"]["dir"])
+
+    def moved(node: Any) -> Any:
+        if isinstance(node, dict):
+            return {name: moved(value) for name, value in node.items()}
+        return RUN_DIR + node.removeprefix(folder) if isinstance(node, str) and node.startswith(folder) else node
+
+    return {name: value if name == "run" else moved(value) for name, value in config.items()}
+
+
+@functools.cache
+def _moved() -> dict[str, str]:
+    return read_yaml(Path(__file__).with_name("moved.yaml"))
+
+
+def current_names(config: Config) -> Config:
+    """Returns a configuration from a file with the names of earlier versions replaced by today's."""
+    return _renamed(config, _moved())
+
+
+def original_names(config: Config) -> Config:
+    """Returns a configuration with today's names replaced by those of the first version, so that hashes stay."""
+    return _renamed(config, {new: old for old, new in _moved().items()})
+
+
+def _renamed(node: Any, names: Mapping[str, str]) -> Any:
+    if isinstance(node, Mapping):
+        renamed = {name: _renamed(value, names) for name, value in node.items()}
+        target = renamed.get("_target_")
+        if isinstance(target, str):
+            found = max((old for old in names if f"{target}.".startswith(f"{old}.")), key=len, default="")
+            renamed["_target_"] = names[found] + target.removeprefix(found) if found else target
+        return renamed
+    return [_renamed(value, names) for value in node] if isinstance(node, list | tuple) else node
+
+
+def trust(config: Config) -> None:
+    """Checks a configuration out of a checkpoint: it may name classes that `TRUSTED` modules define, and no functions.
+
+    The environment variable FLAME_MDM_TRUST adds packages, with commas between them, of which it may name anything.
+    Nothing that it names is imported here.
+
+    Raises:
+        UserError: it names others, or has other keys for `instantiate` than `_target_` and `_recursive_`.
+    """
+    added = [name for name in os.environ.get("FLAME_MDM_TRUST", "").split(",") if name]
+    for path, mapping in walk(config):
+        if "_target_" not in mapping:
+            continue
+        target = mapping["_target_"]
+        package = str(target).partition(".")[0]
+        if not (isinstance(target, str) and (package in added or _is_trusted_class(target))):
+            raise UserError(
+                f"the checkpoint's configuration names {target} at {'.'.join(path)}; such code runs only if you "
+                f"trust it: set FLAME_MDM_TRUST={package}"
+            )
+    for path, mapping in walk(config):
+        for name in mapping.keys() & {"_args_", "_partial_", "_convert_"}:
+            raise UserError(f"the checkpoint's configuration has {'.'.join([*path, name])}, which no model needs")
+
+
+def _is_trusted_class(target: str) -> bool:
+    """Whether the class is defined where it is named to be, or brought there from another trusted module."""
+    module, _, name = target.rpartition(".")
+    found = definition(module, name) if _is_trusted_module(module) else None
+    return found is not None and isinstance(found[1], ast.ClassDef) and _is_trusted_module(found[0])
+
+
+def _is_trusted_module(name: str) -> bool:
+    return any(name == trusted or name.startswith(f"{trusted}.") for trusted in TRUSTED)
+
+
+def instantiate(node: Config, **derived: Any) -> Any:
+    """Builds what a mapping with a `_target_` describes, nested ones included.
+
+    It reads Hydra's keys `_target_`, `_args_`, `_partial_` and `_recursive_`. Interpolations are plain texts to it, and
+    mappings and lists reach the parts as plain copies, as with Hydra's `_convert_: all`.
+
+    Args:
+        node: the mapping.
+        derived: arguments that follow from other parts of the recipe.
+
+    Raises:
+        UserError: no such class or function, or arguments of the wrong kind. What it raises as `UserError`,
+            `ValueError` or `FileNotFoundError` comes through.
+    """
+    if not isinstance(node, Mapping) or not isinstance(node.get("_target_"), str):
+        raise UserError(f"a part needs a _target_, the name of its class: {str(node)[:80]}")
+    name: str = node["_target_"]
+    build = _instances if node.get("_recursive_", True) else copy.deepcopy
+    skipped = ("_target_", "_recursive_", "_convert_", *derived)
+    given: dict[str, Any] = {key: build(value) for key, value in node.items() if key not in skipped}
+    arguments, partial = given.pop("_args_", ()), given.pop("_partial_", False)
+    try:
+        module, _, attribute = name.rpartition(".")
+        if not module:
+            raise UserError(f"_target_={name}: give the name of a module and a class, such as torch.nn.Linear")
+        target = getattr(importlib.import_module(module), attribute)
+        made = functools.partial(target, *arguments, **given, **derived)
+        return made if partial else made()
+    except (UserError, ValueError, FileNotFoundError):
+        raise
+    except Exception as error:
+        raise UserError(f"{name}: {first_line(error)}") from error
+
+
+def _instances(node: Any) -> Any:
+    if isinstance(node, Mapping) and "_target_" in node:
+        return instantiate(dict(node))
+    if isinstance(node, Mapping):
+        return {name: _instances(value) for name, value in node.items()}
+    return [_instances(value) for value in node] if isinstance(node, list | tuple) else node
+
+
+def flatten(config: Any, prefix: str = "") -> dict[str, Any]:
+    """Nested mappings as dotted keys; lists are leaves."""
+    if not isinstance(config, Mapping) or not config:
+        return {prefix: config}
+    return {k: v for name, c in config.items() for k, v in flatten(c, f"{prefix}.{name}" if prefix else name).items()}
+
+
+def save(config: Config, path: Path, head: str = "") -> None:
+    """Writes the configuration as YAML, atomically, after the comment lines of `head`."""
+    comment = "".join(f"# {line}\n" for line in head.splitlines())
+    write_text(path, comment + OmegaConf.to_yaml(OmegaConf.create(config)))

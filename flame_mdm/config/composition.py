@@ -1,0 +1,224 @@
+"""Recipes, composed by Hydra and resolved to plain dicts."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from hydra import compose as hydra_compose
+from hydra import initialize_config_dir
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Glob, Override
+from hydra.errors import HydraException
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from flame_mdm.config.building import RUN_DIR, current_names, plain
+from flame_mdm.config.signatures import Config, check, check_same_kinds, parameters, source_file, unknown_key
+from flame_mdm.errors import UserError, did_you_mean, first_line
+from flame_mdm.files import read_yaml
+
+_PACKAGE = Path(__file__).parent.parent
+EXPERIMENTS = _PACKAGE / "experiments" if (_PACKAGE / "experiments").is_dir() else _PACKAGE.parent / "experiments"
+"""The recipes: inside the installed package, or beside it in a clone."""
+
+LAUNCH = "launch"
+"""The group of `experiments/` whose options start jobs elsewhere."""
+
+LONGEST_WORD = 2**17
+"""Characters of a `key=value`. Linux passes no longer word to a command, and Hydra would take minutes to parse it."""
+
+
+def groups() -> list[str]:
+    """The swappable parts of a recipe: folders of `experiments/` whose files are options, not recipes."""
+    return sorted(p.name for p in EXPERIMENTS.iterdir() if p.is_dir() and not _is_recipe_folder(p))
+
+
+def _is_recipe_folder(folder: Path) -> bool:
+    return any("@package _global_" in file.read_text()[:200] for file in folder.glob("*.yaml"))
+
+
+def recipes() -> list[str]:
+    """Names of all experiments, as `EXP=` takes them."""
+    files = (p for p in EXPERIMENTS.rglob("*.yaml") if "@package _global_" in p.read_text()[:200])
+    return sorted(p.relative_to(EXPERIMENTS).with_suffix("").as_posix() for p in files)
+
+
+def compose(name: str, overrides: Sequence[str] = ()) -> Config:
+    """The recipe `name` with overrides such as `trainer.max_steps=10` or `denoiser=mdm_encoder`, resolved and checked.
+
+    Args:
+        name: a file of `experiments/` without its suffix, or the path of a recipe or of a saved `config.yaml`.
+        overrides: in Hydra's grammar.
+
+    Raises:
+        UserError: an unknown experiment, group, option or key, with the nearest names; or a malformed value.
+    """
+    config = resolve(plan_composition(find_recipe(name), overrides))
+    check(config)
+    return config
+
+
+def settings(name: str, overrides: Sequence[str] = ()) -> Config:
+    """The keys of a command that has a configuration of its own, such as evaluate, with overrides.
+
+    Raises:
+        UserError: as for `compose`.
+    """
+    config = resolve(plan_composition(Recipe(EXPERIMENTS, name), overrides))
+    check(config)
+    return config
+
+
+class Recipe(NamedTuple):
+    """Where a configuration stands, and what it is."""
+
+    folder: Path
+    stem: str
+    saved: bool = False
+    """A resolved configuration, whose parts cannot be swapped."""
+    experiment: str | None = None
+    """Name that a recipe gets."""
+
+
+class Plan(NamedTuple):
+    """What Hydra is asked to compose."""
+
+    folder: Path
+    stem: str
+    overrides: list[str]
+    base: Config | None = None
+    """The recipe before single keys are overridden, whose values tell which kind of value a key takes."""
+
+
+def plan_composition(recipe: Recipe, overrides: Sequence[str]) -> Plan:
+    """Checks names and keys. A key that only the signature of its `_target_` knows is marked as new for Hydra."""
+    parsed = parse(overrides)
+    if recipe.saved:
+        _refuse_groups(parsed, recipe)
+    _check_groups(parsed)
+    first = [f"hydra.searchpath=[file://{EXPERIMENTS}]"] if recipe.folder != EXPERIMENTS else []
+    if recipe.experiment:
+        first.append(f"experiment={recipe.experiment}")
+    parts = [o for o in parsed if _is_group(o)]
+    composed = resolve(Plan(recipe.folder, recipe.stem, [*first, *map(first_choice, parts)]))
+    keys = [_legal(composed, o) for o in parsed if not _is_group(o)]
+    return Plan(recipe.folder, recipe.stem, [*first, *map(override_word, parts), *keys], composed)
+
+
+def override_word(override: Override) -> str:
+    line = override.input_line or ""
+    return f"+{line}" if override.key_or_group == LAUNCH and not override.is_add() else line
+
+
+def first_choice(override: Override) -> str:
+    """The override; of a sweep, that to its first value."""
+    return (
+        f"{override.get_key_element()}={_choices(override)[0]}"
+        if override.is_sweep_override()
+        else override_word(override)
+    )
+
+
+def _choices(override: Override) -> list[str]:
+    """What an override gives its key, one value or those of a sweep."""
+    value = override.value()
+    if isinstance(value, Glob):
+        return value.filter(_options(override.key_or_group)) or [str(value)]
+    return list(override.sweep_string_iterator()) if override.is_sweep_override() else [str(value)]
+
+
+def _options(group: str) -> list[str]:
+    return sorted(p.stem for p in (EXPERIMENTS / group).glob("*.yaml"))
+
+
+def find_recipe(name: str) -> Recipe:
+    if name.endswith((".yaml", ".yml")):
+        path = Path(name).resolve()
+        if not path.is_file():
+            raise UserError(f"{name}: no such file. EXP takes an experiment or the path of a config.yaml")
+        content = read_yaml(path)
+        if not isinstance(content, dict):
+            raise UserError(f"{name}: not a recipe: it has no keys. Begin it with the defaults of another recipe")
+        saved = "defaults" not in content
+        if saved:
+            plain(content, name, but=RUN_DIR)
+        return Recipe(path.parent, path.stem, saved, None if saved else path.stem)
+    if name not in recipes():
+        raise UserError(f"unknown experiment '{name}'.{did_you_mean(name, recipes())} `make help` lists them all")
+    return Recipe(EXPERIMENTS, name, experiment=name)
+
+
+def parse(overrides: Sequence[str]) -> list[Override]:
+    for word in overrides:
+        if len(word) > LONGEST_WORD:
+            raise UserError(f"{word[:60]}…: {len(word):,} characters are too many. Give at most {LONGEST_WORD:,}")
+    try:
+        return OverridesParser.create().parse_overrides(list(overrides))
+    except HydraException as error:
+        raise UserError(f"cannot read an override, write key=value, text as 'a b': {first_line(error)}") from error
+
+
+def _is_group(override: Override) -> bool:
+    return (EXPERIMENTS / override.key_or_group).is_dir()
+
+
+def _check_groups(overrides: Sequence[Override]) -> None:
+    for override in overrides:
+        if not _is_group(override) or override.is_delete():
+            continue
+        group = override.key_or_group
+        options = _options(group)
+        for option in _choices(override):
+            if option not in options:
+                raise UserError(
+                    f"no {group} is called '{option}'.{did_you_mean(option, options)} There are: {', '.join(options)}"
+                )
+        if group == LAUNCH and source_file("submitit") is None:
+            raise UserError(
+                f"{override_word(override).lstrip('+')} needs hydra-submitit-launcher: pip install flame-mdm[slurm]"
+            )
+
+
+def _refuse_groups(overrides: Sequence[Override], recipe: Recipe) -> None:
+    for override in overrides:
+        if _is_group(override) and override.key_or_group != LAUNCH:
+            raise UserError(
+                f"{override_word(override)} swaps a part of a recipe, but {recipe.stem}.yaml is a saved configuration, "
+                "whose parts are fixed; start from the experiment, or override single keys"
+            )
+
+
+def resolve(plan: Plan) -> Config:
+    GlobalHydra.instance().clear()
+    try:
+        with initialize_config_dir(version_base="1.3", config_dir=str(plan.folder)):
+            config = hydra_compose(plan.stem, plan.overrides)
+            resolved = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+    except (HydraException, OmegaConfBaseException) as error:
+        raise UserError(f"{plan.stem}: {first_line(error)}") from error
+    plain: Config = {str(key): value for key, value in resolved.items()}  # type: ignore[union-attr]
+    plain = current_names(plain)
+    check_same_kinds(plan.base or {}, plain)
+    return plain
+
+
+def _legal(config: Config, override: Override) -> str:
+    """The override as Hydra takes it, if its key is written in the recipe or is a parameter of the `_target_`."""
+    line = override_word(override)
+    if override.is_delete() or override.is_force_add() or override.is_add() or line.startswith("hydra."):
+        return line
+    node: Any = config
+    parts = override.key_or_group.split(".")
+    for depth, part in enumerate(parts):
+        if isinstance(node, Mapping) and part in node:
+            node = node[part]
+        elif isinstance(node, Mapping) and "_target_" in node and part in parameters(node["_target_"], exact=False):
+            return "++" + line
+        elif isinstance(node, list) and part.isdigit() and int(part) < len(node):
+            node = node[int(part)]
+        else:
+            raise UserError(unknown_key(config, parts, depth, node))
+    return line

@@ -1,0 +1,213 @@
+"""Checks of recipes against the signatures of what they name.
+
+Signatures are read from source files, so that a misspelt key is answered at once, and so that naming a class in a
+recipe runs none of its code.
+"""
+
+from __future__ import annotations
+
+import ast
+import difflib
+import functools
+import re
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from flame_mdm.errors import UserError
+
+Config = dict[str, Any]
+
+
+def check(config: Config) -> None:
+    """Every mapping with a `_target_` names something that exists and gives it only arguments it takes.
+
+    Raises:
+        UserError: naming the key and the nearest legal ones.
+    """
+    for path, node in walk(config):
+        if "_target_" not in node:
+            continue
+        where = ".".join([*path, "_target_"])
+        if not isinstance(node["_target_"], str):
+            raise UserError(f"{where}={node['_target_']}: the name of a class or a function is needed")
+        legal = signature(node["_target_"], where)
+        for name, value in node.items():
+            if not str(name).startswith("_") and name not in legal and "**" not in legal:
+                raise UserError(unknown_key(config, [*path, str(name)], len(path), node))
+            check_kind(".".join([*path, str(name)]), value, legal.get(name, ""))
+
+
+KINDS: dict[str, tuple[type | tuple[type, ...], str]] = {
+    "bool": (bool, "true or false"),
+    "int": (int, "a whole number"),
+    "float": ((int, float), "a number"),
+    "str": (str, "a text"),
+    "None": (type(None), "null"),
+}
+
+
+def check_kind(key: str, value: Any, annotation: str) -> None:
+    """Refuses a value that the annotation of its parameter plainly rules out; what is not understood is let through."""
+    needed = []
+    for part in re.sub(r"^Optional\[(.*)\]$", r"\1 | None", annotation).split(" | "):
+        if part in KINDS:
+            kind, words = KINDS[part]
+            if isinstance(value, kind) and (part == "bool" or not isinstance(value, bool)):
+                return
+        elif part.startswith("Literal[") and part.endswith("]"):
+            choices = ast.literal_eval(f"({part[8:-1]},)")
+            words = f"one of {', '.join(map(str, choices))}"
+            if value in choices:
+                return
+        elif re.fullmatch(r"[A-Z]\w+", part) and part != "Any" and (value is None or isinstance(value, int | float)):
+            words = "a part"  # a class
+        else:
+            return
+        needed.append(words)
+    raise UserError(f"{key}={value}: it has to be {' or '.join(dict.fromkeys(needed))}")
+
+
+def check_same_kinds(base: Config, config: Config, path: str = "") -> None:
+    """Refuses values of another kind than those of the recipe, where no signature tells."""
+    for name, value in base.items():
+        key = f"{path}{name}"
+        if name not in config:
+            if "_target_" not in base and path != "callbacks.":
+                raise UserError(f"{key} cannot be taken out; give it another value")
+        elif isinstance(value, Mapping):
+            if isinstance(config[name], Mapping):
+                check_same_kinds({k: v for k, v in value.items() if "_target_" not in value}, config[name], f"{key}.")
+            elif config[name] is not None or key in ("run", "callbacks", "losses"):
+                raise UserError(f"{key}={config[name]}: it has to be a mapping of keys")
+        elif value is not None and not isinstance(value, list):
+            kind = type(value).__name__
+            check_kind(key, config[name], "str | int | float" if kind == "str" else kind)
+
+
+def walk(node: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Mapping[str, Any]]]:
+    if isinstance(node, Mapping):
+        yield path, node
+        for name, child in node.items():
+            yield from walk(child, (*path, str(name)))
+    elif isinstance(node, list | tuple):
+        for index, child in enumerate(node):
+            yield from walk(child, (*path, str(index)))
+
+
+def unknown_key(config: Config, parts: Sequence[str], depth: int, node: Any) -> str:
+    """The message for a key that stops being legal at `parts[depth]`, whose parent is `node`."""
+    key = ".".join(parts)
+    known = {".".join([*path, str(name)]) for path, mapping in walk(config) for name in mapping}
+    if isinstance(node, Mapping) and "_target_" in node:
+        known |= {".".join([*parts[:depth], name]) for name in parameters(node["_target_"]) if name != "**"}
+    known -= {key}
+    siblings = {name for name in known if name.rpartition(".")[0] == ".".join(parts[:depth])}
+    near = difflib.get_close_matches(parts[depth], [s.rpartition(".")[2] for s in siblings], 3, 0.6)
+    names = [".".join([*parts[:depth], n]) for n in near] or difflib.get_close_matches(key, known, 3, 0.6)
+    names = names or [name for name in sorted(known) if name.endswith(f".{parts[-1]}")][:3]
+    return f"unknown config key '{key}'." + (f" Did you mean {', '.join(names)}?" if names else "")
+
+
+def parameters(target: str, *, where: str = "_target_", exact: bool = True) -> frozenset[str]:
+    """Names of the arguments a class or function takes, read from its source; "**" stands for any.
+
+    Raises:
+        UserError: `target` is not found. With `exact=False`, "**" alone does not make every key legal.
+    """
+    names = frozenset(signature(target, where))
+    return names if exact else names - {"**"}
+
+
+@functools.cache
+def signature(target: str, where: str) -> dict[str, str]:
+    """The arguments that a class or function takes: name -> annotation, "" without one."""
+    module, _, name = target.rpartition(".")
+    found = definition(module, name)
+    if found is None and (owner := definition(module.rpartition(".")[0], module.rpartition(".")[2])):  # a method
+        methods = (node for node in ast.iter_child_nodes(owner[1]) if isinstance(node, ast.FunctionDef))
+        found = next(((owner[0], node) for node in methods if node.name == name), None)
+    if found is None:
+        raise UserError(f"{where}={target}: no such class or function can be found")
+    return _arguments(*found)
+
+
+def definition(module: str, name: str, seen: frozenset[str] = frozenset()) -> tuple[str, ast.AST] | None:
+    """The module and syntax tree where `module.name` is defined, through re-exports."""
+    tree = _tree(module)
+    if tree is None or module in seen:
+        return None
+    for node in _top_level(tree):
+        if isinstance(node, ast.ClassDef | ast.FunctionDef) and node.name == name:
+            return module, node
+    for node in _top_level(tree):
+        if isinstance(node, ast.ImportFrom):
+            for alias in node.names:
+                if alias.name == "*" or (alias.asname or alias.name) == name:
+                    source = _absolute(module, node)
+                    found = definition(source, name if alias.name == "*" else alias.name, seen | {module})
+                    if found:
+                        return found
+    return None
+
+
+def _top_level(node: ast.AST) -> Iterator[ast.AST]:
+    """The statements of a module, also in its `if` and `try` blocks, but not those in its classes and functions."""
+    for child in ast.iter_child_nodes(node):
+        yield child
+        if isinstance(child, ast.If | ast.Try | ast.ExceptHandler | ast.With):
+            yield from _top_level(child)
+
+
+def _absolute(module: str, node: ast.ImportFrom) -> str:
+    if not node.level:
+        return node.module or ""
+    path = source_file(module)
+    parts = module.split(".")
+    keep = len(parts) - node.level + (1 if path is not None and path.name == "__init__.py" else 0)
+    return ".".join([*parts[:keep], *([node.module] if node.module else [])])
+
+
+def source_file(module: str) -> Path | None:
+    relative = Path(*module.split("."))
+    for entry in [str(Path(__file__).parent.parent.parent), *sys.path]:
+        for candidate in (Path(entry) / relative / "__init__.py", (Path(entry) / relative).with_suffix(".py")):
+            if candidate.is_file():
+                return candidate
+    return None
+
+
+@functools.cache
+def _tree(module: str) -> ast.Module | None:
+    path = source_file(module)
+    return ast.parse(path.read_text(encoding="utf-8")) if path else None
+
+
+def _arguments(module: str, node: ast.AST) -> dict[str, str]:
+    if isinstance(node, ast.FunctionDef):
+        listed = [*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs]
+        names = {a.arg: ast.unparse(a.annotation) if a.annotation else "" for a in listed}
+        names |= {"**": ""} if node.args.kwarg else {}
+        return {name: kind for name, kind in names.items() if name not in ("self", "cls")}
+    assert isinstance(node, ast.ClassDef)
+    for item in node.body:
+        if isinstance(item, ast.FunctionDef) and item.name == "__init__":
+            names = _arguments(module, item)
+            return names if "**" not in names else _inherited(module, node) | names
+    fields = {
+        i.target.id: ast.unparse(i.annotation)
+        for i in node.body
+        if isinstance(i, ast.AnnAssign) and isinstance(i.target, ast.Name)
+    }
+    dataclass = any("dataclass" in ast.unparse(d) for d in node.decorator_list)
+    return _inherited(module, node) | (fields if dataclass else {})
+
+
+def _inherited(module: str, node: ast.ClassDef) -> dict[str, str]:
+    names: dict[str, str] = {}
+    for base in node.bases:
+        found = definition(module, ast.unparse(base).rpartition(".")[2])
+        if found and found[1] is not node:
+            names |= _arguments(*found)
+    return names

@@ -1,0 +1,156 @@
+"""Zip and tar archives of motion data, read in place: plain files only, of bounded sizes."""
+
+from __future__ import annotations
+
+import bz2
+import gzip
+import lzma
+import tarfile
+import zipfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO, Any
+
+from flame_mdm.errors import first_line
+from flame_mdm.files import MEBIBYTE, ZIP_ERRORS, check_expansion, check_member, regular_file
+
+MEMBER_LIMIT = 512 * MEBIBYTE
+"""Most bytes of one unpacked member. Motions, captions and arrays are far smaller."""
+HEADER_LIMIT = MEBIBYTE // 16
+"""Most bytes of a header that describes the next member, or all later ones."""
+GLOBALS = 100
+"""Most values that headers give for all later members; each member copies them."""
+_UNPACKERS = {b"\x1f\x8b": gzip.open, b"BZ": bz2.open, b"\xfd7zXZ": lzma.open}
+_HEADERS = (tarfile.XHDTYPE, tarfile.XGLTYPE, tarfile.SOLARIS_XHDTYPE, tarfile.GNUTYPE_LONGNAME)
+_HEADERS += (tarfile.GNUTYPE_LONGLINK,)
+
+
+def members(path: Path) -> Iterator[tuple[str, Callable[[], bytes]]]:
+    """Yields the name of each member of a zip or tar archive but its folders, and what reads it.
+
+    A member is to be read before the next one is asked for.
+
+    Raises:
+        ValueError: damaged, or no archive at all; or a member that is read is a link, a sparse file or encrypted, or
+            the content expands beyond all proportion. The message names the archive.
+    """
+    size = regular_file(path)
+    with _named(path), path.open("rb") as file:
+        is_zip = file.read(2) == b"PK" or zipfile.is_zipfile(path)
+    with _named(path):
+        yield from _zip_members(path, size) if is_zip else _tar_members(path, size)
+
+
+def read_member(path: Path, name: str) -> bytes:
+    """Returns the bytes of one member of a zip archive; errors as of `members`."""
+    size = regular_file(path)
+    with _named(path), zipfile.ZipFile(path) as archive:
+        try:
+            return _read(archive, archive.getinfo(name), size)
+        except KeyError as error:
+            raise ValueError(f"it holds no {name}") from error
+
+
+def _zip_members(path: Path, size: int) -> Iterator[tuple[str, Callable[[], bytes]]]:
+    with zipfile.ZipFile(path) as archive:
+        infos = [info for info in archive.infolist() if not info.is_dir()]
+        check_expansion(sum(info.file_size for info in infos), size)
+        for info in infos:
+            yield info.filename, lambda info=info: _within(path, lambda: _read(archive, info, size))
+
+
+def _read(archive: zipfile.ZipFile, info: zipfile.ZipInfo, size: int) -> bytes:
+    check_member(info)
+    check_expansion(info.file_size, size)
+    if info.file_size > MEMBER_LIMIT:
+        raise ValueError(f"{info.filename}: {info.file_size:,} bytes, too many for a motion")
+    return archive.read(info)
+
+
+def _tar_members(path: Path, size: int) -> Iterator[tuple[str, Callable[[], bytes]]]:
+    with path.open("rb") as raw:
+        head = raw.read(6)
+        raw.seek(0)
+        unpack: Any = next((opener for magic, opener in _UNPACKERS.items() if head.startswith(magic)), None)
+        with unpack(raw) if unpack else raw as unpacked:
+            stream: Any = _Bounded(unpacked, size)
+            try:
+                archive: Any = tarfile.open(  # noqa: SIM115 - closed below
+                    mode="r|", fileobj=stream, bufsize=MEBIBYTE // 4, tarinfo=_Member
+                )
+            except tarfile.ReadError as error:
+                if str(error) == "empty file" or stream.total < tarfile.BLOCKSIZE or unpack is None:
+                    raise NoArchiveError(f"{path}: neither a folder nor a zip or tar archive") from error
+                raise
+            with archive:
+                while (member := archive.next()) is not None:
+                    if not member.isdir():
+                        yield member.name, lambda member=member: _within(path, lambda: _extract(archive, member))
+                    archive.members = []  # a million empty members take a gigabyte
+
+
+def _extract(archive: tarfile.TarFile, member: tarfile.TarInfo) -> bytes:
+    if not member.isreg() or member.issparse():
+        raise ValueError(f"{member.name}: a link or another special file, not a plain file")
+    if member.size > MEMBER_LIMIT:
+        raise ValueError(f"{member.name}: {member.size:,} bytes, too many for a motion")
+    file = archive.extractfile(member)
+    assert file is not None
+    return file.read()
+
+
+class NoArchiveError(ValueError):
+    """The file is neither a zip nor a tar archive."""
+
+
+class _Member(tarfile.TarInfo):
+    """A member whose headers are read only if they are small and describe no sparse file."""
+
+    def _proc_member(self, archive: tarfile.TarFile) -> Any:
+        if self.type == tarfile.GNUTYPE_SPARSE:
+            raise ValueError(f"{self.name}: a sparse file")
+        if self.type in _HEADERS and self.size > HEADER_LIMIT:
+            raise ValueError(f"a header of {self.size:,} bytes")
+        if (values := len(archive.pax_headers)) > GLOBALS:
+            raise ValueError(f"headers give {values:,} values for all members")
+        return super()._proc_member(archive)  # pyright: ignore[reportAttributeAccessIssue]
+
+    def _proc_gnusparse_10(self, *_: Any) -> None:
+        raise ValueError(f"{self.name}: a sparse file")
+
+
+class _Bounded:
+    """What a compressed file unpacks to, up to a bound.
+
+    Args:
+        file: the unpacked content.
+        packed: bytes of the compressed file.
+    """
+
+    def __init__(self, file: IO[bytes], packed: int):
+        self.file, self.packed, self.total = file, packed, 0
+
+    def read(self, size: int) -> bytes:
+        data = self.file.read(size)
+        self.total += len(data)
+        check_expansion(self.total, self.packed)
+        return data
+
+
+def _within(path: Path, read: Callable[[], bytes]) -> bytes:
+    with _named(path):
+        return read()
+
+
+@contextmanager
+def _named(path: Path) -> Iterator[None]:
+    """Lets the errors of damaged archives name the archive."""
+    try:
+        yield
+    except NoArchiveError:
+        raise
+    except (*ZIP_ERRORS, tarfile.TarError, lzma.LZMAError, OSError, ValueError) as error:
+        if str(error).startswith(str(path)):
+            raise
+        raise ValueError(f"{path}: damaged archive: {first_line(error)}; download it again") from error

@@ -1,0 +1,68 @@
+"""Errors that the user can fix, and suggestions for misspelt names."""
+
+from __future__ import annotations
+
+import difflib
+import html
+import re
+import sys
+import unicodedata
+from collections.abc import Iterable
+
+MOST_SHOWN = 2_000
+"""Characters of an error line that are shown. None of the framework's own messages is as long."""
+
+
+class UserError(Exception):
+    """An error that the user can fix; commands print its message in one line and exit with code 1."""
+
+
+def first_line(error: BaseException) -> str:
+    """Returns the first line of an error's message; joins it with the second if it ends with a colon."""
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    if len(lines) > 1 and lines[0].endswith(":"):
+        return f"{lines[0]} {lines[1]}"
+    return lines[0] if lines else type(error).__name__
+
+
+def did_you_mean(name: str, names: Iterable[str], cutoff: float = 0.5) -> str:
+    """Returns " Did you mean a, b?" with the up to three nearest of `names`, or "" if none is near."""
+    near = difflib.get_close_matches(name, list(names), 3, cutoff)
+    return f" Did you mean {', '.join(near)}?" if near else ""
+
+
+def printable(text: str) -> str:
+    r"""Returns the text with control and direction characters escaped (`\x1b`, `\u202e`), so that a file name or
+    a message from an untrusted file cannot drive the terminal.
+    """
+    return "".join(
+        char if char == "\t" or unicodedata.category(char) not in ("Cc", "Cf", "Cs", "Zl", "Zp") else _escaped(char)
+        for char in text
+    )
+
+
+def one_line(text: str) -> str:
+    """Returns a text, which may come from a result file, in one `printable` line."""
+    return printable(re.sub(r"[\t\n\v\f\r\x1c-\x1e\x85\u2028\u2029]+", " ", text))
+
+
+def markdown_text(text: str) -> str:
+    """Returns a text as one line of Markdown without markup."""
+    return html.escape(re.sub(r"([|*_`~#\[\]\\])", r"\\\1", one_line(text)), quote=False)
+
+
+def say(*lines: object, error: bool = False) -> None:
+    """Prints each argument as one `printable` line, to standard output or, with `error`, to standard error.
+
+    Commands use it instead of `print`, because any name or text that they show may come from an untrusted file. Of an
+    error line beyond `MOST_SHOWN` characters, the middle is left out.
+    """
+    for line in lines:
+        text = str(line)
+        if error and len(text) > MOST_SHOWN:
+            text = f"{text[: MOST_SHOWN // 2]} … {text[-MOST_SHOWN // 2 :]}"
+        print(printable(text), file=sys.stderr if error else sys.stdout, flush=True)
+
+
+def _escaped(char: str) -> str:
+    return char.encode("unicode_escape").decode("ascii")

@@ -1,0 +1,426 @@
+"""Files: atomic writes, hashes, and reading that does not trust what a file declares about itself.
+
+Every file that may come from somebody else is read here or checked here first: only regular files, of a bounded size,
+whose declared sizes match the bytes that are there.
+"""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import json
+import math
+import os
+import secrets
+import shutil
+import stat
+import tokenize
+import zipfile
+import zlib
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import IO, TYPE_CHECKING, Any
+
+from flame_mdm.errors import UserError, first_line
+
+if TYPE_CHECKING:  # `--help` does not wait for NumPy
+    import numpy as np
+
+MEBIBYTE = 2**20
+TEXT_LIMIT = 512 * MEBIBYTE
+"""Largest text or JSON file. The largest known, BABEL's annotations, has 175 MiB."""
+YAML_LIMIT = MEBIBYTE
+"""Largest YAML file: recipes, skeletons, protocols and table specs are far smaller, and YAML parses slowly."""
+YAML_NODES = 100_000
+"""Largest number of keys and values in a YAML file after its aliases are expanded."""
+YAML_DIGITS = 20
+"""Largest number of characters of a whole number in a YAML file; 2^63 has 19."""
+ARRAYS_LIMIT = 128 * MEBIBYTE
+"""Arrays of a compressed file may always be this large in total. Larger ones may have up to `INFLATION` times the
+bytes of the file; motion data compresses less than 10 times."""
+INFLATION = 20
+
+ZIP_ERRORS = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError)
+"""What `zipfile` raises for damaged, encrypted and oddly compressed archives."""
+
+
+# Writing --------------------------------------------------------------------------------------------------------------
+
+
+@contextmanager
+def atomic_write(path: str | Path) -> Iterator[Path]:
+    """Yields a temporary path next to `path`, which is renamed to it at the end; a failure leaves nothing behind.
+
+    The temporary name is unique, so that any number of processes may write the same file; the last one wins.
+
+    Raises:
+        UserError: the file cannot be written, for instance because the disk is full.
+    """
+    path = Path(path)
+    temporary = path.with_name(f".{path.stem[:80]}.{os.getpid()}-{secrets.token_hex(4)}{path.suffix}")
+    with writing(path, temporary), made_folder(path.parent):
+        try:
+            yield temporary
+            temporary.replace(path)
+        finally:
+            temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def atomic_folder(path: str | Path) -> Iterator[Path]:
+    """Yields a temporary folder next to `path`, which becomes `path` at the end; a failure leaves nothing behind.
+
+    If the folder `path` exists, the new files replace those of the same name, and other files stay.
+
+    Raises:
+        UserError: `path` is a file, or something in it cannot be written.
+    """
+    path = Path(path)
+    if path.exists() and not path.is_dir():
+        raise UserError(f"{path}: a file, not a folder. Choose another folder")
+    temporary = path.with_name(f".{path.name[:80]}.{os.getpid()}-{secrets.token_hex(4)}")
+    try:
+        with writing(path, temporary), made_folder(path.parent):
+            try:
+                temporary.mkdir()
+                yield temporary
+                try:
+                    temporary.rename(path)
+                except OSError:
+                    if not path.is_dir():
+                        raise
+                    for file in sorted(temporary.iterdir()):
+                        file.replace(path / file.name)
+            finally:
+                shutil.rmtree(temporary, ignore_errors=True)
+    except UserError as error:
+        raise UserError(str(error).replace(str(temporary), str(path))) from error
+
+
+@contextmanager
+def writing(path: Path, temporary: Path) -> Iterator[None]:
+    """Turns an `OSError` about `temporary`, a file or folder that becomes `path`, into a `UserError` about `path`.
+
+    Errors that name other files, and errors without a number, pass.
+    """
+    try:
+        yield
+    except OSError as error:
+        name = Path(str(error.filename or temporary))
+        if error.errno is None or not (name.is_relative_to(temporary) or name.is_relative_to(path)):
+            raise
+        raise UserError(f"{path}: cannot be written: {write_failure(error, path)}") from error
+
+
+def write_failure(error: BaseException, path: Path) -> str:
+    """Returns why a file could not be written; on a full disk also how much is free."""
+    reason = getattr(error, "strerror", None) or first_line(error)
+    if getattr(error, "errno", None) not in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO):
+        return reason
+    folder = next(parent for parent in path.absolute().parents if parent.exists())
+    return f"{reason}. {_size(shutil.disk_usage(folder).free)} are free on the disk of {folder}"
+
+
+@contextmanager
+def made_folder(folder: Path) -> Iterator[None]:
+    """Creates a folder and its parents; the created ones that are empty at the end are removed."""
+    made = [part for part in (folder, *folder.parents) if not part.exists()]
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        yield
+    finally:
+        for part in made:
+            with suppress(OSError):  # it holds something now
+                part.rmdir()
+
+
+def write_text(path: str | Path, text: str) -> None:
+    """Writes a UTF-8 text file atomically."""
+    with atomic_write(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def write_json(path: str | Path, content: Any, indent: int | None = 2) -> None:
+    """Writes a JSON file atomically; NaN and infinity raise `ValueError`."""
+    write_text(path, json.dumps(content, indent=indent, allow_nan=False) + "\n")
+
+
+# Reading --------------------------------------------------------------------------------------------------------------
+
+
+def sha256(path: str | Path) -> str:
+    """Returns the SHA-256 of a file as 64 hexadecimal digits."""
+    with Path(path).open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def regular_file(path: str | Path, limit: int | None = None) -> int:
+    """Returns the size in bytes of a regular file, or of the one that a link leads to.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        UserError: it is a folder, a pipe or a device, or larger than `limit` bytes.
+    """
+    try:
+        status = Path(path).stat()
+    except (FileNotFoundError, NotADirectoryError):
+        raise FileNotFoundError(f"{path}: no such file") from None
+    except (OSError, ValueError) as error:  # a loop of links, a name that is too long or holds a null character
+        raise UserError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from error
+    if not stat.S_ISREG(status.st_mode):
+        kind = "a folder" if stat.S_ISDIR(status.st_mode) else "a pipe, a socket or a device"
+        raise UserError(f"{path}: {kind}, not a file")
+    if limit is not None and status.st_size > limit:
+        raise UserError(f"{path}: {_size(status.st_size)} is more than the {_size(limit)} that such a file may have")
+    return status.st_size
+
+
+def read_text(path: str | Path, limit: int = TEXT_LIMIT) -> str:
+    """Returns the text of a UTF-8 file of at most `limit` bytes.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        UserError: it is not a regular file, too large, unreadable, or not UTF-8.
+    """
+    path = Path(path)
+    regular_file(path, limit)
+    try:
+        return path.read_text(encoding="utf-8")
+    except UnicodeDecodeError as error:
+        raise UserError(f"{path}: not a UTF-8 text file: {error}") from error
+    except OSError as error:
+        raise UserError(f"{path}: cannot be read: {error.strerror}") from error
+
+
+def read_json(path: str | Path, limit: int = TEXT_LIMIT) -> Any:
+    """Returns the content of a JSON file.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        UserError: it is not JSON, is nested too deeply, or holds NaN, infinity or half a character.
+    """
+    try:
+        return parse_json(read_text(path, limit))
+    except ValueError as error:
+        raise UserError(f"{path}: not a JSON file: {error}") from error
+
+
+def parse_json(text: str | bytes) -> Any:
+    """Returns the content of a JSON text; raises `ValueError` in all cases that `read_json` refuses."""
+
+    def refuse(constant: str) -> None:
+        raise ValueError(f"{constant} is not a JSON number")
+
+    try:
+        content = json.loads(text, parse_constant=refuse)
+        if "\\u" in (text if isinstance(text, str) else text.decode()):
+            json.dumps(content, ensure_ascii=False).encode()  # half a character cannot be written again
+    except RecursionError:
+        raise ValueError("nested too deeply") from None
+    return content
+
+
+def read_yaml(path: str | Path) -> Any:
+    """Returns the plain content of a YAML file; interpolations such as `${a}` stay the texts that they are.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        UserError: it is not YAML, nested too deeply, too large, or aliases make it so.
+    """
+    import yaml
+    from omegaconf import OmegaConf
+
+    text = read_text(path, YAML_LIMIT)
+    try:
+        nodes = _nodes(yaml.compose(text, yaml.SafeLoader), {})
+        if nodes > YAML_NODES:
+            raise ValueError(f"more than {YAML_NODES:,} values after its aliases are expanded")
+        content = OmegaConf.create(text) if text.strip() else None  # with OmegaConf's reading of numbers
+        return OmegaConf.to_container(content) if content is not None else None
+    except RecursionError:
+        raise UserError(f"{path}: not a readable YAML file: nested too deeply") from None
+    except Exception as error:  # YAML's and OmegaConf's many errors all mean the same here
+        raise UserError(f"{path}: not a readable YAML file: {first_line(error)}") from error
+
+
+def _nodes(node: Any, known: dict[int, float]) -> float:
+    """Returns the number of nodes of a YAML file with its aliases expanded; infinite if one contains itself."""
+    if id(node) not in known:
+        known[id(node)] = math.inf
+        content = node.value if node is not None else ""
+        if getattr(node, "tag", "").endswith(":int") and len(content) > YAML_DIGITS:
+            # Keys among them could be chosen so that all have the same hash.
+            raise ValueError(f"a whole number of more than {YAML_DIGITS} digits: {content[:YAML_DIGITS]}…")
+        if isinstance(content, str):
+            content.encode()  # half a character cannot be written again
+        parts = [part for pair in content for part in (pair if isinstance(pair, tuple) else [pair])]
+        known[id(node)] = 1 + sum(_nodes(part, known) for part in parts if hasattr(part, "value"))
+    return known[id(node)]
+
+
+def read_npz(
+    source: Path | IO[bytes], *, skip: Collection[str] = (), only: Collection[str] | None = None
+) -> dict[str, np.ndarray]:
+    """Returns the arrays of an .npz file by name.
+
+    Args:
+        source: a path, or an open file that can be rewound.
+        skip: names of arrays that are not read.
+        only: names of the arrays that are read if they are there; None = all.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        UserError: it is not a regular file.
+        ValueError: it is damaged, encrypted, holds objects, declares other sizes than it has, or expands to more than
+            `ARRAYS_LIMIT` bytes and `INFLATION` times its own size.
+    """
+    if isinstance(source, Path):
+        regular_file(source)
+        with source.open("rb") as file:
+            return read_npz(file, skip=skip, only=only)
+    try:
+        size = source.seek(0, os.SEEK_END)
+        with zipfile.ZipFile(source) as archive:
+            members = {member.filename.removesuffix(".npy"): member for member in archive.infolist()}
+            wanted = {n: m for n, m in members.items() if n not in skip and (only is None or n in only)}
+            check_expansion(sum(member.file_size for member in wanted.values()), size)
+            arrays = {}
+            for name, member in wanted.items():
+                check_member(member)
+                with archive.open(member) as file:
+                    arrays[name] = _array(file, member.file_size, name)
+            return arrays
+    except (*ZIP_ERRORS, OSError, ValueError) as error:
+        raise ValueError(f"damaged, or not a file of plain arrays: {first_line(error)}") from error
+
+
+def read_npy(source: Path | IO[bytes], *, mmap: bool = False) -> np.ndarray:
+    """Returns the array of an .npy file; errors as of `read_npz`.
+
+    Args:
+        source: a path, or an open file that can be rewound.
+        mmap: map the file into memory, for reading, instead of loading it; the source is then a path.
+    """
+    if isinstance(source, Path):
+        regular_file(source)
+        with source.open("rb") as file:
+            return read_npy(file) if not mmap else _npy(file, mmap)
+    return _npy(source, mmap)
+
+
+def _npy(file: IO[bytes], mmap: bool) -> np.ndarray:
+    size = file.seek(0, os.SEEK_END)
+    file.seek(0)
+    try:
+        return _array(file, size, "the array", mmap)
+    except ValueError as error:
+        raise ValueError(f"damaged, or not a file of plain arrays: {first_line(error)}") from error
+
+
+def check_member(member: zipfile.ZipInfo) -> None:
+    """Raises `ValueError` if a member of a zip archive is encrypted, or compressed by other methods than deflate.
+
+    `zipfile` bounds what it unpacks at a time by the declared size for deflate alone.
+    """
+    if member.flag_bits & 1:
+        raise ValueError(f"{member.filename}: encrypted")
+    if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+        raise ValueError(f"{member.filename}: compressed by method {member.compress_type}, not by deflate")
+
+
+def read_torch(path: Path) -> Any:
+    """Returns the plain values and tensors in a file that `torch.save` wrote; none of its code runs.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        UserError: it is not a regular file.
+        ValueError: it is damaged, holds other objects, or is compressed.
+    """
+    import torch
+
+    check_torch(path)
+    try:
+        return torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # torch raises many kinds for damaged files and foreign pickles
+        raise ValueError(f"damaged, or not a file of plain values and tensors: {first_line(error)}") from error
+
+
+def check_torch(path: Path) -> None:
+    """Checks the archive that `torch.load` is about to read, which looks neither at sizes nor at checksums.
+
+    Raises:
+        FileNotFoundError, UserError, ValueError: see `read_torch`.
+    """
+    size = regular_file(path)
+    with path.open("rb") as file:
+        if file.read(4) != b"PK\3\4":  # formats of old versions, which are no archives
+            return
+    try:
+        with zipfile.ZipFile(path) as archive:
+            members = archive.infolist()
+            if any(member.compress_type for member in members) or sum(m.file_size for m in members) > size:
+                raise ValueError("damaged: its parts are compressed or overlap, and torch.save compresses none")
+            if (spoiled := archive.testzip()) is not None:
+                raise ValueError(f"damaged: the checksum of {spoiled} is wrong")
+    except (*ZIP_ERRORS, OSError) as error:
+        raise ValueError(f"damaged, or not a file of torch.save: {first_line(error)}") from error
+
+
+def check_expansion(expanded: int, packed: int) -> None:
+    """Raises `ValueError` if compressed content expands beyond all proportion."""
+    if expanded > max(ARRAYS_LIMIT, INFLATION * packed):
+        raise ValueError(f"its {_size(packed)} expand to {_size(expanded)}, which no motion data does")
+
+
+def _array(file: IO[bytes], size: int, name: str, mmap: bool = False) -> np.ndarray:
+    """Returns the array of an .npy file whose header declares exactly the bytes that are there.
+
+    Args:
+        file: open at its begin.
+        size: its bytes.
+        name: of the array, for messages.
+        mmap: as in `read_npy`.
+    """
+    import numpy as np
+
+    try:
+        version = np.lib.format.read_magic(file)
+        readers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+        if version not in readers:
+            raise ValueError(f"its format is {version[0]}.{version[1]}, not 1.0 or 2.0")
+        shape, fortran, dtype = readers[version](file)
+    except (ValueError, EOFError, TypeError, RecursionError, MemoryError, SyntaxError, tokenize.TokenError) as error:
+        raise ValueError(f"{name}: not an array: {first_line(error)}") from error
+    if dtype.hasobject:
+        raise ValueError(f"{name}: an array of Python objects, which could run code")
+    count, begin = math.prod(shape), file.tell()
+    if min(shape, default=0) < 0 or begin + count * dtype.itemsize != size or (not dtype.itemsize and count > 1):
+        raise ValueError(f"{name}: its header declares {shape} of {dtype}, which is not what follows")
+    order = "F" if fortran else "C"
+    if mmap and count:
+        return np.memmap(file, dtype, "r", begin, shape, order)
+    content = bytearray(size - begin)
+    array = np.ndarray(shape, dtype, content, order=order)
+    if _read_into(file, content) < len(content):
+        raise ValueError(f"{name}: it ends too early")
+    return array
+
+
+def _read_into(file: Any, content: bytearray) -> int:
+    """Fills `content` from a file and returns the number of bytes read."""
+    view, done = memoryview(content), 0
+    while done < len(view):
+        count = file.readinto(view[done : done + MEBIBYTE])
+        if not count:
+            break
+        done += count
+    return done
+
+
+def _size(count: float) -> str:
+    for unit in ("bytes", "KiB", "MiB", "GiB"):
+        if count < 1024:
+            return f"{count:.3g} {unit}"
+        count /= 1024
+    return f"{count:.3g} TiB"

@@ -1,0 +1,332 @@
+"""BVH motion capture files: reading, forward kinematics, resampling, writing.
+
+A BVH file is a tree of joints with offsets, and a table of numbers with one row per frame and one column per channel. A
+joint's rotation channels, in the order in which they are listed, are intrinsic Euler angles in degrees, so that
+`Zrotation Xrotation Yrotation` means R = Rz Rx Ry on column vectors. Position channels replace the joint's offset.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from decimal import Decimal
+from pathlib import Path
+from typing import NoReturn
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from flame_mdm.files import TEXT_LIMIT, regular_file, write_text
+from flame_mdm.formats.resampling import RATES, between, slerp
+
+CHANNELS = tuple(f"{axis}{kind}" for kind in ("position", "rotation") for axis in "XYZ")
+LABELED = 200
+"""Most characters of a line with a label. Python takes quadratic time for numbers of many digits."""
+
+
+@dataclass(frozen=True, eq=False)
+class Bvh:
+    """A skeleton and its motion. J joints, E end sites, F frames, C channels; lengths in the file's unit.
+
+    Attributes:
+        joints: J names; end sites are not joints.
+        parents: index of each joint's parent, smaller than its own; -1 for a root.
+        offsets: (J, 3) float64, resting place of each joint in its parent's frame.
+        channels: names of each joint's channels in the order of its columns, out of `CHANNELS`.
+        end_parents: the joint each end site hangs on.
+        end_offsets: (E, 3) float64, place of each end site in the frame of that joint.
+        frames: (F, C) float64, the channels of all joints in joint order; angles in degrees.
+        fps: frames per second.
+    """
+
+    joints: tuple[str, ...]
+    parents: tuple[int, ...]
+    offsets: np.ndarray
+    channels: tuple[tuple[str, ...], ...]
+    end_parents: tuple[int, ...]
+    end_offsets: np.ndarray
+    frames: np.ndarray
+    fps: float
+
+    def columns(self) -> list[slice]:
+        """Columns of `frames` that hold each joint's channels."""
+        ends = list(itertools.accumulate(map(len, self.channels)))
+        return [slice(end - len(names), end) for end, names in zip(ends, self.channels, strict=True)]
+
+    def rotations(self) -> np.ndarray:
+        """(F, J, 3, 3) rotation of each joint in its parent's frame."""
+        columns_of: dict[str, list[list[int]]] = {}
+        joints_of: dict[str, list[int]] = {}
+        for joint, (names, column) in enumerate(zip(self.channels, self.columns(), strict=True)):
+            turning = [k for k, name in enumerate(names) if name.endswith("rotation")]
+            order = "".join(names[k][0] for k in turning)
+            columns_of.setdefault(order, []).append([column.start + k for k in turning])
+            joints_of.setdefault(order, []).append(joint)
+        rotations = np.tile(np.eye(3), (len(self.frames), len(self.joints), 1, 1))
+        for order, joints in joints_of.items():
+            if order:
+                angles = self.frames[:, columns_of[order]]
+                turned = Rotation.from_euler(order, angles.reshape(-1, len(order)), degrees=True).as_matrix()
+                rotations[:, joints] = turned.reshape(len(angles), len(joints), 3, 3)
+        return rotations
+
+    def translations(self) -> np.ndarray:
+        """(F, J, 3) place of each joint in its parent's frame: position channels, or the offset without them."""
+        translations = np.tile(self.offsets, (len(self.frames), 1, 1))
+        for joint, (names, column) in enumerate(zip(self.channels, self.columns(), strict=True)):
+            for k, name in enumerate(names):
+                if name.endswith("position"):
+                    translations[:, joint, "XYZ".index(name[0])] = self.frames[:, column.start + k]
+        return translations
+
+    def positions(self) -> np.ndarray:
+        """(F, J, 3) place of each joint in the world."""
+        return forward_kinematics(self.parents, self.rotations(), self.translations())[0]
+
+    def end_positions(self) -> np.ndarray:
+        """(F, E, 3) place of each end site in the world."""
+        positions, turned = forward_kinematics(self.parents, self.rotations(), self.translations())
+        parents = list(self.end_parents)
+        return positions[:, parents] + np.einsum("feij,ej->fei", turned[:, parents], self.end_offsets)
+
+    def resample(self, fps: float) -> tuple[np.ndarray, np.ndarray]:
+        """Local motion at times 0, 1/fps, 2/fps, ... up to the last frame.
+
+        Rotations are interpolated on the sphere (slerp) and translations linearly, so bones whose translation does
+        not change keep their exact length, which interpolated joint positions would not.
+
+        Returns:
+            Rotations (F', J, 3, 3) and translations (F', J, 3), F' = floor((F - 1) * fps / self.fps) + 1.
+
+        Raises:
+            ValueError: the motion would get too many frames.
+        """
+        before, after, share = between(len(self.frames), self.fps, fps, len(self.joints), slack=0)
+        translations = self.translations()
+        moved = (1 - share[:, None, None]) * translations[before] + share[:, None, None] * translations[after]
+        return slerp(self.rotations(), before, after, share), moved
+
+
+def forward_kinematics(
+    parents: Sequence[int], rotations: np.ndarray, translations: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Local to world: G_j = G_p R_j and p_j = p_p + G_p t_j for a joint j with parent p.
+
+    Args:
+        parents: index of each joint's parent, smaller than its own; -1 for a root.
+        rotations: (F, J, 3, 3) in the frame of the parent.
+        translations: (F, J, 3) in the frame of the parent.
+
+    Returns:
+        Positions (F, J, 3) and rotations (F, J, 3, 3) in the world.
+    """
+    positions, turned = translations.copy(), rotations.copy()
+    for joint, parent in enumerate(parents):
+        if parent >= 0:
+            turned[:, joint] = turned[:, parent] @ rotations[:, joint]
+            bone = turned[:, parent] @ translations[:, joint, :, None]
+            positions[:, joint] = positions[:, parent] + bone[..., 0]
+    return positions, turned
+
+
+def read(path: str | Path) -> Bvh:
+    """Reads a BVH file.
+
+    Raises:
+        UserError: it is not a regular file, or too large.
+        ValueError: it is not a whole and valid BVH file; the message names the file and the line.
+    """
+    regular_file(path, TEXT_LIMIT)
+    return parse(Path(path).read_bytes(), str(path))
+
+
+def parse(data: bytes, name: str) -> Bvh:
+    """Reads the bytes of a BVH file, which messages call `name`.
+
+    Raises:
+        ValueError: as `read`.
+    """
+    source = _Source(data, name)
+    joints: list[str] = []
+    parents: list[int] = []
+    offsets: list[list[float] | None] = []
+    channels: list[tuple[str, ...]] = []
+    end_parents: list[int] = []
+    end_offsets: list[list[float] | None] = []
+    blocks: list[int] = []  # the joints whose braces are open, then -1 inside an end site
+
+    while (keyword := source.token().upper()) != "MOTION":
+        joint = blocks[-1] if blocks else None
+        if (keyword == "ROOT" and joint is None) or (keyword == "JOINT" and joint is not None and joint >= 0):
+            blocks.append(len(joints))
+            joints.append(source.token())
+            parents.append(-1 if joint is None else joint)
+            offsets.append(None)
+            channels.append(())
+            source.token("{")
+        elif keyword == "END" and joint is not None and joint >= 0:
+            blocks.append(-1)
+            end_parents.append(joint)
+            end_offsets.append(None)
+            source.token("SITE")
+            source.token("{")
+        elif keyword == "OFFSET" and joint is not None:
+            offset = [source.number() for _ in range(3)]
+            if joint < 0:
+                end_offsets[-1] = offset
+            else:
+                offsets[joint] = offset
+        elif keyword == "CHANNELS" and joint is not None and joint >= 0:
+            names = tuple(source.token().capitalize() for _ in range(int(source.number())))
+            if len(set(names)) < len(names) or not set(names) <= set(CHANNELS):
+                source.fail(
+                    f"channels have to be different ones of {', '.join(CHANNELS)}, found {' '.join(names)[:80]}"
+                )
+            channels[joint] = names
+        elif keyword == "}" and joint is not None:
+            if (end_offsets[-1] if joint < 0 else offsets[joint]) is None:
+                source.fail("a joint or an end site without OFFSET")
+            blocks.pop()
+        else:
+            source.fail(f"{keyword[:40]} has no place here")
+    if blocks or not joints:
+        source.fail("MOTION before the end of the hierarchy")
+
+    count = int(source.labeled(r"Frames:\s*(\d{1,18})", "Frames: and a number"))
+    fps = _fps(
+        source.labeled(r"Frame Time:\s*((?:\d+(?:\.\d+)?|\.\d+)(?:E[-+]?\d+)?)", "Frame Time: and a number of seconds")
+    )
+    if fps is None:
+        source.fail(f"the frame time has to lie between {1 / RATES[1]:g} and {1 / RATES[0]:g} seconds")
+    return Bvh(
+        tuple(joints),
+        tuple(parents),
+        np.array(offsets, float),
+        tuple(channels),
+        tuple(end_parents),
+        np.array(end_offsets, float).reshape(-1, 3),
+        source.table(count, sum(map(len, channels))),
+        fps,
+    )
+
+
+class _Source:
+    """Lines of a BVH file, taken one after the other; knows the line to blame."""
+
+    def __init__(self, data: bytes, name: str):
+        self.name, self.line = name, 1
+        try:
+            lines = data.decode("utf-8-sig").splitlines()
+        except UnicodeDecodeError as error:
+            self.line = data.count(b"\n", 0, error.start) + 1
+            self.fail("not a BVH file (not UTF-8 text)")
+        self.lines = ((number, line.strip()) for number, line in enumerate(lines, 1) if line.strip())
+        self.line, first = next(self.lines, (1, ""))
+        if first.upper() != "HIERARCHY":
+            self.fail("not a BVH file (it has to begin with HIERARCHY)")
+        self.tokens = ((number, token) for number, line in self.lines for token in line.split())
+
+    def fail(self, what: str) -> NoReturn:
+        raise ValueError(f"{self.name}, line {self.line}: {what}")
+
+    def token(self, expected: str = "") -> str:
+        """The next word of the hierarchy; has to be `expected`, where given, in any case of letters."""
+        self.line, token = next(self.tokens, (self.line, ""))
+        if not token:
+            self.fail("the file ends inside the hierarchy")
+        if expected and token.upper() != expected:
+            self.fail(f"expected {expected}, found {token[:40]}")
+        return token
+
+    def number(self) -> float:
+        token = self.token()
+        try:
+            value = float(token)
+        except ValueError:
+            value = math.nan
+        if not math.isfinite(value):
+            self.fail(f"expected a number, found {token[:40]}")
+        return value
+
+    def labeled(self, pattern: str, expected: str) -> str:
+        """The value on the next line, the first group of `pattern`."""
+        self.line, line = next(self.lines, (self.line, ""))
+        match = re.fullmatch(pattern, line, re.IGNORECASE) if len(line) <= LABELED else None
+        if match is None:
+            self.fail(f"expected {expected}, found {line[:40] or 'the end of the file'}")
+        return match[1]
+
+    def table(self, count: int, width: int) -> np.ndarray:
+        """(count, width) float64, the numbers in all lines that are left."""
+        rows, numbers = [], []
+        for number, line in self.lines:
+            self.line = number
+            try:
+                row = list(map(float, line.split()))
+            except ValueError as error:
+                self.fail(str(error))
+            if len(row) != width:
+                self.fail(f"{len(row)} numbers, but the joints have {width} channels")
+            rows.append(row)
+            numbers.append(number)
+        if len(rows) != count or not rows:
+            self.fail(f"the file ends after {len(rows)} frames, but it has to have {max(count, 1)}")
+        table = np.array(rows)
+        finite = np.isfinite(table).all(1)
+        if not finite.all():
+            self.line = numbers[int(np.argmin(finite))]
+            self.fail("a number that is not finite")
+        return table
+
+
+def write(bvh: Bvh, path: str | Path) -> None:
+    """Writes a BVH file that `read` turns into the same numbers; joints come in depth-first order."""
+    order: list[int] = []
+    columns = bvh.columns()
+
+    def block(head: str, offset: np.ndarray, inside: Iterator[str]) -> Iterator[str]:
+        yield head
+        yield "{"
+        yield f"\tOFFSET {_numbers(offset)}"
+        yield from (f"\t{line}" for line in inside)
+        yield "}"
+
+    def inside(joint: int) -> Iterator[str]:
+        order.append(joint)
+        yield " ".join(["CHANNELS", str(len(bvh.channels[joint])), *bvh.channels[joint]])
+        for child, parent in enumerate(bvh.parents):
+            if parent == joint:
+                yield from block(f"JOINT {bvh.joints[child]}", bvh.offsets[child], inside(child))
+        for parent, offset in zip(bvh.end_parents, bvh.end_offsets, strict=True):
+            if parent == joint:
+                yield from block("End Site", offset, iter(()))
+
+    lines = ["HIERARCHY"]
+    for joint, parent in enumerate(bvh.parents):
+        if parent < 0:
+            lines += block(f"ROOT {bvh.joints[joint]}", bvh.offsets[joint], inside(joint))
+    lines += ["MOTION", f"Frames: {len(bvh.frames)}", f"Frame Time: {1 / bvh.fps!r}"]
+    frames = bvh.frames[:, np.r_[tuple(columns[joint] for joint in order)]]
+    lines += map(_numbers, frames)
+    write_text(path, "\n".join(lines) + "\n")
+
+
+def _fps(seconds: str) -> float | None:
+    """Frames per second from a written frame time; None if that is out of reason.
+
+    Files round the frame time (0.0333333 for 1/30), which would let a clip's last frame fall past its end after
+    resampling: a whole number of frames per second that the digits may stand for is meant.
+    """
+    time = float(seconds)
+    if not 1 / RATES[1] <= time <= 1 / RATES[0]:
+        return None
+    whole = max(round(1 / time), 1)
+    last_digit = 10.0 ** int(Decimal(seconds).as_tuple().exponent)
+    return float(whole) if abs(1 / whole - time) < min(last_digit, 0.01 * time) else 1 / time
+
+
+def _numbers(row: np.ndarray) -> str:
+    return " ".join(map(repr, row.tolist()))

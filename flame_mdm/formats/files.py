@@ -1,0 +1,212 @@
+"""Reading of motion files; `flame_mdm.formats.motion` writes them. `docs/formats.md` describes the files."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from flame_mdm.files import MEBIBYTE, read_json, read_npy, read_npz, regular_file
+from flame_mdm.formats.layouts import read_bvh
+from flame_mdm.formats.motion import AMASS_AXES, Motion, motion_of_poses
+from flame_mdm.formats.poses import Poses
+from flame_mdm.formats.resampling import between, check_frames, frame_rate, resample
+from flame_mdm.representations import rotation
+from flame_mdm.representations.skeleton import SKELETONS, SMPL22, Skeleton
+from flame_mdm.representations.smpl import ADULT, read_pose
+
+ENDINGS = (".npz", ".bvh", ".json", ".npy")
+CAMERA_AXES = torch.diag(torch.tensor([1.0, -1, -1], dtype=torch.float64))
+"""Turns the camera's world of the action data sets, y down, to y up."""
+ROTATED = {"smpl147": 147, "rot6d-25": 150}
+"""Representations that hold SMPL's rotations, and their numbers of features."""
+JSON_LIMIT = 128 * MEBIBYTE
+"""Largest `.json` motion; parsed, it takes many times its size."""
+
+
+def read(
+    path: str | Path, fps: float | None = None, unit: float | None = None, resample_to: float | None = None
+) -> Motion:
+    """Reads a motion: `.npz` of this project, of AMASS or with joints and fps, `.bvh`, `.json`, or joints `.npy`.
+
+    Args:
+        path: the file.
+        fps: frames per second instead of those that the file gives; an .npy file gives none.
+        unit: metres per unit of the file's lengths, for .bvh (default: that of its skeleton, mostly centimetres) and
+            .npy (default 1).
+        resample_to: the frame rate wanted; joints are interpolated by cubic splines, the rotations of .bvh and AMASS
+            on the sphere. Default: frames are kept.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        UserError: it is not a regular file.
+        ValueError: damaged, of another kind, or without a frame rate.
+    """
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if suffix not in ENDINGS:
+        raise ValueError(f"{path}: unknown kind of motion file. Use one of {', '.join(ENDINGS)}")
+    regular_file(path)
+    if unit is not None and suffix in (".npz", ".json"):
+        raise ValueError(f"{path}: lengths in {suffix} files are metres; unit is for .bvh and .npy")
+    try:
+        if suffix == ".bvh":
+            return _read_bvh(path, fps, unit, resample_to)
+        data = read_arrays(path)
+        if fps is not None:
+            data["fps"] = frame_rate(fps)
+        elif "fps" not in data:
+            raise ValueError("the file does not give its frame rate: set it with fps=20")
+        text = str(data.get("text", ""))
+        if "joints" not in data:
+            translation, turns = smpl_motion(data, resample_to)
+            poses = _smpl_poses(translation, rotation.quaternion_to_matrix(turns), AMASS_AXES)
+            return motion_of_poses(poses, resample_to or data["fps"], text, path.stem)
+        return _of_joints(path, data, text, unit, resample_to)
+    except ValueError as error:
+        raise ValueError(str(error) if str(path) in str(error) else f"{path}: {error}") from error
+
+
+def read_arrays(path: Path) -> dict[str, Any]:
+    """Reads the arrays of an .npz, .json or .npy motion: joints, or poses and trans as AMASS has them; fps if given.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        UserError: it is not a regular file.
+        ValueError: damaged, or no motion; the message names the file.
+    """
+    suffix = path.suffix.lower()
+    try:
+        if suffix == ".npz":
+            data: dict[str, Any] = read_npz(path, skip=("dmpls",))
+        elif suffix == ".npy":
+            data = {"joints": read_npy(path)}
+        else:
+            data = _read_json(path)
+        if not {"joints", "poses"} & set(data):
+            found = ", ".join(data) or "nothing"
+            raise ValueError(f"it holds {found}; a motion is joints and fps, or poses, trans and mocap_framerate")
+        for name in {"joints", "poses", "trans"} & set(data):
+            _check_numbers(name, data[name])
+        if "features" in data and (not _is_real(data["features"]) or data["features"].ndim != 2):
+            raise ValueError("features are not an array (frames, features) of real numbers")
+        if "poses" in data and data.get("trans", np.zeros(0)).shape != (len(data["poses"]), 3):
+            raise ValueError("AMASS's files hold poses (F, 3 K), trans (F, 3) and mocap_framerate")
+        keys = ("fps", "mocap_framerate", "mocap_frame_rate")
+        rate = next((key for key in (keys if "joints" in data else keys[::-1]) if key in data), None)
+        if rate is not None:
+            data["fps"] = frame_rate(data[rate], rate)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+    return data
+
+
+def _is_real(values: np.ndarray) -> bool:
+    return values.dtype.kind in "fiu" and values.dtype.itemsize <= 8
+
+
+def _check_numbers(name: str, values: np.ndarray) -> None:
+    if not _is_real(values):
+        raise ValueError(f"{name} are not an array of real numbers")
+    if not values.ndim or not len(values):
+        raise ValueError(f"{name} of shape {values.shape} have no frames")
+    check_frames(len(values))
+    if (beyond := ~(np.abs(values) < 1e6)).any():
+        raise ValueError(f"numbers of {name} in frame {np.argwhere(beyond)[0][0]} are not finite, or beyond a million")
+
+
+def _read_json(path: Path) -> dict[str, Any]:
+    data = read_json(path, JSON_LIMIT)
+    try:
+        return {"joints": np.array(data["joints"], float), "fps": data["fps"], "text": str(data.get("caption", ""))}
+    except (ValueError, TypeError, KeyError, OverflowError) as error:
+        raise ValueError(f"no motion in JSON, an object with joints and fps: {error}") from error
+
+
+def smpl_motion(data: dict[str, Any], fps: float | None = None) -> tuple[Tensor, Tensor]:
+    """Returns translation (F, 3) and quaternions (F, 24, 4), float64, of arrays of AMASS; `fps` resamples them.
+
+    Raises:
+        ValueError: fewer than 24 joints, or too many frames.
+    """
+    poses = data["poses"].reshape(len(data["poses"]), -1)
+    frames = None if fps is None else between(len(poses), data["fps"], fps, poses.shape[1] // 3)
+    translation, rotations = read_pose(torch.from_numpy(np.concatenate([data["trans"], poses], 1)))
+    turns = rotation.matrix_to_quaternion(rotations)
+    if fps is None or frames is None:
+        return translation, turns
+    before, after, share = frames
+    turns = rotation.slerp(turns[before], turns[after], torch.from_numpy(share)[:, None, None])
+    return torch.from_numpy(resample(translation.numpy(), data["fps"], fps)), turns
+
+
+def _smpl_poses(translation: Tensor, rotations: Tensor, axes: Tensor) -> Poses:
+    """Poses of SMPL's mean body, turned to y up by `axes` (3, 3)."""
+    offsets = torch.tensor(ADULT, dtype=torch.float64)
+    rotations = rotations[:, : len(SMPL22)].clone()
+    rotations[:, 0] = axes @ rotations[:, 0]
+    return Poses(offsets[: len(SMPL22)], rotations, (translation + offsets[0]) @ axes.T)
+
+
+def _poses(data: dict[str, Any]) -> Poses | None:
+    """The rotations beside joints: as AMASS has them, or in features that are SMPL's; those of HumanML3D are not."""
+    if "poses" in data:
+        if len(data["poses"]) != len(data["joints"]):
+            raise ValueError(f"{len(data['poses'])} frames of poses, but {len(data['joints'])} of joints")
+        translation, turns = smpl_motion(data)
+        return _smpl_poses(translation, rotation.quaternion_to_matrix(turns), AMASS_AXES)
+    representation = str(data.get("representation", ""))
+    if "features" not in data or representation not in ROTATED:
+        return None
+    expected = (len(data["joints"]), ROTATED[representation])
+    if data["features"].shape != expected:
+        raise ValueError(f"features of shape {data['features'].shape}, but {representation} has {expected}")
+    x = torch.from_numpy(data["features"]).double()
+    if representation == "smpl147":
+        translation, rows, axes = x[:, :3], x[:, 3:], AMASS_AXES
+    else:
+        translation, rows, axes = x[:, 144:147], x[:, :144], CAMERA_AXES
+    return _smpl_poses(translation, rotation.rot6d_to_matrix(rows.unflatten(1, (24, 6)), "rows"), axes)
+
+
+def _of_joints(path: Path, data: dict[str, Any], text: str, unit: float | None, resample_to: float | None) -> Motion:
+    joints, fps = data["joints"] * (1.0 if unit is None else unit), data["fps"]
+    skeleton = _skeleton(joints)
+    if resample_to is not None and not math.isclose(fps, resample_to):
+        joints = resample(joints.astype(float), fps, resample_to, cubic=True)
+        return Motion(joints, resample_to, skeleton, text, path.stem)
+    motion = Motion(joints, fps, skeleton, text, path.stem, _poses(data))
+    if "features" in data:
+        motion.features = data["features"].astype(np.float32)
+        motion.representation = str(data.get("representation", ""))
+    return motion
+
+
+def _read_bvh(path: Path, fps: float | None, unit: float | None, resample_to: float | None) -> Motion:
+    given = {} if unit is None else {"unit": unit}
+    joints, rate = read_bvh(path, resample_to, given, None if fps is None else frame_rate(fps))
+    _skeleton(joints)
+    tall = float(np.ptp(joints[..., 1], axis=1).max())
+    if not 0.3 < tall < 3.5:
+        raise ValueError(
+            f"the body is {tall:.3g} m tall. Set the metres per unit of the file: unit=1, 0.01 or 0.0254 (inches)"
+        )
+    return Motion(joints, rate, id=path.stem)
+
+
+def _skeleton(joints: np.ndarray) -> Skeleton:
+    """The skeleton of joints (F, J, 3), told by their number."""
+    if joints.ndim == 2 and joints.shape[1] in (263, 251):
+        raise ValueError(
+            f"{joints.shape[1]} features of HumanML3D, not joints; the rotations among them are not SMPL's and are "
+            "never exported: decode joint positions from them (flame_mdm.representations.humanml) and convert those"
+        )
+    for skeleton in SKELETONS.values():
+        if joints.ndim == 3 and joints.shape[1:] == (len(skeleton), 3):
+            return skeleton
+    sizes = " or ".join(f"{len(skeleton)} ({skeleton.name})" for skeleton in SKELETONS.values())
+    raise ValueError(f"joints of shape {joints.shape}, not (frames, joints, 3) with {sizes} joints")

@@ -1,0 +1,243 @@
+"""`Motion`: one motion outside the models, and the writers of motion files. `docs/formats.md` describes the files.
+
+The 6D rotations among the 263 features of HumanML3D are not SMPL's: they follow chains of their own and leave the twist
+of a bone open. So no rotation is ever taken from them; rotations come from joint positions (`flame_mdm.formats.poses`),
+or from features and files that hold SMPL's.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import tempfile
+from dataclasses import dataclass, field
+from html import escape
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from flame_mdm.files import atomic_write, write_text
+from flame_mdm.formats import bvh, glb
+from flame_mdm.formats.poses import Poses, solve
+from flame_mdm.representations import rotation
+from flame_mdm.representations.skeleton import SMPL22, Skeleton
+from flame_mdm.representations.smpl import ADULT
+
+AMASS_AXES = torch.tensor([[-1.0, 0, 0], [0, 0, 1], [0, 1, 0]], dtype=torch.float64)
+"""Turns AMASS's world, z up, to y up as HumanML3D does: (-x, z, y). It is its own inverse."""
+END_SITES = {
+    **{"head": (0.0, 0.18, 0.0), "left_foot": (0.0, 0.0, 0.06), "right_foot": (0.0, 0.0, 0.06)},
+    **{"left_wrist": ADULT[22], "right_wrist": ADULT[23]},
+}
+"""Tips of head, toes and hands beyond the last joints, metres, so that programs draw these bones at all."""
+EULER = tuple("YXZ" if name.endswith("shoulder") else "YZX" for name in SMPL22.joints)
+"""Order of each joint's angles, so that gimbal lock, the middle angle at 90 degrees, is far from what people do: not in
+bent knees, elbows and hips, not in a hanging arm, and not in a body that turns or bows."""
+CENTIMETRE = 0.01
+
+
+@dataclass(eq=False, repr=False)
+class Motion:
+    """One motion outside the models: generated, real or read from a file.
+
+    Attributes:
+        joints: (F, J, 3) float32 joint positions in metres, y up, floor at y = 0.
+        fps: frames per second.
+        skeleton: names and parents of the J joints; `left_` and `right_` tell the sides.
+        text: the caption, or the name of the action; "" if there is none.
+        id: name of the motion: a clip, a file, or the text and the number of the sample, which decide the noise.
+        poses: rotations of SMPL's joints, if they are known.
+        features: (F, D) float32 features in the units of the data; empty if they are not known.
+        representation: name of the representation of the features.
+        contacts: (F, N) bool, True = this one of the N joints `skeleton.feet` is on the floor; None = unknown.
+
+    Raises:
+        ValueError: wrong shapes, joints that are not finite, or a frame rate that is not a positive number.
+    """
+
+    joints: np.ndarray
+    fps: float
+    skeleton: Skeleton = SMPL22
+    text: str = ""
+    id: str = ""
+    poses: Poses | None = None
+    features: np.ndarray = field(default_factory=lambda: np.zeros((0, 0), np.float32))
+    representation: str = ""
+    contacts: np.ndarray | None = None
+
+    def __post_init__(self) -> None:
+        name, skeleton = f"motion {self.id!r}", self.skeleton
+        self.joints = np.asarray(self.joints, dtype=np.float32)
+        shape = self.joints.shape
+        if len(shape) != 3 or shape[2] != 3 or not shape[0]:
+            raise ValueError(f"{name}: joints have shape {shape}, expected (frames, joints, 3)")
+        if shape[1] != len(skeleton.joints):
+            raise ValueError(f"{name}: {shape[1]} joints, but skeleton {skeleton.name} has {len(skeleton.joints)}")
+        if not np.isfinite(self.joints).all():
+            frame, joint, _ = np.argwhere(~np.isfinite(self.joints))[0]
+            raise ValueError(f"{name}: joint {joint} in frame {frame} is not finite; did the model diverge?")
+        self.fps = float(self.fps)
+        if not 0 < self.fps < float("inf"):
+            raise ValueError(f"{name}: fps is {self.fps}, expected a number above 0")
+        if self.contacts is not None:
+            self.contacts = np.asarray(self.contacts, dtype=bool)
+            given, expected = self.contacts.shape, (shape[0], len(skeleton.feet))
+            if given != expected:
+                raise ValueError(f"{name}: contacts have shape {given}, expected (frames, feet) = {expected}")
+
+    def __repr__(self) -> str:
+        name = self.text or self.id
+        return f"{type(self).__name__}({name!r}, {len(self.joints)} frames, {self.fps:g} fps, {self.skeleton.name})"
+
+    def posed(self) -> Poses:
+        """Returns the rotations, which are solved for from joint positions if they are not known.
+
+        Raises:
+            ValueError: the skeleton is not SMPL's.
+        """
+        if self.poses is not None:
+            return self.poses
+        joints = torch.from_numpy(self.joints)
+        if self.skeleton.name == "smpl24":
+            joints = joints[:, : len(SMPL22)]  # the last two are the hands
+        return solve(joints, self.fps)
+
+    def save(self, path: str | Path, **facts: Any) -> str:
+        """Writes a motion file and returns a line that describes it.
+
+        `.npz` holds joints, frame rate, text and features, and AMASS's keys if rotations are known; `.bvh` and `.glb`
+        hold rotations, `.json` and `.npy` joints.
+
+        Args:
+            path: the file; its ending chooses the format.
+            facts: more entries of an `.npz` file, such as the seed.
+
+        Raises:
+            ValueError: an unknown ending, or a skeleton without SMPL's rotations as `.bvh` or `.glb`.
+            UserError: the file cannot be written.
+        """
+        path = Path(path)
+        writers = {".bvh": _write_bvh, ".glb": _write_glb, ".npz": _write_npz, ".json": _write_json, ".npy": _write_npy}
+        writer = writers.get(path.suffix.lower())
+        if writer is None:
+            raise ValueError(f"{path}: unknown kind of motion file. Use one of {', '.join(writers)}")
+        what = writer(self, path, facts) if writer is _write_npz else writer(self, path)
+        return f"{path}: {len(self.joints)} frames at {self.fps:g} per second, {what}"
+
+    def show(self) -> Any:
+        """Returns a player: an HTML display in a notebook, elsewhere the path of a page to open in any browser."""
+        from flame_mdm.visualize import player_page
+
+        page = player_page([self], self.text or self.id or "Motion")
+        if "IPython" in sys.modules:
+            style = "width:100%;height:560px;border:0"
+            frame = f'<iframe sandbox="allow-scripts allow-downloads" style="{style}" srcdoc="{escape(page)}"></iframe>'
+            return import_module("IPython.display").HTML(frame)
+        path = Path(tempfile.mkdtemp(prefix="flame_mdm_")) / "motion.html"
+        write_text(path, page)
+        return path
+
+
+def motion_of_poses(poses: Poses, fps: float, text: str = "", id: str = "") -> Motion:
+    """Returns the motion of a body whose rotations are known."""
+    return Motion(poses.joints().float().numpy(), fps, SMPL22, text, id, poses)
+
+
+# Writing --------------------------------------------------------------------------------------------------------------
+
+
+def _write_npz(motion: Motion, path: Path, facts: dict[str, Any]) -> str:
+    content: dict[str, Any] = {"joints": motion.joints, "features": motion.features, "fps": motion.fps}
+    content |= {"text": motion.text, "representation": motion.representation}
+    if not motion.features.size:
+        del content["features"], content["representation"]
+    what = f"{len(motion.skeleton)} joints in metres, y up"
+    if motion.poses is not None:
+        world = motion.poses.rotations.clone()
+        world[:, 0] = AMASS_AXES @ world[:, 0]
+        turns = rotation.matrix_to_axis_angle(world).flatten(1).numpy()
+        content |= {
+            "poses": np.pad(turns, ((0, 0), (0, 90))),  # hands at rest
+            "trans": (motion.poses.root @ AMASS_AXES.T).numpy() - np.array(ADULT[0]),
+            "betas": np.zeros(16),
+            "gender": "neutral",
+            "mocap_framerate": motion.fps,
+        }
+        what += "; as AMASS, SMPL+H poses in axis-angle, metres, z up, bones of the lengths of SMPL's body"
+    with atomic_write(path) as temporary:
+        np.savez_compressed(temporary, **content, **facts)
+    return what
+
+
+def _write_bvh(motion: Motion, path: Path) -> str:
+    poses = motion.posed()
+    angles = np.round(np.degrees(continuous_euler(poses.rotations).numpy()), 6)
+    rotations = [tuple(f"{axis}rotation" for axis in order) for order in EULER]
+    root = np.round(poses.root.numpy() / CENTIMETRE, 5)
+    offsets = np.round(poses.offsets.numpy() / CENTIMETRE, 5)
+    offsets[0] = 0  # programs disagree on whether the root's channels replace its offset or add to it
+    bvh.write(
+        bvh.Bvh(
+            joints=SMPL22.joints,
+            parents=SMPL22.parents,
+            offsets=offsets,
+            channels=(("Xposition", "Yposition", "Zposition", *rotations[0]), *rotations[1:]),
+            end_parents=tuple(SMPL22.joints.index(name) for name in END_SITES),
+            end_offsets=np.array(list(END_SITES.values())) / CENTIMETRE,
+            frames=np.concatenate([root, angles.reshape(len(angles), -1)], 1),
+            fps=motion.fps,
+        ),
+        path,
+    )
+    return f"centimetres, y up; {_error(motion, poses)}"
+
+
+def continuous_euler(matrices: Tensor) -> Tensor:
+    """Rotations (F, J, 3, 3) -> Euler angles (F, J, 3) in the orders of `EULER`, radians, free of jumps.
+
+    Of the two triples that stand for a rotation, and of the turns that may be added to each angle, the ones nearest to
+    the frame before are taken, so that programs may interpolate; two turns of the body end at 720 degrees.
+    """
+    turn = 2 * torch.pi
+    first = torch.stack([rotation.matrix_to_euler(matrices[:, j], order) for j, order in enumerate(EULER)], 1)
+    second = torch.stack([first[..., 0] + torch.pi, torch.pi - first[..., 1], first[..., 2] + torch.pi], -1)
+    chosen = [first[0]]
+    for pair in torch.stack([first, second], -2)[1:]:
+        before = chosen[-1][:, None]
+        near = pair - turn * ((pair - before) / turn).round()
+        best = (near - before).square().sum(-1).argmin(-1)
+        chosen.append(near[torch.arange(len(near)), best])
+    return torch.stack(chosen)
+
+
+def _write_glb(motion: Motion, path: Path) -> str:
+    poses = motion.posed()
+    glb.write(path, poses, motion.fps, motion.text, motion.id)
+    return f"metres, y up; {_error(motion, poses)}"
+
+
+def _write_json(motion: Motion, path: Path) -> str:
+    content: dict[str, Any] = {
+        **{"id": motion.id, "caption": motion.text, "fps": motion.fps, "unit": "metre", "up": "y"},
+        **{"names": motion.skeleton.joints, "parents": motion.skeleton.parents},
+        "joints": np.round(motion.joints.astype(float), 5).tolist(),
+    }
+    write_text(path, json.dumps(content, separators=(",", ":"), ensure_ascii=False))
+    return f"{len(motion.skeleton)} joints in metres, y up"
+
+
+def _write_npy(motion: Motion, path: Path) -> str:
+    with atomic_write(path) as temporary:
+        np.save(temporary, motion.joints)
+    return f"joints {motion.joints.shape} in metres, y up; the file itself does not say its frame rate"
+
+
+def _error(motion: Motion, poses: Poses) -> str:
+    """How far joints of constant bones are from those of the motion."""
+    off = np.linalg.norm(poses.joints().numpy() - motion.joints[:, : len(SMPL22)], axis=-1)
+    mean, most = 1000 * off.mean(), 1000 * off.max()
+    return f"bones of constant length, joints {mean:.2g} mm off on average and {most:.2g} mm at most"

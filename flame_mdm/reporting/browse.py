@@ -1,0 +1,148 @@
+"""One web page of a prepared data set: `flame-mdm browse data=bandai search="waves left"`"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from markupsafe import Markup
+
+from flame_mdm.errors import UserError
+from flame_mdm.files import atomic_folder
+from flame_mdm.reporting.page import render
+from flame_mdm.reporting.plots import Histogram, Panel, standalone, svg
+
+if TYPE_CHECKING:
+    from flame_mdm.data.store import Entry, Store
+    from flame_mdm.formats.motion import Motion
+    from flame_mdm.representations import Representation
+
+SECONDS = 15
+"""Longer clips show their beginning only, so that the page stays small."""
+BARS = 30
+
+
+def find(clips: Sequence[Entry], split: str | None, search: str) -> list[list[Entry]]:
+    """Clips of a split that have all words of `search` in id and captions; an original and its mirror go together."""
+    ids = {clip.id for clip in clips}
+    families: dict[str, list[Entry]] = {}
+    for clip in clips:
+        if split in (None, clip.split):
+            original = clip.id[1:] if clip.id[0] == "M" and clip.id[1:] in ids else clip.id
+            families.setdefault(original, []).append(clip)
+    words = search.lower().split()
+    texts = {clip.id: " ".join([clip.id, *clip.captions]).lower() for clip in clips}
+    fitting = (f for f in families.values() if any(all(word in texts[clip.id] for word in words) for clip in f))
+    return [sorted(family, key=lambda clip: len(clip.id)) for family in fitting]  # the original stands first
+
+
+def choose(families: Sequence[list[Entry]], most: int) -> list[list[Entry]]:
+    """Families spread evenly over all of them, with `most` clips together at most, and one family at least."""
+    for count in range(min(len(families), max(1, most)), 0, -1):
+        chosen = [families[k] for k in np.linspace(0, len(families) - 1, count).round().astype(int)]
+        if sum(map(len, chosen)) <= most:
+            return chosen
+    return [families[0]]
+
+
+def motion(store: Store, representation: Representation, clip: Entry) -> Motion:
+    """A clip as the player shows it, cut after `SECONDS`."""
+    import torch
+
+    from flame_mdm.formats.motion import Motion
+
+    shown = round(SECONDS * representation.fps)
+    joints = representation.decode(torch.from_numpy(store.motion(clip)[:shown].copy())).numpy()
+    below = joints[..., 1].min()
+    if below < -0.3:  # the camera's coordinates of the action sets have no floor: the lowest joint stands on it
+        joints[..., 1] -= below
+    actions = store.info["actions"]
+    caption = " · ".join(clip.captions) or ("" if clip.action is None else actions[clip.action])
+    if clip.length > shown:
+        caption += f" (the first {SECONDS} of {clip.length / representation.fps:.0f} s)"
+    return Motion(joints, representation.fps, representation.skeleton, caption, clip.id)
+
+
+def write_page(path: Path, store: Store, representation: Representation, clips: Sequence[Entry], title: str) -> None:
+    """Writes the page of some clips of a store."""
+    from flame_mdm.visualize import write_player
+
+    write_player(
+        path,
+        [motion(store, representation, clip) for clip in clips],
+        title,
+        about=describe(store),
+        groups=[clip.split for clip in clips],
+        beside=[clip.id[1:] if clip.id.startswith("M") else "" for clip in clips],
+    )
+
+
+def write_clips(
+    folder: Path, store: Store, representation: Representation, clips: Sequence[Entry], longest: int
+) -> None:
+    """Writes clips as `motion_000.npz` ..., in the form of generated motions, each with one caption.
+
+    A clip of several captions gets the first that no clip before it has, so that a caption names a motion where it can.
+
+    Args:
+        longest: frames after which clips are cut, as they are for training and evaluation.
+
+    Raises:
+        UserError: the folder holds other motions, which would be taken for motions of this choice.
+    """
+    import torch
+
+    from flame_mdm.formats.motion import Motion
+
+    paths = [folder / f"motion_{number:03d}.npz" for number in range(len(clips))]
+    if others := sorted(p for p in set(folder.glob("*.npz")) - set(paths) if not p.name.startswith(".")):
+        raise UserError(f"motions={folder}: holds other motions, such as {others[0].name}; delete it, or name another")
+    given: set[str] = set()
+    with atomic_folder(folder) as made:
+        for path, clip in zip(paths, clips, strict=True):
+            names = clip.captions or ([] if clip.action is None else [store.info["actions"][clip.action]])
+            caption = next((name for name in names if name not in given), names[0] if names else "")
+            given.add(caption)
+            features = representation.rebase(store.motion(clip)[:longest])
+            joints = representation.decode(torch.from_numpy(features.copy())).numpy()
+            facts = {"clip": clip.id, "split": clip.split, "data": store.fingerprint}
+            motion = Motion(joints, representation.fps, representation.skeleton, caption, clip.id)
+            motion.features, motion.representation = features, representation.name
+            motion.save(made / path.name, **facts)
+
+
+def describe(store: Store) -> Markup:
+    """The header of the page, in HTML: statistics of the whole store."""
+    info, fps = store.info, store.info["fps"]
+    splits = {name: [clip for clip in store.clips if clip.split == name] for name, n in info["clips"].items() if n}
+    counts = Counter(info["actions"][clip.action] for clip in store.clips if clip.action is not None)
+    rows = [[name, *_row(clips, fps)] for name, clips in splits.items()]
+    plot = _lengths(splits, fps)
+    return render("browse.html", info=info, actions=counts.most_common(), rows=rows, plot=plot)
+
+
+def _row(clips: Sequence[Entry], fps: float) -> list[str]:
+    lengths = np.array([clip.length for clip in clips])
+    captions = [caption for clip in clips for caption in clip.captions]
+    words = f"{np.mean([len(caption.split()) for caption in captions]):.1f}" if captions else ""
+    cells = [len(clips), f"{lengths.sum() / fps / 60:.1f}", lengths.min(), f"{np.median(lengths):g}", lengths.max()]
+    return [f"{cell}" for cell in (*cells, len(captions), len(set(captions)), words)]
+
+
+def _lengths(splits: dict[str, list[Entry]], fps: float) -> Markup:
+    """The distribution of lengths, as in Kim et al. 2023 (FLAME), figure 7: bars of clips by seconds, stacked by split.
+
+    The last bar holds all clips beyond the 99th percentile, because a few very long ones would squeeze the others.
+    """
+    seconds = {name: np.array([clip.length for clip in clips]) / fps for name, clips in splits.items()}
+    last = float(np.percentile(np.concatenate(list(seconds.values())), 99)) or 1
+    counts = {
+        name: np.bincount(np.minimum(BARS * s / last, BARS - 1).astype(int), minlength=BARS).tolist()
+        for name, s in seconds.items()
+    }
+    edges = [k * last / BARS for k in range(BARS + 1)]
+    plot = svg("Clip lengths", [Panel(Histogram(edges, counts, "s"), "seconds", "clips")])
+    return Markup(standalone(plot or ""))

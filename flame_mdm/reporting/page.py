@@ -1,0 +1,59 @@
+"""Web pages from templates: one file, no network, opens from disk. The same input gives the same bytes."""
+
+from __future__ import annotations
+
+import functools
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from jinja2 import Environment
+    from markupsafe import Markup
+
+POLICY = (
+    "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data:; "
+    "base-uri 'none'; form-action 'none'"
+)
+"""Content security policy of pages: nothing in them may use the network."""
+
+TEMPLATES = Path(__file__).parent / "templates"
+
+
+def render(template: str, **values: Any) -> Markup:
+    """Renders a file of `templates/`. Every text is escaped; only what another template rendered is not."""
+    from markupsafe import Markup
+
+    return Markup(_environment().get_template(template).render(**values))
+
+
+def page(title: str, body: str) -> str:
+    """Returns a whole page around `body`, which `render` made; a plain text is escaped."""
+    return str(render("page.html", title=title, body=body, policy=POLICY))
+
+
+@functools.cache
+def _environment() -> Environment:
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+    options: dict[str, Any] = {"trim_blocks": True, "lstrip_blocks": True, "keep_trailing_newline": True}
+    environment = Environment(loader=FileSystemLoader(TEMPLATES), autoescape=True, undefined=StrictUndefined, **options)
+    environment.filters["number"] = number
+    return environment
+
+
+def number(value: float | None) -> str:
+    """A number as tables show it: four digits; a dash for what has no value."""
+    if value is None:
+        return "–"
+    if isinstance(value, float) and math.isfinite(value) and 0 < abs(value) < 1e-3:
+        return f"{value:.2e}"
+    return f"{value:,.0f}" if abs(value) >= 10_000 else f"{value:.4g}"
+
+
+def short(step: float) -> str:
+    """A number of steps: 1500 -> 1.5k."""
+    for size, unit in ((1e6, "M"), (1e3, "k")):
+        if abs(step) >= size:
+            return f"{step / size:.4g}{unit}"
+    return f"{step:.4g}"

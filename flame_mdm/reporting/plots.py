@@ -1,0 +1,239 @@
+"""Curves, scatter plots and histograms as SVG. The same values give the same bytes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+from flame_mdm.reporting.page import TEMPLATES, number, render, short
+
+if TYPE_CHECKING:
+    from markupsafe import Markup
+
+WIDE, HIGH = 460, 230
+LEFT, RIGHT, TOP, BOTTOM = 58, 10, 8, 24
+ROW = 16
+"""Height of a line of text."""
+MOST = 300
+"""Segments of a curve that are drawn; of each, its lowest and its highest point."""
+LOG_RANGE = 15
+"""Positive values that span more than this factor get a logarithmic axis."""
+COLORS = 8
+SMALLEST = 1e-300
+"""Numbers nearer to 0 end an axis as 0 does: steps between ticks would underflow."""
+
+Curve = Mapping[int, float]
+"""Values by step."""
+
+
+@dataclass
+class Series:
+    """Points of one color, in ascending order.
+
+    Attributes:
+        name: in the legend.
+        points: x and y.
+        spread: half the width of the 95 % interval, by x.
+        kind: line, dashed or dots.
+    """
+
+    name: str
+    points: Sequence[tuple[float, float]]
+    spread: Mapping[float, float] = field(default_factory=dict)
+    kind: str = "line"
+
+
+@dataclass
+class Histogram:
+    """Counts between edges, stacked: by name, one count per bar. `unit` is that of the edges."""
+
+    edges: Sequence[float]
+    counts: Mapping[str, Sequence[int]]
+    unit: str
+
+
+@dataclass
+class Panel:
+    """One pair of axes.
+
+    Attributes:
+        content: series, or a histogram.
+        x: label of the x-axis.
+        y: label of the y-axis.
+        log_x: whether the x-axis is logarithmic.
+        from_zero: whether the x-axis begins at 0.
+        levels: values that horizontal lines mark.
+        legend: whether names are listed below.
+    """
+
+    content: Sequence[Series] | Histogram
+    x: str = ""
+    y: str = ""
+    log_x: bool = False
+    from_zero: bool = False
+    levels: Sequence[float] = ()
+    legend: bool = True
+
+
+def svg(title: str, panels: Sequence[Panel]) -> Markup | None:
+    """Draws panels side by side; None if they have no point. `standalone` makes the SVG a file of its own."""
+    drawn = [_drawn(panel) for panel in panels]
+    if not any(drawn):
+        return None
+    high = max(panel["high"] for panel in drawn if panel)
+    return render("plot.svg", title=title, panels=drawn, width=WIDE, high=high, left=LEFT, right=WIDE - RIGHT)
+
+
+def standalone(plot: str) -> str:
+    """Returns an SVG with the style that it has outside of pages."""
+    return str(plot).replace(">", f"><style>{(TEMPLATES / 'plot.css').read_text(encoding='utf-8')}</style>", 1)
+
+
+def chart(title: str, curves: Mapping[str, Curve], bands: Mapping[str, Curve] | None = None) -> Markup:
+    """Curves over the steps, overlaid, with their last values; the axis is logarithmic where values span much.
+
+    Args:
+        title: what the values are.
+        curves: by name; values that are not finite are left out.
+        bands: of some of the curves, half the width of their 95 % interval.
+    """
+    spread = {name: {x: abs(width) for x, width in _finite(curve)} for name, curve in (bands or {}).items()}
+    series = [Series(name, _finite(curve), spread.get(name, {})) for name, curve in curves.items()]
+    key = [(s.name, number(s.points[-1][1]) if s.points else "–") for s in series]
+    plot = svg(title, [Panel(series, from_zero=True, legend=False)])
+    return render("chart.html", title=title, plot=plot, key=key, colors=COLORS)
+
+
+# Geometry -------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Axis:
+    low: float
+    high: float
+    ticks: Sequence[float]
+    log: bool = False
+
+    def share(self, value: float) -> float:
+        scale = math.log if self.log else float
+        value = min(max(value, self.low), self.high)
+        return (scale(value) - scale(self.low)) / (scale(self.high) - scale(self.low))
+
+
+def _drawn(panel: Panel) -> dict[str, Any] | None:
+    """What the template draws of a panel; None if it has no point."""
+    histogram = panel.content if isinstance(panel.content, Histogram) else None
+    series = [] if isinstance(panel.content, Histogram) else panel.content
+    points = {s.name: [(x, y) for x, y in s.points if x > 0 or not panel.log_x] for s in series}
+    everything = [point for found in points.values() for point in found]
+    if histogram is not None:
+        most = max(map(sum, zip(*histogram.counts.values(), strict=True)))
+        everything = [(histogram.edges[0], 0), (histogram.edges[-1], max(1, most))]
+    if not everything:
+        return None
+    xs, ys = zip(*everything, strict=True)
+    low, high = min(ys), max(ys)
+    logarithmic = panel.from_zero and low > 0 and high > LOG_RANGE * low
+    if not logarithmic:
+        reach = [y + sign * s.spread.get(x, 0) for s in series for x, y in points[s.name] for sign in (-1, 1)]
+        low, high = min([low, *reach, *panel.levels]), max([high, *reach, *panel.levels])
+    y_axis = _log_axis(low, high) if logarithmic else _linear_axis(low, high)
+    x_axis = _log_axis(min(xs), max(xs)) if panel.log_x else _snug_axis(0 if panel.from_zero else min(xs), max(xs))
+
+    def at(x: float, y: float) -> tuple[str, str]:
+        across, down = WIDE - LEFT - RIGHT, HIGH - TOP - BOTTOM
+        return f"{LEFT + across * x_axis.share(x):.1f}", f"{TOP + down * (1 - y_axis.share(y)):.1f}"
+
+    def path(found: Iterable[tuple[float, float]]) -> str:
+        return " ".join(",".join(at(x, y)) for x, y in found)
+
+    lines = []
+    for k, s in enumerate(series):
+        found = points[s.name]
+        wide = [(x, y) for x, y in found if x in s.spread]
+        rim = [(x, y + s.spread[x]) for x, y in wide] + [(x, y - s.spread[x]) for x, y in reversed(wide)]
+        errors = [(*at(x, y - s.spread[x]), at(x, y + s.spread[x])[1]) for x, y in wide]
+        shown = _thinned(found)
+        dots = [at(x, y) for x, y in shown] if len(found) <= 40 or s.kind == "dots" else []
+        lines.append((k % COLORS, s.kind, path(shown), path(rim), errors, dots))
+    names = list(histogram.counts) if histogram else [s.name for s in series]
+    legend = [(k % COLORS, HIGH + ROW * (k + bool(panel.x)), name) for k, name in enumerate(names)]
+    return {
+        "rows": [(at(x_axis.low, tick)[1], _tick(tick)) for tick in y_axis.ticks],
+        "columns": [(at(tick, low)[0], _tick(tick)) for tick in x_axis.ticks],
+        "levels": [at(x_axis.low, level)[1] for level in panel.levels],
+        "bars": _bars(histogram, at) if histogram else [],
+        "lines": lines,
+        "legend": legend if panel.legend and len(names) > 0 else [],
+        "x": panel.x,
+        "y": panel.y,
+        "high": HIGH + ROW * (bool(panel.x) + len(names) * panel.legend),
+    }
+
+
+def _bars(histogram: Histogram, at: Any) -> list[tuple[int, str, str, str, str, str]]:
+    """Color, left, top, width, height and note of each bar."""
+    bars = []
+    for k, (begin, end) in enumerate(zip(histogram.edges, histogram.edges[1:], strict=False)):
+        base = 0
+        for color, (name, counts) in enumerate(histogram.counts.items()):
+            (left, top), (right, bottom) = at(begin, base + counts[k]), at(end, base)
+            note = f"{begin:.4g} to {end:.4g} {histogram.unit}: {counts[k]} {name}"
+            size = (f"{float(right) - float(left) - 1:.1f}", f"{float(bottom) - float(top):.1f}")
+            bars.append((color % COLORS, left, top, *size, note))
+            base += counts[k]
+    return bars
+
+
+def _finite(curve: Curve) -> list[tuple[float, float]]:
+    return [(x, y) for x, y in sorted(curve.items()) if abs(y) < 1e300]  # no NaN, nothing that overflows when drawn
+
+
+def _thinned(points: Sequence[tuple[float, float]]) -> Sequence[tuple[float, float]]:
+    if len(points) <= 2 * MOST:
+        return points
+    size = -(-len(points) // MOST)
+    parts = [points[begin : begin + size] for begin in range(0, len(points), size)]
+    return [p for part in parts for p in sorted({min(part, key=lambda q: q[1]), max(part, key=lambda q: q[1])})]
+
+
+def _linear_axis(low: float, high: float) -> _Axis:
+    """An axis whose ends are ticks."""
+    low, high = (value if abs(value) > SMALLEST else 0.0 for value in (low, high))
+    if high - low <= 1e-9 * max(abs(low), abs(high)):
+        low, high = low - (abs(low) or 1) / 10, high + (abs(high) or 1) / 10
+    step = _round_step((high - low) / 4)
+    ticks = [k * step for k in range(math.floor(low / step + 1e-9), math.ceil(high / step - 1e-9) + 1)]
+    return _Axis(ticks[0], ticks[-1], ticks)
+
+
+def _snug_axis(low: float, high: float) -> _Axis:
+    """An axis that ends where the values end."""
+    if high - low <= SMALLEST:
+        low, high = low - (low != 0) * max(1, abs(low) / 1e9), low + max(1, abs(low) / 1e9)
+    step = _round_step((high - low) / 5)
+    begin, end = math.ceil(low / step - 0.02), math.floor(high / step + 0.02)  # 2999 steps have a tick 3k, too
+    return _Axis(low, high, [k * step for k in range(begin, end + 1)])
+
+
+def _log_axis(low: float, high: float) -> _Axis:
+    low, high = max(low, SMALLEST), max(high, SMALLEST)
+    decades = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
+    every = -(-len(decades) // 6)
+    steps = (1, 2, 5) if len(decades) <= 3 else (1,)
+    ticks = [m * 10.0**d for d in decades if (d - decades[0]) % every == 0 for m in steps]
+    within = [tick for tick in ticks if low * 0.999 <= tick <= high * 1.001]
+    return _Axis(min([low, *within]) / 1.15, max([high, *within]) * 1.15, within, True)
+
+
+def _round_step(least: float) -> float:
+    power = 10 ** math.floor(math.log10(least))
+    return next(m * power for m in (1, 2, 5, 10) if m * power >= least * 0.999)
+
+
+def _tick(value: float) -> str:
+    if abs(value) < 1e-12:
+        return "0"
+    return f"{value:.0e}".replace("e-0", "e-") if abs(value) < 1e-3 else short(float(f"{value:.6g}"))

@@ -1,0 +1,335 @@
+"""Tables of results as Markdown, LaTeX, CSV and HTML, and their plots. The same table gives the same bytes."""
+
+from __future__ import annotations
+
+import csv
+import io
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+from urllib.parse import quote
+
+from flame_mdm.errors import markdown_text, one_line
+from flame_mdm.reporting.page import render
+from flame_mdm.reporting.plots import Histogram, Panel, Series, svg
+from flame_mdm.visualize.scene import shortened
+
+if TYPE_CHECKING:
+    from markupsafe import Markup
+
+ARROWS = {"higher": "↑", "lower": "↓", "real": "→", "none": ""}
+LATEX_ARROWS = {"higher": r"$\uparrow$", "lower": r"$\downarrow$", "real": r"$\rightarrow$", "none": ""}
+KINDS = {
+    "real": "Real motions, measured here",
+    "measured": "Measured here",
+    "reported real": "Real motions, as reported",
+    "reported": "As reported",
+}
+NO_RESULTS = ("NOT VALID", "QUICK")
+"""States of rows whose values must not be taken for results."""
+LEGEND = (
+    "↑ higher is better, ↓ lower is better, → closer to real motions is better. **Best** and <u>second best</u> of the "
+    "rows with the same mark."
+)
+
+
+@dataclass
+class Cell:
+    """One cell: text as printed, its number, and 1 for the best, 2 for the second best."""
+
+    text: str
+    value: float | None = None
+    ci: float | None = None
+    place: int = 0
+
+
+@dataclass
+class Line:
+    """One row.
+
+    Attributes:
+        label: its name.
+        kind: a key of `KINDS`.
+        cells: one a column, None where there is no value.
+        marks: footnotes; rows are compared with rows of the same marks only.
+        state: "" for a whole row, else why it is not: "no checkpoint", "NOT VALID".
+        options: numbers that figures may be drawn over, such as num_inference_steps.
+        facts: where its values come from, for the CSV file and the list below the table.
+    """
+
+    label: str
+    kind: str
+    cells: list[Cell | None]
+    marks: str = ""
+    state: str = ""
+    options: dict[str, float] = field(default_factory=dict)
+    facts: dict[str, str] = field(default_factory=dict)
+
+
+@dataclass
+class Figure:
+    """A plot of columns of a part over an option of its rows; see `draw`."""
+
+    x: str
+    y: list[str]
+    log: bool = False
+    points: bool = False
+
+
+@dataclass
+class Part:
+    """One table: columns by label with their direction, rows, footnotes by mark, and figures."""
+
+    name: str
+    columns: dict[str, str]
+    lines: list[Line]
+    notes: list[tuple[str, str]] = field(default_factory=list)
+    figures: list[Figure] = field(default_factory=list)
+    histograms: dict[str, tuple[list[float], list[int]]] = field(default_factory=dict)
+
+
+@dataclass
+class Table:
+    """All parts that belong together, as in one table of a paper."""
+
+    name: str
+    title: str
+    parts: list[Part]
+    notes: list[str] = field(default_factory=list)
+    drawn: dict[str, str] = field(default_factory=dict)
+    """Figures that have points, as SVG, by the names of `figure_names`."""
+
+
+def _blocks(part: Part) -> list[tuple[str, list[Line]]]:
+    return [(title, rows) for kind, title in KINDS.items() if (rows := [x for x in part.lines if x.kind == kind])]
+
+
+def _label(line: Line) -> str:
+    return f"{line.label} ({line.state})" if line.state else line.label
+
+
+def _head(column: str, better: str) -> str:
+    return f"{column}\u00a0{ARROWS[better]}" if ARROWS[better] else column
+
+
+def _is_ranked(table: Table) -> bool:
+    return any(better != "none" for part in table.parts for better in part.columns.values())
+
+
+def _number(part: Part, index: int) -> str:
+    return f"{index + 1}" if len(part.figures) + len(part.histograms) > 1 else ""
+
+
+def figure_names(table: Table) -> list[tuple[Part, Figure | str, str]]:
+    """The figures of a table with the names of their files, without suffix."""
+    found: list[tuple[Part, Figure | str, str]] = []
+    for part in table.parts:
+        slug = f"-{_slug(part.name)}" if len(table.parts) > 1 else ""
+        for index, figure in enumerate([*part.figures, *part.histograms]):
+            found.append((part, figure, f"{table.name}{slug}-figure{_number(part, index)}"))
+    return found
+
+
+def _slug(text: str) -> str:
+    return re.sub(r"[^a-z0-9]+", "-", text.lower()).strip("-")
+
+
+# Markdown -------------------------------------------------------------------------------------------------------------
+
+
+def markdown(table: Table) -> str:
+    """The table with its footnotes and figures as Markdown."""
+    page = f"# {markdown_text(table.title)}\n"
+    for part in table.parts:
+        page += f"\n## {markdown_text(part.name)}\n\n" if len(table.parts) > 1 else "\n"
+        page += "| | " + " | ".join(markdown_text(_head(c, b)) for c, b in part.columns.items()) + " |\n"
+        page += "|---" * (len(part.columns) + 1) + "|\n"
+        blocks = _blocks(part)
+        for title, lines in blocks:
+            if len(blocks) > 1:
+                page += f"| *{title}* |" + " |" * len(part.columns) + "\n"
+            for line in lines:
+                cells = [_styled(c, markdown_text, "**{}**", "<u>{}</u>") for c in line.cells]
+                marks = f" <sup>{line.marks}</sup>" if line.marks else ""
+                page += f"| {markdown_text(_label(line))}{marks} | " + " | ".join(cells) + " |\n"
+        for mark, text in part.notes:
+            page += f"\n{mark}: {markdown_text(text)}  " if mark else f"\n{markdown_text(text)}  "
+        page += "\n"
+        for owner, _, name in figure_names(table):
+            if owner is part and name in table.drawn:
+                page += f"\n![{markdown_text(part.name)}]({quote(name)}.svg)\n"
+    page += "".join(f"\n- {markdown_text(note)}" for note in table.notes) + "\n" * bool(table.notes)
+    page += f"\n{LEGEND}\n" if _is_ranked(table) else ""
+    rows = _sources(table)
+    if rows:
+        page += "\n<details><summary>Where the rows come from</summary>\n\n" + "\n".join(
+            f"- {markdown_text(row)}" for row in rows
+        )
+        page += "\n\n</details>\n"
+    return page
+
+
+def _sources(table: Table) -> list[str]:
+    rows = []
+    for part in table.parts:
+        for line in part.lines:
+            if line.facts:
+                facts = ", ".join(f"{name} {value}" for name, value in line.facts.items() if value)
+                prefix = f"{part.name}: " if len(table.parts) > 1 else ""
+                rows.append(f"{prefix}{line.label}: {facts}")
+    return rows
+
+
+def _styled(cell: Cell | None, escape: Callable[[str], str], best: str, second: str) -> str:
+    if cell is None:
+        return escape("–")
+    text = escape(cell.text)
+    return best.format(text) if cell.place == 1 else second.format(text) if cell.place == 2 else text
+
+
+# LaTeX ----------------------------------------------------------------------------------------------------------------
+
+
+def latex(table: Table) -> str:
+    """The table as LaTeX; needs the packages booktabs and threeparttable."""
+    page = "% \\usepackage{booktabs,threeparttable}\n"
+    for part in table.parts:
+        title = f"{table.title}: {part.name}" if len(table.parts) > 1 else table.title
+        page += "\\begin{table}\n\\centering\n\\begin{threeparttable}\n"
+        page += f"\\caption{{{_tex(title)}}}\n\\begin{{tabular}}{{l{'r' * len(part.columns)}}}\n\\toprule\n"
+        page += " & ".join(["", *(f"{_tex(c)} {LATEX_ARROWS[b]}".strip() for c, b in part.columns.items())]) + " \\\\\n"
+        for title, lines in _blocks(part):
+            page += f"\\midrule\n\\multicolumn{{{len(part.columns) + 1}}}{{l}}{{\\emph{{{_tex(title)}}}}} \\\\\n"
+            for line in lines:
+                marks = f"\\tnote{{{_tex(line.marks)}}}" if line.marks else ""
+                cells = [_styled(c, _tex, "\\textbf{{{}}}", "\\underline{{{}}}") for c in line.cells]
+                page += " & ".join([_tex(_label(line)) + marks, *cells]) + " \\\\\n"
+        page += "\\bottomrule\n\\end{tabular}\n"
+        if part.notes:
+            items = "".join(f"\\item[{_tex(mark)}] {_tex(text)}\n" for mark, text in part.notes)
+            page += f"\\begin{{tablenotes}}\n\\footnotesize\n{items}\\end{{tablenotes}}\n"
+        page += "\\end{threeparttable}\n\\end{table}\n"
+    return page + "".join(f"% {one_line(note)}\n" for note in table.notes)
+
+
+def _tex(text: str) -> str:
+    special = {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "–": "--"}
+    special |= {"±": r"$\pm$", "†": r"$\dagger$", "≥": r"$\geq$", "×": r"$\times$", "λ": r"$\lambda$", "β": r"$\beta$"}
+    special |= {c: "\\" + c for c in "&%$#_{}"} | {"[": "{[}", "]": "{]}"}  # brackets after \\\\ are its option
+    return "".join(special.get(c, c) for c in one_line(text))
+
+
+# CSV ------------------------------------------------------------------------------------------------------------------
+
+
+def comma_separated(table: Table) -> str:
+    """One row a line of the table, with number, interval and place of each cell, and where it comes from."""
+    facts = list(dict.fromkeys(name for part in table.parts for line in part.lines for name in line.facts))
+    columns = list(dict.fromkeys(name for part in table.parts for name in part.columns))
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    head = [x for c in columns for x in (c, f"{c}: printed", f"{c}: 95 % interval, half", f"{c}: place")]
+    writer.writerow([_inert(x) for x in ("part", "row", "kind", "state", "marks", *head, *facts)])
+    for part in table.parts:
+        for line in part.lines:
+            by_column = dict(zip(part.columns, line.cells, strict=True))
+            values: list[Any] = []
+            for name in columns:
+                cell = by_column.get(name)
+                values += (
+                    ["", "", "", ""]
+                    if cell is None
+                    else [_plain(cell.value), cell.text, _plain(cell.ci), cell.place or ""]
+                )
+            row = [part.name, line.label, line.kind, line.state, line.marks, *values]
+            writer.writerow([_inert(str(x)) for x in (*row, *(line.facts.get(name, "") for name in facts))])
+    return out.getvalue()
+
+
+def _inert(text: str) -> str:
+    """Returns a cell with an apostrophe before it if a spreadsheet program would take it for a formula."""
+    text = one_line(text)
+    number = re.fullmatch(r"[-+]?[\d.,]+([eE][-+]?\d+)?( ?± ?[\d.,]+)?", text)
+    return text if number or not text.lstrip().startswith(("=", "+", "-", "@")) else f"'{text}"
+
+
+def _plain(value: float | None) -> str:
+    return "" if value is None else repr(value)
+
+
+# HTML and plots -------------------------------------------------------------------------------------------------------
+
+
+def fragment(table: Table) -> Markup:
+    """The table as HTML, the body of a page."""
+    figures = {part.name: [name for owner, _, name in figure_names(table) if owner is part] for part in table.parts}
+    values = {"blocks": _blocks, "head": _head, "label": _label, "bad": NO_RESULTS, "figures": figures}
+    return render("table.html", table=table, sources=_sources(table), ranked=_is_ranked(table), **values)
+
+
+def draw(part: Part, figure: Figure | str, labels: Mapping[str, str]) -> str | None:
+    """A figure of a part as SVG; None if it has no point.
+
+    Lines are named after the rows; measured ones are solid, reported ones dashed. Real motions are a dotted line if
+    a column is better the closer to them. `points` draws a scatter plot.
+
+    Args:
+        part: with the values.
+        figure: what to draw, or the name of one of the part's histograms.
+        labels: by option, the text for the axis.
+    """
+    if isinstance(figure, str):
+        edges, counts = part.histograms[figure]
+        return svg(figure, [Panel(Histogram(edges, {"motions": counts}, "frames"), "frames", shortened(figure, 40))])
+    panels = []
+    for column in figure.y:
+        series, levels = _series(part, figure, column)
+        head = f"{shortened(one_line(column), 40)} {ARROWS[part.columns[column]]}".strip()
+        panels.append(Panel(series, labels.get(figure.x, figure.x), head, figure.log, levels=levels))
+    return svg(part.name, panels)
+
+
+def _series(part: Part, figure: Figure, column: str) -> tuple[list[Series], list[float]]:
+    """Points of a column by row, and its values of real motions."""
+    place = list(part.columns).index(column)
+    found: dict[tuple[str, str], list[tuple[float, float, float]]] = {}
+    levels = []
+    for line in part.lines:
+        cell, x = line.cells[place], line.options.get(figure.x)
+        if cell is None or cell.value is None or line.state:
+            continue
+        if line.kind.endswith("real"):
+            levels += [cell.value] if part.columns[column] == "real" else []
+        elif x is not None:
+            found.setdefault((line.kind, line.label), []).append((x, cell.value, cell.ci or 0.0))
+    series = []
+    for (kind, label), points in found.items():
+        reported = kind == "reported"
+        name = shortened(one_line(label), 60) + ", reported" * reported
+        xy = [(x, y) for x, y, _ in sorted(points)]
+        spread = {x: ci for x, _, ci in points if ci}
+        series.append(Series(name, xy, spread, "dots" if figure.points else "dashed" if reported else "line"))
+    return series, levels
+
+
+WRITERS: dict[str, Callable[[Table], str]] = {"md": markdown, "tex": latex, "csv": comma_separated}
+
+
+def places(values: Sequence[float | None], better: str, real: float | None) -> list[int]:
+    """1 for the best and 2 for the second best of values, 0 for the others; nothing is best of one.
+
+    Args:
+        values: None where there is none.
+        better: higher, lower, real (closest to `real`) or none.
+        real: the value of real motions.
+    """
+    there = [v for v in values if v is not None]
+    if better == "none" or len(there) < 2 or (better == "real" and real is None):
+        return [0] * len(values)
+
+    def badness(value: float) -> float:
+        return {"higher": -value, "lower": value}.get(better, abs(value - (real or 0.0)))
+
+    order = sorted({badness(v) for v in there})
+    return [0 if v is None else order.index(badness(v)) + 1 if badness(v) in order[:2] else 0 for v in values]

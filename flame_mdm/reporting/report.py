@@ -1,0 +1,187 @@
+"""Single-page HTML report of a training run."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Mapping
+from pathlib import Path
+
+from flame_mdm.errors import UserError
+from flame_mdm.files import write_text
+from flame_mdm.reporting.page import number, page, render
+from flame_mdm.reporting.plots import Curve, chart
+from flame_mdm.runs import FAULT, HISTORY, Fault, Provenance, Result, Run, Value, read_json, read_run
+
+COST = ("lr", "grad_norm", "samples_per_second", "seconds_per_step", "gpu_memory_gib")
+"""Training curves that show how a run proceeds, not what it learns."""
+
+
+def paths(key: str, given: str) -> list[Path]:
+    """The files or folders that a key names, with spaces between them, and quotes around names with spaces.
+
+    Raises:
+        UserError: none, or an unclosed quote.
+    """
+    try:
+        names = shlex.split(given)
+    except ValueError as error:
+        raise UserError(f"{key}={given}: {error}; put names with spaces in quotes") from error
+    if not all(names) or not names:
+        raise UserError(f"{key}={given}: name at least one, with spaces between several")
+    return [Path(name) for name in names]
+
+
+def write_report(folder: Path) -> Path:
+    """Writes `report.html` into a run directory, and returns its path. The same folder gives the same bytes.
+
+    Raises:
+        UserError: the folder holds no run, or a damaged file.
+    """
+    from omegaconf import OmegaConf
+
+    run = read_run(folder)
+    fault: Fault | None = None
+    if (folder / FAULT).exists():
+        fault = read_json(folder / FAULT, Fault, "delete it, and the page leaves it out")
+    faulty = [[f"process {b.rank}, batch {b.batch}", b.loss, ", ".join(b.ids)] for b in fault.batches] if fault else []
+    groups = {
+        heading: [chart(name, *_curves(run, name, families)) for name, families in charts.items()]
+        for heading, charts in charted(run.curves).items()
+    }
+    body = render(
+        "report.html",
+        run=run,
+        facts=_facts(run),
+        fault=fault,
+        faulty=faulty,
+        player=_player(run),
+        step=int(run.samples.name.removeprefix("step_")) if run.samples else 0,
+        evaluations=[
+            (evaluation_title(r), sampling(r), marks(r), r.not_computed, _values(r)) for r in run.results.values()
+        ],
+        groups=groups,
+        history=HISTORY,
+        constant=constants(run.curves),
+        provenance=_provenance(run.provenance) if run.provenance else [],
+        recipe=OmegaConf.to_yaml(OmegaConf.create(run.config)),
+    )
+    path = folder / "report.html"
+    write_text(path, page(run.label, body))
+    return path
+
+
+# Parts of the page ----------------------------------------------------------------------------------------------------
+
+
+def last(curve: Curve) -> float | None:
+    """The newest value of a curve."""
+    return curve[max(curve)] if curve else None
+
+
+def _facts(run: Run) -> list[str]:
+    facts = [f"step {run.steps:,} of {run.config['trainer']['max_steps']:,}"]
+    if (epochs := last(run.curves.get("train/epochs", {}))) is not None:
+        facts.append(f"{number(epochs)} passes over the data")
+    if run.provenance and run.provenance.parameters is not None:
+        facts.append(f"{run.provenance.parameters / 1e6:.2f} M parameters")
+    if (seconds := last(run.curves.get("train/seconds_per_step", {}))) is not None:
+        facts.append(f"{seconds:.3g} s/step")
+    return facts + ([run.provenance.device] if run.provenance else [])
+
+
+def _player(run: Run) -> str:
+    if run.samples is None:
+        return ""
+    from flame_mdm.formats.files import read
+    from flame_mdm.visualize import player_page
+
+    # The motions are drawn again: `player.html` may be untrusted, and its scripts would run in the report.
+    return player_page([read(path) for path in sorted(run.samples.glob("motion_*.npz"))])
+
+
+def _curves(run: Run, name: str, families: list[str]) -> tuple[dict[str, Curve], dict[str, Curve]]:
+    """Curves of a chart, and half the widths of their intervals."""
+    lines: dict[str, Curve] = {family: run.curves[f"{family}/{name}"] for family in families}
+    return lines, {family: run.curves.get(f"{family}/{name}/ci", {}) for family in families}
+
+
+def charted(curves: Mapping[str, Curve]) -> dict[str, dict[str, list[str]]]:
+    """Groups curves into charts: those of training and validation with the same name share one.
+
+    Returns:
+        The first parts of their names (`train`, `val`) by the rest of it (`loss`), by heading.
+    """
+    samples = "Samples for the fixed prompts"
+    groups: dict[str, dict[str, list[str]]] = {"Losses": {}, "Validation": {}, samples: {}, "Training curves": {}}
+    for name in curves.keys() - constants(curves).keys():
+        family, _, rest = name.partition("/")
+        if rest.endswith("/ci") or rest in ("", "epochs"):  # "": a name without a family, which no run writes
+            continue
+        heading = {"samples": samples, "val": "Validation"}.get(family, "Training curves")
+        if f"train/{rest}" in curves and rest not in COST:
+            heading = "Losses"
+        groups[heading].setdefault(rest, []).append(family)
+    return {title: {n: sorted(g[n]) for n in sorted(g)} for title, g in groups.items() if g}
+
+
+def constants(curves: Mapping[str, Curve]) -> dict[str, float]:
+    """Values of curves that never change."""
+    values = {
+        name: set(curve.values()) for name, curve in curves.items() if len(curve) > 1 and not name.endswith("/ci")
+    }
+    return {name: next(iter(found)) for name, found in values.items() if len(found) == 1}
+
+
+def _values(result: Result) -> list[list[str]]:
+    values, real = result.values or {}, result.ground_truth or {}
+    return [[name, interval(real.get(name)), interval(values.get(name))] for name in sorted(values | real)]
+
+
+def evaluation_title(result: Result) -> str:
+    """What was evaluated, and by what."""
+    measured = f", extractor {result.extractor.sha256[:8]}" if result.extractor else ""
+    protocol, data = result.protocol, result.data
+    return f"{protocol.name} version {protocol.version}, {data.dataset} {result.split}{measured}"
+
+
+def sampling(result: Result) -> str:
+    """How the evaluated motions were sampled."""
+    checkpoint = result.checkpoint
+    if checkpoint is None:
+        return "motions from other systems"
+    words = [
+        f"{Path(checkpoint.path).name} ({checkpoint.sha256[:8]})",
+        f"{checkpoint.sampler}, {checkpoint.num_inference_steps} steps",
+        f"guidance {checkpoint.guidance_scale:g}",
+        f"seed {result.seed}",
+    ]
+    if result.cost and result.cost.seconds_per_sample is not None:
+        words.append(f"{result.cost.seconds_per_sample:.3g} seconds per motion on {result.device}")
+    return ", ".join(words)
+
+
+def marks(result: Result) -> list[str]:
+    """Why a result must not be published."""
+    found = ["Quick run — not for publication"] if result.quick else []
+    found += [f"not valid: {reason}" for reason in result.invalid_because]
+    changed = ", ".join(f"{name} {value}" for name, value in result.changed.items())
+    return found + ([f"differs from the protocol: {changed}"] if changed and not result.quick else [])
+
+
+def interval(value: Value | None) -> str:
+    """Mean and half of its interval."""
+    if value is None or value.mean is None:
+        return "–"
+    return number(value.mean) + (f" ± {value.ci:.2g}" if value.ci is not None else "")
+
+
+def _provenance(facts: Provenance) -> list[list[str]]:
+    changed = " with uncommitted changes" if facts.changed else ""
+    return [
+        ["command", " ".join(facts.command)],
+        ["commit", (facts.commit or "not from a clone") + changed],
+        ["data", ", ".join(f"{k} {v}" for k, v in facts.data.model_dump(exclude_unset=True).items() if k != "actions")],
+        ["device", facts.device],
+        ["machine", f"{facts.machine}, Python {facts.python}"],
+        ["packages", ", ".join(f"{name} {version}" for name, version in facts.packages.items())],
+    ]

@@ -1,0 +1,140 @@
+"""User study: a page on which people judge motions, and the count of their answers."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import random
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from pydantic import Field
+
+from flame_mdm.errors import UserError
+from flame_mdm.reporting.compare import ComparedRun, Prompt, shared
+from flame_mdm.reporting.page import page, render
+from flame_mdm.runs import Int, Schema, read_json
+
+if TYPE_CHECKING:
+    from flame_mdm.formats.motion import Motion
+
+QUESTION = "Which animation better fits the following description?"
+"""As in Tevet et al. 2023 (MDM), appendix D."""
+
+Name = Annotated[str, Field(min_length=1)]
+
+
+class Rating(Schema):
+    """The choice between the motions of two for one prompt."""
+
+    a: Name
+    b: Name
+    choice: Literal["a", "b"]
+
+
+class Answers(Schema):
+    """The file that the rating page saves."""
+
+    study: Name
+    rater: Name
+    ratings: Annotated[list[Rating], Field(min_length=1)]
+
+
+class Pair(Schema):
+    """How often one of two was preferred."""
+
+    a: str
+    b: str
+    wins_a: Annotated[Int, Field(ge=0)]
+    wins_b: Annotated[Int, Field(ge=0)]
+    raters: Int
+
+
+class Ratings(Schema):
+    """The count that `flame-mdm compare ratings=...` writes."""
+
+    pairs: list[Pair]
+
+
+def rating_page(compared: Sequence[ComparedRun], shown: Sequence[Mapping[Prompt, Motion]], seed: int) -> str:
+    """Returns the page that asks which of two motions fits a text better: the first run's or that of each other one.
+
+    Order and sides are drawn from `seed`. The answers come as a file to download, for `tally`.
+
+    Raises:
+        UserError: two have no prompt in common, or motions without a prompt.
+    """
+    from flame_mdm.visualize import player_page
+
+    first, draw = compared[0], random.Random(seed)
+    items = []
+    for other, those in zip(compared[1:], shown[1:], strict=True):
+        prompts = [prompt for prompt in shared([shown[0], those]) if prompt[0]]
+        if not prompts:
+            raise UserError(
+                f"{first.label} and {other.label} have no prompt in common to be judged by; sample both for the same "
+                "with texts=..."
+            )
+        for prompt in prompts:
+            left, right = sides = [("a", shown[0][prompt]), ("b", those[prompt])]
+            if draw.random() < 0.5:
+                left, right = reversed(sides)
+            scene = [replace(left[1], id="the left one", text=""), replace(right[1], id="the right one", text="")]
+            player = player_page(scene, "", columns=2)
+            item = {"prompt": prompt[0], "a": first.label, "b": other.label, "left": left[0], "player": player}
+            items.append(item)
+    draw.shuffle(items)
+    digest = hashlib.sha256(json.dumps(items, sort_keys=True).encode()).hexdigest()[:12]
+    data = {"study": digest, "items": items}
+    return page("Which motion fits better?", render("study.html", question=QUESTION, data=data))
+
+
+def tally(files: Sequence[Path]) -> list[dict[str, Any]]:
+    """Counts the answers of several raters.
+
+    Returns:
+        For each pair of labels: `a`, `b`, `wins_a`, `wins_b`, `raters`, `share_a`, the share of answers for a, and
+        `interval_a`, its 95 % interval as if all answers were independent (Wilson 1927).
+
+    Raises:
+        UserError: a file that is malformed, or a rater's answers to the same page given twice.
+    """
+    raters: dict[tuple[str, str], Path] = {}
+    counts: dict[tuple[str, str], dict[str, Any]] = {}
+    for path in files:
+        answers: Answers = read_json(path, Answers, "give a file that the rating page saved")
+        study, rater = answers.study, answers.rater
+        if (study, rater) in raters:
+            raise UserError(f"{path}: {rater} has answered the same page in {raters[study, rater]}; give one of both")
+        raters[study, rater] = path
+        for place, rating in enumerate(answers.ratings, 1):
+            a, b, choice = rating.a, rating.b, rating.choice
+            if a == b:
+                raise UserError(f"{path}: rating {place} compares {a} with itself; a and b must differ")
+            if (b, a) in counts:
+                a, b, choice = b, a, "a" if choice == "b" else "b"
+            pair = counts.setdefault((a, b), {"a": 0, "b": 0, "raters": set()})
+            pair[choice] += 1
+            pair["raters"].add(rater)
+    return [_pair(a, b, pair["a"], pair["b"], len(pair["raters"])) for (a, b), pair in counts.items()]
+
+
+def _pair(a: str, b: str, wins_a: int, wins_b: int, raters: int) -> dict[str, Any]:
+    share, low, high = wilson(wins_a, wins_a + wins_b)
+    return {
+        **{"a": a, "b": b, "wins_a": wins_a, "wins_b": wins_b, "raters": raters},
+        **{"share_a": share, "interval_a": [max(0.0, low), min(1.0, high)]},
+    }
+
+
+def wilson(wins: int, votes: int) -> tuple[float, float, float]:
+    """Share of wins and its 95 % interval (Wilson 1927)."""
+    if not votes:
+        return 0.0, 0.0, 1.0
+    z, share = 1.96, wins / votes
+    center = (share + z * z / (2 * votes)) / (1 + z * z / votes)
+    half = z * math.sqrt(share * (1 - share) / votes + z * z / (4 * votes * votes)) / (1 + z * z / votes)
+    return share, center - half, center + half

@@ -1,0 +1,658 @@
+"""Tables and figures of results: `flame-mdm tables table="mdm_1 synthetic"`"""
+
+from __future__ import annotations
+
+import difflib
+import functools
+import hashlib
+import itertools
+import json
+import math
+import re
+import string
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import FailFast, Field, model_validator
+
+from flame_mdm.config import EXPERIMENTS, Config, plain, settings
+from flame_mdm.errors import UserError, say
+from flame_mdm.files import read_yaml, write_json, write_text
+from flame_mdm.reporting.page import page
+from flame_mdm.reporting.plots import standalone
+from flame_mdm.reporting.rendering import (
+    WRITERS,
+    Cell,
+    Figure,
+    Line,
+    Part,
+    Table,
+    draw,
+    figure_names,
+    fragment,
+    places,
+)
+from flame_mdm.reporting.study import Ratings, wilson
+from flame_mdm.runs import ClosedSchema, Int, Number, Result, Schema, Value, check_shape, read_json, read_result
+
+SPECS = EXPERIMENTS / "tables"
+PUBLISHED = SPECS / "published.yaml"
+SWEPT = ("sampler", "num_inference_steps", "guidance_scale", "until")
+"""Options of a row that may be lists: one row for each."""
+ABOUT = {
+    "num_inference_steps": "sampling steps",
+    "guidance_scale": "guidance scale",
+    "sampler": "sampler",
+    "until": "share of sampling that is rewritten",
+    "nfe": "network calls per motion",
+    "seconds_per_sample": "seconds per motion",
+    "parameters": "parameters, M",
+}
+"""What a column may show beside metrics, and figures may be drawn over."""
+MOST_ROWS, MOST_COLUMNS, MOST_FIGURES = 1_000, 100, 100
+"""Limits of a part: rows with their lists of options spread out, columns, and plots. Tables of papers have some 20."""
+
+
+# Specs ----------------------------------------------------------------------------------------------------------------
+
+
+class Options(ClosedSchema):
+    """Keys of `flame-mdm evaluate` that a part, a row or a column may give."""
+
+    protocol: str = ""
+    extractor: str = ""
+    data: str = ""
+    split: str = ""
+    seed: Int = 0
+    replications: Int = 0
+    samples: Int = 0
+    multimodality: bool = False
+
+
+class Column(Options):
+    """A metric, or a key of `ABOUT`; which values of it are better."""
+
+    value: str
+    better: Literal["higher", "lower", "real", "none"] = "none"
+
+
+class Row(Options):
+    """A model or baseline, and its sampling options. Keys with a dot in them override those of the data."""
+
+    label: str
+    note: str = ""
+    ckpt: str = ""
+    baseline: str = ""
+    from_samples: str = ""
+    method: str = ""
+    sampler: str | list[str] = ""
+    num_inference_steps: Int | list[Int] = 0
+    guidance_scale: Number | list[Number] = 0
+    until: Number | list[Number] = 0
+
+    @model_validator(mode="before")
+    @classmethod
+    def _overrides(cls, row: Any) -> Any:
+        for key in row if isinstance(row, dict) else ():
+            if "." in str(key) and not re.fullmatch(r"data(\.(?!_)\w+)+", str(key)):
+                raise ValueError(f"{key}: only keys of the data, such as data.crop.max_frames, are overridden")
+        return row
+
+    @model_validator(mode="after")
+    def _one_source(self) -> Row:
+        if len({"ckpt", "baseline", "from_samples"} & self.model_fields_set) != 1:
+            raise ValueError("a row needs one of ckpt, baseline and from_samples")
+        return self
+
+
+class PartSpec(Options):
+    """One of columns and rows, recipes and keys, lengths, and ratings."""
+
+    columns: dict[str, Column] = Field({}, min_length=1)
+    rows: list[Row] = Field([])
+    recipes: dict[str, str] = Field({}, min_length=1)
+    keys: dict[str, str] = Field({}, min_length=1)
+    lengths: list[str] = Field([])
+    ratings: str = ""
+
+    @model_validator(mode="after")
+    def _one_kind(self) -> PartSpec:
+        kinds = [{"columns", "rows"}, {"recipes", "keys"}, {"lengths"}, {"ratings"}]
+        if sum(kind <= self.model_fields_set for kind in kinds) != 1:
+            raise ValueError("needs columns and rows, or recipes and keys, or lengths, or ratings")
+        options = [[len(_list(getattr(row, n))) for n in SWEPT if n in row.model_fields_set] for row in self.rows]
+        _at_most("rows", sum(map(math.prod, options)), MOST_ROWS)
+        _at_most("keys", len(self.keys), MOST_ROWS)
+        for name in ("columns", "recipes", "lengths"):
+            _at_most(name, len(getattr(self, name)), MOST_COLUMNS)
+        if self.rows and not self.protocol:
+            raise ValueError("needs a protocol")
+        return self
+
+
+class FigureSpec(ClosedSchema):
+    """Columns of a part over an option of its rows."""
+
+    part: str
+    x: str
+    y: str | list[str]
+    log: bool = False
+    points: bool = False
+
+
+class Spec(ClosedSchema):
+    """A file of experiments/tables."""
+
+    title: str
+    notes: list[str] = Field([])
+    parts: Annotated[dict[str, PartSpec], Field(min_length=1)]
+    figures: list[FigureSpec] = Field([])
+
+    @model_validator(mode="after")
+    def _figures(self) -> Spec:
+        _at_most("figures", sum(len(_list(figure.y)) for figure in self.figures), MOST_FIGURES)
+        for figure in self.figures:
+            part = self.parts.get(figure.part)
+            if part is None or figure.x not in ABOUT:
+                raise ValueError(f"a figure needs a part of the table and x, one of {', '.join(ABOUT)}")
+            for column in _list(figure.y):
+                if column not in part.columns:
+                    raise ValueError(f"figure: y={column} is not a column of {figure.part}")
+        return self
+
+
+def spec_names() -> list[str]:
+    """Names of all tables."""
+    return sorted(path.stem for path in SPECS.glob("*.yaml") if path != PUBLISHED)
+
+
+def load_spec(name: str) -> Config:
+    """A table's spec, a file of experiments/tables or any other.
+
+    Raises:
+        UserError: no such file, or one that is not a spec.
+    """
+    path = Path(name) if name.endswith((".yaml", ".yml")) else SPECS / f"{name}.yaml"
+    if not path.is_file() or path == PUBLISHED:
+        raise UserError(f"no table is called '{name}'; there are: {', '.join(spec_names())}")
+    spec = _load(path)
+    try:
+        check_shape(spec, Spec)
+    except ValueError as error:
+        raise UserError(f"{path}: {error}") from error
+    return spec
+
+
+def _at_most(what: str, count: int, most: int) -> None:
+    if count > most:
+        raise ValueError(f"{what}: {count:,} are more than the {most:,} that a table shows. Make several tables")
+
+
+def _load(path: Path) -> Config:
+    content = read_yaml(path)
+    if not isinstance(content, dict):
+        raise UserError(f"{path}: not a mapping")
+    plain(content, path)
+    return {str(key): value for key, value in content.items()}
+
+
+def _list(value: Any) -> list[Any]:
+    return value if isinstance(value, list) else [value]
+
+
+# Evaluations ----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Request:
+    """One evaluation: the keys of `flame-mdm evaluate` that differ from their defaults, and the row it is for."""
+
+    label: str
+    keys: Mapping[str, Any]
+
+    def path(self, results: Path) -> Path:
+        """Its result: a function of the keys alone, so that tables share results and need no checkpoint to be drawn."""
+        digest = hashlib.sha256(json.dumps(dict(self.keys), sort_keys=True).encode()).hexdigest()
+        what = self.keys.get("baseline") or self.keys.get("ckpt") or self.keys["from_samples"]
+        name = re.sub(r"^runs-|-checkpoints-|-ckpt$|-default", "-", re.sub(r"[^A-Za-z0-9]+", "-", str(what))).strip("-")
+        name = re.sub(r"-+", "-", name)[-60:]
+        return results / Path(str(self.keys["protocol"])).stem / f"{name}-{digest[:10]}.json"
+
+    @property
+    def lacking(self) -> str:
+        """Which file is not there; "" where the evaluation can be made."""
+        for key, what in (("ckpt", "checkpoint"), ("from_samples", "samples"), ("extractor", "extractor")):
+            path = self.keys.get(key)
+            if path not in (None, "none") and not Path(str(path)).exists():
+                return f"no {what}"
+        return ""
+
+
+def requests(part: Mapping[str, Any]) -> Iterator[tuple[dict[str, Any], list[Request]]]:
+    """The rows of a part, lists of options spread out, each with the evaluation of each column."""
+    for row in part.get("rows", []):
+        for values in itertools.product(*(_list(row[name]) for name in SWEPT if name in row)):
+            single = row | dict(zip((name for name in SWEPT if name in row), values, strict=True))
+            single["label"] = _spread_label(part, row, single)
+            yield single, [_request(part, single, column) for column in part["columns"].values()]
+
+
+def _spread_label(part: Mapping[str, Any], row: Mapping[str, Any], single: Mapping[str, Any]) -> str:
+    """The label of a row, with the options that its lists leave open and no column shows."""
+    shown = {column["value"] for column in part["columns"].values()}
+    options = [
+        f"{ABOUT[name]} {single[name]}" for name in SWEPT if isinstance(row.get(name), list) and name not in shown
+    ]
+    return f"{row['label']} ({', '.join(options)})" if options else row["label"]
+
+
+def _request(part: Mapping[str, Any], row: Mapping[str, Any], column: Mapping[str, Any]) -> Request:
+    keys = {name: row[name] for name in row if name not in ("label", "note")}
+    for name in ("protocol", "split", "extractor", "seed", "data", "replications", "samples", "multimodality"):
+        for place in (part, row, column):
+            if name in place:
+                keys[name] = place[name]
+    if "ckpt" in keys:
+        keys.pop("data", None)  # a checkpoint knows its own
+    return Request(row["label"], keys)
+
+
+# From results to tables -----------------------------------------------------------------------------------------------
+
+
+def build(name: str, spec: Config, results: Path) -> Table:
+    """The table of a spec, from the results that are there and the published numbers.
+
+    Raises:
+        UserError: a published number or a result that does not fit the spec.
+    """
+    published = _published(PUBLISHED, PUBLISHED.stat().st_mtime_ns).get(name, {}) if PUBLISHED.exists() else {}
+    unknown = published.keys() - spec["parts"].keys()
+    if unknown:
+        raise UserError(f"{PUBLISHED}: {name} has parts that its spec lacks: {', '.join(sorted(unknown))}")
+    parts = []
+    for part_name, part in spec["parts"].items():
+        figures = [
+            Figure(f["x"], _list(f["y"]), f.get("log", False), f.get("points", False))
+            for f in spec.get("figures", [])
+            if f["part"] == part_name
+        ]
+        reported = published.get(part_name)
+        if "recipes" in part:
+            parts.append(_hyperparameters(part_name, part, reported))
+        elif "lengths" in part:
+            parts.append(_lengths(part_name, part, results))
+        elif "ratings" in part:
+            parts.append(_ratings(part_name, part, reported))
+        else:
+            parts.append(_measured(part_name, part, reported, results, figures))
+    return Table(name, spec["title"], parts, list(spec.get("notes", [])))
+
+
+@functools.cache
+def _published(path: Path, changed: int) -> Config:
+    """Published numbers, read once for all tables until the file is changed."""
+    return _load(path)
+
+
+@dataclass
+class _Marks:
+    """Footnote letters by the text of the footnote."""
+
+    notes: dict[str, str] = field(default_factory=dict)
+
+    def of(self, text: str) -> str:
+        return self.notes.setdefault(text, string.ascii_lowercase[len(self.notes) % 26] * (1 + len(self.notes) // 26))
+
+
+def _measured(name: str, part: Config, reported: Config | None, results: Path, figures: list[Figure]) -> Part:
+    columns = {label: column.get("better", "none") for label, column in part["columns"].items()}
+    values = [column["value"] for column in part["columns"].values()]
+    marks = _Marks()
+    lines: list[Line] = []
+    truths: dict[str, Line] = {}
+    todo: dict[str, str] = {}
+    for row, asked in requests(part):
+        found = [_result(request, results) for request in asked]
+        line = _line(row, found, values, [request.path(results).name for request in asked])
+        if all(result is None for result in found):
+            line.state = asked[0].lacking or "not evaluated"
+            todo |= _todo(asked[0])
+        own = dict.fromkeys(marks.of(_evaluation(result)) for result in found if result is not None)
+        line.marks = ",".join(own)
+        lines.append(line)
+        if line.marks and line.marks not in truths:
+            truth = Line("Real motions", "real", [_truth(r, v) for r, v in zip(found, values, strict=True)], line.marks)
+            truths[line.marks] = truth
+    lines = [line for line in truths.values() if any(line.cells)] + lines
+    notes = [(mark, text) for text, mark in marks.notes.items()]
+    notes += [("", f"{label}: {text}") for label, text in todo.items()]
+    for line in lines:
+        if line.facts.get("not valid because"):
+            notes.append(("", f"{line.label}: NOT VALID: {line.facts['not valid because']}"))
+    if reported is not None:
+        more, sources = _reported(reported, columns, values, name)
+        lines, notes = lines + more, notes + sources
+    _print_cells(lines, len(columns))
+    _rank(lines, columns)
+    return Part(name, columns, lines, notes, figures)
+
+
+def _result(request: Request, results: Path) -> Result | None:
+    path = request.path(results)
+    return read_result(path) if path.exists() else None
+
+
+def _todo(request: Request) -> dict[str, str]:
+    """By which command a missing row is had."""
+    lacking = request.lacking
+    if lacking in ("no checkpoint", "no extractor"):
+        file = Path(str(request.keys["ckpt" if lacking == "no checkpoint" else "extractor"]))
+        recipe = re.fullmatch(r"runs/(.+)/default/checkpoints/.+", file.as_posix())
+        how = f"make train EXP={recipe[1]}" if recipe else f"{file} is not there"
+        return {request.label: how}
+    return {request.label: "make tables evaluates it"} if not lacking else {request.label: lacking}
+
+
+def _evaluation(result: Result) -> str:
+    """What values of different rows must share to be compared."""
+    protocol, data, extractor = result.protocol, result.data, result.extractor
+    first = next((v for v in (result.values or {}).values() if v and v.n), None)  # others may be of fewer motions
+    text = f"protocol {protocol.name} version {protocol.version}"
+    text += f", {result.split} split of {data.dataset} (fingerprint {data.fingerprint})"
+    text += ", {} to {} frames".format(*data.frames) if data.frames else ""
+    text += f", N = {first.n}, {first.replications} replications" if first else ", nothing measured"
+    text += f", seed {result.seed}"
+    text += f", extractor sha256 {extractor.sha256[:12]}" if extractor else ", no extractor"
+    if result.changed:
+        text += "; not as the protocol has it: " + ", ".join(f"{k} = {v}" for k, v in result.changed.items())
+    if result.published_split:
+        text += "; the published split: test clips that training has seen, or no validation clips"
+    text += "".join(f"; {warning}" for warning in result.warnings)
+    return text + ("; QUICK, NOT A RESULT" if result.quick else "")
+
+
+def _line(row: Mapping[str, Any], found: Sequence[Result | None], values: Sequence[str], files: Sequence[str]) -> Line:
+    cells = [_cell(result, value, row) for result, value in zip(found, values, strict=True)]
+    line = Line(row["label"], "measured", cells)
+    line.options = {name: float(row[name]) for name in SWEPT if isinstance(row.get(name), int | float)}
+    first = next((result for result in found if result is not None), None)
+    if first is None:
+        return line
+    for name in ABOUT:
+        value = _about(first, name)
+        if isinstance(value, int | float):
+            line.options.setdefault(name, float(value))
+    reasons = list(dict.fromkeys(reason for r in found if r is not None for reason in r.invalid_because))
+    line.state = "NOT VALID" if reasons else "QUICK" if first.quick else ""
+    checkpoint = first.checkpoint
+    counts = {
+        name: f"{entry.replications} x {entry.n}"
+        for result, name in zip(found, values, strict=True)
+        if result and (entry := (result.values or {}).get(name)) and entry.n
+    }
+    most = Counter(counts.values()).most_common(1)[0][0] if counts else ""
+    others = "".join(f"; {name} {count}" for name, count in counts.items() if count != most)
+    weights = {True: "averaged", False: "raw", None: ""}
+    line.facts = {
+        "checkpoint sha256": (checkpoint.sha256 if checkpoint else first.samples_sha256 or "")[:16],
+        "recipe": (checkpoint and checkpoint.experiment) or "",
+        "baseline": first.baseline or "",
+        "chosen by": checkpoint.selected_by if checkpoint else "",
+        "weights": weights[checkpoint.averaged_weights if checkpoint else None],
+        "guidance": _text(checkpoint and checkpoint.guidance_scale),
+        "sampler": _text(checkpoint and checkpoint.sampler),
+        "steps": _text(checkpoint and checkpoint.num_inference_steps),
+        "replications x motions": most + others,
+        "seed": _text(first.seed),
+        "device": first.device,
+        "result": " ".join(dict.fromkeys(file for r, file in zip(found, files, strict=True) if r is not None)),
+        "not valid because": "; ".join(reasons),
+    }
+    return line
+
+
+def _text(value: Any) -> str:
+    return "" if value is None else f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def _about(result: Result, name: str) -> Any:
+    """Fact about the model and its cost, by the names of `ABOUT`."""
+    checkpoint, cost = result.checkpoint, result.cost
+    known: dict[str, Any] = dict(checkpoint or ()) | (checkpoint.edit if checkpoint else {}) | dict(cost or ())
+    value = known.get(name)
+    return value / 1e6 if name == "parameters" and value is not None else value
+
+
+def _cell(result: Result | None, value: str, row: Mapping[str, Any]) -> Cell | None:
+    if value in ABOUT:
+        found = row.get(value) if result is None else _about(result, value)
+        if found is None:
+            return None
+        return Cell(f"{float(found):,g}", float(found)) if isinstance(found, int | float) else Cell(str(found))
+    return None if result is None else _entry((result.values or {}).get(value))
+
+
+def _truth(result: Result | None, value: str) -> Cell | None:
+    return None if result is None or value in ABOUT else _entry((result.ground_truth or {}).get(value))
+
+
+def _entry(entry: Value | None) -> Cell | None:
+    if entry is None or entry.mean is None:
+        return None
+    return Cell("", entry.mean, entry.ci if (entry.replications or 0) > 1 else None)
+
+
+def _print_cells(lines: Sequence[Line], columns: int) -> None:
+    """Numbers as text, with the same decimals in a column, about three digits of the largest; short settings stay.
+
+    Numbers that would be all zeros show two digits.
+    """
+    for index in range(columns):
+        cells = [c for line in lines if not line.kind.startswith("reported") and (c := line.cells[index]) is not None]
+        numbers = [abs(cell.value) for cell in cells if cell.value is not None]
+        decimals = _decimals(max(numbers, default=0.0))
+        short = all(cell.value == round(cell.value, 1) for cell in cells if cell.value is not None and cell.ci is None)
+        for cell in cells:
+            if cell.value is not None and not (cell.ci is None and cell.text and short):
+                small = 0 < abs(cell.value) < 10**-decimals
+                digits = 1 - math.floor(math.log10(abs(cell.value))) if small else decimals
+                cell.text = f"{cell.value:.{digits}f}" + (f" ±{cell.ci:.{digits}f}" if cell.ci is not None else "")
+
+
+def _decimals(largest: float) -> int:
+    if largest == 0 or 0.1 <= largest < 10:
+        return 3
+    return min(max(2 - math.floor(math.log10(largest)), 1), 6)
+
+
+def _rank(lines: Sequence[Line], columns: Mapping[str, str]) -> None:
+    """Best and second best among rows of one kind with the same marks."""
+    for kind in ("measured", "reported"):
+        for marks in {line.marks for line in lines}:
+            rows = [x for x in lines if x.kind == kind and x.marks == marks and not x.state]
+            rows = [x for x in rows if not x.facts.get("baseline")]
+            truths = [x for x in lines if x.kind == {"measured": "real", "reported": "reported real"}[kind]]
+            truths = [x for x in truths if kind == "reported" or x.marks == marks]
+            for index, better in enumerate(columns.values()):
+                numbers = [cell.value if (cell := row.cells[index]) else None for row in rows]
+                reals = [c.value for x in truths if (c := x.cells[index]) is not None]
+                found = places(numbers, better, reals[0] if len(reals) == 1 else None)
+                for row, place in zip(rows, found, strict=True):
+                    if (cell := row.cells[index]) is not None:
+                        cell.place = place
+
+
+# Published numbers ----------------------------------------------------------------------------------------------------
+
+
+def _reported(
+    reported: Config, columns: Mapping[str, str], values: Sequence[str], part: str
+) -> tuple[list[Line], list[tuple[str, str]]]:
+    """Rows of a paper, and their footnotes."""
+    notes: dict[str, str] = {}
+    lines = []
+    for row in reported["rows"]:
+        unknown = row["values"].keys() - columns.keys()
+        if unknown:
+            raise UserError(f"{PUBLISHED}: {part}, {row['label']}: no column is called {', '.join(sorted(unknown))}")
+        text = f"as reported: {row.get('source') or reported['source']}; measured with {reported['evaluator']}"
+        mark = notes.setdefault(text, "†" * (len(notes) + 1))
+        cells = [Cell(str(v), _leading(str(v))) if (v := row["values"].get(c)) is not None else None for c in columns]
+        line = Line(row["label"], "reported real" if row.get("real") else "reported", cells, mark)
+        for value, cell in zip(values, cells, strict=True):
+            if value in ABOUT and cell is not None and cell.value is not None:
+                line.options[value] = cell.value
+        lines.append(line)
+    extra = [("", note) for note in reported.get("notes", [])]
+    return lines, [(mark, text) for text, mark in notes.items()] + extra
+
+
+def _leading(text: str) -> float | None:
+    """The number that a printed value begins with; 1,000 is one thousand."""
+    found = re.match(r"[-+]?[\d,]*\.?\d+(?:[eE][-+]?\d+)?", text.strip())
+    return float(found[0].replace(",", "")) if found else None
+
+
+# Other kinds of parts -------------------------------------------------------------------------------------------------
+
+
+def _hyperparameters(name: str, part: Config, reported: Config | None) -> Part:
+    """A table of settings, read from recipes, each with the reported one beside it; keys or recipes, what is more
+    stands in rows.
+    """
+    from flame_mdm.reporting.settings import LABELS, values
+
+    for key in part["keys"].values():
+        if key not in LABELS:
+            near = difflib.get_close_matches(key, LABELS, 3)
+            hint = f"Did you mean {', '.join(near)}?" if near else f"there are: {', '.join(LABELS)}"
+            raise UserError(f"part {name}: no setting is called '{key}'; {hint}")
+    found = {label: values(recipe) for label, recipe in part["recipes"].items()}
+    printed = {row["label"]: row["values"] for row in reported["rows"]} if reported else {}
+    ours: dict[tuple[str, str], Cell | None] = {}
+    theirs: dict[tuple[str, str], Cell | None] = {}
+    for label, key in part["keys"].items():
+        for recipe, known in found.items():
+            place = (label, recipe) if len(part["keys"]) >= len(found) else (recipe, label)
+            ours[place] = Cell(_setting(known[key])) if key in known else None
+            theirs[place] = Cell(text) if (text := printed.get(label, {}).get(recipe)) is not None else None
+    rows, columns = (list(dict.fromkeys(names)) for names in zip(*ours, strict=True))
+    lines = [Line(row, "measured", []) for row in rows]
+    heads: list[str] = []
+    for column in columns:
+        for head, cells in ((column, ours), (f"{column}, reported", theirs)):
+            if any(cells[row, column] for row in rows):
+                heads.append(head)
+                for line in lines:
+                    line.cells.append(cells[line.label, column])
+    notes = [("", f"{label}: recipe {recipe}") for label, recipe in part["recipes"].items()]
+    if reported:
+        notes += [("", f"reported: {reported['source']}"), *(("", note) for note in reported.get("notes", []))]
+    return Part(name, dict.fromkeys(heads, "none"), lines, notes)
+
+
+def _setting(value: Any) -> str:
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, list | tuple):
+        return ", ".join(map(_setting, value))
+    if isinstance(value, int):
+        return f"{value:,}"
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def count_lengths(dataset: str, results: Path, config: Config) -> None:
+    """Counts the motion lengths of a prepared data set, once; says so where it is not prepared."""
+    from flame_mdm.config import instantiate
+
+    options = settings("browse", [f"data={dataset}"])
+    node = options["data"] | ({"root": config["data_root"]} if config["data_root"] else {})
+    data = instantiate(node, representation=instantiate(options["representation"]))
+    if not (data.folder / "store.json").exists():
+        say(f"{dataset}: not prepared, its lengths are left out (make prepare DATA={dataset})")
+        return
+    store = data.open()
+    lengths = sorted(clip.length for clip in store.clips)
+    content = {"fingerprint": store.fingerprint, "fps": store.info["fps"], "lengths": lengths}
+    write_json(results / "lengths" / f"{dataset}.json", content, indent=None)
+
+
+class Lengths(Schema):
+    """Motion lengths of a data set, in frames, as `count_lengths` writes them."""
+
+    fingerprint: str
+    fps: Annotated[Number, Field(gt=0)]
+    lengths: Annotated[list[Annotated[Int, Field(ge=1)]], Field(min_length=1), FailFast()]
+
+
+def _lengths(name: str, part: Config, results: Path) -> Part:
+    """How long the motions of data sets are."""
+    columns = dict.fromkeys(["motions", "hours", "shortest", "median", "mean", "longest"], "none")
+    lines, histograms = [], {}
+    for dataset in part["lengths"]:
+        path = results / "lengths" / f"{dataset}.json"
+        if not path.exists():
+            lines.append(Line(dataset, "measured", [None] * len(columns), state="not prepared"))
+            continue
+        found: Lengths = read_json(path, Lengths, "delete it, and `flame-mdm tables` counts again")
+        lengths, fps = sorted(found.lengths), found.fps
+        numbers = [
+            (f"{len(lengths):,}", len(lengths)),
+            (f"{sum(lengths) / fps / 3600:.2f}", sum(lengths) / fps / 3600),
+            *((f"{x:g}", x) for x in (lengths[0], lengths[len(lengths) // 2])),
+            (f"{sum(lengths) / len(lengths):.1f}", sum(lengths) / len(lengths)),
+            (f"{lengths[-1]}", lengths[-1]),
+        ]
+        facts = {"fingerprint": found.fingerprint, "frames a second": _text(float(fps))}
+        lines.append(Line(dataset, "measured", [Cell(t, float(v)) for t, v in numbers], facts=facts))
+        step = max(1, math.ceil(lengths[-1] / 40))
+        counts = [0] * (lengths[-1] // step + 1)
+        for length in lengths:
+            counts[length // step] += 1
+        histograms[dataset] = ([float(i * step) for i in range(len(counts) + 1)], counts)
+    return Part(name, columns, lines, [("", "lengths in frames of the data set")], histograms=histograms)
+
+
+def _ratings(name: str, part: Config, reported: Config | None) -> Part:
+    """A user study: how often one model was preferred to another."""
+    columns = {"Preferred": "none", "votes": "none", "raters": "none"}
+    lines = []
+    path = Path(part["ratings"])
+    if path.exists():
+        ratings: Ratings = read_json(path, Ratings, "`flame-mdm compare ratings=...` counts again")
+        for pair in ratings.pairs:
+            votes = pair.wins_a + pair.wins_b
+            share, low, high = wilson(pair.wins_a, votes)
+            cells = [
+                Cell(f"{share:.1%} [{low:.1%}, {high:.1%}]", share),
+                Cell(str(votes), votes),
+                Cell(str(pair.raters)),
+            ]
+            lines.append(Line(f"{pair.a} over {pair.b}", "measured", list(cells)))
+    notes = [("", "share of votes, with its 95 % interval (Wilson)")]
+    if not lines:
+        notes = [("", f'{path} is not there: make compare RUNS="a b" RATE=true writes a page to rate motions on')]
+    if reported:
+        more, sources = _reported(reported, columns, ["", "", ""], name)
+        lines, notes = lines + more, notes + sources
+    return Part(name, columns, lines, notes)
+
+
+# Files ----------------------------------------------------------------------------------------------------------------
+
+
+def write(table: Table, out: Path) -> str:
+    """Writes a table in all forms and its figures; returns its HTML, without the head of the page."""
+    for part, figure, name in figure_names(table):
+        if drawn := draw(part, figure, ABOUT):
+            table.drawn[name] = drawn
+            write_text(out / f"{name}.svg", standalone(drawn))
+    for suffix, writer in WRITERS.items():
+        write_text(out / f"{table.name}.{suffix}", writer(table))
+    body = fragment(table)
+    write_text(out / f"{table.name}.html", page(table.title, body))
+    return body

@@ -1,0 +1,387 @@
+"""Run directories and result files: layout, typed schema, readers that name the file and the key of what is damaged."""
+
+from __future__ import annotations
+
+import functools
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
+
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
+
+from flame_mdm import files
+from flame_mdm.config import Config, read_saved
+from flame_mdm.errors import UserError, did_you_mean
+
+CONFIG, PROVENANCE, FAULT = "config.yaml", "provenance.json", "bad_batch.json"
+HISTORY = "metrics.jsonl"
+"""Training curves, one line per log step."""
+RESULTS = "evaluation/**/result*.json"
+SAMPLES = "samples/step_*"
+LAST = "checkpoints/last.ckpt"
+
+LARGEST = 2**63 - 1
+"""Largest whole number in a file; larger ones overflow where they are drawn or logged."""
+LIMIT = 4 * files.MEBIBYTE
+"""Largest file of results, ratings, lengths or provenance. Real ones have 10 to 300 KiB."""
+HISTORY_LIMIT = 256 * files.MEBIBYTE
+"""Largest history; a million steps logged every 50 steps take some 20 MiB."""
+
+T = TypeVar("T")
+Int = Annotated[int, Field(gt=-(2**63), lt=2**63)]
+Number = Annotated[float, Field(gt=-1e300, lt=1e300)]
+"""A finite number that does not overflow when it is drawn."""
+Plain = str | bool | Int | Number | None
+
+
+# Schema ---------------------------------------------------------------------------------------------------------------
+
+
+class Schema(BaseModel):
+    """Content of a file. Types are not converted: "1" is no number. Keys that are not listed are ignored."""
+
+    model_config = ConfigDict(strict=True)
+
+
+class ClosedSchema(Schema):
+    """Content of a file that people write: unknown keys are errors, except overrides such as data.crop.max_frames."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _known_keys(cls, content: Any) -> Any:
+        for name in content if isinstance(content, dict) else ():
+            if name not in cls.model_fields and "." not in str(name):
+                raise ValueError(f"unknown key: {name}.{did_you_mean(str(name), cls.model_fields)}")
+        return content
+
+
+class Value(Schema):
+    """A metric over the replications: mean, half the width of its 95 % interval, motions; None where not computable."""
+
+    mean: Number | None
+    ci: Number | None
+    replications: Int | None
+    n: Int | None
+
+
+class Protocol(Schema):
+    """The evaluation protocol."""
+
+    name: str
+    version: Int
+
+
+class Data(Schema):
+    """The data set that was measured, or trained on."""
+
+    dataset: str
+    fingerprint: str
+    frames: Annotated[list[Int], Field(min_length=2, max_length=2)] | None = None
+
+
+class Extractor(Schema):
+    """The feature extractor."""
+
+    sha256: str
+
+
+class Checkpoint(Schema):
+    """The checkpoint that generated the motions, and its sampling options."""
+
+    path: str
+    sha256: str
+    sampler: str
+    num_inference_steps: Int
+    guidance_scale: Number
+    experiment: str | None = None
+    selected_by: str = ""
+    averaged_weights: bool | None = None
+    parameters: Int | None = None
+    edit: dict[str, Plain] = {}
+
+
+class Cost(Schema):
+    """Cost per motion."""
+
+    nfe: Number | None = None
+    seconds_per_sample: Number | None = None
+
+
+class Result(Schema):
+    """A result of `flame-mdm evaluate`, as far as tables and pages read it."""
+
+    quick: bool
+    protocol: Protocol
+    split: str
+    data: Data
+    seed: Int
+    extractor: Extractor | None
+    checkpoint: Checkpoint | None
+    device: str
+    values: dict[str, Value | None] | None
+    ground_truth: dict[str, Value | None] | None
+    not_computed: dict[str, str]
+    invalid_because: list[str]
+    published_split: bool = False
+    samples_sha256: str | None = None
+    baseline: str | None = None
+    changed: dict[str, Plain] = {}
+    warnings: list[str] = []
+    cost: Cost | None = None
+
+
+class RunName(Schema):
+    """The keys `run` of a configuration."""
+
+    name: str | Int | Number = "default"
+
+
+class TrainerSteps(Schema):
+    """The keys `trainer` of a configuration."""
+
+    max_steps: Int
+
+
+class Recipe(Schema):
+    """The configuration of a run, as far as pages read it."""
+
+    experiment: str | None
+    run: RunName
+    trainer: TrainerSteps
+
+
+class TrainedOn(Schema):
+    """The key `data` of a provenance, with any other facts of the data."""
+
+    model_config = ConfigDict(strict=True, extra="allow")
+    fingerprint: str = "–"
+
+
+class Provenance(Schema):
+    """Command, code, machine, versions, device, parameters and data of a run."""
+
+    command: list[str]
+    commit: str | None
+    python: str
+    machine: str
+    packages: dict[str, str]
+    data: TrainedOn
+    changed: str | None = None
+    device: str = "–"
+    parameters: Int | None = None
+
+
+class FaultyBatch(Schema):
+    """The part of a batch that one process had."""
+
+    rank: Int
+    batch: Int
+    loss: str
+    ids: list[str]
+
+
+class Fault(Schema):
+    """The batch that stopped a run."""
+
+    step: Int
+    usual_loss: str
+    batches: list[FaultyBatch]
+
+
+# Reading --------------------------------------------------------------------------------------------------------------
+
+EXPECTED = {
+    **{"string": "a text", "bool": "true or false", "int": "a whole number", "float": "a number", "finite": "a number"},
+    **{
+        "less": "a smaller number",
+        "greater": "a larger number",
+        "none": "null",
+        "dict": "a mapping",
+        "model": "a mapping",
+        "list": "a list",
+    },
+    **{"string_too_short": "a non-empty text", "too_short": "a longer list or mapping", "too_long": "a shorter list"},
+}
+"""What should be there, by the type of a pydantic error or its first word."""
+
+_adapter = functools.cache(TypeAdapter)
+
+
+def check_shape(content: Any, kind: type[T] | Any) -> T:
+    """Returns content of a file as the type that it has to have.
+
+    Args:
+        content: mappings, lists, texts, numbers.
+        kind: a `Schema`, or any other type that pydantic knows.
+
+    Raises:
+        ValueError: names the key, what it holds, and what it should hold.
+    """
+    if large := _too_large(content):
+        raise ValueError(f"{large[:40]} ... is not a number that JSON readers agree on; the largest is {LARGEST:,}")
+    try:
+        return _adapter(kind).validate_python(content, strict=True)
+    except ValidationError as error:
+        raise ValueError(_first_error(error, content)) from error
+
+
+def _too_large(content: Any) -> str:
+    """Returns the first whole number beyond `LARGEST` in some content, as text; "" without one."""
+    if isinstance(content, dict | list):
+        values = content.values() if isinstance(content, dict) else content
+        return next(filter(None, map(_too_large, values)), "")
+    return hex(content) if isinstance(content, int) and abs(content) > LARGEST else ""
+
+
+def _first_error(error: ValidationError, content: Any) -> str:
+    first: Any = error.errors(include_url=False)[0]
+    keys, kind, context = [], first["type"], first.get("ctx", {})
+    for key in first["loc"]:  # of which some name a type of a union, not a key
+        if (isinstance(content, dict) and key in content) or (isinstance(content, list) and isinstance(key, int)):
+            content = content[key]
+            keys.append(str(key))
+    name = ".".join(keys) or "the file"
+    if first["loc"] and first["loc"][-1] == "[key]":
+        return f"{name} is named by no text; put the name in quotes"
+    if kind == "missing":
+        return f"{name} has no {first['loc'][-1]}"
+    if kind == "value_error":
+        return ": ".join(filter(None, [".".join(keys), str(context["error"])]))
+    shown = json.dumps(content, default=str)
+    shown = shown if len(shown) < 40 else f"{shown[:36]} ..."
+    expected = context["expected"] if kind == "literal_error" else EXPECTED.get(kind, EXPECTED.get(kind.split("_")[0]))
+    return f"{name} is {shown}, not {expected}" if expected else f"{name} is {shown}: {first['msg']}"
+
+
+def read_json(path: Path, kind: type[T] | Any, remedy: str = "") -> T:
+    """Returns the content of a JSON file of at most `LIMIT` bytes as the type that it has to have.
+
+    Args:
+        path: of the file.
+        kind: see `check_shape`.
+        remedy: what to do if it is damaged.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        UserError: it holds anything else.
+    """
+    message = f"; {remedy}" if remedy else ""
+    try:
+        content = files.read_json(path, LIMIT)
+    except UserError as error:
+        raise UserError(f"{error}{message}") from error
+    try:
+        return check_shape(content, kind)
+    except (ValueError, RecursionError) as error:
+        raise UserError(f"{path}: damaged: {error}{message}") from error
+
+
+def read_result(path: Path) -> Result:
+    """Returns a result of `flame-mdm evaluate`.
+
+    Raises:
+        UserError: it is damaged.
+    """
+    return read_json(path, Result, "delete it, and `flame-mdm evaluate` or `flame-mdm tables` evaluates again")
+
+
+@dataclass
+class Run:
+    """Content of a run directory.
+
+    Attributes:
+        folder: the directory.
+        config: the recipe, as the run saved it.
+        provenance: None before training began.
+        curves: values by step, by name.
+        results: evaluations by the name of their file within the folder.
+    """
+
+    folder: Path
+    config: Config
+    provenance: Provenance | None
+    curves: dict[str, dict[int, float]]
+    results: dict[str, Result]
+
+    @property
+    def label(self) -> str:
+        """Recipe and name of the run; the recipe alone for a run that has the default name."""
+        name = self.config["run"].get("name", "default")
+        return str(self.config["experiment"]) + (f"/{name}" if name != "default" else "")
+
+    @property
+    def samples(self) -> Path | None:
+        """The folder of the newest samples."""
+        return newest_samples(self.folder, "motion_000.npz")
+
+    @property
+    def steps(self) -> int:
+        """Steps that the training curves cover."""
+        return max((max(curve) + 1 for name, curve in self.curves.items() if name.startswith("train/")), default=0)
+
+
+def newest_samples(folder: Path, file: str) -> Path | None:
+    """The newest folder of samples in a run directory that holds `file`."""
+    found = (path.parent for path in folder.glob(f"{SAMPLES}/{file}"))
+    return max((path for path in found if path.name.removeprefix("step_").isdecimal()), default=None)
+
+
+def read_run(folder: Path) -> Run:
+    """Returns the content of a run directory.
+
+    Raises:
+        UserError: no run, or a damaged file.
+    """
+    path = folder / CONFIG
+    if not path.exists():
+        raise UserError(f"{folder}: no {CONFIG} there; name the folder of a run, such as runs/synthetic/mdm/default")
+    config = read_saved(path)
+    try:
+        check_shape(config, Recipe)
+    except ValueError as error:
+        raise UserError(f"{path}: not the configuration of a run: {error}") from error
+    origin = folder / PROVENANCE
+    remedy = "delete it, and the page leaves it out"
+    results = {path.relative_to(folder).as_posix(): read_result(path) for path in sorted(folder.glob(RESULTS))}
+    provenance: Provenance | None = read_json(origin, Provenance, remedy) if origin.exists() else None
+    return Run(folder, config, provenance, read_history(folder), results)
+
+
+def read_history(folder: Path) -> dict[str, dict[int, float]]:
+    """Returns the curves of a run: values by step, in their order, by name; {} if the run has no history.
+
+    Raises:
+        UserError: the file is damaged.
+    """
+    curves: dict[str, dict[int, float]] = {}
+    for record in records(folder / HISTORY):
+        for name, value in record.items():
+            if name not in ("step", "epoch"):
+                curves.setdefault(name, {})[record["step"]] = value
+    return {name: dict(sorted(curve.items())) for name, curve in sorted(curves.items())}
+
+
+def records(path: Path) -> list[dict[str, Any]]:
+    """Returns the lines of a history. A last one that a kill has cut does not count.
+
+    Raises:
+        UserError: another line is damaged.
+    """
+    if not path.exists():
+        return []
+    *lines, _ = files.read_text(path, HISTORY_LIMIT).split("\n")
+    found = []
+    for place, line in enumerate(lines, 1):
+        try:
+            record = json.loads(line)
+            if not isinstance(record, dict) or type(record.get("step")) is not int or not 0 <= record["step"] < 2**63:
+                raise ValueError("it has no step, a whole number")
+            wrong = [name for name, value in record.items() if type(value) not in (int, float)]
+            if wrong or any(type(value) is int and abs(value) >= 2**63 for value in record.values()):
+                raise ValueError(f"{', '.join(wrong) or 'a value'} should be a number")
+            "".join(record).encode()  # half a character cannot be written again
+        except (ValueError, RecursionError) as error:
+            raise UserError(f"{path}: line {place} is damaged; delete that line ({error})") from error
+        found.append(record)
+    return found

@@ -1,0 +1,1 @@
+"""Training: checkpointing, safeguards, callbacks, loggers, provenance."""

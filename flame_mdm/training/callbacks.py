@@ -1,0 +1,308 @@
+"""What happens beside the training steps: checkpoints, interruption, progress, samples on the dashboard."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from collections.abc import Sequence
+from inspect import signature
+from itertools import zip_longest
+from multiprocessing import active_children
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import torch
+from lightning import Callback, LightningModule, Trainer
+from lightning.pytorch.callbacks import Checkpoint, TQDMProgressBar
+from torch.nn.utils import get_total_norm
+from torchmetrics import Metric
+
+from flame_mdm.conditions.action import ActionLabels
+from flame_mdm.data.datamodule import MotionDataModule
+from flame_mdm.errors import say
+from flame_mdm.formats.motion import Motion
+from flame_mdm.generation import generate, write_motions
+from flame_mdm.motion import MotionBatch
+from flame_mdm.reporting.report import write_report
+from flame_mdm.task import MotionGeneration
+from flame_mdm.training.loggers import log_video
+
+
+class Interrupted(Exception):
+    """Training stopped at the end of a step because a signal asked for it; a checkpoint has been written."""
+
+    def __init__(self, signum: int, step: int):
+        super().__init__(f"{signal.Signals(signum).name} at step {step}")
+        self.signum, self.step = signum, step
+
+
+class Checkpoints(Checkpoint):
+    """Writes `last.ckpt` every so often, at the last step and when interrupted, and keeps some for good.
+
+    SIGINT, SIGTERM, SIGUSR1 and SIGUSR2 end training at the end of a step, never inside validation, where averaged and
+    raw weights are swapped, or of the next step where there are several processes. A second SIGINT ends it at once, and
+    so does a second SIGTERM that comes more than a second after the first: `timeout` sends two together.
+    """
+
+    def __init__(self, folder: str, every_n_steps: int, keep_every_n_steps: int | None = None):
+        super().__init__()
+        if every_n_steps < 1:
+            raise ValueError(f"callbacks.checkpoints.every_n_steps={every_n_steps}: at least 1 is needed")
+        self.folder = Path(folder)
+        self.every_n_steps, self.keep_every_n_steps = every_n_steps, keep_every_n_steps
+        self.signum, self.noted = 0, 0.0
+        self.exchanged = torch.tensor(0)
+        self.step = -1
+        self.handlers: dict[int, Any] = {}
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        self.step = trainer.global_step
+        for signum in (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGUSR2):
+            self.handlers[signum] = signal.signal(signum, self._note)
+
+    def _note(self, signum: int, frame: FrameType | None) -> None:
+        repeated = self.signum == signum and time.monotonic() > self.noted + 1
+        if self.signum and (signum == signal.SIGINT or (signum == signal.SIGTERM and repeated)):
+            _kill_workers()
+            raise SystemExit(128 + signum)
+        self.signum, self.noted = signum, time.monotonic()
+        # print could find itself interrupted here, which Python refuses
+        os.write(1, b"\nstopping at the end of this step; a second Ctrl-C or SIGTERM stops at once\n")
+
+    def on_train_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        if trainer.global_step == self.step:  # gradients are still being accumulated
+            return
+        self.step = trainer.global_step
+        signum = self.signum
+        if trainer.world_size > 1:
+            # What all processes know of is what was exchanged a step ago: so that none waits for this step to end.
+            signum, known = int(self.exchanged), torch.tensor(signum, device=pl_module.device)
+            torch.distributed.all_reduce(known, torch.distributed.ReduceOp.MAX)
+            self.exchanged = known
+        last = bool(signum) or trainer.should_stop or self.step >= trainer.max_steps > 0
+        if last or self.step % self.every_n_steps == 0:
+            trainer.save_checkpoint(self.folder / "last.ckpt")
+        if self.keep_every_n_steps and self.step % self.keep_every_n_steps == 0:
+            trainer.save_checkpoint(self.folder / f"step={self.step:07d}.ckpt")
+        if signum:
+            raise Interrupted(signum, self.step)
+
+    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        self._restore()
+
+    def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
+        self._restore()
+
+    def _restore(self) -> None:
+        for signum, handler in self.handlers.items():
+            signal.signal(signum, handler)
+        self.handlers = {}
+
+
+def _kill_workers() -> None:
+    """Ends the loading processes, even stopped ones, for which Python would wait without end."""
+    signal.signal(signal.SIGCHLD, signal.SIG_DFL)  # else torch raises an error for each
+    for process in active_children():
+        process.kill()
+
+
+class Measurements(Callback):
+    """What a step does and costs, logged every `trainer.log_every_n_steps` without holding up the steps between.
+
+    Logs `train/grad_norm` (of all gradients together, before they are clipped), `train/lr`, `train/epochs` (passes over
+    the training clips), `train/samples_per_second`, `train/seconds_per_step` (validation does not count) and, on CUDA,
+    `train/gpu_memory_gib` (the most that tensors have held).
+    """
+
+    def __init__(self) -> None:
+        self.step = 0
+        self.since, self.steps, self.samples = 0.0, 0, 0
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        self.step = trainer.global_step
+        self._restart()
+
+    def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        self._restart()
+
+    def _restart(self) -> None:
+        self.since, self.steps, self.samples = time.perf_counter(), 0, 0
+
+    def on_before_optimizer_step(
+        self, trainer: Trainer, pl_module: LightningModule, optimizer: torch.optim.Optimizer
+    ) -> None:
+        if (trainer.global_step + 1) % trainer.log_every_n_steps == 0:  # type: ignore[attr-defined]
+            gradients = [p.grad for p in pl_module.parameters() if p.grad is not None]
+            pl_module.log("train/grad_norm", get_total_norm(gradients))
+            pl_module.log("train/lr", optimizer.param_groups[0]["lr"])
+
+    def on_train_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: MotionBatch, batch_idx: int
+    ) -> None:
+        self.samples += len(batch) * trainer.world_size
+        if trainer.global_step == self.step:  # gradients are still being accumulated
+            return
+        self.step = trainer.global_step
+        self.steps += 1
+        elapsed = time.perf_counter() - self.since
+        if self.step % trainer.log_every_n_steps or elapsed == 0:  # type: ignore[attr-defined]
+            return
+        data: MotionDataModule = trainer.datamodule  # type: ignore[attr-defined]
+        size = data.batch_size * trainer.world_size * trainer.accumulate_grad_batches
+        pl_module.log("train/epochs", self.step * size / len(data.train))
+        pl_module.log("train/samples_per_second", self.samples / elapsed, prog_bar=True)
+        pl_module.log("train/seconds_per_step", elapsed / self.steps)
+        if pl_module.device.type == "cuda":
+            pl_module.log("train/gpu_memory_gib", torch.cuda.max_memory_allocated(pl_module.device) / 2**30)
+        self._restart()
+
+
+class Report(Callback):
+    """Writes `report.html` into the run's folder at the end of training."""
+
+    def __init__(self, folder: Path):
+        self.folder = folder
+
+    def on_fit_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        if trainer.is_global_zero:
+            say(f"the whole run on a page: {write_report(self.folder)}")
+
+
+class Progress(TQDMProgressBar):
+    """A progress bar over all steps of the run, with the time left and samples a second."""
+
+    @property
+    def total_train_batches(self) -> int | float:
+        return self.trainer.max_steps * self.trainer.accumulate_grad_batches
+
+    def on_train_epoch_start(self, trainer: Trainer, *_: Any) -> None:
+        super().on_train_epoch_start(trainer)
+        done = trainer.global_step * trainer.accumulate_grad_batches
+        self.train_progress_bar.initial = self.train_progress_bar.n = done
+        self.train_progress_bar.set_description("training")
+
+    def get_metrics(self, trainer: Trainer, pl_module: LightningModule) -> dict[str, Any]:
+        items = super().get_metrics(trainer, pl_module)
+        items.pop("v_num", None)
+        return {name.rpartition("/")[2] if name != "val/loss" else name: value for name, value in items.items()}
+
+
+class SampleMotions(Callback):
+    """Samples fixed prompts with fixed noise now and then: files in the run's folder, a video on the dashboard.
+
+    Args:
+        folder: where `step_0001000/player.html` and the like are written.
+        every_n_steps: how often, at validation; the end of training always samples.
+        prompts: texts, action names, or (text, asked attributes) pairs; None = as many unconditioned motions as
+            `unconditioned`. A model of actions is asked for as many actions instead where none of them is one.
+        seconds: length of the motions.
+        unconditioned: how many motions to sample where there are no prompts.
+        metrics: torchmetrics by name, updated with those of joints (B, F, J, 3), mask (B, F) and asked that they take.
+    """
+
+    def __init__(
+        self,
+        folder: str,
+        every_n_steps: int,
+        prompts: Sequence[str | tuple[str, dict[str, Any]]] | None,
+        seconds: float,
+        unconditioned: int = 4,
+        metrics: dict[str, Metric] | None = None,
+    ):
+        if not seconds > 0:
+            raise ValueError(f"callbacks.samples.seconds={seconds}: motions last longer than 0 seconds")
+        self.folder, self.every_n_steps, self.seconds = Path(folder), every_n_steps, seconds
+        self.prompts = [(p, {}) if isinstance(p, str) else (p[0], dict(p[1])) for p in prompts or []]
+        self.unconditioned, self.metrics = unconditioned, metrics or {}
+        self.next = every_n_steps
+        self.written: tuple[int, Path, dict[str, float | None]] = (-1, self.folder, {})
+
+    @property
+    def texts(self) -> list[str]:
+        """The prompts without what they ask for."""
+        return [text for text, _ in self.prompts]
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        self.next = trainer.global_step + self.every_n_steps
+        assert isinstance(pl_module, MotionGeneration)
+        actions = pl_module.facts["actions"]
+        if isinstance(pl_module.condition, ActionLabels) and not set(self.texts) & set(actions):
+            # those of a recipe for texts, under condition=action
+            self.prompts = [(action, {"action": action}) for action in actions[: len(self.prompts)]]
+
+    def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
+        if not len(trainer.datamodule.val):  # type: ignore[attr-defined]  # a set published without validation clips
+            self._write_if_due(trainer, pl_module)
+
+    def on_validation_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        self._write_if_due(trainer, pl_module)
+
+    def _write_if_due(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        if trainer.global_step >= self.next:
+            self.next += self.every_n_steps
+            self.write(trainer, pl_module)
+
+    def on_fit_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        if self.written[0] != trainer.global_step:  # the last validation may have written them
+            self.write(trainer, pl_module)
+        _, folder, values = self.written
+        if trainer.is_global_zero:
+            for name, value in values.items():
+                say(f"{name}: {'not asked' if value is None else f'{value:.3f}'}")
+            say(f"see the motions: {folder / 'player.html'} (any browser), {folder / 'motions.gif'}")
+
+    def write(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Samples on all processes, a part on each; the first measures, writes files and tells the dashboard."""
+        assert isinstance(pl_module, MotionGeneration)
+        step = trainer.global_step
+        folder = self.folder / f"step_{step:07d}"
+        motions = self._sample(pl_module, trainer.global_rank, trainer.world_size)
+        if trainer.world_size > 1:
+            parts: list[Any] = [None] * trainer.world_size
+            torch.distributed.all_gather_object(parts, motions)
+            motions = [motion for row in zip_longest(*parts) for motion in row if motion is not None]
+        self.written = (step, folder, {})
+        if not trainer.is_global_zero:
+            return
+        write_motions(folder, motions, {"seed": 0, "step": step, "checkpoint": ""})
+        values = self.measure(motions)
+        for logger in trainer.loggers:
+            # Lightning counts steps from 0 on dashboards: those of this validation stand at step - 1
+            log_video(logger, "samples", folder / "motions.gif", step - 1)
+            logger.log_metrics({f"samples/{k}": v for k, v in values.items() if v is not None}, step - 1)
+        self.written = (step, folder, values)
+
+    def _sample(self, model: MotionGeneration, rank: int, world: int) -> list[Motion]:
+        """The motions of every `world`-th prompt; the first process samples all that have none."""
+        texts = self.texts[rank::world]
+        if not texts and (self.texts or rank):
+            return []
+        labels = bool(texts) and texts[0] in model.facts["actions"]
+        return generate(
+            model,
+            None if labels or not texts else texts,
+            actions=texts if labels else None,
+            frames=min(round(self.seconds * model.representation.fps), model.facts["max_frames"]),
+            samples=1 if texts else self.unconditioned,
+            seed=0,
+        )
+
+    def measure(self, motions: Sequence[Motion]) -> dict[str, float | None]:
+        """Values of all metrics on the motions, None where a metric has nothing to say."""
+        values: dict[str, float | None] = {}
+        for name, metric in self.metrics.items():
+            metric.reset()
+            metric.distributed_available_fn = bool  # False: the first process has all motions, and no other computes
+            for motion, (_, asked) in zip(motions, self.prompts, strict=True):
+                joints = torch.from_numpy(motion.joints)[None]
+                mask = torch.ones(joints.shape[:2], dtype=torch.bool)
+                known = {"joints": joints, "mask": mask, "asked": [asked]}
+                metric.update(**{k: v for k, v in known.items() if k in signature(metric.update).parameters})
+            result = metric.compute()
+            parts = result if isinstance(result, dict) else {"": result}
+            values |= {f"{name}/{k}".rstrip("/"): None if v is None else float(v) for k, v in parts.items()}
+        return values

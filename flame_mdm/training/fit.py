@@ -1,0 +1,130 @@
+"""One training: parts of the recipe, callbacks, trainer, and what ends it."""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import subprocess
+import warnings
+from pathlib import Path
+from typing import Any
+
+import torch
+from hydra.utils import get_class
+from lightning import Callback, Trainer, seed_everything
+from lightning.fabric.plugins.environments.slurm import SLURMEnvironment
+from lightning.fabric.plugins.environments.torchelastic import TorchElasticEnvironment
+from lightning.pytorch.callbacks import EMAWeightAveraging
+
+from flame_mdm.config import Config, instantiate
+from flame_mdm.data.datamodule import MotionDataModule
+from flame_mdm.errors import UserError, say
+from flame_mdm.task import Task
+from flame_mdm.training.callbacks import Interrupted, Measurements, Progress, Report
+from flame_mdm.training.guards import WholeCheckpoints, lost_worker, newest, out_of_memory
+from flame_mdm.training.loggers import History
+from flame_mdm.training.provenance import Provenance
+
+
+def fit(folder: Path, config: Config) -> None:
+    """Trains a recipe in the folder of its run, from the newest checkpoint there; errors as of `flame-mdm train`."""
+    _quiet()
+    torch.set_float32_matmul_precision("high")
+    checkpoint, step = newest(folder / "checkpoints")
+    most = config["trainer"]["max_steps"]
+    if 0 <= most <= step:
+        say(f"{folder} is trained to step {step} already: raise trainer.max_steps, or start anew with run.name=...")
+        return
+    seed_everything(config["seed"], verbose=False)
+    representation = instantiate(config["representation"])
+    data: MotionDataModule = instantiate(config["data"], representation=representation, seed=config["seed"])
+    if checkpoint is not None:
+        _same_data(checkpoint, data)
+    task: Task = get_class(config["task"]["_target_"]).build(config, representation, actions=data.actions)
+    callbacks: list[Callback] = [Provenance(config)]
+    if config["ema"]:
+        # Before those that look at averaged weights in validation. Buffers are copied, not averaged.
+        callbacks.append(EMAWeightAveraging(use_buffers=False, **config["ema"]))
+    callbacks += [instantiate(c) for c in config["callbacks"].values() if c]
+    if config["trainer"].get("enable_progress_bar", True):
+        callbacks.append(Progress())
+    callbacks += [Measurements(), Report(folder)]
+    loggers = [instantiate(config["logger"])] if config["logger"] else []
+    plugins: list[Any] = [WholeCheckpoints()]
+    if SLURMEnvironment.detect() and not TorchElasticEnvironment.detect():
+        # Lightning would save in the middle of a step, to a file that it then prefers to ours.
+        plugins.append(SLURMEnvironment(auto_requeue=False))
+    trainer: Trainer = instantiate(
+        config["trainer"],
+        logger=[*loggers, History(folder, step)],
+        callbacks=callbacks,
+        plugins=plugins,
+        default_root_dir=str(folder),
+        enable_model_summary=False,
+    )
+    try:
+        trainer.fit(task, data, ckpt_path=checkpoint, weights_only=True)
+    except Interrupted as stop:
+        if (
+            not trainer.is_global_zero
+        ):  # the first process tells; what starts processes takes any other code for a crash
+            return
+        say(f"stopped at step {stop.step}; the same command goes on from there")
+        if stop.signum in (signal.SIGUSR1, signal.SIGUSR2):
+            _requeue()
+        raise SystemExit(128 + stop.signum) from None
+    except (Exception, SystemExit) as error:
+        if trainer.strategy.launcher is not None:  # else the processes it started wait for this one for half an hour
+            trainer.strategy.launcher.kill(signal.SIGKILL)
+        if isinstance(error, SystemExit):  # a second signal
+            say("stopped at once; the same command resumes from the last checkpoint")
+        lost = lost_worker(error) if data.num_workers else None
+        if told := lost or out_of_memory(error, callbacks, trainer.global_step):
+            raise told from error
+        raise
+
+
+def _requeue() -> None:
+    """Puts the SLURM job that this is back into the queue."""
+    job = os.environ.get("SLURM_JOB_ID")
+    if job is None:
+        return
+    command = ["scontrol", "requeue", job]
+    try:
+        result = subprocess.run(command, capture_output=True, text=True, check=False)
+        failure = result.stderr.strip() if result.returncode else None
+    except OSError as error:
+        failure = str(error)
+    if failure is None:
+        say(f"job {job} is in the queue again")
+    else:
+        say(f"error: {' '.join(command)}: {failure}; submit the job again", error=True)
+
+
+def _same_data(checkpoint: Path, data: MotionDataModule) -> None:
+    """Refuses to resume a run on data other than it was trained on; the first process looks, for all of them."""
+    import torch
+    from lightning.pytorch.utilities import rank_zero_only
+
+    if rank_zero_only.rank:
+        return
+    data.prepare_data()
+    facts = torch.load(checkpoint, map_location="cpu", weights_only=True, mmap=True)["facts"]  # reads no weights
+    trained, found = facts.get("fingerprint"), data.open().fingerprint
+    if trained not in (None, found):
+        raise UserError(
+            f"{checkpoint}: was trained on data with the fingerprint {trained}, {data.folder} has {found}. Train on it "
+            "as another run with run.name=..., or prepare the first data again"
+        )
+
+
+def _quiet() -> None:
+    """Silences what Lightning says about choices that are made on purpose here."""
+    logging.getLogger("lightning.pytorch").setLevel(logging.ERROR)
+    for message in (
+        ".*does not have many workers.*",
+        ".*Checkpoint directory .* exists and is not empty.*",
+        ".*sync_dist=True.*",  # the metrics are means over all processes already
+    ):
+        warnings.filterwarnings("ignore", message)

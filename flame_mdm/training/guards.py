@@ -1,0 +1,245 @@
+"""What keeps long runs from harm: one run a folder, whole checkpoints, a stop at bad losses."""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import json
+import os
+import re
+import shutil
+import socket
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import torch
+from lightning import Callback, LightningModule, Trainer
+from lightning.pytorch.plugins.io import TorchCheckpointIO
+from torch import Tensor
+
+from flame_mdm.checkpoints.files import read_checkpoint
+from flame_mdm.errors import UserError, say
+from flame_mdm.files import made_folder, write_failure
+from flame_mdm.motion import MotionBatch
+
+LAST, PREVIOUS = "last.ckpt", "previous.ckpt"
+
+
+@contextmanager
+def only_run(folder: Path) -> Iterator[None]:
+    """Holds `run.lock` in the folder of a run, with process and host in it, for as long as the run lasts.
+
+    The operating system releases the lock when a process ends in any way, so a free lock in a file that still names a
+    process was left behind by one that died. POSIX record locks also hold between hosts on NFS and Lustre; `filelock`
+    uses flock, which Lustre limits to one host by default, and empties the file that names the owner. Windows has
+    neither.
+
+    Raises:
+        UserError: another process, here or on another host of a shared file system, holds it.
+    """
+    path, new = folder / "run.lock", not folder.exists()
+    with made_folder(folder), path.open("a+") as file:
+        file.seek(0)
+        before = file.read().strip()
+        try:
+            fcntl.lockf(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            if error.errno in (errno.EACCES, errno.EAGAIN):
+                raise UserError(
+                    f"{folder}: {before or 'another process'} trains here now; give this run a name of its own with "
+                    "run.name=..., or end that one"
+                ) from None
+            say(f"{path}: this file system has no locks ({error.strerror}); do not start a second run in the folder")
+        if before:
+            say(f"{folder}: {before} ended without a word; its run is taken over")
+            for unfinished in (folder / "checkpoints").glob("*.partial"):
+                unfinished.unlink(missing_ok=True)
+        file.truncate(0)
+        file.write(f"process {os.getpid()} on {socket.gethostname()}\n")
+        file.flush()
+        try:
+            yield
+        finally:
+            path.unlink(missing_ok=True)
+            if new and not (folder / "config.yaml").exists():  # training did not start: only loggers' files are there
+                shutil.rmtree(folder, ignore_errors=True)
+
+
+class WholeCheckpoints(TorchCheckpointIO):
+    """Writes checkpoints under a temporary name, to the disk, then renames; `last.ckpt` becomes `previous.ckpt`."""
+
+    def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None) -> None:
+        """Writes one.
+
+        Raises:
+            UserError: it cannot be written, such as on a full disk; the ones before are left as they are.
+        """
+        path = Path(path)
+        partial = path.with_suffix(".partial")
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with partial.open("wb") as file:
+                torch.save(checkpoint, file)
+                file.flush()
+                os.fsync(file.fileno())
+            if path.name == LAST and path.exists():
+                path.replace(path.with_name(PREVIOUS))
+            partial.replace(path)
+        except (OSError, RuntimeError) as error:  # torch reports a failed write as either
+            partial.unlink(missing_ok=True)
+            reason = write_failure(error if isinstance(error, OSError) else error.__context__ or error, path)
+            raise UserError(
+                f"{path}: step {checkpoint['global_step']} cannot be written ({reason}); "
+                "the checkpoints before are whole: make room, and the same command goes on from there"
+            ) from error
+
+
+def newest(folder: Path) -> tuple[Path | None, int]:
+    """The checkpoint to go on from, and its step: the last one, or the one before if the last is damaged.
+
+    Args:
+        folder: where `WholeCheckpoints` writes; need not exist.
+
+    Returns:
+        (None, 0) where there is none.
+
+    Raises:
+        UserError: all that are there are damaged.
+    """
+    there = [folder / name for name in (LAST, PREVIOUS) if (folder / name).exists()]
+    for number, path in enumerate(there):
+        try:
+            step = _resumable(path, read_checkpoint(path))
+        except UserError as error:
+            if number + 1 == len(there):
+                raise UserError(f"{error}; no other is left to go on from: delete {folder} to start anew") from error
+            say(f"{error}; going on from the one before")
+        else:
+            if path.name != LAST:
+                say(f"{path}: going on from step {step}")
+            return path, step
+    return None, 0
+
+
+def _resumable(path: Path, checkpoint: dict[str, Any]) -> int:
+    """The step of a checkpoint that has all that training resumes with."""
+    step, optimizers = checkpoint.get("global_step"), checkpoint.get("optimizer_states")
+    if type(step) is not int or step < 0:
+        raise UserError(f"{path}: damaged: its global_step is {str(step)[:40]}, not a number of steps")
+    whole = isinstance(optimizers, list) and all(
+        isinstance(state, dict)
+        and isinstance(state.get("state"), dict)
+        and isinstance(state.get("param_groups"), list)
+        and all(isinstance(group, dict) and isinstance(group.get("params"), list) for group in state["param_groups"])
+        for state in optimizers
+    )
+    if not whole or not all(isinstance(checkpoint.get(name), dict) for name in ("loops", "callbacks")):
+        raise UserError(f"{path}: damaged: it lacks the state of the optimizer, of the loops or of the callbacks")
+    return step
+
+
+class BadLoss(Callback):
+    """Stops training when a loss is not finite or explodes, before a checkpoint is spoiled.
+
+    Losses stay on the device until the log interval or a checkpoint, so that no step waits for them. What was in the
+    first bad batch is written to `bad_batch.json`: the step, and of each process the number of the batch, the ids of
+    its clips and its loss. Batch and draws are functions of (seed, number), so that it can be looked at again.
+
+    Args:
+        folder: of the run.
+        factor: a loss so many times the median of the interval before is an explosion.
+    """
+
+    def __init__(self, folder: str, factor: float = 1000.0):
+        self.path, self.factor = Path(folder) / "bad_batch.json", factor
+        self.usual = float("inf")
+        self.seen: list[tuple[int, int, Sequence[str], Tensor]] = []
+        self.shape: tuple[int, ...] = ()
+
+    def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: MotionBatch, _: int) -> None:
+        self.shape = tuple(batch.x.shape)
+
+    def on_validation_batch_start(
+        self, trainer: Trainer, pl_module: LightningModule, batch: MotionBatch, *_: Any
+    ) -> None:
+        self.shape = tuple(batch.x.shape)
+
+    def on_train_batch_end(
+        self,
+        trainer: Trainer,
+        pl_module: LightningModule,
+        outputs: Tensor | Mapping[str, Any] | None,
+        batch: MotionBatch,
+        batch_idx: int,
+    ) -> None:
+        loss = outputs["loss"] if isinstance(outputs, Mapping) else outputs
+        assert loss is not None
+        self.seen.append((trainer.global_step, batch_idx, batch.ids, loss.detach()))
+        if (batch_idx + 1) % trainer.log_every_n_steps == 0:  # type: ignore[attr-defined]
+            self.check(trainer)
+
+    def on_save_checkpoint(self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]) -> None:
+        self.check(trainer)
+
+    def check(self, trainer: Trainer) -> None:
+        """Looks at the losses since the last check; all processes do so at the same step.
+
+        Raises:
+            UserError: one of them is bad, on any process.
+        """
+        if not self.seen:
+            return
+        mine = torch.stack([s[-1].float() for s in self.seen])
+        parts = [torch.empty_like(mine) for _ in range(trainer.world_size)]
+        if trainer.world_size > 1:
+            torch.distributed.all_gather(parts, mine)
+        losses = torch.stack(parts if trainer.world_size > 1 else [mine]).cpu()
+        bad = ~losses.isfinite() | (losses > self.factor * self.usual)
+        if bad.any():
+            first = int(bad.any(0).nonzero()[0])
+            step, number, ids, _ = self.seen[first]
+            everyone: list[Any] = [{"rank": trainer.global_rank, "batch": number, "ids": list(ids)}]
+            if trainer.world_size > 1:
+                own, everyone = everyone[0], [None] * trainer.world_size
+                torch.distributed.all_gather_object(everyone, own)
+            values = losses[:, first].tolist()
+            for part, value in zip(everyone, values, strict=True):
+                part["loss"] = str(value)
+            if trainer.is_global_zero:
+                self.path.write_text(json.dumps({"step": step, "usual_loss": str(self.usual), "batches": everyone}))
+            raise UserError(
+                f"the loss of step {step} is {max(values, key=lambda v: v if v == v else float('inf')):g}"
+                + (f", {self.usual:.3g} was usual" if self.usual < float("inf") else "")
+                + f"; the clips of the batch stand in {self.path}. Lower optimizer.lr, set trainer.gradient_clip_val, "
+                "or look at these clips; checkpoints before are whole"
+            )
+        self.usual = float(losses.median())
+        self.seen = []
+
+
+def lost_worker(error: BaseException) -> UserError | None:
+    """Returns what to print if an error means that a loading process died, otherwise None."""
+    message = f"{error} {error.__cause__ or ''}"  # it may come while a checkpoint is written
+    lost = re.search(r"DataLoader worker \(pid.*?\) (?:is killed by signal: (\w+)|exited unexpectedly)", message)
+    if lost is None and not isinstance(error, ConnectionError | EOFError):  # a pipe breaks before torch notices
+        return None
+    killed = lost and lost[1]
+    how = f"was killed (signal: {killed}), as happens when memory runs out" if killed else "ended unexpectedly"
+    return UserError(
+        f"a loading process {how}. Checkpoints are whole, and the same command resumes from the last one; lower "
+        "data.num_workers, or set data.num_workers=0 to load without further processes"
+    )
+
+
+def out_of_memory(error: BaseException, callbacks: Sequence[Callback], step: int) -> UserError | None:
+    """What to tell where an error means that the memory is used up; None where it means something else."""
+    if not isinstance(error, torch.OutOfMemoryError) and "can't allocate memory" not in str(error):
+        return None
+    shape = next((c.shape for c in callbacks if isinstance(c, BadLoss) and c.shape), None)
+    batch = f" with a batch of {shape[0]} clips, {shape[1]} frames, {shape[2]} features" if shape else ""
+    return UserError(
+        f"out of memory at step {step}{batch}: lower data.batch_size (trainer.accumulate_grad_batches makes up for "
+        "it), set trainer.precision=bf16-mixed, or shorten the crops or the network"
+    )

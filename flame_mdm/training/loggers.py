@@ -1,0 +1,143 @@
+"""Where the numbers of a run go: a file beside it, TensorBoard, Weights & Biases."""
+
+from __future__ import annotations
+
+import io
+import json
+import secrets
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from lightning.pytorch.loggers import Logger, TensorBoardLogger, WandbLogger
+from lightning.pytorch.utilities import rank_zero_only
+from omegaconf import OmegaConf
+from typing_extensions import TypedDict
+
+from flame_mdm.config import Config
+from flame_mdm.files import write_json, write_text
+from flame_mdm.runs import HISTORY, read_json, records
+
+
+class History(Logger):
+    """Appends all that loggers get to `metrics.jsonl` in the run's folder, a line of JSON with `step` each time.
+
+    Reports and comparisons read it, whatever dashboard the run has.
+
+    Args:
+        folder: of the run.
+        step: that training goes on from; what a run that was killed wrote beyond it is dropped.
+    """
+
+    def __init__(self, folder: str | Path, step: int = 0):
+        super().__init__()
+        self.path, self.step = Path(folder) / HISTORY, step
+        self.begun = False
+
+    @property
+    def name(self) -> str:
+        """Of the logger."""
+        return "history"
+
+    @property
+    def version(self) -> str:
+        """Is always the same: a run has one history."""
+        return ""
+
+    @rank_zero_only
+    def log_hyperparams(self, *args: Any, **kwargs: Any) -> None:
+        """Does nothing: `config.yaml` has them."""
+
+    @rank_zero_only
+    def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:
+        """Appends a line."""
+        if not self.begun:
+            kept = [line for line in records(self.path) if line["step"] <= self.step]
+            write_text(self.path, "".join(json.dumps(line) + "\n" for line in kept))
+            self.begun = True
+        with self.path.open("a") as file:
+            file.write(json.dumps({"step": step, **metrics}) + "\n")
+
+
+class Kept(TypedDict, total=False):
+    """What `wandb.json` keeps."""
+
+    id: str
+    step: int | None
+    rows: int
+
+
+class WandbRun(WandbLogger):
+    """One run on Weights & Biases, however often it is resumed.
+
+    `wandb.json` in the run's folder keeps its id, the step it has come to, and the number of its rows. Steps that are
+    trained again after a kill have the values they had, and are not told twice, so that `trainer/global_step` never
+    goes back.
+
+    Args:
+        save_dir: the run's folder.
+        options: as `WandbLogger` takes them.
+    """
+
+    def __init__(self, save_dir: str, **options: Any):
+        self.path = Path(save_dir) / "wandb.json"
+        kept = read_json(self.path, Kept, "delete it, and wandb gets a new run") if self.path.exists() else {}
+        told = kept.get("step")
+        self.told, self.rows = -1 if told is None else told, kept.get("rows", 0)
+        known: dict[str, Any] = {"id": kept.get("id") or secrets.token_hex(4)}
+        super().__init__(save_dir=save_dir, **(known | options))
+        self._wandb_init.pop("anonymous")  # wandb warns of it even where it is not set
+
+    @rank_zero_only
+    def log_metrics(self, metrics: Mapping[str, Any], step: int | None = None) -> None:
+        """Logs numbers, tables and videos at a step, unless an earlier part of the run was further."""
+        if step is not None and step < self.told:
+            return
+        if self.experiment.step < self.rows:  # wandb numbers the rows of an offline part anew, from 0
+            self.experiment.log({}, step=self.rows)
+        super().log_metrics(metrics, step)
+        write_json(self.path, {"id": self.experiment.id, "step": step, "rows": self.experiment.step}, indent=None)
+
+    @rank_zero_only
+    def finalize(self, status: str) -> None:
+        """Ends the run: the next one of a sweep, in the same process, is another."""
+        super().finalize(status)
+        if self._experiment is not None:
+            self._experiment.finish(exit_code=int(status != "success"))
+            self._experiment = None
+
+
+def log_config(logger: Logger, config: Config, facts: Mapping[str, Any]) -> None:
+    """Shows configuration and provenance on the dashboard."""
+    if isinstance(logger, TensorBoardLogger):
+        for name, content in (("config", config), ("provenance", facts)):
+            text = OmegaConf.to_yaml(OmegaConf.create(dict(content)))
+            logger.experiment.add_text(name, "".join(f"    {line}\n" for line in text.splitlines()))
+    elif isinstance(logger, WandbLogger):
+        logger.log_hyperparams({**config, "provenance": dict(facts)})
+
+
+def log_table(logger: Logger, name: str, head: Sequence[str], rows: Sequence[Sequence[Any]], step: int) -> None:
+    """Shows a table on the dashboard."""
+    if isinstance(logger, TensorBoardLogger):
+        lines = [head, ["---"] * len(head), *rows]
+        logger.experiment.add_text(name, "\n".join(f"| {' | '.join(map(str, line))} |" for line in lines), step)
+    elif isinstance(logger, WandbLogger):
+        logger.log_table(name, columns=list(head), data=[list(row) for row in rows], step=step)
+
+
+def log_video(logger: Logger, name: str, gif: Path, step: int) -> None:
+    """Shows an animation on the dashboard."""
+    if isinstance(logger, TensorBoardLogger):
+        from PIL import Image
+        from tensorboard.compat.proto.summary_pb2 import Summary  # type: ignore[attr-defined]
+
+        data = gif.read_bytes()
+        width, height = Image.open(io.BytesIO(data)).size
+        image = Summary.Image(height=height, width=width, colorspace=3, encoded_image_string=data)
+        summary = Summary(value=[Summary.Value(tag=name, image=image)])
+        logger.experiment._get_file_writer().add_summary(summary, step)
+    elif isinstance(logger, WandbLogger):
+        import wandb
+
+        logger.log_metrics({name: wandb.Video(str(gif), format="gif")}, step)  # type: ignore[dict-item]

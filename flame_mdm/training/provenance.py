@@ -1,0 +1,89 @@
+"""What a run is made of, written beside it."""
+
+from __future__ import annotations
+
+import platform
+import subprocess
+import sys
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import torch
+from lightning import Callback, LightningModule, Trainer
+
+from flame_mdm.config import Config, movable, save
+from flame_mdm.errors import say
+from flame_mdm.files import write_json
+from flame_mdm.training.loggers import log_config
+
+PACKAGES = ("flame-mdm", "torch", "lightning", "torchmetrics", "transformers", "numpy", "scipy")
+
+
+class Provenance(Callback):
+    """At the start of a fit: `config.yaml` and `provenance.json` in the run's folder, and four lines on the screen.
+
+    The dashboard gets both files, too.
+    """
+
+    def __init__(self, config: Config):
+        self.config = config
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        if not trainer.is_global_zero:
+            return
+        folder = Path(self.config["run"]["dir"])
+        save(movable(self.config), folder / "config.yaml", head="A saved run; EXP=path/to/this/file repeats it.")
+        facts = {
+            **environment(),
+            "device": _device(trainer),
+            "parameters": sum(p.numel() for p in pl_module.parameters() if p.requires_grad),
+            "data": pl_module.facts,
+        }
+        write_json(folder / "provenance.json", facts)
+        for logger in trainer.loggers:
+            log_config(logger, self.config, facts)
+        self._introduce(trainer, pl_module, facts)
+
+    def _introduce(self, trainer: Trainer, task: Any, facts: dict[str, Any]) -> None:
+        count = facts["parameters"]
+        size = self.config["data"]["batch_size"] * trainer.world_size * trainer.accumulate_grad_batches
+        data = trainer.datamodule.store.info  # type: ignore[attr-defined]
+        clips = data["clips"]
+        splits = f"{clips['train']} clips to train on, {clips['val']} to validate, {clips['test']} to test"
+        say(f"{self.config['experiment']}: {task.describe()}, {count / 1e6:.2f} M trainable parameters")
+        say(f"data: {data['dataset']} as {data['representation']}, {splits}; {data['hours']} hours")
+        say(f"device: {facts['device']}, {self.config['trainer']['precision']}")
+        if size > self.config["data"]["batch_size"]:
+            times = f"{trainer.world_size} processes x {trainer.accumulate_grad_batches} accumulated"
+            each, lr = self.config["data"]["batch_size"], self.config["optimizer"].get("lr")
+            say(f"batch: {size} clips = {each} x {times}; optimizer.lr={lr} is not scaled with it")
+        passes = trainer.max_steps * size / clips["train"]
+        say(f"steps: {trainer.global_step} to {trainer.max_steps} of {size} clips, {passes:.0f} passes over the data")
+
+
+def _device(trainer: Trainer) -> str:
+    where = trainer.strategy.root_device
+    name = torch.cuda.get_device_name(where) if where.type == "cuda" else where.type
+    return f"{trainer.world_size} x {name}"
+
+
+def environment() -> dict[str, Any]:
+    """Command, code, machine and versions, as they stand beside every run and result."""
+    return {
+        "command": sys.argv,
+        "commit": _git("rev-parse", "HEAD"),
+        "changed": _git("status", "--porcelain", "--untracked-files=no"),
+        "python": platform.python_version(),
+        "machine": platform.platform(),
+        "packages": {name: version(name) for name in PACKAGES},
+    }
+
+
+def _git(*words: str) -> str | None:
+    try:
+        folder = Path(__file__).parent
+        result = subprocess.run(["git", *words], capture_output=True, text=True, cwd=folder, check=False)
+    except FileNotFoundError:  # no git on this machine
+        return None
+    return result.stdout.strip() if result.returncode == 0 else None

@@ -1,0 +1,97 @@
+"""Commands on input that they must refuse: one line, exit code 1, nothing left behind."""
+
+import os
+import re
+import resource
+import signal
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+
+from flame_mdm.__main__ import main
+
+
+class Refused:
+    """Runs commands on input that they must refuse, and collects the cases where they do not refuse it well.
+
+    Attributes:
+        every: of the cases, every so many are run; FLAME_MDM_FUZZ=all runs all.
+        seconds: longest time of a command.
+        memory: bytes of address space that a command may add; None = any.
+    """
+
+    every: int
+    seconds: int
+    memory: int | None
+
+    def __init__(self, folder: Path, capture: pytest.CaptureFixture[str], watched: Sequence[Path]):
+        self.folder, self.capture, self.watched = folder, capture, [folder, *watched]
+        self.count, self.every, self.faults = 0, 1, list[str]()
+        self.seconds, self.memory = 30, None
+
+    def __call__(self, command: str, *words: str, says: str = "") -> None:
+        """Runs one command, whose error line must contain `says`."""
+        self.count += 1
+        if self.count % self.every and os.environ.get("FLAME_MDM_FUZZ") != "all":
+            return
+        before = self._tree()
+        self.capture.readouterr()
+
+        def late(*_: object) -> None:
+            raise TimeoutError
+
+        handler = signal.signal(signal.SIGALRM, late)
+        signal.alarm(self.seconds)
+        limits = resource.getrlimit(resource.RLIMIT_AS)
+        if self.memory is not None:
+            resource.setrlimit(resource.RLIMIT_AS, (address_space() + self.memory, limits[1]))
+        try:
+            code: object = main([command, *words])
+        except TimeoutError:
+            code = f"no end after {self.seconds} s"
+        except BaseException as error:
+            place = error.__traceback__
+            while place and place.tb_next:
+                place = place.tb_next
+            code = f"{type(error).__name__}: {error}" + (
+                f" ({place.tb_frame.f_code.co_filename}:{place.tb_lineno})" if place else ""
+            )
+        finally:
+            signal.alarm(0)
+            resource.setrlimit(resource.RLIMIT_AS, limits)
+            signal.signal(signal.SIGALRM, handler)
+        out, err = self.capture.readouterr()
+        told = [
+            f"it ended with {code}" if code not in (1, 2) else "",
+            f"it left {sorted(map(str, self._tree() ^ before))}" if self._tree() != before else "",
+            "a traceback" if "Traceback" in out + err else "",
+            f"it said {err!r}" if not one_line(err, command) or says not in err else "",
+            "it ran out of memory" if "out of memory" in err else "",
+        ]
+        if any(told):
+            self.faults.append(f"{command} {str(words)[-200:]}: {'; '.join(filter(None, told))}")
+
+    def _tree(self) -> set[Path]:
+        return {path for folder in self.watched for path in folder.rglob("*")}
+
+
+def address_space() -> int:
+    """Bytes of address space of this process."""
+    pages = int(Path("/proc/self/statm").read_text().split()[0])
+    return pages * resource.getpagesize()
+
+
+def one_line(err: str, command: str) -> bool:
+    """Whether a refusal is one clear line.
+
+    What goes before an error in the middle of work are its progress bars, on lines of their own.
+    """
+    lines = [line for line in err.splitlines() if line and not re.match(r"\r?(generating|preparing \w+): ", line)]
+    return len(lines) == 1 and lines[0].startswith("error: ") and len(lines[0]) > len("error: ") + 8
+
+
+def carry_out(task: tuple) -> object:
+    """Calls the first of these with the others; for processes of their own, which import no more than this module."""
+    function, *arguments = task
+    return function(*arguments)

@@ -1,0 +1,487 @@
+"""Crafted motion files, data folders and archives: refused in one line, at once, in little memory; nothing is left."""
+
+import bz2
+import gzip
+import hashlib
+import io
+import json
+import lzma
+import os
+import pickle
+import signal
+import struct
+import tarfile
+import time
+import zipfile
+from collections.abc import Callable, Iterator
+from multiprocessing import active_children
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from refusals import Refused, carry_out
+from test_fuzz import body, bvh
+
+from evaluators.sources import read_samples
+from flame_mdm.data import archives, restricted_pickle
+from flame_mdm.data.amass import read as read_amass
+from flame_mdm.data.crops import Fixed, Whole
+from flame_mdm.data.datamodule import MotionDataModule
+from flame_mdm.data.parallel import in_order
+from flame_mdm.data.store import Store
+from flame_mdm.errors import UserError
+from flame_mdm.files import MEBIBYTE
+from flame_mdm.formats import resampling
+from flame_mdm.formats.bvh import read
+
+
+def header(shape: tuple[int, ...], dtype: str = "<f8") -> bytes:
+    """The header of an .npy file that declares any shape."""
+    stream = io.BytesIO()
+    np.lib.format.write_array_header_1_0(stream, {"descr": dtype, "fortran_order": False, "shape": shape})
+    return stream.getvalue()
+
+
+def npz(**arrays: Any) -> bytes:
+    stream = io.BytesIO()
+    np.savez(stream, **arrays)
+    return stream.getvalue()
+
+
+def zipped(members: dict[str, bytes], method: int = zipfile.ZIP_DEFLATED) -> bytes:
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w", method) as archive:
+        for name, content in members.items():
+            archive.writestr(name, content)
+    return stream.getvalue()
+
+
+def changed(data: bytes, *, flags: int | None = None, method: int | None = None) -> bytes:
+    """A zip archive with other flags or another method in all headers of its members."""
+    content = bytearray(data)
+    for magic, at in ((b"PK\3\4", 6), (b"PK\1\2", 8)):
+        place = content.find(magic)
+        while place >= 0:
+            if flags is not None:
+                content[place + at : place + at + 2] = struct.pack("<H", flags)
+            if method is not None:
+                content[place + at + 2 : place + at + 4] = struct.pack("<H", method)
+            place = content.find(magic, place + 4)
+    return bytes(content)
+
+
+def zip_bomb(name: str, start: bytes = b"") -> bytes:
+    """A zip archive with a member of 300 MiB of zeros after `start`."""
+    stream = io.BytesIO()
+    archive = zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED, compresslevel=1)
+    with archive, archive.open(name, "w") as member:
+        member.write(start)
+        for _ in range(300):
+            member.write(bytes(2**20))
+    return stream.getvalue()
+
+
+def bvh_at(seconds: str, frames: int = 3) -> bytes:
+    return bvh(frames).replace("Frame Time: 0.05", f"Frame Time: {seconds}").encode()
+
+
+JOINTS = body(4).astype(float)
+BOMB = zip_bomb("joints.npy", header((300 * 2**20 // 528, 22, 3)))
+MOTIONS: dict[str, tuple[str, bytes, str]] = {
+    "bvh frame time": ("a.bvh", bvh_at("999999"), "frame time"),
+    "bvh frame rate": ("a.bvh", bvh_at("0.0000011"), "frame time"),
+    "bvh frames": ("a.bvh", bvh().replace("Frames: 3", "Frames: 1000000000").encode(), "1000000000"),
+    "bvh digits": ("a.bvh", bvh_at("1" * 40_000 + "x"), "Frame Time"),
+    "npz fps": ("a.npz", npz(joints=JOINTS, fps=1e-7), "fps is 1e-07, not a number"),
+    "npz rate": ("a.npz", npz(joints=JOINTS, fps=1e300), "fps is 1e+300, not a number"),
+    "amass rate": (
+        "a.npz",
+        npz(poses=np.zeros((4, 156)), trans=np.zeros((4, 3)), mocap_framerate=1e-7),
+        "not a number",
+    ),
+    "amass longdouble": (
+        "a.npz",
+        npz(poses=np.zeros((4, 156), np.longdouble), trans=np.zeros((4, 3)), mocap_framerate=20),
+        "poses are not an array of real numbers",
+    ),
+    "npz features": (
+        "a.npz",
+        npz(joints=JOINTS, fps=20, representation="smpl147", features=np.zeros((4, 147), [("a", "f4")])),
+        "features are not an array",
+    ),
+    "npz header": ("a.npz", zipped({"joints.npy": header((10**12, 22, 3)), "fps.npy": b"x"}), "declares"),
+    "npz bomb": ("a.npz", BOMB, "expand to"),
+    "npz encrypted": ("a.npz", changed(npz(joints=JOINTS, fps=20), flags=1), "encrypted"),
+    "npz method": ("a.npz", changed(npz(joints=JOINTS, fps=20), method=99), "method 99"),
+    "npz lzma": ("a.npz", zipped({"joints.npy": header((4, 22, 3))}, zipfile.ZIP_LZMA), "method 14"),
+    "npz bz2": ("a.npz", zipped({"joints.npy": header((4, 22, 3))}, zipfile.ZIP_BZIP2), "method 12"),
+    "npz objects": ("a.npz", npz(joints=np.array([{}]), fps=20), "Python objects"),
+}
+
+
+def prepared(attacked: Refused, bad: Path, change: Callable[[Path], Any], says: str) -> None:
+    """Prepares a folder of two motions after a change."""
+    place = bad / f"data{attacked.count}"
+    place.mkdir()
+    for name in "ac":
+        np.savez(place / f"{name}.npz", joints=body(60), fps=20.0)
+    change(place)
+    root = bad.parent / f"prepared{attacked.count}"
+    attacked.watched.append(root)
+    attacked("prepare", "data=folder", f"source={place}", f"data_root={root}", says=says)
+
+
+@pytest.mark.parametrize("case", MOTIONS)
+def test_motion_files(attacked: Refused, bad: Path, trained: Path, case: str):
+    name, content, says = MOTIONS[case]
+    path = bad / name
+    path.write_bytes(content)
+    attacked("convert", str(path), "out=out.json", says=says)
+    prepared(attacked, bad, lambda place: (place / f"b{path.suffix}").write_bytes(content), says)
+    if not case.startswith("amass"):
+        attacked("edit", f"ckpt={trained}", f"motion={path}", "region=in_between", "text=a", says=says)
+
+
+def test_arrays_and_json(attacked: Refused, bad: Path):
+    for name, content, says in (
+        ("a.npy", header((10**12, 22, 3)), "declares"),
+        ("a.npy", header((2**62, 2**62)), "declares"),
+        ("a.npy", b"\x93NUMPY\x01\x00" + struct.pack("<H", 60000) + b"(" * 60000, "not an array"),
+        ("a.npy", b"\x93NUMPY\x01\x00" + struct.pack("<H", 60) + b"(" * 60, "not an array"),
+        ("a.json", b'{"joints": ' + b"[" * 10**6, "nested too deeply"),
+        ("a.json", json.dumps({"fps": 1e-7, "joints": JOINTS.tolist()}).encode(), "fps is 1e-07"),
+        ("a.json", b"\xff\xfe{}", "a.json: not a UTF-8 text file"),
+    ):
+        (bad / name).write_bytes(content)
+        attacked("convert", str(bad / name), "out=out.bvh", *(["fps=20"] if "npy" in name else []), says=says)
+
+
+def test_links_and_pipes(attacked: Refused, bad: Path, trained: Path):
+    os.mkfifo(bad / "pipe")
+    for ending in ("npz", "bvh", "npy", "json"):
+        for number, target in enumerate((bad / "pipe", "/dev/zero", "loop", bad)):
+            path = bad / f"{number}.{ending}"
+            path.symlink_to(path if target == "loop" else target)
+            attacked("convert", str(path), "out=out.glb", "fps=20", says=str(path))
+            if ending in ("npz", "bvh"):
+                attacked("edit", f"ckpt={trained}", f"motion={path}", "region=in_between", "text=a", says=str(path))
+
+
+def test_entries_of_data_folders(attacked: Refused, bad: Path):
+    def loop(place: Path) -> None:
+        (place / "loop").symlink_to(place)
+        (place / "b.npz").symlink_to(place / "b.npz")
+
+    for name in ("b.npz", "b.bvh", "b.npy", "a.txt", "captions.csv", "captions.json", "skeleton.yaml"):
+        prepared(attacked, bad, lambda place, name=name: os.mkfifo(place / name), f"{name}: a pipe")
+        prepared(attacked, bad, lambda place, name=name: (place / name).symlink_to("/dev/zero"), f"{name}: a pipe")
+    for name in ("b.npz", "b.npy", "b.bvh"):
+        prepared(attacked, bad, lambda place, name=name: (place / name).write_bytes(b""), f"{name}")
+        prepared(attacked, bad, lambda place, name=name: (place / name).mkdir(), f"{name}: a folder")
+    prepared(attacked, bad, loop, "b.npz: cannot be read")
+    for name, shown in ((b"\x1b[31m", r"\x1b[31m"), (b"\xff", r"\udcff"), (b"x\ny", r"x\ny")):
+        prepared(
+            attacked,
+            bad,
+            lambda place, name=name: Path(os.fsdecode(os.fsencode(place) + b"/" + name + b".npz")).write_bytes(b""),
+            shown,
+        )
+
+
+ALIASES = "a0: &a0 [x, x, x, x, x, x, x, x, x, x]\n" + "".join(
+    f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 10)}]\n" for n in range(1, 9)
+)
+TABLES: list[tuple[str, bytes, str]] = [
+    ("skeleton.yaml", ALIASES.encode(), "skeleton.yaml"),
+    ("skeleton.yaml", b"a: &x [*x]", "skeleton.yaml"),
+    ("skeleton.yaml", b"[" * 10**5, "skeleton.yaml"),
+    ("skeleton.yaml", b"map: \xff", "skeleton.yaml: not a UTF-8"),
+    ("skeleton.yaml", b"fps: 1.0e-7", "skeleton.yaml: fps"),
+    ("skeleton.yaml", b"joints: [[a], [b]]", "skeleton.yaml: joints"),
+    ("skeleton.yaml", b"map: {pelvis: [a]}", "skeleton.yaml: map"),
+    ("skeleton.yaml", b"map: {pelvis: {a: x}}", "skeleton.yaml: map"),
+    ("captions.json", b"[" * 10**6, "captions.json"),
+    ("captions.json", b'{"a": ' * 10**5, "captions.json"),
+    ("captions.json", b'{"a": {"text": "\xff"}}', "captions.json: not a UTF-8"),
+    ("captions.csv", b"id,text\na," + b"x" * 200_000, "captions.csv, line"),
+    ("captions.csv", b"id," + b"x" * 200_000, "captions.csv, line"),
+    ("captions.csv", b"i\0d,text\n", "captions.csv"),
+    ("captions.csv", b"id,text\na,\xff\n", "captions.csv: not a UTF-8"),
+    ("a.txt", b"\xff\n", "a.txt: not a UTF-8"),
+]
+
+
+@pytest.mark.parametrize("number", range(len(TABLES)))
+def test_tables_of_data_folders(attacked: Refused, bad: Path, number: int):
+    name, content, says = TABLES[number]
+    prepared(attacked, bad, lambda place: (place / name).write_bytes(content), says)
+
+
+def test_long_motions_are_not_resampled_without_end():
+    for rate, fps, joints in ((0.1, 20, 22), (1, 1000, 22), (1, 20, 5000)):
+        with pytest.raises(ValueError, match="would become"):
+            resampling.resampled_frames(10_000, rate, fps, joints)
+    with pytest.raises(ValueError, match="more than the 500,000"):
+        resampling.resampled_frames(10**6, 120, 20, 22)
+    assert resampling.resampled_frames(432_000, 120, 20, 52) == 72_000  # an hour
+    assert resampling.resampled_frames(3, 0.1, 20, 22) == 401
+
+
+# Archives -------------------------------------------------------------------------------------------------------------
+
+TAKE = "dataset-1_walk_happy_001.bvh"
+
+
+def member(name: str, size: int = 0, kind: bytes = tarfile.REGTYPE, link: str = "") -> bytes:
+    """The header of a member of a tar archive that declares any size."""
+    info = tarfile.TarInfo(name)
+    info.size, info.type, info.linkname = size, kind, link
+    return info.tobuf(tarfile.GNU_FORMAT)
+
+
+def sparse(name: str, size: int) -> bytes:
+    """1,536 bytes of a tar archive, in which a file has any size."""
+    data = bytearray(member(name, 0, tarfile.GNUTYPE_SPARSE))
+    data[386:398] = b"00000000000\0"
+    data[483:495] = b"\x80" + size.to_bytes(11, "big")
+    data[148:156] = b" " * 8
+    data[148:156] = b"%06o\0 " % sum(data)
+    return bytes(data) + bytes(1024)
+
+
+def packed(opener: Callable, content: bytes) -> bytes:
+    """The content of a file compressed by `gzip.open` or the like."""
+    stream = io.BytesIO()
+    with opener(stream, "wb") as file:
+        file.write(content)
+    return stream.getvalue()
+
+
+def archive_cases() -> Iterator[tuple[bytes, str]]:
+    whole = bvh().encode()
+    yield sparse(TAKE, 40 * 10**9), "sparse"
+    yield member(TAKE, 10**12) + bytes(1024), "damaged archive"
+    for target in (TAKE, "/etc/passwd", "../../x", "none"):
+        for kind in (tarfile.SYMTYPE, tarfile.LNKTYPE):
+            yield member(TAKE, 0, kind, target) + bytes(1024), "a link"
+    yield member(TAKE, 0, tarfile.FIFOTYPE) + bytes(1024), "special file"
+    yield member("@LongLink", 10**10, tarfile.GNUTYPE_LONGNAME) + bytes(1024), "a header of"
+    yield member("x", 10**10, tarfile.XHDTYPE) + bytes(1024), "a header of"
+    for kind, values, says in ((tarfile.XGLTYPE, 200, "200 values for all"), (tarfile.XHDTYPE, 10_000, "a header of")):
+        records = b"".join(b"%d k%d=v\n" % (len(f"k{n}=v\n") + 3, n) for n in range(10_000, 10_000 + values))
+        padding = bytes(-len(records) % tarfile.BLOCKSIZE)
+        yield member("x", len(records), kind) + records + padding + member(TAKE) + bytes(1024), says
+    for opener in (gzip.open, bz2.open, lzma.open):
+        yield packed(opener, member(TAKE, 8 * MEBIBYTE) + bytes(8 * MEBIBYTE)), "expand to"
+        yield packed(opener, member("junk", 8 * MEBIBYTE) + bytes(8 * MEBIBYTE)), "expand to"
+    yield zipped({TAKE: bytes(8 * MEBIBYTE)}), "expand to"
+    yield changed(zipped({TAKE: whole}), flags=1), "encrypted"
+    yield changed(zipped({TAKE: whole}), method=99), "method 99"
+    yield zipped({TAKE: whole}, zipfile.ZIP_LZMA), "method 14"
+    yield zipped({TAKE: whole}, zipfile.ZIP_BZIP2), "method 12"
+    yield zipped({TAKE: whole})[:-30], "damaged archive"
+    yield b"PK\3\4", "damaged archive"
+    yield b"", "neither a folder nor"
+    yield bytes(10240), "no file dataset-1"
+
+
+def test_archives(attacked: Refused, bad: Path, monkeypatch):
+    monkeypatch.setattr("flame_mdm.files.ARRAYS_LIMIT", 4 * MEBIBYTE)  # packing more takes long
+    path, root = bad / "set", bad.parent / "prepared"
+    for content, says in archive_cases():
+        path.write_bytes(content)
+        words = ("data=bandai", f"source={path}", f"data_root={root}", "data.source.workers=1")
+        attacked("prepare", *words, says=says)
+    path.unlink()
+    os.mkfifo(path)
+    attacked("prepare", "data=bandai", f"source={path}", f"data_root={root}", says="a pipe")
+
+
+def test_a_tar_archive_of_many_members_takes_little_memory(tmp_path: Path):
+    path = tmp_path / "a.tar.gz"
+    path.write_bytes(gzip.compress(member("x") * 20_000 + bytes(1024)))
+    assert sum(1 for _ in archives.members(path)) == 20_000
+
+
+def test_recordings_of_amass_are_bounded(tmp_path: Path):
+    whole: dict[str, Any] = {"poses": np.zeros((4, 156)), "trans": np.zeros((4, 3)), "betas": np.zeros(16)}
+    whole |= {"gender": "male", "mocap_framerate": 120.0}
+    for change in (
+        {"mocap_framerate": np.inf},
+        {"mocap_framerate": 1e-7},
+        {"mocap_framerate": [1, 2]},
+        {"betas": np.array(["x"])},
+        {"betas": np.zeros(())},
+        {"gender": np.array(["a", "b"])},
+        {"poses": np.zeros((4, 156), "S1")},
+        {"poses": np.zeros(())},
+    ):
+        with pytest.raises(ValueError, match="here: "):
+            read_amass(npz(**whole | change), "here")
+
+
+# Workers --------------------------------------------------------------------------------------------------------------
+
+
+def no_children(before: list) -> bool:
+    for _ in range(500):
+        if not set(active_children()) - set(before):
+            return True
+        time.sleep(0.01)
+    return False
+
+
+@pytest.mark.parametrize("case", ["killed", "memory", "bomb", "pipe"])
+def test_one_bad_task_ends_all_workers(case: str, tmp_path: Path):
+    (tmp_path / "bomb").write_bytes(bvh_at("999999"))
+    os.mkfifo(tmp_path / "pipe")
+    tasks: dict[str, tuple] = {"killed": (signal.raise_signal, 9), "memory": (bytes, 2**60)}
+    task = tasks.get(case, (read, tmp_path / case))
+    before, start = active_children(), time.monotonic()
+    first = (abs, 1) if case == "killed" else (signal.raise_signal, signal.SIGSTOP)  # an end that does not come
+    with pytest.raises((UserError, ValueError, MemoryError)) as error:
+        list(in_order(carry_out, [first, task, *[(abs, -2)] * 9], workers=2))
+    assert "\n" not in str(error.value)
+    assert {"killed": "a worker process was killed", "bomb": "frame time", "pipe": "a pipe"}.get(case, "") in str(
+        error.value
+    )
+    assert no_children(before)
+    assert time.monotonic() - start < 60  # most of it for the processes to start
+
+
+# Pickles --------------------------------------------------------------------------------------------------------------
+
+
+def doubled(levels: int) -> bytes:
+    """A pickle of a list that holds a list twice, that holds a list twice ..."""
+    return b"\x80\x04]" + b"".join(b"q\x00](h\x00h\x00e" for _ in range(levels)) + b"."
+
+
+PICKLES = {
+    "bytes": (b"\x80\x04\x8e" + struct.pack("<Q", 10**12) + b"x.", "too early"),
+    "bytearray": (b"\x80\x05\x96" + struct.pack("<Q", 10**12) + b"x.", "too early"),
+    "text": (b"\x80\x04\x8d" + struct.pack("<Q", 10**12) + b"x.", "too early"),
+    "number": (b"\x80\x04\x8b" + struct.pack("<i", 2**31 - 1) + b"x.", "too early"),
+    "frame": (b"\x80\x04\x95" + struct.pack("<Q", 10**12) + b"N.", "too early"),
+    "memo": (b"\x80\x04Nr\xff\xff\xff\x7f.", "has to hold"),
+    "tuples": (b"\x80\x04})" + b"\x85" * 10**6 + b"Ns.", "nested too deeply"),
+    "lists": (b"\x80\x04" + b"](" * 10**5 + b"e" * 10**5 + b".", "nested too deeply"),
+    "doubled": (doubled(60), "more than its size"),
+    "cycle": (b"\x80\x04]\x94h\x00a.", "nested too deeply"),
+    "integers": (pickle.dumps({n * (2**61 - 1): 0 for n in range(2**10)}, 4), "more than 64 bits"),
+    "digits": (b"L" + b"9" * 30 + b"L\n.", "more than 64 bits"),
+    "attributes": (b"\x80\x04c_codecs\nencode\n}\x8c\x01aNsb.", "sets attributes"),
+}
+
+
+@pytest.mark.parametrize("case", PICKLES)
+def test_pickles(attacked: Refused, bad: Path, case: str):
+    content, says = PICKLES[case]
+    path = bad / "humanact12poses.pkl"
+    path.write_bytes(content)
+    attacked("prepare", "data=humanact12", f"source={path}", f"data_root={bad.parent / 'prepared'}", says=says)
+
+
+def test_repeated_arrays_of_a_pickle_count_each_time(tmp_path: Path):
+    array = np.zeros(10**6, np.uint8)
+    (tmp_path / "few.pkl").write_bytes(pickle.dumps([array] * 5))
+    assert len(restricted_pickle.read(tmp_path / "few.pkl")) == 5
+    (tmp_path / "many.pkl").write_bytes(pickle.dumps([array] * 1000))
+    with pytest.raises(ValueError, match="more than its size"):
+        restricted_pickle.read(tmp_path / "many.pkl")
+
+
+def test_lists_of_wrong_things_in_a_pickle_are_named(attacked: Refused, bad: Path):
+    path = bad / "humanact12poses.pkl"
+    for content in (
+        {"poses": 3, "joints3D": 3, "y": 3},
+        {"poses": ["x"], "joints3D": ["x"], "y": [1]},
+        {"poses": [np.zeros((2, 72))], "joints3D": [np.zeros((2, 24, 3))], "y": ["x"]},
+        {"poses": [{}], "joints3D": [None], "y": [None]},
+    ):
+        path.write_bytes(pickle.dumps(content))
+        attacked("prepare", "data=humanact12", f"source={path}", f"data_root={bad.parent / 'prepared'}", says=str(path))
+
+
+# Stores ---------------------------------------------------------------------------------------------------------------
+
+
+def small_store(folder: Path, clip: dict[str, Any], info: dict[str, Any]) -> None:
+    """Writes a store of one clip with changed fields; its hashes and its fingerprint are right."""
+    entry: dict[str, Any] = {"id": "a", "start": 0, "length": 4, "split": "train", "source": "a", "captions": []}
+    entry |= {"action": None, "attributes": {}} | clip
+    folder.mkdir(parents=True, exist_ok=True)
+    np.save(folder / "features.npy", np.zeros((4, 2), np.float32))
+    (folder / "clips.jsonl").write_text(json.dumps(entry) + "\n")
+    np.savez(folder / "statistics.npz", mean=np.zeros(2, np.float32), std=np.ones(2, np.float32))
+    hashes = {
+        path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in folder.iterdir() if path.suffix != ".json"
+    }
+    digest = hashlib.sha256((folder / "clips.jsonl").read_bytes() + b'["r", 20, [0.0, 0.0, 1.0, 1.0]]')
+    content: dict[str, Any] = {"format": 1, "dataset": "d", "representation": "r", "fps": 20, "hours": 0.1}
+    content |= {"actions": ["x"], "excluded": {}, "published_split": False, "shape": [4, 2], "sha256": hashes}
+    content |= {"clips": {"train": 1, "val": 0, "test": 0}, "fingerprint": digest.hexdigest()[:16]}
+    (folder / "store.json").write_text(json.dumps(content | info))
+
+
+CLIPS = [("action", 99), ("action", -1), ("action", "a"), ("action", True), ("id", 5), ("id", ""), ("captions", None)]
+CLIPS += [("captions", [5]), ("start", 3.0), ("length", "4"), ("source", 1), ("split", []), ("attributes", [])]
+COUNTS = {"train": 1, "val": 0, "test": 0}
+INFOS = [("hours", 10**400), ("fps", 10**400), ("clips", COUNTS | {"<b>x": 1}), ("clips", COUNTS | {"val": "x"})]
+INFOS += [("clips", {"train": 1}), ("actions", [1])]
+
+
+def test_every_field_of_a_store_is_checked(tmp_path: Path):
+    small_store(tmp_path / "whole", {"action": 0}, {})
+    Store(tmp_path / "whole").verify()
+    for name, value in CLIPS:
+        small_store(tmp_path / "changed", {name: value}, {})
+        with pytest.raises(ValueError, match=rf"clips\.jsonl: damaged: line 1: no usable {name}"):
+            Store(tmp_path / "changed")
+    for name, value in INFOS:
+        small_store(tmp_path / "changed", {}, {name: value})
+        with pytest.raises(ValueError, match=rf"store\.json: damaged: no usable {name}"):
+            Store(tmp_path / "changed")
+    small_store(tmp_path / "changed", {}, {"fingerprint": "0123456789abcdef"})
+    with pytest.raises(ValueError, match=r"store\.json: damaged: its fingerprint"):
+        Store(tmp_path / "changed")
+
+
+def test_features_and_clips_of_a_store_of_other_kinds(attacked: Refused, bad: Path):
+    place = bad / "synthetic-humanml-clean-smpl22"
+    words = ("browse", "data=synthetic", f"data_root={bad}", "clips=1", "out=out.html")
+    for content in (zipped({"a.npy": b"x"}), header((2**70, 263), "<f4"), header((-1, 263), "<f4")):
+        small_store(place, {}, {})
+        (place / "features.npy").write_bytes(content)
+        attacked(*words, says="features.npy: damaged")
+    small_store(place, {}, {})
+    (place / "clips.jsonl").write_bytes(b"\xff\xfe\n")
+    content = json.loads((place / "store.json").read_text())
+    content["sha256"]["clips.jsonl"] = hashlib.sha256(b"\xff\xfe\n").hexdigest()
+    (place / "store.json").write_text(json.dumps(content))
+    attacked(*words, says="clips.jsonl: damaged: not a UTF-8 text file")
+
+
+def test_crops_are_checked():
+    for crop in (None, 5, Whole(max_frames=10**6), Fixed(frames=0)):
+        with pytest.raises(ValueError, match=r"data\.crop"):
+            MotionDataModule(None, None, root="r", name="n", batch_size=1, crop=crop)  # pyright: ignore
+
+
+def test_samples_of_other_kinds(tmp_path: Path):
+    whole: dict[str, Any] = {"ids": np.array(["a"]), "lengths": np.array([4]), "features": np.zeros((4, 2))}
+    path = tmp_path / "a.npz"
+    path.write_bytes(npz(**whole, captions=np.array(["x"])))
+    assert read_samples(path)["lengths"].tolist() == [4]
+    for change in (
+        {"features": np.zeros((4, 2, 3))},
+        {"features": np.zeros(())},
+        {"features": np.zeros((4, 2), np.longdouble)},
+        {"joints": np.zeros((4, 66))},
+        {"captions": np.array([1])},
+        {"captions": np.zeros(1, [("a", "f4")])},
+    ):
+        path.write_bytes(npz(**whole | change))
+        with pytest.raises(UserError, match=r"a\.npz: .*write it again"):
+            read_samples(path)

@@ -1,0 +1,462 @@
+"""Results, table specs, texts, samples and pages from others: refused in one line, or shown as plain text."""
+
+import csv
+import io
+import json
+import multiprocessing
+import os
+import re
+import time
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from test_architecture import FILES
+from test_compare import motions
+from test_report import a_run, result
+from test_tables import SPEC, put
+
+import flame_mdm
+from evaluators.sources import Row, _write, read_samples
+from flame_mdm.__main__ import main
+from flame_mdm.checkpoints import files, hub
+from flame_mdm.commands import benchmark
+from flame_mdm.errors import UserError, say
+from flame_mdm.files import atomic_folder, atomic_write, write_json
+from flame_mdm.formats.files import read
+from flame_mdm.formats.motion import Motion
+from flame_mdm.generation import write_motions
+from flame_mdm.reporting.page import POLICY, page
+from flame_mdm.reporting.plots import Panel, Series, svg
+from flame_mdm.reporting.rendering import Cell, Line, Part, Table, comma_separated, draw, latex, markdown
+from flame_mdm.reporting.rendering import Figure as Plot
+from flame_mdm.reporting.tables import build, load_spec, requests, write
+from flame_mdm.representations.skeleton import SMPL22
+from flame_mdm.visualize import contact_sheet, player_page, write_gif
+
+TEXT = "text=a person walks"
+
+# Table specs ----------------------------------------------------------------------------------------------------------
+
+ROWS = """title: t
+parts:
+  P:
+    protocol: synthetic
+    columns: {{FID: {{value: fid}}}}
+    rows: [{{label: a, baseline: real, {keys}}}]
+"""
+MANY = list(range(1, 41))
+BOMB = "a: &a [x, x, x, x, x, x, x, x, x]\n" + "".join(
+    f"{name}: &{name} [{', '.join([f'*{before}'] * 9)}]\n" for before, name in zip("abcdefgh", "bcdefghi", strict=True)
+)
+SPECS = {
+    "product": (
+        ROWS.format(keys=f"num_inference_steps: {MANY}, guidance_scale: {MANY}, until: {MANY}"),
+        "64,000 are more",
+    ),
+    "bomb": (f"{BOMB}title: t\nparts: {{P: {{lengths: *i}}}}\n", "after its aliases are expanded"),
+    "loop": ("title: t\nparts: &p {P: *p}\n", "after its aliases are expanded"),
+    "deep": ("title: " + "{a: " * 20_000, "nested too deeply"),
+    "environment": (ROWS.format(keys="note: '${oc.env:HOME}'"), "holds an interpolation"),
+    "code": (ROWS.format(keys="data.source._target_: os.system"), "data.source._target_"),
+    "hydra": (ROWS.format(keys="hydra.searchpath: x"), "only keys of the data"),
+    "columns": (
+        "title: t\nparts: {P: {protocol: synthetic, rows: [], columns: {"
+        + ", ".join(f"c{k}: {{value: fid}}" for k in range(500))
+        + "}}}\n",
+        "500 are more than the 100",
+    ),
+    "figures": (ROWS.format(keys="note: n") + f"figures: [{{part: P, x: nfe, y: {['FID'] * 300}}}]\n", "300 are more"),
+    "latin": ("title: caf\udce9\n", "not a UTF-8 text file"),
+    "no columns": (
+        "title: t\nparts: {P: {protocol: x, columns: {}, rows: [{label: a, ckpt: b}]}}\n",
+        "columns is {}, not a longer",
+    ),
+    "no recipes": ("title: t\nparts: {P: {recipes: {}, keys: {a: seed}}}\n", "recipes is {}, not a longer"),
+    "no keys": ("title: t\nparts: {P: {recipes: {a: quickstart}, keys: {}}}\n", "keys is {}, not a longer"),
+    "digits": (f"title: t\nnotes: [0x{'f' * 20_000}]\n", "spec.yaml: not a readable YAML file: a whole number of more"),
+    "collisions": (
+        "\n".join(f"{k * (2**61 - 1)}: 1" for k in range(20_000)),
+        "spec.yaml: not a readable YAML file: a whole number of more",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", SPECS)
+def test_table_specs(attacked, bad, name):
+    content, says = SPECS[name]
+    (bad / "spec.yaml").write_bytes(content.encode(errors="surrogateescape"))
+    attacked("tables", f"table={bad / 'spec.yaml'}", "evaluate=false", says=says)
+
+
+# Files that cannot be read --------------------------------------------------------------------------------------------
+
+
+def endless(path: Path) -> None:
+    path.symlink_to("/dev/zero")
+
+
+def huge(path: Path) -> None:
+    with path.open("wb") as file:
+        file.truncate(2**40)
+
+
+UNREADABLE: dict[str, tuple[Callable[[Path], object], str]] = {
+    "pipe": (os.mkfifo, "a pipe, a socket or a device, not a file"),
+    "endless": (endless, "a pipe, a socket or a device, not a file"),
+    "folder": (Path.mkdir, "a folder, not a file"),
+    "huge": (huge, "1 TiB is more than the"),
+    "latin": (lambda path: path.write_bytes(b'{"a": "\xe9"}\n'), "not a UTF-8 text file"),
+    "deep": (lambda path: path.write_text('{"a": ' * 20_000 + "\n"), ""),
+    "flat": (lambda path: path.write_text("[" * 300 + "]" * 300 + "\n"), ""),
+}
+
+
+@pytest.mark.parametrize("kind", UNREADABLE)
+def test_unreadable_files_of_runs(attacked, bad, kind):
+    make, says = UNREADABLE[kind]
+    for name in ("metrics.jsonl", "provenance.json", "bad_batch.json", "evaluation/p/result.json", "config.yaml"):
+        folder = a_run(bad / name.replace("/", "-"))
+        (folder / name).unlink(missing_ok=True)
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        make(folder / name)
+        attacked("report", str(folder), says=f"{folder / name}: {says}")
+
+
+@pytest.mark.parametrize("kind", UNREADABLE)
+def test_unreadable_results_and_ratings(attacked, bad, kind):
+    make, says = UNREADABLE[kind]
+    make(bad / "ratings.json")
+    attacked("compare", f"ratings={bad / 'ratings.json'}", says=f"{bad / 'ratings.json'}: {says}")
+    spec = bad / "spec.yaml"
+    spec.write_text(SPEC.format(folder=bad))
+    _, asked = next(requests(load_spec(str(spec))["parts"]["Steps"]))
+    path = asked[0].path(bad / "results")
+    path.parent.mkdir(parents=True)
+    make(path)
+    attacked("tables", f"table={spec}", "evaluate=false", f"results={bad / 'results'}", says=f"{path}: ")
+    (bad / "study.yaml").write_text(f"title: t\nparts: {{P: {{ratings: {bad / 'ratings.json'}}}}}\n")
+    attacked("tables", f"table={bad / 'study.yaml'}", "evaluate=false", says=f"{bad / 'ratings.json'}: ")
+    (bad / "results" / "lengths").mkdir()
+    make(bad / "results" / "lengths" / "kit.json")
+    (bad / "lengths.yaml").write_text("title: t\nparts: {P: {lengths: [kit]}}\n")
+    words = [f"table={bad / 'lengths.yaml'}", "evaluate=false", f"results={bad / 'results'}"]
+    attacked("tables", *words, says="lengths/kit.json: ")
+
+
+@pytest.mark.parametrize("kind", ["pipe", "endless", "folder", "huge", "latin"])
+def test_unreadable_texts(attacked, bad, trained, kind):
+    make, says = UNREADABLE[kind]
+    make(bad / "texts.txt")
+    words = [f"runs={trained.parent.parent} {motions(bad / 'real')}", f"texts={bad / 'texts.txt'}"]
+    attacked("compare", *words, says=f"{bad / 'texts.txt'}: {says}")
+
+
+def test_lengths_in_any_order(tmp_path):
+    (tmp_path / "lengths.yaml").write_text("title: t\nparts: {P: {lengths: [kit]}}\n")
+    (tmp_path / "lengths").mkdir()
+    (tmp_path / "lengths" / "kit.json").write_text('{"fingerprint": "f", "fps": 20.0, "lengths": [90, 5, 7]}')
+    (part,) = build("lengths", load_spec(str(tmp_path / "lengths.yaml")), tmp_path).parts
+    assert [cell and cell.text for cell in part.lines[0].cells][2:4] == ["5", "7"]
+
+
+@pytest.mark.parametrize("line", ['{"step": 1, "a": 1' + "0" * 400 + "}", "[1]", '{"step": true}', '{"a": 1}', "{}"])
+def test_damaged_histories(attacked, bad, line):
+    folder = a_run(bad / "run")
+    (folder / "metrics.jsonl").write_text(line + "\n")
+    attacked("report", str(folder), says="metrics.jsonl: line 1 is damaged")
+
+
+@pytest.mark.parametrize(
+    "values", [{"foo": 1}, {"": 1}, {"a/": 1}, {"train/loss": 5e-324}, {"train/loss": 1e-299}, {"train/loss": 1e299}]
+)
+def test_odd_histories_have_a_page(bad, values):
+    folder = a_run(bad / "run")
+    lines = [{"step": 0} | dict.fromkeys(values, 0), {"step": 1} | values]
+    (folder / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    assert main(["report", str(folder)]) == 0
+
+
+@pytest.mark.parametrize(("low", "high"), [(0, 5e-324), (5e-324, 5e-324), (1e299, 1e299), (-5e-324, 0), (5e-324, 1)])
+def test_axes_of_odd_numbers(low, high):
+    points = [Series("a", [(low, low), (high, high)])]
+    assert svg("a", [Panel(points), Panel(points, from_zero=True), Panel(points, log_x=True)])
+
+
+def test_long_names_are_shortened(attacked, bad, capfd):
+    (bad / "spec.yaml").write_text(f"title: t\nparts: {{P: {{lengths: [{'a' * 5_000}]}}}}\n")
+    attacked("tables", f"table={bad / 'spec.yaml'}", "evaluate=false", says="aaa … ")
+    say("b" * 5_000, error=True)
+    assert len(capfd.readouterr().err) < 2_010
+
+
+# Texts ----------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("length", [2001, 100_000, 1_000_000])
+def test_long_texts(attacked, bad, trained, length):
+    for text in ("x" * length, "a person walks " * (length // 15 + 1)):
+        attacked("sample", f"ckpt={trained}", f"text={text}", says="characters are too many. Give at most ")
+    (bad / "texts.txt").write_text("x" * length)
+    words = [f"runs={trained.parent.parent} {motions(bad / 'real')}", f"texts={bad / 'texts.txt'}"]
+    attacked("compare", *words, says="characters are too many. Give at most 2,000")
+
+
+def test_many_texts(trained):
+    model = flame_mdm.load(trained)
+    with pytest.raises(UserError, match=r"5,001 texts with samples=2: at most 10,000 motions"):
+        flame_mdm.generate(model, [f"text {number}" for number in range(5001)], samples=2)
+
+
+@pytest.mark.parametrize("caption", ["x" * 1_000_000, "a person walks " * 66_667], ids=["one word", "words"])
+def test_long_captions_are_shortened(tmp_path, caption):
+    begin = time.monotonic()
+    shown = [Motion(np.zeros((40, 22, 3)), 20.0, SMPL22, text=caption, id=caption)]
+    write_gif(tmp_path / "a.gif", shown)
+    contact_sheet(tmp_path / "a.png", shown)
+    assert "…" in player_page([Motion(np.zeros((2, 22, 3)), 20.0, SMPL22, text=caption)], caption)
+    assert len(player_page([Motion(np.zeros((2, 22, 3)), 20.0, SMPL22, text=caption)], caption)) < 100_000
+    assert time.monotonic() - begin < 5
+
+
+def test_captions_are_drawn_once(monkeypatch, tmp_path):
+    drawn = []
+    one = flame_mdm.visualize.render._wrapped
+    monkeypatch.setattr(flame_mdm.visualize.render, "_wrapped", lambda *words: drawn.append(1) or one(*words))
+    write_gif(tmp_path / "a.gif", [Motion(np.zeros((40, 22, 3)), 20.0, SMPL22, text="a person walks")])
+    assert len(drawn) <= 2
+
+
+def test_a_text_given_twice_has_two_motions(trained):
+    model = flame_mdm.load(trained)
+
+    def sampled(texts: Any, **options: Any) -> list[np.ndarray]:
+        return [made.features for made in flame_mdm.generate(model, texts, seconds=1, **options)]
+
+    (walk,), (jump,), pair = sampled("walk"), sampled("jump"), sampled("walk", samples=2)
+    twice = sampled(["walk", "jump", "walk"])
+    for found, expected in zip(twice, (walk, jump, pair[1]), strict=True):
+        np.testing.assert_allclose(found, expected, atol=1e-5)
+    assert np.abs(twice[0] - twice[2]).max() > 1e-3
+    ids = [made.id for made in flame_mdm.generate(model, ["walk", "jump", "walk"], seconds=1, samples=2)]
+    assert ids == ["walk#0", "walk#1", "jump#0", "jump#1", "walk#2", "walk#3"]
+
+
+# Races and failures ---------------------------------------------------------------------------------------------------
+
+
+def _model() -> Any:
+    return SimpleNamespace(representation=SimpleNamespace(name="humanml", skeleton=SMPL22))
+
+
+def _made(text: str = "a person walks") -> list[Motion]:
+    return [Motion(np.zeros((4, 22, 3)), 20.0, SMPL22, text, f"{text}#0", features=np.zeros((4, 263), np.float32))]
+
+
+def _write_all(folder: Path, table: Table) -> None:
+    row = SimpleNamespace(id="000001", text="a person walks")
+    for _ in range(100):
+        write_json(folder / "results" / "lengths" / "kit.json", {"lengths": list(range(1000))}, indent=None)
+        _write(folder / "rep_0.npz", [_row(row)], [np.zeros((40, 263), np.float32)], {"nfe": 1.0}, "text")
+    for _ in range(2):
+        write(table, folder / "tables")
+        write_motions(folder / "samples" / "mine", _made(), {"seed": 0})
+
+
+def _row(row: Any) -> Row:
+    return row
+
+
+def test_six_processes_write_the_same_files(tmp_path):
+    table = Table("t", "T", [Part("P", {"FID": "lower"}, [Line("a", "measured", [Cell("1", 1.0)])])])
+    table.parts[0].figures.append(Plot("nfe", ["FID"]))
+    table.parts[0].lines[0].options["nfe"] = 3.0
+    fork = multiprocessing.get_context("fork")
+    processes = [fork.Process(target=_write_all, args=(tmp_path, table)) for _ in range(6)]
+    for process in processes:
+        process.start()
+    for process in processes:
+        process.join(60)
+    assert [process.exitcode for process in processes] == [0] * 6
+    assert sorted(path.name for path in (tmp_path / "tables").iterdir()) == [
+        *("t-figure.svg", "t.csv", "t.html", "t.md", "t.tex")
+    ]
+    assert {path.name for path in (tmp_path / "samples" / "mine").iterdir()} == {
+        *("motion_000.npz", "motions.gif", "motions.png", "player.html")
+    }
+    assert not list(tmp_path.rglob(".*"))
+    assert read(tmp_path / "samples" / "mine" / "motion_000.npz").text == "a person walks"
+    assert read_samples(tmp_path / "rep_0.npz")["ids"].tolist() == ["000001"]
+
+
+def full(*_: Any, **__: Any) -> None:
+    raise OSError(28, "No space left on device")
+
+
+@pytest.mark.parametrize("name", ["Motion.save", "write_gif", "contact_sheet", "write_player"])
+def test_a_sample_folder_is_whole_or_absent(attacked, trained, monkeypatch, name):
+    monkeypatch.setattr(f"flame_mdm.generation.{name}", full)
+    attacked("sample", f"ckpt={trained}", TEXT, "seconds=1", says="No space left on device")
+    attacked("sample", f"ckpt={trained}", TEXT, "seconds=1", "out=new/folder", says="No space left on device")
+
+
+def test_a_sample_folder_is_not_a_file(attacked, bad, trained):
+    (bad / "file").write_text("mine")
+    attacked("sample", f"ckpt={trained}", TEXT, "seconds=1", f"out={bad / 'file'}", says="file: a file, not a folder")
+
+
+def test_a_failed_write_keeps_what_was_there(tmp_path):
+    write_motions(tmp_path / "a", _made(), {})
+    (tmp_path / "a" / "notes.txt").write_text("mine")
+    before = {path.name: path.read_bytes() for path in (tmp_path / "a").iterdir()}
+    with pytest.raises(UserError, match="a: cannot be written"), atomic_folder(tmp_path / "a") as made:
+        (made / "no folder" / "player.html").write_text("half")
+    assert {path.name: path.read_bytes() for path in (tmp_path / "a").iterdir()} == before
+    write_motions(tmp_path / "a", _made("another"), {})
+    assert (tmp_path / "a" / "notes.txt").read_text() == "mine"
+    assert read(tmp_path / "a" / "motion_000.npz").text == "another"
+    with pytest.raises(ZeroDivisionError), atomic_write(tmp_path / "b" / "c" / "file.txt"):
+        raise ZeroDivisionError
+    assert [path.name for path in tmp_path.iterdir()] == ["a"]
+
+
+# What is shown --------------------------------------------------------------------------------------------------------
+
+HOSTILE = "x\n# Heading\n\n<b>|`[a](http://b)\r\x1b[31m\u202e\t~~_*"
+
+
+def hostile_table() -> Table:
+    facts = {"device": "=HYPERLINK(1)", "seed": "-5", "recipe": "@SUM(1)", "result": "\t=1+1", "baseline": "-2+3+cmd"}
+    line = Line(HOSTILE, "measured", [Cell("-0.5 ±0.1", -0.5, 0.1), Cell("+cmd")], "a", facts=facts)
+    line.options["nfe"] = 1.0
+    part = Part(HOSTILE, {"=A": "none", HOSTILE: "none"}, [line], [("a", HOSTILE), ("", HOSTILE)])
+    part.figures.append(Plot("nfe", ["=A"]))
+    return Table("t](x) ", HOSTILE, [part, Part("=P", {"x": "none"}, [Line("$\\frac", "measured", [None])])], [HOSTILE])
+
+
+def test_tables_hold_text_not_markup_and_no_formulas():
+    table = hostile_table()
+    table.drawn["t](x) -x-heading-b-a-http-b-31m-figure"] = ""
+    text, tex = markdown(table), latex(table)
+    assert not [line for line in text.splitlines() if re.match(r"\s*(# Heading|<b>|\|`)", line)]
+    assert "\\[a\\]" in text
+    assert "&lt;b&gt;" in text
+    assert "\\`" in text
+    for form in (text, tex, comma_separated(table)):
+        assert not re.search("[\x00-\x09\x0b-\x1f\u202e]", form)
+    assert not [line for line in tex.splitlines() if line.lstrip().startswith(("#", "<b>", "["))]
+    cells = [cell for row in csv.reader(io.StringIO(comma_separated(table))) for cell in row]
+    formulas = [cell for cell in cells if cell.lstrip().startswith(tuple("=+-@")) and not re.match(r"-[\d.]+", cell)]
+    assert not formulas
+    assert "-5" in cells
+    assert "-0.5 ±0.1" in cells
+    assert "'-2+3+cmd" in cells
+    assert "'=HYPERLINK(1)" in cells
+
+
+def test_figures_draw_labels_as_text():
+    part = hostile_table().parts[0]
+    part.lines[0].label = r"$\frac{$"
+    assert draw(part, part.figures[0], {})
+
+
+def test_a_result_with_a_line_break_starts_no_heading(tmp_path):
+    (tmp_path / "spec.yaml").write_text(SPEC.format(folder=tmp_path))
+    spec = load_spec(str(tmp_path / "spec.yaml"))
+    for _, asked in requests(spec["parts"]["Steps"]):
+        put(asked[0], tmp_path, result(quick=True, warnings=["w\n# Heading"], device="=1+1"))
+    write(build("spec", spec, tmp_path / "results"), tmp_path)
+    assert "w \\# Heading" in (tmp_path / "spec.md").read_text()
+    assert ",=1+1" not in (tmp_path / "spec.csv").read_text()
+
+
+def test_commands_print_no_control_characters(tmp_path, capsys):
+    folder = a_run(tmp_path / "a\x1b[31m\u202e\nerror: b")
+    assert main(["report", f"runs='{folder}'"]) == 0
+    out = capsys.readouterr().out
+    assert "a\\x1b[31m\\u202e\\nerror: b/report.html" in out
+    assert len(out.splitlines()) == 1
+    (tmp_path / "s\x1b[2J.yaml").write_text(ROWS.format(keys="note: n"))
+    assert main(["tables", f"table={tmp_path / 's'}\x1b[2J.yaml", "evaluate=false", f"out={tmp_path / 'out'}"]) == 0
+    assert "\x1b" not in capsys.readouterr().out
+    say("one", "two\x1b")
+    assert capsys.readouterr().out == "one\ntwo\\x1b\n"
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.name)
+def test_all_that_is_printed_is_printable(path):
+    if path.name != "errors.py":
+        assert not re.findall(r"(?<![\w.])print\(|sys\.std(?:out|err)\.write", path.read_text()), "use errors.say"
+
+
+def test_pages_use_no_network(tmp_path):
+    policy = f'<meta http-equiv="Content-Security-Policy" content="{POLICY}">'
+    assert policy in page("title", "")
+    assert "default-src 'none'" in POLICY
+    assert "Content-Security-Policy" in player_page([Motion(np.zeros((2, 22, 3)), 20.0, SMPL22)])
+    runs = [motions(a_run(tmp_path / name, name=name) / "samples" / "step_0000009").parent.parent for name in "ab"]
+    for word in ("rate=false", "rate=true"):
+        words = [f"runs={runs[0]} {runs[1]}", f"out={tmp_path / 'out.html'}", word]
+        assert main(["compare", *words]) == 0
+        assert policy in (tmp_path / "out.html").read_text()
+    write(hostile_table(), tmp_path)
+    assert policy in (tmp_path / "t](x) .html").read_text()
+    assert policy in page("x", benchmark._report("x", "", benchmark.Times(tmp_path / "times.json"), [], []))
+
+
+def test_a_report_plays_the_motions_not_the_page_of_others(tmp_path):
+    folder = a_run(tmp_path / "run")
+    samples = motions(folder / "samples" / "step_0000009")
+    (samples / "player.html").write_text("<script>fetch('https://example.com')</script>")
+    assert main(["report", str(folder)]) == 0
+    text = (folder / "report.html").read_text()
+    assert "example.com" not in text
+    assert "a person jumps" in text
+    assert "Samples at step 9" in text
+
+
+# Push -----------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["a/..", "a/.", "./a", "../a", "a/.git", "a/-x", "a/b/..", "/", "a/"])
+def test_push_takes_names_not_paths(attacked, trained, name):
+    Path("README.md").write_text("mine")
+    attacked("push", str(trained), name, "dry_run=true", says="name the model as user/name")
+    assert Path("README.md").read_text() == "mine"
+
+
+def test_push_overwrites_only_its_own_files(attacked, bad, trained):
+    for name in ("README.md", "config.yaml"):
+        (bad / name).write_text("mine")
+        attacked("push", str(trained), "a/b", f"folder={bad}", "dry_run=true", says="not written by push")
+        assert (bad / name).read_text() == "mine"
+        assert not (bad / "model.safetensors").exists()
+        (bad / name).unlink()
+    for _ in range(2):
+        assert main(["push", str(trained), "a/x.safetensors", "dry_run=true"]) == 0
+    assert {path.name for path in Path("push/x.safetensors").iterdir()} == {
+        "README.md",
+        "config.yaml",
+        "model.safetensors",
+    }
+
+
+def test_a_card_is_a_table_of_text(trained, tmp_path):
+    model = files.read_model_file(hub.export(trained, tmp_path))
+    model["origin"]["file"] = HOSTILE
+    card = hub.card(model, "me/walker")
+    assert "\n# Heading" not in card
+    assert "\x1b" not in card
+
+
+def test_a_sample_is_shown_with_its_text(trained, tmp_path, capsys):
+    """What the refusals above must not break."""
+    assert (
+        main(["sample", f"ckpt={trained}", "text=" + "a person walks " * 100, "seconds=1", f"out={tmp_path / 'o'}"])
+        == 0
+    )
+    assert "player.html" in capsys.readouterr().out
+    assert json.dumps("…")[1:-1] not in (tmp_path / "o" / "player.html").read_text()

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any, TypedDict
 
 import numpy as np
-import torch
 from scipy.ndimage import gaussian_filter1d
 from torch import Tensor
 
@@ -16,7 +15,7 @@ from evaluators.extractors import Extractor
 from evaluators.metrics import make_metrics
 from evaluators.metrics.confidence import mean_ci
 from evaluators.metrics.distribution import FrechetMotionDistance
-from evaluators.sources import Baseline, Generator, Row, SampleFolder, Samples, Source, real_motions
+from evaluators.sources import Baseline, Generator, Row, SampleFolder, Samples, Source, real_motions, shared
 from flame_mdm.config import Config, instantiate
 from flame_mdm.data.datamodule import Clips
 from flame_mdm.editing import MFM_STEPS, method_options
@@ -62,7 +61,7 @@ class Protocol:
         smoothing: standard deviation, in frames, of a Gaussian over time that features of generated motions go through
             before they are measured, mirrored at the ends; None = none.
         expected: by data set or sha256 of the extractor, the values that real motions of the test split must have:
-            metric -> [value, tolerance]. Where they have others, the model's values are not valid.
+            metric -> [value, tolerance]. Where they have others, nothing is generated.
 
     Raises:
         UserError: an option of `multimodality` or of a metric is missing or unknown.
@@ -290,8 +289,9 @@ class Protocol:
         rank: int = 0,
         world: int = 1,
         ground_truth: bool = True,
+        force: bool = False,
     ) -> dict[str, Any]:
-        """Evaluates motions, and real ones before them.
+        """Evaluates motions, and before them the real ones of all replications.
 
         With several processes, all take their share in making motions; the first measures them, all get the result.
 
@@ -304,24 +304,38 @@ class Protocol:
             batch_size: of the extractor.
             rank, world: number of this process, and of all processes.
             ground_truth: whether real motions are measured, too.
+            force: generate even if real motions do not have the values that the protocol expects.
 
         Returns:
             "ground_truth" and "values": by metric, `mean`, `ci` (half the width of the 95 % interval), `replications`,
             `n` motions, each None where not computable; "not_computed": reasons by metric; "cost"; "seeds" of the
-            draws of metrics, by replication; "warnings"; "valid" and "invalid_because".
+            draws of metrics, by replication; "warnings"; "valid", "invalid_because" and "forced".
+
+        Raises:
+            UserError: real motions do not have the expected values; nothing has been generated.
         """
-        box: list[dict[str, Any] | None] = [None]
+        evaluator = self._evaluator(self.metrics, extractor, representation, batch_size)
+        reasons: dict[str, str] = {}
+        truth = self._measure_real(clips, evaluator, seed, reasons) if ground_truth and not rank else None
+        invalid = shared(self._unexpected(truth, clips, extractor) if truth else [], world)
+        if invalid and source is not None and not force:
+            if rank:
+                raise SystemExit(1)  # the first process says why
+            raise UserError(
+                f"nothing was generated, because {'; '.join(invalid)}. Check the data and the extractor, or give "
+                "force=true: the result is then marked as not valid"
+            )
+        result = None
         if rank:
             for name, rows, replication in self._jobs(source, clips, seed):
                 assert source is not None
                 source(name, rows, replication, rank, world)
         else:
-            evaluator = self._evaluator(self.metrics, extractor, representation, batch_size)
-            box[0] = self._measure(source, clips, evaluator, seed, world, ground_truth)
-        if world > 1:
-            torch.distributed.broadcast_object_list(box)
-        assert box[0] is not None
-        return box[0]
+            verdict = {"valid": not invalid, "invalid_because": invalid, "forced": bool(invalid) and source is not None}
+            result = {"ground_truth": truth} | self._measure(source, clips, evaluator, seed, world, reasons) | verdict
+        result = shared(result, world)
+        assert result is not None
+        return result
 
     def _evaluator(
         self, metrics: Mapping[str, Config], extractor: Extractor | None, representation: Representation, size: int
@@ -344,6 +358,28 @@ class Protocol:
     def _has_several_per_prompt(self, source: Source | None) -> bool:
         return self.multimodality is not None and isinstance(source, Generator) and not self.quick
 
+    def _real(
+        self, clips: Clips, evaluator: Evaluator, seed: int, replication: int
+    ) -> tuple[list[Row], Extracted, Extracted]:
+        """Returns the rows of a replication, their real motions, and those that sets are compared with."""
+        rows = self.rows(clips, seed, replication)
+        again = self.rows(clips, seed, replication, purpose="real")
+        paired, real = (evaluator.extract(self.motions(some, real_motions(clips, some))) for some in (rows, again))
+        return rows, paired, real
+
+    def _measure_real(self, clips: Clips, evaluator: Evaluator, seed: int, reasons: dict[str, str]) -> dict[str, Any]:
+        """Returns the values of real motions.
+
+        They are read again later: those of all replications might not fit in memory.
+        """
+        found = []
+        for replication in range(self.replications):
+            _, paired, real = self._real(clips, evaluator, seed, replication)
+            values, why = evaluator.score(paired, paired, real, key("draws", seed, replication))
+            found.append((values, len(paired)))
+            reasons |= why
+        return _summary(found)
+
     def _measure(
         self,
         source: Source | None,
@@ -351,67 +387,47 @@ class Protocol:
         evaluator: Evaluator,
         seed: int,
         world: int,
-        ground_truth: bool,
+        reasons: dict[str, str],
     ) -> dict[str, Any]:
-        """The result, on the first process."""
-        found: dict[str, list[tuple[dict[str, float | None], int]]] = {"ground_truth": [], "values": []}
-        reasons: dict[str, str] = {}
+        """The values of motions, on the first process."""
+        found: list[tuple[dict[str, float | None], int]] = []
         costs: list[dict[str, float]] = []
         warnings: list[str] = []
-        seeds = [key("draws", seed, replication) for replication in range(self.replications)]
-
-        def score(kind: str, motions: Extracted, paired: Extracted, real: Extracted, replication: int) -> None:
-            values, why = evaluator.score(motions, paired, real, seeds[replication])
-            found[kind].append((values, len(motions)))
-            reasons.update(why)
-
-        def extract(rows: Sequence[Row], features: list[np.ndarray], captions: list[str] | None = None) -> Extracted:
-            return evaluator.extract(self.motions(rows, features, captions))
-
         jobs = self._jobs(source, clips, seed)
         several = None
         if self.multimodality and source is not None:
             several = self._evaluator(
                 self.multimodality["metrics"], evaluator.extractor, evaluator.representation, evaluator.batch_size
             )
-        for replication in range(self.replications):
-            rows = self.rows(clips, seed, replication)
-            again = self.rows(clips, seed, replication, purpose="real")
-            paired = extract(rows, real_motions(clips, rows))
-            real = extract(again, real_motions(clips, again))
+        for replication in range(self.replications if source is not None else 0):
+            assert source is not None
+            rows, paired, real = self._real(clips, evaluator, seed, replication)
             for each in (evaluator, several):  # before motions are generated
                 if each is not None and not replication:
                     each.check(paired)
-            if ground_truth:
-                score("ground_truth", paired, paired, real, replication)
-            if source is None:
-                continue
             samples = _samples(source, next(jobs), world)
             costs.append(samples.cost)
             if len(samples.rows) != len(rows):  # motions of others, not one for each clip
                 wanted = {row.id for row in samples.rows}
                 paired = _select(paired, [i for i, row in enumerate(rows) if row.id in wanted])
-            generated = extract(samples.rows, self._smoothed(samples.features), samples.captions)
-            score("values", generated, paired, real, replication)
+            motions = self.motions(samples.rows, self._smoothed(samples.features), samples.captions)
+            generated = evaluator.extract(motions)
+            values, why = evaluator.score(generated, paired, real, key("draws", seed, replication))
+            found.append((values, len(generated)))
+            reasons |= why
             if not replication:
                 warnings = self._warnings(generated, real)
-        results = {kind: _summary(values) for kind, values in found.items()}
+        summary = _summary(found)
         if several is not None and source is not None:
-            results["values"] |= self._measure_multimodality(source, jobs, clips, several, seed, world, reasons)
+            summary |= self._measure_multimodality(source, jobs, clips, several, seed, world, reasons)
         if evaluator.extractor is None and self.extractor is not None:
             reasons["extractor"] = "none was given, metrics of its features have no values"
-        tested = clips.clips[0].split == "test" or not clips.store.info["clips"]["test"]  # HumanAct12 has no test clips
-        gate = ground_truth and not self.quick and tested
-        invalid = self._unexpected(results["ground_truth"], clips, evaluator.extractor) if gate else []
         return {
-            "ground_truth": results["ground_truth"] if ground_truth else None,
-            "values": results["values"] if source is not None else None,
+            "values": summary if source is not None else None,
             "not_computed": reasons,
             "cost": _mean_cost(costs),
-            "seeds": seeds,
+            "seeds": [key("draws", seed, replication) for replication in range(self.replications)],
             "warnings": warnings,
-            "valid": not invalid,
-            "invalid_because": invalid,
         }
 
     def _measure_multimodality(
@@ -468,7 +484,9 @@ class Protocol:
         return lines
 
     def _unexpected(self, values: Mapping[str, Any], clips: Clips, extractor: Extractor | None) -> list[str]:
-        """In which expected values real motions fail."""
+        """In which expected values real motions fail; a quick evaluation, or one of other splits, has none."""
+        if self.quick or (clips.clips[0].split != "test" and clips.store.info["clips"]["test"]):
+            return []  # HumanAct12 has no test clips
         names = [clips.store.info["dataset"], *([extractor.sha256] if extractor else [])]
         lines = []
         for metric, (wanted, tolerance) in (item for name in names for item in self.expected.get(name, {}).items()):

@@ -63,6 +63,7 @@ class EvaluationRequest:
     samples: int | None = None
     multimodality: bool = True
     quick: bool = False
+    force: bool = False
     guidance_scale: float | None = None
     sampler: str | None = None
     num_inference_steps: int | None = None
@@ -177,6 +178,7 @@ def _evaluate(request: EvaluationRequest, rank: int, world: int, device: str) ->
         batch_size=request.batch_size,
         rank=rank,
         world=world,
+        force=request.force,
     )
     if rank:
         return
@@ -427,7 +429,8 @@ def evaluate_missing(specs: Mapping[str, Config], results: Path, config: Config)
         try:
             dotted = [f"{name}={keys.pop(name)}" for name in list(keys) if name == "data" or "." in name]
             options = settings("evaluate", dotted)
-            general = {name: config[name] for name in ("device", "batch_size", "data_root") if config[name] is not None}
+            names = ("device", "batch_size", "force", "data_root")
+            general = {name: config[name] for name in names if config[name] is not None}
             evaluate(EvaluationRequest.of(options | general | keys | {"out": str(path)}))
         except (UserError, ValueError, OSError) as error:
             failed.append(f"{request.label}: {first_line(error)}")

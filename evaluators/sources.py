@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 import torch
@@ -23,6 +23,8 @@ from flame_mdm.motion import Edit, MotionBatch, length_mask, pad_to
 from flame_mdm.representations import Representation
 from flame_mdm.seeds import key, normal
 from flame_mdm.task import MotionGeneration
+
+T = TypeVar("T")
 
 NOISE = 0.5
 """Standard deviation of the noise of noisy baselines, in normalized features."""
@@ -125,7 +127,7 @@ class Generator:
             UserError: the folder holds other motions, or a damaged file; or the model returns what is not finite.
         """
         path = self.folder / f"{name}.npz" if self.folder else None
-        if _agree(path is not None and path.exists(), rank, world):
+        if shared(path is not None and path.exists(), world):
             return self._read(path, rows) if path is not None and not rank else None
         features, counts = self._generate(rows[rank::world], replication)
         if world > 1:
@@ -217,13 +219,12 @@ class Generator:
         return Edit(torch.cat(known), torch.cat(keep), **self.how)
 
 
-def _agree(value: bool, rank: int, world: int) -> bool:
-    """The value of the first process, on all of them."""
-    if world == 1:
-        return value
-    box = [value if not rank else None]
-    torch.distributed.broadcast_object_list(box)
-    return bool(box[0])
+def shared(value: T, world: int) -> T:
+    """Returns the value of the first of `world` processes, on all of them."""
+    box = [value]
+    if world > 1:
+        torch.distributed.broadcast_object_list(box)
+    return box[0]
 
 
 class SampleFolder:

@@ -127,6 +127,7 @@ class Result(Schema):
     samples_sha256: str | None = None
     baseline: str | None = None
     changed: dict[str, Plain] = {}
+    forced: bool = False
     warnings: list[str] = []
     cost: Cost | None = None
 

@@ -313,14 +313,32 @@ def test_captions_crops_and_second_draws_are_functions_of_seed_replication_and_i
     assert len({row.id for row in many}) == len(many) == len(data.test) + 5
 
 
-def test_off_ground_truth_makes_the_values_invalid(runs, tmp_path):
+@pytest.fixture
+def off(tmp_path) -> str:
+    """A protocol that expects what real motions do not have."""
     text = (EXPERIMENTS / "evaluation" / "synthetic.yaml").read_text()
-    for expected, valid in (("[1.0, 0.05]", True), ("[0.5, 0.05]", False)):
-        file = tmp_path / "mine.yaml"
-        file.write_text(f"{text}expected:\n  synthetic:\n    attributes/all: {expected}\n")
-        result = runs.result(tmp_path / "result.json", f"protocol={file}", "replications=1", "extractor=none")
-        assert result["valid"] is valid
-        assert bool(result["invalid_because"]) is not valid
+    (tmp_path / "off.yaml").write_text(f"{text}expected:\n  synthetic:\n    attributes/all: [0.5, 0.05]\n")
+    return f"protocol={tmp_path / 'off.yaml'}"
+
+
+def test_off_ground_truth_stops_before_anything_is_generated(runs, off, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(Generator, "_generate", lambda *_: pytest.fail("sampled before the ground truth was checked"))
+    line = refused(runs, capsys, tmp_path, off, "replications=2", "extractor=none")
+    assert "nothing was generated, because real motions have attributes/all" in line
+    assert "expected 0.5 +- 0.05" in line
+    assert "force=true" in line
+    assert not (tmp_path / "result.json").exists()
+    assert not list(tmp_path.rglob("rep_*.npz"))
+
+
+def test_a_forced_result_says_so(runs, off, tmp_path):
+    words = ["replications=1", "extractor=none", "multimodality=false"]
+    result = runs.result(tmp_path / "result.json", off, *words, "force=true")
+    assert (result["valid"], result["forced"]) == (False, True)
+    assert "expected 0.5" in result["invalid_because"][0]
+    (tmp_path / "right.yaml").write_text((tmp_path / "off.yaml").read_text().replace("[0.5,", "[1.0,"))
+    result = runs.result(tmp_path / "result.json", f"protocol={tmp_path / 'right.yaml'}", *words, "force=true")
+    assert (result["valid"], result["forced"], result["invalid_because"]) == (True, False, [])
 
 
 def refused(runs: Runs, capsys, tmp_path: Path, *words: str) -> str:

@@ -209,12 +209,14 @@ def test_rows_of_another_evaluator_are_marked_and_not_compared(folder):
 def test_an_invalid_row_says_so_and_is_not_ranked(folder):
     path = next(asked[0].path(folder / "results") for row, asked in requests(_part(folder)) if row["label"] == "MFM")
     reason = "real motions have fid 3, expected 0.002 +- 0.02"
-    path.write_text(json.dumps(json.loads(path.read_text()) | {"valid": False, "invalid_because": [reason]}))
+    forced = {"valid": False, "invalid_because": [reason], "forced": True}
+    path.write_text(json.dumps(json.loads(path.read_text()) | forced))
     table = made(folder)
     line = next(line for line in table.parts[0].lines if line.label == "MFM")
     assert line.state == "NOT VALID"
     assert all(cell is None or cell.place == 0 for cell in line.cells)
     assert f"MFM: NOT VALID: {reason}" in markdown(table)
+    assert "; forced: real motions do not have the values that the protocol expects" in markdown(table)
 
 
 def test_sweeps_are_rows_and_lines_of_figures(folder):

@@ -24,7 +24,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Runs the command; returns its exit code."""
     words = sys.argv[1:] if argv is None else argv
     text = ("ckpt", "extractor", "from_samples", "protocol", "data_root", "out")
-    kinds = {**SAMPLING, "replications": "int", "multimodality": "bool", "quick": "bool"}
+    kinds = {**SAMPLING, "replications": "int", "multimodality": "bool", "quick": "bool", "force": "bool"}
     return run(_evaluate, words, usage=USAGE, name="evaluate", objects=("ckpt", "out"), text=text, kinds=kinds)
 
 

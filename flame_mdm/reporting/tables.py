@@ -371,6 +371,8 @@ def _evaluation(result: Result) -> str:
         text += "; not as the protocol has it: " + ", ".join(f"{k} = {v}" for k, v in result.changed.items())
     if result.published_split:
         text += "; the published split: test clips that training has seen, or no validation clips"
+    if result.forced:
+        text += "; forced: real motions do not have the values that the protocol expects"
     text += "".join(f"; {warning}" for warning in result.warnings)
     return text + ("; QUICK, NOT A RESULT" if result.quick else "")
 

@@ -12,20 +12,20 @@ from flame_mdm.errors import UserError, did_you_mean, say
 COMMANDS = {
     "train": "train or resume a recipe",
     "sample": "generate motions from a checkpoint",
-    "edit": "keep part of a motion and sample the rest",
-    "evaluate": "measure a checkpoint by a protocol",
+    "edit": "keep part of a motion and resample the rest",
+    "evaluate": "evaluate a checkpoint under a protocol",
     "tables": "render tables and figures from results",
     "benchmark": "train, evaluate and tabulate a set of small models",
     "prepare": "turn a data set into a packed store, or verify one",
     "browse": "show a prepared data set as a web page",
     "convert": "convert a motion file",
-    "compare": "put runs side by side, or run a user study",
-    "report": "write a run's report page",
-    "import": "import a checkpoint that the authors of a paper released",
+    "compare": "compare runs side by side, or conduct a user study",
+    "report": "write the report page of a run",
+    "import": "import a checkpoint released by the authors of a paper",
     "export": "write a checkpoint as a model file",
     "push": "upload a model file to the Hugging Face hub",
 }
-"""Name of each command -> what it does. `import` lives in `commands/import_released.py`; the others in their name."""
+"""Name of each command -> what it does. Each is in `commands/NAME.py`; `import` is in `commands/import_released.py`."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -207,8 +207,8 @@ def test_a_caption_names_one_motion_where_it_can(store, tmp_path):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["split=dev"], "no split is called dev; there are train, val, test"),
-        (["search=swims"], "'swims' in its id or its captions"),
+        (["split=dev"], "no split is called dev. Available: train, val, test"),
+        (["search=swims"], "'swims' in its id or captions"),
     ],
 )
 def test_command_says_what_is_wrong(tmp_path, data_root, capsys, words, message):

@@ -132,7 +132,7 @@ def test_runs_sample_what_a_folder_of_motions_shows(tmp_path, data_root, capsys)
         "as long at 20 frames a second, to what is sampled"
     )
     assert made[0]["joints"] != made[2]["joints"], "two motions for a prompt that is there twice"
-    assert "1 of 4 motions are made 3 seconds long, the most that quickstart samples" in capsys.readouterr().out
+    assert "1 of 4 motions are shortened to 3 seconds, the maximum length for quickstart" in capsys.readouterr().out
     items = questions(page([model, real], tmp_path / "rate.html", "rate=true"))
     assert sorted(item["prompt"] for item in items) == sorted(text for text, _ in wanted if text)
     again = players(page([model, real], tmp_path / "seed.html", "seed=1", "seconds=1"))[0]
@@ -143,12 +143,12 @@ def test_runs_sample_what_a_folder_of_motions_shows(tmp_path, data_root, capsys)
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        ([], "give one of runs="),
-        (["runs=a b", "ratings=c"], "give one of runs="),
+        ([], "give either runs="),
+        (["runs=a b", "ratings=c"], "give either runs="),
         (["runs=a"], "two runs or more"),
         (["runs=a a"], "two runs or more"),
         (["runs=/nowhere /nothing"], "/nowhere: neither a run"),
-        (["runs={0} {1}", "texts= ; "], "no text in it"),
+        (["runs={0} {1}", "texts= ; "], "contains no text"),
         (["runs={0} {1}", "texts=absent.txt"], "texts=absent.txt: no such file"),
         (["runs={0} {1}", "texts=a person walks"], "no such checkpoint"),
         (["runs={0} {0}/samples/step_0000009"], "no such checkpoint"),

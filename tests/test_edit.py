@@ -426,8 +426,8 @@ def test_the_command_writes_the_original_beside_the_edits(checkpoint, store, tmp
     words += ["text=it's a (jump), $5", "region=in_between", "joints=[left_arm,head]", "seed=4"]
     assert main(["edit", *words]) == 0
     printed = capsys.readouterr().out
-    assert "largest change among them: 0 in normalized features" in printed
-    assert "m of the joints in the world" in printed
+    assert "Largest change in the kept part: 0 in normalized features" in printed
+    assert "m in world joint positions" in printed
     for name in ("player.html", "motions.gif", "motions.png"):
         assert (out / name).stat().st_size > 1000
     page = (out / "player.html").read_text()
@@ -446,7 +446,7 @@ def test_the_command_writes_the_original_beside_the_edits(checkpoint, store, tmp
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        ([], "ask for one of text=..., action=... and unconditioned=true, not none"),
+        ([], "give exactly one of text=..., action=... and unconditioned=true, not none"),
         (["text=jump", "unconditioned=true"], "not text and unconditioned"),
         (["unconditioned=true", "motion=null"], "no motion to edit"),
         (["unconditioned=true", "cut=3"], r"cut=3: write [begin, end]"),

@@ -438,7 +438,7 @@ def test_command_converts(sample, tmp_path, ending, capsys):
     ("words", "message"),
     [
         (["nothing.npz", "out=a.bvh"], "nothing.npz: no such file"),
-        (["{sample}"], "which file, and where to?"),
+        (["{sample}"], "name an input and an output file"),
         (["{sample}", "out=a.fbx"], ".bvh, .glb, .npz, .json, .npy"),
         (["{sample}", "out=a.glb", "unit=0.01"], "metres"),
     ],

@@ -215,7 +215,7 @@ def test_an_unknown_set_gets_the_nearest_name(capsys: pytest.CaptureFixture[str]
     assert main(["prepare", "data=humanl3d"]) == 1
     assert "no data is called 'humanl3d'. Did you mean humanml3d" in capsys.readouterr().err
     assert main(["prepare"]) == 1
-    assert "which data set? data=NAME, one of: babel, bandai" in capsys.readouterr().err
+    assert "no data set named. Add data=NAME, one of: babel, bandai" in capsys.readouterr().err
 
 
 WHERE = {
@@ -248,7 +248,8 @@ def test_a_missing_source_says_where_to_get_the_set(data: str, tmp_path: Path, c
 
 def test_a_set_without_a_source_refuses_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     assert main(["prepare", "data=synthetic", f"source={tmp_path}"]) == 1
-    assert capsys.readouterr().err == "error: synthetic needs no source: it is made from nothing\n"
+    told = f"error: source={tmp_path}: synthetic is generated and has no source. Drop source=\n"
+    assert capsys.readouterr().err == told
 
 
 @pytest.mark.parametrize("data", sorted({*WHERE} - {"folder", "bandai"}))

@@ -282,7 +282,7 @@ def test_a_folder_without_a_run_is_one_line(tmp_path, capsys):
     assert main(["report", str(tmp_path)]) == 1
     assert "no config.yaml there" in capsys.readouterr().err
     assert main(["report"]) == 1
-    assert "which run?" in capsys.readouterr().err
+    assert "no run named" in capsys.readouterr().err
 
 
 def test_a_run_without_a_history_has_a_report(tmp_path):

@@ -206,7 +206,7 @@ def test_sampling_writes_motions_and_a_player(trained, tmp_path, capsys):
     [
         (["text="], "the text is empty"),
         (["text=  "], "the text is empty"),
-        ([], "ask for one of text=..., action=... and unconditioned=true, not none"),
+        ([], "give exactly one of text=..., action=... and unconditioned=true, not none"),
         (["text=a", "unconditioned=true"], "not text and unconditioned"),
         (["text=a", "seconds=30"], "up to 3 seconds (60 frames at 20 a second)"),
         (["text=a", "seconds=0"], "cannot be sampled"),

@@ -7,4 +7,4 @@ SAMPLING = {
     "sampler": "str",
     "num_inference_steps": "int",
 }
-"""Kinds of values of the keys that all commands that sample take."""
+"""Keys that all sampling commands share, and the types of their values."""

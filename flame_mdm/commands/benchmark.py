@@ -1,4 +1,4 @@
-"""Trains and measures small models of all kinds: `flame-mdm benchmark synthetic`"""
+"""`flame-mdm benchmark NAME`: trains and evaluates a set of small models, and writes a report page."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ USAGE = """
 usage: flame-mdm benchmark NAME [out=FOLDER]
 
 Trains a motion-CLIP and a small model of each kind, evaluates them, and writes a table and a report page: the whole
-chain in one command. An interrupted command continues where it stopped.
-NAME is a file of experiments/benchmark: synthetic, which needs no download, or bandai.
+pipeline in one command. If interrupted, the same command continues where it stopped.
+NAME is a file in experiments/benchmark: synthetic, which needs no download, or bandai.
 """
 
 
@@ -37,17 +37,17 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def benchmark(config: Config) -> None:
-    """Trains, evaluates and reports what a file of experiments/benchmark lists.
+    """Trains and evaluates the models listed in a file of experiments/benchmark, and writes a report page.
 
     Raises:
-        UserError: no such file, a training that failed, or a model that is worse than expected.
+        UserError: If the file does not exist, a training run fails, or a model is worse than expected.
     """
     names = sorted(path.stem for path in (EXPERIMENTS / "benchmark").glob("*.yaml"))
     if config["exp"] not in names:
-        raise UserError(f"which benchmark? EXP=NAME, one of: {', '.join(names)}")
+        raise UserError(f"no benchmark named. Add EXP=NAME, one of: {', '.join(names)}")
     plan = read_yaml(EXPERIMENTS / "benchmark" / f"{config['exp']}.yaml")
     out = Path(config["out"] or Path("runs") / "benchmark" / config["exp"])
-    out.mkdir(parents=True, exist_ok=True)  # before hours of work
+    out.mkdir(parents=True, exist_ok=True)  # fails before hours of work, not after
     times = Times(out / "times.json")
     if config["evaluate"]:
         for words in plan["train"]:
@@ -65,20 +65,20 @@ def benchmark(config: Config) -> None:
     checks = check(table, plan.get("expected", {}))
     report = out / "report.html"
     write_text(report, page(table.title, _report(config["exp"], body, times, checks, plan["train"])))
-    say(f"{sum(times.seconds.values()) / 60:.0f} minutes in all; see {report}")
+    say(f"{sum(times.seconds.values()) / 60:.0f} minutes in total; report: {report}")
     wrong = [line for line, right in checks if not right]
     if failed or wrong:
         raise UserError("; ".join([*failed, *wrong]))
 
 
 class Times:
-    """Seconds by what they were spent on, kept in a file, so that a benchmark that goes on knows of its beginning."""
+    """Seconds spent per activity, kept in a file so that a resumed benchmark reports its total time."""
 
     def __init__(self, path: Path):
         self.path = path
         self.seconds: dict[str, float] = {}
         if path.exists():
-            self.seconds = read_json(path, dict[str, Number], "delete it, and the time before is not counted")
+            self.seconds = read_json(path, dict[str, Number], "delete it; the time spent so far is then not counted")
 
     def add(self, name: str, seconds: float) -> None:
         self.seconds[name] = self.seconds.get(name, 0.0) + seconds
@@ -89,7 +89,8 @@ def train(words: Sequence[str], times: Times, data_root: str | None) -> None:
     """Runs `flame-mdm train` in a separate process.
 
     Raises:
-        UserError: it failed. SystemExit: it was interrupted.
+        UserError: If training fails.
+        SystemExit: If training is interrupted.
     """
     root = [f"data_root={data_root}"] if data_root else []
     say(f"== training {' '.join(words)}")
@@ -101,11 +102,15 @@ def train(words: Sequence[str], times: Times, data_root: str | None) -> None:
     if code >= 128 or code < 0:
         raise SystemExit(code if code > 0 else 128 - code)
     if code:
-        raise UserError(f"training {' '.join(words)} failed, see above; the same command goes on from here")
+        raise UserError(f"training {' '.join(words)} failed (see above). Run the benchmark again to continue")
 
 
 def check(table: Table, expected: Mapping[str, Mapping[str, Mapping[str, Sequence[float]]]]) -> list[tuple[str, bool]]:
-    """Compares values of a table with what is expected of them; one line each, and whether it holds."""
+    """Compares values of a table with their expected ranges.
+
+    Returns:
+        For each expected range, a line that describes the check, and whether the value is within the range.
+    """
     found = {
         (part.name, line.label, column): cell.value if cell is not None and not line.state else None
         for part in table.parts
@@ -116,11 +121,11 @@ def check(table: Table, expected: Mapping[str, Mapping[str, Mapping[str, Sequenc
     checks = []
     for part, rows in expected.items():
         for row, columns in rows.items():
-            for column, (least, most) in columns.items():
+            for column, (low, high) in columns.items():
                 value = found.get((part, row, column))
                 measured = "not measured" if value is None else f"{value:.3g}"
-                line = f"{row}: {column} {measured}, expected {least:g} to {most:g}"
-                checks.append((line, value is not None and least <= value <= most))
+                line = f"{row}: {column} {measured}, expected {low:g} to {high:g}"
+                checks.append((line, value is not None and low <= value <= high))
     return checks
 
 

@@ -1,4 +1,4 @@
-"""`flame-mdm browse DATA`: shows a prepared data set as one web page."""
+"""`flame-mdm browse DATA`: shows a prepared data set as a web page."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ USAGE = """
 usage: flame-mdm browse data=NAME [split=train] [search="waves left"] [clips=200] [out=FILE.html]
        flame-mdm browse data=NAME split=test clips=10 motions=FOLDER
 
-Writes one web page that opens from disk: clips of a data set with their captions, mirrored copies beside their
-originals, a search, a choice of splits, the distribution of lengths and other statistics. motions= writes the clips of
-the page as motion files, too, so that generated motions can be compared with them.
+Writes a single web page that opens from disk. It shows clips of a data set with their captions, mirrored copies next
+to their originals, a search field, a choice of splits, the distribution of clip lengths and other statistics.
+motions=FOLDER also writes the shown clips as motion files, to compare generated motions with them.
 """
 
 
@@ -33,35 +33,35 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def browse(config: Config) -> None:
-    """Writes the page, after the data set is prepared where that has not been done.
+    """Prepares the data set if needed, and writes the page.
 
     Raises:
-        UserError: no data set named, no clip fits, or other motions in the folder `motions`.
-        FileNotFoundError, ValueError: the raw data is absent or damaged.
+        UserError: If no data set is named, no clip matches, or the folder `motions` holds other motions.
+        FileNotFoundError, ValueError: If the raw data is missing or damaged.
     """
     if "data" not in config:
         names = sorted(path.stem for path in (EXPERIMENTS / "data").glob("*.yaml"))
-        raise UserError(f"which data set? data=NAME, one of: {', '.join(names)}")
+        raise UserError(f"no data set named. Add data=NAME, one of: {', '.join(names)}")
     if config["clips"] < 1:
-        raise UserError(f"clips={config['clips']}: a page shows at least 1")
+        raise UserError(f"clips={config['clips']}: must be at least 1")
 
     representation = instantiate(config["representation"])
     data = instantiate(config["data"], representation=representation)
     data.prepare_data()
     store = data.open()
     if config["split"] not in (None, *store.info["clips"]):
-        raise UserError(f"no split is called {config['split']}; there are {', '.join(store.info['clips'])}")
+        raise UserError(f"no split is called {config['split']}. Available: {', '.join(store.info['clips'])}")
     search = "" if config["search"] is None else str(config["search"])
     families = find(store.clips, config["split"], search)
     if not families:
-        raise UserError(f"no clip of {data.folder} has '{search}' in its id or its captions")
-    fitting = sum(map(len, families))
+        raise UserError(f"no clip of {data.folder} has '{search}' in its id or captions. Search for other words")
+    matching = sum(map(len, families))
     clips = [clip for family in choose(families, config["clips"]) for clip in family]
-    title = f"{store.info['dataset']}: {len(clips)} of {fitting} clips"
+    title = f"{store.info['dataset']}: {len(clips)} of {matching} clips"
     title += f" in {config['split']}" * (config["split"] is not None) + f" with '{search}'" * bool(search)
     out = Path(config["out"] or Path("runs") / "browse" / f"{data.folder.name}.html")
     write_page(out, store, representation, clips, title)
-    say(f"{out}: {len(clips)} of {fitting} clips, {out.stat().st_size / 1e6:.1f} MB")
+    say(f"{out}: {len(clips)} of {matching} clips, {out.stat().st_size / 1e6:.1f} MB")
     if config["motions"] is not None:
         write_clips(Path(config["motions"]), store, representation, clips, data.crop.longest())
         say(f"{config['motions']}: {len(clips)} motions")

@@ -1,4 +1,4 @@
-"""`flame-mdm compare RUN RUN ...`: puts runs side by side on one page, or runs a user study."""
+"""`flame-mdm compare RUN RUN ...`: compares runs on one page, or conducts a user study."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ usage: flame-mdm compare runs="A B C" [texts="a person walks; a person jumps"]
        flame-mdm compare runs="A B FOLDER" rate=true [texts=prompts.txt]
        flame-mdm compare ratings="ann.json bob.json" out=ratings.json
 
-Puts runs side by side on one page: configuration differences, curves, evaluations and motions for the same prompts.
-rate=true writes a page that asks which of two motions fits a text better, without saying whose they are; ratings=
-counts the answers. FOLDER holds motion files, such as real ones: without texts=, the runs sample for its captions at
-its lengths. Keys: experiments/compare.yaml
+Compares runs side by side on one page: configuration differences, curves, evaluations and motions for the same prompts.
+rate=true writes a blind user study instead: a page that asks which of two motions fits a text better. ratings= counts
+the answers. FOLDER holds motion files, for example real motions: unless texts= is given, the runs are then sampled for
+the captions of these motions, at their lengths. Keys, with their defaults: experiments/compare.yaml
 """
 
 
@@ -52,13 +52,14 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def compare(config: Config) -> None:
-    """Writes the page that the configuration asks for, or counts ratings.
+    """Writes the requested page, or counts ratings.
 
     Raises:
-        UserError: not one of both asked for, too few runs, folders without a run, or malformed ratings.
+        UserError: If not exactly one of `runs` and `ratings` is given, there are fewer than two runs, a folder holds no
+            run, or a file of ratings is malformed.
     """
     if (config["runs"] is None) == (config["ratings"] is None):
-        raise UserError('give one of runs="A B" to compare and ratings="x.json y.json" to count')
+        raise UserError('give either runs="A B" to compare runs, or ratings="x.json y.json" to count ratings')
     if config["ratings"] is not None:
         out, pairs = Path(config["out"] or "runs/ratings.json"), tally(paths("ratings", str(config["ratings"])))
         write_json(out, {"format": 1, "question": QUESTION, "pairs": pairs})
@@ -81,13 +82,14 @@ def compare(config: Config) -> None:
 
 
 def motions(compared: Sequence[ComparedRun], config: Config) -> list[dict[Prompt, Motion]]:
-    """Motions by prompt of each compared_run.
+    """Returns the motions of each compared run, by prompt.
 
-    Runs show what their last checkpoint makes of `texts`, or else of the captions of the first folder of motions, at
-    the lengths of its motions; where there is neither, their newest samples.
+    The last checkpoint of each run is sampled for `texts`. Without `texts`, it is sampled for the captions of the first
+    folder of motions, at the lengths of these motions. Without either, the newest samples of each run are used.
 
     Raises:
-        UserError: no texts in the file, or what `generate` refuses. ValueError: a damaged file.
+        UserError: If a file of texts is empty, or `generate` refuses the request.
+        ValueError: If a file is damaged.
     """
     given = {c.label: _read(c.folder) for c in compared if c.run is None}
     wanted: dict[Prompt, float | None] = {}
@@ -108,7 +110,7 @@ def motions(compared: Sequence[ComparedRun], config: Config) -> list[dict[Prompt
 
 
 def _read(folder: Path) -> dict[Prompt, Motion]:
-    """Motions of a folder, whose equal captions are counted."""
+    """Returns the motions of a folder; equal captions are numbered."""
     from flame_mdm.formats.files import read
 
     files = [path for path in sorted(folder.iterdir()) if path.suffix.lower() in MOTIONS and path.name[0] != "."]
@@ -116,25 +118,30 @@ def _read(folder: Path) -> dict[Prompt, Motion]:
 
 
 def read_texts(given: str) -> list[str]:
-    """Texts with semicolons between them, or the lines of a .txt file.
+    """Returns texts that are separated by semicolons, or the lines of a .txt file, without duplicates.
 
     Raises:
-        UserError: there are none, or no such file.
+        UserError: If there is no text, or the file does not exist.
     """
     if given.endswith(".txt") and not Path(given).exists():
         raise UserError(f"texts={given}: no such file")
     parts = read_text(given, MEBIBYTE).splitlines() if given.endswith(".txt") else given.split(";")
     texts = [part.strip() for part in parts if part.strip()]
     if not texts:
-        raise UserError(f'texts={given}: no text in it; texts="a person walks; a person jumps", or a .txt file')
+        raise UserError(f'texts={given}: contains no text. Give texts="a person walks; a person jumps" or a .txt file')
     return list(dict.fromkeys(texts))
 
 
 def _sampled(compared_run: ComparedRun, wanted: Mapping[Prompt, float | None], config: Config) -> dict[Prompt, Motion]:
-    """Motions of a run's last checkpoint for texts or labels, each of so many seconds; None = as `generate` has it.
+    """Samples a run's last checkpoint for texts or action labels.
 
-    Motions that would be longer than the run samples are made as long as it does. Those of a text that is wanted more
-    than once have the seeds that follow the configuration's.
+    Motions longer than the model supports are shortened to its maximum. If a prompt is requested several times, its
+    repetitions use the seeds after the configured one.
+
+    Args:
+        compared_run: the run.
+        wanted: length in seconds of each motion; None = the default length of `generate`.
+        config: the configuration of the command.
     """
     import torch
 
@@ -145,7 +152,7 @@ def _sampled(compared_run: ComparedRun, wanted: Mapping[Prompt, float | None], c
     fps, longest = model.representation.fps, model.facts["max_frames"]
     lengths = {prompt: round(seconds * fps) for prompt, seconds in wanted.items() if seconds is not None}
     if over := sum(length > longest for length in lengths.values()):
-        limit = f"made {longest / fps:g} seconds long, the most that {compared_run.label} samples"
+        limit = f"shortened to {longest / fps:g} seconds, the maximum length for {compared_run.label}"
         say(f"{over} of {len(lengths)} motions are {limit}")
     found: dict[Prompt, Motion] = {}
     for count in sorted({count for _, count in wanted}):

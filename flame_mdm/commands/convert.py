@@ -1,4 +1,4 @@
-"""Converts motion files: `flame-mdm convert motion.npz walk.bvh`"""
+"""`flame-mdm convert MOTION OUT`: converts a motion file."""
 
 from __future__ import annotations
 
@@ -12,8 +12,10 @@ from flame_mdm.errors import UserError, say
 USAGE = """
 usage: flame-mdm convert MOTION OUT [fps=20] [unit=0.01]
 
-Reads a motion (.npz of `make sample` or of AMASS, .bvh, .json, or joints .npy) and writes it as .bvh or .glb for
-Blender and game engines, .npz as AMASS, or .json or .npy with the joints. Units, axes and names: docs/formats.md
+Converts a motion file.
+Inputs: .npz written by `make sample`, .npz of AMASS, .bvh, .json, and .npy with joint positions.
+Outputs: .bvh and .glb for Blender and game engines, .npz in the layout of AMASS, and .json and .npy with joint
+positions. Units, axes and joint names: docs/formats.md
 """
 
 
@@ -36,17 +38,17 @@ def convert(config: Config) -> None:
     """Converts one file.
 
     Raises:
-        UserError: no input or no output named.
-        FileNotFoundError, ValueError: as `formats.files.read` and `Motion.save`.
+        UserError: If the input or the output is not named.
+        FileNotFoundError, ValueError: As raised by `formats.files.read` and `Motion.save`.
     """
     if config["motion"] is None or config["out"] is None:
-        raise UserError("which file, and where to? flame-mdm convert motion.npz walk.bvh")
+        raise UserError("name an input and an output file: flame-mdm convert motion.npz walk.bvh")
     from flame_mdm.formats.files import read
 
     motion = read(str(config["motion"]), config["fps"], config["unit"])
     out = Path(str(config["out"]))
     if out.suffix.lower() == ".npz":
-        motion.poses = motion.posed()  # other programs read AMASS's keys
+        motion.poses = motion.posed()  # other programs expect AMASS's keys
     say(motion.save(out))
 
 

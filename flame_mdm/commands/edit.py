@@ -1,4 +1,4 @@
-"""Edits a motion: `flame-mdm edit ckpt=... motion=walk.npz region=in_between text="a person jumps"`"""
+"""`flame-mdm edit CKPT motion=FILE`: keeps part of a motion and resamples the rest."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ usage: flame-mdm edit ckpt=FILE motion=walk.npz region=in_between text="a person
        flame-mdm edit ckpt=FILE motion=take.bvh cut=[0,3] joints=upper_body unconditioned=true
        flame-mdm edit ckpt=FILE motion=bandai:CLIP region_seconds=[1,2] joints=[left_arm,head] method=flame ...
 
-Keeps a part of a motion and resamples the rest. Writes the original and the results (.npz), a GIF and a player for
-any browser. Keys, with their defaults: experiments/edit.yaml
+Keeps part of a motion and resamples the rest. Writes the original and the results (.npz), a GIF, and a player that
+opens in any browser. Keys, with their defaults: experiments/edit.yaml
 """
 
 
@@ -37,14 +37,14 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def write_edits(config: Config) -> None:
-    """Edits as the configuration asks, and writes the results.
+    """Edits a motion as configured, and writes the original and the results.
 
     Raises:
-        UserError: nothing, or two things, asked for; or what `flame_mdm.editing.edit` refuses.
+        UserError: If not exactly one condition is requested, or `flame_mdm.editing.edit` refuses the request.
     """
     check_request(config)
     if config["motion"] is None:
-        raise UserError("no motion to edit: give motion=FILE (.npz, .bvh, .json, .npy) or motion=dataset:id")
+        raise UserError("no motion to edit. Give motion=FILE (.npz, .bvh, .json, .npy) or motion=dataset:id")
 
     import torch
 
@@ -69,18 +69,19 @@ def write_edits(config: Config) -> None:
         actions=None if config["action"] is None else [str(config["action"])],
         **{key: config[key] for key in keys},
     )
-    asked = {key: config[key] for key in keys if key not in ("resample", "samples", "seed")} | {"cut": config["cut"]}
-    asked["resample"] = config["resample"] if config["resample"] != 1 else None
+    requested = {key: config[key] for key in keys if key not in ("resample", "samples", "seed")}
+    requested["cut"] = config["cut"]
+    requested["resample"] = config["resample"] if config["resample"] != 1 else None
     what = f"edit {Path(original.id).stem} {edits[0].text}"
-    folder = Path(config["out"] or default_folder(model, what, config["seed"], asked))
+    folder = Path(config["out"] or default_folder(model, what, config["seed"], requested))
     shown = replace(original, text=f"original: {original.text or original.id}")
     facts = {"seed": config["seed"], "checkpoint": sha256(file), "keep": edits[0].keep}
     write_motions(folder, [shown, *edits], facts)
     say(f"{len(edits)} motions of {len(original.joints)} frames: {folder / 'player.html'}, {folder / 'motions.gif'}")
     say(
-        f"{edits[0].keep.mean():.0%} of the features were to be kept; largest change among them: "
-        f"{max(e.feature_error for e in edits):.3g} in normalized features; "
-        f"{max(e.joint_error for e in edits):.3g} m of the joints in the world"
+        f"{edits[0].keep.mean():.0%} of the features are kept. Largest change in the kept part: "
+        f"{max(e.feature_error for e in edits):.3g} in normalized features, "
+        f"{max(e.joint_error for e in edits):.3g} m in world joint positions"
     )
 
 

@@ -1,4 +1,4 @@
-"""`flame-mdm evaluate CKPT`: measures a checkpoint, a folder of motions or a baseline by a protocol."""
+"""`flame-mdm evaluate CKPT`: evaluates a checkpoint, a folder of motions or a baseline under a protocol."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ usage: flame-mdm evaluate ckpt=FILE [protocol=NAME] extractor=FILE [key=value ..
        flame-mdm evaluate baseline=shuffled data=NAME protocol=NAME extractor=FILE
        torchrun --nproc-per-node 8 -m flame_mdm evaluate ckpt=FILE ...
 
-Measures real motions and generated ones by a protocol, and writes a JSON file with all values and where they come from.
-The same command goes on where a killed one stopped. quick=true shows in a minute that all works.
+Evaluates generated and real motions under a protocol, and writes a JSON file with all values and their provenance.
+If interrupted, the same command continues where it stopped. quick=true checks within a minute that everything works.
 Keys, with their defaults: experiments/evaluate.yaml; protocols: experiments/evaluation
 """
 

@@ -11,7 +11,7 @@ from flame_mdm.errors import UserError, say
 USAGE = """
 usage: flame-mdm export CKPT OUT
 
-Writes the averaged weights of a checkpoint, its recipe and the facts of its data as one .safetensors file.
+Writes the averaged weights of a checkpoint, its recipe and the metadata of its data set as one .safetensors file.
 """
 
 
@@ -23,7 +23,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _export(config: Config) -> None:
     if config["ckpt"] is None or config["out"] is None:
-        raise UserError("a checkpoint and a file to write are needed: flame-mdm export CKPT model.safetensors")
+        raise UserError("name a checkpoint and an output file: flame-mdm export CKPT model.safetensors")
     from flame_mdm.checkpoints.hub import export
     from flame_mdm.checkpoints.loading import find
 

@@ -1,4 +1,4 @@
-"""`flame-mdm import KIND FILE [ARGS] out=FILE`: imports a checkpoint that the authors of a paper released."""
+"""`flame-mdm import KIND FILE [ARGS] out=FILE`: imports a checkpoint released by the authors of a paper."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ usage: flame-mdm import mdm model000475000.pt args.json out=mdm.safetensors stat
        flame-mdm import mfm model.pt .hydra/config.yaml out=mfm.safetensors stats=FOLDER
        flame-mdm import flame model.ckpt out=flame.safetensors
 
-Writes a released checkpoint of MDM, MFM, FLAME, or FLAME's motion-CLIP (mclip) as a model file that all commands take.
+Converts a released checkpoint of MDM, MFM, FLAME, or FLAME's motion-CLIP (mclip) into a model file for all commands.
 Keys, with their defaults: experiments/import.yaml
 """
 
@@ -35,9 +35,9 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _import(config: Config) -> None:
     if config["kind"] not in KINDS:
-        raise UserError(f"unknown kind of released model: {config['kind']}. Write {', '.join(KINDS[:-1])} or mclip")
+        raise UserError(f"unknown kind of released model: {config['kind']}. Use {', '.join(KINDS[:-1])} or mclip")
     if config["file"] is None or config["out"] is None:
-        raise UserError("FILE and out=... are needed: flame-mdm import mdm model.pt args.json out=mdm.safetensors")
+        raise UserError("name FILE and out=...: flame-mdm import mdm model.pt args.json out=mdm.safetensors")
     from flame_mdm.checkpoints.released import import_released
 
     keys = ("kind", "file", "args", "out", "stats", "averaged", "num_heads", "time_token", "run_code")

@@ -1,4 +1,4 @@
-"""Prepares a data set: `flame-mdm prepare data=bandai source=/path/to/the/archive`"""
+"""`flame-mdm prepare DATA`: prepares a data set, or verifies a prepared one."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from flame_mdm.errors import UserError, say
 USAGE = """
 usage: flame-mdm prepare data=NAME [source=PATH] [representation=NAME] [check|verify|force=true]
 
-Turns a data set, as its owners hand it out, into a packed store under data/. `check=true` only tells what is there to
-prepare and what is missing; `verify=true` checks an existing store; `force=true` writes it anew.
+Converts a data set, as distributed by its owners, into a packed store under data/. `check=true` only lists the files
+that were found and those that are missing; `verify=true` checks an existing store; `force=true` rewrites it.
 """
 
 
@@ -26,15 +26,16 @@ def prepare(config: Config) -> None:
     """Writes or verifies the store of a data set.
 
     Raises:
-        UserError: no data set named. FileNotFoundError, ValueError: the raw data is absent or damaged.
+        UserError: If no data set is named, or the data set takes no source.
+        FileNotFoundError, ValueError: If the raw data is missing or damaged.
     """
     if "data" not in config:
         names = sorted(path.stem for path in (EXPERIMENTS / "data").glob("*.yaml"))
-        raise UserError(f"which data set? data=NAME, one of: {', '.join(names)}")
+        raise UserError(f"no data set named. Add data=NAME, one of: {', '.join(names)}")
     node = config["data"]
     if config["source"] is not None:
         if "path" not in node["source"]:
-            raise UserError(f"{node['name']} needs no source: it is made from nothing")
+            raise UserError(f"source={config['source']}: {node['name']} is generated and has no source. Drop source=")
         node["source"]["path"] = str(config["source"])
 
     from flame_mdm.data.store import write_store
@@ -55,7 +56,7 @@ def prepare(config: Config) -> None:
         ]
         if differ:
             say(f"DIFFERS from the published figures: {'; '.join(differ)}")
-        say(f"{data.folder}: whole, every hash is the recorded one; the report is in verify.json")
+        say(f"{data.folder}: complete, every hash matches; the report is in verify.json")
         return
     if (data.folder / "store.json").exists() and not config["force"]:
         store = data.open()
@@ -66,8 +67,8 @@ def prepare(config: Config) -> None:
     clips = ", ".join(f"{count} {split}" for split, count in info["clips"].items())
     say(f"{info['dataset']} as {info['representation']} at {info['fps']:g} fps: {clips}; {info['hours']} hours")
     if info["excluded"]:
-        say("left out: " + ", ".join(f"{count} {reason}" for reason, count in info["excluded"].items()))
-    say(f"{info['shape'][0]} frames of {info['shape'][1]} features, fingerprint {store.fingerprint}: {data.folder}")
+        say("excluded: " + ", ".join(f"{count} {reason}" for reason, count in info["excluded"].items()))
+    say(f"{info['shape'][0]} frames with {info['shape'][1]} features, fingerprint {store.fingerprint}: {data.folder}")
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""`flame-mdm push CKPT user/name`: uploads a model file with its card to the Hugging Face hub."""
+"""`flame-mdm push CKPT user/name`: uploads a model file and its model card to the Hugging Face hub."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _push(config: Config) -> None:
     if config["ckpt"] is None or config["repository"] is None:
-        raise UserError("a checkpoint and a repository are needed: flame-mdm push CKPT user/name")
+        raise UserError("name a checkpoint and a repository: flame-mdm push CKPT user/name")
     from flame_mdm.checkpoints.hub import push
     from flame_mdm.checkpoints.loading import find
 

@@ -12,8 +12,8 @@ from flame_mdm.reporting.report import paths, write_report
 USAGE = """
 usage: flame-mdm report RUN
 
-Writes report.html into the folder of a run: its curves, newest samples, evaluations, and what it was made of, in one
-page that needs no server and no network. Training writes it at its end, too. runs="A B" does several.
+Writes report.html into a run directory: curves, newest samples, evaluations and provenance on one page that needs no
+server and no network. Training also writes it at the end. runs="A B" writes several reports.
 """
 
 
@@ -27,10 +27,10 @@ def report(config: Config) -> None:
     """Writes the report of each run.
 
     Raises:
-        UserError: no run named, or a folder that holds none.
+        UserError: If no run is named, or a folder holds no run.
     """
     if config["runs"] is None:
-        raise UserError("which run? flame-mdm report runs/synthetic/mdm/default")
+        raise UserError("no run named. Name a run directory: flame-mdm report runs/synthetic/mdm/default")
     for folder in paths("runs", str(config["runs"])):
         say(write_report(folder))
 

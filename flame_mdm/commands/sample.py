@@ -1,4 +1,4 @@
-"""Samples from a checkpoint: `flame-mdm sample ckpt=... text="a person walks" seconds=3`"""
+"""`flame-mdm sample CKPT text="a person walks" seconds=3`: samples motions from a checkpoint."""
 
 from __future__ import annotations
 
@@ -20,7 +20,8 @@ usage: flame-mdm sample ckpt=FILE text="a person walks in a circle" [seconds=6] 
        flame-mdm sample ckpt=FILE action=walk
        flame-mdm sample ckpt=FILE unconditioned=true
 
-Writes motions (.npz), a GIF and a player for any browser. Keys, with their defaults: experiments/sample.yaml
+Writes motions (.npz), a GIF, and a player that opens in any browser.
+Keys, with their defaults: experiments/sample.yaml
 """
 
 
@@ -39,10 +40,10 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def sample(config: Config) -> None:
-    """Samples what the configuration asks for.
+    """Samples the requested motions and writes them.
 
     Raises:
-        UserError: nothing, or two things, asked for; or what `generate` refuses.
+        UserError: If not exactly one condition is requested, or `generate` refuses the request.
     """
     check_request(config)
 
@@ -67,8 +68,8 @@ def sample(config: Config) -> None:
         sampler=config["sampler"],
         num_inference_steps=config["num_inference_steps"],
     )
-    asked = {key: config[key] for key in ("seconds", "frames", "guidance_scale", "sampler", "num_inference_steps")}
-    folder = Path(config["out"] or default_folder(model, motions[0].text or "unconditioned", config["seed"], asked))
+    requested = {key: config[key] for key in ("seconds", "frames", "guidance_scale", "sampler", "num_inference_steps")}
+    folder = Path(config["out"] or default_folder(model, motions[0].text or "unconditioned", config["seed"], requested))
     write_motions(folder, motions, {"seed": config["seed"], "checkpoint": sha256(file)})
     say(
         f"{len(motions)} motions of {len(motions[0].joints)} frames: {folder / 'player.html'}, {folder / 'motions.gif'}"
@@ -76,31 +77,33 @@ def sample(config: Config) -> None:
 
 
 def default_folder(model: MotionGeneration, what: str, seed: int, options: Mapping[str, Any]) -> Path:
-    """`samples/<experiment>/<what>-seed<seed>`, and the options that are not None: other motions, another folder.
+    """Returns `samples/<experiment>/<what>-seed<seed>`, followed by all options that are not None.
 
-    The experiment is a word of the checkpoint, which may be a stranger's: the folder is within `samples` all the same.
+    Requests for different motions thus go to different folders. The name of the experiment comes from the checkpoint,
+    which may be untrusted; it is cleaned, so the folder is always within `samples`.
     """
     experiment = re.findall(r"[\w-][\w.-]*", str(model.config["experiment"]))
     name = re.sub(r"[^a-z0-9]+", "-", what.lower()).strip("-")[:60]
     values = {key: re.sub(r"[^\w.,-]+", "", str(value)) for key, value in options.items() if value is not None}
-    told = "".join(f"-{key}={value}" for key, value in values.items())[:150]
-    return Path("samples", *experiment, f"{name}-seed{seed}{told}")
+    suffix = "".join(f"-{key}={value}" for key, value in values.items())[:150]
+    return Path("samples", *experiment, f"{name}-seed{seed}{suffix}")
 
 
 def check_request(config: Config) -> None:
-    """Checks that a checkpoint and one condition are asked for.
+    """Checks that a checkpoint and exactly one condition are requested.
 
     Raises:
-        UserError: they are not.
+        UserError: If not.
     """
-    asked = [key for key in ("text", "action") if config[key] is not None] + ["unconditioned"] * config["unconditioned"]
+    conditions = [key for key in ("text", "action") if config[key] is not None]
+    conditions += ["unconditioned"] * config["unconditioned"]
     if config["ckpt"] is None:
-        raise UserError("no checkpoint: ckpt=runs/.../checkpoints/last.ckpt")
+        raise UserError("no checkpoint given. Add ckpt=runs/.../checkpoints/last.ckpt")
     if config["text"] is not None and not str(config["text"]).strip():
-        raise UserError("the text is empty; write what the person does, or ask for unconditioned motions by name")
-    if len(asked) != 1:
+        raise UserError("the text is empty. Describe what the person does, or use unconditioned=true")
+    if len(conditions) != 1:
         raise UserError(
-            f"ask for one of text=..., action=... and unconditioned=true, not {' and '.join(asked) or 'none'}"
+            f"give exactly one of text=..., action=... and unconditioned=true, not {' and '.join(conditions) or 'none'}"
         )
 
 

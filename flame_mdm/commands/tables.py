@@ -13,9 +13,10 @@ from flame_mdm.files import write_text
 USAGE = """
 usage: flame-mdm tables [table="NAME ..."] [evaluate=false] [out=FOLDER]
 
-Renders tables and figures as Markdown, LaTeX, CSV and HTML. A table is a file of experiments/tables, or of your own: it
-names checkpoints, a protocol and columns. Checkpoints that have not been evaluated are evaluated first; evaluate=false
-takes what is there. Without table=, all tables. The same results give the same bytes.
+Renders tables and figures as Markdown, LaTeX, CSV and HTML. A table is described by a file in experiments/tables, or by
+your own file, which names checkpoints, a protocol and columns. Checkpoints without a result are evaluated first;
+evaluate=false uses existing results only. Without table=, all tables are rendered. Output is deterministic: the same
+results give the same bytes.
 Keys, with their defaults: experiments/tables.yaml
 """
 
@@ -29,10 +30,11 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def tables(config: Config) -> None:
-    """Evaluates what is missing and renders the tables.
+    """Runs missing evaluations and renders the tables.
 
     Raises:
-        UserError: a malformed spec, or an evaluation that failed; the tables are written all the same.
+        UserError: If a spec is malformed, or an evaluation fails. After a failed evaluation, the tables are still
+            written.
     """
     from evaluators.run import evaluate_missing
     from flame_mdm.reporting.page import page, render
@@ -40,7 +42,7 @@ def tables(config: Config) -> None:
 
     names = str(config["table"]).split() if config["table"] is not None else spec_names()
     if not names:
-        raise UserError("table= names no table")
+        raise UserError("table= names no table. Give names of experiments/tables, or leave it out for all tables")
     specs = {Path(name).stem: load_spec(name) for name in names}
     results = Path(config["results"])
     failed = evaluate_missing(specs, results, config) if config["evaluate"] else []

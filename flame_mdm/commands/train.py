@@ -1,4 +1,4 @@
-"""Trains an experiment: `flame-mdm train NAME key=value ...`"""
+"""`flame-mdm train NAME key=value ...`: trains an experiment, or resumes it."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from flame_mdm.errors import UserError
 USAGE = """
 usage: flame-mdm train NAME [key=value ...] [--multirun]
 
-Trains the experiment NAME (a file of experiments/, or the path of a recipe or of a saved config.yaml).
-key=value changes one key (trainer.max_steps=1000), part=name swaps a part (denoiser=mdm_decoder).
-The same command in the same folder resumes; run.name=other starts another run.
+Trains the experiment NAME: a file in experiments/, or the path of a recipe or of a saved config.yaml.
+key=value overrides one key (trainer.max_steps=1000); part=name replaces a component (denoiser=mdm_decoder).
+Running the same command again resumes the run; run.name=other starts another run.
 """
 
 FREE = (
@@ -46,11 +46,11 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def train(config: Config) -> None:
-    """Trains the composed experiment, resuming what its folder holds.
+    """Trains the composed experiment, or resumes the run in its directory.
 
     Raises:
-        UserError: the folder holds a run of another configuration, or the data or the recipe is unusable.
-        SystemExit: interrupted; the checkpoint is written and the code is 128 + the signal's number.
+        UserError: If the directory holds a run with another configuration, or the data or the recipe is unusable.
+        SystemExit: If interrupted, after a checkpoint is written. The exit code is 128 + the number of the signal.
     """
     folder = Path(config["run"]["dir"])
     _same_run(folder, config)
@@ -65,7 +65,7 @@ def train(config: Config) -> None:
 
 
 def _same_run(folder: Path, config: Config) -> None:
-    """Refuses a folder that holds a run of another configuration."""
+    """Raises `UserError` if the folder holds a run with another configuration."""
     if not (folder / "config.yaml").exists():
         return
     saved, wanted = flatten(movable(read_saved(folder / "config.yaml"))), flatten(movable(config))
@@ -76,8 +76,8 @@ def _same_run(folder: Path, config: Config) -> None:
     ]
     if differing:
         raise UserError(
-            f"{folder} holds a run of another configuration: {'; '.join(differing)}. Give this one a name of its own "
-            "with run.name=..., or delete that folder"
+            f"{folder} holds a run with another configuration: {'; '.join(differing)}. Choose another name with "
+            "run.name=..., or delete that folder"
         )
 
 

@@ -420,7 +420,7 @@ def evaluate_missing(specs: Mapping[str, Config], results: Path, config: Config)
             for dataset in part.get("lengths", []):
                 count_lengths(dataset, results, config)
             for _, row in requests(part) if "columns" in part else ():
-                wanted |= {request.path(results): request for request in row if not request.lacking}
+                wanted |= {request.path(results): request for request in row if not request.missing}
     missing = {path: request for path, request in wanted.items() if not path.exists() or _outdated(path, request)}
     failed = []
     for number, (path, request) in enumerate(missing.items()):

@@ -95,7 +95,7 @@ def test_runs_without_a_common_prompt_are_compared_and_not_judged(three, tmp_pat
     motions(other / "samples" / "step_0000009", ("a person swims",))
     assert "no prompt in common" in page([three[0], other], tmp_path / "out.html")
     assert main(["compare", f"runs={three[0]} {other}", "rate=true", f"out={tmp_path / 'rate.html'}"]) == 1
-    assert "no prompt in common to be judged by" in capsys.readouterr().err
+    assert "have no prompt in common" in capsys.readouterr().err
     assert not (tmp_path / "rate.html").exists()
 
 
@@ -257,5 +257,5 @@ def test_malformed_ratings_are_one_line(tmp_path, content, message, capsys):
 
 def test_nobody_counts_twice(tmp_path):
     files = [ratings(tmp_path / name, "ab") for name in ("x.json", "copy.json")]
-    with pytest.raises(UserError, match=r"copy\.json: ann has answered the same page in .*x\.json"):
+    with pytest.raises(UserError, match=r"copy\.json: ann also answered this page in .*x\.json"):
         tally(files)

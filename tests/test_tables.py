@@ -280,7 +280,7 @@ spec:
     with pytest.raises(UserError, match="x: no column is called FDI"):
         made(folder)
     published.write_text("spec: {Txt: {evaluator: e, source: s, rows: []}}")
-    with pytest.raises(UserError, match="parts that its spec lacks: Txt"):
+    with pytest.raises(UserError, match="parts that are not in its spec: Txt"):
         made(folder)
 
 
@@ -380,7 +380,7 @@ parts:
     assert "mine: 2 of 3 rows measured" in shown
     first = files(Path("runs/tables"))
     assert b"elsewhere: make train EXP=synthetic/mdm" in first["mine.md"]
-    assert b"not as the protocol has it: replications = 1, samples = 4" in first["mine.md"]
+    assert b"differs from the protocol: replications = 1, samples = 4" in first["mine.md"]
     assert main(["tables", *asked]) == 0
     assert "evaluating" not in capsys.readouterr().out
     assert files(Path("runs/tables")) == first

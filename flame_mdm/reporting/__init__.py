@@ -1,1 +1,1 @@
-"""Tables, run reports, comparisons and data set pages, from files alone: no model is loaded here."""
+"""Tables, run reports, comparisons and data set pages, made from files alone. No model is loaded here."""

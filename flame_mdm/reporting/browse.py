@@ -1,4 +1,4 @@
-"""One web page of a prepared data set: `flame-mdm browse data=bandai search="waves left"`"""
+"""Single-page view of a prepared data set: `flame-mdm browse data=bandai search="waves left"`"""
 
 from __future__ import annotations
 
@@ -21,12 +21,20 @@ if TYPE_CHECKING:
     from flame_mdm.representations import Representation
 
 SECONDS = 15
-"""Longer clips show their beginning only, so that the page stays small."""
+"""Seconds shown of a longer clip, to keep the page small."""
 BARS = 30
 
 
 def find(clips: Sequence[Entry], split: str | None, search: str) -> list[list[Entry]]:
-    """Clips of a split that have all words of `search` in id and captions; an original and its mirror go together."""
+    """Returns the clips of a split whose id and captions contain all words of `search`.
+
+    Each clip is grouped with its mirrored copy, original first; a group matches if one of its clips does.
+
+    Args:
+        clips: all clips of a store.
+        split: None = all splits.
+        search: words, in any order and case.
+    """
     ids = {clip.id for clip in clips}
     families: dict[str, list[Entry]] = {}
     for clip in clips:
@@ -35,12 +43,12 @@ def find(clips: Sequence[Entry], split: str | None, search: str) -> list[list[En
             families.setdefault(original, []).append(clip)
     words = search.lower().split()
     texts = {clip.id: " ".join([clip.id, *clip.captions]).lower() for clip in clips}
-    fitting = (f for f in families.values() if any(all(word in texts[clip.id] for word in words) for clip in f))
-    return [sorted(family, key=lambda clip: len(clip.id)) for family in fitting]  # the original stands first
+    matching = (f for f in families.values() if any(all(word in texts[clip.id] for word in words) for clip in f))
+    return [sorted(family, key=lambda clip: len(clip.id)) for family in matching]  # a mirrored id is longer
 
 
 def choose(families: Sequence[list[Entry]], most: int) -> list[list[Entry]]:
-    """Families spread evenly over all of them, with `most` clips together at most, and one family at least."""
+    """Returns evenly spaced families with at most `most` clips in total, but at least one family."""
     for count in range(min(len(families), max(1, most)), 0, -1):
         chosen = [families[k] for k in np.linspace(0, len(families) - 1, count).round().astype(int)]
         if sum(map(len, chosen)) <= most:
@@ -49,7 +57,7 @@ def choose(families: Sequence[list[Entry]], most: int) -> list[list[Entry]]:
 
 
 def motion(store: Store, representation: Representation, clip: Entry) -> Motion:
-    """A clip as the player shows it, cut after `SECONDS`."""
+    """Returns a clip for the player, cut after `SECONDS`."""
     import torch
 
     from flame_mdm.formats.motion import Motion
@@ -57,7 +65,7 @@ def motion(store: Store, representation: Representation, clip: Entry) -> Motion:
     shown = round(SECONDS * representation.fps)
     joints = representation.decode(torch.from_numpy(store.motion(clip)[:shown].copy())).numpy()
     below = joints[..., 1].min()
-    if below < -0.3:  # the camera's coordinates of the action sets have no floor: the lowest joint stands on it
+    if below < -0.3:  # the action data sets use camera coordinates, without a floor: put the lowest joint on it
         joints[..., 1] -= below
     actions = store.info["actions"]
     caption = " · ".join(clip.captions) or ("" if clip.action is None else actions[clip.action])
@@ -67,7 +75,7 @@ def motion(store: Store, representation: Representation, clip: Entry) -> Motion:
 
 
 def write_page(path: Path, store: Store, representation: Representation, clips: Sequence[Entry], title: str) -> None:
-    """Writes the page of some clips of a store."""
+    """Writes a page that shows some clips of a store."""
     from flame_mdm.visualize import write_player
 
     write_player(
@@ -83,15 +91,19 @@ def write_page(path: Path, store: Store, representation: Representation, clips: 
 def write_clips(
     folder: Path, store: Store, representation: Representation, clips: Sequence[Entry], longest: int
 ) -> None:
-    """Writes clips as `motion_000.npz` ..., in the form of generated motions, each with one caption.
+    """Writes clips as `motion_000.npz` ..., in the layout of generated motions, each with one caption.
 
-    A clip of several captions gets the first that no clip before it has, so that a caption names a motion where it can.
+    A clip with several captions gets the first one that no earlier clip has, so captions are unique if possible.
 
     Args:
-        longest: frames after which clips are cut, as they are for training and evaluation.
+        folder: where to write.
+        store: the prepared data set.
+        representation: of the features in the store.
+        clips: the clips to write.
+        longest: maximum length in frames; clips are cut as for training and evaluation.
 
     Raises:
-        UserError: the folder holds other motions, which would be taken for motions of this choice.
+        UserError: If the folder holds other motions, which would be mistaken for motions of this selection.
     """
     import torch
 
@@ -99,7 +111,9 @@ def write_clips(
 
     paths = [folder / f"motion_{number:03d}.npz" for number in range(len(clips))]
     if others := sorted(p for p in set(folder.glob("*.npz")) - set(paths) if not p.name.startswith(".")):
-        raise UserError(f"motions={folder}: holds other motions, such as {others[0].name}; delete it, or name another")
+        raise UserError(
+            f"motions={folder}: the folder holds other motions, such as {others[0].name}. Delete it, or choose another"
+        )
     given: set[str] = set()
     with atomic_folder(folder) as made:
         for path, clip in zip(paths, clips, strict=True):
@@ -115,7 +129,7 @@ def write_clips(
 
 
 def describe(store: Store) -> Markup:
-    """The header of the page, in HTML: statistics of the whole store."""
+    """Returns the header of the page as HTML: statistics of the whole store."""
     info, fps = store.info, store.info["fps"]
     splits = {name: [clip for clip in store.clips if clip.split == name] for name, n in info["clips"].items() if n}
     counts = Counter(info["actions"][clip.action] for clip in store.clips if clip.action is not None)
@@ -133,9 +147,9 @@ def _row(clips: Sequence[Entry], fps: float) -> list[str]:
 
 
 def _lengths(splits: dict[str, list[Entry]], fps: float) -> Markup:
-    """The distribution of lengths, as in Kim et al. 2023 (FLAME), figure 7: bars of clips by seconds, stacked by split.
+    """Draws the distribution of clip lengths, as in Kim et al. 2023 (FLAME), figure 7: a histogram, stacked by split.
 
-    The last bar holds all clips beyond the 99th percentile, because a few very long ones would squeeze the others.
+    The last bar includes all clips beyond the 99th percentile, since a few very long clips would squeeze the others.
     """
     seconds = {name: np.array([clip.length for clip in clips]) / fps for name, clips in splits.items()}
     last = float(np.percentile(np.concatenate(list(seconds.values())), 99)) or 1

@@ -1,4 +1,4 @@
-"""Runs side by side on one web page."""
+"""Side-by-side comparison of runs on one web page."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ if TYPE_CHECKING:
     from flame_mdm.formats.motion import Motion
 
 MOTIONS = (".npz", ".bvh", ".json")
-"""Motion files in a folder that is compared; an .npy file does not give its frame rate."""
+"""Suffixes of the motion files that are compared. Not .npy, which does not store its frame rate."""
 Prompt = tuple[str, int]
-"""Requested caption or action, and the number of the motion among those of the same request."""
+"""Requested caption or action, and the index of the motion among those with the same request."""
 
 
 @dataclass
@@ -36,13 +36,13 @@ class ComparedRun:
 
 
 def find(folders: Sequence[Path]) -> list[ComparedRun]:
-    """Returns the runs in some folders, named by recipe and name, or by folder if two have the same.
+    """Returns the runs in some folders, labeled by recipe and run name, or by folder where these are ambiguous.
 
     Raises:
-        UserError: fewer than two; a folder that holds neither a run nor motions.
+        UserError: If there are fewer than two folders, or a folder holds neither a run nor motions.
     """
     if len(set(folders)) < 2:
-        raise UserError(f'comparing takes two runs or more: runs="A B", not {" ".join(map(str, folders))}')
+        raise UserError(f'a comparison needs two or more runs: runs="A B", not {" ".join(map(str, folders))}')
     found = []
     for folder in folders:
         if (folder / CONFIG).exists():
@@ -59,7 +59,7 @@ def find(folders: Sequence[Path]) -> list[ComparedRun]:
 
 
 def shared(shown: Sequence[Mapping[Prompt, Motion]]) -> list[Prompt]:
-    """Prompts for which every run has a motion, in the order of the first run."""
+    """Returns the prompts for which every run has a motion, in the order of the first run."""
     return [prompt for prompt in shown[0] if all(prompt in those for those in shown[1:])]
 
 
@@ -67,7 +67,7 @@ def shared(shown: Sequence[Mapping[Prompt, Motion]]) -> list[Prompt]:
 
 
 def comparison(compared: Sequence[ComparedRun], shown: Sequence[Mapping[Prompt, Motion]]) -> str:
-    """Returns the page that puts runs side by side. The same runs give the same bytes."""
+    """Returns the page that compares runs side by side. The same runs give the same bytes."""
     runs = {c.label: c.run for c in compared if c.run is not None}
     body = render(
         "compare.html",
@@ -118,7 +118,7 @@ def _player(compared: Sequence[ComparedRun], shown: Sequence[Mapping[Prompt, Mot
 
 
 def _evaluations(runs: Mapping[str, Run]) -> list[tuple[str, list[str], list[list[str]], list[Any]]]:
-    """Title, heads, rows and notes of each table; results share one if they may be compared."""
+    """Returns title, column titles, rows and notes of each table. Only comparable results share a table."""
     groups: dict[str, list[tuple[str, Result]]] = {}
     for label, found in runs.items():
         for result in found.results.values():

@@ -1,4 +1,7 @@
-"""Web pages from templates: one file, no network, opens from disk. The same input gives the same bytes."""
+"""Self-contained web pages from templates: one file that opens from disk without a network.
+
+The same input gives the same bytes.
+"""
 
 from __future__ import annotations
 
@@ -15,20 +18,20 @@ POLICY = (
     "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data:; "
     "base-uri 'none'; form-action 'none'"
 )
-"""Content security policy of pages: nothing in them may use the network."""
+"""Content security policy of pages: blocks all network access."""
 
 TEMPLATES = Path(__file__).parent / "templates"
 
 
 def render(template: str, **values: Any) -> Markup:
-    """Renders a file of `templates/`. Every text is escaped; only what another template rendered is not."""
+    """Renders a file of `templates/`. All text is escaped, except the output of other templates."""
     from markupsafe import Markup
 
     return Markup(_environment().get_template(template).render(**values))
 
 
 def page(title: str, body: str) -> str:
-    """Returns a whole page around `body`, which `render` made; a plain text is escaped."""
+    """Returns a complete page around `body`, the output of `render`; plain text is escaped."""
     return str(render("page.html", title=title, body=body, policy=POLICY))
 
 
@@ -43,7 +46,7 @@ def _environment() -> Environment:
 
 
 def number(value: float | None) -> str:
-    """A number as tables show it: four digits; a dash for what has no value."""
+    """Formats a number for a table, with four digits; a missing value is a dash."""
     if value is None:
         return "–"
     if isinstance(value, float) and math.isfinite(value) and 0 < abs(value) < 1e-3:
@@ -52,7 +55,7 @@ def number(value: float | None) -> str:
 
 
 def short(step: float) -> str:
-    """A number of steps: 1500 -> 1.5k."""
+    """Formats a number of steps: 1500 -> 1.5k."""
     for size, unit in ((1e6, "M"), (1e3, "k")):
         if abs(step) >= size:
             return f"{step / size:.4g}{unit}"

@@ -17,12 +17,12 @@ LEFT, RIGHT, TOP, BOTTOM = 58, 10, 8, 24
 ROW = 16
 """Height of a line of text."""
 MOST = 300
-"""Segments of a curve that are drawn; of each, its lowest and its highest point."""
+"""Maximum number of segments per curve; the lowest and the highest point of each are drawn."""
 LOG_RANGE = 15
 """Positive values that span more than this factor get a logarithmic axis."""
 COLORS = 8
 SMALLEST = 1e-300
-"""Numbers nearer to 0 end an axis as 0 does: steps between ticks would underflow."""
+"""Numbers closer to 0 are treated as 0 on axes, since steps between ticks would underflow."""
 
 Curve = Mapping[int, float]
 """Values by step."""
@@ -47,7 +47,13 @@ class Series:
 
 @dataclass
 class Histogram:
-    """Counts between edges, stacked: by name, one count per bar. `unit` is that of the edges."""
+    """Stacked histogram.
+
+    Attributes:
+        edges: of the bars.
+        counts: by name, one count per bar.
+        unit: of the edges.
+    """
 
     edges: Sequence[float]
     counts: Mapping[str, Sequence[int]]
@@ -64,8 +70,8 @@ class Panel:
         y: label of the y-axis.
         log_x: whether the x-axis is logarithmic.
         from_zero: whether the x-axis begins at 0.
-        levels: values that horizontal lines mark.
-        legend: whether names are listed below.
+        levels: values marked by horizontal lines.
+        legend: whether names are listed below the axes.
     """
 
     content: Sequence[Series] | Histogram
@@ -78,7 +84,7 @@ class Panel:
 
 
 def svg(title: str, panels: Sequence[Panel]) -> Markup | None:
-    """Draws panels side by side; None if they have no point. `standalone` makes the SVG a file of its own."""
+    """Draws panels side by side; None if they have no points. `standalone` turns the SVG into a separate file."""
     drawn = [_drawn(panel) for panel in panels]
     if not any(drawn):
         return None
@@ -87,17 +93,19 @@ def svg(title: str, panels: Sequence[Panel]) -> Markup | None:
 
 
 def standalone(plot: str) -> str:
-    """Returns an SVG with the style that it has outside of pages."""
+    """Returns an SVG with an embedded style sheet, for use outside of pages."""
     return str(plot).replace(">", f"><style>{(TEMPLATES / 'plot.css').read_text(encoding='utf-8')}</style>", 1)
 
 
 def chart(title: str, curves: Mapping[str, Curve], bands: Mapping[str, Curve] | None = None) -> Markup:
-    """Curves over the steps, overlaid, with their last values; the axis is logarithmic where values span much.
+    """Draws curves over training steps in one chart, and lists their last values.
+
+    The y-axis is logarithmic if the values span more than `LOG_RANGE`.
 
     Args:
         title: what the values are.
-        curves: by name; values that are not finite are left out.
-        bands: of some of the curves, half the width of their 95 % interval.
+        curves: by name; values that are not finite are skipped.
+        bands: half widths of the 95 % intervals of some of the curves.
     """
     spread = {name: {x: abs(width) for x, width in _finite(curve)} for name, curve in (bands or {}).items()}
     series = [Series(name, _finite(curve), spread.get(name, {})) for name, curve in curves.items()]
@@ -123,7 +131,7 @@ class _Axis:
 
 
 def _drawn(panel: Panel) -> dict[str, Any] | None:
-    """What the template draws of a panel; None if it has no point."""
+    """Returns the template values of a panel; None if it has no points."""
     histogram = panel.content if isinstance(panel.content, Histogram) else None
     series = [] if isinstance(panel.content, Histogram) else panel.content
     points = {s.name: [(x, y) for x, y in s.points if x > 0 or not panel.log_x] for s in series}
@@ -174,7 +182,7 @@ def _drawn(panel: Panel) -> dict[str, Any] | None:
 
 
 def _bars(histogram: Histogram, at: Any) -> list[tuple[int, str, str, str, str, str]]:
-    """Color, left, top, width, height and note of each bar."""
+    """Returns color, left, top, width, height and tooltip of each bar."""
     bars = []
     for k, (begin, end) in enumerate(zip(histogram.edges, histogram.edges[1:], strict=False)):
         base = 0
@@ -188,7 +196,7 @@ def _bars(histogram: Histogram, at: Any) -> list[tuple[int, str, str, str, str, 
 
 
 def _finite(curve: Curve) -> list[tuple[float, float]]:
-    return [(x, y) for x, y in sorted(curve.items()) if abs(y) < 1e300]  # no NaN, nothing that overflows when drawn
+    return [(x, y) for x, y in sorted(curve.items()) if abs(y) < 1e300]  # drops NaN and values that would overflow
 
 
 def _thinned(points: Sequence[tuple[float, float]]) -> Sequence[tuple[float, float]]:
@@ -200,7 +208,7 @@ def _thinned(points: Sequence[tuple[float, float]]) -> Sequence[tuple[float, flo
 
 
 def _linear_axis(low: float, high: float) -> _Axis:
-    """An axis whose ends are ticks."""
+    """Returns an axis that ends at ticks."""
     low, high = (value if abs(value) > SMALLEST else 0.0 for value in (low, high))
     if high - low <= 1e-9 * max(abs(low), abs(high)):
         low, high = low - (abs(low) or 1) / 10, high + (abs(high) or 1) / 10
@@ -210,11 +218,11 @@ def _linear_axis(low: float, high: float) -> _Axis:
 
 
 def _snug_axis(low: float, high: float) -> _Axis:
-    """An axis that ends where the values end."""
+    """Returns an axis that ends at the extreme values."""
     if high - low <= SMALLEST:
         low, high = low - (low != 0) * max(1, abs(low) / 1e9), low + max(1, abs(low) / 1e9)
     step = _round_step((high - low) / 5)
-    begin, end = math.ceil(low / step - 0.02), math.floor(high / step + 0.02)  # 2999 steps have a tick 3k, too
+    begin, end = math.ceil(low / step - 0.02), math.floor(high / step + 0.02)  # an axis up to 2999 has a tick at 3k
     return _Axis(low, high, [k * step for k in range(begin, end + 1)])
 
 

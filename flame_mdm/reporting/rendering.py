@@ -1,4 +1,4 @@
-"""Tables of results as Markdown, LaTeX, CSV and HTML, and their plots. The same table gives the same bytes."""
+"""Tables of results as Markdown, LaTeX, CSV and HTML, with figures. The same table gives the same bytes."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ KINDS = {
     "reported": "As reported",
 }
 NO_RESULTS = ("NOT VALID", "QUICK")
-"""States of rows whose values must not be taken for results."""
+"""States of rows whose values must not be mistaken for results."""
 LEGEND = (
     "↑ higher is better, ↓ lower is better, → closer to real motions is better. **Best** and <u>second best</u> of the "
     "rows with the same mark."
@@ -36,7 +36,14 @@ LEGEND = (
 
 @dataclass
 class Cell:
-    """One cell: text as printed, its number, and 1 for the best, 2 for the second best."""
+    """One cell of a table.
+
+    Attributes:
+        text: as printed.
+        value: the number.
+        ci: half width of its 95 % interval.
+        place: 1 = best, 2 = second best, 0 = neither.
+    """
 
     text: str
     value: float | None = None
@@ -46,16 +53,16 @@ class Cell:
 
 @dataclass
 class Line:
-    """One row.
+    """One row of a table.
 
     Attributes:
         label: its name.
         kind: a key of `KINDS`.
-        cells: one a column, None where there is no value.
-        marks: footnotes; rows are compared with rows of the same marks only.
-        state: "" for a whole row, else why it is not: "no checkpoint", "NOT VALID".
-        options: numbers that figures may be drawn over, such as num_inference_steps.
-        facts: where its values come from, for the CSV file and the list below the table.
+        cells: one per column; None if there is no value.
+        marks: footnote marks; only rows with the same marks are compared.
+        state: "" if the row is complete and valid, otherwise the reason: "no checkpoint", "NOT VALID".
+        options: numbers for the x-axis of figures, such as num_inference_steps.
+        facts: provenance of its values, for the CSV file and the list below the table.
     """
 
     label: str
@@ -69,7 +76,7 @@ class Line:
 
 @dataclass
 class Figure:
-    """A plot of columns of a part over an option of its rows; see `draw`."""
+    """A figure that plots columns of a part over an option of its rows; see `draw`."""
 
     x: str
     y: list[str]
@@ -79,7 +86,16 @@ class Figure:
 
 @dataclass
 class Part:
-    """One table: columns by label with their direction, rows, footnotes by mark, and figures."""
+    """One table.
+
+    Attributes:
+        name: its title within the table of a paper.
+        columns: label -> which values are better, a key of `ARROWS`.
+        lines: its rows.
+        notes: mark and text of each footnote; the mark may be empty.
+        figures: plots of columns.
+        histograms: name -> edges and counts.
+    """
 
     name: str
     columns: dict[str, str]
@@ -91,14 +107,14 @@ class Part:
 
 @dataclass
 class Table:
-    """All parts that belong together, as in one table of a paper."""
+    """A table of one or more parts, like one table of a paper."""
 
     name: str
     title: str
     parts: list[Part]
     notes: list[str] = field(default_factory=list)
     drawn: dict[str, str] = field(default_factory=dict)
-    """Figures that have points, as SVG, by the names of `figure_names`."""
+    """SVG of each figure that has points, by its name from `figure_names`."""
 
 
 def _blocks(part: Part) -> list[tuple[str, list[Line]]]:
@@ -122,7 +138,7 @@ def _number(part: Part, index: int) -> str:
 
 
 def figure_names(table: Table) -> list[tuple[Part, Figure | str, str]]:
-    """The figures of a table with the names of their files, without suffix."""
+    """Returns the figures of a table with their parts and file names, without suffix."""
     found: list[tuple[Part, Figure | str, str]] = []
     for part in table.parts:
         slug = f"-{_slug(part.name)}" if len(table.parts) > 1 else ""
@@ -139,7 +155,7 @@ def _slug(text: str) -> str:
 
 
 def markdown(table: Table) -> str:
-    """The table with its footnotes and figures as Markdown."""
+    """Returns the table with its footnotes and figures as Markdown."""
     page = f"# {markdown_text(table.title)}\n"
     for part in table.parts:
         page += f"\n## {markdown_text(part.name)}\n\n" if len(table.parts) > 1 else "\n"
@@ -163,7 +179,7 @@ def markdown(table: Table) -> str:
     page += f"\n{LEGEND}\n" if _is_ranked(table) else ""
     rows = _sources(table)
     if rows:
-        page += "\n<details><summary>Where the rows come from</summary>\n\n" + "\n".join(
+        page += "\n<details><summary>Sources of the rows</summary>\n\n" + "\n".join(
             f"- {markdown_text(row)}" for row in rows
         )
         page += "\n\n</details>\n"
@@ -192,7 +208,7 @@ def _styled(cell: Cell | None, escape: Callable[[str], str], best: str, second: 
 
 
 def latex(table: Table) -> str:
-    """The table as LaTeX; needs the packages booktabs and threeparttable."""
+    """Returns the table as LaTeX, for the packages booktabs and threeparttable."""
     page = "% \\usepackage{booktabs,threeparttable}\n"
     for part in table.parts:
         title = f"{table.title}: {part.name}" if len(table.parts) > 1 else table.title
@@ -224,7 +240,7 @@ def _tex(text: str) -> str:
 
 
 def comma_separated(table: Table) -> str:
-    """One row a line of the table, with number, interval and place of each cell, and where it comes from."""
+    """Returns the table as CSV: for each row, the number, interval and place of each cell, and its provenance."""
     facts = list(dict.fromkeys(name for part in table.parts for line in part.lines for name in line.facts))
     columns = list(dict.fromkeys(name for part in table.parts for name in part.columns))
     out = io.StringIO()
@@ -248,7 +264,7 @@ def comma_separated(table: Table) -> str:
 
 
 def _inert(text: str) -> str:
-    """Returns a cell with an apostrophe before it if a spreadsheet program would take it for a formula."""
+    """Returns the text of a cell, preceded by an apostrophe if a spreadsheet program would read it as a formula."""
     text = one_line(text)
     number = re.fullmatch(r"[-+]?[\d.,]+([eE][-+]?\d+)?( ?± ?[\d.,]+)?", text)
     return text if number or not text.lstrip().startswith(("=", "+", "-", "@")) else f"'{text}"
@@ -262,22 +278,22 @@ def _plain(value: float | None) -> str:
 
 
 def fragment(table: Table) -> Markup:
-    """The table as HTML, the body of a page."""
+    """Returns the table as HTML, the body of a page."""
     figures = {part.name: [name for owner, _, name in figure_names(table) if owner is part] for part in table.parts}
     values = {"blocks": _blocks, "head": _head, "label": _label, "bad": NO_RESULTS, "figures": figures}
     return render("table.html", table=table, sources=_sources(table), ranked=_is_ranked(table), **values)
 
 
 def draw(part: Part, figure: Figure | str, labels: Mapping[str, str]) -> str | None:
-    """A figure of a part as SVG; None if it has no point.
+    """Draws a figure of a part as SVG; None if it has no points.
 
-    Lines are named after the rows; measured ones are solid, reported ones dashed. Real motions are a dotted line if
-    a column is better the closer to them. `points` draws a scatter plot.
+    Curves are named after rows; measured ones are solid, reported ones dashed. If closer to real motions is better in
+    a column, real motions are a dotted line. `points` makes it a scatter plot.
 
     Args:
-        part: with the values.
+        part: the table with the values.
         figure: what to draw, or the name of one of the part's histograms.
-        labels: by option, the text for the axis.
+        labels: option -> label of the x-axis.
     """
     if isinstance(figure, str):
         edges, counts = part.histograms[figure]
@@ -291,7 +307,7 @@ def draw(part: Part, figure: Figure | str, labels: Mapping[str, str]) -> str | N
 
 
 def _series(part: Part, figure: Figure, column: str) -> tuple[list[Series], list[float]]:
-    """Points of a column by row, and its values of real motions."""
+    """Returns the points of a column by row, and its values for real motions."""
     place = list(part.columns).index(column)
     found: dict[tuple[str, str], list[tuple[float, float, float]]] = {}
     levels = []
@@ -317,12 +333,12 @@ WRITERS: dict[str, Callable[[Table], str]] = {"md": markdown, "tex": latex, "csv
 
 
 def places(values: Sequence[float | None], better: str, real: float | None) -> list[int]:
-    """1 for the best and 2 for the second best of values, 0 for the others; nothing is best of one.
+    """Ranks values: 1 for the best, 2 for the second best, 0 for all others. A single value is not ranked.
 
     Args:
-        values: None where there is none.
+        values: None = missing.
         better: higher, lower, real (closest to `real`) or none.
-        real: the value of real motions.
+        real: the value for real motions.
     """
     there = [v for v in values if v is not None]
     if better == "none" or len(there) < 2 or (better == "real" and real is None):

@@ -13,21 +13,21 @@ from flame_mdm.reporting.plots import Curve, chart
 from flame_mdm.runs import FAULT, HISTORY, Fault, Provenance, Result, Run, Value, read_json, read_run
 
 COST = ("lr", "grad_norm", "samples_per_second", "seconds_per_step", "gpu_memory_gib")
-"""Training curves that show how a run proceeds, not what it learns."""
+"""Training curves about speed and optimization rather than losses."""
 
 
 def paths(key: str, given: str) -> list[Path]:
-    """The files or folders that a key names, with spaces between them, and quotes around names with spaces.
+    """Splits the value of a key into paths. They are separated by spaces; a path that contains spaces is quoted.
 
     Raises:
-        UserError: none, or an unclosed quote.
+        UserError: If there is no path, or a quote is not closed.
     """
     try:
         names = shlex.split(given)
     except ValueError as error:
-        raise UserError(f"{key}={given}: {error}; put names with spaces in quotes") from error
+        raise UserError(f"{key}={given}: {error}. Put names that contain spaces in quotes") from error
     if not all(names) or not names:
-        raise UserError(f"{key}={given}: name at least one, with spaces between several")
+        raise UserError(f"{key}={given}: no path given. Name at least one; separate several by spaces")
     return [Path(name) for name in names]
 
 
@@ -35,14 +35,14 @@ def write_report(folder: Path) -> Path:
     """Writes `report.html` into a run directory, and returns its path. The same folder gives the same bytes.
 
     Raises:
-        UserError: the folder holds no run, or a damaged file.
+        UserError: If the folder holds no run, or a file is damaged.
     """
     from omegaconf import OmegaConf
 
     run = read_run(folder)
     fault: Fault | None = None
     if (folder / FAULT).exists():
-        fault = read_json(folder / FAULT, Fault, "delete it, and the page leaves it out")
+        fault = read_json(folder / FAULT, Fault, "delete it to write the page without it")
     faulty = [[f"process {b.rank}, batch {b.batch}", b.loss, ", ".join(b.ids)] for b in fault.batches] if fault else []
     groups = {
         heading: [chart(name, *_curves(run, name, families)) for name, families in charts.items()]
@@ -74,7 +74,7 @@ def write_report(folder: Path) -> Path:
 
 
 def last(curve: Curve) -> float | None:
-    """The newest value of a curve."""
+    """Returns the last value of a curve; None if it is empty."""
     return curve[max(curve)] if curve else None
 
 
@@ -95,27 +95,27 @@ def _player(run: Run) -> str:
     from flame_mdm.formats.files import read
     from flame_mdm.visualize import player_page
 
-    # The motions are drawn again: `player.html` may be untrusted, and its scripts would run in the report.
+    # Written again from the motions: `player.html` may be untrusted, and its scripts would run in the report.
     return player_page([read(path) for path in sorted(run.samples.glob("motion_*.npz"))])
 
 
 def _curves(run: Run, name: str, families: list[str]) -> tuple[dict[str, Curve], dict[str, Curve]]:
-    """Curves of a chart, and half the widths of their intervals."""
+    """Returns the curves of a chart, and the half widths of their intervals."""
     lines: dict[str, Curve] = {family: run.curves[f"{family}/{name}"] for family in families}
     return lines, {family: run.curves.get(f"{family}/{name}/ci", {}) for family in families}
 
 
 def charted(curves: Mapping[str, Curve]) -> dict[str, dict[str, list[str]]]:
-    """Groups curves into charts: those of training and validation with the same name share one.
+    """Groups curves into charts. Training and validation curves with the same name share a chart.
 
     Returns:
-        The first parts of their names (`train`, `val`) by the rest of it (`loss`), by heading.
+        heading -> rest of the name (`loss`) -> families, the first parts of the names (`train`, `val`).
     """
     samples = "Samples for the fixed prompts"
     groups: dict[str, dict[str, list[str]]] = {"Losses": {}, "Validation": {}, samples: {}, "Training curves": {}}
     for name in curves.keys() - constants(curves).keys():
         family, _, rest = name.partition("/")
-        if rest.endswith("/ci") or rest in ("", "epochs"):  # "": a name without a family, which no run writes
+        if rest.endswith("/ci") or rest in ("", "epochs"):  # "": a name without a family; runs write none
             continue
         heading = {"samples": samples, "val": "Validation"}.get(family, "Training curves")
         if f"train/{rest}" in curves and rest not in COST:
@@ -125,7 +125,7 @@ def charted(curves: Mapping[str, Curve]) -> dict[str, dict[str, list[str]]]:
 
 
 def constants(curves: Mapping[str, Curve]) -> dict[str, float]:
-    """Values of curves that never change."""
+    """Returns the values of constant curves, by name."""
     values = {
         name: set(curve.values()) for name, curve in curves.items() if len(curve) > 1 and not name.endswith("/ci")
     }
@@ -138,14 +138,14 @@ def _values(result: Result) -> list[list[str]]:
 
 
 def evaluation_title(result: Result) -> str:
-    """What was evaluated, and by what."""
+    """Returns the protocol, data and extractor of a result, as a title."""
     measured = f", extractor {result.extractor.sha256[:8]}" if result.extractor else ""
     protocol, data = result.protocol, result.data
     return f"{protocol.name} version {protocol.version}, {data.dataset} {result.split}{measured}"
 
 
 def sampling(result: Result) -> str:
-    """How the evaluated motions were sampled."""
+    """Describes how the evaluated motions were sampled."""
     checkpoint = result.checkpoint
     if checkpoint is None:
         return "motions from other systems"
@@ -161,7 +161,7 @@ def sampling(result: Result) -> str:
 
 
 def marks(result: Result) -> list[str]:
-    """Why a result must not be published."""
+    """Returns reasons not to publish a result, and its differences from the protocol."""
     found = ["Quick run — not for publication"] if result.quick else []
     found += [f"not valid: {reason}" for reason in result.invalid_because]
     changed = ", ".join(f"{name} {value}" for name, value in result.changed.items())
@@ -169,7 +169,7 @@ def marks(result: Result) -> list[str]:
 
 
 def interval(value: Value | None) -> str:
-    """Mean and half of its interval."""
+    """Formats a mean and the half width of its interval."""
     if value is None or value.mean is None:
         return "–"
     return number(value.mean) + (f" ± {value.ci:.2g}" if value.ci is not None else "")

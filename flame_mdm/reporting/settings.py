@@ -1,4 +1,4 @@
-"""Hyper-parameters of recipes, as tables show them."""
+"""Hyperparameters of recipes, for tables."""
 
 from __future__ import annotations
 
@@ -52,12 +52,12 @@ LABELS = {
     "task.network.embedding_dim": "width of the common space",
     "parameters": "parameters, M",
 }
-"""The hyper-parameters that tables show, by dotted key; `features` and `parameters` are counted."""
+"""Labels of the hyperparameters in tables, by dotted key; `features` and `parameters` are counted."""
 
 
 @cache
 def values(name: str) -> dict[str, Any]:
-    """The hyper-parameters of a recipe by the keys of `LABELS`; what it leaves open is the default of the class."""
+    """Returns the hyperparameters of a recipe, by the keys of `LABELS`. Unset ones have the default of their class."""
     config = compose(name)
     found = {key: value(config, key) for key in LABELS if "." in key}
     found["features"] = instantiate(config["representation"]).features
@@ -67,7 +67,7 @@ def values(name: str) -> dict[str, Any]:
 
 
 def value(config: Config, key: str) -> Any:
-    """The value of a dotted key; the default of the class where the recipe does not say; None where there is none."""
+    """Returns the value of a dotted key: from the recipe, or else the default of the class, or else None."""
     *path, name = key.split(".")
     node: Any = config
     for part in path:
@@ -80,7 +80,7 @@ def value(config: Config, key: str) -> Any:
 
 
 def count_parameters(config: Config, features: int) -> int:
-    """Parameters of the denoiser; a language model has its own."""
+    """Counts the parameters of the denoiser, without the language model."""
     process = instantiate(config["process"])
     with torch.device("meta"):
         denoiser = instantiate(

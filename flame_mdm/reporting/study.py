@@ -1,4 +1,4 @@
-"""User study: a page on which people judge motions, and the count of their answers."""
+"""User study: a page on which people rate motions, and the count of their answers."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ Name = Annotated[str, Field(min_length=1)]
 
 
 class Rating(Schema):
-    """The choice between the motions of two for one prompt."""
+    """A choice between the motions of two runs for one prompt."""
 
     a: Name
     b: Name
@@ -44,7 +44,7 @@ class Answers(Schema):
 
 
 class Pair(Schema):
-    """How often one of two was preferred."""
+    """How often one run was preferred to another."""
 
     a: str
     b: str
@@ -60,12 +60,13 @@ class Ratings(Schema):
 
 
 def rating_page(compared: Sequence[ComparedRun], shown: Sequence[Mapping[Prompt, Motion]], seed: int) -> str:
-    """Returns the page that asks which of two motions fits a text better: the first run's or that of each other one.
+    """Returns a page that asks which of two motions fits a text better: the first run's or another run's.
 
-    Order and sides are drawn from `seed`. The answers come as a file to download, for `tally`.
+    The first run is compared with each other run. Order and sides are random, from `seed`. The page saves the answers
+    to a file for `tally`.
 
     Raises:
-        UserError: two have no prompt in common, or motions without a prompt.
+        UserError: If two runs have no prompt in common, apart from the empty one.
     """
     from flame_mdm.visualize import player_page
 
@@ -75,8 +76,8 @@ def rating_page(compared: Sequence[ComparedRun], shown: Sequence[Mapping[Prompt,
         prompts = [prompt for prompt in shared([shown[0], those]) if prompt[0]]
         if not prompts:
             raise UserError(
-                f"{first.label} and {other.label} have no prompt in common to be judged by; sample both for the same "
-                "with texts=..."
+                f"{first.label} and {other.label} have no prompt in common. Give texts=... to sample both for the "
+                "same prompts"
             )
         for prompt in prompts:
             left, right = sides = [("a", shown[0][prompt]), ("b", those[prompt])]
@@ -97,10 +98,10 @@ def tally(files: Sequence[Path]) -> list[dict[str, Any]]:
 
     Returns:
         For each pair of labels: `a`, `b`, `wins_a`, `wins_b`, `raters`, `share_a`, the share of answers for a, and
-        `interval_a`, its 95 % interval as if all answers were independent (Wilson 1927).
+        `interval_a`, its 95 % interval (Wilson 1927), which treats all answers as independent.
 
     Raises:
-        UserError: a file that is malformed, or a rater's answers to the same page given twice.
+        UserError: If a file is malformed, or contains a rater's answers to the same page a second time.
     """
     raters: dict[tuple[str, str], Path] = {}
     counts: dict[tuple[str, str], dict[str, Any]] = {}
@@ -108,7 +109,7 @@ def tally(files: Sequence[Path]) -> list[dict[str, Any]]:
         answers: Answers = read_json(path, Answers, "give a file that the rating page saved")
         study, rater = answers.study, answers.rater
         if (study, rater) in raters:
-            raise UserError(f"{path}: {rater} has answered the same page in {raters[study, rater]}; give one of both")
+            raise UserError(f"{path}: {rater} also answered this page in {raters[study, rater]}. Give only one of them")
         raters[study, rater] = path
         for place, rating in enumerate(answers.ratings, 1):
             a, b, choice = rating.a, rating.b, rating.choice
@@ -131,7 +132,7 @@ def _pair(a: str, b: str, wins_a: int, wins_b: int, raters: int) -> dict[str, An
 
 
 def wilson(wins: int, votes: int) -> tuple[float, float, float]:
-    """Share of wins and its 95 % interval (Wilson 1927)."""
+    """Returns the share of wins and its 95 % interval (Wilson 1927)."""
     if not votes:
         return 0.0, 0.0, 1.0
     z, share = 1.96, wins / votes

@@ -1,4 +1,4 @@
-"""Tables and figures of results: `flame-mdm tables table="mdm_1 synthetic"`"""
+"""Tables and figures from results: `flame-mdm tables table="mdm_1 synthetic"`"""
 
 from __future__ import annotations
 
@@ -41,26 +41,26 @@ from flame_mdm.runs import ClosedSchema, Int, Number, Result, Schema, Value, che
 SPECS = EXPERIMENTS / "tables"
 PUBLISHED = SPECS / "published.yaml"
 SWEPT = ("sampler", "num_inference_steps", "guidance_scale", "until")
-"""Options of a row that may be lists: one row for each."""
+"""Options of a row that may be lists; each value makes one row."""
 ABOUT = {
     "num_inference_steps": "sampling steps",
     "guidance_scale": "guidance scale",
     "sampler": "sampler",
-    "until": "share of sampling that is rewritten",
+    "until": "fraction of sampling that is rewritten",
     "nfe": "network calls per motion",
     "seconds_per_sample": "seconds per motion",
     "parameters": "parameters, M",
 }
-"""What a column may show beside metrics, and figures may be drawn over."""
+"""Labels of the values that a column may show besides metrics, and of the x-axes of figures."""
 MOST_ROWS, MOST_COLUMNS, MOST_FIGURES = 1_000, 100, 100
-"""Limits of a part: rows with their lists of options spread out, columns, and plots. Tables of papers have some 20."""
+"""Limits of a table: rows after expanding lists of options, columns, and plots. Tables of papers have about 20 rows."""
 
 
 # Specs ----------------------------------------------------------------------------------------------------------------
 
 
 class Options(ClosedSchema):
-    """Keys of `flame-mdm evaluate` that a part, a row or a column may give."""
+    """Keys of `flame-mdm evaluate` that a part, a row or a column may set."""
 
     protocol: str = ""
     extractor: str = ""
@@ -73,14 +73,14 @@ class Options(ClosedSchema):
 
 
 class Column(Options):
-    """A metric, or a key of `ABOUT`; which values of it are better."""
+    """A column: a metric or a key of `ABOUT`, and which of its values are better."""
 
     value: str
     better: Literal["higher", "lower", "real", "none"] = "none"
 
 
 class Row(Options):
-    """A model or baseline, and its sampling options. Keys with a dot in them override those of the data."""
+    """A row: a model or baseline, and its sampling options. Keys that contain a dot override keys of the data."""
 
     label: str
     note: str = ""
@@ -98,7 +98,7 @@ class Row(Options):
     def _overrides(cls, row: Any) -> Any:
         for key in row if isinstance(row, dict) else ():
             if "." in str(key) and not re.fullmatch(r"data(\.(?!_)\w+)+", str(key)):
-                raise ValueError(f"{key}: only keys of the data, such as data.crop.max_frames, are overridden")
+                raise ValueError(f"{key}: only keys of the data can be overridden, such as data.crop.max_frames")
         return row
 
     @model_validator(mode="after")
@@ -109,7 +109,7 @@ class Row(Options):
 
 
 class PartSpec(Options):
-    """One of columns and rows, recipes and keys, lengths, and ratings."""
+    """A part of a table: either columns and rows, recipes and keys, lengths, or ratings."""
 
     columns: dict[str, Column] = Field({}, min_length=1)
     rows: list[Row] = Field([])
@@ -134,7 +134,7 @@ class PartSpec(Options):
 
 
 class FigureSpec(ClosedSchema):
-    """Columns of a part over an option of its rows."""
+    """A figure that plots columns of a part over an option of its rows."""
 
     part: str
     x: str
@@ -144,7 +144,7 @@ class FigureSpec(ClosedSchema):
 
 
 class Spec(ClosedSchema):
-    """A file of experiments/tables."""
+    """A table: the content of a file in experiments/tables."""
 
     title: str
     notes: list[str] = Field([])
@@ -165,15 +165,18 @@ class Spec(ClosedSchema):
 
 
 def spec_names() -> list[str]:
-    """Names of all tables."""
+    """Returns the names of all tables."""
     return sorted(path.stem for path in SPECS.glob("*.yaml") if path != PUBLISHED)
 
 
 def load_spec(name: str) -> Config:
-    """A table's spec, a file of experiments/tables or any other.
+    """Loads the spec of a table.
+
+    Args:
+        name: a name in experiments/tables, or the path of a .yaml file.
 
     Raises:
-        UserError: no such file, or one that is not a spec.
+        UserError: If the file does not exist, or is not a valid spec.
     """
     path = Path(name) if name.endswith((".yaml", ".yml")) else SPECS / f"{name}.yaml"
     if not path.is_file() or path == PUBLISHED:
@@ -188,7 +191,7 @@ def load_spec(name: str) -> Config:
 
 def _at_most(what: str, count: int, most: int) -> None:
     if count > most:
-        raise ValueError(f"{what}: {count:,} are more than the {most:,} that a table shows. Make several tables")
+        raise ValueError(f"{what}: {count:,} exceed the limit of {most:,} per table. Split it into several tables")
 
 
 def _load(path: Path) -> Config:
@@ -208,13 +211,15 @@ def _list(value: Any) -> list[Any]:
 
 @dataclass(frozen=True)
 class Request:
-    """One evaluation: the keys of `flame-mdm evaluate` that differ from their defaults, and the row it is for."""
+    """One evaluation: the label of its row, and the keys of `flame-mdm evaluate` that differ from their defaults."""
 
     label: str
     keys: Mapping[str, Any]
 
     def path(self, results: Path) -> Path:
-        """Its result: a function of the keys alone, so that tables share results and need no checkpoint to be drawn."""
+        """Returns the path of the result. It depends on the keys alone, so tables share results and are rendered without
+        checkpoints.
+        """
         digest = hashlib.sha256(json.dumps(dict(self.keys), sort_keys=True).encode()).hexdigest()
         what = self.keys.get("baseline") or self.keys.get("ckpt") or self.keys["from_samples"]
         name = re.sub(r"^runs-|-checkpoints-|-ckpt$|-default", "-", re.sub(r"[^A-Za-z0-9]+", "-", str(what))).strip("-")
@@ -222,8 +227,8 @@ class Request:
         return results / Path(str(self.keys["protocol"])).stem / f"{name}-{digest[:10]}.json"
 
     @property
-    def lacking(self) -> str:
-        """Which file is not there; "" where the evaluation can be made."""
+    def missing(self) -> str:
+        """The first missing input, as in "no checkpoint"; "" if all exist."""
         for key, what in (("ckpt", "checkpoint"), ("from_samples", "samples"), ("extractor", "extractor")):
             path = self.keys.get(key)
             if path not in (None, "none") and not Path(str(path)).exists():
@@ -232,7 +237,7 @@ class Request:
 
 
 def requests(part: Mapping[str, Any]) -> Iterator[tuple[dict[str, Any], list[Request]]]:
-    """The rows of a part, lists of options spread out, each with the evaluation of each column."""
+    """Yields the rows of a part, with lists of options expanded, each with one evaluation per column."""
     for row in part.get("rows", []):
         for values in itertools.product(*(_list(row[name]) for name in SWEPT if name in row)):
             single = row | dict(zip((name for name in SWEPT if name in row), values, strict=True))
@@ -241,7 +246,7 @@ def requests(part: Mapping[str, Any]) -> Iterator[tuple[dict[str, Any], list[Req
 
 
 def _spread_label(part: Mapping[str, Any], row: Mapping[str, Any], single: Mapping[str, Any]) -> str:
-    """The label of a row, with the options that its lists leave open and no column shows."""
+    """Returns the label of an expanded row, with the values of its lists that no column shows."""
     shown = {column["value"] for column in part["columns"].values()}
     options = [
         f"{ABOUT[name]} {single[name]}" for name in SWEPT if isinstance(row.get(name), list) and name not in shown
@@ -256,7 +261,7 @@ def _request(part: Mapping[str, Any], row: Mapping[str, Any], column: Mapping[st
             if name in place:
                 keys[name] = place[name]
     if "ckpt" in keys:
-        keys.pop("data", None)  # a checkpoint knows its own
+        keys.pop("data", None)  # a checkpoint names its data set
     return Request(row["label"], keys)
 
 
@@ -264,15 +269,15 @@ def _request(part: Mapping[str, Any], row: Mapping[str, Any], column: Mapping[st
 
 
 def build(name: str, spec: Config, results: Path) -> Table:
-    """The table of a spec, from the results that are there and the published numbers.
+    """Builds the table of a spec from existing results and published numbers.
 
     Raises:
-        UserError: a published number or a result that does not fit the spec.
+        UserError: If a published number or a result does not match the spec.
     """
     published = _published(PUBLISHED, PUBLISHED.stat().st_mtime_ns).get(name, {}) if PUBLISHED.exists() else {}
     unknown = published.keys() - spec["parts"].keys()
     if unknown:
-        raise UserError(f"{PUBLISHED}: {name} has parts that its spec lacks: {', '.join(sorted(unknown))}")
+        raise UserError(f"{PUBLISHED}: {name} has parts that are not in its spec: {', '.join(sorted(unknown))}")
     parts = []
     for part_name, part in spec["parts"].items():
         figures = [
@@ -294,7 +299,7 @@ def build(name: str, spec: Config, results: Path) -> Table:
 
 @functools.cache
 def _published(path: Path, changed: int) -> Config:
-    """Published numbers, read once for all tables until the file is changed."""
+    """Returns the published numbers. They are read once for all tables, until the file changes."""
     return _load(path)
 
 
@@ -315,12 +320,12 @@ def _measured(name: str, part: Config, reported: Config | None, results: Path, f
     lines: list[Line] = []
     truths: dict[str, Line] = {}
     todo: dict[str, str] = {}
-    for row, asked in requests(part):
-        found = [_result(request, results) for request in asked]
-        line = _line(row, found, values, [request.path(results).name for request in asked])
+    for row, requested in requests(part):
+        found = [_result(request, results) for request in requested]
+        line = _line(row, found, values, [request.path(results).name for request in requested])
         if all(result is None for result in found):
-            line.state = asked[0].lacking or "not evaluated"
-            todo |= _todo(asked[0])
+            line.state = requested[0].missing or "not evaluated"
+            todo |= _todo(requested[0])
         own = dict.fromkeys(marks.of(_evaluation(result)) for result in found if result is not None)
         line.marks = ",".join(own)
         lines.append(line)
@@ -347,20 +352,20 @@ def _result(request: Request, results: Path) -> Result | None:
 
 
 def _todo(request: Request) -> dict[str, str]:
-    """By which command a missing row is had."""
-    lacking = request.lacking
-    if lacking in ("no checkpoint", "no extractor"):
-        file = Path(str(request.keys["ckpt" if lacking == "no checkpoint" else "extractor"]))
+    """Returns the command that produces a missing row, by the label of the row."""
+    missing = request.missing
+    if missing in ("no checkpoint", "no extractor"):
+        file = Path(str(request.keys["ckpt" if missing == "no checkpoint" else "extractor"]))
         recipe = re.fullmatch(r"runs/(.+)/default/checkpoints/.+", file.as_posix())
-        how = f"make train EXP={recipe[1]}" if recipe else f"{file} is not there"
+        how = f"make train EXP={recipe[1]}" if recipe else f"{file} is missing"
         return {request.label: how}
-    return {request.label: "make tables evaluates it"} if not lacking else {request.label: lacking}
+    return {request.label: "make tables evaluates it"} if not missing else {request.label: missing}
 
 
 def _evaluation(result: Result) -> str:
-    """What values of different rows must share to be compared."""
+    """Describes the evaluation of a result. Only rows with the same description are compared."""
     protocol, data, extractor = result.protocol, result.data, result.extractor
-    first = next((v for v in (result.values or {}).values() if v and v.n), None)  # others may be of fewer motions
+    first = next((v for v in (result.values or {}).values() if v and v.n), None)  # later ones may have fewer motions
     text = f"protocol {protocol.name} version {protocol.version}"
     text += f", {result.split} split of {data.dataset} (fingerprint {data.fingerprint})"
     text += ", {} to {} frames".format(*data.frames) if data.frames else ""
@@ -368,9 +373,9 @@ def _evaluation(result: Result) -> str:
     text += f", seed {result.seed}"
     text += f", extractor sha256 {extractor.sha256[:12]}" if extractor else ", no extractor"
     if result.changed:
-        text += "; not as the protocol has it: " + ", ".join(f"{k} = {v}" for k, v in result.changed.items())
+        text += "; differs from the protocol: " + ", ".join(f"{k} = {v}" for k, v in result.changed.items())
     if result.published_split:
-        text += "; the published split: test clips that training has seen, or no validation clips"
+        text += "; published split: test clips are also used for training, or there are no validation clips"
     if result.forced:
         text += "; forced: real motions do not have the values that the protocol expects"
     text += "".join(f"; {warning}" for warning in result.warnings)
@@ -422,7 +427,7 @@ def _text(value: Any) -> str:
 
 
 def _about(result: Result, name: str) -> Any:
-    """Fact about the model and its cost, by the names of `ABOUT`."""
+    """Returns a fact about the model or its cost, by its name in `ABOUT`."""
     checkpoint, cost = result.checkpoint, result.cost
     known: dict[str, Any] = dict(checkpoint or ()) | (checkpoint.edit if checkpoint else {}) | dict(cost or ())
     value = known.get(name)
@@ -449,9 +454,10 @@ def _entry(entry: Value | None) -> Cell | None:
 
 
 def _print_cells(lines: Sequence[Line], columns: int) -> None:
-    """Numbers as text, with the same decimals in a column, about three digits of the largest; short settings stay.
+    """Formats the numbers of each column with the same decimals, about three digits for the largest.
 
-    Numbers that would be all zeros show two digits.
+    Short settings, with at most one decimal and no interval, keep their text. Numbers that would round to zero show
+    two significant digits.
     """
     for index in range(columns):
         cells = [c for line in lines if not line.kind.startswith("reported") and (c := line.cells[index]) is not None]
@@ -472,7 +478,7 @@ def _decimals(largest: float) -> int:
 
 
 def _rank(lines: Sequence[Line], columns: Mapping[str, str]) -> None:
-    """Best and second best among rows of one kind with the same marks."""
+    """Marks best and second best among rows of the same kind with the same marks."""
     for kind in ("measured", "reported"):
         for marks in {line.marks for line in lines}:
             rows = [x for x in lines if x.kind == kind and x.marks == marks and not x.state]
@@ -494,7 +500,7 @@ def _rank(lines: Sequence[Line], columns: Mapping[str, str]) -> None:
 def _reported(
     reported: Config, columns: Mapping[str, str], values: Sequence[str], part: str
 ) -> tuple[list[Line], list[tuple[str, str]]]:
-    """Rows of a paper, and their footnotes."""
+    """Returns the rows of a paper, and their footnotes."""
     notes: dict[str, str] = {}
     lines = []
     for row in reported["rows"]:
@@ -514,7 +520,7 @@ def _reported(
 
 
 def _leading(text: str) -> float | None:
-    """The number that a printed value begins with; 1,000 is one thousand."""
+    """Returns the number at the beginning of a printed value; 1,000 is one thousand."""
     found = re.match(r"[-+]?[\d,]*\.?\d+(?:[eE][-+]?\d+)?", text.strip())
     return float(found[0].replace(",", "")) if found else None
 
@@ -523,8 +529,9 @@ def _leading(text: str) -> float | None:
 
 
 def _hyperparameters(name: str, part: Config, reported: Config | None) -> Part:
-    """A table of settings, read from recipes, each with the reported one beside it; keys or recipes, what is more
-    stands in rows.
+    """Builds a table of hyperparameters, read from recipes, each next to its reported value.
+
+    The rows are keys or recipes, whichever are more.
     """
     from flame_mdm.reporting.settings import LABELS, values
 
@@ -568,14 +575,14 @@ def _setting(value: Any) -> str:
 
 
 def count_lengths(dataset: str, results: Path, config: Config) -> None:
-    """Counts the motion lengths of a prepared data set, once; says so where it is not prepared."""
+    """Writes the motion lengths of a data set to `results`; prints a message if the data set is not prepared."""
     from flame_mdm.config import instantiate
 
     options = settings("browse", [f"data={dataset}"])
     node = options["data"] | ({"root": config["data_root"]} if config["data_root"] else {})
     data = instantiate(node, representation=instantiate(options["representation"]))
     if not (data.folder / "store.json").exists():
-        say(f"{dataset}: not prepared, its lengths are left out (make prepare DATA={dataset})")
+        say(f"{dataset}: not prepared, so its lengths are omitted. To prepare it: make prepare DATA={dataset}")
         return
     store = data.open()
     lengths = sorted(clip.length for clip in store.clips)
@@ -592,7 +599,7 @@ class Lengths(Schema):
 
 
 def _lengths(name: str, part: Config, results: Path) -> Part:
-    """How long the motions of data sets are."""
+    """Builds a table of the motion lengths of data sets."""
     columns = dict.fromkeys(["motions", "hours", "shortest", "median", "mean", "longest"], "none")
     lines, histograms = [], {}
     for dataset in part["lengths"]:
@@ -600,7 +607,7 @@ def _lengths(name: str, part: Config, results: Path) -> Part:
         if not path.exists():
             lines.append(Line(dataset, "measured", [None] * len(columns), state="not prepared"))
             continue
-        found: Lengths = read_json(path, Lengths, "delete it, and `flame-mdm tables` counts again")
+        found: Lengths = read_json(path, Lengths, "delete it; `flame-mdm tables` then counts again")
         lengths, fps = sorted(found.lengths), found.fps
         numbers = [
             (f"{len(lengths):,}", len(lengths)),
@@ -609,23 +616,25 @@ def _lengths(name: str, part: Config, results: Path) -> Part:
             (f"{sum(lengths) / len(lengths):.1f}", sum(lengths) / len(lengths)),
             (f"{lengths[-1]}", lengths[-1]),
         ]
-        facts = {"fingerprint": found.fingerprint, "frames a second": _text(float(fps))}
+        facts = {"fingerprint": found.fingerprint, "frames per second": _text(float(fps))}
         lines.append(Line(dataset, "measured", [Cell(t, float(v)) for t, v in numbers], facts=facts))
         step = max(1, math.ceil(lengths[-1] / 40))
         counts = [0] * (lengths[-1] // step + 1)
         for length in lengths:
             counts[length // step] += 1
         histograms[dataset] = ([float(i * step) for i in range(len(counts) + 1)], counts)
-    return Part(name, columns, lines, [("", "lengths in frames of the data set")], histograms=histograms)
+    return Part(
+        name, columns, lines, [("", "lengths are in frames, at the frame rate of each data set")], histograms=histograms
+    )
 
 
 def _ratings(name: str, part: Config, reported: Config | None) -> Part:
-    """A user study: how often one model was preferred to another."""
+    """Builds the table of a user study: how often one model was preferred to another."""
     columns = {"Preferred": "none", "votes": "none", "raters": "none"}
     lines = []
     path = Path(part["ratings"])
     if path.exists():
-        ratings: Ratings = read_json(path, Ratings, "`flame-mdm compare ratings=...` counts again")
+        ratings: Ratings = read_json(path, Ratings, "run `flame-mdm compare ratings=...` to count again")
         for pair in ratings.pairs:
             votes = pair.wins_a + pair.wins_b
             share, low, high = wilson(pair.wins_a, votes)
@@ -637,7 +646,7 @@ def _ratings(name: str, part: Config, reported: Config | None) -> Part:
             lines.append(Line(f"{pair.a} over {pair.b}", "measured", list(cells)))
     notes = [("", "share of votes, with its 95 % interval (Wilson)")]
     if not lines:
-        notes = [("", f'{path} is not there: make compare RUNS="a b" RATE=true writes a page to rate motions on')]
+        notes = [("", f'{path} is missing. make compare RUNS="a b" RATE=true writes a page for rating motions')]
     if reported:
         more, sources = _reported(reported, columns, ["", "", ""], name)
         lines, notes = lines + more, notes + sources
@@ -648,7 +657,7 @@ def _ratings(name: str, part: Config, reported: Config | None) -> Part:
 
 
 def write(table: Table, out: Path) -> str:
-    """Writes a table in all forms and its figures; returns its HTML, without the head of the page."""
+    """Writes a table in all formats and its figures; returns its HTML, without the head of the page."""
     for part, figure, name in figure_names(table):
         if drawn := draw(part, figure, ABOUT):
             table.drawn[name] = drawn

@@ -145,8 +145,8 @@ def test_runs_sample_what_a_folder_of_motions_shows(tmp_path, data_root, capsys)
     [
         ([], "give either runs="),
         (["runs=a b", "ratings=c"], "give either runs="),
-        (["runs=a"], "two runs or more"),
-        (["runs=a a"], "two runs or more"),
+        (["runs=a"], "two or more runs"),
+        (["runs=a a"], "two or more runs"),
         (["runs=/nowhere /nothing"], "/nowhere: neither a run"),
         (["runs={0} {1}", "texts= ; "], "contains no text"),
         (["runs={0} {1}", "texts=absent.txt"], "texts=absent.txt: no such file"),

@@ -217,8 +217,9 @@ class Request:
     keys: Mapping[str, Any]
 
     def path(self, results: Path) -> Path:
-        """Returns the path of the result. It depends on the keys alone, so tables share results and are rendered without
-        checkpoints.
+        """Returns the path of the result, a function of the keys alone.
+
+        Tables therefore share results, and are rendered without checkpoints.
         """
         digest = hashlib.sha256(json.dumps(dict(self.keys), sort_keys=True).encode()).hexdigest()
         what = self.keys.get("baseline") or self.keys.get("ckpt") or self.keys["from_samples"]

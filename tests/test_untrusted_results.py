@@ -67,7 +67,7 @@ SPECS = {
         "title: t\nparts: {P: {protocol: synthetic, rows: [], columns: {"
         + ", ".join(f"c{k}: {{value: fid}}" for k in range(500))
         + "}}}\n",
-        "500 are more than the 100",
+        "500 exceed the limit of 100",
     ),
     "figures": (ROWS.format(keys="note: n") + f"figures: [{{part: P, x: nfe, y: {['FID'] * 300}}}]\n", "300 are more"),
     "latin": ("title: caf\udce9\n", "not a UTF-8 text file"),

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 from lightning import Callback, LightningModule, Trainer
 
 from evaluators.run import open_protocol
 from flame_mdm.data.datamodule import MotionDataModule
+from flame_mdm.errors import UserError
+from flame_mdm.runs import made_by
 from flame_mdm.task import MotionGeneration
 from flame_mdm.training.loggers import log_table
 
@@ -15,8 +19,8 @@ class Evaluate(Callback):
 
     With several replications, val/<protocol>/<metric>/ci is half the width of the 95 % interval. A table shows all.
 
-    It runs at the first validation and then every so often, with averaged weights where the recipe averages them. All
-    processes take their share of the motions.
+    It runs at the first validation and then at multiples of `every_n_steps`, with averaged weights where the recipe
+    averages them. All processes take their share of the motions.
 
     Args:
         protocol: a name of experiments/evaluation, or the path of a file.
@@ -25,6 +29,9 @@ class Evaluate(Callback):
         samples: motions; None = as the protocol has it.
         replications: how often they are drawn.
         batch_size: motions at once.
+
+    Raises:
+        UserError: there is no such extractor; before training begins.
     """
 
     def __init__(
@@ -36,6 +43,11 @@ class Evaluate(Callback):
         replications: int = 1,
         batch_size: int = 64,
     ):
+        if extractor not in (None, "none") and not Path(extractor).exists():
+            raise UserError(
+                f"callbacks.evaluate.extractor={extractor}: no such file, so that no checkpoint can be chosen by it: "
+                f"{made_by(extractor)}. Or choose by the validation loss, as results will say: selection=loss"
+            )
         self.name, self.path, self.every_n_steps = protocol, extractor, every_n_steps
         self.samples, self.replications, self.batch_size = samples, replications, batch_size
         self.next = 0
@@ -55,7 +67,7 @@ class Evaluate(Callback):
         if trainer.global_step < self.next or not hasattr(self, "protocol"):
             return
         assert isinstance(pl_module, MotionGeneration)
-        self.next = trainer.global_step + self.every_n_steps
+        self.next = (trainer.global_step // self.every_n_steps + 1) * self.every_n_steps
         source = self.protocol.generator(
             pl_module, None, {"seed": 0}, clips=self.clips, batch_size=self.batch_size, progress=False
         )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import json
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
@@ -276,6 +277,14 @@ def read_json(path: Path, kind: type[T] | Any, remedy: str = "") -> T:
         return check_shape(content, kind)
     except (ValueError, RecursionError) as error:
         raise UserError(f"{path}: damaged: {error}{message}") from error
+
+
+def made_by(path: str | Path) -> str:
+    """Returns what to do about a checkpoint or extractor that is missing: the command that makes it, or where it is."""
+    name = Path(path).as_posix()
+    recipe = re.fullmatch(r"runs/(.+)/default/checkpoints/.+", name)
+    where = f"{name} is missing" + '; see "Extractors" in docs/evaluation.md' * name.startswith("assets/")
+    return f"make train EXP={recipe[1]}" if recipe else where
 
 
 def read_result(path: Path) -> Result:

@@ -522,10 +522,27 @@ def test_training_logs_the_values_of_the_validation_split(runs, tmp_path):
     lines = [line.split(",") for line in (tmp_path / "run" / "csv" / "metrics.csv").read_text().splitlines()]
     rows = [dict(zip(lines[0], line, strict=True)) for line in lines[1:]]
     logged = [int(row["step"]) for row in rows if row["val/synthetic/fid"]]
-    assert len(logged) == 2, "at the first validation and 4 steps later"
+    assert logged == [1, 3, 7], "at the first validation, and after every 4 steps, the last ones included"
     assert "val/synthetic/attributes/all" in rows[0]
     assert "val/synthetic/diversity" not in rows[0], "too few motions"
     assert (tmp_path / "run" / "checkpoints" / "best.ckpt").exists()
+
+
+def test_a_missing_extractor_of_the_selection_stops_before_training(runs, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    words = [*GENERATOR, f"data_root={runs.folder / 'data'}", "run.dir=run", "trainer.max_steps=2"]
+    assert main(["train", "quickstart", *words, "selection=babel"]) == 1
+    error = capsys.readouterr().err
+    assert "callbacks.evaluate.extractor=runs/motion_clip/babel/default/checkpoints/last.ckpt: no such file" in error
+    assert "make train EXP=motion_clip/babel" in error
+    assert "selection=loss" in error
+    assert not Path("run").exists()
+    assert main(["train", "quickstart", *words, "selection=t2m"]) == 1
+    assert 'assets/t2m/synthetic is missing; see "Extractors" in docs/evaluation.md' in capsys.readouterr().err
+    assert main(["train", "quickstart", *words, "selection=loss"]) == 0
+    best = "ckpt=run/checkpoints/best.ckpt"
+    assert main(["evaluate", best, "extractor=none", "quick=true", "samples=4", "out=a.json", "device=cpu"]) == 0
+    assert json.loads(Path("a.json").read_text())["checkpoint"]["selected_by"] == "best val/loss"
 
 
 def shares(rank: int, world: int, runs: Runs, samples: int, kept: Path | None) -> dict:

@@ -12,7 +12,7 @@ import yaml
 
 from evaluators.evaluator import Evaluator, Motions
 from evaluators.run import load_protocol
-from flame_mdm.config import EXPERIMENTS, Config, compose, instantiate
+from flame_mdm.config import EXPERIMENTS, Config, compose, instantiate, recipes
 from flame_mdm.errors import UserError
 from flame_mdm.processes.diffusion import Sampler
 from flame_mdm.processes.flow_matching import STEPS
@@ -171,6 +171,18 @@ def test_rows_are_checkpoints_of_recipes_that_fit(name):
         labels = config["condition"].get("_target_", "").endswith("ActionLabels")
         assert protocol.condition in ("none", "action" if labels else "text")
         assert extracted(part.get("extractor", "")) == wanted_extractor(protocol, config)
+
+
+@pytest.mark.parametrize("name", [n for n in recipes() if n.startswith(("humanml3d/", "kit/", "babel/"))])
+def test_papers_checkpoints_are_chosen_by_fid(name):
+    callbacks = recipe(name)["callbacks"]
+    evaluate = callbacks["evaluate"]
+    protocol, _ = measures(evaluate["protocol"], name)
+    assert callbacks["best"]["monitor"] == f"val/{evaluate['protocol']}/fid"
+    assert protocol.metrics["fid"]["_target_"].endswith("FrechetMotionDistance")
+    assert extracted(evaluate["extractor"]) == wanted_extractor(protocol, recipe(name))
+    assert 512 <= evaluate["samples"] <= 1000
+    assert recipe(name)["trainer"]["max_steps"] % evaluate["every_n_steps"] == 0, "the last step is evaluated"
 
 
 def test_motion_lengths_are_those_of_data_sets():

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -135,7 +136,7 @@ LABELS = [
 @pytest.fixture
 def small(tmp_path: Path) -> tuple[Path, Path]:
     """BABEL with a few motions of 15 s in both parts, and one without frame labels."""
-    names = [f"CMU/{k:02d}/{k:02d}_01_poses.npz" for k in range(24)]
+    names = [f"CMU/{k:02d}/{k:02d}_01_poses.npz" for k in [*range(23), 27]]  # of the val part, 27 is for testing
     for seed, name in enumerate(names):
         write_amass(tmp_path / "amass" / name, 900, 60.0, seed)
     sequences = {
@@ -187,6 +188,33 @@ def test_one_batch_from_raw_files(small: tuple[Path, Path], tmp_path: Path):
     expected = representation.encode(torch.from_numpy(frames_of(small[1], clip.source)))
     start = clip.attributes["start"]
     np.testing.assert_allclose(data.store.motion(clip), expected[start : start + 128].numpy(), atol=1e-6)
+
+
+def test_the_official_training_set_stays_whole_and_val_is_divided_by_motion(tmp_path: Path):
+    names = [f"CMU/{k:02d}/{k:02d}_01_poses.npz" for k in range(60)]
+    for seed, name in enumerate(names):
+        write_amass(tmp_path / "amass" / name, 300, 20.0, seed)
+    parts = {
+        "train": names[:20],
+        "extra_train": names[20:24],
+        "val": [*names[24:52], names[3]],
+        "extra_val": names[52:],
+    }
+    labels = [label("walk", ["walk"], 0.0, 8.0)]
+    sequences = {
+        part: {name: sequence(name, labels, part.startswith("extra")) for name in listed}
+        for part, listed in parts.items()
+    }
+    source = open_babel(write_babel(tmp_path / "babel", sequences), tmp_path / "amass")
+    splits: dict[str, set[str]] = {"train": set(), "val": set(), "test": set()}
+    for window in source.windows():
+        assert window.split == "train" if window.id.startswith("train") else window.split in ("val", "test")
+        splits[window.split].add(window.motion)
+    assert {split: len(motions) for split, motions in splits.items()} == {"train": 24, "val": 28, "test": 8}
+    assert len(set().union(*splits.values())) == 60, "a motion in two splits"
+    assert source.excluded() == {"labels of the val part on motions of the train part": 1}
+    flames = Counter(w.split for w in open_babel(tmp_path / "babel", tmp_path / "amass", True).windows())
+    assert flames["val"] + flames["test"] == 4 * 37
 
 
 def test_flames_split_is_marked(small: tuple[Path, Path], tmp_path: Path):

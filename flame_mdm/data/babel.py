@@ -61,9 +61,9 @@ class Babel(MotionSource):
     A longer label gives windows every `stride` frames; a shorter one is extended past its end, or left out where the
     motion ends before. The stretch of a label is floor(20 start) to floor(20 end) - 1, as FLAME's code has it.
 
-    Ours keeps each motion in one split: 60 % train, 20 % val, 20 % test of the motions of both parts. FLAME's trains on
-    BABEL's train part and takes every fifth clip of the val part for testing, so that overlapping windows of one label
-    stand in val and test.
+    Both splits train on BABEL's whole train part and take 20 % of its val part for testing. Ours takes 20 % of the
+    motions, so no motion is in two splits. FLAME's takes every fifth clip, so overlapping windows of one label are in
+    val and in test.
     """
 
     name = "babel"
@@ -134,10 +134,16 @@ class Babel(MotionSource):
             measured = self.amass.each(keys, _measure, self.workers)
             lengths = dict(tqdm(measured, "measuring the motions of AMASS", len(keys), unit=" motions"))
             self._windows = []
+            trained = {label.motion for label in labels["train"]}
             for part in PARTS:
                 number = 0
                 for label in labels[part]:
-                    for start in self._starts(label, lengths[label.motion]):
+                    starts = self._starts(label, lengths[label.motion])
+                    if starts and part == "val" and label.motion in trained and not self.published_split:
+                        self._exclude("labels of the val part on motions of the train part")
+                        number += len(starts)
+                        continue
+                    for start in starts:
                         split = self._split(part, number, label.motion)
                         self._windows.append(Window(f"{part}_{number:06d}", label.motion, split, start, label))
                         number += 1
@@ -207,9 +213,11 @@ class Babel(MotionSource):
         return range(0)
 
     def _split(self, part: str, number: int, motion: str) -> Split:
+        if part == "train":
+            return "train"
         if not self.published_split:
-            return hashed_split(motion, val=20, test=20)
-        return "train" if part == "train" else "test" if number % 5 == 0 else "val"
+            return hashed_split(motion, val=80, test=20)
+        return "test" if number % 5 == 0 else "val"
 
     def _key(self, motion: str) -> str:
         key = key_of(motion)

@@ -13,11 +13,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from flame_mdm.config import compose
+
 ROOT = Path(__file__).parent.parent
 GOLDEN = Path(os.environ.get("FLAME_MDM_GOLDEN", ROOT / "tests" / "golden"))
 SHARED = Path(os.environ.get("FLAME_MDM_SHARED", ROOT.parent / "shared"))
 
 Arrays = dict[str, np.ndarray]
+
+recipe = cache(compose)
+"""Composed recipes by name, shared by the test modules of a process."""
 
 needs_third_party = pytest.mark.skipif(
     not SHARED.is_dir(), reason=f"third-party fixtures are not redistributed and {SHARED} does not exist"

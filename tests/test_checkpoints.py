@@ -88,6 +88,7 @@ def imported_flame() -> MotionGeneration:
         model = load(name)
     assert torch.equal(model.condition.get_buffer("pooler_weight"), state["lm.pooler.dense.weight"])
     assert torch.equal(model.condition.get_buffer("pooler_bias"), state["lm.pooler.dense.bias"])
+    assert model.config["process"]["clip_x0"], "released FLAME was sampled with the clamp of its code"
     return model
 
 

@@ -24,7 +24,7 @@ PROCESSES = {
     "x0": {"process": "diffusion"},
     "epsilon": {"process": "diffusion", "prediction": "epsilon"},
     "velocity": {"process": "diffusion", "prediction": "velocity"},
-    "learned_range": {"process": "flame", "clip_x0": False},
+    "learned_range": {"process": "flame"},
     FLOW: {"process": FLOW},
 }
 CONDITIONS = ("learned", "action", "none")

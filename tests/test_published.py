@@ -9,10 +9,11 @@ from typing import Any, get_args
 
 import pytest
 import yaml
+from fixtures import recipe
 
 from evaluators.evaluator import Evaluator, Motions
 from evaluators.run import load_protocol
-from flame_mdm.config import EXPERIMENTS, Config, compose, instantiate, recipes
+from flame_mdm.config import EXPERIMENTS, Config, instantiate, recipes
 from flame_mdm.errors import UserError
 from flame_mdm.processes.diffusion import Sampler
 from flame_mdm.processes.flow_matching import STEPS
@@ -28,8 +29,6 @@ MEASURED = {name: part for name, part in PARTS.items() if "columns" in part}
 SETTINGS = {name: part for name, part in PARTS.items() if "recipes" in part}
 REPORTED = {f"{name}: {label}": part for name, parts in PUBLISHED.items() for label, part in parts.items()}
 NUMBER = re.compile(r"(\d{1,3}(,\d{3})*|\d+)(\.\d+)?(M|%)?( ±\d*\.\d+)?")
-
-recipe = cache(compose)
 
 
 def models(part: Config) -> list[Config]:

@@ -2,14 +2,13 @@
 
 import importlib.util
 import sys
-from functools import cache
 from typing import Any, get_args
 
 import pytest
 import torch
-from fixtures import ROOT
+from fixtures import ROOT, recipe
 
-from flame_mdm.config import compose, instantiate, recipes
+from flame_mdm.config import instantiate, recipes
 from flame_mdm.motion import Condition
 from flame_mdm.processes.diffusion import Sampler
 from flame_mdm.processes.flow_matching import STEPS as SOLVERS
@@ -29,7 +28,6 @@ CELLS = {
     for key, papers in column.items()
     if papers is not None
 }
-recipe = cache(compose)
 GENERATION = [name for name in recipes() if "denoiser" in recipe(name)]
 each_recipe = pytest.mark.parametrize("name", GENERATION)
 

@@ -367,7 +367,7 @@ def option(group: str, name: str) -> Config:
 
 def _flame_recipe(released: Released) -> tuple[Config, dict[str, Any]]:
     condition = option("condition", "roberta") | {"features": released.features[2]}
-    config = _recipe("released/flame", released, "smpl", condition, option("process", "flame"))
+    config = _recipe("released/flame", released, "smpl", condition, option("process", "flame_code"))
     config["task"] |= {"cond_drop_prob": 0.25, "guidance_scale": 8.0}
     config["optimizer"] |= {"weight_decay": 0.0}
     # The authors' table has one row more than there are lengths.

@@ -98,7 +98,7 @@ class GaussianDiffusion(Process):
                 (guided-diffusion) the likelihood of the data in 255 bins of [-1, 1], which is meant for pixels.
             average_padding: legacy of FLAME's code: losses are averaged over the padded length, with noise 0 in the
                 padding, so that short motions weigh less. The denoiser must return 0 there.
-            clip_x0: sampling clamps the clean estimate to [-1, 1] (FLAME).
+            clip_x0: legacy of FLAME's code: sampling clamps the clean estimate to [-1, 1].
             timestep_sampling: how training steps are drawn.
 
         Raises:

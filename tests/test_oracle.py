@@ -1,0 +1,129 @@
+"""A perfect denoiser reproduces a motion whose root travels far, sampled as each recipe says."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+from analytic import NO_CONDITION
+from fixtures import recipe
+from torch import Tensor
+
+from flame_mdm.config import instantiate, recipes
+from flame_mdm.editing import METHODS
+from flame_mdm.motion import Denoise, Edit
+from flame_mdm.processes import Process
+from flame_mdm.processes.diffusion import GaussianDiffusion
+from flame_mdm.representations import Representation
+from flame_mdm.seeds import normal
+
+METERS, FRAMES = 10.0, 60
+
+
+GENERATION = [name for name in recipes() if "process" in recipe(name)]
+
+
+def family(name: str) -> str:
+    """What decides how a recipe's motions are sampled."""
+    config, task = recipe(name), recipe(name)["task"]
+    return repr([config["process"], config["representation"], task["sampler"], task["num_inference_steps"]])
+
+
+FAMILIES = {family(name): name for name in reversed(GENERATION)}.values()
+CLAMPED = {"babel/flame_code", "humanml3d/flame_code"}
+UNCLAMPED = sorted(set(FAMILIES) - CLAMPED)
+
+
+def traveller(representation: Representation) -> Tensor:
+    """Normalized features (1, F, D) float64 of a stiff body whose root moves `METERS` at constant speed."""
+    raw = torch.zeros(FRAMES + 1, 75)
+    raw[:, 0] = METERS * torch.arange(FRAMES + 1) / FRAMES
+    raw[:, 2] = 0.9
+    if representation.name.startswith(("smpl", "rot6d")):
+        features = representation.encode(raw)
+    else:
+        skeleton = representation.skeleton
+        bones = 0.3 * torch.tensor(skeleton.raw_offsets, dtype=torch.float32).expand(len(raw), -1, -1)
+        features = representation.encode(skeleton.assemble(bones, raw[:, [0, 2, 1]]))
+        representation.std.fill_(0.05)  # as small as those of real velocities: normalized ones reach beyond 1
+    return representation.normalize(features.double())[None]
+
+
+def oracle(process: Process, x: Tensor, start: Tensor) -> Denoise:
+    """The denoiser that knows the motion, and of a flow the noise that it started from."""
+
+    def denoise(x_t: Tensor, t: Tensor, *_: Any) -> Tensor:
+        noise = start
+        if isinstance(process, GaussianDiffusion):
+            deviation = process.corrupt(torch.zeros_like(x), torch.ones_like(x), t)
+            noise = (x_t - process.corrupt(x, torch.zeros_like(x), t)) / deviation
+        output = process.target(x, noise, t)
+        return torch.cat([output, torch.zeros_like(output)], -1)[..., : process.out_features(x.shape[-1])]
+
+    return denoise
+
+
+def root_path(name: str, edit: Edit | None = None) -> tuple[Tensor, Tensor]:
+    """The root (F, 3) of the traveller, and of the oracle's sample, as the recipe has it."""
+    config = recipe(name)
+    representation = instantiate(config["representation"]).double()
+    process, x = instantiate(config["process"]), traveller(representation)
+    if edit is not None:
+        edit.known, edit.keep = x, torch.ones_like(x, dtype=torch.bool)
+        edit.keep[:, FRAMES // 4 : 3 * FRAMES // 4] = False
+
+    def noise(draw: int) -> Tensor:
+        return normal(torch.tensor([draw]), *x.shape[1:]).double()
+
+    sampled = process.sample(
+        oracle(process, x, noise(0)),
+        noise,
+        torch.ones(x.shape[:2], dtype=torch.bool),
+        NO_CONDITION,
+        sampler=config["task"]["sampler"],
+        num_inference_steps=config["task"]["num_inference_steps"],
+        edit=edit,
+    )
+    real, ours = (representation.to_joints(motion)[0, :, 0] for motion in (x, sampled))
+    return real, ours
+
+
+def longest_step(root: Tensor) -> float:
+    return root.diff(dim=0).norm(dim=-1).max().item()
+
+
+@pytest.mark.parametrize("name", UNCLAMPED)
+def test_an_oracle_travels_as_far_as_the_motion(name):
+    real, ours = root_path(name)
+    assert (real[-1] - real[0]).norm() > METERS - 0.2  # some features have a frame less, or scale the body
+    torch.testing.assert_close(ours, real, rtol=0, atol=0.02)
+
+
+@pytest.mark.parametrize(
+    ("name", "method"),
+    [
+        (name, method)
+        for name in UNCLAMPED
+        for method, how in METHODS.items()
+        if how["mode"] in instantiate(recipe(name)["process"]).edit_modes
+    ],
+)
+def test_in_betweening_does_not_teleport(name, method):
+    known = torch.zeros(0)
+    real, ours = root_path(name, Edit(known, known, **METHODS[method]))
+    torch.testing.assert_close(ours[-1], real[-1], rtol=0, atol=0.02)
+    assert longest_step(ours) < 2 * longest_step(real)
+
+
+def test_only_recipes_of_the_authors_code_clamp():
+    assert {name for name in GENERATION if recipe(name)["process"].get("clip_x0")} == CLAMPED
+
+
+@pytest.mark.parametrize("name", sorted(CLAMPED))
+def test_the_clamp_of_the_authors_code_stops_the_root_and_teleports(name):
+    real, ours = root_path(name)
+    assert (ours[-1] - real[-1]).norm() == pytest.approx(METERS - 1, abs=1e-3)
+    known = torch.zeros(0)
+    _, between = root_path(name, Edit(known, known, **METHODS["flame"]))
+    assert longest_step(between) > 1

@@ -221,7 +221,7 @@ def test_samples_are_those_of_actor(number: str, tmp_path: Path):
 @pytest.mark.parametrize(
     ("columns", "message"),
     [
-        ({"y": [0]}, r"humanact12poses\.pkl: as many of each are needed"),
+        ({"y": [0]}, r"humanact12poses\.pkl: lists differ in length"),
         ({"y": [12] * 24}, r"clip 0 has the label 12, not one of 0 to 11"),
         ({"joints3D": [np.zeros((9, 18, 3))] * 24}, r"clip 0 has poses \(20, 72\) and joints \(9, 18, 3\)"),
         ({"poses": [np.full((f, 72), np.nan) for _ in range(2) for f in range(20, 104, 7)]}, "clip humanact12_00"),
@@ -234,9 +234,9 @@ def test_another_humanact12_file_is_named(columns: dict, message: str, tmp_path:
     path = written(tmp_path / "humanact12poses.pkl", full | columns)
     with pytest.raises(ValueError, match=message):
         write_store(tmp_path / "store", HumanAct12(str(path)), Rot6D())
-    with pytest.raises(ValueError, match="it holds list"):
+    with pytest.raises(ValueError, match="it contains list"):
         HumanAct12(str(written(path, [1]))).count()
-    with pytest.raises(FileNotFoundError, match=r"no humanact12poses\.pkl; the set is published with ACTOR"):
+    with pytest.raises(FileNotFoundError, match=r"no humanact12poses\.pkl; the data set is published with ACTOR"):
         HumanAct12(str(tmp_path / "store")).count()
 
 
@@ -340,7 +340,7 @@ def test_front_view_is_actors_camera():
         ("names.txt", "a0_p001.avi\n", r"names\.txt, line 1: 'a0_p001\.avi' is not the name of a video"),
         ("names.txt", "a40_d0_p001_c1_color.avi\n", r"names\.txt, line 1: .* one of the 40 actions"),
         ("num_frames_min.txt", "3\n", r"num_frames_min\.txt 1 and vibe_cache_refined\.pkl 60 clips"),
-        ("names.txt", None, r"info/names\.txt: it belongs to the set"),
+        ("names.txt", None, r"info/names\.txt: no such file; it is part of the data set"),
     ],
 )
 def test_damaged_lists_are_named(file: str, text: str | None, message: str, tmp_path: Path):

@@ -226,7 +226,9 @@ def test_flames_split_is_marked(small: tuple[Path, Path], tmp_path: Path):
     assert all((int(c.id[4:]) % 5 == 0) == (c.split == "test") for c in held_out)
     ours = MotionDataModule(open_babel(*small), SMPL(), root=str(tmp_path), name="x", batch_size=1, crop=Whole())
     ours.folder = store.folder
-    with pytest.raises(ValueError, match="prepared with published_split=True, the recipe says published_split=False"):
+    with pytest.raises(
+        ValueError, match="prepared with published_split=True, but the recipe has published_split=False"
+    ):
         ours.open()
 
 
@@ -238,7 +240,7 @@ def test_absent_and_damaged_motions_are_named(small: tuple[Path, Path]):
     with pytest.raises(ValueError, match=r"03_01_poses\.npz: damaged"):
         open_babel(*small).count()
     shutil.rmtree(small[1] / "CMU/03")
-    with pytest.raises(FileNotFoundError, match=r"CMU: 1 of 23 recordings are absent, such as CMU/03/03_01_poses"):
+    with pytest.raises(FileNotFoundError, match=r"CMU: 1 of 23 recordings are missing, such as CMU/03/03_01_poses"):
         open_babel(*small).count()
     with pytest.raises(FileNotFoundError, match=r"register at https://amass"):
         open_babel(small[0], small[0] / "none").count()

@@ -427,12 +427,12 @@ def test_wrong_input_is_explained(tiny, tmp_path):
     with pytest.raises(ValueError, match=r"notes.txt: neither a folder nor a zip or tar archive"):
         Bandai(str(tmp_path / "notes.txt")).count()
     (tmp_path / "dataset-1_swim_happy_001.bvh").write_text("")
-    with pytest.raises(ValueError, match=r"dataset-1_swim_happy_001.bvh: .* no content swim in a style happy"):
+    with pytest.raises(ValueError, match=r"dataset-1_swim_happy_001.bvh: .* no content swim with style happy"):
         Bandai(str(tmp_path)).count()
     for name in ("one", "two"):
         (tmp_path / name).mkdir()
         shutil.copy(next(tiny.rglob("dataset-1_walk_happy_001.bvh")), tmp_path / name)
-    with pytest.raises(ValueError, match=r"dataset-1_walk_happy_001 is there twice, as .*one/.* and as .*two/"):
+    with pytest.raises(ValueError, match=r"dataset-1_walk_happy_001 exists twice, as .*one/.* and .*two/"):
         Bandai(str(tmp_path)).count()
 
 

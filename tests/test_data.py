@@ -116,10 +116,10 @@ def clip(name, split: Split = "train", source=None, motion=None, **options):
     [
         ([clip("a"), clip("b", motion=np.full((30, 22, 3), np.nan))], "clip b: "),
         ([clip("a"), clip("b", motion=np.zeros((30, 21, 3)))], "clip b: "),
-        ([clip("a", "train", "take"), clip("Ma", "test", "take")], "clips of take stand in train and in test"),
+        ([clip("a", "train", "take"), clip("Ma", "test", "take")], "clips of take are in both train and test"),
         ([clip("a"), clip("a")], "two clips have the same id"),
         ([clip("a", "test")], "no clip is in the training split"),
-        ([clip("a", motion=np.zeros((9, 263)), encoded="other")], "clip a: handed out as other"),
+        ([clip("a", motion=np.zeros((9, 263)), encoded="other")], "clip a: published as other"),
         (
             [clip("a", motion=np.zeros((9, 5)), encoded="humanml-clean-smpl22")],
             r"clip a: shape \(9, 5\), not \(frames, 263\)",
@@ -264,5 +264,5 @@ def test_a_store_of_another_representation_is_refused(folder, tmp_path):
         batch_size=4,
         crop=Units(24, 60, 4),
     )
-    with pytest.raises(ValueError, match="the recipe says representation=humanml-legacy-smpl22"):
+    with pytest.raises(ValueError, match="the recipe has representation=humanml-legacy-smpl22"):
         module.open()

@@ -228,30 +228,33 @@ def test_splits_go_by_the_source(tmp_path: Path):
 MAP = json.dumps({joint: f"{joint}?" for joint in SMPL22.joints})
 BAD = {
     "no motion": (lambda f: [p.unlink() for p in f.rglob("*.np*")], "no motion in it; give a folder"),
-    "twice": (lambda f: np.savez(f / "one.npz", joints=WALK, fps=30), r"one\.npz: there is one\.npy, too"),
+    "twice": (lambda f: np.savez(f / "one.npz", joints=WALK, fps=30), r"one\.npz: has the same name as one\.npy"),
     "no caption": (lambda f: (f / "one.txt").unlink(), "1 of 3 motions have no caption, such as one"),
     "unknown id": (lambda f: (f / "captions.csv").write_text("id,text\nonce,a\n"), r"captions\.csv, line 2: .*'once'"),
     "columns": (lambda f: (f / "captions.csv").write_text("id,caption\none,a\n"), r"captions\.csv: its columns are"),
-    "cells": (lambda f: (f / "captions.csv").write_text("id,text\none,a, b\n"), r"line 2: not as many cells"),
-    "split": (lambda f: (f / "captions.csv").write_text("id,split\none,dev\n"), r"line 2: the split 'dev' is none of"),
+    "cells": (lambda f: (f / "captions.csv").write_text("id,text\none,a, b\n"), r"line 2: not one cell per column"),
+    "split": (lambda f: (f / "captions.csv").write_text("id,split\none,dev\n"), r"line 2: unknown split 'dev'; use"),
     "json": (lambda f: (f / "captions.json").write_text("{"), r"captions\.json: not a JSON file"),
     "json key": (lambda f: (f / "captions.json").write_text('{"one": {"txt": "a"}}'), "one: unknown key txt"),
     "json shape": (lambda f: (f / "captions.json").write_text('{"one": "a"}'), r"captions\.json: write {"),
     "two splits": (
         lambda f: (f / "captions.csv").write_text("id,split\none,val\none,test\n"),
-        "line 3: one has the split val and test",
+        "line 3: one has two values of split: val and test",
     ),
-    "no rate": (lambda f: (f / "skeleton.yaml").unlink(), r"one\.npy: it does not give its frame rate"),
+    "no rate": (lambda f: (f / "skeleton.yaml").unlink(), r"one\.npy: no frame rate in the file"),
     "cut": (lambda f: (f / "one.npy").write_bytes((f / "one.npy").read_bytes()[:900]), r"one\.npy: damaged"),
     "objects": (lambda f: np.save(f / "one.npy", np.array([{}])), r"one\.npy: damaged, or not a file of plain arrays"),
     "keys": (lambda f: np.savez(f / "three.npz", x=1), r"three\.npz: it holds x"),
     "flat": (lambda f: np.save(f / "one.npy", WALK.reshape(-1, 66)), r"one\.npy: joints of shape \(\d+, 66\)"),
     "23 joints": (lambda f: np.save(f / "one.npy", np.zeros((9, 23, 3))), r"one\.npy: 23 joints, not the 22, 24 or 52"),
-    "17 joints": (lambda f: np.save(f / "one.npy", np.zeros((9, 17, 3))), r"one\.npy: 17 joints of unknown names"),
+    "17 joints": (lambda f: np.save(f / "one.npy", np.zeros((9, 17, 3))), r"one\.npy: 17 joints with unknown names"),
     "nan": (lambda f: np.save(f / "one.npy", WALK * np.nan), r"one\.npy: numbers of joints in frame 0 are not finite"),
-    "unit": (lambda f: np.save(f / "one.npy", WALK * 100), r"one\.npy: a leg of 8\d.* m; say in skeleton\.yaml"),
+    "unit": (lambda f: np.save(f / "one.npy", WALK * 100), r"one\.npy: the legs are 8\d.* m long; set `unit`"),
     "sides": (lambda f: np.save(f / "one.npy", WALK * [-1, 1, 1]), r"one\.npy: the toes point backwards"),
-    "up": (lambda f: np.savez(f / "deep/two.npz", joints=WALK[..., [0, 2, 1]] * [1, -1, 1], fps=9), "the body lies"),
+    "up": (
+        lambda f: np.savez(f / "deep/two.npz", joints=WALK[..., [0, 2, 1]] * [1, -1, 1], fps=9),
+        "the body is lying down",
+    ),
     "trans": (lambda f: np.savez(f / "three.npz", poses=np.zeros((9, 72))), r"three\.npz: AMASS's files hold poses"),
     "yaml": (lambda f: skeleton(f, "fps: [30"), r"skeleton\.yaml: not a readable YAML file"),
     "yaml key": (lambda f: skeleton(f, "rate: 30"), r"skeleton\.yaml: unknown key rate; there are map, joints"),
@@ -294,7 +297,7 @@ def test_motions_are_excluded_by_name(arrays: Path):
         Folder(str(arrays), exclude=["won"]).count()
     with pytest.raises(ValueError, match=r"one\.npy: damaged"):
         write_store(arrays / "store", Folder(str(arrays)), HumanML())
-    with pytest.raises(ValueError, match=r"deep/two\.npz: it holds no rotations of SMPL"):
+    with pytest.raises(ValueError, match=r"deep/two\.npz: contains no SMPL rotations"):
         list(Folder(str(arrays), motion="smpl").clips(20.0))
 
 

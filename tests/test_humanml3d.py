@@ -232,15 +232,15 @@ def set_nan(folder):
     [
         (lambda f: motion(f).unlink(), r"new_joint_vecs/\*\.npy lacks 1 of the names .* 000001; .*exclude=\[000001\]"),
         (lambda f: (f / "texts" / "M000005.txt").unlink(), r"texts/\*\.txt lacks 1 of the names .* M000005"),
-        (set_nan, r"2 motions hold numbers that are not finite: 000001, M000000; .*exclude=\["),
+        (set_nan, r"2 motions contain non-finite numbers: 000001, M000000; .*exclude=\["),
         (lambda f: motion(f).write_bytes(motion(f).read_bytes()[:-999]), r"000001\.npy: damaged"),
         (lambda f: motion(f).write_bytes(b""), r"000001\.npy: damaged"),
         (lambda f: np.save(motion(f), np.zeros((3, 4, 5))), r"000001\.npy: shape \(3, 4, 5\)"),
         (lambda f: np.save(motion(f), np.zeros((50, 4))), r"clip 000001: shape \(50, 4\)"),
         (lambda f: (f / "Mean.npy").unlink(), r"Mean\.npy: no such file; clone"),
-        (lambda f: np.save(f / "Std.npy", np.zeros(263)), "no mean and positive std"),
-        (lambda f: (f / "test.txt").write_text("000000\n"), r"test\.txt: 000000 is in train\.txt, too"),
-        (lambda f: (f / "val.txt").write_text("M000000\n"), r"is in train\.txt, too"),
+        (lambda f: np.save(f / "Std.npy", np.zeros(263)), "is not a mean or positive std"),
+        (lambda f: (f / "test.txt").write_text("000000\n"), r"test\.txt: 000000 is also in train\.txt"),
+        (lambda f: (f / "val.txt").write_text("M000000\n"), r"is also in train\.txt"),
         (lambda f: (f / "val.txt").unlink(), r"val\.txt: no such list of names"),
         (lambda f: (f / "texts/000001.txt").write_text("ok#a/DET#0#0\nno tags\n"), r"000001\.txt, line 2: not caption"),
         (shutil.rmtree, r"HumanML3D: no such folder; clone"),
@@ -257,7 +257,7 @@ def test_a_damaged_folder_is_named(folder, tmp_path, damage, message):
 def test_a_mirrored_copy_in_another_split_is_refused(folder, tmp_path):
     (folder / "train.txt").write_text("000000\n")
     (folder / "val.txt").write_text("M000000\n")
-    with pytest.raises(ValueError, match="clips of 000000 stand in train and in val"):
+    with pytest.raises(ValueError, match="clips of 000000 are in both train and val"):
         write_store(tmp_path / "store", HumanML3D(str(folder)), legacy())
 
 
@@ -269,12 +269,12 @@ def test_damaged_motions_can_be_excluded(folder, tmp_path):
     store = write_store(tmp_path / "store", source, legacy())
     assert not {"000001", "M000000", "000005"} & {clip.id for clip in store.clips}
     assert store.info["excluded"]["names by data.source.exclude"] == 3
-    with pytest.raises(ValueError, match=r"data\.source\.exclude: no split has 7"):
+    with pytest.raises(ValueError, match=r"data\.source\.exclude: no split contains 7"):
         HumanML3D(str(folder), exclude=["7"]).count()
 
 
 def test_another_frame_rate_is_refused(folder):
-    with pytest.raises(ValueError, match=r"humanml3d has 20 frames a second, the representation asks for 12\.5"):
+    with pytest.raises(ValueError, match=r"humanml3d has 20 frames per second, but representation\.fps is 12\.5"):
         next(iter(HumanML3D(str(folder)).clips(12.5)))
 
 
@@ -444,7 +444,7 @@ def made(root):
 
 def test_the_set_is_made_from_amass_and_an_interrupted_run_is_taken_up(mine):
     source = raw(mine)
-    assert source.check() == ["0 of 6 motions and their mirrored copies are made"]
+    assert source.check() == ["0 of 6 motions and their mirrored copies are created"]
     assert source.count() == 2 * 6
     expected = expected_features(mine)
     result = made(mine)
@@ -460,7 +460,7 @@ def test_the_set_is_made_from_amass_and_an_interrupted_run_is_taken_up(mine):
     kept = np.zeros((44, 263), np.float32)
     np.save(folder / "000005.npy", kept)
     again = raw(mine)
-    assert again.check() == ["5 of 6 motions and their mirrored copies are made"]
+    assert again.check() == ["5 of 6 motions and their mirrored copies are created"]
     again.count()
     np.testing.assert_array_equal(made(mine)["M000003"], result["M000003"])
     np.testing.assert_array_equal(made(mine)["000005"], kept, err_msg="what is there is not made again")
@@ -527,35 +527,38 @@ def body_of_55_joints(root):
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
-        (smplx, r"kick_high_left02_poses\.npz: this is AMASS's SMPL-X release; download the one called SMPL\+H G"),
+        (smplx, r"kick_high_left02_poses\.npz: this is AMASS's SMPL-X release; download the SMPL\+H G release"),
         (rename_as_smplx, r"KIT: this is the SMPL-X release \(files end in _stageii\); download SMPL\+H G"),
         (truncate_archive, r"KIT\.tar\.bz2: damaged archive: .*; download it again"),
         (
             archive_without_recording,
-            r"BMLrub\.tar\.bz2: 1 recordings are not in it, such as BioMotionLab",
+            r"BMLrub\.tar\.bz2: 1 recordings are missing in the archive, such as BioMotionLab",
         ),
         (
             lambda r: truncate(r / "amass/CMU/80/80_63_poses.npz"),
             r"80_63_poses\.npz: damaged, or not a file of plain arrays",
         ),
-        (lambda r: set_in_file(r, trans=np.full((360, 3), np.nan)), r"80_63_poses\.npz: it holds numbers that are not"),
+        (lambda r: set_in_file(r, trans=np.full((360, 3), np.nan)), r"80_63_poses\.npz: contains non-finite numbers"),
         (lambda r: set_in_file(r, poses=np.zeros((360, 72))), r"80_63_poses\.npz: poses \(360, 72\)"),
-        (lambda r: set_in_file(r, mocap_framerate=np.array(15.0)), r"80_63_poses\.npz: recorded at 15 frames a second"),
+        (
+            lambda r: set_in_file(r, mocap_framerate=np.array(15.0)),
+            r"80_63_poses\.npz: recorded at 15 frames per second",
+        ),
         (
             lambda r: set_in_file(r, gender=np.array({"a": 1})),
             r"80_63_poses\.npz: damaged, or not a file of plain arrays",
         ),
         (
             lambda r: shutil.rmtree(r / "amass" / "BMLrub"),
-            r"cannot be made: BioMotionLab_NTroje: absent \(1 recordings\); .* BioMotionLab_NTroje or BMLrub",
+            r"cannot be created: BioMotionLab_NTroje: missing \(1 recordings\); .* BioMotionLab_NTroje or BMLrub",
         ),
         (lambda r: shutil.rmtree(r / "amass"), r"amass: no such folder; register at https://amass"),
-        (lambda r: shutil.rmtree(r / "bodies"), r"bodies: neither male/model\.npz nor SMPLH_MALE\.npz in it"),
-        (lambda r: truncate(r / "bodies/smplh/male/model.npz"), r"male/model\.npz: damaged or no SMPL\+H model"),
-        (body_of_55_joints, r"male/model\.npz: a model of 55 joints, not SMPL\+H's 52"),
+        (lambda r: shutil.rmtree(r / "bodies"), r"bodies: contains neither male/model\.npz nor SMPLH_MALE\.npz"),
+        (lambda r: truncate(r / "bodies/smplh/male/model.npz"), r"male/model\.npz: damaged or not an SMPL\+H model"),
+        (body_of_55_joints, r"male/model\.npz: a model with 55 joints, not SMPL\+H with 52"),
         (lambda r: (r / "HumanML3D/index.csv").unlink(), r"index\.csv: no such file"),
         (lambda r: (r / "HumanML3D/index.csv").write_text("a,b\n1,2\n"), r"index\.csv, line 2: not a clip"),
-        (lambda r: shutil.rmtree(r / "HumanML3D/pose_data"), r"1 clips of HumanAct12 are absent, such as P11G01R02"),
+        (lambda r: shutil.rmtree(r / "HumanML3D/pose_data"), r"1 clips of HumanAct12 are missing, such as P11G01R02"),
         (lambda r: truncate(r / "HumanML3D/pose_data/humanact12.zip"), r"humanact12\.zip: damaged archive"),
     ],
 )
@@ -571,11 +574,11 @@ def test_the_dry_run_lists_all_that_is_missing(mine, capsys):
     (mine / "amass" / "CMU" / "80" / "80_63_poses.npz").unlink()
     shutil.rmtree(mine / "bodies")
     first, *missing = raw(mine).check()
-    assert first == "0 of 6 motions and their mirrored copies are made"
+    assert first == "0 of 6 motions and their mirrored copies are created"
     assert [line.split(":")[1] for line in missing] == [f" {mine}/bodies", " BioMotionLab_NTroje", " CMU"]
     options = [f"data.source.{key}={mine / key}" for key in ("amass",)]
     assert prepare(["data=humanml3d", f"source={mine / 'HumanML3D/HumanML3D'}", "check=true", *options]) == 0
-    assert "missing: BioMotionLab_NTroje: absent" in capsys.readouterr().out
+    assert "missing: BioMotionLab_NTroje: missing" in capsys.readouterr().out
     assert not (mine / "HumanML3D" / "HumanML3D" / "new_joint_vecs").exists()
 
 
@@ -636,6 +639,6 @@ def test_captions_of_the_smpl_form_must_be_there(mine):
         smpl(mine).count()
     assert json.dumps(HumanML3DSMPL.published)
     shutil.rmtree(mine / "amass" / "CMU")
-    with pytest.raises(FileNotFoundError, match="CMU: absent"):
+    with pytest.raises(FileNotFoundError, match="CMU: missing"):
         smpl(mine, exclude=["000003"]).count()
     assert Amass(mine / "amass").missing(["CMU/80/80_63_poses"])

@@ -73,7 +73,7 @@ def both(tmp_path) -> Iterator[tuple[subprocess.Popen[str], subprocess.Popen[str
     first.send_signal(signal.SIGSTOP)
     second = start("prepare", *words(tmp_path))
     assert second.stdout is not None
-    assert "another process prepares it" in second.stdout.readline()
+    assert "another process is preparing it" in second.stdout.readline()
     yield first, second
     for process in (first, second):
         process.kill()

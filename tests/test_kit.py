@@ -50,9 +50,9 @@ def test_a_processed_folder_becomes_batches(tmp_path):
 
 def test_frames_of_another_rate_or_set_are_refused(tmp_path):
     folder = write_folder(tmp_path / "KIT-ML", TEXTS, {"train": ["00001"], "val": [], "test": []}, 251)
-    with pytest.raises(ValueError, match=r"kit has 12\.5 frames a second, the representation asks for 20"):
+    with pytest.raises(ValueError, match=r"kit has 12\.5 frames per second, but representation\.fps is 20"):
         next(iter(KIT(str(folder)).clips(20.0)))
-    with pytest.raises(ValueError, match="clip 00001: handed out as humanml-legacy-kit21"):
+    with pytest.raises(ValueError, match="clip 00001: published as humanml-legacy-kit21"):
         write_store(tmp_path / "store", KIT(str(folder)), HumanML("smpl22", "legacy", fps=12.5))
 
 
@@ -150,15 +150,18 @@ def rewrite(path, change):
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
-        (lambda f: (f / "00003_fke.csv").unlink(), r"1 of 24 files are absent, such as 00003_fke\.csv"),
+        (lambda f: (f / "00003_fke.csv").unlink(), r"1 of 24 files are missing, such as 00003_fke\.csv"),
         (lambda f: (f / "00006_meta.json").unlink(), r"such as 00006_meta\.json"),
-        (lambda f: (f / "00001_annotations.json").write_text("[]"), r"00001_meta\.json: nb_annotations does not count"),
+        (lambda f: (f / "00001_annotations.json").write_text("[]"), r"00001_meta\.json: nb_annotations does not match"),
         (lambda f: (f / "00001_annotations.json").write_text('["a'), r"00001_annotations\.json: not a JSON file"),
         (lambda f: rewrite(f / "00001_fke.csv", lambda x: [*x[:9], "a,b", *x[10:]]), r"00001_fke\.csv: damaged"),
-        (lambda f: rewrite(f / "00001_fke.csv", lambda x: [y[: y.rindex(",")] for y in x]), "63 columns, not a number"),
-        (lambda f: np.savetxt(f / "00001_fke.csv", np.full((90, 64), math.nan), delimiter=","), "are not finite"),
+        (
+            lambda f: rewrite(f / "00001_fke.csv", lambda x: [y[: y.rindex(",")] for y in x]),
+            "63 columns, not a row number",
+        ),
+        (lambda f: np.savetxt(f / "00001_fke.csv", np.full((90, 64), math.nan), delimiter=","), "non-finite"),
         (lambda f: shutil.rmtree(f.parent / "kit-splits"), r"kit-splits/train: no such list of motions; .*TEMOS"),
-        (lambda f: (f.parent / "kit-splits/val").write_text("00001"), r"kit-splits/val: 00001 is in train, too"),
+        (lambda f: (f.parent / "kit-splits/val").write_text("00001"), r"kit-splits/val: 00001 is also in train"),
     ],
 )
 def test_a_damaged_folder_is_named(mmm, tmp_path, damage, message):
@@ -172,5 +175,5 @@ def test_motions_can_be_excluded(mmm, tmp_path):
     (mmm / "00003_fke.csv").unlink()
     store = write_store(tmp_path / "store", source(mmm, exclude=["00003"]), Rifke())
     assert store.info["excluded"]["motions by data.source.exclude"] == 1
-    with pytest.raises(ValueError, match="no split has 00099"):
+    with pytest.raises(ValueError, match="no split contains 00099"):
         source(mmm, exclude=["00099"]).count()

@@ -78,7 +78,7 @@ def test_a_store_of_other_options_is_refused_everywhere(tmp_path, data_root, tra
     assert prepare.main(prepared(root, 61)) == 0
     capsys.readouterr()
     before = tree(root)
-    says = f"error: {root / STORE}: was prepared with clips=61, the recipe says clips=60. Prepare it again with force"
+    says = f"error: {root / STORE}: prepared with clips=61, but the recipe has clips=60. Prepare it again with force"
     commands: list[tuple[Callable[[list[str]], int], list[str]]] = [
         (train.main, words(root, run, "trainer.max_steps=2")),
         (prepare.main, prepared(root, 60)),

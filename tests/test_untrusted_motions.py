@@ -268,7 +268,10 @@ def archive_cases() -> Iterator[tuple[bytes, str]]:
     yield member(TAKE, 0, tarfile.FIFOTYPE) + bytes(1024), "special file"
     yield member("@LongLink", 10**10, tarfile.GNUTYPE_LONGNAME) + bytes(1024), "a header of"
     yield member("x", 10**10, tarfile.XHDTYPE) + bytes(1024), "a header of"
-    for kind, values, says in ((tarfile.XGLTYPE, 200, "200 values for all"), (tarfile.XHDTYPE, 10_000, "a header of")):
+    for kind, values, says in (
+        (tarfile.XGLTYPE, 200, "200 header values apply"),
+        (tarfile.XHDTYPE, 10_000, "a header of"),
+    ):
         records = b"".join(b"%d k%d=v\n" % (len(f"k{n}=v\n") + 3, n) for n in range(10_000, 10_000 + values))
         padding = bytes(-len(records) % tarfile.BLOCKSIZE)
         yield member("x", len(records), kind) + records + padding + member(TAKE) + bytes(1024), says
@@ -364,7 +367,7 @@ PICKLES = {
     "text": (b"\x80\x04\x8d" + struct.pack("<Q", 10**12) + b"x.", "too early"),
     "number": (b"\x80\x04\x8b" + struct.pack("<i", 2**31 - 1) + b"x.", "too early"),
     "frame": (b"\x80\x04\x95" + struct.pack("<Q", 10**12) + b"N.", "too early"),
-    "memo": (b"\x80\x04Nr\xff\xff\xff\x7f.", "has to hold"),
+    "memo": (b"\x80\x04Nr\xff\xff\xff\x7f.", "must contain"),
     "tuples": (b"\x80\x04})" + b"\x85" * 10**6 + b"Ns.", "nested too deeply"),
     "lists": (b"\x80\x04" + b"](" * 10**5 + b"e" * 10**5 + b".", "nested too deeply"),
     "doubled": (doubled(60), "more than its size"),
@@ -437,11 +440,11 @@ def test_every_field_of_a_store_is_checked(tmp_path: Path):
     Store(tmp_path / "whole").verify()
     for name, value in CLIPS:
         small_store(tmp_path / "changed", {name: value}, {})
-        with pytest.raises(ValueError, match=rf"clips\.jsonl: damaged: line 1: no usable {name}"):
+        with pytest.raises(ValueError, match=rf"clips\.jsonl: damaged: line 1: no valid {name}"):
             Store(tmp_path / "changed")
     for name, value in INFOS:
         small_store(tmp_path / "changed", {}, {name: value})
-        with pytest.raises(ValueError, match=rf"store\.json: damaged: no usable {name}"):
+        with pytest.raises(ValueError, match=rf"store\.json: damaged: no valid {name}"):
             Store(tmp_path / "changed")
     small_store(tmp_path / "changed", {}, {"fingerprint": "0123456789abcdef"})
     with pytest.raises(ValueError, match=r"store\.json: damaged: its fingerprint"):

@@ -1,4 +1,4 @@
-"""Data sets: from what their owners hand out to packed stores and training batches."""
+"""Data sets: reading published releases, packing them into stores, and serving training batches."""
 
 import hashlib
 import inspect
@@ -15,22 +15,22 @@ Split = Literal["train", "val", "test"]
 
 @dataclass
 class Clip:
-    """One motion on its way from a data set into a store.
+    """One motion that a data set yields to be written into a store.
 
     Attributes:
-        id: unique name; mirrored copies are named `M` + the name of their original.
-        motion: what the representation encodes, at its frame rate; for joint-based representations the joint positions
-            (F, J, 3) in metres, y up, in the joint order of its skeleton.
-        captions: what is done, each a full description of the clip; empty for sets with action labels only.
-        split: mirrored copies and cuts of a take stand in the split of that take.
-        source: the take the clip comes from; clips of one source never stand in two splits.
+        id: unique name; a mirrored copy is named `M` + the name of its original.
+        motion: input of the representation, at its frame rate; for joint-based representations the joint positions
+            (F, J, 3) in meters, y up, in the joint order of its skeleton.
+        captions: descriptions of the motion, each complete; empty for data sets with action labels only.
+        split: mirrored copies and cuts of a take belong to the split of that take.
+        source: the take the clip comes from; clips of one source are never in two splits.
         action: index into the data set's `actions`, or None.
-        attributes: exact facts about the motion, where the set knows them (side, count, direction, speed, tagged words
-            of the captions ...); plain values that JSON can hold.
-        encoded: where the owners hand out features, the name of the representation that `motion` (F, D) is in; it is
-            stored as it is. Empty: `motion` is raw.
-        window: (first, length): the clip is this cut of its motion. Clips that follow one another with the very same
-            array share its frames in the store. Only for representations that make one row a frame.
+        attributes: exact facts about the motion, if the data set knows them (side, count, direction, speed, tagged
+            words of the captions ...); plain values that JSON can hold.
+        encoded: if the release contains features, the name of the representation that `motion` (F, D) is in; the
+            features are stored unchanged. If empty, `motion` is raw.
+        window: (first, length): the clip is this cut of its motion. Consecutive clips with the identical array object
+            share its frames in the store. Only for representations with one row per frame.
     """
 
     id: str
@@ -45,22 +45,22 @@ class Clip:
 
 
 PLACES = frozenset({"path", "amass", "body_models", "humanact12", "index", "splits", "workers"})
-"""Arguments of sources that tell where files are and how to read them. The others define the data."""
+"""Arguments of sources that say where files are and how to read them. All others define the data."""
 
 
 class MotionSource(ABC):
-    """A data set as its owners hand it out."""
+    """A data set in the form in which it is published."""
 
     name: str
     options: Mapping[str, Any]
-    """Arguments that define the data, all but `PLACES`, as JSON values. The store keeps them."""
+    """Arguments that define the data (all but `PLACES`), as JSON values. They are saved in the store."""
     actions: tuple[str, ...] = ()
     """Names of the action labels, in the order of their numbers; empty for sets without labels."""
     published: ClassVar[dict[str, int]] = {}
-    """Figures of the set as its owners or the papers give them, to compare with what is found."""
+    """Published figures of the data set (from its owners or the papers), to compare with the figures found."""
     published_split: bool = False
-    """The split is the one that papers use although clips are tested on that training has seen, or so that nothing is
-    left to validate on; the store carries it, and so does every result."""
+    """Whether the split is the one used in papers although it tests on clips seen in training or leaves no validation
+    clips. Saved in the store and in every result."""
 
     def __new__(cls, *args: Any, **kwargs: Any) -> Self:
         """Keeps the arguments of the constructor as `options`."""
@@ -78,32 +78,32 @@ class MotionSource(ABC):
         return source
 
     def excluded(self) -> dict[str, int]:
-        """How many clips or labels were left out, by reason; known once `clips` is exhausted."""
+        """Returns the number of clips or labels left out, by reason; complete once `clips` is exhausted."""
         return {}
 
     def counts(self) -> dict[str, int]:
-        """What is in the raw data under the names of `published`; the store keeps it, once `clips` is exhausted."""
+        """Returns the figures of the raw data under the names of `published`; saved once `clips` is exhausted."""
         return {}
 
     @abstractmethod
     def count(self) -> int:
-        """Number of clips that `clips` yields, known without reading motions, for the progress bar.
+        """Returns the number of clips that `clips` yields, without reading motions; used by the progress bar.
 
         Raises:
-            FileNotFoundError: the raw data is not where the recipe says; the message says how to get it.
+            FileNotFoundError: the raw data is not at the path in the recipe; the message says how to get it.
         """
 
     def check(self) -> list[str]:
-        """What is there and what is missing, in lines to print; nothing is prepared."""
+        """Returns lines to print about the files that are present and missing; prepares nothing."""
         return [f"{self.name}: {self.count()} clips can be prepared"]
 
     def statistics(self) -> tuple[np.ndarray, np.ndarray] | None:
-        """Mean and std (D,) that the owners hand out with encoded features; None = computed from the training clips."""
+        """Returns mean and std (D,) published with encoded features; None = computed from the training clips."""
         return None
 
     @abstractmethod
     def clips(self, fps: float) -> Iterator[Clip]:
-        """All clips at `fps` frames a second, always in the same order.
+        """Yields all clips at `fps` frames per second, always in the same order.
 
         Raises:
             ValueError: a file is damaged; the message names it.
@@ -111,6 +111,6 @@ class MotionSource(ABC):
 
 
 def hashed_split(name: str, val: int, test: int) -> Split:
-    """Holds out `val` and `test` per cent of all names; by the name alone, so that more names do not move any."""
+    """Holds out `val` and `test` percent of all names by a hash of the name, so that adding names moves no others."""
     share = int(hashlib.sha1(name.encode()).hexdigest()[:8], 16) % 100
     return "train" if share < 100 - val - test else "val" if share < 100 - test else "test"

@@ -1,4 +1,4 @@
-"""AMASS, the SMPL+H G release: archives as downloaded or unpacked folders, and joints from the parameters in them.
+"""Reader of AMASS (SMPL+H G release): downloaded archives or unpacked folders, and joints from the body parameters.
 
 Mahmood et al., "AMASS: Archive of Motion Capture as Surface Shapes", ICCV 2019; license at amass.is.tue.mpg.de.
 """
@@ -49,14 +49,14 @@ SUBSETS = {
     "SOMA": (),
     "WEIZMANN": (),
 }
-"""Folder of each subset in the archives that HumanML3D was made from -> its other names, on the web page and later."""
+"""Folder of each subset in the archives that HumanML3D was made from -> its other names (web page, later releases)."""
 
 Wanted = TypeVar("Wanted")
 Result = TypeVar("Result")
 ARCHIVE_ENDINGS = (".tar.bz2", ".tar.xz", ".tar.gz", ".tar")
 CHUNK = 32
 _Place = Path | dict[str, Path]
-"""An archive, or files by key."""
+"""An archive, or a mapping from key to file."""
 
 
 def _plain(name: str) -> str:
@@ -67,7 +67,7 @@ _BY_NAME = {_plain(alias): name for name, aliases in SUBSETS.items() for alias i
 
 
 class Recording(NamedTuple):
-    """One file of AMASS: poses (F, 156) axis-angle of SMPL+H's 52 joints, translation (F, 3) in metres, z up."""
+    """One AMASS file: poses (F, 156), axis-angle of SMPL+H's 52 joints, and translation (F, 3) in meters, z up."""
 
     poses: np.ndarray
     translation: np.ndarray
@@ -76,24 +76,26 @@ class Recording(NamedTuple):
     fps: float
 
     def every(self, fps: float) -> Recording:
-        """Every int(self.fps / fps)-th frame, as HumanML3D, FLAME and BABEL's users decimate: no interpolation.
+        """Returns every int(self.fps / fps)-th frame without interpolation, as HumanML3D, FLAME and users of BABEL do.
 
-        Of 59.94 Hz every second frame is kept, of 250 Hz every twelfth, so that the rate is only about `fps`.
+        For 20 fps, every second frame is kept at 59.94 Hz and every twelfth at 250 Hz, so the resulting rate is only
+        approximately `fps`.
 
         Raises:
-            ValueError: it was recorded at less than `fps`.
+            ValueError: the recording has a frame rate below `fps`.
         """
         step = int(self.fps / fps)
         if step < 1:
-            raise ValueError(f"recorded at {self.fps:g} frames a second, less than the {fps:g} asked for")
+            raise ValueError(f"recorded at {self.fps:g} frames per second, fewer than the requested {fps:g}")
         return self._replace(poses=self.poses[::step], translation=self.translation[::step])
 
 
 def key_of(path: str) -> str | None:
-    """Name of a recording whatever its subset is called, such as `bmlrub/rub001/0000_x_poses`; None outside a subset.
+    """Returns the key of a recording, such as `BioMotionLab_NTroje/rub001/0000_x_poses`, or None outside a subset.
 
-    Takes paths of index files (`./pose_data/KIT/3/x_poses.npy`), of archives and of unpacked folders, nested or not.
-    Spaces, which later releases replace by underscores, and capital letters do not count.
+    All names of a subset give the same key. Accepts paths from index files (`./pose_data/KIT/3/x_poses.npy`), from
+    archives and from unpacked folders, nested or not. Ignores case, and treats spaces as underscores, which later
+    releases use.
     """
     *folders, file = PurePosixPath(path).parts
     for depth in range(len(folders) - 1, -1, -1):
@@ -105,15 +107,15 @@ def key_of(path: str) -> str | None:
 
 
 def subset_of(key: str) -> str:
-    """Folder name of the subset, as in `SUBSETS`, that a key of `key_of` belongs to."""
+    """Returns the folder name of the subset, as in `SUBSETS`, that a key of `key_of` belongs to."""
     return key.split("/", 1)[0]
 
 
 def read(file: Path | bytes, name: str) -> Recording:
-    """Reads a recording; `name` stands in the errors.
+    """Reads a recording; `name` is used in error messages.
 
     Raises:
-        ValueError: no SMPL+H file of AMASS, damaged, or with numbers that are not finite.
+        ValueError: the file is not an SMPL+H file of AMASS, is damaged, or contains non-finite numbers.
     """
     try:
         data = read_npz(io.BytesIO(file) if isinstance(file, bytes) else file, skip=("dmpls", "marker_data"))
@@ -121,18 +123,18 @@ def read(file: Path | bytes, name: str) -> Recording:
         raise ValueError(f"{name}: {error}; download it again") from error
     width = data["poses"].shape[-1] if "poses" in data and data["poses"].ndim else 0
     if width == 165 or "surface_model_type" in data:
-        raise ValueError(f"{name}: this is AMASS's SMPL-X release; download the one called SMPL+H G")
+        raise ValueError(f"{name}: this is AMASS's SMPL-X release; download the SMPL+H G release")
     missing = [key for key in ("poses", "trans", "betas", "gender", "mocap_framerate") if key not in data]
     if missing:
-        raise ValueError(f"{name}: no motion of AMASS's SMPL+H G release, it lacks {', '.join(missing)}")
+        raise ValueError(f"{name}: not a motion of AMASS's SMPL+H G release: {', '.join(missing)} missing")
     poses, translation = data["poses"], data["trans"]
     if poses.ndim != 2 or width != 156 or translation.shape != (len(poses), 3):
         raise ValueError(f"{name}: poses {poses.shape} and trans {translation.shape}, not (F, 156) and (F, 3)")
     betas, gender = data["betas"], data["gender"]
     if {poses.dtype.kind, translation.dtype.kind, betas.dtype.kind} - set("fiu") or betas.ndim != 1 or gender.size != 1:
-        raise ValueError(f"{name}: poses, trans and betas are no arrays of real numbers, or gender is not one word")
+        raise ValueError(f"{name}: poses, trans and betas must be arrays of real numbers, and gender a single word")
     if not (np.isfinite(poses).all() and np.isfinite(translation).all() and np.isfinite(betas).all()):
-        raise ValueError(f"{name}: it holds numbers that are not finite")
+        raise ValueError(f"{name}: contains non-finite numbers")
     try:
         check_frames(len(poses))
         fps = frame_rate(data["mocap_framerate"], "mocap_framerate")
@@ -143,7 +145,7 @@ def read(file: Path | bytes, name: str) -> Recording:
 
 
 class Amass:
-    """A folder that holds AMASS: archives as downloaded, unpacked subsets, or both."""
+    """A folder with AMASS: downloaded archives, unpacked subsets, or both."""
 
     def __init__(self, root: Path):
         self.root = Path(root)
@@ -166,7 +168,7 @@ class Amass:
 
     @cached_property
     def archives(self) -> dict[str, Path]:
-        """Subset -> its archive, known by its file name."""
+        """Subset -> its archive, recognized by file name."""
         found = {}
         for ending in ARCHIVE_ENDINGS:
             for path in sorted(self.root.rglob(f"*{ending}")):
@@ -176,7 +178,7 @@ class Amass:
         return found
 
     def missing(self, keys: Collection[str]) -> list[str]:
-        """One line for each subset of which recordings are absent; what is in an archive shows when it is read."""
+        """Returns one line per subset with missing recordings; archives are not opened, so not checked."""
         lines = []
         stems = {subset_of(key): key.endswith("_stageii") for key in self.files}
         for subset, wanted in sorted(_by_subset(keys).items()):
@@ -185,26 +187,26 @@ class Amass:
                 continue
             names = " or ".join((subset, *SUBSETS[subset]))
             if len(absent) < len(wanted):
-                lines.append(f"{subset}: {len(absent)} of {len(wanted)} recordings are absent, such as {min(absent)}")
+                lines.append(f"{subset}: {len(absent)} of {len(wanted)} recordings are missing, such as {min(absent)}")
             elif stems.get(subset):
                 lines.append(f"{subset}: this is the SMPL-X release (files end in _stageii); download SMPL+H G")
             else:
-                lines.append(f"{subset}: absent ({len(wanted)} recordings); the archive is called {names}")
+                lines.append(f"{subset}: missing ({len(wanted)} recordings); the archive is called {names}")
         return lines
 
     def each(
         self, wanted: Mapping[str, Wanted], function: Callable[[Wanted, Recording], Result], workers: int = 0
     ) -> Iterator[tuple[str, Result]]:
-        """Calls `function(wanted[key], recording)` for each key, in processes of its own; yields (key, result), sorted.
+        """Calls `function(wanted[key], recording)` for each key in worker processes; yields (key, result), sorted.
 
         Args:
-            wanted: key of `key_of` -> what the function is to know; both it and the function can be pickled.
-            function: its errors get the name of the file.
-            workers: processes; 0 = one a core, 1 = none but this one.
+            wanted: key of `key_of` -> first argument of the function; picklable.
+            function: picklable; the file name is prepended to its errors.
+            workers: number of processes; 0 = one per core, 1 = this process only.
 
         Raises:
-            FileNotFoundError: recordings are absent.
-            ValueError: a damaged file or archive, or what `function` raises.
+            FileNotFoundError: recordings are missing.
+            ValueError: a file or archive is damaged, or `function` raised a `ValueError`.
         """
         absent = self.missing(wanted)
         if absent:
@@ -242,7 +244,7 @@ def _run(
 
 
 def _contents(place: _Place, keys: Collection[str]) -> Iterator[tuple[str, str, Path | bytes]]:
-    """Key, name and content of the recordings in an archive or among files."""
+    """Yields key, name and content of the recordings in an archive or a set of files."""
     if isinstance(place, dict):
         yield from ((key, str(path), path) for key, path in place.items())
         return
@@ -257,21 +259,21 @@ def _contents(place: _Place, keys: Collection[str]) -> Iterator[tuple[str, str, 
         if not left:
             return
     if True in releases:
-        raise ValueError(f"{place}: this is AMASS's SMPL-X release (_stageii.npz); download the one called SMPL+H G")
-    raise ValueError(f"{place}: {len(left)} recordings are not in it, such as {min(left)}")
+        raise ValueError(f"{place}: this is AMASS's SMPL-X release (_stageii.npz); download the SMPL+H G release")
+    raise ValueError(f"{place}: {len(left)} recordings are missing in the archive, such as {min(left)}")
 
 
 class Body(NamedTuple):
-    """Where SMPL+H's first 22 joints rest: `rest` (22, 3) metres for the mean shape, `shape` (22, 3, 10) per beta."""
+    """Rest joints of SMPL+H (the first 22), meters: `rest` (22, 3) of the mean shape, `shape` (22, 3, 10) per beta."""
 
     rest: torch.Tensor
     shape: torch.Tensor
 
     def joints(self, recording: Recording) -> np.ndarray:
-        """Joints (F, 22, 3) float64 in metres, y up as in HumanML3D: AMASS's (-x, z, y).
+        """Returns joints (F, 22, 3) float64 in meters, y up as in HumanML3D: AMASS's (-x, z, y).
 
-        The other 30 joints are the fingers', on which these do not depend; soft tissue and pose correctives move the
-        surface only.
+        These joints do not depend on the other 30, which are finger joints; soft tissue and pose correctives move
+        only the surface.
         """
         betas = torch.from_numpy(recording.betas[:10].astype(np.float64))
         rest = self.rest + self.shape[..., : len(betas)] @ betas
@@ -283,15 +285,15 @@ class Body(NamedTuple):
 
 
 def load_bodies(folder: Path) -> dict[str, Body]:
-    """The bodies `male` and `female` of the extended SMPL+H model, from template, shape and joint regressor alone.
+    """Loads the bodies `male` and `female` of the extended SMPL+H model: only template, shape and joint regressor.
 
     Args:
-        folder: holds `male/model.npz` and `female/model.npz` (of the model's archive), or `SMPLH_MALE.npz` and
-            `SMPLH_FEMALE.npz`; a folder `smplh` inside it may hold them, too.
+        folder: contains `male/model.npz` and `female/model.npz` (from the model's archive), or `SMPLH_MALE.npz` and
+            `SMPLH_FEMALE.npz`, directly or in a subfolder `smplh`.
 
     Raises:
-        FileNotFoundError: there is none.
-        ValueError: damaged, or no SMPL+H model.
+        FileNotFoundError: a model file is missing.
+        ValueError: a file is damaged or not an SMPL+H model.
     """
     return {gender: _load_body(Path(folder), gender) for gender in ("male", "female")}
 
@@ -305,22 +307,23 @@ def _load_body(folder: Path, gender: str) -> Body:
     path = next((path for path in candidates if path.is_file()), None)
     if path is None:
         raise FileNotFoundError(
-            f"{folder}: neither {' nor '.join(names)} in it; get the extended SMPL+H model at https://mano.is.tue.mpg.de"
+            f"{folder}: contains neither {' nor '.join(names)}; download the extended SMPL+H model from "
+            "https://mano.is.tue.mpg.de"
         )
     try:
         arrays = read_npz(path, only=(*_MODEL, "kintree_table"))
         regressor, template, directions = (arrays[key] for key in _MODEL)
         parents = arrays["kintree_table"][0, 1:22]
         if {array.dtype.kind for array in arrays.values()} - set("fiu"):
-            raise ValueError("it holds arrays of other things than real numbers")
+            raise ValueError("its arrays do not all contain real numbers")
     except (ValueError, KeyError, IndexError) as error:
-        raise ValueError(f"{path}: damaged or no SMPL+H model: {error}") from error
+        raise ValueError(f"{path}: damaged or not an SMPL+H model: {error}") from error
     vertices = regressor.shape[1:]
     if (template.shape, directions.shape[:2], directions.ndim) != ((*vertices, 3), (*vertices, 3), 3):
         shapes = f"{regressor.shape}, {template.shape} and {directions.shape}"
-        raise ValueError(f"{path}: damaged or no SMPL+H model: its arrays have shapes {shapes}")
+        raise ValueError(f"{path}: damaged or not an SMPL+H model: its arrays have shapes {shapes}")
     if regressor.shape[0] != 52 or tuple(parents) != SMPL22.parents[1:]:
-        raise ValueError(f"{path}: a model of {regressor.shape[0]} joints, not SMPL+H's 52")
+        raise ValueError(f"{path}: a model with {regressor.shape[0]} joints, not SMPL+H with 52")
     regressor = regressor[:22].astype(np.float64)
     shape = np.einsum("jv,vck->jck", regressor, directions[..., :10].astype(np.float64))
     return Body(torch.from_numpy(regressor @ template.astype(np.float64)), torch.from_numpy(shape))

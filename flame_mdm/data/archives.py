@@ -1,4 +1,4 @@
-"""Zip and tar archives of motion data, read in place: plain files only, of bounded sizes."""
+"""Reader of zip and tar archives of motion data without unpacking: regular files only, with size limits."""
 
 from __future__ import annotations
 
@@ -16,24 +16,24 @@ from flame_mdm.errors import first_line
 from flame_mdm.files import MEBIBYTE, ZIP_ERRORS, check_expansion, check_member, regular_file
 
 MEMBER_LIMIT = 512 * MEBIBYTE
-"""Most bytes of one unpacked member. Motions, captions and arrays are far smaller."""
+"""Maximum size of one unpacked member in bytes. Motions, captions and arrays are far smaller."""
 HEADER_LIMIT = MEBIBYTE // 16
-"""Most bytes of a header that describes the next member, or all later ones."""
+"""Maximum size in bytes of a header that describes the next member or all later ones."""
 GLOBALS = 100
-"""Most values that headers give for all later members; each member copies them."""
+"""Maximum number of header values that apply to all later members; each member copies them."""
 _UNPACKERS = {b"\x1f\x8b": gzip.open, b"BZ": bz2.open, b"\xfd7zXZ": lzma.open}
 _HEADERS = (tarfile.XHDTYPE, tarfile.XGLTYPE, tarfile.SOLARIS_XHDTYPE, tarfile.GNUTYPE_LONGNAME)
 _HEADERS += (tarfile.GNUTYPE_LONGLINK,)
 
 
 def members(path: Path) -> Iterator[tuple[str, Callable[[], bytes]]]:
-    """Yields the name of each member of a zip or tar archive but its folders, and what reads it.
+    """Yields the name of each member of a zip or tar archive, except folders, and a function that reads it.
 
-    A member is to be read before the next one is asked for.
+    A member must be read before the next one is requested.
 
     Raises:
-        ValueError: damaged, or no archive at all; or a member that is read is a link, a sparse file or encrypted, or
-            the content expands beyond all proportion. The message names the archive.
+        ValueError: the file is damaged or not an archive, a member that is read is a link, a sparse file or encrypted,
+            or the content expands disproportionately. The message names the archive.
     """
     size = regular_file(path)
     with _named(path), path.open("rb") as file:
@@ -43,13 +43,13 @@ def members(path: Path) -> Iterator[tuple[str, Callable[[], bytes]]]:
 
 
 def read_member(path: Path, name: str) -> bytes:
-    """Returns the bytes of one member of a zip archive; errors as of `members`."""
+    """Returns the bytes of one member of a zip archive; raises the errors of `members`."""
     size = regular_file(path)
     with _named(path), zipfile.ZipFile(path) as archive:
         try:
             return _read(archive, archive.getinfo(name), size)
         except KeyError as error:
-            raise ValueError(f"it holds no {name}") from error
+            raise ValueError(f"contains no {name}") from error
 
 
 def _zip_members(path: Path, size: int) -> Iterator[tuple[str, Callable[[], bytes]]]:
@@ -92,7 +92,7 @@ def _tar_members(path: Path, size: int) -> Iterator[tuple[str, Callable[[], byte
 
 def _extract(archive: tarfile.TarFile, member: tarfile.TarInfo) -> bytes:
     if not member.isreg() or member.issparse():
-        raise ValueError(f"{member.name}: a link or another special file, not a plain file")
+        raise ValueError(f"{member.name}: a link or another special file, not a regular file")
     if member.size > MEMBER_LIMIT:
         raise ValueError(f"{member.name}: {member.size:,} bytes, too many for a motion")
     file = archive.extractfile(member)
@@ -105,7 +105,7 @@ class NoArchiveError(ValueError):
 
 
 class _Member(tarfile.TarInfo):
-    """A member whose headers are read only if they are small and describe no sparse file."""
+    """A tar member that rejects large headers and sparse files before it reads them."""
 
     def _proc_member(self, archive: tarfile.TarFile) -> Any:
         if self.type == tarfile.GNUTYPE_SPARSE:
@@ -113,7 +113,7 @@ class _Member(tarfile.TarInfo):
         if self.type in _HEADERS and self.size > HEADER_LIMIT:
             raise ValueError(f"a header of {self.size:,} bytes")
         if (values := len(archive.pax_headers)) > GLOBALS:
-            raise ValueError(f"headers give {values:,} values for all members")
+            raise ValueError(f"{values:,} header values apply to all members")
         return super()._proc_member(archive)  # pyright: ignore[reportAttributeAccessIssue]
 
     def _proc_gnusparse_10(self, *_: Any) -> None:
@@ -121,11 +121,11 @@ class _Member(tarfile.TarInfo):
 
 
 class _Bounded:
-    """What a compressed file unpacks to, up to a bound.
+    """The unpacked content of a compressed file, limited in size.
 
     Args:
         file: the unpacked content.
-        packed: bytes of the compressed file.
+        packed: size of the compressed file in bytes.
     """
 
     def __init__(self, file: IO[bytes], packed: int):
@@ -145,7 +145,7 @@ def _within(path: Path, read: Callable[[], bytes]) -> bytes:
 
 @contextmanager
 def _named(path: Path) -> Iterator[None]:
-    """Lets the errors of damaged archives name the archive."""
+    """Adds the name of the archive to errors raised for damaged archives."""
     try:
         yield
     except NoArchiveError:

@@ -1,4 +1,4 @@
-"""BABEL: labels of what is done when, on the motions of AMASS, cut into clips as FLAME does.
+"""BABEL: time-stamped action labels on the motions of AMASS, cut into clips as FLAME does.
 
 Punnakkal et al., "BABEL: Bodies, Action and Behavior with English Labels", CVPR 2021; Kim et al., "FLAME: Free-form
 Language-based Motion Synthesis & Editing", AAAI 2023, appendix "BABEL". `docs/babel.md` describes the set.
@@ -23,18 +23,18 @@ from flame_mdm.files import read_json
 FPS = 20.0
 
 PARTS: dict[str, tuple[str, ...]] = {"train": ("train", "extra_train"), "val": ("val", "extra_val")}
-"""The files of a part. Those called extra hold several annotators' labels, of which the first one's count."""
+"""Files of each part. The "extra" files contain labels of several annotators; only the first annotator's are used."""
 
 
 @dataclass(frozen=True)
 class Label:
-    """One text for one stretch of a motion.
+    """One text for one segment of a motion.
 
     Attributes:
-        motion: key of the recording of AMASS, as `amass.key_of` makes it.
-        text: what is done.
-        start, end: seconds; None where BABEL does not know.
-        kind: the annotator's words, or the category of the action.
+        motion: key of the AMASS recording, as returned by `amass.key_of`.
+        text: the description.
+        start, end: seconds; None if BABEL does not give them.
+        kind: whether the text is the annotator's words or the category of the action.
     """
 
     motion: str
@@ -46,7 +46,7 @@ class Label:
 
 @dataclass(frozen=True)
 class Window:
-    """A clip: `length` frames of a motion from `start` on; `id` is FLAME's number of it in its part."""
+    """A clip: a fixed number of frames of a motion, beginning at `start`; `id` contains FLAME's number in the part."""
 
     id: str
     motion: str
@@ -56,14 +56,14 @@ class Window:
 
 
 class Babel(MotionSource):
-    """Clips of `length` frames, as raw motions of the SMPL representations, in AMASS's world.
+    """Clips of `length` frames, as raw motions of the SMPL representations, in AMASS's coordinates.
 
-    A longer label gives windows every `stride` frames; a shorter one is extended past its end, or left out where the
-    motion ends before. The stretch of a label is floor(20 start) to floor(20 end) - 1, as FLAME's code has it.
+    A longer label gives one window every `stride` frames. A shorter one is extended past its end, or left out if the
+    motion is too short for that. A label covers frames floor(20 start) to floor(20 end) - 1, as in FLAME's code.
 
-    Both splits train on BABEL's whole train part and take 20 % of its val part for testing. Ours takes 20 % of the
-    motions, so no motion is in two splits. FLAME's takes every fifth clip, so overlapping windows of one label are in
-    val and in test.
+    Both splits train on BABEL's entire train part and use 20 % of its val part for testing. Our split uses 20 % of the
+    motions, so that no motion is in two splits. FLAME's split uses every fifth clip, so that overlapping windows of one
+    label are in both val and test.
     """
 
     name = "babel"
@@ -78,15 +78,15 @@ class Babel(MotionSource):
         stride: int = 10,
         workers: int = 0,
     ):
-        """Reads nothing yet.
+        """Stores the arguments; reads no files.
 
         Args:
             path: folder with `train.json`, `extra_train.json`, `val.json` and `extra_val.json` (BABEL v1.0).
             amass: folder of AMASS's SMPL+H G release, as archives or unpacked.
-            published_split: FLAME's split, in which clips of val and test overlap.
-            length: frames of a clip at 20 frames a second.
+            published_split: use FLAME's split, in which clips of val and test overlap.
+            length: frames per clip at 20 frames per second.
             stride: frames between the windows of a label.
-            workers: processes that read AMASS; 0 = one a core, 1 = none but this one.
+            workers: number of processes that read AMASS; 0 = one per core, 1 = this process only.
         """
         self.path, self.amass, self.published_split = Path(path), Amass(Path(amass)), published_split
         self.length, self.stride, self.workers = length, stride, workers
@@ -105,7 +105,7 @@ class Babel(MotionSource):
 
     def clips(self, fps: float) -> Iterator[Clip]:
         if fps != FPS:
-            raise ValueError(f"babel: its rules are those of {FPS:g} frames a second, set representation.fps={FPS:g}")
+            raise ValueError(f"babel: clips are cut at {FPS:g} frames per second, set representation.fps={FPS:g}")
         windows: defaultdict[str, list[Window]] = defaultdict(list)
         for window in self.windows():
             windows[window.motion].append(window)
@@ -122,10 +122,10 @@ class Babel(MotionSource):
                 )
 
     def windows(self) -> list[Window]:
-        """All clips in FLAME's order; reads the labels, and measures the motions.
+        """Returns all clips in FLAME's order; reads the labels and the lengths of the motions.
 
         Raises:
-            FileNotFoundError, ValueError: a file is absent or damaged.
+            FileNotFoundError, ValueError: a file is missing or damaged.
         """
         if self._windows is None:
             self._excluded = Counter()
@@ -150,19 +150,19 @@ class Babel(MotionSource):
         return self._windows
 
     def labels(self, part: str) -> list[Label]:
-        """The labels of a part in FLAME's order: of each file first the annotators' words, then the categories.
+        """Returns the labels of a part in FLAME's order: for each file the annotators' words, then the categories.
 
-        Labels that say nothing are dropped, and those that say the same of the same stretch of a motion count once.
+        Empty labels and repeated labels (same text, motion, start and end) are dropped.
         """
         labels = []
         for name in PARTS[part]:
             words, categories = [], []
-            for motion, given in self._annotations(self.path / f"{name}.json"):
-                stretch = given["start_t"], given["end_t"]
-                kinds = given["act_cat"]
-                if kinds is None or kinds:  # FLAME's code loses the words where the list of categories is empty
-                    words.append(Label(motion, given["proc_label"], *stretch, "words"))
-                categories += [Label(motion, kind, *stretch, "category") for kind in kinds or ()]
+            for motion, annotation in self._annotations(self.path / f"{name}.json"):
+                segment = annotation["start_t"], annotation["end_t"]
+                kinds = annotation["act_cat"]
+                if kinds is None or kinds:  # FLAME's code drops the words if the list of categories is empty
+                    words.append(Label(motion, annotation["proc_label"], *segment, "words"))
+                categories += [Label(motion, kind, *segment, "category") for kind in kinds or ()]
             once: dict[tuple, Label] = {}
             for label in words + categories:
                 once.setdefault((label.motion, label.text, label.start, label.end), label)
@@ -170,7 +170,7 @@ class Babel(MotionSource):
         return labels
 
     def _annotations(self, path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
-        """Path of the motion and label, for every frame label of a file."""
+        """Yields the key of the motion and the label, for every frame label of a file."""
         try:
             data = read_json(path)
         except FileNotFoundError:
@@ -183,14 +183,14 @@ class Babel(MotionSource):
             for sequence in data.values():
                 annotation = sequence[key][0] if key == "frame_anns" and sequence[key] else sequence[key]
                 for label in annotation["labels"] if annotation else ():
-                    given = {k: label[k] for k in ("proc_label", "act_cat", "start_t", "end_t")}
-                    _check(given)
-                    yield self._key(str(sequence["feat_p"])), given
+                    fields = {k: label[k] for k in ("proc_label", "act_cat", "start_t", "end_t")}
+                    _check(fields)
+                    yield self._key(str(sequence["feat_p"])), fields
         except (AttributeError, KeyError, TypeError, IndexError) as error:
             raise ValueError(f"{path}: not in the layout of BABEL v1.0: {error!r}") from error
 
     def _starts(self, label: Label, frames: int) -> range:
-        """First frames of the clips of a label in a motion of so many frames; says why where there is none."""
+        """Returns the first frame of each clip of a label in a motion of `frames` frames; counts why there are none."""
         if label.text == "transition":
             return self._exclude("transitions")
         if label.start is None or label.end is None:
@@ -222,12 +222,12 @@ class Babel(MotionSource):
     def _key(self, motion: str) -> str:
         key = key_of(motion)
         if key is None:
-            raise ValueError(f"{self.path}: the labels name {motion}, which is in no subset of AMASS")
+            raise ValueError(f"{self.path}: the labels refer to {motion}, which is in no subset of AMASS")
         return key
 
 
 def _check(label: dict[str, Any]) -> None:
-    """Raises `TypeError` if a value of a label is of the wrong kind."""
+    """Raises `TypeError` if a value of a label has the wrong type."""
     for key in ("start_t", "end_t"):
         time = label[key]
         if time is not None and not (isinstance(time, int | float) and abs(time) < 1e6):
@@ -243,6 +243,6 @@ def _measure(_: None, recording: Recording) -> int:
 
 
 def _motion(_: None, recording: Recording) -> np.ndarray:
-    """(F, 75): translation and the 24 joints that FLAME takes."""
+    """Returns (F, 75) float32: translation and the rotations of the 24 joints that FLAME uses."""
     kept = recording.every(FPS)
     return np.concatenate([kept.translation, kept.poses[:, :72]], 1).astype(np.float32)

@@ -31,14 +31,14 @@ _TOES = np.array([np.sin(0.153), 0.0, np.cos(0.153)])  # where SMPL's left foot 
 
 
 def _axes(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Columns: the direction of x, then that of y as far as x leaves it free, then what is perpendicular to both."""
+    """Returns orthonormal columns: the direction of x, the part of y perpendicular to x, and their cross product."""
     first = x / np.linalg.norm(x)
     third = np.cross(first, y) / np.linalg.norm(np.cross(first, y))
     return np.stack([first, np.cross(third, first), third], 1)
 
 
 def _limb(name: str, bone: Sequence[float] | np.ndarray, y: np.ndarray) -> dict[str, np.ndarray]:
-    """The left and the right joint; the right one has its bone on -x, all its axes being the left's, in a mirror."""
+    """Returns the axes of the left and right joint; the right axes are mirrored, so its bone is on -x."""
     left = _axes(np.asarray(bone), y)
     return {f"{name}_L": left, f"{name}_R": np.diag([1.0, -1.0, -1.0]) @ left}
 
@@ -47,9 +47,9 @@ def _sloping(degrees: float) -> np.ndarray:
     return np.cos(np.radians(degrees)) * _TOES - np.sin(np.radians(degrees)) * _UP
 
 
-# Where each joint's own axes point (columns) when the body is in SMPL's rest pose, in which all rotations of SMPL are
-# the identity: standing straight, feet flat, arms out, palms down. The bones of arms and legs lie on x and point where
-# those of SMPL's rest pose do; knees and elbows bend about y. `docs/bandai.md` tells how the axes were measured.
+# Directions of each joint's local axes (columns) when the body is in SMPL's rest pose, in which all rotations of SMPL
+# are the identity: standing straight, feet flat, arms out, palms down. The bones of arms and legs lie on x and have the
+# directions of SMPL's rest pose; knees and elbows bend about y. `docs/bandai.md` explains how the axes were measured.
 REST = {
     "Hips": _axes(_UP, -_LEFT),
     **dict.fromkeys(("Spine", "Chest", "Neck", "Head"), _axes(_UP, _FORWARD)),
@@ -62,7 +62,7 @@ REST = {
     **_limb("Foot", _sloping(39.8), np.cross(_UP, _TOES)),
     **_limb("Toes", _sloping(23.0), np.cross(_UP, _TOES)),
 }
-# y up -> AMASS's z up and back: (-x, z, y), so that motions look the same once the SMPL representation decodes them.
+# y up <-> AMASS's z up: (-x, z, y), so that motions look the same after the SMPL representation decodes them.
 AXES = np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 1.0, 0.0]])
 
 CONTENTS_1 = (
@@ -110,8 +110,8 @@ STYLES_2: tuple[str, ...] = (
     "normal",
     "youthful",
 )
-# Published takes of data set 2, by content, in the order of STYLES_2. The split is drawn from these numbers, not from
-# the files at hand, so that a missing or excluded file moves no other take to another split.
+# Published number of takes in data set 2, by content, in the order of STYLES_2. The split is drawn from these numbers,
+# not from the files found, so that a missing or excluded file does not move other takes to another split.
 TAKES_2 = {
     "walk": (32, 17, 23, 27, 25, 24, 27),
     "walk-turn-left": (41, 31, 39, 31, 30, 34, 30),
@@ -125,14 +125,14 @@ TAKES_2 = {
     "raise-up-right-hand": (100, 42, 40, 65, 51, 79, 60),
 }
 
-# Takes that turn to the other side than their name says: their labels and captions follow the motion.
+# Takes that turn to the opposite side of what their name says; their labels and captions follow the motion.
 WRONG_SIDE = (
     "dataset-2_walk-turn-left_masculine_006",
     "dataset-2_walk-turn-left_masculine_007",
     "dataset-2_walk-turn-right_masculine_006",
     "dataset-2_walk-turn-right_masculine_007",
 )
-SIDES = {"bye": "right", "guide": "right", "respond": "left", "byebye": "both"}  # where the name does not tell
+SIDES = {"bye": "right", "guide": "right", "respond": "left", "byebye": "both"}  # not part of the name
 
 
 FILE = re.compile(r"dataset-([12])_([^_]+)_([^_]+)_(\d+)\.bvh")
@@ -140,7 +140,7 @@ FILE = re.compile(r"dataset-([12])_([^_]+)_([^_]+)_(\d+)\.bvh")
 
 @dataclass(frozen=True)
 class Take:
-    """One BVH file; `content` is what is done, which the name mistakes in the takes of `WRONG_SIDE`."""
+    """One BVH file; `content` is the action performed, which differs from the file name for takes in `WRONG_SIDE`."""
 
     id: str
     dataset: int
@@ -150,10 +150,10 @@ class Take:
 
 
 class Bandai(MotionSource):
-    """Both data sets on SMPL's skeleton, with captions made from content and style.
+    """Both data sets on SMPL's skeleton, with captions generated from content and style.
 
-    Mirrored copies belong to the split of their take, and only those of the training split are yielded: validation
-    and test hold originals alone.
+    Mirrored copies belong to the split of their take. Only those of the training split are yielded: validation and test
+    contain originals only.
     """
 
     name = "bandai"
@@ -168,17 +168,17 @@ class Bandai(MotionSource):
         workers: int = 0,
         exclude: Sequence[str] = (),
     ):
-        """Reads nothing yet.
+        """Stores the arguments; reads no files.
 
         Args:
-            path: the folder of the original repository or any folder above the BVH files, or a zip or tar of one.
+            path: a clone of the original repository, any folder above the BVH files, or a zip or tar archive of one.
             motion: "joints" for representations of joint positions, "smpl" for those of SMPL's rotations.
             mirror: yield a mirrored copy after each clip of the training split.
-            workers: processes that read and convert; 0 = one a core, 1 = none but this one.
-            exclude: takes to leave out, by the name of the BVH file without its ending.
+            workers: number of processes that read and convert; 0 = one per core, 1 = this process only.
+            exclude: takes to leave out, by the name of the BVH file without extension.
 
         Raises:
-            ValueError: another `motion`.
+            ValueError: `motion` has another value.
         """
         if motion not in ("joints", "smpl"):
             raise ValueError(f"data.source.motion={motion}: give joints or smpl")
@@ -214,18 +214,18 @@ class Bandai(MotionSource):
                     yield self._clip(take, motion, mirrored=True)
 
     def takes(self) -> list[Take]:
-        """The takes that are there and not excluded, sorted by name.
+        """Returns the takes that are present and not excluded, sorted by name.
 
         Raises:
-            FileNotFoundError: there is no such folder or archive, or no BVH file of the data sets in it.
-            ValueError: a damaged archive, a file that is there twice, an unknown name in `exclude`.
+            FileNotFoundError: the folder or archive does not exist or contains no BVH file of the data sets.
+            ValueError: the archive is damaged, a file is present twice, or `exclude` has an unknown name.
         """
         if self._found is None:
             names: dict[str, str] = {}
             for name, _ in _files(self.path, wanted=()):
                 id_ = PurePosixPath(name).stem
                 if id_ in names:
-                    raise ValueError(f"{self.path}: {id_} is there twice, as {names[id_]} and as {name}")
+                    raise ValueError(f"{self.path}: {id_} exists twice, as {names[id_]} and {name}; delete one")
                 names[id_] = name
             if not names:
                 raise _not_found(f"{self.path}: no file dataset-1_*.bvh or dataset-2_*.bvh in it")
@@ -236,7 +236,7 @@ class Bandai(MotionSource):
         return self._found
 
     def _motions(self, ids: set[str], fps: float) -> Generator[tuple[str, np.ndarray]]:
-        """Id and motion of these takes in the order of the folder or archive."""
+        """Yields id and motion of these takes in the order of the folder or archive."""
         files = ((name, data) for name, data in _files(self.path, ids) if PurePosixPath(name).stem in ids)
         yield from in_order(partial(convert, fps=fps, kind=self.motion), files, self.workers)
 
@@ -260,10 +260,10 @@ class Bandai(MotionSource):
 
 
 def convert(file: tuple[str, bytes], fps: float, kind: Literal["joints", "smpl"] = "joints") -> tuple[str, np.ndarray]:
-    """Name and content of a BVH file -> its id and motion, float32, at `fps`.
+    """Converts name and content of a BVH file to its id and motion, float32, at `fps`.
 
-    The motion is joints (F, 22, 3) in metres, y up, or the SMPL motion (F, 75) that `smpl_motion` tells about. Local
-    rotations and the place of the hips are interpolated, so bones keep their length.
+    The motion is joints (F, 22, 3) in meters, y up, or the SMPL motion (F, 75) described in `smpl_motion`. Local
+    rotations and the position of the hips are interpolated, so bones keep their length.
 
     Raises:
         ValueError: the file is damaged or has another skeleton; the message names it.
@@ -274,10 +274,10 @@ def convert(file: tuple[str, bytes], fps: float, kind: Literal["joints", "smpl"]
         motion = bvh.parse(data, name)
         missing = sorted(set(JOINTS.values()) - set(motion.joints))
         if missing:
-            raise ValueError(f"{name}: not the skeleton of this data set, there is no joint {', '.join(missing)}")
+            raise ValueError(f"{name}: not the skeleton of this data set: joint {', '.join(missing)} missing")
         rotations, translations = _resampled(motion, fps, name)
     except ValueError as error:
-        raise ValueError(f"{error}; to go on without it: data.source.exclude=[{id_}]") from error
+        raise ValueError(f"{error}; to continue without it: data.source.exclude=[{id_}]") from error
     if kind == "smpl":
         return id_, smpl_motion(motion, rotations, translations)
     positions, _ = bvh.forward_kinematics(motion.parents, rotations, translations)
@@ -294,18 +294,19 @@ def _resampled(motion: bvh.Bvh, fps: float, name: str) -> tuple[np.ndarray, np.n
 
 
 def smpl_motion(skeleton: bvh.Bvh, rotations: np.ndarray, translations: np.ndarray) -> np.ndarray:
-    """A take as SMPL's parameters in the convention of AMASS: z up, pelvis and axis-angle vectors of 24 joints.
+    """Converts a take to SMPL parameters in the convention of AMASS: z up, pelvis and axis-angle vectors of 24 joints.
 
-    SMPL's parent of a joint is the parent in the file, but for spine1, which lies between two of its joints and turns
-    with the pelvis. So a rotation of SMPL is the file's, seen in the axes of the rest pose: B_parent R B_joint^-1.
+    SMPL's parent of a joint is the parent in the file, except for spine1, which lies between two joints of the file and
+    rotates with the pelvis. So a rotation of SMPL is that of the file in the axes of the rest pose:
+    B_parent R B_joint^-1.
 
     Args:
         skeleton: the file.
         rotations: (F, J, 3, 3) of its joints in the frame of the parent.
-        translations: (F, J, 3) in the frame of the parent, centimetres.
+        translations: (F, J, 3) in the frame of the parent, centimeters.
 
     Returns:
-        (F, 3 + 72) float32: place of the pelvis in metres, then rotations. Hands (22 and 23) do not turn.
+        (F, 3 + 72) float32: position of the pelvis in meters, then rotations. Hands (22 and 23) do not rotate.
     """
     positions, turned = bvh.forward_kinematics(skeleton.parents, rotations, translations)
     local = np.tile(np.eye(3), (len(rotations), 24, 1, 1))
@@ -321,13 +322,13 @@ def smpl_motion(skeleton: bvh.Bvh, rotations: np.ndarray, translations: np.ndarr
 
 
 def mirror(motion: np.ndarray) -> np.ndarray:
-    """Joints (F, 22, 3) of the same motion done with the other side: x -> -x, left and right joints swapped."""
+    """Mirrors joints (F, 22, 3): x -> -x, left and right joints swapped."""
     names = list(JOINTS)
     return motion[:, [names.index(swap_sides(name)) for name in names]] * np.array([-1, 1, 1], motion.dtype)
 
 
 def mirror_smpl(motion: np.ndarray) -> np.ndarray:
-    """The same for an SMPL motion (F, 75): left and right joints swapped, turns about y and z the other way round."""
+    """Mirrors an SMPL motion (F, 75): left and right joints swapped, rotations about y and z negated."""
     names = [*JOINTS, "left_hand", "right_hand"]
     vectors = motion[:, 3:].reshape(len(motion), len(names), 3)
     vectors = vectors[:, [names.index(swap_sides(name)) for name in names]] * np.array([1, -1, -1], motion.dtype)
@@ -336,18 +337,18 @@ def mirror_smpl(motion: np.ndarray) -> np.ndarray:
 
 
 def swap_sides(text: str) -> str:
-    """Left for right and right for left."""
+    """Swaps "left" and "right" in a text."""
     return re.sub("left|right", lambda match: "right" if match[0] == "left" else "left", text)
 
 
 def side_of(content: str) -> str:
-    """The side that moves or is moved to: left, right, both, or "" where a content has none."""
+    """Returns the side that moves or is moved to: left, right, both, or "" if a content has none."""
     named = re.search("left|right|both", content)
     return named[0] if named else SIDES.get(content, "")
 
 
 def captions(content: str, style: str, side: str) -> list[str]:
-    """Four descriptions in the manner of HumanML3D; `side` is left or right where the content has one of them."""
+    """Returns four descriptions in the style of HumanML3D; `side` is left or right if the content contains one."""
     contents, styles = phrases()
     filled = (
         phrase.format(side=side, other=swap_sides(side), how=how)
@@ -358,17 +359,17 @@ def captions(content: str, style: str, side: str) -> list[str]:
 
 @cache
 def phrases() -> tuple[dict[str, list[str]], dict[str, list[str]]]:
-    """Returns four captions of each content, and four ways to say each style, from `bandai.yaml`."""
+    """Returns four captions for each content and four phrases for each style, from `bandai.yaml`."""
     words = read_yaml(Path(__file__).with_suffix(".yaml"))
     return words["contents"], words["styles"]
 
 
 def split_of(dataset: int, content: str, style: str, number: int) -> Split:
-    """The split of a take, from its name alone.
+    """Returns the split of a take, determined by its name.
 
-    Neighboring takes come from one session and look alike, so whole blocks of five go to one split; of data set 1,
-    which has a single take of most combinations, the combination does. The normal takes of walk-turn-left and -right
-    overlap in time across names and are all for training.
+    Neighboring takes come from one session and look alike, so blocks of five go to one split. Data set 1 has a single
+    take of most combinations, so there each combination goes to one split. The normal takes of walk-turn-left and
+    -right overlap in time across names and are all used for training.
     """
     if dataset == 1:
         draw = _hash(f"dataset-1_{content}_{style}") % 20
@@ -382,7 +383,7 @@ def split_of(dataset: int, content: str, style: str, number: int) -> Split:
 
 @cache
 def _held_out_blocks(content: str, style: str) -> tuple[list[int], list[int]]:
-    """Test (10 %, at least one) and validation blocks (5 %, at least one) of one combination of data set 2."""
+    """Returns test (10 %, at least one) and validation blocks (5 %, at least one) of a combination of data set 2."""
     takes = TAKES_2[content][STYLES_2.index(style)]
     blocks = sorted(range(-(-takes // 5)), key=lambda block: _hash(f"dataset-2_{content}_{style}_{block}"))
     test, val = max(1, round(0.1 * len(blocks))), max(1, round(0.05 * len(blocks)))
@@ -398,15 +399,15 @@ def _take(id_: str) -> Take:
     dataset = int(name[-1])
     contents, styles = (CONTENTS_1, STYLES_1) if dataset == 1 else (TAKES_2, STYLES_2)
     if content not in contents or style not in styles:
-        raise ValueError(f"{id_}.bvh: data set {dataset} has no content {content} in a style {style}")
+        raise ValueError(f"{id_}.bvh: data set {dataset} has no content {content} with style {style}")
     split = split_of(dataset, content, style, int(number))
     return Take(id_, dataset, swap_sides(content) if id_ in WRONG_SIDE else content, style, split)
 
 
 def _files(path: Path, wanted: Container[str]) -> Iterator[tuple[str, bytes]]:
-    """Path and content of the BVH files in a folder or archive; the content is empty where the id is not `wanted`.
+    """Yields path and content of the BVH files in a folder or archive; the content is empty if the id is not `wanted`.
 
-    Archives are read in place: they unpack to 550 MB, which would have to be cleaned up whatever happens.
+    Archives are not unpacked to disk: that would take 550 MB, which would have to be removed after every error.
     """
 
     def belongs(name: str) -> bool:
@@ -429,7 +430,7 @@ def _files(path: Path, wanted: Container[str]) -> Iterator[tuple[str, bytes]]:
 
 
 def prompts() -> list[str]:
-    """Fixed prompts in the words of the captions, shown on the dashboard by recipes over those of the synthetic set."""
+    """Returns fixed prompts worded like the captions; recipes of this data set use them for dashboard samples."""
     return [
         "a person walks forward",
         "a person walks forward like an old person",
@@ -443,6 +444,6 @@ def prompts() -> list[str]:
 def _not_found(what: str) -> FileNotFoundError:
     return FileNotFoundError(
         f"{what}; the data sets are published at "
-        "https://github.com/BandaiNamcoResearchInc/Bandai-Namco-Research-Motiondataset (CC BY-NC 4.0): clone it and "
+        "https://github.com/BandaiNamcoResearchInc/Bandai-Namco-Research-Motiondataset (CC BY-NC 4.0): clone it, then "
         "set data.source.path=/path/to/the/clone"
     )

@@ -1,4 +1,4 @@
-"""Which frames of a clip a training sample holds: the rules of the papers' codes."""
+"""Crop rules: which frames of a clip a training sample contains, as in the authors' code."""
 
 from __future__ import annotations
 
@@ -10,27 +10,27 @@ import numpy as np
 
 @runtime_checkable
 class Crop(Protocol):
-    """A rule that turns clips of any length into training samples."""
+    """A rule that selects the frames of a training sample from a clip of any length."""
 
     def shortest(self) -> int:
-        """Frames a clip must have."""
+        """Returns the minimum number of frames of a clip."""
         ...
 
     def longest(self) -> int:
-        """Frames a sample has at most."""
+        """Returns the maximum number of frames of a sample."""
         ...
 
     def __call__(self, frames: int, generator: np.random.Generator | None) -> np.ndarray:
-        """Indices of the frames taken from a clip of `frames` frames; without a generator, always the same ones."""
+        """Returns the indices of the frames selected from a clip of `frames` frames; fixed without a generator."""
         ...
 
 
 @dataclass(frozen=True)
 class Units:
-    """HumanML3D and KIT (Guo et al. 2022): a multiple of `unit` frames, one unit shorter for one draw in three.
+    """HumanML3D and KIT (Guo et al. 2022): a multiple of `unit` frames, one unit shorter in one of three draws.
 
-    A clip longer than `max_frames` gives a window of that length; the window lies anywhere in the clip. Without a
-    generator: the longest window, from the first frame on.
+    A clip longer than `max_frames` gives a window of that length at a random position. Without a generator: the longest
+    window, beginning at the first frame.
     """
 
     min_frames: int = 40
@@ -61,7 +61,7 @@ class Units:
 
 @dataclass(frozen=True)
 class Whole:
-    """FLAME: the clip as it is, cut after `max_frames`."""
+    """FLAME: the whole clip, cut after `max_frames`."""
 
     min_frames: int = 1
     max_frames: int = 471
@@ -78,9 +78,9 @@ class Whole:
 
 @dataclass(frozen=True)
 class Fixed:
-    """ACTOR's action sets: always `frames` frames; short clips repeat their last one, long ones give a window.
+    """ACTOR's action data sets: always `frames` frames; short clips repeat their last frame, long ones give a window.
 
-    Legacy of ACTOR's code: the window never starts at the last possible frame. Without a generator: the first window.
+    As in ACTOR's code, the window never starts at the last possible frame. Without a generator: the first window.
     """
 
     frames: int = 60

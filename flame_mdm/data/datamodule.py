@@ -1,7 +1,7 @@
 """Training and evaluation batches from a packed store.
 
-Every batch is a function of (seed, step, rank): no generator state needs saving, and a resumed run sees the batches
-that the uninterrupted one would have seen.
+Every batch is a function of (seed, step, rank). No generator state needs to be saved, and a resumed run sees the same
+batches as an uninterrupted one.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ from flame_mdm.representations import Representation
 from flame_mdm.seeds import key
 
 FRAMES = 100_000
-"""Most frames of a sample; an hour at 20 frames per second has 72,000."""
+"""Maximum number of frames of a sample; one hour at 20 frames per second has 72,000."""
 Draw = tuple[int, int]
-"""(index of a clip, number of the batch it is drawn for; -1 in evaluation)."""
+"""(index of a clip, number of the batch that it is drawn for; -1 in evaluation)."""
 
 
 Sample = tuple[str, Tensor, str | None, int | None]
-"""(id, x (F, D), caption, action), what `collate` joins."""
+"""(id, x (F, D), caption, action), input of `collate`."""
 
 
 class Clips(Dataset[Sample]):
-    """The clips of a split that are long enough for the crop rule, cropped anew at every draw, then normalized."""
+    """The clips of a split that are long enough for the crop rule, cropped at every draw, then normalized."""
 
     def __init__(self, store: Store, split: Split, *, representation: Representation, crop: Crop, seed: int):
         self.store, self.representation, self.crop, self.seed = store, representation, crop, seed
@@ -51,22 +51,22 @@ class Clips(Dataset[Sample]):
         return clip.id, torch.from_numpy((features - self.mean) / self.std), self.caption(clip, batch), clip.action
 
     def frames(self, index: int, batch: int) -> np.ndarray:
-        """Frames of a clip that a batch takes."""
+        """Returns the indices of the frames of a clip in a batch."""
         generator = None if batch < 0 else np.random.default_rng((self.seed, batch, index))
         return self.crop(self.clips[index].length, generator)
 
     def caption(self, clip: Entry, batch: int) -> str | None:
-        """The caption of a clip in a batch: any in training, always the same one in evaluation."""
+        """Returns the caption of a clip in a batch: a random one in training, always the same one in evaluation."""
         if not clip.captions:
             return None
         return clip.captions[key("caption", self.seed, max(batch, -1), clip.id) % len(clip.captions)]
 
 
 class TrainingBatches(Sampler[list[Draw]]):
-    """An endless stream of batches; number n is a function of (seed, n), its clips of about the same length.
+    """An endless stream of batches. Batch n is a function of (seed, n); its clips have similar lengths.
 
-    Each pass over the data is shuffled, cut into stretches of `BUCKETS` batches, and each stretch sorted by length, so
-    that little is padded. Process `rank` of `world` takes every `world`-th batch.
+    Each pass over the data is shuffled and cut into groups of `BUCKETS` batches. Each group is sorted by length to
+    reduce padding. Process `rank` of `world` takes every `world`-th batch.
     """
 
     BUCKETS = 16
@@ -87,7 +87,7 @@ class TrainingBatches(Sampler[list[Draw]]):
             number += self.world
 
     def batches(self, number: int, per_pass: int) -> list[np.ndarray]:
-        """The batches of one pass over the data."""
+        """Returns the batches of one pass over the data, as indices of clips."""
         generator = np.random.default_rng((self.seed, number))
         order = generator.permutation(len(self.lengths))
         order = np.resize(order, max(len(order), self.batch_size))[: per_pass * self.batch_size]
@@ -101,7 +101,7 @@ class TrainingBatches(Sampler[list[Draw]]):
 
 
 class EvaluationBatches(Sampler[list[Draw]]):
-    """Every clip once over all processes together, longest first, without the repeats of a distributed sampler."""
+    """Every clip once across all processes, longest first, without the repeats of a distributed sampler."""
 
     def __init__(self, lengths: np.ndarray, batch_size: int, *, rank: int, world: int):
         mine = np.argsort(-lengths, kind="stable")[rank::world]
@@ -116,24 +116,24 @@ class EvaluationBatches(Sampler[list[Draw]]):
 
 def _check_crop(crop: Crop) -> None:
     if not isinstance(crop, Crop):
-        raise ValueError(f"data.crop={crop!s:.80}: not a rule such as those of flame_mdm.data.crops; give one")
+        raise ValueError(f"data.crop={crop!s:.80}: not a crop rule; give one such as those in flame_mdm.data.crops")
     for name, frames in (("shortest", crop.shortest()), ("longest", crop.longest())):
         if type(frames) is not int or not 1 <= frames <= FRAMES:
             raise ValueError(f"data.crop: its {name} sample has {frames!s:.20} frames; give 1 to {FRAMES:,}")
 
 
 class MotionDataModule(LightningDataModule):
-    """Prepares a data set where that has not been done, and serves its batches.
+    """Prepares a data set if it is not prepared yet, and serves its batches.
 
     Args:
-        source: the data set as its owners hand it out.
-        representation: what clips are encoded as; gets the statistics of the store.
+        source: the published data set.
+        representation: encodes the clips; receives the statistics of the store.
         root: folder of all prepared data sets.
-        name: folder of this one.
-        batch_size: clips a process and step.
-        num_workers: loading processes; 0 loads in the training process.
-        crop: which frames of a clip a sample holds, and how long clips must be.
-        seed: of the draws.
+        name: name of the folder of this data set.
+        batch_size: clips per process and step.
+        num_workers: number of loading processes; 0 loads in the training process.
+        crop: rule for the frames of a sample and the minimum length of a clip.
+        seed: seed of the random draws.
     """
 
     def __init__(
@@ -161,22 +161,22 @@ class MotionDataModule(LightningDataModule):
         self.prepare_data_per_node = False  # machines share the folder
 
     def prepare_data(self) -> None:
-        """Writes the store where there is none; Lightning calls this on one process only."""
+        """Writes the store if there is none; Lightning calls this in one process only."""
         if not (self.folder / "store.json").exists():
             write_store(self.folder, self.source, self.representation)
 
     @property
     def actions(self) -> Sequence[str]:
-        """Names of the action labels; from the store, where there is one, so that it is enough to train."""
+        """Names of the action labels; from the store if it exists, so that training does not need the raw data."""
         prepared = (self.folder / "store.json").exists()
         return self.open().info["actions"] if prepared else self.source.actions
 
     def open(self) -> Store:
-        """Returns the prepared store; its statistics go to the representation.
+        """Returns the prepared store and copies its statistics to the representation.
 
         Raises:
-            FileNotFoundError: it is not prepared.
-            ValueError: it was prepared with other options or another representation, or is damaged.
+            FileNotFoundError: the data set is not prepared.
+            ValueError: the store is damaged, or was prepared with other options or another representation.
         """
         store = Store(self.folder)
         wanted = {
@@ -192,7 +192,7 @@ class MotionDataModule(LightningDataModule):
         if differing:
             there, here = (", ".join(f"{name}={of[name]}" for name in differing) for of in (found, wanted))
             raise ValueError(
-                f"{self.folder}: was prepared with {there}, the recipe says {here}. Prepare it again with force=true, "
+                f"{self.folder}: prepared with {there}, but the recipe has {here}. Prepare it again with force=true, "
                 "choose another data_root or data.name, or change the recipe"
             )
         self.representation.mean.copy_(torch.from_numpy(store.mean))
@@ -200,7 +200,7 @@ class MotionDataModule(LightningDataModule):
         return store
 
     def captions(self) -> list[str]:
-        """All distinct captions of the store, sorted."""
+        """Returns all distinct captions of the store, sorted."""
         return sorted({caption for clip in self.open().clips for caption in clip.captions})
 
     def setup(self, stage: str) -> None:
@@ -211,16 +211,16 @@ class MotionDataModule(LightningDataModule):
             raise ValueError(f"{self.folder}: no training clip has {self.crop.shortest()} frames or more")
 
     def clips(self, split: Split) -> Clips:
-        """The clips of a split, with what samples them.
+        """Returns the clips of a split with their crop rule.
 
-        A set that is published without test clips (HumanAct12) and prepared so is tested on its training clips.
+        A data set prepared with a published split that has no test clips (HumanAct12) is tested on its training clips.
         """
         if split == "test" and self.store.info["published_split"] and not self.store.info["clips"]["test"]:
             split = "train"
         return Clips(self.store, split, representation=self.representation, crop=self.crop, seed=self.seed)
 
     def train_dataloader(self) -> DataLoader[Sample]:
-        """Endless; starts at the step the trainer is at, so that a resumed run goes on with the right batch."""
+        """Returns an endless loader that starts at the trainer's current step, so that a resumed run is unchanged."""
         trainer = self.trainer
         first = trainer.global_step * trainer.accumulate_grad_batches if trainer else 0
         rank, world = (trainer.global_rank, trainer.world_size) if trainer else (0, 1)
@@ -229,15 +229,16 @@ class MotionDataModule(LightningDataModule):
         return self._loader(self.train, sampler)
 
     def val_dataloader(self) -> DataLoader[Sample]:
-        """Each validation clip once over all processes; all of them on each where some process would have none.
+        """Returns each validation clip once across all processes.
 
-        A process without a batch would skip validation, and the others wait for it.
+        With fewer clips than processes, every process gets all clips: a process without a batch would skip validation
+        while the others wait for it.
         """
         few = self.trainer is not None and len(self.val) < self.trainer.world_size
         return self._evaluation(self.val, alone=few)
 
     def test_dataloader(self) -> DataLoader[Sample]:
-        """Each test clip once over all processes."""
+        """Returns each test clip once across all processes."""
         return self._evaluation(self.test)
 
     def _evaluation(self, clips: Clips, alone: bool = False) -> DataLoader[Sample]:

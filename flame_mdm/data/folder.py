@@ -1,4 +1,4 @@
-"""Own data: a folder of motions in BVH, AMASS's or joint files, with captions beside them. `docs/own-data.md`."""
+"""Own data: a folder of motions (BVH, AMASS or joint files) with captions, described in `docs/own-data.md`."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ from flame_mdm.representations.smpl import SMPL
 
 MOTIONS = (".bvh", ".npz", ".npy", ".json")
 UNFIT = re.compile("[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
-"""Characters that no name of a motion may hold: it is stored as text, one clip per line."""
+"""Characters not allowed in the name of a motion: names are stored as text, one clip per line."""
 TABLES = ("captions.csv", "captions.json")
 COLUMNS = ("id", "text", "action", "split", "source")
 
 
 @dataclass
 class Note:
-    """What is said about a motion."""
+    """Captions and labels of a motion."""
 
     texts: list[str] = field(default_factory=list)
     action: str | None = None
@@ -44,10 +44,10 @@ class Note:
 
 
 class Folder(MotionSource):
-    """Motions and captions in a folder, as joints of SMPL's 22 or as raw motions of the SMPL representation.
+    """Motions and captions in a folder, as SMPL's 22 joints or as raw motions of the SMPL representation.
 
-    Without a split of their own, 85 % of the sources are for training, 5 % for validation and 10 % for testing, drawn
-    by their names.
+    If the tables give no split, 85 % of the sources are used for training, 5 % for validation and 10 % for testing,
+    selected by a hash of their names.
     """
 
     name = "folder"
@@ -59,17 +59,17 @@ class Folder(MotionSource):
         mirror: bool = False,
         exclude: Sequence[str] = (),
     ):
-        """Reads nothing yet.
+        """Stores the arguments; reads no files.
 
         Args:
-            path: the folder; motions may lie in folders below.
+            path: the folder; motions may be in subfolders.
             motion: "joints" for representations of joint positions; "smpl" for those of SMPL's rotations, which only
-                AMASS's files hold.
+                AMASS files contain.
             mirror: yield a mirrored copy after each clip of the training split; joints only.
-            exclude: motions to leave out, by their path in the folder without ending.
+            exclude: motions to leave out, by their path in the folder without extension.
 
         Raises:
-            ValueError: another `motion`, or mirrored SMPL rotations are wanted.
+            ValueError: `motion` has another value, or `mirror` is combined with SMPL rotations.
         """
         if motion not in ("joints", "smpl") or (mirror and motion == "smpl"):
             raise ValueError(f"data.source.motion={motion}, mirror={mirror}: give joints, or smpl with mirror=false")
@@ -99,16 +99,16 @@ class Folder(MotionSource):
             if self.mirror and split == "train":
                 yield self._mirrored(clip, note)
         if self._upright and np.median(self._upright) < 0.3:
-            raise ValueError(f"{self.path}: in most motions the body lies; say in skeleton.yaml which axis is `up`")
+            raise ValueError(f"{self.path}: the body is lying down in most motions; set the axis `up` in skeleton.yaml")
 
     @cached_property
     def files(self) -> dict[str, Path]:
-        """Path in the folder without ending -> file, sorted.
+        """Path in the folder without extension -> file, sorted.
 
         Raises:
-            FileNotFoundError: no such folder, or no motion in it.
+            FileNotFoundError: the folder does not exist or contains no motion.
             UserError: a motion is not a regular file, or its name cannot be stored.
-            ValueError: two motions of one name, or an unknown name in `exclude`.
+            ValueError: two motions have the same name, or `exclude` has an unknown name.
         """
         found: dict[str, Path] = {}
         for path in sorted(self.path.rglob("*")) if self.path.is_dir() else ():
@@ -116,11 +116,11 @@ class Folder(MotionSource):
                 name = path.relative_to(self.path).with_suffix("").as_posix()
                 if UNFIT.search(name):
                     raise UserError(
-                        f"{printable(str(path))}: its name holds control characters, or is not UTF-8. Rename it"
+                        f"{printable(str(path))}: its name contains control characters or is not UTF-8. Rename it"
                     )
                 regular_file(path)
                 if name in found:
-                    raise ValueError(f"{path}: there is {found[name].name}, too; each motion needs a name of its own")
+                    raise ValueError(f"{path}: has the same name as {found[name].name}; each motion needs its own name")
                 found[name] = path
         if not found:
             what = "no motion in it" if self.path.is_dir() else "no such folder"
@@ -132,10 +132,10 @@ class Folder(MotionSource):
 
     @cached_property
     def notes(self) -> dict[str, Note]:
-        """What tables and text files say about each motion.
+        """Captions and labels of each motion, from tables and text files.
 
         Raises:
-            ValueError: a table that cannot be read, names a motion that is not there, or leaves one without a caption.
+            ValueError: a table cannot be read or names an unknown motion, or some motions lack a caption or an action.
         """
         notes = {name: Note() for name in self.files}
         for table in TABLES:
@@ -151,14 +151,14 @@ class Folder(MotionSource):
             bare = [name for name, note in notes.items() if not getattr(note, values)]
             if 0 < len(bare) < len(notes):
                 raise ValueError(
-                    f"{self.path}: {len(bare)} of {len(notes)} motions have no {kind}, such as {bare[0]}; give all "
-                    "of them one, or leave these out by data.source.exclude"
+                    f"{self.path}: {len(bare)} of {len(notes)} motions have no {kind}, such as {bare[0]}; add one to "
+                    "each, or leave these out with data.source.exclude"
                 )
         return notes
 
     @cached_property
     def skeleton(self) -> dict[str, Any]:
-        """What `skeleton.yaml` in the folder says; nothing without one."""
+        """Content of `skeleton.yaml` in the folder; empty without one."""
         path = self.path / "skeleton.yaml"
         return read_skeleton(path) if _is_there(path) else {}
 
@@ -172,7 +172,7 @@ class Folder(MotionSource):
         data = read_arrays(path)
         rate = data.setdefault("fps", self.skeleton.get("fps"))
         if rate is None:
-            raise ValueError(f"{path}: it does not give its frame rate. Write `fps: 30` (or yours) into skeleton.yaml")
+            raise ValueError(f"{path}: no frame rate in the file. Write it into skeleton.yaml, for example `fps: 30`")
         if "poses" in data:
             return self._from_smpl(path, data, fps)
         joints = data["joints"]
@@ -186,7 +186,7 @@ class Folder(MotionSource):
         return self._joints(path, moved, names)
 
     def _names(self, path: Path, joints: int) -> tuple[str, ...]:
-        """Names of the joints of an array, told by their number where `skeleton.yaml` does not tell."""
+        """Returns the names of the joints of an array, from `skeleton.yaml` or inferred from the number of joints."""
         given = self.skeleton.get("joints")
         if given:
             if len(given) != joints:
@@ -196,7 +196,7 @@ class Folder(MotionSource):
             return KIT21.joints
         if joints < len(SMPL22):
             raise ValueError(
-                f"{path}: {joints} joints of unknown names; write their names and a map into skeleton.yaml"
+                f"{path}: {joints} joints with unknown names; write their names and a map into skeleton.yaml"
             )
         if joints not in (22, 24, 52):
             raise ValueError(f"{path}: {joints} joints, not the 22, 24 or 52 of SMPL; write a skeleton.yaml")
@@ -207,7 +207,7 @@ class Folder(MotionSource):
 
     def _checked(self, path: Path, joints: np.ndarray) -> np.ndarray:
         if self.motion == "smpl":
-            raise ValueError(f"{path}: it holds no rotations of SMPL; AMASS's .npz files do, or take motion=joints")
+            raise ValueError(f"{path}: contains no SMPL rotations; use AMASS .npz files, or set motion=joints")
         _check_body(path, joints)
         trunk = joints[:, SMPL22.joints.index("neck")] - joints[:, 0]
         self._upright.append(float((trunk[:, 1] / np.linalg.norm(trunk, axis=1)).mean()))
@@ -235,7 +235,7 @@ class Folder(MotionSource):
 
 
 def _is_there(path: Path) -> bool:
-    """Whether there is a file of this name; raises an error if it is no regular one."""
+    """Returns whether the file exists; raises `UserError` if it is not a regular file."""
     if not os.path.lexists(path):
         return False
     regular_file(path)
@@ -243,14 +243,16 @@ def _is_there(path: Path) -> bool:
 
 
 def _check_body(path: Path, joints: np.ndarray) -> None:
-    """Wrong units and sides show in the length of a leg and in where the toes point."""
+    """Detects wrong units by the length of a leg, and swapped sides by the direction of the toes."""
     at = {name: joints[:, number] for number, name in enumerate(SMPL22.joints)}
     if not np.isfinite(joints).all():
         raise ValueError(f"{path}: numbers in frame {int(np.argmin(np.isfinite(joints).all((1, 2))))} are not finite")
     bones = at["left_hip"] - at["left_knee"], at["left_knee"] - at["left_ankle"]
     leg = sum(float(np.linalg.norm(bone, axis=1).mean()) for bone in bones)
     if not 0.3 < leg < 1.5:
-        raise ValueError(f"{path}: a leg of {leg:.3g} m; say in skeleton.yaml how many metres a unit of the file is")
+        raise ValueError(
+            f"{path}: the legs are {leg:.3g} m long; set `unit` (meters per unit of the file) in skeleton.yaml"
+        )
     across, trunk = at["left_hip"] - at["right_hip"], at["neck"] - at["pelvis"]
     toes = at["left_foot"] + at["right_foot"] - at["left_ankle"] - at["right_ankle"]
     if np.median((np.cross(across, trunk) * toes).sum(1)) < 0:
@@ -265,12 +267,16 @@ def _csv_rows(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
     try:
         names = list(reader.fieldnames or ())
         if len(set(names)) < len(names):
-            raise ValueError(f"{path}: a column stands in it twice: {', '.join(names)[:200]}")
+            raise ValueError(f"{path}: duplicate column: {', '.join(names)[:200]}")
         if set(names) - set(COLUMNS) or "id" not in names:
-            raise ValueError(f"{path}: its columns are {str(names)[:200]}; there are {', '.join(COLUMNS)}, id needed")
+            raise ValueError(
+                f"{path}: its columns are {str(names)[:200]}; use {', '.join(COLUMNS)} (only id is required)"
+            )
         for row in reader:
             if None in row or None in row.values():
-                raise ValueError(f"{path}, line {reader.line_num}: not as many cells as columns; quote texts with ,")
+                raise ValueError(
+                    f"{path}, line {reader.line_num}: not one cell per column; put texts that contain a comma in quotes"
+                )
             yield f"{path}, line {reader.line_num}", {key: cell.strip() for key, cell in row.items()}
     except csv.Error as error:
         raise ValueError(f"{path}, line {reader.line_num}: {error}") from error
@@ -283,18 +289,16 @@ def _json_rows(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
     for name, value in data.items():
         unknown = set(value) - set(COLUMNS[1:])
         if unknown:
-            raise ValueError(
-                f"{path}: {name}: unknown key {', '.join(sorted(unknown))}; there are {', '.join(COLUMNS[1:])}"
-            )
+            raise ValueError(f"{path}: {name}: unknown key {', '.join(sorted(unknown))}; use {', '.join(COLUMNS[1:])}")
         yield f"{path}: {name}", {"id": name, **value}
 
 
 def _take(notes: dict[str, Note], exclude: Sequence[str], where: str, row: Mapping[str, Any]) -> None:
-    """Adds what a row of a table says."""
+    """Adds a row of a table to the notes."""
     if row["id"] in exclude:
         return
     if row["id"] not in notes:
-        raise ValueError(f"{where}: there is no motion {row['id']!r}; ids are paths in the folder without ending")
+        raise ValueError(f"{where}: no motion {row['id']!r}; ids are paths in the folder without extension")
     note = notes[row["id"]]
     texts = row.get("text") or []
     if not isinstance(texts, str | list) or not all(isinstance(text, str) for text in texts):
@@ -304,14 +308,14 @@ def _take(notes: dict[str, Note], exclude: Sequence[str], where: str, row: Mappi
         value = row.get(key)
         if value:
             if getattr(note, key) not in (None, value):
-                raise ValueError(f"{where}: {row['id']} has the {key} {getattr(note, key)} and {value}")
+                raise ValueError(f"{where}: {row['id']} has two values of {key}: {getattr(note, key)} and {value}")
             setattr(note, key, str(value))
     if note.split not in (None, *get_args(Split)):
-        raise ValueError(f"{where}: the split {note.split!r} is none of {', '.join(get_args(Split))}")
+        raise ValueError(f"{where}: unknown split {note.split!r}; use {', '.join(get_args(Split))}")
 
 
 def _swapped(text: str) -> str:
-    """Left for right and clockwise for counterclockwise, and the other way around."""
+    """Swaps left and right, clockwise and counterclockwise."""
     pairs = {"left": "right", "right": "left", "clockwise": "counterclockwise"}
     pairs |= {"counterclockwise": "clockwise", "anticlockwise": "clockwise"}
 

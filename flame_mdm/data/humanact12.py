@@ -1,7 +1,7 @@
-"""HumanAct12: 1,191 clips of 12 actions, as the SMPL poses that ACTOR's authors hand out.
+"""HumanAct12: 1,191 clips of 12 actions, as the SMPL poses published by ACTOR's authors.
 
 Guo et al., "Action2Motion: Conditioned Generation of 3D Human Motions", ACM MM 2020; poses by Petrovich et al.,
-"Action-Conditioned 3D Human Motion Synthesis with Transformer VAE", ICCV 2021. `docs/actions.md` describes the set.
+"Action-Conditioned 3D Human Motion Synthesis with Transformer VAE", ICCV 2021. Described in `docs/actions.md`.
 """
 
 from __future__ import annotations
@@ -18,17 +18,17 @@ from flame_mdm.data import Clip, MotionSource, Split, restricted_pickle
 from flame_mdm.files import read_npy
 
 FPS = 20.0
-"""Frames a second at which the papers' codes play the action sets; no frame is dropped or made."""
+"""Frames per second at which the authors' code plays the action data sets; frames are not resampled."""
 
 BLOCK = 10
-"""Clips that follow one another in the file and go to one split together: they may be cut from one recording."""
+"""Number of consecutive clips in the file that go to one split together: they may be cut from one recording."""
 
 
 class HumanAct12(MotionSource):
     """The clips of `humanact12poses.pkl`, as raw motions of the SMPL representations.
 
     The file names neither subjects nor recordings. Our split (70 % train, 10 % val, 20 % test of each action) keeps
-    neighboring clips together. The published use has no split: every clip is for training, and tested on.
+    neighboring clips together. The papers use no split: every clip is used for training and for testing.
     """
 
     name = "humanact12"
@@ -36,14 +36,14 @@ class HumanAct12(MotionSource):
         *("warm_up", "walk", "run", "jump", "drink", "lift_dumbbell", "sit", "eat"),
         *("turn steering wheel", "phone", "boxing", "throw"),
     )
-    published: ClassVar[dict[str, int]] = {"clips": 1191, "fewest clips an action": 47, "most clips an action": 218}
+    published: ClassVar[dict[str, int]] = {"clips": 1191, "fewest clips per action": 47, "most clips per action": 218}
 
     def __init__(self, path: str, published_split: bool = False):
-        """Reads nothing yet.
+        """Stores the arguments; reads no files.
 
         Args:
-            path: `humanact12poses.pkl`, or the folder that holds it.
-            published_split: all clips are training clips, which are also the test clips.
+            path: `humanact12poses.pkl`, or the folder that contains it.
+            published_split: use all clips for training and for testing.
         """
         self.path, self.published_split = Path(path), published_split
         self._found: list[tuple[np.ndarray, int]] | None = None
@@ -64,7 +64,7 @@ class HumanAct12(MotionSource):
         return self._found
 
     def _splits(self, actions: list[int]) -> list[tuple[str, Split]]:
-        """Source and split of each clip."""
+        """Returns source and split of each clip."""
         if self.published_split:
             return [(f"humanact12_{number:04d}", "train") for number in range(len(actions))]
         seen: defaultdict[int, int] = defaultdict(int)
@@ -82,14 +82,14 @@ class HumanAct12(MotionSource):
 
 
 def read(path: Path, actions: int = len(HumanAct12.actions)) -> list[tuple[np.ndarray, int]]:
-    """Motion and action of each clip of `humanact12poses.pkl`, in the order of the file.
+    """Reads motion and action of each clip of `humanact12poses.pkl`, in the order of the file.
 
     Returns:
-        Pairs of (F, 75) float32 and a label in [0, `actions`): the root joint's place (metres, the camera's axes), then
-        24 axis-angle vectors, the root's in the camera's axes.
+        Pairs of a motion (F, 75) float32 and a label in [0, `actions`). A motion is the position of the root joint
+        (meters, camera axes), then 24 axis-angle vectors, that of the root in camera axes.
 
     Raises:
-        FileNotFoundError, ValueError: the file is absent, damaged or another one.
+        FileNotFoundError, ValueError: the file is missing, damaged or another file.
     """
     data = restricted_pickle.read(path)
     poses, joints, labels = columns(path, data, "poses", "joints3D", "y")
@@ -110,17 +110,17 @@ def read(path: Path, actions: int = len(HumanAct12.actions)) -> list[tuple[np.nd
 
 
 def read_unconstrained(path: Path) -> np.ndarray:
-    """The reference motions of unconstrained generation (Tevet et al. 2023, section 4.3, after Raab et al. 2022).
+    """Reads the reference motions of unconstrained generation (Tevet et al. 2023, section 4.3; Raab et al. 2022).
 
     Args:
         path: `humanact12_unconstrained_modi_struct.npy`, (N, 15 or more, 3, F).
 
     Returns:
-        (N, F, 15, 3) float32, joints as they stand in the file; of SMPL's joints, these are 15, 12, 16, 18, 20, 17,
-        19, 21, 0, 1, 4, 7, 2, 5, 8.
+        (N, F, 15, 3) float32, joints in the order of the file: SMPL's joints 15, 12, 16, 18, 20, 17, 19, 21, 0, 1, 4,
+        7, 2, 5, 8.
 
     Raises:
-        FileNotFoundError, ValueError: the file is absent, damaged or another one.
+        FileNotFoundError, ValueError: the file is missing, damaged or another file.
     """
     try:
         data = read_npy(path)
@@ -132,10 +132,10 @@ def read_unconstrained(path: Path) -> np.ndarray:
 
 
 def find(path: Path, name: str) -> Path:
-    """`path` itself, or the file of this name directly in it or in one folder below.
+    """Returns `path` if it is a file, else the file of this name in that folder or one of its subfolders.
 
     Raises:
-        FileNotFoundError: there is none; says where it is published.
+        FileNotFoundError: there is no such file; the message says where it is published.
     """
     if path.is_file():
         return path
@@ -143,30 +143,30 @@ def find(path: Path, name: str) -> Path:
         if found.is_file():
             return found
     raise FileNotFoundError(
-        f"{path}: no {name}; the set is published with ACTOR (https://github.com/Mathux/ACTOR, prepare/"
+        f"{path}: no {name}; the data set is published with ACTOR (https://github.com/Mathux/ACTOR, prepare/"
         "download_datasets.sh): unpack it and set data.source.path=/path/to/the/folder"
     )
 
 
 def columns(path: Path, data: Any, *names: str) -> list[Any]:
-    """The lists of these names in a pickled dictionary, checked to have one length."""
+    """Returns the lists of these names in a pickled dictionary, checked to have equal length."""
     if not isinstance(data, dict) or not set(names) <= set(data):
         kind = f"keys {', '.join(map(str, data))}" if isinstance(data, dict) else type(data).__name__
-        raise ValueError(f"{path}: has to hold {', '.join(names)}; it holds {kind}")
+        raise ValueError(f"{path}: must contain {', '.join(names)}; it contains {kind}")
     for name in names:
         values = data[name]
         if not isinstance(values, list | tuple | np.ndarray) or (isinstance(values, np.ndarray) and not values.ndim):
-            raise ValueError(f"{path}: {name} is no list, but {type(values).__name__}")
+            raise ValueError(f"{path}: {name} is not a list, but {type(values).__name__}")
     lengths = {name: len(data[name]) for name in names}
     if len(set(lengths.values())) > 1:
-        raise ValueError(f"{path}: as many of each are needed, not {lengths}")
+        raise ValueError(f"{path}: lists differ in length: {lengths}")
     return [data[name] for name in names]
 
 
 def check_fps(name: str, fps: float) -> None:
-    """The action sets are not resampled."""
+    """Raises `ValueError` for another frame rate: the action data sets are not resampled."""
     if fps != FPS:
-        raise ValueError(f"{name}: its clips are played at {FPS:g} frames a second, set representation.fps={FPS:g}")
+        raise ValueError(f"{name}: clips are played at {FPS:g} frames per second, set representation.fps={FPS:g}")
 
 
 def _hash(text: str) -> str:

@@ -1,7 +1,7 @@
 """HumanML3D: motions of AMASS and HumanAct12 with descriptions, as features and as SMPL parameters.
 
-Guo et al., "Generating Diverse and Natural 3D Human Motions From Text", CVPR 2022. `docs/humanml3d.md` tells what to
-download and how the set is prepared.
+Guo et al., "Generating Diverse and Natural 3D Human Motions From Text", CVPR 2022. `docs/humanml3d.md` explains what to
+download and how the data set is prepared.
 """
 
 from __future__ import annotations
@@ -27,16 +27,16 @@ from flame_mdm.representations.humanml import HumanML
 FPS = 20
 
 TRIMMED = {"Eyes_Japan_Dataset": 60, "MPI_HDM05": 60, "TotalCapture": 20, "MPI_Limits": 20, "Transitions_mocap": 10}
-"""Frames at 20 fps that recordings of a subset lose at their start (T poses); `index.csv` counts from there."""
+"""Frames at 20 fps trimmed from the start of a subset's recordings (T poses); `index.csv` counts from there."""
 
 GET_IT = (
-    "clone https://github.com/EricGuo5513/HumanML3D and use its folder HumanML3D; the motions have to be made from "
+    "clone https://github.com/EricGuo5513/HumanML3D and use its folder HumanML3D; the motions have to be created from "
     "AMASS: docs/humanml3d.md"
 )
 
 
 class Row(NamedTuple):
-    """A clip in `index.csv`: frames `start` to `end` of a recording at 20 fps; `key` of `key_of`."""
+    """A clip in `index.csv`: frames `start` to `end` of a recording at 20 fps; `key` as returned by `key_of`."""
 
     name: str
     key: str
@@ -45,11 +45,11 @@ class Row(NamedTuple):
 
     @property
     def humanact12(self) -> bool:
-        """Of HumanAct12, whose clips are taken as they are; `key` is the name of its file."""
+        """Whether the clip is from HumanAct12, whose clips are used whole; `key` is then the name of its file."""
         return "/" not in self.key
 
     def frames(self, count: int) -> range:
-        """The frames that the clip takes out of so many."""
+        """Returns the range of the clip's frames in a recording of `count` frames."""
         if self.humanact12:
             return range(count)
         trimmed = TRIMMED.get(subset_of(self.key), 0)
@@ -57,11 +57,11 @@ class Row(NamedTuple):
 
 
 def read_index(path: Path) -> list[Row]:
-    """The clips of HumanML3D's `index.csv`.
+    """Reads the clips of HumanML3D's `index.csv`.
 
     Raises:
-        FileNotFoundError: there is none.
-        ValueError: it is no such file; the line is named.
+        FileNotFoundError: the file does not exist.
+        ValueError: the file has another layout; the message names the line.
     """
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file; it is index.csv of https://github.com/EricGuo5513/HumanML3D")
@@ -84,7 +84,7 @@ def read_index(path: Path) -> list[Row]:
 
 
 class HumanML3D(T2MFolder):
-    """The processed folder with 263 features; made first, where it is not there, if `amass` is given."""
+    """The processed folder with 263 features; missing motions are first created from AMASS if `amass` is given."""
 
     name = "humanml3d"
     representation = "humanml-legacy-smpl22"
@@ -105,18 +105,18 @@ class HumanML3D(T2MFolder):
         bone_lengths: Sequence[float] | None = None,
         workers: int = 0,
     ):
-        """Reads nothing yet. All but `path` and `exclude` serve to make the folder from AMASS.
+        """Stores the arguments; reads no files. All but `path` and `exclude` are for creating the folder from AMASS.
 
         Args:
-            path: the folder; texts and splits must be there.
+            path: the folder; it must contain texts and splits.
             exclude: names to leave out; a mirrored copy has its own name.
             amass: folder of AMASS's SMPL+H G archives, packed or unpacked.
             body_models: folder of the extended SMPL+H model.
-            humanact12: folder or zip of HumanAct12's joints; default `humanact12` or `pose_data/humanact12.zip` beside
+            humanact12: folder or zip of HumanAct12's joints; default `humanact12` or `pose_data/humanact12.zip` next to
                 `path`.
-            index: default `index.csv` in `path` or beside it.
-            bone_lengths: 22 lengths of the skeleton that all motions get, metres.
-            workers: processes; 0 = one a core, 1 = none but this one.
+            index: default `index.csv` in `path` or next to it.
+            bone_lengths: 22 bone lengths, in meters, of the skeleton that all motions are retargeted to.
+            workers: number of processes; 0 = one per core, 1 = this process only.
         """
         super().__init__(path, exclude)
         self.amass = Amass(Path(amass)) if amass else None
@@ -132,11 +132,11 @@ class HumanML3D(T2MFolder):
         return super().count()
 
     def check(self) -> list[str]:
-        """What is there, and what is still to be done or missing."""
+        """Returns lines about motions already created and files missing for the others."""
         if not self.amass:
             return super().check()
         todo = self._todo()
-        done = f"{len(self.rows) - len(todo)} of {len(self.rows)} motions and their mirrored copies are made"
+        done = f"{len(self.rows) - len(todo)} of {len(self.rows)} motions and their mirrored copies are created"
         return [done, *(f"missing: {line}" for line in self._missing(self.amass, todo))]
 
     @cached_property
@@ -159,21 +159,21 @@ class HumanML3D(T2MFolder):
             missing += amass.missing({row.key for row in todo if not row.humanact12})
         absent = {row.key for row in todo if row.humanact12} - _humanact12_files(self.humanact12).keys()
         if absent:
-            missing.append(f"{self.humanact12}: {len(absent)} clips of HumanAct12 are absent, such as {min(absent)}")
+            missing.append(f"{self.humanact12}: {len(absent)} clips of HumanAct12 are missing, such as {min(absent)}")
         return missing
 
     def _bodies(self) -> dict[str, Body]:
         if not self.body_models:
-            raise FileNotFoundError("data.source.body_models: not given; the folder of the extended SMPL+H model")
+            raise FileNotFoundError("data.source.body_models: not set; give the folder of the extended SMPL+H model")
         return load_bodies(self.body_models)
 
     def _make(self, amass: Amass) -> None:
-        """Makes the motions that are not there yet, so that an interrupted run is taken up."""
+        """Creates the motions that do not exist yet; an interrupted run thus continues where it stopped."""
         todo = self._todo()
         if todo:
             missing = self._missing(amass, todo)
             if missing:
-                raise FileNotFoundError(f"{self.name} cannot be made: {'; '.join(missing)}")
+                raise FileNotFoundError(f"{self.name} cannot be created: {'; '.join(missing)}")
             folder = self.path / "new_joint_vecs"
             made = not folder.exists()
             folder.mkdir(exist_ok=True)
@@ -183,7 +183,7 @@ class HumanML3D(T2MFolder):
                 recordings[row.key].append(row)
             joints = _humanact12_files(self.humanact12)
             try:
-                with tqdm(desc=f"making {self.name}", total=len(todo), unit=" motions") as progress:
+                with tqdm(desc=f"creating {self.name}", total=len(todo), unit=" motions") as progress:
                     from_amass = {key: rows for key, rows in recordings.items() if not rows[0].humanact12}
                     for _, done in amass.each(from_amass, partial(_from_amass, write, self._bodies()), self.workers):
                         progress.update(done)
@@ -201,7 +201,7 @@ class HumanML3D(T2MFolder):
             self._write_statistics()
 
     def _write_statistics(self) -> None:
-        """Mean and std over all motions, mirrored ones too, whatever their length and split."""
+        """Writes mean and std over all motions of any length and split, including mirrored ones."""
         names = sorted(self._motions())
         lengths = [len(self._load(name, mmap=True)) for name in names]
         representation = HumanML("smpl22", "legacy")
@@ -211,7 +211,9 @@ class HumanML3D(T2MFolder):
                 for name in names:
                     motion = self._load(name)
                     if motion.shape[1] != representation.features:
-                        raise ValueError(f"{self.path}: {name} has {motion.shape[1]} features; make it again")
+                        raise ValueError(
+                            f"{self.path}: {name} has {motion.shape[1]} features; delete it and prepare again"
+                        )
                     motion.astype(np.float32).tofile(file)
             rows = np.memmap(packed, np.float32, "r+", shape=(sum(lengths), representation.features))
             mean, std = representation.statistics(torch.from_numpy(rows))
@@ -222,7 +224,7 @@ class HumanML3D(T2MFolder):
 
 
 def _from_amass(write: partial[None], bodies: dict[str, Body], rows: Sequence[Row], recording: Recording) -> int:
-    """Writes the clips of a recording; anything but "male" uses the female body, as published."""
+    """Writes the clips of a recording; any gender but "male" uses the female body, as published."""
     recording = recording.every(FPS)
     body = bodies["male" if recording.gender == "male" else "female"]
     for row in rows:
@@ -239,7 +241,7 @@ def _write_features(folder: Path, representation: HumanML, row: Row, joints: np.
     try:
         features = representation.encode_many([motion, representation.skeleton.mirror(motion)])
     except ValueError as error:
-        raise ValueError(f"clip {row.name}: {error}, by data.source.exclude=[{row.name}]") from error
+        raise ValueError(f"clip {row.name}: {error}, with data.source.exclude=[{row.name}]") from error
     for name, array in zip((row.name, f"M{row.name}"), features, strict=True):
         _save(folder / f"{name}.npy", array.numpy())
 
@@ -250,13 +252,13 @@ def _save(path: Path, array: np.ndarray) -> None:
 
 
 def _beside(path: Path, *names: str) -> Path:
-    """The first of these that is in a folder or beside it; else the first, in it."""
+    """Returns the first of these names that exists in the folder or next to it, else the first name in the folder."""
     candidates = [folder / name for name in names for folder in (path, path.parent)]
     return next((candidate for candidate in candidates if candidate.exists()), candidates[0])
 
 
 def _humanact12_files(path: Path) -> dict[str, Path | tuple[Path, str]]:
-    """Name -> file of joints, in a folder or a zip; in a zip, its path and the name of the member."""
+    """Returns name -> file of joints in a folder; in a zip, name -> (path of the zip, name of the member)."""
     if path.is_dir():
         return {file.stem: file for file in path.rglob("*.npy")}
     if not path.is_file():
@@ -272,18 +274,19 @@ def _read_joints(source: Path | tuple[Path, str]) -> np.ndarray:
     except ValueError as error:
         raise ValueError(f"{file}: {error}") from error
     if joints.dtype.kind not in "fiu":
-        raise ValueError(f"{file}: an array of {joints.dtype}, not of numbers")
+        raise ValueError(f"{file}: an array of {joints.dtype}, not of real numbers")
     if joints.ndim != 3 or joints.shape[1] < 22 or joints.shape[2] != 3:
         raise ValueError(f"{file}: shape {joints.shape}, not (frames, 22 joints or more, 3)")
     return joints[:, :22]
 
 
 class HumanML3DSMPL(MotionSource):
-    """FLAME's form of the set (Kim et al., AAAI 2023): SMPL parameters, whole clips, each caption a clip of its own.
+    """FLAME's form of the data set (Kim et al., AAAI 2023): SMPL parameters, whole clips, one clip per caption.
 
-    No mirrored copies, no limits of length, no cuts: a caption of a part is a caption of the whole, as in FLAME's code.
-    A clip is named NAME#0, NAME#1 ...; those of one motion share its frames. Of `index.csv`'s frames FLAME's code does
-    not count those that five subsets lose at their start; here it does, so that motion and caption fit.
+    As in FLAME's code, there are no mirrored copies, no limits of length and no cuts: a caption of a part is used as a
+    caption of the whole motion. Clips are named NAME#0, NAME#1 ...; those of one motion share its frames. Unlike in
+    FLAME's code, the frames trimmed from the start of five subsets are taken into account when `index.csv` is applied,
+    so that motion and caption match.
     """
 
     name = "humanml3d-smpl"
@@ -300,16 +303,16 @@ class HumanML3DSMPL(MotionSource):
         exclude: Sequence[str] = (),
         workers: int = 0,
     ):
-        """Reads nothing yet.
+        """Stores the arguments; reads no files.
 
         Args:
             path: folder with the texts and splits of HumanML3D; no motions are needed.
             amass: folder of AMASS's SMPL+H G archives, packed or unpacked.
             humanact12: FLAME's `humanact12_processed.pkl`; without it, the clips of HumanAct12 are left out.
-            index: default `index.csv` in `path` or beside it.
-            published_split: train on the validation clips, too (FLAME's "final"); none are left to validate on.
+            index: default `index.csv` in `path` or next to it.
+            published_split: train on the validation clips as well (FLAME's "final"); none are left for validation.
             exclude: names to leave out.
-            workers: processes; 0 = one a core, 1 = none but this one.
+            workers: number of processes; 0 = one per core, 1 = this process only.
         """
         self.folder, self.amass = HumanML3D(path, exclude, index=index), Amass(Path(amass))
         self.humanact12 = Path(humanact12) if humanact12 else None
@@ -334,17 +337,17 @@ class HumanML3DSMPL(MotionSource):
         return sum(len(self.folder.texts[row.name]) for row in self.rows)
 
     def check(self) -> list[str]:
-        """What is there and what is missing."""
+        """Returns lines about the number of motions and the missing files."""
         missing = self.amass.missing({row.key for row in self.rows if not row.humanact12})
         return [f"{len(self.rows)} motions in the index", *(f"missing: {line}" for line in missing)]
 
     def excluded(self) -> dict[str, int]:
-        """Motions that were left out."""
+        """Returns the number of motions left out, by reason."""
         return dict(self._excluded)
 
     def clips(self, fps: float) -> Iterator[Clip]:
         if fps != FPS:
-            raise ValueError(f"{self.name} has {FPS} frames a second, the representation asks for {fps:g}")
+            raise ValueError(f"{self.name} has {FPS} frames per second, but representation.fps is {fps:g}")
         left_out = sum(row.humanact12 for row in self.folder.rows if row.name in self.folder.names)
         self._excluded = Counter()
         if left_out and not self.humanact12:
@@ -360,7 +363,7 @@ class HumanML3DSMPL(MotionSource):
             yield from self._from_humanact12(self.humanact12, recordings)
 
     def _from_humanact12(self, path: Path, recordings: dict[str, list[Row]]) -> Iterator[Clip]:
-        """SMPL poses of HumanAct12; the root's place stands for SMPL's translation, as in FLAME's code."""
+        """Yields SMPL poses of HumanAct12; the root position is used as SMPL's translation, as in FLAME's code."""
         data = restricted_pickle.read(path)
         for key in sorted(recordings):
             entry = data.get(f"{key}.npy", data.get(key)) if isinstance(data, dict) else None
@@ -371,7 +374,7 @@ class HumanML3DSMPL(MotionSource):
                 poses = np.asarray(entry["poses"], np.float32)
                 motion = np.concatenate([np.asarray(entry["joints3D"], np.float32)[:, 0], poses.reshape(-1, 72)], 1)
             except (KeyError, TypeError, ValueError, IndexError) as error:
-                raise ValueError(f"{path}: {key} holds no poses (F, 72) and joints3D (F, 24, 3): {error}") from error
+                raise ValueError(f"{path}: {key} lacks poses (F, 72) or joints3D (F, 24, 3): {error}") from error
             for row in recordings[key]:
                 yield from self._clips(row, motion)
 
@@ -391,7 +394,7 @@ class HumanML3DSMPL(MotionSource):
 
 
 def _parameters(rows: Sequence[Row], recording: Recording) -> list[np.ndarray]:
-    """Translation and poses (F, 3 + 156) float32 of the clips of a recording."""
+    """Returns translation and poses (F, 3 + 156) float32 of each clip of a recording."""
     recording = recording.every(FPS)
     motion = np.concatenate([recording.translation, recording.poses], 1).astype(np.float32)
     cuts = [row.frames(len(motion)) for row in rows]

@@ -1,6 +1,6 @@
-"""KIT Motion-Language: as 251 features of a processed folder, and as joints the way TEMOS reads them.
+"""KIT Motion-Language: a processed folder with 251 features, and joint positions as TEMOS reads them.
 
-Plappert, Mandery, Asfour, "The KIT Motion-Language Dataset", Big Data 2016. `docs/kit.md` tells what to download.
+Plappert, Mandery, Asfour, "The KIT Motion-Language Dataset", Big Data 2016. `docs/kit.md` says what to download.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from flame_mdm.data import Clip, MotionSource, Split
 from flame_mdm.data.t2m import SPLITS, T2MFolder
 from flame_mdm.files import TEXT_LIMIT, read_json, read_text, regular_file
 
-UNITS_PER_METRE = 640
+UNITS_PER_METER = 640
 MMM_FPS = 100
 
 
@@ -34,10 +34,10 @@ class KIT(T2MFolder):
 
 
 class KITTemos(MotionSource):
-    """Joints of the MMM model at 100 frames a second, of which every eighth counts; TEMOS's splits and limits.
+    """Joints of the MMM model, every eighth of 100 frames per second, with TEMOS's splits and limits.
 
-    Petrovich, Black, Varol, "TEMOS", ECCV 2022, whose rules FLAME takes over. Training and validation leave out motions
-    of fewer than 10 or more than 500 frames; the test split keeps all. There, the first caption counts alone; the clips
+    Petrovich, Black, Varol, "TEMOS", ECCV 2022, whose rules FLAME follows. Training and validation leave out motions
+    of fewer than 10 or more than 500 frames. The test split keeps all motions, but only their first caption; the clips
     of Ghosh et al.'s test split have the attribute `ghosh_test`.
     """
 
@@ -46,7 +46,7 @@ class KITTemos(MotionSource):
     shortest, longest = 10, 500
 
     def __init__(self, path: str, splits: str, exclude: Sequence[str] = ()):
-        """Reads nothing yet.
+        """Stores the arguments; reads no files.
 
         Args:
             path: folder with `NUMBER_fke.csv`, `NUMBER_annotations.json` and `NUMBER_meta.json`.
@@ -58,28 +58,28 @@ class KITTemos(MotionSource):
 
     @cached_property
     def names(self) -> dict[str, Split]:
-        """The motions of each split.
+        """Name of each motion in a split -> its split.
 
         Raises:
-            FileNotFoundError: no splits.
-            ValueError: a motion is in two splits.
+            FileNotFoundError: the list of a split is missing.
+            ValueError: a motion is in two splits, or `exclude` has an unknown name.
         """
         found: dict[str, Split] = {}
         for split in SPLITS:
             for name in self._list(split):
                 if found.setdefault(name, split) != split:
-                    raise ValueError(f"{self.splits}/{split}: {name} is in {found[name]}, too")
+                    raise ValueError(f"{self.splits}/{split}: {name} is also in {found[name]}")
         unknown = self.exclude - found.keys()
         if unknown:
-            raise ValueError(f"data.source.exclude: no split has {', '.join(sorted(unknown))}")
+            raise ValueError(f"data.source.exclude: no split contains {', '.join(sorted(unknown))}")
         return {name: split for name, split in found.items() if name not in self.exclude}
 
     @cached_property
     def texts(self) -> dict[str, list[str]]:
-        """Captions of each motion in the splits; motions without any are not in it.
+        """Captions of each motion in the splits, except motions without captions.
 
         Raises:
-            FileNotFoundError: files are absent.
+            FileNotFoundError: files are missing.
             ValueError: a file is damaged, or the two files of a motion disagree.
         """
         wanted = [f"{name}_{kind}" for name in self.names for kind in ("fke.csv", "annotations.json", "meta.json")]
@@ -87,34 +87,34 @@ class KITTemos(MotionSource):
         absent = [name for name in wanted if name not in there]
         if absent:
             raise FileNotFoundError(
-                f"{self.path}: {len(absent)} of {len(wanted)} files are absent, such as {absent[0]}; get KIT-ML at "
-                "https://motion-annotation.humanoids.kit.edu/dataset and the joints as docs/kit.md says"
+                f"{self.path}: {len(absent)} of {len(wanted)} files are missing, such as {absent[0]}; download KIT-ML "
+                "from https://motion-annotation.humanoids.kit.edu/dataset and the joints as described in docs/kit.md"
             )
         found = {}
         for name in self.names:
             captions, meta = (_json(self.path / f"{name}_{kind}.json") for kind in ("annotations", "meta"))
             if len(captions) != meta.get("nb_annotations"):
-                raise ValueError(f"{self.path}/{name}_meta.json: nb_annotations does not count {name}_annotations.json")
+                raise ValueError(f"{self.path}/{name}_meta.json: nb_annotations does not match {name}_annotations.json")
             if captions:
                 found[name] = captions
         return found
 
     @cached_property
     def frames(self) -> dict[str, int]:
-        """Number of frames at 12.5 a second of each motion with captions."""
+        """Number of frames, at 12.5 per second, of each motion with captions."""
         return {name: -(-_rows(self.path / f"{name}_fke.csv") // 8) for name in self.texts}
 
     def count(self) -> int:
         return sum(self._fits(name) for name in self.frames)
 
     def clips(self, fps: float) -> Iterator[Clip]:
-        """All motions, in the order of the splits.
+        """Yields all motions, in the order of the splits.
 
         Raises:
-            ValueError: another rate than a whole part of 100 frames a second; a damaged file.
+            ValueError: `fps` is not 12.5, or a file is damaged.
         """
         if fps * 8 != MMM_FPS:
-            raise ValueError(f"{self.name} has 12.5 frames a second, the representation asks for {fps:g}")
+            raise ValueError(f"{self.name} has 12.5 frames per second, but representation.fps is {fps:g}")
         ghosh = set(self._list("ghosh-test")) if (self.splits / "ghosh-test").is_file() else set()
         self._excluded = Counter({"motions by data.source.exclude": len(self.exclude)} if self.exclude else {})
         self._excluded.update(f"motions of {split} without a caption" for split in self._without_caption())
@@ -134,11 +134,11 @@ class KITTemos(MotionSource):
             )
 
     def excluded(self) -> dict[str, int]:
-        """Motions that were left out."""
+        """Returns the number of motions left out, by reason."""
         return dict(self._excluded)
 
     def counts(self) -> dict[str, int]:
-        """What is in the folder under the names of `published`."""
+        """Returns the figures of the folder under the names of `published`."""
         files = [path for path in self.path.glob("*_annotations.json") if _json(path)]
         texts = sum(len(_json(path)) for path in files)
         splits = {split.replace("-", "_"): len(self._list(split)) for split in (*SPLITS, "ghosh-test")}
@@ -154,15 +154,15 @@ class KITTemos(MotionSource):
         file = self.splits / split
         if not file.is_file():
             raise FileNotFoundError(
-                f"{file}: no such list of motions; it is in datasets/kit-splits of https://github.com/Mathux/TEMOS"
+                f"{file}: no such list of motions; get datasets/kit-splits of https://github.com/Mathux/TEMOS"
             )
         return read_text(file).split()
 
 
 def read_joints(path: Path) -> np.ndarray:
-    """Every eighth frame of `NUMBER_fke.csv`: joints (F, 21, 3) float32 in metres, y up.
+    """Reads every eighth frame of `NUMBER_fke.csv`: joints (F, 21, 3) float32 in meters, y up.
 
-    A row has its number and 63 coordinates in KIT's unit, about 1/640 of a metre.
+    A row contains its number and 63 coordinates in KIT's unit, about 1/640 of a meter.
 
     Raises:
         ValueError: the file is damaged.
@@ -174,14 +174,14 @@ def read_joints(path: Path) -> np.ndarray:
         except ValueError as error:
             raise ValueError(f"{path}: damaged: {error}; exclude the motion by its number") from error
     if rows.shape[1] != 64 or not len(rows):
-        raise ValueError(f"{path}: {rows.shape[1]} columns, not a number and 63 coordinates")
+        raise ValueError(f"{path}: {rows.shape[1]} columns, not a row number and 63 coordinates")
     if not np.isfinite(rows).all():
-        raise ValueError(f"{path}: it holds numbers that are not finite; exclude the motion by its number")
-    return (rows[:, 1:].reshape(-1, 21, 3) / UNITS_PER_METRE).astype(np.float32)
+        raise ValueError(f"{path}: contains non-finite numbers; exclude the motion by its number")
+    return (rows[:, 1:].reshape(-1, 21, 3) / UNITS_PER_METER).astype(np.float32)
 
 
 def _rows(path: Path) -> int:
-    """Lines of a table without its head."""
+    """Returns the number of lines of a table without its header."""
     regular_file(path, TEXT_LIMIT)
     data = path.read_bytes()
     return data.count(b"\n") + (not data.endswith(b"\n")) - 1

@@ -1,4 +1,4 @@
-"""Work on many files in processes of their own, results in order."""
+"""Parallel processing of many files in worker processes, with results in order."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ Result = TypeVar("Result")
 
 
 def in_order(function: Callable[[Task], Result], tasks: Iterable[Task], workers: int = 0) -> Iterator[Result]:
-    """`function(task)` of each task, in the order of the tasks, of which only a few are read ahead.
+    """Yields `function(task)` for each task, in the order of the tasks; reads only a few tasks ahead.
 
     Args:
-        function: can be pickled, as the tasks and results can.
-        tasks: what to do.
-        workers: processes; 0 = one a core, 1 = none but this one.
+        function: picklable, like the tasks and results.
+        tasks: arguments of the calls.
+        workers: number of processes; 0 = one per core, 1 = this process only.
 
     Raises:
         UserError: a worker died, for instance because the system ran out of memory.
@@ -35,7 +35,7 @@ def in_order(function: Callable[[Task], Result], tasks: Iterable[Task], workers:
         yield from map(function, tasks)
         return
     others = active_children()
-    # Fresh processes: a fork would copy the threads' locks of a process that may have used torch before.
+    # Spawned, not forked: a fork would copy locks held by threads of this process, which may have used torch.
     with ProcessPoolExecutor(workers, get_context("spawn"), _start_worker) as pool:
         pending: deque[Future[Result]] = deque()
         try:
@@ -45,21 +45,21 @@ def in_order(function: Callable[[Task], Result], tasks: Iterable[Task], workers:
                     yield _first(pending)
             while pending:
                 yield _first(pending)
-        except BaseException as error:  # an error or Ctrl-C shall not wait for tasks that may take half an hour
+        except BaseException as error:  # an error or Ctrl-C must not wait for tasks that may take half an hour
             pool.shutdown(wait=False, cancel_futures=True)
             for process in set(active_children()) - set(others):
                 process.kill()  # a stopped process would not answer SIGTERM
                 process.join()
             if isinstance(error, BrokenProcessPool):
                 raise UserError(
-                    "a worker process was killed, perhaps because the memory did not suffice: take fewer processes "
+                    "a worker process was killed, perhaps because memory ran out: use fewer processes "
                     "(data.source.workers=1 also names the file)"
                 ) from error
             raise
 
 
 def _first(pending: deque[Future[Result]]) -> Result:
-    """Returns the result of the first task, or raises the error of any: the first one may take long, or never end."""
+    """Returns the result of the first task, or raises the error of any task: the first may take long or never end."""
     while True:
         for future in pending:
             if future.done() and future.exception() is not None:
@@ -70,7 +70,7 @@ def _first(pending: deque[Future[Result]]) -> Result:
 
 
 def _start_worker() -> None:
-    """Leaves Ctrl-C to the process that started this one, and ends with it, even when that is killed; one thread."""
+    """Sets up a worker: one thread, ignores Ctrl-C (the parent handles it), and exits when the parent dies."""
     os.environ["OMP_NUM_THREADS"] = "1"  # read when a task imports torch; importing it for tasks that do not takes long
 
     def follow() -> None:

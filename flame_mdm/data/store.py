@@ -1,13 +1,13 @@
-"""Prepared data sets: all clips packed in one memory-mapped array, with an index, statistics and hashes.
+"""Stores of prepared data: all clips packed in one memory-mapped array, with an index, statistics and hashes.
 
 A store is a folder that is written once and never changed:
 
-    features.npy     (N, D) float32, the frames of all clips one after the other, not normalized
-    clips.jsonl      one clip a line: id, start, length, split, source, captions, action, attributes
-    statistics.npz   mean and std (D,) of the training frames, as the representation normalizes with them
+    features.npy     (N, D) float32, the concatenated frames of all clips, not normalized
+    clips.jsonl      one clip per line: id, start, length, split, source, captions, action, attributes
+    statistics.npz   mean and std (D,) of the training frames, used by the representation for normalization
     store.json       representation, frame rate, options of the source, counts, hashes of the three files, fingerprint
 
-Verifying it leaves a report beside them, `verify.json`.
+Verification adds a report to the folder, `verify.json`.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ SPLITS = get_args(Split)
 
 @dataclass(frozen=True)
 class Entry:
-    """One clip of a store: frames `start` to `start + length` of the packed array; see `Clip` for the rest."""
+    """One clip of a store: frames `start` to `start + length` of the packed array; other fields as in `Clip`."""
 
     id: str
     start: int
@@ -58,8 +58,8 @@ class Store:
     """A prepared data set, opened for reading.
 
     Raises:
-        FileNotFoundError: there is none in `folder`.
-        ValueError: its files do not belong together or are damaged.
+        FileNotFoundError: `folder` contains no store.
+        ValueError: the files are damaged or do not belong together.
     """
 
     def __init__(self, folder: Path):
@@ -74,7 +74,7 @@ class Store:
         except (UserError, OSError, ValueError) as error:
             raise _damaged(self.folder / "features.npy", str(error)) from error
         if list(self.features.shape) != shape or len(shape) != 2 or self.features.dtype != np.float32:
-            raise _damaged(self.folder / "features.npy", f"it holds {self.features.shape}, not {shape} numbers")
+            raise _damaged(self.folder / "features.npy", f"shape {self.features.shape}, not {shape}, or not float32")
         self.clips = _entries(self.folder / "clips.jsonl", shape[0], len(self.info["actions"]))
         try:
             statistics = read_npz(self.folder / "statistics.npz")
@@ -82,37 +82,37 @@ class Store:
         except (ValueError, KeyError) as error:
             raise _damaged(self.folder / "statistics.npz", str(error)) from error
         if not self.mean.shape == self.std.shape == (shape[1],) or {self.mean.dtype.kind, self.std.dtype.kind} != {"f"}:
-            raise _damaged(self.folder / "statistics.npz", f"no mean and std of {shape[1]} features")
+            raise _damaged(self.folder / "statistics.npz", f"not a mean and std of {shape[1]} features")
         name, fps = self.info["representation"], self.info["fps"]
         if _fingerprint(self.folder, name, fps, self.mean, self.std) != self.fingerprint:
-            raise _damaged(self.folder / "store.json", "its fingerprint is not that of the clips")
+            raise _damaged(self.folder / "store.json", "its fingerprint does not match the clips")
 
     @property
     def fingerprint(self) -> str:
-        """Names this data in results: the same for the same clips and options, on any machine."""
+        """Identifier of the data in results: equal for equal clips and options, on any machine."""
         return self.info["fingerprint"]
 
     def motion(self, clip: Entry) -> np.ndarray:
-        """(F, D) float32, the features of a clip, not normalized; a view of the memory-mapped array."""
+        """Returns the features (F, D) float32 of a clip, not normalized: a view of the memory-mapped array."""
         return self.features[clip.start : clip.start + clip.length]
 
     def verify(self) -> None:
-        """Hashes the packed features, which opening does not; what the fingerprint is made of is checked there.
+        """Checks the hash of the packed features; opening the store checks only the other files and the fingerprint.
 
         Raises:
-            ValueError: they are not the ones that were written.
+            ValueError: the features have changed since they were written.
         """
         if _sha256(self.folder / "features.npy") != self.info["sha256"].get("features.npy"):
             raise _damaged(self.folder / "features.npy", "its hash is not the recorded one")
 
 
 def write_store(folder: Path, source: MotionSource, representation: Representation) -> Store:
-    """Encodes every clip of a data set and writes the store, under a temporary name until it is whole.
+    """Encodes every clip of a data set and writes the store, under a temporary name until it is complete.
 
-    Where another process is at it, this one waits, and opens what the other has written.
+    If another process is writing the store, waits for it and opens the result.
 
     Raises:
-        FileNotFoundError, ValueError: from the data set, or a clip whose features are not finite; nothing is left.
+        FileNotFoundError, ValueError: from the data set, or because features are not finite; no files are left behind.
     """
     total, before = source.count(), (folder / "store.json").exists()
     with _only_writer(folder):
@@ -123,9 +123,9 @@ def write_store(folder: Path, source: MotionSource, representation: Representati
 
 @contextmanager
 def _only_writer(folder: Path) -> Iterator[None]:
-    """Waits until no other process, here or on another host of a shared file system, writes the store.
+    """Waits until no other process, on this host or another one with the same file system, writes the store.
 
-    The operating system lets go of the lock of a process that dies; what such a one leaves, the next one removes.
+    The operating system releases the lock of a process that dies; the next process removes its leftover files.
     """
     path = folder.with_name(folder.name + ".lock")
     while True:
@@ -134,11 +134,11 @@ def _only_writer(folder: Path) -> Iterator[None]:
                 fcntl.lockf(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except OSError as error:
                 if error.errno in (errno.EACCES, errno.EAGAIN):
-                    say(f"{folder}: another process prepares it; waiting for it")
+                    say(f"{folder}: another process is preparing it; waiting")
                     fcntl.lockf(file, fcntl.LOCK_EX)
                 else:
                     say(f"{path}: this file system has no locks ({error.strerror}); prepare in one process at a time")
-            if not _is_at(file, path):  # the process before has removed it, and another may hold a new one
+            if not _is_at(file, path):  # the previous process has removed it, and another may hold a new lock file
                 continue
             try:
                 yield
@@ -195,11 +195,13 @@ def _write(folder: Path, source: MotionSource, representation: Representation, t
 
 
 def _encode(clips: Sequence[Clip], representation: Representation) -> list[np.ndarray]:
-    """Features of each clip's whole motion; a motion that several clips are cut from is encoded once."""
+    """Returns the features of each clip's entire motion; encodes a motion shared by several clips once."""
     whole = {id(clip.motion): clip for clip in clips}
     for clip in whole.values():
         if clip.encoded and clip.encoded != representation.name:
-            raise ValueError(f"clip {clip.id}: handed out as {clip.encoded}, it cannot become {representation.name}")
+            raise ValueError(
+                f"clip {clip.id}: published as {clip.encoded}, cannot be converted to {representation.name}"
+            )
     raw = [torch.from_numpy(np.ascontiguousarray(clip.motion)) for clip in whole.values() if not clip.encoded]
     try:
         fresh = iter(representation.encode_many(raw) if raw else [])
@@ -239,7 +241,7 @@ def _check_entries(name: str, entries: list[Entry]) -> None:
     seen: dict[str, str] = {}
     for entry in entries:
         if seen.setdefault(entry.source, entry.split) != entry.split:
-            raise ValueError(f"{name}: clips of {entry.source} stand in {seen[entry.source]} and in {entry.split}")
+            raise ValueError(f"{name}: clips of {entry.source} are in both {seen[entry.source]} and {entry.split}")
     if len({entry.id for entry in entries}) != len(entries):
         raise ValueError(f"{name}: two clips have the same id")
     if not any(entry.split == "train" for entry in entries):
@@ -256,7 +258,7 @@ def _header(frames: int, features: int) -> bytes:
 
 
 def _append(file: io.RawIOBase, folder: Path, content: bytes) -> None:
-    """Writes all bytes of a part of features.npy. Through a memory map, a full disk would end the process (SIGBUS)."""
+    """Writes all bytes of a part of features.npy. With a memory map, a full disk would kill the process (SIGBUS)."""
     left = memoryview(content)
     with writing(folder / "features.npy", folder):
         while left:
@@ -293,8 +295,8 @@ def _describe(
 
 def _fingerprint(folder: Path, representation: str, fps: float, mean: np.ndarray, std: np.ndarray) -> str:
     digest = hashlib.sha256((folder / "clips.jsonl").read_bytes())
-    # Features differ in their last bits between processors and thread counts, so the fingerprint sees them through
-    # statistics rounded to a fixed place: what should be 0 is not told apart by its noise, nor by its sign.
+    # Features differ in their last bits between processors and thread counts, so the fingerprint depends on them only
+    # through statistics rounded to a fixed number of decimals. Adding 0.0 makes -0.0 and 0.0 equal.
     rounded = [round(float(value), 4) + 0.0 for value in np.concatenate([mean, std])]
     digest.update(json.dumps([representation, fps, rounded]).encode())
     return digest.hexdigest()[:16]
@@ -307,18 +309,18 @@ INFO: dict[str, type | tuple[type, ...]] = {
     **dict.fromkeys(("fps", "hours"), (int, float)),
     "published_split": bool,
 }
-"""Kinds of the values of store.json that commands rely on."""
+"""Types of the values of store.json that commands rely on."""
 
 
 def _read_info(folder: Path) -> dict[str, Any]:
     try:
         info = read_json(folder / "store.json")
     except FileNotFoundError:
-        raise FileNotFoundError(f"{folder}: no prepared data set; `make prepare` writes it") from None
+        raise FileNotFoundError(f"{folder}: no prepared data set; run `make prepare`") from None
     except UserError as error:
         raise _damaged(folder / "store.json", str(error)) from error
     if not isinstance(info, dict) or info.get("format") != FORMAT:
-        raise ValueError(f"{folder}: not a store of format {FORMAT}, which this version reads; prepare it again")
+        raise ValueError(f"{folder}: not a store of format {FORMAT}, the one this version reads; prepare it again")
     wrong = [name for name, kind in INFO.items() if not isinstance(info.get(name), kind)]
     if not wrong:
         counts, numbers = info["clips"], {"fps": info["fps"], "hours": info["hours"]}
@@ -328,18 +330,18 @@ def _read_info(folder: Path) -> dict[str, Any]:
         usable["source"] = isinstance(info.get("source", {}), dict)
         wrong = [name for name, good in usable.items() if not good]
     if wrong:
-        raise _damaged(folder / "store.json", f"no usable {wrong[0]}")
+        raise _damaged(folder / "store.json", f"no valid {wrong[0]}")
     return info
 
 
 def _entries(path: Path, frames: int, actions: int) -> list[Entry]:
     clips: list[Entry] = []
     try:
-        with path.open(encoding="utf-8") as lines:  # captions may hold other line separators
+        with path.open(encoding="utf-8") as lines:  # captions may contain other line separators
             for line in lines:
                 clip = Entry(**parse_json(line))
                 if wrong := _wrong_field(clip, actions):
-                    raise ValueError(f"no usable {wrong}: {getattr(clip, wrong)!r:.80}")
+                    raise ValueError(f"no valid {wrong}: {getattr(clip, wrong)!r:.80}")
                 if clip.start < 0 or clip.length < 1 or clip.start + clip.length > frames:
                     raise ValueError(f"{clip.id}: frames {clip.start} to {clip.start + clip.length} of {frames}")
                 clips.append(clip)
@@ -351,7 +353,7 @@ def _entries(path: Path, frames: int, actions: int) -> list[Entry]:
 
 
 def _wrong_field(clip: Entry, actions: int) -> str | None:
-    """Returns the first field of a clip that has another kind of value than `Entry` says; None = all are right."""
+    """Returns the first field of a clip with a value of the wrong type, or None."""
     good = {
         "id": isinstance(clip.id, str) and clip.id != "",
         "start": type(clip.start) is int,

@@ -1,8 +1,8 @@
-"""Procedural motions with captions and exact attributes: a person moves without any download.
+"""Procedurally generated motions with captions and exact attributes; needs no download.
 
-Joint angles move the upper body by forward kinematics; the legs follow planned footprints by two-bone inverse
-kinematics, so that a foot on the ground stays exactly where it is. Bone lengths are close to HumanML3D's reference
-skeleton (Guo et al. 2022). The grammar of the captions and the limits of the set stand in `docs/synthetic.md`.
+Joint angles move the upper body by forward kinematics. The legs follow planned footprints by two-bone inverse
+kinematics, so that a foot on the ground does not move at all. Bone lengths are close to HumanML3D's reference
+skeleton (Guo et al. 2022). `docs/synthetic.md` describes the grammar of the captions and the limits of the data set.
 """
 
 from __future__ import annotations
@@ -14,12 +14,12 @@ import numpy as np
 
 from flame_mdm.data import Clip, MotionSource, hashed_split
 
-# Offsets from the parent in metres, standing with hanging arms, facing +z; x for the left side, mirrored on the right.
+# Offsets from the parent in meters, standing with hanging arms, facing +z; x for the left side, mirrored on the right.
 HIP, SPINE1, SPINE2, SPINE3 = (0.075, -0.075, 0.0), (0.0, 0.131, -0.015), (0.0, 0.142, 0.0), (0.0, 0.057, 0.01)
 NECK, HEAD, COLLAR, SHOULDER = (0.0, 0.217, -0.02), (0.0, 0.085, 0.058), (0.072, 0.119, -0.01), (0.125, -0.02, -0.01)
 THIGH, SHIN, UPPER_ARM, FOREARM = 0.393, 0.429, 0.260, 0.268
 ANKLE_HEIGHT, FOOT = 0.06, (0.0, -0.06, 0.134)  # a flat foot: the ankle at 6 cm, the toe joint on the floor
-STAND = 0.97  # height of the pelvis in metres that the legs are asked for and, standing, just do not reach
+STAND = 0.97  # target height of the pelvis in meters, which standing legs just do not reach
 
 LEFT, RIGHT = 0, 1
 SIDES = {"left": (LEFT,), "right": (RIGHT,), "both": (LEFT, RIGHT)}
@@ -31,18 +31,18 @@ Attributes = dict[str, str | int | float]
 
 
 def _ease(t: np.ndarray, start: float, end: float) -> np.ndarray:
-    """0 before `start`, 1 after `end`, with the least jerk between (Flash & Hogan 1985)."""
+    """Returns 0 before `start`, 1 after `end`, and a minimum-jerk transition between (Flash & Hogan 1985)."""
     s = np.clip((t - start) / (end - start), 0, 1)
     return s * s * s * (10 + s * (6 * s - 15))
 
 
 def _pulse(t: np.ndarray, start: float, top: float, leave: float, end: float) -> np.ndarray:
-    """Rises from 0 to 1 between `start` and `top`, falls back between `leave` and `end`."""
+    """Returns a curve that rises from 0 to 1 between `start` and `top` and falls back between `leave` and `end`."""
     return _ease(t, start, top) - _ease(t, leave, end)
 
 
 def _rotation(axis: int, angle: np.ndarray) -> np.ndarray:
-    """Rotations (..., 3, 3) about x, y or z (0, 1, 2) by radians (...)."""
+    """Returns rotations (..., 3, 3) about x, y or z (0, 1, 2) by angles (...) in radians."""
     i, j = (axis + 1) % 3, (axis + 2) % 3
     matrix = np.zeros((*np.shape(angle), 3, 3))
     matrix[..., axis, axis] = 1
@@ -53,9 +53,9 @@ def _rotation(axis: int, angle: np.ndarray) -> np.ndarray:
 
 
 class _Body:
-    """What an action controls: curves over the frames, at first those of somebody who stands and breathes.
+    """Curves over the frames that an action controls, initialized to a person who stands and breathes.
 
-    Angles are radians. Feet and arms have the side first: 0 = left, 1 = right.
+    Angles are in radians. The first axis of feet and arms is the side: 0 = left, 1 = right.
     """
 
     def __init__(self, rng: np.random.Generator, t: np.ndarray, width: float | None = None):
@@ -82,7 +82,7 @@ class _Body:
         self.position[:, [0, 2]] -= self.position[0, [0, 2]]
 
     def _drift(self, rng: np.random.Generator, size: float, *shape: int) -> np.ndarray:
-        """Slow smooth noise (*shape, F): two waves of 0.1 to 0.7 Hz."""
+        """Returns slow smooth noise (*shape, F): two waves of 0.1 to 0.7 Hz."""
         frequency, phase = rng.uniform(0.1, 0.7, (2, *shape, 1)), rng.random((2, *shape, 1))
         weight = rng.normal(0, size, (2, *shape, 1))
         return (weight * np.sin(2 * np.pi * (frequency * self.t + phase))).sum(0)
@@ -93,19 +93,19 @@ class _Body:
             self.arms[side, angle] += weight * (wanted - self.arms[side, angle])
 
     def joints(self) -> np.ndarray:
-        """Joint positions (F, 22, 3) in metres, y up."""
+        """Returns joint positions (F, 22, 3) in meters, y up."""
         out = np.empty((len(self.t), 22, 3))
         facing = _rotation(1, self.heading)
         pelvis = facing @ _rotation(1, self.pelvis[1]) @ _rotation(0, self.pelvis[0]) @ _rotation(2, -self.pelvis[2])
         hips = np.stack([pelvis @ np.array([SIGN[side] * HIP[0], *HIP[1:]]) for side in (0, 1)])
 
-        # A raised heel turns about the toes, raised toes turn about the ankle: what touches the floor does not move.
+        # A raised heel rotates about the toes, raised toes about the ankle: the part on the floor does not move.
         foot = _rotation(1, self.foot_yaw) @ _rotation(0, self.foot_pitch)
         toe_offset = foot @ np.array(FOOT)
         heel_up = (self.foot_pitch > 0)[..., None]
         ankles = self.ankles + heel_up * (_rotation(1, self.foot_yaw) @ np.array(FOOT) - toe_offset)
 
-        # The pelvis sinks where a leg would not reach its footprint: the bob of a walk follows from it.
+        # The pelvis sinks if a leg would not reach its footprint, which produces the bobbing of a walk.
         reach = 0.998 * (THIGH + SHIN)
         out[:, 0] = self.position
         apart = np.sum((ankles - hips - self.position)[..., [0, 2]] ** 2, -1)
@@ -153,17 +153,17 @@ class _Body:
 
 @dataclass
 class _Gait:
-    """How steps are taken. Seconds, metres, radians."""
+    """Parameters of steps, in seconds, meters and radians."""
 
-    step: float  # from one footprint to the next
-    swing: float  # a foot in the air; above 1 step both feet leave the ground in between
-    lift: float  # of the foot in mid-swing
-    heel_off: float  # the heel's angle when the foot leaves the floor
-    toe_up: float  # the toes' angle when the foot comes down; negative: the toes come down first
-    width: float  # half the distance between the tracks
-    sink: float = 0.03  # of the pelvis under way
-    bounce: float = 0.0  # of the pelvis, highest with both feet in the air
-    behind: float = 0.0  # how much further back the feet come down than they stand
+    step: float  # time from one footprint to the next
+    swing: float  # time of a foot in the air; if longer than `step`, both feet leave the ground in between
+    lift: float  # height of the foot in mid-swing
+    heel_off: float  # angle of the heel when the foot leaves the floor
+    toe_up: float  # angle of the toes when the foot comes down; negative: the toes come down first
+    width: float  # half the distance between the tracks of the feet
+    sink: float = 0.03  # lowering of the pelvis while moving
+    bounce: float = 0.0  # amplitude of the pelvis, highest with both feet in the air
+    behind: float = 0.0  # how much farther back the feet come down than they stand
 
 
 def _walk_along(
@@ -175,19 +175,19 @@ def _walk_along(
     first: int,
     stops: bool = False,
 ) -> np.ndarray:
-    """Moves the pelvis along a path and puts the feet down beside it.
+    """Moves the pelvis along a path and places the feet on either side of it.
 
     Args:
-        body: standing; its pelvis, heading and feet are replaced.
-        rng: draws the moment of the first step.
-        gait: how.
-        speed: along the path, once under way.
-        place: way along the path (N,) -> x (N,), z (N,) and heading (N,).
+        body: a standing body; its pelvis, heading and feet are replaced.
+        rng: draws the time of the first step.
+        gait: parameters of the steps.
+        speed: speed along the path after acceleration, meters per second (radians per second when turning).
+        place: distance along the path (N,) -> x (N,), z (N,) and heading (N,).
         first: the side that steps first.
-        stops: come to a stand before the clip ends.
+        stops: stop before the clip ends.
 
     Returns:
-        (F,) how far the right foot is in front of the left one, in metres, seen from the pelvis.
+        (F,) how far the right foot is in front of the left one, in meters, relative to the heading of the pelvis.
     """
     t, end = body.t, body.t[-1]
     start = rng.uniform(0.1, 0.2)
@@ -247,8 +247,8 @@ def _walk_along(
     return (apart.T * forward).sum(0)
 
 
-def _walk(rng: np.random.Generator, t: np.ndarray, asked: Attributes) -> _Body:
-    direction = asked["direction"]
+def _walk(rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> _Body:
+    direction = requested["direction"]
     sign = 1 if direction in ("left", "counterclockwise") else -1
     sideways = direction in ("left", "right")
     body = _Body(rng, t, 0.15 if sideways else None)
@@ -262,7 +262,7 @@ def _walk(rng: np.random.Generator, t: np.ndarray, asked: Attributes) -> _Body:
         gait = _Gait(0.54, 0.42, 0.12, -0.2, -0.4, rng.uniform(0.08, 0.1))
         apart = _walk_along(body, rng, gait, speed, lambda s: (0 * s, -s, 0 * s), RIGHT)
     elif direction == "forward":
-        low, high = {"slow": (0.5, 0.7), "normal": (1.0, 1.25), "fast": (1.55, 1.8)}[str(asked["speed"])]
+        low, high = {"slow": (0.5, 0.7), "normal": (1.0, 1.25), "fast": (1.55, 1.8)}[str(requested["speed"])]
         speed = rng.uniform(low, high)
         step = np.interp(speed, [0.5, 1.2, 1.8], [0.66, 0.52, 0.42]) * rng.uniform(0.95, 1.05)
         lift, sink = rng.uniform(0.1, 0.13), 0.02 + 0.01 * speed
@@ -285,7 +285,7 @@ def _walk(rng: np.random.Generator, t: np.ndarray, asked: Attributes) -> _Body:
     return body
 
 
-def _run(rng: np.random.Generator, t: np.ndarray, asked: Attributes) -> _Body:
+def _run(rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> _Body:
     body = _Body(rng, t)
     body.spine[0] += 0.12
     body.pelvis[0] += 0.06
@@ -299,7 +299,7 @@ def _run(rng: np.random.Generator, t: np.ndarray, asked: Attributes) -> _Body:
 
 
 def _swing_arms(body: _Body, apart: np.ndarray, size: float) -> None:
-    """Swings the arms against the legs, and the shoulders against the hips."""
+    """Swings the arms opposite to the legs, and the shoulders opposite to the hips."""
     body.pelvis[1] += 0.15 * apart
     body.spine[1] -= 0.3 * apart
     for side in (0, 1):
@@ -307,28 +307,28 @@ def _swing_arms(body: _Body, apart: np.ndarray, size: float) -> None:
         body.arms[side, 3] += 0.35 * np.maximum(SIGN[side] * apart, 0)
 
 
-def _turn(rng: np.random.Generator, t: np.ndarray, asked: Attributes) -> _Body:
-    body, sign = _Body(rng, t), 1 if asked["direction"] == "left" else -1
+def _turn(rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> _Body:
+    body, sign = _Body(rng, t), 1 if requested["direction"] == "left" else -1
     speed = rng.uniform(np.radians(85), np.radians(140)) / (t[-1] - 1.2)
     gait = _Gait(0.36, 0.3, 0.07, 0.3, 0.0, 0.1)
     _walk_along(body, rng, gait, speed, lambda s: (0 * s, 0 * s, sign * s), LEFT if sign > 0 else RIGHT, stops=True)
     ahead = np.gradient(body.heading, t)
-    body.head[1] += 0.2 * ahead  # one looks where one turns
+    body.head[1] += 0.2 * ahead  # the head looks in the direction of the turn
     body.spine[1] += 0.08 * ahead
     return body
 
 
 def _events(rng: np.random.Generator, t: np.ndarray, count: int, slowest: float) -> list[tuple[float, float]]:
-    """(start, seconds) of `count` equal repetitions, somewhere inside the clip."""
+    """Returns (start, seconds) of `count` repetitions of equal duration at a random time inside the clip."""
     seconds = min(rng.uniform(0.85, 1.0) * slowest, (t[-1] - 0.3) / count)
     start = rng.uniform(0.1, max(0.15, min(0.4, t[-1] - 0.15 - seconds * count)))
     return [(start + n * seconds, seconds) for n in range(count)]
 
 
-def _jump(rng: np.random.Generator, t: np.ndarray, asked: Attributes) -> _Body:
+def _jump(rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> _Body:
     body = _Body(rng, t)
     depth, reach = rng.uniform(0.16, 0.24), rng.uniform(0.8, 1.6)
-    for start, seconds in _events(rng, t, int(asked["count"]), 1.05):
+    for start, seconds in _events(rng, t, int(requested["count"]), 1.05):
         up = start + 0.4 * seconds
         air = min(rng.uniform(0.36, 0.44), 0.42 * seconds)
         land = up + air
@@ -346,36 +346,36 @@ def _jump(rng: np.random.Generator, t: np.ndarray, asked: Attributes) -> _Body:
     return body
 
 
-def _wave(rng: np.random.Generator, t: np.ndarray, asked: Attributes) -> _Body:
+def _wave(rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> _Body:
     body = _Body(rng, t)
     start, end = rng.uniform(0.1, 0.3), t[-1]
     weight = _pulse(t, start, start + 0.5, end - 0.45, end + 0.05)
     swing = 2 * np.pi * rng.uniform(1.4, 1.7) * (t - start)
     forward, sideways, size = rng.uniform(0.2, 0.5), rng.uniform(1.3, 1.7), rng.uniform(0.45, 0.6)
-    for side in SIDES[str(asked["side"])]:
+    for side in SIDES[str(requested["side"])]:
         pose = (forward, sideways + 0.1 * np.sin(swing), np.pi / 2, rng.uniform(1.3, 1.5) + size * np.sin(swing))
         body.move_arm(side, weight, pose)
         body.spine[2] -= 0.03 * SIGN[side] * weight
     return body
 
 
-def _raise(rng: np.random.Generator, t: np.ndarray, asked: Attributes) -> _Body:
+def _raise(rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> _Body:
     body = _Body(rng, t)
     start = rng.uniform(0.15, 0.5)
     weight = _ease(t, start, start + rng.uniform(0.7, 1.0))
     over_front, high = rng.random() < 0.5, rng.uniform(2.7, 3.0)
-    for side in SIDES[str(asked["side"])]:
+    for side in SIDES[str(requested["side"])]:
         pose = (high, 0.05, -0.2, 0.15) if over_front else (0.1, high, 1.2, 0.15)
         body.move_arm(side, weight, pose)
         body.spine[2] -= 0.05 * SIGN[side] * weight
     return body
 
 
-def _kick(rng: np.random.Generator, t: np.ndarray, asked: Attributes) -> _Body:
+def _kick(rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> _Body:
     body = _Body(rng, t)
-    (side,) = SIDES[str(asked["side"])]
+    (side,) = SIDES[str(requested["side"])]
     high = rng.uniform(1.15, 1.45)
-    events = _events(rng, t, int(asked["count"]), 1.25)
+    events = _events(rng, t, int(requested["count"]), 1.25)
     first, last = events[0][0], events[-1][0] + events[-1][1]
     leaning = _pulse(t, first - 0.1, first + 0.2, last - 0.2, last)
     body.position[:, 0] -= 0.07 * SIGN[side] * leaning
@@ -403,12 +403,12 @@ def _kick(rng: np.random.Generator, t: np.ndarray, asked: Attributes) -> _Body:
     return body
 
 
-def _punch(rng: np.random.Generator, t: np.ndarray, asked: Attributes) -> _Body:
+def _punch(rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> _Body:
     body = _Body(rng, t, 0.13)
-    (side,) = SIDES[str(asked["side"])]
+    (side,) = SIDES[str(requested["side"])]
     body.ankles[..., 2] += rng.uniform(0.04, 0.1) * rng.choice([-1, 1]) * SIGN[:, None]
     body.position[:, 1] -= 0.03
-    events = _events(rng, t, int(asked["count"]), 0.8)
+    events = _events(rng, t, int(requested["count"]), 0.8)
     first, last = events[0][0], events[-1][0] + events[-1][1]
     guard = _pulse(t, first - 0.1, first + 0.2, last, last + 0.4)
     for arm in (0, 1):
@@ -424,10 +424,10 @@ def _punch(rng: np.random.Generator, t: np.ndarray, asked: Attributes) -> _Body:
     return body
 
 
-def _squat(rng: np.random.Generator, t: np.ndarray, asked: Attributes) -> _Body:
+def _squat(rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> _Body:
     body = _Body(rng, t, rng.uniform(0.12, 0.15))
     depth, reach = rng.uniform(0.34, 0.44), rng.uniform(1.0, 1.5)
-    for start, seconds in _events(rng, t, int(asked["count"]), 1.5):
+    for start, seconds in _events(rng, t, int(requested["count"]), 1.5):
         down = _pulse(t, start, start + 0.45 * seconds, start + 0.5 * seconds, start + seconds)
         body.position[:, 1] -= depth * down
         body.position[:, 2] -= 0.16 * down
@@ -438,7 +438,7 @@ def _squat(rng: np.random.Generator, t: np.ndarray, asked: Attributes) -> _Body:
     return body
 
 
-def _bow(rng: np.random.Generator, t: np.ndarray, asked: Attributes) -> _Body:
+def _bow(rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> _Body:
     body = _Body(rng, t)
     start, end = rng.uniform(0.15, 0.35), t[-1] - rng.uniform(0.1, 0.25)
     middle, half = (start + end) / 2, rng.uniform(0.1, 0.25)
@@ -452,7 +452,7 @@ def _bow(rng: np.random.Generator, t: np.ndarray, asked: Attributes) -> _Body:
     return body
 
 
-def _stand(rng: np.random.Generator, t: np.ndarray, asked: Attributes) -> _Body:
+def _stand(rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> _Body:
     return _Body(rng, t)
 
 
@@ -472,40 +472,40 @@ MOTIONS: Mapping[str, Callable[[np.random.Generator, np.ndarray, Attributes], _B
 SHARES = {"walk": 6, "turn": 2, "jump": 2, "wave": 2, "raise": 2, "kick": 2, "punch": 2}  # others: 1
 MOST = {"jump": 3, "punch": 3, "kick": 2, "squat": 2}
 SHORTEST_EVENT = 0.8
-"""Seconds a repetition takes at least; it bounds how many fit into a clip."""
+"""Minimum duration of a repetition in seconds; it limits how many fit into a clip."""
 
 
 def _draw(rng: np.random.Generator, max_seconds: float) -> Attributes:
-    """What a clip shows: action, and of side, count, direction and speed those that the action has."""
+    """Draws the attributes of a clip: the action and those of side, count, direction and speed that it has."""
     shares = np.array([SHARES.get(name, 1) for name in MOTIONS], float)
     action = str(rng.choice(list(MOTIONS), p=shares / shares.sum()))
-    asked: Attributes = {"action": action}
+    requested: Attributes = {"action": action}
     if action in ("wave", "raise"):
-        asked["side"] = str(rng.choice(["left", "right", "both"]))
+        requested["side"] = str(rng.choice(["left", "right", "both"]))
     elif action in ("kick", "punch"):
-        asked["side"] = str(rng.choice(["left", "right"]))
+        requested["side"] = str(rng.choice(["left", "right"]))
     if action in MOST:
-        asked["count"] = int(rng.integers(1, min(MOST[action], int((max_seconds - 0.35) / SHORTEST_EVENT)) + 1))
+        requested["count"] = int(rng.integers(1, min(MOST[action], int((max_seconds - 0.35) / SHORTEST_EVENT)) + 1))
     if action == "walk":
         ways = ["forward", "backward", "left", "right", "clockwise", "counterclockwise"]
-        asked["direction"] = str(rng.choice(ways, p=[0.3, 0.14, 0.14, 0.14, 0.14, 0.14]))
-        if asked["direction"] == "forward":
-            asked["speed"] = str(rng.choice(["slow", "normal", "fast"]))
+        requested["direction"] = str(rng.choice(ways, p=[0.3, 0.14, 0.14, 0.14, 0.14, 0.14]))
+        if requested["direction"] == "forward":
+            requested["speed"] = str(rng.choice(["slow", "normal", "fast"]))
     elif action == "run":
-        asked["direction"] = "forward"
+        requested["direction"] = "forward"
     elif action == "turn":
-        asked["direction"] = str(rng.choice(["left", "right"]))
-    return asked
+        requested["direction"] = str(rng.choice(["left", "right"]))
+    return requested
 
 
-def captions(asked: Attributes) -> list[str]:
-    """Every predicate that says exactly what is asked: "walks forward slowly", "kicks twice with the left leg", ..."""
-    side, direction, count = asked.get("side"), asked.get("direction"), int(asked.get("count", 0))
+def captions(requested: Attributes) -> list[str]:
+    """Returns four predicates that state exactly the attributes: "walks forward slowly", "kicks twice with ...", ..."""
+    side, direction, count = requested.get("side"), requested.get("direction"), int(requested.get("count", 0))
     times, number, plural = TIMES[count], NUMBERS[count], "s" if count > 1 else ""
-    match asked["action"]:
+    match requested["action"]:
         case "walk" if direction == "forward":
             how = {"slow": (" slowly", " at a slow pace"), "fast": (" quickly", " at a fast pace")}
-            words = how.get(str(asked.get("speed")), ("", ""))
+            words = how.get(str(requested.get("speed")), ("", ""))
             ways = ("walks forward", "walks straight ahead", "is walking forward", "goes forward on foot")
             return [f"{way}{words[n % 2]}" for n, way in enumerate(ways)]
         case "walk" if direction == "backward":
@@ -599,14 +599,14 @@ def captions(asked: Attributes) -> list[str]:
 class Synthetic(MotionSource):
     """Clips of the 22 SMPL joints, y up, that start at the origin facing +z; each shows one action.
 
-    The clip of a number depends on the seed and the number alone.
+    Clip number n is a function of the seed and n.
     """
 
     name = "synthetic"
     actions = tuple(MOTIONS)
 
     def __init__(self, clips: int = 5000, seed: int = 0, min_seconds: float = 2.0, max_seconds: float = 3.0):
-        """`clips` motions of `min_seconds` to `max_seconds`.
+        """Defines `clips` motions of `min_seconds` to `max_seconds`.
 
         Raises:
             ValueError: no clips, a negative seed, or durations below 2 s or out of order.
@@ -627,29 +627,29 @@ class Synthetic(MotionSource):
             yield self.clip(index, fps)
 
     def clip(self, index: int, fps: float) -> Clip:
-        """Clip number `index`, `round(seconds * fps) + 1` frames."""
+        """Returns clip number `index` with `round(seconds * fps) + 1` frames."""
         rng = np.random.default_rng((self.seed, index))
-        asked = _draw(rng, self.max_seconds)
-        shortest = max(self.min_seconds, 0.35 + SHORTEST_EVENT * int(asked.get("count", 0)))
+        requested = _draw(rng, self.max_seconds)
+        shortest = max(self.min_seconds, 0.35 + SHORTEST_EVENT * int(requested.get("count", 0)))
         seconds = rng.uniform(shortest, self.max_seconds)
         subjects = rng.permutation(["a person", "someone", "the person", "a human"])
-        texts = [f"{subject} {predicate}" for subject, predicate in zip(subjects, captions(asked), strict=True)]
+        texts = [f"{subject} {predicate}" for subject, predicate in zip(subjects, captions(requested), strict=True)]
         name = f"synthetic_{self.seed}_{index:06d}"
         t = np.arange(round(seconds * fps) + 1) / fps
         return Clip(
             id=name,
-            motion=MOTIONS[str(asked["action"])](rng, t, asked).joints().astype(np.float32),
+            motion=MOTIONS[str(requested["action"])](rng, t, requested).joints().astype(np.float32),
             captions=texts,
             split=hashed_split(name, val=5, test=10),
             source=name,
-            action=self.actions.index(str(asked["action"])),
-            attributes=asked,
+            action=self.actions.index(str(requested["action"])),
+            attributes=requested,
         )
 
 
 def prompts() -> list[tuple[str, Attributes]]:
-    """Fixed prompts with what they ask for: shown on the dashboard, read back by `evaluators.metrics.attributes`."""
-    asked: list[Attributes] = [
+    """Returns fixed prompts with their attributes, for dashboard samples and `evaluators.metrics.attributes`."""
+    requested: list[Attributes] = [
         {"action": "walk", "direction": "forward"},
         {"action": "walk", "direction": "forward", "speed": "slow"},
         {"action": "walk", "direction": "forward", "speed": "fast"},
@@ -677,4 +677,4 @@ def prompts() -> list[tuple[str, Attributes]]:
         {"action": "bow"},
         {"action": "stand"},
     ]
-    return [(f"a person {captions(wanted)[0]}", wanted) for wanted in asked]
+    return [(f"a person {captions(wanted)[0]}", wanted) for wanted in requested]

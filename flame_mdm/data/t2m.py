@@ -1,7 +1,7 @@
-"""The folder layout and sample rules that HumanML3D and KIT-ML share (Guo et al., CVPR 2022).
+"""Folder layout and sampling rules shared by HumanML3D and KIT-ML (Guo et al., CVPR 2022).
 
 new_joint_vecs/NAME.npy     (F, D) features
-texts/NAME.txt              one description a line: caption#word/POS word/POS#from#to, seconds; or texts.zip
+texts/NAME.txt              one description per line: caption#word/POS word/POS#from#to, in seconds; or texts.zip
 train.txt val.txt test.txt  names; the mirrored copy of NAME is MNAME
 Mean.npy Std.npy            (D,)
 """
@@ -22,17 +22,17 @@ from flame_mdm.data.store import Store
 from flame_mdm.files import read_npy, read_text
 
 TAG_FPS = 20
-"""Frames a second of the tags `from` and `to`, in KIT-ML too, whose motions have 12.5."""
+"""Frames per second of the tags `from` and `to`, also in KIT-ML, whose motions have 12.5."""
 
 LIMIT = 200
-"""Motions of so many frames or more are left out, and so are cuts."""
+"""Motions and cuts of this many frames or more are left out."""
 
 MAX_TOKENS = 20
 SPLITS: tuple[Split, ...] = ("train", "val", "test")
 
 
 class Description(NamedTuple):
-    """One line of a text file: seconds `begin` to `end` of the motion, both 0 for the whole of it."""
+    """One line of a text file: seconds `begin` to `end` of the motion, both 0 for the entire motion."""
 
     caption: str
     tokens: list[str]
@@ -41,7 +41,7 @@ class Description(NamedTuple):
 
 
 class Cut(NamedTuple):
-    """One item of the data set: frames `start` to `start + length` of a motion, and what is said about them."""
+    """One item of the data set: frames `start` to `start + length` of a motion and their descriptions."""
 
     id: str
     start: int
@@ -50,10 +50,10 @@ class Cut(NamedTuple):
 
 
 def parse(text: str, where: str) -> list[Description]:
-    """The descriptions in a text file; a tag that is not a number means 0, as published.
+    """Parses the descriptions in a text file; a NaN tag means 0, as published.
 
     Raises:
-        ValueError: a line without the four parts; `where` and its number are named.
+        ValueError: a line does not have four parts; the message contains `where` and the line number.
     """
     found = []
     for number, line in enumerate(text.splitlines(), 1):
@@ -63,16 +63,16 @@ def parse(text: str, where: str) -> list[Description]:
             caption, tokens, *tags = line.strip().rsplit("#", 3)
             begin, end = (0.0 if math.isnan(float(tag)) else float(tag) for tag in tags)
         except ValueError:
-            raise ValueError(f"{where}, line {number}: not caption#words#from#to, but {line.strip()[:60]!r}") from None
+            raise ValueError(f"{where}, line {number}: not caption#words#from#to: {line.strip()[:60]!r}") from None
         found.append(Description(caption, tokens.split(" "), begin, end))
     return found
 
 
 def cuts(name: str, frames: int, descriptions: Sequence[Description], shortest: int) -> list[Cut]:
-    """The items that a motion of so many frames gives, in the published order.
+    """Returns the items of a motion of `frames` frames, in the published order.
 
-    A description of a part makes an item of its own, named NAME@from-to, and NAME@from-to#2 for the second of the same
-    part. As published, a motion that is too short or too long gives nothing, although parts of it would fit.
+    A description of a part gives a separate item named NAME@from-to; the second item of the same part is named
+    NAME@from-to#2. As published, a motion that is too short or too long gives no items, even if parts of it would fit.
     """
     if not shortest <= frames < LIMIT:
         return []
@@ -92,25 +92,25 @@ def cuts(name: str, frames: int, descriptions: Sequence[Description], shortest: 
 
 
 def frame_tokens(tokens: Sequence[str]) -> tuple[list[str], int]:
-    """The first 20 tokens between sos and eos, filled up to 22 with unk; and how many of the 22 are no filling."""
+    """Returns the first 20 tokens between sos and eos, padded to 22 with unk, and the number without padding."""
     framed = ["sos/OTHER", *tokens[:MAX_TOKENS], "eos/OTHER"]
     return framed + ["unk/OTHER"] * (MAX_TOKENS + 2 - len(framed)), len(framed)
 
 
 class T2MFolder(MotionSource):
-    """A processed folder. Cuts and mirrored copies belong to the split of their motion and have it as their source.
+    """A processed folder. Cuts and mirrored copies have the split of their motion, which is also their source.
 
-    The words with their parts of speech stand in the attribute `tokens`, one list a caption.
+    The attribute `tokens` contains the words with their parts of speech, one list per caption.
     """
 
     representation: str
-    """Name of the features that the folder holds."""
+    """Name of the representation of the features in the folder."""
     fps: float
     shortest: int
     get_it: str
 
     def __init__(self, path: str, exclude: Sequence[str] = ()):
-        """Reads nothing yet.
+        """Stores the arguments; reads no files.
 
         Args:
             path: the folder.
@@ -121,11 +121,11 @@ class T2MFolder(MotionSource):
 
     @cached_property
     def names(self) -> dict[str, Split]:
-        """Names in the lists of the splits, and their split; in the order of the lists.
+        """Name in a list of the splits -> its split, in the order of the lists.
 
         Raises:
-            FileNotFoundError: the folder or a list is not there.
-            ValueError: a name is in two splits, or `exclude` has a name that is in none.
+            FileNotFoundError: the folder or a list is missing.
+            ValueError: a name is in two splits, or `exclude` has an unknown name.
         """
         if not self.path.is_dir():
             raise FileNotFoundError(f"{self.path}: no such folder; {self.get_it}")
@@ -136,10 +136,10 @@ class T2MFolder(MotionSource):
                 raise FileNotFoundError(f"{file}: no such list of names; {self.get_it}")
             for name in read_text(file).split():
                 if found.setdefault(name, split) != split:
-                    raise ValueError(f"{file}: {name} is in {found[name]}.txt, too")
+                    raise ValueError(f"{file}: {name} is also in {found[name]}.txt")
         unknown = self.exclude - found.keys()
         if unknown:
-            raise ValueError(f"data.source.exclude: no split has {_some(unknown)}")
+            raise ValueError(f"data.source.exclude: no split contains {_some(unknown)}")
         return {name: split for name, split in found.items() if name not in self.exclude}
 
     @cached_property
@@ -152,7 +152,7 @@ class T2MFolder(MotionSource):
         """Number of frames of each motion in the splits.
 
         Raises:
-            FileNotFoundError: motions or texts of names in the splits are absent.
+            FileNotFoundError: motions or texts of names in the splits are missing.
             ValueError: a file is damaged.
         """
         names = self.names
@@ -161,7 +161,7 @@ class T2MFolder(MotionSource):
             if absent:
                 raise FileNotFoundError(
                     f"{self.path}: {kind} lacks {len(absent)} of the names in the splits: {_some(absent)}; process "
-                    f"them again, or leave them out: {_exclusion(absent)}"
+                    f"them again, or leave them out with {_exclusion(absent)}"
                 )
         return {name: len(self._load(name, mmap=True)) for name in names}
 
@@ -171,14 +171,14 @@ class T2MFolder(MotionSource):
         return total
 
     def clips(self, fps: float) -> Iterator[Clip]:
-        """All items, at the frame rate of the folder.
+        """Yields all items, at the frame rate of the folder.
 
         Raises:
-            ValueError: another rate is asked for, a file is damaged, or motions are not finite: all of these are named
-                at the end, to be excluded at once.
+            ValueError: another frame rate is requested, a file is damaged, or motions are not finite; these are all
+                listed at the end, so that they can be excluded together.
         """
         if fps != self.fps:
-            raise ValueError(f"{self.name} has {self.fps:g} frames a second, the representation asks for {fps:g}")
+            raise ValueError(f"{self.name} has {self.fps:g} frames per second, but representation.fps is {fps:g}")
         self._excluded = Counter({"names by data.source.exclude": len(self.exclude)} if self.exclude else {})
         orphans = self.texts.keys() - self._motions() - self.exclude
         if orphans:
@@ -204,30 +204,30 @@ class T2MFolder(MotionSource):
                 )
         if damaged:
             raise ValueError(
-                f"{self.path}: {len(damaged)} motions hold numbers that are not finite: {_some(damaged)}; process them "
-                f"again, or leave them out: {_exclusion(damaged)}"
+                f"{self.path}: {len(damaged)} motions contain non-finite numbers: {_some(damaged)}; process them "
+                f"again, or leave them out with {_exclusion(damaged)}"
             )
 
     def excluded(self) -> dict[str, int]:
-        """Names without any clip, one reason each, by split; and descriptions of parts that make no clip."""
+        """Returns the number of names without clips, by split and reason, and of descriptions of parts without clip."""
         return dict(self._excluded)
 
     def statistics(self) -> tuple[np.ndarray, np.ndarray]:
-        """Mean and std as they are handed out, over all motions of all splits.
+        """Returns the published mean and std, which are over all motions of all splits.
 
         Raises:
-            FileNotFoundError: there are none.
-            ValueError: they are damaged, or a std is not positive.
+            FileNotFoundError: the files are missing.
+            ValueError: the files are damaged, or a std is not positive.
         """
         mean, std = (self._array(self.path / f"{name}.npy") for name in ("Mean", "Std"))
         if {mean.dtype.kind, std.dtype.kind} - set("fiu"):
-            raise ValueError(f"{self.path}: Mean.npy and Std.npy are no arrays of real numbers")
+            raise ValueError(f"{self.path}: Mean.npy and Std.npy are not arrays of real numbers")
         if mean.shape != std.shape or mean.ndim != 1 or not np.isfinite(mean).all() or not (std > 0).all():
-            raise ValueError(f"{self.path}: Mean.npy {mean.shape} and Std.npy {std.shape} are no mean and positive std")
+            raise ValueError(f"{self.path}: Mean.npy {mean.shape} or Std.npy {std.shape} is not a mean or positive std")
         return mean.astype(np.float32), std.astype(np.float32)
 
     def counts(self) -> dict[str, int]:
-        """What is in the folder under the names of `published`."""
+        """Returns the figures of the folder under the names of `published`."""
         originals = {name.removeprefix("M") for name in self._motions()}
         texts = sum(len(lines) for name, lines in self.texts.items() if not name.startswith("M"))
         splits = Counter(self.names.values())
@@ -235,7 +235,7 @@ class T2MFolder(MotionSource):
 
     def _motions(self) -> set[str]:
         files = (self.path / "new_joint_vecs").glob("*.npy")
-        return {path.stem for path in files if not path.name.startswith(".")}  # an unfinished one of a killed process
+        return {path.stem for path in files if not path.name.startswith(".")}  # unfinished, of a killed process
 
     def _load(self, name: str, mmap: bool = False) -> np.ndarray:
         motion = self._array(self.path / "new_joint_vecs" / f"{name}.npy", mmap)
@@ -253,7 +253,7 @@ class T2MFolder(MotionSource):
             raise ValueError(f"{path}: {error}; process it again, or exclude it by name") from error
 
     def _account(self, name: str, frames: int, found: Sequence[Cut]) -> None:
-        """Notes what a motion loses."""
+        """Counts what is left out of a motion, by reason."""
         lost = len(self.texts[name]) - sum(len(cut.descriptions) for cut in found)
         reason = ""
         if frames < self.shortest:
@@ -271,7 +271,7 @@ class T2MFolder(MotionSource):
 
 
 def stored_names(store: Store) -> dict[str, int]:
-    """Names a split has, from a prepared store: those that gave clips and those that were left out."""
+    """Returns the number of names per split of a prepared store, both with clips and left out."""
     totals = {split: len({c.id.split("@")[0] for c in store.clips if c.split == split}) for split in SPLITS}
     for reason, number in store.info["excluded"].items():
         for split in SPLITS:
@@ -281,14 +281,14 @@ def stored_names(store: Store) -> dict[str, int]:
 
 
 def _texts(path: Path) -> Iterator[tuple[str, str, str]]:
-    """Name, file and content of all text files, sorted."""
+    """Yields name, path and content of all text files, sorted."""
     if (path / "texts").is_dir():
         for file in sorted((path / "texts").glob("*.txt")):
             yield file.stem, str(file), read_text(file)
         return
     archive = path / "texts.zip"
     if not archive.is_file():
-        raise FileNotFoundError(f"{path}: neither a folder texts nor texts.zip in it")
+        raise FileNotFoundError(f"{path}: contains neither a folder texts nor texts.zip")
     contents = {
         member: content()
         for member, content in archives.members(archive)
@@ -308,5 +308,5 @@ def _some(names: Iterable[str]) -> str:
 
 
 def _exclusion(names: Sequence[str]) -> str:
-    """The override that leaves these names out, where it can be typed."""
+    """Returns the override that leaves these names out; only its key if there are more than 100."""
     return f"'data.source.exclude=[{','.join(names)}]'" if len(names) <= 100 else "data.source.exclude"

@@ -1,7 +1,7 @@
 """UESTC: 25,600 videos of 40 exercises by 118 subjects, as the SMPL poses that ACTOR's authors estimated with VIBE.
 
 Ji et al., "A Large-scale RGB-D Database for Arbitrary-view Human Action Recognition", ACM MM 2018; poses by Petrovich
-et al., "Action-Conditioned 3D Human Motion Synthesis with Transformer VAE", ICCV 2021. `docs/actions.md` describes it.
+et al., "Action-Conditioned 3D Human Motion Synthesis with Transformer VAE", ICCV 2021. Described in `docs/actions.md`.
 """
 
 from __future__ import annotations
@@ -26,23 +26,23 @@ TRAIN_SUBJECTS = (
     *(1, 2, 6, 12, 13, 16, 21, 24, 28, 29, 30, 31, 33, 35, 39, 41, 42, 45, 47, 50, 52, 54, 55, 57, 59, 61, 63),
     *(64, 67, 69, 70, 71, 73, 77, 81, 84, 86, 87, 88, 90, 91, 93, 96, 99, 102, 103, 104, 107, 108, 112, 113),
 )
-"""51 of the 118 subjects, the cross-subject protocol; the other 67 are for testing."""
+"""Training subjects of the cross-subject protocol: 51 of 118; the other 67 are for testing."""
 
 HELD_OUT = 5
-"""Training subjects that our split validates on."""
+"""Number of training subjects that our split uses for validation."""
 
 ROOT = 8
-"""The middle of the hips among VIBE's 49 joints, which ACTOR takes as the root."""
+"""Index of the middle of the hips among VIBE's 49 joints, which ACTOR uses as the root."""
 
 FOCAL_LENGTH, IMAGE_SIZE = 500.0, 540.0
-"""In pixels: the camera that ACTOR assumes where VIBE estimates a scale only."""
+"""Camera in pixels that ACTOR assumes, since VIBE estimates only a scale."""
 
 NAME = re.compile(r"a(\d+)_d(\d+)_p(\d+)_c(\d+)(_.*)?")
 
 
 @dataclass(frozen=True)
 class Video:
-    """What the name of a video says; `index` is its place in the lists."""
+    """Fields of a video's file name; `index` is its position in the lists."""
 
     index: int
     id: str
@@ -53,9 +53,9 @@ class Video:
 
 
 class UESTC(MotionSource):
-    """The clips of `vibe_cache_refined.pkl`, turned to the front view, as raw motions of the SMPL representations.
+    """The clips of `vibe_cache_refined.pkl`, rotated to the front view, as raw motions of the SMPL representations.
 
-    Training subjects' clips of fewer than `min_frames` frames are left out, as published; test clips are all kept.
+    As published, training clips of fewer than `min_frames` frames are left out and all test clips are kept.
     """
 
     name = "uestc"
@@ -63,17 +63,17 @@ class UESTC(MotionSource):
         "videos": 25600,
         "actions": 40,
         "subjects": 118,
-        "fewest training clips an action": 225,
-        "most training clips an action": 345,
+        "fewest training clips per action": 225,
+        "most training clips per action": 345,
     }
 
     def __init__(self, path: str, published_split: bool = False, min_frames: int = 45):
-        """Reads nothing yet.
+        """Stores the arguments; reads no files.
 
         Args:
-            path: the folder that holds `vibe_cache_refined.pkl` and `info`.
-            published_split: train on all 51 training subjects; otherwise 5 of them are for validation.
-            min_frames: of a training clip; published: three quarters of 60.
+            path: the folder that contains `vibe_cache_refined.pkl` and `info`.
+            published_split: train on all 51 training subjects; otherwise 5 of them are used for validation.
+            min_frames: minimum length of a training clip; published: three quarters of 60.
         """
         self.path, self.published_split, self.min_frames = Path(path), published_split, min_frames
         self._videos: list[Video] | None = None
@@ -82,12 +82,12 @@ class UESTC(MotionSource):
 
     @property
     def actions(self) -> tuple[str, ...]:
-        """Names of the actions, which stand in the files alone: models have to know their number before training."""
+        """Names of the actions, read from the data set: models need their number before training."""
         self.videos()
         return self._actions
 
     def count(self) -> int:
-        """Videos; the few that are left out are known when their poses are read."""
+        """Returns the number of videos, including the few left out when their poses are read."""
         return len(self.videos())
 
     def excluded(self) -> dict[str, int]:
@@ -97,10 +97,10 @@ class UESTC(MotionSource):
         return {"videos": self._size, "subjects": len({video.subject for video in self.videos()})}
 
     def videos(self) -> list[Video]:
-        """The videos that are used: of side 2, those of views 0 to 7. Reads the names of the actions, too.
+        """Returns the videos that are used: of side 2, only views 0 to 7. Also reads the names of the actions.
 
         Raises:
-            FileNotFoundError, ValueError: a file of `info` is absent or damaged.
+            FileNotFoundError, ValueError: a file of `info` is missing or damaged.
         """
         if self._videos is None:
             self._folder = find(self.path, "vibe_cache_refined.pkl").parent
@@ -128,7 +128,7 @@ class UESTC(MotionSource):
         if not self._size == len(frames) == len(poses):
             raise ValueError(
                 f"{self._folder}: names.txt has {self._size} lines, num_frames_min.txt {len(frames)} and "
-                f"vibe_cache_refined.pkl {len(poses)} clips; they have to be as many"
+                f"vibe_cache_refined.pkl {len(poses)} clips; the numbers must be equal"
             )
         self._excluded = Counter()
         if self._size > len(videos):
@@ -159,7 +159,7 @@ class UESTC(MotionSource):
             )
 
     def split(self, subject: int) -> Split:
-        """The split of a subject's clips."""
+        """Returns the split of a subject's clips."""
         if subject not in TRAIN_SUBJECTS:
             return "test"
         ranked = sorted(TRAIN_SUBJECTS, key=lambda s: hashlib.sha1(f"uestc_p{s:03d}".encode()).hexdigest())
@@ -167,19 +167,19 @@ class UESTC(MotionSource):
 
 
 def front_view(pose: np.ndarray, root: np.ndarray, camera: np.ndarray, video: Video) -> np.ndarray:
-    """A raw motion out of VIBE's estimates; what side 2 sees is turned about the vertical by its view.
+    """Converts VIBE's estimates to a raw motion; videos of side 2 are rotated about the vertical by their view.
 
-    VIBE's camera is weak: a scale s and a shift. ACTOR's code puts the body at the depth z at which a camera of focal
-    length f shows it in that size, z = f / (s w / 2) in an image w pixels wide, and at x, y = the shift.
+    VIBE's camera is weak-perspective: a scale s and a shift. ACTOR's code places the body at x, y = the shift and at
+    the depth z at which a camera of focal length f shows it in that size: z = f / (s w / 2) in an image w pixels wide.
 
     Args:
         pose: (F, 72) axis-angle.
-        root: (F, 3) the root joint relative to the body's place.
-        camera: (F, 4) scales sx and sy, of which the first counts, then the shift.
-        video: which view it is.
+        root: (F, 3) position of the root joint relative to the body.
+        camera: (F, 4) scales sx and sy, of which only the first is used, then the shift.
+        video: gives side and view.
 
     Returns:
-        (F, 75) float32: translation since the first frame and pose, in the camera's axes.
+        (F, 75) float32: translation relative to the first frame and pose, in camera axes.
     """
     depth = FOCAL_LENGTH / (np.abs(camera[:, 0]) * IMAGE_SIZE / 2)
     place = np.concatenate([camera[:, 2:], depth[:, None]], 1)
@@ -196,5 +196,5 @@ def _lines(path: Path) -> list[str]:
         return read_text(path).splitlines()
     except FileNotFoundError:
         raise FileNotFoundError(
-            f"{path}: it belongs to the set as ACTOR publishes it; unpack the archive again"
+            f"{path}: no such file; it is part of the data set published by ACTOR; unpack the archive again"
         ) from None

@@ -1,4 +1,4 @@
-"""A full report on a prepared data set: what is in it, how that compares with the published figures, what is odd."""
+"""Verification report of a prepared data set: contents, comparison with published figures, anomalies."""
 
 from __future__ import annotations
 
@@ -20,22 +20,22 @@ from flame_mdm.representations import Representation
 
 SPLITS: tuple[Split, ...] = get_args(Split)
 STILL = 0.01
-"""Metres; a clip in which no joint leaves its first place by more shows no movement."""
+"""Meters; a clip in which no joint moves farther from its first position counts as still."""
 
 FRAMES = 500_000
-"""Training frames that statistics are computed anew from, at most; they all fit in memory."""
+"""Maximum number of training frames from which statistics are recomputed, so that they fit in memory."""
 
 
 def report(data: MotionDataModule) -> dict[str, Any]:
-    """Hashes and scans the store, and writes what it finds into its folder as `verify.json`.
+    """Hashes and scans the store, and writes the report into its folder as `verify.json`.
 
     Returns:
         Plain values: files (SHA-256), figures (name -> found, published or None, state), captions, actions (clips by
         split), frames, still (ids), duplicates (groups of ids), duplicates_across_splits, statistics, excluded.
 
     Raises:
-        FileNotFoundError: nothing is prepared.
-        ValueError: the store is damaged: hashes, numbers that are not finite, a source in two splits.
+        FileNotFoundError: the data set is not prepared.
+        ValueError: the store is damaged: wrong hashes, non-finite numbers, or a source in two splits.
     """
     store = data.open()
     store.verify()
@@ -79,7 +79,7 @@ def report(data: MotionDataModule) -> dict[str, Any]:
 
 
 def lines(found: dict[str, Any]) -> list[str]:
-    """A report as an aligned table."""
+    """Returns the lines of a report as an aligned table."""
     rows: list[tuple[str, ...]] = []
 
     def section(title: str, *head: str) -> None:
@@ -88,7 +88,7 @@ def lines(found: dict[str, Any]) -> list[str]:
     rows.append(("data set", f"{found['dataset']} as {found['representation']} at {found['fps']:g} fps"))
     rows.append(("fingerprint", found["fingerprint"]))
     rows.append(
-        ("split", "the published one" if found["published_split"] else "without leaks: a source is in one only")
+        ("split", "as published" if found["published_split"] else "without leaks: each source is in one split only")
     )
     rows.extend((f"sha256 {name}", digest) for name, digest in found["files"].items())
     section("figures", "found", "published", "")
@@ -107,13 +107,13 @@ def lines(found: dict[str, Any]) -> list[str]:
         (f"  {name}", f"{number:g}" if isinstance(number, float) else str(number))
         for name, number in found["frames"].items()
     )
-    section("faults")
-    rows.append(("  numbers that are not finite", "0"))
+    section("anomalies")
+    rows.append(("  non-finite numbers", "0"))
     rows.append(("  clips without movement", str(len(found["still"])), _some(found["still"])))
     groups = [" = ".join(group) for group in found["duplicates"]]
-    rows.append(("  motions that are there twice", str(len(groups)), _some(groups)))
-    rows.append(("  of these in two splits", str(found["duplicates_across_splits"])))
-    section("mean and std, off from the training frames'")
+    rows.append(("  duplicate motions", str(len(groups)), _some(groups)))
+    rows.append(("  duplicates across splits", str(found["duplicates_across_splits"])))
+    section("deviation of mean and std from the training frames")
     rows.extend((f"  {name}", f"{number:.2g}") for name, number in found["statistics"].items())
     section("left out")
     rows.extend((f"  {reason}", str(number)) for reason, number in found["excluded"].items())
@@ -123,35 +123,35 @@ def lines(found: dict[str, Any]) -> list[str]:
 
 
 def _figures(store: Store, published: dict[str, int]) -> dict[str, dict[str, Any]]:
-    """Counts of the store and, before those of the same name, of the raw data as it was when the store was written."""
+    """Returns figures of the store and of the raw data when it was prepared; the raw data keeps names in both."""
     by_split = store.info["clips"]
     of_action = Counter(clip.action for clip in store.clips if clip.action is not None)
     training = Counter(clip.action for clip in store.clips if clip.action is not None and clip.split != "test")
     counted: dict[str, int] = {"clips": len(store.clips), **by_split}
     if of_action:
         counted["actions"] = len(of_action)
-        counted["fewest clips an action"] = min(of_action.values())
-        counted["most clips an action"] = max(of_action.values())
+        counted["fewest clips per action"] = min(of_action.values())
+        counted["most clips per action"] = max(of_action.values())
     if training:
-        counted["fewest training clips an action"] = min(training.values())
-        counted["most training clips an action"] = max(training.values())
+        counted["fewest training clips per action"] = min(training.values())
+        counted["most training clips per action"] = max(training.values())
     raw: dict[str, int] = store.info.get("counts", {})
     counted = {f"{name} of the store" if name in raw else name: number for name, number in counted.items()} | raw
     figures = {}
     for name in [*published, *(name for name in counted if name not in published)]:
-        given, number = published.get(name), counted.get(name)
-        if given is None:
+        expected, number = published.get(name), counted.get(name)
+        if expected is None:
             state = "not published"
         elif number is None:
             state = "not counted"
         else:
-            state = "ok" if number == given else "differs"
-        figures[name] = {"found": number, "published": given, "state": state}
+            state = "ok" if number == expected else "differs"
+        figures[name] = {"found": number, "published": expected, "state": state}
     return figures
 
 
 def _check_frames(store: Store) -> None:
-    """Every number of every clip is finite, and clips lie within the packed frames."""
+    """Raises `ValueError` if a clip has non-finite numbers or extends beyond the packed frames."""
     finite = np.concatenate(
         [np.isfinite(store.features[begin : begin + 65536]).all(1) for begin in range(0, len(store.features), 65536)]
     )
@@ -171,13 +171,13 @@ def _check_sources(store: Store) -> None:
     if leaks:
         source, found = next(iter(leaks.items()))
         raise ValueError(
-            f"{store.folder}: damaged: {len(leaks)} sources stand in two splits, such as {source} in "
+            f"{store.folder}: damaged: {len(leaks)} sources are in two splits, such as {source} in "
             f"{' and '.join(found)}; prepare it again"
         )
 
 
 def _motions(store: Store) -> list[list[Entry]]:
-    """Clips that share their very frames (one a caption), together."""
+    """Returns the clips grouped by motion: clips that share all their frames differ only in caption."""
     groups: defaultdict[tuple[int, int], list[Entry]] = defaultdict(list)
     for clip in store.clips:
         groups[clip.start, clip.length].append(clip)
@@ -185,7 +185,7 @@ def _motions(store: Store) -> list[list[Entry]]:
 
 
 def _still(store: Store, representation: Representation) -> list[str]:
-    """Ids of the clips without movement."""
+    """Returns the ids of clips without movement."""
     found = []
     for group in tqdm(_motions(store), "looking for movement", unit=" motions"):
         joints = representation.decode(torch.from_numpy(np.array(store.motion(group[0]))))
@@ -195,7 +195,7 @@ def _still(store: Store, representation: Representation) -> list[str]:
 
 
 def _duplicates(store: Store) -> list[list[str]]:
-    """Ids of motions that are there more than once, number for number; captions of one motion do not count."""
+    """Returns groups of ids of bit-identical motions; several captions of one motion are not duplicates."""
     groups: defaultdict[bytes, list[str]] = defaultdict(list)
     for group in _motions(store):
         groups[sha1(np.ascontiguousarray(store.motion(group[0])).tobytes()).digest()].append(group[0].id)
@@ -203,7 +203,7 @@ def _duplicates(store: Store) -> list[list[str]]:
 
 
 def _deviation(store: Store, representation: Representation) -> dict[str, float]:
-    """How far the statistics, which may be handed out with the set, are from those of its training frames."""
+    """Returns how far the statistics, which may be published with the data set, deviate from the training frames."""
     training = np.zeros(len(store.features), bool)
     for clip in store.clips:
         training[clip.start : clip.start + clip.length] |= clip.split == "train"
@@ -221,7 +221,7 @@ def _some(names: list[str]) -> str:
 
 
 def _aligned(rows: list[tuple[str, ...]]) -> list[str]:
-    """Columns as wide as their widest cell, but for last cells, which may be long."""
+    """Returns aligned rows; the last cell of a row, which may be long, does not count for the width of its column."""
     widths: Counter[int] = Counter()
     for row in rows:
         for column, cell in enumerate(row[:-1]):

@@ -166,7 +166,7 @@ LAST = "4 5 6 10 20 30 40 50 60 9.5"
         (ARM.replace("Yrotation Xrotation Zrotation", "Yrotation Yrotation Zrotation"), 9, "channels"),
         (ARM.replace("Yrotation Xrotation Zrotation", "Yrotation Wrotation Zrotation"), 9, "channels"),
         (ARM.replace("  JOINT Arm\n  {", "  JOINT Arm\n"), 8, "expected {"),
-        (ARM.replace("ROOT", "LIMB"), 2, "LIMB has no place"),
+        (ARM.replace("ROOT", "LIMB"), 2, "unexpected LIMB"),
         (ARM.replace("9.5\n", "9.5\n1 2\n"), 31, "2 numbers, but the joints have 10"),
         (ARM.replace("\n}\nMOTION", "\nMOTION"), 24, "before the end of the hierarchy"),
         (ARM.replace("Frames:\t3", "Frames: many"), 26, "expected Frames:"),

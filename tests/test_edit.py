@@ -283,7 +283,7 @@ def test_a_bvh_file_of_a_known_skeleton(diffusion, tmp_path):
     bvh.write(bvh.Bvh(("Bip01", *names[1:]), *skeleton[1:], frames, 50.0), file)
     assert read_motion(diffusion.representation, file).features.shape == expected.features.shape
     bvh.write(bvh.Bvh((*names[:-1], "Tail"), *skeleton[1:], frames, 50.0), file)
-    with pytest.raises(ValueError, match=r"take\.bvh: its joints .*Tail.* are those of none of the skeletons"):
+    with pytest.raises(ValueError, match=r"take\.bvh: its joints .*Tail.* do not match any of the known skeletons"):
         read_motion(diffusion.representation, file)
 
 
@@ -355,12 +355,12 @@ def test_a_motion_longer_than_those_of_the_training(motion):
         ({"joints": np.zeros((9, 21, 3)), "fps": 20}, r"shape \(9, 21, 3\), but humanml-clean-smpl22 takes"),
         ({"joints": np.zeros((9, 22)), "fps": 20}, r"joints of shape \(9, 22\), not \(frames, joints, 3\)"),
         ({"joints": np.full((9, 22, 3), np.nan), "fps": 30}, "are not finite"),
-        ({"joints": np.zeros((9, 22, 3))}, "does not give its frame rate"),
+        ({"joints": np.zeros((9, 22, 3))}, "no frame rate in the file"),
         ({"joints": np.zeros((9, 22, 3)), "fps": 0}, "fps is 0, not a number"),
-        ({"fps": 20}, "it holds fps; a motion is joints and fps"),
+        ({"fps": 20}, "contains fps; a motion has joints and fps"),
         (
             {"features": np.zeros((9, 251)), "fps": 12.5, "representation": "x"},
-            "it holds features, fps, representation; a motion",
+            "contains features, fps, representation; a motion",
         ),
         (
             {

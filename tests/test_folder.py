@@ -244,7 +244,7 @@ BAD = {
     "no rate": (lambda f: (f / "skeleton.yaml").unlink(), r"one\.npy: no frame rate in the file"),
     "cut": (lambda f: (f / "one.npy").write_bytes((f / "one.npy").read_bytes()[:900]), r"one\.npy: damaged"),
     "objects": (lambda f: np.save(f / "one.npy", np.array([{}])), r"one\.npy: damaged, or not a file of plain arrays"),
-    "keys": (lambda f: np.savez(f / "three.npz", x=1), r"three\.npz: it holds x"),
+    "keys": (lambda f: np.savez(f / "three.npz", x=1), r"three\.npz: contains x"),
     "flat": (lambda f: np.save(f / "one.npy", WALK.reshape(-1, 66)), r"one\.npy: joints of shape \(\d+, 66\)"),
     "23 joints": (lambda f: np.save(f / "one.npy", np.zeros((9, 23, 3))), r"one\.npy: 23 joints, not the 22, 24 or 52"),
     "17 joints": (lambda f: np.save(f / "one.npy", np.zeros((9, 17, 3))), r"one\.npy: 17 joints with unknown names"),
@@ -255,15 +255,15 @@ BAD = {
         lambda f: np.savez(f / "deep/two.npz", joints=WALK[..., [0, 2, 1]] * [1, -1, 1], fps=9),
         "the body is lying down",
     ),
-    "trans": (lambda f: np.savez(f / "three.npz", poses=np.zeros((9, 72))), r"three\.npz: AMASS's files hold poses"),
+    "trans": (lambda f: np.savez(f / "three.npz", poses=np.zeros((9, 72))), r"three\.npz: AMASS files have poses"),
     "yaml": (lambda f: skeleton(f, "fps: [30"), r"skeleton\.yaml: not a readable YAML file"),
     "yaml key": (lambda f: skeleton(f, "rate: 30"), r"skeleton\.yaml: unknown key rate; there are map, joints"),
     "yaml list": (lambda f: skeleton(f, "- 30"), r"skeleton\.yaml: unknown key list"),
     "yaml value": (lambda f: skeleton(f, "fps: 0"), r"skeleton\.yaml: fps: 0 is not valid"),
     "yaml up": (lambda f: skeleton(f, "up: x"), r"skeleton\.yaml: up: x is not valid"),
-    "yaml map": (lambda f: skeleton(f, "map: {pelvis: Hips}"), r"skeleton\.yaml: map: which joint stands for head"),
+    "yaml map": (lambda f: skeleton(f, "map: {pelvis: Hips}"), r"skeleton\.yaml: map: no joint given for head"),
     "yaml names": (lambda f: skeleton(f, f"joints: [a]\nmap: {MAP}"), r"map: head\?, .* is not among the joints"),
-    "other map": (lambda f: skeleton(f, f"fps: 30\nmap: {MAP}"), r"two\.npz: its joints .* are not those of the map"),
+    "other map": (lambda f: skeleton(f, f"fps: 30\nmap: {MAP}"), r"two\.npz: its joints .* do not match the map"),
 }
 
 
@@ -283,7 +283,8 @@ def test_every_fault_is_named_in_a_line(case: str, arrays: Path):
 def test_unknown_joints_are_listed(tmp_path: Path):
     bvh.write(bvh_of(("root", "tail"), WALK[:, :2], (-1, 0), 30.0), tmp_path / "cat.bvh")
     with pytest.raises(
-        ValueError, match=r"cat\.bvh: its joints \(root, tail\) are those of none of the skeletons SMPL, Mixamo, CMU"
+        ValueError,
+        match=r"cat\.bvh: its joints \(root, tail\) do not match any of the known skeletons SMPL, Mixamo, CMU",
     ):
         only(tmp_path)
 

@@ -1,1 +1,1 @@
-"""Motion files: what other programs read and write. `docs/formats.md` has units, axes and joints of each."""
+"""Motion files for exchange with other programs. `docs/formats.md` lists units, axes and joints of each format."""

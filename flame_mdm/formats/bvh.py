@@ -1,7 +1,7 @@
 """BVH motion capture files: reading, forward kinematics, resampling, writing.
 
-A BVH file is a tree of joints with offsets, and a table of numbers with one row per frame and one column per channel. A
-joint's rotation channels, in the order in which they are listed, are intrinsic Euler angles in degrees, so that
+A BVH file is a tree of joints with offsets, and a table of numbers with one row per frame and one column per channel.
+The rotation channels of a joint are intrinsic Euler angles in degrees, in the order in which they are listed:
 `Zrotation Xrotation Yrotation` means R = Rz Rx Ry on column vectors. Position channels replace the joint's offset.
 """
 
@@ -24,7 +24,7 @@ from flame_mdm.formats.resampling import RATES, between, slerp
 
 CHANNELS = tuple(f"{axis}{kind}" for kind in ("position", "rotation") for axis in "XYZ")
 LABELED = 200
-"""Most characters of a line with a label. Python takes quadratic time for numbers of many digits."""
+"""Maximum length of a line with a label. Python needs quadratic time for numbers with many digits."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,10 +34,10 @@ class Bvh:
     Attributes:
         joints: J names; end sites are not joints.
         parents: index of each joint's parent, smaller than its own; -1 for a root.
-        offsets: (J, 3) float64, resting place of each joint in its parent's frame.
-        channels: names of each joint's channels in the order of its columns, out of `CHANNELS`.
-        end_parents: the joint each end site hangs on.
-        end_offsets: (E, 3) float64, place of each end site in the frame of that joint.
+        offsets: (J, 3) float64, rest position of each joint in its parent's frame.
+        channels: names of each joint's channels in the order of its columns, from `CHANNELS`.
+        end_parents: the parent joint of each end site.
+        end_offsets: (E, 3) float64, position of each end site in the frame of that joint.
         frames: (F, C) float64, the channels of all joints in joint order; angles in degrees.
         fps: frames per second.
     """
@@ -52,12 +52,12 @@ class Bvh:
     fps: float
 
     def columns(self) -> list[slice]:
-        """Columns of `frames` that hold each joint's channels."""
+        """Returns the columns of `frames` with each joint's channels."""
         ends = list(itertools.accumulate(map(len, self.channels)))
         return [slice(end - len(names), end) for end, names in zip(ends, self.channels, strict=True)]
 
     def rotations(self) -> np.ndarray:
-        """(F, J, 3, 3) rotation of each joint in its parent's frame."""
+        """Returns the rotation (F, J, 3, 3) of each joint in its parent's frame."""
         columns_of: dict[str, list[list[int]]] = {}
         joints_of: dict[str, list[int]] = {}
         for joint, (names, column) in enumerate(zip(self.channels, self.columns(), strict=True)):
@@ -74,7 +74,7 @@ class Bvh:
         return rotations
 
     def translations(self) -> np.ndarray:
-        """(F, J, 3) place of each joint in its parent's frame: position channels, or the offset without them."""
+        """Returns the position (F, J, 3) of each joint in its parent's frame, from position channels or the offset."""
         translations = np.tile(self.offsets, (len(self.frames), 1, 1))
         for joint, (names, column) in enumerate(zip(self.channels, self.columns(), strict=True)):
             for k, name in enumerate(names):
@@ -83,26 +83,26 @@ class Bvh:
         return translations
 
     def positions(self) -> np.ndarray:
-        """(F, J, 3) place of each joint in the world."""
+        """Returns the position (F, J, 3) of each joint in the world."""
         return forward_kinematics(self.parents, self.rotations(), self.translations())[0]
 
     def end_positions(self) -> np.ndarray:
-        """(F, E, 3) place of each end site in the world."""
+        """Returns the position (F, E, 3) of each end site in the world."""
         positions, turned = forward_kinematics(self.parents, self.rotations(), self.translations())
         parents = list(self.end_parents)
         return positions[:, parents] + np.einsum("feij,ej->fei", turned[:, parents], self.end_offsets)
 
     def resample(self, fps: float) -> tuple[np.ndarray, np.ndarray]:
-        """Local motion at times 0, 1/fps, 2/fps, ... up to the last frame.
+        """Resamples the local motion to times 0, 1/fps, 2/fps, ... up to the last frame.
 
-        Rotations are interpolated on the sphere (slerp) and translations linearly, so bones whose translation does
-        not change keep their exact length, which interpolated joint positions would not.
+        Rotations are interpolated on the sphere (slerp) and translations linearly. Unlike with interpolated joint
+        positions, bones whose translation does not change keep their exact length.
 
         Returns:
             Rotations (F', J, 3, 3) and translations (F', J, 3), F' = floor((F - 1) * fps / self.fps) + 1.
 
         Raises:
-            ValueError: the motion would get too many frames.
+            ValueError: the resampled motion would have too many frames.
         """
         before, after, share = between(len(self.frames), self.fps, fps, len(self.joints), slack=0)
         translations = self.translations()
@@ -113,7 +113,7 @@ class Bvh:
 def forward_kinematics(
     parents: Sequence[int], rotations: np.ndarray, translations: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Local to world: G_j = G_p R_j and p_j = p_p + G_p t_j for a joint j with parent p.
+    """Converts local to world coordinates: G_j = G_p R_j and p_j = p_p + G_p t_j for a joint j with parent p.
 
     Args:
         parents: index of each joint's parent, smaller than its own; -1 for a root.
@@ -136,18 +136,18 @@ def read(path: str | Path) -> Bvh:
     """Reads a BVH file.
 
     Raises:
-        UserError: it is not a regular file, or too large.
-        ValueError: it is not a whole and valid BVH file; the message names the file and the line.
+        UserError: the path is not a regular file, or the file is too large.
+        ValueError: the file is not a complete and valid BVH file; the message names file and line.
     """
     regular_file(path, TEXT_LIMIT)
     return parse(Path(path).read_bytes(), str(path))
 
 
 def parse(data: bytes, name: str) -> Bvh:
-    """Reads the bytes of a BVH file, which messages call `name`.
+    """Reads the bytes of a BVH file; `name` is used in error messages.
 
     Raises:
-        ValueError: as `read`.
+        ValueError: as in `read`.
     """
     source = _Source(data, name)
     joints: list[str] = []
@@ -182,16 +182,14 @@ def parse(data: bytes, name: str) -> Bvh:
         elif keyword == "CHANNELS" and joint is not None and joint >= 0:
             names = tuple(source.token().capitalize() for _ in range(int(source.number())))
             if len(set(names)) < len(names) or not set(names) <= set(CHANNELS):
-                source.fail(
-                    f"channels have to be different ones of {', '.join(CHANNELS)}, found {' '.join(names)[:80]}"
-                )
+                source.fail(f"channels must be distinct and among {', '.join(CHANNELS)}, found {' '.join(names)[:80]}")
             channels[joint] = names
         elif keyword == "}" and joint is not None:
             if (end_offsets[-1] if joint < 0 else offsets[joint]) is None:
-                source.fail("a joint or an end site without OFFSET")
+                source.fail("joint or end site without OFFSET")
             blocks.pop()
         else:
-            source.fail(f"{keyword[:40]} has no place here")
+            source.fail(f"unexpected {keyword[:40]}")
     if blocks or not joints:
         source.fail("MOTION before the end of the hierarchy")
 
@@ -200,7 +198,7 @@ def parse(data: bytes, name: str) -> Bvh:
         source.labeled(r"Frame Time:\s*((?:\d+(?:\.\d+)?|\.\d+)(?:E[-+]?\d+)?)", "Frame Time: and a number of seconds")
     )
     if fps is None:
-        source.fail(f"the frame time has to lie between {1 / RATES[1]:g} and {1 / RATES[0]:g} seconds")
+        source.fail(f"the frame time must be between {1 / RATES[1]:g} and {1 / RATES[0]:g} seconds")
     return Bvh(
         tuple(joints),
         tuple(parents),
@@ -214,7 +212,7 @@ def parse(data: bytes, name: str) -> Bvh:
 
 
 class _Source:
-    """Lines of a BVH file, taken one after the other; knows the line to blame."""
+    """Lines of a BVH file, read one after the other; tracks the line number for error messages."""
 
     def __init__(self, data: bytes, name: str):
         self.name, self.line = name, 1
@@ -226,14 +224,14 @@ class _Source:
         self.lines = ((number, line.strip()) for number, line in enumerate(lines, 1) if line.strip())
         self.line, first = next(self.lines, (1, ""))
         if first.upper() != "HIERARCHY":
-            self.fail("not a BVH file (it has to begin with HIERARCHY)")
+            self.fail("not a BVH file (it must begin with HIERARCHY)")
         self.tokens = ((number, token) for number, line in self.lines for token in line.split())
 
     def fail(self, what: str) -> NoReturn:
         raise ValueError(f"{self.name}, line {self.line}: {what}")
 
     def token(self, expected: str = "") -> str:
-        """The next word of the hierarchy; has to be `expected`, where given, in any case of letters."""
+        """Returns the next word of the hierarchy; it must be `expected` (case-insensitive) if that is given."""
         self.line, token = next(self.tokens, (self.line, ""))
         if not token:
             self.fail("the file ends inside the hierarchy")
@@ -252,7 +250,7 @@ class _Source:
         return value
 
     def labeled(self, pattern: str, expected: str) -> str:
-        """The value on the next line, the first group of `pattern`."""
+        """Returns the value on the next line, the first group of `pattern`."""
         self.line, line = next(self.lines, (self.line, ""))
         match = re.fullmatch(pattern, line, re.IGNORECASE) if len(line) <= LABELED else None
         if match is None:
@@ -260,7 +258,7 @@ class _Source:
         return match[1]
 
     def table(self, count: int, width: int) -> np.ndarray:
-        """(count, width) float64, the numbers in all lines that are left."""
+        """Returns the numbers (count, width) float64 in all remaining lines."""
         rows, numbers = [], []
         for number, line in self.lines:
             self.line = number
@@ -273,17 +271,17 @@ class _Source:
             rows.append(row)
             numbers.append(number)
         if len(rows) != count or not rows:
-            self.fail(f"the file ends after {len(rows)} frames, but it has to have {max(count, 1)}")
+            self.fail(f"the file ends after {len(rows)} frames, but must have {max(count, 1)}")
         table = np.array(rows)
         finite = np.isfinite(table).all(1)
         if not finite.all():
             self.line = numbers[int(np.argmin(finite))]
-            self.fail("a number that is not finite")
+            self.fail("number is not finite")
         return table
 
 
 def write(bvh: Bvh, path: str | Path) -> None:
-    """Writes a BVH file that `read` turns into the same numbers; joints come in depth-first order."""
+    """Writes a BVH file that `read` converts back to the same numbers; joints are in depth-first order."""
     order: list[int] = []
     columns = bvh.columns()
 
@@ -315,10 +313,10 @@ def write(bvh: Bvh, path: str | Path) -> None:
 
 
 def _fps(seconds: str) -> float | None:
-    """Frames per second from a written frame time; None if that is out of reason.
+    """Returns frames per second from a frame time in text; None if it is out of range.
 
-    Files round the frame time (0.0333333 for 1/30), which would let a clip's last frame fall past its end after
-    resampling: a whole number of frames per second that the digits may stand for is meant.
+    Files round the frame time (0.0333333 for 1/30), which could move a clip's last frame past its end in resampling.
+    So if the frame time is a rounded integer rate, that integer is returned.
     """
     time = float(seconds)
     if not 1 / RATES[1] <= time <= 1 / RATES[0]:

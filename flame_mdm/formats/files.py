@@ -1,4 +1,4 @@
-"""Reading of motion files; `flame_mdm.formats.motion` writes them. `docs/formats.md` describes the files."""
+"""Readers of motion files; writers are in `flame_mdm.formats.motion`. `docs/formats.md` describes the files."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from flame_mdm.representations.smpl import ADULT, read_pose
 
 ENDINGS = (".npz", ".bvh", ".json", ".npy")
 CAMERA_AXES = torch.diag(torch.tensor([1.0, -1, -1], dtype=torch.float64))
-"""Turns the camera's world of the action data sets, y down, to y up."""
+"""Rotates the camera coordinates of the action data sets, y down, to y up."""
 ROTATED = {"smpl147": 147, "rot6d-25": 150}
-"""Representations that hold SMPL's rotations, and their numbers of features."""
+"""Representations that contain SMPL's rotations -> number of features."""
 JSON_LIMIT = 128 * MEBIBYTE
-"""Largest `.json` motion; parsed, it takes many times its size."""
+"""Maximum size of a `.json` motion; parsed, it takes many times its size."""
 
 
 def read(
@@ -35,16 +35,16 @@ def read(
 
     Args:
         path: the file.
-        fps: frames per second instead of those that the file gives; an .npy file gives none.
-        unit: metres per unit of the file's lengths, for .bvh (default: that of its skeleton, mostly centimetres) and
+        fps: frames per second, overrides the rate in the file; an .npy file has none.
+        unit: meters per unit of length in the file, for .bvh (default: that of its skeleton, mostly centimeters) and
             .npy (default 1).
-        resample_to: the frame rate wanted; joints are interpolated by cubic splines, the rotations of .bvh and AMASS
-            on the sphere. Default: frames are kept.
+        resample_to: target frame rate; joints are interpolated with cubic splines, the rotations of .bvh and AMASS on
+            the sphere. Default: frames are not resampled.
 
     Raises:
-        FileNotFoundError: there is no such file.
-        UserError: it is not a regular file.
-        ValueError: damaged, of another kind, or without a frame rate.
+        FileNotFoundError: the file does not exist.
+        UserError: the path is not a regular file.
+        ValueError: the file is damaged, of another kind, or has no frame rate.
     """
     path = Path(path)
     suffix = path.suffix.lower()
@@ -52,7 +52,7 @@ def read(
         raise ValueError(f"{path}: unknown kind of motion file. Use one of {', '.join(ENDINGS)}")
     regular_file(path)
     if unit is not None and suffix in (".npz", ".json"):
-        raise ValueError(f"{path}: lengths in {suffix} files are metres; unit is for .bvh and .npy")
+        raise ValueError(f"{path}: lengths in {suffix} files are in meters; unit is only for .bvh and .npy")
     try:
         if suffix == ".bvh":
             return _read_bvh(path, fps, unit, resample_to)
@@ -60,7 +60,7 @@ def read(
         if fps is not None:
             data["fps"] = frame_rate(fps)
         elif "fps" not in data:
-            raise ValueError("the file does not give its frame rate: set it with fps=20")
+            raise ValueError("no frame rate in the file: set it, for example with fps=20")
         text = str(data.get("text", ""))
         if "joints" not in data:
             translation, turns = smpl_motion(data, resample_to)
@@ -72,12 +72,12 @@ def read(
 
 
 def read_arrays(path: Path) -> dict[str, Any]:
-    """Reads the arrays of an .npz, .json or .npy motion: joints, or poses and trans as AMASS has them; fps if given.
+    """Reads the arrays of an .npz, .json or .npy motion: joints, or poses and trans as in AMASS; and fps if present.
 
     Raises:
-        FileNotFoundError: there is no such file.
-        UserError: it is not a regular file.
-        ValueError: damaged, or no motion; the message names the file.
+        FileNotFoundError: the file does not exist.
+        UserError: the path is not a regular file.
+        ValueError: the file is damaged or contains no motion; the message names the file.
     """
     suffix = path.suffix.lower()
     try:
@@ -89,13 +89,13 @@ def read_arrays(path: Path) -> dict[str, Any]:
             data = _read_json(path)
         if not {"joints", "poses"} & set(data):
             found = ", ".join(data) or "nothing"
-            raise ValueError(f"it holds {found}; a motion is joints and fps, or poses, trans and mocap_framerate")
+            raise ValueError(f"contains {found}; a motion has joints and fps, or poses, trans and mocap_framerate")
         for name in {"joints", "poses", "trans"} & set(data):
             _check_numbers(name, data[name])
         if "features" in data and (not _is_real(data["features"]) or data["features"].ndim != 2):
             raise ValueError("features are not an array (frames, features) of real numbers")
         if "poses" in data and data.get("trans", np.zeros(0)).shape != (len(data["poses"]), 3):
-            raise ValueError("AMASS's files hold poses (F, 3 K), trans (F, 3) and mocap_framerate")
+            raise ValueError("AMASS files have poses (F, 3 K), trans (F, 3) and mocap_framerate")
         keys = ("fps", "mocap_framerate", "mocap_frame_rate")
         rate = next((key for key in (keys if "joints" in data else keys[::-1]) if key in data), None)
         if rate is not None:
@@ -116,7 +116,7 @@ def _check_numbers(name: str, values: np.ndarray) -> None:
         raise ValueError(f"{name} of shape {values.shape} have no frames")
     check_frames(len(values))
     if (beyond := ~(np.abs(values) < 1e6)).any():
-        raise ValueError(f"numbers of {name} in frame {np.argwhere(beyond)[0][0]} are not finite, or beyond a million")
+        raise ValueError(f"numbers of {name} in frame {np.argwhere(beyond)[0][0]} are not finite, or exceed a million")
 
 
 def _read_json(path: Path) -> dict[str, Any]:
@@ -124,11 +124,11 @@ def _read_json(path: Path) -> dict[str, Any]:
     try:
         return {"joints": np.array(data["joints"], float), "fps": data["fps"], "text": str(data.get("caption", ""))}
     except (ValueError, TypeError, KeyError, OverflowError) as error:
-        raise ValueError(f"no motion in JSON, an object with joints and fps: {error}") from error
+        raise ValueError(f"not a motion in JSON, which is an object with joints and fps: {error}") from error
 
 
 def smpl_motion(data: dict[str, Any], fps: float | None = None) -> tuple[Tensor, Tensor]:
-    """Returns translation (F, 3) and quaternions (F, 24, 4), float64, of arrays of AMASS; `fps` resamples them.
+    """Returns translation (F, 3) and quaternions (F, 24, 4), float64, of AMASS arrays, resampled to `fps` if given.
 
     Raises:
         ValueError: fewer than 24 joints, or too many frames.
@@ -145,7 +145,7 @@ def smpl_motion(data: dict[str, Any], fps: float | None = None) -> tuple[Tensor,
 
 
 def _smpl_poses(translation: Tensor, rotations: Tensor, axes: Tensor) -> Poses:
-    """Poses of SMPL's mean body, turned to y up by `axes` (3, 3)."""
+    """Returns poses of SMPL's mean body, rotated to y up by `axes` (3, 3)."""
     offsets = torch.tensor(ADULT, dtype=torch.float64)
     rotations = rotations[:, : len(SMPL22)].clone()
     rotations[:, 0] = axes @ rotations[:, 0]
@@ -153,7 +153,7 @@ def _smpl_poses(translation: Tensor, rotations: Tensor, axes: Tensor) -> Poses:
 
 
 def _poses(data: dict[str, Any]) -> Poses | None:
-    """The rotations beside joints: as AMASS has them, or in features that are SMPL's; those of HumanML3D are not."""
+    """Returns the rotations stored with joints, from AMASS arrays or SMPL features; HumanML3D features contain none."""
     if "poses" in data:
         if len(data["poses"]) != len(data["joints"]):
             raise ValueError(f"{len(data['poses'])} frames of poses, but {len(data['joints'])} of joints")
@@ -193,17 +193,17 @@ def _read_bvh(path: Path, fps: float | None, unit: float | None, resample_to: fl
     tall = float(np.ptp(joints[..., 1], axis=1).max())
     if not 0.3 < tall < 3.5:
         raise ValueError(
-            f"the body is {tall:.3g} m tall. Set the metres per unit of the file: unit=1, 0.01 or 0.0254 (inches)"
+            f"the body is {tall:.3g} m tall. Set the meters per unit of the file: unit=1, 0.01 or 0.0254 (inches)"
         )
     return Motion(joints, rate, id=path.stem)
 
 
 def _skeleton(joints: np.ndarray) -> Skeleton:
-    """The skeleton of joints (F, J, 3), told by their number."""
+    """Returns the skeleton of joints (F, J, 3), identified by the number of joints."""
     if joints.ndim == 2 and joints.shape[1] in (263, 251):
         raise ValueError(
-            f"{joints.shape[1]} features of HumanML3D, not joints; the rotations among them are not SMPL's and are "
-            "never exported: decode joint positions from them (flame_mdm.representations.humanml) and convert those"
+            f"{joints.shape[1]} features of HumanML3D, not joints; their rotations are not SMPL's and cannot be "
+            "exported: decode joint positions (flame_mdm.representations.humanml) and convert those"
         )
     for skeleton in SKELETONS.values():
         if joints.ndim == 3 and joints.shape[1:] == (len(skeleton), 3):

@@ -22,21 +22,21 @@ UNSIGNED_BYTE, UNSIGNED_SHORT, FLOAT = 5121, 5123, 5126
 VERTICES, INDICES = 34962, 34963
 KINDS = {1: "SCALAR", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
 SIDES = 10
-"""Corners of the section of a limb."""
+"""Number of corners of a limb's cross section."""
 
 
 def write(path: Path, poses: Poses, fps: float, text: str, name: str) -> None:
-    """Writes metres, y up; the rest pose faces +z, as the format asks for.
+    """Writes a .glb file in meters, y up; the rest pose faces +z, as the format requires.
 
-    One node per joint, named as in SMPL, with one animation that turns all of them and moves the root, at the frames'
-    own times in seconds; one mesh of rounded limbs, skinned to the joints.
+    It contains one node per joint, named as in SMPL, one animation that rotates all nodes and moves the root, with one
+    key per frame in seconds, and one mesh of rounded limbs skinned to the joints.
     """
     binary = _Binary()
     rest = poses.rest().numpy()
     position, normal, color, joint, index = _figure(rest)
     weight = np.tile(np.array([1, 0, 0, 0], np.float32), (len(joint), 1))
     bind = np.tile(np.eye(4, dtype=np.float32), (len(rest), 1, 1))
-    bind[:, 3, :3] = -rest  # matrices stand in the file column by column
+    bind[:, 3, :3] = -rest  # matrices are stored in column-major order
     attributes = {
         "POSITION": binary.add(position, VERTICES, bounds=True),
         "NORMAL": binary.add(normal, VERTICES),
@@ -92,7 +92,7 @@ def write(path: Path, poses: Poses, fps: float, text: str, name: str) -> None:
 
 
 class _Binary:
-    """The binary part of the file: arrays one after the other, and what tells them apart."""
+    """The binary part of the file: concatenated arrays, with buffer views and accessors that describe them."""
 
     def __init__(self) -> None:
         self.data = bytearray()
@@ -100,7 +100,7 @@ class _Binary:
         self.accessors: list[dict[str, Any]] = []
 
     def add(self, array: np.ndarray, target: int | None = None, bounds: bool = False) -> int:
-        """Appends (N,) or (N, K) numbers and returns the number of their accessor."""
+        """Appends numbers (N,) or (N, K) and returns the index of their accessor."""
         rows = array.reshape(len(array), -1)
         component = {"u1": UNSIGNED_BYTE, "u2": UNSIGNED_SHORT, "f4": FLOAT}[rows.dtype.str[1:]]
         view = {"buffer": 0, "byteOffset": len(self.data), "byteLength": rows.nbytes}
@@ -116,7 +116,7 @@ class _Binary:
 
 
 def _figure(rest: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Limbs of the rest pose: positions, normals, linear colors, the joint (N, 4) each vertex moves with, triangles."""
+    """Returns the limbs of the rest pose: positions, normals, linear colors, joint (N, 4) of each vertex, triangles."""
     thickness, side_of, parents = radii(SMPL22), sides(SMPL22), SMPL22.parents
     limbs = []
     for joint, parent in enumerate(parents):
@@ -140,7 +140,7 @@ def _figure(rest: np.ndarray) -> tuple[np.ndarray, ...]:
 
 
 def _limb(a: np.ndarray, b: np.ndarray, radius_a: float, radius_b: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A limb with round ends: positions (N, 3), normals (N, 3) and triangles (T, 3), counterclockwise from outside."""
+    """Returns a limb with round ends: positions (N, 3), normals (N, 3), outward-facing triangles (T, 3)."""
     along = (b - a) / np.linalg.norm(b - a)
     side = np.cross(along, np.eye(3)[np.abs(along).argmin()])
     side /= np.linalg.norm(side)

@@ -1,4 +1,4 @@
-"""Skeletons of motion files: how their joints become the 22 joints of SMPL."""
+"""Skeletons of motion files and their mapping to the 22 joints of SMPL."""
 
 from __future__ import annotations
 
@@ -20,23 +20,23 @@ UP = {
     "z": ((1, 0, 0), (0, 0, 1), (0, -1, 0)),
     "-y": ((1, 0, 0), (0, -1, 0), (0, 0, -1)),
 }
-"""The axis that points up -> rows of the rotation that turns it to +y."""
+"""The axis that points up -> rows of the rotation that maps it to +y."""
 
 Place = str | Mapping[str, float]
-"""A joint of a file, or shares of several that lie around the place that is meant."""
+"""A joint of a file, or weights of several joints whose weighted mean is the position."""
 
 
 @dataclass(frozen=True)
 class Layout:
-    """How the joints of files become the 22 joints of SMPL, in metres, y up.
+    """Mapping from the joints of files to the 22 joints of SMPL, in meters, y up.
 
     Attributes:
-        map: for each of SMPL's joints the joint of the files that stands for it.
-        joints: names of the joints of arrays, in their order; BVH files bring their own.
-        unit: metres per unit of length in the files.
+        map: for each of SMPL's joints, the corresponding joint in the files.
+        joints: names of the joints of arrays, in order; BVH files contain their own.
+        unit: meters per unit of length in the files.
         up: the axis that points up.
-        mirrored: the files hold mirrored motion; x changes its sign.
-        fps: frames per second, for files that do not give it.
+        mirrored: the files contain mirrored motion; the sign of x is changed.
+        fps: frames per second, for files that do not contain it.
     """
 
     map: Mapping[str, Place]
@@ -47,11 +47,11 @@ class Layout:
     fps: float | None = None
 
     def knows(self, names: Sequence[str]) -> bool:
-        """Returns whether all joints that it maps from are among these."""
+        """Returns whether these names include all joints that the mapping uses."""
         return {name for place in self.map.values() for name in _shares(place)} <= set(names)
 
     def apply(self, positions: np.ndarray, names: Sequence[str]) -> np.ndarray:
-        """Joints (F, J, 3) of a file with these names -> (F, 22, 3) float32, metres, y up."""
+        """Maps joints (F, J, 3) of a file with these names to (F, 22, 3) float32, meters, y up."""
         weights = np.zeros((len(SMPL22), len(names)))
         for row, joint in zip(weights, SMPL22.joints, strict=True):
             for name, share in _shares(self.map[joint]).items():
@@ -65,7 +65,7 @@ def _shares(place: Place) -> Mapping[str, float]:
 
 
 def _body(left: str, right: str, limbs: Mapping[str, Place], **middle: Place) -> dict[str, Place]:
-    """A map whose limbs have the same names on both sides but for the mark of the side, which stands for `*`."""
+    """Returns a map whose limbs have the same names on both sides; the mark of the side replaces `*`."""
     both = {
         f"{side}_{joint}": {name.replace("*", mark): share for name, share in _shares(place).items()}
         for side, mark in (("left", left), ("right", right))
@@ -107,8 +107,8 @@ BANDAI = {
     "left_wrist": "Hand_L",
     "right_wrist": "Hand_R",
 }
-"""The joint of the BVH files of the Bandai-Namco set for each joint of SMPL, in the order of SMPL. The files have two
-joints between hips and neck where SMPL has three: spine1 is at 40 % of the way from Hips to Spine."""
+"""For each joint of SMPL, in order, the joint in the BVH files of the Bandai-Namco data set. The files have two joints
+between hips and neck, SMPL has three: spine1 is at 40 % of the distance from Hips to Spine."""
 LAYOUTS: dict[str, Layout] = {
     "SMPL": Layout(dict(zip(SMPL22.joints, SMPL22.joints, strict=True))),
     "Mixamo": Layout(
@@ -119,7 +119,7 @@ LAYOUTS: dict[str, Layout] = {
         ),
         unit=0.01,
     ),
-    # CMU, Bandai-Namco and MMM have two joints between hips and neck where SMPL has three. CMU's shoulders start in the
+    # CMU, Bandai-Namco and MMM have two joints between hips and neck, SMPL has three. CMU's shoulders start in the
     # middle of the chest; MMM has no collars.
     "CMU": Layout(
         _body(
@@ -141,28 +141,28 @@ LAYOUTS: dict[str, Layout] = {
         mirrored=True,
     ),
 }
-"""Skeletons that are known by the names of their joints. CMU's unit is that of its recordings, 0.45 an inch."""
+"""Known skeletons, recognized by the names of their joints. CMU's unit is that of its recordings: 0.45 per inch."""
 
 
 def read_bvh(
     path: Path, fps: float | None = None, given: Mapping[str, Any] = {}, rate: float | None = None
 ) -> tuple[np.ndarray, float]:
-    """The joints of SMPL in a BVH file of a known skeleton.
+    """Reads the joints of SMPL from a BVH file with a known skeleton.
 
     Args:
         path: the file.
-        fps: frames per second wanted; None = those of the file. Rotations are interpolated, so bones keep their length.
-        given: fields of `Layout` that replace the known ones. Joints with SMPL's own names are in centimetres, as
-            `flame_mdm.formats` writes them.
-        rate: replaces the frame rate that the file gives.
+        fps: target frames per second; None = those of the file. Rotations are interpolated, so bones keep their length.
+        given: fields of `Layout` that override the known ones. Joints with SMPL's names are in centimeters, as written
+            by `flame_mdm.formats`.
+        rate: overrides the frame rate of the file.
 
     Returns:
-        (F, 22, 3) float32 in metres, y up; frames per second.
+        Joints (F, 22, 3) float32 in meters, y up, and frames per second.
 
     Raises:
-        FileNotFoundError: there is no such file.
-        UserError: it is not a regular file, or too large.
-        ValueError: damaged, or an unknown skeleton.
+        FileNotFoundError: the file does not exist.
+        UserError: the path is not a regular file, or the file is too large.
+        ValueError: the file is damaged or has an unknown skeleton.
     """
     file = bvh.read(path)
     file = file if rate is None else replace(file, fps=rate)
@@ -180,7 +180,7 @@ def read_bvh(
 
 
 def find_layout(path: Path, names: Sequence[str], given: Mapping[str, Any]) -> Layout:
-    """Returns the layout of joints with these names: a known one, with its fields replaced by those that are given.
+    """Returns the known layout for joints with these names, with the fields in `given` overridden.
 
     Raises:
         ValueError: no known layout has these names.
@@ -188,26 +188,26 @@ def find_layout(path: Path, names: Sequence[str], given: Mapping[str, Any]) -> L
     known = (layout for layout in LAYOUTS.values() if layout.knows(names))
     layout = Layout(given["map"]) if "map" in given else next(known, None)
     if layout is None or not layout.knows(names):
-        which = "not those of the map" if "map" in given else f"those of none of the skeletons {', '.join(LAYOUTS)}"
+        which = "the map" if "map" in given else f"any of the known skeletons {', '.join(LAYOUTS)}"
         raise ValueError(
-            f"{path}: its joints ({', '.join(names)[:1000]}) are {which}. Rename them, or map them to SMPL's in the "
-            "skeleton.yaml of a folder of own data"
+            f"{path}: its joints ({', '.join(names)[:1000]}) do not match {which}. Rename them, or map them to SMPL's "
+            "in the skeleton.yaml of a folder of own data"
         )
     return replace(layout, **given)
 
 
 def read_skeleton(path: Path) -> dict[str, Any]:
-    """The fields of `Layout` that a skeleton file gives; the others are those of a known skeleton.
+    """Reads the fields of `Layout` in a skeleton file; the others are those of a known skeleton.
 
     Raises:
-        UserError: it cannot be read.
-        ValueError: it misnames something; the message names the file and the key.
+        UserError: the file cannot be read.
+        ValueError: a key or value is invalid; the message names the file and the key.
     """
     data = read_yaml(path)
     allowed = tuple(Layout.__dataclass_fields__)
     if not isinstance(data, dict) or not set(data) <= set(allowed):
         unknown = ", ".join(map(str, set(data) - set(allowed))) if isinstance(data, dict) else type(data).__name__
-        raise ValueError(f"{path}: unknown key {unknown}; there are {', '.join(allowed)}")
+        raise ValueError(f"{path}: unknown key {unknown}; use {', '.join(allowed)}")
     kinds = {"map": dict, "joints": list, "unit": (int, float), "up": str, "mirrored": bool, "fps": (int, float)}
     for key, value in data.items():
         fits = isinstance(value, kinds[key]) and (key == "mirrored" or not isinstance(value, bool))
@@ -216,14 +216,14 @@ def read_skeleton(path: Path) -> dict[str, Any]:
         fits = fits and (key != "fps" or RATES[0] <= value <= RATES[1])
         if not fits or (key == "unit" and not 0 < value < math.inf) or (key == "up" and value not in UP):
             raise ValueError(
-                f"{path}: {key}: {str(value)[:100]} is not valid. map and joints are a map and a list, unit (metres "
-                f"per unit) is a number above 0, fps one from {RATES[0]:g} to {RATES[1]:g}, up one of {', '.join(UP)}, "
-                "mirrored true or false"
+                f"{path}: {key}: {str(value)[:100]} is not valid. map is a mapping and joints a list of names, unit "
+                f"(meters per unit) a number above 0, fps one from {RATES[0]:g} to {RATES[1]:g}, up one of "
+                f"{', '.join(UP)}, mirrored true or false"
             )
     if "map" in data:
         missing = sorted(set(SMPL22.joints) - set(map(str, data["map"])))
         if missing:
-            raise ValueError(f"{path}: map: which joint stands for {', '.join(missing)}?")
+            raise ValueError(f"{path}: map: no joint given for {', '.join(missing)}")
         named = {name for place in data["map"].values() for name in _shares(place)}
         if "joints" in data and not named <= set(data["joints"]):
             raise ValueError(f"{path}: map: {', '.join(sorted(named - set(data['joints'])))} is not among the joints")
@@ -231,7 +231,7 @@ def read_skeleton(path: Path) -> dict[str, Any]:
 
 
 def _is_place(place: object) -> bool:
-    """Whether a value of the map is the name of a joint, or shares of several."""
+    """Returns whether a value of the map is the name of a joint or weights of several."""
     if not isinstance(place, dict):
         return isinstance(place, str)
     numbers = all(isinstance(share, int | float) and math.isfinite(share) for share in place.values())

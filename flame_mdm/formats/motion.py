@@ -1,8 +1,8 @@
-"""`Motion`: one motion outside the models, and the writers of motion files. `docs/formats.md` describes the files.
+"""`Motion`, one motion outside the models, and writers of motion files. `docs/formats.md` describes the files.
 
-The 6D rotations among the 263 features of HumanML3D are not SMPL's: they follow chains of their own and leave the twist
-of a bone open. So no rotation is ever taken from them; rotations come from joint positions (`flame_mdm.formats.poses`),
-or from features and files that hold SMPL's.
+The 6D rotations among the 263 features of HumanML3D are not SMPL's: they follow different chains and do not define the
+twist of a bone. They are never exported as rotations, which come from joint positions (`flame_mdm.formats.poses`) or
+from features and files that contain SMPL's rotations.
 """
 
 from __future__ import annotations
@@ -28,16 +28,16 @@ from flame_mdm.representations.skeleton import SMPL22, Skeleton
 from flame_mdm.representations.smpl import ADULT
 
 AMASS_AXES = torch.tensor([[-1.0, 0, 0], [0, 0, 1], [0, 1, 0]], dtype=torch.float64)
-"""Turns AMASS's world, z up, to y up as HumanML3D does: (-x, z, y). It is its own inverse."""
+"""Converts AMASS's coordinates, z up, to y up as in HumanML3D: (-x, z, y). It is its own inverse."""
 END_SITES = {
     **{"head": (0.0, 0.18, 0.0), "left_foot": (0.0, 0.0, 0.06), "right_foot": (0.0, 0.0, 0.06)},
     **{"left_wrist": ADULT[22], "right_wrist": ADULT[23]},
 }
-"""Tips of head, toes and hands beyond the last joints, metres, so that programs draw these bones at all."""
+"""Tips of head, toes and hands beyond the last joints, in meters; without them programs do not draw these bones."""
 EULER = tuple("YXZ" if name.endswith("shoulder") else "YZX" for name in SMPL22.joints)
-"""Order of each joint's angles, so that gimbal lock, the middle angle at 90 degrees, is far from what people do: not in
-bent knees, elbows and hips, not in a hanging arm, and not in a body that turns or bows."""
-CENTIMETRE = 0.01
+"""Euler order of each joint, chosen to keep gimbal lock (middle angle at 90 degrees) away from common poses: bent
+knees, elbows and hips, a hanging arm, a body that turns or bows."""
+CENTIMETER = 0.01
 
 
 @dataclass(eq=False, repr=False)
@@ -45,18 +45,18 @@ class Motion:
     """One motion outside the models: generated, real or read from a file.
 
     Attributes:
-        joints: (F, J, 3) float32 joint positions in metres, y up, floor at y = 0.
+        joints: (F, J, 3) float32 joint positions in meters, y up, floor at y = 0.
         fps: frames per second.
-        skeleton: names and parents of the J joints; `left_` and `right_` tell the sides.
+        skeleton: names and parents of the J joints; the prefixes `left_` and `right_` mark the sides.
         text: the caption, or the name of the action; "" if there is none.
-        id: name of the motion: a clip, a file, or the text and the number of the sample, which decide the noise.
+        id: name of the motion: a clip, a file, or text and sample number, which determine the noise.
         poses: rotations of SMPL's joints, if they are known.
         features: (F, D) float32 features in the units of the data; empty if they are not known.
         representation: name of the representation of the features.
-        contacts: (F, N) bool, True = this one of the N joints `skeleton.feet` is on the floor; None = unknown.
+        contacts: (F, N) bool, True if a joint of `skeleton.feet` is on the floor; None = unknown.
 
     Raises:
-        ValueError: wrong shapes, joints that are not finite, or a frame rate that is not a positive number.
+        ValueError: wrong shapes, non-finite joints, or a frame rate that is not a positive number.
     """
 
     joints: np.ndarray
@@ -94,7 +94,7 @@ class Motion:
         return f"{type(self).__name__}({name!r}, {len(self.joints)} frames, {self.fps:g} fps, {self.skeleton.name})"
 
     def posed(self) -> Poses:
-        """Returns the rotations, which are solved for from joint positions if they are not known.
+        """Returns the rotations; if they are not known, computes them from joint positions.
 
         Raises:
             ValueError: the skeleton is not SMPL's.
@@ -109,15 +109,15 @@ class Motion:
     def save(self, path: str | Path, **facts: Any) -> str:
         """Writes a motion file and returns a line that describes it.
 
-        `.npz` holds joints, frame rate, text and features, and AMASS's keys if rotations are known; `.bvh` and `.glb`
-        hold rotations, `.json` and `.npy` joints.
+        `.npz` contains joints, frame rate, text and features, and AMASS's keys if rotations are known. `.bvh` and
+        `.glb` contain rotations, `.json` and `.npy` joints.
 
         Args:
-            path: the file; its ending chooses the format.
-            facts: more entries of an `.npz` file, such as the seed.
+            path: the file; its extension selects the format.
+            facts: additional entries of an `.npz` file, such as the seed.
 
         Raises:
-            ValueError: an unknown ending, or a skeleton without SMPL's rotations as `.bvh` or `.glb`.
+            ValueError: the extension is unknown, or `.bvh` or `.glb` is requested for another skeleton than SMPL's.
             UserError: the file cannot be written.
         """
         path = Path(path)
@@ -129,7 +129,7 @@ class Motion:
         return f"{path}: {len(self.joints)} frames at {self.fps:g} per second, {what}"
 
     def show(self) -> Any:
-        """Returns a player: an HTML display in a notebook, elsewhere the path of a page to open in any browser."""
+        """Returns a player: an HTML display in a notebook, otherwise the path of a page to open in any browser."""
         from flame_mdm.visualize import player_page
 
         page = player_page([self], self.text or self.id or "Motion")
@@ -155,7 +155,7 @@ def _write_npz(motion: Motion, path: Path, facts: dict[str, Any]) -> str:
     content |= {"text": motion.text, "representation": motion.representation}
     if not motion.features.size:
         del content["features"], content["representation"]
-    what = f"{len(motion.skeleton)} joints in metres, y up"
+    what = f"{len(motion.skeleton)} joints in meters, y up"
     if motion.poses is not None:
         world = motion.poses.rotations.clone()
         world[:, 0] = AMASS_AXES @ world[:, 0]
@@ -167,7 +167,7 @@ def _write_npz(motion: Motion, path: Path, facts: dict[str, Any]) -> str:
             "gender": "neutral",
             "mocap_framerate": motion.fps,
         }
-        what += "; as AMASS, SMPL+H poses in axis-angle, metres, z up, bones of the lengths of SMPL's body"
+        what += "; also in AMASS's format: SMPL+H poses in axis-angle, meters, z up, bone lengths of SMPL's body"
     with atomic_write(path) as temporary:
         np.savez_compressed(temporary, **content, **facts)
     return what
@@ -177,8 +177,8 @@ def _write_bvh(motion: Motion, path: Path) -> str:
     poses = motion.posed()
     angles = np.round(np.degrees(continuous_euler(poses.rotations).numpy()), 6)
     rotations = [tuple(f"{axis}rotation" for axis in order) for order in EULER]
-    root = np.round(poses.root.numpy() / CENTIMETRE, 5)
-    offsets = np.round(poses.offsets.numpy() / CENTIMETRE, 5)
+    root = np.round(poses.root.numpy() / CENTIMETER, 5)
+    offsets = np.round(poses.offsets.numpy() / CENTIMETER, 5)
     offsets[0] = 0  # programs disagree on whether the root's channels replace its offset or add to it
     bvh.write(
         bvh.Bvh(
@@ -187,20 +187,20 @@ def _write_bvh(motion: Motion, path: Path) -> str:
             offsets=offsets,
             channels=(("Xposition", "Yposition", "Zposition", *rotations[0]), *rotations[1:]),
             end_parents=tuple(SMPL22.joints.index(name) for name in END_SITES),
-            end_offsets=np.array(list(END_SITES.values())) / CENTIMETRE,
+            end_offsets=np.array(list(END_SITES.values())) / CENTIMETER,
             frames=np.concatenate([root, angles.reshape(len(angles), -1)], 1),
             fps=motion.fps,
         ),
         path,
     )
-    return f"centimetres, y up; {_error(motion, poses)}"
+    return f"centimeters, y up; {_error(motion, poses)}"
 
 
 def continuous_euler(matrices: Tensor) -> Tensor:
-    """Rotations (F, J, 3, 3) -> Euler angles (F, J, 3) in the orders of `EULER`, radians, free of jumps.
+    """Converts rotations (F, J, 3, 3) to Euler angles (F, J, 3) in the orders of `EULER`, radians, without jumps.
 
-    Of the two triples that stand for a rotation, and of the turns that may be added to each angle, the ones nearest to
-    the frame before are taken, so that programs may interpolate; two turns of the body end at 720 degrees.
+    A rotation has two triples of angles, and full turns may be added to each angle. The angles nearest to the previous
+    frame are used, so that programs can interpolate; two full turns of the body end at 720 degrees.
     """
     turn = 2 * torch.pi
     first = torch.stack([rotation.matrix_to_euler(matrices[:, j], order) for j, order in enumerate(EULER)], 1)
@@ -217,7 +217,7 @@ def continuous_euler(matrices: Tensor) -> Tensor:
 def _write_glb(motion: Motion, path: Path) -> str:
     poses = motion.posed()
     glb.write(path, poses, motion.fps, motion.text, motion.id)
-    return f"metres, y up; {_error(motion, poses)}"
+    return f"meters, y up; {_error(motion, poses)}"
 
 
 def _write_json(motion: Motion, path: Path) -> str:
@@ -227,17 +227,17 @@ def _write_json(motion: Motion, path: Path) -> str:
         "joints": np.round(motion.joints.astype(float), 5).tolist(),
     }
     write_text(path, json.dumps(content, separators=(",", ":"), ensure_ascii=False))
-    return f"{len(motion.skeleton)} joints in metres, y up"
+    return f"{len(motion.skeleton)} joints in meters, y up"
 
 
 def _write_npy(motion: Motion, path: Path) -> str:
     with atomic_write(path) as temporary:
         np.save(temporary, motion.joints)
-    return f"joints {motion.joints.shape} in metres, y up; the file itself does not say its frame rate"
+    return f"joints {motion.joints.shape} in meters, y up; the file does not contain the frame rate"
 
 
 def _error(motion: Motion, poses: Poses) -> str:
-    """How far joints of constant bones are from those of the motion."""
+    """Describes the distance between joints with constant bone lengths and those of the motion."""
     off = np.linalg.norm(poses.joints().numpy() - motion.joints[:, : len(SMPL22)], axis=-1)
     mean, most = 1000 * off.mean(), 1000 * off.max()
-    return f"bones of constant length, joints {mean:.2g} mm off on average and {most:.2g} mm at most"
+    return f"constant bone lengths; mean joint error {mean:.2g} mm, max {most:.2g} mm"

@@ -15,29 +15,29 @@ from flame_mdm.representations.smpl import ADULT
 CHILDREN = tuple(tuple(joint for joint, parent in enumerate(SMPL22.parents) if parent == j) for j in range(len(SMPL22)))
 PELVIS, SPINE3 = 0, 9
 SPINE = {3: 1 / 3, 6: 2 / 3}
-"""Joints between pelvis and chest, and how far each has turned from the one to the other."""
+"""Joints between pelvis and chest -> fraction of the rotation from pelvis to chest."""
 FORWARD = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
 BENDS = {1: -FORWARD, 2: -FORWARD, 16: FORWARD, 17: FORWARD}
-"""Hips and shoulders, and where a knee or an elbow bends the limb to in the rest pose."""
+"""Hips and shoulders -> direction in which the knee or elbow bends the limb in the rest pose."""
 STRAIGHT = 0.15
-"""Sine of the bend at which a knee or elbow says as much about the twist of its limb as the body that carries it;
-squares weigh, so that a clear bend decides almost alone."""
+"""Sine of the bend at which a knee or elbow has the same weight for the twist of its limb as the parent's rotation.
+Weights are squared, so that a clear bend dominates."""
 FOOT = 0.3
-"""Weight of the foot beside the shin in the twist of a thigh: it tells the twist of a straight leg."""
+"""Weight of the foot relative to the shin in the twist of a thigh: it determines the twist of a straight leg."""
 SMOOTH = 0.1
-"""Seconds over which the bend is averaged before a limb is twisted by it, so that a hand that passes through the
-straight arm does not spin it. Positions do not depend on the twist."""
+"""Seconds over which the bend is averaged before it determines the twist, so that an arm does not spin when it passes
+through the straight position. Joint positions do not depend on the twist."""
 
 
 @dataclass(eq=False)
 class Poses:
-    """A body in motion: metres, y up; the rest pose is SMPL's, arms out to the sides, facing +z, left at +x.
+    """A body in motion, in meters, y up; the rest pose is SMPL's: arms out to the sides, facing +z, left at +x.
 
     Attributes:
-        offsets: (22, 3) float64, where each joint of `SMPL22` sits relative to its parent in the rest pose.
+        offsets: (22, 3) float64, position of each joint of `SMPL22` relative to its parent in the rest pose.
         rotations: (F, 22, 3, 3) float64, of the root in the world and of each other joint relative to its parent. A
-            joint's rotation turns the bones that leave it.
-        root: (F, 3) float64, where the pelvis is.
+            joint's rotation applies to the bones that leave it.
+        root: (F, 3) float64, position of the pelvis.
     """
 
     offsets: Tensor
@@ -45,40 +45,40 @@ class Poses:
     root: Tensor
 
     def joints(self) -> Tensor:
-        """(F, 22, 3) joint positions."""
+        """Returns joint positions (F, 22, 3)."""
         return forward_kinematics(SMPL22, self.rotations, self.offsets, self.root)
 
     def quaternions(self) -> Tensor:
-        """(F, 22, 4) w, x, y, z of the rotations, without changes of sign from frame to frame."""
+        """Returns quaternions (F, 22, 4), w, x, y, z, without sign changes between frames."""
         return rotation.continuous(rotation.matrix_to_quaternion(self.rotations), dim=0)
 
     def rest(self) -> Tensor:
-        """(22, 3) joint positions of the rest pose, its lowest joint on the floor."""
+        """Returns joint positions (22, 3) of the rest pose, with the lowest joint on the floor."""
         identity = torch.eye(3, dtype=self.offsets.dtype).expand(1, len(SMPL22), 3, 3)
         joints = forward_kinematics(SMPL22, identity, self.offsets, self.offsets.new_zeros(1, 3))[0]
         return joints - joints.new_tensor([0, 1, 0]) * joints[:, 1].min()
 
 
 def solve(joints: Tensor, fps: float) -> Poses:
-    """The body and the rotations that put its joints where they are in every frame.
+    """Computes a body and rotations that reproduce its joint positions in every frame.
 
-    Bones get their mean length over the clip. Pelvis and chest, from which three bones leave, are turned to fit all of
-    them best (Kabsch 1976); every other joint points its bone at the place of the joint at its end. So the positions
-    come out exactly where bones keep their length and the three bones of pelvis and chest their angles, as in recorded
-    motion. What positions leave open is the turn of a bone about itself: thighs and upper arms are twisted so that
-    knees and elbows bend like hinges, the spine turns evenly from pelvis to chest, all else follows its parent. Head,
-    hands and toes have no bone to show their turn.
+    Bones get their mean length over the clip. Pelvis and chest, which have three bones each, are rotated for the best
+    fit of all three (Kabsch 1976); every other joint aims its bone at the next joint. The positions are reproduced
+    exactly if bones keep their length and the three bones of pelvis and chest their angles, as in recorded motion.
+    Positions do not determine the twist of a bone about its own axis: thighs and upper arms are twisted so that knees
+    and elbows bend like hinges, the spine twists evenly from pelvis to chest, and all other joints follow their parent.
+    The rotations of head, hands and toes are not observable.
 
     Args:
-        joints: (F, 22, 3) positions in metres, y up, in the order of `SMPL22`.
-        fps: frames a second.
+        joints: (F, 22, 3) positions in meters, y up, in the order of `SMPL22`.
+        fps: frames per second.
 
     Raises:
-        ValueError: joints of another skeleton, or a bone that has no length.
+        ValueError: the joints are of another skeleton, or a bone has no length.
     """
     if joints.ndim != 3 or not len(joints) or joints.shape[1:] != (len(SMPL22), 3):
         raise ValueError(
-            f"joint rotations are found for the {len(SMPL22)} joints of SMPL, (frames, {len(SMPL22)}, 3); "
+            f"joint rotations are computed only for the {len(SMPL22)} joints of SMPL, (frames, {len(SMPL22)}, 3); "
             f"these joints have shape {tuple(joints.shape)}: write them as .json or .npy"
         )
     joints = joints.double()
@@ -86,7 +86,7 @@ def solve(joints: Tensor, fps: float) -> Poses:
     lengths = torch.linalg.vector_norm(bones, dim=-1).mean(0)
     if (lengths[1:] < 1e-4).any():
         name = SMPL22.joints[int(lengths[1:].argmin()) + 1]
-        raise ValueError(f"the bone that ends in {name} has no length, so that nothing tells its direction")
+        raise ValueError(f"the bone that ends in {name} has no length, so its direction is undefined")
     adult = torch.tensor(ADULT[: len(SMPL22)], dtype=torch.float64)
     offsets = lengths[:, None] * F.normalize(adult, dim=-1)
     for joint in (PELVIS, SPINE3):
@@ -122,7 +122,7 @@ def solve(joints: Tensor, fps: float) -> Poses:
 
 
 def _fit(offsets: Tensor, bones: Tensor) -> Tensor:
-    """The rotations (F, 3, 3) that turn K offsets (K, 3) closest to K bones (F, K, 3)."""
+    """Returns rotations (F, 3, 3) that best align K offsets (K, 3) with K bones (F, K, 3)."""
     u, _, vt = torch.linalg.svd(bones.mT @ offsets)
     sign = torch.ones_like(bones[:, 0])
     sign[:, 2] = torch.linalg.det(u @ vt)
@@ -130,7 +130,7 @@ def _fit(offsets: Tensor, bones: Tensor) -> Tensor:
 
 
 def _twist(joint: int, swung: Tensor, offset: Tensor, bones: Tensor, fps: float) -> Tensor:
-    """Quaternions (F, 4) that turn a limb about itself, until the hinge at its end stands as its bend shows."""
+    """Returns quaternions (F, 4) that rotate a limb about its axis so that the hinge at its end matches the bend."""
     middle = CHILDREN[joint][0]
     end = CHILDREN[middle][0]
     axis = F.normalize(rotation.rotate(swung, offset), dim=-1)
@@ -147,7 +147,7 @@ def _twist(joint: int, swung: Tensor, offset: Tensor, bones: Tensor, fps: float)
 
 
 def _smooth(x: Tensor, frames: float) -> Tensor:
-    """(F, N), averaged over time with a Gaussian of this width in frames."""
+    """Smooths (F, N) over time with a Gaussian whose standard deviation is `frames`."""
     from scipy.ndimage import gaussian_filter1d
 
     return torch.from_numpy(gaussian_filter1d(x.numpy(), frames, axis=0, mode="nearest"))

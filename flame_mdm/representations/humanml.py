@@ -14,10 +14,10 @@ from flame_mdm.representations.skeleton import SKELETONS, global_rotations
 
 LEGACY_SMOOTHING_FRAMES = 20
 SMOOTHING_SECONDS = 1.0
-"""Deviation of the Gaussian that takes the swing of the arms out of the heading: 20 frames at 20 fps, as published."""
+"""Standard deviation of the Gaussian that removes arm swing from the heading: 20 frames at 20 fps, as published."""
 
 SMALLEST_STD = 1e-4
-"""A group of features that varies less is constant up to rounding (positions in KIT's units round to 3e-5)."""
+"""A group of features with a smaller std is constant up to rounding (positions in KIT's units round to 3e-5)."""
 
 
 class HumanML(Representation):
@@ -28,26 +28,26 @@ class HumanML(Representation):
     | name | width | content |
     |---|---|---|
     | turn | 1 | heading change to the next frame, radians |
-    | root_velocity | 2 | x and z of the root's way to the next frame, seen by the body |
+    | root_velocity | 2 | x and z of the root's displacement to the next frame, in body coordinates |
     | root_height | 1 | y of the root |
-    | positions | 3 (J - 1) | joints but the root, seen by the body: root at x = z = 0, facing +z |
-    | rotations | 6 (J - 1) | 6D (columns) of each bone relative to the one before; shortest arcs, no SMPL rotations |
-    | velocities | 3 J | each joint's way to the next frame, seen by the body |
-    | contacts | 4 | 1 where a foot joint (`skeleton.feet`) hardly moves to the next frame |
+    | positions | 3 (J - 1) | joints except the root, in body coordinates: root at x = z = 0, facing +z |
+    | rotations | 6 (J - 1) | 6D (columns) of each bone relative to the previous one; shortest arcs, not SMPL's |
+    | velocities | 3 J | each joint's displacement to the next frame, in body coordinates |
+    | contacts | 4 | 1 if a foot joint (`skeleton.feet`) hardly moves to the next frame |
 
-    The heading is 0 where the body faces +z and grows as it turns left, towards +x. Motions are made canonical first:
-    lowest joint at y = 0, the root of the first frame at x = z = 0, facing +z there.
+    The heading is 0 when the body faces +z and increases as it turns left, towards +x. Motions are first made
+    canonical: lowest joint at y = 0, root of the first frame at x = z = 0, facing +z there.
 
-    Variant "legacy" equals the published data with all its peculiarities: its heading subtracts the hips from the
-    shoulders in place of adding them, and is 0 in the first frame although the smoothed one is not; `turn` is half the
-    turn to the right and changes sign where the heading crosses 180 degrees; the root velocity is seen by the next
-    frame's body; rotations are those of bones in the world relative to the inverse heading, also at the shoulders. Its
-    `decode` is the published one. Where a bone is exactly opposite to its rest direction, the published code gives NaN;
-    here it is a half turn.
+    Variant "legacy" equals the published data with all its peculiarities. Its heading subtracts the hips from the
+    shoulders instead of adding them, and is 0 in the first frame although the smoothed heading is not. `turn` is half
+    the turn to the right and changes sign where the heading crosses 180 degrees. The root velocity is in the body
+    coordinates of the next frame. Rotations are those of bones in the world relative to the inverse heading, also at
+    the shoulders. `decode` is the published one. If a bone is exactly opposite to its rest direction, the published
+    code gives NaN; here it is a half turn.
 
-    Variant "clean" has none of these. Headings are unwrapped before they are smoothed, point-symmetrically past both
-    ends, which keeps the first and the last heading and steady turns as they are; rotations are those of the body that
-    faces +z, each relative to its parent in the skeleton.
+    Variant "clean" has none of these. Headings are unwrapped before smoothing and padded point-symmetrically at both
+    ends, which preserves the first and the last heading and steady turns. Rotations are those of the body facing +z,
+    each relative to its parent in the skeleton.
     """
 
     def __init__(
@@ -59,20 +59,20 @@ class HumanML(Representation):
         units_per_metre: float = 1.0,
         contact_threshold: float = 0.002,
     ):
-        """Joints come in and go out in metres; features are in units of 1 / `units_per_metre` metres.
+        """Input and output joints are in meters; features are in units of 1 / `units_per_metre` meters.
 
         Args:
             skeleton: key in `SKELETONS`.
-            variant: the features as they are meant, or as they were published.
-            fps: frames a second of the motions.
-            bone_lengths: J lengths in the features' unit, of the bone that ends in each joint, to give to every motion;
-                None leaves each motion its own.
-            units_per_metre: KIT's features are in units of about 1/640 of a metre.
-            contact_threshold: squared way of a foot to the next frame, in the features' unit, below which it is in
-                contact: 0.002 for HumanML3D, 0.05 for KIT.
+            variant: "clean" for the intended features, "legacy" for the published ones.
+            fps: frames per second of the motions.
+            bone_lengths: J lengths in the features' unit, of the bone that ends in each joint, that all motions are
+                retargeted to; None keeps the lengths of each motion.
+            units_per_metre: KIT's features are in units of about 1/640 of a meter.
+            contact_threshold: squared displacement of a foot per frame, in the features' unit, below which the foot is
+                in contact: 0.002 for HumanML3D, 0.05 for KIT.
 
         Raises:
-            ValueError: an unknown skeleton or variant, or the wrong number of bone lengths.
+            ValueError: the skeleton or variant is unknown, or the number of bone lengths is wrong.
         """
         if skeleton not in SKELETONS:
             raise ValueError(f"skeleton: {skeleton!r} is unknown; use one of {', '.join(SKELETONS)}")
@@ -98,15 +98,15 @@ class HumanML(Representation):
         self.contact_threshold = contact_threshold
 
     def encode(self, motion: Tensor) -> Tensor:
-        """Joints (T, J, 3) in metres, y up -> features (T - 1, D) float32.
+        """Encodes joints (T, J, 3) in meters, y up, as features (T - 1, D) float32.
 
         Raises:
-            ValueError: fewer than 3 frames, another number of joints, or coordinates that are not finite.
+            ValueError: fewer than 3 frames, another number of joints, or non-finite coordinates.
         """
         return self.encode_many([motion])[0]
 
     def encode_many(self, motions: Sequence[Tensor]) -> list[Tensor]:
-        """Encodes several motions; one pass over all their frames is faster than one pass a motion."""
+        """Encodes several motions; one pass over all their frames is faster than one pass per motion."""
         joints, lengths = self._canonical(motions)
         heading = torch.cat([self._heading(clip) for clip in joints.split(lengths)])
         last = torch.tensor(lengths).cumsum(0) - 1
@@ -129,15 +129,15 @@ class HumanML(Representation):
         return list(torch.cat([part.float() for part in features], 1).split([length - 1 for length in lengths]))
 
     def canonicalize(self, motion: Tensor) -> Tensor:
-        """Joints (T, J, 3) in metres -> (T, J, 3) float64, as the features see them: `decode(encode(motion))`.
+        """Returns canonical joints (T, J, 3) float64 of joints (T, J, 3) in meters, equal to `decode(encode(motion))`.
 
         Raises:
-            ValueError: as `encode`.
+            ValueError: as in `encode`.
         """
         return self._canonical([motion])[0] / self.units_per_metre
 
     def decode(self, features: Tensor) -> Tensor:
-        """Features (..., F, D) -> joints (..., F, J, 3) in metres, from turn, root and positions. Differentiable."""
+        """Decodes turn, root and positions of features (..., F, D) to joints (..., F, J, 3), meters. Differentiable."""
         heading, root = self._root(features)
         local = features[..., self.slices["positions"]].unflatten(-1, (-1, 3))
         turned = rotation.rotate_y(local, heading[..., None])
@@ -145,11 +145,11 @@ class HumanML(Representation):
         return torch.cat([root[..., None, :], turned + ground[..., None, :]], -2) / self.units_per_metre
 
     def decode_rotations(self, features: Tensor, bone_lengths: Tensor) -> Tensor:
-        """Features (..., F, D) -> joints (..., F, J, 3) in metres, from turn, root and rotations. Differentiable.
+        """Decodes turn, root and rotations of features (..., F, D) to joints (..., F, J, 3), meters. Differentiable.
 
         Args:
             features: in the data's units.
-            bone_lengths: (J,) metres, length of the bone that ends in each joint.
+            bone_lengths: (J,) meters, length of the bone that ends in each joint.
         """
         heading, root = self._root(features)
         facing = torch.zeros_like(root)
@@ -161,14 +161,15 @@ class HumanML(Representation):
         return self.skeleton.assemble((turned @ offsets[..., None])[..., 0], root / self.units_per_metre)
 
     def root(self, features: Tensor) -> tuple[Tensor, Tensor]:
-        """Features (..., F, D) -> heading (..., F) in radians, 0 = +z, positive to the left; position (..., F, 3)."""
+        """Returns heading (..., F) in radians, 0 = +z, positive to the left, and position (..., F, 3) of the root."""
         heading, position = self._root(features)
         return heading, position / self.units_per_metre
 
     def statistics(self, features: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean of each feature; std averaged over each entry of `slices`, so that scales within one stay as they are.
+        """Returns the mean of each feature, and the std averaged over each entry of `slices`.
 
-        A group that does not vary (`SMALLEST_STD`) gets 1: it carries nothing, and must not blow up rounding errors.
+        Averaging preserves the relative scales within an entry. A constant entry (`SMALLEST_STD`) gets std 1, so that
+        rounding errors are not amplified.
         """
         chunks = features.split(1 << 16)  # the frames of a data set, in float64, would not fit in memory
         mean = sum((chunk.double().sum(0) for chunk in chunks), torch.zeros(())) / len(features)
@@ -180,9 +181,9 @@ class HumanML(Representation):
         return mean.float(), std.float()
 
     def joint_features(self, joints: Iterable[int]) -> Tensor:
-        """As the contract: (D,) bool, True for the features that describe these joints.
+        """Returns (D,) bool, True for the features of these joints; the root features belong to joint 0.
 
-        The root features belong to joint 0. With the lower body, root included, this is MDM's `HML_LOWER_BODY_MASK`.
+        For the lower body, including the root, this equals MDM's `HML_LOWER_BODY_MASK`.
         """
         part = torch.zeros(len(self.skeleton), dtype=torch.bool)
         part[list(joints)] = True
@@ -192,14 +193,14 @@ class HumanML(Representation):
         )
 
     def weigh_root(self, std: Tensor, weight: float = 5.0) -> Tensor:
-        """Std (D,) with root features and contacts scaled up by `weight`, as Guo et al. train their evaluators."""
+        """Returns std (D,) that scales root features and contacts by `weight`, as Guo et al. train their evaluators."""
         std = std.clone()
         for name in ("turn", "root_velocity", "root_height", "contacts"):
             std[self.slices[name]] /= weight
         return std
 
     def _canonical(self, motions: Sequence[Tensor]) -> tuple[Tensor, list[int]]:
-        """All frames (N, J, 3) of the canonical motions, float64 in the features' unit, and their numbers of frames."""
+        """Returns all frames (N, J, 3) of the canonical motions, float64 in the features' unit, and their lengths."""
         for number, motion in enumerate(motions):
             name = f"motion {number}" if len(motions) > 1 else "motion"
             if motion.ndim != 3 or motion.shape[1:] != (len(self.skeleton), 3):
@@ -207,7 +208,7 @@ class HumanML(Representation):
                     f"{name}: shape {tuple(motion.shape)}, but {self.name} takes (frames, {len(self.skeleton)}, 3)"
                 )
             if len(motion) < 3:
-                raise ValueError(f"{name}: {len(motion)} frames, but features need at least 3; leave the motion out")
+                raise ValueError(f"{name}: {len(motion)} frames, but encoding needs at least 3; leave the motion out")
             if not motion.isfinite().all():
                 frame = int((~motion.isfinite()).flatten(1).any(1).nonzero()[0, 0])
                 raise ValueError(f"{name}: coordinates in frame {frame} are not finite; leave the motion out")
@@ -224,7 +225,7 @@ class HumanML(Representation):
         return rotation.rotate_y(joints - shift[clip, None], -torch.atan2(*facing.unbind(-1))[clip, None]), lengths
 
     def _retarget(self, joints: Tensor, first: Tensor, clip: Tensor) -> Tensor:
-        """Gives the bones their lengths; the root moves as many leg lengths (of the first frame) as before."""
+        """Sets the bone lengths and scales the root trajectory by the ratio of leg lengths in the first frame."""
         target = torch.tensor(self.bone_lengths, dtype=joints.dtype)
         bones = self.skeleton.bones(joints)
         leg = list(self.skeleton.leg)
@@ -232,12 +233,12 @@ class HumanML(Representation):
         return self.skeleton.assemble(F.normalize(bones, dim=-1) * target[:, None], joints[:, 0] * scale[clip, None])
 
     def _facing(self, joints: Tensor) -> Tensor:
-        """(N, J, 3) -> x and z of the direction that hips and shoulders face, shorter where the body lies on a side."""
+        """Returns x and z (N, 2) of the direction hips and shoulders face; shorter if the body lies on its side."""
         right_hip, left_hip, right_shoulder, left_shoulder = (joints[:, joint] for joint in self.skeleton.facing)
         return _turn_forward((right_hip - left_hip) + (right_shoulder - left_shoulder))
 
     def _heading(self, joints: Tensor) -> Tensor:
-        """Smoothed heading (T,) of one canonical motion (T, J, 3)."""
+        """Returns the smoothed heading (T,) of one canonical motion (T, J, 3)."""
         if self.legacy:
             right_hip, left_hip, right_shoulder, left_shoulder = (joints[:, joint] for joint in self.skeleton.facing)
             forward = _turn_forward((left_hip - right_hip) + (right_shoulder - left_shoulder)).numpy()
@@ -253,7 +254,7 @@ class HumanML(Representation):
         return torch.from_numpy(smooth - smooth[0])
 
     def _rotations(self, joints: Tensor, heading: Tensor) -> Tensor:
-        """6D columns (N, J - 1, 6) of the shortest arcs from rest to the bones, relative to each other."""
+        """Returns 6D columns (N, J - 1, 6) of the shortest arcs from rest to the bones, relative to the parent arc."""
         rest = joints.new_tensor(self.skeleton.raw_offsets)
         arcs = rotation.between(rest, self.skeleton.bones(joints))
         if self.legacy:
@@ -263,7 +264,7 @@ class HumanML(Representation):
         return rotation.matrix_to_rot6d(rotation.quaternion_to_matrix(relative), "columns")
 
     def _root(self, features: Tensor) -> tuple[Tensor, Tensor]:
-        """Heading (..., F) and position (..., F, 3) of the root in the features' unit."""
+        """Returns heading (..., F) and position (..., F, 3) of the root in the features' unit."""
         turn = F.pad(features[..., :-1, 0].cumsum(-1), (1, 0))
         heading = -2 * turn if self.legacy else turn
         x, z = features[..., :-1, self.slices["root_velocity"]].unbind(-1)
@@ -274,6 +275,6 @@ class HumanML(Representation):
 
 
 def _turn_forward(right: Tensor) -> Tensor:
-    """(N, 3) -> the vertical crossed with the direction of `right`, (N, 2) x and z."""
+    """Returns x and z (N, 2) of the cross product of the vertical and the direction of `right` (N, 3)."""
     right = F.normalize(right, dim=-1)
     return torch.stack([right[:, 2], -right[:, 0]], -1)

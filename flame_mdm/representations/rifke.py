@@ -1,4 +1,4 @@
-"""TEMOS's features: root height, local joints, and how the heading and the root move."""
+"""TEMOS's features: root height, local joints, heading change and root velocity."""
 
 from collections.abc import Iterable
 
@@ -10,33 +10,33 @@ from flame_mdm.representations import Representation, rotation
 from flame_mdm.representations.skeleton import KIT21
 
 KNEES_AND_ELBOWS = [KIT21.joints.index(f"{side}_{part}") for part in ("knee", "elbow") for side in ("left", "right")]
-"""Where the published code finds hips and shoulders: it looks their indices up once the root is gone."""
+"""Joints that the published code uses as hips and shoulders: it applies their indices after removing the root."""
 
 
 class Rifke(Representation):
-    """64 features of Petrovich et al. 2022 (TEMOS) for KIT's 21 joints, FLAME's for KIT; T rows for T frames.
+    """64 features of Petrovich et al. 2022 (TEMOS) for KIT's 21 joints, also used by FLAME; T rows for T frames.
 
     | columns | content |
     |---|---|
     | 0 | y of the root above the floor |
-    | 1:61 | joints but the root, seen by the body: root at x = z = 0, facing +z; y above the floor |
-    | 61 | heading change since the frame before, radians, 0 in the first frame |
-    | 62:64 | x and z of the root's way since the frame before, seen by the body |
+    | 1:61 | joints except the root, in body coordinates: root at x = z = 0, facing +z; y above the floor |
+    | 61 | heading change since the previous frame, radians, 0 in the first frame |
+    | 62:64 | x and z of the root's displacement since the previous frame, in body coordinates |
 
     Kept as published: the floor is a soft minimum, which depends on the unit of length; heading changes are not
-    unwrapped; and the heading is that of knees and elbows, where that of hips and shoulders is meant.
+    unwrapped; and the heading is that of knees and elbows instead of the intended hips and shoulders.
     """
 
     def __init__(self, fps: float = 12.5, units_per_metre: float = 640.0):
-        """Joints come in and go out in metres; features are in KIT's unit, 1 / `units_per_metre` metres."""
+        """Input and output joints are in meters; features are in KIT's unit, 1 / `units_per_metre` meters."""
         super().__init__("rifke", 64, fps, KIT21)
         self.units_per_metre = units_per_metre
 
     def encode(self, motion: Tensor) -> Tensor:
-        """Joints (T, 21, 3) in metres, y up -> features (T, 64) float32.
+        """Encodes joints (T, 21, 3) in meters, y up, as features (T, 64) float32.
 
         Raises:
-            ValueError: no frames, another number of joints, or coordinates that are not finite.
+            ValueError: no frames, another number of joints, or non-finite coordinates.
         """
         if motion.ndim != 3 or motion.shape[1:] != (21, 3) or not len(motion):
             raise ValueError(f"motion: shape {tuple(motion.shape)}, but {self.name} takes (frames, 21, 3)")
@@ -54,9 +54,9 @@ class Rifke(Representation):
         return torch.cat([root[:, 1:2], local.flatten(1), turn[:, None], way[:, ::2]], 1).float()
 
     def decode(self, features: Tensor) -> Tensor:
-        """Features (..., T, 64) -> joints (..., T, 21, 3) in metres; the first frame's root is at x = z = 0, facing +z.
+        """Decodes features (..., T, 64) to joints (..., T, 21, 3) in meters. Differentiable.
 
-        Differentiable.
+        The root of the first frame is at x = z = 0, facing +z.
         """
         turned, way = features[..., 61].cumsum(-1), features[..., 62:]
         heading = turned - turned[..., :1]
@@ -68,32 +68,32 @@ class Rifke(Representation):
         return torch.cat([root[..., None, :], local + ground[..., None, :]], -2) / self.units_per_metre
 
     def floor(self, joints: Tensor) -> Tensor:
-        """Height of the floor, from joints (T, 21, 3) in KIT's unit: a soft minimum of the lowest foot over time."""
+        """Returns the floor height of joints (T, 21, 3) in KIT's unit: a soft minimum over time of the lowest foot."""
         lowest = joints[:, list(KIT21.feet), 1].amin(1)
         least, most = lowest.min(), lowest.max()
         return least - torch.log(0.5 + torch.exp(least - most))
 
     def heading(self, joints: Tensor) -> Tensor:
-        """(T, 21, 3) -> (T,) radians, 0 = +z, positive towards +x, in (-pi, pi]."""
+        """Returns the heading (T,) of joints (T, 21, 3) in radians, 0 = +z, positive towards +x, in (-pi, pi]."""
         left_knee, right_knee, left_elbow, right_elbow = (joints[:, joint] for joint in KNEES_AND_ELBOWS)
         across = right_knee - left_knee + right_elbow - left_elbow
         return torch.atan2(-across[:, 2], across[:, 0])
 
     def joint_features(self, joints: Iterable[int]) -> Tensor:
-        """As the contract."""
+        """Returns (D,) bool, True for the features of these joints."""
         part = torch.zeros(21, dtype=torch.bool)
         part[list(joints)] = True
         return torch.cat([part[:1], part[1:].repeat_interleave(3), part[:1].expand(3)])
 
     def statistics(self, features: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean and unbiased std of each feature; 1 where it does not vary."""
+        """Returns mean and unbiased std of each feature; std 1 if it is constant."""
         features = features.double()
         std = features.std(0)
         return features.mean(0).float(), torch.where(std > 0, std, 1.0).float()
 
 
 def upsample(joints: Tensor, factor: int = 8) -> Tensor:
-    """(T, ...) -> ((T - 1) * factor + 1, ...), linear: from 12.5 to 100 frames a second, as TEMOS evaluates."""
+    """Interpolates (T, ...) linearly to ((T - 1) * factor + 1, ...): TEMOS evaluates at 100 frames per second."""
     steps = torch.arange((len(joints) - 1) * factor + 1)
     begin = (steps // factor).clamp(max=max(len(joints) - 2, 0))
     weight = ((steps - begin * factor) / factor).to(joints).reshape(-1, *[1] * (joints.ndim - 1))

@@ -1,4 +1,4 @@
-"""Features of the action data sets: SMPL rotations, and the way of the root."""
+"""Features of the action data sets: SMPL rotations and root trajectory."""
 
 from collections.abc import Iterable, Sequence
 
@@ -15,40 +15,40 @@ from flame_mdm.representations.smpl import ADULT, read_pose
 class Rot6D(Representation):
     """25 x 6 features of Petrovich et al. 2021 (ACTOR): 24 rotations as 6D rows, then (x, y, z, 0, 0, 0).
 
-    (x, y, z) is the root's translation since the first frame. Coordinates are the camera's: metres, y down, z away from
-    it. Nothing is normalized. Raw motions are those of `read_pose`.
+    (x, y, z) is the root's translation relative to the first frame, in camera coordinates: meters, y down, z away from
+    the camera. Not normalized. Raw motions are those of `read_pose`.
     """
 
     def __init__(self, fps: float = 20.0, offsets: Sequence[Sequence[float]] = ADULT):
-        """`offsets` (24, 3): the body to show, as `ADULT`."""
+        """`offsets` (24, 3) of the body used for decoding, like `ADULT`."""
         super().__init__("rot6d-25", 150, fps, SMPL24)
         self.offsets = offsets
 
     def encode(self, motion: Tensor) -> Tensor:
-        """Raw motion (F, 3 + 3 K) -> features (F, 150) float32."""
+        """Encodes a raw motion (F, 3 + 3 K) as features (F, 150) float32."""
         translation, rotations = read_pose(motion)
         rows = rotation.matrix_to_rot6d(rotations, "rows").flatten(1)
         return torch.cat([rows, F.pad(translation - translation[:1], (0, 3))], 1).float()
 
     def rebase(self, features: np.ndarray) -> np.ndarray:
-        """The root's way starts anew at the first frame of the cut."""
+        """Makes the root translation relative to the first frame of the cut."""
         moved = features.copy()
         moved[:, 144:147] -= features[:1, 144:147]
         return moved
 
     def decode(self, features: Tensor) -> Tensor:
-        """Features (..., F, 150) -> joints (..., F, 24, 3) metres, y up: half a turn about the camera's x axis."""
+        """Decodes features (..., F, 150) to joints (..., F, 24, 3), meters, y up (half turn about the camera's x axis)."""
         rows = features.unflatten(-1, (25, 6))
         rotations = rotation.rot6d_to_matrix(rows[..., :24, :], "rows")
         joints = forward_kinematics(self.skeleton, rotations, features.new_tensor(self.offsets), rows[..., 24, :3])
         return joints * joints.new_tensor([1.0, -1.0, -1.0])
 
     def joint_features(self, joints: Iterable[int]) -> Tensor:
-        """As the contract; the last row, the translation, belongs to joint 0."""
+        """Returns (D,) bool, True for features of these joints; the last row, the translation, belongs to joint 0."""
         part = torch.zeros(24, dtype=torch.bool)
         part[list(joints)] = True
         return torch.cat([part, part[:1]]).repeat_interleave(6)
 
     def statistics(self, features: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean 0 and std 1: ACTOR and MDM train on the features as they are."""
+        """Returns mean 0 and std 1: ACTOR and MDM train on features that are not normalized."""
         return torch.zeros(self.features), torch.ones(self.features)

@@ -1,7 +1,7 @@
-"""Rotations: axis-angle, quaternions, matrices, the two 6D conventions and Euler angles.
+"""Conversions between rotations: axis-angle, quaternions, matrices, the two 6D conventions and Euler angles.
 
-Every function takes any leading batch shape, keeps the dtype and is differentiable. Quaternions are (w, x, y, z) and
-unit length; matrices act on column vectors; angles are radians.
+Every function accepts any leading batch shape, preserves the dtype and is differentiable. Quaternions are (w, x, y, z)
+of unit length; matrices act on column vectors; angles are in radians.
 """
 
 from typing import Literal
@@ -33,7 +33,7 @@ def quaternion_to_axis_angle(quaternion: Tensor) -> Tensor:
 
 
 def quaternion_to_matrix(quaternion: Tensor) -> Tensor:
-    """(..., 4) -> (..., 3, 3). A quaternion of another length stands for its direction."""
+    """(..., 4) -> (..., 3, 3). Quaternions of other lengths are normalized."""
     q = quaternion * (2**0.5 / torch.linalg.vector_norm(quaternion, dim=-1, keepdim=True))
     w, x, y, z = q.unbind(-1)
     elements = [
@@ -47,7 +47,7 @@ def quaternion_to_matrix(quaternion: Tensor) -> Tensor:
 def matrix_to_quaternion(matrix: Tensor) -> Tensor:
     """(..., 3, 3) -> (..., 4) with w >= 0."""
     (a, b, c), (d, e, f), (g, h, i) = (row.unbind(-1) for row in matrix.unbind(-2))
-    # The rows of 4 q q^T; the row of the largest component is the well-conditioned one, at every rotation.
+    # Rows of 4 q q^T; the row of the largest component is well-conditioned for every rotation.
     outer = [
         *(1 + a + e + i, h - f, c - g, d - b),
         *(h - f, 1 + a - e - i, b + d, c + g),
@@ -109,7 +109,7 @@ def matrix_to_euler(matrix: Tensor, order: str) -> Tensor:
 
 
 def standardize(quaternion: Tensor) -> Tensor:
-    """The one of q and -q, which are the same rotation, with w >= 0."""
+    """Returns q or -q, which are the same rotation, with w >= 0."""
     return torch.where(quaternion[..., :1] < 0, -quaternion, quaternion)
 
 
@@ -132,23 +132,23 @@ def inverse(quaternion: Tensor) -> Tensor:
 
 
 def rotate(quaternion: Tensor, vector: Tensor) -> Tensor:
-    """Turns (..., 3) vectors by (..., 4) unit quaternions; the leading shapes broadcast."""
+    """Rotates vectors (..., 3) by unit quaternions (..., 4); the leading shapes broadcast."""
     xyz, vector = torch.broadcast_tensors(quaternion[..., 1:], vector)
     twice = 2 * torch.linalg.cross(xyz, vector)
     return vector + quaternion[..., :1] * twice + torch.linalg.cross(xyz, twice)
 
 
 def _scaled(vectors: Tensor) -> Tensor:
-    """Vectors of largest entry 1, so that squares of tiny ones do not vanish; 0 stays 0."""
+    """Returns vectors scaled to largest entry 1, so that squares of tiny ones do not underflow; 0 stays 0."""
     largest = vectors.abs().amax(-1, keepdim=True)
     return vectors / torch.where(largest > 0, largest, 1.0)
 
 
 def between(a: Tensor, b: Tensor) -> Tensor:
-    """The shortest rotation from the direction of `a` to that of `b`: (..., 3), (..., 3) -> (..., 4) with w >= 0.
+    """Returns the shortest rotation from the direction of `a` to that of `b`: (..., 3), (..., 3) -> (..., 4), w >= 0.
 
-    Of opposite directions, where every half turn about a perpendicular axis is shortest, one is picked; where a vector
-    is 0 the rotation is the identity.
+    For opposite directions, it is one of the half turns about a perpendicular axis. If a vector is 0, it is the
+    identity.
     """
     a, b = torch.broadcast_tensors(_scaled(a), _scaled(b))
     lengths = torch.linalg.vector_norm(a, dim=-1, keepdim=True) * torch.linalg.vector_norm(b, dim=-1, keepdim=True)
@@ -166,7 +166,7 @@ def between(a: Tensor, b: Tensor) -> Tensor:
 
 
 def slerp(a: Tensor, b: Tensor, t: Tensor | float) -> Tensor:
-    """The rotation at `t` in [0, 1] (a number, or of shape (..., 1)) on the shorter way from `a` to `b` (..., 4)."""
+    """Returns the rotation at `t` in [0, 1] (number or shape (..., 1)) on the shorter arc from `a` to `b` (..., 4)."""
     dot = (a * b).sum(-1, keepdim=True)
     b = torch.where(dot < 0, -b, b)
     dot = dot.abs()
@@ -179,14 +179,14 @@ def slerp(a: Tensor, b: Tensor, t: Tensor | float) -> Tensor:
 
 
 def continuous(quaternion: Tensor, dim: int) -> Tensor:
-    """Changes signs along the time axis `dim`, so that neighbors lie in one hemisphere; the first one stays."""
+    """Flips signs along the time axis `dim`, so that neighbors are in one hemisphere; the first one is unchanged."""
     q = quaternion.movedim(dim, 0)
     flips = torch.where((q[1:] * q[:-1]).sum(-1, keepdim=True) < 0, -1.0, 1.0).to(q.dtype)
     return torch.cat([q[:1], q[1:] * flips.cumprod(0)]).movedim(0, dim)
 
 
 def rotate_y(vector: Tensor, angle: Tensor) -> Tensor:
-    """Turns (..., 3) vectors about the vertical by `angle` (...); a positive angle turns +z towards +x, to the left."""
+    """Rotates vectors (..., 3) about the vertical by `angle` (...); positive angles turn +z towards +x, to the left."""
     x, y, z = vector.unbind(-1)
     cosine, sine = torch.cos(angle), torch.sin(angle)
     return torch.stack([cosine * x + sine * z, y.expand_as(cosine * x), cosine * z - sine * x], -1)

@@ -1,4 +1,4 @@
-"""Skeletons as data, and forward kinematics over them."""
+"""Skeleton definitions and forward kinematics."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,18 +10,18 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Skeleton:
-    """A tree of joints; parents stand before their children, joint 0 is the root.
+    """A tree of joints; parents precede their children, joint 0 is the root.
 
     Attributes:
         name: key in `SKELETONS`.
-        joints: names in the order of the data; `left_` and `right_` tell the sides.
+        joints: names in the order of the data; the prefixes `left_` and `right_` mark the sides.
         parents: parent of each joint, -1 for the root.
-        chains: the paths along which HumanML3D's inverse kinematics walks.
-        raw_offsets: (J, 3) unit direction in the rest pose of the bone that ends in a joint, 0 for the root; those of
+        chains: paths followed by HumanML3D's inverse kinematics.
+        raw_offsets: (J, 3) unit direction, in the rest pose, of the bone that ends in a joint, 0 for the root; from
             HumanML3D's `paramUtil.py`.
-        facing: right hip, left hip, right shoulder, left shoulder: the heading is the vertical crossed with the way
-            from left to right.
-        feet: the joints that touch the ground, in the order of HumanML3D's contact features.
+        facing: right hip, left hip, right shoulder, left shoulder: the heading is the cross product of the vertical and
+            the direction from left to right.
+        feet: joints that touch the ground, in the order of HumanML3D's contact features.
         leg: (knee, ankle), whose bones measure the size of a body.
     """
 
@@ -44,27 +44,27 @@ class Skeleton:
 
     @cached_property
     def chain_parents(self) -> tuple[int, ...]:
-        """Like `parents`, but for the first joint of a chain the root: what HumanML3D's rotations are relative to."""
+        """Joint that each of HumanML3D's rotations is relative to: the parent, or the root for the start of a chain."""
         starts = {chain[1] for chain in self.chains}
         return tuple(0 if joint in starts else parent for joint, parent in enumerate(self.parents))
 
     @cached_property
     def mirrored(self) -> tuple[int, ...]:
-        """The joint that takes the place of each joint in a left-right mirror."""
+        """Index of the joint that replaces each joint in a left-right mirror image."""
         swap = {"left": "right", "right": "left"}
         sides = [name.split("_") for name in self.joints]
         return tuple(self.joints.index("_".join([swap.get(side, side), *rest])) for side, *rest in sides)
 
     def mirror(self, joints: Tensor) -> Tensor:
-        """Left-right mirror image of joints (..., J, 3): x changes sign, left and right joints change places."""
+        """Returns the mirror image of joints (..., J, 3): x changes sign, left and right joints are swapped."""
         return joints[..., list(self.mirrored), :] * joints.new_tensor([-1.0, 1.0, 1.0])
 
     def bones(self, joints: Tensor) -> Tensor:
-        """Vectors (..., J, 3) to each joint from its parent; 0 for the root."""
+        """Returns vectors (..., J, 3) from the parent to each joint; 0 for the root."""
         return joints - joints[..., [max(parent, 0) for parent in self.parents], :]
 
     def assemble(self, bones: Tensor, root: Tensor) -> Tensor:
-        """Joints (..., J, 3) from the vectors that `bones` gives and the root's position (..., 3)."""
+        """Returns joints (..., J, 3) from the vectors of `bones` and the root's position (..., 3)."""
         paths = [[0.0] * len(self)]
         for joint, parent in enumerate(self.parents[1:], 1):
             paths.append([1.0 if bone == joint else on for bone, on in enumerate(paths[parent])])
@@ -72,13 +72,13 @@ class Skeleton:
 
 
 def forward_kinematics(skeleton: Skeleton, rotations: Tensor, offsets: Tensor, root: Tensor) -> Tensor:
-    """Poses a skeleton in all frames at once. Differentiable.
+    """Computes joint positions of all frames from rotations. Differentiable.
 
     Args:
-        skeleton: its tree.
+        skeleton: the tree of joints.
         rotations: (..., J, 3, 3), the root's in the world and each other joint's relative to its parent. A joint's
-            rotation turns the bones that leave it, as in SMPL and BVH.
-        offsets: (J, 3), where each joint sits relative to its parent in the rest pose; the root's is not used.
+            rotation applies to the bones that leave it, as in SMPL and BVH.
+        offsets: (J, 3), position of each joint relative to its parent in the rest pose; the root's is not used.
         root: (..., 3) position of the root.
 
     Returns:
@@ -86,12 +86,12 @@ def forward_kinematics(skeleton: Skeleton, rotations: Tensor, offsets: Tensor, r
     """
     turned = global_rotations(rotations, skeleton.parents)
     bones = (turned[..., [max(parent, 0) for parent in skeleton.parents], :, :] @ offsets[..., None])[..., 0]
-    # the root's offset lies on no path, so what stands there does not count
+    # the root's offset is on no path, so its value does not matter
     return skeleton.assemble(bones, root)
 
 
 def global_rotations(rotations: Tensor, parents: Sequence[int]) -> Tensor:
-    """Rotations (..., J, 3, 3) relative to `parents` -> in the world, one matrix product a level of the tree."""
+    """Converts rotations (..., J, 3, 3) from parent to world frames, with one matrix product per level of the tree."""
     level = [0]
     joints, turned = [0], [rotations[..., :1, :, :]]
     while level := [joint for joint, parent in enumerate(parents) if parent in level]:
@@ -134,8 +134,8 @@ SMPL24 = Skeleton(
 )
 
 # In the order of MMM's root, BP, BT, BLN, BUN, LS, LE, LW, RS, RE, RW, LH, LK, LA, LMrot, LF, RH, RK, RA, RMrot, RF.
-# KIT's coordinates are mirrored: seen by a body that faces +z, its left stands at -x. So the published code calls the
-# leg named L in MMM the right one; `facing` and `feet` keep its order, whereas the names here are MMM's.
+# KIT's coordinates are mirrored: the left side of a body that faces +z is at -x. So the published code calls the leg
+# named L in MMM the right one; `facing` and `feet` keep its order, whereas the names here are MMM's.
 KIT21 = Skeleton(
     name="kit21",
     joints=(

@@ -17,24 +17,24 @@ ADULT = (
     *((0.12, 0.045, -0.02), (-0.12, 0.045, -0.02), (0.26, -0.015, -0.025), (-0.26, -0.015, -0.025)),
     *((0.267, 0.01, 0.0), (-0.267, 0.01, 0.0), (0.085, -0.01, -0.015), (-0.085, -0.01, -0.015)),
 )
-"""Where each of SMPL's 24 joints sits relative to its parent in SMPL's rest pose (arms out, facing +z, y up), metres.
+"""Position of each of SMPL's 24 joints relative to its parent in the rest pose (arms out, facing +z, y up), meters.
 
-A stand-in for the licensed model files: bones as long as HumanML3D's reference clip has them, rounded and symmetric.
+Replaces the licensed model files: bone lengths of HumanML3D's reference clip, rounded and symmetric.
 """
 
 
 def read_pose(motion: Tensor) -> tuple[Tensor, Tensor]:
-    """Translation and joint rotations out of a raw SMPL motion.
+    """Splits a raw SMPL motion into translation and joint rotations.
 
     Args:
-        motion: (F, 3 + 3 K) translation in metres, then K >= 24 axis-angle vectors. Of SMPL+H's 52 the first 24 count,
-            as in FLAME's code, so that the hands are its left_index1 and left_index2.
+        motion: (F, 3 + 3 K) translation in meters, then K >= 24 axis-angle vectors. Of SMPL+H's 52, the first 24 are
+            used, as in FLAME's code, so that the hands are its left_index1 and left_index2.
 
     Returns:
         Translation (F, 3) and matrices (F, 24, 3, 3), float64.
 
     Raises:
-        ValueError: no frames, fewer than 24 joints, or numbers that are not finite.
+        ValueError: no frames, fewer than 24 joints, or non-finite numbers.
     """
     if motion.ndim != 2 or not len(motion) or motion.shape[1] < 75 or motion.shape[1] % 3:
         raise ValueError(
@@ -51,32 +51,32 @@ def read_pose(motion: Tensor) -> tuple[Tensor, Tensor]:
 class SMPL(Representation):
     """147 features of Kim et al. 2023 (FLAME): translation (3), then 24 rotations as 6D rows. Not normalized.
 
-    World coordinates as in AMASS: metres, z up, neither centered nor turned. Raw motions are those of `read_pose`.
+    World coordinates as in AMASS: meters, z up, neither centered nor rotated. Raw motions are those of `read_pose`.
     """
 
     def __init__(self, fps: float = 20.0, offsets: Sequence[Sequence[float]] = ADULT):
-        """`offsets` (24, 3): the body to show, as `ADULT`; the first is the pelvis relative to the translation."""
+        """`offsets` (24, 3) of the body used for decoding, like `ADULT`; the first is from translation to pelvis."""
         super().__init__("smpl147", 147, fps, SMPL24)
         self.offsets = offsets
 
     def encode(self, motion: Tensor) -> Tensor:
-        """Raw motion (F, 3 + 3 K) -> features (F, 147) float32."""
+        """Encodes a raw motion (F, 3 + 3 K) as features (F, 147) float32."""
         translation, rotations = read_pose(motion)
         return torch.cat([translation, rotation.matrix_to_rot6d(rotations, "rows").flatten(1)], 1).float()
 
     def decode(self, features: Tensor) -> Tensor:
-        """Features (..., F, 147) -> joints (..., F, 24, 3) metres, turned to y up as HumanML3D does: (-x, z, y)."""
+        """Decodes features (..., F, 147) to joints (..., F, 24, 3), meters, y up as in HumanML3D: (-x, z, y)."""
         rotations = rotation.rot6d_to_matrix(features[..., 3:].unflatten(-1, (24, 6)), "rows")
         offsets = features.new_tensor(self.offsets)
         joints = forward_kinematics(self.skeleton, rotations, offsets, features[..., :3] + offsets[0])
         return joints[..., [0, 2, 1]] * joints.new_tensor([-1.0, 1.0, 1.0])
 
     def joint_features(self, joints: Iterable[int]) -> Tensor:
-        """As the contract; the translation belongs to joint 0."""
+        """Returns (D,) bool, True for the features of these joints; the translation belongs to joint 0."""
         part = torch.zeros(24, dtype=torch.bool)
         part[list(joints)] = True
         return torch.cat([part[:1].expand(3), part.repeat_interleave(6)])
 
     def statistics(self, features: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean 0 and std 1: FLAME trains on the features as they are."""
+        """Returns mean 0 and std 1: FLAME trains on features that are not normalized."""
         return torch.zeros(self.features), torch.ones(self.features)

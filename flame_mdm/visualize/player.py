@@ -13,7 +13,7 @@ import numpy as np
 from flame_mdm.files import write_text
 from flame_mdm.visualize.scene import Shown, check_any, head, radii, shortened, sides
 
-MILLIMETRE = 0.001
+MILLIMETER = 0.001
 
 
 def write_player(path: str | Path, motions: Sequence[Shown], title: str = "Motions", **options: Any) -> None:
@@ -37,7 +37,7 @@ def player_page(
 ) -> str:
     """A self-contained HTML page that plays motions side by side in 3D, under one clock and one camera.
 
-    Positions are rounded to millimetres; a motion that spans more than 65 m is rounded to 1/65534 of its span.
+    Positions are rounded to millimeters; a motion that spans more than 65 m is rounded to 1/65534 of its span.
 
     Args:
         motions: what to show; skeletons, lengths and frame rates may differ.
@@ -64,7 +64,7 @@ def player_page(
 def _packed(motion: Shown, group: str, beside: str) -> dict[str, Any]:
     low, high = motion.joints.min((0, 1)).astype(float), motion.joints.max((0, 1)).astype(float)
     center = (low + high) / 2
-    step = max(MILLIMETRE, float((high - low).max()) / 65534)
+    step = max(MILLIMETER, float((high - low).max()) / 65534)
     return {
         "id": motion.id,
         "caption": shortened(motion.text),

@@ -18,7 +18,7 @@ SIDE_COLORS: dict[int, Color] = {1: (47, 127, 209), -1: (226, 112, 42), 0: (140,
 PAPER, GROUND, LINE, TEXT, FAINT = (255, 255, 255), (243, 245, 247), (205, 211, 219), (28, 36, 48), (102, 112, 133)
 SHADOW, TRAIL, CONTACT = (212, 216, 222), (122, 91, 208), (15, 157, 107)
 NEAR = 0.3
-"""What comes closer to the camera than this, in metres, is not drawn."""
+"""What comes closer to the camera than this, in meters, is not drawn."""
 LIT, DARK = 0.3, -0.45
 SMOOTH = 2
 """Images are drawn this many times larger and then reduced."""
@@ -195,7 +195,7 @@ def _figure(motion: Shown, frame: int, size: int) -> Image.Image:
 
 
 def _camera(target: np.ndarray, side: int) -> Callable[[np.ndarray], np.ndarray]:
-    """A camera in front, to the left and above: (N, 3) metres -> (N, 4) x, y, pixels a metre and depth."""
+    """A camera in front, to the left and above: (N, 3) meters -> (N, 4) x, y, pixels a metre and depth."""
     yaw, pitch, distance = 0.6, 0.24, 5.0
     toward = np.array([math.sin(yaw) * math.cos(pitch), math.sin(pitch), math.cos(yaw) * math.cos(pitch)])
     right = np.array([math.cos(yaw), 0, -math.sin(yaw)])
@@ -215,7 +215,7 @@ def _points(projected: np.ndarray) -> list[tuple[float, float]]:
 
 
 class Limb(NamedTuple):
-    """Two ends (x, y, pixels a metre, depth), their radii in metres, and a color."""
+    """Two ends (x, y, pixels a metre, depth), their radii in meters, and a color."""
 
     a: np.ndarray
     b: np.ndarray
@@ -261,7 +261,7 @@ def _draw(pen: ImageDraw.ImageDraw, limb: Limb, rim: float) -> None:
 def _capsule(
     pen: ImageDraw.ImageDraw, a: np.ndarray, b: np.ndarray, ra: float, rb: float, color: Color, grow: float = 0
 ) -> None:
-    """Fills the outline around two circles of radius `ra` and `rb` metres, `grow` pixels wider."""
+    """Fills the outline around two circles of radius `ra` and `rb` meters, `grow` pixels wider."""
     (ax, ay, ra), (bx, by, rb) = (*a[:2], ra * a[2] + grow), (*b[:2], rb * b[2] + grow)
     length = math.hypot(bx - ax, by - ay)
     if length > abs(ra - rb):

@@ -44,7 +44,7 @@ def head(skeleton: Skeleton) -> int | None:
 
 
 def radii(skeleton: Skeleton) -> list[float]:
-    """Returns the thickness of the body around each joint in metres, which grows with the number of joints below it."""
+    """Returns the thickness of the body around each joint in meters, which grows with the number of joints below it."""
     below = [0] * len(skeleton.parents)
     for joint in reversed(range(1, len(below))):
         below[skeleton.parents[joint]] += below[joint] + 1

@@ -257,7 +257,7 @@ BAD = {
     ),
     "trans": (lambda f: np.savez(f / "three.npz", poses=np.zeros((9, 72))), r"three\.npz: AMASS files have poses"),
     "yaml": (lambda f: skeleton(f, "fps: [30"), r"skeleton\.yaml: not a readable YAML file"),
-    "yaml key": (lambda f: skeleton(f, "rate: 30"), r"skeleton\.yaml: unknown key rate; there are map, joints"),
+    "yaml key": (lambda f: skeleton(f, "rate: 30"), r"skeleton\.yaml: unknown key rate; use map, joints"),
     "yaml list": (lambda f: skeleton(f, "- 30"), r"skeleton\.yaml: unknown key list"),
     "yaml value": (lambda f: skeleton(f, "fps: 0"), r"skeleton\.yaml: fps: 0 is not valid"),
     "yaml up": (lambda f: skeleton(f, "up: x"), r"skeleton\.yaml: up: x is not valid"),

@@ -37,7 +37,7 @@ class Rot6D(Representation):
         return moved
 
     def decode(self, features: Tensor) -> Tensor:
-        """Decodes features (..., F, 150) to joints (..., F, 24, 3), meters, y up (half turn about the camera's x axis)."""
+        """Decodes features (..., F, 150) to joints (..., F, 24, 3), meters, y up (rotated 180 degrees about x)."""
         rows = features.unflatten(-1, (25, 6))
         rotations = rotation.rot6d_to_matrix(rows[..., :24, :], "rows")
         joints = forward_kinematics(self.skeleton, rotations, features.new_tensor(self.offsets), rows[..., 24, :3])

@@ -1,8 +1,9 @@
-"""The analytic denoisers of the diffusion and flow fixtures, and how values are compared with these."""
+"""Analytic denoisers of the diffusion and flow fixtures, comparisons with these, and rotations of Euler angles."""
 
 import numpy as np
 import torch
 from fixtures import Arrays, meta
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from flame_mdm.motion import Condition, Denoise
@@ -57,3 +58,9 @@ def spaced(total: int, spec: str) -> list[int]:
 def flow_field(arrays: Arrays) -> Denoise:
     """The fixture's velocity field A x + b + c t, with t as the flow has it."""
     return linear_denoiser(arrays["field/A"], arrays["field/b"], float(arrays["field/c"]))
+
+
+def euler_to_matrix(angles: Tensor, order: str) -> Tensor:
+    """(..., 3) angles about the axes of `order` -> (..., 3, 3); "ZXY" is Rz(first) Rx(second) Ry(third), as in BVH."""
+    matrices = Rotation.from_euler(order, angles.reshape(-1, 3).double().numpy()).as_matrix()
+    return torch.from_numpy(matrices).to(angles.dtype).reshape(*angles.shape, 3)

@@ -137,7 +137,7 @@ def trust(config: Config) -> None:
     Nothing that it names is imported here.
 
     Raises:
-        UserError: it names others, or has other keys for `instantiate` than `_target_` and `_recursive_`.
+        UserError: it names others.
     """
     added = [name for name in os.environ.get("FLAME_MDM_TRUST", "").split(",") if name]
     for path, mapping in walk(config):
@@ -150,9 +150,6 @@ def trust(config: Config) -> None:
                 f"the checkpoint's configuration names {target} at {'.'.join(path)}; such code runs only if you "
                 f"trust it: set FLAME_MDM_TRUST={package}"
             )
-    for path, mapping in walk(config):
-        for name in mapping.keys() & {"_args_", "_partial_", "_convert_"}:
-            raise UserError(f"the checkpoint's configuration has {'.'.join([*path, name])}, which no model needs")
 
 
 def _is_trusted_class(target: str) -> bool:
@@ -169,8 +166,8 @@ def _is_trusted_module(name: str) -> bool:
 def instantiate(node: Config, **derived: Any) -> Any:
     """Builds what a mapping with a `_target_` describes, nested ones included.
 
-    It reads Hydra's keys `_target_`, `_args_`, `_partial_` and `_recursive_`. Interpolations are plain texts to it, and
-    mappings and lists reach the parts as plain copies, as with Hydra's `_convert_: all`.
+    It reads Hydra's keys `_target_` and `_recursive_`. Interpolations are plain texts to it, and mappings and lists
+    reach the parts as plain copies, as with Hydra's `_convert_: all`.
 
     Args:
         node: the mapping.
@@ -184,16 +181,13 @@ def instantiate(node: Config, **derived: Any) -> Any:
         raise UserError(f"a part needs a _target_, the name of its class: {str(node)[:80]}")
     name: str = node["_target_"]
     build = _instances if node.get("_recursive_", True) else copy.deepcopy
-    skipped = ("_target_", "_recursive_", "_convert_", *derived)
+    skipped = ("_target_", "_recursive_", *derived)
     given: dict[str, Any] = {key: build(value) for key, value in node.items() if key not in skipped}
-    arguments, partial = given.pop("_args_", ()), given.pop("_partial_", False)
     try:
         module, _, attribute = name.rpartition(".")
         if not module:
             raise UserError(f"_target_={name}: give the name of a module and a class, such as torch.nn.Linear")
-        target = getattr(importlib.import_module(module), attribute)
-        made = functools.partial(target, *arguments, **given, **derived)
-        return made if partial else made()
+        return getattr(importlib.import_module(module), attribute)(**given, **derived)
     except (UserError, ValueError, FileNotFoundError):
         raise
     except Exception as error:

@@ -18,7 +18,6 @@ from typing import NamedTuple
 import numpy as np
 
 from flame_mdm.data import Clip, MotionSource, Split, archives
-from flame_mdm.data.store import Store
 from flame_mdm.files import read_npy, read_text
 
 TAG_FPS = 20
@@ -268,16 +267,6 @@ class T2MFolder(MotionSource):
             self._excluded["captions of parts that are too short or too long"] += lost
         if reason:
             self._excluded[f"names of {self.names[name]} {reason}"] += 1
-
-
-def stored_names(store: Store) -> dict[str, int]:
-    """Returns the number of names per split of a prepared store, both with clips and left out."""
-    totals = {split: len({c.id.split("@")[0] for c in store.clips if c.split == split}) for split in SPLITS}
-    for reason, number in store.info["excluded"].items():
-        for split in SPLITS:
-            if reason.startswith(f"names of {split} "):
-                totals[split] += number
-    return totals
 
 
 def _texts(path: Path) -> Iterator[tuple[str, str, str]]:

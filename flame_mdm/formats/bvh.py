@@ -86,12 +86,6 @@ class Bvh:
         """Returns the position (F, J, 3) of each joint in the world."""
         return forward_kinematics(self.parents, self.rotations(), self.translations())[0]
 
-    def end_positions(self) -> np.ndarray:
-        """Returns the position (F, E, 3) of each end site in the world."""
-        positions, turned = forward_kinematics(self.parents, self.rotations(), self.translations())
-        parents = list(self.end_parents)
-        return positions[:, parents] + np.einsum("feij,ej->fei", turned[:, parents], self.end_offsets)
-
     def resample(self, fps: float) -> tuple[np.ndarray, np.ndarray]:
         """Resamples the local motion to times 0, 1/fps, 2/fps, ... up to the last frame.
 

@@ -10,7 +10,7 @@ from scipy.ndimage import gaussian_filter1d
 from torch import Tensor
 
 from flame_mdm.representations import Representation, rotation
-from flame_mdm.representations.skeleton import SKELETONS, global_rotations
+from flame_mdm.representations.skeleton import SKELETONS
 
 LEGACY_SMOOTHING_FRAMES = 20
 SMOOTHING_SECONDS = 1.0
@@ -144,27 +144,6 @@ class HumanML(Representation):
         ground = root * root.new_tensor([1.0, 0.0, 1.0])
         return torch.cat([root[..., None, :], turned + ground[..., None, :]], -2) / self.units_per_metre
 
-    def decode_rotations(self, features: Tensor, bone_lengths: Tensor) -> Tensor:
-        """Decodes turn, root and rotations of features (..., F, D) to joints (..., F, J, 3), meters. Differentiable.
-
-        Args:
-            features: in the data's units.
-            bone_lengths: (J,) meters, length of the bone that ends in each joint.
-        """
-        heading, root = self._root(features)
-        facing = torch.zeros_like(root)
-        facing[..., 1] = -heading if self.legacy else heading
-        local = rotation.rot6d_to_matrix(features[..., self.slices["rotations"]].unflatten(-1, (-1, 6)), "columns")
-        local = torch.cat([rotation.axis_angle_to_matrix(facing)[..., None, :, :], local], -3)
-        turned = global_rotations(local, self.skeleton.chain_parents if self.legacy else self.skeleton.parents)
-        offsets = features.new_tensor(self.skeleton.raw_offsets) * bone_lengths[:, None]
-        return self.skeleton.assemble((turned @ offsets[..., None])[..., 0], root / self.units_per_metre)
-
-    def root(self, features: Tensor) -> tuple[Tensor, Tensor]:
-        """Returns heading (..., F) in radians, 0 = +z, positive to the left, and position (..., F, 3) of the root."""
-        heading, position = self._root(features)
-        return heading, position / self.units_per_metre
-
     def statistics(self, features: Tensor) -> tuple[Tensor, Tensor]:
         """Returns the mean of each feature, and the std averaged over each entry of `slices`.
 
@@ -191,13 +170,6 @@ class HumanML(Representation):
         return torch.cat(
             [part[:1].expand(4), *(part[1:].repeat_interleave(n) for n in (3, 6)), part.repeat_interleave(3), feet]
         )
-
-    def weigh_root(self, std: Tensor, weight: float = 5.0) -> Tensor:
-        """Returns std (D,) that scales root features and contacts by `weight`, as Guo et al. train their evaluators."""
-        std = std.clone()
-        for name in ("turn", "root_velocity", "root_height", "contacts"):
-            std[self.slices[name]] /= weight
-        return std
 
     def _canonical(self, motions: Sequence[Tensor]) -> tuple[Tensor, list[int]]:
         """Returns all frames (N, J, 3) of the canonical motions, float64 in the features' unit, and their lengths."""

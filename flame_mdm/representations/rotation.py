@@ -85,14 +85,6 @@ def rot6d_to_matrix(rot6d: Tensor, convention: SixD) -> Tensor:
     return rows if convention == "rows" else rows.mT
 
 
-def euler_to_matrix(angles: Tensor, order: str) -> Tensor:
-    """(..., 3) angles about the axes of `order` -> (..., 3, 3); "ZXY" is Rz(first) Rx(second) Ry(third), as in BVH."""
-    axes = _axes(order)
-    basis = torch.eye(3, dtype=angles.dtype, device=angles.device)
-    first, second, third = (axis_angle_to_matrix(angles[..., n : n + 1] * basis[axes[n]]) for n in range(3))
-    return first @ second @ third
-
-
 def matrix_to_euler(matrix: Tensor, order: str) -> Tensor:
     """(..., 3, 3) -> (..., 3), the middle angle in [-pi/2, pi/2]; in gimbal lock the third angle is 0."""
     i, j, k = _axes(order)

@@ -65,9 +65,7 @@ def test_a_slurm_job_that_runs_out_of_time_is_requeued_and_ends_as_if_it_had_not
     words = [*tiny, *RUN, "callbacks.samples=null", "trainer.max_steps=5"]
     time_over = alarm(tmp_path, "time", step=3, rank=0, attempt=0, counter="SLURM_RESTART_COUNT", signal="SIGUSR2")
     launch = ["launch=slurm", "hydra.launcher.partition=gpu", "hydra.launcher.timeout_min=90"]
-    code, out, err = finish(
-        spawn(["flame_mdm.commands.train", "quickstart", *words, *time_over, *TWO, *launch], **cluster)
-    )
+    code, out, err = finish(spawn(["flame_mdm", "train", "quickstart", *words, *time_over, *TWO, *launch], **cluster))
     logs = "\n".join(path.read_text() for path in (tmp_path / "run" / ".submitit").rglob("*.out"))
     assert code == 0, out + err + logs
     assert "job 7 is in the queue again" in logs
@@ -99,7 +97,7 @@ def test_jobs_of_a_sweep_run_beside_one_another_in_folders_of_their_own(tiny, tm
     words = [*tiny, "callbacks.samples=null", "callbacks.best=null", "trainer.max_steps=1"]
     (tmp_path / "run" / "seed=1").mkdir(parents=True)
     (tmp_path / "run" / "seed=1" / "config.yaml").write_text("seed: 5\n")
-    code, out, err = finish(spawn(["flame_mdm.commands.train", "quickstart", *words, "seed=1,2", "launch=local"]))
+    code, out, err = finish(spawn(["flame_mdm", "train", "quickstart", *words, "seed=1,2", "launch=local"]))
     assert code == 1, out + err
     assert str(tmp_path / "run" / ".submitit") in out
     logs = "\n".join(path.read_text() for path in (tmp_path / "run" / ".submitit").rglob("*log.err"))

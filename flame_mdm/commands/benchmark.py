@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -28,12 +29,6 @@ Trains a motion-CLIP and a small model of each kind, evaluates them, and writes 
 pipeline in one command. If interrupted, the same command continues where it stopped.
 NAME is a file in experiments/benchmark: synthetic, which needs no download, or bandai.
 """
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Runs the command; returns its exit code."""
-    words = sys.argv[1:] if argv is None else argv
-    return run(benchmark, words, usage=USAGE, name="benchmark", objects=("exp",), text=("exp", "out", "data_root"))
 
 
 def benchmark(config: Config) -> None:
@@ -69,6 +64,9 @@ def benchmark(config: Config) -> None:
     wrong = [line for line, right in checks if not right]
     if failed or wrong:
         raise UserError("; ".join([*failed, *wrong]))
+
+
+main = partial(run, benchmark, usage=USAGE, name="benchmark", objects=("exp",), text=("exp", "out", "data_root"))
 
 
 class Times:
@@ -139,7 +137,3 @@ def _report(
             movies.append((words[0], base64.b64encode((folder / "motions.gif").read_bytes()).decode()))
     minutes = [[what, f"{s / 60:.1f}"] for what, s in times.seconds.items()]
     return render("benchmark.html", name=name, table_body=body, movies=movies, checks=checks, minutes=minutes)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

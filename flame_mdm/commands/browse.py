@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 from flame_mdm.config import EXPERIMENTS, Config, instantiate, run
@@ -18,18 +17,6 @@ Writes a single web page that opens from disk. It shows clips of a data set with
 to their originals, a search field, a choice of splits, the distribution of clip lengths and other statistics.
 motions=FOLDER also writes the shown clips as motion files, to compare generated motions with them.
 """
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Runs the command; returns its exit code."""
-    return run(
-        browse,
-        sys.argv[1:] if argv is None else argv,
-        usage=USAGE,
-        name="browse",
-        objects=("data", "out"),
-        text=("search", "out", "motions"),
-    )
 
 
 def browse(config: Config) -> None:
@@ -67,5 +54,4 @@ def browse(config: Config) -> None:
         say(f"{config['motions']}: {len(clips)} motions")
 
 
-if __name__ == "__main__":
-    sys.exit(main())
+main = partial(run, browse, usage=USAGE, name="browse", objects=("data", "out"), text=("search", "out", "motions"))

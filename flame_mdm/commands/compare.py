@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import sys
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -36,21 +36,6 @@ the captions of these motions, at their lengths. Keys, with their defaults: expe
 """
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Runs the command; returns its exit code."""
-    words = sys.argv[1:] if argv is None else argv
-    text = ("runs", "texts", "ratings", "out")
-    return run(
-        compare,
-        words,
-        usage=USAGE,
-        name="compare",
-        objects=("runs*",),
-        text=text,
-        kinds={"seconds": "float", "seed": "int"},
-    )
-
-
 def compare(config: Config) -> None:
     """Writes the requested page, or counts ratings.
 
@@ -79,6 +64,17 @@ def compare(config: Config) -> None:
         out, content = Path(config["out"] or "runs/compare.html"), comparison(compared, shown)
     write_text(out, content)
     say(out)
+
+
+main = partial(
+    run,
+    compare,
+    usage=USAGE,
+    name="compare",
+    objects=("runs*",),
+    text=("runs", "texts", "ratings", "out"),
+    kinds={"seconds": "float", "seed": "int"},
+)
 
 
 def motions(compared: Sequence[ComparedRun], config: Config) -> list[dict[Prompt, Motion]]:
@@ -178,7 +174,3 @@ def _by_prompt(found: Sequence[Motion]) -> dict[Prompt, Motion]:
         prompts[motion.text, counts[motion.text]] = motion
         counts[motion.text] += 1
     return prompts
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 from flame_mdm.config import Config, run
@@ -17,21 +16,6 @@ Inputs: .npz written by `make sample`, .npz of AMASS, .bvh, .json, and .npy with
 Outputs: .bvh and .glb for Blender and game engines, .npz in the layout of AMASS, and .json and .npy with joint
 positions. Units, axes and joint names: docs/formats.md
 """
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Runs the command; returns its exit code."""
-    words = sys.argv[1:] if argv is None else argv
-    objects = ("motion", "out")
-    return run(
-        convert,
-        words,
-        usage=USAGE,
-        name="convert",
-        objects=objects,
-        text=objects,
-        kinds={"fps": "float", "unit": "float"},
-    )
 
 
 def convert(config: Config) -> None:
@@ -52,5 +36,12 @@ def convert(config: Config) -> None:
     say(motion.save(out))
 
 
-if __name__ == "__main__":
-    sys.exit(main())
+main = partial(
+    run,
+    convert,
+    usage=USAGE,
+    name="convert",
+    objects=("motion", "out"),
+    text=("motion", "out"),
+    kinds={"fps": "float", "unit": "float"},
+)

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 from flame_mdm.commands import SAMPLING
@@ -20,20 +19,6 @@ usage: flame-mdm edit ckpt=FILE motion=walk.npz region=in_between text="a person
 Keeps part of a motion and resamples the rest. Writes the original and the results (.npz), a GIF, and a player that
 opens in any browser. Keys, with their defaults: experiments/edit.yaml
 """
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Runs the command; returns its exit code."""
-    words = sys.argv[1:] if argv is None else argv
-    return run(
-        write_edits,
-        words,
-        usage=USAGE,
-        name="edit",
-        objects=("ckpt", "out"),
-        text=("text", "ckpt", "motion", "out"),
-        kinds={**SAMPLING, "method": "str", "until": "float", "resample": "int"},
-    )
 
 
 def write_edits(config: Config) -> None:
@@ -85,5 +70,12 @@ def write_edits(config: Config) -> None:
     )
 
 
-if __name__ == "__main__":
-    sys.exit(main())
+main = partial(
+    run,
+    write_edits,
+    usage=USAGE,
+    name="edit",
+    objects=("ckpt", "out"),
+    text=("text", "ckpt", "motion", "out"),
+    kinds={**SAMPLING, "method": "str", "until": "float", "resample": "int"},
+)

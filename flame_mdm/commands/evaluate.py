@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Sequence
+from functools import partial
 
 from flame_mdm.commands import SAMPLING
 from flame_mdm.config import Config, run
@@ -20,19 +19,18 @@ Keys, with their defaults: experiments/evaluate.yaml; protocols: experiments/eva
 """
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Runs the command; returns its exit code."""
-    words = sys.argv[1:] if argv is None else argv
-    text = ("ckpt", "extractor", "from_samples", "protocol", "data_root", "out")
-    kinds = {**SAMPLING, "replications": "int", "multimodality": "bool", "quick": "bool", "force": "bool"}
-    return run(_evaluate, words, usage=USAGE, name="evaluate", objects=("ckpt", "out"), text=text, kinds=kinds)
-
-
 def _evaluate(config: Config) -> None:
     from evaluators.run import EvaluationRequest, evaluate
 
     evaluate(EvaluationRequest.of(config))
 
 
-if __name__ == "__main__":
-    sys.exit(main())
+main = partial(
+    run,
+    _evaluate,
+    usage=USAGE,
+    name="evaluate",
+    objects=("ckpt", "out"),
+    text=("ckpt", "extractor", "from_samples", "protocol", "data_root", "out"),
+    kinds={**SAMPLING, "replications": "int", "multimodality": "bool", "quick": "bool", "force": "bool"},
+)

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Sequence
+from functools import partial
 
 from flame_mdm.config import Config, run
 from flame_mdm.errors import UserError, say
@@ -15,12 +14,6 @@ Writes the averaged weights of a checkpoint, its recipe and the metadata of its 
 """
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Runs the command and returns its exit code."""
-    words = sys.argv[1:] if argv is None else argv
-    return run(_export, words, usage=USAGE, name="export", objects=("ckpt", "out"), text=("ckpt", "out"))
-
-
 def _export(config: Config) -> None:
     if config["ckpt"] is None or config["out"] is None:
         raise UserError("name a checkpoint and an output file: flame-mdm export CKPT model.safetensors")
@@ -30,5 +23,4 @@ def _export(config: Config) -> None:
     say(f"written: {export(find(config['ckpt'], config['which']), config['out'])}")
 
 
-if __name__ == "__main__":
-    sys.exit(main())
+main = partial(run, _export, usage=USAGE, name="export", objects=("ckpt", "out"), text=("ckpt", "out"))

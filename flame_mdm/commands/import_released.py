@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Sequence
+from functools import partial
 
 from flame_mdm.config import Config, run
 from flame_mdm.errors import UserError, say
@@ -20,19 +19,6 @@ Keys, with their defaults: experiments/import.yaml
 KINDS = ("mdm", "mfm", "flame", "mclip")
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Runs the command and returns its exit code."""
-    words = sys.argv[1:] if argv is None else argv
-    return run(
-        _import,
-        words,
-        usage=USAGE,
-        name="import",
-        objects=("kind", "file", "args"),
-        text=("file", "args", "out", "stats"),
-    )
-
-
 def _import(config: Config) -> None:
     if config["kind"] not in KINDS:
         raise UserError(f"unknown kind of released model: {config['kind']}. Use {', '.join(KINDS[:-1])} or mclip")
@@ -44,5 +30,6 @@ def _import(config: Config) -> None:
     say(f"written: {import_released(**{key: config[key] for key in keys})}")
 
 
-if __name__ == "__main__":
-    sys.exit(main())
+main = partial(
+    run, _import, usage=USAGE, name="import", objects=("kind", "file", "args"), text=("file", "args", "out", "stats")
+)

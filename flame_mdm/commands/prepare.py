@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Sequence
+from functools import partial
 
 from flame_mdm.config import EXPERIMENTS, Config, instantiate, run
 from flame_mdm.errors import UserError, say
@@ -14,12 +13,6 @@ usage: flame-mdm prepare data=NAME [source=PATH] [representation=NAME] [check|ve
 Converts a data set, as distributed by its owners, into a packed store under data/. `check=true` only lists the files
 that were found and those that are missing; `verify=true` checks an existing store; `force=true` rewrites it.
 """
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Runs the command; returns its exit code."""
-    words = sys.argv[1:] if argv is None else argv
-    return run(prepare, words, usage=USAGE, name="prepare", objects=("data",), text=("source",))
 
 
 def prepare(config: Config) -> None:
@@ -71,5 +64,4 @@ def prepare(config: Config) -> None:
     say(f"{info['shape'][0]} frames with {info['shape'][1]} features, fingerprint {store.fingerprint}: {data.folder}")
 
 
-if __name__ == "__main__":
-    sys.exit(main())
+main = partial(run, prepare, usage=USAGE, name="prepare", objects=("data",), text=("source",))

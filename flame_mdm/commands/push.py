@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 from flame_mdm.config import Config, run
@@ -15,13 +14,6 @@ usage: flame-mdm push CKPT user/name [folder=FOLDER] [private=true] [dry_run=tru
 Writes model.safetensors, config.yaml and a model card, and uploads them to the Hugging Face hub.
 Keys, with their defaults: experiments/push.yaml
 """
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Runs the command and returns its exit code."""
-    words = sys.argv[1:] if argv is None else argv
-    text = ("ckpt", "repository", "folder")
-    return run(_push, words, usage=USAGE, name="push", objects=("ckpt", "repository"), text=text)
 
 
 def _push(config: Config) -> None:
@@ -36,5 +28,6 @@ def _push(config: Config) -> None:
     say(f"{f'uploaded to {name}' if upload else 'not uploaded'}: {folder}")
 
 
-if __name__ == "__main__":
-    sys.exit(main())
+main = partial(
+    run, _push, usage=USAGE, name="push", objects=("ckpt", "repository"), text=("ckpt", "repository", "folder")
+)

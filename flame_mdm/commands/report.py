@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Sequence
+from functools import partial
 
 from flame_mdm.config import Config, run
 from flame_mdm.errors import UserError, say
@@ -15,12 +14,6 @@ usage: flame-mdm report RUN
 Writes report.html into a run directory: curves, newest samples, evaluations and provenance on one page that needs no
 server and no network. Training also writes it at the end. runs="A B" writes several reports.
 """
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Runs the command; returns its exit code."""
-    words = sys.argv[1:] if argv is None else argv
-    return run(report, words, usage=USAGE, name="report", objects=("runs*",), text=("runs",))
 
 
 def report(config: Config) -> None:
@@ -35,5 +28,4 @@ def report(config: Config) -> None:
         say(write_report(folder))
 
 
-if __name__ == "__main__":
-    sys.exit(main())
+main = partial(run, report, usage=USAGE, name="report", objects=("runs*",), text=("runs",))

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import re
-import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,20 +23,6 @@ usage: flame-mdm sample ckpt=FILE text="a person walks in a circle" [seconds=6] 
 Writes motions (.npz), a GIF, and a player that opens in any browser.
 Keys, with their defaults: experiments/sample.yaml
 """
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Runs the command; returns its exit code."""
-    words = sys.argv[1:] if argv is None else argv
-    return run(
-        sample,
-        words,
-        usage=USAGE,
-        name="sample",
-        objects=("ckpt", "out"),
-        text=("text", "ckpt", "out"),
-        kinds={**SAMPLING, "seconds": "float"},
-    )
 
 
 def sample(config: Config) -> None:
@@ -76,6 +62,17 @@ def sample(config: Config) -> None:
     )
 
 
+main = partial(
+    run,
+    sample,
+    usage=USAGE,
+    name="sample",
+    objects=("ckpt", "out"),
+    text=("text", "ckpt", "out"),
+    kinds={**SAMPLING, "seconds": "float"},
+)
+
+
 def default_folder(model: MotionGeneration, what: str, seed: int, options: Mapping[str, Any]) -> Path:
     """Returns `samples/<experiment>/<what>-seed<seed>`, followed by all options that are not None.
 
@@ -105,7 +102,3 @@ def check_request(config: Config) -> None:
         raise UserError(
             f"give exactly one of text=..., action=... and unconditioned=true, not {' and '.join(conditions) or 'none'}"
         )
-
-
-if __name__ == "__main__":
-    sys.exit(main())

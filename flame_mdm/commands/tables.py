@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 from flame_mdm.config import Config, run
@@ -19,14 +18,6 @@ evaluate=false uses existing results only. Without table=, all tables are render
 results give the same bytes.
 Keys, with their defaults: experiments/tables.yaml
 """
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Runs the command; returns its exit code."""
-    words = sys.argv[1:] if argv is None else argv
-    return run(
-        tables, words, usage=USAGE, name="tables", objects=("table*",), text=("table", "out", "results", "data_root")
-    )
 
 
 def tables(config: Config) -> None:
@@ -59,5 +50,6 @@ def tables(config: Config) -> None:
         raise UserError(f"{len(failed)} evaluations failed: {'; '.join(failed)}")
 
 
-if __name__ == "__main__":
-    sys.exit(main())
+main = partial(
+    run, tables, usage=USAGE, name="tables", objects=("table*",), text=("table", "out", "results", "data_root")
+)

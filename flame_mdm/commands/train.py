@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Sequence
 from contextlib import nullcontext
+from functools import partial
 from pathlib import Path
 
 from flame_mdm.config import Config, flatten, movable, read_saved, run
@@ -40,11 +39,6 @@ FREE = (
 """Keys that may differ when a run is resumed."""
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Runs the command; returns its exit code."""
-    return run(train, sys.argv[1:] if argv is None else argv, usage=USAGE)
-
-
 def train(config: Config) -> None:
     """Trains the composed experiment, or resumes the run in its directory.
 
@@ -64,6 +58,9 @@ def train(config: Config) -> None:
         fit(folder, config)
 
 
+main = partial(run, train, usage=USAGE)
+
+
 def _same_run(folder: Path, config: Config) -> None:
     """Raises `UserError` if the folder holds a run with another configuration."""
     if not (folder / "config.yaml").exists():
@@ -79,7 +76,3 @@ def _same_run(folder: Path, config: Config) -> None:
             f"{folder} holds a run with another configuration: {'; '.join(differing)}. Choose another name with "
             "run.name=..., or delete that folder"
         )
-
-
-if __name__ == "__main__":
-    sys.exit(main())

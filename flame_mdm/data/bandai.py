@@ -65,65 +65,13 @@ REST = {
 # y up <-> AMASS's z up: (-x, z, y), so that motions look the same after the SMPL representation decodes them.
 AXES = np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 1.0, 0.0]])
 
-CONTENTS_1 = (
-    "walk",
-    "run",
-    "dash",
-    "walk-back",
-    "walk-left",
-    "walk-right",
-    "bow",
-    "bye",
-    "guide",
-    "byebye",
-    "respond",
-    "call",
-    "punch",
-    "kick",
-    "slash",
-    "dance-long",
-    "dance-short",
-)
-STYLES_1 = (
-    "normal",
-    "happy",
-    "sad",
-    "angry",
-    "proud",
-    "not-confident",
-    "masculinity",
-    "feminine",
-    "childish",
-    "old",
-    "tired",
-    "active",
-    "musical",
-    "giant",
-    "chimpira",
-)
-STYLES_2: tuple[str, ...] = (
-    "active",
-    "elderly",
-    "exhausted",
-    "feminine",
-    "masculine",
-    "normal",
-    "youthful",
-)
-# Published number of takes in data set 2, by content, in the order of STYLES_2. The split is drawn from these numbers,
-# not from the files found, so that a missing or excluded file does not move other takes to another split.
-TAKES_2 = {
-    "walk": (32, 17, 23, 27, 25, 24, 27),
-    "walk-turn-left": (41, 31, 39, 31, 30, 34, 30),
-    "walk-turn-right": (41, 30, 37, 31, 30, 35, 30),
-    "run": (59, 28, 41, 45, 47, 52, 45),
-    "wave-both-hands": (35, 29, 31, 27, 28, 30, 28),
-    "wave-left-hand": (36, 28, 30, 27, 28, 31, 29),
-    "wave-right-hand": (34, 28, 31, 28, 28, 30, 29),
-    "raise-up-both-hands": (102, 39, 40, 60, 58, 74, 61),
-    "raise-up-left-hand": (104, 42, 41, 65, 54, 76, 62),
-    "raise-up-right-hand": (100, 42, 40, 65, 51, 79, 60),
-}
+WORDS = read_yaml(Path(__file__).with_suffix(".yaml"))
+"""Contents, styles and captions."""
+CONTENTS_1, STYLES_1 = tuple(WORDS["dataset_1"]["contents"]), tuple(WORDS["dataset_1"]["styles"])
+STYLES_2 = tuple(WORDS["dataset_2"]["styles"])
+TAKES_2: dict[str, list[int]] = WORDS["dataset_2"]["takes"]
+"""Published number of takes in data set 2, by content, in the order of STYLES_2. The split is drawn from these numbers,
+not from the files found, so that a missing or excluded file does not move other takes to another split."""
 
 # Takes that turn to the opposite side of what their name says; their labels and captions follow the motion.
 WRONG_SIDE = (
@@ -349,19 +297,12 @@ def side_of(content: str) -> str:
 
 def captions(content: str, style: str, side: str) -> list[str]:
     """Returns four descriptions in the style of HumanML3D; `side` is left or right if the content contains one."""
-    contents, styles = phrases()
+    contents, styles = WORDS["contents"], WORDS["styles"]
     filled = (
         phrase.format(side=side, other=swap_sides(side), how=how)
         for phrase, how in zip(contents[re.sub("left|right", "{side}", content)], styles[style], strict=True)
     )
     return [" ".join(caption.split()).replace(" ,", ",") for caption in filled]
-
-
-@cache
-def phrases() -> tuple[dict[str, list[str]], dict[str, list[str]]]:
-    """Returns four captions for each content and four phrases for each style, from `bandai.yaml`."""
-    words = read_yaml(Path(__file__).with_suffix(".yaml"))
-    return words["contents"], words["styles"]
 
 
 def split_of(dataset: int, content: str, style: str, number: int) -> Split:

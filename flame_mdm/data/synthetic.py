@@ -7,12 +7,17 @@ skeleton (Guo et al. 2022). `docs/synthetic.md` describes the grammar of the cap
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from flame_mdm.data import Clip, MotionSource, hashed_split
+from flame_mdm.files import read_yaml
 
 # Offsets from the parent in meters, standing with hanging arms, facing +z; x for the left side, mirrored on the right.
 HIP, SPINE1, SPINE2, SPINE3 = (0.075, -0.075, 0.0), (0.0, 0.131, -0.015), (0.0, 0.142, 0.0), (0.0, 0.057, 0.01)
@@ -498,102 +503,21 @@ def _draw(rng: np.random.Generator, max_seconds: float) -> Attributes:
     return requested
 
 
+@cache
+def _words() -> dict[str, Any]:
+    return read_yaml(Path(__file__).with_suffix(".yaml"))
+
+
 def captions(requested: Attributes) -> list[str]:
     """Returns four predicates that state exactly the attributes: "walks forward slowly", "kicks twice with ...", ..."""
-    side, direction, count = requested.get("side"), requested.get("direction"), int(requested.get("count", 0))
-    times, number, plural = TIMES[count], NUMBERS[count], "s" if count > 1 else ""
-    match requested["action"]:
-        case "walk" if direction == "forward":
-            how = {"slow": (" slowly", " at a slow pace"), "fast": (" quickly", " at a fast pace")}
-            words = how.get(str(requested.get("speed")), ("", ""))
-            ways = ("walks forward", "walks straight ahead", "is walking forward", "goes forward on foot")
-            return [f"{way}{words[n % 2]}" for n, way in enumerate(ways)]
-        case "walk" if direction == "backward":
-            return ["walks backward", "walks backwards", "is walking backward", "takes steps backward"]
-        case "walk" if direction in ("left", "right"):
-            return [
-                f"walks sideways to the {direction}",
-                f"side-steps to the {direction}",
-                f"takes side steps to the {direction}",
-                f"is stepping sideways to the {direction}",
-            ]
-        case "walk":
-            hand = "left" if direction == "counterclockwise" else "right"
-            return [
-                f"walks in a circle {direction}",
-                f"walks in a {direction} circle",
-                f"is walking {direction} in a circle",
-                f"walks {direction} in a circle to the {hand}",
-            ]
-        case "run":
-            return ["runs forward", "is running forward", "runs straight ahead", "jogs forward"]
-        case "turn":
-            return [
-                f"turns to the {direction}",
-                f"turns {direction} on the spot",
-                f"is turning {direction} in place",
-                f"turns around to the {direction} without walking",
-            ]
-        case "jump":
-            return [
-                f"jumps {times}",
-                f"jumps up {times}",
-                f"does {number} jump{plural}",
-                f"is jumping in place {times}",
-            ]
-        case "wave" if side == "both":
-            return [
-                "waves with both hands",
-                "waves both hands",
-                "is waving with both arms",
-                "raises both hands and waves",
-            ]
-        case "wave":
-            return [
-                f"waves with the {side} hand",
-                f"waves the {side} hand",
-                f"is waving with the {side} arm",
-                f"greets by waving the {side} arm",
-            ]
-        case "raise" if side == "both":
-            return [
-                "raises both arms",
-                "lifts both arms up",
-                "is raising both hands high",
-                "puts both arms up",
-            ]
-        case "raise":
-            return [
-                f"raises the {side} arm",
-                f"lifts the {side} arm up",
-                f"is raising the {side} hand high",
-                f"puts the {side} arm up",
-            ]
-        case "kick":
-            return [
-                f"kicks {times} with the {side} leg",
-                f"kicks with the {side} foot {times}",
-                f"does {number} kick{plural} with the {side} leg",
-                f"is kicking {times} with the {side} foot",
-            ]
-        case "punch":
-            return [
-                f"punches {times} with the {side} hand",
-                f"punches with the {side} fist {times}",
-                f"throws {number} punch{'es' if count > 1 else ''} with the {side} arm",
-                f"is punching {times} with the {side} arm",
-            ]
-        case "squat":
-            return [
-                f"squats {times}",
-                f"squats down {times}",
-                f"does {number} squat{plural}",
-                f"bends the knees and squats {times}",
-            ]
-        case "bow":
-            return ["bows", "takes a bow", "bows forward and stands up again", "is bowing politely"]
-        case _:
-            return ["stands still", "is standing still", "stands in place", "does not move and stands still"]
+    side, count = requested.get("side", requested.get("direction")), int(requested.get("count", 0))
+    named = [str(requested.get(name, "")) for name in ("action", "side", "direction", "speed")]
+    kind = " ".join(word for word in named if word not in ("", "normal"))
+    endings = {"s": "s", "es": "es"} if count > 1 else {"s": "", "es": ""}
+    return [
+        phrase.format(side=side, times=TIMES[count], number=NUMBERS[count], **endings)
+        for phrase in _words()["captions"][re.sub("left|right", "{side}", kind)]
+    ]
 
 
 class Synthetic(MotionSource):
@@ -649,32 +573,4 @@ class Synthetic(MotionSource):
 
 def prompts() -> list[tuple[str, Attributes]]:
     """Returns fixed prompts with their attributes, for dashboard samples and `evaluators.metrics.attributes`."""
-    requested: list[Attributes] = [
-        {"action": "walk", "direction": "forward"},
-        {"action": "walk", "direction": "forward", "speed": "slow"},
-        {"action": "walk", "direction": "forward", "speed": "fast"},
-        {"action": "walk", "direction": "backward"},
-        {"action": "walk", "direction": "left"},
-        {"action": "walk", "direction": "right"},
-        {"action": "walk", "direction": "counterclockwise"},
-        {"action": "walk", "direction": "clockwise"},
-        {"action": "run", "direction": "forward"},
-        {"action": "turn", "direction": "left"},
-        {"action": "turn", "direction": "right"},
-        {"action": "jump", "count": 1},
-        {"action": "jump", "count": 2},
-        {"action": "wave", "side": "left"},
-        {"action": "wave", "side": "right"},
-        {"action": "wave", "side": "both"},
-        {"action": "raise", "side": "left"},
-        {"action": "raise", "side": "right"},
-        {"action": "raise", "side": "both"},
-        {"action": "kick", "side": "left", "count": 1},
-        {"action": "kick", "side": "right", "count": 2},
-        {"action": "punch", "side": "left", "count": 2},
-        {"action": "punch", "side": "right", "count": 1},
-        {"action": "squat", "count": 1},
-        {"action": "bow"},
-        {"action": "stand"},
-    ]
-    return [(f"a person {captions(wanted)[0]}", wanted) for wanted in requested]
+    return [(f"a person {captions(requested)[0]}", dict(requested)) for requested in _words()["prompts"]]

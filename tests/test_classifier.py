@@ -53,6 +53,7 @@ def validated(trained: Path) -> list[float]:
     return [row["val/accuracy"] for row in map(json.loads, lines) if "val/accuracy" in row]
 
 
+@pytest.mark.slow
 def test_training_by_recipe_learns_the_actions(trained, data, tmp_path):
     assert validated(trained)[-1] > 0.5  # by chance: about 1 in 11
     result = measure(
@@ -65,6 +66,7 @@ def test_training_by_recipe_learns_the_actions(trained, data, tmp_path):
     assert result["extractor"]["data"] == result["data"]["fingerprint"]
 
 
+@pytest.mark.slow
 def test_a_model_of_actions_is_measured_by_it(trained, data, tmp_path):
     words = [word for word in TINY if not word.startswith(("condition", "data.source"))]
     words += [
@@ -86,6 +88,7 @@ def test_a_model_of_actions_is_measured_by_it(trained, data, tmp_path):
     assert result["values"]["fid"]["mean"] > 2 * result["ground_truth"]["fid"]["mean"]
 
 
+@pytest.mark.slow
 def test_what_was_not_made_for_one_another_is_refused(trained, data, tmp_path, capsys):
     extractor = OwnClassifierExtractor(str(trained))
     own = extractor.task.representation
@@ -136,6 +139,7 @@ def test_recipes_build_the_sizes_of_their_data(recipe):
     assert task(torch.randn(2, 12, joints, 3), torch.ones(2, 12, dtype=torch.bool)).shape == (2, task.network.features)
 
 
+@pytest.mark.slow
 def test_st_gcn_trains_by_the_same_recipe(data, tmp_path):
     sizes = ["task=classifier_stgcn", "task.network.widths=[8,8]", "task.network.strides=[1,2]"]
     options = [
@@ -174,6 +178,7 @@ def validate(rank: int, world: int) -> tuple[float, float | None]:
     return float(task.val_loss.compute()), task.accuracy.compute()
 
 
+@pytest.mark.slow
 def test_two_processes_validate_as_one():
     loss, accuracy = validate(0, 1)
     with GlooPool(2) as pool:

@@ -135,7 +135,9 @@ def legal(denoiser: str, condition: str) -> bool:
 
 each_denoiser = pytest.mark.parametrize("denoiser", DENOISERS)
 each_process = pytest.mark.parametrize("process", PROCESSES)
-each_condition = pytest.mark.parametrize("condition", CONDITIONS)
+each_condition = pytest.mark.parametrize(
+    "condition", ["learned", *(pytest.param(name, marks=pytest.mark.slow) for name in CONDITIONS[1:])]
+)
 
 
 @each_condition

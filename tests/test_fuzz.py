@@ -28,6 +28,8 @@ from flame_mdm.checkpoints.files import read_checkpoint
 from flame_mdm.formats.motion import END_SITES
 from flame_mdm.representations.skeleton import SMPL22
 
+pytestmark = pytest.mark.slow
+
 TEXT = "text=a person walks"
 
 

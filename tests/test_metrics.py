@@ -171,6 +171,7 @@ def test_kernel_distance_equals_the_authors(case: str):
     np.testing.assert_allclose([mmd.mean(), mmd.std()], array(f"{case}_float64/mean_std"), rtol=1e-11, atol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.golden
 @one
 def test_kernel_distance_of_whole_sets_equals_the_authors(stem: str):
@@ -777,6 +778,7 @@ def test_values_do_not_depend_on_the_number_of_processes(first: range, pool: Glo
     assert results == [expected, expected]
 
 
+@pytest.mark.slow
 def test_processes_without_samples_have_no_values(pool: GlooPool):
     first, second = pool.run(measure, (all_metrics(), []), (all_metrics(), []))
     assert first == second == nothing()

@@ -114,6 +114,7 @@ def released() -> dict[str, torch.Tensor]:
     return state | {"net.text_model.embeddings.word_embeddings.weight": torch.randn(5, 768)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stem", ["state_dict_manifest-flame_mclip_net"])
 def test_the_released_file_becomes_an_extractor(stem, released, tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("FLAME_MDM_DATA", str(tmp_path / "own"))
@@ -198,6 +199,7 @@ def loss_and_gradients(first: int, last: int) -> tuple[float, dict[str, torch.Te
     return loss.item(), gradients
 
 
+@pytest.mark.slow
 def test_two_processes_learn_what_one_learns_from_all_pairs():
     loss, gradients = loss_and_gradients(0, 6)
     with GlooPool(2) as pool:
@@ -252,6 +254,7 @@ def trained(tmp_path_factory, data_root):
     return folder / "checkpoints" / "last.ckpt"
 
 
+@pytest.mark.slow
 def test_training_by_recipe_learns_to_retrieve(trained):
     lines = [line.split(",") for line in (trained.parent.parent / "csv" / "metrics.csv").read_text().splitlines()]
     rows = [dict(zip(lines[0], line, strict=True)) for line in lines[1:]]
@@ -264,6 +267,7 @@ def test_training_by_recipe_learns_to_retrieve(trained):
     assert float(rows[0]["train/temperature"]) == pytest.approx(0.07, rel=0.1)
 
 
+@pytest.mark.slow
 def test_a_checkpoint_is_a_feature_extractor(trained):
     extractor = load_task(trained, MotionCLIPTask)
     torch.manual_seed(0)
@@ -281,11 +285,13 @@ def test_a_checkpoint_is_a_feature_extractor(trained):
     assert facts["fingerprint"]
 
 
+@pytest.mark.slow
 def test_a_feature_extractor_is_not_sampled_from(trained):
     with pytest.raises(UserError, match=r"last\.ckpt: holds a MotionCLIPTask, not a MotionGeneration"):
         load(trained)
 
 
+@pytest.mark.slow
 def test_few_captions_train_without_retrieval(tmp_path, capsys):
     options = ["data.source.clips=60", "data.batch_size=8", f"data_root={tmp_path}/data", f"run.dir={tmp_path}/run"]
     steps = ["trainer.max_steps=2", "trainer.val_check_interval=2"]

@@ -164,6 +164,7 @@ def test_numbers_that_are_not_finite_are_damage(tmp_path: Path, capsys: pytest.C
     assert f"frame 3 of clip {clip.id} is not finite" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("data", ["bandai", "humanml3d"])
 def test_the_fingerprint_does_not_depend_on_the_number_of_workers(
     data: str, request: pytest.FixtureRequest, tmp_path: Path
@@ -182,6 +183,7 @@ def test_the_fingerprint_does_not_depend_on_the_number_of_workers(
     assert stores[0].info["sha256"]["features.npy"] == stores[1].info["sha256"]["features.npy"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("how", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
 def test_an_interrupted_preparation_leaves_nothing(
     how: signal.Signals, code: int, takes: Path, fingerprint: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -292,6 +294,7 @@ def words_of(data: str, request: pytest.FixtureRequest, tmp_path: Path) -> list[
     return [f"source={write_uestc(tmp_path / 'set')}"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("data", sorted({*WHERE} - {"folder"}))  # own data goes this way in the tests of its tutorial
 def test_every_set_from_raw_files_to_a_training_step(data: str, request: pytest.FixtureRequest, tmp_path: Path):
     root = f"data_root={tmp_path / 'data'}"

@@ -76,6 +76,7 @@ def logged(checkpoint: Path, name: str) -> dict[int, float]:
     return {int(row["step"]): row[name] for row in history(checkpoint) if name in row}
 
 
+@pytest.mark.slow
 def test_training_by_recipe_matches_texts_and_motions(trained):
     loss, top3 = logged(trained, "val/loss"), logged(trained, "val/motions_for_text_top3")
     assert list(loss) == list(logged(trained, "val/mm_dist")) == [39, 79, 119, 159, 199]
@@ -98,6 +99,7 @@ def same(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor], *parts: str) ->
     return {torch.equal(a[name], b[name]) for name in a if name.startswith(parts) and "bias" not in name}
 
 
+@pytest.mark.slow
 def test_a_resumed_run_is_the_uninterrupted_one_and_changes_parts_at_its_step(words, tmp_path):
     options = [*words, "task.movement_steps=3", "trainer.val_check_interval=2"]
     whole = weights(fit(tmp_path / "whole", options, "trainer.max_steps=6"))
@@ -109,6 +111,7 @@ def test_a_resumed_run_is_the_uninterrupted_one_and_changes_parts_at_its_step(wo
     assert same(at[2], at[3], *matching) == same(at[3], at[4], *movement) == same(at[4], at[6], *movement) == {True}
 
 
+@pytest.mark.slow
 def test_it_measures_text_to_motion(trained, words, tmp_path, monkeypatch):
     where = [word for word in words if word.startswith(("data.source", "data_root"))]
     out = tmp_path / "result.json"
@@ -124,6 +127,7 @@ def test_it_measures_text_to_motion(trained, words, tmp_path, monkeypatch):
     assert result["extractor"]["data"] == result["data"]["fingerprint"]
 
 
+@pytest.mark.slow
 def test_the_checkpoint_needs_no_word_vectors_beside_it(trained):
     extractor = OwnT2MExtractor(str(trained))
     tokens = [["walks/VERB", "slowly/ADV"], ["runs/VERB", "unheard/ADV"]]
@@ -138,6 +142,7 @@ def test_the_checkpoint_needs_no_word_vectors_beside_it(trained):
         extractor.check(extractor.task.representation, "humanml3d")
 
 
+@pytest.mark.slow
 def test_what_is_missing_is_told_in_a_line(words, tmp_path, monkeypatch, capsys):
     def refused(*more: str) -> str:
         assert main(["train", "t2m/kit", *words, f"run.dir={tmp_path / 'run'}", *more]) == 1

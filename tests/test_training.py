@@ -58,6 +58,7 @@ def test_a_run_leaves_what_a_user_looks_for(trained):
     assert not list(folder.rglob("*.partial"))
 
 
+@pytest.mark.slow
 def test_training_learns(tiny):
     checkpoint = run([*tiny, *STEPS, "optimizer.lr=0.01", "trainer.log_every_n_steps=1", "logger=csv"], 120)
     rows = (checkpoint.parent.parent / "csv" / "metrics.csv").read_text().splitlines()
@@ -108,6 +109,7 @@ def test_a_saved_config_repeats_a_run(tiny, tmp_path):
     assert all(torch.equal(second[name], value) for name, value in weights(first).items())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("signum", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_stops_at_the_end_of_a_step_and_the_run_goes_on(tiny, signum, tmp_path):
     overrides = [*tiny, *STEPS, "trainer.max_steps=100000"]

@@ -25,6 +25,8 @@ from flame_mdm.checkpoints.loading import load
 from flame_mdm.config import compose, instantiate, parameters, plain
 from flame_mdm.errors import UserError
 
+pytestmark = pytest.mark.slow
+
 TEXT = "text=a person walks"
 
 

@@ -132,6 +132,7 @@ def prepared(attacked: Refused, bad: Path, change: Callable[[Path], Any], says: 
     attacked("prepare", "data=folder", f"source={place}", f"data_root={root}", says=says)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", MOTIONS)
 def test_motion_files(attacked: Refused, bad: Path, trained: Path, case: str):
     name, content, says = MOTIONS[case]
@@ -212,6 +213,7 @@ TABLES: list[tuple[str, bytes, str]] = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", range(len(TABLES)))
 def test_tables_of_data_folders(attacked: Refused, bad: Path, number: int):
     name, content, says = TABLES[number]
@@ -289,6 +291,7 @@ def archive_cases() -> Iterator[tuple[bytes, str]]:
     yield bytes(10240), "no file dataset-1"
 
 
+@pytest.mark.slow
 def test_archives(attacked: Refused, bad: Path, monkeypatch):
     monkeypatch.setattr("flame_mdm.files.ARRAYS_LIMIT", 4 * MEBIBYTE)  # packing more takes long
     path, root = bad / "set", bad.parent / "prepared"
@@ -301,6 +304,7 @@ def test_archives(attacked: Refused, bad: Path, monkeypatch):
     attacked("prepare", "data=bandai", f"source={path}", f"data_root={root}", says="a pipe")
 
 
+@pytest.mark.slow
 def test_a_tar_archive_of_many_members_takes_little_memory(tmp_path: Path):
     path = tmp_path / "a.tar.gz"
     path.write_bytes(gzip.compress(member("x") * 20_000 + bytes(1024)))
@@ -335,6 +339,7 @@ def no_children(before: list) -> bool:
     return False
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", ["killed", "memory", "bomb", "pipe"])
 def test_one_bad_task_ends_all_workers(case: str, tmp_path: Path):
     (tmp_path / "bomb").write_bytes(bvh_at("999999"))
@@ -378,6 +383,7 @@ PICKLES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", PICKLES)
 def test_pickles(attacked: Refused, bad: Path, case: str):
     content, says = PICKLES[case]

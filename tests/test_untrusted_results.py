@@ -37,6 +37,8 @@ from flame_mdm.reporting.tables import build, load_spec, requests, write
 from flame_mdm.representations.skeleton import SMPL22
 from flame_mdm.visualize import contact_sheet, player_page, write_gif
 
+pytestmark = pytest.mark.slow
+
 TEXT = "text=a person walks"
 
 # Table specs ----------------------------------------------------------------------------------------------------------

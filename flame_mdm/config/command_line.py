@@ -147,7 +147,8 @@ def _serve(
 
     def start(plain: Config, task: Sequence[str]) -> int:
         if name is None:  # what Lightning starts further processes with
-            sys.argv = [sys.argv[0], first, *task, _quoted(f"run.dir={plain['run']['dir']}", ("run.dir",))]
+            folder = _quoted(f"run.dir={plain['run']['dir']}", ("run.dir",))
+            sys.argv = [sys.argv[0], "train", first, *task, folder]
         code = guarded(lambda: command(plain))
         codes.append(code)
         return code

@@ -4,6 +4,7 @@ import csv
 import os
 import re
 import sys
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import cast
@@ -17,7 +18,7 @@ from evaluators.extractors.motion_clip import MotionCLIPTask
 from flame_mdm.__main__ import main
 from flame_mdm.checkpoints.files import read_checkpoint
 from flame_mdm.commands import train
-from flame_mdm.config import compose, instantiate
+from flame_mdm.config import compose, instantiate, run
 from flame_mdm.motion import collate
 from flame_mdm.task import MotionGeneration
 
@@ -121,14 +122,18 @@ def test_motion_clip_keeps_fewer_pairs_than_processes_once_each(clips, kept):
 
 def test_processes_are_started_with_the_words_of_one_job(tiny, tmp_path, monkeypatch):
     seen = []
-    monkeypatch.setattr(train, "train", lambda config: seen.append((sys.argv[1:], config["run"]["dir"], config)))
-    monkeypatch.setattr(sys, "argv", ["train"])
+
+    def note(config: dict) -> None:
+        seen.append((sys.argv[1:], config["run"]["dir"], config))
+
+    monkeypatch.setattr(train, "main", partial(run, note, usage=train.USAGE))
+    monkeypatch.setattr(sys, "argv", ["flame-mdm", "train"])
     folder = f"run.dir={tmp_path / 'sweep'}"
     assert main(["train", "quickstart", *tiny[:-1], folder, "seed=1,2", "--multirun"]) == 0
     assert len(seen) == 2
     for number, (words, directory, config) in enumerate(seen, 1):
-        assert words[0] == "quickstart"
+        assert words[:2] == ["train", "quickstart"]
         assert config["callbacks"]["checkpoints"]["folder"] == f"{directory}/checkpoints"
         assert f"seed={number}" in words
-        again = compose(words[0], words[1:])
+        again = compose(words[1], words[2:])
         assert again["run"]["dir"] == directory == str(tmp_path / "sweep" / f"seed={number}")

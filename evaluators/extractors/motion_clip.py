@@ -13,8 +13,7 @@ from torch import Tensor, nn
 from torch.distributed.nn.functional import all_gather
 
 from evaluators.extractors.released import load_strictly
-from evaluators.metrics.alignment import MotionsForText, TextsForMotion
-from evaluators.metrics.samples import SampleMetric
+from evaluators.metrics.alignment import MotionsForText, TextAndMotion, TextsForMotion
 from flame_mdm.checkpoints.released import (
     _ENCODER_LAYER,
     _count_layers,
@@ -129,24 +128,18 @@ def info_nce(motion: Tensor, text: Tensor, logit_scale: Tensor) -> Tensor:
     return (F.cross_entropy(scale * motion @ texts.T, own) + F.cross_entropy(scale * text @ motions.T, own)) / 2
 
 
-class PooledLoss(SampleMetric):
+class PooledLoss(TextAndMotion):
     """InfoNCE in pools of 32, formed by key, so that batch size and number of processes do not matter.
 
     The pairs of an incomplete last pool meet the last 32 pairs; with fewer pairs than 32 there is one smaller pool.
+    Features of motions are scaled by the inverse temperature.
     """
 
     higher_is_better = False
 
-    def __init__(self, **kwargs: Any):
-        super().__init__(("keys", "motion", "text"), **kwargs)
-
-    def update(self, motion: Tensor, text: Tensor, keys: Tensor) -> None:
-        """Adds features (B, E) of motions, scaled by the inverse temperature, and of texts, with keys (B,)."""
-        self.keep(keys=keys, motion=motion, text=text)
-
     def compute(self) -> float | None:
         """Mean loss of a pair, in nats."""
-        rows = self.rows("keys", "motion", "text")
+        rows = self.rows("keys", "generated", "text")
         if rows is None:
             return None
         motion, text = rows

@@ -11,8 +11,7 @@ from torch import Tensor, nn
 from torchmetrics import MeanMetric
 
 from evaluators.extractors.t2m import CONTACTS, UNIT, T2MEvaluator, WordVectors
-from evaluators.metrics.alignment import MotionsForText, MultimodalDistance
-from evaluators.metrics.samples import SampleMetric
+from evaluators.metrics.alignment import MotionsForText, MultimodalDistance, TextAndMotion
 from flame_mdm.conditions import Unconditional
 from flame_mdm.config import Config, instantiate
 from flame_mdm.data.datamodule import MotionDataModule
@@ -71,22 +70,18 @@ def matching_loss(motion: Tensor, text: Tensor, margin: float) -> Tensor:
     return (near.square() + (margin - far).clamp(min=0).square()).mean()
 
 
-class MatchingLoss(SampleMetric):
+class MatchingLoss(TextAndMotion):
     """`matching_loss` over all pairs in the order of their keys, whatever the batches and the number of processes."""
 
     higher_is_better = False
 
     def __init__(self, margin: float, **kwargs: Any):
-        super().__init__(("keys", "motion", "text"), **kwargs)
+        super().__init__(**kwargs)
         self.margin = margin
-
-    def update(self, motion: Tensor, text: Tensor, keys: Tensor) -> None:
-        """Adds embeddings (B, E) of motions and of their texts, with keys (B,)."""
-        self.keep(keys=keys, motion=motion, text=text)
 
     def compute(self) -> float | None:
         """The loss; None of fewer than two pairs."""
-        rows = self.rows("keys", "motion", "text")
+        rows = self.rows("keys", "generated", "text")
         if rows is None or len(rows[0]) < 2:
             return None
         motion, text = rows

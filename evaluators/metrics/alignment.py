@@ -126,7 +126,13 @@ def _tensor(indices: np.ndarray, like: Tensor) -> Tensor:
     return torch.from_numpy(indices).to(like.device)
 
 
-class _TextAndMotion(SampleMetric):
+class TextAndMotion(SampleMetric):
+    """A metric of pairs of motion and text.
+
+    Args:
+        kwargs: options of `torchmetrics.Metric`.
+    """
+
     def __init__(self, **kwargs: Any):
         super().__init__(("keys", "generated", "text"), **kwargs)
 
@@ -135,7 +141,7 @@ class _TextAndMotion(SampleMetric):
         self.keep(keys=keys, generated=generated, text=text)
 
 
-class MultimodalDistance(_TextAndMotion):
+class MultimodalDistance(TextAndMotion):
     """MM-Dist, "matching score" in the code of Guo et al. 2022: mean Euclidean distance of motion and own text.
 
     MFM, eq. 10. The authors' code takes distances in float32 and leaves out an incomplete last batch.
@@ -160,7 +166,7 @@ class MultimodalDistance(_TextAndMotion):
         return torch.linalg.vector_norm(motion - text, dim=-1).mean().item()
 
 
-class MotionCLIPScore(_TextAndMotion):
+class MotionCLIPScore(TextAndMotion):
     """mCLIP score of FLAME ("Evaluation Metrics"): mean cosine of the features of motion and own text, in [-1, 1]."""
 
     higher_is_better = True
@@ -171,7 +177,7 @@ class MotionCLIPScore(_TextAndMotion):
         return None if rows is None else F.cosine_similarity(rows[0], rows[1]).mean().item()
 
 
-class WholeSetRetrieval(_TextAndMotion):
+class WholeSetRetrieval(TextAndMotion):
     """Retrieval among all test samples by cosine, protocol "all" of Petrovich et al. 2023 (TMR).
 
     Ties get their mean rank. Other than R-precision, values fall as the test set grows.

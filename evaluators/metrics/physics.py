@@ -85,7 +85,13 @@ class _MeanOverFrames(SampleMetric):
         raise NotImplementedError
 
 
-class Penetration(_MeanOverFrames):
+class _OffTheFloor(_MeanOverFrames):
+    def __init__(self, tolerance: float = 0.005, **kwargs: Any):
+        super().__init__(**kwargs)
+        self.tolerance = tolerance
+
+
+class Penetration(_OffTheFloor):
     """Mean depth of the lowest joint below the floor, y = 0, in metres.
 
     Yuan et al. 2023 (PhysDiff) measure the lowest vertex of a mesh; there, as here, depths up to 5 mm count as 0.
@@ -95,17 +101,13 @@ class Penetration(_MeanOverFrames):
         kwargs: options of `torchmetrics.Metric`.
     """
 
-    def __init__(self, tolerance: float = 0.005, **kwargs: Any):
-        super().__init__(**kwargs)
-        self.tolerance = tolerance
-
     def frame_values(self, motion: Tensor) -> Tensor:
         """Depth of each frame."""
         depth = -motion[..., 1].amin(1)
         return torch.where(depth > self.tolerance, depth, 0.0)
 
 
-class Floating(_MeanOverFrames):
+class Floating(_OffTheFloor):
     """Mean height of the lowest joint above the floor, y = 0, in metres. Jumps float too: compare with real motions.
 
     Yuan et al. 2023 (PhysDiff) measure the lowest vertex of a mesh; there, as here, heights up to 5 mm count as 0.
@@ -114,10 +116,6 @@ class Floating(_MeanOverFrames):
         tolerance: metres that count as 0.
         kwargs: options of `torchmetrics.Metric`.
     """
-
-    def __init__(self, tolerance: float = 0.005, **kwargs: Any):
-        super().__init__(**kwargs)
-        self.tolerance = tolerance
 
     def frame_values(self, motion: Tensor) -> Tensor:
         """Height of each frame."""

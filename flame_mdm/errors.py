@@ -25,9 +25,9 @@ def first_line(error: BaseException) -> str:
     return lines[0] if lines else type(error).__name__
 
 
-def did_you_mean(name: str, names: Iterable[str], cutoff: float = 0.5) -> str:
+def did_you_mean(name: str, names: Iterable[str]) -> str:
     """Returns " Did you mean a, b?" with the up to three nearest of `names`, or "" if none is near."""
-    near = difflib.get_close_matches(name, list(names), 3, cutoff)
+    near = difflib.get_close_matches(name, list(names), 3, 0.5)
     return f" Did you mean {', '.join(near)}?" if near else ""
 
 

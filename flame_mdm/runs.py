@@ -20,7 +20,6 @@ HISTORY = "metrics.jsonl"
 """Training curves, one line per log step."""
 RESULTS = "evaluation/**/result*.json"
 SAMPLES = "samples/step_*"
-LAST = "checkpoints/last.ckpt"
 
 LARGEST = 2**63 - 1
 """Largest whole number in a file; larger ones overflow where they are drawn or logged."""

@@ -205,6 +205,7 @@ def test_texts_may_stay_packed(folder, tmp_path):
         HumanML3D(str(folder)).count()
 
 
+@pytest.mark.slow
 def test_the_command_tells_what_is_there_and_prepares_it(folder, tmp_path, capsys):
     words = ["data=humanml3d", f"source={folder}", f"data_root={tmp_path / 'data'}"]
     assert prepare([*words, "check=true"]) == 0
@@ -472,6 +473,7 @@ def pack(root, subset, name, inner):
     shutil.rmtree(root / "amass" / subset)
 
 
+@pytest.mark.slow
 def test_archives_are_read_in_place_by_several_processes(downloads, mine):
     raw(mine).count()
     packed = shutil.copytree(downloads, mine.parent / "packed")

@@ -11,13 +11,7 @@ from fixtures import GOLDEN, Arrays, golden, meta
 from torch.nn import functional
 
 from evaluators.extractors import MotionCLIPExtractor
-from evaluators.extractors.motion_clip import (
-    MotionCLIP,
-    MotionCLIPTask,
-    PooledLoss,
-    import_mclip,
-    info_nce,
-)
+from evaluators.extractors.motion_clip import MotionCLIP, MotionCLIPTask, PooledLoss, import_mclip, info_nce
 from flame_mdm.__main__ import main
 from flame_mdm.checkpoints.files import read_checkpoint
 from flame_mdm.checkpoints.loading import load, load_task

@@ -14,14 +14,7 @@ from torch.distributed.nn.functional import all_gather
 
 from evaluators.extractors.released import load_strictly
 from evaluators.metrics.alignment import MotionsForText, TextAndMotion, TextsForMotion
-from flame_mdm.checkpoints.released import (
-    _ENCODER_LAYER,
-    _count_layers,
-    _layer_names,
-    _renamed,
-    _shape,
-    released_state,
-)
+from flame_mdm.checkpoints.released import _ENCODER_LAYER, _count_layers, _layer_names, _renamed, _shape, released_state
 from flame_mdm.conditions import ConditionEncoder
 from flame_mdm.config import Config, instantiate
 from flame_mdm.denoisers.flame import cosine_first_sinusoid

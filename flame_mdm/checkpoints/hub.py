@@ -11,11 +11,7 @@ from flame_mdm.checkpoints.files import FILE, read_checkpoint, read_model_file, 
 from flame_mdm.checkpoints.loading import find
 from flame_mdm.config import save
 from flame_mdm.errors import UserError, first_line, markdown_text
-from flame_mdm.files import (
-    read_text,
-    sha256,
-    write_text,
-)
+from flame_mdm.files import read_text, sha256, write_text
 
 WRITTEN = {"README.md": "library_name: flame-mdm", "config.yaml": "The recipe of this model."}
 """Files that `push` writes beside the model, with what tells them from files of others."""

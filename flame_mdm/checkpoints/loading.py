@@ -15,9 +15,7 @@ from torch.utils._pytree import tree_leaves
 from flame_mdm.checkpoints.files import FILE, read_checkpoint
 from flame_mdm.config import Config, flatten, instantiate, trust
 from flame_mdm.errors import UserError, first_line
-from flame_mdm.files import (
-    regular_file,
-)
+from flame_mdm.files import regular_file
 from flame_mdm.processes import MOST_STEPS
 from flame_mdm.task import MotionGeneration, Task
 

@@ -11,13 +11,7 @@ from typing import TYPE_CHECKING
 from flame_mdm.config import Config, run
 from flame_mdm.errors import UserError, say
 from flame_mdm.files import MEBIBYTE, read_text, write_json, write_text
-from flame_mdm.reporting.compare import (
-    MOTIONS,
-    ComparedRun,
-    Prompt,
-    comparison,
-    find,
-)
+from flame_mdm.reporting.compare import MOTIONS, ComparedRun, Prompt, comparison, find
 from flame_mdm.reporting.report import paths
 from flame_mdm.reporting.study import QUESTION, rating_page, tally
 

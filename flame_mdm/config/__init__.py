@@ -19,27 +19,3 @@ from flame_mdm.config.building import (
 from flame_mdm.config.command_line import guarded, run
 from flame_mdm.config.composition import EXPERIMENTS, compose, groups, recipes, settings
 from flame_mdm.config.signatures import Config, check, parameters
-
-__all__ = [
-    "EXPERIMENTS",
-    "RUN_DIR",
-    "TRUSTED",
-    "Config",
-    "check",
-    "compose",
-    "current_names",
-    "flatten",
-    "groups",
-    "guarded",
-    "instantiate",
-    "movable",
-    "original_names",
-    "parameters",
-    "plain",
-    "read_saved",
-    "recipes",
-    "run",
-    "save",
-    "settings",
-    "trust",
-]

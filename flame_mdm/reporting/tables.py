@@ -23,18 +23,7 @@ from flame_mdm.errors import UserError, say
 from flame_mdm.files import read_yaml, write_json, write_text
 from flame_mdm.reporting.page import page
 from flame_mdm.reporting.plots import standalone
-from flame_mdm.reporting.rendering import (
-    WRITERS,
-    Cell,
-    Figure,
-    Line,
-    Part,
-    Table,
-    draw,
-    figure_names,
-    fragment,
-    places,
-)
+from flame_mdm.reporting.rendering import WRITERS, Cell, Figure, Line, Part, Table, draw, figure_names, fragment, places
 from flame_mdm.reporting.study import Ratings, wilson
 from flame_mdm.runs import ClosedSchema, Int, Number, Result, Schema, Value, check_shape, read_json, read_result
 

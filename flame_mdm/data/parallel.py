@@ -1,18 +1,24 @@
-"""Parallel processing of many files in worker processes, with results in order."""
+"""Parallel processing of many files in worker processes, with results in order; locks between processes."""
 
 from __future__ import annotations
 
+import errno
+import fcntl
 import os
 import signal
+import socket
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager, suppress
 from multiprocessing import active_children, get_context, parent_process
-from typing import TypeVar
+from pathlib import Path
+from typing import IO, TypeVar
 
-from flame_mdm.errors import UserError
+from flame_mdm.errors import UserError, say
+from flame_mdm.files import made_folder
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
@@ -81,3 +87,51 @@ def _start_worker() -> None:
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=follow, daemon=True).start()
+
+
+@contextmanager
+def locked(path: Path, busy: Callable[[str], object], advice: str) -> Iterator[str]:
+    """Holds a lock file, with process and host in it, that no other process holds, here or on other hosts.
+
+    The operating system releases the lock when a process ends in any way, so a free lock in a file that still names a
+    process was left behind by one that died. POSIX record locks also hold between hosts on NFS and Lustre; `filelock`
+    uses flock, which Lustre limits to one host by default, and empties the file that names the owner. Windows has
+    neither.
+
+    Args:
+        path: the lock file; removed at the end.
+        busy: called with the owner if another process holds the lock; raises, or returns to wait.
+        advice: what to do on file systems without locks.
+
+    Yields:
+        The process that died and left the file behind; "" if there is none.
+    """
+    while True:
+        with made_folder(path.parent), path.open("a+") as file:
+            file.seek(0)
+            owner = file.read().strip()
+            try:
+                fcntl.lockf(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError as error:
+                if error.errno in (errno.EACCES, errno.EAGAIN):
+                    busy(owner)
+                    fcntl.lockf(file, fcntl.LOCK_EX)
+                else:
+                    say(f"{path}: this file system has no locks ({error.strerror}); {advice}")
+            if not _is_at(file, path):  # the previous process has removed it, and another may hold a new one
+                continue
+            with suppress(OSError):  # a full disk
+                file.truncate(0)
+                os.write(file.fileno(), f"process {os.getpid()} on {socket.gethostname()}\n".encode())
+            try:
+                yield owner
+            finally:
+                path.unlink(missing_ok=True)
+            return
+
+
+def _is_at(file: IO[str], path: Path) -> bool:
+    try:
+        return os.path.samestat(os.fstat(file.fileno()), path.stat())
+    except FileNotFoundError:
+        return False

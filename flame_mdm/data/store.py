@@ -12,27 +12,24 @@ Verification adds a report to the folder, `verify.json`.
 
 from __future__ import annotations
 
-import errno
-import fcntl
 import hashlib
 import io
 import json
-import os
 import shutil
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from itertools import islice
 from pathlib import Path
-from typing import IO, Any, get_args
+from typing import Any, get_args
 
 import numpy as np
 import torch
 from tqdm import tqdm
 
 from flame_mdm.data import Clip, MotionSource, Split
+from flame_mdm.data.parallel import locked
 from flame_mdm.errors import UserError, first_line, say
-from flame_mdm.files import made_folder, parse_json, read_json, read_npy, read_npz, regular_file, sha256, writing
+from flame_mdm.files import parse_json, read_json, read_npy, read_npz, regular_file, sha256, writing
 from flame_mdm.representations import Representation
 
 FORMAT = 1
@@ -115,43 +112,12 @@ def write_store(folder: Path, source: MotionSource, representation: Representati
         FileNotFoundError, ValueError: from the data set, or because features are not finite; no files are left behind.
     """
     total, before = source.count(), (folder / "store.json").exists()
-    with _only_writer(folder):
+    lock = folder.with_name(folder.name + ".lock")
+    waiting = f"{folder}: another process is preparing it; waiting"
+    with locked(lock, lambda _: say(waiting), "prepare in one process at a time"):
         if before or not (folder / "store.json").exists():
             _write(folder, source, representation, total)
     return Store(folder)
-
-
-@contextmanager
-def _only_writer(folder: Path) -> Iterator[None]:
-    """Waits until no other process, on this host or another one with the same file system, writes the store.
-
-    The operating system releases the lock of a process that dies; the next process removes its leftover files.
-    """
-    path = folder.with_name(folder.name + ".lock")
-    while True:
-        with made_folder(folder.parent), path.open("w") as file:
-            try:
-                fcntl.lockf(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError as error:
-                if error.errno in (errno.EACCES, errno.EAGAIN):
-                    say(f"{folder}: another process is preparing it; waiting")
-                    fcntl.lockf(file, fcntl.LOCK_EX)
-                else:
-                    say(f"{path}: this file system has no locks ({error.strerror}); prepare in one process at a time")
-            if not _is_at(file, path):  # the previous process has removed it, and another may hold a new lock file
-                continue
-            try:
-                yield
-            finally:
-                path.unlink(missing_ok=True)
-            return
-
-
-def _is_at(file: IO[str], path: Path) -> bool:
-    try:
-        return os.path.samestat(os.fstat(file.fileno()), path.stat())
-    except FileNotFoundError:
-        return False
 
 
 def _write(folder: Path, source: MotionSource, representation: Representation, total: int) -> None:

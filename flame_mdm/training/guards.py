@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import errno
-import fcntl
 import json
 import os
 import re
 import shutil
-import socket
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -20,8 +17,9 @@ from lightning.pytorch.plugins.io import TorchCheckpointIO
 from torch import Tensor
 
 from flame_mdm.checkpoints.files import read_checkpoint
+from flame_mdm.data.parallel import locked
 from flame_mdm.errors import UserError, say
-from flame_mdm.files import made_folder, write_failure
+from flame_mdm.files import write_failure
 from flame_mdm.motion import MotionBatch
 
 LAST, PREVIOUS = "last.ckpt", "previous.ckpt"
@@ -31,38 +29,25 @@ LAST, PREVIOUS = "last.ckpt", "previous.ckpt"
 def only_run(folder: Path) -> Iterator[None]:
     """Holds `run.lock` in the folder of a run, with process and host in it, for as long as the run lasts.
 
-    The operating system releases the lock when a process ends in any way, so a free lock in a file that still names a
-    process was left behind by one that died. POSIX record locks also hold between hosts on NFS and Lustre; `filelock`
-    uses flock, which Lustre limits to one host by default, and empties the file that names the owner. Windows has
-    neither.
-
     Raises:
         UserError: another process, here or on another host of a shared file system, holds it.
     """
-    path, new = folder / "run.lock", not folder.exists()
-    with made_folder(folder), path.open("a+") as file:
-        file.seek(0)
-        before = file.read().strip()
-        try:
-            fcntl.lockf(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            if error.errno in (errno.EACCES, errno.EAGAIN):
-                raise UserError(
-                    f"{folder}: {before or 'another process'} trains here now; give this run a name of its own with "
-                    "run.name=..., or end that one"
-                ) from None
-            say(f"{path}: this file system has no locks ({error.strerror}); do not start a second run in the folder")
-        if before:
-            say(f"{folder}: {before} ended without a word; its run is taken over")
+
+    def refuse(owner: str) -> None:
+        raise UserError(
+            f"{folder}: {owner or 'another process'} trains here now; give this run a name of its own with "
+            "run.name=..., or end that one"
+        )
+
+    new = not folder.exists()
+    with locked(folder / "run.lock", refuse, "do not start a second run in the folder") as dead:
+        if dead:
+            say(f"{folder}: {dead} ended without a word; its run is taken over")
             for unfinished in (folder / "checkpoints").glob("*.partial"):
                 unfinished.unlink(missing_ok=True)
-        file.truncate(0)
-        file.write(f"process {os.getpid()} on {socket.gethostname()}\n")
-        file.flush()
         try:
             yield
         finally:
-            path.unlink(missing_ok=True)
             if new and not (folder / "config.yaml").exists():  # training did not start: only loggers' files are there
                 shutil.rmtree(folder, ignore_errors=True)
 

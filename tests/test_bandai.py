@@ -282,6 +282,7 @@ def test_mirrored_smpl_rotations(tiny):
         np.testing.assert_allclose(decoded(clip.motion), expected, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_preparing_smpl_rotations(tiny, tmp_path, capsys):
     words = ["data=bandai", "representation=smpl", f"source={tiny}", f"data_root={tmp_path}", "data.source.workers=1"]
     assert main(["prepare", *words, "data.source.motion=smpl"]) == 0
@@ -363,10 +364,12 @@ def test_archives_give_the_same_clips_and_leave_no_files(tiny, kind, tmp_path, m
     assert len(list(tmp_path.iterdir())) == 2
 
 
+@pytest.mark.slow
 def test_processes_do_not_change_the_result(tiny):
     same(clips(tiny, workers=2), clips(tiny, workers=1))
 
 
+@pytest.mark.slow
 def test_stopping_early_ends_the_processes(tiny):
     iterator = Bandai(str(tiny), workers=2).clips(20)
     next(iterator)
@@ -375,6 +378,7 @@ def test_stopping_early_ends_the_processes(tiny):
     assert not multiprocessing.active_children()
 
 
+@pytest.mark.slow
 def test_no_process_survives_a_killed_command(tiny):
     code = f"""
 import time
@@ -391,6 +395,7 @@ time.sleep(60)
         process.communicate(timeout=20)  # the workers hold the other end of the pipe
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("workers", [1, 2])
 def test_a_damaged_take_is_named_unless_excluded(tiny, tmp_path, workers):
     root = tmp_path / "copy"

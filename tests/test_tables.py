@@ -350,6 +350,7 @@ def test_wilson_interval():
     assert wilson(0, 0) == (0.0, 0.0, 1.0)
 
 
+@pytest.mark.slow
 def test_what_is_missing_is_evaluated_once(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     words = ["data.source.clips=400", *TINY[1:], f"data_root={tmp_path / 'data'}", "run.dir=runs/tiny/default"]

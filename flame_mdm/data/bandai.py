@@ -22,8 +22,12 @@ from flame_mdm.data import Clip, MotionSource, Split, archives
 from flame_mdm.data.parallel import in_order
 from flame_mdm.files import TEXT_LIMIT, read_yaml, regular_file
 from flame_mdm.formats import bvh
-from flame_mdm.formats.layouts import BANDAI as JOINTS
+from flame_mdm.formats.layouts import LAYOUTS
+from flame_mdm.representations.skeleton import SMPL22
 
+_PLACES = LAYOUTS["Bandai-Namco"].map
+JOINTS = {name: place if isinstance(place := _PLACES[name], str) else next(iter(place)) for name in SMPL22.joints}
+"""The joint of the files for each joint of SMPL, in the order of SMPL; spine1 lies between Hips and Spine."""
 SPINE1, SPINE2 = list(JOINTS).index("spine1"), list(JOINTS).index("spine2")
 
 _LEFT, _UP, _FORWARD = np.eye(3)

@@ -83,32 +83,10 @@ _MMM_LIMBS: dict[str, Place] = {
     "collar": {"thorax": 0.5, "*_shoulder": 0.5},
     **{"shoulder": "*_shoulder", "elbow": "*_elbow", "wrist": "*_wrist"},
 }
-BANDAI = {
-    "pelvis": "Hips",
-    "left_hip": "UpperLeg_L",
-    "right_hip": "UpperLeg_R",
-    "spine1": "Hips",
-    "left_knee": "LowerLeg_L",
-    "right_knee": "LowerLeg_R",
-    "spine2": "Spine",
-    "left_ankle": "Foot_L",
-    "right_ankle": "Foot_R",
-    "spine3": "Chest",
-    "left_foot": "Toes_L",
-    "right_foot": "Toes_R",
-    "neck": "Neck",
-    "left_collar": "Shoulder_L",
-    "right_collar": "Shoulder_R",
-    "head": "Head",
-    "left_shoulder": "UpperArm_L",
-    "right_shoulder": "UpperArm_R",
-    "left_elbow": "LowerArm_L",
-    "right_elbow": "LowerArm_R",
-    "left_wrist": "Hand_L",
-    "right_wrist": "Hand_R",
+_BANDAI_LIMBS: dict[str, Place] = {
+    **{"hip": "UpperLeg_*", "knee": "LowerLeg_*", "ankle": "Foot_*", "foot": "Toes_*"},
+    **{"collar": "Shoulder_*", "shoulder": "UpperArm_*", "elbow": "LowerArm_*", "wrist": "Hand_*"},
 }
-"""For each joint of SMPL, in order, the joint in the BVH files of the Bandai-Namco data set. The files have two joints
-between hips and neck, SMPL has three: spine1 is at 40 % of the distance from Hips to Spine."""
 LAYOUTS: dict[str, Layout] = {
     "SMPL": Layout(dict(zip(SMPL22.joints, SMPL22.joints, strict=True))),
     "Mixamo": Layout(
@@ -129,7 +107,14 @@ LAYOUTS: dict[str, Layout] = {
         ),
         unit=0.0254 / 0.45,
     ),
-    "Bandai-Namco": Layout({**BANDAI, "spine1": {"Hips": 0.6, "Spine": 0.4}}, unit=0.01),
+    "Bandai-Namco": Layout(
+        _body(
+            *("L", "R", _BANDAI_LIMBS),
+            **{"pelvis": "Hips", "spine1": {"Hips": 0.6, "Spine": 0.4}, "spine2": "Spine", "spine3": "Chest"},
+            **{"neck": "Neck", "head": "Head"},
+        ),
+        unit=0.01,
+    ),
     "MMM": Layout(
         _body(
             *("left", "right", _MMM_LIMBS),

@@ -30,6 +30,7 @@ LABELS = {
     "denoiser.num_heads": "heads",
     "denoiser.dropout": "dropout",
     "denoiser.max_frames": "longest motion, frames",
+    "condition.model": "text encoder",
     "condition.max_tokens": "longest text, tokens",
     "condition.freeze": "language model frozen",
     "denoiser.length_token": "motion-length token",

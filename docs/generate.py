@@ -102,7 +102,7 @@ def hyperparameters_page() -> str:
 {HEAD}
 What the recipes say, in the order of the papers' tables. In bold: the paper gives this value, too. Where the two
 differ, both stand there. The rest is what the papers leave open, mostly the value of the authors' code; "–": there is
-no such thing. Text encoders go by the id of their checkpoint; where a paper names the kind alone (MFM: CLIP and T5; MDM:
+no such thing. Text encoders go by the id of their checkpoint; where a paper names the kind alone (MFM: CLIP, T5; MDM:
 sentence-BERT), the checkpoint is our choice.
 """
     for table in TABLES:

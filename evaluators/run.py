@@ -125,7 +125,11 @@ def _processes(device: str | None) -> Iterator[tuple[int, int, str]]:
     if world == 1:
         yield rank, world, device
         return
-    # Motions are sent once a replication, by the CPU; a process that is done may wait for hours.
+    # Imported before the group exists: its functions would keep the group, and with it gloo's threads, in their default
+    # arguments, and a thread that is alive while Python shuts down can abort the process.
+    import torch.distributed.nn.functional  # noqa: F401
+
+    # Motions are sent once per replication, by the CPU; a process that is done may wait for hours.
     torch.distributed.init_process_group("gloo", timeout=timedelta(days=7))
     try:
         yield rank, world, device

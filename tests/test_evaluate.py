@@ -579,8 +579,23 @@ def test_processes_share_the_sampling_and_get_one_result(runs, tmp_path):
         assert alone[name] == (value and pytest.approx(value, rel=2e-3, abs=0.04)), name
 
 
+LEAVES_NO_THREADS = """
+import sys
+from pathlib import Path
+
+from flame_mdm.__main__ import main
+
+code = main(sys.argv[1:])
+names = [path.read_text().strip() for path in Path("/proc/self/task").glob("*/comm")]
+sys.exit(code or ", ".join(name for name in names if "gloo" in name) or 0)
+"""
+
+
 @pytest.mark.slow
 def test_torchrun_writes_one_result(runs, tmp_path):
+    """And no thread of gloo is left, which could abort the process while Python shuts down."""
+    script = tmp_path / "evaluate.py"
+    script.write_text(LEAVES_NO_THREADS)
     out = tmp_path / "result.json"
     model = tmp_path / "model" / "checkpoints" / "last.ckpt"
     model.parent.mkdir(parents=True)
@@ -589,7 +604,7 @@ def test_torchrun_writes_one_result(runs, tmp_path):
     torchrun = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2"]
     environment = os.environ | {"OMP_NUM_THREADS": "1"}
     done = subprocess.run(
-        [*torchrun, "-m", "flame_mdm", "evaluate", *words], capture_output=True, text=True, check=False, env=environment
+        [*torchrun, str(script), "evaluate", *words], capture_output=True, text=True, check=False, env=environment
     )
     assert done.returncode == 0, done.stderr
     assert done.stdout.count("written:") == 1

@@ -127,7 +127,7 @@ def _processes(device: str | None) -> Iterator[tuple[int, int, str]]:
         return
     # Imported before the group exists: its functions would keep the group, and with it gloo's threads, in their default
     # arguments, and a thread that is alive while Python shuts down can abort the process.
-    import torch.distributed.nn.functional  # noqa: F401
+    import torch.distributed.nn.functional
 
     # Motions are sent once per replication, by the CPU; a process that is done may wait for hours.
     torch.distributed.init_process_group("gloo", timeout=timedelta(days=7))

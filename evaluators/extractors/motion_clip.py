@@ -290,7 +290,7 @@ def import_mclip(state: Mapping[str, Tensor], *, num_heads: int = 8) -> MotionCL
     stack = "motion_encoder.motion_encoder"
     layers = _count_layers(learned, stack)
     ours = _renamed(learned, {**_layer_names(stack, _ENCODER_LAYER, layers), **_MCLIP})
-    _shape(ours, "cls")
+    _shape(ours, "cls", ndim=3)
     ours["cls"] = ours["cls"].flatten()
     latent_dim, in_features = _shape(ours, "input.weight")
     embedding_dim, text_features = _shape(ours, "text_projection.weight")

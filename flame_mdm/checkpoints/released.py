@@ -219,11 +219,11 @@ def _renamed(state: Mapping[str, Tensor], names: Mapping[str, str]) -> dict[str,
     return renamed
 
 
-def _shape(state: Mapping[str, Tensor], key: str) -> torch.Size:
+def _shape(state: Mapping[str, Tensor], key: str, ndim: int = 2) -> torch.Size:
     if key not in state:
         raise ValueError(f"released weights: nothing for {key}: not a network of this kind, or a damaged file")
-    if key.endswith("weight") and state[key].ndim != 2:
-        raise ValueError(f"released weights: {key} is {tuple(state[key].shape)}, not a matrix")
+    if state[key].ndim != ndim:
+        raise ValueError(f"released weights: {key} has the shape {tuple(state[key].shape)}, not {ndim} dimensions")
     return state[key].shape
 
 

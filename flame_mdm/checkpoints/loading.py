@@ -40,7 +40,8 @@ def find(source: str | Path, which: Which = "last") -> Path:
     if path.exists() and not path.is_dir():
         regular_file(path)
         return path
-    is_run = (path / "config.yaml").is_file() and not any(path.glob("*.safetensors"))
+    weights = [file for file in sorted(path.glob("*.safetensors")) if not file.name.startswith(".")]  # not half-written
+    is_run = (path / "config.yaml").is_file() and not weights
     if is_run or (path / "checkpoints").is_dir():
         file = path / "checkpoints" / f"{which}.ckpt"
         if not file.exists():
@@ -48,12 +49,11 @@ def find(source: str | Path, which: Which = "last") -> Path:
             raise FileNotFoundError(f"{file}: no such checkpoint; the run has {there}")
         return file
     if path.is_dir():
-        files = sorted(path.glob("*.safetensors"))
-        if len(files) != 1:
-            there = ", ".join(file.name for file in files) or "no .safetensors file"
+        if len(weights) != 1:
+            there = ", ".join(file.name for file in weights) or "no .safetensors file"
             raise UserError(f"{path}: this folder holds {there}; name the file of the model")
-        regular_file(files[0])
-        return files[0]
+        regular_file(weights[0])
+        return weights[0]
     match = re.fullmatch(r"([\w.-]+/[\w.-]+)(?:@([\w./-]+))?", str(source))
     if match is None or path.suffix in (".ckpt", ".safetensors", ".pt") or path.parent.is_dir():
         raise FileNotFoundError(f"{path}: no such checkpoint")
@@ -136,7 +136,7 @@ class _Sizes(TorchDispatchMode):
 
     def __init__(self, path: str | Path, weights: dict[str, Tensor], parts: Config):
         super().__init__()
-        largest = max((size for value in weights.values() for size in value.shape), default=0)
+        largest = max((size for value in weights.values() if value.numel() for size in value.shape), default=0)
         for name, value in flatten(parts).items():
             for number in value if isinstance(value, list | tuple) else [value]:
                 if isinstance(number, int) and abs(number) > max(MOST_STEPS, largest):

@@ -30,7 +30,7 @@ if TYPE_CHECKING:  # `--help` does not wait for NumPy
 MEBIBYTE = 2**20
 TEXT_LIMIT = 512 * MEBIBYTE
 """Largest text or JSON file. The largest known, BABEL's annotations, has 175 MiB."""
-YAML_LIMIT = MEBIBYTE
+YAML_LIMIT = MEBIBYTE // 4
 """Largest YAML file: recipes, skeletons, protocols and table specs are far smaller, and YAML parses slowly."""
 YAML_NODES = 100_000
 """Largest number of keys and values in a YAML file after its aliases are expanded."""

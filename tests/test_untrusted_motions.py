@@ -378,6 +378,12 @@ PICKLES = {
     "doubled": (doubled(60), "more than its size"),
     "cycle": (b"\x80\x04]\x94h\x00a.", "nested too deeply"),
     "integers": (pickle.dumps({n * (2**61 - 1): 0 for n in range(2**10)}, 4), "more than 64 bits"),
+    "complex": (pickle.dumps({complex(-1_000_003 * n, n): 0 for n in range(1, 2**10)}, 4), "neither a number nor text"),
+    "complexes": (pickle.dumps({complex(-1_000_003 * n, n) for n in range(1, 2**10)}, 4), "neither a number nor text"),
+    "frozen": (pickle.dumps(frozenset([(1, 2), (3, 4)]), 4), "neither a number nor text"),
+    "old set": (pickle.dumps({(1, 2), (3, 4)}, 2), "neither a number nor text"),
+    "one key": (pickle.dumps({1j: 0}, 4), "neither a number nor text"),
+    "old dictionary": (b"((I1\nI2\ntI3\nd.", "neither a number nor text"),
     "digits": (b"L" + b"9" * 30 + b"L\n.", "more than 64 bits"),
     "attributes": (b"\x80\x04c_codecs\nencode\n}\x8c\x01aNsb.", "sets attributes"),
 }

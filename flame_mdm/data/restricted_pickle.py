@@ -29,7 +29,10 @@ NODE = 32
 MAX_NODES = 200_000
 """Values that a pickle may always hold. Larger ones hold no more than they have bytes, unless they repeat some."""
 MAX_DEPTH = 20
-"""Tuples within tuples. Hashing a tuple that is nested 100,000 times ends the process."""
+"""Tuples within tuples: taking apart a tuple that is nested 100,000 times ends the process."""
+KEYS = (str, bytes, int, float, np.integer, np.floating, type(None))
+"""Keys of dictionaries and members of sets. Of any other kind, many with the same hash could be chosen, which makes
+reading them quadratic."""
 
 
 class _DType:
@@ -137,12 +140,12 @@ class _ArrayUnpickler(pickle._Unpickler):
     def make_set(self, items: Sequence[Any] = ()) -> set:
         """Returns a set."""
         self._spend(NODE * len(items))
-        return set(items)
+        return set(_keys(items))
 
     def make_frozenset(self, items: Sequence[Any] = ()) -> frozenset:
         """Returns a set that can be part of another."""
         self._spend(NODE * len(items))
-        return frozenset(items)
+        return frozenset(_keys(items))
 
     def _spend(self, size: int) -> None:
         self.budget -= size
@@ -196,6 +199,25 @@ class _ArrayUnpickler(pickle._Unpickler):
             raise pickle.UnpicklingError("an integer of more than 64 bits")
 
 
+def _keys(values: Sequence[Any]) -> Sequence[Any]:
+    """Returns the values if all of them may be keys."""
+    if not all(isinstance(value, KEYS) for value in values):
+        raise pickle.UnpicklingError("a key or a member of a set is neither a number nor text")
+    return values
+
+
+def _after_check(
+    load: Callable[[Any], None], keys: Callable[[list[Any]], Sequence[Any]]
+) -> Callable[[_ArrayUnpickler], None]:
+    """Returns how an opcode is read that takes keys from the stack."""
+
+    def checked(self: _ArrayUnpickler) -> None:
+        _keys(keys(self.stack))
+        load(self)
+
+    return checked
+
+
 def _then_check(
     load: Callable[[Any], None], check: Callable[[_ArrayUnpickler], None]
 ) -> Callable[[_ArrayUnpickler], None]:
@@ -213,6 +235,11 @@ for _code in (pickle.TUPLE, pickle.TUPLE1, pickle.TUPLE2, pickle.TUPLE3):
     _dispatch[_code[0]] = _then_check(_dispatch[_code[0]], _ArrayUnpickler._check_tuple)
 for _code in (pickle.LONG1, pickle.LONG4, pickle.LONG, pickle.INT):
     _dispatch[_code[0]] = _then_check(_dispatch[_code[0]], _ArrayUnpickler._check_integer)
+_dispatch[pickle.SETITEM[0]] = _after_check(_dispatch[pickle.SETITEM[0]], lambda stack: stack[-2:-1])
+for _code in (pickle.DICT, pickle.SETITEMS):
+    _dispatch[_code[0]] = _after_check(_dispatch[_code[0]], lambda stack: stack[::2])
+for _code in (pickle.ADDITEMS, pickle.FROZENSET):
+    _dispatch[_code[0]] = _after_check(_dispatch[_code[0]], lambda stack: stack)
 _dispatch[pickle.BUILD[0]] = _ArrayUnpickler._load_build
 _dispatch[pickle.BYTEARRAY8[0]] = _ArrayUnpickler._load_bytearray8
 

@@ -389,11 +389,12 @@ def test_checkpoints_that_cannot_be_resumed(attacked, trained, tmp_path):
     run = tmp_path / "run"
     (run / "checkpoints").mkdir(parents=True)
     whole = read_checkpoint(trained)
+    state = {"state": {0: {"exp_avg": torch.zeros(7, 7, 7)}}, "param_groups": [{"params": [0]}]}
     attacked.watched.append(run)
     words = [*TINY, f"data_root={trained.parent}", f"run.dir={run}", "callbacks.samples=null", "callbacks.best=null"]
     for key, values in {
         "global_step": ("x", None, -1, [], True),
-        "optimizer_states": (None, "x", [3], [{}], [{"state": {}, "param_groups": 3}]),
+        "optimizer_states": (None, "x", [3], [{}], [{"state": {}, "param_groups": 3}], [state]),
         "loops": (None,),
         "callbacks": (3,),
     }.items():

@@ -15,6 +15,7 @@ import torch
 from lightning import Callback, LightningModule, Trainer
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 from torch import Tensor
+from torch.utils._pytree import tree_leaves
 
 from flame_mdm.checkpoints.files import read_checkpoint
 from flame_mdm.data.parallel import locked
@@ -120,6 +121,8 @@ def _resumable(path: Path, checkpoint: dict[str, Any]) -> int:
         and all(isinstance(group, dict) and isinstance(group.get("params"), list) for group in state["param_groups"])
         for state in optimizers
     )
+    shapes = {(), (1,)} | {value.shape for value in checkpoint["state_dict"].values()}
+    whole &= all(value.shape in shapes for value in tree_leaves(optimizers) if isinstance(value, Tensor))
     if not whole or not all(isinstance(checkpoint.get(name), dict) for name in ("loops", "callbacks")):
         raise UserError(f"{path}: damaged: it lacks the state of the optimizer, of the loops or of the callbacks")
     return step

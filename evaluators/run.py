@@ -359,6 +359,7 @@ def _describe(
             "representation": info["representation"],
             "fingerprint": info["fingerprint"],
             "frames": [data.crop.shortest(), data.crop.longest()],
+            "excluded": _excluded(data, request.split),
         },
         "seed": request.seed,
         "extractor": extractor
@@ -381,6 +382,13 @@ def _describe(
     return report
 
 
+def _excluded(data: MotionDataModule, split: Split) -> dict[str, int]:
+    """Returns how many clips were left out of the data set and of the split, by reason."""
+    short = data.clips(split).too_short
+    reason = f"{split} clips shorter than {data.crop.shortest()} frames"
+    return data.store.info["excluded"] | ({reason: short} if short else {})
+
+
 def _selection(model: MotionGeneration, file: Path) -> str:
     """By which rule a checkpoint was chosen among those of its run, as far as its name tells."""
     best = (model.config.get("callbacks") or {}).get("best") or {}
@@ -400,6 +408,8 @@ def _show(report: Mapping[str, Any], out: Path) -> None:
     for name, value in report["values"].items():
         real = report["ground_truth"].get(name)
         say(f"{name:32}{_cell(real):>24}{_cell(value):>24}")
+    for reason, count in report["data"]["excluded"].items():
+        say(f"left out of the data set: {count} {reason}")
     for name, reason in report["not_computed"].items():
         say(f"not computed: {name}: {reason}")
     for reason in report["warnings"]:

@@ -78,6 +78,7 @@ class Data(Schema):
     dataset: str
     fingerprint: str
     frames: Annotated[list[Int], Field(min_length=2, max_length=2)] | None = None
+    excluded: dict[str, Int] = {}
 
 
 class Extractor(Schema):

@@ -32,6 +32,7 @@ from flame_mdm.editing import find_joints
 from flame_mdm.errors import UserError
 from flame_mdm.motion import length_mask
 from flame_mdm.representations.rot6d import Rot6D
+from flame_mdm.runs import read_result
 
 DATA = ("data=synthetic", "data.source.clips=400")
 GENERATOR = ["data.source.clips=400", *TINY[1:], "callbacks.samples=null", "trainer.val_check_interval=2"]
@@ -119,6 +120,7 @@ def test_a_result_says_what_it_is_and_where_it_comes_from(runs, full):
     assert (result["split"], result["published_split"], result["quick"], result["seed"]) == ("test", False, False, 0)
     assert result["changed"] == {"replications": 2}
     assert result["valid"]
+    assert result["data"]["excluded"] == {}
     assert result["data"]["fingerprint"] == runs.data().store.fingerprint == result["extractor"]["data"]
     checkpoint = result["checkpoint"]
     assert len(checkpoint["sha256"]) == len(checkpoint["config_sha256"]) == len(result["extractor"]["sha256"]) == 64
@@ -130,6 +132,21 @@ def test_a_result_says_what_it_is_and_where_it_comes_from(runs, full):
     assert result["environment"]["packages"]["torch"] == torch.__version__
     assert result["device"] == "cpu"
     assert not list(out.parent.rglob("*.partial"))
+
+
+def test_a_result_counts_the_clips_that_were_left_out(runs, full, tmp_path, capsys):
+    root = Path(shutil.copytree(runs.folder / "data", tmp_path / "data"))
+    (path,) = root.glob("*/store.json")
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"excluded": {"motions of HumanAct12": 1191}}))
+    out = tmp_path / "result.json"
+    words = ["baseline=real", *DATA, "data.crop.min_frames=50", f"data_root={root}", "protocol=synthetic", "quick=true"]
+    assert main(["evaluate", *words, "extractor=none", f"out={out}", "device=cpu"]) == 0
+    short = sum(clip.split == "test" and clip.length < 50 for clip in runs.data().store.clips)
+    excluded = {"motions of HumanAct12": 1191, "test clips shorter than 50 frames": short}
+    assert json.loads(out.read_text())["data"]["excluded"] == excluded
+    assert short > 0
+    assert "left out of the data set: 1191 motions of HumanAct12" in capsys.readouterr().out
+    assert read_result(out).data.excluded == excluded
 
 
 def test_real_motions_show_what_was_asked_and_an_untrained_model_does_not(full):

@@ -626,6 +626,18 @@ def test_flames_final_split_trains_on_the_validation_clips(mine, tmp_path):
     assert store.info["excluded"] == {"motions of HumanAct12, as data.source.humanact12 is not given": 1}
 
 
+def test_motions_left_out_of_the_smpl_form_are_counted(mine, tmp_path):
+    index = mine / "HumanML3D" / "index.csv"
+    index.write_text("".join(row for row in index.read_text().splitlines(True) if "000003" not in row))
+    store = write_store(tmp_path / "store", smpl(mine, exclude=["000001", "M000004"]), SMPL())
+    assert {clip.source for clip in store.clips} == {"000000", "000004", "000005"}
+    assert store.info["excluded"] == {
+        "motions by data.source.exclude": 1,
+        "motions that index.csv lacks": 1,
+        "motions of HumanAct12, as data.source.humanact12 is not given": 1,
+    }
+
+
 def test_order_and_fingerprint_do_not_depend_on_how_the_subsets_are_packed(downloads, mine, tmp_path):
     unpacked = write_store(tmp_path / "a", smpl(downloads), SMPL())
     pack(mine, "BMLrub", "BMLrub.tar.bz2", "BioMotionLab_NTroje")

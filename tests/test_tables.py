@@ -206,6 +206,20 @@ def test_rows_of_another_evaluator_are_marked_and_not_compared(folder):
         assert [line.marks for line in reals] == ["a", "b"], change
 
 
+def test_clips_left_out_of_the_data_set_are_in_the_footnotes(folder):
+    (request,) = [asked[0] for row, asked in requests(_part(folder)) if row["label"] == "MDM"]
+    excluded = {"motions of HumanAct12, as data.source.humanact12 is not given": 1191}
+    data = {"dataset": "synthetic", "fingerprint": "f" * 16, "excluded": excluded}
+    put(request, folder, result(0.5, 0.4, 9.0, data=data))
+    (note,) = [text for _, text in made(folder).parts[0].notes if "left out" in text]
+    assert "; left out of the data set: 1,191 motions of HumanAct12, as data.source.humanact12 is not given" in note
+    lengths = {"fingerprint": "f" * 16, "fps": 20.0, "lengths": [50, 60], "excluded": excluded}
+    (folder / "results" / "lengths").mkdir()
+    (folder / "results" / "lengths" / "mine.json").write_text(json.dumps(lengths))
+    table = build("x", {"title": "Lengths", "parts": {"All": {"lengths": ["mine"]}}}, folder / "results")
+    assert table.parts[0].notes[1] == ("", f"mine; left out of the data set: 1,191 {next(iter(excluded))}")
+
+
 def test_an_invalid_row_says_so_and_is_not_ranked(folder):
     path = next(asked[0].path(folder / "results") for row, asked in requests(_part(folder)) if row["label"] == "MFM")
     reason = "real motions have fid 3, expected 0.002 +- 0.02"

@@ -37,7 +37,9 @@ class Clips(Dataset[Sample]):
 
     def __init__(self, store: Store, split: Split, *, representation: Representation, crop: Crop, seed: int):
         self.store, self.representation, self.crop, self.seed = store, representation, crop, seed
-        self.clips = [c for c in store.clips if c.split == split and c.length >= crop.shortest()]
+        of_split = [clip for clip in store.clips if clip.split == split]
+        self.clips = [clip for clip in of_split if clip.length >= crop.shortest()]
+        self.too_short = len(of_split) - len(self.clips)
         self.lengths = np.array([min(c.length, crop.longest()) for c in self.clips])
         self.mean, self.std = store.mean.astype(np.float32), store.std.astype(np.float32)
 

@@ -348,10 +348,14 @@ class HumanML3DSMPL(MotionSource):
     def clips(self, fps: float) -> Iterator[Clip]:
         if fps != FPS:
             raise ValueError(f"{self.name} has {FPS} frames per second, but representation.fps is {fps:g}")
-        left_out = sum(row.humanact12 for row in self.folder.rows if row.name in self.folder.names)
-        self._excluded = Counter()
-        if left_out and not self.humanact12:
-            self._excluded["motions of HumanAct12, as data.source.humanact12 is not given"] = left_out
+        listed = {name for name in self.folder.names if not name.startswith("M")}  # without mirrored copies
+        indexed = [row for row in self.folder.rows if row.name in listed]
+        left_out = {
+            "motions by data.source.exclude": sum(not name.startswith("M") for name in self.folder.exclude),
+            "motions that index.csv lacks": len(listed) - len(indexed),
+            "motions of HumanAct12, as data.source.humanact12 is not given": len(indexed) - len(self.rows),
+        }
+        self._excluded = Counter({reason: count for reason, count in left_out.items() if count})
         recordings: dict[str, list[Row]] = defaultdict(list)
         for row in self.rows:
             recordings[row.key].append(row)

@@ -362,6 +362,7 @@ def _evaluation(result: Result) -> str:
     text += f", N = {first.n}, {first.replications} replications" if first else ", nothing measured"
     text += f", seed {result.seed}"
     text += f", extractor sha256 {extractor.sha256[:12]}" if extractor else ", no extractor"
+    text += _left_out(data.excluded)
     if result.changed:
         text += "; differs from the protocol: " + ", ".join(f"{k} = {v}" for k, v in result.changed.items())
     if result.published_split:
@@ -370,6 +371,12 @@ def _evaluation(result: Result) -> str:
         text += "; forced: real motions do not have the values that the protocol expects"
     text += "".join(f"; {warning}" for warning in result.warnings)
     return text + ("; QUICK, NOT A RESULT" if result.quick else "")
+
+
+def _left_out(excluded: Mapping[str, int]) -> str:
+    """Describes the clips that were left out of a data set, by reason."""
+    listed = ", ".join(f"{count:,} {reason}" for reason, count in excluded.items())
+    return f"; left out of the data set: {listed}" if listed else ""
 
 
 def _line(row: Mapping[str, Any], found: Sequence[Result | None], values: Sequence[str], files: Sequence[str]) -> Line:
@@ -577,6 +584,7 @@ def count_lengths(dataset: str, results: Path, config: Config) -> None:
     store = data.open()
     lengths = sorted(clip.length for clip in store.clips)
     content = {"fingerprint": store.fingerprint, "fps": store.info["fps"], "lengths": lengths}
+    content["excluded"] = store.info["excluded"]
     write_json(results / "lengths" / f"{dataset}.json", content, indent=None)
 
 
@@ -586,12 +594,14 @@ class Lengths(Schema):
     fingerprint: str
     fps: Annotated[Number, Field(gt=0)]
     lengths: Annotated[list[Annotated[Int, Field(ge=1)]], Field(min_length=1), FailFast()]
+    excluded: dict[str, Int] = Field({})
 
 
 def _lengths(name: str, part: Config, results: Path) -> Part:
     """Builds a table of the motion lengths of data sets."""
     columns = dict.fromkeys(["motions", "hours", "shortest", "median", "mean", "longest"], "none")
     lines, histograms = [], {}
+    notes = [("", "lengths are in frames, at the frame rate of each data set")]
     for dataset in part["lengths"]:
         path = results / "lengths" / f"{dataset}.json"
         if not path.exists():
@@ -608,14 +618,13 @@ def _lengths(name: str, part: Config, results: Path) -> Part:
         ]
         facts = {"fingerprint": found.fingerprint, "frames per second": _text(float(fps))}
         lines.append(Line(dataset, "measured", [Cell(t, float(v)) for t, v in numbers], facts=facts))
+        notes += [("", dataset + _left_out(found.excluded))] if found.excluded else []
         step = max(1, math.ceil(lengths[-1] / 40))
         counts = [0] * (lengths[-1] // step + 1)
         for length in lengths:
             counts[length // step] += 1
         histograms[dataset] = ([float(i * step) for i in range(len(counts) + 1)], counts)
-    return Part(
-        name, columns, lines, [("", "lengths are in frames, at the frame rate of each data set")], histograms=histograms
-    )
+    return Part(name, columns, lines, notes, histograms=histograms)
 
 
 def _ratings(name: str, part: Config, reported: Config | None) -> Part:

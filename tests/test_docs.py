@@ -1,10 +1,12 @@
 """README and docs: every link, name, path and command in them exists."""
 
+import ast
 import importlib
 import re
 import shlex
 import shutil
 import subprocess
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -47,7 +49,8 @@ def exists(name: str) -> bool:
 
 
 def unknown_paths(text: str) -> list[str]:
-    """Returns paths inside the repository's folders that do not exist."""
+    """Returns paths inside the repository's folders that do not exist; targets of links are left to `broken_links`."""
+    text = re.sub(r"\]\([^)]*\)", "]", text)
     paths = set(re.findall(r"(?<![\w/.-])(?:flame_mdm|evaluators|experiments|benchmarks|tests)/[\w./-]*\w", text))
     return sorted(path for path in paths if not (ROOT / path).exists() and not any(word in path for word in OWN))
 
@@ -108,7 +111,34 @@ def test_links_names_paths_and_commands_of_a_page_exist(page):
     assert wrong_commands(text) == []
 
 
+def unknown_messages(text: str) -> list[str]:
+    """Returns messages, set as **`...`**, that no string of the code holds; … stands for what it fills in."""
+    known = "\n".join(strings())
+    return [
+        message
+        for message in re.findall(r"\*\*`([^`]+)`\*\*", text)
+        if not re.search(".*".join(map(re.escape, message.split("…"))), known)
+    ]
+
+
+def strings() -> Iterator[str]:
+    """Yields the strings of the code, with … for what is filled in."""
+    for path in [*(ROOT / "flame_mdm").rglob("*.py"), *(ROOT / "evaluators").rglob("*.py")]:
+        for node in ast.walk(ast.parse(path.read_text())):
+            parts = node.values if isinstance(node, ast.JoinedStr) else [node]
+            yield "".join(str(part.value) if isinstance(part, ast.Constant) else "…" for part in parts)
+
+
+def test_messages_on_the_page_of_first_problems_are_those_of_the_code():
+    text = (ROOT / "docs" / "first-problems.md").read_text()
+    assert text.count("**`") > 20
+    assert unknown_messages(text) == []
+
+
 def test_the_checks_can_fail():
+    assert unknown_messages("**`a leg of … m`** **`unknown experiment 'x'`** `no message`") == [
+        "unknown experiment 'x'"
+    ]
     assert broken_links(PAGES[0], "[a](docs/data.md#x) [b](docs/nothing.md) [c](https://d.e)") == ["docs/nothing.md"]
     assert unknown_names("flame_mdm.load evaluators.run.evaluate flame_mdm.nothing flame_mdm.config.nothing") == [
         "flame_mdm.config.nothing",

@@ -327,8 +327,9 @@ class Run:
 
     @property
     def steps(self) -> int:
-        """Steps that the training curves cover."""
-        return max((max(curve) + 1 for name, curve in self.curves.items() if name.startswith("train/")), default=0)
+        """Number of training steps that the curves cover."""
+        trained = (curve for name, curve in self.curves.items() if name.startswith(("train/", "samples/")))
+        return max((max(curve) + 1 for curve in trained), default=0)
 
 
 def newest_samples(folder: Path, file: str) -> Path | None:

@@ -1,8 +1,8 @@
-"""What a second process costs: seconds a step of two gloo processes against one, `python benchmarks/ddp.py [runs]`.
+"""Scaling of DDP: seconds per step of two gloo processes and of one, `python benchmarks/ddp.py [runs]`.
 
-Both train the same batches of 16 clips, one process all 16 and two processes 8 each, with one thread each. With a core
-for each process, the ratio is 0.5 where nothing is lost; two processes on one core cannot go below 1. The loss is what
-gathering the gradients costs, and that both wait for the slower one. Seconds are between steps, so without imports.
+Both train on the same batches of 16 clips, one process with all 16 and two processes with 8 each, one thread per
+process. With one core per process, the ideal ratio is 0.5; two processes on one core cannot be below 1. The overhead is
+reducing the gradients and waiting for the slower process. Times are between steps, so they do not include imports.
 """
 
 import json
@@ -43,7 +43,7 @@ class Clock(Callback):
 
 
 def step_seconds(folder: Path, processes: int, run: int) -> float:
-    """Median of the seconds between steps."""
+    """Returns the median time between steps in seconds."""
     words = ["quickstart", *SMALL, f"data.batch_size={16 // processes}", f"run.dir=run{processes}-{run}"]
     words += ["trainer.devices=2", "trainer.strategy=ddp"] if processes == 2 else []
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(folder), "GLOO_SOCKET_IFNAME": "lo"}
@@ -61,14 +61,14 @@ def step_seconds(folder: Path, processes: int, run: int) -> float:
 
 
 def main(runs: int) -> None:
-    """Prints the medians over runs, taken by turns, and their ratio."""
+    """Prints the medians over alternating runs, and their ratio."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         (folder / "clock.py").write_text(CLOCK)
         pairs = [(step_seconds(folder, 1, run), step_seconds(folder, 2, run)) for run in range(runs)]
     one, two = (statistics.median(values) for values in zip(*pairs, strict=True))
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    print(f"{cores} cores; milliseconds a step of 16 clips: one process {1000 * one:.1f}, two {1000 * two:.1f}")
+    print(f"{cores} cores; milliseconds per step of 16 clips: one process {1000 * one:.1f}, two {1000 * two:.1f}")
     print(f"ratio {statistics.median(two / one for one, two in pairs):.2f}")
 
 

@@ -1,4 +1,7 @@
-"""Speed of HumanML3D's features on one core, beside a loop over frames and joints: `python benchmarks/features.py`."""
+"""Speed of HumanML3D's features on one core, compared to a loop over frames and joints.
+
+Run with `python benchmarks/features.py`.
+"""
 
 import statistics
 import time
@@ -16,7 +19,7 @@ FRAMES, CLIPS, RUNS = 90, 16, 15
 
 
 def motion(seed: int) -> Tensor:
-    """A body that bends its joints while it walks a circle, (FRAMES, 22, 3) metres."""
+    """Returns joints (FRAMES, 22, 3) in meters of a body that bends its joints while moving in a circle."""
     rng = torch.Generator().manual_seed(seed)
     time = torch.linspace(0, 2 * torch.pi, FRAMES, dtype=torch.float64)
     bend = 0.2 * torch.randn(22, 3, generator=rng, dtype=torch.float64) * torch.sin(3 * time)[:, None, None]
@@ -27,7 +30,7 @@ def motion(seed: int) -> Tensor:
 
 
 def loop(joints: np.ndarray, heading: np.ndarray) -> np.ndarray:
-    """The clean features of canonical joints with known headings, one frame and one joint at a time."""
+    """Computes clean features of canonical joints with known headings, one frame and one joint at a time."""
     rest = np.array(SMPL22.raw_offsets, dtype=np.float64)
     rows = []
     for t in range(len(joints) - 1):
@@ -52,7 +55,7 @@ def loop(joints: np.ndarray, heading: np.ndarray) -> np.ndarray:
 
 
 def rate(run: Callable[[], object], frames: int) -> float:
-    """Frames a second of processor time, so that other programs on the machine do not count; median of the runs."""
+    """Returns the median frames per second of processor time, which excludes other programs on the machine."""
     run()
     seconds = []
     for _ in range(RUNS):
@@ -71,7 +74,7 @@ def main() -> None:
     heading = clean._heading(joints).numpy()
     difference = np.abs(loop(joints.numpy(), heading) - clean.encode(motions[0]).numpy()).max()
     if difference > 1e-5:
-        raise SystemExit(f"the loop and the representation differ by {difference:.1e}: they do not compute the same")
+        raise SystemExit(f"the features of the loop and of the representation differ by {difference:.1e}")
     features = torch.stack(clean.encode_many(motions))
     rates = {
         "encode, loop over frames and joints": rate(lambda: loop(joints.numpy(), heading), FRAMES),
@@ -82,7 +85,7 @@ def main() -> None:
         f"decode, {CLIPS} clips": rate(lambda: clean.decode(features), CLIPS * FRAMES),
     }
     loop_rate = next(iter(rates.values()))
-    print(f"{FRAMES} frames a clip, one core, median of {RUNS} runs")
+    print(f"{FRAMES} frames per clip, one core, median of {RUNS} runs")
     for name, value in rates.items():
         print(f"{name:<40}{value:>12,.0f} frames/s{value / loop_rate:>10,.1f}x")
 

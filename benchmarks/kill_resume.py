@@ -1,10 +1,11 @@
-"""Kills training, preparation and evaluation at random moments: `python benchmarks/kill_resume.py [kills]`, 20 of each.
+"""Kills training, preparation and evaluation at random times and resumes them.
 
-Kills are SIGKILL and SIGTERM by turns; every fourth of training is SIGKILL in the middle of a checkpoint's bytes.
-Moments of training are so many steps and up to 50 ms after its start, others up to the seconds of an uninterrupted run;
-kills that come too late do not count. What the runs make at the end must be what uninterrupted ones make: weights bit
-for bit, the fingerprint of the data, the evaluation's JSON but for measured seconds; exit code 1 otherwise. Processes
-are forked off one that has imported everything.
+Usage: `python benchmarks/kill_resume.py [kills]`, by default 20 kills of each command. Signals alternate between
+SIGKILL and SIGTERM; every fourth kill of training is a SIGKILL halfway through writing a checkpoint. Training is killed
+after a random number of steps plus up to 50 ms, the other commands at a random time up to the duration of an
+uninterrupted run; kills that come too late do not count. The final outputs must equal those of uninterrupted runs:
+weights bit for bit, the fingerprint of the data, the JSON of the evaluation except for measured times. Otherwise the
+exit code is 1. Processes are forked from one that has imported everything.
 """
 
 from __future__ import annotations
@@ -45,7 +46,7 @@ STORE = "synthetic-humanml-clean-smpl22"
 
 
 class Kill:
-    """A signal to this process after so many steps of training and seconds; `writing`, inside the next checkpoint."""
+    """A signal to this process after `steps` of training and `seconds`; with `writing`, inside the next checkpoint."""
 
     def __init__(self, seconds: float, signum: int, steps: int = 0, writing: bool = False):
         self.seconds, self.signum, self.steps, self.writing = seconds, signum, steps, writing
@@ -78,7 +79,7 @@ class Kill:
 
 
 def work(main: Callable[[list[str]], int], words: list[str], kill: Kill | None, log: Path) -> None:
-    """Runs a command in this process, until the kill."""
+    """Runs a command in this process until it is killed."""
     with log.open("w") as file:
         os.dup2(file.fileno(), 1)
         os.dup2(file.fileno(), 2)
@@ -92,14 +93,14 @@ def work(main: Callable[[list[str]], int], words: list[str], kill: Kill | None, 
 
 
 class Trials:
-    """Runs of commands in a folder, each in a process of its own; prints a table, and keeps whether all was well."""
+    """Runs commands in a folder, each in a separate process; prints a table and records whether all went well."""
 
     def __init__(self, folder: Path):
         self.folder, self.good = folder, True
         self.draw = random.Random(0)
 
     def run(self, main: Callable[[list[str]], int], words: list[str], kill: Kill | None = None) -> tuple[int, float]:
-        """Exit code and seconds; without a kill, the command has to succeed."""
+        """Returns exit code and seconds; without a kill, the command must succeed."""
         begin = time.monotonic()
         arguments = (main, words, kill, self.folder / "log")
         process = multiprocessing.get_context("fork").Process(target=work, args=arguments)
@@ -112,7 +113,7 @@ class Trials:
         return code, time.monotonic() - begin
 
     def kill(self, number: int, longest: float, steps: int = 0, writing: bool = False) -> Kill:
-        """The next one: after up to so many seconds, or 1 to `steps` steps of training."""
+        """Returns the next kill: after up to `longest` seconds, and after 1 to `steps` steps of training if given."""
         seconds = self.draw.uniform(0.0, longest)
         signum = signal.SIGTERM if number % 2 else signal.SIGKILL
         return Kill(seconds, signum, self.draw.randint(1, steps) if steps else 0, writing)
@@ -139,7 +140,7 @@ def training(trials: Trials, kills: int) -> None:
         return ["quickstart", *RECIPE, f"data_root={folder / 'data'}", f"run.dir={folder / name}"]
 
     _, seconds = trials.run(train.main, words("whole"))
-    head(f"Training, {STEPS} steps in {seconds:.1f} s without a break", "goes on from")
+    head(f"Training, {STEPS} steps in {seconds:.1f} s without interruption", "resumes from")
     for number in range(kills):
         # So few steps that all kills come before the end.
         kill = trials.kill(number, 0.05, 2 * STEPS // (kills + 6), writing=number % 4 == 2)
@@ -163,7 +164,7 @@ def preparation(trials: Trials, kills: int) -> None:
 
     _, seconds = trials.run(prepare.main, words(trials.folder / "prepared"))
     wanted = Store(trials.folder / "prepared" / STORE).info
-    head(f"Preparation, {seconds:.1f} s without a break", "left behind; after the next run")
+    head(f"Preparation, {seconds:.1f} s without interruption", "left behind; result of the next run")
     for number in range(kills):
         root = trials.folder / f"prepared{number}"
         code = 0
@@ -172,12 +173,12 @@ def preparation(trials: Trials, kills: int) -> None:
             kill = trials.kill(number, seconds)
             code, _ = trials.run(prepare.main, words(root), kill)
         left = sorted(path.name for path in root.iterdir()) if root.exists() else []
-        # What has the name of the store is whole.
+        # A folder with the name of the store must be complete.
         whole = STORE not in left or Store(root / STORE).info == wanted
         trials.run(prepare.main, words(root))
         same = Store(root / STORE).info == wanted and [path.name for path in root.iterdir()] == [STORE]
         trials.row(
-            number, kill, code, f"{', '.join(left) or 'nothing'}; {'the same' if same else 'ANOTHER'}", whole and same
+            number, kill, code, f"{', '.join(left) or 'nothing'}; {'the same' if same else 'DIFFERENT'}", whole and same
         )
         shutil.rmtree(root)
     print()
@@ -209,17 +210,17 @@ def evaluation(trials: Trials, kills: int) -> None:
     def result(name: str) -> dict[str, Any]:
         report = json.loads((trials.folder / name / "result.json").read_text())
         report["checkpoint"].pop("path")
-        for name in ("command", "commit", "changed"):  # somebody may edit the code meanwhile
+        for name in ("command", "commit", "changed"):  # the code may be edited meanwhile
             report["environment"].pop(name)
         report["cost"].pop("seconds_per_sample")
         return report
 
     _, seconds = trials.run(evaluate.main, words("evaluated"))
     wanted = result("evaluated")
-    head(f"Evaluation, {seconds:.1f} s without a break", "replications kept")
+    head(f"Evaluation, {seconds:.1f} s without interruption", "replications kept")
     equal, name = True, ""
     for number in range(kills):
-        if number % 4 == 0:  # anew, after three runs that went on with what a killed one had made
+        if number % 4 == 0:  # start over, after three runs that resumed from a killed one
             name = f"evaluated{number}"
         code = 0
         while code == 0:
@@ -232,7 +233,7 @@ def evaluation(trials: Trials, kills: int) -> None:
         if number % 4 == 3 or number == kills - 1:
             trials.run(evaluate.main, words(name))
             equal &= result(name) == wanted
-    trials.verdict("evaluated to the end; results equal but for measured seconds", equal)
+    trials.verdict("evaluated to the end; results equal except for measured times", equal)
 
 
 def main(kills: int) -> int:
@@ -243,7 +244,7 @@ def main(kills: int) -> int:
         trials = Trials(Path(name))
         for part in (training, preparation, evaluation):
             part(trials, kills)
-    print("all as without a break" if trials.good else "NOT AS WITHOUT A BREAK")
+    print("all equal to uninterrupted runs" if trials.good else "NOT EQUAL TO UNINTERRUPTED RUNS")
     return 0 if trials.good else 1
 
 

@@ -1,9 +1,9 @@
-"""Speed of the training loader beside a training step: `python benchmarks/loading.py [clips]`.
+"""Speed of the training loader compared to a training step: `python benchmarks/loading.py [clips]`.
 
-A synthetic set is packed into a temporary folder. Loading in the training process, and forward, backward and update of
-the small MDM encoder, are counted in processor time of one core, so that other programs on the machine do not matter.
-Loading by workers is counted in wall time, which sees what handing batches over costs, and what the machine is busy
-with besides. Medians of the rounds.
+A synthetic data set is packed into a temporary folder. Loading in the training process, and forward, backward and
+update of the small MDM encoder, are measured in processor time of one core, which excludes other programs on the
+machine. Loading with workers is measured in wall time, which includes passing batches between processes and the load of
+the machine. Prints medians over the rounds.
 """
 
 import itertools
@@ -26,11 +26,11 @@ from flame_mdm.representations.humanml import HumanML
 
 BATCH, BATCHES, ROUNDS = 64, 60, 5
 GOAL = 5000
-"""Clips a second and worker."""
+"""Target clips per second and worker."""
 
 
 def training(features: int) -> Callable[[MotionBatch], None]:
-    """Forward, backward and update of MDM's encoder in its size for CPU runs."""
+    """Returns a training step (forward, backward, update) of MDM's encoder in its size for CPU runs."""
     model = MDMEncoder(features, features, 512, latent_dim=128, ff_size=256, num_layers=4, num_heads=4, dropout=0.0)
     optimizer = torch.optim.AdamW(model.parameters(), fused=True)
 
@@ -45,7 +45,7 @@ def training(features: int) -> Callable[[MotionBatch], None]:
 
 
 def median(run: Callable[[], object], times: int, clock: Callable[[], float]) -> float:
-    """Median seconds of one of `times` calls over the rounds."""
+    """Returns the median over rounds of the mean seconds per call in `times` calls."""
     seconds = []
     for _ in range(ROUNDS):
         start = clock()
@@ -73,10 +73,10 @@ def main(clips: int) -> None:
         lengths = torch.cat([batch.lengths for batch in batches]).float().mean()
         frames = statistics.mean(batch.x.shape[1] for batch in batches)
         print(
-            f"{BATCH} clips a batch, {lengths:.0f} frames of {batches[0].x.shape[2]} features, padded to {frames:.0f}"
+            f"{BATCH} clips per batch, {lengths:.0f} frames of {batches[0].x.shape[2]} features, padded to {frames:.0f}"
         )
         print(f"a training step takes {1000 * wait:.0f} ms of one core, loading its batch {load / wait:.1%} of that")
-        print(f"{'loader':<26}{'ms a batch':>12}{'batches/s':>12}{'clips/s':>10}{'of the goal':>13}")
+        print(f"{'loader':<26}{'ms/batch':>12}{'batches/s':>12}{'clips/s':>10}{'vs. target':>13}")
         row("one core", load, 1)
         for workers in (1, 2):
             data.num_workers = workers
@@ -88,7 +88,7 @@ def main(clips: int) -> None:
 
 
 def row(name: str, seconds: float, workers: int) -> None:
-    """Prints one loader beside the goal."""
+    """Prints the speed of one loader and its ratio to the target."""
     rate = BATCH / seconds
     print(f"{name:<26}{1000 * seconds:>12.2f}{1 / seconds:>12.1f}{rate:>10,.0f}{rate / workers / GOAL:>12.2f}x")
 

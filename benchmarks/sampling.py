@@ -1,8 +1,8 @@
-"""Time to sample by sampler and number of steps: `python benchmarks/sampling.py`.
+"""Sampling time by sampler and number of steps: `python benchmarks/sampling.py`.
 
-Two denoisers: a stub that costs next to nothing, which leaves the cost of the sampling loop itself, and MDM's encoder.
-Samplers take turns within a run, so that a busy machine slows all of them, and medians over the runs are printed with
-their ratio to the first row.
+Uses two denoisers: a stub that costs almost nothing, to measure the sampling loop itself, and MDM's encoder. Samplers
+take turns within a run, so that a busy machine slows all of them. Prints medians over the runs and their ratio to the
+first row.
 """
 
 import argparse
@@ -36,13 +36,13 @@ RUNS = [
 
 
 def stub(x_t: Tensor, t: Tensor, mask: Tensor, cond: Condition) -> Tensor:
-    """A denoiser of one operation."""
+    """A denoiser with a single operation."""
     return 0.5 * x_t
 
 
 @torch.no_grad()
 def measure(denoise: Denoise, args: argparse.Namespace) -> None:
-    """Prints one row a sampler."""
+    """Prints one row per sampler."""
     mask = torch.ones(args.batch, args.frames, dtype=torch.bool, device=args.device)
     null = Condition(torch.zeros(1, 512), torch.zeros(1, 0, 512), None)
     cond = Condition(torch.randn(args.batch, 512), torch.zeros(args.batch, 0, 512), None, null)

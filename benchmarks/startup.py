@@ -1,8 +1,8 @@
-"""Seconds until commands answer: `python benchmarks/startup.py [runs]`, means of 2 by default.
+"""Startup time of commands: `python benchmarks/startup.py [runs]`, medians of 2 runs by default.
 
-`--help` and a misspelt key answer without importing torch. The work itself is the smallest there is: one step of
-training, one motion, one replication of eight motions, so that what is measured is imports and preparation. Ratios are
-to `python -c "import torch"`, so that machines compare.
+`--help` and a misspelled key answer without importing torch. The work itself is minimal (one training step, one motion,
+one replication of eight motions), so that mainly imports and preparation are measured. Ratios are relative to
+`python -c "import torch"`, to compare machines.
 """
 
 import os
@@ -23,7 +23,7 @@ CKPT = "ckpt=first/checkpoints/last.ckpt"
 
 
 def seconds(folder: Path, *words: str) -> float:
-    """Of one process from start to end."""
+    """Returns the duration of one process."""
     begin = time.monotonic()
     done = subprocess.run([sys.executable, *words], capture_output=True, text=True, cwd=folder, check=False)
     if "Traceback" in done.stderr:
@@ -36,9 +36,9 @@ def main(runs: int) -> None:
     os.environ["OMP_NUM_THREADS"] = "1"
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        seconds(folder, "-m", "flame_mdm", "train", "quickstart", *TINY, "run.dir=first")  # prepares the data, too
+        seconds(folder, "-m", "flame_mdm", "train", "quickstart", *TINY, "run.dir=first")  # also prepares the data
         evaluation = ["protocol=synthetic", "extractor=none", "quick=true", "replications=1", "samples=8"]
-        work: dict[str, tuple[list[str], list[str]]] = {  # with the words that differ from run to run
+        work: dict[str, tuple[list[str], list[str]]] = {  # the second list differs from run to run
             "train": (["quickstart", *TINY], ["run.dir=run{}"]),
             "sample": ([CKPT, "text=a person walks", "samples=1", "seconds=0.5"], ["out=samples{}"]),
             "evaluate": ([CKPT, *evaluation, "data_root=data"], ["seed={}", "out=result{}.json"]),
@@ -47,8 +47,8 @@ def main(runs: int) -> None:
         for command, (words, varying) in work.items():
             module = ["-m", "flame_mdm", command]
             rows[f"{command} --help"] = ([*module, "--help"], [])
-            rows[f"{command}, misspelt key"] = ([*module, *words[: command == "train"], "seeed=1"], [])
-            rows[f"{command}, smallest work"] = ([*module, *words], varying)
+            rows[f"{command}, misspelled key"] = ([*module, *words[: command == "train"], "seeed=1"], [])
+            rows[f"{command}, minimal work"] = ([*module, *words], varying)
         print("| | seconds | ratio |\n|---|---|---|")
         base = 0.0
         for row, (words, varying) in rows.items():

@@ -1,6 +1,6 @@
-"""Text encoding from the cache against the live language model, in one run.
+"""Speed of text encoding from the cache and with the language model.
 
-    python benchmarks/text.py [captions a batch]
+    python benchmarks/text.py [captions per batch]
 
 Uses sentence-BERT from the extra `offline`, with tokens, so that nothing is downloaded. Prints medians and their ratio.
 """
@@ -57,7 +57,7 @@ def main(size: int) -> None:
         encoder.load_cache(captions, Path(folder))
         encoder(batches[0])
         cached = median_ms(encoder, batches)
-    print(f"{size} captions a batch: live {live:.2f} ms, cached {cached:.2f} ms, ratio {live / cached:.0f}")
+    print(f"{size} captions per batch: live {live:.2f} ms, cached {cached:.2f} ms, ratio {live / cached:.0f}")
 
 
 if __name__ == "__main__":

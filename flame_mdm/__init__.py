@@ -3,7 +3,7 @@
 import flame_mdm
 model = flame_mdm.load("runs/quickstart/default")
 motion = flame_mdm.generate(model, "a person waves with the left hand", seconds=3, seed=0)[0]
-motion.joints  # (F, J, 3) metres, y up
+motion.joints  # (F, J, 3) meters, y up
 motion.save("wave.glb")
 """
 
@@ -28,7 +28,7 @@ _HOMES = {
 
 
 def __getattr__(name: str) -> Any:
-    """Imports the public names when they are first used: commands answer `--help` without waiting for torch."""
+    """Imports public names on first use, so that commands answer `--help` without importing torch."""
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from importlib import import_module

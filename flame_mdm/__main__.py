@@ -16,7 +16,7 @@ COMMANDS = {
     "evaluate": "evaluate a checkpoint under a protocol",
     "tables": "render tables and figures from results",
     "benchmark": "train, evaluate and tabulate a set of small models",
-    "prepare": "turn a data set into a packed store, or verify one",
+    "prepare": "convert a data set to a packed store, or verify a store",
     "browse": "show a prepared data set as a web page",
     "convert": "convert a motion file",
     "compare": "compare runs side by side, or conduct a user study",
@@ -25,7 +25,7 @@ COMMANDS = {
     "export": "write a checkpoint as a model file",
     "push": "upload a model file to the Hugging Face hub",
 }
-"""Name of each command -> what it does. Each is in `commands/NAME.py`; `import` is in `commands/import_released.py`."""
+"""Command -> purpose. Commands are in `commands/NAME.py`; `import` is in `commands/import_released.py`."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -1,4 +1,4 @@
-"""Editing without training: a part of a motion is kept, the rest is resampled."""
+"""Motion editing without additional training: part of a motion is kept, the rest is resampled."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ METHODS: dict[str, dict[str, Any]] = {
     "flame_code": {"mode": "x_t", "blend": "before"},
     "mfm": {"mode": "trajectory"},
 }
-"""What the papers do, in terms of `Edit`."""
+"""Methods of the papers, as options of `Edit`."""
 
 MFM_STEPS, MFM_UNTIL = 25, 0.2
-"""MFM rewrites "the first 6 time steps" and "0.2 time": both hold for 25 steps (i = 0 ... 5, i / 25 <= 0.2)."""
+"""MFM overwrites "the first 6 time steps" and "0.2 time": both are true for 25 steps (i = 0 ... 5, i / 25 <= 0.2)."""
 
 LEG, ARM = ("hip", "knee", "ankle", "foot", "toes"), ("collar", "shoulder", "elbow", "wrist", "hand")
 
@@ -42,14 +42,15 @@ Ranges = Sequence[float] | Sequence[Sequence[float]]
 
 @dataclass(eq=False, repr=False, kw_only=True)
 class Edited(Motion):
-    """A motion of which a part was kept.
+    """An edited motion, of which a part was kept.
 
     Attributes:
-        original: the motion it was made from.
-        keep: (F, D) bool, True = this feature of this frame was to be kept.
-        feature_error: largest change of what was to be kept, in normalized features; 0 where the method is exact.
-        joint_error: largest way in metres that a joint to be kept went from where it was in the world. Features that
-            are relative to the root do not pin it: behind a new part, kept frames start where that part ends.
+        original: the motion before editing.
+        keep: (F, D) bool, True if this feature of this frame was to be kept.
+        feature_error: maximum change of kept values in normalized features; 0 if the method is exact.
+        joint_error: maximum distance in meters between the world positions of a kept joint before and after. It can be
+            large although features are kept: they are relative to the root, so frames after a resampled part continue
+            from where that part ends.
     """
 
     original: Motion
@@ -76,45 +77,44 @@ def edit(
     sampler: str | None = None,
     num_inference_steps: int | None = None,
 ) -> list[Edited]:
-    """Resamples a part of a motion: `joints` in `region`, each by default all.
+    """Resamples part of a motion: `joints` in `region`, each by default all.
 
     Args:
         model: from `flame_mdm.load`.
-        motion: what `read_motion` reads, or its result, or a generated motion.
-        texts, actions: what to do, as in `generate`; neither = without condition.
+        motion: a source that `read_motion` reads, its result, or a generated motion.
+        texts, actions: conditions, as in `generate`; neither = unconditioned.
         region: frames to resample, [begin, end) or several such ranges; or a task: "in_between" keeps the first and
             the last quarter, "prediction" ("prefix") the first, "suffix" the last, "interpolate" every fifth frame.
         region_seconds: ranges in seconds instead of `region`.
-        joints: names of joints or of parts of the body (see `part_names`), to resample; default all. The root
-            trajectory belongs to joint 0, which is in lower_body.
-        method: "mdm" overwrites the clean estimate (exact); "flame" blends after each step as the paper says (exact);
-            "flame_code" before each call as the paper's code; "mfm" rewrites the path early on. Default: "mdm" on
-            diffusion, "mfm" on flows.
-        until: for "mfm", the flow time up to which the path is rewritten; default 0.2, with 25 steps.
-        resample: for FLAME's methods, how often each step is taken.
+        joints: names of joints or body parts (see `part_names`) to resample; default all. The root trajectory belongs
+            to joint 0, which is in lower_body.
+        method: "mdm" overwrites the clean estimate (exact); "flame" blends after each step, as in the paper (exact);
+            "flame_code" blends before each call, as in FLAME's code; "mfm" overwrites the early part of the path.
+            Default: "mdm" for diffusion, "mfm" for flow matching.
+        until: for "mfm", the flow time up to which the path is overwritten; default 0.2, with 25 steps.
+        resample: for FLAME's methods, how many times each step is repeated.
         samples, seed, guidance_scale, sampler, num_inference_steps: as in `generate`.
 
     Raises:
-        UserError: a mask that keeps all or nothing, unknown names, a method that the model's process does not allow, a
-            motion longer than those of the training, or what `read_motion` and `generate` refuse.
+        UserError: the mask keeps everything or nothing, a name is unknown, the process does not support the method, the
+            motion is longer than those in training, or `read_motion` or `generate` raises it.
         FileNotFoundError, ValueError: from `read_motion`.
     """
     representation = model.representation
-    given = motion if isinstance(motion, Motion) else read_motion(representation, motion)
-    original = with_features(representation, given)
+    motion = motion if isinstance(motion, Motion) else read_motion(representation, motion)
+    original = with_features(representation, motion)
     features = original.features
     length = len(features)
     if length > model.facts["max_frames"]:
         raise UserError(
-            f"{original.id}: {length} frames are more than the {model.facts['max_frames']} "
-            f"({model.facts['max_frames'] / original.fps:g} seconds) that the model was trained on: take a part, "
-            "cut=[begin, end] in seconds"
+            f"{original.id}: {length} frames, but the model was trained on at most {model.facts['max_frames']} "
+            f"({model.facts['max_frames'] / original.fps:g} seconds): select a part with cut=[begin, end] in seconds"
         )
     keep, still = kept_parts(representation, length, region=region, region_seconds=region_seconds, joints=joints)
     if not keep.any():
-        raise UserError("this keeps nothing of the motion: choose region=..., region_seconds=... or joints=...")
+        raise UserError("no part of the motion is kept: choose region=..., region_seconds=... or joints=...")
     if keep.all():
-        raise UserError("this keeps all of the motion: nothing is left to sample")
+        raise UserError("the entire motion is kept: choose a region or joints to resample")
     how = method_options(model.process, method, until, resample)
     if how["mode"] == "trajectory" and num_inference_steps is None:
         num_inference_steps = MFM_STEPS
@@ -131,7 +131,7 @@ def edit(
         num_inference_steps=num_inference_steps,
         edit=Edit(known[None], keep[None].to(model.device), **how),
     )
-    # Normalizing rounds, so what is kept is compared with what the sampler was given.
+    # Normalization rounds, so kept values are compared with the input of the sampler.
     exact, std = representation.denormalize(known).cpu().numpy(), representation.std.cpu().numpy()
     return [
         Edited(
@@ -153,13 +153,13 @@ def kept_parts(
     region_seconds: Ranges | None = None,
     joints: str | Sequence[str] | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """What an edit of a motion of `length` frames keeps; arguments as of `edit`.
+    """Returns the mask of an edit of a motion with `length` frames; arguments are those of `edit`.
 
     Returns:
-        (F, D) bool, True = this feature of this frame is kept; (F, J) bool, the same of the joints.
+        (F, D) bool, True if this feature of this frame is kept; (F, J) bool, the same for joints.
 
     Raises:
-        UserError: frames outside of the motion, unknown names.
+        UserError: a range is outside of the motion, or a name is unknown.
     """
     new_frames = _new_frames(length, representation.fps, region, region_seconds)
     part = torch.zeros(len(representation.skeleton), dtype=torch.bool)
@@ -172,7 +172,7 @@ def kept_parts(
 
 
 def _new_frames(length: int, fps: float, region: str | Ranges | None, seconds: Ranges | None) -> Tensor:
-    """(F,) bool, True = this frame is resampled."""
+    """Returns (F,) bool, True if this frame is resampled."""
     if region is not None and seconds is not None:
         raise UserError("give region or region_seconds, not both")
     if isinstance(region, str):
@@ -200,7 +200,7 @@ def _new_frames(length: int, fps: float, region: str | Ranges | None, seconds: R
         first, last = round(begin * scale), round(end * scale)
         if not 0 <= first < last <= length:
             raise UserError(
-                f"{name}=[{begin:g}, {end:g}] is no part of this motion, which has {length} frames "
+                f"{name}=[{begin:g}, {end:g}] is not a range of this motion, which has {length} frames "
                 f"({length / fps:g} seconds)"
             )
         new[first:last] = True
@@ -210,12 +210,12 @@ def _new_frames(length: int, fps: float, region: str | Ranges | None, seconds: R
 def _pairs(ranges: Ranges, name: str) -> list[tuple[float, float]]:
     listed: Any = [ranges] if is_range(ranges) else ranges
     if not isinstance(listed, list | tuple) or not listed or not all(map(is_range, listed)):
-        raise UserError(f"{name}={ranges}: write [begin, end], or several as [[begin, end], [begin, end]]")
+        raise UserError(f"{name}={ranges}: write [begin, end], or several ranges as [[begin, end], [begin, end]]")
     return [(begin, end) for begin, end in listed]
 
 
 def is_range(value: Any) -> bool:
-    """Whether this is a pair of finite numbers."""
+    """Returns whether the value is a pair of finite numbers."""
     return (
         isinstance(value, list | tuple)
         and len(value) == 2
@@ -224,9 +224,9 @@ def is_range(value: Any) -> bool:
 
 
 def part_names(skeleton: Skeleton) -> dict[str, list[int]]:
-    """Parts of the body by name: indices of their joints.
+    """Returns body parts by name, as indices of their joints.
 
-    lower_body is the root and the legs, as in MDM; upper_body is all the rest.
+    lower_body is the root and the legs, as in MDM; upper_body is everything else.
     """
     sided = {
         f"{side}_{limb}": [
@@ -246,10 +246,10 @@ def part_names(skeleton: Skeleton) -> dict[str, list[int]]:
 
 
 def find_joints(skeleton: Skeleton, names: str | Sequence[str]) -> list[int]:
-    """Indices of the joints that are named, one by one or as parts of the body.
+    """Returns the indices of joints given by names of joints or body parts.
 
     Raises:
-        UserError: an unknown name, with the nearest ones.
+        UserError: a name is unknown; the message suggests similar ones.
     """
     known = part_names(skeleton) | {name: [i] for i, name in enumerate(skeleton.joints)}
     found: set[int] = set()
@@ -266,17 +266,17 @@ def find_joints(skeleton: Skeleton, names: str | Sequence[str]) -> list[int]:
 def method_options(
     process: Process, method: str | None = None, until: float | None = None, resample: int = 1
 ) -> dict[str, Any]:
-    """The options of `Edit` for a method, by default the one of the process; arguments as of `edit`.
+    """Returns the options of `Edit` for a method, by default that of the process; arguments are those of `edit`.
 
     Raises:
-        UserError: the process does not allow the method, or the method lacks an option.
+        UserError: the process does not support the method, or the method does not have an option.
     """
     possible = [name for name, how in METHODS.items() if how["mode"] in process.edit_modes]
     if method is None:
         method = next(name for name in possible if METHODS[name]["mode"] == process.edit_modes[0])
     if method not in possible:
         raise UserError(
-            f"method={method} is not possible with {type(process).__name__}; this model takes: {', '.join(possible)}"
+            f"method={method} is not supported by {type(process).__name__}; this model supports: {', '.join(possible)}"
         )
     how = dict(METHODS[method])
     if until is not None and how["mode"] != "trajectory":
@@ -300,21 +300,21 @@ def read_motion(
     cut: Sequence[float] | None = None,
     data_root: str | Path = "data",
 ) -> Motion:
-    """Reads a motion to edit, in the features of a model.
+    """Reads a motion to edit and computes the features of a model.
 
     Args:
-        representation: of the model.
-        source: a motion file, of any kind that `flame_mdm.formats.files.read` reads; or `dataset:id`, a clip of a
-            prepared data set. Features of the same representation and frame rate are kept; joints are brought to the
-            frame rate of the model and turned as its features have them.
+        representation: the representation of the model.
+        source: a motion file of any kind that `flame_mdm.formats.files.read` reads; or `dataset:id`, a clip of a
+            prepared data set. Features of the same representation and frame rate are kept. Joints are resampled to the
+            frame rate of the model and made canonical by its representation.
         fps, unit: of the file, as in `flame_mdm.formats.files.read`.
-        cut: begin and end in seconds, of the part that counts.
+        cut: begin and end, in seconds, of the part to use.
         data_root: folder of the prepared data sets.
 
     Raises:
-        FileNotFoundError: no such file or data set.
-        ValueError: a damaged file, or a motion whose features this representation cannot compute.
-        UserError: an unknown clip, or a `cut` outside of the motion.
+        FileNotFoundError: the file or data set does not exist.
+        ValueError: the file is damaged, or this representation cannot encode the motion.
+        UserError: the clip is unknown, or `cut` is outside of the motion.
     """
     name = str(source)
     if Path(source).suffix.lower() in ENDINGS:
@@ -333,16 +333,16 @@ def read_motion(
         begin, end = (round(second * representation.fps) for second in cut)
         if not 0 <= begin < end <= len(motion.features):
             seconds = len(motion.features) / representation.fps
-            raise UserError(f"cut=[{cut[0]:g}, {cut[1]:g}] is no part of {name}, which lasts {seconds:g} seconds")
+            raise UserError(f"cut=[{cut[0]:g}, {cut[1]:g}] is not a range of {name}, which lasts {seconds:g} seconds")
         motion = _decoded(representation, representation.rebase(motion.features[begin:end]), motion.text, name)
     return motion
 
 
 def with_features(representation: Representation, motion: Motion) -> Motion:
-    """Returns a motion with features of this representation: as it is if it has them, otherwise computed from joints.
+    """Returns the motion if it has features of this representation, otherwise computes them from its joints.
 
     Raises:
-        ValueError: features of another shape, too many frames, or joints that the representation does not take.
+        ValueError: the features have another shape, the motion is too long, or its joints cannot be encoded.
     """
     fits = motion.representation == representation.name and math.isclose(motion.fps, representation.fps)
     if fits:
@@ -371,7 +371,9 @@ def _read_clip(representation: Representation, source: str, data_root: Path) -> 
     dataset, _, clip_id = source.partition(":")
     store = Store(data_root / f"{dataset}-{representation.name}")
     if store.info["fps"] != representation.fps:
-        raise ValueError(f"{store.folder}: prepared at {store.info['fps']:g} fps, the model has {representation.fps:g}")
+        raise ValueError(
+            f"{store.folder}: prepared at {store.info['fps']:g} fps, but the model has {representation.fps:g}"
+        )
     clips = {clip.id: clip for clip in store.clips}
     if clip_id not in clips:
         raise UserError(f"{store.folder} has no clip '{clip_id}'.{did_you_mean(clip_id, list(clips))}")

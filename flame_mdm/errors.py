@@ -1,4 +1,4 @@
-"""Errors that the user can fix, and suggestions for misspelt names."""
+"""Errors that the user can fix, suggestions for misspelled names, and safe output."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import unicodedata
 from collections.abc import Iterable
 
 MOST_SHOWN = 2_000
-"""Characters of an error line that are shown. None of the framework's own messages is as long."""
+"""Maximum number of characters shown of an error line. The framework's own messages are shorter."""
 
 
 class UserError(Exception):
@@ -26,14 +26,14 @@ def first_line(error: BaseException) -> str:
 
 
 def did_you_mean(name: str, names: Iterable[str]) -> str:
-    """Returns " Did you mean a, b?" with the up to three nearest of `names`, or "" if none is near."""
+    """Returns " Did you mean a, b?" with up to three of the most similar `names`, or "" if none is similar."""
     near = difflib.get_close_matches(name, list(names), 3, 0.5)
     return f" Did you mean {', '.join(near)}?" if near else ""
 
 
 def printable(text: str) -> str:
     r"""Returns the text with control and direction characters escaped (`\x1b`, `\u202e`), so that a file name or
-    a message from an untrusted file cannot drive the terminal.
+    a message from an untrusted file cannot control the terminal.
     """
     return "".join(
         char if char == "\t" or unicodedata.category(char) not in ("Cc", "Cf", "Cs", "Zl", "Zp") else _escaped(char)
@@ -42,7 +42,7 @@ def printable(text: str) -> str:
 
 
 def one_line(text: str) -> str:
-    """Returns a text, which may come from a result file, in one `printable` line."""
+    """Returns a text, which may come from a result file, as one `printable` line."""
     return printable(re.sub(r"[\t\n\v\f\r\x1c-\x1e\x85\u2028\u2029]+", " ", text))
 
 
@@ -54,8 +54,8 @@ def markdown_text(text: str) -> str:
 def say(*lines: object, error: bool = False) -> None:
     """Prints each argument as one `printable` line, to standard output or, with `error`, to standard error.
 
-    Commands use it instead of `print`, because any name or text that they show may come from an untrusted file. Of an
-    error line beyond `MOST_SHOWN` characters, the middle is left out.
+    Commands use it instead of `print`, because any name or text may come from an untrusted file. Error lines longer
+    than `MOST_SHOWN` characters are shortened in the middle.
     """
     for line in lines:
         text = str(line)

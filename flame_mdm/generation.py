@@ -1,4 +1,4 @@
-"""Sampling of motions for texts, actions or nothing, and the files of one request."""
+"""Motion sampling, with text, action or no condition, and output files of one request."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from flame_mdm.visualize.scene import shortened
 
 BATCH = 32
 MOST = 10_000
-"""Samples of one request; they are kept in memory until all are there."""
+"""Maximum number of samples per request; they are kept in memory until all are complete."""
 LONGEST_TEXT = 2000
-"""Characters of a text, far more than any caption of the data sets has."""
+"""Maximum number of characters of a text; captions of the data sets are far shorter."""
 
 
 def generate(
@@ -40,47 +40,47 @@ def generate(
     num_inference_steps: int | None = None,
     edit: Edit | None = None,
 ) -> list[Motion]:
-    """Motions for texts or actions, `samples` of each; for neither, unconditioned ones.
+    """Generates motions for texts or actions, `samples` of each; unconditioned motions if neither is given.
 
-    A motion depends on its text, its length, the number of the sample and the seed alone, not on other texts. If a text
-    is given several times, its samples are numbered on, so that they differ.
+    A motion depends only on its text, its length, the sample number and the seed, not on other texts. If a text is
+    given several times, sample numbers continue, so that its samples differ.
 
     Args:
         model: from `flame_mdm.load`.
-        texts, actions: what to do; one of the two, as the model was trained, or neither.
-        seconds, frames: length; frames may differ from motion to motion. Default: 3 seconds, or the longest possible.
-        samples: motions for each text.
-        seed: of the noise.
-        guidance_scale, sampler, num_inference_steps: instead of the recipe's.
-        edit: what to keep of a motion of that length, `known` and `keep` (1, F, D), in every motion; see
+        texts, actions: conditions; one of the two, depending on the model's training, or neither.
+        seconds, frames: length; `frames` may be one length per motion. Default: 3 seconds, or the maximum if shorter.
+        samples: motions per text.
+        seed: seed of the noise.
+        guidance_scale, sampler, num_inference_steps: override those of the recipe.
+        edit: part of a motion of that length to keep in every sample, with `known` and `keep` (1, F, D); see
             `flame_mdm.commands.edit`.
 
     Raises:
-        UserError: an empty or endless text, an unknown action, a length the model was not trained for.
+        UserError: a text is empty or too long, an action is unknown, or the model was not trained for the length.
     """
     for name, value, most in (("samples", samples, MOST), ("num_inference_steps", num_inference_steps, None)):
         if value is not None and not 1 <= value <= (most or value):
             raise UserError(f"{name}={value}: give 1{f' to {most:,}' if most else ' or more'}")
     if guidance_scale is not None and not math.isfinite(guidance_scale):
-        raise UserError(f"guidance_scale={guidance_scale} is no finite number")
+        raise UserError(f"guidance_scale={guidance_scale} is not a finite number")
     texts = [texts] if isinstance(texts, str) else texts
-    wanted = list(texts or actions or [""])
+    requested = list(texts or actions or [""])
     if texts is not None and not all(text.strip() for text in texts):
-        raise UserError("an empty text describes no motion; leave the text out to sample without condition")
-    for text in wanted:
+        raise UserError("empty text. Omit the text to sample without condition")
+    for text in requested:
         if len(text) > LONGEST_TEXT:
             raise UserError(
                 f"{shortened(text, 60)}: {len(text):,} characters are too many. Give at most {LONGEST_TEXT:,}"
             )
-    if len(wanted) * samples > MOST:
-        raise UserError(f"{len(wanted):,} texts with samples={samples}: at most {MOST:,} motions are sampled at once")
-    captions = [text for text in wanted for _ in range(samples)]
+    if len(requested) * samples > MOST:
+        raise UserError(f"{len(requested):,} texts with samples={samples}: at most {MOST:,} motions per request")
+    captions = [text for text in requested for _ in range(samples)]
     numbers: Counter[str] = Counter()
     ids = []
     for text in captions:
         ids.append(f"{text}#{numbers[text]}")
         numbers[text] += 1
-    lengths = _lengths(model, len(wanted), samples, seconds, frames)
+    lengths = _lengths(model, len(requested), samples, seconds, frames)
     labels = None if actions is None else [_action(model, name) for name in captions]
     results = []
     for begin in range(0, len(ids), BATCH):
@@ -112,7 +112,7 @@ def _finish(model: MotionGeneration, batch: MotionBatch, x: torch.Tensor, captio
         features = known.denormalize(x[row, :length].float())
         joints = known.decode(features)
         if not torch.isfinite(joints).all():
-            raise UserError(f"the model returned a motion that is not finite for '{captions[row]}'")
+            raise UserError(f"the model returned non-finite numbers for '{captions[row]}'")
         motion = Motion(joints.cpu().numpy(), known.fps, known.skeleton, captions[row], batch.ids[row])
         motion.features, motion.representation = features.cpu().numpy(), known.name
         results.append(motion)
@@ -120,23 +120,23 @@ def _finish(model: MotionGeneration, batch: MotionBatch, x: torch.Tensor, captio
 
 
 def _lengths(
-    model: MotionGeneration, wanted: int, samples: int, seconds: float | None, frames: int | Sequence[int] | None
+    model: MotionGeneration, requested: int, samples: int, seconds: float | None, frames: int | Sequence[int] | None
 ) -> list[int]:
     fps, longest = model.representation.fps, model.facts["max_frames"]
     if seconds is not None and not (isinstance(seconds, int | float) and math.isfinite(seconds)):
-        raise UserError(f"seconds={seconds} is no length of a motion")
+        raise UserError(f"seconds={seconds} is not a valid length")
     if seconds is not None and frames is not None:
         raise UserError("give seconds or frames, not both")
     if frames is None:
         frames = min(round(3 * fps), longest) if seconds is None else round(seconds * fps)
-    each = [frames] * wanted if isinstance(frames, int) else list(frames)
-    if len(each) != wanted:
-        raise UserError(f"{len(each)} lengths for {wanted} motions")
+    each = [frames] * requested if isinstance(frames, int) else list(frames)
+    if len(each) != requested:
+        raise UserError(f"{len(each)} lengths for {requested} motions")
     for length in each:
         if not 2 <= length <= longest:
             raise UserError(
                 f"{length / fps:g} seconds ({length} frames) cannot be sampled: the model was trained on motions of up "
-                f"to {longest / fps:g} seconds ({longest} frames at {fps:g} a second)"
+                f"to {longest / fps:g} seconds ({longest} frames at {fps:g} fps)"
             )
     return [length for length in each for _ in range(samples)]
 
@@ -144,14 +144,14 @@ def _lengths(
 def _action(model: MotionGeneration, name: str) -> int:
     actions = model.facts["actions"]
     if name not in actions:
-        raise UserError(f"no action is called '{name}'; there are: {', '.join(actions) or 'none in this model'}")
+        raise UserError(f"unknown action '{name}'; this model knows: {', '.join(actions) or 'none'}")
     return actions.index(name)
 
 
 def write_motions(folder: Path, motions: Sequence[Motion], facts: dict[str, Any]) -> None:
-    """Writes `motion_000.npz` ..., `motions.gif`, `motions.png` and `player.html` into a folder, all of them or none.
+    """Writes `motion_000.npz` ..., `motions.gif`, `motions.png` and `player.html` into a folder, all or none.
 
-    `facts` are added to each `.npz`: seed, checkpoint hash ...
+    `facts`, such as seed and checkpoint hash, are added to each `.npz`.
     """
     scene = [replace(motion, text=motion.text or "unconditioned") for motion in motions]
     with atomic_folder(folder) as made:

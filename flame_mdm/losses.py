@@ -1,4 +1,4 @@
-"""Reconstruction error over real frames, and geometric losses on the clean estimate."""
+"""Reconstruction error over real frames, and geometric losses of the clean estimate."""
 
 from collections.abc import Callable, Sequence
 
@@ -7,9 +7,9 @@ from torch import Tensor, nn
 
 
 def masked_mean(x: Tensor, mask: Tensor) -> Tensor:
-    """(B,) mean of x (B, F, ...) over the real frames of each sample; 0 where a sample has none.
+    """Returns the mean (B,) of x (B, F, ...) over the real frames of each sample; 0 if a sample has none.
 
-    Unlike MDM's code, nothing is added to the number of entries: its 1e-8 is below the resolution of float32.
+    Unlike in MDM's code, 1e-8 is not added to the number of entries: it is below the resolution of float32.
     """
     x = x.flatten(2)
     total = (x * mask[..., None]).sum((1, 2))
@@ -17,23 +17,23 @@ def masked_mean(x: Tensor, mask: Tensor) -> Tensor:
 
 
 def masked_mse(a: Tensor, b: Tensor, mask: Tensor) -> Tensor:
-    """(B,) squared error between a and b (B, F, ...), averaged over real frames (mask (B, F)) and all their entries.
+    """Returns the squared error (B,) of a and b (B, F, ...), averaged over the entries of real frames (mask (B, F)).
 
-    Each sample weighs the same whatever its length (Tevet et al. 2022, eq. 2, as their code averages it).
+    All samples have equal weight, regardless of length (Tevet et al. 2022, eq. 2, averaged as in their code).
     """
     return masked_mean((a - b).square(), mask)
 
 
 def differences(x: Tensor) -> Tensor:
-    """(B, F, ...) -> (B, F - 1, ...), change from each frame to the next."""
+    """Returns the change (B, F - 1, ...) from each frame of x (B, F, ...) to the next."""
     return x[:, 1:] - x[:, :-1]
 
 
 class MotionLosses(nn.Module):
-    """Geometric losses of MDM (Tevet et al. 2022, eq. 3-5), each weighted; terms of weight 0 are not computed.
+    """Weighted geometric losses of MDM (Tevet et al. 2022, eq. 3-5); terms with weight 0 are not computed.
 
-    All are means over real frames and entries, so the paper's norms are divided by the number of entries of a frame,
-    as its code does. Velocities are per frame.
+    All are means over real frames and entries: the norms in the paper are divided by the number of entries per frame,
+    as in its code. Velocities are per frame.
     """
 
     def __init__(
@@ -49,21 +49,21 @@ class MotionLosses(nn.Module):
         root_relative: bool = False,
         velocity_features: int | None = None,
     ):
-        """Weights and options.
+        """Stores weights and options.
 
         Args:
-            to_joints: normalised features (B, F, D) -> joint positions (B, F, J, 3) in metres, differentiable.
+            to_joints: differentiable map from normalized features (B, F, D) to joint positions (B, F, J, 3) in meters.
             feet: indices of the joints that touch the ground.
             joints: weight of the squared error of the joint positions (eq. 3).
             velocity: weight of the squared error of the features' velocity (eq. 5).
-            joint_velocity: weight of the squared error of the joints' velocity; in MDM's code, not in its loss.
-            foot_contact: weight of the squared velocity of feet that stand in the data (eq. 4). The mean includes the
-                feet that do not stand, whose entries are 0, as the paper's sum over all frames does.
-            contact_speed: a foot stands where it moves at most this far per frame in the data, in metres.
-            root_relative: legacy of MDM's code: joints are taken relative to the first one, so that no joint-based loss
-                sees the root translation.
-            velocity_features: legacy of MDM's code: `velocity` sees the first so many features only (144 of 25 x 6,
-                262 of 263: the last row of the feature matrix is left out). None = all.
+            joint_velocity: weight of the squared error of the joints' velocity; in MDM's code, but not in its loss.
+            foot_contact: weight of the squared velocity of feet in contact in the data (eq. 4). The mean includes feet
+                that are not in contact, whose entries are 0, like the sum over all frames in the paper.
+            contact_speed: maximum displacement per frame, in meters, of a foot in contact in the data.
+            root_relative: subtract the first joint from all joints, as in MDM's code, so that joint-based losses do not
+                depend on the root translation.
+            velocity_features: number of features, from the first, that `velocity` uses, as in MDM's code (144 of
+                25 x 6, 262 of 263: the last row of the feature matrix is left out). None = all.
         """
         super().__init__()
         self.to_joints = to_joints
@@ -79,8 +79,8 @@ class MotionLosses(nn.Module):
         self.velocity_features = velocity_features
 
     def forward(self, x0_hat: Tensor, x: Tensor, mask: Tensor) -> dict[str, Tensor]:
-        """Weighted losses (B,) by name, from the clean estimate and the data (B, F, D) and mask (B, F)."""
-        # The first frame has no velocity; a velocity is real where its second frame is, as motions are padded behind.
+        """Returns weighted losses (B,) by name, from clean estimate and data (B, F, D) and mask (B, F)."""
+        # The first frame has no velocity. Padding is at the end, so a velocity is real if its second frame is.
         moving = mask[:, 1:]
         losses: dict[str, Tensor] = {}
         if self.weights["velocity"]:

@@ -1,6 +1,6 @@
-"""The vocabulary: batches of motion, conditions, edits and masks.
+"""Common data types: batches of motions, conditions, edits and masks.
 
-B batch, F frames, D features, S condition tokens, C condition width. Masks: True = real, everywhere.
+B batch, F frames, D features, S condition tokens, C condition width. In all masks, True = real.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ class MotionBatch:
     """Motions of mixed lengths, padded to the longest.
 
     Attributes:
-        x: (B, F, D) float32, normalised features, 0 past the end of each motion.
+        x: (B, F, D) float32, normalized features, 0 past the end of each motion.
         mask: (B, F) bool, True = real frame.
-        ids: B names, unique in the data set; they seed the noise of each sample and join tables.
-        text: one caption a motion, or None where the data has none.
+        ids: B names, unique in the data set; they seed the noise of each sample and are keys for joining tables.
+        text: one caption per motion, or None if the data has none.
         action: (B,) int64 class labels, or None.
     """
 
@@ -33,7 +33,7 @@ class MotionBatch:
 
     @property
     def lengths(self) -> Tensor:
-        """(B,) int64, real frames of each motion."""
+        """Number of real frames (B,) int64 of each motion."""
         return self.mask.sum(1)
 
     def __len__(self) -> int:
@@ -42,13 +42,13 @@ class MotionBatch:
 
 @dataclass
 class Condition:
-    """What the motion is conditioned on, encoded once a batch.
+    """Encoded conditions of a batch.
 
     Attributes:
-        pooled: (B, C), one vector a sample.
-        tokens: (B, S, C), one vector a word piece; (B, 0, C) where the encoder has none.
-        token_mask: (B, S) bool, True = real token. On a null, None means: keep the mask of the sample it replaces.
-        null: the condition that stands for "no condition", with batch size 1; None where there is none to drop to.
+        pooled: (B, C), one vector per sample.
+        tokens: (B, S, C), one vector per word piece; (B, 0, C) if the encoder has none.
+        token_mask: (B, S) bool, True = real token. In a null, None means: keep the mask of the replaced sample.
+        null: the condition that means "no condition", with batch size 1; None if there is none.
     """
 
     pooled: Tensor
@@ -57,7 +57,7 @@ class Condition:
     null: Condition | None = None
 
     def drop(self, drop: Tensor) -> Condition:
-        """Replaces the samples where `drop` (B,) bool is True by the null condition.
+        """Returns conditions in which samples with `drop` (B,) bool True are replaced by the null condition.
 
         Raises:
             ValueError: there is no null condition.
@@ -77,7 +77,7 @@ class Condition:
         return Condition(pooled, tokens, token_mask, null)
 
     def with_null(self) -> Condition:
-        """The batch followed by its null conditions, 2B samples: one forward serves classifier-free guidance."""
+        """Returns the batch followed by its null conditions (2B), for classifier-free guidance in one forward pass."""
         batch = len(self.pooled)
         twice = Condition(
             torch.cat([self.pooled, self.pooled]),
@@ -90,17 +90,18 @@ class Condition:
 
 @dataclass
 class Edit:
-    """A motion of which parts are kept: in-betweening, prediction, interpolation and body parts are data.
+    """Parts of a motion to keep; in-betweening, prediction, interpolation and body-part editing differ only in `keep`.
 
     Attributes:
-        known: (B, F, D) normalised features of the motion to keep parts of.
+        known: (B, F, D) normalized features of the motion.
         keep: (B, F, D) bool, True = keep this feature of this frame.
-        mode: how the process imposes it. "x0" overwrites the clean estimate (MDM); "x_t" replaces the noisy sample
-            by the equally noisy known part (FLAME, RePaint); "trajectory" rewrites the flow's path early on (MFM).
-        until: for "trajectory", the flow time up to which (included) the path is rewritten.
+        mode: how the process applies the edit. "x0" overwrites the clean estimate (MDM); "x_t" replaces part of the
+            noisy sample by the equally noisy known part (FLAME, RePaint); "trajectory" overwrites the early part of the
+            flow's path (MFM).
+        until: for "trajectory", the flow time up to which (inclusive) the path is overwritten.
         blend: for "x_t", replace the kept part "after" each step (FLAME, eq. 6), which ends in the known motion itself,
             or "before" each call of the denoiser (FLAME's code), which ends in the model's version of it.
-        resample: for "x_t", how often each step is taken, going back by fresh noise in between (RePaint, algorithm 1).
+        resample: for "x_t", how many times each step is repeated, after adding noise again (RePaint, algorithm 1).
     """
 
     known: Tensor
@@ -112,10 +113,10 @@ class Edit:
 
 
 Denoise = Callable[[Tensor, Tensor, Tensor, Condition], Tensor]
-"""(x_t (B, F, D), t (B,) float in [0, 1000), mask (B, F), cond) -> (B, F, out_features): a denoiser, guided or not."""
+"""A denoiser, guided or not: (x_t (B, F, D), t (B,) in [0, 1000), mask (B, F), cond) -> (B, F, out_features)."""
 
 Noise = Callable[[int], Tensor]
-"""Noise number 0, 1, 2, ... of a sampling run, each (B, F, D); number 0 is where sampling starts."""
+"""Returns noise number 0, 1, 2, ... of a sampling run, each (B, F, D); sampling starts from number 0."""
 
 
 def pad_to(x: Tensor, size: int) -> Tensor:
@@ -125,7 +126,7 @@ def pad_to(x: Tensor, size: int) -> Tensor:
 
 
 def length_mask(lengths: Tensor, frames: int | None = None) -> Tensor:
-    """(B,) lengths -> (B, F) bool mask, F = `frames` or the longest length."""
+    """Returns the mask (B, F) bool of lengths (B,); F is `frames` or the maximum length."""
     frames = int(lengths.max()) if frames is None else frames
     return torch.arange(frames, device=lengths.device) < lengths[:, None]
 

@@ -1,4 +1,4 @@
-"""Run directories and result files: layout, typed schema, readers that name the file and the key of what is damaged."""
+"""Run directories and result files: layout, typed schema, and readers whose errors name file and key."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ RESULTS = "evaluation/**/result*.json"
 SAMPLES = "samples/step_*"
 
 LARGEST = 2**63 - 1
-"""Largest whole number in a file; larger ones overflow where they are drawn or logged."""
+"""Maximum integer in a file; larger ones overflow when they are plotted or logged."""
 LIMIT = 4 * files.MEBIBYTE
-"""Largest file of results, ratings, lengths or provenance. Real ones have 10 to 300 KiB."""
+"""Maximum size of a file of results, ratings, lengths or provenance. Typical files have 10 to 300 KiB."""
 HISTORY_LIMIT = 256 * files.MEBIBYTE
-"""Largest history; a million steps logged every 50 steps take some 20 MiB."""
+"""Maximum size of a history; a million steps logged every 50 steps take about 20 MiB."""
 
 T = TypeVar("T")
 Int = Annotated[int, Field(gt=-(2**63), lt=2**63)]
 Number = Annotated[float, Field(gt=-1e300, lt=1e300)]
-"""A finite number that does not overflow when it is drawn."""
+"""A finite number that does not overflow when it is plotted."""
 Plain = str | bool | Int | Number | None
 
 
@@ -39,13 +39,13 @@ Plain = str | bool | Int | Number | None
 
 
 class Schema(BaseModel):
-    """Content of a file. Types are not converted: "1" is no number. Keys that are not listed are ignored."""
+    """Content of a file. Types are not converted: "1" is not a number. Unlisted keys are ignored."""
 
     model_config = ConfigDict(strict=True)
 
 
 class ClosedSchema(Schema):
-    """Content of a file that people write: unknown keys are errors, except overrides such as data.crop.max_frames."""
+    """Content of a file written by people: unknown keys are errors, except overrides such as data.crop.max_frames."""
 
     @model_validator(mode="before")
     @classmethod
@@ -57,7 +57,7 @@ class ClosedSchema(Schema):
 
 
 class Value(Schema):
-    """A metric over the replications: mean, half the width of its 95 % interval, motions; None where not computable."""
+    """A metric over replications: mean, half-width of its 95 % interval, number of motions; None if not computable."""
 
     mean: Number | None
     ci: Number | None
@@ -73,7 +73,7 @@ class Protocol(Schema):
 
 
 class Data(Schema):
-    """The data set that was measured, or trained on."""
+    """The data set of an evaluation or training."""
 
     dataset: str
     fingerprint: str
@@ -110,7 +110,7 @@ class Cost(Schema):
 
 
 class Result(Schema):
-    """A result of `flame-mdm evaluate`, as far as tables and pages read it."""
+    """A result of `flame-mdm evaluate`, with the keys that tables and pages read."""
 
     quick: bool
     protocol: Protocol
@@ -146,7 +146,7 @@ class TrainerSteps(Schema):
 
 
 class Recipe(Schema):
-    """The configuration of a run, as far as pages read it."""
+    """The configuration of a run, with the keys that pages read."""
 
     experiment: str | None
     run: RunName
@@ -154,7 +154,7 @@ class Recipe(Schema):
 
 
 class TrainedOn(Schema):
-    """The key `data` of a provenance, with any other facts of the data."""
+    """The key `data` of a provenance file, which may contain other facts about the data."""
 
     model_config = ConfigDict(strict=True, extra="allow")
     fingerprint: str = "–"
@@ -175,7 +175,7 @@ class Provenance(Schema):
 
 
 class FaultyBatch(Schema):
-    """The part of a batch that one process had."""
+    """The part of a batch in one process."""
 
     rank: Int
     batch: Int
@@ -205,23 +205,23 @@ EXPECTED = {
     },
     **{"string_too_short": "a non-empty text", "too_short": "a longer list or mapping", "too_long": "a shorter list"},
 }
-"""What should be there, by the type of a pydantic error or its first word."""
+"""Expected content, by the type of a pydantic error or its first word."""
 
 _adapter = functools.cache(TypeAdapter)
 
 
 def check_shape(content: Any, kind: type[T] | Any) -> T:
-    """Returns content of a file as the type that it has to have.
+    """Returns content of a file converted to the expected type.
 
     Args:
         content: mappings, lists, texts, numbers.
-        kind: a `Schema`, or any other type that pydantic knows.
+        kind: a `Schema`, or any other type that pydantic supports.
 
     Raises:
-        ValueError: names the key, what it holds, and what it should hold.
+        ValueError: the content has another type; the message gives key, found value and expected type.
     """
     if large := _too_large(content):
-        raise ValueError(f"{large[:40]} ... is not a number that JSON readers agree on; the largest is {LARGEST:,}")
+        raise ValueError(f"{large[:40]} ... is too large for a JSON integer; the maximum is {LARGEST:,}")
     try:
         return _adapter(kind).validate_python(content, strict=True)
     except ValidationError as error:
@@ -229,7 +229,7 @@ def check_shape(content: Any, kind: type[T] | Any) -> T:
 
 
 def _too_large(content: Any) -> str:
-    """Returns the first whole number beyond `LARGEST` in some content, as text; "" without one."""
+    """Returns the first integer beyond `LARGEST` in some content, as text; "" if there is none."""
     if isinstance(content, dict | list):
         values = content.values() if isinstance(content, dict) else content
         return next(filter(None, map(_too_large, values)), "")
@@ -245,7 +245,7 @@ def _first_error(error: ValidationError, content: Any) -> str:
             keys.append(str(key))
     name = ".".join(keys) or "the file"
     if first["loc"] and first["loc"][-1] == "[key]":
-        return f"{name} is named by no text; put the name in quotes"
+        return f"{name}: a key is not a text; put it in quotes"
     if kind == "missing":
         return f"{name} has no {first['loc'][-1]}"
     if kind == "value_error":
@@ -257,16 +257,16 @@ def _first_error(error: ValidationError, content: Any) -> str:
 
 
 def read_json(path: Path, kind: type[T] | Any, remedy: str = "") -> T:
-    """Returns the content of a JSON file of at most `LIMIT` bytes as the type that it has to have.
+    """Returns the content of a JSON file of at most `LIMIT` bytes, converted to the expected type.
 
     Args:
-        path: of the file.
+        path: the file.
         kind: see `check_shape`.
-        remedy: what to do if it is damaged.
+        remedy: what to do if the file is damaged.
 
     Raises:
-        FileNotFoundError: there is no such file.
-        UserError: it holds anything else.
+        FileNotFoundError: the file does not exist.
+        UserError: the file has other content.
     """
     message = f"; {remedy}" if remedy else ""
     try:
@@ -280,7 +280,7 @@ def read_json(path: Path, kind: type[T] | Any, remedy: str = "") -> T:
 
 
 def made_by(path: str | Path) -> str:
-    """Returns what to do about a checkpoint or extractor that is missing: the command that makes it, or where it is."""
+    """Returns how to get a missing checkpoint or extractor: the command that creates it, or where to find it."""
     name = Path(path).as_posix()
     recipe = re.fullmatch(r"runs/(.+)/default/checkpoints/.+", name)
     where = f"{name} is missing" + '; see "Extractors" in docs/evaluation.md' * name.startswith("assets/")
@@ -291,9 +291,9 @@ def read_result(path: Path) -> Result:
     """Returns a result of `flame-mdm evaluate`.
 
     Raises:
-        UserError: it is damaged.
+        UserError: the file is damaged.
     """
-    return read_json(path, Result, "delete it, and `flame-mdm evaluate` or `flame-mdm tables` evaluates again")
+    return read_json(path, Result, "delete it, then run `flame-mdm evaluate` or `flame-mdm tables` again")
 
 
 @dataclass
@@ -302,10 +302,10 @@ class Run:
 
     Attributes:
         folder: the directory.
-        config: the recipe, as the run saved it.
+        config: the recipe saved by the run.
         provenance: None before training began.
-        curves: values by step, by name.
-        results: evaluations by the name of their file within the folder.
+        curves: name -> step -> value.
+        results: path of a result file within the folder -> evaluation.
     """
 
     folder: Path
@@ -316,13 +316,13 @@ class Run:
 
     @property
     def label(self) -> str:
-        """Recipe and name of the run; the recipe alone for a run that has the default name."""
+        """Recipe and name of the run; only the recipe for a run with the default name."""
         name = self.config["run"].get("name", "default")
         return str(self.config["experiment"]) + (f"/{name}" if name != "default" else "")
 
     @property
     def samples(self) -> Path | None:
-        """The folder of the newest samples."""
+        """Folder of the newest samples."""
         return newest_samples(self.folder, "motion_000.npz")
 
     @property
@@ -333,7 +333,7 @@ class Run:
 
 
 def newest_samples(folder: Path, file: str) -> Path | None:
-    """The newest folder of samples in a run directory that holds `file`."""
+    """Returns the newest folder of samples in a run directory that contains `file`."""
     found = (path.parent for path in folder.glob(f"{SAMPLES}/{file}"))
     return max((path for path in found if path.name.removeprefix("step_").isdecimal()), default=None)
 
@@ -342,25 +342,25 @@ def read_run(folder: Path) -> Run:
     """Returns the content of a run directory.
 
     Raises:
-        UserError: no run, or a damaged file.
+        UserError: the folder is not a run directory, or a file is damaged.
     """
     path = folder / CONFIG
     if not path.exists():
-        raise UserError(f"{folder}: no {CONFIG} there; name the folder of a run, such as runs/synthetic/mdm/default")
+        raise UserError(f"{folder}: contains no {CONFIG}; give a run directory, such as runs/synthetic/mdm/default")
     config = read_saved(path)
     try:
         check_shape(config, Recipe)
     except ValueError as error:
         raise UserError(f"{path}: not the configuration of a run: {error}") from error
     origin = folder / PROVENANCE
-    remedy = "delete it, and the page leaves it out"
+    remedy = "delete it; the page then omits it"
     results = {path.relative_to(folder).as_posix(): read_result(path) for path in sorted(folder.glob(RESULTS))}
     provenance: Provenance | None = read_json(origin, Provenance, remedy) if origin.exists() else None
     return Run(folder, config, provenance, read_history(folder), results)
 
 
 def read_history(folder: Path) -> dict[str, dict[int, float]]:
-    """Returns the curves of a run: values by step, in their order, by name; {} if the run has no history.
+    """Returns the curves of a run, name -> step -> value, sorted; {} if the run has no history.
 
     Raises:
         UserError: the file is damaged.
@@ -374,7 +374,7 @@ def read_history(folder: Path) -> dict[str, dict[int, float]]:
 
 
 def records(path: Path) -> list[dict[str, Any]]:
-    """Returns the lines of a history. A last one that a kill has cut does not count.
+    """Returns the lines of a history; ignores an incomplete last line, left by a killed process.
 
     Raises:
         UserError: another line is damaged.
@@ -387,11 +387,11 @@ def records(path: Path) -> list[dict[str, Any]]:
         try:
             record = json.loads(line)
             if not isinstance(record, dict) or type(record.get("step")) is not int or not 0 <= record["step"] < 2**63:
-                raise ValueError("it has no step, a whole number")
+                raise ValueError("it has no integer step")
             wrong = [name for name, value in record.items() if type(value) not in (int, float)]
             if wrong or any(type(value) is int and abs(value) >= 2**63 for value in record.values()):
                 raise ValueError(f"{', '.join(wrong) or 'a value'} should be a number")
-            "".join(record).encode()  # half a character cannot be written again
+            "".join(record).encode()  # a lone surrogate cannot be written again
         except (ValueError, RecursionError) as error:
             raise UserError(f"{path}: line {place} is damaged; delete that line ({error})") from error
         found.append(record)

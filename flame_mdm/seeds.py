@@ -1,8 +1,8 @@
-"""Random numbers that are a function of what they are for, not of the order in which they are drawn.
+"""Counter-based random numbers, which depend on their purpose and not on the order of draws.
 
-A sampling run gives every motion the noise of (seed, replication, id), element by element: the same whatever the batch,
-the padding, the number of processes or the device. A counter is hashed (splitmix64: Steele, Lea and Flood 2014,
-"Fast splittable pseudorandom number generators") and mapped to the normal distribution (Box and Muller 1958).
+In a sampling run, the noise of a motion is an elementwise function of (seed, replication, id): it does not depend on
+batch, padding, number of processes or device. A counter is hashed (splitmix64: Steele, Lea and Flood 2014, "Fast
+splittable pseudorandom number generators") and mapped to the normal distribution (Box and Muller 1958).
 """
 
 import hashlib
@@ -16,7 +16,7 @@ from flame_mdm.motion import Noise
 
 
 def key(*parts: str | int) -> int:
-    """A 63-bit number from any parts, the same on every machine."""
+    """Hashes parts to a 63-bit number, the same on every machine."""
     text = "\x1f".join(str(part) for part in parts)
     return int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "big") >> 1
 
@@ -40,7 +40,7 @@ def _hash(x: Tensor) -> Tensor:
 
 
 def uniform(keys: Tensor, shape: Sequence[int]) -> tuple[Tensor, Tensor]:
-    """Two independent uniform draws in (0, 1) for each key (B,) and position: (B, *shape), float32."""
+    """Returns two independent uniform draws in (0, 1) for each key (B,) and position: (B, *shape), float32."""
     positions = torch.arange(math.prod(shape), device=keys.device).reshape(1, *shape)
     bits = _hash(_hash(keys).reshape(-1, *[1] * len(shape)) + positions * _GOLDEN)
     scale = 2.0**-24
@@ -48,7 +48,7 @@ def uniform(keys: Tensor, shape: Sequence[int]) -> tuple[Tensor, Tensor]:
 
 
 def normal(keys: Tensor, frames: int, features: int) -> Tensor:
-    """Standard normal noise (B, F, D), float32. Element (f, d) of key k does not depend on B or F."""
+    """Returns standard normal noise (B, F, D), float32. Element (f, d) of key k does not depend on B or F."""
     pairs = (features + 1) // 2
     u, v = uniform(keys, (frames, pairs))
     radius, angle = torch.sqrt(-2 * torch.log(u)), 2 * math.pi * v
@@ -56,9 +56,9 @@ def normal(keys: Tensor, frames: int, features: int) -> Tensor:
 
 
 def seeded_noise(ids: Sequence[str], frames: int, features: int, *, seed: int, replication: int, like: Tensor) -> Noise:
-    """Noise of a sampling run for the motions named `ids`, on the device of `like`.
+    """Returns the noise of a sampling run for the motions named `ids`, on the device of `like`.
 
-    Draw n is a function of (seed, replication, id, n) and the position in the motion alone.
+    Draw n is a function of seed, replication, id, n and the position in the motion only.
     """
     keys = torch.tensor([key("noise", seed, replication, name) for name in ids], device=like.device)
     return lambda draw: normal(_hash(keys + draw), frames, features).to(like.dtype)

@@ -1,4 +1,4 @@
-"""The task: the only place where denoiser, process, condition and representation meet."""
+"""Lightning modules that combine denoiser, process, condition and representation."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ from flame_mdm.seeds import key, normal, seeded_noise, uniform
 
 
 class Task(LightningModule):
-    """What all models share that `make train` trains; a recipe names its class in `task._target_`."""
+    """Base class of all models that `make train` trains; a recipe names the class in `task._target_`."""
 
     config: Config
-    """The recipe this was built from, saved in checkpoints."""
+    """The recipe, saved in checkpoints."""
     facts: dict[str, Any]
-    """What sampling and evaluation have to know of the training data: actions, longest motion, fingerprint."""
+    """Facts about the training data for sampling and evaluation: actions, maximum length, fingerprint."""
 
     def __init__(self, condition: ConditionEncoder, representation: Representation, *, optimizer: Config, seed: int):
         super().__init__()
@@ -47,18 +47,18 @@ class Task(LightningModule):
         raise NotImplementedError
 
     def describe(self) -> str:
-        """Name of the network, for the line that opens a run."""
+        """Returns the name of the network, for the first line of a run's output."""
         return type(self).__name__
 
     def prepare_data(self) -> None:
-        """Encodes all captions of the data once, on one process, where the text encoder is frozen."""
+        """Encodes all captions of the data once, in one process, if the text encoder is frozen."""
         self.condition.precompute(*self._captions())
 
     def setup(self, stage: str) -> None:
-        """Opens what `prepare_data` encoded, and notes what sampling has to know of the data."""
+        """Opens the captions encoded by `prepare_data`, and stores facts about the data."""
         self.condition.load_cache(*self._captions())
-        # Buffers are the same on all processes. Sent at each forward pass, they would keep processes waiting that have
-        # more validation batches than others.
+        # Buffers are equal in all processes. If DDP broadcast them in each forward pass, processes with more validation
+        # batches than others would wait forever.
         self._ddp_params_and_buffers_to_ignore = [name for name, _ in self.named_buffers()]
         data: MotionDataModule = self.trainer.datamodule  # type: ignore[attr-defined]
         self.facts |= {
@@ -73,20 +73,21 @@ class Task(LightningModule):
         return sorted({*data.captions(), *prompts}), data.folder.parent / "text"
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
-        """The optimizer of the recipe over all trainable parameters."""
+        """Returns the optimizer of the recipe with all trainable parameters."""
         return instantiate(self.optimizer, params=[p for p in self.parameters() if p.requires_grad])
 
     def on_train_start(self) -> None:
-        """Lets fused optimizers be clipped in bfloat16.
+        """Enables gradient clipping for fused optimizers in bfloat16.
 
-        Lightning clips no gradients for them under mixed precision, as they may hold scaled ones; bfloat16 scales none.
+        Lightning does not clip gradients for them with mixed precision, since these may be scaled; in bfloat16 they are
+        not.
         """
         if self.trainer.precision == "bf16-mixed":
             for optimizer in self.trainer.optimizers:
                 optimizer._step_supports_amp_scaling = False  # type: ignore[attr-defined]
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """The checkpoint carries its recipe and the facts of its data, as plain values."""
+        """Adds the recipe and the facts about the data to the checkpoint, as plain values."""
         checkpoint["config"], checkpoint["facts"] = self.config, self.facts
 
 
@@ -99,10 +100,10 @@ class MotionGeneration(Task):
         optimizer: a mapping with the `_target_` of a torch optimizer and its arguments.
         cond_drop_prob: probability that a training sample gets the null condition.
         guidance_scale: default of `generate`; 1 = off.
-        sampler: default of `generate`, one that the process knows.
+        sampler: default of `generate`, one that the process supports.
         num_inference_steps: default of `generate`.
-        seed: with the step and the rank, decides all draws of a training step.
-        compile: compiles the denoiser with torch.compile.
+        seed: determines, together with step and rank, all draws of a training step.
+        compile: compile the denoiser with torch.compile.
     """
 
     def __init__(
@@ -123,9 +124,9 @@ class MotionGeneration(Task):
     ):
         super().__init__(condition, representation, optimizer=optimizer, seed=seed)
         if not 0 <= cond_drop_prob <= 1:
-            raise UserError(f"task.cond_drop_prob={cond_drop_prob}: a probability lies between 0 and 1")
+            raise UserError(f"task.cond_drop_prob={cond_drop_prob}: give a probability from 0 to 1")
         if not math.isfinite(guidance_scale):
-            raise UserError(f"task.guidance_scale={guidance_scale} is no finite number")
+            raise UserError(f"task.guidance_scale={guidance_scale} is not a finite number")
         if type(num_inference_steps) is not int or not 1 <= num_inference_steps <= MOST_STEPS:
             raise UserError(f"task.num_inference_steps={num_inference_steps}: give a number from 1 to {MOST_STEPS:,}")
         self.denoiser, self.process = denoiser, process
@@ -174,7 +175,7 @@ class MotionGeneration(Task):
     # Training ---------------------------------------------------------------------------------------------------------
 
     def on_fit_start(self) -> None:
-        """Takes the sampler's steps with a denoiser that returns 0: one that cannot run fails here, not after hours."""
+        """Runs the sampler with a denoiser that returns 0, so that invalid sampling options fail at the start."""
         like = torch.zeros(1, 2, self.representation.features, device=self.device)
         mask = torch.ones(1, 2, dtype=torch.bool, device=self.device)
         self.process.sample(
@@ -187,10 +188,10 @@ class MotionGeneration(Task):
         )
 
     def training_step(self, batch: MotionBatch, batch_idx: int) -> Tensor:
-        """Loss of one batch; every draw in it is a function of (seed, batch number, rank)."""
+        """Returns the loss of one batch; every draw is a function of (seed, batch number, rank)."""
         torch.manual_seed(key("step", self.seed, batch_idx, self.global_rank))
         cond = self.condition(batch)
-        if cond.null is not None:  # at probability 0 too: every parameter then has a gradient, as DDP needs
+        if cond.null is not None:  # also with probability 0, so that every parameter has a gradient, as DDP requires
             cond = cond.drop(torch.rand(len(batch), device=self.device) < self.cond_drop_prob)
         terms = self.process.loss(self.denoiser, batch.x, batch.mask, cond, auxiliary=self.losses)
         means = {f"train/{name}": value.mean() for name, value in terms.items()}
@@ -198,7 +199,7 @@ class MotionGeneration(Task):
         return means["train/loss"]
 
     def validation_step(self, batch: MotionBatch, batch_idx: int) -> None:
-        """Losses of the validation clips, at times and with noise that belong to each clip."""
+        """Updates the losses of the validation clips, with fixed times and noise per clip."""
         keys = torch.tensor([key("validation", name) for name in batch.ids], device=self.device)
         t = self.process.training_times(uniform(keys, (1,))[0][:, 0])
         noise = normal(keys, *batch.x.shape[1:])
@@ -213,7 +214,7 @@ class MotionGeneration(Task):
             metric.update(value)
 
     def on_validation_epoch_end(self) -> None:
-        """Logs the mean over all clips, each of the same weight, over all processes."""
+        """Logs the mean over all clips of all processes, with equal weights."""
         for name, metric in self.val_losses.items():
             assert isinstance(metric, MeanMetric)
             self.log(f"val/{name}", metric.compute(), prog_bar=name == "loss")
@@ -234,10 +235,10 @@ class MotionGeneration(Task):
         edit: Edit | None = None,
         unconditioned: bool = False,
     ) -> Tensor:
-        """Motions for the conditions, lengths and ids of `batch`; its `x` is not looked at.
+        """Samples motions for the conditions, lengths and ids of `batch`; its `x` is ignored.
 
-        The noise of a motion is a function of (seed, replication, its id): the same motion in any batch.
-        `unconditioned` samples a conditional model with its null condition throughout.
+        The noise of a motion is a function of (seed, replication, id), so the motion is the same in any batch.
+        `unconditioned` samples a conditional model with its null condition.
 
         Returns:
             (B, F, D) normalized, 0 past the end of each motion.
@@ -255,7 +256,7 @@ class MotionGeneration(Task):
             denoise = classifier_free_guidance(self.denoiser, scale, self.representation.features)
         mask, frames, features = batch.mask, batch.mask.shape[1], self.representation.features
         if not getattr(self.denoiser, "mask_padding", True):
-            # Frames attend to the padding, which a model knows only at the length that it was trained with.
+            # Frames attend to the padding, so the padded length must be that of training.
             mask = pad_to(mask, max(frames, self.facts.get("max_frames", 0)))
             if edit is not None:
                 known, keep = pad_to(edit.known, mask.shape[1]), ~pad_to(~edit.keep, mask.shape[1])

@@ -147,7 +147,7 @@ def test_trains_and_samples(denoiser, process, condition, monkeypatch):
     task = build(denoiser, process, condition)
     motions = batch()
     if not legal(denoiser, condition):
-        with pytest.raises(ValueError, match="reads condition tokens, but the condition encoder returns none"):
+        with pytest.raises(ValueError, match="needs condition tokens, but the condition encoder has none"):
             task.generate(motions)
         return
     logged: dict[str, Tensor] = {}

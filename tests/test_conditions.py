@@ -436,7 +436,7 @@ class TestCache:
         if damage != "changed":
             with pytest.raises(ValueError, match="damaged"):
                 encoder.load_cache(CAPTIONS, tmp_path)
-        with pytest.warns(UserWarning, match=f"{name} is damaged .*; building it again"):
+        with pytest.warns(UserWarning, match=f"{name} is damaged .*; rebuilding it"):
             encoder.precompute(CAPTIONS, tmp_path)
         assert (folder / name).read_bytes() == intact
 

@@ -289,5 +289,5 @@ def test_bad_options_are_named() -> None:
         MDMUNet(D, D, C, latent_dim=16, channels=[8], num_groups=3, dropout=0.0)
     x_t, t, mask, cond = batch()
     pooled_only = Condition(cond.pooled, cond.tokens[:, :0], None)
-    with pytest.raises(ValueError, match="the condition encoder returns none"):
+    with pytest.raises(ValueError, match="the condition encoder has none"):
         MDMDecoder(D, D, C, **TRANSFORMER, token_memory=True).double()(x_t, t, mask, pooled_only)

@@ -313,11 +313,11 @@ def _npz(folder: Path, **arrays) -> Path:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({}, "this keeps nothing of the motion: choose region"),
-        ({"region": [0, 40]}, "this keeps nothing of the motion"),
-        ({"joints": []}, "this keeps all of the motion"),
-        ({"region": [5, 5]}, r"region=\[5, 5\] is no part of this motion, which has 40 frames \(2 seconds\)"),
-        ({"region": [30, 50]}, "is no part of this motion"),
+        ({}, "no part of the motion is kept: choose region"),
+        ({"region": [0, 40]}, "no part of the motion is kept"),
+        ({"joints": []}, "the entire motion is kept"),
+        ({"region": [5, 5]}, r"region=\[5, 5\] is not a range of this motion, which has 40 frames \(2 seconds\)"),
+        ({"region": [30, 50]}, "is not a range of this motion"),
         ({"region_seconds": [1.5, 2.5]}, r"region_seconds=\[1.5, 2.5\] is no part"),
         ({"region": [1, 2, 3]}, r"write \[begin, end\], or several"),
         ({"region": [[1, 2], 3]}, r"write \[begin, end\], or several"),
@@ -326,8 +326,8 @@ def _npz(folder: Path, **arrays) -> Path:
         ({"region": "inbetween"}, "region=inbetween is unknown. Did you mean in_between"),
         ({"joints": "uper_body"}, "no joint or part 'uper_body'. Did you mean upper_body"),
         ({"joints": ["left_hnad"]}, "Did you mean left_hip"),
-        ({"region": "suffix", "method": "mfm"}, "method=mfm is not possible with GaussianDiffusion; .* mdm, flame"),
-        ({"region": "suffix", "method": "repaint"}, "this model takes: mdm, flame, flame_code"),
+        ({"region": "suffix", "method": "mfm"}, "method=mfm is not supported by GaussianDiffusion; .* mdm, flame"),
+        ({"region": "suffix", "method": "repaint"}, "this model supports: mdm, flame, flame_code"),
         ({"region": "suffix", "until": 0.3}, "until=0.3 is an option of method=mfm, not of mdm"),
         ({"region": "suffix", "resample": 3}, "resample=3 is an option of method=flame"),
     ],
@@ -339,13 +339,16 @@ def test_bad_edits_are_one_line(diffusion, motion, options, message):
 
 
 def test_methods_of_diffusion_are_refused_by_flows(flow, motion):
-    with pytest.raises(UserError, match="method=flame is not possible with FlowMatching; this model takes: mdm, mfm"):
+    with pytest.raises(UserError, match="method=flame is not supported by FlowMatching; this model supports: mdm, mfm"):
         edit(flow, motion, region="suffix", method="flame")
 
 
 def test_a_motion_longer_than_those_of_the_training(motion):
     model = build(TINY, max_frames=36)
-    with pytest.raises(UserError, match=r"walk: 40 frames are more than the 36 \(1.8 seconds\) .*: take a part, cut="):
+    with pytest.raises(
+        UserError,
+        match=r"walk: 40 frames, but the model was trained on at most 36 \(1.8 seconds\): select a part with cut=",
+    ):
         edit(model, motion, region="suffix")
 
 
@@ -398,7 +401,7 @@ def test_motions_that_are_not_there(diffusion, store, tmp_path):
         read_motion(representation, "synthetic:synthetic_0_00003", data_root=store)
     with pytest.raises(FileNotFoundError, match="no prepared data set"):
         read_motion(representation, "kit:1", data_root=store)
-    with pytest.raises(UserError, match="is no part of synthetic:synthetic_0_000003, which lasts"):
+    with pytest.raises(UserError, match="is not a range of synthetic:synthetic_0_000003, which lasts"):
         read_motion(representation, "synthetic:synthetic_0_000003", data_root=store, cut=[1, 99])
     with pytest.raises(ValueError, match=r"motion.npz: motion: shape \(9, 22, 3\), expected \(frames, 3 \+ 3 x joints"):
         read_motion(SMPL(), _npz(tmp_path, joints=np.zeros((9, 22, 3)), fps=20))

@@ -22,7 +22,7 @@ def test_kills_at_random_moments_change_nothing():
     )
     assert done.returncode == 0, done.stdout + done.stderr
     assert "weights equal bit for bit: True" in done.stdout
-    assert "results equal but for measured seconds: True" in done.stdout
+    assert "results equal except for measured times: True" in done.stdout
     assert done.stdout.count("; the same |") == 4
     assert "SIGKILL" in done.stdout
     assert "SIGTERM" in done.stdout

@@ -282,7 +282,7 @@ def test_damaged_files_are_named(tmp_path, name, content, message):
 
 def test_a_folder_without_a_run_is_one_line(tmp_path, capsys):
     assert main(["report", str(tmp_path)]) == 1
-    assert "no config.yaml there" in capsys.readouterr().err
+    assert "contains no config.yaml" in capsys.readouterr().err
     assert main(["report"]) == 1
     assert "no run named" in capsys.readouterr().err
 

@@ -337,7 +337,7 @@ def test_a_damaged_result_is_told(folder, capsys):
     words = [f"table={folder / 'spec.yaml'}", f"results={folder / 'results'}", f"out={folder / 'out'}"]
     assert main(["tables", *words, "evaluate=false"]) == 1
     assert "not a JSON file" in (error := capsys.readouterr().err)
-    assert "delete it, and `flame-mdm evaluate` or `flame-mdm tables` evaluates again" in error
+    assert "delete it, then run `flame-mdm evaluate` or `flame-mdm tables` again" in error
 
 
 def test_places():

@@ -259,7 +259,7 @@ def test_nothing_to_show_is_an_error(tmp_path, write):
 
 
 def test_contact_sheet_without_poses_is_an_error(tmp_path):
-    with pytest.raises(ValueError, match=r"c\.png: 0 poses a row"):
+    with pytest.raises(ValueError, match=r"c\.png: 0 poses per row"):
         contact_sheet(tmp_path / "c.png", [walk()], frames=0)
 
 

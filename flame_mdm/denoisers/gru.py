@@ -11,9 +11,9 @@ from flame_mdm.motion import Condition
 
 
 class MDMGRU(Denoiser):
-    """GRU over the frames, time + condition concatenated to each of them.
+    """GRU over the frames, with time + condition concatenated to each frame.
 
-    It runs forward in time, so that padding at the end reaches no real frame.
+    It runs forward in time, so that padding at the end does not affect real frames.
     """
 
     def __init__(
@@ -37,9 +37,9 @@ class MDMGRU(Denoiser):
             latent_dim: width of the recurrent state.
             num_layers: number of recurrent layers.
             dropout: probability, after the positions.
-            project_condition: False adds the condition to the time as it is.
-            recur_over_batch: recurs from sample to sample in place of from frame to frame, as MDM's released code
-                does by a swap of axes; only to reproduce it: results then depend on the order of the batch.
+            project_condition: False adds the condition to the time without projection.
+            recur_over_batch: recurs from sample to sample instead of from frame to frame, as MDM's released code does
+                because of swapped axes. Only for reproduction: results then depend on the order of the batch.
         """
         super().__init__()
         self.condition = TimeAndCondition(latent_dim, cond_features, project_condition)

@@ -1,4 +1,4 @@
-"""Parts that the denoisers share: sinusoids, post-norm transformer, time and condition in one vector."""
+"""Layers shared by the denoisers: sinusoids, post-norm transformer, embedding of time and condition."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from torch.nn import functional
 
 
 def sinusoid(position: Tensor, features: int) -> Tensor:
-    """Sines on even and cosines on odd channels (Vaswani et al. 2017, section 3.5).
+    """Returns sines in even and cosines in odd channels (Vaswani et al. 2017, section 3.5).
 
-    Computed in float32 whatever the precision of the network, as released weights were trained with.
+    Computed in float32 for any precision of the network, as in the training of the released weights.
 
     Args:
         position: (N,), integer or not.
@@ -27,15 +27,15 @@ def sinusoid(position: Tensor, features: int) -> Tensor:
 
 
 def with_prefix(mask: Tensor, prefix: int) -> Tensor:
-    """(B, N) mask -> (B, prefix + N): what stands before the sequence is always real."""
+    """Extends a mask (B, N) to (B, prefix + N); the prefix is always real."""
     return torch.cat([mask.new_ones(len(mask), prefix), mask], 1)
 
 
 class Attention(nn.Module):
     """Multi-head attention of x to itself or to a memory (Vaswani et al. 2017, section 3.2.2).
 
-    Query, key and value share one matrix (3C, C), so that self-attention projects once and released weights map one
-    to one.
+    Query, key and value share one matrix (3C, C), so that self-attention projects once and released weights can be
+    copied directly.
     """
 
     def __init__(self, features: int, num_heads: int, dropout: float):
@@ -70,7 +70,7 @@ class Attention(nn.Module):
 
 
 class TransformerLayer(nn.Module):
-    """Self-attention, cross-attention where asked for, feed-forward; the norm comes after each residual sum."""
+    """Self-attention, optional cross-attention and feed-forward, with a norm after each residual sum."""
 
     def __init__(
         self,
@@ -134,15 +134,15 @@ class Transformer(nn.Module):
 class TimeAndCondition(nn.Module):
     """z_tk of MDM: the embedded time plus the projected condition (Tevet et al. 2023, section 3).
 
-    The time is a row of the sinusoidal table, sent through two linear layers; the null condition is a zero vector
-    *before* the projection, so that it leaves the projection's bias.
+    The time is a row of the sinusoidal table, passed through two linear layers. The null condition is a zero vector
+    *before* the projection, so that only the projection's bias remains.
     """
 
     def __init__(self, features: int, cond_features: int, project_condition: bool):
         super().__init__()
         if cond_features and not project_condition and cond_features != features:
             raise ValueError(
-                f"without project_condition the condition is added to the time embedding as it is: its width "
+                f"with project_condition=false the condition is added directly to the time embedding: its width "
                 f"({cond_features}) must equal latent_dim ({features})"
             )
         self.features, self.cond_features = features, cond_features
@@ -150,11 +150,11 @@ class TimeAndCondition(nn.Module):
         self.projection = nn.Linear(cond_features, features) if cond_features and project_condition else nn.Identity()
 
     def time(self, t: Tensor) -> Tensor:
-        """(B,) times -> (B, features)."""
+        """Embeds times (B,) as (B, features)."""
         return self.time_embedding(sinusoid(t, self.features).to(next(self.parameters()).dtype))
 
     def forward(self, t: Tensor, condition: Tensor) -> Tensor:
-        """Times (B,) and condition (B, C) or (B, S, C) -> (B, features) or (B, S, features)."""
+        """Embeds times (B,) and condition (B, C) or (B, S, C) as (B, features) or (B, S, features)."""
         time = self.time(t)
         if not self.cond_features:
             return time

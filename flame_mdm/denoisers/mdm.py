@@ -41,9 +41,9 @@ class MDMEncoder(Denoiser):
             num_layers: number of its layers.
             num_heads: attention heads.
             dropout: probability, after the positions and inside the layers.
-            project_condition: False adds the condition to the time as it is (MDM's learned action embeddings).
-            max_tokens: 0 = the pooled condition is added to the time. Otherwise up to so many condition tokens stand
-                between the time and the frames (MFM with T5: 30); frames keep their positions when there are fewer.
+            project_condition: False adds the condition to the time without projection (MDM's action embeddings).
+            max_tokens: 0 = the pooled condition is added to the time. Otherwise the maximum number of condition tokens
+                between the time and the frames (MFM with T5: 30); frames keep their positions if there are fewer.
             mask_padding: False lets frames attend to the padding, as the released models of MDM and MFM do: they are
                 sampled at the padded length of their training and cropped.
         """
@@ -56,10 +56,10 @@ class MDMEncoder(Denoiser):
         self.output = nn.Linear(latent_dim, out_features)
 
     def forward(self, x_t: Tensor, t: Tensor, mask: Tensor, cond: Condition) -> Tensor:
-        """Predicts as the contract says.
+        """See `Denoiser.forward`.
 
         Raises:
-            ValueError: no condition tokens where they are asked for, or more than `max_tokens`.
+            ValueError: condition tokens are needed but missing, or there are more than `max_tokens`.
         """
         token_mask = mask[:, :0]
         if self.max_tokens:
@@ -82,7 +82,7 @@ class MDMEncoder(Denoiser):
 
 
 class MDMDecoder(Denoiser):
-    """Transformer decoder over the frames that reads time + condition as cross-attention memory."""
+    """Transformer decoder over the frames, with time + condition as cross-attention memory."""
 
     def __init__(
         self,
@@ -111,12 +111,12 @@ class MDMDecoder(Denoiser):
             num_layers: number of its layers.
             num_heads: attention heads.
             dropout: probability, after the positions and inside the layers.
-            project_condition: False adds the condition to the time as it is (MDM's learned action embeddings).
-            input_token: what stands before the frames: "condition" is the paper's "+ input token", time + condition
-                entering both ways, as in the released model; "time" is MDM's code since February 2025, where the
-                token is the time alone.
-            token_memory: the memory is all condition tokens, the time added to each (MDM with DistilBERT), in place of
-                the one pooled vector.
+            project_condition: False adds the condition to the time without projection (MDM's action embeddings).
+            input_token: token before the frames: "condition" is the paper's "+ input token", where time + condition
+                are both input token and memory, as in the released model; "time" is MDM's code since February 2025,
+                where the token is only the time.
+            token_memory: use all condition tokens as memory, with the time added to each (MDM with DistilBERT), instead
+                of the pooled vector.
             mask_padding: False lets frames attend to the padding, as the released models without `mask_frames` do.
         """
         super().__init__()
@@ -131,10 +131,10 @@ class MDMDecoder(Denoiser):
         self.output = nn.Linear(latent_dim, out_features)
 
     def forward(self, x_t: Tensor, t: Tensor, mask: Tensor, cond: Condition) -> Tensor:
-        """Predicts as the contract says.
+        """See `Denoiser.forward`.
 
         Raises:
-            ValueError: no condition tokens where they are asked for.
+            ValueError: condition tokens are needed but missing.
         """
         x = self.input(x_t)
         if self.input_token == "condition":
@@ -153,11 +153,11 @@ class MDMDecoder(Denoiser):
 
 
 def condition_tokens(cond: Condition) -> tuple[Tensor, Tensor]:
-    """Tokens (B, S, C) and their mask (B, S).
+    """Returns the tokens (B, S, C) and their mask (B, S).
 
     Raises:
         ValueError: the condition encoder returns no tokens.
     """
     if cond.token_mask is None or not cond.tokens.shape[1]:
-        raise ValueError("this denoiser reads condition tokens, but the condition encoder returns none: choose another")
+        raise ValueError("this denoiser needs condition tokens, but the condition encoder has none: choose another one")
     return cond.tokens, cond.token_mask

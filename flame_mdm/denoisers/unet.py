@@ -1,6 +1,6 @@
-"""The U-Net of the Human Motion Diffusion Model (Tevet et al. 2023, "MDM", section 4.1), of which no code is public.
+"""The U-Net of the Human Motion Diffusion Model (Tevet et al. 2023, "MDM", section 4.1), whose code is not public.
 
-The paper says: convolutions over time, joints as channels, 23.47 M parameters. The rest follows the network of DDPM
+The paper specifies convolutions over time, joints as channels, 23.47 M parameters. The rest follows the network of DDPM
 (Ho et al. 2020, appendix B) with the scale-and-shift injection of Dhariwal and Nichol 2021.
 """
 
@@ -18,10 +18,10 @@ from flame_mdm.motion import Condition
 
 
 class MDMUNet(Denoiser):
-    """U-Net over time, the features of a frame as channels; any length, and padding reaches no real frame.
+    """U-Net over time with the features of a frame as channels, for any length; padding does not affect real frames.
 
-    Padded frames are zeroed before every convolution, as if the motion ended there, and left out of the statistics of
-    the norms. A frame of a coarser level is real where the first of its two finer frames is.
+    Padded frames are zeroed before every convolution, as if the motion ended there, and excluded from the statistics of
+    the norms. A frame of a coarser level is real if the first of its two finer frames is.
     """
 
     def __init__(
@@ -43,10 +43,10 @@ class MDMUNet(Denoiser):
             out_features: channels to predict.
             cond_features: C, width of the condition; 0 = unconditioned.
             latent_dim: width of the time and condition embedding.
-            channels: width of each level; each has half the frame rate of the one before.
+            channels: width of each level; each level has half the frame rate of the previous one.
             num_groups: groups of the group norms; divides all widths.
             dropout: probability inside the residual blocks.
-            project_condition: False adds the condition to the time as it is.
+            project_condition: False adds the condition to the time without projection.
         """
         super().__init__()
 
@@ -89,7 +89,7 @@ class MDMUNet(Denoiser):
 
 
 class ResidualBlock(nn.Module):
-    """Norm, SiLU, convolution, twice; time and condition scale and shift the second norm."""
+    """Norm, SiLU and convolution, twice; time and condition scale and shift the second norm."""
 
     def __init__(self, in_channels: int, out_channels: int, features: int, num_groups: int, dropout: float):
         super().__init__()
@@ -115,7 +115,7 @@ class MaskedGroupNorm(nn.Module):
     def __init__(self, channels: int, num_groups: int):
         super().__init__()
         if channels % num_groups:
-            raise ValueError(f"num_groups ({num_groups}) does not divide a width of channels ({channels})")
+            raise ValueError(f"num_groups ({num_groups}) does not divide the number of channels ({channels})")
         self.num_groups = num_groups
         self.weight = nn.Parameter(torch.ones(channels))
         self.bias = nn.Parameter(torch.zeros(channels))

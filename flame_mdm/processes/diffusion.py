@@ -21,22 +21,22 @@ Sampler = Literal["ancestral", "ddim", "dpm_solver_pp_2m"]
 class LossAwareTimesteps(nn.Module):
     """Draws training steps in proportion to sqrt(E[L_t^2]) (Nichol and Dhariwal 2021, eq. 18).
 
-    E[L_t^2] is the mean over the last 10 losses of a step; until every step has 10, steps are drawn evenly. The history
-    stands in buffers: it is saved with the model, and under DDP that of rank 0 is broadcast to all.
+    E[L_t^2] is the mean over the last 10 losses of a step; until every step has 10, steps are drawn uniformly. The
+    history is stored in buffers: it is saved with the model, and with DDP that of rank 0 is broadcast to all ranks.
     """
 
     history: Tensor
     counts: Tensor
 
     def __init__(self, num_train_timesteps: int, kept: int = 10, uniform_share: float = 0.001):
-        """`uniform_share` is the probability of drawing evenly, so that no step is ever left out."""
+        """`uniform_share` is the probability of drawing uniformly, so that every step can be drawn."""
         super().__init__()
         self.uniform_share = uniform_share
         self.register_buffer("history", torch.zeros(num_train_timesteps, kept))
         self.register_buffer("counts", torch.zeros(num_train_timesteps, dtype=torch.int64))
 
     def probabilities(self) -> Tensor:
-        """(T,) probability of each step, sum 1."""
+        """Returns the probability (T,) of each step."""
         total, kept = self.history.shape
         weights = self.history.square().mean(1).sqrt()
         share = weights / weights.sum().clamp(min=torch.finfo(weights.dtype).tiny)
@@ -44,7 +44,7 @@ class LossAwareTimesteps(nn.Module):
         return torch.where((self.counts >= kept).all(), share, torch.full_like(share, 1 / total))
 
     def draw(self, batch: int) -> tuple[Tensor, Tensor]:
-        """Steps (B,) int64, and weights (B,) that make their losses unbiased for even drawing."""
+        """Returns steps (B,) int64 and weights (B,) that make the expected losses those of uniform drawing."""
         p = self.probabilities()
         t = torch.multinomial(p, batch, replacement=True)
         return t, 1 / (len(p) * p[t])
@@ -64,7 +64,7 @@ class LossAwareTimesteps(nn.Module):
 
 
 class GaussianDiffusion(Process):
-    """Gaussian diffusion over T steps. t is the whole step 0 ... T - 1 as a float; the denoiser gets it as it is."""
+    """Gaussian diffusion over T steps. t is the step 0 ... T - 1 as a float, passed unchanged to the denoiser."""
 
     edit_modes = ("x0", "x_t")
 
@@ -81,28 +81,28 @@ class GaussianDiffusion(Process):
         clip_x0: bool = False,
         timestep_sampling: TimestepSampling = "uniform",
     ):
-        """Options.
+        """Builds the process.
 
         Args:
             num_train_timesteps: T.
             schedule: name of the noise schedule.
-            prediction: what the first D channels of the denoiser's output are: the clean motion, the noise, or the
+            prediction: meaning of the first D channels of the denoiser's output: the clean motion, the noise, or the
                 velocity sqrt(ab) noise - sqrt(1 - ab) x (Salimans and Ho 2022).
-            variance: of the reverse process: that of the posterior, beta, or learned between the two, from a second
-                set of D channels (Nichol and Dhariwal 2021, eq. 15).
-            vlb_weight: lambda of L_simple + lambda L_vlb (FLAME, eq. 4 and 15), where the variance is learned. L_vlb
-                is the sum over T steps, estimated by T times the term of one step; so 0.001 at T = 1000, the value of
-                Nichol and Dhariwal, is what FLAME's code calls 1.
-            vlb_units: legacy of guided-diffusion: "bits" divides by ln 2.
-            vlb_decoder: the term of step 0: the divergence with the clipped posterior variance (FLAME's code), or
-                (guided-diffusion) the likelihood of the data in 255 bins of [-1, 1], which is meant for pixels.
-            average_padding: legacy of FLAME's code: losses are averaged over the padded length, with noise 0 in the
-                padding, so that short motions weigh less. The denoiser must return 0 there.
-            clip_x0: legacy of FLAME's code: sampling clamps the clean estimate to [-1, 1].
+            variance: variance of the reverse process: that of the posterior, beta, or learned between the two, from a
+                second set of D channels (Nichol and Dhariwal 2021, eq. 15).
+            vlb_weight: lambda in L_simple + lambda L_vlb (FLAME, eq. 4 and 15), if the variance is learned. L_vlb is
+                the sum over T steps, estimated by T times the term of one step. So 0.001 at T = 1000, the value of
+                Nichol and Dhariwal, corresponds to 1 in FLAME's code.
+            vlb_units: "bits" divides by ln 2, as in guided-diffusion.
+            vlb_decoder: term of step 0: "kl" is the divergence with the clipped posterior variance (FLAME's code),
+                "discretized" the likelihood of the data in 255 bins of [-1, 1] (guided-diffusion), intended for pixels.
+            average_padding: average losses over the padded length with noise 0 in the padding, as in FLAME's code, so
+                that short motions have less weight. The denoiser must return 0 there.
+            clip_x0: clamp the clean estimate to [-1, 1] in sampling, as in FLAME's code.
             timestep_sampling: how training steps are drawn.
 
         Raises:
-            ValueError: an option has a value that does not exist.
+            ValueError: an option has an unknown value.
         """
         super().__init__()
         for name, value, known in (
@@ -141,7 +141,7 @@ class GaussianDiffusion(Process):
         return self.schedule.at("signal", t, x) * noise - self.schedule.at("noise", t, x) * x
 
     def to_x0(self, output: Tensor, x_t: Tensor, t: Tensor) -> Tensor:
-        """As the contract; `output` may carry the channels of a learned variance."""
+        """See `Process.to_x0`; `output` may contain the channels of a learned variance."""
         return self._to_x0(output, x_t, t)
 
     def _to_x0(self, output: Tensor, x_t: Tensor, i: Tensor | int) -> Tensor:
@@ -154,7 +154,7 @@ class GaussianDiffusion(Process):
         return signal * x_t - noise * output
 
     def log_variance(self, output: Tensor, x_t: Tensor, i: Tensor | int, schedule: Schedule) -> Tensor | float:
-        """Log-variance of x_{t-1} at step i of `schedule`: a number, (B, 1, 1), or (B, F, D) where it is learned."""
+        """Returns the log-variance of x_{t-1} at step i of `schedule`: a number, (B, 1, 1), or (B, F, D) if learned."""
         small = schedule.at("posterior_log_variance", i, x_t)
         if self.variance == "fixed_small":
             return small
@@ -174,10 +174,10 @@ class GaussianDiffusion(Process):
         noise: Tensor | None = None,
         auxiliary: Auxiliary | None = None,
     ) -> dict[str, Tensor]:
-        """Terms "mse" (FLAME, eq. 3), "vlb" where the variance is learned, those of `auxiliary`, and "loss".
+        """Returns the terms "mse" (FLAME, eq. 3), "vlb" if the variance is learned, those of `auxiliary`, and "loss".
 
-        Loss-aware steps are drawn and their history is kept in training mode only, where t is not given; all terms are
-        then weighted so that they are unbiased.
+        Loss-aware steps are drawn, and their history updated, only in training mode and if t is not given. All terms
+        are then weighted so that they are unbiased.
         """
         weights = None
         if t is None and self.timesteps is not None and self.training:
@@ -206,9 +206,9 @@ class GaussianDiffusion(Process):
         return terms | {"loss": loss}
 
     def vlb(self, output: Tensor, x: Tensor, x_t: Tensor, t: Tensor) -> Tensor:
-        """Terms of the variational bound (B, F, D) at steps t (B,), in `vlb_units` (Ho et al. 2020, eq. 5).
+        """Returns terms of the variational bound (B, F, D) at steps t (B,), in `vlb_units` (Ho et al. 2020, eq. 5).
 
-        The gradient reaches the variance alone (Nichol and Dhariwal 2021, section 3.1).
+        Only the variance receives a gradient (Nichol and Dhariwal 2021, section 3.1).
         """
         real = self.schedule.posterior_mean(x, x_t, t)
         real_log_variance = self.schedule.at("posterior_log_variance", t, x_t)
@@ -220,7 +220,7 @@ class GaussianDiffusion(Process):
         return terms / math.log(2) if self.vlb_units == "bits" else terms
 
     def prior(self, x: Tensor, mask: Tensor) -> Tensor:
-        """(B,) divergence of the noisiest x_t from the normal prior, L_T of the bound, in `vlb_units` an entry."""
+        """Returns the divergence (B,) of the noisiest x_t from the prior, the term L_T, in `vlb_units` per entry."""
         last = len(self.schedule) - 1
         mean = self.schedule.at("signal", last, x) * x
         log_variance = x.new_tensor(2 * math.log(self.schedule.at("noise", last, x)))
@@ -241,27 +241,27 @@ class GaussianDiffusion(Process):
         eta: float = 0.0,
         trajectory: list[Tensor] | None = None,
     ) -> Tensor:
-        """As the contract.
+        """See `Process.sample`.
 
         Args:
-            denoise: the denoiser, guided or not; called once a step.
-            noise: draws in order of use: the start, then those of each step. The last step draws nothing.
+            denoise: the denoiser, with or without guidance; called once per step.
+            noise: draws in order of use: the start, then those of each step. The last step draws none.
             mask: (B, F).
             cond: the condition.
             sampler: "ancestral", "ddim" or "dpm_solver_pp_2m".
-            num_inference_steps: 2 to T steps placed by `spacing`, or the steps themselves, rising.
-            edit: mode "x0" (the kept part is met exactly) or "x_t".
+            num_inference_steps: 2 to T steps placed by `spacing`, or the steps themselves in increasing order.
+            edit: mode "x0" (reproduces the kept part exactly) or "x_t".
             spacing: see `schedules.timesteps`.
             eta: randomness of "ddim", 0 to 1.
-            trajectory: list that the clean estimate of each call (B, F, D) is appended to.
+            trajectory: list to which the clean estimate (B, F, D) of each call is appended.
 
         Raises:
-            ValueError: the sampler, the number of steps, the edit or eta is not possible.
+            ValueError: the sampler, number of steps, edit or eta is not supported.
         """
         if sampler not in get_args(Sampler):
             raise ValueError(f"unknown sampler '{sampler}': GaussianDiffusion has {', '.join(get_args(Sampler))}")
         if eta and (sampler != "ddim" or not 0 <= eta <= 1):
-            raise ValueError(f"eta={eta} with the sampler {sampler}: eta is an option of ddim, from 0 to 1")
+            raise ValueError(f"eta={eta} with sampler {sampler}: eta is an option of ddim, from 0 to 1")
         if edit is not None:
             check_edit(edit, mask, self.edit_modes, "GaussianDiffusion")
             if edit.resample > 1 and sampler == "dpm_solver_pp_2m":
@@ -298,7 +298,7 @@ class GaussianDiffusion(Process):
         steps = list(chosen)
         if len(steps) < 2 or steps != sorted(set(steps)) or steps[0] < 0 or steps[-1] >= total:
             raise ValueError(
-                f"sampling steps must be 2 or more different ones of 0 to {total - 1}, rising: got {steps}"
+                f"sampling steps must be at least 2 distinct steps from 0 to {total - 1}, increasing: got {steps}"
             )
         return steps
 
@@ -307,29 +307,29 @@ def check_edit(edit: Edit, mask: Tensor, modes: Sequence[str], process: str) -> 
     """Checks an edit before a long run.
 
     Raises:
-        ValueError: the process lacks its mode, or its shape is not that of the motions.
+        ValueError: the process does not support its mode, or its shape does not match the motions.
     """
     if edit.mode not in modes:
-        raise ValueError(f"edit mode '{edit.mode}' is not possible here: {process} has {', '.join(modes)}")
+        raise ValueError(f"edit mode '{edit.mode}' is not supported: {process} has {', '.join(modes)}")
     if edit.blend not in ("after", "before") or edit.resample < 1:
         raise ValueError(
-            f"edit has blend={edit.blend}, resample={edit.resample}: choose after or before, and 1 or more"
+            f"edit has blend={edit.blend}, resample={edit.resample}: blend is after or before, resample at least 1"
         )
     if edit.known.shape != edit.keep.shape or edit.known.shape[:2] != mask.shape:
         shapes = f"known {tuple(edit.known.shape)}, keep {tuple(edit.keep.shape)}"
-        raise ValueError(f"edit does not fit the motions: {shapes}, mask {tuple(mask.shape)}")
+        raise ValueError(f"edit does not match the shape of the motions: {shapes}, mask {tuple(mask.shape)}")
 
 
 def _normal_kl(mean: Tensor, log_variance: Tensor, other_mean: Tensor, other_log_variance: Tensor) -> Tensor:
-    """KL divergence of one normal distribution from another, entry by entry, in nats."""
+    """Returns the elementwise KL divergence of one normal distribution from another, in nats."""
     difference = log_variance - other_log_variance
     return 0.5 * (difference.exp() - 1 - difference + (mean - other_mean).square() * (-other_log_variance).exp())
 
 
 def _binned_log_likelihood(x: Tensor, mean: Tensor, log_variance: Tensor) -> Tensor:
-    """Log-probability of x's bin, 255 bins in [-1, 1], the outer ones open (Ho et al. 2020, eq. 13), in nats.
+    """Returns the log-probability in nats of x's bin: 255 bins in [-1, 1], outer ones open (Ho et al. 2020, eq. 13).
 
-    The normal distribution function is approximated by a tanh, as guided-diffusion does.
+    The normal distribution function is approximated by a tanh, as in guided-diffusion.
     """
 
     def cdf(z: Tensor) -> Tensor:

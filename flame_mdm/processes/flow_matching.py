@@ -15,7 +15,7 @@ STEPS = {"euler": samplers.euler, "midpoint": samplers.midpoint, "heun": sampler
 
 
 class FlowMatching(Process):
-    """A straight path from noise at t = 0 to motion at t = 1; the denoiser predicts its velocity and gets 1000 t."""
+    """Straight path from noise at t = 0 to motion at t = 1; the denoiser predicts its velocity and is passed 1000 t."""
 
     edit_modes = ("trajectory", "x0")
 
@@ -27,20 +27,20 @@ class FlowMatching(Process):
         quantize_time: bool = False,
         odeint_grid: bool = False,
     ):
-        """Options.
+        """Builds the process.
 
         Args:
-            sigma_min: deviation of the noise left at t = 1 (Lipman et al. 2023, eq. 20-23).
-            prediction: what the denoiser returns: the velocity of the path (MFM), or the clean motion, from which the
-                velocity follows. A network narrower than the motion cannot carry the noise that the velocity holds.
-            time_distribution: of training times: even on [0, 1), or the logistic of a normal variable, which favors
-                the middle (Esser et al. 2024, eq. 19).
-            quantize_time: legacy of MFM's code: the denoiser gets floor(1000 t), a row of its time table.
-            odeint_grid: legacy of MFM's code, which takes torchdiffeq's Euler steps: times are float32 multiples of
-                1 / N, at some N one row of the table lower than N equal steps (never at 10, 20 or 30).
+            sigma_min: standard deviation of the noise left at t = 1 (Lipman et al. 2023, eq. 20-23).
+            prediction: output of the denoiser: the velocity of the path (MFM), or the clean motion, from which the
+                velocity is computed. A network narrower than the motion cannot represent the noise in the velocity.
+            time_distribution: distribution of training times: uniform on [0, 1), or the logistic of a normal variable,
+                which favors the middle (Esser et al. 2024, eq. 19).
+            quantize_time: pass floor(1000 t), a row of the time table, to the denoiser, as in MFM's code.
+            odeint_grid: use float32 multiples of 1 / N as times, like torchdiffeq's Euler steps in MFM's code. For some
+                N, a time is one row of the table lower than with N equal steps (never for 10, 20 or 30).
 
         Raises:
-            ValueError: an unknown prediction or time distribution, or sigma_min not in [0, 1).
+            ValueError: the prediction or time distribution is unknown, or sigma_min is not in [0, 1).
         """
         super().__init__()
         if prediction not in ("velocity", "x0"):
@@ -70,18 +70,18 @@ class FlowMatching(Process):
         return x if self.prediction == "x0" else x - (1 - self.sigma_min) * noise
 
     def to_x0(self, output: Tensor, x_t: Tensor, t: Tensor) -> Tensor:
-        """As the contract, exactly: x_t + (1 - t) u, which MFM's code uses, leaves sigma_min times the noise."""
+        """See `Process.to_x0`. Exact, unlike x_t + (1 - t) u in MFM's code, which leaves sigma_min times the noise."""
         if self.prediction == "x0":
             return output
         return (1 - (1 - self.sigma_min) * t[:, None, None]) * output + (1 - self.sigma_min) * x_t
 
     def table_time(self, t: Tensor) -> Tensor:
-        """Flow times -> times as the denoiser gets them, [0, 1000]; beyond 1000 only where a solver looks beyond 1."""
-        # In float32, whatever t is: trained models were shown this rounding.
+        """Converts flow times to times for the denoiser in [0, 1000]; above 1000 only if a solver evaluates t > 1."""
+        # Always in float32: models were trained with this rounding.
         return (t.to(torch.float32) * 1000).floor() if self.quantize_time else t * 1000
 
     def times(self, num_inference_steps: int) -> list[float]:
-        """The N + 1 times from 0 to 1 between which steps are taken."""
+        """Returns the N + 1 times from 0 to 1 that bound the steps."""
         count = num_inference_steps
         if self.odeint_grid:
             return [*(torch.arange(count, dtype=torch.float32) * (1 / count)).tolist(), 1.0]
@@ -98,7 +98,7 @@ class FlowMatching(Process):
         noise: Tensor | None = None,
         auxiliary: Auxiliary | None = None,
     ) -> dict[str, Tensor]:
-        """Terms "mse" of the velocity (Lipman et al. 2023, eq. 23), those of `auxiliary`, and "loss"."""
+        """Returns the terms "mse" of the velocity (Lipman et al. 2023, eq. 23), those of `auxiliary`, and "loss"."""
         if t is None:
             t = self.training_times(torch.rand(len(x), device=x.device))
         if noise is None:
@@ -122,27 +122,29 @@ class FlowMatching(Process):
         edit: Edit | None = None,
         trajectory: list[Tensor] | None = None,
     ) -> Tensor:
-        """As the contract; draws noise number 0 alone.
+        """See `Process.sample`; draws only noise number 0.
 
         Args:
-            denoise: the denoiser, guided or not; called 1 (euler), 2 (midpoint, heun) or 4 times (rk4) a step.
+            denoise: the denoiser, with or without guidance; called 1 (euler), 2 (midpoint, heun) or 4 times (rk4) per
+                step.
             noise: the start.
             mask: (B, F).
             cond: the condition.
             sampler: "euler", "midpoint", "heun", "rk4" or "dopri5".
             num_inference_steps: N >= 1 equal steps; "dopri5" chooses its own.
-            edit: mode "trajectory" (MFM, algorithm 1) rewrites the kept part before each step at a time <= `until`, by
-                the straight path from its noise to the known motion; from there on the model alone moves it. Mode
-                "x0" overwrites the clean estimate of every call and so meets the kept part exactly. Not with "dopri5".
-            trajectory: list that the clean estimate of each call (B, F, D) is appended to.
+            edit: mode "trajectory" (MFM, algorithm 1) overwrites the kept part before each step at a time <= `until`
+                with the straight path from its noise to the known motion; after that, the model moves it freely. Mode
+                "x0" overwrites the clean estimate of every call, which reproduces the kept part exactly. Not supported
+                by "dopri5".
+            trajectory: list to which the clean estimate (B, F, D) of each call is appended.
 
         Raises:
-            ValueError: the sampler, the number of steps or the edit is not possible.
+            ValueError: the sampler, number of steps or edit is not supported.
         """
         if sampler != "dopri5" and sampler not in STEPS:
             raise ValueError(f"unknown sampler '{sampler}': FlowMatching has {', '.join(STEPS)}, dopri5")
         if num_inference_steps < 1:
-            raise ValueError(f"num_inference_steps is {num_inference_steps}: a flow takes 1 or more")
+            raise ValueError(f"num_inference_steps is {num_inference_steps}: flow matching needs at least 1")
         if edit is not None:
             check_edit(edit, mask, self.edit_modes, "FlowMatching")
             if sampler == "dopri5":
@@ -150,7 +152,7 @@ class FlowMatching(Process):
         start = noise(0)
 
         def velocity(x: Tensor, t: float | Tensor) -> Tensor:
-            # A number fills a tensor on the device; nothing is copied or waited for.
+            # Filling a tensor on the device with a number needs no copy and no synchronization.
             precision = torch.promote_types(x.dtype, torch.float32)
             time = t.expand(len(x)) if isinstance(t, Tensor) else x.new_full((len(x),), t, dtype=precision)
             output = denoise(x, self.table_time(time), mask, cond).to(x.dtype)

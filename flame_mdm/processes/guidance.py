@@ -1,4 +1,4 @@
-"""Guidance: wrappers of the denoiser that samplers cannot tell from the denoiser itself."""
+"""Guidance: wrappers with the same interface as the denoiser."""
 
 import torch
 from torch import Tensor
@@ -7,22 +7,23 @@ from flame_mdm.motion import Condition, Denoise
 
 
 def classifier_free_guidance(denoise: Denoise, scale: float | Tensor, features: int) -> Denoise:
-    """Guides a denoiser by its own unconditional prediction: null + scale * (cond - null), in one forward of 2B.
+    """Returns a denoiser guided by its unconditional prediction: null + scale * (cond - null), with batch size 2B.
 
-    Ho and Salimans 2021 in the form of MDM and FLAME (eq. 5), where 1 means "off"; their own w is scale - 1.
+    Ho and Salimans 2021 in the form of MDM and FLAME (eq. 5), where 1 means no guidance; w in Ho and Salimans is
+    scale - 1.
 
     Args:
         denoise: the denoiser.
-        scale: guidance scale, one number or one a sample (B,). For the number 1, `denoise` itself is returned.
-        features: D. Channels from D on (a learned variance) are not guided but those of the conditional half.
+        scale: guidance scale, one number or one per sample (B,). For the number 1, `denoise` itself is returned.
+        features: D. Channels from D on (a learned variance) are not guided: those of the conditional half are returned.
 
     Raises:
-        ValueError: at the first call, where the condition has no null.
+        ValueError: in the first call, if the condition has no null.
     """
     if not isinstance(scale, Tensor) and scale == 1:
         return denoise
     strength = scale[:, None, None] if isinstance(scale, Tensor) else scale
-    # One doubled condition a sampling run, so that a denoiser may keep what it computes from it.
+    # One doubled condition per sampling run, so that a denoiser can cache what it computes from it.
     doubled: tuple[Condition, Condition] | None = None
 
     def guided(x_t: Tensor, t: Tensor, mask: Tensor, cond: Condition) -> Tensor:

@@ -1,8 +1,8 @@
-"""Samplers: ways back from noise to motion, one function each.
+"""Samplers from noise to motion, one function each.
 
-Diffusion samplers go down the steps of a `Schedule`; they see the denoiser as `estimate(x_t, i)`, the clean motion and
-the log-variance of the step at step i. Solvers of ordinary differential equations see a velocity field. Coefficients
-and times are Python numbers, so that no loop waits for the device.
+Diffusion samplers descend the steps of a `Schedule`; they call the denoiser as `estimate(x_t, i)`, which returns the
+clean motion and the log-variance at step i. ODE solvers call a velocity field. Coefficients and times are Python
+numbers, so that no loop waits for the device.
 """
 
 import itertools
@@ -24,7 +24,7 @@ Velocity = Callable[[Tensor, float | Tensor], Tensor]
 
 
 class CountedDenoise:
-    """A denoiser that counts its calls: NFE, to which the doubled batch of guidance adds nothing if wrapped outside."""
+    """A denoiser that counts its calls (NFE). Outside of guidance, a call with the doubled batch counts once."""
 
     def __init__(self, denoise: Denoise):
         self.denoise = denoise
@@ -38,7 +38,7 @@ class CountedDenoise:
 def ancestral_step(
     x_t: Tensor, x0_hat: Tensor, log_variance: Tensor | float, schedule: Schedule, i: int, noise: Tensor | None
 ) -> Tensor:
-    """x_{t-1} drawn from p(x_{t-1} | x_t) (Ho et al. 2020, algorithm 2); its mean where `noise` is None."""
+    """Draws x_{t-1} from p(x_{t-1} | x_t) (Ho et al. 2020, algorithm 2); returns its mean if `noise` is None."""
     mean = schedule.posterior_mean(x0_hat, x_t, i)
     if noise is None:
         return mean
@@ -47,7 +47,7 @@ def ancestral_step(
 
 
 def ddim_step(x_t: Tensor, x0_hat: Tensor, schedule: Schedule, i: int, noise: Tensor | None, eta: float) -> Tensor:
-    """x_{t-1} by DDIM (Song et al. 2021, eq. 12 and 16); `noise` is needed where eta > 0."""
+    """Returns x_{t-1} of DDIM (Song et al. 2021, eq. 12 and 16); `noise` is needed if eta > 0."""
     epsilon = (x_t - schedule.at("signal", i, x_t) * x0_hat) / schedule.at("noise", i, x_t)
     # eq. 16: eta = 1 has the variance of the ancestral step.
     variance = eta**2 * schedule.tables["posterior_variance"][i].item()
@@ -57,7 +57,7 @@ def ddim_step(x_t: Tensor, x0_hat: Tensor, schedule: Schedule, i: int, noise: Te
 
 
 def ancestral(estimate: Estimate, schedule: Schedule, noise: Noise, edit: Edit | None = None) -> Tensor:
-    """Draws every x_{t-1} from the learned reverse process (Ho et al. 2020, algorithm 2), at the end its mean."""
+    """Draws every x_{t-1} from the learned reverse process (Ho et al. 2020, algorithm 2); the last one is its mean."""
 
     def step(x_t: Tensor, i: int, draw: Callable[[], Tensor]) -> Tensor:
         x0_hat, log_variance = estimate(x_t, i)
@@ -79,7 +79,7 @@ def ddim(estimate: Estimate, schedule: Schedule, noise: Noise, edit: Edit | None
 def dpm_solver_pp_2m(estimate: Estimate, schedule: Schedule, noise: Noise, edit: Edit | None = None) -> Tensor:
     """DPM-Solver++ (2M), a deterministic multistep solver (Lu et al. 2022b, algorithm 2).
 
-    The first step is of first order for want of history; the last one, to data without noise, is the clean estimate.
+    The first step is of first order, since there is no history; the last one returns the clean estimate.
     """
     signal, deviation = schedule.tables["signal"].tolist(), schedule.tables["noise"].tolist()
     log_snr = [math.log(a / s) for a, s in zip(signal, deviation, strict=True)]
@@ -103,9 +103,9 @@ def dpm_solver_pp_2m(estimate: Estimate, schedule: Schedule, noise: Noise, edit:
 def _descend(
     step: Callable[[Tensor, int, Callable[[], Tensor]], Tensor], schedule: Schedule, noise: Noise, edit: Edit | None
 ) -> Tensor:
-    """Goes down all steps from noise(0), imposing an edit of mode "x_t" on the way.
+    """Descends all steps from noise(0) and applies an edit of mode "x_t".
 
-    Draws are numbered in the order of use: blending before a step, the step, blending after it, going back.
+    Draws are numbered in order of use: blending before a step, the step, blending after it, resampling.
     """
     draws = itertools.count()
 
@@ -151,7 +151,7 @@ def heun(velocity: Velocity, x: Tensor, t: float, dt: float) -> Tensor:
 
 
 def rk4(velocity: Velocity, x: Tensor, t: float, dt: float) -> Tensor:
-    """One step of order 4, four calls, by Kutta's 3/8 rule, which torchdiffeq calls rk4 too."""
+    """One step of order 4, four calls: Kutta's 3/8 rule, also called rk4 in torchdiffeq."""
     k1 = velocity(x, t)
     k2 = velocity(x + dt / 3 * k1, t + dt / 3)
     k3 = velocity(x + dt * (k2 - k1 / 3), t + dt * 2 / 3)
@@ -160,10 +160,10 @@ def rk4(velocity: Velocity, x: Tensor, t: float, dt: float) -> Tensor:
 
 
 def dopri5(velocity: Velocity, x: Tensor) -> Tensor:
-    """From t = 0 to 1 by adaptive steps of order 5 (Dormand and Prince 1980), rtol = atol = 1e-5, as MFM.
+    """Integrates from t = 0 to 1 with adaptive steps of order 5 (Dormand and Prince 1980), rtol = atol = 1e-5, as MFM.
 
-    The error is measured over the whole batch: a motion depends on what it shares the batch with, up to the tolerance.
-    The last step may look beyond t = 1, from where the solver interpolates back.
+    The error is measured over the entire batch, so a motion depends on the rest of its batch, up to the tolerance. The
+    last step may go beyond t = 1; the solver then interpolates back.
     """
     ends = torch.tensor([0.0, 1.0], dtype=x.dtype, device=x.device)
     path = odeint(lambda t, y: velocity(y, t), x, ends, rtol=1e-5, atol=1e-5, method="dopri5")

@@ -1,4 +1,4 @@
-"""Noise schedules of Gaussian diffusion, their coefficients, and the choice of the steps to sample at."""
+"""Noise schedules of Gaussian diffusion: coefficients, and selection of sampling steps."""
 
 import math
 from typing import Literal, get_args
@@ -13,7 +13,7 @@ Spacing = Literal["linspace", "stride"]
 
 
 def cosine_betas(num_train_timesteps: int) -> Tensor:
-    """(T,) float64 noise variances of Nichol and Dhariwal 2021, eq. 17, clipped at 0.999."""
+    """Returns noise variances (T,) float64 of Nichol and Dhariwal 2021, eq. 17, clipped at 0.999."""
 
     def alpha_bar(t: float) -> float:
         return math.cos((t + 0.008) / 1.008 * math.pi / 2) ** 2
@@ -24,10 +24,10 @@ def cosine_betas(num_train_timesteps: int) -> Tensor:
 
 
 def linear_betas(num_train_timesteps: int) -> Tensor:
-    """(T,) float64 noise variances of Ho et al. 2020, section 4: 1e-4 to 0.02 at T = 1000.
+    """Returns noise variances (T,) float64 of Ho et al. 2020, section 4: 1e-4 to 0.02 at T = 1000.
 
-    Other T are scaled by 1000 / T to end at the same noise, as in guided-diffusion. Clipped at 0.999, which is reached
-    below T = 21.
+    For other T they are scaled by 1000 / T to end at the same noise, as in guided-diffusion. Clipped at 0.999, which is
+    reached below T = 21.
     """
     scale = 1000 / num_train_timesteps
     return torch.linspace(scale * 1e-4, scale * 0.02, num_train_timesteps, dtype=torch.float64).clamp(max=0.999)
@@ -36,16 +36,16 @@ def linear_betas(num_train_timesteps: int) -> Tensor:
 class Schedule:
     """Coefficients of a Gaussian diffusion, by step i = 0 (least noise) to N - 1.
 
-    Tables are float64 on the CPU and rounded once, at use; they are no buffers because casting or moving a model
+    Tables are float64 on the CPU and rounded once, when used. They are not buffers, because casting or moving a model
     (bfloat16, MPS) must not round them. Formulas: Ho et al. 2020, eq. 4 and 7.
     """
 
     def __init__(self, betas: Tensor):
-        """From the variances (N,) of the N >= 2 noise steps, float64."""
+        """Computes the tables from the variances (N,) float64 of the N >= 2 noise steps."""
         alphas_cumprod = (1 - betas).cumprod(0)
         previous = torch.cat([betas.new_ones(1), alphas_cumprod[:-1]])
         posterior_variance = betas * (1 - previous) / (1 - alphas_cumprod)
-        # The posterior of step 0 has no variance; its logarithm takes the value of step 1 (Nichol and Dhariwal 2021).
+        # The posterior of step 0 has variance 0: its logarithm is that of step 1 (Nichol and Dhariwal 2021).
         clipped = torch.cat([posterior_variance[1:2], posterior_variance[1:]])
         self.tables = {
             "betas": betas,
@@ -66,7 +66,7 @@ class Schedule:
         return len(self.tables["betas"])
 
     def at(self, name: str, i: int | Tensor, x: Tensor) -> Tensor | float:
-        """A coefficient at step i: a number, or for steps (B,) a tensor (B, 1, 1) beside x, at least float32."""
+        """Returns a coefficient at step i: a number, or for steps (B,) a tensor (B, 1, 1) like x, at least float32."""
         if isinstance(i, int):
             return self.tables[name][i].item()
         key = (name, x.device, torch.promote_types(x.dtype, torch.float32))
@@ -75,25 +75,25 @@ class Schedule:
         return self._moved[key][i.long()][:, None, None]
 
     def respace(self, steps: list[int]) -> "Schedule":
-        """The diffusion that visits only these steps, in rising order (Nichol and Dhariwal 2021, section 4)."""
+        """Returns the schedule that visits only these increasing steps (Nichol and Dhariwal 2021, section 4)."""
         alphas_cumprod = self.tables["alphas_cumprod"][steps]
         previous = torch.cat([alphas_cumprod.new_ones(1), alphas_cumprod[:-1]])
         return Schedule(1 - alphas_cumprod / previous)
 
     def corrupt(self, x: Tensor, noise: Tensor, i: int | Tensor) -> Tensor:
-        """x_t (B, F, D) at step i (Ho et al. 2020, eq. 4)."""
+        """Returns x_t (B, F, D) at step i (Ho et al. 2020, eq. 4)."""
         return self.at("signal", i, x) * x + self.at("noise", i, x) * noise
 
     def posterior_mean(self, x0: Tensor, x_t: Tensor, i: int | Tensor) -> Tensor:
-        """Mean (B, F, D) of x_{t-1} given x_0 and x_t (Ho et al. 2020, eq. 7)."""
+        """Returns the mean (B, F, D) of x_{t-1} given x_0 and x_t (Ho et al. 2020, eq. 7)."""
         return self.at("posterior_x0", i, x_t) * x0 + self.at("posterior_x_t", i, x_t) * x_t
 
 
 def build_schedule(name: ScheduleName, num_train_timesteps: int) -> Schedule:
-    """The schedule of this name with T steps.
+    """Returns the schedule of this name with T steps.
 
     Raises:
-        ValueError: an unknown name, or fewer than 2 steps.
+        ValueError: the name is unknown, or the number of steps is not in [2, `MOST_STEPS`].
     """
     if name not in get_args(ScheduleName):
         raise ValueError(f"unknown schedule '{name}': choose from {', '.join(get_args(ScheduleName))}")
@@ -103,17 +103,18 @@ def build_schedule(name: ScheduleName, num_train_timesteps: int) -> Schedule:
 
 
 def timesteps(num_train_timesteps: int, num_inference_steps: int, spacing: Spacing = "linspace") -> list[int]:
-    """Steps to sample at, N of 0 ... T - 1, rising.
+    """Returns N increasing sampling steps from 0 ... T - 1.
 
     Args:
         num_train_timesteps: T.
         num_inference_steps: N.
-        spacing: "linspace" takes both ends and points evenly between them, rounded half to even ("N" in the codes of
-            MDM and FLAME, after Nichol and Dhariwal 2021); "stride" counts from 0 by the first whole number that makes
-            N steps, so that the last, noisiest step may lie well below T - 1 ("ddimN" there, after Song et al. 2021).
+        spacing: "linspace" gives evenly spaced steps including both ends, rounded half to even ("N" in the code of MDM
+            and FLAME, after Nichol and Dhariwal 2021). "stride" counts from 0 with the smallest integer stride that
+            gives N steps, so that the last, noisiest step may be well below T - 1 ("ddimN" there, after Song et al.
+            2021).
 
     Raises:
-        ValueError: N is not in 1 ... T, the spacing is unknown, or no stride makes N steps.
+        ValueError: N is not in 1 ... T, the spacing is unknown, or no stride gives N steps.
     """
     total, count = num_train_timesteps, num_inference_steps
     if not 1 <= count <= total:
@@ -122,11 +123,11 @@ def timesteps(num_train_timesteps: int, num_inference_steps: int, spacing: Spaci
         for stride in range(1, total + 1):
             if len(range(0, total, stride)) == count:
                 return list(range(0, total, stride))
-        raise ValueError(f"no stride makes {count} of {total} steps: choose another number or spacing=linspace")
+        raise ValueError(f"no stride gives {count} of {total} steps: choose another number or spacing=linspace")
     if spacing != "linspace":
         raise ValueError(f"unknown spacing '{spacing}': choose from {', '.join(get_args(Spacing))}")
     stride = (total - 1) / (count - 1) if count > 1 else 1.0
-    # A running sum, not i * stride: its rounding decides ties, and trained models were sampled at those steps.
+    # A running sum, not i * stride: its rounding decides ties, and the released models were sampled at those steps.
     steps, position = [], 0.0
     for _ in range(count):
         steps.append(round(position))

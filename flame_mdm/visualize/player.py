@@ -1,4 +1,4 @@
-"""A web page that plays motions: one file, no network, opens from disk."""
+"""HTML player of motions: a single file that needs no network and opens from disk."""
 
 import base64
 import html
@@ -17,7 +17,7 @@ MILLIMETER = 0.001
 
 
 def write_player(path: str | Path, motions: Sequence[Shown], title: str = "Motions", **options: Any) -> None:
-    """Writes the page of `player_page`, which has the same arguments, to a file.
+    """Writes the page of `player_page` to a file; the options are those of `player_page`.
 
     Raises:
         ValueError: there are no motions.
@@ -35,22 +35,22 @@ def player_page(
     groups: Sequence[str] = (),
     beside: Sequence[str] = (),
 ) -> str:
-    """A self-contained HTML page that plays motions side by side in 3D, under one clock and one camera.
+    """Returns a self-contained HTML page that plays motions side by side in 3D, with a shared clock and camera.
 
     Positions are rounded to millimeters; a motion that spans more than 65 m is rounded to 1/65534 of its span.
 
     Args:
-        motions: what to show; skeletons, lengths and frame rates may differ.
+        motions: motions to show; skeletons, lengths and frame rates may differ.
         title: heading of the page.
-        about: HTML that the page unfolds below the heading; its texts have to be escaped.
+        about: HTML of a collapsible section below the heading; its texts must be escaped.
         columns: motions per row; 0 = as many as fit into the window.
-        groups: for each motion what the page can be narrowed down to, such as its split; "" = nothing.
-        beside: for each motion the id of an earlier one that it is shown next to, such as the original of a mirrored
-            copy; "" = none.
+        groups: for each motion, a name to filter by, such as its split; "" = none.
+        beside: for each motion, the id of an earlier one to show it next to, such as the original of a mirrored copy;
+            "" = none.
     """
     blank = [""] * len(motions)
     packed = [_packed(*each) for each in zip(motions, groups or blank, beside or blank, strict=True)]
-    # "<" never stands in the data, so no caption can close the script element
+    # "<" never occurs in the data, so no caption can close the script element
     content = {
         "TITLE": html.escape(shortened(title)),
         "ABOUT": about and f"<details><summary>About these motions</summary><div>{about}</div></details>",

@@ -18,24 +18,24 @@ SIDE_COLORS: dict[int, Color] = {1: (47, 127, 209), -1: (226, 112, 42), 0: (140,
 PAPER, GROUND, LINE, TEXT, FAINT = (255, 255, 255), (243, 245, 247), (205, 211, 219), (28, 36, 48), (102, 112, 133)
 SHADOW, TRAIL, CONTACT = (212, 216, 222), (122, 91, 208), (15, 157, 107)
 NEAR = 0.3
-"""What comes closer to the camera than this, in meters, is not drawn."""
+"""Distance from the camera in meters below which nothing is drawn."""
 LIT, DARK = 0.3, -0.45
 SMOOTH = 2
 """Images are drawn this many times larger and then reduced."""
 
 
 def frames_array(motion: Shown, size: int = 256) -> np.ndarray:
-    """Draws each frame of a motion: (F, size, size, 3) uint8, for the video panels of loggers."""
+    """Returns each frame of a motion as an image: (F, size, size, 3) uint8, for the video panels of loggers."""
     return np.stack([np.asarray(_figure(motion, frame, size)) for frame in range(len(motion.joints))])
 
 
 def write_gif(path: str | Path, motions: Sequence[Shown], size: int = 256) -> None:
-    """Writes an animation of motions side by side, captions below; it plays at their frame rate and loops.
+    """Writes a looping animation of motions side by side, with captions below.
 
     Args:
         path: the GIF to write.
-        motions: drawn under one clock, that of the highest frame rate; a motion that ends earlier stays at its last
-            frame. The format shows at most 50 frames per second: of faster motions frames are left out.
+        motions: drawn at the highest of their frame rates; a motion that ends earlier stays at its last frame. The
+            format allows at most 50 frames per second, so frames of faster motions are dropped.
         size: width and height of a panel in pixels.
 
     Raises:
@@ -61,7 +61,7 @@ def write_gif(path: str | Path, motions: Sequence[Shown], size: int = 256) -> No
 
 
 def write_mp4(path: str | Path, motions: Sequence[Shown], size: int = 384) -> None:
-    """Writes the animation of `write_gif` as H.264 video, by the program ffmpeg.
+    """Writes the animation of `write_gif` as H.264 video, with the program ffmpeg.
 
     Raises:
         FileNotFoundError: ffmpeg is not installed.
@@ -75,7 +75,7 @@ def write_mp4(path: str | Path, motions: Sequence[Shown], size: int = 384) -> No
         raise FileNotFoundError(f"{path}: MP4 needs ffmpeg on the PATH; install it, or write a .gif")
     fps = max(motion.fps for motion in motions)
     video = [np.asarray(image) for image in _video(motions, fps, size)]
-    height, width = (length // 2 * 2 for length in video[0].shape[:2])  # H.264 codes even sizes only
+    height, width = (length // 2 * 2 for length in video[0].shape[:2])  # H.264 needs even sizes
     with atomic_write(path) as temporary:
         command = [ffmpeg, "-loglevel", "error", "-y", "-f", "rawvideo", "-pix_fmt", "rgb24"]
         command += ["-s", f"{width}x{height}", "-r", str(fps), "-i", "-", "-c:v", "libx264", "-pix_fmt", "yuv420p"]
@@ -87,21 +87,21 @@ def write_mp4(path: str | Path, motions: Sequence[Shown], size: int = 384) -> No
 
 
 def contact_sheet(path: str | Path, motions: Sequence[Shown], frames: int = 6, size: int = 192) -> None:
-    """Writes one PNG with a row for each motion: its poses at equally spaced times from first to last, and its caption.
+    """Writes one PNG with a row per motion: its poses at equally spaced times from first to last, and its caption.
 
     Args:
         path: the PNG to write.
         motions: one row each.
-        frames: poses a row.
+        frames: poses per row.
         size: width and height of a pose in pixels.
 
     Raises:
-        ValueError: there are no motions, or fewer than one pose a row.
+        ValueError: there are no motions, or fewer than one pose per row.
     """
     path = Path(path)
     check_any(motions, path)
     if frames < 1:
-        raise ValueError(f"{path}: {frames} poses a row, expected at least 1")
+        raise ValueError(f"{path}: {frames} poses per row, expected at least 1")
     rows = []
     for motion in motions:
         row = Image.new("RGB", (frames * size, size), PAPER)
@@ -120,7 +120,7 @@ def contact_sheet(path: str | Path, motions: Sequence[Shown], frames: int = 6, s
 
 
 def _palette() -> Image.Image:
-    """All colors drawn, and their blends at smoothed edges: one palette, so that colors never flicker."""
+    """Returns one palette of all colors and their blends at smoothed edges, so that colors do not flicker."""
     limbs = [color for side in SIDE_COLORS.values() for color in (side, _shade(side, LIT), _shade(side, DARK))]
     drawn = np.array([*limbs, LINE, TEXT, FAINT, SHADOW, TRAIL, CONTACT])
     grounds = np.array([PAPER, GROUND])
@@ -131,7 +131,7 @@ def _palette() -> Image.Image:
 
 
 def _video(motions: Sequence[Shown], fps: float, size: int) -> Iterator[Image.Image]:
-    """Images of the panels side by side, one every 1 / fps seconds, with a bar that shows the time."""
+    """Yields images of the panels side by side, one every 1 / fps seconds, with a progress bar."""
     seconds = max(len(motion.joints) / motion.fps for motion in motions)
     columns = len(motions) if len(motions) < 4 else min(4, math.ceil(math.sqrt(len(motions))))
     lines = _caption_lines(motions, size, size)
@@ -154,7 +154,7 @@ def _video(motions: Sequence[Shown], fps: float, size: int) -> Iterator[Image.Im
 
 
 def _figure(motion: Shown, frame: int, size: int) -> Image.Image:
-    """One pose on the ground, (size, size) pixels; the camera follows the root smoothed over a second."""
+    """Draws one pose on the ground, (size, size) pixels; the camera follows the root smoothed over one second."""
     side = size * SMOOTH
     image = Image.new("RGB", (side, side), PAPER)
     pen = ImageDraw.Draw(image)
@@ -195,7 +195,10 @@ def _figure(motion: Shown, frame: int, size: int) -> Image.Image:
 
 
 def _camera(target: np.ndarray, side: int) -> Callable[[np.ndarray], np.ndarray]:
-    """A camera in front, to the left and above: (N, 3) meters -> (N, 4) x, y, pixels a metre and depth."""
+    """Returns the projection of a camera in front, to the left and above.
+
+    It maps points (N, 3) in meters to (N, 4): x, y, pixels per meter and depth.
+    """
     yaw, pitch, distance = 0.6, 0.24, 5.0
     toward = np.array([math.sin(yaw) * math.cos(pitch), math.sin(pitch), math.cos(yaw) * math.cos(pitch)])
     right = np.array([math.cos(yaw), 0, -math.sin(yaw)])
@@ -215,7 +218,7 @@ def _points(projected: np.ndarray) -> list[tuple[float, float]]:
 
 
 class Limb(NamedTuple):
-    """Two ends (x, y, pixels a metre, depth), their radii in meters, and a color."""
+    """Two ends (x, y, pixels per meter, depth), their radii in meters, and a color."""
 
     a: np.ndarray
     b: np.ndarray
@@ -246,7 +249,7 @@ def _body(motion: Shown, joints: np.ndarray, project: Callable[[np.ndarray], np.
 
 
 def _draw(pen: ImageDraw.ImageDraw, limb: Limb, rim: float) -> None:
-    """A limb in its color, with a dark rim and a highlight toward the light, which falls from above left."""
+    """Draws a limb in its color, with a dark rim and a highlight toward the light from the upper left."""
     a, b, radius_a, radius_b, color = limb
     _capsule(pen, a, b, radius_a, radius_b, _shade(color, DARK), grow=rim)
     _capsule(pen, a, b, radius_a, radius_b, color)
@@ -261,7 +264,7 @@ def _draw(pen: ImageDraw.ImageDraw, limb: Limb, rim: float) -> None:
 def _capsule(
     pen: ImageDraw.ImageDraw, a: np.ndarray, b: np.ndarray, ra: float, rb: float, color: Color, grow: float = 0
 ) -> None:
-    """Fills the outline around two circles of radius `ra` and `rb` meters, `grow` pixels wider."""
+    """Fills the convex hull of two circles of radius `ra` and `rb` meters, `grow` pixels wider."""
     (ax, ay, ra), (bx, by, rb) = (*a[:2], ra * a[2] + grow), (*b[:2], rb * b[2] + grow)
     length = math.hypot(bx - ax, by - ay)
     if length > abs(ra - rb):
@@ -276,7 +279,7 @@ def _capsule(
 
 
 def _shade(color: Color, light: float) -> Color:
-    """-1 black, 0 as it is, 1 white."""
+    """Returns a darker or lighter color: -1 is black, 0 is unchanged, 1 is white."""
     red, green, blue = (round(c + (255 - c) * light if light > 0 else c * (1 + light)) for c in color)
     return red, green, blue
 
@@ -286,7 +289,7 @@ def _font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
 
 
 def _wrapped(text: str, width: int, size: int) -> list[str]:
-    """Breaks a caption between words so that each line fits; the third line ends in dots where more is left."""
+    """Breaks a caption into lines of words that fit; a third line ends in an ellipsis if text is left."""
     lines, font = [""], _font(size)
     for word in shortened(text, width).split():  # more does not fit into three lines
         longer = f"{lines[-1]} {word}".strip()
@@ -303,7 +306,7 @@ def _caption_lines(motions: Sequence[Shown], width: int, size: int) -> int:
 
 
 def _caption(motion: Shown, width: int, lines: int, size: int) -> Image.Image:
-    """The caption of a motion on paper, with room for `lines` lines; drawn once for all frames."""
+    """Draws the caption of a motion with room for `lines` lines; it is drawn once for all frames."""
     line = round(max(10, size // 18) * 1.35)
     image = Image.new("RGB", (width, lines * line + 10), PAPER)
     pen = ImageDraw.Draw(image)
@@ -313,7 +316,7 @@ def _caption(motion: Shown, width: int, lines: int, size: int) -> Image.Image:
 
 
 def _below(image: Image.Image, caption: Image.Image) -> Image.Image:
-    """The image with its caption below."""
+    """Returns the image with its caption below."""
     taller = Image.new("RGB", (image.width, image.height + caption.height), PAPER)
     taller.paste(image)
     taller.paste(caption, (0, image.height))

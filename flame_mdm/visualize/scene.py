@@ -1,4 +1,4 @@
-"""The figure to draw: a motion on its skeleton, the thickness and side of its limbs."""
+"""Description of the figure to draw: the motion protocol, and side and thickness of limbs."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:  # drawing needs numpy and Pillow, not torch
 
 
 LONGEST = 2000
-"""Characters of a caption that are shown."""
+"""Maximum number of characters of a caption that are shown."""
 
 
 class Shown(Protocol):
@@ -44,7 +44,7 @@ def head(skeleton: Skeleton) -> int | None:
 
 
 def radii(skeleton: Skeleton) -> list[float]:
-    """Returns the thickness of the body around each joint in meters, which grows with the number of joints below it."""
+    """Returns the radius of the body around each joint in meters, which grows with the number of its descendants."""
     below = [0] * len(skeleton.parents)
     for joint in reversed(range(1, len(below))):
         below[skeleton.parents[joint]] += below[joint] + 1

@@ -318,7 +318,7 @@ def _npz(folder: Path, **arrays) -> Path:
         ({"joints": []}, "the entire motion is kept"),
         ({"region": [5, 5]}, r"region=\[5, 5\] is not a range of this motion, which has 40 frames \(2 seconds\)"),
         ({"region": [30, 50]}, "is not a range of this motion"),
-        ({"region_seconds": [1.5, 2.5]}, r"region_seconds=\[1.5, 2.5\] is no part"),
+        ({"region_seconds": [1.5, 2.5]}, r"region_seconds=\[1.5, 2.5\] is not a range"),
         ({"region": [1, 2, 3]}, r"write \[begin, end\], or several"),
         ({"region": [[1, 2], 3]}, r"write \[begin, end\], or several"),
         ({"region": []}, r"write \[begin, end\], or several"),

@@ -48,7 +48,7 @@ class Task(LightningModule):
 
     def describe(self) -> str:
         """Returns the name of the network, for the first line of a run's output."""
-        return type(self).__name__
+        return type(getattr(self, "network", self)).__name__
 
     def prepare_data(self) -> None:
         """Encodes all captions of the data once, in one process, if the text encoder is frozen."""

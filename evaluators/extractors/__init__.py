@@ -62,7 +62,11 @@ class Extractor(ABC):
 
 
 class _OwnExtractor(Extractor):
-    """A network that `make train` has made, from its checkpoint."""
+    """A network that `make train` has made, from its checkpoint.
+
+    Raises:
+        FileNotFoundError, UserError: no such checkpoint, or one of another network.
+    """
 
     trained: type[Task]
     recipes: str
@@ -90,11 +94,7 @@ class _OwnExtractor(Extractor):
 
 
 class MotionCLIPExtractor(_OwnExtractor):
-    """A motion-CLIP that `make train EXP=motion_clip/...` has made.
-
-    Raises:
-        FileNotFoundError, UserError: no such checkpoint, or none of a motion-CLIP.
-    """
+    """A motion-CLIP that `make train EXP=motion_clip/...` has made."""
 
     trained, recipes = MotionCLIPTask, "motion_clip"
     task: MotionCLIPTask
@@ -166,11 +166,7 @@ class T2MExtractor(Extractor):
 
 
 class OwnT2MExtractor(_OwnExtractor):
-    """An evaluator of Guo et al. 2022 that `make train EXP=t2m/...` has made.
-
-    Raises:
-        FileNotFoundError, UserError: no such checkpoint, or none of this evaluator.
-    """
+    """An evaluator of Guo et al. 2022 that `make train EXP=t2m/...` has made."""
 
     trained, recipes = T2MTask, "t2m"
     task: T2MTask
@@ -261,11 +257,7 @@ class ClassifierExtractor(Extractor):
 
 
 class OwnClassifierExtractor(_OwnExtractor):
-    """An action classifier that `make train EXP=classifier/...` has made.
-
-    Raises:
-        FileNotFoundError, UserError: no such checkpoint, or none of a classifier.
-    """
+    """An action classifier that `make train EXP=classifier/...` has made."""
 
     trained, recipes = ClassifierTask, "classifier"
     task: ClassifierTask

@@ -66,9 +66,6 @@ class ClassifierTask(Task):
         task.config, task.facts = config, {"actions": list(actions)}
         return task
 
-    def describe(self) -> str:
-        return type(self.network).__name__
-
     def setup(self, stage: str) -> None:
         """As all tasks.
 

@@ -142,9 +142,6 @@ class T2MTask(Task):
         task.config, task.facts = config, {"actions": list(actions)}
         return task
 
-    def describe(self) -> str:
-        return type(self.network).__name__
-
     def setup(self, stage: str) -> None:
         """As all tasks; reads the word vectors, and notes the tagged words of all captions.
 

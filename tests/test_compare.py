@@ -99,6 +99,7 @@ def test_runs_without_a_common_prompt_are_compared_and_not_judged(three, tmp_pat
     assert not (tmp_path / "rate.html").exists()
 
 
+@pytest.mark.slow
 def test_texts_are_sampled_by_the_last_checkpoints(tmp_path, data_root):
     first = run(tmp_path / "a", data_root, "trainer.max_steps=2", "callbacks.samples=null")
     second = run(tmp_path / "b", data_root, "trainer.max_steps=4", "callbacks.samples=null", "run.name=longer")
@@ -112,6 +113,7 @@ def test_texts_are_sampled_by_the_last_checkpoints(tmp_path, data_root):
     assert read_texts("a person walks; a person (jumps), 100%;") == ["a person walks", "a person (jumps), 100%"]
 
 
+@pytest.mark.slow
 def test_runs_sample_what_a_folder_of_motions_shows(tmp_path, data_root, capsys):
     model = run(tmp_path / "a", data_root, "trainer.max_steps=2", "callbacks.samples=null")
     real = tmp_path / "real"

@@ -143,6 +143,7 @@ def test_a_checkpoint_names_only_own_classes(target, monkeypatch):
             trust({"denoiser": hidden})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", recipes())
 def test_what_checkpoints_of_our_recipes_name_is_trusted(name):
     composed = compose(name)

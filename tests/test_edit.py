@@ -417,6 +417,7 @@ def checkpoint(diffusion, tmp_path) -> Path:
     return tmp_path / "last.ckpt"
 
 
+@pytest.mark.slow
 def test_the_command_writes_the_original_beside_the_edits(checkpoint, store, tmp_path, capsys):
     out = tmp_path / "out"
     words = [

@@ -365,6 +365,7 @@ def refused(runs: Runs, capsys, tmp_path: Path, *words: str) -> str:
     return lines[0]
 
 
+@pytest.mark.slow
 def test_what_does_not_fit_is_refused_in_one_line(runs, capsys, tmp_path):
     assert "needs a feature extractor" in refused(runs, capsys, tmp_path, "extractor=null")
     assert "not a MotionCLIPTask" in refused(runs, capsys, tmp_path, f"extractor={runs.model}")
@@ -399,6 +400,7 @@ def test_misspelt_options_of_metrics_are_refused_before_anything_is_generated(ru
         assert message in refused(runs, capsys, tmp_path, protocol_file(tmp_path, old, new))
 
 
+@pytest.mark.slow
 def test_missing_inputs_of_metrics_are_refused_before_anything_is_generated(runs, capsys, tmp_path, monkeypatch):
     monkeypatch.setattr(Generator, "_generate", lambda *_: pytest.fail("sampled"))
     metrics = "evaluators.metrics"
@@ -454,6 +456,7 @@ def test_released_classifiers_give_features_and_scores_of_their_data_alone(tmp_p
             extractor.check(representation, "bandai")
 
 
+@pytest.mark.slow
 def test_the_t2m_evaluator_is_read_from_a_folder(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"lacks finest\.tar, mean\.npy"):
         T2MExtractor(str(tmp_path))
@@ -639,6 +642,7 @@ def baseline(runs: Runs, folder: Path, kind: str, *words: str) -> int:
     return main(["evaluate", f"baseline={kind}", *place, f"extractor={runs.clip}", "replications=1", out, *words])
 
 
+@pytest.mark.slow
 def test_baselines_show_what_each_metric_sees(runs, tmp_path):
     found, truth = {}, {}
     for kind in Baseline.KINDS:

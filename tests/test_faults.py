@@ -28,6 +28,7 @@ def test_kills_at_random_moments_change_nothing():
     assert "SIGTERM" in done.stdout
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", ["train", "sample", "edit", "evaluate", "prepare", "browse", "convert", "export"])
 def test_help_and_misspelt_keys_do_not_wait_for_torch(command, tmp_path):
     words = {"train": ["quickstart", "seeed=1"]}.get(command, ["seeed=1"])

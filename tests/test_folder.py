@@ -329,6 +329,7 @@ def make(line: str, environment: pytest.MonkeyPatch) -> int:
     return main([target, "--from-make"])
 
 
+@pytest.mark.slow
 def test_the_tutorial_works_as_it_is_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):

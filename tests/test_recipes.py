@@ -91,6 +91,7 @@ def test_recipes_name_paper_and_deviations():
             assert deviations
 
 
+@pytest.mark.slow
 @each_recipe
 def test_the_parts_of_a_recipe_fit(name):
     """The real sizes, without their memory: one forward at the longest motion of the data with the longest text."""

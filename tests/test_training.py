@@ -68,7 +68,14 @@ def test_training_learns(tiny):
     assert np.mean(losses[-20:]) < 0.7 * np.mean(losses[:5])
 
 
-@pytest.mark.parametrize("extra", [[], ["trainer.accumulate_grad_batches=2"], ["ema=null", "data.num_workers=1"]])
+@pytest.mark.parametrize(
+    "extra",
+    [
+        [],
+        pytest.param(["trainer.accumulate_grad_batches=2"], marks=pytest.mark.slow),
+        pytest.param(["ema=null", "data.num_workers=1"], marks=pytest.mark.slow),
+    ],
+)
 def test_a_resumed_run_is_the_uninterrupted_one(tiny, extra, tmp_path):
     overrides = [*tiny, *STEPS, "denoiser.dropout=0.1", *extra]
     run(overrides, 5, tmp_path / "parts")

@@ -178,7 +178,7 @@ class Evaluator:
         others = {name: metric for name, metric in usable.items() if name not in sets}
         for metric in metrics.values():
             metric.distributed_available_fn = bool  # False: this process has all motions, and no other computes
-        for part in _chunks(len(generated)):
+        for part in (slice(begin, begin + CHUNK) for begin in range(0, len(generated), CHUNK)):
             rows = {name: values[part] for name, values in generated.rows.items()}
             if sets:
                 update_metrics(sets, generated=rows["generated"], keys=rows["keys"])
@@ -228,10 +228,6 @@ class Evaluator:
             elif not (self.skip_features and FEATURES.intersection(missing)):
                 raise UserError(missing_input(name, metric, missing[0]))
         return usable
-
-
-def _chunks(count: int) -> list[slice]:
-    return [slice(begin, begin + CHUNK) for begin in range(0, count, CHUNK)]
 
 
 def _pad(joints: Sequence[Tensor]) -> tuple[Tensor, Tensor]:

@@ -183,7 +183,7 @@ class Folder(MotionSource):
             moved = resample(joints.astype(float), rate, fps)
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from error
-        return self._joints(path, moved, names)
+        return self._checked(path, find_layout(path, names, self.skeleton).apply(moved, names))
 
     def _names(self, path: Path, joints: int) -> tuple[str, ...]:
         """Returns the names of the joints of an array, from `skeleton.yaml` or inferred from the number of joints."""
@@ -201,9 +201,6 @@ class Folder(MotionSource):
         if joints not in (22, 24, 52):
             raise ValueError(f"{path}: {joints} joints, not the 22, 24 or 52 of SMPL; write a skeleton.yaml")
         return (*SMPL22.joints, *(f"joint{number}" for number in range(len(SMPL22), joints)))
-
-    def _joints(self, path: Path, positions: np.ndarray, names: Sequence[str]) -> np.ndarray:
-        return self._checked(path, find_layout(path, names, self.skeleton).apply(positions, names))
 
     def _checked(self, path: Path, joints: np.ndarray) -> np.ndarray:
         if self.motion == "smpl":

@@ -457,10 +457,6 @@ def _bow(rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> _Bod
     return body
 
 
-def _stand(rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> _Body:
-    return _Body(rng, t)
-
-
 MOTIONS: Mapping[str, Callable[[np.random.Generator, np.ndarray, Attributes], _Body]] = {
     "walk": _walk,
     "run": _run,
@@ -472,7 +468,7 @@ MOTIONS: Mapping[str, Callable[[np.random.Generator, np.ndarray, Attributes], _B
     "punch": _punch,
     "squat": _squat,
     "bow": _bow,
-    "stand": _stand,
+    "stand": lambda rng, t, requested: _Body(rng, t),
 }
 SHARES = {"walk": 6, "turn": 2, "jump": 2, "wave": 2, "raise": 2, "kick": 2, "punch": 2}  # others: 1
 MOST = {"jump": 3, "punch": 3, "kick": 2, "squat": 2}

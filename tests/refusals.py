@@ -38,18 +38,20 @@ class Refused:
         before = self._tree()
         self.capture.readouterr()
 
-        def late(*_: object) -> None:
+        late = False
+
+        def alarm(*_: object) -> None:
+            nonlocal late
+            late = True
             raise TimeoutError
 
-        handler = signal.signal(signal.SIGALRM, late)
+        handler = signal.signal(signal.SIGALRM, alarm)
         signal.alarm(self.seconds)
         limits = resource.getrlimit(resource.RLIMIT_AS)
         if self.memory is not None:
             resource.setrlimit(resource.RLIMIT_AS, (address_space() + self.memory, limits[1]))
         try:
             code: object = main([command, *words])
-        except TimeoutError:
-            code = f"no end after {self.seconds} s"
         except BaseException as error:
             place = error.__traceback__
             while place and place.tb_next:
@@ -63,6 +65,7 @@ class Refused:
             signal.signal(signal.SIGALRM, handler)
         out, err = self.capture.readouterr()
         told = [
+            f"no end after {self.seconds} s" if late else "",  # which code that catches every exception hides
             f"it ended with {code}" if code not in (1, 2) else "",
             f"it left {sorted(map(str, self._tree() ^ before))}" if self._tree() != before else "",
             "a traceback" if "Traceback" in out + err else "",

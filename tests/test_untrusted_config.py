@@ -364,13 +364,17 @@ def test_bombs_of_yaml(attacked, trained, bad):
         "laughs": "a: &a [1,1,1,1,1,1,1,1,1]\n"
         + "\n".join(f"{b}: &{b} [{','.join([f'*{a}'] * 9)}]" for a, b in zip("abcdefgh", "bcdefghi", strict=True)),
         "deep": "a: " + "[" * 50_000,
+        "half a character": 'a: "\\ud800"',
+        "digits": f"{10**20}: x",
+        "long": "a: [" + "1," * 2**17 + "]",
     }
     for name, text in bombs.items():
         folder = bad / name
         folder.mkdir()
         (folder / "config.yaml").write_text(text)
         path = str(folder / "config.yaml")
-        attacked("train", path, says="config.yaml: not a readable YAML file")
+        says = {"digits": "a whole number of more than 20 digits", "long": "256 KiB that such a file may have"}
+        attacked("train", path, says=says.get(name, "config.yaml: not a readable YAML file"))
         if name != "itself":  # the others read the same way
             continue
         attacked("train", "quickstart", f"run.dir={folder}", says="config.yaml: not a readable YAML file")

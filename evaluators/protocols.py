@@ -60,6 +60,8 @@ class Protocol:
             but as edits of the real ones; None = whole.
         smoothing: standard deviation, in frames, of a Gaussian over time that features of generated motions go through
             before they are measured, mirrored at the ends; None = none.
+        batch_size: motions at once, of a protocol that measures time: a first batch that is not timed comes before
+            them; None = as many as the evaluation says, 64 by default.
         expected: by data set or sha256 of the extractor, the values that real motions of the test split must have:
             metric -> [value, tolerance]. Where they have others, nothing is generated.
 
@@ -82,6 +84,7 @@ class Protocol:
         multimodality: Multimodality | None = None,
         edit: dict[str, Any] | None = None,
         smoothing: float | None = None,
+        batch_size: int | None = None,
         expected: dict[str, dict[str, list[float]]] | None = None,
     ):
         if condition not in ("text", "action", "none"):
@@ -96,13 +99,22 @@ class Protocol:
         self.extractor, self.metrics, self.replications, self.samples = extractor, metrics, replications, samples
         self.real_samples, self.multimodality, self.expected = real_samples, multimodality, expected or {}
         self.edit = edit and {REGION.get(key, key): value for key, value in edit.items()}
-        self.smoothing = smoothing
+        self.smoothing, self.batch_size = smoothing, batch_size
         self.quick, self.sha256 = False, ""
 
     def change(
-        self, *, replications: int | None, samples: int | None, quick: bool, clips: int, multimodality: bool = True
+        self,
+        *,
+        replications: int | None,
+        samples: int | None,
+        quick: bool,
+        clips: int,
+        multimodality: bool = True,
+        batch_size: int | None = None,
     ) -> dict[str, Any]:
         """Makes the protocol cheaper, for a split of so many clips; `multimodality` False leaves that out.
+
+        `batch_size` changes that of a protocol that measures time.
 
         Returns:
             What is no longer as published, to stand in the result.
@@ -115,7 +127,8 @@ class Protocol:
             replications = QUICK_REPLICATIONS if replications is None else replications
             samples = min(QUICK_SAMPLES, clips) if samples is None else samples
         changed: dict[str, Any] = {}
-        for name, value in (("replications", replications), ("samples", samples)):
+        size = batch_size if self.batch_size else None
+        for name, value in (("replications", replications), ("samples", samples), ("batch_size", size)):
             if value is not None and value < 1:
                 raise UserError(f"{name}={value}: at least 1 is needed")
             if value is not None and value != getattr(self, name):
@@ -260,6 +273,7 @@ class Protocol:
             clips=clips,
             condition=self.condition,
             batch_size=batch_size,
+            timed=self.batch_size is not None,
             parts=self.edit,
             total=total // world,
             progress=progress,

@@ -69,7 +69,7 @@ class EvaluationRequest:
     num_inference_steps: int | None = None
     method: str | None = None
     until: float | None = None
-    batch_size: int = 64
+    batch_size: int | None = None
     device: str | None = None
     data_root: str | None = None
     out: str | None = None
@@ -94,7 +94,7 @@ class EvaluationRequest:
             raise UserError("from_samples measures all motions of the files: leave out quick, samples and replications")
         if self.split not in ("train", "val", "test"):
             raise UserError(f"unknown split: {self.split}. Choose train, val or test")
-        if self.batch_size < 1:
+        if self.batch_size is not None and self.batch_size < 1:
             raise UserError(f"batch_size={self.batch_size}: at least 1 is needed")
         if self.guidance_scale is not None and not math.isfinite(self.guidance_scale):
             raise UserError(f"guidance_scale={self.guidance_scale} is not a finite number")
@@ -145,9 +145,11 @@ def _evaluate(request: EvaluationRequest, rank: int, world: int, device: str) ->
     data = _data(request, model)
     representation = model.representation if model else data.representation.to(device)
     clips = data.clips(request.split)
-    changes = {name: getattr(request, name) for name in ("replications", "samples", "quick", "multimodality")}
+    names = ("replications", "samples", "quick", "multimodality", "batch_size")
+    changes = {name: getattr(request, name) for name in names}
     name = request.protocol or default_protocol(model)
     protocol, changed = open_protocol(name, clips, representation, model, **changes)
+    size = protocol.batch_size or request.batch_size or 64
     extractor = protocol.open_extractor(request.extractor, representation, data.store.info["dataset"])
     report = _describe(request, protocol, model, data, extractor)
     if model is not None and file is not None:
@@ -159,10 +161,11 @@ def _evaluate(request: EvaluationRequest, rank: int, world: int, device: str) ->
             file,
             _kind(protocol),
             report["checkpoint"]["sha256"],
-            {**options, "split": request.split, "data": data.store.fingerprint, "samples": protocol.samples},
+            {**options, "split": request.split, "data": data.store.fingerprint, "samples": protocol.samples}
+            | ({"batch_size": size} if protocol.batch_size else {}),
         )
         source = protocol.generator(
-            model, folder, options, clips=clips, batch_size=request.batch_size, world=world, progress=not rank
+            model, folder, options, clips=clips, batch_size=size, world=world, progress=not rank
         )
         path = folder / "result"
     elif request.baseline is not None:
@@ -179,7 +182,7 @@ def _evaluate(request: EvaluationRequest, rank: int, world: int, device: str) ->
         extractor,
         representation,
         seed=request.seed,
-        batch_size=request.batch_size,
+        batch_size=size,
         rank=rank,
         world=world,
         force=request.force,
@@ -221,6 +224,19 @@ def _kind(protocol: Protocol) -> str:
     return f"{protocol.name}-{protocol.version}"
 
 
+def protocol_file(name: str) -> Path:
+    """The file of a protocol, by its name in experiments/evaluation or its path.
+
+    Raises:
+        UserError: no such protocol.
+    """
+    path = Path(name) if name.endswith((".yaml", ".yml")) else EXPERIMENTS / "evaluation" / f"{name}.yaml"
+    if not path.exists():
+        names = ", ".join(sorted(p.stem for p in path.parent.glob("*.yaml")))
+        raise UserError(f"no protocol is called '{name}'; there are: {names or 'none'}")
+    return path
+
+
 def load_protocol(name: str, representation: Representation) -> Protocol:
     """The protocol of that name in experiments/evaluation, or in a file, for motions of a representation.
 
@@ -231,10 +247,7 @@ def load_protocol(name: str, representation: Representation) -> Protocol:
     """
     from evaluators.protocols import Protocol
 
-    path = Path(name) if name.endswith((".yaml", ".yml")) else EXPERIMENTS / "evaluation" / f"{name}.yaml"
-    if not path.exists():
-        names = ", ".join(sorted(p.stem for p in path.parent.glob("*.yaml")))
-        raise UserError(f"no protocol is called '{name}'; there are: {names or 'none'}")
+    path = protocol_file(name)
     skeleton = representation.skeleton
     facts = {"fps": representation.fps, "toes": list(skeleton.feet[1::2]), "parents": list(skeleton.parents)}
     known = {f"${{representation.{fact}}}": value for fact, value in facts.items()}
@@ -378,6 +391,8 @@ def _describe(
             "config_sha256": _digest(original_names(model.config)),
             "averaged_weights": bool(model.config.get("ema")),
             "parameters": sum(p.numel() for p in model.parameters() if p.requires_grad),
+            "prediction": {"epsilon": "noise"}.get(model.process.prediction, model.process.prediction),
+            **{f"training_{name}": value for name, value in model.facts.get("training", {}).items()},
         }
     return report
 
@@ -434,7 +449,7 @@ def evaluate_missing(specs: Mapping[str, Config], results: Path, config: Config)
             for dataset in part.get("lengths", []):
                 count_lengths(dataset, results, config)
             for _, row in requests(part) if "columns" in part else ():
-                wanted |= {request.path(results): request for request in row if not request.missing}
+                wanted |= {request.path(results): request for request in row if not request.absent}
     missing = {path: request for path, request in wanted.items() if not path.exists() or _outdated(path, request)}
     failed = []
     for number, (path, request) in enumerate(missing.items()):
@@ -445,6 +460,8 @@ def evaluate_missing(specs: Mapping[str, Config], results: Path, config: Config)
             options = settings("evaluate", dotted)
             names = ("device", "batch_size", "force", "data_root")
             general = {name: config[name] for name in names if config[name] is not None}
+            if "batch_size" in read_yaml(protocol_file(keys["protocol"])):
+                general.pop("batch_size", None)  # a protocol that measures time has its own
             evaluate(EvaluationRequest.of(options | general | keys | {"out": str(path)}))
         except (UserError, ValueError, OSError) as error:
             failed.append(f"{request.label}: {first_line(error)}")

@@ -97,6 +97,7 @@ class Generator:
         clips: the split.
         condition: "text", "action" or "none".
         batch_size: motions at once.
+        timed: whether a first batch, which is slower than the others, is sampled once more than it is counted.
         parts: `region` and `joints` as of `flame_mdm.editing.kept_parts`: the motions are edits of the real ones.
         total: motions of the whole evaluation, for the time left.
         progress: whether to show it.
@@ -111,12 +112,13 @@ class Generator:
         clips: Clips,
         condition: str,
         batch_size: int,
+        timed: bool = False,
         parts: Mapping[str, Any] | None = None,
         total: int = 0,
         progress: bool = True,
     ):
         self.model, self.folder, self.options, self.clips = model, folder, dict(options), clips
-        self.condition, self.batch_size, self.parts = condition, batch_size, parts
+        self.condition, self.batch_size, self.timed, self.parts = condition, batch_size, timed, parts
         self.how = self.options.pop("edit", {})
         self.bar = tqdm(total=total, desc="generating", unit=" motions", disable=not progress)
 
@@ -166,22 +168,26 @@ class Generator:
             nonlocal calls
             calls += 1
 
+        def sample(some: Sequence[Row]) -> np.ndarray:
+            x = self.model.generate(
+                self._batch(some),
+                replication=replication,
+                unconditioned=self.condition == "none",
+                edit=None if self.parts is None else self._edit(some),
+                **self.options,
+            )
+            return self.model.representation.denormalize(x.float()).cpu().numpy()
+
         order = np.argsort([-len(row.frames) for row in rows], kind="stable").tolist()
+        if self.timed:
+            sample([rows[i] for i in order[: self.batch_size]])
         hook = self.model.denoiser.register_forward_hook(count)
         begin, batches = time.perf_counter(), 0
         try:
             for first in range(0, len(rows), self.batch_size):
                 indices = order[first : first + self.batch_size]
                 some = [rows[i] for i in indices]
-                x = self.model.generate(
-                    self._batch(some),
-                    replication=replication,
-                    unconditioned=self.condition == "none",
-                    edit=None if self.parts is None else self._edit(some),
-                    **self.options,
-                )
-                raw = self.model.representation.denormalize(x.float()).cpu().numpy()
-                for i, motion in zip(indices, raw, strict=True):
+                for i, motion in zip(indices, sample(some), strict=True):
                     features[i] = motion[: len(rows[i].frames)].copy()
                     if not np.isfinite(features[i]).all():
                         raise UserError(f"the model returned a motion that is not finite for {rows[i].id}")

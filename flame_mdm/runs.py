@@ -99,6 +99,9 @@ class Checkpoint(Schema):
     selected_by: str = ""
     averaged_weights: bool | None = None
     parameters: Int | None = None
+    prediction: str | None = None
+    training_hours: Number | None = None
+    training_memory_gib: Number | None = None
     edit: dict[str, Plain] = {}
 
 
@@ -107,6 +110,7 @@ class Cost(Schema):
 
     nfe: Number | None = None
     seconds_per_sample: Number | None = None
+    batch_size: Number | None = None
 
 
 class Result(Schema):

@@ -33,6 +33,7 @@ from flame_mdm.errors import UserError
 from flame_mdm.motion import length_mask
 from flame_mdm.representations.rot6d import Rot6D
 from flame_mdm.runs import read_result
+from flame_mdm.task import MotionGeneration
 
 DATA = ("data=synthetic", "data.source.clips=400")
 GENERATOR = ["data.source.clips=400", *TINY[1:], "callbacks.samples=null", "trainer.val_check_interval=2"]
@@ -563,6 +564,27 @@ def test_a_missing_extractor_of_the_selection_stops_before_training(runs, tmp_pa
     best = "ckpt=run/checkpoints/best.ckpt"
     assert main(["evaluate", best, "extractor=none", "quick=true", "samples=4", "out=a.json", "device=cpu"]) == 0
     assert json.loads(Path("a.json").read_text())["checkpoint"]["selected_by"] == "best val/loss"
+
+
+def test_latency_is_that_of_one_motion_at_a_time_after_a_first_one(runs, tmp_path, monkeypatch):
+    sizes = []
+    generate = MotionGeneration.generate
+
+    def counted(self, batch, **options):
+        sizes.append(len(batch))
+        return generate(self, batch, **options)
+
+    monkeypatch.setattr(MotionGeneration, "generate", counted)
+    result = runs.result(tmp_path / "one.json", "protocol=latency")
+    assert sizes == [1] * 17, "the first one is not timed"
+    assert (result["cost"]["batch_size"], result["changed"]) == (1, {})
+    assert result["checkpoint"]["prediction"] == "x0"
+    assert result["checkpoint"]["training_hours"] > 0
+    assert result["checkpoint"]["training_memory_gib"] > 0
+    sizes.clear()
+    result = runs.result(tmp_path / "eight.json", "protocol=latency", "batch_size=8")
+    assert sizes == [8] * 3, "sampled again, not read from the motions of batches of 1"
+    assert (result["cost"]["batch_size"], result["changed"]) == (8, {"batch_size": 8})
 
 
 def shares(rank: int, world: int, runs: Runs, samples: int, kept: Path | None) -> dict:

@@ -220,6 +220,106 @@ def test_clips_left_out_of_the_data_set_are_in_the_footnotes(folder):
     assert table.parts[0].notes[1] == ("", f"mine; left out of the data set: 1,191 {next(iter(excluded))}")
 
 
+def test_a_missing_extractor_is_noted_beside_a_missing_checkpoint(folder):
+    (folder / "clip.ckpt").unlink()
+    text = (folder / "spec.yaml").read_text().replace(f"{folder}/clip.ckpt", "assets/t2m/kit")
+    (folder / "spec.yaml").write_text(text)
+    part = made(folder).parts[0]
+    notes = [note for mark, note in part.notes if not mark]
+    assert next(line.state for line in part.lines if line.label == "missing") == "no checkpoint"
+    assert f"missing: {folder}/missing.ckpt is missing" in notes
+    wanted = 'MDM; MFM; FLAME <b>; missing: assets/t2m/kit is missing; see "Extractors" in docs/evaluation.md'
+    assert wanted in notes, "one line for all rows"
+
+
+def test_footnotes_list_what_differs_and_group_rows(folder):
+    for number, (_, asked) in enumerate(requests(load_spec(str(folder / "spec.yaml"))["parts"]["Steps"])):
+        path = asked[0].path(folder / "results")
+        reasons = {"invalid_because": ["real motions have fid 3, expected 0.002 +- 0.02"], "valid": False}
+        path.write_text(json.dumps(json.loads(path.read_text()) | reasons | {"seed": number // 2}))
+    table = made(folder)
+    notes = table.parts[1].notes
+    assert [note for note in notes if note[0]] == [
+        (
+            "a",
+            "protocol synthetic version 1; test split of synthetic (fingerprint ffffffffffffffff); N = 400, 5 "
+            "replications; seed 0; extractor sha256 eeeeeeeeeeee",
+        ),
+        ("b", "as a, but seed 1"),
+    ]
+    labels = "MDM (guidance scale 1.0); MDM (guidance scale 2.5)"
+    assert ("", f"{labels}: NOT VALID: real motions have fid 3, expected 0.002 +- 0.02") in notes
+    assert sum("NOT VALID" in note for _, note in notes) == 1
+    (line,) = [line for line in markdown(table).splitlines() if line.startswith("- Steps: ")]
+    assert "guidance 1 | 2.5 | 1 | 2.5" in line
+    assert line.count("recipe synthetic/mdm") == 1
+
+
+def test_a_table_tells_how_its_checkpoints_were_chosen(folder):
+    for row, asked in requests(_part(folder)):
+        path = asked[0].path(folder / "results")
+        if row["label"] == "MFM":
+            content = json.loads(path.read_text())
+            content["checkpoint"]["selected_by"] = "best val/text_to_motion_t2m/fid"
+            path.write_text(json.dumps(content))
+    notes = [note for _, note in made(folder).parts[0].notes]
+    assert "MFM: the checkpoint with the best val/text_to_motion_t2m/fid" in notes
+    assert "MDM; FLAME <b>: the checkpoint last, which validation did not choose" in notes
+
+
+def test_a_distance_of_0_between_real_motions_is_explained(folder):
+    for _, asked in requests(_part(folder)):
+        path = asked[0].path(folder / "results")
+        if path.exists():
+            content = json.loads(path.read_text())
+            content["ground_truth"]["fid"]["mean"] = 0.0
+            path.write_text(json.dumps(content))
+    assert "FID of real motions is 0 by construction: clips are taken whole" in markdown(made(folder))
+
+
+TIMED = """
+title: Time
+parts:
+  all:
+    protocol: latency
+    columns:
+      Batch: {{value: batch_size}}
+      Seconds: {{value: seconds_per_sample, better: lower}}
+      Predicts: {{value: prediction}}
+      Hours: {{value: training_hours}}
+      Memory: {{value: training_memory_gib}}
+    rows:
+      - {{label: MDM, ckpt: {folder}/mdm.ckpt, batch_size: [1, 64]}}
+      - {{label: MFM, ckpt: {folder}/mfm.ckpt}}
+figures:
+  - {{part: all, x: batch_size, y: Seconds}}
+"""
+
+
+def test_times_are_compared_in_batches_of_the_same_size_alone(folder):
+    (folder / "timed.yaml").write_text(TIMED.format(folder=folder))
+    spec = load_spec(str(folder / "timed.yaml"))
+    for row, asked in requests(spec["parts"]["all"]):
+        size = row.get("batch_size", 1)
+        content = result(0, 0, 0, cost={"nfe": 10.0, "seconds_per_sample": 1 / size, "batch_size": float(size)})
+        trained = {"prediction": "velocity", "training_hours": 12.25, "training_memory_gib": 7.5}
+        content["checkpoint"] |= trained if row["label"] == "MFM" else {}
+        put(asked[0], folder, content)
+        assert asked[0].keys.get("batch_size") == row.get("batch_size")
+    (part,) = build("timed", spec, folder / "results").parts
+    lines = [line for line in part.lines if line.kind == "measured"]
+    texts = [[cell and cell.text for cell in line.cells] for line in lines]
+    assert texts == [
+        ["1", "1.000", None, None, None],
+        ["64", "0.016", None, None, None],
+        ["1", "1.000", "velocity", "12.25", "7.5"],
+    ], "results of earlier versions have no parameterization"
+    assert [line.marks for line in lines] == ["a", "b", "a"]
+    assert "as a, but timed in batches of 64 on cpu" in [note for _, note in part.notes]
+    assert [cell.place for line in lines if (cell := line.cells[1])] == [1, 0, 1]
+    assert "predicts velocity" in markdown(Table("timed", "", [part]))
+
+
 def test_an_invalid_row_says_so_and_is_not_ranked(folder):
     path = next(asked[0].path(folder / "results") for row, asked in requests(_part(folder)) if row["label"] == "MFM")
     reason = "real motions have fid 3, expected 0.002 +- 0.02"

@@ -18,6 +18,9 @@ MOST_STEPS = 100_000
 class Process(nn.Module, ABC):
     """A path between noise and data. Only the process interprets t; the denoiser just embeds it."""
 
+    prediction: str
+    """What the denoiser returns: x0, epsilon (the noise) or velocity."""
+
     edit_modes: Sequence[str] = ()
     """Modes of `Edit` that sampling supports; the first is the authors'."""
 

@@ -7,6 +7,7 @@ import io
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import groupby
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
@@ -187,14 +188,21 @@ def markdown(table: Table) -> str:
 
 
 def _sources(table: Table) -> list[str]:
+    """Returns where rows come from; rows of one checkpoint share a line, in which `|` separates what is different."""
     rows = []
     for part in table.parts:
-        for line in part.lines:
-            if line.facts:
-                facts = ", ".join(f"{name} {value}" for name, value in line.facts.items() if value)
-                prefix = f"{part.name}: " if len(table.parts) > 1 else ""
-                rows.append(f"{prefix}{line.label}: {facts}")
+        lines = [line for line in part.lines if line.facts]
+        for _, group in groupby(lines, lambda line: [line.facts.get(name) for name in ("checkpoint sha256", "recipe")]):
+            some = list(group)
+            values = {name: [line.facts[name] for line in some] for name in some[0].facts}
+            facts = ", ".join(f"{name} {_joined(found)}" for name, found in values.items() if any(found))
+            prefix = f"{part.name}: " if len(table.parts) > 1 else ""
+            rows.append(f"{prefix}{_joined([line.label for line in some])}: {facts}")
     return rows
+
+
+def _joined(values: Sequence[str]) -> str:
+    return values[0] if len(set(values)) == 1 else " | ".join(value or "–" for value in values)
 
 
 def _styled(cell: Cell | None, escape: Callable[[str], str], best: str, second: str) -> str:

@@ -157,6 +157,8 @@ def sampling(result: Result) -> str:
     ]
     if result.cost and result.cost.seconds_per_sample is not None:
         words.append(f"{result.cost.seconds_per_sample:.3g} seconds per motion on {result.device}")
+        if result.cost.batch_size:
+            words.append(f"batches of {result.cost.batch_size:g}")
     return ", ".join(words)
 
 

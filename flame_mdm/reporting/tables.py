@@ -25,11 +25,22 @@ from flame_mdm.reporting.page import page
 from flame_mdm.reporting.plots import standalone
 from flame_mdm.reporting.rendering import WRITERS, Cell, Figure, Line, Part, Table, draw, figure_names, fragment, places
 from flame_mdm.reporting.study import Ratings, wilson
-from flame_mdm.runs import ClosedSchema, Int, Number, Result, Schema, Value, check_shape, read_json, read_result
+from flame_mdm.runs import (
+    ClosedSchema,
+    Int,
+    Number,
+    Result,
+    Schema,
+    Value,
+    check_shape,
+    made_by,
+    read_json,
+    read_result,
+)
 
 SPECS = EXPERIMENTS / "tables"
 PUBLISHED = SPECS / "published.yaml"
-SWEPT = ("sampler", "num_inference_steps", "guidance_scale", "until")
+SWEPT = ("sampler", "num_inference_steps", "guidance_scale", "until", "batch_size")
 """Options of a row that may be lists; each value makes one row."""
 ABOUT = {
     "num_inference_steps": "sampling steps",
@@ -38,7 +49,11 @@ ABOUT = {
     "until": "fraction of sampling that is rewritten",
     "nfe": "network calls per motion",
     "seconds_per_sample": "seconds per motion",
+    "batch_size": "batch size",
     "parameters": "parameters, M",
+    "prediction": "prediction",
+    "training_hours": "training hours",
+    "training_memory_gib": "peak memory of training, GiB",
 }
 """Labels of the values that a column may show besides metrics, and of the x-axes of figures."""
 MOST_ROWS, MOST_COLUMNS, MOST_FIGURES = 1_000, 100, 100
@@ -81,6 +96,7 @@ class Row(Options):
     num_inference_steps: Int | list[Int] = 0
     guidance_scale: Number | list[Number] = 0
     until: Number | list[Number] = 0
+    batch_size: Int | list[Int] = 0
 
     @model_validator(mode="before")
     @classmethod
@@ -217,13 +233,11 @@ class Request:
         return results / Path(str(self.keys["protocol"])).stem / f"{name}-{digest[:10]}.json"
 
     @property
-    def missing(self) -> str:
-        """The first missing input, as in "no checkpoint"; "" if all exist."""
-        for key, what in (("ckpt", "checkpoint"), ("from_samples", "samples"), ("extractor", "extractor")):
-            path = self.keys.get(key)
-            if path not in (None, "none") and not Path(str(path)).exists():
-                return f"no {what}"
-        return ""
+    def absent(self) -> dict[str, str]:
+        """Files that do not exist, by what is missing: "no checkpoint"."""
+        files = {"no checkpoint": "ckpt", "no samples": "from_samples", "no extractor": "extractor"}
+        paths = {what: str(self.keys.get(key) or "none") for what, key in files.items()}
+        return {what: path for what, path in paths.items() if path != "none" and not Path(path).exists()}
 
 
 def requests(part: Mapping[str, Any]) -> Iterator[tuple[dict[str, Any], list[Request]]]:
@@ -295,12 +309,27 @@ def _published(path: Path, changed: int) -> Config:
 
 @dataclass
 class _Marks:
-    """Footnote letters by the text of the footnote."""
+    """Footnote letters by what the footnote says; see `_evaluation`."""
 
-    notes: dict[str, str] = field(default_factory=dict)
+    found: dict[tuple[tuple[str, str], ...], str] = field(default_factory=dict)
 
-    def of(self, text: str) -> str:
-        return self.notes.setdefault(text, string.ascii_lowercase[len(self.notes) % 26] * (1 + len(self.notes) // 26))
+    def of(self, facts: Mapping[str, str]) -> str:
+        mark = string.ascii_lowercase[len(self.found) % 26] * (1 + len(self.found) // 26)
+        return self.found.setdefault(tuple(facts.items()), mark)
+
+    @property
+    def notes(self) -> list[tuple[str, str]]:
+        """The footnotes. One that is much like the first tells only what is different."""
+        notes = []
+        for facts, mark in self.found.items():
+            own = [
+                text or f"no {name}"
+                for (name, text), other in zip(facts, next(iter(self.found)), strict=True)
+                if (name, text) != other
+            ]
+            whole = "; ".join(text for _, text in facts if text)
+            notes.append((mark, f"as a, but {'; '.join(own)}" if 0 < len(own) <= 3 else whole))
+        return notes
 
 
 def _measured(name: str, part: Config, reported: Config | None, results: Path, figures: list[Figure]) -> Part:
@@ -309,25 +338,49 @@ def _measured(name: str, part: Config, reported: Config | None, results: Path, f
     marks = _Marks()
     lines: list[Line] = []
     truths: dict[str, Line] = {}
-    todo: dict[str, str] = {}
+    todo: list[tuple[str, str]] = []
     for row, requested in requests(part):
         found = [_result(request, results) for request in requested]
         line = _line(row, found, values, [request.path(results).name for request in requested])
         if all(result is None for result in found):
-            line.state = requested[0].missing or "not evaluated"
-            todo |= _todo(requested[0])
-        own = dict.fromkeys(marks.of(_evaluation(result)) for result in found if result is not None)
+            line.state = next(iter(requested[0].absent), "not evaluated")
+        for request, result in zip(requested, found, strict=True):
+            if result is None:
+                todo += [(line.label, made_by(path)) for path in request.absent.values()] or [
+                    (line.label, "make tables evaluates it")
+                ]
+        timed = [r.path(results) for r, value in zip(requested, values, strict=True) if value == "seconds_per_sample"]
+        own = dict.fromkeys(
+            marks.of(_evaluation(result, request.path(results) in timed))
+            for request, result in zip(requested, found, strict=True)
+            if result is not None
+        )
         line.marks = ",".join(own)
         lines.append(line)
         if line.marks and line.marks not in truths:
             truth = Line("Real motions", "real", [_truth(r, v) for r, v in zip(found, values, strict=True)], line.marks)
             truths[line.marks] = truth
     lines = [line for line in truths.values() if any(line.cells)] + lines
-    notes = [(mark, text) for text, mark in marks.notes.items()]
-    notes += [("", f"{label}: {text}") for label, text in todo.items()]
-    for line in lines:
-        if line.facts.get("not valid because"):
-            notes.append(("", f"{line.label}: NOT VALID: {line.facts['not valid because']}"))
+    notes = [*marks.notes, *_grouped(todo)]
+    invalid = [(line.label, f"NOT VALID: {line.facts.get('not valid because')}") for line in lines]
+    notes += _grouped([note for note, line in zip(invalid, lines, strict=True) if line.facts.get("not valid because")])
+    chosen = [(line.label, line.facts.get("chosen by", "").partition(" ")) for line in lines]
+    best = {"best": "the checkpoint with the best {}", "none:": "the checkpoint {}, which validation did not choose"}
+    notes += _grouped([(label, best[kind].format(name)) for label, (kind, _, name) in chosen if kind in best])
+    zero = {
+        label
+        for line in truths.values()
+        for label, value, cell in zip(columns, values, line.cells, strict=True)
+        if value == "fid" and cell and cell.value == 0
+    }
+    notes += [
+        (
+            "",
+            f"{label} of real motions is 0 by construction: clips are taken whole, so that both draws of real "
+            "motions, which are compared, are the same",
+        )
+        for label in sorted(zero)
+    ]
     if reported is not None:
         more, sources = _reported(reported, columns, values, name)
         lines, notes = lines + more, notes + sources
@@ -341,42 +394,41 @@ def _result(request: Request, results: Path) -> Result | None:
     return read_result(path) if path.exists() else None
 
 
-def _todo(request: Request) -> dict[str, str]:
-    """Returns the command that produces a missing row, by the label of the row."""
-    missing = request.missing
-    if missing in ("no checkpoint", "no extractor"):
-        file = Path(str(request.keys["ckpt" if missing == "no checkpoint" else "extractor"]))
-        recipe = re.fullmatch(r"runs/(.+)/default/checkpoints/.+", file.as_posix())
-        how = f"make train EXP={recipe[1]}" if recipe else f"{file} is missing"
-        return {request.label: how}
-    return {request.label: "make tables evaluates it"} if not missing else {request.label: missing}
+def _grouped(lines: Sequence[tuple[str, str]]) -> list[tuple[str, str]]:
+    """Returns one note per text, with the labels of all rows that it is about."""
+    labels: dict[str, dict[str, None]] = {}
+    for label, text in lines:
+        labels.setdefault(text, {})[label] = None
+    return [("", f"{'; '.join(rows)}: {text}") for text, rows in labels.items()]
 
 
-def _evaluation(result: Result) -> str:
-    """Describes the evaluation of a result. Only rows with the same description are compared."""
-    protocol, data, extractor = result.protocol, result.data, result.extractor
+def _evaluation(result: Result, timed: bool) -> dict[str, str]:
+    """Describes the evaluation of a result, and its time if that is shown. Only rows with the same one are compared."""
+    protocol, data, extractor, cost = result.protocol, result.data, result.extractor, result.cost
     first = next((v for v in (result.values or {}).values() if v and v.n), None)  # later ones may have fewer motions
-    text = f"protocol {protocol.name} version {protocol.version}"
-    text += f", {result.split} split of {data.dataset} (fingerprint {data.fingerprint})"
-    text += ", {} to {} frames".format(*data.frames) if data.frames else ""
-    text += f", N = {first.n}, {first.replications} replications" if first else ", nothing measured"
-    text += f", seed {result.seed}"
-    text += f", extractor sha256 {extractor.sha256[:12]}" if extractor else ", no extractor"
-    text += _left_out(data.excluded)
-    if result.changed:
-        text += "; differs from the protocol: " + ", ".join(f"{k} = {v}" for k, v in result.changed.items())
-    if result.published_split:
-        text += "; published split: test clips are also used for training, or there are no validation clips"
-    if result.forced:
-        text += "; forced: real motions do not have the values that the protocol expects"
-    text += "".join(f"; {warning}" for warning in result.warnings)
-    return text + ("; QUICK, NOT A RESULT" if result.quick else "")
+    changed = ", ".join(f"{k} = {v}" for k, v in result.changed.items())
+    return {
+        "protocol": f"protocol {protocol.name} version {protocol.version}",
+        "data": f"{result.split} split of {data.dataset} (fingerprint {data.fingerprint})",
+        "limits": "{} to {} frames".format(*data.frames) if data.frames else "",
+        "metrics": f"N = {first.n}, {first.replications} replications" if first else "",
+        "time": f"timed in batches of {cost.batch_size or '?'} on {result.device}" if timed and cost else "",
+        "seed": f"seed {result.seed}",
+        "extractor": f"extractor sha256 {extractor.sha256[:12]}" if extractor else "no extractor",
+        "exclusions": _left_out(data.excluded),
+        "changes": f"differs from the protocol: {changed}" if changed else "",
+        "published split": "published split: test clips are also used for training, or there are no validation clips"
+        * result.published_split,
+        "force": "forced: real motions do not have the values that the protocol expects" * result.forced,
+        "warnings": "; ".join(result.warnings),
+        "quick run": "QUICK, NOT A RESULT" * result.quick,
+    }
 
 
 def _left_out(excluded: Mapping[str, int]) -> str:
     """Describes the clips that were left out of a data set, by reason."""
     listed = ", ".join(f"{count:,} {reason}" for reason, count in excluded.items())
-    return f"; left out of the data set: {listed}" if listed else ""
+    return f"left out of the data set: {listed}" if listed else ""
 
 
 def _line(row: Mapping[str, Any], found: Sequence[Result | None], values: Sequence[str], files: Sequence[str]) -> Line:
@@ -386,8 +438,8 @@ def _line(row: Mapping[str, Any], found: Sequence[Result | None], values: Sequen
     first = next((result for result in found if result is not None), None)
     if first is None:
         return line
-    for name in ABOUT:
-        value = _about(first, name)
+    for name, result in (*zip(values, found, strict=True), *((name, first) for name in ABOUT)):
+        value = _about(result, name) if result is not None and name in ABOUT else None
         if isinstance(value, int | float):
             line.options.setdefault(name, float(value))
     reasons = list(dict.fromkeys(reason for r in found if r is not None for reason in r.invalid_because))
@@ -405,14 +457,17 @@ def _line(row: Mapping[str, Any], found: Sequence[Result | None], values: Sequen
         "checkpoint sha256": (checkpoint.sha256 if checkpoint else first.samples_sha256 or "")[:16],
         "recipe": (checkpoint and checkpoint.experiment) or "",
         "baseline": first.baseline or "",
-        "chosen by": checkpoint.selected_by if checkpoint else "",
+        "chosen by": _text(checkpoint and checkpoint.selected_by),
         "weights": weights[checkpoint.averaged_weights if checkpoint else None],
         "guidance": _text(checkpoint and checkpoint.guidance_scale),
+        "predicts": _text(checkpoint and checkpoint.prediction),
         "sampler": _text(checkpoint and checkpoint.sampler),
         "steps": _text(checkpoint and checkpoint.num_inference_steps),
         "replications x motions": most + others,
         "seed": _text(first.seed),
         "device": first.device,
+        "training hours": _text(checkpoint and checkpoint.training_hours),
+        "peak memory of training, GiB": _text(checkpoint and checkpoint.training_memory_gib),
         "result": " ".join(dict.fromkeys(file for r, file in zip(found, files, strict=True) if r is not None)),
         "not valid because": "; ".join(reasons),
     }
@@ -618,7 +673,7 @@ def _lengths(name: str, part: Config, results: Path) -> Part:
         ]
         facts = {"fingerprint": found.fingerprint, "frames per second": _text(float(fps))}
         lines.append(Line(dataset, "measured", [Cell(t, float(v)) for t, v in numbers], facts=facts))
-        notes += [("", dataset + _left_out(found.excluded))] if found.excluded else []
+        notes += [("", f"{dataset}; {_left_out(found.excluded)}")] if found.excluded else []
         step = max(1, math.ceil(lengths[-1] / 40))
         counts = [0] * (lengths[-1] // step + 1)
         for length in lengths:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 import time
 from collections.abc import Sequence
 from inspect import signature
 from itertools import zip_longest
 from multiprocessing import active_children
 from pathlib import Path
+from resource import RUSAGE_SELF, getrusage
 from types import FrameType
 from typing import Any
 
@@ -26,7 +28,7 @@ from flame_mdm.formats.motion import Motion
 from flame_mdm.generation import generate, write_motions
 from flame_mdm.motion import MotionBatch
 from flame_mdm.reporting.report import write_report
-from flame_mdm.task import MotionGeneration
+from flame_mdm.task import MotionGeneration, Task
 from flame_mdm.training.loggers import log_video
 
 
@@ -116,15 +118,36 @@ class Measurements(Callback):
     Logs `train/grad_norm` (of all gradients together, before they are clipped), `train/lr`, `train/epochs` (passes over
     the training clips), `train/samples_per_second`, `train/seconds_per_step` (validation does not count) and, on CUDA,
     `train/gpu_memory_gib` (the most that tensors have held).
+
+    Checkpoints tell in `facts.training` how many `hours` the run has trained, validation included, on how many
+    `processes`, and the peak `memory_gib`: of tensors on CUDA, else of the first process.
     """
 
     def __init__(self) -> None:
         self.step = 0
         self.since, self.steps, self.samples = 0.0, 0, 0
+        self.begin = 0.0
+        self.earlier: dict[str, float] = {}
+
+    def on_load_checkpoint(self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]) -> None:
+        self.earlier = checkpoint["facts"].get("training", {})
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         self.step = trainer.global_step
+        self.begin = time.perf_counter()
         self._restart()
+
+    def on_save_checkpoint(self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]) -> None:
+        if pl_module.device.type == "cuda":
+            memory = torch.cuda.max_memory_allocated(pl_module.device) / 2**30
+        else:
+            memory = getrusage(RUSAGE_SELF).ru_maxrss / (2**30 if sys.platform == "darwin" else 2**20)
+        assert isinstance(pl_module, Task)
+        pl_module.facts["training"] = {
+            "hours": self.earlier.get("hours", 0.0) + (time.perf_counter() - self.begin) / 3600,
+            "memory_gib": max(self.earlier.get("memory_gib", 0.0), memory),
+            "processes": trainer.world_size,
+        }
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         self._restart()

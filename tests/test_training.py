@@ -53,9 +53,25 @@ def test_a_run_leaves_what_a_user_looks_for(trained):
     checkpoint = read_checkpoint(trained)
     assert checkpoint["config"]["experiment"] == "quickstart"
     assert checkpoint["global_step"] == 6
+    training = checkpoint["facts"].pop("training")
+    assert training.keys() == {"hours", "memory_gib", "processes"}
     facts = json.loads((folder / "provenance.json").read_text())["data"]
     assert facts == checkpoint["facts"]
     assert not list(folder.rglob("*.partial"))
+
+
+def test_a_resumed_run_adds_up_what_it_cost(tiny, tmp_path):
+    first = read_checkpoint(run([*tiny, *STEPS], 2, tmp_path / "run"))
+    training = first["facts"]["training"]
+    assert 0 < training["hours"] < 1
+    assert 0.01 < training["memory_gib"] < 1000
+    assert training["processes"] == 1
+    path = tmp_path / "run" / "checkpoints" / "last.ckpt"
+    first["facts"]["training"] |= {"hours": 100.0, "memory_gib": 2000.0}
+    torch.save(first, path)
+    resumed = read_checkpoint(run([*tiny, *STEPS], 4, tmp_path / "run"))["facts"]["training"]
+    assert 100 < resumed["hours"] < 101
+    assert resumed["memory_gib"] == 2000
 
 
 @pytest.mark.slow

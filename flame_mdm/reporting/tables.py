@@ -362,11 +362,13 @@ def _measured(name: str, part: Config, reported: Config | None, results: Path, f
             truths[line.marks] = truth
     lines = [line for line in truths.values() if any(line.cells)] + lines
     notes = [*marks.notes, *_grouped(todo)]
-    invalid = [(line.label, f"NOT VALID: {line.facts.get('not valid because')}") for line in lines]
-    notes += _grouped([note for note, line in zip(invalid, lines, strict=True) if line.facts.get("not valid because")])
-    chosen = [(line.label, line.facts.get("chosen by", "").partition(" ")) for line in lines]
-    best = {"best": "the checkpoint with the best {}", "none:": "the checkpoint {}, which validation did not choose"}
-    notes += _grouped([(label, best[kind].format(name)) for label, (kind, _, name) in chosen if kind in best])
+    facts = [(line.label, line.facts) for line in lines]
+    notes += _grouped(
+        [(label, f"NOT VALID: {why}") for label, known in facts if (why := known.get("not valid because"))]
+    )
+    chosen = [(label, known.get("chosen by", "").partition(" ")) for label, known in facts]
+    texts = {"best": "checkpoint: best {}", "none:": "checkpoint: {}, not chosen by validation"}
+    notes += _grouped([(label, texts[kind].format(name)) for label, (kind, _, name) in chosen if kind in texts])
     zero = {
         label
         for line in truths.values()
@@ -412,7 +414,7 @@ def _evaluation(result: Result, timed: bool) -> dict[str, str]:
         "data": f"{result.split} split of {data.dataset} (fingerprint {data.fingerprint})",
         "limits": "{} to {} frames".format(*data.frames) if data.frames else "",
         "metrics": f"N = {first.n}, {first.replications} replications" if first else "",
-        "time": f"timed in batches of {cost.batch_size or '?'} on {result.device}" if timed and cost else "",
+        "time": f"timed in batches of {cost.batch_size or 0:g} on {result.device}" if timed and cost else "",
         "seed": f"seed {result.seed}",
         "extractor": f"extractor sha256 {extractor.sha256[:12]}" if extractor else "no extractor",
         "exclusions": _left_out(data.excluded),

@@ -188,7 +188,7 @@ def markdown(table: Table) -> str:
 
 
 def _sources(table: Table) -> list[str]:
-    """Returns where rows come from; rows of one checkpoint share a line, in which `|` separates what is different."""
+    """Returns where rows come from; rows of one checkpoint share a line, with `/` between what is different."""
     rows = []
     for part in table.parts:
         lines = [line for line in part.lines if line.facts]
@@ -202,7 +202,7 @@ def _sources(table: Table) -> list[str]:
 
 
 def _joined(values: Sequence[str]) -> str:
-    return values[0] if len(set(values)) == 1 else " | ".join(value or "–" for value in values)
+    return values[0] if len(set(values)) == 1 else " / ".join(value or "–" for value in values)
 
 
 def _styled(cell: Cell | None, escape: Callable[[str], str], best: str, second: str) -> str:

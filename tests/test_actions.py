@@ -109,6 +109,7 @@ def test_damaged_pickles_are_named(size: int, tmp_path: Path):
         restricted_pickle.read(path)
 
 
+@pytest.mark.slow
 def test_every_byte_may_be_wrong(tmp_path: Path):
     """NumPy's own functions end the process on some of these, so this test does."""
     path = tmp_path / "x.pkl"

@@ -18,6 +18,7 @@ def threads(_: int) -> int:
     return torch.get_num_threads()
 
 
+@pytest.mark.slow
 def test_each_process_has_one_thread(monkeypatch):
     monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
     assert list(in_order(threads, [0], workers=2)) == [1]

@@ -158,6 +158,7 @@ def test_arrays_and_json(attacked: Refused, bad: Path):
         attacked("convert", str(bad / name), "out=out.bvh", *(["fps=20"] if "npy" in name else []), says=says)
 
 
+@pytest.mark.slow
 def test_links_and_pipes(attacked: Refused, bad: Path, trained: Path):
     os.mkfifo(bad / "pipe")
     for ending in ("npz", "bvh", "npy", "json"):
@@ -169,6 +170,7 @@ def test_links_and_pipes(attacked: Refused, bad: Path, trained: Path):
                 attacked("edit", f"ckpt={trained}", f"motion={path}", "region=in_between", "text=a", says=str(path))
 
 
+@pytest.mark.slow
 def test_entries_of_data_folders(attacked: Refused, bad: Path):
     def loop(place: Path) -> None:
         (place / "loop").symlink_to(place)

@@ -1,13 +1,14 @@
 """Estimated cost of training a recipe, without a GPU or data: `python benchmarks/cost.py humanml3d/mdm kit/mdm ...`
 
-One training step of a full batch, every motion at its longest, runs on PyTorch's `meta` device, where operations have
-shapes but no values. Counted are the floating-point operations, and the bytes of weights, gradients, optimizer state,
-averaged weights and tensors kept for the backward pass. Frozen text encoders are left out, as training reads their
-cache; text encoders that are trained are not counted, either.
+One training step of a full batch of motions of maximum length runs on PyTorch's `meta` device, where operations have
+shapes but no values. The script counts floating-point operations, and the bytes of weights, gradients, optimizer state,
+averaged weights and tensors saved for the backward pass. Text encoders are not counted: frozen ones are cached in
+training, and trained ones are ignored.
 
-A call of the network costs a third of its training step, forward and backward; a generated motion takes two for each
-sampling step, as guidance doubles the batch. Time is the operations divided by a rate that the GPU sustains: 20 % of
-its float32 peak is about what MDM's paper reports (three days on a GeForce RTX 2080 Ti, whose peak is 13.4 TFLOP/s).
+A forward pass costs a third of a training step (forward and backward). A generated motion needs two forward passes per
+sampling step, because guidance doubles the batch. Time is the number of operations divided by the sustained rate of the
+GPU: 20 % of its float32 peak is about what MDM's paper reports (three days on a GeForce RTX 2080 Ti, whose peak is
+13.4 TFLOP/s).
 """
 
 import argparse

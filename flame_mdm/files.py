@@ -1,7 +1,7 @@
-"""Files: atomic writes, hashes, and reading that does not trust what a file declares about itself.
+"""Atomic writes, hashes, and safe reading of untrusted files.
 
-Every file that may come from somebody else is read here or checked here first: only regular files, of a bounded size,
-whose declared sizes match the bytes that are there.
+Every file that may come from other people is read here or checked here first: it must be a regular file of limited
+size, and the sizes that it declares must match its actual bytes.
 """
 
 from __future__ import annotations
@@ -24,25 +24,25 @@ from typing import IO, TYPE_CHECKING, Any
 
 from flame_mdm.errors import UserError, first_line
 
-if TYPE_CHECKING:  # `--help` does not wait for NumPy
+if TYPE_CHECKING:  # `--help` must not import NumPy
     import numpy as np
 
 MEBIBYTE = 2**20
 TEXT_LIMIT = 512 * MEBIBYTE
-"""Largest text or JSON file. The largest known, BABEL's annotations, has 175 MiB."""
+"""Maximum size of a text or JSON file. The largest known, BABEL's annotations, has 175 MiB."""
 YAML_LIMIT = MEBIBYTE // 4
-"""Largest YAML file: recipes, skeletons, protocols and table specs are far smaller, and YAML parses slowly."""
+"""Maximum size of a YAML file: recipes, skeletons, protocols and table specs are far smaller, and parsing is slow."""
 YAML_NODES = 100_000
-"""Largest number of keys and values in a YAML file after its aliases are expanded."""
+"""Maximum number of keys and values in a YAML file after its aliases are expanded."""
 YAML_DIGITS = 20
-"""Largest number of characters of a whole number in a YAML file; 2^63 has 19."""
+"""Maximum number of characters of an integer in a YAML file; 2^63 has 19."""
 ARRAYS_LIMIT = 128 * MEBIBYTE
-"""Arrays of a compressed file may always be this large in total. Larger ones may have up to `INFLATION` times the
-bytes of the file; motion data compresses less than 10 times."""
+"""Total size that the arrays of a compressed file may always have. Beyond that, they may have up to `INFLATION` times
+the size of the file; motion data compresses less than 10 times."""
 INFLATION = 20
 
 ZIP_ERRORS = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError)
-"""What `zipfile` raises for damaged, encrypted and oddly compressed archives."""
+"""Errors that `zipfile` raises for damaged, encrypted and unusually compressed archives."""
 
 
 # Writing --------------------------------------------------------------------------------------------------------------
@@ -50,9 +50,9 @@ ZIP_ERRORS = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, Run
 
 @contextmanager
 def atomic_write(path: str | Path) -> Iterator[Path]:
-    """Yields a temporary path next to `path`, which is renamed to it at the end; a failure leaves nothing behind.
+    """Yields a temporary path next to `path` that is renamed to `path` at the end; a failure leaves no files behind.
 
-    The temporary name is unique, so that any number of processes may write the same file; the last one wins.
+    The temporary name is unique, so that several processes can write the same file; the last one wins.
 
     Raises:
         UserError: the file cannot be written, for instance because the disk is full.
@@ -69,9 +69,9 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
 
 @contextmanager
 def atomic_folder(path: str | Path) -> Iterator[Path]:
-    """Yields a temporary folder next to `path`, which becomes `path` at the end; a failure leaves nothing behind.
+    """Yields a temporary folder next to `path` that is renamed to `path` at the end; a failure leaves no files behind.
 
-    If the folder `path` exists, the new files replace those of the same name, and other files stay.
+    If the folder `path` exists, the new files replace files of the same name, and other files are kept.
 
     Raises:
         UserError: `path` is a file, or something in it cannot be written.
@@ -100,9 +100,9 @@ def atomic_folder(path: str | Path) -> Iterator[Path]:
 
 @contextmanager
 def writing(path: Path, temporary: Path) -> Iterator[None]:
-    """Turns an `OSError` about `temporary`, a file or folder that becomes `path`, into a `UserError` about `path`.
+    """Converts an `OSError` about `temporary`, a file or folder that becomes `path`, to a `UserError` about `path`.
 
-    Errors that name other files, and errors without a number, pass.
+    Errors that name other files, and errors without `errno`, are not converted.
     """
     try:
         yield
@@ -114,7 +114,7 @@ def writing(path: Path, temporary: Path) -> Iterator[None]:
 
 
 def write_failure(error: BaseException, path: Path) -> str:
-    """Returns why a file could not be written; on a full disk also how much is free."""
+    """Returns why a file could not be written, and the free space if the disk may be full."""
     reason = getattr(error, "strerror", None) or first_line(error)
     if getattr(error, "errno", None) not in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO):
         return reason
@@ -124,14 +124,14 @@ def write_failure(error: BaseException, path: Path) -> str:
 
 @contextmanager
 def made_folder(folder: Path) -> Iterator[None]:
-    """Creates a folder and its parents; the created ones that are empty at the end are removed."""
+    """Creates a folder and its parents; those created here are removed at the end if they are empty."""
     made = [part for part in (folder, *folder.parents) if not part.exists()]
     try:
         folder.mkdir(parents=True, exist_ok=True)
         yield
     finally:
         for part in made:
-            with suppress(OSError):  # it holds something now
+            with suppress(OSError):  # it is not empty
                 part.rmdir()
 
 
@@ -156,23 +156,23 @@ def sha256(path: str | Path) -> str:
 
 
 def regular_file(path: str | Path, limit: int | None = None) -> int:
-    """Returns the size in bytes of a regular file, or of the one that a link leads to.
+    """Returns the size in bytes of a regular file or of the target of a link.
 
     Raises:
-        FileNotFoundError: there is no such file.
-        UserError: it is a folder, a pipe or a device, or larger than `limit` bytes.
+        FileNotFoundError: the file does not exist.
+        UserError: the path is a folder, a pipe or a device, or the file has more than `limit` bytes.
     """
     try:
         status = Path(path).stat()
     except (FileNotFoundError, NotADirectoryError):
         raise FileNotFoundError(f"{path}: no such file") from None
-    except (OSError, ValueError) as error:  # a loop of links, a name that is too long or holds a null character
+    except (OSError, ValueError) as error:  # a loop of links, or a name that is too long or contains a null character
         raise UserError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from error
     if not stat.S_ISREG(status.st_mode):
         kind = "a folder" if stat.S_ISDIR(status.st_mode) else "a pipe, a socket or a device"
         raise UserError(f"{path}: {kind}, not a file")
     if limit is not None and status.st_size > limit:
-        raise UserError(f"{path}: {_size(status.st_size)} is more than the {_size(limit)} that such a file may have")
+        raise UserError(f"{path}: {_size(status.st_size)}, but such a file may have at most {_size(limit)}")
     return status.st_size
 
 
@@ -180,8 +180,8 @@ def read_text(path: str | Path, limit: int = TEXT_LIMIT) -> str:
     """Returns the text of a UTF-8 file of at most `limit` bytes.
 
     Raises:
-        FileNotFoundError: there is no such file.
-        UserError: it is not a regular file, too large, unreadable, or not UTF-8.
+        FileNotFoundError: the file does not exist.
+        UserError: the path is not a regular file, or the file is too large, unreadable or not UTF-8.
     """
     path = Path(path)
     regular_file(path, limit)
@@ -197,8 +197,8 @@ def read_json(path: str | Path, limit: int = TEXT_LIMIT) -> Any:
     """Returns the content of a JSON file.
 
     Raises:
-        FileNotFoundError: there is no such file.
-        UserError: it is not JSON, is nested too deeply, or holds NaN, infinity or half a character.
+        FileNotFoundError: the file does not exist.
+        UserError: the file is not JSON, is nested too deeply, or contains NaN, infinity or a lone surrogate.
     """
     try:
         return parse_json(read_text(path, limit))
@@ -207,7 +207,7 @@ def read_json(path: str | Path, limit: int = TEXT_LIMIT) -> Any:
 
 
 def parse_json(text: str | bytes) -> Any:
-    """Returns the content of a JSON text; raises `ValueError` in all cases that `read_json` refuses."""
+    """Returns the content of a JSON text; raises `ValueError` in all cases in which `read_json` raises `UserError`."""
 
     def refuse(constant: str) -> None:
         raise ValueError(f"{constant} is not a JSON number")
@@ -215,18 +215,18 @@ def parse_json(text: str | bytes) -> Any:
     try:
         content = json.loads(text, parse_constant=refuse)
         if "\\u" in (text if isinstance(text, str) else text.decode()):
-            json.dumps(content, ensure_ascii=False).encode()  # half a character cannot be written again
+            json.dumps(content, ensure_ascii=False).encode()  # a lone surrogate cannot be written again
     except RecursionError:
         raise ValueError("nested too deeply") from None
     return content
 
 
 def read_yaml(path: str | Path) -> Any:
-    """Returns the plain content of a YAML file; interpolations such as `${a}` stay the texts that they are.
+    """Returns the plain content of a YAML file; interpolations such as `${a}` are kept as texts.
 
     Raises:
-        FileNotFoundError: there is no such file.
-        UserError: it is not YAML, nested too deeply, too large, or aliases make it so.
+        FileNotFoundError: the file does not exist.
+        UserError: the file is not YAML, is nested too deeply, or is too large before or after expanding aliases.
     """
     import yaml
     from omegaconf import OmegaConf
@@ -240,7 +240,7 @@ def read_yaml(path: str | Path) -> Any:
         return OmegaConf.to_container(content) if content is not None else None
     except RecursionError:
         raise UserError(f"{path}: not a readable YAML file: nested too deeply") from None
-    except Exception as error:  # YAML's and OmegaConf's many errors all mean the same here
+    except Exception as error:  # YAML and OmegaConf raise many kinds of errors for invalid files
         raise UserError(f"{path}: not a readable YAML file: {first_line(error)}") from error
 
 
@@ -250,10 +250,10 @@ def _nodes(node: Any, known: dict[int, float]) -> float:
         known[id(node)] = math.inf
         content = node.value if node is not None else ""
         if getattr(node, "tag", "").endswith(":int") and len(content) > YAML_DIGITS:
-            # Keys among them could be chosen so that all have the same hash.
+            # As keys, large integers could be chosen so that all have the same hash.
             raise ValueError(f"a whole number of more than {YAML_DIGITS} digits: {content[:YAML_DIGITS]}…")
         if isinstance(content, str):
-            content.encode()  # half a character cannot be written again
+            content.encode()  # a lone surrogate cannot be written again
         parts = [part for pair in content for part in (pair if isinstance(pair, tuple) else [pair])]
         known[id(node)] = 1 + sum(_nodes(part, known) for part in parts if hasattr(part, "value"))
     return known[id(node)]
@@ -265,15 +265,15 @@ def read_npz(
     """Returns the arrays of an .npz file by name.
 
     Args:
-        source: a path, or an open file that can be rewound.
-        skip: names of arrays that are not read.
-        only: names of the arrays that are read if they are there; None = all.
+        source: a path, or a seekable open file.
+        skip: names of arrays not to read.
+        only: names of arrays to read if they exist; None = all.
 
     Raises:
-        FileNotFoundError: there is no such file.
-        UserError: it is not a regular file.
-        ValueError: it is damaged, encrypted, holds objects, declares other sizes than it has, or expands to more than
-            `ARRAYS_LIMIT` bytes and `INFLATION` times its own size.
+        FileNotFoundError: the file does not exist.
+        UserError: the path is not a regular file.
+        ValueError: the file is damaged or encrypted, contains objects, declares wrong sizes, or expands to more than
+            `ARRAYS_LIMIT` bytes and more than `INFLATION` times its size.
     """
     if isinstance(source, Path):
         regular_file(source)
@@ -296,11 +296,11 @@ def read_npz(
 
 
 def read_npy(source: Path | IO[bytes], *, mmap: bool = False) -> np.ndarray:
-    """Returns the array of an .npy file; errors as of `read_npz`.
+    """Returns the array of an .npy file; raises the errors of `read_npz`.
 
     Args:
-        source: a path, or an open file that can be rewound.
-        mmap: map the file into memory, for reading, instead of loading it; the source is then a path.
+        source: a path, or a seekable open file.
+        mmap: memory-map the file, read-only, instead of loading it; requires a path.
     """
     if isinstance(source, Path):
         regular_file(source)
@@ -319,42 +319,42 @@ def _npy(file: IO[bytes], mmap: bool) -> np.ndarray:
 
 
 def check_member(member: zipfile.ZipInfo) -> None:
-    """Raises `ValueError` if a member of a zip archive is encrypted, or compressed by other methods than deflate.
+    """Raises `ValueError` if a member of a zip archive is encrypted, or compressed with another method than deflate.
 
-    `zipfile` bounds what it unpacks at a time by the declared size for deflate alone.
+    Only for deflate does `zipfile` limit the bytes unpacked at a time by the declared size.
     """
     if member.flag_bits & 1:
         raise ValueError(f"{member.filename}: encrypted")
     if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-        raise ValueError(f"{member.filename}: compressed by method {member.compress_type}, not by deflate")
+        raise ValueError(f"{member.filename}: compressed with method {member.compress_type}, not deflate")
 
 
 def read_torch(path: Path) -> Any:
-    """Returns the plain values and tensors in a file that `torch.save` wrote; none of its code runs.
+    """Returns the plain values and tensors in a file written by `torch.save`; code in the file is never executed.
 
     Raises:
-        FileNotFoundError: there is no such file.
-        UserError: it is not a regular file.
-        ValueError: it is damaged, holds other objects, or is compressed.
+        FileNotFoundError: the file does not exist.
+        UserError: the path is not a regular file.
+        ValueError: the file is damaged, contains other objects, or is compressed.
     """
     import torch
 
     check_torch(path)
     try:
         return torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # torch raises many kinds for damaged files and foreign pickles
+    except Exception as error:  # torch raises many kinds of errors for damaged files and other pickles
         raise ValueError(f"damaged, or not a file of plain values and tensors: {first_line(error)}") from error
 
 
 def check_torch(path: Path) -> None:
-    """Checks the archive that `torch.load` is about to read, which looks neither at sizes nor at checksums.
+    """Checks sizes and checksums of an archive, which `torch.load` does not check.
 
     Raises:
         FileNotFoundError, UserError, ValueError: see `read_torch`.
     """
     size = regular_file(path)
     with path.open("rb") as file:
-        if file.read(4) != b"PK\3\4":  # formats of old versions, which are no archives
+        if file.read(4) != b"PK\3\4":  # formats of old versions, which are not archives
             return
     try:
         with zipfile.ZipFile(path) as archive:
@@ -368,18 +368,18 @@ def check_torch(path: Path) -> None:
 
 
 def check_expansion(expanded: int, packed: int) -> None:
-    """Raises `ValueError` if compressed content expands beyond all proportion."""
+    """Raises `ValueError` if compressed content expands disproportionately."""
     if expanded > max(ARRAYS_LIMIT, INFLATION * packed):
-        raise ValueError(f"its {_size(packed)} expand to {_size(expanded)}, which no motion data does")
+        raise ValueError(f"its {_size(packed)} expand to {_size(expanded)}; motion data does not")
 
 
 def _array(file: IO[bytes], size: int, name: str, mmap: bool = False) -> np.ndarray:
-    """Returns the array of an .npy file whose header declares exactly the bytes that are there.
+    """Returns the array of an .npy file whose header declares exactly the size of the content.
 
     Args:
-        file: open at its begin.
-        size: its bytes.
-        name: of the array, for messages.
+        file: open file, positioned at its beginning.
+        size: size of the file in bytes.
+        name: name of the array in error messages.
         mmap: as in `read_npy`.
     """
     import numpy as np
@@ -396,7 +396,7 @@ def _array(file: IO[bytes], size: int, name: str, mmap: bool = False) -> np.ndar
         raise ValueError(f"{name}: an array of Python objects, which could run code")
     count, begin = math.prod(shape), file.tell()
     if min(shape, default=0) < 0 or begin + count * dtype.itemsize != size or (not dtype.itemsize and count > 1):
-        raise ValueError(f"{name}: its header declares {shape} of {dtype}, which is not what follows")
+        raise ValueError(f"{name}: its header declares {shape} of {dtype}, which does not match the content")
     order = "F" if fortran else "C"
     if mmap and count:
         return np.memmap(file, dtype, "r", begin, shape, order)

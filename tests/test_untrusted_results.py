@@ -110,7 +110,7 @@ UNREADABLE: dict[str, tuple[Callable[[Path], object], str]] = {
     "pipe": (os.mkfifo, "a pipe, a socket or a device, not a file"),
     "endless": (endless, "a pipe, a socket or a device, not a file"),
     "folder": (Path.mkdir, "a folder, not a file"),
-    "huge": (huge, "1 TiB is more than the"),
+    "huge": (huge, "1 TiB, but such a file may have at most"),
     "latin": (lambda path: path.write_bytes(b'{"a": "\xe9"}\n'), "not a UTF-8 text file"),
     "deep": (lambda path: path.write_text('{"a": ' * 20_000 + "\n"), ""),
     "flat": (lambda path: path.write_text("[" * 300 + "]" * 300 + "\n"), ""),

@@ -187,11 +187,11 @@ class Folder(MotionSource):
 
     def _names(self, path: Path, joints: int) -> tuple[str, ...]:
         """Returns the names of the joints of an array, from `skeleton.yaml` or inferred from the number of joints."""
-        given = self.skeleton.get("joints")
-        if given:
-            if len(given) != joints:
-                raise ValueError(f"{path}: {joints} joints, but skeleton.yaml names {len(given)}")
-            return tuple(given)
+        names = self.skeleton.get("joints")
+        if names:
+            if len(names) != joints:
+                raise ValueError(f"{path}: {joints} joints, but skeleton.yaml names {len(names)}")
+            return tuple(names)
         if joints == len(KIT21):
             return KIT21.joints
         if joints < len(SMPL22):

@@ -1,11 +1,11 @@
-"""Pickles of arrays, read without running what else a pickle can hold.
+"""Restricted reader of pickles: arrays, numbers, text and plain containers; other content is never executed.
 
-Two action data sets are handed out as pickles, a format in which a file can name any function and have it called. Even
-NumPy's own functions are not safe to call with what a stranger wrote (a wrong byte in a dtype crashes the interpreter),
-so arrays are put together here, from their bytes.
+Two action data sets are published as pickles, a format in which a file can name any function and have it called. Even
+NumPy's own functions are not safe to call with untrusted arguments (a wrong byte in a dtype crashes the interpreter),
+so this module constructs arrays from their bytes.
 
-Python's reader in C reserves whatever memory a file of ten bytes asks for, so this one builds on the reader in Python:
-no read may ask for more than is left of the file, and what a file repeats counts each time.
+Python's C unpickler allocates as much memory as a file of ten bytes requests. Therefore this reader is based on the
+unpickler in Python: no read may request more bytes than are left in the file, and repeated content counts each time.
 """
 
 from __future__ import annotations
@@ -25,18 +25,19 @@ from flame_mdm.files import ARRAYS_LIMIT, INFLATION, regular_file
 
 DTYPE = re.compile(r"[biufcSU]\d{1,9}|O8?")
 NODE = 32
-"""Bytes that a value in a container takes at least."""
+"""Minimum memory in bytes of a value in a container."""
 MAX_NODES = 200_000
-"""Values that a pickle may always hold. Larger ones hold no more than they have bytes, unless they repeat some."""
+"""Number of values that is always allowed. Larger files may have one value per byte, which is exceeded only by
+repetition."""
 MAX_DEPTH = 20
-"""Tuples within tuples: taking apart a tuple that is nested 100,000 times ends the process."""
+"""Maximum depth of nested tuples: deallocating a tuple nested 100,000 times crashes the process."""
 KEYS = (str, bytes, int, float, np.integer, np.floating, type(None))
-"""Keys of dictionaries and members of sets. Of any other kind, many with the same hash could be chosen, which makes
-reading them quadratic."""
+"""Allowed types of dictionary keys and set members. For other types, a file could contain many values with the same
+hash, which makes reading quadratic."""
 
 
 class _DType:
-    """Stands for a dtype: a code such as f4, then the order of bytes."""
+    """Placeholder of a dtype: a code such as f4, then the byte order."""
 
     def __init__(self, code: str, align: bool = False, copy: bool = False):
         if not DTYPE.fullmatch(code):
@@ -49,7 +50,7 @@ class _DType:
 
 
 class _Array:
-    """Stands for an array that gets its content after other objects may refer to it."""
+    """Placeholder of an array, whose content comes after other objects may already refer to it."""
 
     def __init__(self, kind: Any, shape: Any, code: Any):
         self.state: tuple = ()
@@ -68,12 +69,12 @@ ALLOWED: dict[str, Any] = {
     **{f"{builtins}.{kind}": kind for builtins in ("builtins", "__builtin__") for kind in ("set", "frozenset")},
     **{f"{builtins}.complex": complex for builtins in ("builtins", "__builtin__")},
 }
-"""Everything a pickle may name: arrays and numbers under NumPy's old and new paths, and plain values. A text names a
-method of `_ArrayUnpickler`, after `make_`."""
+"""All globals that a pickle may name: arrays and numbers under NumPy's old and new paths, and plain values. A text NAME
+refers to the method `make_NAME` of `_ArrayUnpickler`."""
 
 
 class _File:
-    """A file whose reads may not ask for more than is left of it."""
+    """A file whose reads must not request more bytes than are left."""
 
     def __init__(self, file: IO[bytes], size: int):
         self.file, self.left = file, size
@@ -106,7 +107,7 @@ class _ArrayUnpickler(pickle._Unpickler):
         self.depths: dict[int, tuple[int, tuple]] = {}
 
     def content(self) -> Any:
-        """Returns what the pickle holds, with arrays in place of what stands for them."""
+        """Returns the content of the pickle, in which placeholders are replaced by arrays."""
         value = self.load()
         self.memo.clear()
         self.depths.clear()
@@ -117,21 +118,21 @@ class _ArrayUnpickler(pickle._Unpickler):
         if name not in ALLOWED:
             raise pickle.UnpicklingError(
                 f"it names {name[:200]}, but only arrays, numbers, text and plain containers are read (anything else "
-                "could run code); take the file from its owners"
+                "could run code); download the file from its owners"
             )
         allowed = ALLOWED[name]
         return getattr(self, f"make_{allowed}") if isinstance(allowed, str) else allowed
 
     def make_scalar(self, dtype: _DType, data: bytes) -> Any:
-        """Returns a number of NumPy."""
+        """Returns a NumPy number."""
         return self._array(dtype, data, (1,), "C")[0]
 
     def make_from_buffer(self, data: bytes, dtype: _DType, shape: Sequence[int], order: Any) -> np.ndarray:
-        """Returns an array, as protocol 5 writes them."""
+        """Returns an array in the encoding of protocol 5."""
         return self._array(dtype, data, shape, order)
 
     def make_encode(self, text: str, encoding: str) -> bytes:
-        """Returns bytes, as protocols below 3 write them."""
+        """Returns bytes in the encoding of protocols below 3."""
         if encoding != "latin1":
             raise pickle.UnpicklingError(f"bytes encoded as {encoding[:40]!r}")
         self._spend(len(text))
@@ -143,17 +144,17 @@ class _ArrayUnpickler(pickle._Unpickler):
         return set(_keys(items))
 
     def make_frozenset(self, items: Sequence[Any] = ()) -> frozenset:
-        """Returns a set that can be part of another."""
+        """Returns a frozen set."""
         self._spend(NODE * len(items))
         return frozenset(_keys(items))
 
     def _spend(self, size: int) -> None:
         self.budget -= size
         if self.budget < 0:
-            raise pickle.UnpicklingError("it unpacks to far more than its size, which no motion data does")
+            raise pickle.UnpicklingError("it unpacks to far more than its size; motion data does not")
 
     def _array(self, dtype: _DType, data: Any, shape: Sequence[int], order: Any) -> np.ndarray:
-        """Returns the array of this type and shape out of bytes, or out of a list of objects."""
+        """Returns an array of this type and shape from bytes or a list of objects."""
         if dtype.dtype != object:
             self._spend(len(data))
             return np.frombuffer(data, dtype.dtype).reshape(shape, order=order).copy()
@@ -166,7 +167,7 @@ class _ArrayUnpickler(pickle._Unpickler):
         return array.reshape(shape, order=order)
 
     def _plain(self, value: Any) -> Any:
-        """Returns the same with arrays in place of what stands for them."""
+        """Returns the value with placeholders replaced by arrays."""
         self.nodes -= 1
         if self.nodes < 0:
             self._spend(self.budget + 1)
@@ -181,7 +182,7 @@ class _ArrayUnpickler(pickle._Unpickler):
 
     def _load_build(self) -> None:
         if not isinstance(self.stack[-2], (_DType, _Array)):
-            raise pickle.UnpicklingError("it sets attributes of other things than arrays")
+            raise pickle.UnpicklingError("it sets attributes of an object that is not an array")
         super().load_build()  # pyright: ignore[reportAttributeAccessIssue]
 
     def _load_bytearray8(self) -> None:
@@ -192,15 +193,15 @@ class _ArrayUnpickler(pickle._Unpickler):
         depth = 1 + max((self.depths.get(id(part), (0,))[0] for part in made if isinstance(part, tuple)), default=0)
         if depth > MAX_DEPTH:
             raise pickle.UnpicklingError("nested too deeply")
-        self.depths[id(made)] = depth, made  # which also keeps its id
+        self.depths[id(made)] = depth, made  # the reference also keeps the id valid
 
     def _check_integer(self) -> None:
-        if self.stack[-1].bit_length() > 64:  # any number of larger ones may have the same hash
+        if self.stack[-1].bit_length() > 64:  # arbitrarily many larger integers can have the same hash
             raise pickle.UnpicklingError("an integer of more than 64 bits")
 
 
 def _keys(values: Sequence[Any]) -> Sequence[Any]:
-    """Returns the values if all of them may be keys."""
+    """Returns the values if all of them have types in `KEYS`."""
     if not all(isinstance(value, KEYS) for value in values):
         raise pickle.UnpicklingError("a key or a member of a set is neither a number nor text")
     return values
@@ -209,7 +210,7 @@ def _keys(values: Sequence[Any]) -> Sequence[Any]:
 def _after_check(
     load: Callable[[Any], None], keys: Callable[[list[Any]], Sequence[Any]]
 ) -> Callable[[_ArrayUnpickler], None]:
-    """Returns how an opcode is read that takes keys from the stack."""
+    """Returns the handler of an opcode that takes keys from the stack; checks them first."""
 
     def checked(self: _ArrayUnpickler) -> None:
         _keys(keys(self.stack))
@@ -221,7 +222,7 @@ def _after_check(
 def _then_check(
     load: Callable[[Any], None], check: Callable[[_ArrayUnpickler], None]
 ) -> Callable[[_ArrayUnpickler], None]:
-    """Returns how an opcode is read whose value is checked."""
+    """Returns the handler of an opcode that checks the value it reads."""
 
     def checked(self: _ArrayUnpickler) -> None:
         load(self)
@@ -245,12 +246,12 @@ _dispatch[pickle.BYTEARRAY8[0]] = _ArrayUnpickler._load_bytearray8
 
 
 def read(path: Path) -> Any:
-    """Returns what a pickle of arrays, numbers, text and builtin containers holds; protocols 0 to 5.
+    """Returns the content of a pickle of arrays, numbers, text and builtin containers; protocols 0 to 5.
 
     Raises:
-        FileNotFoundError: there is no such file.
-        UserError: it is not a regular file.
-        ValueError: it is damaged, or names anything else; the message names the file and the global.
+        FileNotFoundError: the file does not exist.
+        UserError: the path is not a regular file.
+        ValueError: the file is damaged or names other globals; the message gives the file and the global.
     """
     size = regular_file(path)
     with path.open("rb") as file:

@@ -187,8 +187,8 @@ def _of_joints(path: Path, data: dict[str, Any], text: str, unit: float | None, 
 
 
 def _read_bvh(path: Path, fps: float | None, unit: float | None, resample_to: float | None) -> Motion:
-    given = {} if unit is None else {"unit": unit}
-    joints, rate = read_bvh(path, resample_to, given, None if fps is None else frame_rate(fps))
+    overrides = {} if unit is None else {"unit": unit}
+    joints, rate = read_bvh(path, resample_to, overrides, None if fps is None else frame_rate(fps))
     _skeleton(joints)
     tall = float(np.ptp(joints[..., 1], axis=1).max())
     if not 0.3 < tall < 3.5:

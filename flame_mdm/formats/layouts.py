@@ -130,15 +130,15 @@ LAYOUTS: dict[str, Layout] = {
 
 
 def read_bvh(
-    path: Path, fps: float | None = None, given: Mapping[str, Any] = {}, rate: float | None = None
+    path: Path, fps: float | None = None, overrides: Mapping[str, Any] = {}, rate: float | None = None
 ) -> tuple[np.ndarray, float]:
     """Reads the joints of SMPL from a BVH file with a known skeleton.
 
     Args:
         path: the file.
         fps: target frames per second; None = those of the file. Rotations are interpolated, so bones keep their length.
-        given: fields of `Layout` that override the known ones. Joints with SMPL's names are in centimeters, as written
-            by `flame_mdm.formats`.
+        overrides: fields of `Layout` that override the known ones. Joints with SMPL's names are in centimeters, as
+            written by `flame_mdm.formats`.
         rate: overrides the frame rate of the file.
 
     Returns:
@@ -152,8 +152,8 @@ def read_bvh(
     file = bvh.read(path)
     file = file if rate is None else replace(file, fps=rate)
     names = [name.rpartition(":")[2] for name in file.joints]
-    layout = find_layout(path, names, given)
-    if layout.map is LAYOUTS["SMPL"].map and "unit" not in given:
+    layout = find_layout(path, names, overrides)
+    if layout.map is LAYOUTS["SMPL"].map and "unit" not in overrides:
         layout = replace(layout, unit=0.01)
     if fps is None:
         return layout.apply(file.positions(), names), file.fps
@@ -164,21 +164,21 @@ def read_bvh(
     return layout.apply(bvh.forward_kinematics(file.parents, *moved)[0], names), fps
 
 
-def find_layout(path: Path, names: Sequence[str], given: Mapping[str, Any]) -> Layout:
-    """Returns the known layout for joints with these names, with the fields in `given` overridden.
+def find_layout(path: Path, names: Sequence[str], overrides: Mapping[str, Any]) -> Layout:
+    """Returns the known layout for joints with these names, with the fields in `overrides` overridden.
 
     Raises:
         ValueError: no known layout has these names.
     """
     known = (layout for layout in LAYOUTS.values() if layout.knows(names))
-    layout = Layout(given["map"]) if "map" in given else next(known, None)
+    layout = Layout(overrides["map"]) if "map" in overrides else next(known, None)
     if layout is None or not layout.knows(names):
-        which = "the map" if "map" in given else f"any of the known skeletons {', '.join(LAYOUTS)}"
+        which = "the map" if "map" in overrides else f"any of the known skeletons {', '.join(LAYOUTS)}"
         raise ValueError(
             f"{path}: its joints ({', '.join(names)[:1000]}) do not match {which}. Rename them, or map them to SMPL's "
             "in the skeleton.yaml of a folder of own data"
         )
-    return replace(layout, **given)
+    return replace(layout, **overrides)
 
 
 def read_skeleton(path: Path) -> dict[str, Any]:

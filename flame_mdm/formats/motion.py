@@ -85,9 +85,9 @@ class Motion:
             raise ValueError(f"{name}: fps is {self.fps}, expected a number above 0")
         if self.contacts is not None:
             self.contacts = np.asarray(self.contacts, dtype=bool)
-            given, expected = self.contacts.shape, (shape[0], len(skeleton.feet))
-            if given != expected:
-                raise ValueError(f"{name}: contacts have shape {given}, expected (frames, feet) = {expected}")
+            found, expected = self.contacts.shape, (shape[0], len(skeleton.feet))
+            if found != expected:
+                raise ValueError(f"{name}: contacts have shape {found}, expected (frames, feet) = {expected}")
 
     def __repr__(self) -> str:
         name = self.text or self.id

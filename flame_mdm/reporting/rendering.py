@@ -29,6 +29,8 @@ KINDS = {
 }
 NO_RESULTS = ("NOT VALID", "QUICK")
 """States of rows whose values must not be mistaken for results."""
+SHARED = ("checkpoint sha256", "recipe", "sampler")
+"""Facts that rows must have in common to be listed together as sources."""
 LEGEND = (
     "↑ higher is better, ↓ lower is better, → closer to real motions is better. **Best** and <u>second best</u> of the "
     "rows with the same mark."
@@ -188,16 +190,16 @@ def markdown(table: Table) -> str:
 
 
 def _sources(table: Table) -> list[str]:
-    """Returns where rows come from; rows of one checkpoint share a line, with `/` between what is different."""
+    """Returns the provenance of rows. Those that share `SHARED` are listed in one line, with `/` between different facts."""
     rows = []
     for part in table.parts:
         lines = [line for line in part.lines if line.facts]
-        for _, group in groupby(lines, lambda line: [line.facts.get(name) for name in ("checkpoint sha256", "recipe")]):
+        for _, group in groupby(lines, lambda line: [line.facts.get(name) for name in SHARED]):
             some = list(group)
             values = {name: [line.facts[name] for line in some] for name in some[0].facts}
             facts = ", ".join(f"{name} {_joined(found)}" for name, found in values.items() if any(found))
             prefix = f"{part.name}: " if len(table.parts) > 1 else ""
-            rows.append(f"{prefix}{_joined([line.label for line in some])}: {facts}")
+            rows.append(f"{prefix}{' / '.join(dict.fromkeys(line.label for line in some))}: {facts}")
     return rows
 
 

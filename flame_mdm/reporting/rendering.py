@@ -190,7 +190,7 @@ def markdown(table: Table) -> str:
 
 
 def _sources(table: Table) -> list[str]:
-    """Returns the provenance of rows. Those that share `SHARED` are listed in one line, with `/` between different facts."""
+    """Returns the provenance of rows. Those that agree in `SHARED` share a line, with `/` between other facts."""
     rows = []
     for part in table.parts:
         lines = [line for line in part.lines if line.facts]

@@ -633,6 +633,26 @@ sys.exit(code or ", ".join(name for name in names if "gloo" in name) or 0)
 """
 
 
+def stopped(rank: int, world: int, runs: Runs) -> str:
+    """How the evaluation ends on one of several processes where the ground truth is off."""
+    model, data = load(runs.model), runs.data()
+    protocol = load_protocol("synthetic", model.representation)
+    protocol.change(replications=1, samples=4, quick=False, clips=len(data.test))
+    protocol.expected = {"synthetic": {"attributes/all": [0.1, 0.05]}}
+    source = protocol.generator(model, None, {"seed": 0}, clips=data.test, batch_size=8, world=world, progress=False)
+    try:
+        protocol.evaluate(source, data.test, None, model.representation, rank=rank, world=world)
+    except (UserError, SystemExit) as error:
+        return type(error).__name__
+    return "generated"
+
+
+@pytest.mark.slow
+def test_off_ground_truth_stops_all_processes_and_one_says_why(runs):
+    with GlooPool(2) as pool:
+        assert pool.run(stopped, *((rank, 2, runs) for rank in range(2))) == ["UserError", "SystemExit"]
+
+
 @pytest.mark.slow
 def test_torchrun_writes_one_result(runs, tmp_path):
     """And no thread of gloo is left, which could abort the process while Python shuts down."""

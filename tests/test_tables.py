@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 from conftest import TINY
 
+import evaluators.run
 from evaluators.run import _outdated
 from flame_mdm.__main__ import main
 from flame_mdm.errors import UserError
@@ -318,6 +319,18 @@ def test_times_are_compared_in_batches_of_the_same_size_alone(folder):
     assert "as a, but timed in batches of 64 on cpu" in [note for _, note in part.notes]
     assert [cell.place for line in lines if (cell := line.cells[1])] == [1, 0, 1]
     assert "predicts – / – / velocity" in markdown(Table("timed", "", [part]))
+
+
+def test_the_batch_size_of_the_command_is_not_that_of_timed_rows(folder, monkeypatch):
+    (folder / "timed.yaml").write_text(TIMED.format(folder=folder))
+    asked = []
+    monkeypatch.setattr(evaluators.run, "evaluate", asked.append)
+    words = [f"results={folder / 'none'}", f"out={folder / 'out'}", "batch_size=256"]
+    assert main(["tables", f"table={folder / 'timed.yaml'}", *words]) == 0
+    assert [request.batch_size for request in asked] == [1, 64, None]
+    asked.clear()
+    assert main(["tables", f"table={folder / 'spec.yaml'}", *words]) == 0
+    assert {request.batch_size for request in asked} == {256}
 
 
 def test_an_invalid_row_says_so_and_is_not_ranked(folder):

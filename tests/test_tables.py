@@ -264,8 +264,8 @@ def test_a_table_tells_how_its_checkpoints_were_chosen(folder):
             content["checkpoint"]["selected_by"] = "best val/text_to_motion_t2m/fid"
             path.write_text(json.dumps(content))
     notes = [note for _, note in made(folder).parts[0].notes]
-    assert "MFM: checkpoint: best val/text_to_motion_t2m/fid" in notes
-    assert "MDM; FLAME <b>: checkpoint: last, not chosen by validation" in notes
+    assert "MFM: best checkpoint by val/text_to_motion_t2m/fid" in notes
+    assert "MDM; FLAME <b>: last checkpoint, not chosen by validation" in notes
 
 
 def test_a_distance_of_0_between_real_motions_is_explained(folder):

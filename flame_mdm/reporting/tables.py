@@ -367,7 +367,7 @@ def _measured(name: str, part: Config, reported: Config | None, results: Path, f
         [(label, f"NOT VALID: {why}") for label, known in facts if (why := known.get("not valid because"))]
     )
     chosen = [(label, known.get("chosen by", "").partition(" ")) for label, known in facts]
-    texts = {"best": "checkpoint: best {}", "none:": "checkpoint: {}, not chosen by validation"}
+    texts = {"best": "best checkpoint by {}", "none:": "{} checkpoint, not chosen by validation"}
     notes += _grouped([(label, texts[kind].format(name)) for label, (kind, _, name) in chosen if kind in texts])
     zero = {
         label

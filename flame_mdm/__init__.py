@@ -7,7 +7,12 @@ motion.joints  # (F, J, 3) meters, y up
 motion.save("wave.glb")
 """
 
+import os
 from typing import TYPE_CHECKING, Any
+
+# Before torch is imported: threads that wait for the others sleep. By default they spin, and while another program uses
+# one of two cores, a training step then takes ten times as long.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 if TYPE_CHECKING:
     from flame_mdm.checkpoints.loading import load

@@ -1,5 +1,6 @@
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -20,6 +21,7 @@ from flame_mdm.config import compose, instantiate
 from flame_mdm.errors import UserError
 from flame_mdm.generation import generate
 from flame_mdm.motion import MotionBatch, length_mask
+from flame_mdm.training.callbacks import Progress
 
 STEPS = ["trainer.val_check_interval=4", "callbacks.checkpoints.every_n_steps=4", "callbacks.samples=null"]
 
@@ -101,6 +103,30 @@ def test_a_resumed_run_is_the_uninterrupted_one(tiny, extra, tmp_path):
         a, b = (read_checkpoint(path).get(key, {}) for path in (parts, whole))
         assert a.keys() == b.keys()
         assert all(torch.equal(a[name], b[name]) for name in a), key
+
+
+def test_progress_counts_all_steps_and_shows_losses(tiny, capfd, monkeypatch):
+    """Also after a resume; in a log file as plain lines, here one per step."""
+    monkeypatch.setattr(Progress, "SECONDS", 0.0)
+    overrides = [*tiny, *STEPS, "trainer.enable_progress_bar=true", "trainer.log_every_n_steps=2"]
+    run(overrides, 6)
+    run(overrides, 8)
+    lines = [line for line in capfd.readouterr().err.splitlines() if line.startswith("training:")]
+    counts = [re.search(r" (\d+/\d+) \[", line) for line in lines]
+    assert [found and found[1] for found in counts] == ["1/6", "2/6", "3/6", "4/6", "5/6", "6/6", "7/8", "8/8"]
+    assert "train/loss=" in lines[2]
+    assert "val/loss=" in lines[5]
+    assert not any("\r" in line for line in lines)
+
+
+def test_waiting_threads_sleep():
+    """Importing the package says so to OpenMP before torch is loaded, unless the user has said otherwise."""
+    code = "import os, sys, flame_mdm; assert 'torch' not in sys.modules; print(os.environ['OMP_WAIT_POLICY'])"
+    environment = {name: value for name, value in os.environ.items() if name != "OMP_WAIT_POLICY"}
+    for own, expected in (({}, "PASSIVE"), ({"OMP_WAIT_POLICY": "ACTIVE"}, "ACTIVE")):
+        line = [sys.executable, "-c", code]
+        done = subprocess.run(line, capture_output=True, text=True, check=True, env=environment | own)
+        assert done.stdout.strip() == expected
 
 
 def test_bfloat16_is_one_switch(tiny):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import signal
 import sys
@@ -17,9 +18,10 @@ from typing import Any
 
 import torch
 from lightning import Callback, LightningModule, Trainer
-from lightning.pytorch.callbacks import Checkpoint, TQDMProgressBar
+from lightning.pytorch.callbacks import Checkpoint
 from torch.nn.utils import get_total_norm
 from torchmetrics import Metric
+from tqdm import tqdm
 
 from flame_mdm.conditions.action import ActionLabels
 from flame_mdm.data.datamodule import MotionDataModule
@@ -195,23 +197,41 @@ class Report(Callback):
             say(f"the whole run on a page: {write_report(self.folder)}")
 
 
-class Progress(TQDMProgressBar):
-    """A progress bar over all steps of the run, with the time left and samples a second."""
+class Progress(Callback):
+    """Progress bar over the steps of a run, with time left and losses; in a log file, a plain line every 30 seconds."""
 
-    @property
-    def total_train_batches(self) -> int | float:
-        return self.trainer.max_steps * self.trainer.accumulate_grad_batches
+    SECONDS = 30.0
 
-    def on_train_epoch_start(self, trainer: Trainer, *_: Any) -> None:
-        super().on_train_epoch_start(trainer)
-        done = trainer.global_step * trainer.accumulate_grad_batches
-        self.train_progress_bar.initial = self.train_progress_bar.n = done
-        self.train_progress_bar.set_description("training")
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        self.screen = sys.stderr.isatty()
+        self.bar = tqdm(
+            desc="training",
+            initial=trainer.global_step,
+            total=trainer.max_steps if trainer.max_steps > 0 else None,
+            unit="step",
+            dynamic_ncols=True,
+            file=sys.stderr if self.screen else io.StringIO(),
+            disable=not trainer.is_global_zero,
+        )
+        self.printed = time.monotonic()
 
-    def get_metrics(self, trainer: Trainer, pl_module: LightningModule) -> dict[str, Any]:
-        items = super().get_metrics(trainer, pl_module)
-        items.pop("v_num", None)
-        return {name.rpartition("/")[2] if name != "val/loss" else name: value for name, value in items.items()}
+    def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
+        if self.bar.disable or trainer.global_step == self.bar.n:  # gradients are still being accumulated
+            return
+        if trainer.global_step % trainer.log_every_n_steps == 0:  # type: ignore[attr-defined]
+            losses = {name: trainer.callback_metrics.get(name) for name in ("train/loss", "val/loss")}
+            self.bar.set_postfix({n: f"{v:.4g}" for n, v in losses.items() if v is not None}, refresh=False)
+        self.bar.update(trainer.global_step - self.bar.n)
+        if not self.screen and time.monotonic() >= self.printed + self.SECONDS:
+            self.printed = time.monotonic()
+            say(str(self.bar), error=True)
+
+    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        self.bar.close()
+
+    def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
+        if hasattr(self, "bar"):
+            self.bar.close()
 
 
 class SampleMotions(Callback):

@@ -56,7 +56,7 @@ def fit(folder: Path, config: Config) -> None:
         # Lightning would save in the middle of a step, to a file that it then prefers to ours.
         plugins.append(SLURMEnvironment(auto_requeue=False))
     trainer: Trainer = instantiate(
-        config["trainer"],
+        config["trainer"] | {"enable_progress_bar": False},  # `Progress` instead
         logger=[*loggers, History(folder, step)],
         callbacks=callbacks,
         plugins=plugins,
@@ -123,6 +123,7 @@ def _quiet() -> None:
     """Silences what Lightning says about choices that are made on purpose here."""
     logging.getLogger("lightning.pytorch").setLevel(logging.ERROR)
     for message in (
+        ".*isinstance\\(treespec, LeafSpec\\).*",  # Lightning's own
         ".*does not have many workers.*",
         ".*Checkpoint directory .* exists and is not empty.*",
         ".*sync_dist=True.*",  # the metrics are means over all processes already

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Motion", "MotionGeneration", "edit", "generate", "load"]
 
-_HOMES = {
+_MODULES = {
     "load": "checkpoints.loading",
     "MotionGeneration": "task",
     "generate": "generation",
@@ -34,8 +34,8 @@ _HOMES = {
 
 def __getattr__(name: str) -> Any:
     """Imports public names on first use, so that commands answer `--help` without importing torch."""
-    if name not in _HOMES:
+    if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from importlib import import_module
 
-    return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
+    return getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)

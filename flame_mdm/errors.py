@@ -9,7 +9,7 @@ import sys
 import unicodedata
 from collections.abc import Iterable
 
-MOST_SHOWN = 2_000
+MAX_LINE = 2_000
 """Maximum number of characters shown of an error line. The framework's own messages are shorter."""
 
 
@@ -55,12 +55,12 @@ def say(*lines: object, error: bool = False) -> None:
     """Prints each argument as one `printable` line, to standard output or, with `error`, to standard error.
 
     Commands use it instead of `print`, because any name or text may come from an untrusted file. Error lines longer
-    than `MOST_SHOWN` characters are shortened in the middle.
+    than `MAX_LINE` characters are shortened in the middle.
     """
     for line in lines:
         text = str(line)
-        if error and len(text) > MOST_SHOWN:
-            text = f"{text[: MOST_SHOWN // 2]} … {text[-MOST_SHOWN // 2 :]}"
+        if error and len(text) > MAX_LINE:
+            text = f"{text[: MAX_LINE // 2]} … {text[-MAX_LINE // 2 :]}"
         print(printable(text), file=sys.stderr if error else sys.stdout, flush=True)
 
 

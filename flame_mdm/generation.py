@@ -20,9 +20,9 @@ from flame_mdm.visualize import contact_sheet, write_gif, write_player
 from flame_mdm.visualize.scene import shortened
 
 BATCH = 32
-MOST = 10_000
+MAX_SAMPLES = 10_000
 """Maximum number of samples per request; they are kept in memory until all are complete."""
-LONGEST_TEXT = 2000
+MAX_TEXT_LENGTH = 2000
 """Maximum number of characters of a text; captions of the data sets are far shorter."""
 
 
@@ -58,7 +58,7 @@ def generate(
     Raises:
         UserError: a text is empty or too long, an action is unknown, or the model was not trained for the length.
     """
-    for name, value, most in (("samples", samples, MOST), ("num_inference_steps", num_inference_steps, None)):
+    for name, value, most in (("samples", samples, MAX_SAMPLES), ("num_inference_steps", num_inference_steps, None)):
         if value is not None and not 1 <= value <= (most or value):
             raise UserError(f"{name}={value}: give 1{f' to {most:,}' if most else ' or more'}")
     if guidance_scale is not None and not math.isfinite(guidance_scale):
@@ -68,12 +68,12 @@ def generate(
     if texts is not None and not all(text.strip() for text in texts):
         raise UserError("empty text. Omit the text to sample without condition")
     for text in requested:
-        if len(text) > LONGEST_TEXT:
+        if len(text) > MAX_TEXT_LENGTH:
             raise UserError(
-                f"{shortened(text, 60)}: {len(text):,} characters are too many. Give at most {LONGEST_TEXT:,}"
+                f"{shortened(text, 60)}: {len(text):,} characters are too many. Give at most {MAX_TEXT_LENGTH:,}"
             )
-    if len(requested) * samples > MOST:
-        raise UserError(f"{len(requested):,} texts with samples={samples}: at most {MOST:,} motions per request")
+    if len(requested) * samples > MAX_SAMPLES:
+        raise UserError(f"{len(requested):,} texts with samples={samples}: at most {MAX_SAMPLES:,} motions per request")
     captions = [text for text in requested for _ in range(samples)]
     numbers: Counter[str] = Counter()
     ids = []

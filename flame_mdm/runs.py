@@ -21,7 +21,7 @@ HISTORY = "metrics.jsonl"
 RESULTS = "evaluation/**/result*.json"
 SAMPLES = "samples/step_*"
 
-LARGEST = 2**63 - 1
+MAX_INTEGER = 2**63 - 1
 """Maximum integer in a file; larger ones overflow when they are plotted or logged."""
 LIMIT = 4 * files.MEBIBYTE
 """Maximum size of a file of results, ratings, lengths or provenance. Typical files have 10 to 300 KiB."""
@@ -225,7 +225,7 @@ def check_shape(content: Any, kind: type[T] | Any) -> T:
         ValueError: the content has another type; the message gives key, found value and expected type.
     """
     if large := _too_large(content):
-        raise ValueError(f"{large[:40]} ... is too large for a JSON integer; the maximum is {LARGEST:,}")
+        raise ValueError(f"{large[:40]} ... is too large for a JSON integer; the maximum is {MAX_INTEGER:,}")
     try:
         return _adapter(kind).validate_python(content, strict=True)
     except ValidationError as error:
@@ -233,11 +233,11 @@ def check_shape(content: Any, kind: type[T] | Any) -> T:
 
 
 def _too_large(content: Any) -> str:
-    """Returns the first integer beyond `LARGEST` in some content, as text; "" if there is none."""
+    """Returns the first integer beyond `MAX_INTEGER` in some content, as text; "" if there is none."""
     if isinstance(content, dict | list):
         values = content.values() if isinstance(content, dict) else content
         return next(filter(None, map(_too_large, values)), "")
-    return hex(content) if isinstance(content, int) and abs(content) > LARGEST else ""
+    return hex(content) if isinstance(content, int) and abs(content) > MAX_INTEGER else ""
 
 
 def _first_error(error: ValidationError, content: Any) -> str:

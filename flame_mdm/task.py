@@ -20,7 +20,7 @@ from flame_mdm.denoisers import Denoiser
 from flame_mdm.errors import UserError
 from flame_mdm.losses import MotionLosses
 from flame_mdm.motion import Condition, Edit, MotionBatch, pad_to
-from flame_mdm.processes import MOST_STEPS, Process
+from flame_mdm.processes import MAX_STEPS, Process
 from flame_mdm.processes.guidance import classifier_free_guidance
 from flame_mdm.representations import Representation
 from flame_mdm.seeds import key, normal, seeded_noise, uniform
@@ -127,8 +127,8 @@ class MotionGeneration(Task):
             raise UserError(f"task.cond_drop_prob={cond_drop_prob}: give a probability from 0 to 1")
         if not math.isfinite(guidance_scale):
             raise UserError(f"task.guidance_scale={guidance_scale} is not a finite number")
-        if type(num_inference_steps) is not int or not 1 <= num_inference_steps <= MOST_STEPS:
-            raise UserError(f"task.num_inference_steps={num_inference_steps}: give a number from 1 to {MOST_STEPS:,}")
+        if type(num_inference_steps) is not int or not 1 <= num_inference_steps <= MAX_STEPS:
+            raise UserError(f"task.num_inference_steps={num_inference_steps}: give a number from 1 to {MAX_STEPS:,}")
         self.denoiser, self.process = denoiser, process
         self.losses = MotionLosses(representation.to_joints, representation.skeleton.feet, **losses)
         self.cond_drop_prob = cond_drop_prob

@@ -373,7 +373,7 @@ def test_bombs_of_yaml(attacked, trained, bad):
         folder.mkdir()
         (folder / "config.yaml").write_text(text)
         path = str(folder / "config.yaml")
-        says = {"digits": "a whole number of more than 20 digits", "long": "256 KiB that such a file may have"}
+        says = {"digits": "a whole number of more than 20 digits", "long": "at most 256 KiB"}
         attacked("train", path, says=says.get(name, "config.yaml: not a readable YAML file"))
         if name != "itself":  # the others read the same way
             continue

@@ -16,7 +16,7 @@ from flame_mdm.checkpoints.files import FILE, read_checkpoint
 from flame_mdm.config import Config, flatten, instantiate, trust
 from flame_mdm.errors import UserError, first_line
 from flame_mdm.files import regular_file
-from flame_mdm.processes import MOST_STEPS
+from flame_mdm.processes import MAX_STEPS
 from flame_mdm.task import MotionGeneration, Task
 
 Which = Literal["last", "best"]
@@ -139,7 +139,7 @@ class _Sizes(TorchDispatchMode):
         largest = max((size for value in weights.values() if value.numel() for size in value.shape), default=0)
         for name, value in flatten(parts).items():
             for number in value if isinstance(value, list | tuple) else [value]:
-                if isinstance(number, int) and abs(number) > max(MOST_STEPS, largest):
+                if isinstance(number, int) and abs(number) > max(MAX_STEPS, largest):
                     raise UserError(f"{path}: {name}={number} in its recipe: no model is so large")
         self.path, self.numbers = path, 4 * sum(value.numel() for value in weights.values()) + 10_000_000
         self.tensors = 4 * len(weights) + 2_000

@@ -26,7 +26,7 @@ from flame_mdm.denoisers.gru import MDMGRU
 from flame_mdm.denoisers.mdm import MDMDecoder, MDMEncoder
 from flame_mdm.errors import UserError, first_line
 from flame_mdm.files import check_torch, read_npy, read_yaml, sha256
-from flame_mdm.processes import MOST_STEPS
+from flame_mdm.processes import MAX_STEPS
 from flame_mdm.runs import Number, check_shape
 from flame_mdm.task import MotionGeneration
 
@@ -514,7 +514,7 @@ def _unpickle(path: Path, run_code: bool) -> Any:
 
 class _Solver(TypedDict, total=False):
     method: str
-    step_size: Annotated[float, Field(ge=1 / MOST_STEPS, le=1)]
+    step_size: Annotated[float, Field(ge=1 / MAX_STEPS, le=1)]
 
 
 class _Options(TypedDict, total=False):
@@ -527,12 +527,12 @@ class _Options(TypedDict, total=False):
     text_emebed: str
     text_encoder_type: str
     cond_mask_prob: Annotated[float, Field(ge=0, le=1)]
-    diffusion_steps: Annotated[int, Field(ge=1, le=MOST_STEPS)]
+    diffusion_steps: Annotated[int, Field(ge=1, le=MAX_STEPS)]
     lambda_fc: Number | None
     lambda_rcxyz: Number | None
     lambda_vel: Number | None
     num_frames: Annotated[int, Field(ge=0, le=MOST_FRAMES)] | None
-    num_heads: Annotated[int, Field(ge=1, le=MOST_STEPS)] | None
+    num_heads: Annotated[int, Field(ge=1, le=MAX_STEPS)] | None
     ode_kwargs: _Solver | None
 
 

@@ -19,7 +19,7 @@ MEMBER_LIMIT = 512 * MEBIBYTE
 """Maximum size of one unpacked member in bytes. Motions, captions and arrays are far smaller."""
 HEADER_LIMIT = MEBIBYTE // 16
 """Maximum size in bytes of a header that describes the next member or all later ones."""
-GLOBALS = 100
+MAX_GLOBAL_VALUES = 100
 """Maximum number of header values that apply to all later members; each member copies them."""
 _UNPACKERS = {b"\x1f\x8b": gzip.open, b"BZ": bz2.open, b"\xfd7zXZ": lzma.open}
 _HEADERS = (tarfile.XHDTYPE, tarfile.XGLTYPE, tarfile.SOLARIS_XHDTYPE, tarfile.GNUTYPE_LONGNAME)
@@ -112,7 +112,7 @@ class _Member(tarfile.TarInfo):
             raise ValueError(f"{self.name}: a sparse file")
         if self.type in _HEADERS and self.size > HEADER_LIMIT:
             raise ValueError(f"a header of {self.size:,} bytes")
-        if (values := len(archive.pax_headers)) > GLOBALS:
+        if (values := len(archive.pax_headers)) > MAX_GLOBAL_VALUES:
             raise ValueError(f"{values:,} header values apply to all members")
         return super()._proc_member(archive)  # pyright: ignore[reportAttributeAccessIssue]
 

@@ -22,7 +22,7 @@ from flame_mdm.motion import collate
 from flame_mdm.representations import Representation
 from flame_mdm.seeds import key
 
-FRAMES = 100_000
+MAX_FRAMES = 100_000
 """Maximum number of frames of a sample; one hour at 20 frames per second has 72,000."""
 Draw = tuple[int, int]
 """(index of a clip, number of the batch that it is drawn for; -1 in evaluation)."""
@@ -120,8 +120,8 @@ def _check_crop(crop: Crop) -> None:
     if not isinstance(crop, Crop):
         raise ValueError(f"data.crop={crop!s:.80}: not a crop rule; give one such as those in flame_mdm.data.crops")
     for name, frames in (("shortest", crop.shortest()), ("longest", crop.longest())):
-        if type(frames) is not int or not 1 <= frames <= FRAMES:
-            raise ValueError(f"data.crop: its {name} sample has {frames!s:.20} frames; give 1 to {FRAMES:,}")
+        if type(frames) is not int or not 1 <= frames <= MAX_FRAMES:
+            raise ValueError(f"data.crop: its {name} sample has {frames!s:.20} frames; give 1 to {MAX_FRAMES:,}")
 
 
 class MotionDataModule(LightningDataModule):

@@ -27,7 +27,7 @@ from flame_mdm.representations.skeleton import KIT21, SMPL22
 from flame_mdm.representations.smpl import SMPL
 
 MOTIONS = (".bvh", ".npz", ".npy", ".json")
-UNFIT = re.compile("[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
+FORBIDDEN_CHARACTERS = re.compile("[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
 """Characters not allowed in the name of a motion: names are stored as text, one clip per line."""
 TABLES = ("captions.csv", "captions.json")
 COLUMNS = ("id", "text", "action", "split", "source")
@@ -114,7 +114,7 @@ class Folder(MotionSource):
         for path in sorted(self.path.rglob("*")) if self.path.is_dir() else ():
             if path.suffix.lower() in MOTIONS and path != self.path / TABLES[1]:
                 name = path.relative_to(self.path).with_suffix("").as_posix()
-                if UNFIT.search(name):
+                if FORBIDDEN_CHARACTERS.search(name):
                     raise UserError(
                         f"{printable(str(path))}: its name contains control characters or is not UTF-8. Rename it"
                     )

@@ -471,8 +471,8 @@ MOTIONS: Mapping[str, Callable[[np.random.Generator, np.ndarray, Attributes], _B
     "stand": lambda rng, t, requested: _Body(rng, t),
 }
 SHARES = {"walk": 6, "turn": 2, "jump": 2, "wave": 2, "raise": 2, "kick": 2, "punch": 2}  # others: 1
-MOST = {"jump": 3, "punch": 3, "kick": 2, "squat": 2}
-SHORTEST_EVENT = 0.8
+MAX_COUNT = {"jump": 3, "punch": 3, "kick": 2, "squat": 2}
+MIN_EVENT_SECONDS = 0.8
 """Minimum duration of a repetition in seconds; it limits how many fit into a clip."""
 
 
@@ -485,8 +485,10 @@ def _draw(rng: np.random.Generator, max_seconds: float) -> Attributes:
         requested["side"] = str(rng.choice(["left", "right", "both"]))
     elif action in ("kick", "punch"):
         requested["side"] = str(rng.choice(["left", "right"]))
-    if action in MOST:
-        requested["count"] = int(rng.integers(1, min(MOST[action], int((max_seconds - 0.35) / SHORTEST_EVENT)) + 1))
+    if action in MAX_COUNT:
+        requested["count"] = int(
+            rng.integers(1, min(MAX_COUNT[action], int((max_seconds - 0.35) / MIN_EVENT_SECONDS)) + 1)
+        )
     if action == "walk":
         ways = ["forward", "backward", "left", "right", "clockwise", "counterclockwise"]
         requested["direction"] = str(rng.choice(ways, p=[0.3, 0.14, 0.14, 0.14, 0.14, 0.14]))
@@ -550,7 +552,7 @@ class Synthetic(MotionSource):
         """Returns clip number `index` with `round(seconds * fps) + 1` frames."""
         rng = np.random.default_rng((self.seed, index))
         requested = _draw(rng, self.max_seconds)
-        shortest = max(self.min_seconds, 0.35 + SHORTEST_EVENT * int(requested.get("count", 0)))
+        shortest = max(self.min_seconds, 0.35 + MIN_EVENT_SECONDS * int(requested.get("count", 0)))
         seconds = rng.uniform(shortest, self.max_seconds)
         subjects = rng.permutation(["a person", "someone", "the person", "a human"])
         texts = [f"{subject} {predicate}" for subject, predicate in zip(subjects, captions(requested), strict=True)]

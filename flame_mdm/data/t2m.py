@@ -23,7 +23,7 @@ from flame_mdm.files import read_npy, read_text
 TAG_FPS = 20
 """Frames per second of the tags `from` and `to`, also in KIT-ML, whose motions have 12.5."""
 
-LIMIT = 200
+MAX_LENGTH = 200
 """Motions and cuts of this many frames or more are left out."""
 
 MAX_TOKENS = 20
@@ -73,7 +73,7 @@ def cuts(name: str, frames: int, descriptions: Sequence[Description], shortest: 
     A description of a part gives a separate item named NAME@from-to; the second item of the same part is named
     NAME@from-to#2. As published, a motion that is too short or too long gives no items, even if parts of it would fit.
     """
-    if not shortest <= frames < LIMIT:
+    if not shortest <= frames < MAX_LENGTH:
         return []
     found: list[Cut] = []
     seen: Counter[str] = Counter()
@@ -82,7 +82,7 @@ def cuts(name: str, frames: int, descriptions: Sequence[Description], shortest: 
             continue
         start = int(description.begin * TAG_FPS)
         length = min(int(description.end * TAG_FPS), frames) - start
-        if shortest <= length < LIMIT:
+        if shortest <= length < MAX_LENGTH:
             id_ = f"{name}@{description.begin:g}-{description.end:g}"
             seen[id_] += 1
             found.append(Cut(id_ if seen[id_] == 1 else f"{id_}#{seen[id_]}", start, length, [description]))
@@ -257,8 +257,8 @@ class T2MFolder(MotionSource):
         reason = ""
         if frames < self.shortest:
             reason = f"shorter than {self.shortest} frames"
-        elif frames >= LIMIT:
-            reason = f"of {LIMIT} frames or more"
+        elif frames >= MAX_LENGTH:
+            reason = f"of {MAX_LENGTH} frames or more"
         elif not self.texts[name]:
             reason = "without a caption"
         elif not found:

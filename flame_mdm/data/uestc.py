@@ -28,7 +28,7 @@ TRAIN_SUBJECTS = (
 )
 """Training subjects of the cross-subject protocol: 51 of 118; the other 67 are for testing."""
 
-HELD_OUT = 5
+VAL_SUBJECTS = 5
 """Number of training subjects that our split uses for validation."""
 
 ROOT = 8
@@ -163,7 +163,7 @@ class UESTC(MotionSource):
         if subject not in TRAIN_SUBJECTS:
             return "test"
         ranked = sorted(TRAIN_SUBJECTS, key=lambda s: hashlib.sha1(f"uestc_p{s:03d}".encode()).hexdigest())
-        return "val" if not self.published_split and subject in ranked[:HELD_OUT] else "train"
+        return "val" if not self.published_split and subject in ranked[:VAL_SUBJECTS] else "train"
 
 
 def front_view(pose: np.ndarray, root: np.ndarray, camera: np.ndarray, video: Video) -> np.ndarray:

@@ -19,10 +19,10 @@ from flame_mdm.files import write_text
 from flame_mdm.representations import Representation
 
 SPLITS: tuple[Split, ...] = get_args(Split)
-STILL = 0.01
+STILL_DISTANCE = 0.01
 """Meters; a clip in which no joint moves farther from its first position counts as still."""
 
-FRAMES = 500_000
+MAX_FRAMES = 500_000
 """Maximum number of training frames from which statistics are recomputed, so that they fit in memory."""
 
 
@@ -189,7 +189,7 @@ def _still(store: Store, representation: Representation) -> list[str]:
     found = []
     for group in tqdm(_motions(store), "looking for movement", unit=" motions"):
         joints = representation.decode(torch.from_numpy(np.array(store.motion(group[0]))))
-        if float((joints - joints[:1]).norm(dim=-1).max()) < STILL:
+        if float((joints - joints[:1]).norm(dim=-1).max()) < STILL_DISTANCE:
             found += [clip.id for clip in group]
     return found
 
@@ -208,7 +208,7 @@ def _deviation(store: Store, representation: Representation) -> dict[str, float]
     for clip in store.clips:
         training[clip.start : clip.start + clip.length] |= clip.split == "train"
     frames = np.flatnonzero(training)
-    frames = frames[:: -(-len(frames) // FRAMES)]
+    frames = frames[:: -(-len(frames) // MAX_FRAMES)]
     mean, std = (part.double().numpy() for part in representation.statistics(torch.from_numpy(store.features[frames])))
     return {
         "largest difference of a mean, in std": float((np.abs(store.mean - mean) / std).max()),

@@ -23,7 +23,7 @@ from flame_mdm.files import TEXT_LIMIT, regular_file, write_text
 from flame_mdm.formats.resampling import RATES, between, slerp
 
 CHANNELS = tuple(f"{axis}{kind}" for kind in ("position", "rotation") for axis in "XYZ")
-LABELED = 200
+MAX_LABELED_LINE = 200
 """Maximum length of a line with a label. Python needs quadratic time for numbers with many digits."""
 
 
@@ -246,7 +246,7 @@ class _Source:
     def labeled(self, pattern: str, expected: str) -> str:
         """Returns the value on the next line, the first group of `pattern`."""
         self.line, line = next(self.lines, (self.line, ""))
-        match = re.fullmatch(pattern, line, re.IGNORECASE) if len(line) <= LABELED else None
+        match = re.fullmatch(pattern, line, re.IGNORECASE) if len(line) <= MAX_LABELED_LINE else None
         if match is None:
             self.fail(f"expected {expected}, found {line[:40] or 'the end of the file'}")
         return match[1]

@@ -11,7 +11,7 @@ Auxiliary = Callable[[Tensor, Tensor, Tensor], dict[str, Tensor]]
 """(x0_hat (B, F, D), x (B, F, D), mask (B, F)) -> weighted per-sample losses (B,) of the clean estimate, by name."""
 
 
-MOST_STEPS = 100_000
+MAX_STEPS = 100_000
 """Maximum number of steps of a diffusion or sampler."""
 
 

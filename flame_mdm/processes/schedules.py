@@ -6,7 +6,7 @@ from typing import Literal, get_args
 import torch
 from torch import Tensor
 
-from flame_mdm.processes import MOST_STEPS
+from flame_mdm.processes import MAX_STEPS
 
 ScheduleName = Literal["cosine", "linear"]
 Spacing = Literal["linspace", "stride"]
@@ -93,12 +93,12 @@ def build_schedule(name: ScheduleName, num_train_timesteps: int) -> Schedule:
     """Returns the schedule of this name with T steps.
 
     Raises:
-        ValueError: the name is unknown, or the number of steps is not in [2, `MOST_STEPS`].
+        ValueError: the name is unknown, or the number of steps is not in [2, `MAX_STEPS`].
     """
     if name not in get_args(ScheduleName):
         raise ValueError(f"unknown schedule '{name}': choose from {', '.join(get_args(ScheduleName))}")
-    if not 2 <= num_train_timesteps <= MOST_STEPS:
-        raise ValueError(f"num_train_timesteps is {num_train_timesteps}: a diffusion has 2 to {MOST_STEPS:,} steps")
+    if not 2 <= num_train_timesteps <= MAX_STEPS:
+        raise ValueError(f"num_train_timesteps is {num_train_timesteps}: a diffusion has 2 to {MAX_STEPS:,} steps")
     return Schedule({"cosine": cosine_betas, "linear": linear_betas}[name](num_train_timesteps))
 
 

@@ -12,7 +12,7 @@ if TYPE_CHECKING:  # drawing needs numpy and Pillow, not torch
     from flame_mdm.representations.skeleton import Skeleton
 
 
-LONGEST = 2000
+MAX_CAPTION_LENGTH = 2000
 """Maximum number of characters of a caption that are shown."""
 
 
@@ -56,7 +56,7 @@ def frame_at(motion: Shown, seconds: float) -> int:
     return min(int(seconds * motion.fps + 1e-6), len(motion.joints) - 1)
 
 
-def shortened(text: str, most: int = LONGEST) -> str:
+def shortened(text: str, most: int = MAX_CAPTION_LENGTH) -> str:
     """Returns a text of at most `most` characters; a longer one ends in an ellipsis."""
     return text if len(text) <= most else f"{text[: most - 1]}…"
 

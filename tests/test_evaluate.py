@@ -374,6 +374,8 @@ def test_what_does_not_fit_is_refused_in_one_line(runs, capsys, tmp_path):
     assert "synthetic" in refused(runs, capsys, tmp_path, "protocol=synthetical")
     assert "condition text" in refused(runs, capsys, tmp_path, "protocol=action_to_motion")
     assert "at least 1" in refused(runs, capsys, tmp_path, "samples=0")
+    assert "batch_size" in refused(runs, capsys, tmp_path, "batch_size=many")
+    assert "at least 1" in refused(runs, capsys, tmp_path, "batch_size=0")
     broken = tmp_path / "broken.ckpt"
     broken.write_bytes(runs.model.read_bytes()[:1000])
     assert runs.evaluate(tmp_path / "result.json", model=broken) == 1

@@ -32,5 +32,12 @@ main = partial(
     name="evaluate",
     objects=("ckpt", "out"),
     text=("ckpt", "extractor", "from_samples", "protocol", "data_root", "out"),
-    kinds={**SAMPLING, "replications": "int", "multimodality": "bool", "quick": "bool", "force": "bool"},
+    kinds={
+        **SAMPLING,
+        "replications": "int",
+        "batch_size": "int",
+        "multimodality": "bool",
+        "quick": "bool",
+        "force": "bool",
+    },
 )

@@ -19,7 +19,7 @@ HEAD = "<!-- Written by docs/generate.py; do not edit. -->\n"
 
 
 def head(name: str) -> tuple[str, str]:
-    """What the head comment of a recipe says it is (paper, table, row), and its deviations."""
+    """Returns the head comment of a recipe: what it is (paper, table, row), and its deviations."""
     lines = (EXPERIMENTS / f"{name}.yaml").read_text().splitlines()[1:]
     comment = " ".join(line.removeprefix("#").strip() for line in takewhile(lambda line: line.startswith("#"), lines))
     what, _, deviations = comment.partition("Deviations")
@@ -27,13 +27,13 @@ def head(name: str) -> tuple[str, str]:
 
 
 def recipes_page() -> str:
-    """All recipes with the paper, table and row they stand for."""
+    """Returns the page of all recipes, with the paper, table and row that each reproduces."""
     page = f"""# Recipes
 
 {HEAD}
-One recipe a row of the papers' tables: `make train EXP=humanml3d/mdm`. "Those of mdm" are the deviations of the recipe
-of that name in the same folder. A few hold for all recipes: a batch holds motions of about the same length, every
-sample of a batch weighs the same, and checkpoints are chosen on validation clips.
+Each row of the papers' tables has a recipe: `make train EXP=humanml3d/mdm`. "Those of mdm" are the deviations of the
+recipe `mdm` in the same folder. Some deviations hold for all recipes: a batch contains motions of about the same length,
+every sample of a batch has the same weight, and checkpoints are chosen on validation clips.
 """
     folder = None
     for name in sorted(recipes(), key=lambda name: ("/" in name, name)):
@@ -46,7 +46,7 @@ sample of a batch weighs the same, and checkpoints are chosen on validation clip
     return page
 
 
-# Hyper-parameters -----------------------------------------------------------------------------------------------------
+# Hyperparameters ------------------------------------------------------------------------------------------------------
 
 
 class Table(NamedTuple):
@@ -57,7 +57,7 @@ class Table(NamedTuple):
 
 
 def published_tables() -> list[Table]:
-    """The hyperparameters of the papers, from published.yaml."""
+    """Returns the hyperparameters of the papers, from published.yaml."""
     published = read_yaml(PUBLISHED)
     tables = []
     for page in published["hyperparameters"]["pages"]:
@@ -72,7 +72,7 @@ def published_tables() -> list[Table]:
 
 
 def printed(text: str) -> Any:
-    """Returns the value of a printed one: 1,000 is a number, "0.9, 0.999" two of them."""
+    """Returns the value of a printed text: 1,000 is a number, "0.9, 0.999" two numbers."""
     if ", " in text:
         return tuple(map(printed, text.split(", ")))
     number = text.removesuffix(" words").replace(",", "")
@@ -84,11 +84,11 @@ TABLES = published_tables()
 DEVIATIONS = {
     ("humanml3d/mdm_unet", "parameters"): "no code is public; the widths are chosen to come close",
 }
-"""Where a recipe leaves what the paper says, by (recipe, key), and why."""
+"""Deviations of recipes from their papers, by (recipe, key), with the reason."""
 
 
 def same(ours: Any, papers: Any) -> bool:
-    """Whether a value is the paper's, as far as the paper's digits go."""
+    """Returns whether a value agrees with the paper's, to the paper's digits."""
     if isinstance(papers, float) and isinstance(ours, float):
         digits = len(f"{papers}".partition(".")[2]) if papers > 1 else 12
         return round(ours, digits) == papers
@@ -96,13 +96,13 @@ def same(ours: Any, papers: Any) -> bool:
 
 
 def hyperparameters_page() -> str:
-    """The papers' tables of hyper-parameters, filled from the recipes."""
+    """Returns the page of the papers' hyperparameter tables, filled from the recipes."""
     page = f"""# Hyperparameters
 
 {HEAD}
-What the recipes say, in the order of the papers' tables. In bold: the paper gives this value, too. Where the two
-differ, both stand there. The rest is what the papers leave open, mostly the value of the authors' code; "–": there is
-no such thing. Text encoders go by the id of their checkpoint; where a paper names the kind alone (MFM: CLIP, T5; MDM:
+Values of the recipes, in the order of the papers' tables. Bold: the paper gives the same value. If the two differ,
+both are shown. The other values are not in the papers; most are those of the authors' code. "–": the recipe has no
+such value. Text encoders go by the id of their checkpoint; where a paper names the kind alone (MFM: CLIP, T5; MDM:
 sentence-BERT), the checkpoint is our choice.
 """
     for table in TABLES:
@@ -113,10 +113,10 @@ sentence-BERT), the checkpoint is our choice.
         for key in rows:
             cells = [_cell(ours.get(key), table.columns[name].get(key)) for name, ours in columns.items()]
             page += f"| {LABELS[key]} | {' | '.join(cells)} |\n"
-    page += "\n## Where a recipe leaves its paper\n\n"
+    page += "\n## Deviations from the papers\n\n"
     for (name, key), reason in DEVIATIONS.items():
         page += f"- `{name}`, {LABELS[key]}: {reason}.\n"
-    return page + "\nWhat the tables of the papers do not show stands in [recipes.md](recipes.md).\n"
+    return page + "\n[Recipes](recipes.md) lists deviations that the tables of the papers do not cover.\n"
 
 
 def _cell(ours: Any, papers: Any) -> str:

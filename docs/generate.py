@@ -33,7 +33,8 @@ def recipes_page() -> str:
 {HEAD}
 Each row of the papers' tables that FLAME, MDM or MFM fill has a recipe: `make train EXP=humanml3d/mdm`. "Those of mdm"
 are the deviations of the recipe `mdm` in the same folder. Some deviations hold for all recipes: a batch contains
-motions of about the same length, every sample of a batch has the same weight, and checkpoints are chosen on validation clips.
+motions of about the same length, every sample of a batch has the same weight, and checkpoints are chosen on validation
+clips.
 """
     folder = None
     for name in sorted(recipes(), key=lambda name: ("/" in name, name)):

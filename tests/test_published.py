@@ -214,6 +214,21 @@ def test_small_models_say_what_they_predict():
             assert name != "synthetic" or f"| {row['label']} <sup>a</sup> | {prediction} |" in page
 
 
+@pytest.mark.parametrize("name", sorted(path.stem for path in (EXPERIMENTS / "evaluation").glob("*.yaml")))
+def test_protocols_cite_tables_of_their_task(name):
+    text = (EXPERIMENTS / "evaluation" / f"{name}.yaml").read_text()
+    head = re.sub(r"\n# ", " ", text.partition("_target_")[0])
+    for paper, numbers in re.findall(r"(FLAME|MDM|MFM)(?:,|'s) tables? (\d(?:(?:,| and| to) \d)*)", head):
+        for number in re.findall(r"\d", numbers):
+            parts = SPECS[f"{paper.lower()}_{number}"]["parts"].values()
+            tasks = {
+                yaml.safe_load((EXPERIMENTS / "evaluation" / f"{p['protocol']}.yaml").read_text())["condition"]
+                for p in parts
+                if "protocol" in p
+            }
+            assert tasks == {yaml.safe_load(text)["condition"]}, f"{paper}, table {number}"
+
+
 def test_arrows_are_those_of_the_paper():
     assert SPECS["mdm_5"]["parts"]["HumanAct12"]["columns"]["Diversity"]["better"] == "higher"
 

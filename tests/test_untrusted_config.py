@@ -347,6 +347,7 @@ def test_odd_recipes(attacked, trained, changed, bad):
     cases = [("config__" + part, value) for part in ("task", "denoiser", "process") for value in (None, 3, [], {})]
     cases += [("config__run", "x"), ("config__data_root", []), ("config__experiment", 3), ("facts__dataset", 3)]
     cases += [("config__representation", "x"), ("facts__actions", [1]), ("facts__fingerprint", [])]
+    cases += [("facts__training", "x"), ("facts__training", {"hours": "x"})]
     for key, value in cases:
         path = changed(**{key: value})
         attacked("sample", f"ckpt={path}", TEXT, says="damaged")

@@ -17,7 +17,7 @@ from typing_extensions import TypedDict
 from flame_mdm.config import current_names, plain
 from flame_mdm.errors import UserError
 from flame_mdm.files import atomic_write, parse_json, read_torch
-from flame_mdm.runs import check_shape
+from flame_mdm.runs import Number, check_shape
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -88,6 +88,7 @@ class _Facts(TypedDict):
     max_frames: int
     dataset: NotRequired[str]  # of released extractors, nobody told
     fingerprint: NotRequired[str | None]
+    training: NotRequired[dict[str, Number]]
 
 
 class _Model(TypedDict):

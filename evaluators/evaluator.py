@@ -45,6 +45,7 @@ class Motions:
         groups: names of the prompts, where several motions have the same one.
         asked: attributes asked for, where the data has them.
         edit: what was kept of real motions, as `region` and `joints` of `flame_mdm.editing.kept_parts`.
+        references: of real motions, the joints (F', J, 3) at the frame rate of the recording, where the data has them.
     """
 
     ids: list[str]
@@ -55,6 +56,7 @@ class Motions:
     groups: list[str] | None = None
     asked: list[Mapping[str, Any]] | None = None
     edit: Mapping[str, Any] | None = None
+    references: list[np.ndarray] | None = None
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -129,10 +131,21 @@ class Evaluator:
             rows["groups"] = self._keys(motions.groups)
         if motions.asked is not None and all("action" in asked for asked in motions.asked):
             rows["asked"] = [{k: v for k, v in asked.items() if k in ATTRIBUTES} for asked in motions.asked]
+        if motions.references is not None:
+            rows["references"] = [torch.from_numpy(joints) for joints in motions.references]
         kept = None
         if motions.edit is not None:
             kept = [kept_parts(self.representation, len(motion), **motions.edit)[1] for motion in joints]
         return Extracted(rows, joints, kept)
+
+    @torch.no_grad()
+    def reference(self) -> Extracted | None:
+        """The features of the real motions that belong to the extractor; None = sets are compared with the data's."""
+        features = self.extractor.reference() if self.extractor is not None else None
+        if features is None:
+            return None
+        names = [f"reference {number}" for number in range(len(features))]
+        return Extracted({"generated": features, "keys": self._keys(names)}, list(features))
 
     def _keys(self, names: Sequence[str]) -> Tensor:
         return torch.tensor([key(name) for name in names], dtype=torch.long)
@@ -187,6 +200,7 @@ class Evaluator:
                 rows["kept"] = pad_sequence(generated.kept[part], batch_first=True)
             real_joints, real_mask = _pad(paired.joints[part])
             rows |= {"joints": joints, "mask": mask, "real_joints": real_joints, "real_mask": real_mask}
+            rows |= {"references": paired.rows["references"][part]} if "references" in paired.rows else {}
             if "generated" in paired.rows:
                 rows["real"] = paired.rows["generated"][part]
             update_metrics(others, **rows)

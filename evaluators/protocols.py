@@ -18,6 +18,7 @@ from evaluators.metrics.distribution import FrechetMotionDistance
 from evaluators.sources import Baseline, Generator, Row, SampleFolder, Samples, Source, real_motions, shared
 from flame_mdm.config import Config, instantiate
 from flame_mdm.data.datamodule import Clips
+from flame_mdm.data.store import Entry
 from flame_mdm.editing import MFM_STEPS, method_options
 from flame_mdm.errors import UserError
 from flame_mdm.representations import Representation
@@ -62,6 +63,7 @@ class Protocol:
             before they are measured, mirrored at the ends; None = none.
         batch_size: motions at once, of a protocol that measures time: a first batch that is not timed comes before
             them; None = as many as the evaluation says, 64 by default.
+        only: attributes that clips must have to be evaluated on; None = all clips of the split.
         expected: by data set or sha256 of the extractor, the values that real motions of the test split must have:
             metric -> [value, tolerance]. Where they have others, nothing is generated.
 
@@ -85,6 +87,7 @@ class Protocol:
         edit: dict[str, Any] | None = None,
         smoothing: float | None = None,
         batch_size: int | None = None,
+        only: dict[str, Any] | None = None,
         expected: dict[str, dict[str, list[float]]] | None = None,
     ):
         if condition not in ("text", "action", "none"):
@@ -99,7 +102,7 @@ class Protocol:
         self.extractor, self.metrics, self.replications, self.samples = extractor, metrics, replications, samples
         self.real_samples, self.multimodality, self.expected = real_samples, multimodality, expected or {}
         self.edit = edit and {REGION.get(key, key): value for key, value in edit.items()}
-        self.smoothing, self.batch_size = smoothing, batch_size
+        self.smoothing, self.batch_size, self.only = smoothing, batch_size, only or {}
         self.quick, self.sha256 = False, ""
 
     def change(
@@ -161,12 +164,17 @@ class Protocol:
 
     # What is generated ------------------------------------------------------------------------------------------------
 
+    def selected(self, clips: Clips) -> list[Entry]:
+        """The clips of a split that the protocol evaluates on."""
+        return [clip for clip in clips.clips if self.only.items() <= clip.attributes.items()]
+
     def rows(self, clips: Clips, seed: int, replication: int, *, purpose: str = "generated") -> list[Row]:
         """What one replication generates, or, for another purpose, another draw of clips, captions and crops."""
         drawn = () if purpose == "generated" else (purpose,)
-        entries = sorted(clips.clips, key=lambda clip: key("sample", *drawn, seed, replication, clip.id))
+        entries = sorted(self.selected(clips), key=lambda clip: key("sample", *drawn, seed, replication, clip.id))
         if not entries:
-            raise UserError(f"the split has no clip of {clips.crop.shortest()} frames or more to evaluate on")
+            only = "".join(f" and {name}={value}" for name, value in self.only.items())
+            raise UserError(f"the split has no clip of {clips.crop.shortest()} frames or more{only} to evaluate on")
         count = self.samples if purpose == "generated" else self.real_samples
         rows = []
         for number in range(len(entries) if count is None else count):
@@ -261,7 +269,7 @@ class Protocol:
         progress: bool = True,
     ) -> Generator:
         """The source of a model's motions, for one of `world` processes; see `Generator`."""
-        count = self.samples or len(clips)
+        count = self.samples or len(self.selected(clips))
         total = self.replications * count
         if self.multimodality and not self.quick:
             several = self.multimodality
@@ -378,8 +386,14 @@ class Protocol:
         """Returns the rows of a replication, their real motions, and those that sets are compared with."""
         rows = self.rows(clips, seed, replication)
         again = self.rows(clips, seed, replication, purpose="real")
-        paired, real = (evaluator.extract(self.motions(some, real_motions(clips, some))) for some in (rows, again))
-        return rows, paired, real
+        real = evaluator.reference() or evaluator.extract(self.motions(again, real_motions(clips, again)))
+        return rows, self._paired(clips, evaluator, rows), real
+
+    def _paired(self, clips: Clips, evaluator: Evaluator, rows: Sequence[Row]) -> Extracted:
+        """Returns what metrics see of the real motions of rows."""
+        motions = self.motions(rows, real_motions(clips, rows))
+        motions.references = clips.store.references([row.clip.id for row in rows])
+        return evaluator.extract(motions)
 
     def _measure_real(self, clips: Clips, evaluator: Evaluator, seed: int, reasons: dict[str, str]) -> dict[str, Any]:
         """Returns the values of real motions.
@@ -465,7 +479,7 @@ class Protocol:
                 samples = _samples(source, job, world)
                 motions = evaluator.extract(self.motions(rows, self._smoothed(samples.features)))
                 prompts = rows[:: self.multimodality["samples"]]
-                real = evaluator.extract(self.motions(prompts, real_motions(clips, prompts)))
+                real = self._paired(clips, evaluator, prompts)
                 paired = _select(real, [i // self.multimodality["samples"] for i in range(len(rows))])
             values, why = evaluator.score(motions, paired, nothing, key("draws", seed, replication))
             found.append((values, len(motions)))

@@ -57,6 +57,7 @@ class EvaluationRequest:
     representation: Config | None = None
     protocol: str | None = None
     extractor: str | None = None
+    smpl: str | None = None
     split: Split = "test"
     seed: int = 0
     replications: int | None = None
@@ -144,6 +145,7 @@ def _evaluate(request: EvaluationRequest, rank: int, world: int, device: str) ->
     model = load(file, device) if file is not None else None
     data = _data(request, model)
     representation = model.representation if model else data.representation.to(device)
+    skeleton = _skeleton(request, representation)
     clips = data.clips(request.split)
     names = ("replications", "samples", "quick", "multimodality", "batch_size")
     changes = {name: getattr(request, name) for name in names}
@@ -151,7 +153,7 @@ def _evaluate(request: EvaluationRequest, rank: int, world: int, device: str) ->
     protocol, changed = open_protocol(name, clips, representation, model, **changes)
     size = protocol.batch_size or request.batch_size or 64
     extractor = protocol.open_extractor(request.extractor, representation, data.store.info["dataset"])
-    report = _describe(request, protocol, model, data, extractor)
+    report = _describe(request, protocol, model, data, extractor) | {"skeleton": skeleton}
     if model is not None and file is not None:
         names = ("guidance_scale", "sampler", "num_inference_steps", "method", "until")
         sampling = protocol.sampling(model, **{name: getattr(request, name) for name in names})
@@ -208,7 +210,7 @@ def open_protocol(
         UserError: no such protocol, or one that does not fit the clips or the model.
     """
     protocol = load_protocol(name, representation)
-    changed = protocol.change(**changes, clips=len(clips))
+    changed = protocol.change(**changes, clips=len(protocol.selected(clips)))
     protocol.check_data(clips)
     if model is not None:
         check_condition(protocol, model)
@@ -397,6 +399,26 @@ def _describe(
     return report
 
 
+def _skeleton(request: EvaluationRequest, representation: Representation) -> dict[str, Any] | None:
+    """Gives SMPL's own offsets to a representation of its rotations, and returns whose the joints are.
+
+    None for representations that hold the joints themselves.
+
+    Raises:
+        FileNotFoundError, ValueError: no such file, or no SMPL model.
+    """
+    from flame_mdm.data.body_model import load_offsets
+    from flame_mdm.representations.rot6d import Rot6D
+    from flame_mdm.representations.smpl import SMPL
+
+    if not isinstance(representation, SMPL | Rot6D):
+        return None
+    if request.smpl is None:
+        return {"stand_in": True, "smpl_sha256": None}
+    representation.offsets = load_offsets(Path(request.smpl))
+    return {"stand_in": False, "smpl_sha256": sha256(request.smpl)}
+
+
 def _excluded(data: MotionDataModule, split: Split) -> dict[str, int]:
     """Returns how many clips were left out of the data set and of the split, by reason."""
     short = data.clips(split).too_short
@@ -427,6 +449,8 @@ def _show(report: Mapping[str, Any], out: Path) -> None:
         say(f"left out of the data set: {count} {reason}")
     for name, reason in report["not_computed"].items():
         say(f"not computed: {name}: {reason}")
+    if report["skeleton"] and report["skeleton"]["stand_in"]:
+        say("warning: the joints are those of a stand-in skeleton; smpl=FILE, SMPL's model file, gives SMPL's own")
     for reason in report["warnings"]:
         say(f"warning: {reason}")
     for reason in report["invalid_because"]:
@@ -472,6 +496,8 @@ def evaluate_missing(specs: Mapping[str, Config], results: Path, config: Config)
 def _outdated(path: Path, request: Request) -> bool:
     """Whether a result was made of another checkpoint or by another extractor than those that are there now."""
     result = read_result(path)
+    if result.stand_in_skeleton and os.environ.get("FLAME_MDM_SMPL"):
+        return True
     for used, key in ((result.checkpoint, "ckpt"), (result.extractor, "extractor")):
         file = Path(str(request.keys.get(key)))
         if file.is_file() and (used is None or used.sha256 != sha256(file)):

@@ -79,6 +79,7 @@ class Data(Schema):
     fingerprint: str
     frames: Annotated[list[Int], Field(min_length=2, max_length=2)] | None = None
     excluded: dict[str, Int] = {}
+    representation: str = ""
 
 
 class Extractor(Schema):
@@ -103,6 +104,13 @@ class Checkpoint(Schema):
     training_hours: Number | None = None
     training_memory_gib: Number | None = None
     edit: dict[str, Plain] = {}
+
+
+class Skeleton(Schema):
+    """Whose joints SMPL's rotations were given: those of SMPL's model file, or of a stand-in."""
+
+    stand_in: bool
+    smpl_sha256: str | None = None
 
 
 class Cost(Schema):
@@ -135,6 +143,12 @@ class Result(Schema):
     forced: bool = False
     warnings: list[str] = []
     cost: Cost | None = None
+    skeleton: Skeleton | None = None
+
+    @property
+    def stand_in_skeleton(self) -> bool:
+        """Whether joints are those of a stand-in skeleton; results of earlier versions do not say so."""
+        return self.skeleton.stand_in if self.skeleton else self.data.representation in ("smpl147", "rot6d-25")
 
 
 class RunName(Schema):

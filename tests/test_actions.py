@@ -1,9 +1,13 @@
 """HumanAct12 and UESTC, on pickles in the layout of ACTOR's, and the reader of pickles."""
 
 import contextlib
+import hashlib
+import json
 import os
 import pickle
 import pickletools
+import sys
+import types
 from collections import Counter, OrderedDict
 from pathlib import Path
 
@@ -11,8 +15,14 @@ import numpy as np
 import pytest
 import torch
 from fixtures import golden
+from scipy.sparse import csc_matrix
 
+from evaluators.extractors import UnconstrainedExtractor
+from evaluators.extractors.action_gru import ActionGRU
+from evaluators.extractors.stgcn import UNCONSTRAINED_JOINTS, Unconstrained
+from flame_mdm.__main__ import main
 from flame_mdm.data import humanact12, restricted_pickle, uestc
+from flame_mdm.data.body_model import load_offsets
 from flame_mdm.data.crops import Fixed
 from flame_mdm.data.datamodule import MotionDataModule
 from flame_mdm.data.humanact12 import HumanAct12, read_unconstrained
@@ -20,6 +30,8 @@ from flame_mdm.data.store import write_store
 from flame_mdm.data.uestc import TRAIN_SUBJECTS, UESTC, front_view
 from flame_mdm.representations import rotation
 from flame_mdm.representations.rot6d import Rot6D
+from flame_mdm.representations.skeleton import SMPL24
+from flame_mdm.runs import read_result
 
 # Pickles
 
@@ -254,6 +266,117 @@ def test_the_unconstrained_reference_is_read(tmp_path: Path):
     (tmp_path / "x.npy").write_bytes(b"PK")
     with pytest.raises(ValueError, match=r"x\.npy: damaged"):
         read_unconstrained(tmp_path / "x.npy")
+
+
+def features_of(extractor: UnconstrainedExtractor, motion: torch.Tensor) -> torch.Tensor:
+    mask = torch.ones(motion.shape[:2], dtype=torch.bool)
+    with torch.no_grad():
+        return extractor.motions(motion, motion, mask)["features"]
+
+
+def test_unconditioned_motions_are_compared_with_the_reference_motions(tmp_path: Path, capsys):
+    """24 joints as models generate them, y up, and the same as the 15 of the file, y down and not from the pelvis."""
+    torch.manual_seed(0)
+    motion = torch.randn(70, 20, 24, 3)
+    shown = (motion[:, :, list(UNCONSTRAINED_JOINTS)] * torch.tensor([1.0, -1.0, -1.0]) + 3).permute(0, 2, 3, 1)
+    folder = tmp_path / "assets"
+    folder.mkdir()
+    torch.save(Unconstrained().state_dict(), folder / "humanact12_gru_modi_struct.pth.tar")
+    with pytest.raises(FileNotFoundError, match=r"it lacks humanact12_unconstrained_modi_struct\.npy"):
+        UnconstrainedExtractor(str(folder))
+    np.save(
+        folder / "humanact12_unconstrained_modi_struct.npy", np.pad(shown.numpy(), ((0, 0), (0, 3), (0, 0), (0, 0)))
+    )
+    extractor = UnconstrainedExtractor(str(folder))
+    with torch.no_grad():
+        torch.testing.assert_close(extractor.reference(), features_of(extractor, motion), atol=1e-5, rtol=1e-4)
+
+    write_humanact12(tmp_path / "raw")
+    raw = ["data=humanact12_unconstrained", f"data_root={tmp_path}"]
+    assert main(["prepare", *raw, f"source={tmp_path / 'raw'}"]) == 0
+    words = ["evaluate", "baseline=real", *raw, f"extractor={folder}", "quick=true", f"out={tmp_path / 'result.json'}"]
+    results = []
+    for scale in (1.0, 3.0):
+        np.save(folder / "humanact12_unconstrained_modi_struct.npy", scale * shown.numpy())
+        assert main([*words, "protocol=unconditioned_humanact12_version_2"]) == 0
+        results.append(json.loads((tmp_path / "result.json").read_text()))
+    first, second = (result["values"]["fid"]["mean"] for result in results)
+    assert first != pytest.approx(second, rel=0.1), "the reference motions are not looked at"
+    assert results[0]["extractor"]["sha256"] != results[1]["extractor"]["sha256"]
+
+
+def smpl_model(seed: int = 0, **changed) -> dict:
+    """The arrays of SMPL's model file that count, and one that does not."""
+    rng = np.random.default_rng(seed)
+    regressor = rng.random((24, 50)) * (rng.random((24, 50)) < 0.3)
+    parents = np.array([[2**32 - 1, *SMPL24.parents[1:]], range(24)])
+    model = {"J_regressor": regressor, "v_template": rng.normal(size=(50, 3)), "kintree_table": parents}
+    return model | {"bs_style": "lbs"} | changed
+
+
+def test_smpls_offsets_come_from_its_file_without_running_code(tmp_path: Path, monkeypatch):
+    model = smpl_model()
+    np.savez(tmp_path / "SMPL.npz", **model)
+    wanted = model["J_regressor"] @ model["v_template"]
+    offsets = np.array(load_offsets(tmp_path / "SMPL.npz"))
+    np.testing.assert_allclose(offsets[1:], (wanted - wanted[list(SMPL24.parents)])[1:])
+    np.testing.assert_allclose(offsets[0], wanted[0])
+    chumpy = types.ModuleType("chumpy.ch")
+    chumpy.Ch = type("Ch", (), {"__module__": "chumpy.ch", "__init__": lambda self, x: self.__dict__.update(x=x)})
+    with monkeypatch.context() as patch:
+        patch.setitem(sys.modules, "chumpy.ch", chumpy)
+        patch.setitem(sys.modules, "chumpy", types.ModuleType("chumpy"))
+        parts = {"J_regressor": csc_matrix(model["J_regressor"]), "v_template": chumpy.Ch(model["v_template"])}
+        for protocol in (0, 2, 4):
+            written(tmp_path / f"SMPL_{protocol}.pkl", model | parts, protocol)
+    for protocol in (0, 2, 4):
+        path = tmp_path / f"SMPL_{protocol}.pkl"
+        np.testing.assert_allclose(load_offsets(path), offsets)
+        with pytest.raises(ValueError, match=r"it names (scipy|copy_?reg)"):
+            restricted_pickle.read(path)
+    path = written(tmp_path / "bad.pkl", smpl_model(v_template=Attack(os.mkdir, str(tmp_path / "run"))))
+    with pytest.raises(ValueError, match=r"not a SMPL model of 24 joints: .*it names posix\.mkdir"):
+        load_offsets(path)
+    assert not (tmp_path / "run").exists()
+    for changed in ({"J_regressor": np.ones((52, 50))}, {"v_template": 3}, {"kintree_table": np.zeros((2, 24))}):
+        with pytest.raises(ValueError, match=r"bad\.pkl: not a SMPL model of 24 joints"):
+            load_offsets(written(path, smpl_model(**changed)))
+
+
+def test_arrays_of_python_2_are_read(tmp_path: Path):
+    numbers = np.array([1.5, -2.5])
+    head = b"\x80\x02cnumpy.core.multiarray\n_reconstruct\ncnumpy\nndarray\nK\x00\x85U\x01b\x87R(K\x01K\x02\x85"
+    dtype = b"cnumpy\ndtype\nU\x02f8K\x00K\x01\x87R(K\x03U\x01<NNNJ\xff\xff\xff\xffJ\xff\xff\xff\xffK\x00tb"
+    (tmp_path / "x.pkl").write_bytes(head + dtype + b"\x89U\x10" + numbers.tobytes() + b"tb.")
+    np.testing.assert_array_equal(restricted_pickle.read(tmp_path / "x.pkl"), numbers)
+
+
+def test_classifiers_see_smpls_joints_or_the_result_says_that_they_do_not(tmp_path: Path, capsys):
+    write_humanact12(tmp_path / "raw")
+    raw = ["data=humanact12", f"data_root={tmp_path}"]
+    assert main(["prepare", *raw, f"source={tmp_path / 'raw'}"]) == 0
+    np.savez(tmp_path / "SMPL.npz", **smpl_model())
+    torch.save({"model": ActionGRU().state_dict()}, tmp_path / "gru.tar")
+    words = ["evaluate", "baseline=real", *raw, f"extractor={tmp_path / 'gru.tar'}", "quick=true"]
+    results = []
+    for smpl in ([], [f"smpl={tmp_path / 'SMPL.npz'}"]):
+        out = tmp_path / f"{len(smpl)}.json"
+        assert main([*words, "protocol=action_to_motion", f"out={out}", *smpl]) == 0
+        results.append(json.loads(out.read_text()))
+        assert read_result(out).stand_in_skeleton == (not smpl)
+        assert ("stand-in skeleton" in capsys.readouterr().out) == (not smpl)
+    digest = hashlib.sha256((tmp_path / "SMPL.npz").read_bytes()).hexdigest()
+    assert [result["skeleton"] for result in results] == [
+        {"stand_in": True, "smpl_sha256": None},
+        {"stand_in": False, "smpl_sha256": digest},
+    ]
+    one, other = (result["values"]["diversity"]["mean"] for result in results)
+    assert one != pytest.approx(other, rel=1e-3), "the classifier sees the same joints"
+    assert main([*words, "protocol=action_to_motion", "smpl=absent.pkl"]) == 1
+    assert "absent.pkl: no such file" in capsys.readouterr().err
+    del results[0]["skeleton"]
+    out.write_text(json.dumps(results[0]))
+    assert read_result(out).stand_in_skeleton, "results of earlier versions"
 
 
 # UESTC

@@ -8,9 +8,11 @@ import torch
 from fixtures import golden
 from t2m_folder import line, write_folder
 
+from evaluators.metrics.reconstruction import PARTS, temos_parts
+from flame_mdm.__main__ import main
 from flame_mdm.config import compose, instantiate
 from flame_mdm.data.kit import KIT, KITTemos, read_joints
-from flame_mdm.data.store import write_store
+from flame_mdm.data.store import Store, write_store
 from flame_mdm.errors import UserError
 from flame_mdm.representations.humanml import HumanML
 from flame_mdm.representations.rifke import Rifke
@@ -129,6 +131,57 @@ def test_temos_motions_become_a_store(mmm, tmp_path):
     np.testing.assert_allclose(store.std, np.where(training.std(0) > 0, training.std(0, ddof=1), 1), rtol=1e-6)
     assert kit.counts() == {"motions": 8, "texts": 14, "train": 5, "val": 1, "test": 2, "ghosh_test": 1}
     assert kit.counts().keys() == KITTemos.published.keys()
+
+
+def evaluated(mmm, out, protocol, *words):
+    """Exit code of evaluating real motions on the prepared files, with their splits."""
+    raw = [f"data.source.splits={mmm.parent / 'kit-splits'}", f"data_root={mmm.parent / 'data'}"]
+    if not (mmm.parent / "data").exists():
+        assert main(["prepare", "data=kit_temos", f"source={mmm}", *raw]) == 0
+    return main(["evaluate", "baseline=real", "data=kit_temos", *raw, f"protocol={protocol}", f"out={out}", *words])
+
+
+def test_version_2_compares_with_the_recordings_of_520_clips_at_100_fps(mmm, tmp_path, capsys):
+    out = tmp_path / "result.json"
+    assert evaluated(mmm, out, "reconstruction_kit_version_2") == 0
+    result = json.loads(out.read_text())
+    assert (result["protocol"]["name"], result["protocol"]["version"]) == ("reconstruction_kit", 2)
+    recording = torch.from_numpy(walk(161)).float().double()  # of 00008, the only clip in ghosh-test
+    motion = Rifke().decode(Rifke().encode(recording[::8] / 640)) * 640
+    times = np.arange(161) / 8
+    joints = np.stack([np.interp(times, np.arange(21), x) for x in motion.flatten(1).numpy().T], 1)
+    parts = [temos_parts(x) for x in (torch.from_numpy(joints.reshape(161, 21, 3)), recording)]
+    apart = {name: (parts[0][name] - parts[1][name]).norm(dim=-1).mean().item() / 1000 for name in PARTS}
+    assert 1e-4 < apart["root"] < 0.01
+    for name, value in apart.items():
+        for kind in ("values", "ground_truth"):
+            found = result[kind][f"temos/ape_{name}"]
+            assert found["n"] == 1, "all 587 clips, of which 520 are compared"
+            assert found["mean"] == pytest.approx(value, rel=0.02, abs=1e-6)
+    assert evaluated(mmm, out, "reconstruction_kit") == 0
+    before = json.loads(out.read_text())["values"]["temos/ape_root"]
+    assert (before["mean"], before["n"]) == (0, 2)
+    assert evaluated(mmm, out, "reconstruction_kit_version_2", "split=val") == 1
+    assert "no clip of 1 frames or more and ghosh_test=True" in capsys.readouterr().err
+
+
+def test_stores_without_recordings_are_prepared_again_for_version_2(mmm, tmp_path, capsys):
+    assert evaluated(mmm, tmp_path / "a.json", "reconstruction_kit") == 0
+    store = Store(mmm.parent / "data" / "kit-temos-rifke")
+    store.verify()
+    path = store.folder / "references.npz"
+    content = path.read_bytes()
+    path.write_bytes(content[:-1])
+    with pytest.raises(ValueError, match=r"references\.npz: damaged: its hash"):
+        store.verify()
+    assert evaluated(mmm, tmp_path / "a.json", "reconstruction_kit_version_2") == 1
+    assert "references.npz: damaged: its hash" in capsys.readouterr().err
+    path.unlink()
+    del store.info["sha256"]["references.npz"]
+    (store.folder / "store.json").write_text(json.dumps(store.info))
+    Store(store.folder).verify()
+    assert evaluated(mmm, tmp_path / "a.json", "reconstruction_kit_version_2") == 1
+    assert "Prepare the data set again with force=true" in capsys.readouterr().err
 
 
 @pytest.mark.golden

@@ -148,6 +148,8 @@ def extracted(path: str) -> tuple[str, str]:
         return "MotionCLIPExtractor", recipe(trained({"ckpt": path}))["data"]["name"]
     if path.startswith("assets/t2m/"):
         return "T2MExtractor", Path(path).name
+    if path == "assets/humanact12":
+        return "UnconstrainedExtractor", "humanact12"
     return ("ClassifierExtractor", Path(path).parent.name) if path else ("", "")
 
 

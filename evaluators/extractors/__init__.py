@@ -13,10 +13,11 @@ from torch import Tensor
 from evaluators.extractors.action_gru import ActionGRU, load_action_gru
 from evaluators.extractors.classifier import ClassifierTask
 from evaluators.extractors.motion_clip import MotionCLIPTask
-from evaluators.extractors.stgcn import load_uestc, load_unconstrained
+from evaluators.extractors.stgcn import Unconstrained, load_uestc, load_unconstrained
 from evaluators.extractors.t2m import WordVectors, load_t2m
 from evaluators.extractors.t2m_training import T2MTask
 from flame_mdm.checkpoints.loading import find, load_task
+from flame_mdm.data.humanact12 import read_unconstrained
 from flame_mdm.errors import UserError
 from flame_mdm.files import sha256
 from flame_mdm.representations import Representation
@@ -58,6 +59,10 @@ class Extractor(ABC):
 
     def texts(self, captions: Sequence[str], tokens: Sequence[Sequence[str] | None]) -> Tensor | None:
         """(B, E) features of captions; None where the network reads no text. `tokens` are "word/PART", if known."""
+        return None
+
+    def reference(self) -> Tensor | None:
+        """(N, E) features of real motions that belong to the network, to compare sets with; None = the data set's."""
         return None
 
 
@@ -254,6 +259,39 @@ class ClassifierExtractor(Extractor):
     def _start(self, use: str, name: str) -> Tensor:
         assert isinstance(self.network, ActionGRU)
         return self.network.random_state(1, torch.Generator().manual_seed(key(use, name)))
+
+
+class UnconstrainedExtractor(ClassifierExtractor):
+    """The classifier of unconstrained HumanAct12 with its reference motions, from a folder of the two files in `FILES`.
+
+    Args:
+        path: the folder.
+        device: to compute on.
+
+    Raises:
+        FileNotFoundError, UserError, ValueError: a file is missing, or is another one.
+    """
+
+    FILES = ("humanact12_gru_modi_struct.pth.tar", "humanact12_unconstrained_modi_struct.npy")
+
+    def __init__(self, path: str, device: str | torch.device = "cpu"):
+        weights, motions = (Path(path) / name for name in self.FILES)
+        missing = [file.name for file in (weights, motions) if not file.is_file()]
+        if missing:
+            raise FileNotFoundError(
+                f"{path}: not a folder of the unconstrained reference, it lacks {', '.join(missing)}"
+            )
+        super().__init__("humanact12_unconstrained", str(weights), device)
+        self.real = torch.from_numpy(read_unconstrained(motions)).to(device)
+        self.sha256 = hashlib.sha256((self.sha256 + sha256(motions)).encode()).hexdigest()
+
+    def reference(self) -> Tensor:
+        """(N, 256) features of the reference motions."""
+        assert isinstance(self.network, Unconstrained)
+        batches = self.real.split(64)
+        masks = [torch.ones(batch.shape[:2], dtype=torch.bool, device=batch.device) for batch in batches]
+        found = [self.network.published(batch, mask) for batch, mask in zip(batches, masks, strict=True)]
+        return torch.cat(found).float().cpu()
 
 
 class OwnClassifierExtractor(_OwnExtractor):

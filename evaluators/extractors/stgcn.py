@@ -137,8 +137,11 @@ class Unconstrained(STGCN):
 
     def forward(self, x: Tensor, mask: Tensor) -> Tensor:
         """(B, 256) features of joints (B, F, 24, 3), metres, y up; seen from the pelvis, and y down as published."""
-        x = (x - x[:, :, :1])[:, :, list(UNCONSTRAINED_JOINTS)]
-        return super().forward(x * x.new_tensor([1.0, -1.0, -1.0]), mask)
+        return self.published(x[:, :, list(UNCONSTRAINED_JOINTS)] * x.new_tensor([1.0, -1.0, -1.0]), mask)
+
+    def published(self, x: Tensor, mask: Tensor) -> Tensor:
+        """(B, 256) features of the 15 joints (B, F, 15, 3) of the published reference motions, y down."""
+        return super().forward(x - x[:, :, 8:9], mask)
 
 
 class JointSTGCN(STGCN):

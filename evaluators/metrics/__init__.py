@@ -15,6 +15,7 @@ Every `update` takes some of these tensors by name. A batch holds B generated an
 | kept | (B, F, J) bool | True = this joint of this frame was to be kept, where motions are edits |
 | keys | (B,) int64 | keys of generated motions, no two the same |
 | real, real_joints, real_mask, real_keys | as above | the same of real motions |
+| references | B of (F', J, 3) | the real motions at the frame rates of their recordings |
 
 A key is `flame_mdm.seeds.key` of an id (and the number of the sample, where there are several). Metrics that compare
 motion by motion (MID, position and displacement errors) take real motions in the order of the generated ones.

@@ -9,8 +9,9 @@ import torch
 from torch import Tensor
 
 from evaluators.metrics.samples import SampleMetric, by_group, real_frames
+from flame_mdm.errors import UserError
 from flame_mdm.representations import rotation
-from flame_mdm.representations.rifke import Rifke
+from flame_mdm.representations.rifke import Rifke, upsample
 
 PARTS = ("root", "trajectory", "mean_local", "mean_global")
 
@@ -57,14 +58,16 @@ class _PositionErrors(SampleMetric):
     Args:
         samples: motions a text. Of several, the best and the worst count, as in TEMOS: those with the smallest and the
             largest APE of the root, from which all other values are taken, too.
+        upsampling: frames of a recording per frame of a motion. Above 1, motions are interpolated and compared with
+            the recordings.
         kwargs: options of `torchmetrics.Metric`.
     """
 
     higher_is_better = False
 
-    def __init__(self, samples: int = 1, **kwargs: Any):
+    def __init__(self, samples: int = 1, upsampling: int = 1, **kwargs: Any):
         super().__init__(("keys", "groups", "position", "variance", "frames"), **kwargs)
-        self.samples = samples
+        self.samples, self.upsampling = samples, upsampling
 
     def update(
         self,
@@ -74,17 +77,27 @@ class _PositionErrors(SampleMetric):
         real_mask: Tensor,
         keys: Tensor,
         groups: Tensor | None = None,
+        references: Sequence[Tensor] | None = None,
     ) -> None:
         """Adds generated motions (B, F, J, 3) and the real ones in the same order (B, F', J, 3), with their masks.
 
         Both are compared up to the end of the shorter. `groups` are the keys of the prompts, of several motions each.
+        `references` are the real ones (F', J, 3) at the frame rate of their recordings.
 
         Raises:
             ValueError: a motion has fewer than two frames.
+            UserError: no references, although motions are compared at the frame rate of the recordings.
         """
         rows, name = [], type(self).__name__
-        motions = zip(real_frames(name, joints, mask), real_frames(name, real_joints, real_mask), strict=True)
-        for motion, real in motions:
+        generated, real_motions = real_frames(name, joints, mask), real_frames(name, real_joints, real_mask)
+        if self.upsampling > 1:
+            if references is None:
+                raise UserError(
+                    f"{name}: the store has no recordings at their own frame rate. Prepare the data set again with "
+                    "force=true"
+                )
+            generated, real_motions = [upsample(motion, self.upsampling) for motion in generated], list(references)
+        for motion, real in zip(generated, real_motions, strict=True):
             a, b = self.parts(motion.double()), self.parts(real.double())
             length = min(len(a["root"]), len(b["root"]))
             self.need(length, 2, "frames of a motion")
@@ -144,11 +157,12 @@ class TemosPositionErrors(_PositionErrors):
 
     APE: distance of `temos_parts`, joints averaged; mean over all frames of all clips. AVE: distance of variances over
     time (n - 1 in the denominator) of each coordinate, joints averaged; mean over clips. Both are in units of 1000 KIT
-    units, which the tables call metres and which are 1.56 m. TEMOS compares at 100 frames a second.
+    units, which the tables call metres and which are 1.56 m. TEMOS compares at 100 frames per second:
+    `upsampling=8`.
 
     Args:
         units_per_metre: KIT's units in the metres of `joints`, as the KIT representations have it.
-        kwargs: `samples` motions a text, see `_PositionErrors`; options of `torchmetrics.Metric`.
+        kwargs: `samples` and `upsampling`, see `_PositionErrors`; options of `torchmetrics.Metric`.
     """
 
     def __init__(self, units_per_metre: float = 640.0, **kwargs: Any):

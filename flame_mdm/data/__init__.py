@@ -31,6 +31,7 @@ class Clip:
             features are stored unchanged. If empty, `motion` is raw.
         window: (first, length): the clip is this cut of its motion. Consecutive clips with the identical array object
             share its frames in the store. Only for representations with one row per frame.
+        reference: (F', J, 3) joints in meters at the frame rate of the recording, for protocols that compare at it.
     """
 
     id: str
@@ -42,6 +43,7 @@ class Clip:
     attributes: Mapping[str, Any] = field(default_factory=dict)
     encoded: str = ""
     window: tuple[int, int] | None = None
+    reference: np.ndarray | None = None
 
 
 PLACES = frozenset({"path", "amass", "body_models", "humanact12", "index", "splits", "workers"})

@@ -124,13 +124,15 @@ class KITTemos(MotionSource):
                 limit = f"shorter than {self.shortest}" if frames < self.shortest else f"longer than {self.longest}"
                 self._excluded[f"motions of {split} {limit} frames"] += 1
                 continue
+            recording = read_joints(self.path / f"{name}_fke.csv", 1 if split == "test" else 8)
             yield Clip(
                 id=name,
-                motion=read_joints(self.path / f"{name}_fke.csv"),
+                motion=recording[::8] if split == "test" else recording,
                 captions=self.texts[name][:1] if split == "test" else self.texts[name],
                 split=split,
                 source=name,
                 attributes={"ghosh_test": name in ghosh},
+                reference=recording if split == "test" else None,
             )
 
     def excluded(self) -> dict[str, int]:
@@ -159,8 +161,8 @@ class KITTemos(MotionSource):
         return read_text(file).split()
 
 
-def read_joints(path: Path) -> np.ndarray:
-    """Reads every eighth frame of `NUMBER_fke.csv`: joints (F, 21, 3) float32 in meters, y up.
+def read_joints(path: Path, step: int = 8) -> np.ndarray:
+    """Reads every `step`-th frame of `NUMBER_fke.csv`: joints (F, 21, 3) float32 in meters, y up.
 
     A row contains its number and 63 coordinates in KIT's unit, about 1/640 of a meter.
 
@@ -170,7 +172,7 @@ def read_joints(path: Path) -> np.ndarray:
     regular_file(path, TEXT_LIMIT)
     with path.open(encoding="utf-8") as file:
         try:
-            rows = np.loadtxt(islice(file, 1, None, 8), delimiter=",", ndmin=2)
+            rows = np.loadtxt(islice(file, 1, None, step), delimiter=",", ndmin=2)
         except ValueError as error:
             raise ValueError(f"{path}: damaged: {error}; exclude the motion by its number") from error
     if rows.shape[1] != 64 or not len(rows):

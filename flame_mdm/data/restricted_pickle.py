@@ -36,6 +36,10 @@ KEYS = (str, bytes, int, float, np.integer, np.floating, type(None))
 hash, which makes reading quadratic."""
 
 
+OBJECTS = frozenset({"copy_reg._reconstructor", "copyreg._reconstructor", "__builtin__.object", "builtins.object"})
+"""What pickles of old protocols name to make an object of a class."""
+
+
 class _DType:
     """Placeholder of a dtype: a code such as f4, then the byte order."""
 
@@ -73,6 +77,16 @@ ALLOWED: dict[str, Any] = {
 refers to the method `make_NAME` of `_ArrayUnpickler`."""
 
 
+class _Opaque:
+    """Stands for an object of a class that is not loaded. Only its state is kept."""
+
+    def __init__(self, *_: Any):
+        self.state: Any = None
+
+    def __setstate__(self, state: Any) -> None:
+        self.state = state
+
+
 class _File:
     """A file whose reads must not request more bytes than are left."""
 
@@ -100,8 +114,9 @@ class _ArrayUnpickler(pickle._Unpickler):
     append: Callable[[Any], None]
     read: Callable[[int], bytes]
 
-    def __init__(self, file: IO[bytes], size: int):
-        super().__init__(_File(file, size))
+    def __init__(self, file: IO[bytes], size: int, opaque: tuple[str, ...] = ()):
+        super().__init__(_File(file, size), encoding="latin1")  # as Python 2 wrote the bytes of arrays
+        self.opaque = opaque
         self.size, self.budget = size, max(ARRAYS_LIMIT, INFLATION * size)
         self.nodes = max(MAX_NODES, size)
         self.depths: dict[int, tuple[int, tuple]] = {}
@@ -115,6 +130,8 @@ class _ArrayUnpickler(pickle._Unpickler):
 
     def find_class(self, module_name: str, global_name: str, /) -> Any:
         name = f"{module_name}.{global_name}"
+        if self.opaque and (name.startswith(self.opaque) or name in OBJECTS):
+            return _Opaque
         if name not in ALLOWED:
             raise pickle.UnpicklingError(
                 f"it names {name[:200]}, but only arrays, numbers, text and plain containers are read (anything else "
@@ -156,6 +173,7 @@ class _ArrayUnpickler(pickle._Unpickler):
     def _array(self, dtype: _DType, data: Any, shape: Sequence[int], order: Any) -> np.ndarray:
         """Returns an array of this type and shape from bytes or a list of objects."""
         if dtype.dtype != object:
+            data = data.encode("latin1") if isinstance(data, str) else data
             self._spend(len(data))
             return np.frombuffer(data, dtype.dtype).reshape(shape, order=order).copy()
         if math.prod(shape) != len(data):
@@ -174,6 +192,8 @@ class _ArrayUnpickler(pickle._Unpickler):
         if isinstance(value, _Array):
             _, shape, dtype, is_fortran, data = value.state
             return self._array(dtype, data, shape, "F" if is_fortran else "C")
+        if isinstance(value, _Opaque):
+            return self._plain(value.state)
         if isinstance(value, dict):
             return {self._plain(key): self._plain(item) for key, item in value.items()}
         if isinstance(value, (list, tuple)):
@@ -181,7 +201,7 @@ class _ArrayUnpickler(pickle._Unpickler):
         return value
 
     def _load_build(self) -> None:
-        if not isinstance(self.stack[-2], (_DType, _Array)):
+        if not isinstance(self.stack[-2], (_DType, _Array, _Opaque)):
             raise pickle.UnpicklingError("it sets attributes of an object that is not an array")
         super().load_build()  # pyright: ignore[reportAttributeAccessIssue]
 
@@ -245,8 +265,13 @@ _dispatch[pickle.BUILD[0]] = _ArrayUnpickler._load_build
 _dispatch[pickle.BYTEARRAY8[0]] = _ArrayUnpickler._load_bytearray8
 
 
-def read(path: Path) -> Any:
+def read(path: Path, opaque: tuple[str, ...] = ()) -> Any:
     """Returns the content of a pickle of arrays, numbers, text and builtin containers; protocols 0 to 5.
+
+    Args:
+        path: of the file.
+        opaque: beginnings of names whose objects the file may hold, too. Nothing of them is loaded or run: the state of
+            such an object takes its place.
 
     Raises:
         FileNotFoundError: the file does not exist.
@@ -256,7 +281,7 @@ def read(path: Path) -> Any:
     size = regular_file(path)
     with path.open("rb") as file:
         try:
-            return _ArrayUnpickler(file, size).content()
+            return _ArrayUnpickler(file, size, opaque).content()
         except RecursionError as error:
             raise ValueError(f"{path}: not read as a pickle: nested too deeply") from error
         except Exception as error:  # a damaged pickle can fail in any way

@@ -5,7 +5,8 @@ A store is a folder that is written once and never changed:
     features.npy     (N, D) float32, the concatenated frames of all clips, not normalized
     clips.jsonl      one clip per line: id, start, length, split, source, captions, action, attributes
     statistics.npz   mean and std (D,) of the training frames, used by the representation for normalization
-    store.json       representation, frame rate, options of the source, counts, hashes of the three files, fingerprint
+    references.npz   joints (F', J, 3) float32 at the frame rate of the recording by id, for clips that have them
+    store.json       representation, frame rate, options of the source, counts, hashes of the other files, fingerprint
 
 Verification adds a report to the folder, `verify.json`.
 """
@@ -16,6 +17,7 @@ import hashlib
 import io
 import json
 import shutil
+import zipfile
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from itertools import islice
@@ -93,14 +95,30 @@ class Store:
         """Returns the features (F, D) float32 of a clip, not normalized: a view of the memory-mapped array."""
         return self.features[clip.start : clip.start + clip.length]
 
-    def verify(self) -> None:
-        """Checks the hash of the packed features; opening the store checks only the other files and the fingerprint.
+    def references(self, ids: Sequence[str]) -> list[np.ndarray] | None:
+        """Returns the joints of clips at the frame rate of their recording; None if a clip has none.
 
         Raises:
-            ValueError: the features have changed since they were written.
+            ValueError: they have changed since they were written.
         """
-        if _sha256(self.folder / "features.npy") != self.info["sha256"].get("features.npy"):
-            raise _damaged(self.folder / "features.npy", "its hash is not the recorded one")
+        if "references.npz" not in self.info["sha256"]:
+            return None
+        self._check("references.npz")
+        found = read_npz(self.folder / "references.npz", only=set(ids))
+        return [found[name] for name in ids] if found.keys() == set(ids) else None
+
+    def verify(self) -> None:
+        """Checks the hashes of the features and references; opening the store checks the other files only.
+
+        Raises:
+            ValueError: one of them has changed since it was written.
+        """
+        for name in {"features.npy"} | ({"references.npz"} & self.info["sha256"].keys()):
+            self._check(name)
+
+    def _check(self, name: str) -> None:
+        if _sha256(self.folder / name) != self.info["sha256"].get(name):
+            raise _damaged(self.folder / name, "its hash is not the recorded one")
 
 
 def write_store(folder: Path, source: MotionSource, representation: Representation) -> Store:
@@ -129,7 +147,12 @@ def _write(folder: Path, source: MotionSource, representation: Representation, t
         entries: list[Entry] = []
         motion, begin, frames = None, 0, 0
         bar = tqdm(source.clips(representation.fps), f"preparing {source.name}", total, unit=" clips")
-        with bar as clips, (partial / "features.npy").open("wb", buffering=0) as file:
+        with (
+            bar as clips,
+            (partial / "features.npy").open("wb", buffering=0) as file,
+            writing(folder, partial),
+            zipfile.ZipFile(partial / "references.npz", "w") as references,
+        ):
             _append(file, folder, _header(frames, representation.features))
             for chunk in _batched(clips, CHUNK):
                 for clip, features in zip(chunk, _encode(chunk, representation), strict=True):
@@ -142,9 +165,14 @@ def _write(folder: Path, source: MotionSource, representation: Representation, t
                         raise ValueError(f"clip {clip.id}: no window {clip.window} in {len(features)} frames")
                     entry = Entry(clip.id, begin + first, length, clip.split, clip.source, clip.captions, clip.action)
                     entries.append(replace(entry, attributes=dict(clip.attributes)))
+                    if clip.reference is not None:
+                        with references.open(f"{clip.id}.npy", "w", force_zip64=True) as member:
+                            np.lib.format.write_array(member, np.asarray(clip.reference, np.float32))
             _check_entries(source.name, entries)
             file.seek(0)
             _append(file, folder, _header(frames, representation.features))
+        if not references.namelist():
+            (partial / "references.npz").unlink()
         packed = np.load(partial / "features.npy", mmap_mode="r")
         mean, std = source.statistics() or _statistics(representation, packed, entries)
         lines = [json.dumps(asdict(entry), ensure_ascii=False, sort_keys=True) for entry in entries]
@@ -255,7 +283,7 @@ def _describe(
         "shape": [frames, representation.features],
         "hours": round(frames / representation.fps / 3600, 3),
         "fingerprint": _fingerprint(folder, representation.name, representation.fps, mean, std),
-        "sha256": {name: _sha256(folder / name) for name in ("features.npy", "clips.jsonl", "statistics.npz")},
+        "sha256": {path.name: _sha256(path) for path in sorted(folder.iterdir())},
     }
 
 

@@ -418,6 +418,7 @@ def _evaluation(result: Result, timed: bool) -> dict[str, str]:
         "seed": f"seed {result.seed}",
         "extractor": f"extractor sha256 {extractor.sha256[:12]}" if extractor else "no extractor",
         "exclusions": _left_out(data.excluded),
+        "skeleton": _joints_of(result),
         "changes": f"differs from the protocol: {changed}" if changed else "",
         "published split": "published split: test clips are also used for training, or there are no validation clips"
         * result.published_split,
@@ -425,6 +426,14 @@ def _evaluation(result: Result, timed: bool) -> dict[str, str]:
         "warnings": "; ".join(result.warnings),
         "quick run": "QUICK, NOT A RESULT" * result.quick,
     }
+
+
+def _joints_of(result: Result) -> str:
+    """Describes the skeleton of joints that were computed from SMPL's rotations."""
+    if result.stand_in_skeleton:
+        return "joints of a stand-in skeleton, whose bones are not SMPL's"
+    smpl = result.skeleton and result.skeleton.smpl_sha256
+    return f"joints of SMPL's model file, sha256 {smpl[:12]}" if smpl else ""
 
 
 def _left_out(excluded: Mapping[str, int]) -> str:

@@ -153,7 +153,8 @@ def _evaluate(request: EvaluationRequest, rank: int, world: int, device: str) ->
     protocol, changed = open_protocol(name, clips, representation, model, **changes)
     size = protocol.batch_size or request.batch_size or 64
     extractor = protocol.open_extractor(request.extractor, representation, data.store.info["dataset"])
-    report = _describe(request, protocol, model, data, extractor) | {"skeleton": skeleton}
+    report = _describe(request, protocol, model, data, extractor)
+    report["skeleton"] = skeleton
     if model is not None and file is not None:
         names = ("guidance_scale", "sampler", "num_inference_steps", "method", "until")
         sampling = protocol.sampling(model, **{name: getattr(request, name) for name in names})

@@ -5,8 +5,16 @@ from pathlib import Path
 
 import numpy as np
 
+from flame_mdm.data.verify import PUBLISHED
+from flame_mdm.files import read_yaml
+
 Texts = Mapping[str, tuple[int, list[str]]]
 """Name -> number of frames, lines of the text file."""
+
+
+def published(name: str) -> dict:
+    """The published figures of a data set."""
+    return read_yaml(PUBLISHED)[name]
 
 
 def line(caption: str, begin: object = 0.0, end: object = 0.0) -> str:

@@ -522,7 +522,7 @@ def test_a_model_of_other_data_is_marked(runs, tmp_path):
 @pytest.mark.parametrize("name", sorted(path.stem for path in (EXPERIMENTS / "evaluation").glob("*.yaml")))
 def test_every_protocol_can_be_read(runs, name):
     protocol = load_protocol(name, runs.data().representation)
-    assert protocol.name == name
+    assert name == protocol.name + (f"_version_{protocol.version}" if protocol.version > 1 else "")
     assert protocol.version >= 1
     evaluator = Evaluator(None, protocol.metrics, runs.data().representation)
     nothing = Extracted({"keys": torch.zeros(0, dtype=torch.long)}, [])

@@ -1,4 +1,3 @@
-import json
 import math
 import pickle
 import shutil
@@ -10,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from fixtures import golden, groups
-from t2m_folder import line, write_folder
+from t2m_folder import line, published, write_folder
 
 from flame_mdm.commands.prepare import main as prepare
 from flame_mdm.data import amass, humanml3d, t2m
@@ -187,8 +186,10 @@ def test_what_was_left_out_is_counted_and_counts_agree_with_the_folder(folder, t
         "names of train without a caption": 2,
         "names of train with captions of unfit parts only": 2,
     }
-    assert source.counts() == {"motions": 8, "texts": 12, "train": 12, "val": 2, "test": 2}
-    assert source.counts().keys() == HumanML3D.published.keys()
+    counts = {"motions": 8, "texts": 12, "train": 12, "val": 2, "test": 2}
+    counts |= {"train share, %": 75, "val share, %": 12.5, "test share, %": 12.5}
+    assert source.counts() == counts | {"vocabulary": 27, "words per caption": 3.5}
+    assert source.counts().keys() == published("humanml3d").keys()
 
 
 def test_texts_may_stay_packed(folder, tmp_path):
@@ -650,7 +651,6 @@ def test_captions_of_the_smpl_form_must_be_there(mine):
     (mine / "HumanML3D" / "HumanML3D" / "texts" / "000003.txt").unlink()
     with pytest.raises(FileNotFoundError, match="1 clips have no text, such as 000003"):
         smpl(mine).count()
-    assert json.dumps(HumanML3DSMPL.published)
     shutil.rmtree(mine / "amass" / "CMU")
     with pytest.raises(FileNotFoundError, match="CMU: missing"):
         smpl(mine, exclude=["000003"]).count()

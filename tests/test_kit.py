@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from fixtures import golden
-from t2m_folder import line, write_folder
+from t2m_folder import line, published, write_folder
 
 from evaluators.metrics.reconstruction import PARTS, temos_parts
 from flame_mdm.__main__ import main
@@ -46,8 +46,10 @@ def test_a_processed_folder_becomes_batches(tmp_path):
     assert set((batch.lengths % 4).tolist()) == {0}
     assert int(batch.lengths.max()) <= 196
     assert data.store.info["excluded"] == {"names of train shorter than 24 frames": 2}
-    assert data.source.counts() == {"motions": 4, "texts": 5, "train": 6, "val": 2, "test": 0}
-    assert data.source.counts().keys() >= KIT.published.keys()
+    counts = {"motions": 4, "texts": 5, "train": 6, "val": 2, "test": 0}
+    counts |= {"train share, %": 75, "val share, %": 25, "test share, %": 0}
+    assert data.source.counts() == counts | {"vocabulary": 10, "words per caption": 2.4}
+    assert data.source.counts().keys() >= published("kit").keys()
 
 
 def test_frames_of_another_rate_or_set_are_refused(tmp_path):
@@ -130,7 +132,7 @@ def test_temos_motions_become_a_store(mmm, tmp_path):
     np.testing.assert_allclose(store.mean, training.mean(0), rtol=1e-6, atol=1e-6)
     np.testing.assert_allclose(store.std, np.where(training.std(0) > 0, training.std(0, ddof=1), 1), rtol=1e-6)
     assert kit.counts() == {"motions": 8, "texts": 14, "train": 5, "val": 1, "test": 2, "ghosh_test": 1}
-    assert kit.counts().keys() == KITTemos.published.keys()
+    assert kit.counts().keys() == published("kit-temos").keys()
 
 
 def evaluated(mmm, out, protocol, *words):

@@ -95,7 +95,10 @@ def test_differences_from_published_figures_are_loud_but_not_fatal(tmp_path: Pat
     assert main(["prepare", *words]) == 0
     assert main(["prepare", *words, "verify=true"]) == 0
     output = capsys.readouterr().out
-    assert "DIFFERS from the published figures: 3 motions, not 14616; 3 texts, not 44970; 2 train" in output
+    assert "DIFFERS from the published figures:\n  motions: 3 found, 14,616 published (-14,613, -99.98%)\n" in output
+    assert "  vocabulary: 5 found, 5,371 published (-5,366, -99.91%)" in output
+    assert "  words per caption: 4.0 found, 12 published (-8, -66.67%)" in output
+    assert "  train share, %: 33.33 found, 80 published (-46.67, -58.34%)" in output
     report = json.loads((only_store(tmp_path / "data").folder / "verify.json").read_text())
     assert report["figures"]["motions"] == {"found": 3, "published": 14616, "state": "differs"}
     frames = np.load(folder / "new_joint_vecs" / "a.npy")[:, 0], np.load(folder / "new_joint_vecs" / "Ma.npy")[:, 0]

@@ -333,6 +333,32 @@ def test_the_batch_size_of_the_command_is_not_that_of_timed_rows(folder, monkeyp
     assert {request.batch_size for request in asked} == {256}
 
 
+@pytest.mark.parametrize(
+    ("skeleton", "representation", "note"),
+    [
+        (
+            {"stand_in": True, "smpl_sha256": None},
+            "rot6d-25",
+            "joints of a stand-in skeleton, whose bones are not SMPL's",
+        ),
+        (None, "rot6d-25", "joints of a stand-in skeleton"),  # as results of earlier versions
+        (
+            {"stand_in": False, "smpl_sha256": "5" * 64},
+            "rot6d-25",
+            "joints of SMPL's model file, sha256 555555555555",
+        ),
+        (None, "humanml-clean-smpl22", ""),
+    ],
+)
+def test_the_skeleton_of_the_joints_is_in_the_footnotes(folder, skeleton, representation, note):
+    (request,) = [asked[0] for row, asked in requests(_part(folder)) if row["label"] == "MDM"]
+    data = {"dataset": "synthetic", "fingerprint": "f" * 16, "representation": representation}
+    put(request, folder, result(0.5, 0.4, 9.0, data=data, skeleton=skeleton))
+    found = [text for _, text in made(folder).parts[0].notes if "joints of" in text]
+    assert len(found) == bool(note)
+    assert all(note in text for text in found)
+
+
 def test_an_invalid_row_says_so_and_is_not_ranked(folder):
     path = next(asked[0].path(folder / "results") for row, asked in requests(_part(folder)) if row["label"] == "MFM")
     reason = "real motions have fid 3, expected 0.002 +- 0.02"

@@ -32,7 +32,7 @@ def prepare(config: Config) -> None:
         node["source"]["path"] = str(config["source"])
 
     from flame_mdm.data.store import write_store
-    from flame_mdm.data.verify import lines, report
+    from flame_mdm.data.verify import deviations, lines, report
 
     representation = instantiate(config["representation"])
     data = instantiate(node, representation=representation)
@@ -42,13 +42,8 @@ def prepare(config: Config) -> None:
     if config["verify"]:
         found = report(data)
         say(*lines(found))
-        differ = [
-            f"{f['found']} {name}, not {f['published']}"
-            for name, f in found["figures"].items()
-            if f["state"] == "differs"
-        ]
-        if differ:
-            say(f"DIFFERS from the published figures: {'; '.join(differ)}")
+        if differ := deviations(found):
+            say("DIFFERS from the published figures:", *(f"  {line}" for line in differ))
         say(f"{data.folder}: complete, every hash matches; the report is in verify.json")
         return
     if (data.folder / "store.json").exists() and not config["force"]:

@@ -6,7 +6,7 @@ import json
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Literal, Self
+from typing import Any, Literal, Self
 
 import numpy as np
 
@@ -58,8 +58,6 @@ class MotionSource(ABC):
     """Arguments that define the data (all but `PLACES`), as JSON values. They are saved in the store."""
     actions: tuple[str, ...] = ()
     """Names of the action labels, in the order of their numbers; empty for sets without labels."""
-    published: ClassVar[dict[str, int]] = {}
-    """Published figures of the data set (from its owners or the papers), to compare with the figures found."""
     published_split: bool = False
     """Whether the split is the one used in papers although it tests on clips seen in training or leaves no validation
     clips. Saved in the store and in every result."""
@@ -83,8 +81,8 @@ class MotionSource(ABC):
         """Returns the number of clips or labels left out, by reason; complete once `clips` is exhausted."""
         return {}
 
-    def counts(self) -> dict[str, int]:
-        """Returns the figures of the raw data under the names of `published`; saved once `clips` is exhausted."""
+    def counts(self) -> Mapping[str, float]:
+        """Returns the figures of the raw data under the names of `published.yaml`; saved once `clips` is exhausted."""
         return {}
 
     @abstractmethod

@@ -11,7 +11,7 @@ from collections import Counter, defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any, Literal
 
 import numpy as np
 from tqdm import tqdm
@@ -67,7 +67,6 @@ class Babel(MotionSource):
     """
 
     name = "babel"
-    published: ClassVar[dict[str, int]] = {"labels": 63353}
 
     def __init__(
         self,

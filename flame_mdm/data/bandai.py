@@ -13,7 +13,7 @@ from contextlib import closing
 from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path, PurePosixPath
-from typing import ClassVar, Literal
+from typing import Literal
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -110,7 +110,6 @@ class Bandai(MotionSource):
 
     name = "bandai"
     actions = tuple(dict.fromkeys([*CONTENTS_1, *TAKES_2]))
-    published: ClassVar[dict[str, int]] = {"takes": 3077, "takes of data set 1": 175, "takes of data set 2": 2902}
 
     def __init__(
         self,

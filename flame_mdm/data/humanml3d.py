@@ -91,7 +91,6 @@ class HumanML3D(T2MFolder):
     fps = 20.0
     shortest = 40
     get_it = GET_IT
-    published = {"motions": 14616, "texts": 44970, "train": 23384, "val": 1460, "test": 4384}  # noqa: RUF012
 
     def __init__(
         self,
@@ -290,7 +289,6 @@ class HumanML3DSMPL(MotionSource):
     """
 
     name = "humanml3d-smpl"
-    published = {"train": 34936, "test": 6557}  # noqa: RUF012
 
     def __init__(
         self,

@@ -30,7 +30,6 @@ class KIT(T2MFolder):
     fps = 12.5
     shortest = 24
     get_it = "get KIT-ML as processed for text-to-motion, linked at https://github.com/EricGuo5513/HumanML3D"
-    published = {"motions": 3911, "texts": 6278}  # noqa: RUF012
 
 
 class KITTemos(MotionSource):
@@ -42,7 +41,6 @@ class KITTemos(MotionSource):
     """
 
     name = "kit-temos"
-    published = {"motions": 3911, "texts": 6353, "train": 1784, "val": 566, "test": 587, "ghosh_test": 520}  # noqa: RUF012
     shortest, longest = 10, 500
 
     def __init__(self, path: str, splits: str, exclude: Sequence[str] = ()):
@@ -140,7 +138,7 @@ class KITTemos(MotionSource):
         return dict(self._excluded)
 
     def counts(self) -> dict[str, int]:
-        """Returns the figures of the folder under the names of `published`."""
+        """Returns the figures of the folder under the names of `published.yaml`."""
         files = [path for path in self.path.glob("*_annotations.json") if _json(path)]
         texts = sum(len(_json(path)) for path in files)
         splits = {split.replace("-", "_"): len(self._list(split)) for split in (*SPLITS, "ghosh-test")}

@@ -9,6 +9,7 @@ Mean.npy Std.npy            (D,)
 from __future__ import annotations
 
 import math
+import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from functools import cached_property
@@ -88,6 +89,11 @@ def cuts(name: str, frames: int, descriptions: Sequence[Description], shortest: 
             found.append(Cut(id_ if seen[id_] == 1 else f"{id_}#{seen[id_]}", start, length, [description]))
     whole = [d for d in descriptions if d.begin == d.end == 0]
     return [*found, Cut(name, 0, frames, whole)] if whole else found
+
+
+def words_of(caption: str) -> list[str]:
+    """Returns the words of a caption, without capitals and punctuation."""
+    return re.findall(r"[^\W_]+", caption.lower())
 
 
 def frame_tokens(tokens: Sequence[str]) -> tuple[list[str], int]:
@@ -225,12 +231,20 @@ class T2MFolder(MotionSource):
             raise ValueError(f"{self.path}: Mean.npy {mean.shape} or Std.npy {std.shape} is not a mean or positive std")
         return mean.astype(np.float32), std.astype(np.float32)
 
-    def counts(self) -> dict[str, int]:
-        """Returns the figures of the folder under the names of `published`."""
+    def counts(self) -> dict[str, float]:
+        """Returns the figures of the folder under the names of `published.yaml`, of which mirrored copies give none."""
         originals = {name.removeprefix("M") for name in self._motions()}
-        texts = sum(len(lines) for name, lines in self.texts.items() if not name.startswith("M"))
+        captions = [d.caption for name, found in self.texts.items() if not name.startswith("M") for d in found]
+        words = [words_of(caption) for caption in captions]
         splits = Counter(self.names.values())
-        return {"motions": len(originals), "texts": texts, **{split: splits[split] for split in SPLITS}}
+        return {
+            "motions": len(originals),
+            "texts": len(captions),
+            "vocabulary": len({word for caption in words for word in caption}),
+            "words per caption": round(sum(map(len, words)) / max(len(words), 1), 2),
+            **{split: splits[split] for split in SPLITS},
+            **{f"{split} share, %": round(100 * splits[split] / max(len(self.names), 1), 2) for split in SPLITS},
+        }
 
     def _motions(self) -> set[str]:
         files = (self.path / "new_joint_vecs").glob("*.npy")

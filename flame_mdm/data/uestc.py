@@ -13,7 +13,6 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -59,13 +58,6 @@ class UESTC(MotionSource):
     """
 
     name = "uestc"
-    published: ClassVar[dict[str, int]] = {
-        "videos": 25600,
-        "actions": 40,
-        "subjects": 118,
-        "fewest training clips per action": 225,
-        "most training clips per action": 345,
-    }
 
     def __init__(self, path: str, published_split: bool = False, min_frames: int = 45):
         """Stores the arguments; reads no files.

@@ -6,6 +6,7 @@ import json
 import re
 from collections import Counter, defaultdict
 from hashlib import sha1
+from pathlib import Path
 from typing import Any, get_args
 
 import numpy as np
@@ -15,9 +16,10 @@ from tqdm import tqdm
 from flame_mdm.data import Split
 from flame_mdm.data.datamodule import MotionDataModule
 from flame_mdm.data.store import Entry, Store
-from flame_mdm.files import write_text
+from flame_mdm.files import read_yaml, write_text
 from flame_mdm.representations import Representation
 
+PUBLISHED = Path(__file__).with_name("published.yaml")
 SPLITS: tuple[Split, ...] = get_args(Split)
 STILL_DISTANCE = 0.01
 """Meters; a clip in which no joint moves farther from its first position counts as still."""
@@ -49,7 +51,7 @@ def report(data: MotionDataModule) -> dict[str, Any]:
     found = {
         **{key: store.info[key] for key in ("dataset", "representation", "fps", "fingerprint", "published_split")},
         "files": store.info["sha256"],
-        "figures": _figures(store, data.source.published),
+        "figures": _figures(store),
         "captions": {
             "captions": len(captions),
             "different captions": len(set(captions)),
@@ -122,12 +124,23 @@ def lines(found: dict[str, Any]) -> list[str]:
     return _aligned(rows)
 
 
-def _figures(store: Store, published: dict[str, int]) -> dict[str, dict[str, Any]]:
+def deviations(found: dict[str, Any]) -> list[str]:
+    """Returns which figures of a report differ from the published ones, and by how much."""
+    lines = []
+    for name, figure in found["figures"].items():
+        if figure["state"] == "differs":
+            number, published = figure["found"], figure["published"]
+            off = number - published
+            lines.append(f"{name}: {number:,} found, {published:,} published ({off:+,g}, {off / published:+.2%})")
+    return lines
+
+
+def _figures(store: Store) -> dict[str, dict[str, Any]]:
     """Returns figures of the store and of the raw data when it was prepared; the raw data keeps names in both."""
     by_split = store.info["clips"]
     of_action = Counter(clip.action for clip in store.clips if clip.action is not None)
     training = Counter(clip.action for clip in store.clips if clip.action is not None and clip.split != "test")
-    counted: dict[str, int] = {"clips": len(store.clips), **by_split}
+    counted: dict[str, float] = {"clips": len(store.clips), **by_split}
     if of_action:
         counted["actions"] = len(of_action)
         counted["fewest clips per action"] = min(of_action.values())
@@ -135,17 +148,19 @@ def _figures(store: Store, published: dict[str, int]) -> dict[str, dict[str, Any
     if training:
         counted["fewest training clips per action"] = min(training.values())
         counted["most training clips per action"] = max(training.values())
-    raw: dict[str, int] = store.info.get("counts", {})
+    raw: dict[str, float] = store.info.get("counts", {})
     counted = {f"{name} of the store" if name in raw else name: number for name, number in counted.items()} | raw
+    published = read_yaml(PUBLISHED).get(store.info["dataset"], {})
     figures = {}
     for name in [*published, *(name for name in counted if name not in published)]:
-        expected, number = published.get(name), counted.get(name)
+        given, number = published.get(name), counted.get(name)
+        expected, tolerance = given if isinstance(given, list) else (given, 0)
         if expected is None:
             state = "not published"
-        elif number is None:
+        elif not isinstance(number, int | float):
             state = "not counted"
         else:
-            state = "ok" if number == expected else "differs"
+            state = "ok" if abs(number - expected) <= tolerance else "differs"
         figures[name] = {"found": number, "published": expected, "state": state}
     return figures
 

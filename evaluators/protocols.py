@@ -235,18 +235,24 @@ class Protocol:
         *,
         guidance_scale: float | None = None,
         sampler: str | None = None,
-        num_inference_steps: int | None = None,
+        num_inference_steps: int | Sequence[int] | None = None,
+        eta: float | None = None,
+        spacing: str | None = None,
         method: str | None = None,
         until: float | None = None,
+        strength: float | None = None,
     ) -> dict[str, Any]:
-        """How a model is sampled: as asked, or by its recipe; edits by `method` and `until` of `flame_mdm.editing`.
+        """How a model is sampled: as asked, or by its recipe; edits by `method`, `until` and `strength` of
+        `flame_mdm.editing`.
 
         Raises:
             UserError: a method of editing where nothing is edited, or one that the model's process does not allow.
         """
-        if self.edit is None and (method is not None or until is not None):
-            raise UserError(f"protocol {self.name} edits no motions: leave out method and until")
-        how = {} if self.edit is None else {"edit": method_options(model.process, method, until)}
+        if self.edit is None and (method, until, strength) != (None, None, None):
+            raise UserError(f"protocol {self.name} edits no motions: leave out method, until and strength")
+        how: dict[str, Any] = {}
+        if self.edit is not None:
+            how["edit"] = method_options(model.process, method, until, strength=strength)
         if num_inference_steps is None:
             along = how and how["edit"]["mode"] == "trajectory"
             num_inference_steps = MFM_STEPS if along else model.num_inference_steps
@@ -254,6 +260,7 @@ class Protocol:
             "guidance_scale": model.guidance_scale if guidance_scale is None else guidance_scale,
             "sampler": sampler or model.sampler,
             "num_inference_steps": num_inference_steps,
+            **{name: value for name, value in (("eta", eta), ("spacing", spacing)) if value is not None},
             **how,
         }
 

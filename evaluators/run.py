@@ -6,7 +6,7 @@ import hashlib
 import json
 import math
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from datetime import timedelta
@@ -67,9 +67,12 @@ class EvaluationRequest:
     force: bool = False
     guidance_scale: float | None = None
     sampler: str | None = None
-    num_inference_steps: int | None = None
+    num_inference_steps: int | Sequence[int] | None = None
+    eta: float | None = None
+    spacing: str | None = None
     method: str | None = None
     until: float | None = None
+    strength: float | None = None
     batch_size: int | None = None
     device: str | None = None
     data_root: str | None = None
@@ -156,7 +159,7 @@ def _evaluate(request: EvaluationRequest, rank: int, world: int, device: str) ->
     report = _describe(request, protocol, model, data, extractor)
     report["skeleton"] = skeleton
     if model is not None and file is not None:
-        names = ("guidance_scale", "sampler", "num_inference_steps", "method", "until")
+        names = ("guidance_scale", "sampler", "num_inference_steps", "eta", "spacing", "method", "until", "strength")
         sampling = protocol.sampling(model, **{name: getattr(request, name) for name in names})
         report["checkpoint"] |= {"selected_by": _selection(model, file), "sha256": sha256(file), **sampling}
         options = {"seed": request.seed, **sampling}

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 import torch
@@ -18,7 +18,7 @@ from flame_mdm.formats.files import ENDINGS, read
 from flame_mdm.formats.motion import Motion
 from flame_mdm.formats.resampling import resample as resample_joints
 from flame_mdm.generation import generate
-from flame_mdm.motion import Edit
+from flame_mdm.motion import Edit, Sampling
 from flame_mdm.processes import Process
 from flame_mdm.representations import Representation
 from flame_mdm.representations.skeleton import Skeleton
@@ -71,13 +71,13 @@ def edit(
     method: str | None = None,
     until: float | None = None,
     resample: int = 1,
+    strength: float | None = None,
     samples: int = 1,
     seed: int = 0,
-    guidance_scale: float | None = None,
-    sampler: str | None = None,
-    num_inference_steps: int | None = None,
+    stages: list[Motion] | None = None,
+    **sampling: Unpack[Sampling],
 ) -> list[Edited]:
-    """Resamples part of a motion: `joints` in `region`, each by default all.
+    """Resamples part of a motion: `joints` in `region`, each by default all; with `strength`, as a variation of it.
 
     Args:
         model: from `flame_mdm.load`.
@@ -93,7 +93,9 @@ def edit(
             Default: "mdm" for diffusion, "mfm" for flow matching.
         until: for "mfm", the flow time up to which the path is overwritten; default 0.2, with 25 steps.
         resample: for FLAME's methods, how many times each step is repeated.
-        samples, seed, guidance_scale, sampler, num_inference_steps: as in `generate`.
+        strength: starts from the motion itself with noise added, and takes this fraction of the sampling steps, in
+            (0, 1]: the smaller, the closer to the motion. Without region and joints, the entire motion is varied.
+        samples, seed, stages, sampling: as in `generate`.
 
     Raises:
         UserError: the mask keeps everything or nothing, a name is unknown, the process does not support the method, the
@@ -111,13 +113,16 @@ def edit(
             f"({model.facts['max_frames'] / original.fps:g} seconds): select a part with cut=[begin, end] in seconds"
         )
     keep, still = kept_parts(representation, length, region=region, region_seconds=region_seconds, joints=joints)
-    if not keep.any():
-        raise UserError("no part of the motion is kept: choose region=..., region_seconds=... or joints=...")
+    if not keep.any() and strength is None:
+        raise UserError(
+            "no part of the motion is kept: choose region=..., region_seconds=... or joints=..., or vary all of it with "
+            "strength=0.5"
+        )
     if keep.all():
         raise UserError("the entire motion is kept: choose a region or joints to resample")
-    how = method_options(model.process, method, until, resample)
-    if how["mode"] == "trajectory" and num_inference_steps is None:
-        num_inference_steps = MFM_STEPS
+    how = method_options(model.process, method, until, resample, strength)
+    if how["mode"] == "trajectory" and sampling.get("num_inference_steps") is None:
+        sampling["num_inference_steps"] = MFM_STEPS
     known = representation.normalize(torch.from_numpy(features).to(model.device))
     generated = generate(
         model,
@@ -126,9 +131,8 @@ def edit(
         frames=length,
         samples=samples,
         seed=seed,
-        guidance_scale=guidance_scale,
-        sampler=sampler,
-        num_inference_steps=num_inference_steps,
+        stages=stages,
+        **sampling,
         edit=Edit(known[None], keep[None].to(model.device), **how),
     )
     # Normalization rounds, so kept values are compared with the input of the sampler.
@@ -138,8 +142,8 @@ def edit(
             **vars(result),
             original=original,
             keep=keep.numpy(),
-            feature_error=float((np.abs(result.features - exact) / std)[keep.numpy()].max()),
-            joint_error=float(np.linalg.norm(result.joints - original.joints, axis=-1)[still.numpy()].max()),
+            feature_error=float((np.abs(result.features - exact) / std)[keep.numpy()].max(initial=0)),
+            joint_error=float(np.linalg.norm(result.joints - original.joints, axis=-1)[still.numpy()].max(initial=0)),
         )
         for result in generated
     ]
@@ -264,7 +268,11 @@ def find_joints(skeleton: Skeleton, names: str | Sequence[str]) -> list[int]:
 
 
 def method_options(
-    process: Process, method: str | None = None, until: float | None = None, resample: int = 1
+    process: Process,
+    method: str | None = None,
+    until: float | None = None,
+    resample: int = 1,
+    strength: float | None = None,
 ) -> dict[str, Any]:
     """Returns the options of `Edit` for a method, by default that of the process; arguments are those of `edit`.
 
@@ -285,6 +293,10 @@ def method_options(
         raise UserError(f"resample={resample} is an option of method=flame and flame_code, not of {method}")
     if how["mode"] == "trajectory":
         how["until"] = MFM_UNTIL if until is None else until
+    if strength is not None:
+        if not 0 < strength <= 1:
+            raise UserError(f"strength={strength:g}: give a number above 0, up to 1")
+        how["strength"] = strength
     return how | {"resample": resample}
 
 

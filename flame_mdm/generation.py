@@ -7,14 +7,14 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 import torch
 
 from flame_mdm.errors import UserError
 from flame_mdm.files import atomic_folder
 from flame_mdm.formats.motion import Motion
-from flame_mdm.motion import Edit, MotionBatch, length_mask
+from flame_mdm.motion import Edit, MotionBatch, Sampling, length_mask
 from flame_mdm.task import MotionGeneration
 from flame_mdm.visualize import contact_sheet, write_gif, write_player
 from flame_mdm.visualize.scene import shortened
@@ -22,6 +22,8 @@ from flame_mdm.visualize.scene import shortened
 BATCH = 32
 MAX_SAMPLES = 10_000
 """Maximum number of samples per request; they are kept in memory until all are complete."""
+STAGES = 10
+"""Clean estimates shown of one sampling run: one per tenth of it, as in figure 5 of MFM."""
 MAX_TEXT_LENGTH = 2000
 """Maximum number of characters of a text; captions of the data sets are far shorter."""
 
@@ -35,10 +37,10 @@ def generate(
     frames: int | Sequence[int] | None = None,
     samples: int = 1,
     seed: int = 0,
-    guidance_scale: float | None = None,
-    sampler: str | None = None,
-    num_inference_steps: int | None = None,
     edit: Edit | None = None,
+    shared_noise: bool = False,
+    stages: list[Motion] | None = None,
+    **sampling: Unpack[Sampling],
 ) -> list[Motion]:
     """Generates motions for texts or actions, `samples` of each; unconditioned motions if neither is given.
 
@@ -51,18 +53,22 @@ def generate(
         seconds, frames: length; `frames` may be one length per motion. Default: 3 seconds, or the maximum if shorter.
         samples: motions per text.
         seed: seed of the noise.
-        guidance_scale, sampler, num_inference_steps: override those of the recipe.
         edit: part of a motion of that length to keep in every sample, with `known` and `keep` (1, F, D); see
             `flame_mdm.commands.edit`.
+        shared_noise: all motions get the same noise, so that they differ by their texts and lengths alone.
+        stages: list that gets the clean estimates along the sampling of the first motion, at equal intervals, and that
+            motion itself (MFM, figure 5).
+        sampling: options of `flame_mdm.motion.Sampling`, instead of the recipe's.
 
     Raises:
         UserError: a text is empty or too long, an action is unknown, or the model was not trained for the length.
     """
-    for name, value, most in (("samples", samples, MAX_SAMPLES), ("num_inference_steps", num_inference_steps, None)):
-        if value is not None and not 1 <= value <= (most or value):
+    steps, scale = sampling.get("num_inference_steps"), sampling.get("guidance_scale")
+    for name, value, most in (("samples", samples, MAX_SAMPLES), ("num_inference_steps", steps, None)):
+        if isinstance(value, int) and not 1 <= value <= (most or value):
             raise UserError(f"{name}={value}: give 1{f' to {most:,}' if most else ' or more'}")
-    if guidance_scale is not None and not math.isfinite(guidance_scale):
-        raise UserError(f"guidance_scale={guidance_scale} is not a finite number")
+    if scale is not None and not math.isfinite(scale):
+        raise UserError(f"guidance_scale={scale} is not a finite number")
     texts = [texts] if isinstance(texts, str) else texts
     requested = list(texts or actions or [""])
     if texts is not None and not all(text.strip() for text in texts):
@@ -93,17 +99,37 @@ def generate(
             text=captions[part] if texts is not None else None,
             action=None if labels is None else torch.tensor(labels[part], device=model.device),
         )
+        trajectory = _First() if stages is not None and not begin else None
         x = model.generate(
             batch,
             seed=seed,
-            guidance_scale=guidance_scale,
-            sampler=sampler,
-            num_inference_steps=num_inference_steps,
+            shared_noise=shared_noise,
+            trajectory=trajectory,
+            **sampling,
             edit=edit and replace(edit, known=edit.known.expand_as(batch.x), keep=edit.keep.expand_as(batch.x)),
             unconditioned=texts is None and actions is None,
         )
         results += _finish(model, batch, x, captions[part])
+        if stages is not None and trajectory:
+            stages += _stages(model, trajectory, results[0])
     return results
+
+
+class _First(list[torch.Tensor]):
+    """Keeps the first motion (1, F, D) of each batch that is appended, on the CPU."""
+
+    def append(self, x: torch.Tensor) -> None:
+        super().append(x[:1].cpu())
+
+
+def _stages(model: MotionGeneration, trajectory: Sequence[torch.Tensor], result: Motion) -> list[Motion]:
+    """Returns up to `STAGES` of the first motion's clean estimates at equal intervals of the calls, and the motion."""
+    count, stages = len(trajectory), []
+    for call in sorted({index * count // STAGES for index in range(STAGES)}):
+        x = trajectory[call][0, : len(result.features)].float()
+        joints = model.representation.to_joints(x.to(model.device)).cpu().numpy()
+        stages.append(replace(result, joints=joints, text=f"estimate after {call / count:.0%} of the sampling"))
+    return [*stages, replace(result, text=f"result: {result.text}")]
 
 
 def _finish(model: MotionGeneration, batch: MotionBatch, x: torch.Tensor, captions: Sequence[str]) -> list[Motion]:
@@ -148,10 +174,13 @@ def _action(model: MotionGeneration, name: str) -> int:
     return actions.index(name)
 
 
-def write_motions(folder: Path, motions: Sequence[Motion], facts: dict[str, Any]) -> None:
+def write_motions(
+    folder: Path, motions: Sequence[Motion], facts: dict[str, Any], stages: Sequence[Motion] | None = None
+) -> None:
     """Writes `motion_000.npz` ..., `motions.gif`, `motions.png` and `player.html` into a folder, all or none.
 
-    `facts`, such as seed and checkpoint hash, are added to each `.npz`.
+    `facts`, such as seed and checkpoint hash, are added to each `.npz`; `stages` of a sampling run are drawn in
+    `trajectory.png`.
     """
     scene = [replace(motion, text=motion.text or "unconditioned") for motion in motions]
     with atomic_folder(folder) as made:
@@ -159,5 +188,7 @@ def write_motions(folder: Path, motions: Sequence[Motion], facts: dict[str, Any]
             motion.save(made / f"motion_{number:03d}.npz", **facts)
         write_gif(made / "motions.gif", scene[:8])
         contact_sheet(made / "motions.png", scene[:8])
+        if stages:
+            contact_sheet(made / "trajectory.png", stages)
         title = motions[0].text if len({motion.text for motion in motions}) == 1 else ""
         write_player(made / "player.html", scene, title or "Motions")

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, TypedDict
 
 import torch
 from torch import Tensor
@@ -102,6 +102,8 @@ class Edit:
         blend: for "x_t", replace the kept part "after" each step (FLAME, eq. 6), which ends in the known motion itself,
             or "before" each call of the denoiser (FLAME's code), which ends in the model's version of it.
         resample: for "x_t", how many times each step is repeated, after adding noise again (RePaint, algorithm 1).
+        strength: fraction of the sampling steps to take, in (0, 1]. Sampling starts from `known`, as noisy as the first
+            of these steps (SDEdit; of N steps, MDM's code skips `skip_timesteps` = (1 - strength) N). None: from noise.
     """
 
     known: Tensor
@@ -110,6 +112,29 @@ class Edit:
     until: float = 0.2
     blend: Literal["after", "before"] = "after"
     resample: int = 1
+    strength: float | None = None
+
+    def steps(self, total: int) -> int:
+        """Returns how many of `total` sampling steps are taken, at least one."""
+        return total if self.strength is None else max(1, round(self.strength * total))
+
+
+class Sampling(TypedDict, total=False):
+    """How motions are sampled; an option that is absent or None has the value of the recipe or of the process.
+
+    Attributes:
+        guidance_scale: 1 = off.
+        sampler: a name that the process knows.
+        num_inference_steps: number of steps; of diffusion also the steps themselves, rising, 0 = the least noisy one.
+        eta: randomness of the sampler "ddim", 0 to 1.
+        spacing: how diffusion places a number of steps, "linspace" or "stride"; see `schedules.timesteps`.
+    """
+
+    guidance_scale: float | None
+    sampler: str | None
+    num_inference_steps: int | Sequence[int] | None
+    eta: float | None
+    spacing: str | None
 
 
 Denoise = Callable[[Tensor, Tensor, Tensor, Condition], Tensor]

@@ -94,7 +94,9 @@ class Checkpoint(Schema):
     path: str
     sha256: str
     sampler: str
-    num_inference_steps: Int
+    num_inference_steps: Int | list[Int]
+    eta: Number | None = None
+    spacing: str | None = None
     guidance_scale: Number
     experiment: str | None = None
     selected_by: str = ""

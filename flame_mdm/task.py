@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Self, Unpack
 
 import torch
 from lightning import LightningModule
@@ -19,7 +19,7 @@ from flame_mdm.data.datamodule import MotionDataModule
 from flame_mdm.denoisers import Denoiser
 from flame_mdm.errors import UserError
 from flame_mdm.losses import MotionLosses
-from flame_mdm.motion import Condition, Edit, MotionBatch, pad_to
+from flame_mdm.motion import Condition, Edit, MotionBatch, Sampling, pad_to
 from flame_mdm.processes import MAX_STEPS, Process
 from flame_mdm.processes.guidance import classifier_free_guidance
 from flame_mdm.representations import Representation
@@ -229,23 +229,27 @@ class MotionGeneration(Task):
         *,
         seed: int = 0,
         replication: int = 0,
-        guidance_scale: float | None = None,
-        sampler: str | None = None,
-        num_inference_steps: int | None = None,
         edit: Edit | None = None,
         unconditioned: bool = False,
+        shared_noise: bool = False,
+        trajectory: list[Tensor] | None = None,
+        **sampling: Unpack[Sampling],
     ) -> Tensor:
         """Samples motions for the conditions, lengths and ids of `batch`; its `x` is ignored.
 
         The noise of a motion is a function of (seed, replication, id), so the motion is the same in any batch.
-        `unconditioned` samples a conditional model with its null condition.
+        `unconditioned` samples a conditional model with its null condition; `shared_noise` gives all motions the noise
+        of (seed, replication) alone; `trajectory` gets the normalized clean estimate (B, F, D) of each call.
 
         Returns:
             (B, F, D) normalized, 0 past the end of each motion.
         """
         was_training = self.training
         self.eval()
-        scale = self.guidance_scale if guidance_scale is None else guidance_scale
+        chosen: dict[str, Any] = {name: value for name, value in sampling.items() if value is not None}
+        scale = chosen.pop("guidance_scale", self.guidance_scale)
+        if trajectory is not None:
+            chosen["trajectory"] = trajectory
         denoise = self.denoiser
         if unconditioned and self.condition.features:
             nothing = torch.zeros(len(batch), dtype=torch.long, device=batch.x.device)
@@ -261,15 +265,15 @@ class MotionGeneration(Task):
             if edit is not None:
                 known, keep = pad_to(edit.known, mask.shape[1]), ~pad_to(~edit.keep, mask.shape[1])
                 edit = replace(edit, known=known, keep=keep)
-        noise = seeded_noise(batch.ids, mask.shape[1], features, seed=seed, replication=replication, like=batch.x)
+        ids = ["shared"] * len(batch) if shared_noise else batch.ids
+        noise = seeded_noise(ids, mask.shape[1], features, seed=seed, replication=replication, like=batch.x)
         x = self.process.sample(
             denoise,
             noise,
             mask,
             cond,
-            sampler=sampler or self.sampler,
-            num_inference_steps=self.num_inference_steps if num_inference_steps is None else num_inference_steps,
             edit=edit,
+            **({"sampler": self.sampler, "num_inference_steps": self.num_inference_steps} | chosen),
         )
         self.train(was_training)
         return x[:, :frames]

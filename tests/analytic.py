@@ -43,7 +43,9 @@ def assert_golden(arrays: Arrays, key: str, value: Tensor, within: float = 10.0)
 
 
 def spaced(total: int, spec: str) -> list[int]:
-    """The fixtures' names of step choices: "ddimN", "N" or the counts of equal sections "a,b,c"."""
+    """The fixtures' names of step choices: "ddimN", "N", the counts of equal sections "a,b,c", or GLIDE's "fast27"."""
+    if spec == "fast27":
+        return sorted({*spaced(total, "10,10,3,2,2"), total - 3} - {total - 1})
     if spec.startswith("ddim"):
         return timesteps(total, int(spec.removeprefix("ddim")), "stride")
     counts = [int(count) for count in spec.split(",")]

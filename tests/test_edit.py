@@ -24,6 +24,7 @@ from flame_mdm.representations.humanml import HumanML
 from flame_mdm.representations.rot6d import Rot6D
 from flame_mdm.representations.skeleton import KIT21, SMPL22, SMPL24
 from flame_mdm.representations.smpl import SMPL
+from flame_mdm.seeds import seeded_noise
 from flame_mdm.task import MotionGeneration
 
 FLOW = ["process=flow_matching", "task.sampler=euler"]
@@ -196,6 +197,35 @@ def test_flows_are_rewritten_in_25_steps_up_to_a_fifth(flow, motion):
     six = edit(flow, motion, region="in_between", until=5 / 25, num_inference_steps=25)[0]
     assert np.array_equal(default.features, six.features)
     assert not np.array_equal(default.features, edit(flow, motion, region="in_between", until=0.19)[0].features)
+
+
+@pytest.mark.parametrize("strength", [0.3, 1.0])
+@pytest.mark.parametrize("kind", ["diffusion", "flow"])
+def test_a_variation_starts_from_the_noised_motion(kind, strength, motion, request):
+    model, seen = request.getfixturevalue(kind), []
+    hook = model.denoiser.register_forward_hook(lambda module, inputs, output: seen.append(inputs))
+    varied = edit(model, motion, strength=strength, num_inference_steps=10, guidance_scale=1.0)[0]
+    hook.remove()
+    assert len(seen) == round(10 * strength)
+    assert not varied.keep.any()
+    assert (varied.feature_error, varied.joint_error) == (0, 0)
+    x_t, t = seen[0][:2]
+    known = model.representation.normalize(torch.from_numpy(motion.features))[None]
+    noise = seeded_noise(["#0"], *known.shape[1:], seed=0, replication=0, like=known)(0)
+    time = t / 1000 if kind == "flow" else t
+    torch.testing.assert_close(x_t, model.process.corrupt(known, noise, time), rtol=0, atol=1e-4)
+
+
+def test_a_variation_may_keep_parts(diffusion, motion):
+    assert edit(diffusion, motion, strength=0.5, joints="upper_body")[0].feature_error == 0
+
+
+@pytest.mark.parametrize("strength", [0.0, 1.5, float("nan")])
+def test_a_variation_needs_a_share_of_the_steps(diffusion, motion, strength):
+    with pytest.raises(UserError, match=r"strength=.*above 0, up to 1"):
+        edit(diffusion, motion, strength=strength)
+    with pytest.raises(UserError, match=r"keeps nothing.*strength=0\.5"):
+        edit(diffusion, motion)
 
 
 def test_resampling_takes_each_step_more_often(diffusion, motion):

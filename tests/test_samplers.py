@@ -1,6 +1,8 @@
 """Every sampler of both processes: against the authors' loops, diffusers and torchdiffeq, and against an oracle."""
 
+import json
 import math
+import re
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -48,31 +50,138 @@ def ones(x: Tensor) -> Tensor:
     return torch.ones(x.shape[:2], dtype=torch.bool)
 
 
-@pytest.mark.golden
-@pytest.mark.parametrize("dtype", PRECISIONS)
-@pytest.mark.parametrize("case", [pytest.param(name, id=f"gaussian-{name}") for name in OPTIONS["mdm_loops"]])
-def test_mdm_loop(case, dtype):
-    total, section, kind, options = OPTIONS["mdm_loops"][case]
+def skipped(case: str, options: dict[str, Any]) -> int:
+    """How many of the noisiest steps a loop leaves out: MDM's `skip_timesteps`."""
+    named = re.search(r"skip(\d+)", case)
+    return int(options.get("skip_timesteps") or options.get("skip") or (named[1] if named else 0))
+
+
+def replay_mdm_loop(arrays: Arrays, case: str, dtype: torch.dtype = torch.float32) -> None:
+    """Samples as one of the authors' loops of `meta.options.mdm_loops`, and compares."""
+    total, section, kind, options = meta(arrays)["options"]["mdm_loops"][case]
+    unknown = options.keys() - {
+        "eta",
+        "inpaint",
+        "skip_timesteps",
+        "skip",
+        "init_image",
+        "init",
+        "const_noise",
+        "const",
+    }
+    if unknown:
+        pytest.skip(f"{case}: options that the product does not have: {', '.join(sorted(unknown))}")
     process = GaussianDiffusion(num_train_timesteps=total)
-    x_T = motions(GAUSSIAN["loop/x_T"], dtype)
-    draws = [motions(noise, dtype) for noise in GAUSSIAN[f"loop/{case}/noise"]]
+    x_T, steps = motions(arrays["loop/x_T"], dtype), steps_of(section, total)
+    draws = [motions(noise, dtype) for noise in arrays[f"loop/{case}/noise"]]
+    if options.get("const_noise") or options.get("const") or "const_noise" in case:  # of the steps, not of the start
+        draws = [noise[:1].expand_as(noise) for noise in draws]
     edit = None
-    if options.get("inpaint"):
-        keep = motions(GAUSSIAN["loop/inpainting_mask"]) > 0
-        edit = Edit(motions(GAUSSIAN["loop/inpainted_motion"], dtype), keep, mode="x0")
+    skip = skipped(case, options)
+    if skip or options.get("inpaint"):
+        start = next((key for key in (f"loop/{case}/init_image", "loop/init_image") if key in arrays), "")
+        edit = Edit(
+            motions(arrays["loop/inpainted_motion" if options.get("inpaint") or not start else start], dtype),
+            torch.zeros_like(x_T, dtype=torch.bool),
+            mode="x0",
+            strength=(len(steps) - skip) / len(steps) if skip else None,
+        )
+    if edit is not None and options.get("inpaint"):
+        edit.keep = motions(arrays["loop/inpainting_mask"]) > 0
     x = process.sample(
-        linear_denoiser(GAUSSIAN["loop/lin4/A"], GAUSSIAN["loop/lin4/b"], float(GAUSSIAN["lin4/g"])),
+        linear_denoiser(arrays["loop/lin4/A"], arrays["loop/lin4/b"], float(arrays["lin4/g"])),
         replay(x_T, draws),
         ones(x_T),
         NO_CONDITION,
         sampler={"ddpm": "ancestral", "ddim": "ddim"}[kind],
-        num_inference_steps=steps_of(section, total),
+        num_inference_steps=steps,
         edit=edit,
         eta=options.get("eta", 0.0),
     )
-    assert_golden(GAUSSIAN, f"loop/{case}/out", x)
+    assert_golden(arrays, f"loop/{case}/out", x)
     if edit is not None:
         torch.testing.assert_close(x[edit.keep], edit.known[edit.keep], rtol=0, atol=1e-12)
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize("dtype", PRECISIONS)
+@pytest.mark.parametrize("case", [pytest.param(name, id=f"gaussian-{name}") for name in OPTIONS["mdm_loops"]])
+def test_mdm_loop(case, dtype):
+    replay_mdm_loop(GAUSSIAN, case, dtype)
+
+
+def numpy_loop(
+    arrays: Arrays, total: int, steps: list[int], draws: np.ndarray, start: np.ndarray, eta: float
+) -> np.ndarray:
+    """The way from `start`, as noisy as the last of `steps`, in numpy; DDPM where eta is 1 (Song et al. 2021, eq. 12).
+
+    `arrays` holds the linear denoiser that returns the clean motion, of `total` steps; a draw is used after each step.
+    """
+    ends = np.cos((np.arange(total + 1) / total + 0.008) / 1.008 * np.pi / 2) ** 2
+    signal = np.cumprod(np.maximum(ends[1:] / ends[:-1], 0.001))[steps]
+    before = np.append(1.0, signal[:-1])
+    x = start
+    for i, noise in zip(reversed(range(len(steps))), draws, strict=False):
+        mixed = np.einsum("jk,bkfl->bjfl", arrays["loop/lin4/A"], x) + arrays["loop/lin4/b"][:, :, None]
+        x0 = mixed + arrays["lin4/g"] * steps[i] / 1000
+        epsilon = (x - signal[i] ** 0.5 * x0) / (1 - signal[i]) ** 0.5
+        variance = eta**2 * (1 - before[i]) / (1 - signal[i]) * (1 - signal[i] / before[i])
+        x = before[i] ** 0.5 * x0 + (1 - before[i] - variance) ** 0.5 * epsilon + variance**0.5 * noise
+    return x
+
+
+def stand_in(case: str, section: str | list[int], **options: Any) -> Arrays:
+    """A fixture in the layout of gaussian.npz with one loop of T = 30, or of 1000 for a section by name."""
+    rng, shape, total = np.random.default_rng(7), (3, 4, 2, 5), 1000 if isinstance(section, str) else section[0]
+    kind = "ddim" if "eta" in options else "ddpm"
+    arrays: Arrays = {
+        "loop/lin4/A": rng.normal(size=(4, 4)) / 4,
+        "loop/lin4/b": rng.normal(size=(4, 2)) / 4,
+        "lin4/g": np.array(0.3),
+        "loop/x_T": rng.normal(size=shape),
+        "loop/inpainted_motion": rng.normal(size=shape),
+        f"loop/{case}/noise": rng.normal(size=(30, *shape)),
+        "meta": np.array(
+            json.dumps(
+                {
+                    "options": {"mdm_loops": {case: [total, section, kind, options]}},
+                    "max_abs_diff_f32_vs_f64": {},
+                }
+            )
+        ),
+    }
+    steps, draws, x = steps_of(section, total), arrays[f"loop/{case}/noise"], arrays["loop/x_T"]
+    if skip := skipped(case, options):
+        steps = steps[:-skip]
+        level = np.cos((np.arange(total + 1) / total + 0.008) / 1.008 * np.pi / 2) ** 2
+        level = level[steps[-1] + 1] / level[0]
+        x = level**0.5 * arrays["loop/inpainted_motion"] + (1 - level) ** 0.5 * x
+    if "const_noise" in case:
+        draws = np.repeat(draws[:, :1], shape[0], 1)
+    arrays[f"loop/{case}/out"] = numpy_loop(arrays, total, steps, draws, x, options.get("eta", 1.0))
+    return arrays
+
+
+@pytest.mark.parametrize(
+    ("case", "section", "options"),
+    [
+        ("ddpm_T30_skip12_init", [30], {"skip_timesteps": 12, "init_image": True}),
+        ("ddpm_T30_skip12_init", [30], {}),
+        ("ddpm_T30_const_noise", [30], {"const_noise": True}),
+        ("ddpm_T30_skip12_const_noise", [30], {}),
+        ("ddim_T1000_fast27", "fast27", {"eta": 0.0}),
+        ("ddim_T1000_10", "10", {"eta": 0.5}),
+    ],
+)
+def test_loops_are_replayed_as_their_options_say(case, section, options):
+    replay_mdm_loop(stand_in(case, section, **options), case)
+
+
+def test_section_names():
+    assert spaced(1000, "1") == [0]
+    steps = spaced(1000, "fast27")
+    assert (len(steps), steps[-1]) == (27, 997)
+    assert steps[:-1] == spaced(1000, "10,10,3,2,2")[:-1]
 
 
 @pytest.mark.golden
@@ -166,10 +275,14 @@ def test_flow_run(case):
     np.testing.assert_allclose(seen, MFM[f"times/{case}"], rtol=0, atol=2e-4 if method == "dopri5" else 1e-6)
 
 
-def released_flow() -> tuple[Denoise, Condition]:
-    """The fixture's network with its random weights, and its conditions with their null."""
-    released = import_mdm(weights(MFM), {"arch": "trans_enc"}, num_heads=meta(MFM)["config"]["heads"])
-    pooled = torch.from_numpy(MFM["in/text_embed"])
+def released_flow(arrays: Arrays = MFM) -> tuple[Denoise, Condition]:
+    """The fixture's network with its random weights, and its conditions, texts or actions, with their null."""
+    released = import_mdm(weights(arrays), {"arch": "trans_enc"}, num_heads=meta(arrays)["config"]["heads"])
+    if "in/action" in arrays:
+        assert released.action_embedding is not None
+        pooled = released.action_embedding[torch.from_numpy(arrays["in/action"]).flatten()]
+    else:
+        pooled = torch.from_numpy(arrays["in/text_embed"]).flatten(0, -2)
     tokens = torch.zeros(len(pooled), 0, pooled.shape[1])
     null = Condition(torch.zeros_like(pooled[:1]), tokens[:1], None)
     return built(released), Condition(pooled, tokens, None, null)
@@ -191,23 +304,62 @@ NETWORK_RUNS = [name for name, run in meta(MFM)["config"]["runs"].items() if run
 @pytest.mark.golden
 @pytest.mark.parametrize("case", [pytest.param(name, id=f"mfm-{name}") for name in NETWORK_RUNS])
 def test_flow_run_of_the_network(case):
-    run = meta(MFM)["config"]["runs"][case]
+    replay_flow_run(MFM, case)
+
+
+def replay_flow_run(arrays: Arrays, case: str) -> None:
+    """Samples with the fixture's network as one of the authors' runs, and compares."""
+    run = meta(arrays)["config"]["runs"][case]
     method: str = run.get("method", "euler")
-    process = FlowMatching(meta(MFM)["sigma_min"], quantize_time=True, odeint_grid=method not in EULER)
-    denoise, cond = released_flow()
-    start, features = motions(MFM["sample/x_init"]), MFM["sample/x_init"].shape[1] * MFM["sample/x_init"].shape[2]
+    process = FlowMatching(meta(arrays)["sigma_min"], quantize_time=True, odeint_grid=method not in EULER)
+    denoise, cond = released_flow(arrays)
+    start, features = (
+        motions(arrays["sample/x_init"]),
+        arrays["sample/x_init"].shape[1] * arrays["sample/x_init"].shape[2],
+    )
     if run["on"] == "cfg":
-        denoise = classifier_free_guidance(denoise, torch.from_numpy(MFM["in/scale"]), features)
+        denoise = classifier_free_guidance(denoise, torch.from_numpy(arrays["in/scale"]), features)
     edit = None
     if "edit" in method:
-        keep, known = motions(MFM["edit/inpainting_mask"]) > 0, motions(MFM["edit/inpainted_motion"])
+        keep, known = motions(arrays["edit/inpainting_mask"]) > 0, motions(arrays["edit/inpainted_motion"])
         edit = Edit(known, keep, mode="trajectory", until=run.get("edit_till", 1.0))
     count = round(1 / run.get("step_size", 0.1))
     x = process.sample(
         denoise, replay(start, []), ones(start), cond,
         sampler=EULER.get(method, method), num_inference_steps=count, edit=edit,
     )  # fmt: skip
-    assert_golden(MFM, f"run/{case}", x)
+    assert_golden(arrays, f"run/{case}", x)
+
+
+ACTIONS = golden("mdm_action_rot6d")
+
+
+def test_flow_runs_of_action_models_are_replayed():
+    """A fixture of MFM with actions and 25 x 6 rotations, made of MDM's network for actions by steps in numpy."""
+    count, scale, x = 4, 2.5, ACTIONS["in/x_t"]
+    run = {"on": "cfg", "step_size": 1 / count, "method": "euler_raw"}
+    config = {"heads": meta(ACTIONS)["config"]["num_heads"], "runs": {"raw_cfg": run}}
+    arrays = ACTIONS | {
+        "sample/x_init": x,
+        "in/scale": np.full(len(x), scale, np.float32),
+        "meta": np.array(json.dumps({"config": config, "sigma_min": 1e-4, "max_abs_diff_f32_vs_f64": {}})),
+    }
+    released = import_mdm(weights(ACTIONS), {"arch": "trans_enc"}, num_heads=config["heads"])
+    assert released.action_embedding is not None
+    network, label = built(released), released.action_embedding[torch.from_numpy(ACTIONS["in/action"])[:, 0]]
+    tokens = torch.zeros(len(x), 0, label.shape[1])
+    for i in range(count):
+        inputs = motions(x)
+        time = torch.full((len(x),), float(1000 * i // count))
+        conditional, null = (
+            network(inputs, time, ones(inputs), Condition(pooled, tokens, None))
+            .transpose(1, 2)
+            .reshape(x.shape)
+            .numpy()
+            for pooled in (label, torch.zeros_like(label))
+        )
+        x = x + (null + scale * (conditional - null)) / count
+    replay_flow_run(arrays | {"run/raw_cfg": x}, "raw_cfg")
 
 
 @pytest.mark.golden
@@ -628,6 +780,9 @@ def test_rewriting_ends_at_its_threshold(sampler):
         (FlowMatching, {"sampler": "ddim"}, "has euler, midpoint, heun, rk4, dopri5"),
         (FlowMatching, {"sampler": "euler", "num_inference_steps": 0}, "at least 1"),
         (FlowMatching, {"sampler": "euler", "edit": "x_t"}, "trajectory, x0"),
+        (FlowMatching, {"sampler": "euler", "eta": 0.5}, "eta=0.5: a flow takes equal steps without noise"),
+        (FlowMatching, {"sampler": "euler", "spacing": "stride"}, "spacing=stride"),
+        (FlowMatching, {"sampler": "euler", "num_inference_steps": [0, 2]}, "a number of equal steps"),
         (FlowMatching, {"sampler": "dopri5", "edit": "x0"}, "cannot edit"),
     ],
 )

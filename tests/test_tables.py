@@ -523,7 +523,11 @@ parts:
       FID: {value: fid}
       Steps: {value: num_inference_steps}
     rows:
-      - {label: tiny, ckpt: runs/tiny/default/checkpoints/last.ckpt, num_inference_steps: [2, 3]}
+      - label: tiny
+        ckpt: runs/tiny/default/checkpoints/last.ckpt
+        sampler: ddim
+        eta: 0.5
+        num_inference_steps: [2, [0, 5, 9]]
       - {label: elsewhere, ckpt: runs/synthetic/mdm/default/checkpoints/last.ckpt}
 """
     )
@@ -534,6 +538,8 @@ parts:
     assert "mine: 2 of 3 rows measured" in shown
     first = files(Path("runs/tables"))
     assert b"elsewhere: make train EXP=synthetic/mdm" in first["mine.md"]
+    assert first["mine.html"].count(b"ddim, eta 0.5") == 2
+    assert first["mine.md"].count(b"0, 5, 9") == 2  # the cell, and the list of results
     assert b"differs from the protocol: replications = 1, samples = 4" in first["mine.md"]
     assert main(["tables", *asked]) == 0
     assert "evaluating" not in capsys.readouterr().out

@@ -6,11 +6,12 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 from torchmetrics import MeanMetric
 
 import flame_mdm
@@ -252,6 +253,49 @@ def test_sampling_writes_motions_and_a_player(trained, tmp_path, capsys):
     assert "player.html" in capsys.readouterr().out
 
 
+def test_sample_takes_every_option_of_sampling(trained, tmp_path):
+    out, text = tmp_path / "samples", "a person walks"
+    how: dict[str, Any] = {"frames": 40, "sampler": "ddim", "eta": 0.5, "num_inference_steps": [0, 2, 5, 9]}
+    words = [f"{key}={value}".replace(" ", "") for key, value in how.items()]
+    words += ["samples=2", "shared_noise=true", "trajectory=true"]
+    assert main(["sample", f"ckpt={trained}", f"text={text}", f"out={out}", *words]) == 0
+    model = load(trained)
+
+    def features(**change: Any) -> np.ndarray:
+        return generate(model, text, **({"shared_noise": True} | how | change))[0].features
+
+    for name in ("motion_000.npz", "motion_001.npz"):  # of the same noise
+        with np.load(out / name) as motion:
+            np.testing.assert_allclose(motion["features"], features(), atol=1e-5)
+    five = features(num_inference_steps=5)
+    assert len(five) == 40
+    np.testing.assert_array_equal(features(num_inference_steps=[0, 2, 4, 7, 9]), five)
+    for change in ({"spacing": "stride"}, {"eta": 0.0}, {"shared_noise": False}):
+        assert not np.allclose(features(num_inference_steps=5, **change), five)
+    with Image.open(out / "trajectory.png") as sheet, Image.open(out / "motions.png") as motions:
+        assert sheet.height / 5 == pytest.approx(motions.height / 2, rel=0.2)  # four estimates and the result
+
+
+def test_shared_noise_is_that_of_no_text(trained):
+    model, seen = load(trained), []
+    hook = model.denoiser.register_forward_hook(lambda module, inputs, output: seen.append(inputs[0]))
+    generate(model, ["a person walks", "a person jumps"], frames=20, shared_noise=True, guidance_scale=1.0)
+    hook.remove()
+    assert torch.equal(seen[0][0], seen[0][1])
+
+
+def test_stages_are_the_clean_estimates_up_to_the_motion(trained):
+    model, stages = load(trained), []
+    motion = generate(model, "a person walks", frames=20, num_inference_steps=4, stages=stages)[0]
+    assert [stage.text for stage in stages] == [
+        *(f"estimate after {share}% of the sampling" for share in (0, 25, 50, 75)),
+        "result: a person walks",
+    ]
+    # The last step is the mean of the posterior, which is the estimate itself.
+    np.testing.assert_allclose(stages[3].joints, motion.joints, atol=1e-5)
+    assert np.abs(stages[0].joints - motion.joints).max() > 1e-3
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [
@@ -264,6 +308,10 @@ def test_sampling_writes_motions_and_a_player(trained, tmp_path, capsys):
         (["text=a", "seconds=-1"], "cannot be sampled"),
         (["text=a", "sampler=euler"], "unknown sampler 'euler'"),
         (["text=a", "num_inference_steps=11"], "11"),
+        (["text=a", "num_inference_steps=[3,1]"], "got [3, 1]"),
+        (["text=a", "num_inference_steps=[0,1.5]"], "got [0, 1.5]"),
+        (["text=a", "eta=0.5"], "eta=0.5"),
+        (["text=a", "spacing=even"], "spacing=even"),
         (["action=wlk"], "unknown action 'wlk'"),
         (["text=a", "sead=3"], "unknown config key 'sead'. Did you mean seed"),
     ],

@@ -6,7 +6,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-from flame_mdm.commands import SAMPLING
+from flame_mdm.commands import OPTIONS, SAMPLING
 from flame_mdm.commands.sample import check_request, default_folder
 from flame_mdm.config import Config, run
 from flame_mdm.errors import UserError, say
@@ -45,13 +45,15 @@ def write_edits(config: Config) -> None:
         str(config["motion"]),
         **{key: config[key] for key in ("fps", "unit", "cut", "data_root")},
     )
-    keys = ("region", "region_seconds", "joints", "method", "until", "resample", "samples", "seed")
-    keys += ("guidance_scale", "sampler", "num_inference_steps")
+    keys = ("region", "region_seconds", "joints", "method", "until", "resample", "strength")
+    keys += ("samples", "seed", *OPTIONS)
+    stages = [] if config["trajectory"] else None
     edits = edit(
         model,
         original,
         None if config["text"] is None else str(config["text"]),
         actions=None if config["action"] is None else [str(config["action"])],
+        stages=stages,
         **{key: config[key] for key in keys},
     )
     requested = {key: config[key] for key in keys if key not in ("resample", "samples", "seed")}
@@ -61,7 +63,7 @@ def write_edits(config: Config) -> None:
     folder = Path(config["out"] or default_folder(model, what, config["seed"], requested))
     shown = replace(original, text=f"original: {original.text or original.id}")
     facts = {"seed": config["seed"], "checkpoint": sha256(file), "keep": edits[0].keep}
-    write_motions(folder, [shown, *edits], facts)
+    write_motions(folder, [shown, *edits], facts, stages)
     say(f"{len(edits)} motions of {len(original.joints)} frames: {folder / 'player.html'}, {folder / 'motions.gif'}")
     say(
         f"{edits[0].keep.mean():.0%} of the features are kept. Largest change in the kept part: "
@@ -77,5 +79,5 @@ main = partial(
     name="edit",
     objects=("ckpt", "out"),
     text=("text", "ckpt", "motion", "out"),
-    kinds={**SAMPLING, "method": "str", "until": "float", "resample": "int"},
+    kinds={**SAMPLING, "method": "str", "until": "float", "resample": "int", "strength": "float", "trajectory": "bool"},
 )

@@ -34,6 +34,7 @@ main = partial(
     text=("ckpt", "extractor", "from_samples", "protocol", "data_root", "out"),
     kinds={
         **SAMPLING,
+        "strength": "float",
         "replications": "int",
         "batch_size": "int",
         "multimodality": "bool",

@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from flame_mdm.commands import SAMPLING
+from flame_mdm.commands import OPTIONS, SAMPLING
 from flame_mdm.config import Config, run
 from flame_mdm.errors import UserError, say
 
@@ -42,21 +42,21 @@ def sample(config: Config) -> None:
     device = config["device"] or ("cuda" if torch.cuda.is_available() else "cpu")
     file = find(config["ckpt"], config["which"])
     model = load(file, device)
+    stages = [] if config["trajectory"] else None
+    keys = ("seconds", "frames", *OPTIONS)
     motions = generate(
         model,
         None if config["text"] is None else str(config["text"]),
         actions=None if config["action"] is None else [str(config["action"])],
-        seconds=config["seconds"],
-        frames=config["frames"],
         samples=config["samples"],
         seed=config["seed"],
-        guidance_scale=config["guidance_scale"],
-        sampler=config["sampler"],
-        num_inference_steps=config["num_inference_steps"],
+        shared_noise=config["shared_noise"],
+        stages=stages,
+        **{key: config[key] for key in keys},
     )
-    requested = {key: config[key] for key in ("seconds", "frames", "guidance_scale", "sampler", "num_inference_steps")}
+    requested = {key: config[key] for key in keys} | {"shared_noise": config["shared_noise"] or None}
     folder = Path(config["out"] or default_folder(model, motions[0].text or "unconditioned", config["seed"], requested))
-    write_motions(folder, motions, {"seed": config["seed"], "checkpoint": sha256(file)})
+    write_motions(folder, motions, {"seed": config["seed"], "checkpoint": sha256(file)}, stages)
     say(
         f"{len(motions)} motions of {len(motions[0].joints)} frames: {folder / 'player.html'}, {folder / 'motions.gif'}"
     )
@@ -69,7 +69,7 @@ main = partial(
     name="sample",
     objects=("ckpt", "out"),
     text=("text", "ckpt", "out"),
-    kinds={**SAMPLING, "seconds": "float"},
+    kinds={**SAMPLING, "seconds": "float", "shared_noise": "bool", "trajectory": "bool"},
 )
 
 

@@ -44,6 +44,7 @@ KINDS: dict[str, tuple[type | tuple[type, ...], str]] = {
     "int": (int, "a whole number"),
     "float": ((int, float), "a number"),
     "str": (str, "a text"),
+    "list[int]": (list, "a list of whole numbers"),
     "None": (type(None), "null"),
 }
 

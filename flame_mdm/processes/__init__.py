@@ -70,8 +70,11 @@ class Process(nn.Module, ABC):
         cond: Condition,
         *,
         sampler: str,
-        num_inference_steps: int,
+        num_inference_steps: int | Sequence[int],
         edit: Edit | None = None,
+        spacing: str = "linspace",
+        eta: float = 0.0,
+        trajectory: list[Tensor] | None = None,
     ) -> Tensor:
         """Samples normalized motion (B, F, D) from noise; frames past the end of a motion are 0.
 

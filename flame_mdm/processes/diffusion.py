@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from flame_mdm.losses import masked_mean, masked_mse
 from flame_mdm.motion import Condition, Denoise, Edit, Noise
 from flame_mdm.processes import Auxiliary, Process, samplers
-from flame_mdm.processes.schedules import Schedule, ScheduleName, Spacing, build_schedule, timesteps
+from flame_mdm.processes.schedules import Schedule, ScheduleName, build_schedule, timesteps
 
 Prediction = Literal["x0", "epsilon", "velocity"]
 Variance = Literal["fixed_small", "fixed_large", "learned_range"]
@@ -234,10 +234,10 @@ class GaussianDiffusion(Process):
         mask: Tensor,
         cond: Condition,
         *,
-        sampler: Sampler | str = "ancestral",
+        sampler: str = "ancestral",
         num_inference_steps: int | Sequence[int],
         edit: Edit | None = None,
-        spacing: Spacing = "linspace",
+        spacing: str = "linspace",
         eta: float = 0.0,
         trajectory: list[Tensor] | None = None,
     ) -> Tensor:
@@ -289,14 +289,15 @@ class GaussianDiffusion(Process):
             x = samplers.dpm_solver_pp_2m(estimate, schedule, noise, edit)
         return x * mask[..., None]
 
-    def _steps(self, chosen: int | Sequence[int], spacing: Spacing) -> list[int]:
+    def _steps(self, chosen: int | Sequence[int], spacing: str) -> list[int]:
         total = len(self.schedule)
         if isinstance(chosen, int):
             if chosen < 2:
                 raise ValueError(f"num_inference_steps is {chosen}: diffusion takes 2 to {total} steps")
             return timesteps(total, chosen, spacing)
         steps = list(chosen)
-        if len(steps) < 2 or steps != sorted(set(steps)) or steps[0] < 0 or steps[-1] >= total:
+        whole = all(type(step) is int for step in steps)
+        if not whole or len(steps) < 2 or steps != sorted(set(steps)) or steps[0] < 0 or steps[-1] >= total:
             raise ValueError(
                 f"sampling steps must be at least 2 distinct steps from 0 to {total - 1}, increasing: got {steps}"
             )
@@ -315,6 +316,8 @@ def check_edit(edit: Edit, mask: Tensor, modes: Sequence[str], process: str) -> 
         raise ValueError(
             f"edit has blend={edit.blend}, resample={edit.resample}: blend is after or before, resample at least 1"
         )
+    if edit.strength is not None and not 0 < edit.strength <= 1:
+        raise ValueError(f"strength={edit.strength}: choose a number above 0, up to 1")
     if edit.known.shape != edit.keep.shape or edit.known.shape[:2] != mask.shape:
         shapes = f"known {tuple(edit.known.shape)}, keep {tuple(edit.keep.shape)}"
         raise ValueError(f"edit does not match the shape of the motions: {shapes}, mask {tuple(mask.shape)}")

@@ -1,5 +1,6 @@
 """Flow matching on straight paths (Lipman et al. 2023; Motion Flow Matching)."""
 
+from collections.abc import Sequence
 from typing import Literal, get_args
 
 import torch
@@ -118,8 +119,10 @@ class FlowMatching(Process):
         cond: Condition,
         *,
         sampler: str = "euler",
-        num_inference_steps: int,
+        num_inference_steps: int | Sequence[int],
         edit: Edit | None = None,
+        spacing: str = "linspace",
+        eta: float = 0.0,
         trajectory: list[Tensor] | None = None,
     ) -> Tensor:
         """See `Process.sample`; draws only noise number 0.
@@ -136,6 +139,7 @@ class FlowMatching(Process):
                 with the straight path from its noise to the known motion; after that, the model moves it freely. Mode
                 "x0" overwrites the clean estimate of every call, which reproduces the kept part exactly. Not supported
                 by "dopri5".
+            spacing, eta: of diffusion; other values than these are refused.
             trajectory: list to which the clean estimate (B, F, D) of each call is appended.
 
         Raises:
@@ -143,6 +147,10 @@ class FlowMatching(Process):
         """
         if sampler != "dopri5" and sampler not in STEPS:
             raise ValueError(f"unknown sampler '{sampler}': FlowMatching has {', '.join(STEPS)}, dopri5")
+        if spacing != "linspace" or eta:
+            raise ValueError(f"spacing={spacing}, eta={eta}: a flow takes equal steps without noise; leave them out")
+        if not isinstance(num_inference_steps, int):
+            raise ValueError(f"num_inference_steps={num_inference_steps}: a flow takes a number of equal steps")
         if num_inference_steps < 1:
             raise ValueError(f"num_inference_steps is {num_inference_steps}: flow matching needs at least 1")
         if edit is not None:
@@ -174,8 +182,11 @@ class FlowMatching(Process):
         if sampler == "dopri5":
             return samplers.dopri5(velocity, start) * mask[..., None]
         step, times, count = STEPS[sampler], self.times(num_inference_steps), num_inference_steps
+        first = 0 if edit is None else count - edit.steps(count)
         x = start
-        for i in range(count):
+        if edit is not None and edit.strength is not None:
+            x = self.corrupt(edit.known, start, start.new_full((len(start),), times[first]))
+        for i in range(first, count):
             if edit is not None and edit.mode == "trajectory" and i / count <= edit.until:
                 x = torch.where(edit.keep, (start * (count - i) + edit.known * i) / count, x)
             x = step(velocity, x, times[i], times[i + 1] - times[i])

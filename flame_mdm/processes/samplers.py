@@ -113,13 +113,15 @@ def _descend(
         return noise(next(draws))
 
     x = draw()
-    top = len(schedule) - 1
+    top = (len(schedule) if edit is None else edit.steps(len(schedule))) - 1
+    if edit is not None and edit.strength is not None:
+        x = schedule.corrupt(edit.known, x, top)
+    elif edit is not None and edit.mode == "x_t" and edit.blend == "after":
+        x = torch.where(edit.keep, schedule.corrupt(edit.known, x, top), x)
     if edit is None or edit.mode != "x_t":
         for i in range(top, -1, -1):
             x = step(x, i, draw)
         return x
-    if edit.blend == "after":
-        x = torch.where(edit.keep, schedule.corrupt(edit.known, x, top), x)
     for i in range(top, -1, -1):
         for repeats_left in range(edit.resample - 1 if i else 0, -1, -1):
             if edit.blend == "before":

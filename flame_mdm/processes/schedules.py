@@ -102,7 +102,7 @@ def build_schedule(name: ScheduleName, num_train_timesteps: int) -> Schedule:
     return Schedule({"cosine": cosine_betas, "linear": linear_betas}[name](num_train_timesteps))
 
 
-def timesteps(num_train_timesteps: int, num_inference_steps: int, spacing: Spacing = "linspace") -> list[int]:
+def timesteps(num_train_timesteps: int, num_inference_steps: int, spacing: str = "linspace") -> list[int]:
     """Returns N increasing sampling steps from 0 ... T - 1.
 
     Args:

@@ -26,6 +26,7 @@ from flame_mdm.reporting.plots import standalone
 from flame_mdm.reporting.rendering import WRITERS, Cell, Figure, Line, Part, Table, draw, figure_names, fragment, places
 from flame_mdm.reporting.study import Ratings, wilson
 from flame_mdm.runs import (
+    Checkpoint,
     ClosedSchema,
     Int,
     Number,
@@ -40,13 +41,16 @@ from flame_mdm.runs import (
 
 SPECS = EXPERIMENTS / "tables"
 PUBLISHED = SPECS / "published.yaml"
-SWEPT = ("sampler", "num_inference_steps", "guidance_scale", "until", "batch_size")
+SWEPT = ("sampler", "num_inference_steps", "eta", "spacing", "guidance_scale", "until", "strength", "batch_size")
 """Options of a row that may be lists; each value makes one row."""
 ABOUT = {
     "num_inference_steps": "sampling steps",
     "guidance_scale": "guidance scale",
     "sampler": "sampler",
+    "eta": "eta",
+    "spacing": "spacing",
     "until": "fraction of sampling that is rewritten",
+    "strength": "strength of the variation",
     "nfe": "network calls per motion",
     "seconds_per_sample": "seconds per motion",
     "batch_size": "batch size",
@@ -93,9 +97,12 @@ class Row(Options):
     from_samples: str = ""
     method: str = ""
     sampler: str | list[str] = ""
-    num_inference_steps: Int | list[Int] = 0
+    num_inference_steps: Int | list[Int | list[Int]] = 0
+    eta: Number | list[Number] = 0
+    spacing: str | list[str] = ""
     guidance_scale: Number | list[Number] = 0
     until: Number | list[Number] = 0
+    strength: Number | list[Number] = 0
     batch_size: Int | list[Int] = 0
 
     @model_validator(mode="before")
@@ -472,7 +479,7 @@ def _line(row: Mapping[str, Any], found: Sequence[Result | None], values: Sequen
         "weights": weights[checkpoint.averaged_weights if checkpoint else None],
         "guidance": _text(checkpoint and checkpoint.guidance_scale),
         "predicts": _text(checkpoint and checkpoint.prediction),
-        "sampler": _text(checkpoint and checkpoint.sampler),
+        "sampler": _sampler(checkpoint) if checkpoint else "",
         "steps": _text(checkpoint and checkpoint.num_inference_steps),
         "replications x motions": most + others,
         "seed": _text(first.seed),
@@ -486,7 +493,14 @@ def _line(row: Mapping[str, Any], found: Sequence[Result | None], values: Sequen
 
 
 def _text(value: Any) -> str:
+    if isinstance(value, list):  # chosen steps
+        return ", ".join(map(str, value))
     return "" if value is None else f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def _sampler(checkpoint: Checkpoint) -> str:
+    options = {"eta": checkpoint.eta, "spacing": checkpoint.spacing}
+    return ", ".join([checkpoint.sampler, *(f"{name} {value}" for name, value in options.items() if value is not None)])
 
 
 def _about(result: Result, name: str) -> Any:
@@ -502,7 +516,7 @@ def _cell(result: Result | None, value: str, row: Mapping[str, Any]) -> Cell | N
         found = row.get(value) if result is None else _about(result, value)
         if found is None:
             return None
-        return Cell(f"{float(found):,g}", float(found)) if isinstance(found, int | float) else Cell(str(found))
+        return Cell(f"{float(found):,g}", float(found)) if isinstance(found, int | float) else Cell(_text(found))
     return None if result is None else _entry((result.values or {}).get(value))
 
 

@@ -115,8 +115,8 @@ def edit(
     keep, still = kept_parts(representation, length, region=region, region_seconds=region_seconds, joints=joints)
     if not keep.any() and strength is None:
         raise UserError(
-            "no part of the motion is kept: choose region=..., region_seconds=... or joints=..., or vary all of it with "
-            "strength=0.5"
+            "no part of the motion is kept: choose region=..., region_seconds=... or joints=..., or vary all "
+            "of it with strength=0.5"
         )
     if keep.all():
         raise UserError("the entire motion is kept: choose a region or joints to resample")

@@ -224,7 +224,7 @@ def test_a_variation_may_keep_parts(diffusion, motion):
 def test_a_variation_needs_a_share_of_the_steps(diffusion, motion, strength):
     with pytest.raises(UserError, match=r"strength=.*above 0, up to 1"):
         edit(diffusion, motion, strength=strength)
-    with pytest.raises(UserError, match=r"keeps nothing.*strength=0\.5"):
+    with pytest.raises(UserError, match=r"no part of the motion is kept.*strength=0\.5"):
         edit(diffusion, motion)
 
 

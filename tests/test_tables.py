@@ -538,8 +538,8 @@ parts:
     assert "mine: 2 of 3 rows measured" in shown
     first = files(Path("runs/tables"))
     assert b"elsewhere: make train EXP=synthetic/mdm" in first["mine.md"]
-    assert first["mine.html"].count(b"ddim, eta 0.5") == 2
-    assert first["mine.md"].count(b"0, 5, 9") == 2  # the cell, and the list of results
+    assert b"ddim, eta 0.5" in first["mine.html"]
+    assert b"| 0, 5, 9 |" in first["mine.md"]
     assert b"differs from the protocol: replications = 1, samples = 4" in first["mine.md"]
     assert main(["tables", *asked]) == 0
     assert "evaluating" not in capsys.readouterr().out

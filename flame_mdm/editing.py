@@ -15,6 +15,7 @@ from torch import Tensor
 from flame_mdm.data.store import Store
 from flame_mdm.errors import UserError, did_you_mean
 from flame_mdm.formats.files import ENDINGS, read
+from flame_mdm.formats.layouts import find_skeleton
 from flame_mdm.formats.motion import Motion
 from flame_mdm.formats.resampling import resample as resample_joints
 from flame_mdm.generation import generate
@@ -309,6 +310,7 @@ def read_motion(
     *,
     fps: float | None = None,
     unit: float | None = None,
+    up: str | None = None,
     cut: Sequence[float] | None = None,
     data_root: str | Path = "data",
 ) -> Motion:
@@ -320,6 +322,7 @@ def read_motion(
             prepared data set. Features of the same representation and frame rate are kept. Joints are resampled to the
             frame rate of the model and made canonical by its representation.
         fps, unit: of the file, as in `flame_mdm.formats.files.read`.
+        up: the axis of the file that points up (y, z or -y); other facts are those of the nearest `skeleton.yaml`.
         cut: begin and end, in seconds, of the part to use.
         data_root: folder of the prepared data sets.
 
@@ -330,7 +333,8 @@ def read_motion(
     """
     name = str(source)
     if Path(source).suffix.lower() in ENDINGS:
-        motion = replace(read(source, fps, unit, resample_to=representation.fps), id=name)
+        given = find_skeleton(Path(source), up)
+        motion = replace(read(source, fps, unit, representation.fps, given), id=name)
         motion = with_features(representation, motion)
     elif ":" in name:
         motion = _read_clip(representation, name, Path(data_root))

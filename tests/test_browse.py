@@ -179,7 +179,7 @@ def test_shown_clips_are_written_as_motion_files(tmp_path, data_root, capsys):
     assert run(tmp_path, data_root, "split=test", "clips=4", f"motions={folder}") == 0
     page = Page(tmp_path / "page.html")
     files = sorted(folder.glob("*.npz"))
-    assert [path.name for path in files] == [f"motion_{number:03d}.npz" for number in range(len(page.motions))]
+    assert [path.name for path in files] == [f"motion_{n:03d}_{m['id']}.npz" for n, m in enumerate(page.motions)]
     for path, shown in zip(files, page.motions, strict=True):
         found = read(path)
         assert found.fps == 20
@@ -192,7 +192,7 @@ def test_shown_clips_are_written_as_motion_files(tmp_path, data_root, capsys):
                 HumanML().decode(torch.from_numpy(file["features"])).numpy(), file["joints"], atol=1e-6
             )
     assert run(tmp_path, data_root, "split=test", "clips=1", f"motions={folder}") == 1
-    assert "holds other motions, such as motion_001.npz" in capsys.readouterr().err
+    assert "holds other motions, such as motion_001_" in capsys.readouterr().err
 
 
 def test_a_caption_names_one_motion_where_it_can(store, tmp_path):

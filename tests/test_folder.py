@@ -12,14 +12,17 @@ import torch
 from fixtures import ROOT
 
 from flame_mdm.__main__ import main
+from flame_mdm.data import hashed_split
 from flame_mdm.data.crops import Units
 from flame_mdm.data.datamodule import MotionDataModule
 from flame_mdm.data.folder import Folder
-from flame_mdm.data.store import write_store
+from flame_mdm.data.store import Store, write_store
 from flame_mdm.data.synthetic import Synthetic
+from flame_mdm.editing import read_motion
 from flame_mdm.errors import UserError
 from flame_mdm.formats import bvh
-from flame_mdm.formats.layouts import LAYOUTS, read_skeleton
+from flame_mdm.formats.files import read
+from flame_mdm.formats.layouts import LAYOUTS, SOMA77, read_skeleton
 from flame_mdm.representations.humanml import HumanML
 from flame_mdm.representations.skeleton import KIT21, SMPL22
 from flame_mdm.representations.smpl import ADULT, SMPL
@@ -93,7 +96,7 @@ def bvh_of(names: tuple[str, ...], positions: np.ndarray, parents: tuple[int, ..
 
 
 @pytest.mark.parametrize("name", LAYOUTS)
-@pytest.mark.parametrize("prefix", ["", "mixamorig:"])
+@pytest.mark.parametrize("prefix", ["", "mixamorig:", "mixamorig_", "mixamorig1_"])
 def test_known_skeletons_are_recognized(name: str, prefix: str, tmp_path: Path):
     """Joints that a skeleton has itself come out where they are; the blended ones lie between them."""
     layout = LAYOUTS[name]
@@ -104,7 +107,7 @@ def test_known_skeletons_are_recognized(name: str, prefix: str, tmp_path: Path):
     names = [*own, *sorted(extra)]
     number = {joint: k for k, joint in enumerate(SMPL22.joints)}
     place = [number[own[n]] if n in own else number["spine3"] for n in names]
-    unit = 0.01 if name == "SMPL" else layout.unit
+    unit = 0.01 if name in ("SMPL", "SOMA") else layout.unit
     positions = WALK[:, place] / unit * [-1 if layout.mirrored else 1, 1, 1]
     names = tuple(prefix + n for n in names)
     bvh.write(bvh_of(names, positions, (-1, *(0 for _ in names[1:])), 30.0), tmp_path / "take.bvh")
@@ -249,7 +252,10 @@ BAD = {
     "23 joints": (lambda f: np.save(f / "one.npy", np.zeros((9, 23, 3))), r"one\.npy: 23 joints, not the 22, 24 or 52"),
     "17 joints": (lambda f: np.save(f / "one.npy", np.zeros((9, 17, 3))), r"one\.npy: 17 joints with unknown names"),
     "nan": (lambda f: np.save(f / "one.npy", WALK * np.nan), r"one\.npy: numbers of joints in frame 0 are not finite"),
-    "unit": (lambda f: np.save(f / "one.npy", WALK * 100), r"one\.npy: the legs are 8\d.* m long; set `unit`"),
+    "unit": (
+        lambda f: np.save(f / "one.npy", WALK * 100),
+        r"one\.npy: the legs are 8\d.* m long .* be 0\.01 \(cent",
+    ),
     "sides": (lambda f: np.save(f / "one.npy", WALK * [-1, 1, 1]), r"one\.npy: the toes point backwards"),
     "up": (
         lambda f: np.savez(f / "deep/two.npz", joints=WALK[..., [0, 2, 1]] * [1, -1, 1], fps=9),
@@ -263,7 +269,10 @@ BAD = {
     "yaml up": (lambda f: skeleton(f, "up: x"), r"skeleton\.yaml: up: x is not valid"),
     "yaml map": (lambda f: skeleton(f, "map: {pelvis: Hips}"), r"skeleton\.yaml: map: no joint given for head"),
     "yaml names": (lambda f: skeleton(f, f"joints: [a]\nmap: {MAP}"), r"map: head\?, .* is not among the joints"),
-    "other map": (lambda f: skeleton(f, f"fps: 30\nmap: {MAP}"), r"two\.npz: its joints .* do not match the map"),
+    "other map": (
+        lambda f: skeleton(f, f"fps: 30\nmap: {MAP}"),
+        r"two\.npz: the map in skeleton\.yaml uses .* head\?",
+    ),
 }
 
 
@@ -284,7 +293,7 @@ def test_unknown_joints_are_listed(tmp_path: Path):
     bvh.write(bvh_of(("root", "tail"), WALK[:, :2], (-1, 0), 30.0), tmp_path / "cat.bvh")
     with pytest.raises(
         ValueError,
-        match=r"cat\.bvh: its joints \(root, tail\) do not match any of the known skeletons SMPL, Mixamo, CMU",
+        match=r"cat\.bvh: unknown skeleton\. .* missing: .*those of the file: root, tail",
     ):
         only(tmp_path)
 
@@ -305,6 +314,177 @@ def test_motions_are_excluded_by_name(arrays: Path):
 def test_a_skeleton_file_is_read(tmp_path: Path):
     skeleton(tmp_path, "up: -y\nmirrored: true\n")
     assert read_skeleton(tmp_path / "skeleton.yaml") == {"up": "-y", "mirrored": True}
+
+
+def mixamo(path: Path, scale: float = 1.0, prefix: str = "", toes: float = 1.0) -> Path:
+    """Writes the stiff body of `turning` in another unit, with end sites below the feet in place of toes if wanted."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    body = bvh.read(turning(path))
+    names = [prefix + name for name in body.joints]
+    keep = [k for k, name in enumerate(names) if toes == 1 or "Toe" not in name]
+    ends = [k for k in range(len(names)) if k not in keep]
+    columns = np.r_[tuple(body.columns()[k] for k in keep)]
+    frames = body.frames[:, columns] * np.r_[np.full(3, scale), np.ones(len(columns) - 3)]
+    made = bvh.Bvh(
+        tuple(names[k] for k in keep),
+        tuple(keep.index(body.parents[k]) if k else -1 for k in keep),
+        body.offsets[keep] * scale,
+        tuple(body.channels[k] for k in keep),
+        tuple(keep.index(body.parents[k]) for k in ends),
+        body.offsets[ends].reshape(-1, 3) * scale * toes,
+        frames,
+        30.0,
+    )
+    bvh.write(made, path)
+    return path
+
+
+INCH = 1 / 2.54
+
+
+def test_wrong_units_are_refused_with_the_unit_that_fits(tmp_path: Path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    mixamo(tmp_path / "mine" / "a.bvh", INCH)
+    message = r"a\.bvh: the legs are 0\.3\d+ m long .*The unit may be 0\.0254 \(inches\): set `unit: 0\.0254`"
+    with pytest.raises(ValueError, match=message):
+        only(tmp_path / "mine")
+    assert main(["convert", "mine/a.bvh", "out=a.glb"]) == 1
+    assert re.search(message, capsys.readouterr().err)
+    assert main(["convert", "mine/a.bvh", "out=a.bvh"]) == 0, "a copy keeps its proportions"
+    assert "adults have legs of 0.6 to 1.2 m" in capsys.readouterr().out
+    assert main(["convert", "mine/a.bvh", "out=a.glb", "unit=0.0254"]) == 0
+    skeleton(tmp_path / "mine", "children: true\n")
+    assert only(tmp_path / "mine").shape[1:] == (22, 3)
+    skeleton(tmp_path / "mine", "unit: 0.0254\n")
+    assert only(tmp_path / "mine").shape[1:] == (22, 3)
+
+
+def test_convert_and_edit_read_files_as_prepare_does(tmp_path: Path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    mixamo(tmp_path / "mine" / "deep" / "a.bvh", INCH)
+    skeleton(tmp_path / "mine", "unit: 0.0254\nup: z\n")
+    assert main(["convert", "mine/deep/a.bvh", "out=a.npy"]) == 0
+    np.testing.assert_allclose(np.load("a.npy"), next(Folder("mine").clips(30.0)).motion, atol=1e-5)
+    assert main(["convert", "mine/deep/a.bvh", "out=b.npy", "up=y"]) == 0
+    np.testing.assert_allclose(np.load("b.npy")[..., 2], np.load("a.npy")[..., 1], atol=1e-5)
+    skeleton(tmp_path / "mine", "unit: 0.0254\n")
+    edited = read_motion(HumanML(), "mine/deep/a.bvh").joints
+    np.testing.assert_allclose(np.ptp(edited[0, :, 1]), np.ptp(np.load("b.npy")[0, :, 1]), atol=1e-3)
+    assert np.ptp(read_motion(HumanML(), "mine/deep/a.bvh", up="z").joints[0, :, 1]) < 0.6, "it lies"
+
+    np.save("mine/walk.npy", WALK[..., [0, 2, 1]] * [-1, -1, 1] / 0.0254)
+    skeleton(tmp_path / "mine", "unit: 0.0254\nup: z\nmirrored: true\nfps: 30\n")
+    assert main(["convert", "mine/walk.npy", "out=walk.npy"]) == 0
+    np.testing.assert_allclose(np.load("walk.npy"), WALK, atol=1e-5)
+    np.savez("mine/made.npz", joints=WALK, fps=30, text="a person walks")
+    assert main(["convert", "mine/made.npz", "out=made.npy"]) == 0, "motions made by this project are in meters, y up"
+    np.testing.assert_allclose(np.load("made.npy"), WALK, atol=1e-6)
+    assert main(["convert", "mine/walk.npy", "out=walk.npy", "up=x"]) == 1
+
+
+def test_the_nearest_skeleton_file_applies(tmp_path: Path):
+    mixamo(tmp_path / "a" / "x.bvh")
+    mixamo(tmp_path / "b" / "deep" / "y.bvh", INCH, "theirs_")
+    places = {
+        joint: f"theirs_{next(iter(p)) if isinstance(p, dict) else p}" for joint, p in LAYOUTS["Mixamo"].map.items()
+    }
+    skeleton(tmp_path / "b", f"unit: 0.0254\nmap: {json.dumps(places)}\n")
+    source = Folder(str(tmp_path))
+    one, two = source.clips(30.0)
+    np.testing.assert_allclose(one.motion, two.motion, atol=1e-4)
+    assert len(source.findings()) == 2
+    assert "own map, unit 0.0254, 30 fps (" in source.findings()[1]
+
+
+def test_feet_without_toes_end_at_the_end_sites(tmp_path: Path):
+    mixamo(tmp_path / "a.bvh", toes=1.0)
+    mixamo(tmp_path / "b.bvh", toes=0.999)
+    places = {j: next(iter(p)) if isinstance(p, dict) else p for j, p in LAYOUTS["Mixamo"].map.items()}
+    whole, ends = (clip.motion for clip in Folder(str(tmp_path)).clips(30.0))
+    np.testing.assert_allclose(whole, ends, atol=1e-3)
+    places |= {"left_foot": "LeftFoot.end", "right_foot": "RightFoot.end"}
+    (tmp_path / "a.bvh").unlink()
+    skeleton(tmp_path, f"unit: 0.01\nmap: {json.dumps(places)}\n")
+    np.testing.assert_allclose(only(tmp_path), ends, atol=1e-6)
+    places |= {"left_foot": "LeftFoot"}
+    skeleton(tmp_path, f"unit: 0.01\nmap: {json.dumps(places)}\n")
+    with pytest.raises(ValueError, match=r"b\.bvh: the left foot has no length"):
+        only(tmp_path)
+
+
+def test_arrays_of_kimodo_are_known(tmp_path: Path):
+    layout = LAYOUTS["SOMA"]
+    joints = np.zeros((len(WALK), 77, 3))
+    for joint, place in layout.map.items():
+        (name,) = [place] if isinstance(place, str) else place
+        joints[:, SOMA77.index(name)] = WALK[:, SMPL22.joints.index(joint)]
+    np.savez(tmp_path / "a.npz", posed_joints=joints, root_positions=joints[:, 0])
+    np.testing.assert_allclose(only(tmp_path), WALK, atol=1e-5)
+    np.testing.assert_allclose(read(tmp_path / "a.npz").joints, WALK, atol=1e-5)
+
+
+def test_check_lists_skeletons_and_all_failures(tmp_path: Path):
+    mixamo(tmp_path / "a.bvh")
+    mixamo(tmp_path / "b.bvh", INCH)
+    mixamo(tmp_path / "c.bvh", INCH)
+    (tmp_path / "d.bvh").write_text("HIERARCHY\n")
+    lines = Folder(str(tmp_path)).check()
+    assert re.fullmatch(r"Mixamo, unit 0\.01, 30 fps: 1 motions, legs 0\.8\d m, head joint at 1\.\d\d m", lines[0])
+    assert re.match(r"error: .*b\.bvh and 1 more: the legs are", lines[1])
+    assert re.match(r"error: .*d\.bvh, line 1: ", lines[2])
+    assert re.fullmatch(r"error: 3 of 4 motions of .* cannot be prepared", lines[3])
+
+
+@pytest.mark.parametrize("motions", [10, 12, 15, 20])
+def test_from_ten_motions_on_each_split_has_some(motions: int, tmp_path: Path):
+    for begin in range(6):
+        folder = tmp_path / str(begin)
+        folder.mkdir()
+        for number in range(motions):
+            np.savez(folder / f"walk_{begin}_{number}.npz", joints=WALK[:30], fps=30)
+        splits = Folder(str(folder)).splits
+        hashed = {name: hashed_split(name, val=5, test=10) for name in splits}
+        assert set(splits.values()) == {"train", "val", "test"}
+        if set(hashed.values()) == {"train", "val", "test"}:
+            assert splits == hashed
+        assert sum(splits[name] != hashed[name] for name in splits) <= 2
+        rows = [{"id": name, "text": "a", "source": f"take {number % 4}"} for number, name in enumerate(splits)]
+        write_table(folder, rows, "json")
+        taken = Folder(str(folder))
+        of_source = {(taken.notes[name].source, split) for name, split in taken.splits.items()}
+        assert len(of_source) == 4, "a source stays in one split"
+        assert len({split for _, split in of_source}) == 3
+
+
+def test_counts_are_of_clips_that_the_recipe_uses(tmp_path: Path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    for number in range(9):
+        (tmp_path / "mine").mkdir(exist_ok=True)
+        np.savez(f"mine/{number}.npz", joints=WALK[: 20 if number < 5 else 60], fps=20)
+    rows = [{"id": str(number), "text": "walks", "split": "train"} for number in range(9)]
+    write_table(tmp_path / "mine", rows, "csv")
+    words = ["data=folder", "data.name=mine", "data_root=data"]
+    assert main(["prepare", *words, "source=mine"]) == 0
+    prepared = capsys.readouterr().out
+    assert main(["browse", *words]) == 0
+    for output in (prepared, capsys.readouterr().out):
+        assert "clips: 4 of 9 (5 shorter than 24 frames) train, 0 val, 0 test" in output
+        assert "no test clips: own data gets some by a `split` column in captions.csv" in output
+    assert "legs 0.8" in prepared
+    assert Store(tmp_path / "data" / "mine-humanml-clean-smpl22").info["dataset"] == "mine"
+
+
+def test_stores_of_earlier_versions_keep_their_name(tmp_path: Path):
+    np.savez(tmp_path / "a.npz", joints=WALK, fps=30)
+
+    def data(name: str) -> MotionDataModule:
+        source = Folder(str(tmp_path))
+        return MotionDataModule(source, HumanML(), root=str(tmp_path / "x"), name=name, batch_size=1, crop=Units(24))
+
+    earlier = data("folder")
+    earlier.prepare_data()
+    (tmp_path / "x" / f"folder-{HumanML().name}").rename(tmp_path / "x" / f"mine-{HumanML().name}")
+    assert data("mine").open().info["dataset"] == "folder"
 
 
 QUICK = [
@@ -350,6 +530,6 @@ def test_the_tutorial_works_as_it_is_written(
     assert ran == 4
     output = capsys.readouterr().out
     assert "40 clips can be prepared" in output
-    assert "folder as humanml-clean-smpl22 at 20 fps" in output
+    assert "mine as humanml-clean-smpl22 at 20 fps" in output
     assert list(tmp_path.glob("samples/mine/*/*.html"))
     assert set(read_skeleton(tmp_path / "mine" / "skeleton.yaml")["map"]) == set(SMPL22.joints)

@@ -49,6 +49,7 @@ def browse(config: Config) -> None:
     out = Path(config["out"] or Path("runs") / "browse" / f"{data.folder.name}.html")
     write_page(out, store, representation, clips, title)
     say(f"{out}: {len(clips)} of {matching} clips, {out.stat().st_size / 1e6:.1f} MB")
+    say(*data.counts(store))
     if config["motions"] is not None:
         write_clips(Path(config["motions"]), store, representation, clips, data.crop.longest())
         say(f"{config['motions']}: {len(clips)} motions")

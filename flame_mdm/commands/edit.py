@@ -43,7 +43,7 @@ def write_edits(config: Config) -> None:
     original = read_motion(
         model.representation,
         str(config["motion"]),
-        **{key: config[key] for key in ("fps", "unit", "cut", "data_root")},
+        **{key: config[key] for key in ("fps", "unit", "up", "cut", "data_root")},
     )
     keys = ("region", "region_seconds", "joints", "method", "until", "resample", "strength")
     keys += ("samples", "seed", *OPTIONS)
@@ -78,6 +78,6 @@ main = partial(
     usage=USAGE,
     name="edit",
     objects=("ckpt", "out"),
-    text=("text", "ckpt", "motion", "out"),
+    text=("text", "ckpt", "motion", "out", "up"),
     kinds={**SAMPLING, "method": "str", "until": "float", "resample": "int", "strength": "float", "trajectory": "bool"},
 )

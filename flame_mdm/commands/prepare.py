@@ -51,9 +51,10 @@ def prepare(config: Config) -> None:
         say(f"{data.folder}: already prepared (force=true rewrites it, verify=true checks it)")
     else:
         store = write_store(data.folder, data.source, representation)
+        say(*data.source.findings())
     info = store.info
-    clips = ", ".join(f"{count} {split}" for split, count in info["clips"].items())
-    say(f"{info['dataset']} as {info['representation']} at {info['fps']:g} fps: {clips}; {info['hours']} hours")
+    say(f"{info['dataset']} as {info['representation']} at {info['fps']:g} fps; {info['hours']} hours")
+    say(*data.counts(store))
     if info["excluded"]:
         say("excluded: " + ", ".join(f"{count} {reason}" for reason, count in info["excluded"].items()))
     say(f"{info['shape'][0]} frames with {info['shape'][1]} features, fingerprint {store.fingerprint}: {data.folder}")

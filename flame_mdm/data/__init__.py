@@ -54,6 +54,8 @@ class MotionSource(ABC):
     """A data set in the form in which it is published."""
 
     name: str
+    named_by_recipe: ClassVar[bool] = False
+    """Whether the name of the data set is `data.name` of the recipe, because the files are the user's own."""
     options: Mapping[str, Any]
     """Arguments that define the data (all but `PLACES`), as JSON values. They are saved in the store."""
     actions: tuple[str, ...] = ()
@@ -84,6 +86,10 @@ class MotionSource(ABC):
     def counts(self) -> Mapping[str, float]:
         """Returns the figures of the raw data under the names of `published.yaml`; saved once `clips` is exhausted."""
         return {}
+
+    def findings(self) -> list[str]:
+        """Returns lines to print about the motions, complete once `clips` is exhausted."""
+        return []
 
     @abstractmethod
     def count(self) -> int:

@@ -6,6 +6,7 @@ batches as an uninterrupted one.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -156,6 +157,8 @@ class MotionDataModule(LightningDataModule):
         if num_workers < 0 or not name:
             raise ValueError(f"data.num_workers={num_workers}, data.name='{name}': give 0 or more, and a name")
         _check_crop(crop)
+        if source.named_by_recipe:
+            source.name = name
         self.source, self.representation = source, representation
         self.folder = Path(root) / f"{name}-{representation.name}"
         self.batch_size, self.num_workers, self.seed = batch_size, num_workers, seed
@@ -187,8 +190,10 @@ class MotionDataModule(LightningDataModule):
             "fps": self.representation.fps,
             "published_split": self.source.published_split,
         }
-        # Stores of earlier versions do not have their options.
+        # Stores of earlier versions do not have their options; those of own data have the name "folder".
         found = {name: store.info[name] for name in wanted} | store.info.get("source", {})
+        if self.source.named_by_recipe and found["dataset"] == type(self.source).name:
+            found["dataset"] = wanted["dataset"]
         wanted |= self.source.options
         differing = [name for name in wanted if name in found and found[name] != wanted[name]]
         if differing:
@@ -200,6 +205,19 @@ class MotionDataModule(LightningDataModule):
         self.representation.mean.copy_(torch.from_numpy(store.mean))
         self.representation.std.copy_(torch.from_numpy(store.std))
         return store
+
+    def counts(self, store: Store) -> list[str]:
+        """Returns lines about the number of clips of each split that are long enough for the crop rule."""
+        shortest = self.crop.shortest()
+        used = Counter(clip.split for clip in store.clips if clip.length >= shortest)
+        short = {split: total - used[split] for split, total in store.info["clips"].items()}
+        each = (
+            f"{used[split]}" + f" of {used[split] + n} ({n} shorter than {shortest} frames)" * bool(n) + f" {split}"
+            for split, n in short.items()
+        )
+        empty = [split for split in short if not used[split]]
+        advice = [f"no {split} clips: own data gets some by a `split` column in captions.csv" for split in empty]
+        return ["clips: " + ", ".join(each), *(() if store.info["published_split"] else advice)]
 
     def captions(self) -> list[str]:
         """Returns all distinct captions of the store, sorted."""

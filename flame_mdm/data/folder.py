@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import csv
+import hashlib
 import io
 import os
 import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -19,16 +20,19 @@ import torch
 from flame_mdm.data import Clip, MotionSource, Split, hashed_split
 from flame_mdm.errors import UserError, printable
 from flame_mdm.files import read_json, read_text, regular_file
+from flame_mdm.formats.body import check_feet, check_size, head_height, leg_length
 from flame_mdm.formats.files import read_arrays, smpl_motion
-from flame_mdm.formats.layouts import find_layout, read_bvh, read_skeleton
+from flame_mdm.formats.layouts import Layout, array_layout, layout_name, read_bvh, read_skeleton, skeleton_file
 from flame_mdm.formats.resampling import resample
 from flame_mdm.representations import rotation
-from flame_mdm.representations.skeleton import KIT21, SMPL22
+from flame_mdm.representations.skeleton import SMPL22
 from flame_mdm.representations.smpl import SMPL
 
 MOTIONS = (".bvh", ".npz", ".npy", ".json")
 FORBIDDEN_CHARACTERS = re.compile("[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
 """Characters not allowed in the name of a motion: names are stored as text, one clip per line."""
+SPLITTABLE = 10
+"""Number of motions from which on each split has at least one."""
 TABLES = ("captions.csv", "captions.json")
 COLUMNS = ("id", "text", "action", "split", "source")
 
@@ -51,6 +55,7 @@ class Folder(MotionSource):
     """
 
     name = "folder"
+    named_by_recipe = True
 
     def __init__(
         self,
@@ -74,9 +79,11 @@ class Folder(MotionSource):
         if motion not in ("joints", "smpl") or (mirror and motion == "smpl"):
             raise ValueError(f"data.source.motion={motion}, mirror={mirror}: give joints, or smpl with mirror=false")
         self.path, self.motion, self.mirror, self.exclude = Path(path), motion, mirror, tuple(exclude)
+        self._skeletons: dict[Path, dict[str, Any]] = {}
+        self._sizes: dict[str, list[tuple[float, float, float]]] = {}
 
     def count(self) -> int:
-        splits = Counter(self._split(name) for name in self.files)
+        splits = Counter(self.splits.values())
         return sum(splits.values()) + (splits["train"] if self.mirror else 0)
 
     def excluded(self) -> dict[str, int]:
@@ -84,9 +91,9 @@ class Folder(MotionSource):
 
     def clips(self, fps: float) -> Iterator[Clip]:
         self.actions = tuple(sorted({note.action for note in self.notes.values() if note.action is not None}))
-        self._upright: list[float] = []
+        self._sizes: dict[str, list[tuple[float, float, float]]] = {}
         for name, path in self.files.items():
-            note, split = self.notes[name], self._split(name)
+            note, split = self.notes[name], self.splits[name]
             clip = Clip(
                 name.replace("/", "_"),
                 self._read(path, fps),
@@ -98,8 +105,46 @@ class Folder(MotionSource):
             yield clip
             if self.mirror and split == "train":
                 yield self._mirrored(clip, note)
-        if self._upright and np.median(self._upright) < 0.3:
-            raise ValueError(f"{self.path}: the body is lying down in most motions; set the axis `up` in skeleton.yaml")
+        self._check_upright()
+
+    def findings(self) -> list[str]:
+        """Returns the skeletons found so far, with the range of their sizes."""
+        lines = []
+        for skeleton, sizes in self._sizes.items():
+            legs, heads = (sorted({f"{size[k]:.2f}" for size in sizes}) for k in (0, 1))
+            legs, heads = (" to ".join(dict.fromkeys((values[0], values[-1]))) for values in (legs, heads))
+            lines.append(f"{skeleton}: {len(sizes)} motions, legs {legs} m, head joint at {heads} m")
+        return lines
+
+    def check(self) -> list[str]:
+        """Reads all motions and captions; returns a line per skeleton and per failure."""
+        self._sizes, failed = {}, {}
+        for name, path in self.files.items():
+            try:
+                self._read(path, 20.0)
+            except (ValueError, UserError) as error:
+                failed.setdefault(str(error).replace(str(path), ""), []).append(name)
+        lines = self.findings()
+        for error, names in failed.items():
+            more = f" and {len(names) - 1} more" * (len(names) > 1)
+            lines.append(f"error: {self.files[names[0]]}{more}{error}")
+        try:
+            self._check_upright()
+            splits = ", ".join(f"{count} {split}" for split, count in Counter(self.splits.values()).items())
+        except (ValueError, UserError) as error:
+            return [*lines, f"error: {error}"]
+        if failed:
+            count = sum(map(len, failed.values()))
+            return [*lines, f"error: {count} of {len(self.files)} motions of {self.path} cannot be prepared"]
+        return [*lines, f"{self.name}: {self.count()} clips can be prepared: {splits}"]
+
+    def _check_upright(self) -> None:
+        for skeleton, sizes in self._sizes.items():
+            if np.median([upright for _, _, upright in sizes]) < 0.3:
+                raise ValueError(
+                    f"{self.path}: the body is lying down in most motions ({skeleton}); set the axis `up` in "
+                    "skeleton.yaml"
+                )
 
     @cached_property
     def files(self) -> dict[str, Path]:
@@ -156,58 +201,70 @@ class Folder(MotionSource):
                 )
         return notes
 
-    @cached_property
-    def skeleton(self) -> dict[str, Any]:
-        """Content of `skeleton.yaml` in the folder; empty without one."""
-        path = self.path / "skeleton.yaml"
-        return read_skeleton(path) if _is_there(path) else {}
+    def _skeleton(self, path: Path) -> tuple[str, dict[str, Any]]:
+        """Returns the name and the content of the nearest `skeleton.yaml` above a motion; empty without one."""
+        found = skeleton_file(path)
+        if found is None:
+            return "", {}
+        if found not in self._skeletons:
+            self._skeletons[found] = read_skeleton(found)
+        return os.path.relpath(found), self._skeletons[found]
 
-    def _split(self, name: str) -> Split:
-        note = self.notes[name]
-        return note.split or hashed_split(note.source or name, val=5, test=10)
+    @cached_property
+    def splits(self) -> dict[str, Split]:
+        """Split of each motion: that of the tables, else drawn by a hash of the source.
+
+        An empty training split, and in a set of `SPLITTABLE` or more motions any empty split, gets the source with the
+        highest hash from the split with the most sources. All motions of a source stay in one split.
+        """
+        sources = {name: note.source or name for name, note in self.notes.items()}
+        given: dict[str, Split] = {sources[name]: note.split for name, note in self.notes.items() if note.split}
+        drawn = {source: hashed_split(source, val=5, test=10) for source in sorted(set(sources.values()) - set(given))}
+        for split in get_args(Split) if len(sources) >= SPLITTABLE else ("train",):
+            if split not in {*given.values(), *drawn.values()}:
+                sizes = Counter(drawn.values())
+                movable = [source for source in drawn if sizes[drawn[source]] == max(sizes.values()) > 1]
+                if movable:
+                    drawn[max(movable, key=lambda source: hashlib.sha1(source.encode()).digest())] = split
+        return {
+            name: note.split or drawn.get(sources[name], given.get(sources[name])) for name, note in self.notes.items()
+        }
 
     def _read(self, path: Path, fps: float) -> np.ndarray:
+        where, given = self._skeleton(path)
         if path.suffix.lower() == ".bvh":
-            return self._checked(path, read_bvh(path, fps, self.skeleton)[0])
+            joints, _, layout = read_bvh(path, fps, given)
+            return self._checked(path, joints, layout, where)
         data = read_arrays(path)
-        rate = data.setdefault("fps", self.skeleton.get("fps"))
+        rate = data.setdefault("fps", given.get("fps"))
         if rate is None:
             raise ValueError(f"{path}: no frame rate in the file. Write it into skeleton.yaml, for example `fps: 30`")
         if "poses" in data:
             return self._from_smpl(path, data, fps)
-        joints = data["joints"]
-        if joints.ndim != 3 or joints.shape[2] != 3 or not len(joints):
-            raise ValueError(f"{path}: joints of shape {joints.shape}, not (frames, joints, 3)")
-        names = self._names(path, joints.shape[1])
+        layout, names = array_layout(path, data["joints"], given)
         try:
-            moved = resample(joints.astype(float), rate, fps)
+            moved = resample(data["joints"].astype(float), rate, fps)
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from error
-        return self._checked(path, find_layout(path, names, self.skeleton).apply(moved, names))
+        return self._checked(path, layout.apply(moved, names), replace(layout, fps=rate), where)
 
-    def _names(self, path: Path, joints: int) -> tuple[str, ...]:
-        """Returns the names of the joints of an array, from `skeleton.yaml` or inferred from the number of joints."""
-        names = self.skeleton.get("joints")
-        if names:
-            if len(names) != joints:
-                raise ValueError(f"{path}: {joints} joints, but skeleton.yaml names {len(names)}")
-            return tuple(names)
-        if joints == len(KIT21):
-            return KIT21.joints
-        if joints < len(SMPL22):
-            raise ValueError(
-                f"{path}: {joints} joints with unknown names; write their names and a map into skeleton.yaml"
-            )
-        if joints not in (22, 24, 52):
-            raise ValueError(f"{path}: {joints} joints, not the 22, 24 or 52 of SMPL; write a skeleton.yaml")
-        return (*SMPL22.joints, *(f"joint{number}" for number in range(len(SMPL22), joints)))
-
-    def _checked(self, path: Path, joints: np.ndarray) -> np.ndarray:
+    def _checked(self, path: Path, joints: np.ndarray, layout: Layout, where: str) -> np.ndarray:
+        """Returns the joints; raises `ValueError` if their size, feet or values are wrong."""
         if self.motion == "smpl":
             raise ValueError(f"{path}: contains no SMPL rotations; use AMASS .npz files, or set motion=joints")
-        _check_body(path, joints)
+        if not np.isfinite(joints).all():
+            frame = int(np.argmin(np.isfinite(joints).all((1, 2))))
+            raise ValueError(f"{path}: numbers in frame {frame} are not finite")
+        leg = leg_length(joints)
+        try:
+            check_size(leg, layout.unit, layout.children)
+            check_feet(joints)
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}") from error
         trunk = joints[:, SMPL22.joints.index("neck")] - joints[:, 0]
-        self._upright.append(float((trunk[:, 1] / np.linalg.norm(trunk, axis=1)).mean()))
+        upright = float((trunk[:, 1] / np.linalg.norm(trunk, axis=1)).mean())
+        name = f"{layout_name(layout)}, unit {layout.unit:.4g}, {layout.fps:g} fps" + f" ({where})" * bool(where)
+        self._sizes.setdefault(name, []).append((leg, head_height(joints), upright))
         return joints
 
     def _from_smpl(self, path: Path, data: dict[str, Any], fps: float) -> np.ndarray:
@@ -237,26 +294,6 @@ def _is_there(path: Path) -> bool:
         return False
     regular_file(path)
     return True
-
-
-def _check_body(path: Path, joints: np.ndarray) -> None:
-    """Detects wrong units by the length of a leg, and swapped sides by the direction of the toes."""
-    at = {name: joints[:, number] for number, name in enumerate(SMPL22.joints)}
-    if not np.isfinite(joints).all():
-        raise ValueError(f"{path}: numbers in frame {int(np.argmin(np.isfinite(joints).all((1, 2))))} are not finite")
-    bones = at["left_hip"] - at["left_knee"], at["left_knee"] - at["left_ankle"]
-    leg = sum(float(np.linalg.norm(bone, axis=1).mean()) for bone in bones)
-    if not 0.3 < leg < 1.5:
-        raise ValueError(
-            f"{path}: the legs are {leg:.3g} m long; set `unit` (meters per unit of the file) in skeleton.yaml"
-        )
-    across, trunk = at["left_hip"] - at["right_hip"], at["neck"] - at["pelvis"]
-    toes = at["left_foot"] + at["right_foot"] - at["left_ankle"] - at["right_ankle"]
-    if np.median((np.cross(across, trunk) * toes).sum(1)) < 0:
-        raise ValueError(
-            f"{path}: the toes point backwards: left and right are swapped, or the axes are mirrored (mirrored: true "
-            "in skeleton.yaml)"
-        )
 
 
 def _csv_rows(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:

@@ -10,8 +10,9 @@ from __future__ import annotations
 import itertools
 import math
 import re
+from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from decimal import Decimal
 from pathlib import Path
 from typing import NoReturn
@@ -55,6 +56,23 @@ class Bvh:
         """Returns the columns of `frames` with each joint's channels."""
         ends = list(itertools.accumulate(map(len, self.channels)))
         return [slice(end - len(names), end) for end, names in zip(ends, self.channels, strict=True)]
+
+    def with_end_joints(self) -> Bvh:
+        """Returns the file with its end sites as joints: `NAME.end`, or `NAME.end2` for the second one of a joint."""
+        count = Counter[int]()
+        names = []
+        for parent in self.end_parents:
+            count[parent] += 1
+            names.append(f"{self.joints[parent]}.end{count[parent] if count[parent] > 1 else ''}")
+        return replace(
+            self,
+            joints=(*self.joints, *names),
+            parents=self.parents + self.end_parents,
+            offsets=np.concatenate([self.offsets, self.end_offsets]),
+            channels=self.channels + ((),) * len(names),
+            end_parents=(),
+            end_offsets=np.zeros((0, 3)),
+        )
 
     def rotations(self) -> np.ndarray:
         """Returns the rotation (F, J, 3, 3) of each joint in its parent's frame."""

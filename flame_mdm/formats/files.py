@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,8 @@ import torch
 from torch import Tensor
 
 from flame_mdm.files import MEBIBYTE, read_json, read_npy, read_npz, regular_file
-from flame_mdm.formats.layouts import read_bvh
+from flame_mdm.formats.body import check_size, leg_length
+from flame_mdm.formats.layouts import array_layout, read_bvh
 from flame_mdm.formats.motion import AMASS_AXES, Motion, motion_of_poses
 from flame_mdm.formats.poses import Poses
 from flame_mdm.formats.resampling import between, check_frames, frame_rate, resample
@@ -24,12 +26,18 @@ CAMERA_AXES = torch.diag(torch.tensor([1.0, -1, -1], dtype=torch.float64))
 """Rotates the camera coordinates of the action data sets, y down, to y up."""
 ROTATED = {"smpl147": 147, "rot6d-25": 150}
 """Representations that contain SMPL's rotations -> number of features."""
+KIMODO_FPS = 30.0
 JSON_LIMIT = 128 * MEBIBYTE
 """Maximum size of a `.json` motion; parsed, it takes many times its size."""
 
 
 def read(
-    path: str | Path, fps: float | None = None, unit: float | None = None, resample_to: float | None = None
+    path: str | Path,
+    fps: float | None = None,
+    unit: float | None = None,
+    resample_to: float | None = None,
+    given: Mapping[str, Any] = {},
+    any_size: bool = False,
 ) -> Motion:
     """Reads a motion: `.npz` of this project, of AMASS or with joints and fps, `.bvh`, `.json`, or joints `.npy`.
 
@@ -40,11 +48,14 @@ def read(
             .npy (default 1).
         resample_to: target frame rate; joints are interpolated with cubic splines, the rotations of .bvh and AMASS on
             the sphere. Default: frames are not resampled.
+        given: fields of `Layout` that override those of a known skeleton, as from `find_skeleton`; `fps` and `unit`
+            override them in turn. Not for .json and .npz files written by this project, nor for AMASS.
+        any_size: accept bodies of any size in .bvh files and arrays; otherwise their legs must be those of people.
 
     Raises:
         FileNotFoundError: the file does not exist.
         UserError: the path is not a regular file.
-        ValueError: the file is damaged, of another kind, or has no frame rate.
+        ValueError: the file is damaged, of another kind or a wrong unit, or has no frame rate.
     """
     path = Path(path)
     suffix = path.suffix.lower()
@@ -53,10 +64,17 @@ def read(
     regular_file(path)
     if unit is not None and suffix in (".npz", ".json"):
         raise ValueError(f"{path}: lengths in {suffix} files are in meters; unit is only for .bvh and .npy")
+    given = {**given} if unit is None else {**given, "unit": unit}
     try:
         if suffix == ".bvh":
-            return _read_bvh(path, fps, unit, resample_to)
+            rate = None if fps is None else frame_rate(fps)
+            joints, rate, layout = read_bvh(path, resample_to, given, rate)
+            if not any_size:
+                check_size(leg_length(joints), layout.unit, layout.children)
+            return Motion(joints, rate, id=path.stem)
         data = read_arrays(path)
+        given = {} if "text" in data else given
+        fps = given.get("fps") if fps is None and "fps" not in data else fps
         if fps is not None:
             data["fps"] = frame_rate(fps)
         elif "fps" not in data:
@@ -66,13 +84,23 @@ def read(
             translation, turns = smpl_motion(data, resample_to)
             poses = _smpl_poses(translation, rotation.quaternion_to_matrix(turns), AMASS_AXES)
             return motion_of_poses(poses, resample_to or data["fps"], text, path.stem)
-        return _of_joints(path, data, text, unit, resample_to)
+        if {"joints", "map", "up", "mirrored"} & set(given) or data["joints"].shape[1:2] in ((52,), (77,)):
+            layout, names = array_layout(path, data["joints"], given)
+            data = {"fps": data["fps"], "joints": layout.apply(data["joints"].astype(float), names)}
+            given = {"unit": layout.unit, "children": layout.children}
+        elif "unit" in given:
+            data["joints"] = data["joints"] * given["unit"]
+        if given and not any_size and data["joints"].shape[1:] == (len(SMPL22), 3):
+            check_size(leg_length(data["joints"]), given.get("unit", 1.0), given.get("children", False))
+        return _of_joints(path, data, text, resample_to)
     except ValueError as error:
         raise ValueError(str(error) if str(path) in str(error) else f"{path}: {error}") from error
 
 
 def read_arrays(path: Path) -> dict[str, Any]:
     """Reads the arrays of an .npz, .json or .npy motion: joints, or poses and trans as in AMASS; and fps if present.
+
+    `posed_joints`, as in files of NVIDIA's Kimodo, are returned as joints.
 
     Raises:
         FileNotFoundError: the file does not exist.
@@ -87,6 +115,8 @@ def read_arrays(path: Path) -> dict[str, Any]:
             data = {"joints": read_npy(path)}
         else:
             data = _read_json(path)
+        if "posed_joints" in data:  # of NVIDIA's Kimodo, whose files do not contain their rate
+            data = {"fps": KIMODO_FPS, **data, "joints": data["posed_joints"]}
         if not {"joints", "poses"} & set(data):
             found = ", ".join(data) or "nothing"
             raise ValueError(f"contains {found}; a motion has joints and fps, or poses, trans and mocap_framerate")
@@ -173,8 +203,8 @@ def _poses(data: dict[str, Any]) -> Poses | None:
     return _smpl_poses(translation, rotation.rot6d_to_matrix(rows.unflatten(1, (24, 6)), "rows"), axes)
 
 
-def _of_joints(path: Path, data: dict[str, Any], text: str, unit: float | None, resample_to: float | None) -> Motion:
-    joints, fps = data["joints"] * (1.0 if unit is None else unit), data["fps"]
+def _of_joints(path: Path, data: dict[str, Any], text: str, resample_to: float | None) -> Motion:
+    joints, fps = data["joints"], data["fps"]
     skeleton = _skeleton(joints)
     if resample_to is not None and not math.isclose(fps, resample_to):
         joints = resample(joints.astype(float), fps, resample_to, cubic=True)
@@ -184,18 +214,6 @@ def _of_joints(path: Path, data: dict[str, Any], text: str, unit: float | None, 
         motion.features = data["features"].astype(np.float32)
         motion.representation = str(data.get("representation", ""))
     return motion
-
-
-def _read_bvh(path: Path, fps: float | None, unit: float | None, resample_to: float | None) -> Motion:
-    overrides = {} if unit is None else {"unit": unit}
-    joints, rate = read_bvh(path, resample_to, overrides, None if fps is None else frame_rate(fps))
-    _skeleton(joints)
-    tall = float(np.ptp(joints[..., 1], axis=1).max())
-    if not 0.3 < tall < 3.5:
-        raise ValueError(
-            f"the body is {tall:.3g} m tall. Set the meters per unit of the file: unit=1, 0.01 or 0.0254 (inches)"
-        )
-    return Motion(joints, rate, id=path.stem)
 
 
 def _skeleton(joints: np.ndarray) -> Skeleton:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
@@ -91,7 +92,7 @@ def write_page(path: Path, store: Store, representation: Representation, clips: 
 def write_clips(
     folder: Path, store: Store, representation: Representation, clips: Sequence[Entry], longest: int
 ) -> None:
-    """Writes clips as `motion_000.npz` ..., in the layout of generated motions, each with one caption.
+    """Writes clips as `motion_000_ID.npz` ..., in the layout of generated motions, each with one caption.
 
     A clip with several captions gets the first one that no earlier clip has, so captions are unique if possible.
 
@@ -109,7 +110,8 @@ def write_clips(
 
     from flame_mdm.formats.motion import Motion
 
-    paths = [folder / f"motion_{number:03d}.npz" for number in range(len(clips))]
+    ids = [re.sub(r"[^\w.-]+", "_", clip.id)[:100] for clip in clips]
+    paths = [folder / f"motion_{number:03d}_{name}.npz" for number, name in enumerate(ids)]
     if others := sorted(p for p in set(folder.glob("*.npz")) - set(paths) if not p.name.startswith(".")):
         raise UserError(
             f"motions={folder}: the folder holds other motions, such as {others[0].name}. Delete it, or choose another"

@@ -13,6 +13,7 @@ import torch
 from lightning import Callback, LightningModule, Trainer
 
 from flame_mdm.config import Config, movable, save
+from flame_mdm.data.datamodule import MotionDataModule
 from flame_mdm.errors import say
 from flame_mdm.files import write_json
 from flame_mdm.training.loggers import log_config
@@ -48,17 +49,17 @@ class Provenance(Callback):
     def _introduce(self, trainer: Trainer, task: Any, facts: dict[str, Any]) -> None:
         count = facts["parameters"]
         size = self.config["data"]["batch_size"] * trainer.world_size * trainer.accumulate_grad_batches
-        data = trainer.datamodule.store.info  # type: ignore[attr-defined]
-        clips = data["clips"]
-        splits = f"{clips['train']} clips to train on, {clips['val']} to validate, {clips['test']} to test"
+        module: MotionDataModule = trainer.datamodule  # type: ignore[attr-defined]
+        data = module.store.info
         say(f"{self.config['experiment']}: {task.describe()}, {count / 1e6:.2f} M trainable parameters")
-        say(f"data: {data['dataset']} as {data['representation']}, {splits}; {data['hours']} hours")
+        say(f"data: {data['dataset']} as {data['representation']}; {data['hours']} hours")
+        say(*module.counts(module.store))
         say(f"device: {facts['device']}, {self.config['trainer']['precision']}")
         if size > self.config["data"]["batch_size"]:
             times = f"{trainer.world_size} processes x {trainer.accumulate_grad_batches} accumulated"
             each, lr = self.config["data"]["batch_size"], self.config["optimizer"].get("lr")
             say(f"batch: {size} clips = {each} x {times}; optimizer.lr={lr} is not scaled with it")
-        passes = trainer.max_steps * size / clips["train"]
+        passes = trainer.max_steps * size / len(module.train)
         say(f"steps: {trainer.global_step} to {trainer.max_steps} of {size} clips, {passes:.0f} passes over the data")
 
 

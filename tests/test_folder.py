@@ -456,6 +456,12 @@ def test_from_ten_motions_on_each_split_has_some(motions: int, tmp_path: Path):
         assert len({split for _, split in of_source}) == 3
 
 
+@pytest.mark.parametrize("name", ["a", "walk_2", "walk_8", "walk_16"])
+def test_a_single_motion_is_for_training(name: str, tmp_path: Path):
+    np.savez(tmp_path / f"{name}.npz", joints=WALK[:30], fps=30)
+    assert Folder(str(tmp_path)).splits == {name: "train"}
+
+
 def test_counts_are_of_clips_that_the_recipe_uses(tmp_path: Path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     for number in range(9):

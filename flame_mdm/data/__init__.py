@@ -54,7 +54,7 @@ class MotionSource(ABC):
     """A data set in the form in which it is published."""
 
     name: str
-    named_by_recipe: ClassVar[bool] = False
+    named_by_recipe: bool = False
     """Whether the name of the data set is `data.name` of the recipe, because the files are the user's own."""
     options: Mapping[str, Any]
     """Arguments that define the data (all but `PLACES`), as JSON values. They are saved in the store."""

@@ -219,16 +219,16 @@ class Folder(MotionSource):
         """
         sources = {name: note.source or name for name, note in self.notes.items()}
         given: dict[str, Split] = {sources[name]: note.split for name, note in self.notes.items() if note.split}
-        drawn = {source: hashed_split(source, val=5, test=10) for source in sorted(set(sources.values()) - set(given))}
+        free = sorted(set(sources.values()) - set(given))
+        drawn: dict[str, Split] = {source: hashed_split(source, val=5, test=10) for source in free}
         for split in get_args(Split) if len(sources) >= SPLITTABLE else ("train",):
             if split not in {*given.values(), *drawn.values()}:
                 sizes = Counter(drawn.values())
-                movable = [source for source in drawn if sizes[drawn[source]] == max(sizes.values()) > 1]
-                if movable:
+                most = max(sizes.values(), default=0)
+                if movable := [source for source in drawn if sizes[drawn[source]] == most > (split != "train")]:
                     drawn[max(movable, key=lambda source: hashlib.sha1(source.encode()).digest())] = split
-        return {
-            name: note.split or drawn.get(sources[name], given.get(sources[name])) for name, note in self.notes.items()
-        }
+        splits: dict[str, Split] = {**given, **drawn}
+        return {name: note.split or splits[sources[name]] for name, note in self.notes.items()}
 
     def _read(self, path: Path, fps: float) -> np.ndarray:
         where, given = self._skeleton(path)

@@ -567,3 +567,16 @@ def test_a_result_is_outdated_when_checkpoint_or_extractor_are_others_now(folder
         (folder / name).write_bytes(b"trained anew")
         assert _outdated(path, request)
         (folder / name).write_bytes(b"")
+
+
+def test_a_result_of_a_stand_in_skeleton_is_outdated_once_smpl_is_there(folder, monkeypatch):
+    (request,) = [asked[0] for row, asked in requests(_part(folder)) if row["label"] == "MDM"]
+    hashes = {name: hashlib.sha256((folder / name).read_bytes()).hexdigest() for name in ("mdm.ckpt", "clip.ckpt")}
+    content = json.loads(request.path(folder / "results").read_text())
+    content["checkpoint"]["sha256"], content["extractor"]["sha256"] = hashes["mdm.ckpt"], hashes["clip.ckpt"]
+    path = put(request, folder, content | {"skeleton": {"stand_in": True, "smpl_sha256": None}})
+    assert not _outdated(path, request)
+    monkeypatch.setenv("FLAME_MDM_SMPL", "SMPL_NEUTRAL.pkl")
+    assert _outdated(path, request)
+    put(request, folder, content | {"skeleton": {"stand_in": False, "smpl_sha256": "5" * 64}})
+    assert not _outdated(path, request)

@@ -1,1 +1,1 @@
-"""Evaluation: protocols, the evaluator, metrics, and the feature extractors that they read."""
+"""Evaluation: protocols, the evaluator, metrics and feature extractors."""

@@ -15,23 +15,24 @@ from flame_mdm.training.loggers import log_table
 
 
 class Evaluate(Callback):
-    """Evaluates by a protocol on the validation split: val/<protocol>/<metric> on the dashboard, to select by, too.
+    """Evaluates the model on the validation split under a protocol, and logs val/<protocol>/<metric>.
 
-    With several replications, val/<protocol>/<metric>/ci is half the width of the 95 % interval. A table shows all.
+    Checkpoints can be selected by these values. With several replications, val/<protocol>/<metric>/ci is the half width
+    of the 95 % interval. A table lists all values.
 
-    It runs at the first validation and then at multiples of `every_n_steps`, with averaged weights where the recipe
-    averages them. All processes take their share of the motions.
+    The evaluation runs at the first validation and then at multiples of `every_n_steps`, with averaged weights if the
+    recipe averages them. The motions are divided among all processes.
 
     Args:
-        protocol: a name of experiments/evaluation, or the path of a file.
-        extractor: what the protocol's extractor is loaded from; "none" leaves metrics of features without values.
-        every_n_steps: how often, at validation.
-        samples: motions; None = as the protocol has it.
-        replications: how often they are drawn.
-        batch_size: motions at once.
+        protocol: a name in experiments/evaluation, or the path of a file.
+        extractor: path from which the protocol's extractor is loaded; "none" skips metrics of features.
+        every_n_steps: interval in training steps; evaluations run at validation.
+        samples: motions per replication; None = the protocol's number.
+        replications: number of replications.
+        batch_size: motions per batch.
 
     Raises:
-        UserError: there is no such extractor; before training begins.
+        UserError: If the extractor does not exist, before training begins.
     """
 
     def __init__(
@@ -95,5 +96,5 @@ class Evaluate(Callback):
                 )
 
     def on_validation_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        pl_module.log_dict(self.values)  # averaged weights are gone by now, so values were taken at the start
+        pl_module.log_dict(self.values)  # computed at the start, since averaged weights are swapped out by now
         self.values = {}

@@ -26,7 +26,7 @@ from flame_mdm.representations import Representation
 from flame_mdm.seeds import key
 
 CHUNK = 256
-"""Motions that metrics get at once."""
+"""Motions per metric update."""
 
 FEATURES = {"generated", "real", "text", "logits"}
 """Inputs of metrics that an extractor provides."""
@@ -34,18 +34,18 @@ FEATURES = {"generated", "real", "text", "logits"}
 
 @dataclass
 class Motions:
-    """Motions, real or generated, with what they were asked to be; N of each.
+    """N real or generated motions, with their conditions.
 
     Attributes:
         ids: unique names.
         features: (F, D) float32 each, in the data's units.
         captions: of motions with text.
-        tokens: "word/PART" of the captions, where the data has them.
+        tokens: "word/PART" tokens of the captions, if the data has them.
         labels: classes of motions with action labels.
-        groups: names of the prompts, where several motions have the same one.
-        asked: attributes asked for, where the data has them.
-        edit: what was kept of real motions, as `region` and `joints` of `flame_mdm.editing.kept_parts`.
-        references: of real motions, the joints (F', J, 3) at the frame rate of the recording, where the data has them.
+        groups: names of the prompts, if several motions share a prompt.
+        requested: requested attributes, if the data has them.
+        edit: parts kept from real motions, as `region` and `joints` of `flame_mdm.editing.kept_parts`.
+        references: of real motions, joints (F', J, 3) at the frame rate of the recording, if the data has them.
     """
 
     ids: list[str]
@@ -54,7 +54,7 @@ class Motions:
     tokens: list[list[str] | None] | None = None
     labels: list[int] | None = None
     groups: list[str] | None = None
-    asked: list[Mapping[str, Any]] | None = None
+    requested: list[Mapping[str, Any]] | None = None
     edit: Mapping[str, Any] | None = None
     references: list[np.ndarray] | None = None
 
@@ -64,9 +64,12 @@ class Motions:
 
 @dataclass
 class Extracted:
-    """What metrics see of N motions: `rows` by the names of `evaluators`, tensors or lists, each (N, ...).
+    """Metric inputs of N motions.
 
-    Joints and what is kept of them, where motions are edits, are (F, J, 3) and (F, J) each.
+    Attributes:
+        rows: tensors or lists of N entries, by the names in `evaluators.metrics`.
+        joints: (F, J, 3) each.
+        kept: (F, J) each, True = kept by an edit; None if the motions are not edits.
     """
 
     rows: dict[str, Any]
@@ -78,17 +81,17 @@ class Extracted:
 
 
 class Evaluator:
-    """Measures motions.
+    """Computes metrics of motions.
 
-    Given the same features, all values are the same to the last bit in whatever batches and order the motions come.
-    It measures on this process alone, on the CPU.
+    For the same features, all values are bit-identical for any batch size and order. Metrics are computed by this
+    process alone, on the CPU.
 
     Args:
-        extractor: of the features that metrics compare; None = no features.
-        metrics: mappings with the `_target_` of a metric, by name; each replication draws with a seed of its own.
+        extractor: computes the features for metrics; None = no features.
+        metrics: mappings with the `_target_` of a metric, by name; each replication uses a different seed.
         representation: of the motions.
         batch_size: of the extractor.
-        skip_features: leaves metrics of features without a value, instead of raising because they have no input.
+        skip_features: whether metrics of features have no value, instead of raising for lack of input.
     """
 
     def __init__(
@@ -105,18 +108,18 @@ class Evaluator:
 
     @torch.no_grad()
     def extract(self, motions: Motions) -> Extracted:
-        """The feature pass.
+        """Runs the feature pass over motions.
 
         Raises:
-            UserError: a motion is not finite.
+            UserError: If a motion contains NaN or infinity.
         """
         for name, features in zip(motions.ids, motions.features, strict=True):
             if not np.isfinite(features).all():
-                raise UserError(f"motion {name} is not finite; did the model diverge?")
+                raise UserError(f"motion {name} is not finite. Did the model diverge?")
         where = self.representation.mean.device
         joints = [self.representation.decode(torch.from_numpy(x).to(where)).cpu() for x in motions.features]
         rows: dict[str, Any] = {"keys": self._keys(motions.ids)}
-        order = np.argsort([len(x) for x in joints], kind="stable")  # like lengths together, for little padding
+        order = np.argsort([len(x) for x in joints], kind="stable")  # batches of similar lengths need little padding
         if self.extractor is not None and len(motions):
             size = self.batch_size
             batches = [order[begin : begin + size].tolist() for begin in range(0, len(order), size)]
@@ -129,8 +132,8 @@ class Evaluator:
             rows["labels"] = torch.tensor(motions.labels)
         if motions.groups is not None:
             rows["groups"] = self._keys(motions.groups)
-        if motions.asked is not None and all("action" in asked for asked in motions.asked):
-            rows["asked"] = [{k: v for k, v in asked.items() if k in ATTRIBUTES} for asked in motions.asked]
+        if motions.requested is not None and all("action" in attributes for attributes in motions.requested):
+            rows["requested"] = [{k: v for k, v in each.items() if k in ATTRIBUTES} for each in motions.requested]
         if motions.references is not None:
             rows["references"] = [torch.from_numpy(joints) for joints in motions.references]
         kept = None
@@ -168,29 +171,29 @@ class Evaluator:
     def score(
         self, generated: Extracted, paired: Extracted, real: Extracted, seed: int
     ) -> tuple[dict[str, float | None], dict[str, str]]:
-        """The values of all metrics.
+        """Computes all metrics.
 
         Args:
             generated: motions to measure.
-            paired: the real motion of each of them, in their order.
-            real: real motions to compare with as a set: a draw of its own, or the distance of real motions from
-                themselves is 0.
-            seed: of what metrics draw.
+            paired: the corresponding real motions, in the same order.
+            real: real motions for comparisons of sets. They are a separate draw, since the distance of a set from
+                itself is 0.
+            seed: of the random draws of metrics.
 
         Returns:
-            Values by name, `metric` or `metric/part`, None where not computable; and the reasons by metric, where the
-            samples are too few.
+            The values by name, `metric` or `metric/part`, None if not computable; and the reasons by metric, if there
+            are too few samples.
 
         Raises:
-            UserError: the motions lack an input that a metric needs.
-            ValueError: motions do not fit a metric that compares them one by one.
+            UserError: If the motions lack an input that a metric needs.
+            ValueError: If motions do not match in a metric that compares them one by one.
         """
         metrics = make_metrics(self.metrics, seed=key("metric", seed) % 2**32)
         usable = self.check(generated, metrics) if len(generated) else {}
         sets = {name: metric for name, metric in usable.items() if isinstance(metric, TwoSets)}
         others = {name: metric for name, metric in usable.items() if name not in sets}
         for metric in metrics.values():
-            metric.distributed_available_fn = bool  # False: this process has all motions, and no other computes
+            metric.distributed_available_fn = bool  # returns False: no synchronization, this process has all motions
         for part in (slice(begin, begin + CHUNK) for begin in range(0, len(generated), CHUNK)):
             rows = {name: values[part] for name, values in generated.rows.items()}
             if sets:
@@ -208,7 +211,7 @@ class Evaluator:
             update_metrics(sets, real=real.rows["generated"], real_keys=real.rows["keys"])
         values: dict[str, float | None] = {}
         reasons: dict[str, str] = {}
-        with warnings.catch_warnings():  # a metric that was given nothing says so by None
+        with warnings.catch_warnings():  # a metric without samples returns None
             warnings.filterwarnings("ignore", message=".*was called before the ``update`` method.*")
             for name, metric in metrics.items():
                 try:
@@ -225,10 +228,10 @@ class Evaluator:
         return values, reasons
 
     def check(self, motions: Extracted, metrics: Mapping[str, Metric] | None = None) -> dict[str, Metric]:
-        """Returns the metrics that can measure the motions: all of them, or those without features.
+        """Returns the metrics that can be computed: all of them, or those that need no features.
 
         Raises:
-            UserError: the motions lack an input that a metric needs.
+            UserError: If the motions lack an input that a metric needs.
         """
         given = {*motions.rows, "joints", "mask", "real_joints", "real_mask"}
         given |= {"real"} if "generated" in motions.rows else set()

@@ -1,4 +1,4 @@
-"""Protocols: which motions are generated, how often, and what is measured of them."""
+"""Evaluation protocols: which motions are generated, how often, and which metrics are computed."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ from flame_mdm.seeds import key
 from flame_mdm.task import MotionGeneration
 
 REGION = {"frames": "region"}
-"""Argument of `flame_mdm.editing.kept_parts` as named in protocol files, which are never changed -> its name today."""
+"""Option name in protocol files, which never change -> current argument name of `flame_mdm.editing.kept_parts`."""
 QUICK_REPLICATIONS, QUICK_SAMPLES = 2, 64
 
 
 class Multimodality(TypedDict):
-    """A second evaluation with several motions per prompt; `prompts` None = all of the split."""
+    """A second evaluation with several motions per prompt; `prompts` None = all prompts of the split."""
 
     prompts: int | None
     samples: int
@@ -40,36 +40,36 @@ class Multimodality(TypedDict):
 
 
 class Protocol:
-    """A way to evaluate, named and versioned; its file is never changed, another version gets another file.
+    """A named and versioned evaluation procedure. Its file never changes; a new version gets a new file.
 
-    Caption and crop of a clip are a function of (seed, replication, id), and so is the noise of its motion. Motions are
-    generated at the length of the real clip. Real motions are measured first, by the same metrics, against a second
-    draw of themselves.
+    The caption and crop of a clip, and the noise of its generated motion, are functions of (seed, replication, id).
+    Motions are generated at the length of the real clip. Real motions are measured first, with the same metrics,
+    against a second draw of real motions.
 
     Args:
         name: of the protocol.
         version: of the protocol.
-        condition: what motions are generated for: "text", "action" or "none".
-        extractor: a mapping with the `_target_` of an `Extractor`, which is opened with a path; None = needs none.
+        condition: condition of the generated motions: "text", "action" or "none".
+        extractor: a mapping with the `_target_` of an `Extractor`, which is opened with a path; None = not needed.
         metrics: mappings with the `_target_` of a metric, by name.
-        replications: how often all is repeated.
-        samples: motions a replication; clips are drawn, and taken repeatedly where there are fewer. None = each clip of
-            the split once.
-        real_samples: real motions a replication that sets are compared with, drawn alike; None = each clip once.
+        replications: number of repetitions of the evaluation.
+        samples: motions per replication. Clips are drawn at random, and repeatedly if there are too few. None = each
+            clip of the split once.
+        real_samples: real motions per replication for comparisons of sets, drawn likewise; None = each clip once.
         multimodality: a second evaluation with several motions per prompt; None = none.
-        edit: `frames` (the region) and `joints` as of `flame_mdm.editing.kept_parts`: motions are not generated whole,
-            but as edits of the real ones; None = whole.
-        smoothing: standard deviation, in frames, of a Gaussian over time that features of generated motions go through
-            before they are measured, mirrored at the ends; None = none.
-        batch_size: motions at once, of a protocol that measures time: a first batch that is not timed comes before
-            them; None = as many as the evaluation says, 64 by default.
-        only: attributes that clips must have to be evaluated on; None = all clips of the split.
+        edit: `frames` (the region) and `joints` of `flame_mdm.editing.kept_parts`: motions are edits of real motions;
+            None = motions are generated from scratch.
+        smoothing: standard deviation, in frames, of a Gaussian filter over time that is applied to the features of
+            generated motions before they are measured, with mirrored ends; None = no filter.
+        batch_size: motions per batch in a protocol that measures time, which first samples an untimed batch; None = the
+            batch size of the evaluation, 64 by default.
+        only: attributes that evaluated clips must have; None = all clips of the split.
         expected: by data set or sha256 of the extractor, the values that real motions of the test split must have:
-            metric -> [value, tolerance]. Where they have others, nothing is generated.
+            metric -> [value, tolerance]. If they differ, nothing is generated.
 
     Raises:
-        UserError: an option of `multimodality` or of a metric is missing or unknown.
-        ValueError: an unknown condition.
+        UserError: If an option of `multimodality` or of a metric is missing or unknown.
+        ValueError: If the condition is unknown.
     """
 
     def __init__(
@@ -115,15 +115,20 @@ class Protocol:
         multimodality: bool = True,
         batch_size: int | None = None,
     ) -> dict[str, Any]:
-        """Makes the protocol cheaper, for a split of so many clips; `multimodality` False leaves that out.
+        """Reduces the size of the evaluation.
 
-        `batch_size` changes that of a protocol that measures time.
+        Args:
+            replications, samples: new values; None = unchanged, or those of a quick evaluation.
+            quick: whether the evaluation is quick.
+            clips: number of clips in the split.
+            multimodality: False = skip multimodality.
+            batch_size: new batch size of a protocol that measures time.
 
         Returns:
-            What is no longer as published, to stand in the result.
+            The changed options, for the result.
 
         Raises:
-            UserError: fewer than one replication or motion.
+            UserError: If `replications` or `samples` is less than 1.
         """
         self.quick = quick
         if quick:
@@ -133,7 +138,7 @@ class Protocol:
         size = batch_size if self.batch_size else None
         for name, value in (("replications", replications), ("samples", samples), ("batch_size", size)):
             if value is not None and value < 1:
-                raise UserError(f"{name}={value}: at least 1 is needed")
+                raise UserError(f"{name}={value}: must be at least 1")
             if value is not None and value != getattr(self, name):
                 setattr(self, name, value)
                 changed[name] = value
@@ -145,18 +150,18 @@ class Protocol:
         return changed
 
     def open_extractor(self, path: str | None, representation: Representation, dataset: str) -> Extractor | None:
-        """The extractor at `path`, on the device of the representation; "none" leaves its metrics without values.
+        """Opens the extractor at `path`, on the device of the representation; None if not needed, or `path` is "none".
 
         Raises:
-            UserError: none given where one is needed, or one of another representation or data set.
-            FileNotFoundError, ValueError: no such file, or not one of the protocol's extractor.
+            UserError: If a required extractor is not given, or belongs to another representation or data set.
+            FileNotFoundError, ValueError: If the file does not exist, or holds another kind of extractor.
         """
         if self.extractor is None or path == "none":
             return None
         if path is None:
             raise UserError(
-                f"protocol {self.name} needs a feature extractor: extractor=FILE, such as a checkpoint of make train "
-                "EXP=motion_clip/...; extractor=none leaves the metrics that read features without values"
+                f"protocol {self.name} needs a feature extractor. Give extractor=FILE, such as a checkpoint of make "
+                "train EXP=motion_clip/..., or extractor=none to skip the metrics that need features"
             )
         extractor: Extractor = instantiate(self.extractor, path=path, device=representation.mean.device)
         extractor.check(representation, dataset)
@@ -165,16 +170,16 @@ class Protocol:
     # What is generated ------------------------------------------------------------------------------------------------
 
     def selected(self, clips: Clips) -> list[Entry]:
-        """The clips of a split that the protocol evaluates on."""
+        """Returns the clips of a split that the protocol evaluates on."""
         return [clip for clip in clips.clips if self.only.items() <= clip.attributes.items()]
 
     def rows(self, clips: Clips, seed: int, replication: int, *, purpose: str = "generated") -> list[Row]:
-        """What one replication generates, or, for another purpose, another draw of clips, captions and crops."""
+        """Returns the motions of one replication; another `purpose` gives another draw of clips, captions and crops."""
         drawn = () if purpose == "generated" else (purpose,)
         entries = sorted(self.selected(clips), key=lambda clip: key("sample", *drawn, seed, replication, clip.id))
         if not entries:
             only = "".join(f" and {name}={value}" for name, value in self.only.items())
-            raise UserError(f"the split has no clip of {clips.crop.shortest()} frames or more{only} to evaluate on")
+            raise UserError(f"the split has no clip with at least {clips.crop.shortest()} frames{only} to evaluate on")
         count = self.samples if purpose == "generated" else self.real_samples
         rows = []
         for number in range(len(entries) if count is None else count):
@@ -187,7 +192,7 @@ class Protocol:
         return rows
 
     def prompts(self, clips: Clips, seed: int, replication: int) -> list[Row]:
-        """What one replication of multimodality generates: several motions for each of the first prompts."""
+        """Returns the motions of one replication of multimodality: several for each of the first prompts."""
         assert self.multimodality is not None
         prompts = self.rows(clips, seed, replication)[: self.multimodality["prompts"]]
         return [
@@ -197,7 +202,7 @@ class Protocol:
         ]
 
     def motions(self, rows: Sequence[Row], features: list[np.ndarray], captions: list[str] | None = None) -> Motions:
-        """Returns the motions of the rows, with what the rows request; `captions` replace theirs."""
+        """Returns motions with the conditions of their rows; `captions` replace the captions of the rows."""
         texts = captions or [row.text for row in rows] if self.condition == "text" else None
         labels = [row.clip.action for row in rows]
         return Motions(
@@ -207,26 +212,26 @@ class Protocol:
             tokens=[_tokens(row, caption) for row, caption in zip(rows, texts, strict=True)] if texts else None,
             labels=[int(label) for label in labels if label is not None] if self.condition == "action" else None,
             groups=[row.prompt for row in rows],
-            asked=[row.clip.attributes for row in rows] if self.condition != "none" else None,
+            requested=[row.clip.attributes for row in rows] if self.condition != "none" else None,
             edit=self.edit,
         )
 
     def check_data(self, clips: Clips) -> None:
-        """Refuses data that lacks what the protocol's motions are generated for.
+        """Checks that the data has the captions or labels that the protocol needs.
 
         Raises:
-            UserError: no captions, no labels, or no clip.
+            UserError: If a clip has no caption or label, or there is no clip.
         """
         rows = self.rows(clips, 0, 0)
-        lacking = {
+        incomplete = {
             "text": any(row.caption is None for row in rows),
             "action": any(row.clip.action is None for row in rows),
             "none": False,
         }
-        if lacking[self.condition]:
+        if incomplete[self.condition]:
             raise UserError(
-                f"protocol {self.name} generates motions for {self.condition}, but the data set "
-                f"{clips.store.info['dataset']} has clips without: choose another protocol"
+                f"protocol {self.name} generates motions from {self.condition}, but the data set "
+                f"{clips.store.info['dataset']} has clips without {self.condition}. Choose another protocol"
             )
 
     def sampling(
@@ -242,14 +247,15 @@ class Protocol:
         until: float | None = None,
         strength: float | None = None,
     ) -> dict[str, Any]:
-        """How a model is sampled: as asked, or by its recipe; edits by `method`, `until` and `strength` of
-        `flame_mdm.editing`.
+        """Returns the sampling options of a model: those given, otherwise those of its recipe.
+
+        `method`, `until` and `strength` are for edits, as in `flame_mdm.editing`.
 
         Raises:
-            UserError: a method of editing where nothing is edited, or one that the model's process does not allow.
+            UserError: If an editing option is given but nothing is edited, or the model's process does not allow it.
         """
         if self.edit is None and (method, until, strength) != (None, None, None):
-            raise UserError(f"protocol {self.name} edits no motions: leave out method, until and strength")
+            raise UserError(f"protocol {self.name} does not edit motions. Remove method, until and strength")
         how: dict[str, Any] = {}
         if self.edit is not None:
             how["edit"] = method_options(model.process, method, until, strength=strength)
@@ -275,7 +281,7 @@ class Protocol:
         world: int = 1,
         progress: bool = True,
     ) -> Generator:
-        """The source of a model's motions, for one of `world` processes; see `Generator`."""
+        """Returns the source of a model's motions, for one of `world` processes; see `Generator`."""
         count = self.samples or len(self.selected(clips))
         total = self.replications * count
         if self.multimodality and not self.quick:
@@ -295,7 +301,7 @@ class Protocol:
         )
 
     def baseline(self, kind: str, clips: Clips, seed: int) -> Baseline:
-        """The source of motions that no model made; see `Baseline`."""
+        """Returns the source of a sanity-check baseline; see `Baseline`."""
         return Baseline(kind, clips, self.condition, seed)
 
     def sample_folder(self, folder: Path, representation: Representation) -> SampleFolder:
@@ -320,28 +326,28 @@ class Protocol:
         ground_truth: bool = True,
         force: bool = False,
     ) -> dict[str, Any]:
-        """Evaluates motions, and before them the real ones of all replications.
+        """Evaluates real motions of all replications, and then the motions of the source.
 
-        With several processes, all take their share in making motions; the first measures them, all get the result.
+        With several processes, the motions are divided among them; the first measures them, and all get the result.
 
         Args:
-            source: of the motions; None = real ones alone.
+            source: of the motions; None = real motions only.
             clips: the split.
-            extractor: opened; None = metrics of features have no value.
+            extractor: an opened extractor; None = metrics of features have no value.
             representation: of the motions, on the device to compute on.
-            seed: of all draws.
+            seed: of all random draws.
             batch_size: of the extractor.
-            rank, world: number of this process, and of all processes.
-            ground_truth: whether real motions are measured, too.
+            rank, world: rank of this process, and number of processes.
+            ground_truth: whether real motions are measured.
             force: generate even if real motions do not have the values that the protocol expects.
 
         Returns:
-            "ground_truth" and "values": by metric, `mean`, `ci` (half the width of the 95 % interval), `replications`,
-            `n` motions, each None where not computable; "not_computed": reasons by metric; "cost"; "seeds" of the
-            draws of metrics, by replication; "warnings"; "valid", "invalid_because" and "forced".
+            "ground_truth" and "values": by metric, `mean`, `ci` (half width of the 95 % interval), `replications` and
+            `n` motions, each None if not computable; "not_computed": reasons by metric; "cost"; "seeds" of the draws
+            of metrics, by replication; "warnings"; "valid", "invalid_because" and "forced".
 
         Raises:
-            UserError: real motions do not have the expected values; nothing has been generated.
+            UserError: If real motions do not have the expected values; nothing has been generated.
         """
         evaluator = self._evaluator(self.metrics, extractor, representation, batch_size)
         reasons: dict[str, str] = {}
@@ -349,7 +355,7 @@ class Protocol:
         invalid = shared(self._unexpected(truth, clips, extractor) if truth else [], world)
         if invalid and source is not None and not force:
             if rank:
-                raise SystemExit(1)  # the first process says why
+                raise SystemExit(1)  # the first process prints the reason
             raise UserError(
                 f"nothing was generated, because {'; '.join(invalid)}. Check the data and the extractor, or give "
                 "force=true: the result is then marked as not valid"
@@ -369,12 +375,12 @@ class Protocol:
     def _evaluator(
         self, metrics: Mapping[str, Config], extractor: Extractor | None, representation: Representation, size: int
     ) -> Evaluator:
-        """Returns the evaluator of some metrics; `extractor=none` leaves those of features without a value."""
+        """Returns an evaluator of some metrics. With extractor=none, metrics of features have no value."""
         skip = extractor is None and self.extractor is not None
         return Evaluator(extractor, metrics, representation, batch_size=size, skip_features=skip)
 
     def _jobs(self, source: Source | None, clips: Clips, seed: int) -> Iterator[tuple[str, list[Row], int]]:
-        """What is asked of the source, in order: the name of a file, the rows, the replication."""
+        """Yields the requests to the source, in order: the name of a file, the rows, the replication."""
         if source is None:
             return
         for replication in range(self.replications):
@@ -390,14 +396,14 @@ class Protocol:
     def _real(
         self, clips: Clips, evaluator: Evaluator, seed: int, replication: int
     ) -> tuple[list[Row], Extracted, Extracted]:
-        """Returns the rows of a replication, their real motions, and those that sets are compared with."""
+        """Returns the rows of a replication, their real motions, and the real motions for comparisons of sets."""
         rows = self.rows(clips, seed, replication)
         again = self.rows(clips, seed, replication, purpose="real")
         real = evaluator.reference() or evaluator.extract(self.motions(again, real_motions(clips, again)))
         return rows, self._paired(clips, evaluator, rows), real
 
     def _paired(self, clips: Clips, evaluator: Evaluator, rows: Sequence[Row]) -> Extracted:
-        """Returns what metrics see of the real motions of rows."""
+        """Returns the metric inputs of the real motions of rows."""
         motions = self.motions(rows, real_motions(clips, rows))
         motions.references = clips.store.references([row.clip.id for row in rows])
         return evaluator.extract(motions)
@@ -405,7 +411,7 @@ class Protocol:
     def _measure_real(self, clips: Clips, evaluator: Evaluator, seed: int, reasons: dict[str, str]) -> dict[str, Any]:
         """Returns the values of real motions.
 
-        They are read again later: those of all replications might not fit in memory.
+        The motions are read again later, since those of all replications might not fit in memory.
         """
         found = []
         for replication in range(self.replications):
@@ -424,7 +430,7 @@ class Protocol:
         world: int,
         reasons: dict[str, str],
     ) -> dict[str, Any]:
-        """The values of motions, on the first process."""
+        """Returns the values of the source's motions, on the first process."""
         found: list[tuple[dict[str, float | None], int]] = []
         costs: list[dict[str, float]] = []
         warnings: list[str] = []
@@ -442,7 +448,7 @@ class Protocol:
                     each.check(paired)
             samples = _samples(source, next(jobs), world)
             costs.append(samples.cost)
-            if len(samples.rows) != len(rows):  # motions of others, not one for each clip
+            if len(samples.rows) != len(rows):  # motions from another system may not cover all clips
                 wanted = {row.id for row in samples.rows}
                 paired = _select(paired, [i for i, row in enumerate(rows) if row.id in wanted])
             motions = self.motions(samples.rows, self._smoothed(samples.features), samples.captions)
@@ -456,7 +462,7 @@ class Protocol:
         if several is not None and source is not None:
             summary |= self._measure_multimodality(source, jobs, clips, several, seed, world, reasons)
         if evaluator.extractor is None and self.extractor is not None:
-            reasons["extractor"] = "none was given, metrics of its features have no values"
+            reasons["extractor"] = "extractor=none: metrics of its features have no values"
         return {
             "values": summary if source is not None else None,
             "not_computed": reasons,
@@ -475,7 +481,7 @@ class Protocol:
         world: int,
         reasons: dict[str, str],
     ) -> dict[str, Any]:
-        """Multimodality: values of the metrics that need several motions a prompt."""
+        """Returns the values of the metrics that need several motions per prompt."""
         assert self.multimodality is not None
         found = []
         nothing = evaluator.extract(self.motions([], []))
@@ -492,17 +498,17 @@ class Protocol:
             found.append((values, len(motions)))
             reasons |= why
         if not self._has_several_per_prompt(source):
-            why_not = "left out of a quick evaluation" if self.quick else "the samples are one a clip"
-            reasons["multimodality"] = f"{why_not}, but it takes several motions for each of some prompts"
+            why_not = "not computed in a quick evaluation" if self.quick else "there is one sample per clip"
+            reasons["multimodality"] = f"{why_not}: it needs several samples per prompt"
         return _summary(found)
 
     def _smoothed(self, features: list[np.ndarray]) -> list[np.ndarray]:
-        """Motions as FLAME's code measures them, each within its own length."""
+        """Smooths motions as FLAME's code does, each within its own length."""
         sigma = self.smoothing
         return features if sigma is None else [gaussian_filter1d(motion, sigma, axis=0) for motion in features]
 
     def _warnings(self, generated: Extracted, real: Extracted) -> list[str]:
-        """Why Fréchet distances are biased."""
+        """Returns warnings about biased Fréchet distances."""
         lines = []
         for name, config in self.metrics.items():
             if not config["_target_"].endswith(FrechetMotionDistance.__name__) or "generated" not in generated.rows:
@@ -510,16 +516,19 @@ class Protocol:
             width = generated.rows["generated"].shape[1]
             few = min(len(generated), len(real))
             if few < 2 * width:
-                lines.append(f"{name}: {few} motions for {width} features, fewer than twice as many: biased upwards")
+                lines.append(f"{name}: biased upwards: {few} motions are fewer than twice the {width} features")
             if len(generated) != len(real):
                 lines.append(
-                    f"{name}: {len(generated)} generated motions and {len(real)} real ones; compare it with values of "
-                    "the same two numbers only"
+                    f"{name}: {len(generated)} generated and {len(real)} real motions. Compare it only with values for "
+                    "the same two numbers"
                 )
         return lines
 
     def _unexpected(self, values: Mapping[str, Any], clips: Clips, extractor: Extractor | None) -> list[str]:
-        """In which expected values real motions fail; a quick evaluation, or one of other splits, has none."""
+        """Returns a line for each value of real motions that is not as expected.
+
+        Nothing is expected in a quick evaluation, or on splits other than the test split.
+        """
         if self.quick or (clips.clips[0].split != "test" and clips.store.info["clips"]["test"]):
             return []  # HumanAct12 has no test clips
         names = [clips.store.info["dataset"], *([extractor.sha256] if extractor else [])]
@@ -532,13 +541,13 @@ class Protocol:
 
 
 def _tokens(row: Row, caption: str) -> list[str] | None:
-    """The "word/PART" of a caption of the clip, where the data has them."""
+    """Returns the "word/PART" tokens of a caption of the clip, if the data has them."""
     tagged = row.clip.attributes.get("tokens")
     return tagged[row.clip.captions.index(caption)] if tagged and caption in row.clip.captions else None
 
 
 def _samples(source: Source, job: tuple[str, list[Row], int], world: int) -> Samples:
-    """What the first of several processes gets."""
+    """Returns the motions of a request, on the first process."""
     samples = source(*job, 0, world)
     assert samples is not None
     return samples
@@ -551,7 +560,7 @@ def _select(extracted: Extracted, indices: list[int]) -> Extracted:
 
 
 def _summary(found: Sequence[tuple[Mapping[str, float | None], int]]) -> dict[str, Any]:
-    """Means over replications; None as soon as one has no value."""
+    """Returns means over replications; None if one replication has no value."""
     table = {}
     for name in found[0][0] if found else ():
         values = [value for replication, _ in found if (value := replication[name]) is not None]

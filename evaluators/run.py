@@ -43,10 +43,10 @@ FORMAT = 1
 
 @dataclass(frozen=True, kw_only=True)
 class EvaluationRequest:
-    """What to evaluate, and how: the keys that experiments/evaluate.yaml explains.
+    """The keys of an evaluation, which experiments/evaluate.yaml explains.
 
     Raises:
-        UserError: keys that do not fit one another, or a value out of range.
+        UserError: If keys contradict each other, or a value is out of range.
     """
 
     ckpt: str | None = None
@@ -80,26 +80,26 @@ class EvaluationRequest:
 
     @classmethod
     def of(cls, config: Config) -> EvaluationRequest:
-        """Returns the request that a composed configuration describes."""
+        """Returns the request of a composed configuration."""
         return cls(**{field.name: config[field.name] for field in fields(cls) if field.name in config})
 
     def __post_init__(self) -> None:
         what = [name for name in ("ckpt", "from_samples", "baseline") if getattr(self, name) is not None]
         if len(what) != 1:
             raise UserError(
-                "give one of ckpt=runs/.../checkpoints/last.ckpt, from_samples=<folder of .npz files> and "
+                "give exactly one of ckpt=runs/.../checkpoints/last.ckpt, from_samples=<folder of .npz files> and "
                 "baseline=shuffled"
             )
         if what != ["ckpt"] and not self.data:
-            raise UserError(f"{what[0]} needs the name of the data set, such as data=humanml3d")
+            raise UserError(f"{what[0]} needs a data set. Add data=NAME, such as data=humanml3d")
         if what != ["ckpt"] and self.protocol is None:
-            raise UserError(f"{what[0]} needs a protocol, such as protocol=text_to_motion")
+            raise UserError(f"{what[0]} needs a protocol. Add protocol=NAME, such as protocol=text_to_motion")
         if what == ["from_samples"] and (self.quick or self.samples or self.replications):
-            raise UserError("from_samples measures all motions of the files: leave out quick, samples and replications")
+            raise UserError("from_samples evaluates all motions of the files. Remove quick, samples and replications")
         if self.split not in ("train", "val", "test"):
             raise UserError(f"unknown split: {self.split}. Choose train, val or test")
         if self.batch_size is not None and self.batch_size < 1:
-            raise UserError(f"batch_size={self.batch_size}: at least 1 is needed")
+            raise UserError(f"batch_size={self.batch_size}: must be at least 1")
         if self.guidance_scale is not None and not math.isfinite(self.guidance_scale):
             raise UserError(f"guidance_scale={self.guidance_scale} is not a finite number")
 
@@ -108,11 +108,11 @@ def evaluate(request: EvaluationRequest) -> None:
     """Evaluates a checkpoint, files of motions or a baseline, and writes the JSON file.
 
     Raises:
-        UserError, FileNotFoundError, ValueError: a file is missing, or parts do not fit one another.
+        UserError, FileNotFoundError, ValueError: If a file is missing, or parts do not match.
     """
-    if request.out is not None:  # before hours of work
+    if request.out is not None:  # fails before hours of work, not after
         if Path(request.out).is_dir():
-            raise UserError(f"out={request.out} is a folder; name the JSON file to write")
+            raise UserError(f"out={request.out} is a folder. Name the JSON file to write")
         Path(request.out).parent.mkdir(parents=True, exist_ok=True)
     with _processes(request.device) as (rank, world, device):
         _evaluate(request, rank, world, device)
@@ -120,7 +120,7 @@ def evaluate(request: EvaluationRequest) -> None:
 
 @contextmanager
 def _processes(device: str | None) -> Iterator[tuple[int, int, str]]:
-    """Joins the processes that torchrun has started, if it has: number of this one, of all, device of this one."""
+    """Joins the processes started by torchrun, if any. Gives rank, number of processes, and device of this process."""
     import torch
 
     rank, world, local = (int(os.environ.get(n, d)) for n, d in (("RANK", 0), ("WORLD_SIZE", 1), ("LOCAL_RANK", 0)))
@@ -129,11 +129,11 @@ def _processes(device: str | None) -> Iterator[tuple[int, int, str]]:
     if world == 1:
         yield rank, world, device
         return
-    # Imported before the group exists: its functions would keep the group, and with it gloo's threads, in their default
-    # arguments, and a thread that is alive while Python shuts down can abort the process.
+    # Imported before the group exists: otherwise, the default arguments of its functions would keep the group and its
+    # gloo threads alive, and a live thread can abort the process while Python shuts down.
     import torch.distributed.nn.functional
 
-    # Motions are sent once per replication, by the CPU; a process that is done may wait for hours.
+    # Motions are gathered once per replication, on the CPU; a process that finishes early may wait for hours.
     torch.distributed.init_process_group("gloo", timeout=timedelta(days=7))
     try:
         yield rank, world, device
@@ -208,10 +208,10 @@ def _evaluate(request: EvaluationRequest, rank: int, world: int, device: str) ->
 def open_protocol(
     name: str, clips: Clips, representation: Representation, model: MotionGeneration | None, **changes: Any
 ) -> tuple[Protocol, dict[str, Any]]:
-    """Returns a protocol for a split and a model, and what `Protocol.change` has changed of it.
+    """Returns a protocol for a split and a model, and the options changed by `Protocol.change`.
 
     Raises:
-        UserError: no such protocol, or one that does not fit the clips or the model.
+        UserError: If the protocol does not exist, or does not match the clips or the model.
     """
     protocol = load_protocol(name, representation)
     changed = protocol.change(**changes, clips=len(protocol.selected(clips)))
@@ -222,7 +222,7 @@ def open_protocol(
 
 
 def _motions_folder(checkpoint: Path, kind: str, digest: str, options: Mapping[str, Any]) -> Path:
-    """Returns where the motions of a checkpoint are kept that are sampled with some options."""
+    """Returns the folder of the motions that a checkpoint generates with some options."""
     return run_folder(checkpoint) / "evaluation" / kind / f"{digest[:16]}-{_digest(options)[:8]}"
 
 
@@ -231,25 +231,29 @@ def _kind(protocol: Protocol) -> str:
 
 
 def protocol_file(name: str) -> Path:
-    """The file of a protocol, by its name in experiments/evaluation or its path.
+    """Returns the file of a protocol, by its name in experiments/evaluation or its path.
 
     Raises:
-        UserError: no such protocol.
+        UserError: If the protocol does not exist.
     """
     path = Path(name) if name.endswith((".yaml", ".yml")) else EXPERIMENTS / "evaluation" / f"{name}.yaml"
     if not path.exists():
         names = ", ".join(sorted(p.stem for p in path.parent.glob("*.yaml")))
-        raise UserError(f"no protocol is called '{name}'; there are: {names or 'none'}")
+        raise UserError(f"no protocol is called '{name}'. Available: {names or 'none'}")
     return path
 
 
 def load_protocol(name: str, representation: Representation) -> Protocol:
-    """The protocol of that name in experiments/evaluation, or in a file, for motions of a representation.
+    """Loads a protocol for motions of a representation.
 
     Its file may use ${representation.fps}, ${representation.toes} and ${representation.parents}.
 
+    Args:
+        name: a name in experiments/evaluation, or the path of a .yaml file.
+        representation: of the motions.
+
     Raises:
-        UserError: no such protocol, or one that cannot be read.
+        UserError: If the protocol does not exist or cannot be read.
     """
     from evaluators.protocols import Protocol
 
@@ -277,7 +281,7 @@ def load_protocol(name: str, representation: Representation) -> Protocol:
 
 
 def default_protocol(model: MotionGeneration | None) -> str:
-    """The protocol for what a model was trained to do."""
+    """Returns the name of the default protocol for a model."""
     assert model is not None
     condition = _condition(model)
     if condition == "none":
@@ -289,7 +293,7 @@ def default_protocol(model: MotionGeneration | None) -> str:
 
 
 def _condition(model: MotionGeneration) -> str:
-    """What a model was trained to generate motions for."""
+    """Returns the condition of a model: "text", "action" or "none"."""
     if not model.condition.features:
         return "none"
     return "action" if model.config["condition"]["_target_"].endswith("ActionLabels") else "text"
@@ -299,28 +303,28 @@ def check_condition(protocol: Protocol, model: MotionGeneration) -> None:
     """Checks that the model was trained with the condition of the protocol.
 
     Raises:
-        UserError: it was trained with another condition.
+        UserError: If it was trained with another condition.
     """
     if protocol.condition not in ("none", _condition(model)):
         raise UserError(
-            f"protocol {protocol.name} generates motions for {protocol.condition}, but the checkpoint was trained with "
-            f"condition {_condition(model)}: choose another protocol, such as {default_protocol(model)}"
+            f"protocol {protocol.name} generates motions from {protocol.condition}, but the checkpoint was trained "
+            f"with condition {_condition(model)}. Choose another protocol, such as {default_protocol(model)}"
         )
 
 
 def run_folder(checkpoint: Path) -> Path:
-    """The folder of the run that a checkpoint belongs to; that of the file where it belongs to none."""
+    """Returns the run directory of a checkpoint, or the folder of a file that belongs to no run."""
     return checkpoint.parent.parent if checkpoint.parent.name == "checkpoints" else checkpoint.parent
 
 
 def _data(request: EvaluationRequest, model: MotionGeneration | None) -> MotionDataModule:
-    """Returns the prepared data, with its own representation: the model keeps the statistics of its training."""
+    """Returns the prepared data, with its own representation. The model keeps the statistics of its training data."""
     from flame_mdm.data.datamodule import MotionDataModule
 
     module, encoding, root = request.data, request.representation, "data"
     if model is not None and not module:
         if "data" not in model.config:
-            raise UserError(f"{request.ckpt}: its recipe names no data; give data=NAME")
+            raise UserError(f"{request.ckpt}: its recipe names no data set. Add data=NAME")
         module, encoding = model.config["data"], model.config["representation"]
         trust({"data": module})
         root = module.get("root")
@@ -335,17 +339,17 @@ def _data(request: EvaluationRequest, model: MotionGeneration | None) -> MotionD
         )
     data = instantiate(module | {"root": root}, representation=representation, seed=0)
     if not isinstance(data, MotionDataModule):
-        raise UserError(f"{request.ckpt}: its recipe names {type(data).__name__} as data; give data=NAME")
+        raise UserError(f"{request.ckpt}: its recipe names {type(data).__name__} as the data set. Add data=NAME")
     data.setup("test")
     return data
 
 
 def _overlaps(model: MotionGeneration | None, data: MotionDataModule) -> list[str]:
-    """Returns why values are not valid: training clips of the model may be among the evaluated ones."""
+    """Returns reasons why values are not valid: the evaluated clips may include training clips of the model."""
     trained = model.facts.get("fingerprint") if model is not None else None
     if not trained or trained == data.store.fingerprint:
         return []
-    return [f"the model was trained on data {trained}, this is {data.store.fingerprint}: splits may overlap"]
+    return [f"the model was trained on data {trained}, but this is {data.store.fingerprint}: splits may overlap"]
 
 
 def _describe(
@@ -424,14 +428,14 @@ def _skeleton(request: EvaluationRequest, representation: Representation) -> dic
 
 
 def _excluded(data: MotionDataModule, split: Split) -> dict[str, int]:
-    """Returns how many clips were left out of the data set and of the split, by reason."""
+    """Returns the number of clips excluded from the data set and from the split, by reason."""
     short = data.clips(split).too_short
     reason = f"{split} clips shorter than {data.crop.shortest()} frames"
     return data.store.info["excluded"] | ({reason: short} if short else {})
 
 
 def _selection(model: MotionGeneration, file: Path) -> str:
-    """By which rule a checkpoint was chosen among those of its run, as far as its name tells."""
+    """Returns the rule by which a checkpoint was selected among those of its run, judging by its name."""
     best = (model.config.get("callbacks") or {}).get("best") or {}
     return f"best {best['monitor']}" if file.stem == "best" and "monitor" in best else f"none: {file.stem}"
 
@@ -441,7 +445,7 @@ def _digest(values: Any) -> str:
 
 
 def _show(report: Mapping[str, Any], out: Path) -> None:
-    """Prints the values beside those of real motions."""
+    """Prints the values next to those of real motions."""
     protocol = report["protocol"]
     mark = " QUICK, NOT A RESULT" if report["quick"] else ""
     say(f"{protocol['name']} version {protocol['version']}, {report['data']['dataset']} {report['split']}{mark}")
@@ -466,11 +470,15 @@ def _cell(value: Mapping[str, Any] | None) -> str:
     return "-" if value is None or value["mean"] is None else f"{value['mean']:.4g} +- {value['ci']:.2g}"
 
 
-# What tables ask for --------------------------------------------------------------------------------------------------
+# Evaluations for tables -----------------------------------------------------------------------------------------------
 
 
 def evaluate_missing(specs: Mapping[str, Config], results: Path, config: Config) -> list[str]:
-    """Evaluates what specs ask for and is not there, or was made of another checkpoint; returns what failed."""
+    """Runs the evaluations of specs whose results are missing or outdated.
+
+    Returns:
+        One line per failed evaluation.
+    """
     wanted: dict[Path, Request] = {}
     for spec in specs.values():
         for part in spec["parts"].values():
@@ -498,7 +506,7 @@ def evaluate_missing(specs: Mapping[str, Config], results: Path, config: Config)
 
 
 def _outdated(path: Path, request: Request) -> bool:
-    """Whether a result was made of another checkpoint or by another extractor than those that are there now."""
+    """Returns whether a result's checkpoint or extractor has changed since (its hash differs)."""
     result = read_result(path)
     if result.stand_in_skeleton and os.environ.get("FLAME_MDM_SMPL"):
         return True

@@ -711,9 +711,9 @@ def test_baselines_that_make_no_sense_are_refused(runs, tmp_path, capsys):
     assert baseline(runs, tmp_path, "shufled") == 1
     assert "real, shuffled, noisy, static" in capsys.readouterr().err
     assert baseline(runs, tmp_path, "shuffled", "protocol=unconditioned") == 1
-    assert "cannot be given those of others" in capsys.readouterr().err
+    assert "without text or labels cannot be shuffled" in capsys.readouterr().err
     assert baseline(runs, tmp_path, "real", f"ckpt={runs.model}") == 1
-    assert "give one of" in capsys.readouterr().err
+    assert "give exactly one of" in capsys.readouterr().err
     assert baseline(runs, tmp_path, "real", "protocol=null") == 1
     assert "needs a protocol" in capsys.readouterr().err
 
@@ -731,7 +731,7 @@ def test_shuffled_motions_are_all_there_and_belong_to_what_others_ask_for(runs, 
     assert sorted(given) == sorted(own)
     for row, motion in zip(rows, given, strict=True):
         assert asked[motion] != (row.text if condition == "text" else row.clip.action)
-    with pytest.raises(UserError, match="2 of 3 motions are asked to be the same"):
+    with pytest.raises(UserError, match="2 of 3 motions have the same caption or label"):
         Baseline("shuffled", clips, condition, 0)("rep_0", [rows[0], rows[0], rows[1]], 0)
 
 
@@ -786,7 +786,7 @@ def test_methods_of_editing_are_chosen_and_checked(runs, tmp_path, capsys):
     result = runs.result(tmp_path / "flame" / "result.json", *words, "method=flame")
     assert result["checkpoint"]["edit"]["mode"] == "x_t"
     assert "option of method=mfm" in refused(runs, capsys, tmp_path, *words, "until=0.3")
-    assert "edits no motions" in refused(runs, capsys, tmp_path, "method=mdm")
+    assert "does not edit motions" in refused(runs, capsys, tmp_path, "method=mdm")
 
 
 def test_smoothing_takes_each_motion_for_itself(runs, tmp_path):
@@ -820,8 +820,8 @@ def test_few_samples_are_warned_of(runs, tmp_path, capsys):
     result = runs.result(tmp_path / "result.json", "quick=true", "samples=7", "replications=1", "protocol=synthetic")
     count = len(runs.data().test)
     assert result["warnings"] == [
-        "fid: 7 motions for 4 features, fewer than twice as many: biased upwards",
-        f"fid: 7 generated motions and {count} real ones; compare it with values of the same two numbers only",
+        "fid: biased upwards: 7 motions are fewer than twice the 4 features",
+        f"fid: 7 generated and {count} real motions. Compare it only with values for the same two numbers",
     ]
     assert result["warnings"][0] in capsys.readouterr().out
 

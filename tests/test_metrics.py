@@ -595,7 +595,7 @@ def test_best_and_worst_of_several_are_chosen_by_the_root():
     assert values["ape_root"] == pytest.approx(2, rel=1e-5)
     metric = FlamePositionErrors(KIT21.parents, samples=2)
     metric.update(**motions, keys=torch.arange(6), groups=groups)
-    with pytest.raises(ValueError, match="2 of 2 prompts have not 2 motions"):
+    with pytest.raises(ValueError, match="2 of 2 prompts do not have 2 motions"):
         metric.compute()
 
 

@@ -1,28 +1,30 @@
-"""Metrics of generated motions, as torchmetrics classes that share one vocabulary.
+"""Metrics of generated motions: torchmetrics classes whose inputs have common names.
 
-Every `update` takes some of these tensors by name. A batch holds B generated and R real motions, B and R of any size.
+Every `update` takes some of these inputs by name. A batch holds B generated and R real motions; B and R may be any
+size.
 
-| name | shape | what |
+| name | shape | content |
 |---|---|---|
 | generated | (B, E) | features of generated motions |
 | text | (B, E) | features of the texts they were generated for |
 | text_keys | (B,) int64 | keys of those captions; equal captions have equal keys |
 | logits | (B, A) | class scores of generated motions |
 | labels | (B,) int64 | classes they were generated for |
-| groups | (B,) int64 | keys of the prompts, where several motions are generated for one |
-| joints | (B, F, J, 3) | generated motions in metres, y up, floor at y = 0 |
+| groups | (B,) int64 | keys of the prompts, if several motions are generated per prompt |
+| requested | B mappings | attributes of the motions as requested, see `attributes` |
+| joints | (B, F, J, 3) | generated motions in meters, y up, floor at y = 0 |
 | mask | (B, F) bool | True = real frame of a generated motion |
-| kept | (B, F, J) bool | True = this joint of this frame was to be kept, where motions are edits |
-| keys | (B,) int64 | keys of generated motions, no two the same |
-| real, real_joints, real_mask, real_keys | as above | the same of real motions |
-| references | B of (F', J, 3) | the real motions at the frame rates of their recordings |
+| kept | (B, F, J) bool | True = this joint of this frame was to be kept, if motions are edits |
+| keys | (B,) int64 | unique keys of generated motions |
+| real, real_joints, real_mask, real_keys | as above | the same for real motions |
+| references | B of (F', J, 3) | real motions at the frame rate of their recording |
 
-A key is `flame_mdm.seeds.key` of an id (and the number of the sample, where there are several). Metrics that compare
-motion by motion (MID, position and displacement errors) take real motions in the order of the generated ones.
+A key is `flame_mdm.seeds.key` of an id (and of the sample number, if there are several samples). Metrics that compare
+motions one by one (MID, position and displacement errors) take real motions in the order of the generated ones.
 
-`compute()` gives a number, or a dict of numbers by name, or None where the metric was given nothing; it raises
-ValueError where a number would mean nothing, as with too few samples. For the same features the values are the same to
-the last bit in whatever batches, order and processes the samples came; draws depend on `seed` alone.
+`compute()` returns a number, a dict of numbers by name, or None if the metric was given nothing. It raises ValueError
+if a number would be meaningless, for example with too few samples. For the same features, values are bit-identical for
+any batch size, order and number of processes; random draws depend on `seed` alone.
 """
 
 from __future__ import annotations
@@ -39,14 +41,14 @@ if TYPE_CHECKING:
 
 
 def make_metrics(configs: Mapping[str, Config], **options: Any) -> dict[str, Metric]:
-    """Returns the metrics that mappings with a `_target_` describe, by name.
+    """Creates metrics from mappings with a `_target_`.
 
     Args:
         configs: the mappings, by name.
         options: further arguments, for those metrics that take them.
 
     Raises:
-        UserError: a mapping has no `_target_`, or an option that its metric does not take.
+        UserError: If a mapping has no `_target_`, or an option that its metric does not take.
     """
     metrics = {}
     for name, config in configs.items():
@@ -61,7 +63,7 @@ def make_metrics(configs: Mapping[str, Config], **options: Any) -> dict[str, Met
 
 
 def required_inputs(metric: Metric) -> list[str]:
-    """Returns the names of the inputs that each update needs."""
+    """Returns the names of the inputs that `update` requires."""
     return [p.name for p in inspect.signature(metric.update).parameters.values() if p.default is p.empty]
 
 
@@ -69,7 +71,7 @@ def update_metrics(metrics: Mapping[str, Metric], **features: Any) -> None:
     """Updates each metric with the inputs that it takes.
 
     Raises:
-        UserError: a required input is missing.
+        UserError: If a required input is missing.
     """
     for name, metric in metrics.items():
         missing = [needed for needed in required_inputs(metric) if needed not in features]
@@ -80,7 +82,7 @@ def update_metrics(metrics: Mapping[str, Metric], **features: Any) -> None:
 
 
 def missing_input(name: str, metric: Metric, needed: str) -> str:
-    """Returns the message about a metric that lacks an input."""
+    """Returns the error message for a metric that lacks an input."""
     return (
         f"metric {name} ({type(metric).__name__}): missing input: {needed}. Remove the metric from the protocol, or "
         "choose data, an extractor or a protocol with this input"

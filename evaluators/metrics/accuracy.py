@@ -1,4 +1,4 @@
-"""How often a classifier sees in a motion the class that was asked for."""
+"""Action recognition accuracy of generated motions."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from torchmetrics import Metric
 
 
 class ActionAccuracy(Metric):
-    """Share of motions whose largest logit is that of their label (Guo et al. 2020), in [0, 1]."""
+    """Fraction of motions whose largest logit is that of their label (Guo et al. 2020), in [0, 1]."""
 
     higher_is_better = True
     full_state_update = False
@@ -23,16 +23,16 @@ class ActionAccuracy(Metric):
         self.add_state("total", torch.tensor(0), dist_reduce_fx="sum")
 
     def update(self, logits: Tensor, labels: Tensor) -> None:
-        """Adds class scores (B, A) and the classes asked for (B,).
+        """Adds class scores (B, A) and requested classes (B,).
 
         Raises:
-            ValueError: scores are not finite.
+            ValueError: If scores contain NaN or infinity.
         """
         if not logits.isfinite().all():
-            raise ValueError("ActionAccuracy: class scores are not finite; look for motions that are not")
+            raise ValueError("ActionAccuracy: class scores are not finite. Look for motions that are not finite")
         self.right += (logits.argmax(1) == labels).sum()
         self.total += len(labels)
 
     def compute(self) -> float | None:
-        """The share."""
+        """Returns the accuracy; None without motions."""
         return int(self.right) / int(self.total) if int(self.total) else None

@@ -1,4 +1,4 @@
-"""How well generated motions fit their texts."""
+"""Alignment of generated motions with their texts: R-precision, distances, retrieval and MID."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from evaluators.metrics.samples import SampleMetric
 
 
 def retrieval_ranks(queries: Tensor, candidates: Tensor, pools: Tensor, own: Tensor) -> Tensor:
-    """How many candidates stand before the right one, by Euclidean distance.
+    """Returns the number of candidates that rank before the correct one, by Euclidean distance.
 
     Args:
         queries: (N, E) features.
         candidates: (M, E) features.
         pools: (N, P) indices of the candidates of each query.
-        own: (N,) where in its pool the right one stands.
+        own: (N,) position of the correct candidate in each pool.
 
     Returns:
-        (N,) int64: candidates that are nearer, or as near and earlier in the pool.
+        (N,) int64: the number of candidates that are closer, or equally close and earlier in the pool.
     """
     ranks = []
     for query, pool, right in zip(queries.split(256), pools.split(256), own.split(256), strict=True):
@@ -45,7 +45,7 @@ class _RPrecision(SampleMetric):
         self.keep(keys=keys, generated=generated, text=text, text_keys=text_keys)
 
     def compute(self) -> dict[str, float | None]:
-        """`top1`, `top2`, ...: the share, in [0, 1], of queries with fewer than k candidates before the right one."""
+        """Returns `top1`, `top2`, ...: the fraction of queries with fewer than k candidates before the correct one."""
         rows = self.rows("keys", "generated", "text", "text_keys")
         if rows is None:
             return {f"top{k}": None for k in range(1, self.top + 1)}
@@ -54,27 +54,27 @@ class _RPrecision(SampleMetric):
         return {f"top{k}": int((ranks < k).sum()) / len(ranks) for k in range(1, self.top + 1)}
 
     def ranks(self, generated: Tensor, text: Tensor, text_keys: Tensor, generator: np.random.Generator) -> Tensor:
-        """Place (N,) of the right candidate for each query, 0 = first."""
+        """Returns the rank (N,) of the correct candidate for each query, 0 = first."""
         raise NotImplementedError
 
 
 class TextsForMotion(_RPrecision):
-    """R-precision, texts for a motion: is its own text among the k nearest of 32?
+    """R-precision, texts for a motion: is the motion's text among the k nearest of 32?
 
-    The definition of the papers (FLAME, "Evaluation Metrics"; MDM, B.2; MFM, 9.1) and of FLAME's code: for every
-    generated motion its own text and 31 others, drawn without replacement from the captions that differ from it, at
-    Euclidean distance. In FLAME's code a pool is as large as the batch, so that the last ones are smaller; here all
-    have 32 texts. The own text stands at a random place, so that an extractor to which all texts are alike gets k / 32.
+    This is the definition of the papers (FLAME, "Evaluation Metrics"; MDM, B.2; MFM, 9.1) and of FLAME's code. Each
+    generated motion ranks its own text and 31 others, drawn without replacement from captions that differ from it, by
+    Euclidean distance. In FLAME's code, a pool is as large as the batch, so the last pools are smaller; here, all pools
+    have 32 texts. The own text is at a random position, so that an extractor that cannot tell texts apart gets k / 32.
 
     Args:
-        pool: texts in a pool, the own one included.
+        pool: texts in a pool, including the own one.
         top: largest k.
-        seed: of the draws.
+        seed: of the random draws.
         kwargs: options of `torchmetrics.Metric`.
     """
 
     def ranks(self, generated: Tensor, text: Tensor, text_keys: Tensor, generator: np.random.Generator) -> Tensor:
-        """Place of the own text in a pool of texts, for each motion."""
+        """Returns the rank of the own text in a pool of texts, for each motion."""
         _, first, own = np.unique(text_keys.cpu().numpy(), return_index=True, return_inverse=True)
         self.need(len(first), self.pool, "different captions")
         others = self.pool - 1
@@ -88,20 +88,22 @@ class TextsForMotion(_RPrecision):
 
 
 class MotionsForText(_RPrecision):
-    """R-precision, motions for a text: is its own motion among the k nearest of 32?
+    """R-precision, motions for a text: is the text's motion among the k nearest of 32?
 
-    The definition of the code of Guo et al. 2022, which MDM's and MFM's tables use: test pairs in random order, cut
-    into pools of 32; each text ranks the motions of its pool by Euclidean distance. Equal captions may meet in a pool.
-    In that code a pool is a batch of the loader, an incomplete last batch is left out, distances are float32, and a
-    motion exactly at its text may come last (square root of a negative number); here pools are drawn, and the texts of
-    an incomplete last pool rank the last 32 motions, so that every text counts once.
+    This is the definition of the code of Guo et al. 2022, which the tables of MDM and MFM use. Test pairs in random
+    order are split into pools of 32; each text ranks the motions of its pool by Euclidean distance. Equal captions may
+    be in the same pool. In that code, a pool is a batch of the data loader, an incomplete last batch is dropped,
+    distances are float32, and a motion exactly at its text may rank last (square root of a negative number). Here,
+    pools are drawn at random, and the texts of an incomplete last pool rank the last 32 motions, so that every text
+    counts once.
 
     Args:
         pool: motions in a pool.
         top: largest k.
-        seed: of the draws.
-        normalize: scales features to length 1 first, which ranks by cosine. An extractor trained by cosines, such as
-            motion-CLIP, leaves lengths open, and the shortest motions would be nearest to every text.
+        seed: of the random draws.
+        normalize: whether to scale features to length 1 first, which ranks by cosine. An extractor trained with
+            cosines, such as motion-CLIP, does not constrain lengths; the motions with the shortest features would be
+            nearest to every text.
         kwargs: options of `torchmetrics.Metric`.
     """
 
@@ -110,7 +112,7 @@ class MotionsForText(_RPrecision):
         self.normalize = normalize
 
     def ranks(self, generated: Tensor, text: Tensor, text_keys: Tensor, generator: np.random.Generator) -> Tensor:
-        """Place of the own motion in a pool of motions, for each text."""
+        """Returns the rank of the own motion in a pool of motions, for each text."""
         count = len(generated)
         if self.normalize:
             generated, text = F.normalize(generated, dim=-1), F.normalize(text, dim=-1)
@@ -142,12 +144,12 @@ class TextAndMotion(SampleMetric):
 
 
 class MultimodalDistance(TextAndMotion):
-    """MM-Dist, "matching score" in the code of Guo et al. 2022: mean Euclidean distance of motion and own text.
+    """MM-Dist, "matching score" in the code of Guo et al. 2022: mean Euclidean distance of motions and their texts.
 
-    MFM, eq. 10. The authors' code takes distances in float32 and leaves out an incomplete last batch.
+    MFM, eq. 10. The authors' code computes distances in float32 and drops an incomplete last batch.
 
     Args:
-        normalize: scales features to length 1 first, as for `MotionsForText`; in [0, 2] then.
+        normalize: whether to scale features to length 1 first, as for `MotionsForText`; the value is then in [0, 2].
         kwargs: options of `torchmetrics.Metric`.
     """
 
@@ -158,7 +160,7 @@ class MultimodalDistance(TextAndMotion):
         self.normalize = normalize
 
     def compute(self) -> float | None:
-        """The mean distance, in units of the features."""
+        """Returns the mean distance, in units of the features."""
         rows = self.rows("keys", "generated", "text")
         if rows is None:
             return None
@@ -167,12 +169,12 @@ class MultimodalDistance(TextAndMotion):
 
 
 class MotionCLIPScore(TextAndMotion):
-    """mCLIP score of FLAME ("Evaluation Metrics"): mean cosine of the features of motion and own text, in [-1, 1]."""
+    """mCLIP score of FLAME ("Evaluation Metrics"): mean cosine of the features of motions and texts, in [-1, 1]."""
 
     higher_is_better = True
 
     def compute(self) -> float | None:
-        """The mean cosine."""
+        """Returns the mean cosine."""
         rows = self.rows("keys", "generated", "text")
         return None if rows is None else F.cosine_similarity(rows[0], rows[1]).mean().item()
 
@@ -180,14 +182,14 @@ class MotionCLIPScore(TextAndMotion):
 class WholeSetRetrieval(TextAndMotion):
     """Retrieval among all test samples by cosine, protocol "all" of Petrovich et al. 2023 (TMR).
 
-    Ties get their mean rank. Other than R-precision, values fall as the test set grows.
+    Ties get their mean rank. Unlike R-precision, values decrease as the test set grows.
     """
 
     higher_is_better = True
     TOP = (1, 2, 3, 5, 10)
 
     def compute(self) -> dict[str, float | None]:
-        """Recall `t2m_top1`, ... in [0, 1] and median rank `t2m_median` (1 = best); `m2t_` the other way."""
+        """Returns recall `t2m_top1`, ... in [0, 1] and median rank `t2m_median` (1 = best); `m2t_` is the reverse."""
         rows = self.rows("keys", "generated", "text")
         if rows is None:
             return {
@@ -198,7 +200,10 @@ class WholeSetRetrieval(TextAndMotion):
 
 
 def whole_set_retrieval(similarity: Tensor, top: tuple[int, ...]) -> dict[str, float | None]:
-    """Recall and median rank from similarities (N, N), rows texts, columns motions: see `WholeSetRetrieval`."""
+    """Computes recall and median rank from similarities (N, N) of texts (rows) and motions (columns).
+
+    See `WholeSetRetrieval`.
+    """
     values: dict[str, float | None] = {}
     for way, table in (("t2m", similarity), ("m2t", similarity.T)):
         own = table.diagonal()[:, None]
@@ -209,15 +214,21 @@ def whole_set_retrieval(similarity: Tensor, top: tuple[int, ...]) -> dict[str, f
 
 
 def mutual_information_divergence(real: Tensor, text: Tensor, generated: Tensor, eps: float) -> Tensor:
-    """MID of generated motions (M, E) for the first M of the texts (N, T) that real motions (N, E) belong to, float64.
+    """Computes MID of generated motions, in float64.
 
     Kim et al. 2022, "Mutual Information Divergence": the mean pointwise mutual information of generated motions and
     their texts under a normal distribution fitted to the real pairs,
 
         (log det S_x + log det S_y - log det S_z) / 2 + (tr S_x^-1 S_x' + tr S_y^-1 S_y - tr S_z^-1 S_z') / 2
 
-    with x real, y text, z both; covariances of generated motions (') are about the means of the real ones; inverses are
-    those of S + eps I. N - 1 and M - 1 in the denominators.
+    where x is real, y is text, and z is both; covariances of generated motions (') are about the means of the real
+    ones; inverses are those of S + eps I. The denominators are N - 1 and M - 1.
+
+    Args:
+        real: (N, E) features of real motions.
+        text: (N, T) features of their texts.
+        generated: (M, E) features of motions generated for the first M texts.
+        eps: added to the diagonal of covariances before they are inverted.
     """
     count = len(generated)
     both = torch.cat([real, text], 1)
@@ -236,8 +247,8 @@ def mutual_information_divergence(real: Tensor, text: Tensor, generated: Tensor,
 class MutualInformationDivergence(SampleMetric):
     """MID, in nats: `mutual_information_divergence` of generated motions, their texts and the real motions.
 
-    Needs the real motion of each generated one, and more samples than motion and text have features together: below,
-    the joint covariance is singular and the value arbitrary (the authors' code asks for half as many).
+    It needs the real motion of each generated one, and more samples than motion and text have features together. With
+    fewer, the joint covariance is singular and the value arbitrary (the authors' code requires half as many).
 
     Args:
         eps: added to the diagonal of covariances before they are inverted. 5e-4 in FLAME, 0 in the authors' release.
@@ -255,7 +266,7 @@ class MutualInformationDivergence(SampleMetric):
         self.keep(keys=keys, generated=generated, text=text, real=real)
 
     def compute(self) -> float | None:
-        """The divergence."""
+        """Returns the divergence."""
         rows = self.rows("keys", "generated", "text", "real")
         if rows is None:
             return None

@@ -1,7 +1,7 @@
-"""What a motion shows, read from its joints by geometric rules: action, side, count, direction, speed.
+"""Attributes of a motion, read from its joints by geometric rules: action, side, count, direction, speed.
 
-The rules know nothing of how a motion was made. They read what a person would see on a clip of a few seconds that shows
-one action of the synthetic set; thresholds are stated beside them. The joints are the 22 of SMPL.
+The rules are independent of how a motion was generated. They read what a person would see in a clip of a few seconds
+that shows one action of the synthetic set; each threshold is stated next to its rule. The joints are the 22 of SMPL.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ def read_attributes(joints: np.ndarray, fps: float) -> dict[str, str | int]:
     """Reads one clip of the 22 SMPL joints.
 
     Args:
-        joints: (F, 22, 3) metres, y up, at any place and facing anywhere.
-        fps: frames a second.
+        joints: (F, 22, 3) in meters, y up, with any position and heading.
+        fps: frames per second.
 
     Returns:
-        "action" and those of "side", "count", "direction", "speed" that the action has; empty where no action of the
-        set is recognised, as in noise, or in a body that is none.
+        "action", and those of "side", "count", "direction", "speed" that the action has; empty if no action of the set
+        is recognized, for example in noise, or if the joints do not form a body.
     """
     joints = np.asarray(joints, np.float64)
     if len(joints) < fps or not np.isfinite(joints).all():
@@ -68,7 +68,9 @@ def read_attributes(joints: np.ndarray, fps: float) -> dict[str, str | int]:
 
 
 def _is_a_body(joints: np.ndarray, smooth: np.ndarray) -> bool:
-    """Upright, limbs of 15 to 60 cm that keep their length within a quarter, less than 2 cm off a smooth curve."""
+    """Returns whether the body is upright, its limbs are 15 to 60 cm long and keep their length within 25 %, and its
+    joints are less than 2 cm off a smooth curve.
+    """
     bones = np.stack([np.linalg.norm(smooth[:, a] - smooth[:, b], axis=-1) for a, b in BONES])
     length = np.median(bones, 1, keepdims=True)
     steady = (np.abs(bones / np.maximum(length, 1e-6) - 1) < 0.25).mean() > 0.9
@@ -80,7 +82,7 @@ def _is_a_body(joints: np.ndarray, smooth: np.ndarray) -> bool:
 
 
 def _count(signal: np.ndarray, high: float, low: float) -> int:
-    """How often a signal rises above `high`, having been below `low` before."""
+    """Counts how often a signal rises above `high` after having been below `low`."""
     count, armed = 0, False
     for value in signal:
         if armed and value > high:
@@ -93,7 +95,7 @@ def _count(signal: np.ndarray, high: float, low: float) -> int:
 def _locomotion(
     smooth: np.ndarray, forward: np.ndarray, left: np.ndarray, turned: float, fps: float
 ) -> dict[str, str | int]:
-    """Walks and runs go further than 33 cm from where they began, and lift both ankles by 4 cm."""
+    """Reads walks and runs, which move more than 33 cm from where they began and lift both ankles by 4 cm."""
     ground = gaussian_filter1d(smooth[:, PELVIS][:, [0, 2]], 0.15 * fps, axis=0, mode="nearest")
     if np.linalg.norm(ground - ground[0], axis=-1).max() < 0.33:
         return {}
@@ -115,7 +117,7 @@ def _locomotion(
 
 
 def _kick(smooth: np.ndarray, floor: float, forward: np.ndarray) -> dict[str, str | int]:
-    """A foot more than 35 cm in front of the pelvis and more than 25 cm above where it stands."""
+    """Reads kicks: a foot more than 35 cm in front of the pelvis and more than 25 cm above its standing height."""
     out = smooth[:, ANKLES] - smooth[:, [PELVIS]]
     ahead = (out[..., [0, 2]] * forward[:, None]).sum(-1)
     high = smooth[:, ANKLES, 1] - floor - 0.06
@@ -126,7 +128,7 @@ def _kick(smooth: np.ndarray, floor: float, forward: np.ndarray) -> dict[str, st
 
 
 def _arms(smooth: np.ndarray, fps: float) -> dict[str, str | int]:
-    """Raised arms, waves, punches; or nothing but standing."""
+    """Reads raised arms, waves and punches, or standing if there is none."""
     upper = smooth[:, ELBOWS] - smooth[:, SHOULDERS]
     fore = smooth[:, WRISTS] - smooth[:, ELBOWS]
     arm = smooth[:, WRISTS] - smooth[:, SHOULDERS]
@@ -160,10 +162,10 @@ def _arms(smooth: np.ndarray, fps: float) -> dict[str, str | int]:
 
 
 class AttributeAccuracy(Metric):
-    """Share of motions that show what was asked, by attribute.
+    """Fraction of motions that show the requested value, by attribute.
 
     Args:
-        fps: frames a second of the motions.
+        fps: frames per second of the motions.
     """
 
     higher_is_better = True
@@ -174,37 +176,38 @@ class AttributeAccuracy(Metric):
         self.fps = fps
         for name in (*ATTRIBUTES, "all"):
             self.add_state(f"right_{name}", tensor(0), dist_reduce_fx="sum")
-            self.add_state(f"asked_{name}", tensor(0), dist_reduce_fx="sum")
+            self.add_state(f"requested_{name}", tensor(0), dist_reduce_fx="sum")
 
-    def update(self, joints: Tensor, mask: Tensor, asked: Sequence[Mapping[str, str | int | float]]) -> None:
+    def update(self, joints: Tensor, mask: Tensor, requested: Sequence[Mapping[str, str | int | float]]) -> None:
         """Adds motions.
 
         Args:
-            joints: (B, F, 22, 3) metres, y up.
+            joints: (B, F, 22, 3) in meters, y up.
             mask: (B, F) bool, True = real frame.
-            asked: of each motion, some of action, side, count, direction, speed; the action at least.
+            requested: of each motion, some of action, side, count, direction, speed; at least the action.
 
         Raises:
-            ValueError: `asked` is not one a motion, or asks for something that cannot be read.
+            ValueError: If `requested` does not have one entry per motion, lacks an action, or names an unknown
+                attribute.
         """
-        if len(asked) != len(joints):
-            raise ValueError(f"attributes: {len(joints)} motions but {len(asked)} sets of attributes were asked")
-        for motion, real, wanted in zip(joints.detach().cpu(), mask.cpu(), asked, strict=True):
+        if len(requested) != len(joints):
+            raise ValueError(f"attributes: {len(joints)} motions but {len(requested)} sets of requested attributes")
+        for motion, real, wanted in zip(joints.detach().cpu(), mask.cpu(), requested, strict=True):
             unknown = set(wanted) - set(ATTRIBUTES)
             if unknown or "action" not in wanted:
-                raise ValueError(f"attributes: asked for {dict(wanted)}; give an action, and only of {ATTRIBUTES}")
+                raise ValueError(f"attributes: {dict(wanted)} requested. Give an action, and only keys of {ATTRIBUTES}")
             seen = read_attributes(motion[real].numpy(), self.fps)
             right = {name: seen.get(name) == value for name, value in wanted.items()}
             right["all"] = right["action"] and right.get("side", True)
             for name, hit in right.items():
                 setattr(self, f"right_{name}", getattr(self, f"right_{name}") + int(hit))
-                setattr(self, f"asked_{name}", getattr(self, f"asked_{name}") + 1)
+                setattr(self, f"requested_{name}", getattr(self, f"requested_{name}") + 1)
 
     def compute(self) -> dict[str, float | None]:
-        """Accuracy in [0, 1] by attribute, None where it was never asked; `all` = action and side both right."""
+        """Returns the accuracy in [0, 1] by attribute, None if never requested; `all` = both action and side right."""
         return {
-            name: int(getattr(self, f"right_{name}")) / asked
-            if (asked := int(getattr(self, f"asked_{name}")))
+            name: int(getattr(self, f"right_{name}")) / requested
+            if (requested := int(getattr(self, f"requested_{name}")))
             else None
             for name in (*ATTRIBUTES, "all")
         }

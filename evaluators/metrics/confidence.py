@@ -1,4 +1,4 @@
-"""The mean of repeated evaluations, and how sure it is."""
+"""Mean and confidence interval of repeated evaluations."""
 
 from collections.abc import Sequence
 
@@ -6,13 +6,14 @@ import numpy as np
 
 
 def mean_ci(values: Sequence[float]) -> tuple[float, float]:
-    """Mean of R replications, and half the width of its 95 % confidence interval.
+    """Returns the mean of R replications, and the half width of its 95 % confidence interval.
 
-    1.96 std / sqrt(R) with R in the denominator of the variance, as in the code of Guo et al. 2022, MDM and MFM. It
-    tells how the evaluation varies, not how training does. ACTOR's tables show 1.96 times the variance instead.
+    The half width is 1.96 std / sqrt(R), with R in the denominator of the variance, as in the code of Guo et al. 2022,
+    MDM and MFM. It measures the variation of the evaluation, not of training. ACTOR's tables show 1.96 times the
+    variance instead.
 
     Raises:
-        ValueError: no values.
+        ValueError: If there are no values.
     """
     if not len(values):
         raise ValueError("mean_ci: no values")

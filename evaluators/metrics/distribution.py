@@ -1,4 +1,4 @@
-"""How close the features of generated motions are to those of real ones, as sets."""
+"""Distances between the feature distributions of generated and real motions: FID, KID, precision and recall."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from evaluators.metrics.samples import TwoSets
 
 
 def frechet_distance(a: Tensor, b: Tensor) -> Tensor:
-    """Fréchet distance of the normal distributions fitted to the rows of a (N, E) and b (M, E), float64.
+    """Computes the Fréchet distance of normal distributions fitted to the rows of a (N, E) and b (M, E), float64.
 
     |m_a - m_b|^2 + tr S_a + tr S_b - 2 tr (S_a S_b)^(1/2) (Dowson and Landau 1982). With centered rows
-    A / sqrt(N - 1) = Q_a R_a, and so for b, the last trace is the sum of the singular values of R_a R_b^T: no square
-    root of a matrix is taken, and covariances without full rank need no special care.
+    A / sqrt(N - 1) = Q_a R_a, and likewise for b, the last trace is the sum of the singular values of R_a R_b^T. This
+    needs no square root of a matrix, and no special treatment of rank-deficient covariances.
     """
     r_a, r_b = (torch.linalg.qr((x - x.mean(0)) / (len(x) - 1) ** 0.5, mode="r").R for x in (a, b))
     shared = torch.linalg.svdvals(r_a @ r_b.T).sum()
@@ -26,27 +26,28 @@ def frechet_distance(a: Tensor, b: Tensor) -> Tensor:
 class FrechetMotionDistance(TwoSets):
     """Fréchet distance of motion features, "FID" (Heusel et al. 2017) or "FD" (FLAME): `frechet_distance`.
 
-    Covariances have N - 1 in the denominator, as in the authors' code (numpy.cov). That code takes means in float32,
-    scipy's `sqrtm` of the product, and adds 1e-6 to the diagonals where that fails: relative differences of 1e-8. The
-    value is biased upwards, the more so the fewer samples: compare values of equal N only.
+    Covariances have N - 1 in the denominator, as in the authors' code (numpy.cov). That code computes means in float32
+    and scipy's `sqrtm` of the product, and adds 1e-6 to the diagonals if that fails; the relative difference is 1e-8.
+    The value is biased upwards, and more so with fewer samples: compare only values for equal N.
     """
 
     higher_is_better = False
 
     def compute(self) -> float | None:
-        """The distance, at least 0."""
+        """Returns the distance, at least 0."""
         sets = self.sets()
         if sets is None:
             return None
         for name, features in zip(("generated", "real"), sets, strict=True):
             self.need(len(features), 2, f"{name} motions")
-        return max(frechet_distance(*sets).item(), 0.0)  # rounding may end a little below 0
+        return max(frechet_distance(*sets).item(), 0.0)  # rounding may give a value slightly below 0
 
 
 def polynomial_mmd2(a: Tensor, b: Tensor) -> Tensor:
-    """Unbiased squared maximum mean discrepancy of a (n, E) and b (n, E) under the kernel (x . y / E + 1)^3.
+    """Computes the unbiased squared MMD of a (n, E) and b (n, E) with the kernel (x . y / E + 1)^3.
 
-    Bińkowski et al. 2018, eq. 4, as in the authors' code: for sets of equal size, with pairs (i, i) across the sets.
+    MMD is the maximum mean discrepancy of Bińkowski et al. 2018, eq. 4, as in the authors' code: for sets of equal
+    size, including the pairs (i, i) across the sets.
     """
     n, width = a.shape
     inner_a, inner_b, cross = ((x @ y.T / width + 1) ** 3 for x, y in ((a, a), (b, b), (a, b)))
@@ -59,10 +60,10 @@ class KernelMotionDistance(TwoSets):
 
     Args:
         subsets: number of subsets.
-        subset_size: samples in each, from either set.
-        replace: draw subsets with replacement, as MoDi's and MDM's code does for more real motions than `subset_size`.
-            Samples drawn twice then raise the value.
-        seed: of the draws.
+        subset_size: samples per subset, from either set.
+        replace: whether to draw with replacement, as the code of MoDi and MDM does if there are more real motions than
+            `subset_size`. Samples that are drawn twice then increase the value.
+        seed: of the random draws.
         kwargs: options of `torchmetrics.Metric`.
     """
 
@@ -75,7 +76,7 @@ class KernelMotionDistance(TwoSets):
         self.subsets, self.subset_size, self.replace, self.seed = subsets, subset_size, replace, seed
 
     def compute(self) -> dict[str, float | None]:
-        """`mean` over the subsets, and `std` (N in the denominator) among them."""
+        """Returns `mean` and `std` (N in the denominator) over the subsets."""
         sets = self.sets()
         if sets is None:
             return {"mean": None, "std": None}
@@ -94,9 +95,10 @@ class KernelMotionDistance(TwoSets):
 
 
 def manifold_coverage(points: Tensor, samples: Tensor, neighbors: int) -> Tensor:
-    """Share of the points (M, E) that lie within reach of a sample (N, E): no further than its k-th nearest neighbor.
+    """Returns the fraction of points (M, E) within the manifold of samples (N, E).
 
-    Kynkäänniemi et al. 2019, eq. 1 and 2; a sample is no neighbor of its own.
+    A point is within the manifold if it is no farther from a sample than the sample's k-th nearest neighbor
+    (Kynkäänniemi et al. 2019, eq. 1 and 2). A sample is not a neighbor of itself.
     """
     reach = _squared_distances(samples, samples).kthvalue(neighbors + 1, dim=1).values
     return (_squared_distances(points, samples) <= reach).any(1).double().mean()
@@ -109,10 +111,10 @@ def _squared_distances(a: Tensor, b: Tensor) -> Tensor:
 class PrecisionRecall(TwoSets):
     """Precision and recall of generated motions (Kynkäänniemi et al. 2019), in [0, 1].
 
-    Precision is the share of generated motions within the manifold of the real ones, recall the share of real motions
-    within that of the generated ones: `manifold_coverage`. Both sets are cut to the size of the smaller, to the first
-    in the order of the keys, as reaches shrink with the number of samples; the authors' code cuts in the order of the
-    files.
+    Precision is the fraction of generated motions within the manifold of the real ones; recall is the fraction of real
+    motions within that of the generated ones (see `manifold_coverage`). Since neighbor distances shrink with the number
+    of samples, both sets are cut to the size of the smaller one, in the order of the keys; the authors' code cuts in
+    the order of the files.
 
     Args:
         neighbors: k, 3 in MoDi and MDM.
@@ -126,7 +128,7 @@ class PrecisionRecall(TwoSets):
         self.neighbors = neighbors
 
     def compute(self) -> dict[str, float | None]:
-        """`precision` and `recall`."""
+        """Returns `precision` and `recall`."""
         sets = self.sets()
         if sets is None:
             return {"precision": None, "recall": None}

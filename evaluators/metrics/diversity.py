@@ -1,4 +1,4 @@
-"""How much generated motions differ from one another."""
+"""Diversity and multimodality: how much generated motions differ from one another."""
 
 from __future__ import annotations
 
@@ -12,20 +12,21 @@ from evaluators.metrics.samples import SampleMetric, by_group, real_frames
 
 
 def pair_distance(a: Tensor, b: Tensor) -> float:
-    """Mean Euclidean distance of features a (..., E) and b (..., E)."""
+    """Returns the mean Euclidean distance of features a (..., E) and b (..., E)."""
     return torch.linalg.vector_norm(a - b, dim=-1).mean().item()
 
 
 class Diversity(SampleMetric):
-    """Mean distance of random pairs of motions (Guo et al. 2020; MDM, eq. 6). Best where it is that of real motions.
+    """Mean distance of random pairs of motions (Guo et al. 2020; MDM, eq. 6). Best if equal to that of real motions.
 
-    Published are 300 pairs, drawn as two sets without replacement, for text-to-motion, and 200 pairs with replacement
-    for action-to-motion and unconstrained synthesis. In both a motion may be paired with itself, which counts as 0.
+    Published values use 300 pairs, drawn as two sets without replacement, for text-to-motion, and 200 pairs with
+    replacement for action-to-motion and unconstrained synthesis. In both cases, a motion may be paired with itself,
+    which counts as 0.
 
     Args:
         pairs: number of pairs.
         replace: whether a motion may be drawn twice for the same side.
-        seed: of the draws.
+        seed: of the random draws.
         kwargs: options of `torchmetrics.Metric`.
     """
 
@@ -40,7 +41,7 @@ class Diversity(SampleMetric):
         self.keep(keys=keys, generated=generated)
 
     def compute(self) -> float | None:
-        """The mean distance, in units of the features."""
+        """Returns the mean distance, in units of the features."""
         rows = self.rows("keys", "generated")
         if rows is None:
             return None
@@ -55,7 +56,7 @@ class Diversity(SampleMetric):
 
 
 class _PerPrompt(SampleMetric):
-    """Multimodality of several motions a prompt; the metric needs the same number for each."""
+    """Multimodality of several motions per prompt, the same number for each prompt."""
 
     higher_is_better = None
 
@@ -64,11 +65,11 @@ class _PerPrompt(SampleMetric):
         self.samples, self.seed = samples, seed
 
     def update(self, generated: Tensor, groups: Tensor, keys: Tensor) -> None:
-        """Adds features (B, E) of motions, with the keys of their prompts and their own (B,)."""
+        """Adds features (B, E) of motions, with the keys (B,) of their prompts and of the motions."""
         self.keep(keys=keys, generated=generated, groups=groups)
 
     def compute(self) -> float | None:
-        """The mean distance, in units of the features."""
+        """Returns the mean distance, in units of the features."""
         rows = self.rows("keys", "generated", "groups")
         if rows is None:
             return None
@@ -76,20 +77,21 @@ class _PerPrompt(SampleMetric):
         return self.distance(features[by_group(self, groups, self.samples)])
 
     def distance(self, features: Tensor) -> float:
-        """Mean distance within (C, S, E) features of S motions of each of C prompts."""
+        """Returns the mean distance within features (C, S, E) of S motions of each of C prompts."""
         raise NotImplementedError
 
 
 class TextMultimodality(_PerPrompt):
-    """Multimodality of Guo et al. 2022 (MDM, B.2; MFM, eq. 12): of 30 motions a text, 10 random pairs.
+    """Multimodality of Guo et al. 2022 (MDM, B.2; MFM, eq. 12): 10 random pairs out of 30 motions per text.
 
-    As in their code, two sets of 10 are drawn without replacement out of the 30, the same numbers for all texts; a
-    motion that is in both may meet itself. Published for 100 texts; MDM's and MFM's code takes whole batches, 128.
+    As in their code, two sets of 10 are drawn without replacement from the 30, with the same indices for all texts; a
+    motion that is in both may be paired with itself. Published for 100 texts; the code of MDM and MFM uses whole
+    batches, that is 128 texts.
 
     Args:
-        samples: motions a text.
-        pairs: pairs a text.
-        seed: of the draws.
+        samples: motions per text.
+        pairs: pairs per text.
+        seed: of the random draws.
         kwargs: options of `torchmetrics.Metric`.
     """
 
@@ -98,7 +100,7 @@ class TextMultimodality(_PerPrompt):
         self.pairs = pairs
 
     def distance(self, features: Tensor) -> float:
-        """Mean distance of the drawn pairs."""
+        """Returns the mean distance of the drawn pairs."""
         generator = np.random.default_rng(self.seed)
         first, second = (
             torch.from_numpy(generator.choice(self.samples, self.pairs, replace=False)).to(features.device)
@@ -108,10 +110,10 @@ class TextMultimodality(_PerPrompt):
 
 
 class PairedMultimodality(_PerPrompt):
-    """Multimodality of FLAME (eq. 19): two sets of 10 motions a text, compared one by one.
+    """Multimodality of FLAME (eq. 19): two sets of 10 motions per text, compared one by one.
 
-    FLAME has no code for it. Its Table 3 has 10 motions a text, eq. 19 takes two sets of 10; here it is the
-    latter, 20 motions a text.
+    FLAME published no code for it. Its Table 3 has 10 motions per text, but eq. 19 uses two sets of 10. This is the
+    latter, with 20 motions per text.
 
     Args:
         samples: motions in each of the two sets.
@@ -122,7 +124,7 @@ class PairedMultimodality(_PerPrompt):
         super().__init__(2 * samples, **kwargs)
 
     def distance(self, features: Tensor) -> float:
-        """Mean distance of the first half of each prompt's motions from the second."""
+        """Returns the mean distance between the first and second half of each prompt's motions."""
         first, second = features.chunk(2, dim=1)
         return pair_distance(first, second)
 
@@ -130,12 +132,13 @@ class PairedMultimodality(_PerPrompt):
 class ActionMultimodality(SampleMetric):
     """Multimodality of Guo et al. 2020 (MDM, eq. 7): 20 random pairs of the same class, for each class.
 
-    As in the authors' code a motion may be drawn repeatedly, and be paired with itself. There the sum is divided by the
-    number of all classes, those without a motion too; here by the number of classes that have motions.
+    As in the authors' code, a motion may be drawn repeatedly and be paired with itself. The authors divide the sum by
+    the number of all classes, including those without motions; here, it is divided by the number of classes that have
+    motions.
 
     Args:
-        pairs: pairs a class.
-        seed: of the draws.
+        pairs: pairs per class.
+        seed: of the random draws.
         kwargs: options of `torchmetrics.Metric`.
     """
 
@@ -150,7 +153,7 @@ class ActionMultimodality(SampleMetric):
         self.keep(keys=keys, generated=generated, labels=labels)
 
     def compute(self) -> float | None:
-        """The mean distance, in units of the features."""
+        """Returns the mean distance, in units of the features."""
         rows = self.rows("keys", "generated", "labels")
         if rows is None:
             return None
@@ -167,15 +170,15 @@ class ActionMultimodality(SampleMetric):
 
 
 class JointVariance(SampleMetric):
-    """Variance of joint positions among the motions of a text, in square metres.
+    """Variance of joint positions among the motions of a text, in square meters.
 
     FLAME (Table 3) averages "the variance of joints for the 10 generated motions" and says that eq. 18, a variance over
-    the frames of one motion, is used; there is no code. Here it is, at each frame and joint, the variance over the
-    motions of a text (n - 1 in the denominator), summed over x, y and z, then averaged over joints, frames and texts.
-    Not comparable with FLAME's numbers. The motions of a text have the same length.
+    the frames of one motion, is used; it published no code. Here, the variance over the motions of a text (n - 1 in the
+    denominator) is computed for each frame and joint, summed over x, y and z, and averaged over joints, frames and
+    texts. It is not comparable with FLAME's numbers. The motions of a text must have the same length.
 
     Args:
-        samples: motions a text.
+        samples: motions per text.
         kwargs: options of `torchmetrics.Metric`.
     """
 
@@ -187,14 +190,14 @@ class JointVariance(SampleMetric):
         self.samples = samples
 
     def update(self, joints: Tensor, mask: Tensor, groups: Tensor, keys: Tensor) -> None:
-        """Adds motions (B, F, J, 3) with masks (B, F), and the keys of their prompts and their own (B,)."""
+        """Adds motions (B, F, J, 3) with masks (B, F), and the keys (B,) of their prompts and of the motions."""
         motions = real_frames("JointVariance", joints, mask)
         for _, motion in zip(keys, motions, strict=True):
             self.motions.append(motion)
         self.keep(keys=keys, groups=groups)
 
     def compute(self) -> float | None:
-        """The variance."""
+        """Returns the variance."""
         rows = self.rows("keys", "groups")
         if rows is None:
             return None
@@ -204,7 +207,7 @@ class JointVariance(SampleMetric):
             lengths = {len(motions[index]) for index in members}
             if len(lengths) > 1:
                 raise ValueError(
-                    f"JointVariance: motions of one text have {sorted(lengths)} frames; generate them alike"
+                    f"JointVariance: motions of one text have {sorted(lengths)} frames. Generate them at one length"
                 )
             joints = torch.stack([motions[index] for index in members]).double()
             values.append(joints.var(0).sum(-1).mean())

@@ -1,4 +1,4 @@
-"""Whether a motion obeys the floor."""
+"""Physical plausibility: foot skating, floor contact, jitter and static motions."""
 
 from __future__ import annotations
 
@@ -11,23 +11,23 @@ from torchmetrics import Metric
 from evaluators.metrics.samples import SampleMetric, real_frames
 
 HEIGHT = 0.05
-"""Metres above the floor, y = 0, below which a toe joint touches it."""
+"""Height in meters above the floor, y = 0, below which a toe joint touches it."""
 SPEED = 0.5
-"""Metres a second over the ground above which a toe joint on the floor slides."""
+"""Speed over the ground, in meters per second, above which a toe joint on the floor slides."""
 
 
 class FootSkating(Metric):
-    """Foot skating ratio: share of frame steps in which a foot that touches the floor slides.
+    """Foot skating ratio: fraction of frame transitions in which a foot that touches the floor slides.
 
-    A toe joint touches the floor while it is below 5 cm in two adjacent frames, and slides when it moves further than
-    2.5 cm between them over the ground (Karunratanakul et al. 2023, "Guided Motion Diffusion"). The 2.5 cm belong to 20
-    frames a second; at other rates the same speed, 0.5 m/s, counts. Two deviations from the code released with the
-    paper: it asks in addition for the same speed in the mean of five frames, which the paper does not; and it averages
-    the ratios of the motions, where here every frame step counts alike.
+    A toe joint touches the floor if it is below 5 cm in two adjacent frames, and slides if it moves more than 2.5 cm
+    over the ground between them (Karunratanakul et al. 2023, "Guided Motion Diffusion"). The 2.5 cm are for 20 frames
+    per second; at other frame rates, the same speed of 0.5 m/s is the limit. There are two deviations from the code
+    released with the paper: that code also requires this speed in the mean of five frames, which the paper does not;
+    and it averages the ratios of the motions, while here every frame transition has the same weight.
 
     Args:
-        fps: frames a second of the motions.
-        toes: the toe joints; the default are those of the 22 SMPL joints.
+        fps: frames per second of the motions.
+        toes: indices of the toe joints; the default is for the 22 SMPL joints.
     """
 
     higher_is_better = False
@@ -42,7 +42,7 @@ class FootSkating(Metric):
         self.add_state("steps", torch.tensor(0), dist_reduce_fx="sum")
 
     def update(self, joints: Tensor, mask: Tensor) -> None:
-        """Adds motions: joints (B, F, J, 3) in metres, y up; mask (B, F) bool, True = real frame."""
+        """Adds motions: joints (B, F, J, 3) in meters, y up; mask (B, F) bool, True = real frame."""
         real_frames("FootSkating", joints, mask)
         toes = joints[:, :, self.toes].double()
         moved = (toes[:, 1:, :, [0, 2]] - toes[:, :-1, :, [0, 2]]).norm(dim=-1)
@@ -53,12 +53,12 @@ class FootSkating(Metric):
         self.steps += real.sum()
 
     def compute(self) -> float | None:
-        """The ratio in [0, 1]; None where no motion had two frames."""
+        """Returns the ratio in [0, 1]; None if no motion has two frames."""
         return int(self.skating) / int(self.steps) if int(self.steps) else None
 
 
 class _MeanOverFrames(SampleMetric):
-    """Mean of a value of each frame over all frames of all motions."""
+    """Mean of a per-frame value over all frames of all motions."""
 
     higher_is_better = False
 
@@ -66,7 +66,7 @@ class _MeanOverFrames(SampleMetric):
         super().__init__(("keys", "total", "frames"), **kwargs)
 
     def update(self, joints: Tensor, mask: Tensor, keys: Tensor) -> None:
-        """Adds motions (B, F, J, 3) in metres, y up, with masks (B, F) and keys (B,)."""
+        """Adds motions (B, F, J, 3) in meters, y up, with masks (B, F) and keys (B,)."""
         motions = real_frames(type(self).__name__, joints, mask)
         values = [self.frame_values(motion.double()) for motion in motions]
         if values:
@@ -74,14 +74,14 @@ class _MeanOverFrames(SampleMetric):
             self.keep(keys=keys, total=total[:, None], frames=total.new_tensor([[len(v)] for v in values]))
 
     def compute(self) -> float | None:
-        """The mean; None where there was no frame to measure."""
+        """Returns the mean; None if there is no frame to measure."""
         rows = self.rows("keys", "total", "frames")
         if rows is None or not rows[1].sum():
             return None
         return (rows[0].sum() / rows[1].sum()).item()
 
     def frame_values(self, motion: Tensor) -> Tensor:
-        """(F, J, 3) -> (F',), one value a frame, or for as many frames as can be measured."""
+        """(F, J, 3) -> (F',), one value per frame that can be measured."""
         raise NotImplementedError
 
 
@@ -92,33 +92,35 @@ class _OffTheFloor(_MeanOverFrames):
 
 
 class Penetration(_OffTheFloor):
-    """Mean depth of the lowest joint below the floor, y = 0, in metres.
+    """Mean depth of the lowest joint below the floor, y = 0, in meters.
 
-    Yuan et al. 2023 (PhysDiff) measure the lowest vertex of a mesh; there, as here, depths up to 5 mm count as 0.
+    Yuan et al. 2023 (PhysDiff) measure the lowest vertex of a mesh instead. In both cases, depths up to 5 mm count as
+    0.
 
     Args:
-        tolerance: metres that count as 0.
+        tolerance: depth in meters that counts as 0.
         kwargs: options of `torchmetrics.Metric`.
     """
 
     def frame_values(self, motion: Tensor) -> Tensor:
-        """Depth of each frame."""
+        """Returns the depth in each frame."""
         depth = -motion[..., 1].amin(1)
         return torch.where(depth > self.tolerance, depth, 0.0)
 
 
 class Floating(_OffTheFloor):
-    """Mean height of the lowest joint above the floor, y = 0, in metres. Jumps float too: compare with real motions.
+    """Mean height of the lowest joint above the floor, y = 0, in meters.
 
-    Yuan et al. 2023 (PhysDiff) measure the lowest vertex of a mesh; there, as here, heights up to 5 mm count as 0.
+    Jumps count as floating, too: compare with the value of real motions. Yuan et al. 2023 (PhysDiff) measure the lowest
+    vertex of a mesh instead. In both cases, heights up to 5 mm count as 0.
 
     Args:
-        tolerance: metres that count as 0.
+        tolerance: height in meters that counts as 0.
         kwargs: options of `torchmetrics.Metric`.
     """
 
     def frame_values(self, motion: Tensor) -> Tensor:
-        """Height of each frame."""
+        """Returns the height in each frame."""
         height = motion[..., 1].amin(1)
         return torch.where(height > self.tolerance, height, 0.0)
 
@@ -126,10 +128,11 @@ class Floating(_OffTheFloor):
 class Jitter(_MeanOverFrames):
     """Mean jerk of the joints, the third derivative of their positions, in m/s^3.
 
-    As in Yi et al. 2022 (PIP), by third differences. It grows with the frame rate: compare values of equal rates.
+    Computed by third differences, as in Yi et al. 2022 (PIP). It grows with the frame rate: compare only values for
+    equal frame rates.
 
     Args:
-        fps: frames a second of the motions.
+        fps: frames per second of the motions.
         kwargs: options of `torchmetrics.Metric`.
     """
 
@@ -138,19 +141,19 @@ class Jitter(_MeanOverFrames):
         self.fps = fps
 
     def frame_values(self, motion: Tensor) -> Tensor:
-        """Jerk of each four frames in a row, joints averaged."""
+        """Returns the jerk of every four consecutive frames, averaged over joints."""
         return motion.diff(n=3, dim=0).norm(dim=-1).mean(1) * self.fps**3
 
 
 class StaticShare(Metric):
-    """Share of motions that hardly move: joints at less than 3 cm/s on average over joints and frames.
+    """Fraction of motions that hardly move: less than 3 cm/s on average over joints and frames.
 
-    A generator that stands still makes many of them, and so do real sets that show standing people: compare with real
-    motions.
+    A generator that stands still has many static motions, but so do real data sets with standing people: compare with
+    the value of real motions.
 
     Args:
-        fps: frames a second of the motions.
-        speed: metres a second below which a motion counts as static.
+        fps: frames per second of the motions.
+        speed: meters per second below which a motion counts as static.
         kwargs: options of `torchmetrics.Metric`.
     """
 
@@ -166,7 +169,7 @@ class StaticShare(Metric):
         self.add_state("motions", torch.tensor(0), dist_reduce_fx="sum")
 
     def update(self, joints: Tensor, mask: Tensor) -> None:
-        """Adds motions: joints (B, F, J, 3) in metres, y up; mask (B, F). Those of one frame do not count."""
+        """Adds motions: joints (B, F, J, 3) in meters, y up; mask (B, F). Motions with one frame are ignored."""
         for motion in real_frames("StaticShare", joints, mask):
             moved = motion.double().diff(dim=0).norm(dim=-1)
             if len(moved):
@@ -174,5 +177,5 @@ class StaticShare(Metric):
                 self.motions += 1
 
     def compute(self) -> float | None:
-        """The share in [0, 1]; None where no motion had two frames."""
+        """Returns the fraction in [0, 1]; None if no motion has two frames."""
         return int(self.static) / int(self.motions) if int(self.motions) else None

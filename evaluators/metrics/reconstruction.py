@@ -1,4 +1,4 @@
-"""How far generated motions are from the real motion of the same text, or from the motion they were to continue."""
+"""Errors of generated motions against the real motion of the same text, or the motion that was edited."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ RIFKE = Rifke()
 
 
 def temos_parts(joints: Tensor) -> dict[str, Tensor]:
-    """Root (F, 3), trajectory (F, 2), local (F, 20, 3) and global (F, 21, 3) positions as TEMOS compares them.
+    """Returns root (F, 3), trajectory (F, 2), local (F, 20, 3) and global (F, 21, 3) positions, as compared by TEMOS.
 
-    The motion is put on the floor, its first root to x = z = 0, its first heading to +z. Local positions are those of
-    all joints but the root seen by the body in each frame: root at x = z = 0, heading +z, y above the floor. Floor and
-    heading are those of `Rifke`, with their peculiarities.
+    The motion is placed on the floor, with its first root at x = z = 0 and its first heading along +z. Local positions
+    are those of all joints except the root, relative to the body in each frame: root at x = z = 0, heading along +z, y
+    above the floor. Floor and heading are those of `Rifke`, with their peculiarities.
 
     Args:
-        joints: (F, 21, 3) MMM's joints in KIT's units, y up; float64.
+        joints: (F, 21, 3) MMM joints in KIT units, y up; float64.
     """
     ground = joints[:, :1] * joints.new_tensor([1.0, 0.0, 1.0])
     floor = joints.new_tensor([0.0, 1.0, 0.0]) * RIFKE.floor(joints)
@@ -41,7 +41,7 @@ def temos_parts(joints: Tensor) -> dict[str, Tensor]:
 
 
 def flame_parts(joints: Tensor, root: Tensor, parents: Sequence[int]) -> dict[str, Tensor]:
-    """Root (F, 3), trajectory (F, 2), bones (F, J - 1, 3) and joints (F, J, 3) as FLAME's code compares them.
+    """Returns root (F, 3), trajectory (F, 2), bones (F, J - 1, 3) and joints (F, J, 3), as compared by FLAME's code.
 
     Args:
         joints: (F, J, 3) positions, y up.
@@ -53,11 +53,11 @@ def flame_parts(joints: Tensor, root: Tensor, parents: Sequence[int]) -> dict[st
 
 
 class _PositionErrors(SampleMetric):
-    """APE and AVE by part; a clip adds a sum of position errors, its frames and its variance errors.
+    """APE and AVE by part. Each clip adds a sum of position errors, its number of frames, and its variance errors.
 
     Args:
-        samples: motions a text. Of several, the best and the worst count, as in TEMOS: those with the smallest and the
-            largest APE of the root, from which all other values are taken, too.
+        samples: motions per text. If there are several, the best and the worst are used, as in TEMOS: those with the
+            smallest and the largest APE of the root, which also provide all other values.
         upsampling: frames of a recording per frame of a motion. Above 1, motions are interpolated and compared with
             the recordings.
         kwargs: options of `torchmetrics.Metric`.
@@ -81,12 +81,12 @@ class _PositionErrors(SampleMetric):
     ) -> None:
         """Adds generated motions (B, F, J, 3) and the real ones in the same order (B, F', J, 3), with their masks.
 
-        Both are compared up to the end of the shorter. `groups` are the keys of the prompts, of several motions each.
-        `references` are the real ones (F', J, 3) at the frame rate of their recordings.
+        They are compared up to the end of the shorter one. `groups` are the keys of the prompts, if each has several
+        motions. `references` are the real motions (F', J, 3) at the frame rate of their recordings.
 
         Raises:
-            ValueError: a motion has fewer than two frames.
-            UserError: no references, although motions are compared at the frame rate of the recordings.
+            ValueError: If a motion has fewer than two frames.
+            UserError: If motions are compared at the frame rate of the recordings, but there are no references.
         """
         rows, name = [], type(self).__name__
         generated, real_motions = real_frames(name, joints, mask), real_frames(name, real_joints, real_mask)
@@ -115,9 +115,9 @@ class _PositionErrors(SampleMetric):
             )
 
     def compute(self) -> dict[str, float | None]:
-        """`ape_root`, `ape_trajectory`, `ape_mean_local`, `ape_mean_global`, and `ave_` of each.
+        """Returns `ape_root`, `ape_trajectory`, `ape_mean_local`, `ape_mean_global`, and the same with `ave_`.
 
-        Of several motions a text, the same after `best_` and `worst_`.
+        With several motions per text, the names have the prefix `best_` or `worst_`.
         """
         rows = self.rows("keys", "groups", "position", "variance", "frames")
         names = [f"{error}_{part}" for error in ("ape", "ave") for part in PARTS]
@@ -136,32 +136,32 @@ class _PositionErrors(SampleMetric):
         return found
 
     def parts(self, joints: Tensor) -> dict[str, Tensor]:
-        """What is compared, from the joints (F, J, 3) of a whole motion, by the names of `PARTS`."""
+        """Returns the compared quantities of a whole motion (F, J, 3), by the names of `PARTS`."""
         raise NotImplementedError
 
     def position_errors(self, a: Mapping[str, Tensor], b: Mapping[str, Tensor]) -> Tensor:
-        """Sum over the frames of a clip of the error of each part, (4,)."""
+        """Returns the error of each part, summed over the frames of a clip, (4,)."""
         raise NotImplementedError
 
     def variance_errors(self, a: Mapping[str, Tensor], b: Mapping[str, Tensor]) -> Tensor:
-        """Error of the variances of a clip in each part, (4,)."""
+        """Returns the error of the variances of each part of a clip, (4,)."""
         raise NotImplementedError
 
     def average(self, position: Tensor, frames: Tensor) -> Tensor:
-        """Position errors (4,) of all clips from their sums (N, 4) and frames (N, 1)."""
+        """Averages the position errors (4,) of all clips from their sums (N, 4) and numbers of frames (N, 1)."""
         raise NotImplementedError
 
 
 class TemosPositionErrors(_PositionErrors):
     """APE and AVE of TEMOS (Petrovich et al. 2022), used by FLAME on KIT (eq. 16 to 18, Table 2).
 
-    APE: distance of `temos_parts`, joints averaged; mean over all frames of all clips. AVE: distance of variances over
-    time (n - 1 in the denominator) of each coordinate, joints averaged; mean over clips. Both are in units of 1000 KIT
-    units, which the tables call metres and which are 1.56 m. TEMOS compares at 100 frames per second:
-    `upsampling=8`.
+    APE is the distance of `temos_parts`, averaged over joints, and over all frames of all clips. AVE is the distance of
+    the variances over time (n - 1 in the denominator) of each coordinate, averaged over joints, then over clips. Both
+    are in units of 1000 KIT units, which the tables call meters and which are 1.56 m. TEMOS compares at 100 frames per
+    second: `upsampling=8`.
 
     Args:
-        units_per_metre: KIT's units in the metres of `joints`, as the KIT representations have it.
+        units_per_metre: KIT units per meter of `joints`, as in the KIT representations.
         kwargs: `samples` and `upsampling`, see `_PositionErrors`; options of `torchmetrics.Metric`.
     """
 
@@ -170,36 +170,36 @@ class TemosPositionErrors(_PositionErrors):
         self.units_per_metre = units_per_metre
 
     def parts(self, joints: Tensor) -> dict[str, Tensor]:
-        """`temos_parts` in thousands of KIT's units."""
+        """Returns `temos_parts` in thousands of KIT units."""
         if joints.shape[1] != 21:
-            raise ValueError(f"TemosPositionErrors: {joints.shape[1]} joints, defined for KIT's 21 (MMM) only")
+            raise ValueError(f"TemosPositionErrors: {joints.shape[1]} joints, but defined only for KIT's 21 (MMM)")
         return {part: values / 1000 for part, values in temos_parts(joints * self.units_per_metre).items()}
 
     def position_errors(self, a: Mapping[str, Tensor], b: Mapping[str, Tensor]) -> Tensor:
-        """Sum over the frames of the distance of each part, joints averaged."""
+        """Returns the distance of each part, averaged over joints and summed over frames."""
         distance = [(a[part] - b[part]).norm(dim=-1) for part in PARTS]
         return torch.stack([d.sum() if d.ndim == 1 else d.mean(1).sum() for d in distance])
 
     def variance_errors(self, a: Mapping[str, Tensor], b: Mapping[str, Tensor]) -> Tensor:
-        """Distance of the variances of each part, joints averaged."""
+        """Returns the distance of the variances of each part, averaged over joints."""
         return torch.stack([(a[part].var(0) - b[part].var(0)).norm(dim=-1).mean() for part in PARTS])
 
     def average(self, position: Tensor, frames: Tensor) -> Tensor:
-        """Each frame counts alike."""
+        """Gives each frame the same weight."""
         return position.sum(0) / frames.sum(0)
 
 
 class FlamePositionErrors(_PositionErrors):
-    """APE and AVE as in FLAME's code, which its tables do not use. In metres and square metres.
+    """APE and AVE as in FLAME's code, which its tables do not use. In meters and square meters.
 
-    Compares `flame_parts`: the trajectory by the sum of the two distances along the axes; local is the error of bones.
-    Variances of global positions are averaged over joints before they are compared. Each clip counts alike. FLAME's
-    joints lack the orientation of the root and start from its translation; here `joints` are as they are, and their
-    first is the root.
+    Compares `flame_parts`. The error of the trajectory is the sum of the distances along its two axes; the local error
+    is that of bones. Variances of global positions are averaged over joints before they are compared. Each clip has the
+    same weight. FLAME's joints lack the orientation of the root and start from its translation; here, `joints` are
+    compared unchanged, and the first one is the root.
 
     Args:
-        parents: parent of each joint, -1 for the root; those of the skeleton.
-        kwargs: `samples` motions a text, see `_PositionErrors`; options of `torchmetrics.Metric`.
+        parents: parent of each joint of the skeleton, -1 for the root.
+        kwargs: `samples` motions per text, see `_PositionErrors`; options of `torchmetrics.Metric`.
     """
 
     def __init__(self, parents: Sequence[int], **kwargs: Any):
@@ -207,32 +207,32 @@ class FlamePositionErrors(_PositionErrors):
         self.parents = tuple(parents)
 
     def parts(self, joints: Tensor) -> dict[str, Tensor]:
-        """`flame_parts`, the first joint being the root."""
+        """Returns `flame_parts`, with the first joint as the root."""
         return flame_parts(joints, joints[:, 0], self.parents)
 
     def position_errors(self, a: Mapping[str, Tensor], b: Mapping[str, Tensor]) -> Tensor:
-        """Sum over the frames of the distance of each part."""
+        """Returns the distance of each part, summed over frames."""
         along_axes = (a["trajectory"] - b["trajectory"]).abs().sum(-1)
         root, local, all_joints = ((a[p] - b[p]).norm(dim=-1) for p in ("root", "mean_local", "mean_global"))
         return torch.stack([root.sum(), along_axes.sum(), local.mean(1).sum(), all_joints.mean(1).sum()])
 
     def variance_errors(self, a: Mapping[str, Tensor], b: Mapping[str, Tensor]) -> Tensor:
-        """Distance of the variances of each part."""
+        """Returns the distance of the variances of each part."""
         root, trajectory, local, all_joints = (a[part].var(0) - b[part].var(0) for part in PARTS)
         return torch.stack([root.norm(), trajectory.norm(), local.norm(dim=-1).mean(), all_joints.mean(0).norm()])
 
     def average(self, position: Tensor, frames: Tensor) -> Tensor:
-        """Each clip counts alike."""
+        """Gives each clip the same weight."""
         return (position / frames).mean(0)
 
 
 class DisplacementErrors(SampleMetric):
-    """ADE and FDE: mean distance of the joints, in all predicted frames and in the last of them. In metres.
+    """ADE and FDE: mean distance of the joints in all predicted frames, and in the last of them, in meters.
 
-    The usual definition of motion prediction (Yuan and Kitani 2020): joints and frames of a clip averaged, then clips.
-    Of an edit, what was kept does not count, neither frames nor joints; motions of other lengths than the real ones are
-    compared up to the end of the shorter. MFM (Table 3) gives no formula, no code and no unit for its numbers, which
-    are too large for metres: not comparable.
+    This is the usual definition in motion prediction (Yuan and Kitani 2020): the average over joints and frames of a
+    clip, then over clips. Frames and joints that an edit kept are ignored. If lengths differ, motions are compared up
+    to the end of the shorter one. MFM (Table 3) gives no formula, code or unit for its numbers, which are too large for
+    meters: they are not comparable.
     """
 
     higher_is_better = False
@@ -254,13 +254,13 @@ class DisplacementErrors(SampleMetric):
         Args:
             joints: generated or edited motions.
             mask: (B, F), True = real frame.
-            real_joints: what they are compared with.
+            real_joints: the real motions.
             real_mask: (B, F').
             keys: of the motions.
             kept: (B, F, J), True = this joint of this frame was given; None = all were generated.
 
         Raises:
-            ValueError: a motion of which nothing was generated.
+            ValueError: If nothing of a motion was generated.
         """
         errors = []
         for distance, given in _distances(type(self).__name__, joints, mask, real_joints, real_mask, kept):
@@ -273,7 +273,7 @@ class DisplacementErrors(SampleMetric):
             self.keep(keys=keys, errors=torch.stack(errors))
 
     def compute(self) -> dict[str, float | None]:
-        """`ade` and `fde`."""
+        """Returns `ade` and `fde`."""
         rows = self.rows("keys", "errors")
         if rows is None:
             return {"ade": None, "fde": None}
@@ -282,10 +282,10 @@ class DisplacementErrors(SampleMetric):
 
 
 class KeptDrift(SampleMetric):
-    """How far what an edit was to keep has moved in the world, in metres. Ours.
+    """Distance in the world, in meters, by which the kept part of an edit has moved. A metric of this project.
 
-    Features that are relative to the root keep steps and poses exactly, and yet let a kept end start wherever the new
-    part before it led.
+    With features relative to the root, an edit can keep steps and poses exactly, and still move a kept ending to where
+    the new part before it leads.
     """
 
     higher_is_better = False
@@ -296,7 +296,7 @@ class KeptDrift(SampleMetric):
     def update(
         self, joints: Tensor, mask: Tensor, real_joints: Tensor, real_mask: Tensor, keys: Tensor, kept: Tensor
     ) -> None:
-        """Adds edits and the motions they were made from; arguments as of `DisplacementErrors`."""
+        """Adds edits and their original motions; arguments as for `DisplacementErrors`."""
         drift, of = [], []
         name = type(self).__name__
         for number, (distance, given) in enumerate(_distances(name, joints, mask, real_joints, real_mask, kept)):
@@ -307,7 +307,7 @@ class KeptDrift(SampleMetric):
             self.keep(keys=keys[of], drift=torch.stack(drift))
 
     def compute(self) -> dict[str, float | None]:
-        """`mean` over the kept joints and frames of a motion, then motions; `largest` of all."""
+        """Returns `mean`, over the kept joints and frames of a motion and then over motions, and `largest`."""
         rows = self.rows("keys", "drift")
         if rows is None:
             return {"mean": None, "largest": None}
@@ -317,7 +317,9 @@ class KeptDrift(SampleMetric):
 def _distances(
     name: str, joints: Tensor, mask: Tensor, real_joints: Tensor, real_mask: Tensor, kept: Tensor | None
 ) -> Iterator[tuple[Tensor, Tensor]]:
-    """For each pair of motions, up to the end of the shorter: distances (F, J) in float64, and what was kept (F, J)."""
+    """Yields, for each pair of motions up to the end of the shorter one, distances (F, J) in float64 and a mask of the
+    kept joints (F, J).
+    """
     motions = zip(real_frames(name, joints, mask), real_frames(name, real_joints, real_mask), strict=True)
     for number, (motion, real) in enumerate(motions):
         length = min(len(motion), len(real))

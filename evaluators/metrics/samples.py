@@ -1,4 +1,4 @@
-"""What all metrics share: samples are kept, put in order, and measured together."""
+"""Base classes of metrics that collect samples, sort them by key, and compute the value from all of them."""
 
 from __future__ import annotations
 
@@ -11,28 +11,28 @@ from torchmetrics.utilities import dim_zero_cat
 
 
 def real_frames(name: str, joints: Tensor, mask: Tensor) -> list[Tensor]:
-    """Motions (F, J, 3) of their own lengths out of joints (B, F, J, 3) and mask (B, F).
+    """Splits joints (B, F, J, 3) with mask (B, F) into motions (F, J, 3) without padding.
 
-    Sums over a motion without its padding round alike in every batch.
+    Without padding, sums over a motion round the same way in every batch.
 
     Raises:
-        ValueError: a motion is not finite; `name` says who refuses it.
+        ValueError: If a motion contains NaN or infinity; the message begins with `name`.
     """
     motions = [motion[real].detach() for motion, real in zip(joints, mask, strict=True)]
     bad = sum(not bool(motion.isfinite().all()) for motion in motions)
     if bad:
-        raise ValueError(f"{name}: {bad} of {len(motions)} motions are not finite; did the model diverge?")
+        raise ValueError(f"{name}: {bad} of {len(motions)} motions are not finite. Did the model diverge?")
     return motions
 
 
 class SampleMetric(Metric):
-    """A metric that keeps a row a sample and measures all of them, sorted by key, in `compute`.
+    """A metric that keeps one row per sample and computes its value from all rows, sorted by key.
 
-    So the value depends neither on batches nor on their order nor on the number of processes, and processes may hold
-    any number of samples, none too.
+    The value therefore does not depend on the batches, their order or the number of processes. Processes may hold any
+    number of samples, including none.
 
     Args:
-        sets: names of tensors that belong together row by row; the first of each set are the keys.
+        sets: names of tensors that belong together row by row; the first name of each set is that of the keys.
         kwargs: options of `torchmetrics.Metric`.
     """
 
@@ -45,26 +45,26 @@ class SampleMetric(Metric):
 
     @property
     def update_called(self) -> bool:
-        """Always: that nothing was given is told by the value None, not by a warning."""
+        """Always True: a metric without samples returns None, without a warning."""
         return True
 
     def keep(self, **rows: Tensor) -> None:
         """Adds rows of one set.
 
         Raises:
-            ValueError: not as many of one name as of the others.
+            ValueError: If the tensors have different numbers of rows.
         """
         if len({len(values) for values in rows.values()}) > 1:
             sizes = ", ".join(f"{len(values)} {name}" for name, values in rows.items())
-            raise ValueError(f"{type(self).__name__}: got {sizes}; give one of each for a sample")
+            raise ValueError(f"{type(self).__name__}: got {sizes}. Give one of each per sample")
         for name, values in rows.items():
             getattr(self, name).append(values.detach())
 
     def rows(self, keys: str, *names: str) -> list[Tensor] | None:
-        """The rows of a set in the order of their keys, floating numbers as float64; None where there are none.
+        """Returns the rows of a set in the order of their keys, floats as float64; None if there are none.
 
         Raises:
-            ValueError: a sample was given twice, or is not finite.
+            ValueError: If a sample was given twice, or contains NaN or infinity.
         """
         if not getattr(self, keys):
             return None
@@ -77,34 +77,34 @@ class SampleMetric(Metric):
                 bad = int((~values.isfinite().reshape(len(values), -1).all(1)).sum())
                 if bad:
                     raise ValueError(
-                        f"{type(self).__name__}: {bad} of {len(values)} rows of {name!r} are not finite; "
-                        "look for motions that are not, in the data or because the model diverged"
+                        f"{type(self).__name__}: {bad} of {len(values)} rows of {name!r} are not finite. "
+                        "Look for damaged motions in the data, or a model that diverged"
                     )
             sorted_rows.append(values)
         return sorted_rows if len(order) else None
 
     def order(self, keys: str) -> Tensor:
-        """Indices that sort a set by its keys.
+        """Returns the indices that sort a set by its keys.
 
         Raises:
-            ValueError: two samples have the same key.
+            ValueError: If two samples have the same key.
         """
         values, order = dim_zero_cat(getattr(self, keys)).sort()
         twice = int((values[1:] == values[:-1]).sum())
         if twice:
             raise ValueError(
-                f"{type(self).__name__}: {twice} samples were given twice ({keys}); evaluate each once, with a sampler "
-                "that does not pad and with a key of its own for each sample of a prompt"
+                f"{type(self).__name__}: {twice} samples were given twice ({keys}). Evaluate each once: use a sampler "
+                "that does not pad, and a different key for each sample of a prompt"
             )
         return order
 
     def need(self, count: int, least: int, what: str) -> None:
-        """Raises ValueError where there are fewer than `least`."""
+        """Raises `ValueError` if `count` is less than `least`."""
         if count < least:
             raise ValueError(f"{type(self).__name__}: got {count} {what}, needs at least {least}")
 
     def _sync_dist(self, dist_sync_fn: Any = None, process_group: Any | None = None) -> None:
-        """Gathers the rows of all processes; torchmetrics' own way fails where one of them has none."""
+        """Gathers the rows of all processes. The default of torchmetrics fails if a process has none."""
         states = {name: [rows.cpu() for rows in getattr(self, name)] for name in self._reductions}
         group = process_group or self.process_group
         gathered: list[Any] = [None] * torch.distributed.get_world_size(group)
@@ -114,19 +114,23 @@ class SampleMetric(Metric):
 
 
 def by_group(metric: SampleMetric, groups: Tensor, samples: int) -> Tensor:
-    """Indices (C, S) of the samples of each group; ValueError where one has not S."""
+    """Returns the indices (C, S) of the samples of each group.
+
+    Raises:
+        ValueError: If a group does not have S samples.
+    """
     names, sizes = groups.unique(return_counts=True)
     wrong = int((sizes != samples).sum())
     if wrong:
         raise ValueError(
-            f"{type(metric).__name__}: {wrong} of {len(names)} prompts have not {samples} motions "
-            f"but {int(sizes.min())} to {int(sizes.max())}; generate {samples} for each"
+            f"{type(metric).__name__}: {wrong} of {len(names)} prompts do not have {samples} motions, but between "
+            f"{int(sizes.min())} and {int(sizes.max())}. Generate {samples} for each"
         )
     return groups.argsort(stable=True).unflatten(0, (len(names), samples))
 
 
 class TwoSets(SampleMetric):
-    """A metric that compares the features of generated motions as a set with those of real ones."""
+    """A metric that compares the set of features of generated motions with that of real motions."""
 
     def __init__(self, **kwargs: Any):
         super().__init__(("keys", "generated"), ("real_keys", "real"), **kwargs)
@@ -138,24 +142,26 @@ class TwoSets(SampleMetric):
         real: Tensor | None = None,
         real_keys: Tensor | None = None,
     ) -> None:
-        """Adds generated (B, E) and real (R, E) features with their keys, together or one after the other."""
+        """Adds generated (B, E) and real (R, E) features with their keys, in the same call or separately."""
         for name, features, ids in (("generated", generated, keys), ("real", real, real_keys)):
             if features is not None:
                 key_name = "keys" if name == "generated" else "real_keys"
                 if ids is None:
-                    raise ValueError(f"{type(self).__name__}: {name!r} came without {key_name!r}")
+                    raise ValueError(f"{type(self).__name__}: {name!r} given without {key_name!r}")
                 self.keep(**{key_name: ids, name: features})
 
     def sets(self) -> tuple[Tensor, Tensor] | None:
-        """Generated (N, E) and real (M, E) features, float64, in the order of their keys; None where one is empty.
+        """Returns generated (N, E) and real (M, E) features, float64, sorted by key; None if a set is empty.
 
         Raises:
-            ValueError: the two have different widths.
+            ValueError: If the two have different widths.
         """
         generated, real = self.rows("keys", "generated"), self.rows("real_keys", "real")
         if generated is None or real is None:
             return None
         widths = generated[0].shape[1], real[0].shape[1]
         if widths[0] != widths[1]:
-            raise ValueError(f"{type(self).__name__}: features are {widths[0]} wide if generated, {widths[1]} if real")
+            raise ValueError(
+                f"{type(self).__name__}: generated motions have {widths[0]} features, but real ones have {widths[1]}"
+            )
         return generated[0], real[0]

@@ -244,7 +244,7 @@ class SampleMotions(Callback):
             `unconditioned`. A model of actions is asked for as many actions instead where none of them is one.
         seconds: length of the motions.
         unconditioned: how many motions to sample where there are no prompts.
-        metrics: torchmetrics by name, updated with those of joints (B, F, J, 3), mask (B, F) and asked that they take.
+        metrics: torchmetrics by name; their `update` takes some of joints (B, F, J, 3), mask (B, F) and requested.
     """
 
     def __init__(
@@ -340,10 +340,10 @@ class SampleMotions(Callback):
         for name, metric in self.metrics.items():
             metric.reset()
             metric.distributed_available_fn = bool  # False: the first process has all motions, and no other computes
-            for motion, (_, asked) in zip(motions, self.prompts, strict=True):
+            for motion, (_, requested) in zip(motions, self.prompts, strict=True):
                 joints = torch.from_numpy(motion.joints)[None]
                 mask = torch.ones(joints.shape[:2], dtype=torch.bool)
-                known = {"joints": joints, "mask": mask, "asked": [asked]}
+                known = {"joints": joints, "mask": mask, "requested": [requested]}
                 metric.update(**{k: v for k, v in known.items() if k in signature(metric.update).parameters})
             result = metric.compute()
             parts = result if isinstance(result, dict) else {"": result}

@@ -95,7 +95,7 @@ def test_what_was_not_made_for_one_another_is_refused(trained, data, tmp_path, c
     extractor.check(own, "synthetic")
     with pytest.raises(UserError, match=r"trained on the data set synthetic, but the motions are those of bandai"):
         extractor.check(own, "bandai")
-    with pytest.raises(UserError, match=r"the motions are rot6d-25 at 20: train one by make train EXP=classifier"):
+    with pytest.raises(UserError, match=r"the motions are rot6d-25 at 20\. Train one with make train EXP=classifier"):
         extractor.check(Rot6D(), "synthetic")
 
     released = tmp_path / "released.tar"
@@ -113,7 +113,9 @@ def test_a_set_without_actions_is_refused():
     config = compose("classifier/synthetic")
     representation = instantiate(config["representation"])
     for actions in ([], ["walk"]):
-        with pytest.raises(UserError, match=rf"needs a data set of two actions or more; this one has {len(actions)}"):
+        with pytest.raises(
+            UserError, match=rf"needs a data set with at least two actions, but this one has {len(actions)}"
+        ):
             ClassifierTask.build(config, representation, actions=actions)
 
 

@@ -134,9 +134,9 @@ def test_the_checkpoint_needs_no_word_vectors_beside_it(trained):
     features = extractor.texts(["", ""], tokens)
     assert features.shape == (2, 16)
     assert torch.allclose(extractor.texts([""], tokens[:1]), features[:1], atol=1e-5)
-    with pytest.raises(UserError, match="other word vectors than those that this run began with"):
+    with pytest.raises(UserError, match="these are not the word vectors that this run began with"):
         extractor.task.set_extra_state(torch.zeros(15, 300))
-    with pytest.raises(UserError, match="reads tagged words, which the data set lacks"):
+    with pytest.raises(UserError, match="needs tagged words, but the data set has captions without them"):
         extractor.texts(["walks"], [None])
     with pytest.raises(UserError, match=r"trained on the data set kit, but the motions are those of humanml3d"):
         extractor.check(extractor.task.representation, "humanml3d")
@@ -150,7 +150,7 @@ def test_what_is_missing_is_told_in_a_line(words, tmp_path, monkeypatch, capsys)
 
     assert "task.words=nowhere: no such folder" in refused("task.words=nowhere")
     assert f"{tmp_path / 'our_vab_data.npy'}: no such file" in refused(f"task.words={tmp_path}")
-    assert "data.batch_size=1: texts are matched" in refused("data.batch_size=1")
+    assert "data.batch_size=1: matching needs at least two motions" in refused("data.batch_size=1")
 
     whole = T2MFolder.clips
     monkeypatch.setattr(T2MFolder, "clips", lambda self, fps: (replace(c, attributes={}) for c in whole(self, fps)))

@@ -1,4 +1,4 @@
-"""Feature extractors as evaluation uses them: opened from what the user gives, asked for features by one name."""
+"""Feature extractors for evaluation: a common interface to trained and released networks."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ from flame_mdm.task import Task
 
 
 class Extractor(ABC):
-    """A network that turns motions, and texts where it reads them, into features.
+    """A network that computes features of motions, and of texts if it supports them.
 
     Attributes:
-        sha256: of what it was loaded from; values of extractors that differ in it are not comparable.
-        fingerprint: of the data it was trained on, where that is known.
+        sha256: of its files. Values of extractors with different hashes are not comparable.
+        fingerprint: of the data it was trained on, if known.
     """
 
     sha256: str
@@ -38,19 +38,19 @@ class Extractor(ABC):
 
     @abstractmethod
     def check(self, representation: Representation, dataset: str) -> None:
-        """Refuses motions that the network was not made for.
+        """Checks that the network was trained for these motions.
 
         Raises:
-            UserError: it was made for another representation or data set.
+            UserError: If it was trained for another representation or data set.
         """
 
     @abstractmethod
     def motions(self, features: Tensor, joints: Tensor, mask: Tensor) -> dict[str, Tensor]:
-        """Features of motions.
+        """Computes features of motions.
 
         Args:
             features: (B, F, D) in the data's units.
-            joints: (B, F, J, 3) metres, y up.
+            joints: (B, F, J, 3) in meters, y up.
             mask: (B, F), True = real frame.
 
         Returns:
@@ -58,7 +58,12 @@ class Extractor(ABC):
         """
 
     def texts(self, captions: Sequence[str], tokens: Sequence[Sequence[str] | None]) -> Tensor | None:
-        """(B, E) features of captions; None where the network reads no text. `tokens` are "word/PART", if known."""
+        """Computes features (B, E) of captions; None if the network does not support text.
+
+        Args:
+            captions: the texts.
+            tokens: their "word/PART" tokens, if known.
+        """
         return None
 
     def reference(self) -> Tensor | None:
@@ -67,15 +72,15 @@ class Extractor(ABC):
 
 
 class _OwnExtractor(Extractor):
-    """A network that `make train` has made, from its checkpoint.
+    """A network trained with `make train`, loaded from its checkpoint.
 
     Raises:
-        FileNotFoundError, UserError: no such checkpoint, or one of another network.
+        FileNotFoundError, UserError: If the checkpoint does not exist, or holds another network.
     """
 
     trained: type[Task]
     recipes: str
-    """Folder of the recipes that make it."""
+    """Folder of the recipes that train it."""
 
     def __init__(self, path: str, device: str | torch.device = "cpu"):
         file = find(path)
@@ -84,22 +89,22 @@ class _OwnExtractor(Extractor):
         self.fingerprint = self.task.facts.get("fingerprint")
 
     def check(self, representation: Representation, dataset: str) -> None:
-        """Representation and data set are those that it was trained on."""
-        own, advice = self.task.representation, f"train one by make train EXP={self.recipes}/..."
+        """Checks that representation and data set are those of its training."""
+        own, advice = self.task.representation, f"Train one with make train EXP={self.recipes}/..."
         if (own.name, own.fps, own.features) != (representation.name, representation.fps, representation.features):
             raise UserError(
-                f"extractor {self.path}: trained on {own.name} at {own.fps:g} frames a second, but the motions are "
-                f"{representation.name} at {representation.fps:g}: {advice}"
+                f"extractor {self.path}: trained on {own.name} at {own.fps:g} frames per second, but the motions are "
+                f"{representation.name} at {representation.fps:g}. {advice}"
             )
         if self.task.facts.get("dataset", dataset) != dataset:
             raise UserError(
                 f"extractor {self.path}: trained on the data set {self.task.facts['dataset']}, but the motions are "
-                f"those of {dataset}: {advice}"
+                f"from {dataset}. {advice}"
             )
 
 
 class MotionCLIPExtractor(_OwnExtractor):
-    """A motion-CLIP that `make train EXP=motion_clip/...` has made."""
+    """A motion-CLIP trained with `make train EXP=motion_clip/...`."""
 
     trained, recipes = MotionCLIPTask, "motion_clip"
     task: MotionCLIPTask
@@ -109,11 +114,11 @@ class MotionCLIPExtractor(_OwnExtractor):
         self.known: dict[str, Tensor] = {}
 
     def motions(self, features: Tensor, joints: Tensor, mask: Tensor) -> dict[str, Tensor]:
-        """Features of motions."""
+        """Computes features of motions."""
         return {"features": self.task(features, mask)}
 
     def texts(self, captions: Sequence[str], tokens: Sequence[Sequence[str] | None]) -> Tensor:
-        """Features of captions, each encoded once."""
+        """Computes features of captions; each caption is encoded once."""
         new = sorted(set(captions) - self.known.keys())
         if new:
             self.known |= dict(zip(new, self.task.text(new), strict=True))
@@ -121,18 +126,18 @@ class MotionCLIPExtractor(_OwnExtractor):
 
 
 class T2MExtractor(Extractor):
-    """The evaluator of Guo et al. 2022 as released, from a folder of five files.
+    """The evaluator of Guo et al. 2022 as released, from a folder with five files.
 
-    finest.tar (in text_mot_match/model), mean.npy and std.npy (t2m_mean.npy and t2m_std.npy in MDM, kit_... for KIT),
-    our_vab_data.npy and our_vab_idx.pkl (GloVe).
+    The files are finest.tar (from text_mot_match/model), mean.npy and std.npy (t2m_mean.npy and t2m_std.npy in MDM,
+    kit_... for KIT), our_vab_data.npy and our_vab_idx.pkl (GloVe).
 
     Args:
         path: the folder.
         device: to compute on.
-        full_length: legacy, see `WordVectors`: captions are said to fill all 22 slots.
+        full_length: legacy option, see `WordVectors`: captions are treated as filling all 22 slots.
 
     Raises:
-        FileNotFoundError, ValueError: a file is not there or is another one.
+        FileNotFoundError, ValueError: If a file is missing, or has other content.
     """
 
     FILES = ("finest.tar", "mean.npy", "std.npy", "our_vab_data.npy", "our_vab_idx.pkl")
@@ -141,14 +146,14 @@ class T2MExtractor(Extractor):
         folder = Path(path)
         missing = [name for name in self.FILES if not (folder / name).is_file()]
         if missing:
-            raise FileNotFoundError(f"{folder}: not a folder of the T2M evaluator, it lacks {', '.join(missing)}")
+            raise FileNotFoundError(f"{folder}: not a folder of the T2M evaluator: it lacks {', '.join(missing)}")
         hashes = "".join(sha256(folder / name) for name in self.FILES)
         self.path, self.sha256 = folder, hashlib.sha256(hashes.encode()).hexdigest()
         self.network = load_t2m(*(folder / name for name in self.FILES[:3])).to(device)
         self.words, self.full_length = WordVectors(folder), full_length
 
     def check(self, representation: Representation, dataset: str) -> None:
-        """Only the features as published, of the data set of that width."""
+        """Checks that the motions have the published features of the data set with that number of features."""
         made_for = {263: ("humanml-legacy-smpl22", "humanml3d"), 251: ("humanml-legacy-kit21", "kit")}
         wanted = made_for.get(len(self.network.mean), ("unknown features", "an unknown data set"))
         if (representation.name, dataset) != wanted:
@@ -158,42 +163,46 @@ class T2MExtractor(Extractor):
             )
 
     def motions(self, features: Tensor, joints: Tensor, mask: Tensor) -> dict[str, Tensor]:
-        """Features of motions."""
+        """Computes features of motions."""
         return {"features": self.network(features, mask)}
 
     def texts(self, captions: Sequence[str], tokens: Sequence[Sequence[str] | None]) -> Tensor:
-        """Features of captions.
+        """Computes features of captions.
 
         Raises:
-            UserError: a caption comes without its tokens.
+            UserError: If a caption has no tokens.
         """
         return self.network.text(self.words(_tagged(self.path, tokens), full_length=self.full_length))
 
 
 class OwnT2MExtractor(_OwnExtractor):
-    """An evaluator of Guo et al. 2022 that `make train EXP=t2m/...` has made."""
+    """An evaluator of Guo et al. 2022 trained with `make train EXP=t2m/...`."""
 
     trained, recipes = T2MTask, "t2m"
     task: T2MTask
 
     def motions(self, features: Tensor, joints: Tensor, mask: Tensor) -> dict[str, Tensor]:
-        """Features of motions."""
+        """Computes features of motions."""
         return {"features": self.task(features, mask)}
 
     def texts(self, captions: Sequence[str], tokens: Sequence[Sequence[str] | None]) -> Tensor:
-        """Features of captions.
+        """Computes features of captions.
 
         Raises:
-            UserError: a caption comes without its tokens.
+            UserError: If a caption has no tokens.
         """
         return self.task.text(_tagged(self.path, tokens))
 
 
 def _tagged(path: Path, tokens: Sequence[Sequence[str] | None]) -> list[Sequence[str]]:
-    """The tokens of captions, refused where one has none."""
+    """Returns the tokens of captions.
+
+    Raises:
+        UserError: If a caption has no tokens.
+    """
     known = [words for words in tokens if words is not None]
     if len(known) < len(tokens):
-        raise UserError(f"extractor {path}: reads tagged words, which the data set lacks for its captions")
+        raise UserError(f"extractor {path}: needs tagged words, but the data set has captions without them")
     return known
 
 
@@ -202,7 +211,7 @@ CLASSIFIERS = {
     "humanact12_unconstrained": (load_unconstrained, "humanact12", "joints"),
     "uestc": (load_uestc, "uestc", "features"),
 }
-"""What loads the released weights, the data set they belong to, and what they read."""
+"""Name -> loader of the released weights, data set that they belong to, and input that they read."""
 
 
 class ClassifierExtractor(Extractor):
@@ -212,12 +221,13 @@ class ClassifierExtractor(Extractor):
         kind: which one.
         path: the file.
         device: to compute on.
-        random_start: legacy of Guo et al. 2020 and all who follow: the recurrence of humanact12 starts from a normal
-            draw, another one for features than for scores. Here it is drawn from the motion, so that it is the same in
-            any batch.
+        random_start: legacy option of Guo et al. 2020 and all later work: the initial state of the humanact12 GRU is
+            drawn from a normal distribution, separately for features and scores. Here, the draw is a function of the
+            motion, so it is the same in any batch.
 
     Raises:
-        FileNotFoundError, UserError, ValueError: no such file, or of other weights; or no recurrence to start.
+        FileNotFoundError, UserError, ValueError: If the file does not exist or holds other weights, or `random_start`
+            is given for a network that is not recurrent.
     """
 
     def __init__(self, kind: str, path: str, device: str | torch.device = "cpu", *, random_start: bool = False):
@@ -226,14 +236,14 @@ class ClassifierExtractor(Extractor):
             self.network = read(path).to(device)
         except ValueError as error:
             raise UserError(
-                f"{error}; protocol=action_to_motion_own takes classifiers of make train EXP=classifier/..."
+                f"{error}. For classifiers of make train EXP=classifier/..., use protocol=action_to_motion_own"
             ) from error
         self.path, self.sha256, self.random_start = path, sha256(path), random_start
         if random_start and not isinstance(self.network, ActionGRU):
-            raise ValueError(f"random_start: the classifier {kind} has no recurrence to start")
+            raise ValueError(f"random_start: the classifier {kind} is not recurrent")
 
     def check(self, representation: Representation, dataset: str) -> None:
-        """Rotations and joints of 24 SMPL joints, of the data set it was trained on."""
+        """Checks that the motions are rotations of 24 SMPL joints, from the data set of its training."""
         if representation.name != "rot6d-25" or dataset != self.dataset:
             raise UserError(
                 f"extractor {self.path}: made for {self.dataset} as rot6d-25, but the motions are "
@@ -241,7 +251,7 @@ class ClassifierExtractor(Extractor):
             )
 
     def motions(self, features: Tensor, joints: Tensor, mask: Tensor) -> dict[str, Tensor]:
-        """Features and class scores of motions."""
+        """Computes features and class scores of motions."""
         x = joints if self.reads == "joints" else features
         if not self.random_start:
             return {"features": self.network(x, mask), "logits": self.network.logits(x, mask)}
@@ -295,11 +305,11 @@ class UnconstrainedExtractor(ClassifierExtractor):
 
 
 class OwnClassifierExtractor(_OwnExtractor):
-    """An action classifier that `make train EXP=classifier/...` has made."""
+    """An action classifier trained with `make train EXP=classifier/...`."""
 
     trained, recipes = ClassifierTask, "classifier"
     task: ClassifierTask
 
     def motions(self, features: Tensor, joints: Tensor, mask: Tensor) -> dict[str, Tensor]:
-        """Features and class scores of motions."""
+        """Computes features and class scores of motions."""
         return {"features": self.task(joints, mask), "logits": self.task.logits(joints, mask)}

@@ -1,4 +1,4 @@
-"""An action classifier, that of HumanAct12: a GRU over joint positions (Guo et al. 2020, "Action2Motion")."""
+"""The action classifier of HumanAct12: a GRU over joint positions (Guo et al. 2020, "Action2Motion")."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ NUM_ACTIONS = 12
 
 
 class ActionGRU(nn.Module):
-    """Two GRU layers read the joints, the state at the last real frame is classified.
+    """Action classifier with two GRU layers over joint positions; it classifies the state at the last real frame.
 
-    The released weights give the features and the accuracy of every HumanAct12 table. The authors start the recurrence
-    from a fresh normal draw at every call, so that their numbers are random even for fixed motions; here it starts from
-    zero, unless a state is given (`random_state` draws one as they do).
+    The released weights provide the features and the accuracy in every HumanAct12 table. The authors draw the initial
+    state from a normal distribution in every call, so their numbers are random even for fixed motions. Here, the
+    initial state is zero, unless one is given (`random_state` draws it as the authors do).
     """
 
     features = 30
@@ -39,13 +39,13 @@ class ActionGRU(nn.Module):
         self.linear2 = nn.Linear(self.features, num_actions)
 
     def forward(self, joints: Tensor, mask: Tensor, state: Tensor | None = None) -> Tensor:
-        """Features of motions.
+        """Computes features of motions.
 
         Args:
-            joints: (B, F, J, 3) metres, y up, SMPL's 24 joints for the released weights; the network sees them y down,
-                as published.
-            mask: (B, F) bool, True = real frame; every motion has one at least.
-            state: (layers, B, hidden) where the recurrence starts; None = zeros.
+            joints: (B, F, J, 3) in meters, y up; the 24 SMPL joints for the released weights. The network sees them
+                with y down, as published.
+            mask: (B, F) bool, True = real frame; every motion has at least one.
+            state: (layers, B, hidden) initial state; None = zeros.
 
         Returns:
             (B, 30) in (-1, 1).
@@ -58,20 +58,22 @@ class ActionGRU(nn.Module):
         return torch.tanh(self.linear1(outputs[torch.arange(len(last), device=last.device), last]))
 
     def logits(self, joints: Tensor, mask: Tensor, state: Tensor | None = None) -> Tensor:
-        """(B, actions) unnormalized log-probabilities of the actions; arguments as of `forward`."""
+        """Returns unnormalized log-probabilities (B, actions) of the actions; arguments as for `forward`."""
         return self.linear2(self(joints, mask, state))
 
     def random_state(self, batch: int, generator: torch.Generator) -> Tensor:
-        """(layers, B, hidden) standard normal: the start of the authors' recurrence, drawn from a seed."""
+        """Draws an initial state (layers, B, hidden) from a standard normal distribution, as the authors do."""
         shape = (self.recurrent.num_layers, batch, self.recurrent.hidden_size)
         return torch.randn(shape, generator=generator).to(self.linear1.weight)
 
 
 def load_action_gru(path: str | Path) -> ActionGRU:
-    """The classifier with the authors' weights (action_recognition_model_humanact12.tar, in MDM humanact12_gru.tar).
+    """Loads the classifier with the authors' weights.
+
+    The file is action_recognition_model_humanact12.tar, or humanact12_gru.tar in MDM.
 
     Raises:
-        FileNotFoundError: no such file.
-        ValueError: it holds other weights.
+        FileNotFoundError: If the file does not exist.
+        ValueError: If it holds other weights.
     """
     return load_strictly(ActionGRU(), read_weights(path, "model"), path)

@@ -1,4 +1,4 @@
-"""Action classifiers to train, for sets without a released one; action-to-motion is measured by their features."""
+"""Training of action classifiers, whose features measure action-to-motion on data sets without a released one."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ from flame_mdm.task import Task
 
 
 class ClassifierTask(Task):
-    """Trains an action classifier by `make train EXP=classifier/...`, and is the extractor that comes out of it.
+    """Task that trains an action classifier (`make train EXP=classifier/...`), and the resulting feature extractor.
 
-    It reads joint positions, whatever the representation.
+    It reads joint positions, in any representation.
 
     Args:
         network: the classifier.
-        representation: of the motions; an extractor of one representation measures no other.
+        representation: of the motions; an extractor can only measure motions in this representation.
         optimizer: a mapping with the `_target_` of a torch optimizer and its arguments.
-        seed: with the step and the rank, decides the draws of a training step.
+        seed: determines the random draws of a training step, together with the step and the rank.
     """
 
     def __init__(
@@ -53,10 +53,10 @@ class ClassifierTask(Task):
         """Builds the network of a recipe for the skeleton and the actions of the data.
 
         Raises:
-            UserError: fewer than two actions.
+            UserError: If there are fewer than two actions.
         """
         if len(actions) < 2:
-            raise UserError(f"a classifier needs a data set of two actions or more; this one has {len(actions)}")
+            raise UserError(f"a classifier needs a data set with at least two actions, but this one has {len(actions)}")
         parents = representation.skeleton.parents
         sizes = {"num_joints": len(parents), "parents": parents, "num_actions": len(actions)}
         settings = config["task"]["network"]
@@ -67,34 +67,34 @@ class ClassifierTask(Task):
         return task
 
     def setup(self, stage: str) -> None:
-        """As all tasks.
+        """Sets up the task.
 
         Raises:
-            UserError: a clip to train or validate on has no label.
+            UserError: If a clip for training or validation has no label.
         """
         super().setup(stage)
         data: MotionDataModule = self.trainer.datamodule  # type: ignore[attr-defined]
         bare = [clip.id for clip in (*data.train.clips, *data.val.clips) if clip.action is None]
         if bare:
             raise UserError(
-                f"{data.folder}: {len(bare)} clips have no action label, such as {bare[0]}; a classifier learns from "
-                "labeled clips: prepare the data without the others"
+                f"{data.folder}: {len(bare)} clips have no action label, such as {bare[0]}. A classifier needs "
+                "labels: prepare the data without these clips"
             )
 
     # Feature extraction -----------------------------------------------------------------------------------------------
 
     def forward(self, joints: Tensor, mask: Tensor) -> Tensor:
-        """(B, E) features of motions (B, F, J, 3), metres, y up, with mask (B, F)."""
+        """Returns features (B, E) of motions (B, F, J, 3) in meters, y up, with mask (B, F)."""
         return self.network(joints, mask)
 
     def logits(self, joints: Tensor, mask: Tensor) -> Tensor:
-        """(B, actions) unnormalized log-probabilities; arguments as of `forward`."""
+        """Returns unnormalized log-probabilities (B, actions); arguments as for `forward`."""
         return self.network.logits(joints, mask)
 
     # Training ---------------------------------------------------------------------------------------------------------
 
     def training_step(self, batch: MotionBatch, batch_idx: int) -> Tensor:
-        """Cross-entropy of one batch, in nats."""
+        """Returns the cross-entropy of one batch, in nats."""
         torch.manual_seed(key("step", self.seed, batch_idx, self.global_rank))
         logits, labels = self._classified(batch)
         loss = F.cross_entropy(logits, labels)
@@ -103,25 +103,25 @@ class ClassifierTask(Task):
         return loss
 
     def _classified(self, batch: MotionBatch) -> tuple[Tensor, Tensor]:
-        """Scores and labels of a batch."""
+        """Returns scores and labels of a batch."""
         assert batch.action is not None
         joints = self.representation.to_joints(batch.x)
-        past_end = ~batch.mask[..., None, None]  # where features of 0 need not be a pose
+        past_end = ~batch.mask[..., None, None]  # features of 0 in the padding may not be a pose
         return self.logits(joints.masked_fill(past_end, 0), batch.mask), batch.action
 
     def on_validation_epoch_start(self) -> None:
-        """Gives all processes the running statistics of the first, those that checkpoints hold.
+        """Copies the running statistics of the first process, which checkpoints contain, to all processes.
 
-        Each has those of its own batches.
+        Before, each process has the statistics of its own batches.
         """
         if torch.distributed.is_initialized() and torch.distributed.get_world_size() > 1:
             for buffer in self.network.buffers():
                 torch.distributed.broadcast(buffer, 0)
 
     def validation_step(self, batch: MotionBatch, batch_idx: int) -> None:
-        """Adds the clips of a batch to what is measured.
+        """Adds the clips of a batch to loss and accuracy.
 
-        Where there are fewer clips than processes, each process has all of them, which changes neither mean nor share.
+        If there are fewer clips than processes, each process has all of them, which does not change the values.
         """
         logits, labels = self._classified(batch)
         self.val_loss.update(F.cross_entropy(logits, labels, reduction="none"))

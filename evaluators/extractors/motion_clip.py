@@ -1,4 +1,4 @@
-"""Motion-CLIP (Kim et al. 2023, "FLAME", table 8): motions and texts in one space, learned by contrast."""
+"""Motion-CLIP (Kim et al. 2023, "FLAME", table 8): a joint embedding of motions and texts, trained contrastively."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ from flame_mdm.seeds import key
 from flame_mdm.task import Task
 
 POOL = 32
-"""Pairs among which validation ranks, as R-precision does."""
+"""Pairs per pool in which validation ranks, as in R-precision."""
 
 
 class MotionCLIP(nn.Module):
-    """A transformer over [CLS, length, frame 1, frame 2, ...] and a linear map of the text encoder's pooled vector.
+    """A transformer over [CLS, length, frame 1, frame 2, ...], and a linear map of the text encoder's pooled vector.
 
-    The features are not scaled to length 1: Frechet distance and MID take them so. The temperature is learned and
-    starts at 0.07.
+    The features are not scaled to length 1, since Fréchet distance and MID use them unscaled. The temperature is
+    learned, with an initial value of 0.07.
     """
 
     def __init__(
@@ -59,15 +59,15 @@ class MotionCLIP(nn.Module):
             num_layers: number of its layers.
             num_heads: attention heads.
             dropout: probability inside the layers.
-            max_frames: longest motion that the length token knows.
-            embedding_dim: E, width of the common space.
-            blind_features: as many features at the beginning of a frame are set to 0. 3 in FLAME's code, whose motions
-                begin with the root's translation: its scores do not see where the body is or how high.
+            max_frames: longest motion that the length token supports.
+            embedding_dim: E, width of the joint space.
+            blind_features: number of features at the beginning of each frame that are set to 0. It is 3 in FLAME's
+                code, whose motions begin with the root's translation: scores do not depend on position and height.
         """
         super().__init__()
         self.max_frames, self.blind_features, self.embedding_dim = max_frames, blind_features, embedding_dim
         self.cls = nn.Parameter(torch.randn(latent_dim))
-        # Row 0, which no length reads in the authors' code, is that of the longest motion: see the FLAME denoiser.
+        # Row 0, unused in the authors' code, is that of the longest motion: see the FLAME denoiser.
         self.length_embedding = nn.Embedding(max_frames, latent_dim)
         self.input = nn.Linear(in_features, latent_dim)
         self.transformer = Transformer(latent_dim, ff_size, num_layers, num_heads, dropout, nn.ReLU)
@@ -76,15 +76,15 @@ class MotionCLIP(nn.Module):
         self.logit_scale = nn.Parameter(torch.tensor(math.log(1 / 0.07)))
 
     def forward(self, x: Tensor, mask: Tensor) -> Tensor:
-        """(B, E) features of normalized motions (B, F, D) with mask (B, F).
+        """Returns features (B, E) of normalized motions (B, F, D) with mask (B, F).
 
         Raises:
-            ValueError: a motion is longer than `max_frames`.
+            ValueError: If a motion is longer than `max_frames`.
         """
         lengths = mask.sum(1)
         if x.shape[1] > self.max_frames and lengths.max() > self.max_frames:
             raise ValueError(
-                f"a motion of {int(lengths.max())} frames is longer than motion-CLIP was built for ({self.max_frames})"
+                f"a motion has {int(lengths.max())} frames, but this motion-CLIP takes at most {self.max_frames}"
             )
         x = self.input(F.pad(x[..., self.blind_features :], (self.blind_features, 0)))
         length = self.length_embedding(lengths % self.max_frames)
@@ -93,15 +93,16 @@ class MotionCLIP(nn.Module):
         return self.output(self.transformer(x, with_prefix(mask, 2))[:, 0])
 
     def text(self, pooled: Tensor) -> Tensor:
-        """(B, E) features of texts, from what the text encoder makes of them (B, C)."""
+        """Returns features (B, E) of texts, from the pooled outputs (B, C) of the text encoder."""
         return self.text_projection(pooled)
 
 
 def info_nce(motion: Tensor, text: Tensor, logit_scale: Tensor) -> Tensor:
-    """Contrastive loss over the pairs of all processes (Oord et al. 2018, eq. 4; both ways as Radford et al. 2021).
+    """Contrastive loss over the pairs of all processes.
 
-    Every process takes the part of its own pairs against all motions and texts. Averaged over processes of equally many
-    pairs, as DDP averages gradients, loss and gradients are those of one process with all pairs.
+    Oord et al. 2018, eq. 4; symmetric, as in Radford et al. 2021. Each process compares its own pairs with all motions
+    and texts. If all processes have the same number of pairs, the average over processes, as of gradients in DDP, is
+    the loss and gradient of a single process with all pairs.
 
     Args:
         motion: (B, E) features.
@@ -122,16 +123,16 @@ def info_nce(motion: Tensor, text: Tensor, logit_scale: Tensor) -> Tensor:
 
 
 class PooledLoss(TextAndMotion):
-    """InfoNCE in pools of 32, formed by key, so that batch size and number of processes do not matter.
+    """InfoNCE in pools of 32, formed by key and thus independent of batch size and number of processes.
 
-    The pairs of an incomplete last pool meet the last 32 pairs; with fewer pairs than 32 there is one smaller pool.
-    Features of motions are scaled by the inverse temperature.
+    The pairs of an incomplete last pool are compared with the last 32 pairs; fewer than 32 pairs form one smaller pool.
+    Features of motions are given scaled by the inverse temperature.
     """
 
     higher_is_better = False
 
     def compute(self) -> float | None:
-        """Mean loss of a pair, in nats."""
+        """Returns the mean loss per pair, in nats."""
         rows = self.rows("keys", "generated", "text")
         if rows is None:
             return None
@@ -146,14 +147,14 @@ class PooledLoss(TextAndMotion):
 
 
 class MotionCLIPTask(Task):
-    """Trains motion-CLIP by `make train EXP=motion_clip/...`, and is the feature extractor that comes out of it.
+    """Task that trains motion-CLIP (`make train EXP=motion_clip/...`), and the resulting feature extractor.
 
     Args:
         network: motion encoder and text projection.
-        condition: text encoder; frozen in FLAME, whatever the evaluated model uses.
-        representation: of the motions; an extractor of one representation measures no other.
+        condition: text encoder, independent of that of the evaluated model; frozen in FLAME.
+        representation: of the motions; an extractor can only measure motions in this representation.
         optimizer: a mapping with the `_target_` of a torch optimizer and its arguments.
-        seed: with the step and the rank, decides the dropout of a training step.
+        seed: determines the dropout of a training step, together with the step and the rank.
     """
 
     def __init__(
@@ -173,7 +174,7 @@ class MotionCLIPTask(Task):
 
     @classmethod
     def build(cls, config: Config, representation: Representation, *, actions: Sequence[str] = ()) -> Self:
-        """Builds the parts of a recipe and joins them; the widths of motions and texts are passed on here."""
+        """Builds the task of a recipe, and passes the widths of motions and texts to the network."""
         condition: ConditionEncoder = instantiate(config["condition"])
         widths = {"in_features": representation.features, "text_features": condition.features}
         network: MotionCLIP = instantiate(config["task"]["network"], **widths)
@@ -183,15 +184,15 @@ class MotionCLIPTask(Task):
 
     @classmethod
     def import_released(cls, checkpoint: Mapping[str, Any], config: Config) -> Self:
-        """FLAME's released motion-CLIP, as a recipe of its sizes would have trained it.
+        """Imports FLAME's released motion-CLIP into the task of a recipe with the same sizes.
 
         Args:
-            checkpoint: what the authors' file holds. Its pooler, a random draw that the network was trained upon, goes
-                to the text encoder.
+            checkpoint: content of the authors' file. Its pooler, with the random weights that the network was trained
+                on, is loaded into the text encoder.
             config: `experiments/motion_clip/humanml3d_smpl.yaml`, composed.
 
         Raises:
-            ValueError: other weights or sizes, or no pooler.
+            ValueError: If weights or sizes do not match, or there is no pooler.
         """
         representation: Representation = instantiate(config["representation"])
         task = cls.build(config, representation)
@@ -207,11 +208,11 @@ class MotionCLIPTask(Task):
     # Feature extraction -----------------------------------------------------------------------------------------------
 
     def forward(self, x: Tensor, mask: Tensor) -> Tensor:
-        """(B, E) features of motions (B, F, D) in the data's units, with mask (B, F)."""
+        """Returns features (B, E) of motions (B, F, D) in the data's units, with mask (B, F)."""
         return self.network(self.representation.normalize(x), mask)
 
     def text(self, captions: Sequence[str]) -> Tensor:
-        """(B, E) features of captions."""
+        """Returns features (B, E) of captions."""
         return self.network.text(self._pooled(list(captions)))
 
     def _pooled(self, captions: list[str]) -> Tensor:
@@ -222,10 +223,10 @@ class MotionCLIPTask(Task):
     # Training ---------------------------------------------------------------------------------------------------------
 
     def training_step(self, batch: MotionBatch, batch_idx: int) -> Tensor:
-        """Loss of one batch, with the pairs of the other processes as negatives."""
+        """Returns the loss of one batch, with the pairs of the other processes as negatives."""
         torch.manual_seed(key("step", self.seed, batch_idx, self.global_rank))
         cond = self.condition(batch)
-        if cond.null is not None:  # a learned null, which is not used here, then has a gradient, as DDP needs
+        if cond.null is not None:  # gives a learned null, which is not used here, a gradient, as DDP requires
             cond = cond.drop(torch.zeros(len(batch), dtype=torch.bool, device=self.device))
         motion, text = self.network(batch.x, batch.mask), self.network.text(cond.pooled)
         loss = info_nce(motion, text, self.network.logit_scale)
@@ -235,15 +236,15 @@ class MotionCLIPTask(Task):
         return loss
 
     def on_validation_epoch_start(self) -> None:
-        """Chooses what is measured: R-precision needs 32 different captions, and small sets go without."""
+        """Chooses the metrics: R-precision needs 32 different captions, and is skipped on smaller sets."""
         clips = self.trainer.datamodule.val  # type: ignore[attr-defined]
         enough = len({clips.caption(clip, -1) for clip in clips.clips}) >= POOL
         self.measured: dict[str, Any] = dict(self.retrieval.items()) if enough else {}
 
     def validation_step(self, batch: MotionBatch, batch_idx: int) -> None:
-        """Keeps the features of the validation pairs, each on one process."""
+        """Collects the features of the validation pairs, each on one process."""
         if self.global_rank and len(self.trainer.datamodule.val) < self.trainer.world_size:  # type: ignore[attr-defined]
-            return  # all processes have all clips then
+            return  # with so few clips, every process has all of them
         assert batch.text is not None
         motion = F.normalize(self.network(batch.x, batch.mask), dim=-1)
         text = F.normalize(self.network.text(self.condition(batch).pooled), dim=-1)
@@ -256,7 +257,7 @@ class MotionCLIPTask(Task):
             metric.update(motion, text, text_keys, keys)
 
     def on_validation_epoch_end(self) -> None:
-        """Logs the loss in pools of 32, and R-precision by cosine both ways."""
+        """Logs the loss in pools of 32, and both kinds of R-precision by cosine."""
         loss = self.val_loss.compute()
         if loss is not None:
             self.log("val/loss", loss, prog_bar=True)
@@ -277,14 +278,14 @@ _MCLIP = {
 
 
 def import_mclip(state: Mapping[str, Tensor], *, num_heads: int = 8) -> MotionCLIP:
-    """FLAME's released network; its RoBERTa (`text_model.*`) is left.
+    """Imports FLAME's released network, without its RoBERTa (`text_model.*`).
 
     Args:
-        state: weights by the authors' names, as `flame_mdm.checkpoints.files.released_state` gives them.
-        num_heads: attention heads, 8 in the released model; the weights do not tell.
+        state: weights by the authors' names, as returned by `flame_mdm.checkpoints.released.released_state`.
+        num_heads: number of attention heads, 8 in the released model; it cannot be read from the weights.
 
     Raises:
-        ValueError: a weight is missing, unknown or of another shape.
+        ValueError: If a weight is missing, unknown or has another shape.
     """
     learned = {name: value for name, value in state.items() if not name.startswith("text_model.")}
     stack = "motion_encoder.motion_encoder"

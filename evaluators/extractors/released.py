@@ -1,4 +1,4 @@
-"""Reading of the files in which authors released the weights of their evaluation networks."""
+"""Reading of released weights of evaluation networks."""
 
 from __future__ import annotations
 
@@ -14,38 +14,38 @@ Network = TypeVar("Network", bound=nn.Module)
 
 
 def read_weights(path: str | Path, key: str | None = None) -> dict[str, Tensor]:
-    """A state dict out of a released file, of which no code is run.
+    """Reads a state dict from a released file, without running code in it.
 
     Args:
         path: the file.
-        key: where in the file the state dict stands; None = the file is the state dict.
+        key: key of the state dict in the file; None = the file is the state dict.
 
     Raises:
-        FileNotFoundError: no such file.
-        ValueError: it is damaged, holds more than plain values and tensors, or lacks `key`.
+        FileNotFoundError: If the file does not exist.
+        ValueError: If it is damaged, holds more than plain values and tensors, or lacks `key`.
     """
     path = Path(path)
     if not path.exists():
-        raise FileNotFoundError(f"{path}: no such file; give the path of the weights that the authors released")
+        raise FileNotFoundError(f"{path}: no such file. Give the path of the weights released by the authors")
     try:
         content = read_torch(path)
     except ValueError as error:
         raise ValueError(
-            f"{path}: damaged, or it holds objects beside plain weights, which are not read: download it again, or "
-            "save its state dict alone"
+            f"{path}: damaged, or it holds objects other than plain weights, which are not read. Download it again, or "
+            "save only its state dict"
         ) from error
     state = content.get(key) if key is not None and isinstance(content, Mapping) else content
     if not isinstance(state, Mapping) or not all(isinstance(value, Tensor) for value in state.values()):
         found = ", ".join(sorted(map(str, content))[:8]) if isinstance(content, Mapping) else type(content).__name__
-        raise ValueError(f"{path}: no weights {f'under {key!r} ' if key else ''}in it, but {found}")
+        raise ValueError(f"{path}: contains no weights{f' under {key!r}' if key else ''}, but {found}")
     return dict(state)
 
 
 def load_strictly(network: Network, state: Mapping[str, Tensor], source: str | Path) -> Network:
-    """The network with these weights, all of them, in evaluation mode.
+    """Loads all weights into a network, and returns it in evaluation mode.
 
     Raises:
-        ValueError: a weight is missing, unknown or of another shape; the message names `source`.
+        ValueError: If a weight is missing, unknown or has another shape; the message begins with `source`.
     """
     try:
         network.load_state_dict(state, strict=True)

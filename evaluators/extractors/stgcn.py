@@ -1,4 +1,4 @@
-"""Action classifiers by graph convolution over the skeleton and time (Yan et al. 2018, "ST-GCN")."""
+"""Action classifiers with graph convolutions over skeleton and time (Yan et al. 2018, "ST-GCN")."""
 
 from __future__ import annotations
 
@@ -12,18 +12,19 @@ from evaluators.extractors.released import load_strictly, read_weights
 from flame_mdm.representations.skeleton import SMPL24
 
 UNCONSTRAINED_JOINTS = (15, 12, 16, 18, 20, 17, 19, 21, 0, 1, 4, 7, 2, 5, 8)
-"""The 15 of the 24 SMPL joints that MDM's unconstrained evaluation sees; entry 8 is the pelvis."""
+"""The 15 of the 24 SMPL joints that MDM's unconstrained evaluation uses; entry 8 is the pelvis."""
 UNCONSTRAINED_PARENTS = (1, -1, 1, 2, 3, 1, 5, 6, 1, 8, 9, 10, 8, 12, 13)
-"""Their tree, rooted in the neck."""
+"""Parents of these joints, with the neck as the root."""
 TEMPORAL_KERNEL = 9
 
 
 def adjacency(parents: Sequence[int]) -> Tensor:
-    """(3, V, V) matrices by which a vertex gathers from itself, from neighbors, and from neighbors near the center.
+    """Returns (3, V, V) matrices that gather from a vertex itself, its neighbors, and its neighbors nearer the center.
 
-    Entry (v, w) is what v gives to w, divided by the number of vertices that give to w. The center is the root of the
-    tree. Legacy of the authors' code: distances from the center are known up to 1 only, all vertices beyond are equally
-    far; the spatial partition of Yan et al. 2018 (section 3.3) thus concerns the vertices beside the center alone.
+    Entry (v, w) is the weight of v in w, divided by the number of vertices that contribute to w. The center is the root
+    of the tree. As in the authors' code, only distances up to 1 from the center are distinguished, and all vertices
+    beyond are equally far. The spatial partition of Yan et al. 2018 (section 3.3) thus only affects the vertices next
+    to the center.
     """
     size, root = len(parents), parents.index(-1)
     linked = torch.eye(size)
@@ -39,11 +40,11 @@ def adjacency(parents: Sequence[int]) -> Tensor:
 
 
 class STGCN(nn.Module):
-    """A stack of graph convolutions with temporal ones of 9 frames, averaged over frames and joints, and classified.
+    """A stack of graph convolutions and temporal convolutions over 9 frames, averaged over frames and joints.
 
-    A network to evaluate with: the dropout of its training is left out. Past the end of a motion the convolutions see
-    zeros, as at the end of the longest, so that its features do not depend on the other motions of a batch. The
-    published action sets have motions of 60 frames only, where short clips repeat their last one.
+    The dropout of the published training code is omitted. Past the end of a motion, the convolutions see zeros, as at
+    the end of the longest one, so features do not depend on the other motions of a batch. In the published evaluations,
+    all motions have 60 frames, and short clips repeat their last frame.
     """
 
     def __init__(
@@ -57,8 +58,8 @@ class STGCN(nn.Module):
         """Builds the network.
 
         Args:
-            in_channels: C, channels of a joint.
-            num_actions: classes.
+            in_channels: C, channels per joint.
+            num_actions: number of classes.
             parents: parent of each joint, -1 for the center.
             widths: channels after each block.
             strides: temporal stride of each block.
@@ -78,7 +79,7 @@ class STGCN(nn.Module):
         self.fcn = nn.Conv2d(widths[-1], num_actions, 1)
 
     def forward(self, x: Tensor, mask: Tensor) -> Tensor:
-        """(B, E) features of what each joint does (B, F, V, C), with mask (B, F); E is the width of the last block."""
+        """Returns features (B, E) of motions (B, F, V, C) with mask (B, F); E is the width of the last block."""
         x = self.data_bn(x.flatten(2).transpose(1, 2)).unflatten(1, x.shape[2:]).permute(0, 2, 3, 1)
         for block, importance in zip(self.st_gcn_networks, self.edge_importance, strict=True):
             x = block(x, self.A * importance, mask)
@@ -86,12 +87,12 @@ class STGCN(nn.Module):
         return x.mean(3).masked_fill(~mask[:, None], 0).sum(2) / mask.sum(1, keepdim=True)
 
     def logits(self, x: Tensor, mask: Tensor) -> Tensor:
-        """(B, actions) unnormalized log-probabilities; arguments as of `forward`."""
+        """Returns unnormalized log-probabilities (B, actions); arguments as for `forward`."""
         return self.fcn(self(x, mask)[..., None, None])[..., 0, 0]
 
 
 class _Block(nn.Module):
-    """Gathers over the graph, then convolves over time; works on (B, C, F, V)."""
+    """A graph convolution followed by a temporal convolution, on (B, C, F, V)."""
 
     def __init__(self, in_channels: int, width: int, partitions: int, stride: int, residual: bool):
         super().__init__()
@@ -118,59 +119,62 @@ class _Block(nn.Module):
 
 
 class UESTC(STGCN):
-    """The classifier of UESTC's 40 actions, that ACTOR, MDM and MFM report: it reads the rotations of 24 joints."""
+    """The classifier of UESTC's 40 actions in the tables of ACTOR, MDM and MFM, which reads rotations of 24 joints."""
 
     def __init__(self):
         widths = (64,) * 4 + (128,) * 3 + (256,) * 3
         super().__init__(6, 40, SMPL24.parents, widths, (1, 1, 1, 1, 2, 1, 1, 2, 1, 1))
 
     def forward(self, x: Tensor, mask: Tensor) -> Tensor:
-        """(B, 256) features of motions (B, F, 150) in the 25 x 6 representation; the root's way is not looked at."""
+        """Returns features (B, 256) of motions (B, F, 150) as 25 x 6 features; the root trajectory is ignored."""
         return super().forward(x.unflatten(-1, (25, 6))[:, :, :24], mask)
 
 
 class Unconstrained(STGCN):
-    """The classifier behind MDM's unconstrained evaluation (Raab et al. 2022, "MoDi"): 15 joints, 12 actions."""
+    """The classifier of MDM's unconstrained evaluation (Raab et al. 2022, "MoDi"): 15 joints, 12 actions."""
 
     def __init__(self):
         super().__init__(3, 12, UNCONSTRAINED_PARENTS, (64, 64, 64, 128, 128, 256), (1, 1, 1, 2, 1, 2))
 
     def forward(self, x: Tensor, mask: Tensor) -> Tensor:
-        """(B, 256) features of joints (B, F, 24, 3), metres, y up; seen from the pelvis, and y down as published."""
+        """Returns features (B, 256) of joints (B, F, 24, 3) in meters, y up.
+
+        The network sees them relative to the pelvis and with y down, as published.
+        """
         return self.published(x[:, :, list(UNCONSTRAINED_JOINTS)] * x.new_tensor([1.0, -1.0, -1.0]), mask)
 
     def published(self, x: Tensor, mask: Tensor) -> Tensor:
-        """(B, 256) features of the 15 joints (B, F, 15, 3) of the published reference motions, y down."""
+        """Returns features (B, 256) of the 15 joints (B, F, 15, 3) of the published reference motions, y down."""
         return super().forward(x - x[:, :, 8:9], mask)
 
 
 class JointSTGCN(STGCN):
-    """A classifier to train on the joints of any skeleton, which it sees from where the root stands at first."""
+    """A classifier to train on the joints of any skeleton, relative to the first position of the root."""
 
     def __init__(self, parents: Sequence[int], num_actions: int, widths: Sequence[int], strides: Sequence[int]):
-        """`parents` of the joints, -1 for the root; `widths` and `strides` of the blocks."""
+        """Builds the network; arguments as for `STGCN`."""
         super().__init__(3, num_actions, parents, widths, strides)
 
     def forward(self, x: Tensor, mask: Tensor) -> Tensor:
-        """(B, E) features of joints (B, F, J, 3), metres, y up, with mask (B, F)."""
+        """Returns features (B, E) of joints (B, F, J, 3) in meters, y up, with mask (B, F)."""
         return super().forward(x - x[:, :1, :1], mask)
 
 
 def load_uestc(path: str | Path) -> UESTC:
-    """The classifier with the authors' weights (uestc_rot6d_stgcn.tar).
+    """Loads the classifier with the authors' weights (uestc_rot6d_stgcn.tar).
 
     Raises:
-        FileNotFoundError: no such file.
-        ValueError: it holds other weights.
+        FileNotFoundError: If the file does not exist.
+        ValueError: If it holds other weights.
     """
     return load_strictly(UESTC(), read_weights(path), path)
 
 
 def load_unconstrained(path: str | Path) -> Unconstrained:
-    """The classifier with the authors' weights (humanact12_gru_modi_struct.pth.tar, no GRU despite its name).
+    """Loads the classifier with the authors' weights (humanact12_gru_modi_struct.pth.tar, not a GRU despite its name).
 
     Raises:
-        FileNotFoundError: no such file.
-        ValueError: it holds other weights.
+        FileNotFoundError: If the file does not exist.
+        ValueError: If it holds other weights.
     """
     return load_strictly(Unconstrained(), read_weights(path), path)

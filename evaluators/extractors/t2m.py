@@ -1,7 +1,7 @@
 """The evaluator of HumanML3D and KIT-ML (Guo et al. 2022, "Generating Diverse and Natural 3D Human Motions from Text").
 
-Networks that load the released weights. The authors' code returns embeddings ordered by descending length; here they
-come in the order of the input.
+The networks load the released weights. The authors' code returns embeddings in the order of descending length; here,
+they are in the order of the input.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from flame_mdm.files import read_npy
 from flame_mdm.motion import pad_to
 
 UNIT = 4
-"""Frames that the movement encoder makes one vector of."""
+"""Frames per vector of the movement encoder."""
 CONTACTS = 4
-"""Features at the end of each frame that the evaluator does not see."""
+"""Number of features at the end of each frame that the evaluator ignores."""
 PARTS_OF_SPEECH = (
     *("VERB", "NOUN", "DET", "ADP", "NUM", "AUX", "PRON", "ADJ", "ADV"),
     *("Loc_VIP", "Body_VIP", "Obj_VIP", "Act_VIP", "Desc_VIP", "OTHER"),
@@ -38,16 +38,16 @@ _SPECIAL_WORDS = {
     "Desc_VIP": "slowly carefully fast careful slow quickly happy angry sad happily angrily sadly",
 }
 SPECIAL = {word: part for part, words in _SPECIAL_WORDS.items() for word in words.split()}
-"""Words that have a part of speech of their own, whatever the tagger said."""
+"""Words with a special part of speech, which overrides that of the tagger."""
 
 
 class Words(NamedTuple):
-    """Captions as the text encoder reads them.
+    """Input of the text encoder for B captions.
 
     Attributes:
         vectors: (B, 22, 300) GloVe vectors.
         parts: (B, 22, 15) one-hot parts of speech.
-        lengths: (B,) int64, slots up to the end mark, which is included.
+        lengths: (B,) int64, number of slots up to and including the end mark.
     """
 
     vectors: Tensor
@@ -56,11 +56,11 @@ class Words(NamedTuple):
 
 
 class WordVectors:
-    """GloVe vectors of the words that HumanML3D's and KIT-ML's captions are made of: our_vab_data.npy, our_vab_idx.pkl.
+    """GloVe vectors of the words in the captions of HumanML3D and KIT-ML: our_vab_data.npy and our_vab_idx.pkl.
 
     Raises:
-        FileNotFoundError: a file is not in `folder`.
-        ValueError: it is not what it should be.
+        FileNotFoundError: If a file is not in `folder`.
+        ValueError: If a file does not have the expected content.
     """
 
     def __init__(self, folder: str | Path):
@@ -68,26 +68,27 @@ class WordVectors:
         for name in ("our_vab_data.npy", "our_vab_idx.pkl"):
             if not (folder / name).is_file():
                 raise FileNotFoundError(
-                    f"{folder / name}: no such file; give the folder of the GloVe vectors that the authors released"
+                    f"{folder / name}: no such file. Give the folder of the GloVe vectors released by the authors"
                 )
         rows = restricted_pickle.read(folder / "our_vab_idx.pkl")
         vectors = _read(folder / "our_vab_data.npy").astype(np.float32)
         if not isinstance(rows, dict) or vectors.ndim != 2 or not {"sos", "eos", "unk"} <= rows.keys():
-            raise ValueError(f"{folder}: not the released GloVe vectors: they need sos, eos, unk, one row a word")
+            raise ValueError(f"{folder}: not the released GloVe vectors, which have sos, eos, unk and one row per word")
         if not all(isinstance(row, int | np.integer) and row >= 0 for row in rows.values()):
-            raise ValueError(f"{folder / 'our_vab_idx.pkl'}: not words and their rows")
+            raise ValueError(f"{folder / 'our_vab_idx.pkl'}: not a mapping of words to row numbers")
         if max(rows.values()) >= len(vectors):
-            raise ValueError(f"{folder / 'our_vab_data.npy'}: {len(vectors)} rows, but the index names more")
+            raise ValueError(f"{folder / 'our_vab_data.npy'}: has {len(vectors)} rows, but the index refers to more")
         self.rows: dict[str, int] = rows
         self.vectors = torch.from_numpy(vectors)
 
     def __call__(self, captions: Sequence[Sequence[str]], *, full_length: bool = False) -> Words:
-        """Captions as lists of "word/PART" tokens, as the data sets' files hold them, without start and end marks.
+        """Returns the text encoder's input for captions.
 
         Args:
-            captions: tokens after the 20th are dropped. A word without a vector is unknown, and so is its part.
-            full_length: legacy of MDM's code before January 2024 and of MFM's: every caption is said to fill all 22
-                slots, which lowers R-precision.
+            captions: lists of "word/PART" tokens as in the files of the data sets, without start and end marks. Tokens
+                after the 20th are dropped. A word without a vector is unknown, and so is its part of speech.
+            full_length: legacy option of MDM's code before January 2024, and of MFM's: every caption is treated as
+                filling all 22 slots, which lowers R-precision.
         """
         index = {part: number for number, part in enumerate(PARTS_OF_SPEECH)}
         rows = torch.full((len(captions), MAX_TOKENS + 2), self.rows["unk"])
@@ -107,11 +108,11 @@ class WordVectors:
 
 
 class T2MEvaluator(nn.Module):
-    """Embeds motions and captions in one space; R-precision, MM-Dist, FID and diversity of HumanML3D and KIT use it.
+    """Embeds motions and captions in a joint space, for R-precision, MM-Dist, FID and diversity on HumanML3D and KIT.
 
-    Features come in the data's units and are normalized with the statistics that belong to the released weights, not
-    with those of the data set. Past its end, a motion is zero after normalization, up to `max_frames`, as the authors'
-    real motions are; the convolutions see 3 frames past the end.
+    Features are in the data's units, and are normalized with the statistics of the released weights, not with those of
+    the data set. As in the authors' code for real motions, motions are padded to `max_frames` with zeros after
+    normalization; the convolutions see 3 frames past the end.
     """
 
     mean: Tensor
@@ -139,10 +140,10 @@ class T2MEvaluator(nn.Module):
             movement_latent: channels of a movement vector.
             text_hidden: width of the text GRU.
             motion_hidden: width of the motion GRU.
-            embedding: E, width of the common space.
-            max_frames: frames that every motion is padded to.
-            keep_padding: legacy of MDM's code, which samples 196 frames whatever the length: what stands past the end
-                of a motion is seen.
+            embedding: E, width of the joint space.
+            max_frames: length to which every motion is padded.
+            keep_padding: legacy option of MDM's code, which always samples 196 frames: the network sees the frames past
+                the end of a motion.
         """
         super().__init__()
         self.features, self.max_frames, self.keep_padding = embedding, max_frames, keep_padding
@@ -153,16 +154,16 @@ class T2MEvaluator(nn.Module):
         self.motion_encoder = _Recurrent(movement_latent, motion_hidden, embedding)
 
     def forward(self, x: Tensor, mask: Tensor) -> Tensor:
-        """(B, E) embeddings of motions (B, F, D) in the data's units, with mask (B, F).
+        """Returns embeddings (B, E) of motions (B, F, D) in the data's units, with mask (B, F).
 
         Raises:
-            ValueError: a motion is shorter than 4 frames or longer than `max_frames`.
+            ValueError: If a motion is shorter than 4 frames or longer than `max_frames`.
         """
         lengths = mask.sum(1)
         if lengths.min() < UNIT or lengths.max() > self.max_frames:
             raise ValueError(
                 f"the T2M evaluator takes motions of {UNIT} to {self.max_frames} frames, "
-                f"not of {int(lengths.min())} to {int(lengths.max())}"
+                f"but these have {int(lengths.min())} to {int(lengths.max())}"
             )
         x = (x - self.mean) / self.std
         if not self.keep_padding:
@@ -171,13 +172,13 @@ class T2MEvaluator(nn.Module):
         return self.motion_encoder(self.movement_encoder(x[..., :-CONTACTS]), lengths // UNIT)
 
     def text(self, words: Words) -> Tensor:
-        """(B, E) embeddings of captions, as `WordVectors` gives them."""
+        """Returns embeddings (B, E) of captions, given as output of `WordVectors`."""
         weight = self.text_encoder.input_emb.weight
         return self.text_encoder(words.vectors.to(weight), words.parts.to(weight), words.lengths)
 
 
 class _MovementEncoder(nn.Module):
-    """Two convolutions over time: 4 frames become one vector."""
+    """Two convolutions over time, which encode 4 frames as one vector."""
 
     def __init__(self, in_features: int, hidden: int, latent: int):
         super().__init__()
@@ -197,7 +198,7 @@ class _MovementEncoder(nn.Module):
 
 
 class _Recurrent(nn.Module):
-    """A GRU in both directions from a learned state; its two last states become the embedding."""
+    """A bidirectional GRU with a learned initial state; its two final states are mapped to the embedding."""
 
     def __init__(self, in_features: int, hidden: int, embedding: int):
         super().__init__()
@@ -216,7 +217,7 @@ class _Recurrent(nn.Module):
 
 
 class _TextEncoder(_Recurrent):
-    """Reads word vectors with the parts of speech added to them."""
+    """Encodes word vectors, to which embeddings of the parts of speech are added."""
 
     WORD = 300
 
@@ -241,22 +242,22 @@ def _read(path: Path) -> np.ndarray:
 
 
 def load_t2m(path: str | Path, mean: str | Path, std: str | Path, **options: Any) -> T2MEvaluator:
-    """The evaluator with the authors' weights.
+    """Loads the evaluator with the authors' weights.
 
     Args:
         path: text_mot_match/model/finest.tar of t2m or kit.
-        mean: the evaluator's mean.npy, in MDM t2m_mean.npy or kit_mean.npy.
+        mean: the evaluator's mean.npy; in MDM, t2m_mean.npy or kit_mean.npy.
         std: its std.npy.
         options: of `T2MEvaluator`.
 
     Raises:
-        FileNotFoundError: a file is not there.
-        ValueError: a file is damaged, or belongs to another data set.
+        FileNotFoundError: If a file does not exist.
+        ValueError: If a file is damaged, or belongs to another data set.
     """
     statistics = []
     for file in (mean, std):
         if not Path(file).is_file():
-            raise FileNotFoundError(f"{file}: no such file; the evaluator needs the statistics it was released with")
+            raise FileNotFoundError(f"{file}: no such file. The evaluator needs the statistics released with it")
         statistics.append(torch.from_numpy(_read(Path(file))))
     network = T2MEvaluator(*statistics, **options)
     for name in ("movement_encoder", "text_encoder", "motion_encoder"):

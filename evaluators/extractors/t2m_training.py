@@ -1,4 +1,4 @@
-"""Training of Guo et al.'s evaluator (evaluators/t2m.py), for those who cannot or will not use the released one."""
+"""Training of Guo et al.'s evaluator (`evaluators.extractors.t2m`), if the released one cannot be used."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from flame_mdm.seeds import key
 from flame_mdm.task import Task
 
 POOL = 32
-"""Pairs among which validation ranks, as R-precision does."""
+"""Pairs per pool in which validation ranks, as in R-precision."""
 
 
 class _MovementDecoder(nn.Module):
-    """The counterpart of the movement encoder: one vector becomes 4 frames, by two transposed convolutions."""
+    """The counterpart of the movement encoder: two transposed convolutions decode one vector to 4 frames."""
 
     def __init__(self, latent: int, hidden: int, out_features: int):
         super().__init__()
@@ -45,7 +45,7 @@ class _MovementDecoder(nn.Module):
 
 
 class _SavedWords(WordVectors):
-    """Word vectors out of a checkpoint."""
+    """Word vectors from a checkpoint."""
 
     def __init__(self, rows: dict[str, int], vectors: Tensor):
         self.rows, self.vectors = rows, vectors
@@ -54,13 +54,13 @@ class _SavedWords(WordVectors):
 def matching_loss(motion: Tensor, text: Tensor, margin: float) -> Tensor:
     """Contrastive loss of Guo et al. 2022 (Hadsell et al. 2006, eq. 4, without its factor 1/2).
 
-    Each text meets its own motion and that of the pair before. The authors draw by how many places the motions are
-    shifted; a draw of 0 pushes pairs apart that belong together.
+    Each text is compared with its own motion, and with the motion of the previous pair. The authors shift the motions
+    by a random number of places instead; a shift of 0 pushes matching pairs apart.
 
     Args:
         motion: (B, E) embeddings.
         text: (B, E) embeddings.
-        margin: Euclidean distance beyond which a wrong pair costs nothing.
+        margin: Euclidean distance beyond which a wrong pair adds no loss.
 
     Returns:
         (), squared distance.
@@ -71,7 +71,7 @@ def matching_loss(motion: Tensor, text: Tensor, margin: float) -> Tensor:
 
 
 class MatchingLoss(TextAndMotion):
-    """`matching_loss` over all pairs in the order of their keys, whatever the batches and the number of processes."""
+    """`matching_loss` over all pairs in the order of their keys, independent of batches and number of processes."""
 
     higher_is_better = False
 
@@ -80,7 +80,7 @@ class MatchingLoss(TextAndMotion):
         self.margin = margin
 
     def compute(self) -> float | None:
-        """The loss; None of fewer than two pairs."""
+        """Returns the loss; None with fewer than two pairs."""
         rows = self.rows("keys", "generated", "text")
         if rows is None or len(rows[0]) < 2:
             return None
@@ -89,21 +89,21 @@ class MatchingLoss(TextAndMotion):
 
 
 class T2MTask(Task):
-    """Trains the evaluator by `make train EXP=t2m/...`, and is the feature extractor that comes out of it.
+    """Task that trains the evaluator (`make train EXP=t2m/...`), and the resulting feature extractor.
 
-    Up to step `movement_steps` the movement encoder learns with a decoder to give back the motions; from then on it
-    stays as it is, and the encoders of text and motion learn to match. Checkpoints hold the word vectors.
+    Until step `movement_steps`, the movement encoder is trained with a decoder to reconstruct motions. It is then
+    frozen, and the encoders of text and motion are trained to match. Checkpoints contain the word vectors.
 
     Args:
-        network: the evaluator; its statistics become those of the data.
+        network: the evaluator; its statistics are set to those of the data.
         representation: of the motions, whose last 4 features are contacts.
-        words: folder of our_vab_data.npy and our_vab_idx.pkl, see `WordVectors`; read in training alone.
-        movement_steps: steps of the first part.
+        words: folder of our_vab_data.npy and our_vab_idx.pkl, see `WordVectors`; only read for training.
+        movement_steps: steps of the first stage.
         sparsity: weight of the mean magnitude of movement vectors.
         smoothness: weight of the mean magnitude of differences of successive movement vectors.
         margin: of `matching_loss`.
         optimizer: a mapping with the `_target_` of a torch optimizer and its arguments.
-        seed: with the step and the rank, decides the dropout of a training step.
+        seed: determines the dropout of a training step, together with the step and the rank.
     """
 
     def __init__(
@@ -143,19 +143,19 @@ class T2MTask(Task):
         return task
 
     def setup(self, stage: str) -> None:
-        """As all tasks; reads the word vectors, and notes the tagged words of all captions.
+        """Sets up the task, reads the word vectors, and collects the tagged words of all captions.
 
         Raises:
-            FileNotFoundError, ValueError: no such word vectors, or damaged.
-            UserError: captions lack their tagged words, or a batch has no second motion to tell the first from.
+            FileNotFoundError, ValueError: If the word vectors do not exist, or are damaged.
+            UserError: If captions have no tagged words, or the batch size is less than 2.
         """
         super().setup(stage)
         data: MotionDataModule = self.trainer.datamodule  # type: ignore[attr-defined]
         if data.batch_size < 2:
-            raise UserError(f"data.batch_size={data.batch_size}: texts are matched with two motions or more")
+            raise UserError(f"data.batch_size={data.batch_size}: matching needs at least two motions per batch")
         if not Path(self.word_folder).is_dir():
             raise FileNotFoundError(
-                f"task.words={self.word_folder}: no such folder; give that of our_vab_data.npy and our_vab_idx.pkl"
+                f"task.words={self.word_folder}: no such folder. Give that of our_vab_data.npy and our_vab_idx.pkl"
             )
         self.words = WordVectors(self.word_folder)
         self.facts["words"] = {str(word): int(row) for word, row in self.words.rows.items()}
@@ -165,42 +165,42 @@ class T2MTask(Task):
         bare = [clip.id for clip in clips if not clip.captions or not clip.attributes.get("tokens")]
         if bare:
             raise UserError(
-                f"{data.folder}: {len(bare)} clips have no captions with tagged words, such as {bare[0]}; this "
-                "evaluator learns from sets that tag them, as HumanML3D and KIT-ML do"
+                f"{data.folder}: {len(bare)} clips have no captions with tagged words, such as {bare[0]}. This "
+                "evaluator needs a data set with tagged words, such as HumanML3D or KIT-ML"
             )
         for clip in clips:
             for caption, tokens in zip(clip.captions, clip.attributes["tokens"], strict=True):
                 self.tokens.setdefault((clip.id, caption), tokens)
 
     def get_extra_state(self) -> Tensor:
-        """(words, 300) word vectors; `facts` tells which is whose."""
+        """Returns the word vectors (words, 300); `facts` maps words to rows."""
         return self.words.vectors if self.words else torch.zeros(0)
 
     def set_extra_state(self, state: Tensor) -> None:
-        """Takes the word vectors of a checkpoint.
+        """Restores the word vectors of a checkpoint.
 
         Raises:
-            UserError: a run that is resumed has been given others.
+            UserError: If a resumed run is given other word vectors.
         """
         if self.words is not None and not torch.equal(self.words.vectors, state.cpu()):
-            raise UserError(f"task.words={self.word_folder}: other word vectors than those that this run began with")
+            raise UserError(f"task.words={self.word_folder}: these are not the word vectors that this run began with")
         self.words = _SavedWords(self.facts["words"], state.cpu())
 
     # Feature extraction -----------------------------------------------------------------------------------------------
 
     def forward(self, x: Tensor, mask: Tensor) -> Tensor:
-        """(B, E) features of motions (B, F, D) in the data's units, with mask (B, F)."""
+        """Returns features (B, E) of motions (B, F, D) in the data's units, with mask (B, F)."""
         return self.network(x, mask)
 
     def text(self, tokens: Sequence[Sequence[str]]) -> Tensor:
-        """(B, E) features of captions, as "word/PART" tokens."""
+        """Returns features (B, E) of captions, given as "word/PART" tokens."""
         assert self.words is not None
         return self.network.text(self.words(tokens))
 
     # Training ---------------------------------------------------------------------------------------------------------
 
     def training_step(self, batch: MotionBatch, batch_idx: int) -> Tensor:
-        """Loss of one batch: of reconstruction up to `movement_steps`, of matching from then on."""
+        """Returns the loss of one batch: reconstruction until `movement_steps`, then matching."""
         torch.manual_seed(key("step", self.seed, batch_idx, self.global_rank))
         self.network.movement_encoder.train(self._learns_movement)
         if self._learns_movement:
@@ -209,10 +209,10 @@ class T2MTask(Task):
         else:
             loss = matching_loss(*self._embed(batch), self.margin)
         self.log("train/loss", loss, batch_size=len(batch))
-        return loss + 0 * sum(parameter.sum() for parameter in self._idle())  # all have a gradient, as DDP needs
+        return loss + 0 * sum(parameter.sum() for parameter in self._idle())  # gives all a gradient, as DDP requires
 
     def on_before_optimizer_step(self, optimizer: torch.optim.Optimizer) -> None:
-        """Keeps the optimizer off what this part of training leaves alone; a gradient of 0 moves it by its momentum."""
+        """Removes the gradients of idle parameters: with a gradient of 0, momentum would still change them."""
         for parameter in self._idle():
             parameter.grad = None
 
@@ -221,13 +221,13 @@ class T2MTask(Task):
         return self.trainer.global_step < self.movement_steps
 
     def _idle(self) -> list[nn.Parameter]:
-        """What the present part of training does not train."""
+        """Returns the parameters that are not trained in the current stage."""
         movement = [*self.network.movement_encoder.parameters(), *self.decoder.parameters()]
         matching = [*self.network.text_encoder.parameters(), *self.network.motion_encoder.parameters()]
         return matching if self._learns_movement else movement
 
     def _reconstruct(self, batch: MotionBatch) -> dict[str, Tensor]:
-        """Terms (B,) of the movement autoencoder, over the real frames and movement vectors of each motion."""
+        """Returns loss terms (B,) of the movement autoencoder, over the real frames and vectors of each motion."""
         frames = batch.x.shape[1] // UNIT * UNIT
         x, mask = batch.x[:, :frames, :-CONTACTS], batch.mask[:, :frames]
         latents = self.network.movement_encoder(x)
@@ -243,15 +243,15 @@ class T2MTask(Task):
         }
 
     def _embed(self, batch: MotionBatch) -> tuple[Tensor, Tensor]:
-        """Embeddings (B, E) of motions and of their captions."""
+        """Returns embeddings (B, E) of motions and of their captions."""
         assert batch.text is not None
         tokens = [self.tokens[pair] for pair in zip(batch.ids, batch.text, strict=True)]
         return self(self.representation.denormalize(batch.x), batch.mask), self.text(tokens)
 
     def validation_step(self, batch: MotionBatch, batch_idx: int) -> None:
-        """Keeps the embeddings of the validation pairs, each on one process."""
+        """Collects the embeddings of the validation pairs, each on one process."""
         if self.global_rank and len(self.trainer.datamodule.val) < self.trainer.world_size:  # type: ignore[attr-defined]
-            return  # all processes have all clips then
+            return  # with so few clips, every process has all of them
         keys = torch.tensor([key("motion", name) for name in batch.ids], device=self.device)
         texts = torch.tensor([key("caption", text) for text in batch.text or ()], device=self.device)
         motion, text = self._embed(batch)
@@ -261,9 +261,9 @@ class T2MTask(Task):
         self.val_reconstruction.update(self._reconstruct(batch)["reconstruction"])
 
     def on_validation_epoch_end(self) -> None:
-        """Logs the loss of matching in both parts of training, so that the best checkpoint is one of the second.
+        """Logs the matching loss in both stages of training, so that the best checkpoint is from the second.
 
-        R-precision needs 32 motions, and small sets go without.
+        R-precision needs 32 motions, and is skipped on smaller sets.
         """
         values: dict[str, float | None] = {"loss": self.val_loss.compute(), "mm_dist": self.distance.compute()}
         if len(self.trainer.datamodule.val) >= POOL:  # type: ignore[attr-defined]

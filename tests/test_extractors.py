@@ -120,7 +120,7 @@ def test_t2m_normalizes_with_its_own_statistics():
     contacts = x + torch.nn.functional.pad(torch.ones(4), (16, 0))
     assert torch.equal(plain(contacts, mask), plain(x, mask))
     for length in (3, 200):
-        with pytest.raises(ValueError, match=f"motions of 4 to 196 frames, not of {length} to {length}"):
+        with pytest.raises(ValueError, match=f"motions of 4 to 196 frames, but these have {length} to {length}"):
             plain(torch.zeros(1, length, 20), torch.ones(1, length, dtype=torch.bool))
 
 

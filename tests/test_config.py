@@ -69,7 +69,7 @@ def test_a_saved_configuration_composes_to_itself_and_its_parts_are_fixed(tmp_pa
     config.save(composed, tmp_path / "config.yaml", head="a run")
     assert compose(str(tmp_path / "config.yaml")) == composed
     assert compose(str(tmp_path / "config.yaml"), ["optimizer.lr=1.0"])["optimizer"]["lr"] == 1.0
-    with pytest.raises(UserError, match="denoiser=mdm_encoder swaps a part of a recipe"):
+    with pytest.raises(UserError, match="denoiser=mdm_encoder replaces a part of a recipe"):
         compose(str(tmp_path / "config.yaml"), ["denoiser=mdm_encoder"])
 
 
@@ -104,7 +104,7 @@ def test_check_finds_unknown_arguments_deep_inside():
 
 
 def test_untrusted_targets_are_refused(monkeypatch):
-    with pytest.raises(UserError, match=r"os\.system at b; such code runs only if you trust it"):
+    with pytest.raises(UserError, match=r"os\.system at b\. Its code is only run if you trust it"):
         trust({"_target_": "flame_mdm.denoisers.mdm.MDMEncoder", "b": {"_target_": "os.system"}})
     monkeypatch.setenv("FLAME_MDM_TRUST", "fractions")
     trust({"_target_": "fractions.Fraction", "numerator": 3})
@@ -139,7 +139,7 @@ def test_a_checkpoint_names_only_own_classes(target, monkeypatch):
         {"a": [1, {"b": ({"_target_": target},)}]},  # a tuple, which Hydra takes as a list
         {"_target_": "flame_mdm.task.MotionGeneration", "_args_": [{"_partial_": True, "_target_": target}]},
     ):
-        with pytest.raises(UserError, match="such code runs only if you"):
+        with pytest.raises(UserError, match="Its code is only run if you"):
             trust({"denoiser": hidden})
 
 

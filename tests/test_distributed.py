@@ -72,9 +72,9 @@ def test_torchrun_starts_a_killed_group_again(tiny, tmp_path):
     # Else torchrun keeps its store, and the new group finds the addresses of the dead one in there.
     _, out, err = finish(spawn(command, PYTHONPATH=path, TORCH_DISABLE_SHARE_RDZV_TCP_STORE="1", PYTHONUNBUFFERED="1"))
     assert "steps: 0 to 100000" in out, err
-    assert "ended without a word; its run is taken over" in out
+    assert "died; taking over its run directory" in out
     assert "steps: 2 to 100000" in out
-    assert out.count("the same command goes on from there") == 1, err
+    assert out.count("Run the same command to resume") == 1, err
     step = int(re.findall(r"stopped at step (\d+)", out)[0])
     checkpoint = read_checkpoint(tmp_path / "run" / "checkpoints" / "last.ckpt")
     assert checkpoint["global_step"] == step >= 6

@@ -13,7 +13,7 @@ from flame_mdm.checkpoints.files import read_checkpoint
 from flame_mdm.config import compose, instantiate
 from flame_mdm.errors import UserError
 from flame_mdm.processes.diffusion import GaussianDiffusion
-from flame_mdm.training.guards import LAST, PREVIOUS, WholeCheckpoints, newest, only_run
+from flame_mdm.training.guards import LAST, PREVIOUS, AtomicCheckpoints, newest, only_run
 
 QUICK = ["callbacks.samples=null", "callbacks.best=null", "callbacks.checkpoints.every_n_steps=2"]
 
@@ -43,7 +43,7 @@ def break_loss(monkeypatch: pytest.MonkeyPatch, step: int, change) -> None:
 
 @pytest.mark.parametrize(
     ("change", "told"),
-    [(lambda v: v * float("nan"), "is nan"), (lambda v: v / 0, "is inf"), (lambda v: v * 1e6, "was usual")],
+    [(lambda v: v * float("nan"), "is nan"), (lambda v: v / 0, "is inf"), (lambda v: v * 1e6, "(typical: ")],
 )
 def test_a_bad_loss_stops_before_a_checkpoint_is_spoiled(tiny, tmp_path, monkeypatch, capsys, change, told):
     break_loss(monkeypatch, 7, change)
@@ -74,7 +74,7 @@ def test_out_of_memory_names_the_batch(tiny, monkeypatch, capsys, error):
     assert main(["train", *words(tiny, 5)]) == 1
     message = capsys.readouterr().err
     assert message.startswith("error: out of memory at step 2 with a batch of 8 clips, ")
-    assert "263 features: lower data.batch_size" in message
+    assert "263 features. Lower data.batch_size" in message
     assert message.count("\n") == 1
 
 
@@ -98,18 +98,18 @@ def test_a_damaged_checkpoint_gives_way_to_the_one_before(tiny, tmp_path, capsys
     assert all(torch.equal(resumed["state_dict"][k], v) for k, v in once["state_dict"].items())
     for name in (LAST, PREVIOUS):
         (folder / name).write_bytes(b"")
-    with pytest.raises(UserError, match="no other is left"):
+    with pytest.raises(UserError, match="no other checkpoint"):
         newest(folder)
 
 
 def test_a_full_disk_leaves_the_checkpoint_before(tmp_path):
-    io = WholeCheckpoints()
+    io = AtomicCheckpoints()
     io.save_checkpoint({"global_step": 1, "config": {}, "facts": {}, "state_dict": {}}, tmp_path / LAST)
     before = (tmp_path / LAST).read_bytes()
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, limits[1]))
     try:
-        with pytest.raises(UserError, match=r"last\.ckpt: step 2 cannot be written .*File too large"):
+        with pytest.raises(UserError, match=r"last\.ckpt: the checkpoint of step 2 cannot be written .*File too large"):
             io.save_checkpoint({"global_step": 2, "state_dict": {"a": torch.zeros(100_000)}}, tmp_path / LAST)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
@@ -139,7 +139,7 @@ def test_a_second_run_in_the_folder_is_refused_and_a_dead_one_taken_over(tiny, t
         assert main(["train", *words(tiny, 2)]) == 1
         message = capsys.readouterr().err
         assert f"process {other.pid} on " in message
-        assert "trains here now" in message
+        assert "is training in this directory" in message
         assert message.count("\n") == 1
         assert not (folder / "config.yaml").exists()
         other.kill()

@@ -68,7 +68,7 @@ def test_a_slurm_job_that_runs_out_of_time_is_requeued_and_ends_as_if_it_had_not
     code, out, err = finish(spawn(["flame_mdm", "train", "quickstart", *words, *time_over, *TWO, *launch], **cluster))
     logs = "\n".join(path.read_text() for path in (tmp_path / "run" / ".submitit").rglob("*.out"))
     assert code == 0, out + err + logs
-    assert "job 7 is in the queue again" in logs
+    assert "job 7 was requeued" in logs
     assert (tmp_path / "asked").read_text() == "requeue 7\n"
     deadline = time.monotonic() + 20
     while len(codes := (tmp_path / "codes").read_text().split()) < 2 and time.monotonic() < deadline:

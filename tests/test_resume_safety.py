@@ -24,7 +24,7 @@ from flame_mdm.errors import UserError
 from flame_mdm.representations.humanml import HumanML
 from flame_mdm.training import callbacks
 from flame_mdm.training.callbacks import Checkpoints
-from flame_mdm.training.guards import WholeCheckpoints, lost_worker, only_run
+from flame_mdm.training.guards import AtomicCheckpoints, lost_worker, only_run
 
 STORE = "synthetic-humanml-clean-smpl22"
 QUIET = ["callbacks.samples=null", "callbacks.best=null", "logger=csv", "callbacks.checkpoints.every_n_steps=2"]
@@ -294,7 +294,7 @@ def test_a_killed_loading_process_is_told_in_one_line(training, tmp_path, data_r
     ],
 )
 def test_what_torch_says_of_lost_workers_is_understood(tmp_path, monkeypatch, message, how):
-    assert f"error: a loading process {how}" in f"error: {lost_worker(RuntimeError(message))}"
+    assert f"error: a data loading process {how}" in f"error: {lost_worker(RuntimeError(message))}"
     assert lost_worker(RuntimeError("Caught ValueError in DataLoader worker process 0.")) is None
     assert "ended unexpectedly" in str(lost_worker(ConnectionResetError(104, "Connection reset by peer")))
 
@@ -303,7 +303,7 @@ def test_what_torch_says_of_lost_workers_is_understood(tmp_path, monkeypatch, me
 
     monkeypatch.setattr("torch.save", interrupted)
     with pytest.raises(UserError) as caught:
-        WholeCheckpoints().save_checkpoint({"global_step": 1}, tmp_path / "last.ckpt")
+        AtomicCheckpoints().save_checkpoint({"global_step": 1}, tmp_path / "last.ckpt")
     assert how in str(lost_worker(caught.value))
     assert list(tmp_path.iterdir()) == []
 
@@ -322,8 +322,8 @@ def test_a_second_sigterm_ends_a_run_whose_loading_processes_hang(training):
     out, err = process.communicate(timeout=10)
     assert process.returncode == 143, err
     assert "Traceback" not in err
-    assert "a second Ctrl-C or SIGTERM stops at once" in out
-    assert "stopped at once; the same command resumes" in out
+    assert "press Ctrl-C or send SIGTERM again to stop immediately" in out
+    assert "stopped immediately. Run the same command to resume" in out
     assert not running(workers)
 
 

@@ -148,7 +148,7 @@ def test_a_folder_of_another_configuration_is_refused(tiny, capsys):
 def test_a_finished_run_says_so(tiny, capsys):
     run([*tiny, *STEPS], 2)
     run([*tiny, *STEPS], 2)
-    assert "is trained to step 2 already" in capsys.readouterr().out
+    assert "already trained for 2 steps" in capsys.readouterr().out
 
 
 def test_a_saved_config_repeats_a_run(tiny, tmp_path):
@@ -175,7 +175,7 @@ def test_a_signal_stops_at_the_end_of_a_step_and_the_run_goes_on(tiny, signum, t
     assert process.returncode == 128 + signum, err
     assert "Traceback" not in err
     step = read_checkpoint(checkpoint)["global_step"]
-    assert f"stopped at step {step}; the same command goes on" in out
+    assert f"stopped at step {step}. Run the same command to resume" in out
     run([*tiny, *STEPS], step + 2)
     whole = run([*tiny, *STEPS], step + 2, tmp_path / "whole")
     a, b = weights(checkpoint), weights(whole)

@@ -1,6 +1,6 @@
-"""Configuration: recipes composed by Hydra, checked against the signatures of what they name, and saved as plain dicts.
+"""Configuration: composition of recipes by Hydra, checks against signatures, instantiation, saving and loading.
 
-Nothing here imports torch or Lightning, so that `--help` and a misspelt key answer at once.
+Nothing here imports torch or Lightning, so that `--help` and errors about misspelled keys are immediate.
 """
 
 from flame_mdm.config.building import (

@@ -1,4 +1,4 @@
-"""Building the parts of a configuration, and configurations in files: what may be in them, reading, writing."""
+"""Instantiation of configurations, and validation, reading and writing of configuration files."""
 
 from __future__ import annotations
 
@@ -29,24 +29,24 @@ TRUSTED = (
 """Modules whose classes a configuration from a checkpoint may name."""
 
 MOST_VALUES, MOST_LEVELS = 1_000_000, 50
-"""Largest number of values, and of mappings and lists inside one another, in a configuration out of a file."""
+"""Limits of a configuration in a file: number of values, and depth of nested mappings and lists."""
 
 RUN_DIR = "${run.dir}"
-"""What a saved `config.yaml` has in place of the folder of its run, so that `run.dir=...` moves all that is in it."""
+"""Placeholder for the run directory in a saved `config.yaml`, so that `run.dir=...` changes all paths in it."""
 
 
 def plain(config: Any, where: str | Path, *, but: str = "") -> None:
-    """Checks what was read from somebody else's file: plain values by name, and no interpolations.
+    """Checks that the content of an untrusted file has only plain values and text keys, and no interpolations.
 
     Hydra and OmegaConf resolve interpolations (`${...}`), which can run any code and read any environment variable.
 
     Args:
         config: mappings, lists and values.
         where: the file, for messages.
-        but: an interpolation that may stand at the beginning of a text.
+        but: an interpolation that is allowed at the beginning of a text.
 
     Raises:
-        UserError: it holds an interpolation or another kind of value, or is nested too deeply, or into itself.
+        UserError: If it contains an interpolation or another kind of value, is nested too deeply, or contains itself.
     """
     count = 0
 
@@ -58,7 +58,7 @@ def plain(config: Any, where: str | Path, *, but: str = "") -> None:
         if isinstance(value, dict):
             for name, child in value.items():
                 if not isinstance(name, str | int):
-                    raise UserError(f"{where}: {'.'.join(path)} has a key that is a {type(name).__name__}, not a text")
+                    raise UserError(f"{where}: {'.'.join(path)} has a key that is a {type(name).__name__}, not text")
                 check_value(name, path)
                 check_value(child, (*path, str(name)))
         elif isinstance(value, list | tuple):
@@ -69,8 +69,8 @@ def plain(config: Any, where: str | Path, *, but: str = "") -> None:
             if "${" in text:
                 text = text if len(text) < 60 else f"{text[:56]} ..."
                 raise UserError(
-                    f"{where}: {'.'.join(path) or 'a key'} holds an interpolation, {text}. Such files may hold plain "
-                    "values only: write the value itself"
+                    f"{where}: {'.'.join(path) or 'a key'} holds an interpolation, {text}. Such files may only hold "
+                    "plain values: write the value itself"
                 )
         elif not isinstance(value, int | float | None):
             raise UserError(f"{where}: {'.'.join(path)} is a {type(value).__name__}, not a plain value")
@@ -79,21 +79,21 @@ def plain(config: Any, where: str | Path, *, but: str = "") -> None:
 
 
 def read_saved(path: Path) -> Config:
-    """Returns the configuration of a run as saved in its folder, with `RUN_DIR` where it names the folder.
+    """Reads the saved configuration of a run, with `RUN_DIR` for its directory.
 
     Raises:
-        FileNotFoundError: there is no such file.
-        UserError: it is damaged, or not the configuration of a run.
+        FileNotFoundError: If the file does not exist.
+        UserError: If it is damaged, or not the configuration of a run.
     """
     config = read_yaml(path)
     if not isinstance(config, dict) or not isinstance(config.get("run"), dict):
-        raise UserError(f"{path}: not the configuration of a run: it has no run")
+        raise UserError(f"{path}: not the configuration of a run: it has no key `run`")
     plain(config, path, but=RUN_DIR)
     return current_names(config)
 
 
 def movable(config: Config) -> Config:
-    """Returns a configuration with `RUN_DIR` for the run's folder, so that `run.dir` moves all that is in it."""
+    """Returns a configuration with `RUN_DIR` for the run directory, so that `run.dir` changes all paths in it."""
     folder = str(config["run"]["dir"])
 
     def moved(node: Any) -> Any:
@@ -110,12 +110,12 @@ def _moved() -> dict[str, str]:
 
 
 def current_names(config: Config) -> Config:
-    """Returns a configuration from a file with the names of earlier versions replaced by today's."""
+    """Returns a configuration from a file with the names of earlier versions replaced by current names."""
     return _renamed(config, _moved())
 
 
 def original_names(config: Config) -> Config:
-    """Returns a configuration with today's names replaced by those of the first version, so that hashes stay."""
+    """Returns a configuration with current names replaced by those of the first version, so that hashes stay equal."""
     return _renamed(config, {new: old for old, new in _moved().items()})
 
 
@@ -131,13 +131,13 @@ def _renamed(node: Any, names: Mapping[str, str]) -> Any:
 
 
 def trust(config: Config) -> None:
-    """Checks a configuration out of a checkpoint: it may name classes that `TRUSTED` modules define, and no functions.
+    """Checks a configuration from a checkpoint: it may only name classes defined in `TRUSTED` modules, no functions.
 
-    The environment variable FLAME_MDM_TRUST adds packages, with commas between them, of which it may name anything.
-    Nothing that it names is imported here.
+    The environment variable FLAME_MDM_TRUST adds packages, separated by commas, of which it may name anything. Nothing
+    that it names is imported here.
 
     Raises:
-        UserError: it names others.
+        UserError: If it names anything else.
     """
     added = [name for name in os.environ.get("FLAME_MDM_TRUST", "").split(",") if name]
     for path, mapping in walk(config):
@@ -147,13 +147,13 @@ def trust(config: Config) -> None:
         package = str(target).partition(".")[0]
         if not (isinstance(target, str) and (package in added or _is_trusted_class(target))):
             raise UserError(
-                f"the checkpoint's configuration names {target} at {'.'.join(path)}; such code runs only if you "
-                f"trust it: set FLAME_MDM_TRUST={package}"
+                f"the checkpoint's configuration names {target} at {'.'.join(path)}. Its code is only run if "
+                f"you trust it: set FLAME_MDM_TRUST={package}"
             )
 
 
 def _is_trusted_class(target: str) -> bool:
-    """Whether the class is defined where it is named to be, or brought there from another trusted module."""
+    """Returns whether a class is defined in the named module, or imported there from another trusted module."""
     module, _, name = target.rpartition(".")
     found = definition(module, name) if _is_trusted_module(module) else None
     return found is not None and isinstance(found[1], ast.ClassDef) and _is_trusted_module(found[0])
@@ -164,21 +164,21 @@ def _is_trusted_module(name: str) -> bool:
 
 
 def instantiate(node: Config, **derived: Any) -> Any:
-    """Builds what a mapping with a `_target_` describes, nested ones included.
+    """Instantiates the object described by a mapping with a `_target_`, including nested ones.
 
-    It reads Hydra's keys `_target_` and `_recursive_`. Interpolations are plain texts to it, and mappings and lists
-    reach the parts as plain copies, as with Hydra's `_convert_: all`.
+    It supports Hydra's keys `_target_` and `_recursive_`. Interpolations are treated as plain text. Mappings and lists
+    are passed as plain copies, as with Hydra's `_convert_: all`.
 
     Args:
         node: the mapping.
-        derived: arguments that follow from other parts of the recipe.
+        derived: further arguments, derived from other parts of the recipe.
 
     Raises:
-        UserError: no such class or function, or arguments of the wrong kind. What it raises as `UserError`,
-            `ValueError` or `FileNotFoundError` comes through.
+        UserError: If the class or function does not exist, or arguments are of the wrong kind. A `UserError`,
+            `ValueError` or `FileNotFoundError` of the class or function is passed through.
     """
     if not isinstance(node, Mapping) or not isinstance(node.get("_target_"), str):
-        raise UserError(f"a part needs a _target_, the name of its class: {str(node)[:80]}")
+        raise UserError(f"no _target_, the name of a class, in {str(node)[:80]}")
     name: str = node["_target_"]
     build = _instances if node.get("_recursive_", True) else copy.deepcopy
     skipped = ("_target_", "_recursive_", *derived)
@@ -186,7 +186,7 @@ def instantiate(node: Config, **derived: Any) -> Any:
     try:
         module, _, attribute = name.rpartition(".")
         if not module:
-            raise UserError(f"_target_={name}: give the name of a module and a class, such as torch.nn.Linear")
+            raise UserError(f"_target_={name}: not the name of a module and a class, such as torch.nn.Linear")
         return getattr(importlib.import_module(module), attribute)(**given, **derived)
     except (UserError, ValueError, FileNotFoundError):
         raise
@@ -203,7 +203,7 @@ def _instances(node: Any) -> Any:
 
 
 def flatten(config: Any, prefix: str = "") -> dict[str, Any]:
-    """Nested mappings as dotted keys; lists are leaves."""
+    """Flattens nested mappings to dotted keys; lists are leaves."""
     if not isinstance(config, Mapping) or not config:
         return {prefix: config}
     return {k: v for name, c in config.items() for k, v in flatten(c, f"{prefix}.{name}" if prefix else name).items()}

@@ -1,4 +1,4 @@
-"""Serving a command line through Hydra."""
+"""Command lines: parsing, composition by Hydra, sweeps and exit codes."""
 
 from __future__ import annotations
 
@@ -36,10 +36,10 @@ from flame_mdm.config.signatures import Config, check, check_kind
 from flame_mdm.errors import UserError, first_line, say
 
 FLAGS = ("--help", "--multirun", "-m", "--cfg", "--resolve", "--package")
-"""Hydra's own options that commands take."""
+"""Hydra's options that all commands accept."""
 
 NO_MEMORY = re.compile("allocate memory|out of memory|bad_alloc|start new thread|create a primitive|failed to map")
-"""What errors say that mean too little memory: those of torch, of threads, and of libraries that cannot be loaded."""
+"""Messages of errors caused by a lack of memory: from torch, from threads, and from libraries that fail to load."""
 
 
 def run(
@@ -52,17 +52,17 @@ def run(
     text: Sequence[str] = (),
     kinds: Mapping[str, str] | None = None,
 ) -> int:
-    """Serves a command line `[OBJECT [OUT]] key=value ...` through Hydra and returns the exit code.
+    """Runs a command line `[OBJECT [OUT]] key=value ...` through Hydra and returns the exit code.
 
     Args:
         command: does the work, given the resolved configuration.
-        argv: the words after the command. Hydra's own flags (`--multirun`, `--cfg job`) pass through. `launch=...`
-            hands each job of a sweep, or the only one, to that launcher, and waits for them.
+        argv: the words after the command. Hydra's flags (`--multirun`, `--cfg job`) are passed on. `launch=...` passes
+            each job of a sweep, or the only job, to that launcher, and waits for them.
         usage: printed for `--help`.
-        name: the configuration, for commands that have one of their own; otherwise the first word names a recipe.
-        objects: keys that the leading words without a key stand for, in their order; a key that ends with `*` takes
-            all words that are left.
-        text: keys whose values are taken as they stand, not read in Hydra's grammar.
+        name: the command's configuration; None = the first word names a recipe.
+        objects: keys of the leading words that have no key, in this order; a key that ends with `*` takes all remaining
+            words.
+        text: keys whose values are taken literally, not parsed with Hydra's grammar.
         kinds: annotations of keys whose values are checked, such as `{"seconds": "float"}`; null is always legal.
     """
     words = _make_variables() if "--from-make" in argv else list(argv)
@@ -77,12 +77,12 @@ def run(
     def serve(keyed: Sequence[str]) -> None:
         _serve(command, [_quoted(word, text) for word in keyed], name, codes, kinds or {})
 
-    with _stoppable() if name is not None else nullcontext():  # training stops at the end of a step, by itself
+    with _stoppable() if name is not None else nullcontext():  # training has its own handler
         return guarded(lambda: serve(words if name is None else _with_keys(words, objects))) or max(codes)
 
 
 def _with_keys(words: Sequence[str], objects: Sequence[str]) -> list[str]:
-    """Gives the leading words that have no key the keys of `objects`."""
+    """Adds the keys of `objects` to the leading words that have no key."""
     count = 0
     while count < len(words) and not words[count].startswith("-") and _is_object(words[count]):
         count += 1
@@ -92,8 +92,8 @@ def _with_keys(words: Sequence[str], objects: Sequence[str]) -> list[str]:
         given[len(keys) - 1 :] = [shlex.join(given[len(keys) - 1 :])]
     for key in keys[: len(given)]:
         if any(word.startswith(f"{key}=") for word in rest):
-            raise UserError(f"{key} is given twice: once without a key, and as {key}=. Leave out one")
-    # A word too many stays as it is, and is refused as one that has no value.
+            raise UserError(f"{key} is given twice: once without a key, and as {key}=. Remove one")
+    # Surplus words remain unchanged; they are refused later because they have no value.
     return [f"{key}={word}" for key, word in zip(keys, given, strict=False)] + given[len(keys) :] + rest
 
 
@@ -104,7 +104,7 @@ def _is_object(word: str) -> bool:
 
 @contextmanager
 def _stoppable() -> Iterator[None]:
-    """SIGTERM ends the work as an exception would, so that nothing half done stays behind; the exit code is 143."""
+    """Turns SIGTERM into an exception, so that partial files are cleaned up; the exit code is 143."""
 
     def stop(number: int, frame: FrameType | None) -> NoReturn:
         raise SystemExit(128 + number)
@@ -129,7 +129,7 @@ def _serve(
     flags = [w for i, w in enumerate(words) if w.startswith("-") or (i and words[i - 1] in ("--cfg", "--package"))]
     unknown = [w for w in flags if w.startswith("-") and w.partition("=")[0] not in FLAGS]
     if unknown:
-        raise UserError(f"unknown option {unknown[0]}; there are {', '.join(FLAGS)}, and keys as key=value")
+        raise UserError(f"unknown option {unknown[0]}. Available: {', '.join(FLAGS)}, and keys as key=value")
     overrides = [w for w in words if w not in flags]
     plan = plan_composition(recipe, overrides)
     parsed = parse(plan.overrides)
@@ -143,10 +143,10 @@ def _serve(
         if composed.get(key) is not None:
             check_kind(key, composed[key], annotation)
     if "local" in launch and composed.get("trainer", {}).get("devices", 1) != 1:
-        raise UserError("launch=local runs each job in one process: leave out launch, or trainer.devices")
+        raise UserError("launch=local runs each job in one process. Remove launch, or trainer.devices")
 
     def start(plain: Config, task: Sequence[str]) -> int:
-        if name is None:  # what Lightning starts further processes with
+        if name is None:  # Lightning starts further processes with these words
             folder = _quoted(f"run.dir={plain['run']['dir']}", ("run.dir",))
             sys.argv = [sys.argv[0], "train", first, *task, folder]
         code = guarded(lambda: command(plain))
@@ -163,9 +163,9 @@ def _serve(
             config = OmegaConf.merge(config, {"run": {"dir": hydra.runtime.output_dir}})
         plain: Config = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)  # type: ignore[assignment]
         check(plain)
-        HydraConfig.instance().cfg = None  # else Lightning adds words for Hydra's own command line
+        HydraConfig.instance().cfg = None  # otherwise Lightning adds words for Hydra's command line
         code = start(plain, [str(word) for word in hydra.overrides.task if not str(word).startswith(f"+{LAUNCH}=")])
-        if code > 128 or (launch and code):  # else a signal ends one job of a sweep, or a launched one counts as done
+        if code > 128 or (launch and code):  # a signal ends the whole sweep, and a failed launched job counts as failed
             raise SystemExit(code)
 
     quiet = ["hydra/job_logging=disabled", "hydra/hydra_logging=disabled", "hydra.output_subdir=null"]
@@ -178,7 +178,7 @@ def _serve(
     ]
     if launch:
         logs = f"{composed['run']['dir'] if name is None else f'runs/sweeps/{name}'}/.submitit"
-        say(f"waiting for the jobs; what they print stands in {logs}")
+        say(f"waiting for the jobs; their output is in {logs}")
     if sweep and not {"-m", "--multirun"} & set(flags):
         flags.append("--multirun")
     sys.argv = [sys.argv[0], *flags, *quiet, *output, *plan.overrides]
@@ -187,32 +187,32 @@ def _serve(
 
 
 def _check_whole(config: Config, name: str) -> None:
-    """Refuses a recipe that lacks what every run needs."""
-    plain(config, name)  # else the checkpoints of the run would be refused
+    """Checks that a recipe has everything that a run needs; raises `UserError` if not."""
+    plain(config, name)  # otherwise the checkpoints of the run would be refused
     for key in ("run", "trainer", "data", "representation", "task", "optimizer", "callbacks"):
         node = config.get(key)
         if not isinstance(node, Mapping) or (key not in ("run", "callbacks") and "_target_" not in node):
-            raise UserError(f"{name}: it has no {key}; begin a recipe with the defaults of another, or with /base")
+            raise UserError(f"{name}: no {key}. Begin the recipe with the defaults of another recipe, or with /base")
     if not config["run"].get("dir"):
-        raise UserError(f"{name}: run.dir is empty; a run needs a folder")
+        raise UserError(f"{name}: run.dir is empty. Set it to the directory of the run")
     if "max_steps" not in config["trainer"]:
-        raise UserError(f"{name}: trainer.max_steps is missing; -1 trains without end")
+        raise UserError(f"{name}: trainer.max_steps is missing. Set it; -1 trains without end")
     for key in ("denoiser", "process", "condition"):
         if key in config and not (isinstance(config[key], Mapping) and "_target_" in config[key]):
-            raise UserError(f"{name}: {key} has no _target_; {key}=... swaps it for one of experiments/{key}")
+            raise UserError(f"{name}: {key} has no _target_. Replace it with one of experiments/{key}: {key}=...")
     for key, value in config.get("denoiser", {}).items():
         if isinstance(value, int) and value < 0:
-            raise UserError(f"denoiser.{key}={value}: a size is not negative")
+            raise UserError(f"denoiser.{key}={value}: must not be negative")
     for key in ("experiment", "seed", "ema", "logger"):
         if key not in config:
-            raise UserError(f"{name}: it has no {key}; begin a recipe with the defaults of another, or with /base")
+            raise UserError(f"{name}: no {key}. Begin the recipe with the defaults of another recipe, or with /base")
 
 
 def _make_variables() -> list[str]:
-    """The variables given to make, as words: `EXP` names the recipe, other upper-case names are keys.
+    """Returns the variables given to make, as words: `EXP` names the recipe, other upper-case names are keys.
 
-    Make hands them down in MAKEFLAGS after ` -- `, latest first, with escaped spaces and doubled dollar signs; read
-    from there, no shell has touched them.
+    Make passes them in MAKEFLAGS after ` -- `, latest first, with escaped spaces and doubled dollar signs. Read from
+    there, they have not been processed by a shell.
     """
     variables = (" " + os.environ.get("MAKEFLAGS", "")).partition(" -- ")[2]
     words = [re.sub(r"\\(.)", r"\1", w).replace("$$", "$") for w in re.findall(r"(?:\\.|[^\\ ])+", variables)]
@@ -226,7 +226,7 @@ def _quoted(word: str, keys: Sequence[str]) -> str:
     key, separator, value = word.partition("=")
     if not separator or key not in keys or value in ("", "null"):
         return word
-    # Hydra takes a backslash as it stands, except right before a quote, where it has to be doubled.
+    # Hydra takes a backslash literally, except right before a quote, where it has to be doubled.
     escaped = re.sub(r"(\\*)('|$)", lambda m: m[1] * 2 + ("\\'" if m[2] else ""), value).replace("${", "\\${")
     return f"{key}='{escaped}'"
 
@@ -234,7 +234,7 @@ def _quoted(word: str, keys: Sequence[str]) -> str:
 def guarded(action: Callable[[], None]) -> int:
     """Runs `action` and returns the exit code.
 
-    An error that the user can fix prints one line and gives 1; FLAME_MDM_TRACEBACK=1 adds the traceback.
+    For an error that the user can fix, it prints one line and returns 1; FLAME_MDM_TRACEBACK=1 adds the traceback.
     """
     try:
         action()
@@ -245,8 +245,10 @@ def guarded(action: Callable[[], None]) -> int:
             raise
         if os.environ.get("FLAME_MDM_TRACEBACK") == "1":
             traceback.print_exc()
-        told = f"out of memory ({first_line(error)}). Free some, or ask for less" if memory else first_line(error)
-        say(f"error: {told}", error=True)
+        message = (
+            f"out of memory ({first_line(error)}). Free memory, or reduce the size" if memory else first_line(error)
+        )
+        say(f"error: {message}", error=True)
         return 1
     except SystemExit as stop:
         return int(stop.code or 0)

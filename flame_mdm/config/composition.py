@@ -1,4 +1,4 @@
-"""Recipes, composed by Hydra and resolved to plain dicts."""
+"""Composition of recipes by Hydra, resolved to plain dicts."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ from flame_mdm.files import read_yaml
 
 _PACKAGE = Path(__file__).parent.parent
 EXPERIMENTS = _PACKAGE / "experiments" if (_PACKAGE / "experiments").is_dir() else _PACKAGE.parent / "experiments"
-"""The recipes: inside the installed package, or beside it in a clone."""
+"""Folder of the recipes: inside the installed package, or next to it in a clone."""
 
 LAUNCH = "launch"
-"""The group of `experiments/` whose options start jobs elsewhere."""
+"""The group of `experiments/` with launchers, which start jobs elsewhere."""
 
 LONGEST_WORD = 2**17
-"""Characters of a `key=value`. Linux passes no longer word to a command, and Hydra would take minutes to parse it."""
+"""Maximum length of a `key=value` in characters, which is also the limit of Linux. Hydra parses longer ones slowly."""
 
 
 def groups() -> list[str]:
-    """The swappable parts of a recipe: folders of `experiments/` whose files are options, not recipes."""
+    """Returns the replaceable parts of a recipe: folders of `experiments/` whose files are options, not recipes."""
     return sorted(p.name for p in EXPERIMENTS.iterdir() if p.is_dir() and not _is_recipe_folder(p))
 
 
@@ -41,20 +41,20 @@ def _is_recipe_folder(folder: Path) -> bool:
 
 
 def recipes() -> list[str]:
-    """Names of all experiments, as `EXP=` takes them."""
+    """Returns the names of all experiments, as for `EXP=`."""
     files = (p for p in EXPERIMENTS.rglob("*.yaml") if "@package _global_" in p.read_text()[:200])
     return sorted(p.relative_to(EXPERIMENTS).with_suffix("").as_posix() for p in files)
 
 
 def compose(name: str, overrides: Sequence[str] = ()) -> Config:
-    """The recipe `name` with overrides such as `trainer.max_steps=10` or `denoiser=mdm_encoder`, resolved and checked.
+    """Composes a recipe with overrides such as `trainer.max_steps=10` or `denoiser=mdm_encoder`, and checks it.
 
     Args:
-        name: a file of `experiments/` without its suffix, or the path of a recipe or of a saved `config.yaml`.
+        name: a file in `experiments/` without its suffix, or the path of a recipe or of a saved `config.yaml`.
         overrides: in Hydra's grammar.
 
     Raises:
-        UserError: an unknown experiment, group, option or key, with the nearest names; or a malformed value.
+        UserError: If an experiment, group, option or key is unknown (with the nearest names), or a value is malformed.
     """
     config = resolve(plan_composition(find_recipe(name), overrides))
     check(config)
@@ -62,10 +62,10 @@ def compose(name: str, overrides: Sequence[str] = ()) -> Config:
 
 
 def settings(name: str, overrides: Sequence[str] = ()) -> Config:
-    """The keys of a command that has a configuration of its own, such as evaluate, with overrides.
+    """Returns the keys of a command with a configuration, such as evaluate, with overrides.
 
     Raises:
-        UserError: as for `compose`.
+        UserError: As for `compose`.
     """
     config = resolve(plan_composition(Recipe(EXPERIMENTS, name), overrides))
     check(config)
@@ -73,28 +73,28 @@ def settings(name: str, overrides: Sequence[str] = ()) -> Config:
 
 
 class Recipe(NamedTuple):
-    """Where a configuration stands, and what it is."""
+    """Location and kind of a configuration."""
 
     folder: Path
     stem: str
     saved: bool = False
-    """A resolved configuration, whose parts cannot be swapped."""
+    """Whether it is a resolved configuration, whose parts cannot be replaced."""
     experiment: str | None = None
-    """Name that a recipe gets."""
+    """Name of the recipe."""
 
 
 class Plan(NamedTuple):
-    """What Hydra is asked to compose."""
+    """Input of Hydra's composition."""
 
     folder: Path
     stem: str
     overrides: list[str]
     base: Config | None = None
-    """The recipe before single keys are overridden, whose values tell which kind of value a key takes."""
+    """The recipe without overrides of single keys. Its values determine which kind of value a key takes."""
 
 
 def plan_composition(recipe: Recipe, overrides: Sequence[str]) -> Plan:
-    """Checks names and keys. A key that only the signature of its `_target_` knows is marked as new for Hydra."""
+    """Checks names and keys. A key that is only in the signature of its `_target_` is marked as new for Hydra."""
     parsed = parse(overrides)
     if recipe.saved:
         _refuse_groups(parsed, recipe)
@@ -114,7 +114,7 @@ def override_word(override: Override) -> str:
 
 
 def first_choice(override: Override) -> str:
-    """The override; of a sweep, that to its first value."""
+    """Returns the override; for a sweep, the override with its first value."""
     return (
         f"{override.get_key_element()}={_choices(override)[0]}"
         if override.is_sweep_override()
@@ -123,7 +123,7 @@ def first_choice(override: Override) -> str:
 
 
 def _choices(override: Override) -> list[str]:
-    """What an override gives its key, one value or those of a sweep."""
+    """Returns the values of an override: one, or those of a sweep."""
     value = override.value()
     if isinstance(value, Glob):
         return value.filter(_options(override.key_or_group)) or [str(value)]
@@ -154,11 +154,11 @@ def find_recipe(name: str) -> Recipe:
 def parse(overrides: Sequence[str]) -> list[Override]:
     for word in overrides:
         if len(word) > LONGEST_WORD:
-            raise UserError(f"{word[:60]}…: {len(word):,} characters are too many. Give at most {LONGEST_WORD:,}")
+            raise UserError(f"{word[:60]}…: has {len(word):,} characters. The limit is {LONGEST_WORD:,}")
     try:
         return OverridesParser.create().parse_overrides(list(overrides))
     except HydraException as error:
-        raise UserError(f"cannot read an override, write key=value, text as 'a b': {first_line(error)}") from error
+        raise UserError(f"cannot read an override: {first_line(error)}. Write key=value, and text as 'a b'") from error
 
 
 def _is_group(override: Override) -> bool:
@@ -186,8 +186,8 @@ def _refuse_groups(overrides: Sequence[Override], recipe: Recipe) -> None:
     for override in overrides:
         if _is_group(override) and override.key_or_group != LAUNCH:
             raise UserError(
-                f"{override_word(override)} swaps a part of a recipe, but {recipe.stem}.yaml is a saved configuration, "
-                "whose parts are fixed; start from the experiment, or override single keys"
+                f"{override_word(override)} replaces a part of a recipe, but {recipe.stem}.yaml is a saved "
+                "configuration, whose parts are fixed. Start from the experiment, or override single keys"
             )
 
 
@@ -206,7 +206,11 @@ def resolve(plan: Plan) -> Config:
 
 
 def _legal(config: Config, override: Override) -> str:
-    """The override as Hydra takes it, if its key is written in the recipe or is a parameter of the `_target_`."""
+    """Returns the override as text for Hydra.
+
+    Raises:
+        UserError: If its key is neither in the recipe nor a parameter of the `_target_`.
+    """
     line = override_word(override)
     if override.is_delete() or override.is_force_add() or override.is_add() or line.startswith("hydra."):
         return line

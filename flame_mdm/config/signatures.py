@@ -1,7 +1,7 @@
-"""Checks of recipes against the signatures of what they name.
+"""Checks of recipes against the signatures of the classes and functions that they name.
 
-Signatures are read from source files, so that a misspelt key is answered at once, and so that naming a class in a
-recipe runs none of its code.
+Signatures are read from source files, so that misspelled keys are reported immediately, and naming a class in a recipe
+does not run its code.
 """
 
 from __future__ import annotations
@@ -21,17 +21,17 @@ Config = dict[str, Any]
 
 
 def check(config: Config) -> None:
-    """Every mapping with a `_target_` names something that exists and gives it only arguments it takes.
+    """Checks that each `_target_` exists and is only given arguments that it takes.
 
     Raises:
-        UserError: naming the key and the nearest legal ones.
+        UserError: If not; the message names the key and the nearest legal ones.
     """
     for path, node in walk(config):
         if "_target_" not in node:
             continue
         where = ".".join([*path, "_target_"])
         if not isinstance(node["_target_"], str):
-            raise UserError(f"{where}={node['_target_']}: the name of a class or a function is needed")
+            raise UserError(f"{where}={node['_target_']}: must be the name of a class or a function")
         legal = signature(node["_target_"], where)
         for name, value in node.items():
             if not str(name).startswith("_") and name not in legal and "**" not in legal:
@@ -50,7 +50,7 @@ KINDS: dict[str, tuple[type | tuple[type, ...], str]] = {
 
 
 def check_kind(key: str, value: Any, annotation: str) -> None:
-    """Refuses a value that the annotation of its parameter plainly rules out; what is not understood is let through."""
+    """Raises `UserError` if the annotation of a parameter rules out a value. Unknown annotations allow any value."""
     needed = []
     for part in re.sub(r"^Optional\[(.*)\]$", r"\1 | None", annotation).split(" | "):
         if part in KINDS:
@@ -67,21 +67,21 @@ def check_kind(key: str, value: Any, annotation: str) -> None:
         else:
             return
         needed.append(words)
-    raise UserError(f"{key}={value}: it has to be {' or '.join(dict.fromkeys(needed))}")
+    raise UserError(f"{key}={value}: must be {' or '.join(dict.fromkeys(needed))}")
 
 
 def check_same_kinds(base: Config, config: Config, path: str = "") -> None:
-    """Refuses values of another kind than those of the recipe, where no signature tells."""
+    """Raises `UserError` for values of another kind than in the recipe, for keys without a signature."""
     for name, value in base.items():
         key = f"{path}{name}"
         if name not in config:
             if "_target_" not in base and path != "callbacks.":
-                raise UserError(f"{key} cannot be taken out; give it another value")
+                raise UserError(f"{key} cannot be removed. Give it another value")
         elif isinstance(value, Mapping):
             if isinstance(config[name], Mapping):
                 check_same_kinds({k: v for k, v in value.items() if "_target_" not in value}, config[name], f"{key}.")
             elif config[name] is not None or key in ("run", "callbacks", "losses"):
-                raise UserError(f"{key}={config[name]}: it has to be a mapping of keys")
+                raise UserError(f"{key}={config[name]}: must be a mapping of keys")
         elif value is not None and not isinstance(value, list):
             kind = type(value).__name__
             check_kind(key, config[name], "str | int | float" if kind == "str" else kind)
@@ -98,7 +98,7 @@ def walk(node: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...
 
 
 def unknown_key(config: Config, parts: Sequence[str], depth: int, node: Any) -> str:
-    """The message for a key that stops being legal at `parts[depth]`, whose parent is `node`."""
+    """Returns the error message for a key whose part `parts[depth]`, in the parent `node`, is unknown."""
     key = ".".join(parts)
     known = {".".join([*path, str(name)]) for path, mapping in walk(config) for name in mapping}
     if isinstance(node, Mapping) and "_target_" in node:
@@ -112,10 +112,15 @@ def unknown_key(config: Config, parts: Sequence[str], depth: int, node: Any) -> 
 
 
 def parameters(target: str, *, where: str = "_target_", exact: bool = True) -> frozenset[str]:
-    """Names of the arguments a class or function takes, read from its source; "**" stands for any.
+    """Returns the argument names of a class or function, read from its source.
+
+    Args:
+        target: dotted name of the class or function.
+        where: key of the target, for messages.
+        exact: whether to include "**", which stands for any argument.
 
     Raises:
-        UserError: `target` is not found. With `exact=False`, "**" alone does not make every key legal.
+        UserError: If `target` is not found.
     """
     names = frozenset(signature(target, where))
     return names if exact else names - {"**"}
@@ -123,19 +128,19 @@ def parameters(target: str, *, where: str = "_target_", exact: bool = True) -> f
 
 @functools.cache
 def signature(target: str, where: str) -> dict[str, str]:
-    """The arguments that a class or function takes: name -> annotation, "" without one."""
+    """Returns the arguments of a class or function: name -> annotation, "" without one."""
     module, _, name = target.rpartition(".")
     found = definition(module, name)
     if found is None and (owner := definition(module.rpartition(".")[0], module.rpartition(".")[2])):  # a method
         methods = (node for node in ast.iter_child_nodes(owner[1]) if isinstance(node, ast.FunctionDef))
         found = next(((owner[0], node) for node in methods if node.name == name), None)
     if found is None:
-        raise UserError(f"{where}={target}: no such class or function can be found")
+        raise UserError(f"{where}={target}: no such class or function")
     return _arguments(*found)
 
 
 def definition(module: str, name: str, seen: frozenset[str] = frozenset()) -> tuple[str, ast.AST] | None:
-    """The module and syntax tree where `module.name` is defined, through re-exports."""
+    """Returns the module and syntax tree of the definition of `module.name`, following re-exports."""
     tree = _tree(module)
     if tree is None or module in seen:
         return None
@@ -154,7 +159,7 @@ def definition(module: str, name: str, seen: frozenset[str] = frozenset()) -> tu
 
 
 def _top_level(node: ast.AST) -> Iterator[ast.AST]:
-    """The statements of a module, also in its `if` and `try` blocks, but not those in its classes and functions."""
+    """Yields the statements of a module, including its `if` and `try` blocks, but not its classes and functions."""
     for child in ast.iter_child_nodes(node):
         yield child
         if isinstance(child, ast.If | ast.Try | ast.ExceptHandler | ast.With):

@@ -1,4 +1,4 @@
-"""What happens beside the training steps: checkpoints, interruption, progress, samples on the dashboard."""
+"""Training callbacks: checkpointing, interruption, progress, measurements, samples and the report."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from flame_mdm.training.loggers import log_video
 
 
 class Interrupted(Exception):
-    """Training stopped at the end of a step because a signal asked for it; a checkpoint has been written."""
+    """Raised when a signal stopped training at the end of a step, after a checkpoint was written."""
 
     def __init__(self, signum: int, step: int):
         super().__init__(f"{signal.Signals(signum).name} at step {step}")
@@ -43,17 +43,22 @@ class Interrupted(Exception):
 
 
 class Checkpoints(Checkpoint):
-    """Writes `last.ckpt` every so often, at the last step and when interrupted, and keeps some for good.
+    """Writes `last.ckpt` periodically, at the last step and when interrupted, and keeps some checkpoints permanently.
 
-    SIGINT, SIGTERM, SIGUSR1 and SIGUSR2 end training at the end of a step, never inside validation, where averaged and
-    raw weights are swapped, or of the next step where there are several processes. A second SIGINT ends it at once, and
-    so does a second SIGTERM that comes more than a second after the first: `timeout` sends two together.
+    SIGINT, SIGTERM, SIGUSR1 and SIGUSR2 stop training at the end of a step, or of the next step if there are several
+    processes; never during validation, where averaged and raw weights are swapped. A second SIGINT stops immediately,
+    as does a second SIGTERM more than one second after the first, since `timeout` sends two at once.
+
+    Args:
+        folder: of the checkpoints.
+        every_n_steps: interval of `last.ckpt`.
+        keep_every_n_steps: interval of the checkpoints that are kept; None = none.
     """
 
     def __init__(self, folder: str, every_n_steps: int, keep_every_n_steps: int | None = None):
         super().__init__()
         if every_n_steps < 1:
-            raise ValueError(f"callbacks.checkpoints.every_n_steps={every_n_steps}: at least 1 is needed")
+            raise ValueError(f"callbacks.checkpoints.every_n_steps={every_n_steps}: must be at least 1")
         self.folder = Path(folder)
         self.every_n_steps, self.keep_every_n_steps = every_n_steps, keep_every_n_steps
         self.signum, self.noted = 0, 0.0
@@ -72,8 +77,8 @@ class Checkpoints(Checkpoint):
             _kill_workers()
             raise SystemExit(128 + signum)
         self.signum, self.noted = signum, time.monotonic()
-        # print could find itself interrupted here, which Python refuses
-        os.write(1, b"\nstopping at the end of this step; a second Ctrl-C or SIGTERM stops at once\n")
+        # Not print: it is not reentrant, and the signal may have interrupted another print.
+        os.write(1, b"\nstopping at the end of this step; press Ctrl-C or send SIGTERM again to stop immediately\n")
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
@@ -83,7 +88,7 @@ class Checkpoints(Checkpoint):
         self.step = trainer.global_step
         signum = self.signum
         if trainer.world_size > 1:
-            # What all processes know of is what was exchanged a step ago: so that none waits for this step to end.
+            # All processes act on the value exchanged one step ago, so that none waits for this step to end.
             signum, known = int(self.exchanged), torch.tensor(signum, device=pl_module.device)
             torch.distributed.all_reduce(known, torch.distributed.ReduceOp.MAX)
             self.exchanged = known
@@ -108,21 +113,21 @@ class Checkpoints(Checkpoint):
 
 
 def _kill_workers() -> None:
-    """Ends the loading processes, even stopped ones, for which Python would wait without end."""
-    signal.signal(signal.SIGCHLD, signal.SIG_DFL)  # else torch raises an error for each
+    """Kills the data loading processes, including suspended ones, for which Python would wait forever."""
+    signal.signal(signal.SIGCHLD, signal.SIG_DFL)  # otherwise torch raises an error for each
     for process in active_children():
         process.kill()
 
 
 class Measurements(Callback):
-    """What a step does and costs, logged every `trainer.log_every_n_steps` without holding up the steps between.
+    """Logs gradient norm, learning rate and speed every `trainer.log_every_n_steps`, without slowing other steps.
 
-    Logs `train/grad_norm` (of all gradients together, before they are clipped), `train/lr`, `train/epochs` (passes over
-    the training clips), `train/samples_per_second`, `train/seconds_per_step` (validation does not count) and, on CUDA,
-    `train/gpu_memory_gib` (the most that tensors have held).
+    Logs `train/grad_norm` (norm of all gradients, before clipping), `train/lr`, `train/epochs` (passes over the
+    training clips), `train/samples_per_second`, `train/seconds_per_step` (without validation) and, on CUDA,
+    `train/gpu_memory_gib` (peak memory allocated by tensors).
 
-    Checkpoints tell in `facts.training` how many `hours` the run has trained, validation included, on how many
-    `processes`, and the peak `memory_gib`: of tensors on CUDA, else of the first process.
+    Checkpoints contain in `facts.training` the `hours` that the run has trained, including validation, the number of
+    `processes`, and the peak `memory_gib`: of tensors on CUDA, otherwise of the first process.
     """
 
     def __init__(self) -> None:
@@ -187,18 +192,18 @@ class Measurements(Callback):
 
 
 class Report(Callback):
-    """Writes `report.html` into the run's folder at the end of training."""
+    """Writes `report.html` into the run directory at the end of training."""
 
     def __init__(self, folder: Path):
         self.folder = folder
 
     def on_fit_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         if trainer.is_global_zero:
-            say(f"the whole run on a page: {write_report(self.folder)}")
+            say(f"report: {write_report(self.folder)}")
 
 
 class Progress(Callback):
-    """Progress bar over the steps of a run, with time left and losses; in a log file, a plain line every 30 seconds."""
+    """Progress bar over the steps of a run, with remaining time and losses. In a log file, a plain line every 30 seconds."""
 
     SECONDS = 30.0
 
@@ -235,15 +240,15 @@ class Progress(Callback):
 
 
 class SampleMotions(Callback):
-    """Samples fixed prompts with fixed noise now and then: files in the run's folder, a video on the dashboard.
+    """Samples fixed prompts with fixed noise: writes files to the run directory and logs a video.
 
     Args:
-        folder: where `step_0001000/player.html` and the like are written.
-        every_n_steps: how often, at validation; the end of training always samples.
-        prompts: texts, action names, or (text, asked attributes) pairs; None = as many unconditioned motions as
-            `unconditioned`. A model of actions is asked for as many actions instead where none of them is one.
+        folder: for the samples of each step, such as `step_0001000/player.html`.
+        every_n_steps: minimum number of steps between samples, which are drawn at validation and after training.
+        prompts: texts, action names, or (text, requested attributes) pairs; None = unconditioned motions. If a model
+            is conditioned on actions and no prompt is one of them, its first actions are used instead.
         seconds: length of the motions.
-        unconditioned: how many motions to sample where there are no prompts.
+        unconditioned: number of motions if there are no prompts.
         metrics: torchmetrics by name; their `update` takes some of joints (B, F, J, 3), mask (B, F) and requested.
     """
 
@@ -257,7 +262,7 @@ class SampleMotions(Callback):
         metrics: dict[str, Metric] | None = None,
     ):
         if not seconds > 0:
-            raise ValueError(f"callbacks.samples.seconds={seconds}: motions last longer than 0 seconds")
+            raise ValueError(f"callbacks.samples.seconds={seconds}: must be greater than 0")
         self.folder, self.every_n_steps, self.seconds = Path(folder), every_n_steps, seconds
         self.prompts = [(p, {}) if isinstance(p, str) else (p[0], dict(p[1])) for p in prompts or []]
         self.unconditioned, self.metrics = unconditioned, metrics or {}
@@ -266,7 +271,7 @@ class SampleMotions(Callback):
 
     @property
     def texts(self) -> list[str]:
-        """The prompts without what they ask for."""
+        """The prompts without their requested attributes."""
         return [text for text, _ in self.prompts]
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
@@ -274,11 +279,11 @@ class SampleMotions(Callback):
         assert isinstance(pl_module, MotionGeneration)
         actions = pl_module.facts["actions"]
         if isinstance(pl_module.condition, ActionLabels) and not set(self.texts) & set(actions):
-            # those of a recipe for texts, under condition=action
+            # the prompts are texts, from a recipe for text with condition=action
             self.prompts = [(action, {"action": action}) for action in actions[: len(self.prompts)]]
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
-        if not len(trainer.datamodule.val):  # type: ignore[attr-defined]  # a set published without validation clips
+        if not len(trainer.datamodule.val):  # type: ignore[attr-defined]  # a data set without validation clips
             self._write_if_due(trainer, pl_module)
 
     def on_validation_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
@@ -290,16 +295,16 @@ class SampleMotions(Callback):
             self.write(trainer, pl_module)
 
     def on_fit_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        if self.written[0] != trainer.global_step:  # the last validation may have written them
+        if self.written[0] != trainer.global_step:  # unless the last validation has written them
             self.write(trainer, pl_module)
         _, folder, values = self.written
         if trainer.is_global_zero:
             for name, value in values.items():
-                say(f"{name}: {'not asked' if value is None else f'{value:.3f}'}")
-            say(f"see the motions: {folder / 'player.html'} (any browser), {folder / 'motions.gif'}")
+                say(f"{name}: {'not requested' if value is None else f'{value:.3f}'}")
+            say(f"player: {folder / 'player.html'} (open in any browser), animation: {folder / 'motions.gif'}")
 
     def write(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Samples on all processes, a part on each; the first measures, writes files and tells the dashboard."""
+        """Samples a share of the motions on each process; the first process measures, writes and logs them."""
         assert isinstance(pl_module, MotionGeneration)
         step = trainer.global_step
         folder = self.folder / f"step_{step:07d}"
@@ -314,13 +319,13 @@ class SampleMotions(Callback):
         write_motions(folder, motions, {"seed": 0, "step": step, "checkpoint": ""})
         values = self.measure(motions)
         for logger in trainer.loggers:
-            # Lightning counts steps from 0 on dashboards: those of this validation stand at step - 1
+            # Lightning logs steps from 0: the values of this validation are logged at step - 1
             log_video(logger, "samples", folder / "motions.gif", step - 1)
             logger.log_metrics({f"samples/{k}": v for k, v in values.items() if v is not None}, step - 1)
         self.written = (step, folder, values)
 
     def _sample(self, model: MotionGeneration, rank: int, world: int) -> list[Motion]:
-        """The motions of every `world`-th prompt; the first process samples all that have none."""
+        """Samples every `world`-th prompt, starting at `rank`; unconditioned motions only on the first process."""
         texts = self.texts[rank::world]
         if not texts and (self.texts or rank):
             return []
@@ -335,11 +340,11 @@ class SampleMotions(Callback):
         )
 
     def measure(self, motions: Sequence[Motion]) -> dict[str, float | None]:
-        """Values of all metrics on the motions, None where a metric has nothing to say."""
+        """Computes all metrics of the motions; a metric without a value is None."""
         values: dict[str, float | None] = {}
         for name, metric in self.metrics.items():
             metric.reset()
-            metric.distributed_available_fn = bool  # False: the first process has all motions, and no other computes
+            metric.distributed_available_fn = bool  # returns False: no synchronization, this process has all motions
             for motion, (_, requested) in zip(motions, self.prompts, strict=True):
                 joints = torch.from_numpy(motion.joints)[None]
                 mask = torch.ones(joints.shape[:2], dtype=torch.bool)

@@ -1,4 +1,4 @@
-"""One training: parts of the recipe, callbacks, trainer, and what ends it."""
+"""Training of a recipe: assembles data, task, callbacks and trainer, and handles interruptions and errors."""
 
 from __future__ import annotations
 
@@ -22,19 +22,23 @@ from flame_mdm.data.datamodule import MotionDataModule
 from flame_mdm.errors import UserError, say
 from flame_mdm.task import Task
 from flame_mdm.training.callbacks import Interrupted, Measurements, Progress, Report
-from flame_mdm.training.guards import WholeCheckpoints, lost_worker, newest, out_of_memory
+from flame_mdm.training.guards import AtomicCheckpoints, lost_worker, newest, out_of_memory
 from flame_mdm.training.loggers import History
 from flame_mdm.training.provenance import Provenance
 
 
 def fit(folder: Path, config: Config) -> None:
-    """Trains a recipe in the folder of its run, from the newest checkpoint there; errors as of `flame-mdm train`."""
+    """Trains a recipe in its run directory, from the newest checkpoint if there is one.
+
+    Raises:
+        UserError, SystemExit: As for `flame-mdm train`.
+    """
     _quiet()
     torch.set_float32_matmul_precision("high")
     checkpoint, step = newest(folder / "checkpoints")
     most = config["trainer"]["max_steps"]
     if 0 <= most <= step:
-        say(f"{folder} is trained to step {step} already: raise trainer.max_steps, or start anew with run.name=...")
+        say(f"{folder}: already trained for {step} steps. Increase trainer.max_steps, or start a new run: run.name=...")
         return
     seed_everything(config["seed"], verbose=False)
     representation = instantiate(config["representation"])
@@ -44,16 +48,16 @@ def fit(folder: Path, config: Config) -> None:
     task: Task = get_class(config["task"]["_target_"]).build(config, representation, actions=data.actions)
     callbacks: list[Callback] = [Provenance(config)]
     if config["ema"]:
-        # Before those that look at averaged weights in validation. Buffers are copied, not averaged.
+        # Before the callbacks that use averaged weights in validation. Buffers are copied, not averaged.
         callbacks.append(EMAWeightAveraging(use_buffers=False, **config["ema"]))
     callbacks += [instantiate(c) for c in config["callbacks"].values() if c]
     if config["trainer"].get("enable_progress_bar", True):
         callbacks.append(Progress())
     callbacks += [Measurements(), Report(folder)]
     loggers = [instantiate(config["logger"])] if config["logger"] else []
-    plugins: list[Any] = [WholeCheckpoints()]
+    plugins: list[Any] = [AtomicCheckpoints()]
     if SLURMEnvironment.detect() and not TorchElasticEnvironment.detect():
-        # Lightning would save in the middle of a step, to a file that it then prefers to ours.
+        # Lightning would save during a step, to a file that it then prefers to `last.ckpt`.
         plugins.append(SLURMEnvironment(auto_requeue=False))
     trainer: Trainer = instantiate(
         config["trainer"] | {"enable_progress_bar": False},  # `Progress` instead
@@ -66,27 +70,25 @@ def fit(folder: Path, config: Config) -> None:
     try:
         trainer.fit(task, data, ckpt_path=checkpoint, weights_only=True)
     except Interrupted as stop:
-        if (
-            not trainer.is_global_zero
-        ):  # the first process tells; what starts processes takes any other code for a crash
+        if not trainer.is_global_zero:  # the first process reports it; launchers treat any other exit code as a crash
             return
-        say(f"stopped at step {stop.step}; the same command goes on from there")
+        say(f"stopped at step {stop.step}. Run the same command to resume")
         if stop.signum in (signal.SIGUSR1, signal.SIGUSR2):
             _requeue()
         raise SystemExit(128 + stop.signum) from None
     except (Exception, SystemExit) as error:
-        if trainer.strategy.launcher is not None:  # else the processes it started wait for this one for half an hour
+        if trainer.strategy.launcher is not None:  # otherwise its processes wait for this one for half an hour
             trainer.strategy.launcher.kill(signal.SIGKILL)
         if isinstance(error, SystemExit):  # a second signal
-            say("stopped at once; the same command resumes from the last checkpoint")
+            say("stopped immediately. Run the same command to resume from the last checkpoint")
         lost = lost_worker(error) if data.num_workers else None
-        if told := lost or out_of_memory(error, callbacks, trainer.global_step):
-            raise told from error
+        if explained := lost or out_of_memory(error, callbacks, trainer.global_step):
+            raise explained from error
         raise
 
 
 def _requeue() -> None:
-    """Puts the SLURM job that this is back into the queue."""
+    """Requeues the SLURM job of this process."""
     job = os.environ.get("SLURM_JOB_ID")
     if job is None:
         return
@@ -97,13 +99,17 @@ def _requeue() -> None:
     except OSError as error:
         failure = str(error)
     if failure is None:
-        say(f"job {job} is in the queue again")
+        say(f"job {job} was requeued")
     else:
-        say(f"error: {' '.join(command)}: {failure}; submit the job again", error=True)
+        say(f"error: {' '.join(command)}: {failure}. Submit the job again", error=True)
 
 
 def _same_data(checkpoint: Path, data: MotionDataModule) -> None:
-    """Refuses to resume a run on data other than it was trained on; the first process looks, for all of them."""
+    """Checks, on the first process, that a resumed run has the data that it was trained on.
+
+    Raises:
+        UserError: If the data has another fingerprint.
+    """
     import torch
     from lightning.pytorch.utilities import rank_zero_only
 
@@ -114,13 +120,13 @@ def _same_data(checkpoint: Path, data: MotionDataModule) -> None:
     trained, found = facts.get("fingerprint"), data.open().fingerprint
     if trained not in (None, found):
         raise UserError(
-            f"{checkpoint}: was trained on data with the fingerprint {trained}, {data.folder} has {found}. Train on it "
-            "as another run with run.name=..., or prepare the first data again"
+            f"{checkpoint}: trained on data with fingerprint {trained}, but {data.folder} has {found}. Start another "
+            "run with run.name=..., or prepare the original data again"
         )
 
 
 def _quiet() -> None:
-    """Silences what Lightning says about choices that are made on purpose here."""
+    """Silences Lightning's warnings about choices that are intended here."""
     logging.getLogger("lightning.pytorch").setLevel(logging.ERROR)
     for message in (
         ".*isinstance\\(treespec, LeafSpec\\).*",  # Lightning's own

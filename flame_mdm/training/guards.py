@@ -1,4 +1,4 @@
-"""What keeps long runs from harm: one run a folder, whole checkpoints, a stop at bad losses."""
+"""Safeguards for long runs: run lock, atomic checkpoints, divergence detection."""
 
 from __future__ import annotations
 
@@ -28,39 +28,42 @@ LAST, PREVIOUS = "last.ckpt", "previous.ckpt"
 
 @contextmanager
 def only_run(folder: Path) -> Iterator[None]:
-    """Holds `run.lock` in the folder of a run, with process and host in it, for as long as the run lasts.
+    """Holds the lock `run.lock` in the run directory for the duration of the run; the file names process and host.
 
     Raises:
-        UserError: another process, here or on another host of a shared file system, holds it.
+        UserError: If another process holds the lock, on this host or on another host of a shared file system.
     """
 
     def refuse(owner: str) -> None:
         raise UserError(
-            f"{folder}: {owner or 'another process'} trains here now; give this run a name of its own with "
-            "run.name=..., or end that one"
+            f"{folder}: {owner or 'another process'} is training in this directory. Choose another run.name, or stop "
+            "that process"
         )
 
     new = not folder.exists()
-    with locked(folder / "run.lock", refuse, "do not start a second run in the folder") as dead:
+    with locked(folder / "run.lock", refuse, "do not start a second run in this directory") as dead:
         if dead:
-            say(f"{folder}: {dead} ended without a word; its run is taken over")
+            say(f"{folder}: the previous {dead} died; taking over its run directory")
             for unfinished in (folder / "checkpoints").glob("*.partial"):
                 unfinished.unlink(missing_ok=True)
         try:
             yield
         finally:
-            if new and not (folder / "config.yaml").exists():  # training did not start: only loggers' files are there
+            if new and not (folder / "config.yaml").exists():  # training did not start, there are only logger files
                 shutil.rmtree(folder, ignore_errors=True)
 
 
-class WholeCheckpoints(TorchCheckpointIO):
-    """Writes checkpoints under a temporary name, to the disk, then renames; `last.ckpt` becomes `previous.ckpt`."""
+class AtomicCheckpoints(TorchCheckpointIO):
+    """Writes checkpoints atomically: to a temporary file, synced and then renamed.
+
+    The former `last.ckpt` is kept as `previous.ckpt`.
+    """
 
     def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None) -> None:
-        """Writes one.
+        """Writes a checkpoint.
 
         Raises:
-            UserError: it cannot be written, such as on a full disk; the ones before are left as they are.
+            UserError: If it cannot be written, for example on a full disk. Earlier checkpoints remain unchanged.
         """
         path = Path(path)
         partial = path.with_suffix(".partial")
@@ -77,22 +80,22 @@ class WholeCheckpoints(TorchCheckpointIO):
             partial.unlink(missing_ok=True)
             reason = write_failure(error if isinstance(error, OSError) else error.__context__ or error, path)
             raise UserError(
-                f"{path}: step {checkpoint['global_step']} cannot be written ({reason}); "
-                "the checkpoints before are whole: make room, and the same command goes on from there"
+                f"{path}: the checkpoint of step {checkpoint['global_step']} cannot be written ({reason}). Earlier "
+                "checkpoints are intact: free some space, and run the same command to resume"
             ) from error
 
 
 def newest(folder: Path) -> tuple[Path | None, int]:
-    """The checkpoint to go on from, and its step: the last one, or the one before if the last is damaged.
+    """Returns the checkpoint to resume from, and its step: the last one, or the previous one if the last is damaged.
 
     Args:
-        folder: where `WholeCheckpoints` writes; need not exist.
+        folder: folder in which `AtomicCheckpoints` writes; it need not exist.
 
     Returns:
-        (None, 0) where there is none.
+        Path and step; (None, 0) if there is no checkpoint.
 
     Raises:
-        UserError: all that are there are damaged.
+        UserError: If all existing checkpoints are damaged.
     """
     there = [folder / name for name in (LAST, PREVIOUS) if (folder / name).exists()]
     for number, path in enumerate(there):
@@ -100,17 +103,17 @@ def newest(folder: Path) -> tuple[Path | None, int]:
             step = _resumable(path, read_checkpoint(path))
         except UserError as error:
             if number + 1 == len(there):
-                raise UserError(f"{error}; no other is left to go on from: delete {folder} to start anew") from error
-            say(f"{error}; going on from the one before")
+                raise UserError(f"{error}. There is no other checkpoint. Delete {folder} to start over") from error
+            say(f"{error}; resuming from the previous checkpoint")
         else:
             if path.name != LAST:
-                say(f"{path}: going on from step {step}")
+                say(f"{path}: resuming from step {step}")
             return path, step
     return None, 0
 
 
 def _resumable(path: Path, checkpoint: dict[str, Any]) -> int:
-    """The step of a checkpoint that has all that training resumes with."""
+    """Returns the step of a checkpoint, after checking that it has everything needed to resume training."""
     step, optimizers = checkpoint.get("global_step"), checkpoint.get("optimizer_states")
     if type(step) is not int or step < 0:
         raise UserError(f"{path}: damaged: its global_step is {str(step)[:40]}, not a number of steps")
@@ -124,20 +127,20 @@ def _resumable(path: Path, checkpoint: dict[str, Any]) -> int:
     shapes = {(), (1,)} | {value.shape for value in checkpoint["state_dict"].values()}
     whole &= all(value.shape in shapes for value in tree_leaves(optimizers) if isinstance(value, Tensor))
     if not whole or not all(isinstance(checkpoint.get(name), dict) for name in ("loops", "callbacks")):
-        raise UserError(f"{path}: damaged: it lacks the state of the optimizer, of the loops or of the callbacks")
+        raise UserError(f"{path}: damaged: the state of the optimizer, the loops or the callbacks is missing")
     return step
 
 
 class BadLoss(Callback):
-    """Stops training when a loss is not finite or explodes, before a checkpoint is spoiled.
+    """Stops training when a loss is not finite or explodes, before it reaches a checkpoint.
 
-    Losses stay on the device until the log interval or a checkpoint, so that no step waits for them. What was in the
-    first bad batch is written to `bad_batch.json`: the step, and of each process the number of the batch, the ids of
-    its clips and its loss. Batch and draws are functions of (seed, number), so that it can be looked at again.
+    Losses are only copied from the device at the log interval and for a checkpoint, so that steps do not wait for them.
+    The first bad batch is described in `bad_batch.json`: the step, and for each process the number of the batch, the
+    ids of its clips and its loss. Batch and random draws are functions of (seed, number), so it can be reproduced.
 
     Args:
-        folder: of the run.
-        factor: a loss so many times the median of the interval before is an explosion.
+        folder: the run directory.
+        factor: a loss greater than this factor times the median of the previous interval is an explosion.
     """
 
     def __init__(self, folder: str, factor: float = 1000.0):
@@ -172,10 +175,10 @@ class BadLoss(Callback):
         self.check(trainer)
 
     def check(self, trainer: Trainer) -> None:
-        """Looks at the losses since the last check; all processes do so at the same step.
+        """Checks the losses since the last check, on all processes at the same step.
 
         Raises:
-            UserError: one of them is bad, on any process.
+            UserError: If a loss of any process is bad.
         """
         if not self.seen:
             return
@@ -199,35 +202,35 @@ class BadLoss(Callback):
                 self.path.write_text(json.dumps({"step": step, "usual_loss": str(self.usual), "batches": everyone}))
             raise UserError(
                 f"the loss of step {step} is {max(values, key=lambda v: v if v == v else float('inf')):g}"
-                + (f", {self.usual:.3g} was usual" if self.usual < float("inf") else "")
-                + f"; the clips of the batch stand in {self.path}. Lower optimizer.lr, set trainer.gradient_clip_val, "
-                "or look at these clips; checkpoints before are whole"
+                + (f" (typical: {self.usual:.3g})" if self.usual < float("inf") else "")
+                + f". The clips of the batch are listed in {self.path}. Lower optimizer.lr, set "
+                "trainer.gradient_clip_val, or inspect these clips. Earlier checkpoints are intact"
             )
         self.usual = float(losses.median())
         self.seen = []
 
 
 def lost_worker(error: BaseException) -> UserError | None:
-    """Returns what to print if an error means that a loading process died, otherwise None."""
-    message = f"{error} {error.__cause__ or ''}"  # it may come while a checkpoint is written
+    """Returns an explanation if an error means that a data loading process died, otherwise None."""
+    message = f"{error} {error.__cause__ or ''}"  # the cause, if it happens while a checkpoint is written
     lost = re.search(r"DataLoader worker \(pid.*?\) (?:is killed by signal: (\w+)|exited unexpectedly)", message)
     if lost is None and not isinstance(error, ConnectionError | EOFError):  # a pipe breaks before torch notices
         return None
     killed = lost and lost[1]
     how = f"was killed (signal: {killed}), as happens when memory runs out" if killed else "ended unexpectedly"
     return UserError(
-        f"a loading process {how}. Checkpoints are whole, and the same command resumes from the last one; lower "
-        "data.num_workers, or set data.num_workers=0 to load without further processes"
+        f"a data loading process {how}. Checkpoints are intact, and the same command resumes from the last one. Lower "
+        "data.num_workers, or set data.num_workers=0 to load in the main process"
     )
 
 
 def out_of_memory(error: BaseException, callbacks: Sequence[Callback], step: int) -> UserError | None:
-    """What to tell where an error means that the memory is used up; None where it means something else."""
+    """Returns an explanation if an error means that memory is exhausted, otherwise None."""
     if not isinstance(error, torch.OutOfMemoryError) and "can't allocate memory" not in str(error):
         return None
     shape = next((c.shape for c in callbacks if isinstance(c, BadLoss) and c.shape), None)
     batch = f" with a batch of {shape[0]} clips, {shape[1]} frames, {shape[2]} features" if shape else ""
     return UserError(
-        f"out of memory at step {step}{batch}: lower data.batch_size (trainer.accumulate_grad_batches makes up for "
-        "it), set trainer.precision=bf16-mixed, or shorten the crops or the network"
+        f"out of memory at step {step}{batch}. Lower data.batch_size (trainer.accumulate_grad_batches compensates for "
+        "it), set trainer.precision=bf16-mixed, or use shorter crops or a smaller network"
     )

@@ -1,4 +1,4 @@
-"""Where the numbers of a run go: a file beside it, TensorBoard, Weights & Biases."""
+"""Loggers: a metrics file in the run directory, TensorBoard, Weights & Biases."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from flame_mdm.runs import HISTORY, read_json, records
 
 
 class History(Logger):
-    """Appends all that loggers get to `metrics.jsonl` in the run's folder, a line of JSON with `step` each time.
+    """Appends all logged values to `metrics.jsonl` in the run directory, as lines of JSON with `step`.
 
-    Reports and comparisons read it, whatever dashboard the run has.
+    Reports and comparisons read this file, independent of the dashboard.
 
     Args:
-        folder: of the run.
-        step: that training goes on from; what a run that was killed wrote beyond it is dropped.
+        folder: the run directory.
+        step: step from which training resumes; later lines of a killed run are dropped.
     """
 
     def __init__(self, folder: str | Path, step: int = 0):
@@ -36,17 +36,17 @@ class History(Logger):
 
     @property
     def name(self) -> str:
-        """Of the logger."""
+        """Name of the logger."""
         return "history"
 
     @property
     def version(self) -> str:
-        """Is always the same: a run has one history."""
+        """Always "", since a run has one history."""
         return ""
 
     @rank_zero_only
     def log_hyperparams(self, *args: Any, **kwargs: Any) -> None:
-        """Does nothing: `config.yaml` has them."""
+        """Does nothing, since hyperparameters are in `config.yaml`."""
 
     @rank_zero_only
     def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:
@@ -60,7 +60,7 @@ class History(Logger):
 
 
 class Kept(TypedDict, total=False):
-    """What `wandb.json` keeps."""
+    """Content of `wandb.json`."""
 
     id: str
     step: int | None
@@ -68,39 +68,39 @@ class Kept(TypedDict, total=False):
 
 
 class WandbRun(WandbLogger):
-    """One run on Weights & Biases, however often it is resumed.
+    """Weights & Biases logger that continues the same wandb run whenever training is resumed.
 
-    `wandb.json` in the run's folder keeps its id, the step it has come to, and the number of its rows. Steps that are
-    trained again after a kill have the values they had, and are not told twice, so that `trainer/global_step` never
-    goes back.
+    `wandb.json` in the run directory stores the id of the run, its last step, and the number of its rows. Steps that
+    are trained again after a kill have the same values and are not logged twice, so `trainer/global_step` never
+    decreases.
 
     Args:
-        save_dir: the run's folder.
-        options: as `WandbLogger` takes them.
+        save_dir: the run directory.
+        options: of `WandbLogger`.
     """
 
     def __init__(self, save_dir: str, **options: Any):
         self.path = Path(save_dir) / "wandb.json"
-        kept = read_json(self.path, Kept, "delete it, and wandb gets a new run") if self.path.exists() else {}
-        told = kept.get("step")
-        self.told, self.rows = -1 if told is None else told, kept.get("rows", 0)
+        kept = read_json(self.path, Kept, "delete it to start a new wandb run") if self.path.exists() else {}
+        step = kept.get("step")
+        self.logged_step, self.rows = -1 if step is None else step, kept.get("rows", 0)
         known: dict[str, Any] = {"id": kept.get("id") or secrets.token_hex(4)}
         super().__init__(save_dir=save_dir, **(known | options))
-        self._wandb_init.pop("anonymous")  # wandb warns of it even where it is not set
+        self._wandb_init.pop("anonymous")  # wandb warns about it even if it is not set
 
     @rank_zero_only
     def log_metrics(self, metrics: Mapping[str, Any], step: int | None = None) -> None:
-        """Logs numbers, tables and videos at a step, unless an earlier part of the run was further."""
-        if step is not None and step < self.told:
+        """Logs numbers, tables and videos at a step, unless a later step was logged before."""
+        if step is not None and step < self.logged_step:
             return
-        if self.experiment.step < self.rows:  # wandb numbers the rows of an offline part anew, from 0
+        if self.experiment.step < self.rows:  # wandb restarts the row numbers of an offline part from 0
             self.experiment.log({}, step=self.rows)
         super().log_metrics(metrics, step)
         write_json(self.path, {"id": self.experiment.id, "step": step, "rows": self.experiment.step}, indent=None)
 
     @rank_zero_only
     def finalize(self, status: str) -> None:
-        """Ends the run: the next one of a sweep, in the same process, is another."""
+        """Ends the wandb run, since the next run of a sweep is in the same process."""
         super().finalize(status)
         if self._experiment is not None:
             self._experiment.finish(exit_code=int(status != "success"))
@@ -108,7 +108,7 @@ class WandbRun(WandbLogger):
 
 
 def log_config(logger: Logger, config: Config, facts: Mapping[str, Any]) -> None:
-    """Shows configuration and provenance on the dashboard."""
+    """Logs configuration and provenance to the dashboard."""
     if isinstance(logger, TensorBoardLogger):
         for name, content in (("config", config), ("provenance", facts)):
             text = OmegaConf.to_yaml(OmegaConf.create(dict(content)))
@@ -118,7 +118,7 @@ def log_config(logger: Logger, config: Config, facts: Mapping[str, Any]) -> None
 
 
 def log_table(logger: Logger, name: str, head: Sequence[str], rows: Sequence[Sequence[Any]], step: int) -> None:
-    """Shows a table on the dashboard."""
+    """Logs a table to the dashboard."""
     if isinstance(logger, TensorBoardLogger):
         lines = [head, ["---"] * len(head), *rows]
         logger.experiment.add_text(name, "\n".join(f"| {' | '.join(map(str, line))} |" for line in lines), step)
@@ -127,7 +127,7 @@ def log_table(logger: Logger, name: str, head: Sequence[str], rows: Sequence[Seq
 
 
 def log_video(logger: Logger, name: str, gif: Path, step: int) -> None:
-    """Shows an animation on the dashboard."""
+    """Logs an animation to the dashboard."""
     if isinstance(logger, TensorBoardLogger):
         from PIL import Image
         from tensorboard.compat.proto.summary_pb2 import Summary  # type: ignore[attr-defined]

@@ -1,4 +1,4 @@
-"""What a run is made of, written beside it."""
+"""Run provenance: command, code version, machine, package versions and data."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ PACKAGES = ("flame-mdm", "torch", "lightning", "torchmetrics", "transformers", "
 
 
 class Provenance(Callback):
-    """At the start of a fit: `config.yaml` and `provenance.json` in the run's folder, and four lines on the screen.
+    """Writes `config.yaml` and `provenance.json` at the start of training, and prints a short summary.
 
-    The dashboard gets both files, too.
+    Both files are also logged to the dashboard.
     """
 
     def __init__(self, config: Config):
@@ -34,7 +34,7 @@ class Provenance(Callback):
         if not trainer.is_global_zero:
             return
         folder = Path(self.config["run"]["dir"])
-        save(movable(self.config), folder / "config.yaml", head="A saved run; EXP=path/to/this/file repeats it.")
+        save(movable(self.config), folder / "config.yaml", head="A saved run; EXP=path/to/this/file reproduces it.")
         facts = {
             **environment(),
             "device": _device(trainer),
@@ -70,7 +70,7 @@ def _device(trainer: Trainer) -> str:
 
 
 def environment() -> dict[str, Any]:
-    """Command, code, machine and versions, as they stand beside every run and result."""
+    """Returns command, code version, machine and package versions, which are stored with every run and result."""
     return {
         "command": sys.argv,
         "commit": _git("rev-parse", "HEAD"),

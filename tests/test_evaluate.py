@@ -864,7 +864,7 @@ def test_the_classifier_of_old_code_starts_at_random_but_the_same_in_any_batch(t
         assert not torch.allclose(found[name], start[name], atol=1e-3)
     assert not torch.allclose(legacy.network.linear2(found["features"]), found["logits"], atol=1e-3), "two draws"
     torch.save(UESTC().state_dict(), tmp_path / "uestc")
-    with pytest.raises(ValueError, match="no recurrence"):
+    with pytest.raises(ValueError, match="not recurrent"):
         ClassifierExtractor("uestc", str(tmp_path / "uestc"), random_start=True)
 
 

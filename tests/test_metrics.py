@@ -834,10 +834,10 @@ def test_nothing_given_is_none_never_0():
         ),
         (Diversity(pairs=300, replace=False), 45, "got 45 motions for 300 pairs, needs at least 300"),
         (Diversity(pairs=200, replace=True), 1, "got 1 motions for 200 pairs, needs at least 2"),
-        (TextMultimodality(), 45, "9 of 9 prompts have not 30 motions but 5 to 5; generate 30 for each"),
-        (PairedMultimodality(), 45, "9 of 9 prompts have not 20 motions"),
+        (TextMultimodality(), 45, "9 of 9 prompts do not have 30 motions but 5 to 5. Generate 30 for each"),
+        (PairedMultimodality(), 45, "9 of 9 prompts do not have 20 motions"),
         (ActionMultimodality(), 5, "got 1 motions of class 1, needs at least 2"),
-        (JointVariance(), 45, "9 of 9 prompts have not 10 motions"),
+        (JointVariance(), 45, "9 of 9 prompts do not have 10 motions"),
     ],
 )
 def test_too_few_samples_are_an_error(metric: Metric, count: int, message: str):
@@ -870,14 +870,18 @@ def test_features_that_are_not_finite_are_an_error(bad: float):
 def wrong_inputs() -> list[tuple[Metric, Callable[[dict[str, Tensor]], dict[str, Tensor]], str]]:
     return [
         (MultimodalDistance(), lambda v: v | {"text": v["text"][:-1]}, "45 keys, 45 generated, 44 text"),
-        (FrechetMotionDistance(), lambda v: {"generated": v["generated"]}, "'generated' came without 'keys'"),
+        (FrechetMotionDistance(), lambda v: {"generated": v["generated"]}, "'generated' given without 'keys'"),
         (
             FrechetMotionDistance(),
             lambda v: v | {"real": v["real"][:, :3]},
-            "features are 6 wide if generated, 3 if real",
+            "generated motions have 6 features, but real ones have 3",
         ),
         (DisplacementErrors(), lambda v: v | {"kept": v["kept"] | True}, "no generated frame"),
-        (TemosPositionErrors(), lambda v: v | {"joints": v["joints"][:, :, :20]}, "20 joints, defined for KIT's 21"),
+        (
+            TemosPositionErrors(),
+            lambda v: v | {"joints": v["joints"][:, :, :20]},
+            "20 joints, but defined only for KIT's 21",
+        ),
         (FlamePositionErrors(KIT21.parents), lambda v: v | {"mask": v["mask"] & (torch.arange(34) < 1)}, "1 frames"),
     ]
 

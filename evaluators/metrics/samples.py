@@ -123,8 +123,8 @@ def by_group(metric: SampleMetric, groups: Tensor, samples: int) -> Tensor:
     wrong = int((sizes != samples).sum())
     if wrong:
         raise ValueError(
-            f"{type(metric).__name__}: {wrong} of {len(names)} prompts do not have {samples} motions, but between "
-            f"{int(sizes.min())} and {int(sizes.max())}. Generate {samples} for each"
+            f"{type(metric).__name__}: {wrong} of {len(names)} prompts do not have {samples} motions but "
+            f"{int(sizes.min())} to {int(sizes.max())}. Generate {samples} for each"
         )
     return groups.argsort(stable=True).unflatten(0, (len(names), samples))
 

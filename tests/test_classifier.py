@@ -101,7 +101,7 @@ def test_what_was_not_made_for_one_another_is_refused(trained, data, tmp_path, c
     released = tmp_path / "released.tar"
     torch.save({"model": ActionGRU().state_dict()}, released)
     for protocol, file, told in (
-        ("action_to_motion", trained, "protocol=action_to_motion_own takes classifiers of make train"),
+        ("action_to_motion", trained, "For classifiers of make train"),
         ("action_to_motion_own", released, f"{released}: not a checkpoint of this framework"),
     ):
         words = ["baseline=real", *DATA, data, f"protocol={protocol}", f"extractor={file}"]
@@ -128,7 +128,7 @@ def test_a_clip_without_label_is_named(monkeypatch, tmp_path, capsys):
     monkeypatch.setattr(Synthetic, "clips", bare)
     words = ["data.source.clips=40", "data.batch_size=8", f"data_root={tmp_path}", f"run.dir={tmp_path / 'run'}"]
     assert main(["train", "classifier/synthetic", *RUN, *words]) == 1
-    assert re.search(r"\d clips have no action label, such as synthetic_0_0000\d7;", capsys.readouterr().err)
+    assert re.search(r"\d clips have no action label, such as synthetic_0_0000\d7\.", capsys.readouterr().err)
 
 
 @pytest.mark.parametrize("recipe", ["classifier/synthetic", "classifier/humanact12", "classifier/uestc"])

@@ -275,7 +275,7 @@ def test_a_killed_loading_process_is_told_in_one_line(training, tmp_path, data_r
     # Python's own thread that shares files between processes may print one.
     assert err.count("Traceback") <= err.count("resource_sharer.py")
     line = next(line for line in err.splitlines() if line.startswith("error: "))
-    assert line.startswith("error: a loading process ")  # "was killed", unless its silence shows first
+    assert line.startswith("error: a data loading process ")  # "was killed", unless its silence shows first
     assert "data.num_workers=0" in line
     assert not running(workers), out
     assert not (tmp_path / "run" / "run.lock").exists()

@@ -36,7 +36,7 @@ def test_two_processes_are_one_with_both_batches(tiny, tmp_path):
     ours = ["callbacks.samples.every_n_steps=2", "trainer.max_steps=4"]
     code, out, err = finish(spawn(["flame_mdm", "train", "quickstart", *words, *TWO, *ours]))
     assert code == 0, err
-    assert out.count("see the motions") == 1
+    assert out.count("player: ") == 1
     assert "batch: 2 clips = 1 x 2 processes x 1 accumulated; optimizer.lr=0.05 is not scaled with it" in out
     assert out.count("steps: 0 to 4") == err.count("preparing synthetic:   0%") == 1  # the data, too, by one process
     wanted = reference(words, 4)

@@ -253,12 +253,12 @@ def test_every_weight_is_used_or_the_import_fails() -> None:
         import_mdm(state | {"embed_style.weight": torch.ones(1)}, {})
     with pytest.raises(ValueError, match=r"unknown seqTransEncoder\.layers\.0\.linear1\.bias.* and 7 more"):
         import_mdm(state, {"arch": "trans_dec"})
-    with pytest.raises(ValueError, match="arch is trans_enc, trans_dec or gru, not 'mamba'"):
+    with pytest.raises(ValueError, match="arch must be trans_enc, trans_dec or gru, not 'mamba'"):
         import_mdm(state, {"arch": "mamba"})
     missing = {key: value for key, value in state.items() if key != "seqTransEncoder.layers.0.linear2.bias"}
-    with pytest.raises(ValueError, match=r"nothing for transformer\.layers\.0\.feed_forward\.3\.bias"):
+    with pytest.raises(ValueError, match=r"missing transformer\.layers\.0\.feed_forward\.3\.bias"):
         import_mdm(missing, {})
-    with pytest.raises(ValueError, match=r"nothing for output\.weight"):
+    with pytest.raises(ValueError, match=r"output\.weight is missing"):
         import_mdm({}, {})
     short = state | {"seqTransEncoder.layers.0.linear1.bias": torch.ones(2)}
     with pytest.raises(ValueError, match=r"feed_forward\.0\.bias is \(2,\), expected \(16,\)"):
@@ -379,7 +379,9 @@ def test_statistics_have_to_fit(tmp_path, capsys):
     state |= {"output_process.poseFinal.weight": torch.ones(263, 8), "output_process.poseFinal.bias": torch.ones(263)}
     words = ["import", "mdm", *released_file(tmp_path, state, {"dataset": "humanml"})]
     assert main([*words]) == 1
-    assert "features of humanml3d are normalized: give the folder of Mean.npy, Std.npy" in capsys.readouterr().err
+    assert (
+        "features of humanml3d are normalized. Give stats=FOLDER with Mean.npy and Std.npy" in capsys.readouterr().err
+    )
     assert main([*words, f"stats={tmp_path}"]) == 1
     assert "Mean.npy: no such file" in capsys.readouterr().err
     statistics_folder(tmp_path, 251)
@@ -390,14 +392,14 @@ def test_statistics_have_to_fit(tmp_path, capsys):
     assert np.array_equal(load(tmp_path).representation.mean, np.load(tmp_path / "Mean.npy").astype(np.float32))
     np.save(tmp_path / "Std.npy", np.zeros(263))
     assert main([*words, f"stats={tmp_path}"]) == 1
-    assert "Std.npy: 263 entries are not above 0" in capsys.readouterr().err
+    assert "Std.npy: 263 entries are not positive" in capsys.readouterr().err
 
 
 def test_flame_needs_the_pooler_of_its_language_model(tmp_path, capsys):
     state = {f"net.{key}": value for key, value in weights(golden("flame_text2motion")).items()}
     torch.save({"state_dict": state}, tmp_path / "a.ckpt")
     assert main(["import", "flame", str(tmp_path / "a.ckpt"), f"out={tmp_path}"]) == 1
-    assert "nothing for lm.pooler.dense.weight" in capsys.readouterr().err
+    assert "lm.pooler.dense.weight is missing" in capsys.readouterr().err
 
 
 def test_pickles_of_objects_are_read_on_demand_only(tmp_path, capsys):
@@ -479,7 +481,7 @@ def test_damaged_and_foreign_files_are_one_line(trained, tmp_path):
         assert "\n" not in str(caught.value)
         assert str(file) in str(caught.value)
     save_file({"w": torch.zeros(1)}, file)
-    with pytest.raises(UserError, match="weights without a recipe; those of MDM"):
+    with pytest.raises(UserError, match="weights without a recipe. Import released weights of MDM"):
         load(file)
 
 
@@ -488,11 +490,13 @@ def test_what_is_not_there_is_one_line(tmp_path):
         load(tmp_path)
     for name in ("a", "b"):
         save_file({"w": torch.zeros(1)}, tmp_path / f"{name}.safetensors")
-    with pytest.raises(UserError, match=r"holds a\.safetensors, b\.safetensors; name the file"):
+    with pytest.raises(UserError, match=r"holds a\.safetensors, b\.safetensors\. Name the file"):
         load(tmp_path)
     with pytest.raises(FileNotFoundError, match="no such checkpoint"):
         load("nobody/model.ckpt")
-    with pytest.raises(UserError, match=r"nobody/model@v1: no such file or folder, nor can .* be fetched") as caught:
+    with pytest.raises(
+        UserError, match=r"nobody/model@v1: no such file or folder, and .* cannot be downloaded"
+    ) as caught:
         load("nobody/model@v1")
     assert "\n" not in str(caught.value)
 
@@ -529,7 +533,7 @@ def test_push_writes_a_card_and_uploads_these_files_alone(trained, tmp_path, cap
     assert main([*words]) == 1
     assert capsys.readouterr().err == f"error: me/walker: {folder} is written but not uploaded: no token\n"
     assert main(["push", str(trained), "walker"]) == 1
-    assert "name the model as user/name" in capsys.readouterr().err
+    assert "not a repository name. Write user/name" in capsys.readouterr().err
 
 
 def test_the_license_follows_the_data(trained, tmp_path):

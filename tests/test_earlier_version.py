@@ -48,7 +48,7 @@ def test_models_generate_the_same_motion(earlier, source):
 def test_the_best_checkpoint_of_a_run_is_named(earlier, capsys):
     best = Path(RUN) / "checkpoints" / "best.ckpt"
     assert main(["sample", RUN, "which=best", "text=a person walks"]) == 1
-    assert "best.ckpt: no such checkpoint; the run has last.ckpt" in capsys.readouterr().err
+    assert "best.ckpt: no such checkpoint. The run has last.ckpt" in capsys.readouterr().err
     shutil.copy(best.with_name("last.ckpt"), best)
     assert main(["export", RUN, "out.safetensors", "which=best"]) == 0
     assert main(["export", RUN, "out.safetensors", "which=newest"]) == 1

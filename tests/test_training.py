@@ -342,7 +342,7 @@ def test_a_checkpoint_of_another_shape_names_the_weight(trained, tmp_path):
     checkpoint = read_checkpoint(trained)
     checkpoint["config"]["denoiser"]["latent_dim"] = 32
     torch.save(checkpoint, tmp_path / "other.ckpt")
-    with pytest.raises(UserError, match=r"the weights do not fit the recipe .*: size mismatch for denoiser"):
+    with pytest.raises(UserError, match=r"the weights do not match the recipe .*: size mismatch for denoiser"):
         load(tmp_path / "other.ckpt")
 
 

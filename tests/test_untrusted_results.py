@@ -429,7 +429,7 @@ def test_a_report_plays_the_motions_not_the_page_of_others(tmp_path):
 @pytest.mark.parametrize("name", ["a/..", "a/.", "./a", "../a", "a/.git", "a/-x", "a/b/..", "/", "a/"])
 def test_push_takes_names_not_paths(attacked, trained, name):
     Path("README.md").write_text("mine")
-    attacked("push", str(trained), name, "dry_run=true", says="name the model as user/name")
+    attacked("push", str(trained), name, "dry_run=true", says="not a repository name. Write user/name")
     assert Path("README.md").read_text() == "mine"
 
 

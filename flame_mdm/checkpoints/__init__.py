@@ -1,1 +1,1 @@
-"""Checkpoints and model files: reading, writing, loading, import of released weights, the hub."""
+"""Checkpoints and model files: reading, writing, loading, import of released weights, upload to the hub."""

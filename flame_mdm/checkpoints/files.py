@@ -1,7 +1,7 @@
-"""The two kinds of files that hold models: checkpoints (.ckpt) of training, and model files (.safetensors).
+"""File formats of models: checkpoints (.ckpt) of training, and model files (.safetensors).
 
-A model file holds the (averaged) weights, statistics of the features included, and as metadata under the key
-`flame_mdm` the recipe, the facts of the data and where the weights come from, as JSON. No part of it is code.
+A model file holds the (averaged) weights, including the statistics of the features. Its metadata has a key `flame_mdm`
+with the recipe, metadata of the data set, and the origin of the weights, as JSON. It contains no code.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ FORMAT = 1
 KEY = "flame_mdm"
 FILE = "model.safetensors"
 MOST_FRAMES = 100_000
-"""Longest motion that a model may claim to sample: more than an hour at 20 frames per second."""
+"""Maximum number of frames that a model file may declare: more than an hour at 20 frames per second."""
 
 
 def read_model_file(path: Path) -> dict[str, Any]:
-    """A model file as `config`, `facts`, `origin` and `state_dict`.
+    """Reads a model file as `config`, `facts`, `origin` and `state_dict`.
 
     Raises:
-        UserError: it is damaged, foreign, or of a newer format.
+        UserError: If it is damaged, not a model file, or has a newer format.
     """
     from safetensors import SafetensorError, safe_open
 
@@ -45,7 +45,7 @@ def read_model_file(path: Path) -> dict[str, Any]:
         raise UserError(f"{path}: damaged, or not a .safetensors file") from error
     if text is None:
         raise UserError(
-            f"{path}: weights without a recipe; those of MDM, MFM and FLAME are imported by `flame-mdm import`"
+            f"{path}: weights without a recipe. Import released weights of MDM, MFM and FLAME with `flame-mdm import`"
         )
     try:
         content = parse_json(text)
@@ -54,10 +54,10 @@ def read_model_file(path: Path) -> dict[str, Any]:
     except (ValueError, TypeError, KeyError) as error:
         raise UserError(f"{path}: damaged: its recipe cannot be read") from error
     if found != FORMAT:
-        raise UserError(f"{path}: of format {found}, but this version reads {FORMAT}: update flame_mdm")
+        raise UserError(f"{path}: has format {found}, but this version reads {FORMAT}. Update flame_mdm")
     model = checked(path, model | {"state_dict": state})
     if _sha256(state) != digest:
-        raise UserError(f"{path}: damaged: its weights are not those that were written; fetch or export it again")
+        raise UserError(f"{path}: damaged: its weights have changed since it was written. Download or export it again")
     return model
 
 
@@ -86,7 +86,7 @@ class _Recipe(TypedDict):
 class _Facts(TypedDict):
     actions: list[str]
     max_frames: int
-    dataset: NotRequired[str]  # of released extractors, nobody told
+    dataset: NotRequired[str]  # unknown for released extractors
     fingerprint: NotRequired[str | None]
     training: NotRequired[dict[str, Number]]
 
@@ -104,31 +104,34 @@ class _Checkpoint(TypedDict):
 
 
 def checked(path: Path, content: Any) -> dict[str, Any]:
-    """Returns what a checkpoint or model file holds, if it is a recipe of plain values, facts of the data and weights.
+    """Checks the content of a checkpoint or model file: a recipe of plain values, metadata of the data, and weights.
+
+    Returns:
+        The content, with current names in its recipe.
 
     Raises:
-        UserError: it is something else; or its weights claim to be larger than the file.
+        UserError: If it is something else, or its weights are declared to be larger than the file.
     """
     if not isinstance(content, dict) or not {"config", "facts", "state_dict"} <= content.keys():
         raise UserError(
-            f"{path}: not a checkpoint of this framework: it holds no recipe; those that authors released are imported "
-            "by `flame-mdm import`"
+            f"{path}: not a checkpoint of this framework: it holds no recipe. Import released checkpoints with "
+            "`flame-mdm import`"
         )
     names = ("config", "facts", "origin", "global_step")
-    told = {name: content[name] for name in names if content.get(name) is not None}
-    for name, value in told.items():
+    metadata = {name: content[name] for name in names if content.get(name) is not None}
+    for name, value in metadata.items():
         plain(value, f"{path}: {name}")
-    facts: Any = told.get("facts")
+    facts: Any = metadata.get("facts")
     if isinstance(facts, dict) and isinstance(facts.get("actions"), tuple):
-        told["facts"] = facts | {"actions": list(facts["actions"])}
+        metadata["facts"] = facts | {"actions": list(facts["actions"])}
     try:
-        check_shape(told, _Model if "origin" in told or path.suffix == ".safetensors" else _Checkpoint)
+        check_shape(metadata, _Model if "origin" in metadata or path.suffix == ".safetensors" else _Checkpoint)
     except ValueError as error:
         raise UserError(f"{path}: damaged: {error}") from error
     if not 1 <= facts["max_frames"] <= MOST_FRAMES:
-        raise UserError(f"{path}: damaged: facts.max_frames is {facts['max_frames']}: give 1 to {MOST_FRAMES:,} frames")
+        raise UserError(f"{path}: damaged: facts.max_frames is {facts['max_frames']}, not 1 to {MOST_FRAMES:,} frames")
     if not isinstance(content["state_dict"], dict):
-        raise UserError(f"{path}: damaged: its weights are no tensors")
+        raise UserError(f"{path}: damaged: its weights are not a mapping of tensors")
     try:
         check_weights(content["state_dict"], path)
     except ValueError as error:
@@ -137,11 +140,11 @@ def checked(path: Path, content: Any) -> dict[str, Any]:
 
 
 def check_weights(weights: Mapping[Any, Any], path: Path) -> None:
-    """Checks weights out of the file at `path`.
+    """Checks weights from the file at `path`.
 
     Raises:
-        ValueError: a name is no text, or a value no dense tensor of real numbers; or all claim to be larger than the
-            file.
+        ValueError: If a name is not text, a value is not a dense tensor of real numbers, or all values together are
+            declared to be larger than the file.
     """
     import torch
 
@@ -149,25 +152,25 @@ def check_weights(weights: Mapping[Any, Any], path: Path) -> None:
     kinds += (torch.int64, torch.int32, torch.int16, torch.int8, torch.uint8, torch.bool)
     for name, value in weights.items():
         if not (isinstance(name, str) and isinstance(value, torch.Tensor)):
-            raise ValueError(f"its weights are no tensors by name: {str(name)[:80]} is a {type(value).__name__}")
+            raise ValueError(f"its weights are not tensors by name: {str(name)[:80]} is a {type(value).__name__}")
         if value.layout != torch.strided or value.device.type != "cpu" or value.dtype not in kinds or value.is_neg():
             shown = f"{value.dtype}, {value.layout}, on {value.device.type}"
-            raise ValueError(f"its weights are no dense tensors of real numbers: {name[:80]} is {shown}")
+            raise ValueError(f"its weights are not dense tensors of real numbers: {name[:80]} is {shown}")
     if sum(value.numel() * value.element_size() for value in weights.values()) > 2 * path.stat().st_size:  # 2: shared
-        raise ValueError("its weights claim to be larger than the file")
+        raise ValueError("its weights are declared to be larger than the file")
 
 
 def write_model_file(
     path: Path, state: Mapping[str, Tensor], *, config: Mapping[str, Any], facts: Mapping[str, Any], origin: Any
 ) -> None:
-    """Writes a model file, under a temporary name until it is whole.
+    """Writes a model file atomically.
 
     Args:
         path: the .safetensors file to write.
         state: the state dict of a task.
         config: its recipe.
-        facts: what sampling and evaluation have to know of its data.
-        origin: where the weights come from; plain values.
+        facts: metadata of its data set, for sampling and evaluation.
+        origin: origin of the weights, as plain values.
     """
     from safetensors.torch import save
 
@@ -188,14 +191,14 @@ def _sha256(state: Mapping[str, Tensor]) -> str:
 
 
 def read_checkpoint(path: Path) -> dict[str, Any]:
-    """The contents of a checkpoint or model file, unpickled with plain values and tensors only.
+    """Reads a checkpoint or model file. Only plain values and tensors are unpickled.
 
     Args:
-        path: a .ckpt or .safetensors file; `flame_mdm.checkpoints.loading.find` finds it.
+        path: a .ckpt or .safetensors file, as returned by `flame_mdm.checkpoints.loading.find`.
 
     Raises:
-        FileNotFoundError: no such file.
-        UserError: not a checkpoint of this framework, or damaged.
+        FileNotFoundError: If the file does not exist.
+        UserError: If it is damaged, or not a checkpoint of this framework.
     """
     if path.suffix == ".safetensors":
         return read_model_file(path)
@@ -207,7 +210,7 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
 
 
 def without_own_paths(config: Mapping[str, Any]) -> dict[str, Any]:
-    """The recipe with the folders of data and of the run where they are by default, not where this machine has them."""
+    """Returns a recipe with default paths of data and run in place of absolute paths on this machine."""
     default = {
         config.get("data_root"): "data",
         config.get("run", {}).get("dir"): f"runs/{config['experiment']}/default",

@@ -1,4 +1,4 @@
-"""From a path or a name to a model: finding its file, building its parts, loading its weights."""
+"""Loading of models: finds the file, builds the parts, loads the weights."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ def find(source: str | Path, which: Which = "last") -> Path:
     """Returns the file of a model.
 
     Args:
-        source: a file; a run directory; a folder with one .safetensors file; or "user/name[@revision]" of the Hugging
+        source: a file; a run directory; a folder with one .safetensors file; or "user/name[@revision]" on the Hugging
             Face hub.
-        which: of a run directory, the last checkpoint or the one with the best validation result.
+        which: for a run directory, the last checkpoint or the one with the best validation result.
 
     Raises:
-        FileNotFoundError: there is no such file, or the run has no such checkpoint.
-        UserError: the folder holds no or several model files, or the hub does not provide the model.
+        FileNotFoundError: If the file does not exist, or the run has no such checkpoint.
+        UserError: If the folder does not hold exactly one model file, or the model cannot be downloaded from the hub.
     """
     if which not in get_args(Which):
         raise UserError(f"which={which}: write last or best")
@@ -46,12 +46,12 @@ def find(source: str | Path, which: Which = "last") -> Path:
         file = path / "checkpoints" / f"{which}.ckpt"
         if not file.exists():
             there = ", ".join(sorted(found.name for found in file.parent.glob("*.ckpt"))) or "none yet"
-            raise FileNotFoundError(f"{file}: no such checkpoint; the run has {there}")
+            raise FileNotFoundError(f"{file}: no such checkpoint. The run has {there}")
         return file
     if path.is_dir():
         if len(weights) != 1:
             there = ", ".join(file.name for file in weights) or "no .safetensors file"
-            raise UserError(f"{path}: this folder holds {there}; name the file of the model")
+            raise UserError(f"{path}: this folder holds {there}. Name the file of the model")
         regular_file(weights[0])
         return weights[0]
     match = re.fullmatch(r"([\w.-]+/[\w.-]+)(?:@([\w./-]+))?", str(source))
@@ -59,33 +59,39 @@ def find(source: str | Path, which: Which = "last") -> Path:
         raise FileNotFoundError(f"{path}: no such checkpoint")
     from huggingface_hub import hf_hub_download, logging
 
-    logging.set_verbosity_error()  # else it reports every attempt to reach the hub
+    logging.set_verbosity_error()  # otherwise it reports every attempt to reach the hub
     try:
         return Path(hf_hub_download(match[1], FILE, revision=match[2]))
     except Exception as error:  # the client raises many kinds: no network, no such repository, no permission ...
         raise UserError(
-            f"{source}: no such file or folder, nor can {FILE} of a model of that name be fetched from the hub: "
-            f"{first_line(error)}"
+            f"{source}: no such file or folder, and {FILE} of a model with this name cannot be downloaded from the "
+            f"hub: {first_line(error)}"
         ) from error
 
 
 def load(source: str | Path, device: str | torch.device = "cpu", *, which: Which = "last") -> MotionGeneration:
-    """Returns a trained model, ready to sample; arguments as of `find`, errors as of `load_task`."""
+    """Loads a trained model for sampling; arguments as for `find`, errors as for `find` and `load_task`."""
     return load_task(find(source, which), MotionGeneration, device)
 
 
 Trained = TypeVar("Trained", bound=Task)
 
 PARTS = ("task", "representation", "process", "condition", "denoiser")
-"""Parts of a recipe that a model is built of."""
+"""Parts of a recipe from which a model is built."""
 
 
 def load_task(path: Path, kind: type[Trained], device: str | torch.device = "cpu") -> Trained:
-    """What a checkpoint holds, in evaluation mode: the averaged weights where the recipe averages them.
+    """Loads the task of a checkpoint in evaluation mode, with averaged weights if its recipe averages them.
+
+    Args:
+        path: a .ckpt or .safetensors file.
+        kind: expected class of the task.
+        device: device of the task.
 
     Raises:
-        FileNotFoundError: no such file.
-        UserError: not a checkpoint of this framework, not of this kind, damaged, or of another shape than its recipe.
+        FileNotFoundError: If the file does not exist.
+        UserError: If it is not a checkpoint of this framework, holds another kind of task, is damaged, or its weights
+            do not match its recipe.
     """
     try:
         torch.empty(0, device=device)
@@ -96,8 +102,8 @@ def load_task(path: Path, kind: type[Trained], device: str | torch.device = "cpu
         return _build(path, checkpoint, kind).eval().to(device)
     except (UserError, FileNotFoundError):
         raise
-    except Exception as error:  # a recipe of nonsense fails anywhere
-        raise UserError(f"{path}: no model can be built of it: {type(error).__name__}: {error}") from error
+    except Exception as error:  # a nonsensical recipe may fail anywhere
+        raise UserError(f"{path}: cannot build the model: {type(error).__name__}: {error}") from error
 
 
 def _build(path: str | Path, checkpoint: dict[str, Any], kind: type[Trained]) -> Trained:
@@ -118,20 +124,20 @@ def _build(path: str | Path, checkpoint: dict[str, Any], kind: type[Trained]) ->
         task.load_state_dict(checkpoint["state_dict"], strict=True)
     except RuntimeError as error:
         lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-        raise UserError(f"{path}: the weights do not fit the recipe saved with them: {lines[1]}") from error
+        raise UserError(f"{path}: the weights do not match the recipe saved with them: {lines[1]}") from error
     return task
 
 
 class _Sizes(TorchDispatchMode):
-    """While a model is built, refuses tensors that the weights in its file do not explain, before they are made.
+    """While a model is built, refuses tensors that are too large for the weights in its file, before allocating them.
 
     Args:
         path: the file, for messages.
         weights: the state dict in it.
-        parts: the recipe of the model, whose whole numbers are checked at once.
+        parts: the recipe of the model, whose integers are checked immediately.
 
     Raises:
-        UserError: a whole number of the recipe is beyond all sizes of models.
+        UserError: If an integer of the recipe exceeds all reasonable sizes.
     """
 
     def __init__(self, path: str | Path, weights: dict[str, Tensor], parts: Config):
@@ -140,7 +146,7 @@ class _Sizes(TorchDispatchMode):
         for name, value in flatten(parts).items():
             for number in value if isinstance(value, list | tuple) else [value]:
                 if isinstance(number, int) and abs(number) > max(MAX_STEPS, largest):
-                    raise UserError(f"{path}: {name}={number} in its recipe: no model is so large")
+                    raise UserError(f"{path}: {name}={number} in its recipe exceeds the size of any model")
         self.path, self.numbers = path, 4 * sum(value.numel() for value in weights.values()) + 10_000_000
         self.tensors = 4 * len(weights) + 2_000
 
@@ -150,5 +156,5 @@ class _Sizes(TorchDispatchMode):
             self.numbers -= sum(v.numel() for v in tree_leaves(func(*args, **kwargs | {"device": "meta"})))
             self.tensors -= 1
             if self.numbers < 0 or self.tensors < 0:
-                raise UserError(f"{self.path}: its recipe asks for a larger model than the weights beside it fill")
+                raise UserError(f"{self.path}: its recipe describes a larger model than the weights saved with it")
         return func(*args, **kwargs)

@@ -1,7 +1,7 @@
-"""Models of the weights that the authors of MDM, MFM and FLAME released.
+"""Import of the checkpoints released by the authors of MDM, MFM and FLAME.
 
-Nothing is read or written here: state dicts and options in, networks, recipes and models out. Each learned weight of a
-released network is used exactly once or the import fails; frozen text encoders and tables of sinusoids are left.
+Each learned weight of a released network is used exactly once, or the import fails. Frozen text encoders and tables of
+sinusoids are skipped.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from flame_mdm.processes import MAX_STEPS
 from flame_mdm.runs import Number, check_shape
 from flame_mdm.task import MotionGeneration
 
-# Beginnings of the authors' keys and of ours; inside a layer and outside.
+# Prefixes of the authors' keys -> ours, inside and outside of layers.
 _LAYER = {
     "self_attn.in_proj_": "self_attention.qkv.",
     "self_attn.out_proj.": "self_attention.out.",
@@ -59,14 +59,14 @@ _FLAME = {
 
 @dataclass
 class Released:
-    """A released network in our terms.
+    """A released network, converted to this framework.
 
     Attributes:
-        config: its `experiments/denoiser` mapping, `_target_` and sizes.
-        features: in_features, out_features and cond_features, which the class takes first.
+        config: its mapping as in `experiments/denoiser`: `_target_` and sizes.
+        features: in_features, out_features and cond_features, the first arguments of the class.
         state: its state dict.
-        action_embedding: (actions, C), MDM's learned embedding of action labels, which belongs to the condition
-            encoder; None in models of text or of neither.
+        action_embedding: (actions, C), MDM's learned embedding of action labels, which is part of the condition
+            encoder; None for models without actions.
     """
 
     config: dict[str, Any]
@@ -76,15 +76,15 @@ class Released:
 
 
 def released_state(checkpoint: Mapping[str, Any], *, ema: bool = True) -> dict[str, Tensor]:
-    """Finds the network's state dict in what a released file holds.
+    """Finds the network's state dict in the content of a released file.
 
     Args:
         checkpoint: a flat state dict (MDM, MFM), {"model", "model_avg"} (MDM trained with `--use_ema`) or FLAME's
             Lightning checkpoint with "state_dict".
-        ema: take averaged weights where the file has them, as the authors' evaluation does.
+        ema: whether to use averaged weights if the file has them, as in the authors' evaluation.
 
     Raises:
-        ValueError: none of these layouts.
+        ValueError: If the file has none of these layouts.
     """
     if pair := "model_avg" in checkpoint:
         state = checkpoint.get("model_avg" if ema else "model")
@@ -108,23 +108,25 @@ def released_state(checkpoint: Mapping[str, Any], *, ema: bool = True) -> dict[s
 def import_mdm(
     state: Mapping[str, Tensor], args: Mapping[str, Any], *, num_heads: int = 4, time_token: bool = False
 ) -> Released:
-    """Maps a network of MDM or MFM: encoder, decoder, decoder + token or GRU; with text (CLIP or DistilBERT), actions
-    or neither.
+    """Converts a network of MDM or MFM.
+
+    It may be an encoder, a decoder, a decoder + token or a GRU, conditioned on text (CLIP or DistilBERT), on actions or
+    on nothing.
 
     Args:
         state: see `released_state`.
-        args: the args.json beside the checkpoint; entries that are missing have the authors' defaults, so that {} does
-            for MFM. Sizes are read from the weights.
-        num_heads: attention heads, 4 in all released models; neither weights nor args tell.
-        time_token: the decoder's input token is the time alone, as in code since February 2025. The released model with
-            such a token is older.
+        args: the args.json next to the checkpoint. Missing entries have the authors' defaults, so {} is enough for MFM.
+            Sizes are read from the weights.
+        num_heads: number of attention heads, 4 in all released models; it is neither in the weights nor in `args`.
+        time_token: whether the decoder's input token is the time alone, as in the code since February 2025. The
+            released model with an input token is older.
 
     Raises:
-        ValueError: a weight is missing, unknown, or not of the network that `args` describes.
+        ValueError: If a weight is missing, unknown, or does not match the network described by `args`.
     """
     arch, text_encoder = args.get("arch", "trans_enc"), args.get("text_encoder_type", "clip")
     if arch not in ("trans_enc", "trans_dec", "gru"):
-        raise ValueError(f"args.json: arch is trans_enc, trans_dec or gru, not {arch!r}")
+        raise ValueError(f"args.json: arch must be trans_enc, trans_dec or gru, not {arch!r}")
     dropped = ("sequence_pos_encoder.pe", "embed_timestep.sequence_pos_encoder.pe", "clip_model.")
     learned = {key: value for key, value in state.items() if not key.startswith(dropped)}
     action_embedding = learned.pop("embed_action.action_embedding", None)
@@ -161,21 +163,21 @@ def import_mdm(
     if arch == "trans_dec":
         options["token_memory"] = text_encoder == "bert"
         if args.get("emb_trans_dec", False):
-            # DistilBERT came with the code whose token is the time alone.
+            # The code that introduced DistilBERT has a token of the time alone.
             options["input_token"] = "time" if time_token or text_encoder == "bert" else "condition"
     network = {"trans_enc": MDMEncoder, "trans_dec": MDMDecoder, "gru": MDMGRU}[arch]
     return _checked(network, (in_features, out_features, cond_features), options, ours, action_embedding)
 
 
 def import_flame(state: Mapping[str, Tensor], *, num_heads: int = 8) -> Released:
-    """Maps FLAME's network, without its RoBERTa.
+    """Converts FLAME's network, without its RoBERTa.
 
     Args:
         state: see `released_state`.
-        num_heads: attention heads, 8 in the released models; the weights do not tell.
+        num_heads: number of attention heads, 8 in the released models; it cannot be read from the weights.
 
     Raises:
-        ValueError: a weight is missing or unknown.
+        ValueError: If a weight is missing or unknown.
     """
     learned = {key: value for key, value in state.items() if not key.startswith("lm.")}
     num_layers = _count_layers(learned, "tf_decoder")
@@ -206,7 +208,7 @@ def _layer_names(stack: str, layer: Mapping[str, str], num_layers: int) -> dict[
 
 
 def _renamed(state: Mapping[str, Tensor], names: Mapping[str, str]) -> dict[str, Tensor]:
-    """Renames every key by its beginning."""
+    """Renames every key by its prefix."""
     renamed, unknown = {}, []
     for key, value in state.items():
         theirs = next((name for name in names if key.startswith(name)), None)
@@ -215,15 +217,15 @@ def _renamed(state: Mapping[str, Tensor], names: Mapping[str, str]) -> dict[str,
         else:
             renamed[names[theirs] + key.removeprefix(theirs)] = value
     if unknown:
-        raise ValueError(f"released weights: unknown {_listed(unknown)}: not a network of this kind")
+        raise ValueError(f"released weights: unknown keys {_listed(unknown)}: not a network of this kind")
     return renamed
 
 
 def _shape(state: Mapping[str, Tensor], key: str, ndim: int = 2) -> torch.Size:
     if key not in state:
-        raise ValueError(f"released weights: nothing for {key}: not a network of this kind, or a damaged file")
+        raise ValueError(f"released weights: {key} is missing: not a network of this kind, or a damaged file")
     if state[key].ndim != ndim:
-        raise ValueError(f"released weights: {key} has the shape {tuple(state[key].shape)}, not {ndim} dimensions")
+        raise ValueError(f"released weights: {key} has shape {tuple(state[key].shape)}, not {ndim} dimensions")
     return state[key].shape
 
 
@@ -234,13 +236,13 @@ def _checked(
     state: dict[str, Tensor],
     action_embedding: Tensor | None = None,
 ) -> Released:
-    """Compares names and shapes with a network of these options."""
+    """Checks names and shapes against a network with these options."""
     with torch.device("meta"):
         expected = network(*features, **options).state_dict()
     if missing := expected.keys() - state.keys():
-        raise ValueError(f"released weights: nothing for {_listed(missing)}: not a network of this kind")
+        raise ValueError(f"released weights: missing {_listed(missing)}: not a network of this kind")
     if unknown := state.keys() - expected.keys():
-        raise ValueError(f"released weights: no place for {_listed(unknown)}: not a network of this kind")
+        raise ValueError(f"released weights: unexpected {_listed(unknown)}: not a network of this kind")
     for key, value in expected.items():
         if state[key].shape != value.shape:
             raise ValueError(f"released weights: {key} is {tuple(state[key].shape)}, expected {tuple(value.shape)}")
@@ -263,7 +265,7 @@ DATASETS = {
     "humanact12": ("humanact12", "rot6d"),
     "uestc": ("uestc", "rot6d"),
 }
-"""Data sets of MDM and MFM by the authors' names: ours, and the representation."""
+"""Authors' name of each data set of MDM and MFM -> our name, and the representation."""
 
 NORMALIZED = ("humanml3d", "kit")
 PADDED_FRAMES = 196
@@ -282,29 +284,29 @@ def import_model(
     num_heads: int | None = None,
     time_token: bool = False,
 ) -> MotionGeneration:
-    """A model that samples as the authors' code does, from what a released file holds.
+    """Builds a model from a released checkpoint, with the sampling of the authors' code.
 
     Args:
-        kind: whose file it is.
+        kind: authors of the file.
         checkpoint: its content, see `released_state`.
         args: MDM's args.json, or MFM's Hydra configuration; {} for FLAME. Missing entries have the authors' defaults.
-        statistics: mean and std (D,) that the features are normalized with: of HumanML3D and KIT-ML.
-        averaged: take averaged weights where the file has them.
-        num_heads: attention heads where they are not the released models'.
+        statistics: mean and std (D,) with which the features are normalized, for HumanML3D and KIT-ML.
+        averaged: whether to use averaged weights if the file has them.
+        num_heads: number of attention heads, if it differs from the released models.
         time_token: see `import_mdm`.
 
     Raises:
-        ValueError: the file is not such a model, `args` names what is not supported, or the statistics do not fit.
+        ValueError: If the file is not such a model, `args` has unsupported options, or the statistics do not match.
     """
     state = released_state(checkpoint, ema=averaged)
     if args.get("dynamic", "flow") != "flow":
-        raise ValueError(f"dynamic={args['dynamic']}: of MFM's models, only the flows can be imported")
+        raise ValueError(f"dynamic={args['dynamic']}: only the flow models of MFM can be imported")
     if kind == "flame":
         released = import_flame(state, num_heads=num_heads or 8)
         config, facts = _flame_recipe(released)
     else:
-        if kind == "mfm" and args.get("text_emebed", "clip") != "clip":  # so spelt in the authors' configuration
-            raise ValueError(f"text_emebed={args['text_emebed']}: only MFM's models with CLIP can be imported")
+        if kind == "mfm" and args.get("text_emebed", "clip") != "clip":  # spelled like this by the authors
+            raise ValueError(f"text_emebed={args['text_emebed']}: only models of MFM with CLIP can be imported")
         heads = num_heads or args.get("num_heads") or 4
         released = import_mdm(state, args, num_heads=heads, time_token=time_token)
         config, facts = _mdm_recipe(kind, released, args)
@@ -312,13 +314,13 @@ def import_model(
     representation = instantiate(config["representation"])
     if representation.features != released.features[0]:
         raise ValueError(
-            f"released weights: {released.features[0]} features, but {representation.name}, the representation of "
+            f"released weights: have {released.features[0]} features, but {representation.name}, the representation of "
             f"data set {facts['dataset']}, has {representation.features}"
         )
     if (statistics is not None) != (facts["dataset"] in NORMALIZED):
         normalized = f"features of {facts['dataset']} are {'' if statistics is None else 'not '}normalized"
         raise ValueError(
-            f"{normalized}: {'give' if statistics is None else 'leave out'} the folder of Mean.npy, Std.npy"
+            f"{normalized}. {'Give' if statistics is None else 'Leave out'} stats=FOLDER with Mean.npy and Std.npy"
         )
     model = MotionGeneration.build(config, representation, actions=facts["actions"])
     model.facts = facts
@@ -329,7 +331,7 @@ def import_model(
     if kind == "flame":
         for name in ("weight", "bias"):
             if POOLER + name not in state:
-                raise ValueError(f"released weights: nothing for {POOLER}{name}, RoBERTa's pooler, which FLAME reads")
+                raise ValueError(f"released weights: {POOLER}{name} is missing: FLAME uses RoBERTa's pooler")
             extra[f"condition.pooler_{name}"] = state[POOLER + name]
     if statistics is not None:
         extra["representation.mean"], extra["representation.std"] = _checked_statistics(*statistics, released)
@@ -342,7 +344,7 @@ def _checked_statistics(mean: Tensor, std: Tensor, released: Released) -> tuple[
         if value.shape != (released.features[0],) or not value.isfinite().all():
             raise ValueError(f"{name}: shape {tuple(value.shape)}, expected ({released.features[0]},) finite numbers")
     if (std <= 0).any():
-        raise ValueError(f"Std.npy: {int((std <= 0).sum())} entries are not above 0")
+        raise ValueError(f"Std.npy: {int((std <= 0).sum())} entries are not positive")
     return mean.float(), std.float()
 
 
@@ -361,7 +363,7 @@ def _recipe(name: str, released: Released, representation: str, condition: Confi
 
 
 def option(group: str, name: str) -> Config:
-    """The mapping in a file of `experiments/`, interpolations as they stand."""
+    """Reads a mapping from `experiments/`, without resolving interpolations."""
     return read_yaml(EXPERIMENTS / group / f"{name}.yaml")
 
 
@@ -370,7 +372,7 @@ def _flame_recipe(released: Released) -> tuple[Config, dict[str, Any]]:
     config = _recipe("released/flame", released, "smpl", condition, option("process", "flame_code"))
     config["task"] |= {"cond_drop_prob": 0.25, "guidance_scale": 8.0}
     config["optimizer"] |= {"weight_decay": 0.0}
-    # The authors' table has one row more than there are lengths.
+    # The authors' table has one row more than the number of lengths.
     longest = released.config["max_frames"] - 1
     return config, {"actions": [], "dataset": "humanml3d-smpl", "fingerprint": None, "max_frames": longest}
 
@@ -378,7 +380,7 @@ def _flame_recipe(released: Released) -> tuple[Config, dict[str, Any]]:
 def _mdm_recipe(kind: Kind, released: Released, args: Mapping[str, Any]) -> tuple[Config, dict[str, Any]]:
     theirs = args.get("dataset", "humanml")
     if theirs not in DATASETS:
-        raise ValueError(f"dataset={theirs} of the released model: known are {', '.join(DATASETS)}")
+        raise ValueError(f"dataset={theirs} of the released model is not supported, only {', '.join(DATASETS)}")
     dataset, representation = DATASETS[theirs]
     actions: list[str] = []
     condition: Config = option("condition", "none")
@@ -390,7 +392,9 @@ def _mdm_recipe(kind: Kind, released: Released, args: Mapping[str, Any]) -> tupl
     elif released.features[2]:
         encoder = args.get("text_encoder_type", "clip")
         if encoder not in ENCODERS:
-            raise ValueError(f"text_encoder_type={encoder} of the released model: known are {', '.join(ENCODERS)}")
+            raise ValueError(
+                f"text_encoder_type={encoder} of the released model is not supported, only {', '.join(ENCODERS)}"
+            )
         condition = option("condition", ENCODERS[encoder]) | {"features": released.features[2]}
     drop = float(args.get("cond_mask_prob", 0.1))
     process = option("process", "flow_matching" if kind == "mfm" else "diffusion")
@@ -399,7 +403,7 @@ def _mdm_recipe(kind: Kind, released: Released, args: Mapping[str, Any]) -> tupl
     if kind == "mfm":
         solver = args.get("ode_kwargs") or {}
         method = solver.get("method", "euler")
-        # Methods beside dopri5 are Euler's; the plain one takes torchdiffeq's float32 times, the others i / N.
+        # All methods other than dopri5 are Euler; "euler" uses torchdiffeq's float32 times, the others i / N.
         process["odeint_grid"] = method == "euler"
         config["task"]["sampler"] = "dopri5" if method == "dopri5" else "euler"
         config["task"]["num_inference_steps"] = int(1 / float(solver.get("step_size", 0.01)))
@@ -429,27 +433,27 @@ def import_released(
     time_token: bool = False,
     run_code: bool = False,
 ) -> Path:
-    """Writes a released checkpoint of MDM, MFM, FLAME or FLAME's motion-CLIP as a model file; returns the file.
+    """Converts a released checkpoint of MDM, MFM, FLAME or FLAME's motion-CLIP into a model file, and returns its path.
 
     Args:
         kind: "mdm", "mfm", "flame" or "mclip".
         file: the released file.
-        args: args.json beside it (MDM), or the Hydra configuration of its run (MFM); not for FLAME's.
-        out: as in `export`.
-        stats: folder with Mean.npy and Std.npy of the data that the model was trained on, where it is normalized.
-        averaged, num_heads, time_token: see `flame_mdm.checkpoints.released.import_model`.
-        run_code: read pickles that hold more than weights, which runs whatever code is in them.
+        args: args.json next to it (MDM), or the Hydra configuration of its run (MFM); not for FLAME.
+        out: as for `export`.
+        stats: folder with Mean.npy and Std.npy of the training data, if it is normalized.
+        averaged, num_heads, time_token: see `import_model`.
+        run_code: whether to load pickles that hold more than weights, which runs any code in them.
 
     Raises:
-        FileNotFoundError: a file is absent.
-        UserError, ValueError: it is damaged, or not a released model of this kind.
+        FileNotFoundError: If a file does not exist.
+        UserError, ValueError: If it is damaged, or not a released model of this kind.
     """
     file, out = Path(file), Path(out)
     if (args is None) != (kind in ("flame", "mclip")):
-        needs = {"mdm": "the args.json beside the checkpoint", "mfm": "the run's .hydra/config.yaml"}
+        needs = {"mdm": "the args.json next to the checkpoint", "mfm": "the run's .hydra/config.yaml"}
         raise UserError(f"{kind} needs {needs[kind]}" if kind in needs else f"{kind} takes no file of options")
     if num_heads is not None and not (type(num_heads) is int and num_heads >= 1):
-        raise UserError(f"num_heads={num_heads}: give a whole number above 0")
+        raise UserError(f"num_heads={num_heads}: must be a positive whole number")
     checkpoint = _unpickle(file, run_code)
     try:
         check_weights(released_state(checkpoint, ema=averaged and kind != "mclip"), file)
@@ -469,9 +473,9 @@ def import_released(
         raise
     except ValueError as error:
         raise UserError(f"{file}: {error}") from error
-    except Exception as error:  # weights and options of nonsense fail anywhere
+    except Exception as error:  # nonsensical weights and options may fail anywhere
         what = f"{type(error).__name__}: {first_line(error)}"
-        raise UserError(f"{file}: no model can be built of it and its options: {what}") from error
+        raise UserError(f"{file}: cannot build a model from it and its options: {what}") from error
     out = out if out.suffix == ".safetensors" else out / FILE
     origin = {"made": f"released by the authors of {kind.upper()}", "file": file.name, "sha256": sha256(file)}
     write_model_file(
@@ -481,7 +485,7 @@ def import_released(
 
 
 def _motion_clip(checkpoint: Mapping[str, Any], num_heads: int | None) -> Any:
-    """FLAME's motion-CLIP, by the class that its recipe names."""
+    """Imports FLAME's motion-CLIP, with the class named by its recipe."""
     from hydra.utils import get_class
 
     from flame_mdm.config import compose
@@ -498,14 +502,14 @@ def _unpickle(path: Path, run_code: bool) -> Any:
     except (FileNotFoundError, UserError):
         raise
     except ImportError as error:
-        raise UserError(f"{path}: {error}; the objects in this file need it: install it") from error
+        raise UserError(f"{path}: {error}. The objects in this file need this package: install it") from error
     except Exception as error:  # torch raises many kinds for damaged files
         unsafe = re.search(r"Unsupported global: GLOBAL (\S+)", str(error))
         if unsafe is None:
             raise UserError(f"{path}: damaged, or not a PyTorch file") from error
         raise UserError(
-            f"{path}: holds Python objects ({unsafe[1]}) beside the weights, as old Lightning files do; reading them "
-            "runs whatever code they name: add run_code=true if you trust those who made the file"
+            f"{path}: holds Python objects ({unsafe[1]}) besides the weights, as old Lightning files do. Reading them "
+            "can run any code. Add run_code=true if you trust the authors of the file"
         ) from error
     if not isinstance(checkpoint, Mapping):
         raise UserError(f"{path}: holds a {type(checkpoint).__name__}, not the weights of a released model")
@@ -518,7 +522,7 @@ class _Solver(TypedDict, total=False):
 
 
 class _Options(TypedDict, total=False):
-    """Options that are read, as far as not any value will do."""
+    """Types and limits of the options that are read."""
 
     arch: str
     dataset: str
@@ -539,8 +543,8 @@ class _Options(TypedDict, total=False):
 def _options(path: Path) -> Mapping[str, Any]:
     options = read_yaml(path)  # JSON is YAML
     if not isinstance(options, dict):
-        raise UserError(f"{path}: holds no options by name")
-    # In a composed configuration of MFM, those of the network and of the training stand one level down.
+        raise UserError(f"{path}: not a mapping of options")
+    # In a composed configuration of MFM, options of network and training are one level down.
     groups = [value for name, value in options.items() if name in ("model", "training") and isinstance(value, dict)]
     found = {name: value for part in (*groups, options) for name, value in part.items() if isinstance(name, str)}
     try:

@@ -249,9 +249,9 @@ def test_options_come_from_args_and_weights() -> None:
 
 def test_every_weight_is_used_or_the_import_fails() -> None:
     state = small_state()
-    with pytest.raises(ValueError, match=r"unknown embed_style\.weight"):
+    with pytest.raises(ValueError, match=r"unknown keys embed_style\.weight"):
         import_mdm(state | {"embed_style.weight": torch.ones(1)}, {})
-    with pytest.raises(ValueError, match=r"unknown seqTransEncoder\.layers\.0\.linear1\.bias.* and 7 more"):
+    with pytest.raises(ValueError, match=r"unknown keys seqTransEncoder\.layers\.0\.linear1\.bias.* and 7 more"):
         import_mdm(state, {"arch": "trans_dec"})
     with pytest.raises(ValueError, match="arch must be trans_enc, trans_dec or gru, not 'mamba'"):
         import_mdm(state, {"arch": "mamba"})
@@ -481,7 +481,7 @@ def test_damaged_and_foreign_files_are_one_line(trained, tmp_path):
         assert "\n" not in str(caught.value)
         assert str(file) in str(caught.value)
     save_file({"w": torch.zeros(1)}, file)
-    with pytest.raises(UserError, match="weights without a recipe. Import released weights of MDM"):
+    with pytest.raises(UserError, match=r"weights without a recipe\. Import released weights of MDM"):
         load(file)
 
 

@@ -354,12 +354,12 @@ def test_models_that_attend_to_the_padding_are_sampled_at_their_length(tmp_path)
 @pytest.mark.parametrize(
     ("kind", "change", "words", "message"),
     [
-        ("mdm", {}, ["stats=."], "model.pt: features of uestc are not normalized: leave out the folder"),
+        ("mdm", {}, ["stats=."], "model.pt: features of uestc are not normalized. Leave out stats=FOLDER"),
         ("mdm", {"dataset": "humanml"}, [], "150 features, but humanml-legacy-smpl22"),
-        ("mdm", {"dataset": "amass"}, [], "dataset=amass of the released model: known are humanml, kit, humanact12"),
-        ("mdm", {"arch": "trans_dec"}, [], "unknown seqTransEncoder"),
-        ("mfm", {"dynamic": "diffusion"}, [], "dynamic=diffusion: of MFM's models, only the flows"),
-        ("mfm", {"text_emebed": "t5-large"}, [], "only MFM's models with CLIP"),
+        ("mdm", {"dataset": "amass"}, [], "dataset=amass of the released model is not supported, only humanml, kit"),
+        ("mdm", {"arch": "trans_dec"}, [], "unknown keys seqTransEncoder"),
+        ("mfm", {"dynamic": "diffusion"}, [], "dynamic=diffusion: only the flow models of MFM"),
+        ("mfm", {"text_emebed": "t5-large"}, [], "only models of MFM with CLIP"),
         ("flame", {}, [], "flame takes no file of options"),
     ],
 )
@@ -471,7 +471,7 @@ def test_damaged_and_foreign_files_are_one_line(trained, tmp_path):
     for content, message in (
         (whole[:-10], "damaged, or not a .safetensors file"),
         (b"", "damaged, or not a .safetensors file"),
-        (bytes(flipped), "its weights are not those that were written"),
+        (bytes(flipped), "its weights have changed since it was written"),
         (whole.replace(b'\\"format\\": 1', b'\\"format\\": 2'), "of format 2, but this version reads 1"),
         (whole.replace(b'\\"origin\\"', b'\\"oregon\\"'), "its recipe cannot be read"),
     ):
@@ -531,7 +531,7 @@ def test_push_writes_a_card_and_uploads_these_files_alone(trained, tmp_path, cap
     capsys.readouterr()
     monkeypatch.setattr(Hub, "create_repo", lambda *_, **__: (_ for _ in ()).throw(RuntimeError("no token\nlog in")))
     assert main([*words]) == 1
-    assert capsys.readouterr().err == f"error: me/walker: {folder} is written but not uploaded: no token\n"
+    assert capsys.readouterr().err == f"error: me/walker: upload failed: no token. The files are in {folder}\n"
     assert main(["push", str(trained), "walker"]) == 1
     assert "not a repository name. Write user/name" in capsys.readouterr().err
 

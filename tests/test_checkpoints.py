@@ -472,7 +472,7 @@ def test_damaged_and_foreign_files_are_one_line(trained, tmp_path):
         (whole[:-10], "damaged, or not a .safetensors file"),
         (b"", "damaged, or not a .safetensors file"),
         (bytes(flipped), "its weights have changed since it was written"),
-        (whole.replace(b'\\"format\\": 1', b'\\"format\\": 2'), "of format 2, but this version reads 1"),
+        (whole.replace(b'\\"format\\": 1', b'\\"format\\": 2'), "has format 2, but this version reads 1"),
         (whole.replace(b'\\"origin\\"', b'\\"oregon\\"'), "its recipe cannot be read"),
     ):
         file.write_bytes(content)

@@ -363,7 +363,7 @@ def test_recipes_stand_in_rows_where_there_are_more_of_them(tmp_path):
     assert list(part.columns) == ["Parameters, M", "Parameters, M, reported"]
     lines = {line.label: [cell and cell.text for cell in line.cells] for line in part.lines}
     assert lines["U-net"] == ["23.57", "23.47"]
-    assert "Action-to-motion has 512 more a class." in [text for _, text in part.notes]
+    assert "Action-to-motion has 512 more parameters per class." in [text for _, text in part.notes]
 
 
 def test_settings_that_no_paper_reports_stand_alone(tmp_path, monkeypatch):

@@ -203,7 +203,7 @@ class Report(Callback):
 
 
 class Progress(Callback):
-    """Progress bar over the steps of a run, with remaining time and losses. In a log file, a plain line every 30 seconds."""
+    """Progress bar over the steps of a run, with remaining time and losses; plain lines every 30 s in a log file."""
 
     SECONDS = 30.0
 

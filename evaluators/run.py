@@ -283,7 +283,7 @@ def load_protocol(name: str, representation: Representation) -> Protocol:
 def default_protocol(model: MotionGeneration | None) -> str:
     """Returns the name of the default protocol for a model."""
     assert model is not None
-    condition = _condition(model)
+    condition = model.conditioned_on
     if condition == "none":
         return "unconditioned"
     if condition == "action":
@@ -292,23 +292,16 @@ def default_protocol(model: MotionGeneration | None) -> str:
     return "synthetic" if model.facts.get("dataset") == "synthetic" else "text_to_motion"
 
 
-def _condition(model: MotionGeneration) -> str:
-    """Returns the condition of a model: "text", "action" or "none"."""
-    if not model.condition.features:
-        return "none"
-    return "action" if model.config["condition"]["_target_"].endswith("ActionLabels") else "text"
-
-
 def check_condition(protocol: Protocol, model: MotionGeneration) -> None:
     """Checks that the model was trained with the condition of the protocol.
 
     Raises:
         UserError: If it was trained with another condition.
     """
-    if protocol.condition not in ("none", _condition(model)):
+    if protocol.condition not in ("none", model.conditioned_on):
         raise UserError(
             f"protocol {protocol.name} generates motions from {protocol.condition}, but the checkpoint was trained "
-            f"with condition {_condition(model)}. Choose another protocol, such as {default_protocol(model)}"
+            f"with condition {model.conditioned_on}. Choose another protocol, such as {default_protocol(model)}"
         )
 
 

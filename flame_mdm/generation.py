@@ -24,6 +24,11 @@ MAX_SAMPLES = 10_000
 """Maximum number of samples per request; they are kept in memory until all are complete."""
 STAGES = 10
 """Clean estimates shown of one sampling run: one per tenth of it, as in figure 5 of MFM."""
+TRAINED_ON = {
+    "text": ("was trained on captions", 'text="a person walks"'),
+    "action": ("was trained on action labels", "action=NAME"),
+    "none": ("was trained without texts and labels", "unconditioned=true"),
+}
 MAX_TEXT_LENGTH = 2000
 """Maximum number of characters of a text; captions of the data sets are far shorter."""
 
@@ -70,6 +75,10 @@ def generate(
     if scale is not None and not math.isfinite(scale):
         raise UserError(f"guidance_scale={scale} is not a finite number")
     texts = [texts] if isinstance(texts, str) else texts
+    kind = "text" if texts is not None else "action" if actions is not None else "none"
+    if kind not in ("none", model.conditioned_on):
+        trained, instead = TRAINED_ON[model.conditioned_on]
+        raise UserError(f"{kind}={shortened((texts or actions or [''])[0], 60)}: this model {trained}. Give {instead}")
     requested = list(texts or actions or [""])
     if texts is not None and not all(text.strip() for text in texts):
         raise UserError("empty text. Omit the text to sample without condition")
@@ -159,7 +168,11 @@ def _lengths(
     if len(each) != requested:
         raise UserError(f"{len(each)} lengths for {requested} motions")
     for length in each:
-        if not 2 <= length <= longest:
+        if length < 2:
+            raise UserError(
+                f"{length / fps:g} seconds ({length} frames) are too short: give at least {2 / fps:g} seconds"
+            )
+        if length > longest:
             raise UserError(
                 f"{length / fps:g} seconds ({length} frames) cannot be sampled: the model was trained on motions of up "
                 f"to {longest / fps:g} seconds ({longest} frames at {fps:g} fps)"

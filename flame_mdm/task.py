@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Self, Unpack
+from typing import Any, Literal, Self, Unpack
 
 import torch
 from lightning import LightningModule
@@ -14,6 +14,7 @@ from torch import Tensor
 from torchmetrics import MeanMetric
 
 from flame_mdm.conditions import ConditionEncoder
+from flame_mdm.conditions.vocabulary import vocabulary
 from flame_mdm.config import Config, instantiate, parameters
 from flame_mdm.data.datamodule import MotionDataModule
 from flame_mdm.denoisers import Denoiser
@@ -171,6 +172,19 @@ class MotionGeneration(Task):
 
     def describe(self) -> str:
         return type(self.denoiser).__name__
+
+    @property
+    def conditioned_on(self) -> Literal["none", "text", "action"]:
+        """The condition that the model was trained with."""
+        return self.condition.reads if self.condition.features else "none"
+
+    def setup(self, stage: str) -> None:
+        """Also stores the vocabulary of the training captions."""
+        super().setup(stage)
+        data: MotionDataModule = self.trainer.datamodule  # type: ignore[attr-defined]
+        if self.conditioned_on == "text":
+            captions = (caption for clip in data.train.clips for caption in clip.captions)
+            self.facts |= vocabulary(captions, share=data.source.captions_may_be_shared)
 
     # Training ---------------------------------------------------------------------------------------------------------
 

@@ -89,6 +89,8 @@ class _Facts(TypedDict):
     dataset: NotRequired[str]  # unknown for released extractors
     fingerprint: NotRequired[str | None]
     training: NotRequired[dict[str, Number]]
+    words: NotRequired[list[str]]
+    captions: NotRequired[list[str]]
 
 
 class _Model(TypedDict):

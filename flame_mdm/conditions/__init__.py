@@ -3,6 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Literal
 
 import torch
 from torch import nn
@@ -15,6 +16,10 @@ class ConditionEncoder(nn.Module, ABC):
 
     features: int
     """C, the width of the condition; 0 = unconditioned."""
+    reads: Literal["text", "action"] = "text"
+    """What it encodes."""
+    max_words: int | None = None
+    """Maximum number of words per caption, where the encoder counts words."""
 
     @abstractmethod
     def forward(self, batch: MotionBatch) -> Condition:

@@ -13,6 +13,8 @@ class ActionLabels(ConditionEncoder):
     As in Tevet et al. 2023 (MDM), section 3. The only token repeats the pooled vector, for denoisers that read tokens.
     """
 
+    reads = "action"
+
     def __init__(self, features: int, num_actions: int):
         """`features` (C) is the width of the vectors; `num_actions` is the number of labels in the data set."""
         super().__init__()

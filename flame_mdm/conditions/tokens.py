@@ -1,18 +1,15 @@
 """Small text encoder that is trained with the model and needs no download."""
 
-import re
 import zlib
 
 import torch
 from torch import Tensor, nn
 
-from flame_mdm.conditions import ConditionEncoder
+from flame_mdm.conditions import ConditionEncoder, vocabulary
 from flame_mdm.motion import Condition, MotionBatch
 
 START = "<start>"
 """Inserted before every caption, so that the empty caption also has a token; no caption contains this word."""
-
-WORD = re.compile(r"[^\W_]+")
 
 
 class LearnedTokens(ConditionEncoder):
@@ -51,7 +48,7 @@ class LearnedTokens(ConditionEncoder):
 
     def rows(self, caption: str) -> list[tuple[int, int]]:
         """Returns the two rows of the table for the start token and each word of a caption."""
-        words = [START, *WORD.findall(caption.lower())[: self.max_words]]
+        words = [START, *vocabulary.words(caption)[: self.max_words]]
         # Not two hashes of the word with different prefixes: CRC is linear, so both would collide together.
         hashes = [zlib.crc32(word.encode()) for word in words]
         return [(h % self.buckets, h // self.buckets % self.buckets) for h in hashes]

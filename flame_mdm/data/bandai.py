@@ -109,6 +109,7 @@ class Bandai(MotionSource):
     """
 
     name = "bandai"
+    captions_may_be_shared = True
     actions = tuple(dict.fromkeys([*CONTENTS_1, *TAKES_2]))
 
     def __init__(

@@ -525,6 +525,7 @@ class Synthetic(MotionSource):
     """
 
     name = "synthetic"
+    captions_may_be_shared = True
     actions = tuple(MOTIONS)
 
     def __init__(self, clips: int = 5000, seed: int = 0, min_seconds: float = 2.0, max_seconds: float = 3.0):

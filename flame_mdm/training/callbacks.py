@@ -329,13 +329,13 @@ class SampleMotions(Callback):
         texts = self.texts[rank::world]
         if not texts and (self.texts or rank):
             return []
-        labels = bool(texts) and texts[0] in model.facts["actions"]
+        condition = model.conditioned_on if texts else "none"
         return generate(
             model,
-            None if labels or not texts else texts,
-            actions=texts if labels else None,
+            texts if condition == "text" else None,
+            actions=texts if condition == "action" else None,
             frames=min(round(self.seconds * model.representation.fps), model.facts["max_frames"]),
-            samples=1 if texts else self.unconditioned,
+            samples=len(texts) if texts and condition == "none" else 1 if texts else self.unconditioned,
             seed=0,
         )
 

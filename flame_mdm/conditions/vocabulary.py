@@ -1,0 +1,64 @@
+"""Vocabulary of the training captions: words that a model has never seen, and captions near a text."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+WORD = re.compile(r"[^\W_]+")
+MAX_CAPTIONS = 1000
+"""Maximum number of training captions that a checkpoint keeps."""
+
+
+def words(text: str) -> list[str]:
+    """Returns the words of a text, lowercased, without punctuation."""
+    return WORD.findall(text.lower())
+
+
+def vocabulary(captions: Iterable[str], *, share: bool) -> dict[str, list[str]]:
+    """Returns what a checkpoint keeps of the training captions.
+
+    Args:
+        captions: of all training clips.
+        share: whether the license of the data allows to redistribute captions.
+
+    Returns:
+        "words": all words, sorted; with `share` also "captions": up to `MAX_CAPTIONS` of them, evenly spaced.
+    """
+    distinct = sorted(set(captions))
+    kept = {"words": sorted({word for caption in distinct for word in words(caption)})}
+    if share:
+        count = min(len(distinct), MAX_CAPTIONS)
+        kept["captions"] = [distinct[number * len(distinct) // count] for number in range(count)]
+    return kept
+
+
+def advice(text: str, facts: Mapping[str, Any], max_words: int | None = None) -> list[str]:
+    """Returns lines about words that a model has never seen in training or does not read.
+
+    Args:
+        text: the prompt.
+        facts: of the checkpoint; older checkpoints have no vocabulary, and nothing is said about them.
+        max_words: maximum number of words that the text encoder reads; None = no such limit.
+    """
+    lines, asked = [], words(text)
+    known = set(facts.get("words", asked))
+    if unseen := [word for word in dict.fromkeys(asked) if word not in known]:
+        line = f"never seen in training: {', '.join(unseen)}. The model guesses from the other words"
+        near = ", ".join(f"'{caption}'" for caption in nearest(text, facts.get("captions", ())))
+        lines.append(line + f"; the nearest training captions are {near}" * bool(near))
+    if max_words is not None and len(asked) > max_words:
+        lines.append(f"only the first {max_words} words are read, not '{' '.join(asked[max_words:])}'")
+    return lines
+
+
+def nearest(text: str, captions: Sequence[str], count: int = 3) -> list[str]:
+    """Returns the captions that share the largest part of their words with a text, best first."""
+    asked = set(words(text))
+
+    def similarity(caption: str) -> float:
+        others = set(words(caption))
+        return len(asked & others) / (len(asked | others) or 1)
+
+    return sorted(captions, key=similarity, reverse=True)[:count]

@@ -192,8 +192,8 @@ def write_motions(
 ) -> None:
     """Writes `motion_000.npz` ..., `motions.gif`, `motions.png` and `player.html` into a folder, all or none.
 
-    `facts`, such as seed and checkpoint hash, are added to each `.npz`; `stages` of a sampling run are drawn in
-    `trajectory.png`.
+    Motions with higher numbers, which an earlier request may have left in the folder, are removed. `facts`, such as
+    seed and checkpoint hash, are added to each `.npz`; `stages` of a sampling run are drawn in `trajectory.png`.
     """
     scene = [replace(motion, text=motion.text or "unconditioned") for motion in motions]
     with atomic_folder(folder) as made:
@@ -205,3 +205,6 @@ def write_motions(
             contact_sheet(made / "trajectory.png", stages)
         title = motions[0].text if len({motion.text for motion in motions}) == 1 else ""
         write_player(made / "player.html", scene, title or "Motions")
+    for stale in folder.glob("motion_[0-9]*.npz"):
+        if int(stale.stem.partition("_")[2]) >= len(motions):
+            stale.unlink()

@@ -33,6 +33,8 @@ class Task(LightningModule):
     config: Config
     """The recipe, saved in checkpoints."""
     facts: dict[str, Any]
+    steps: int | None = None
+    """Training steps of the checkpoint that was loaded; None if they are not known."""
     """Facts about the training data for sampling and evaluation: actions, maximum length, fingerprint."""
 
     def __init__(self, condition: ConditionEncoder, representation: Representation, *, optimizer: Config, seed: int):

@@ -480,7 +480,7 @@ def test_the_command_writes_the_original_beside_the_edits(checkpoint, store, tmp
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        ([], "give exactly one of text=..., action=... and unconditioned=true, not none"),
+        ([], "say what to sample: text=..."),
         (["text=jump", "unconditioned=true"], "not text and unconditioned"),
         (["unconditioned=true", "motion=null"], "no motion to edit"),
         (["unconditioned=true", "cut=3"], r"cut=3: write [begin, end]"),

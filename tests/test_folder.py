@@ -537,5 +537,5 @@ def test_the_tutorial_works_as_it_is_written(
     output = capsys.readouterr().out
     assert "40 clips can be prepared" in output
     assert "mine as humanml-clean-smpl22 at 20 fps" in output
-    assert list(tmp_path.glob("samples/mine/*/*.html"))
+    assert list(tmp_path.glob("samples/mine/*/*/*.html"))
     assert set(read_skeleton(tmp_path / "mine" / "skeleton.yaml")["map"]) == set(SMPL22.joints)

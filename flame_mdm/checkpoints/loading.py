@@ -120,6 +120,7 @@ def _build(path: str | Path, checkpoint: dict[str, Any], kind: type[Trained]) ->
         representation = instantiate(config["representation"])
         task = built.build(config, representation, actions=facts["actions"])
     task.facts = facts
+    task.steps = checkpoint.get("global_step", (checkpoint.get("origin") or {}).get("steps"))
     try:
         task.load_state_dict(checkpoint["state_dict"], strict=True)
     except RuntimeError as error:

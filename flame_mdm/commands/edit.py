@@ -7,7 +7,7 @@ from functools import partial
 from pathlib import Path
 
 from flame_mdm.commands import OPTIONS, SAMPLING
-from flame_mdm.commands.sample import check_request, default_folder
+from flame_mdm.commands.sample import check_condition, check_request, default_folder
 from flame_mdm.config import Config, run
 from flame_mdm.errors import UserError, say
 
@@ -40,6 +40,7 @@ def write_edits(config: Config) -> None:
 
     file = find(config["ckpt"], config["which"])
     model = load(file, config["device"] or ("cuda" if torch.cuda.is_available() else "cpu"))
+    check_condition(config, model)
     original = read_motion(
         model.representation,
         str(config["motion"]),
@@ -59,10 +60,10 @@ def write_edits(config: Config) -> None:
     requested = {key: config[key] for key in keys if key not in ("resample", "samples", "seed")}
     requested["cut"] = config["cut"]
     requested["resample"] = config["resample"] if config["resample"] != 1 else None
-    what = f"edit {Path(original.id).stem} {edits[0].text}"
-    folder = Path(config["out"] or default_folder(model, what, config["seed"], requested))
+    digest, what = sha256(file), f"edit {Path(original.id).stem} {edits[0].text}"
+    folder = Path(config["out"] or default_folder(model, digest, what, config["seed"], requested))
     shown = replace(original, text=f"original: {original.text or original.id}")
-    facts = {"seed": config["seed"], "checkpoint": sha256(file), "keep": edits[0].keep}
+    facts = {"seed": config["seed"], "checkpoint": digest, "keep": edits[0].keep}
     write_motions(folder, [shown, *edits], facts, stages)
     say(f"{len(edits)} motions of {len(original.joints)} frames: {folder / 'player.html'}, {folder / 'motions.gif'}")
     say(

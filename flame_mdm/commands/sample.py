@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import re
 from collections.abc import Mapping
 from functools import partial
@@ -16,7 +17,7 @@ if TYPE_CHECKING:
     from flame_mdm.task import MotionGeneration
 
 USAGE = """
-usage: flame-mdm sample ckpt=FILE text="a person walks in a circle" [seconds=6] [key=value ...]
+usage: flame-mdm sample ckpt=FILE text="a person walks in a circle" [seconds=3] [key=value ...]
        flame-mdm sample ckpt=FILE action=walk
        flame-mdm sample ckpt=FILE unconditioned=true
 
@@ -42,6 +43,7 @@ def sample(config: Config) -> None:
     device = config["device"] or ("cuda" if torch.cuda.is_available() else "cpu")
     file = find(config["ckpt"], config["which"])
     model = load(file, device)
+    check_condition(config, model)
     stages = [] if config["trajectory"] else None
     keys = ("seconds", "frames", *OPTIONS)
     motions = generate(
@@ -55,8 +57,9 @@ def sample(config: Config) -> None:
         **{key: config[key] for key in keys},
     )
     requested = {key: config[key] for key in keys} | {"shared_noise": config["shared_noise"] or None}
-    folder = Path(config["out"] or default_folder(model, motions[0].text or "unconditioned", config["seed"], requested))
-    write_motions(folder, motions, {"seed": config["seed"], "checkpoint": sha256(file)}, stages)
+    digest, what = sha256(file), motions[0].text or "unconditioned"
+    folder = Path(config["out"] or default_folder(model, digest, what, config["seed"], requested))
+    write_motions(folder, motions, {"seed": config["seed"], "checkpoint": digest}, stages)
     say(
         f"{len(motions)} motions of {len(motions[0].joints)} frames: {folder / 'player.html'}, {folder / 'motions.gif'}"
     )
@@ -73,21 +76,50 @@ main = partial(
 )
 
 
-def default_folder(model: MotionGeneration, what: str, seed: int, options: Mapping[str, Any]) -> Path:
-    """Returns `samples/<experiment>/<what>-seed<seed>`, followed by all options that are not None.
+def default_folder(model: MotionGeneration, digest: str, what: str, seed: int, options: Mapping[str, Any]) -> Path:
+    """Returns `samples/<experiment>/<run>-step<steps>-<hash>/<what>-seed<seed>`, followed by all options not None.
 
-    Requests for different motions thus go to different folders. The name of the experiment comes from the checkpoint,
-    which may be untrusted; it is cleaned, so the folder is always within `samples`.
+    Requests for different motions, and checkpoints with another `digest` (SHA-256), thus go to different folders. A
+    text that is not readable as a file name is followed by its hash. The names of experiment and run come from the
+    checkpoint, which may be untrusted; they are cleaned, so the folder is always within `samples`.
     """
+    run = model.config.get("run")
+    name = run.get("name") if isinstance(run, dict) else None
+    parts = [_clean(str(name or "model")), f"step{model.steps}" if model.steps is not None else "", digest[:6]]
     experiment = re.findall(r"[\w-][\w.-]*", str(model.config["experiment"]))
-    name = re.sub(r"[^a-z0-9]+", "-", what.lower()).strip("-")[:60]
+    short = _clean(what.lower())[:60]
+    if short != what.lower().replace(" ", "-"):
+        short = f"{short}-{hashlib.sha256(what.encode()).hexdigest()[:6]}".strip("-")
     values = {key: re.sub(r"[^\w.,-]+", "", str(value)) for key, value in options.items() if value is not None}
     suffix = "".join(f"-{key}={value}" for key, value in values.items())[:150]
-    return Path("samples", *experiment, f"{name}-seed{seed}{suffix}")
+    return Path("samples", *experiment, "-".join(filter(None, parts)), f"{short}-seed{seed}{suffix}")
+
+
+def _clean(name: str) -> str:
+    return re.sub(r"[^\w]+", "-", name).strip("-")
+
+
+def check_condition(config: Config, model: MotionGeneration) -> None:
+    """Warns of words that the model has never seen.
+
+    Raises:
+        UserError: If no condition is requested; the message gives examples.
+    """
+    if config["text"] is not None:
+        from flame_mdm.conditions.vocabulary import advice
+
+        for line in advice(str(config["text"]), model.facts, model.condition.max_words):
+            say(f"warning: {line}")
+    elif config["action"] is None and not config["unconditioned"]:
+        choices = {"text": model.facts.get("captions", ()), "action": model.facts["actions"], "none": ()}
+        examples = list(choices[model.conditioned_on])
+        shown = "; ".join(examples[:: max(1, len(examples) // 5)][:5])
+        key = {"none": "unconditioned=true", "text": "text=...", "action": "action=..."}[model.conditioned_on]
+        raise UserError(f"say what to sample: {key}" + f", for example {shown}" * bool(shown))
 
 
 def check_request(config: Config) -> None:
-    """Checks that a checkpoint and exactly one condition are requested.
+    """Checks that a checkpoint and at most one condition are requested.
 
     Raises:
         UserError: If not.
@@ -98,7 +130,5 @@ def check_request(config: Config) -> None:
         raise UserError("no checkpoint given. Add ckpt=runs/.../checkpoints/last.ckpt")
     if config["text"] is not None and not str(config["text"]).strip():
         raise UserError("the text is empty. Describe what the person does, or use unconditioned=true")
-    if len(conditions) != 1:
-        raise UserError(
-            f"give exactly one of text=..., action=... and unconditioned=true, not {' and '.join(conditions) or 'none'}"
-        )
+    if len(conditions) > 1:
+        raise UserError(f"give only one of text=..., action=... and unconditioned=true, not {' and '.join(conditions)}")

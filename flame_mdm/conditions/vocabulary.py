@@ -47,18 +47,18 @@ def advice(text: str, facts: Mapping[str, Any], max_words: int | None = None) ->
     if unseen := [word for word in dict.fromkeys(asked) if word not in known]:
         line = f"never seen in training: {', '.join(unseen)}. The model guesses from the other words"
         near = ", ".join(f"'{caption}'" for caption in nearest(text, facts.get("captions", ())))
-        lines.append(line + f"; the nearest training captions are {near}" * bool(near))
+        lines.append(line + f". The nearest training captions: {near}" * bool(near))
     if max_words is not None and len(asked) > max_words:
         lines.append(f"only the first {max_words} words are read, not '{' '.join(asked[max_words:])}'")
     return lines
 
 
 def nearest(text: str, captions: Sequence[str], count: int = 3) -> list[str]:
-    """Returns the captions that share the largest part of their words with a text, best first."""
+    """Returns the captions that share the largest part of their words with a text, best first; none if none does."""
     asked = set(words(text))
 
     def similarity(caption: str) -> float:
         others = set(words(caption))
         return len(asked & others) / (len(asked | others) or 1)
 
-    return sorted(captions, key=similarity, reverse=True)[:count]
+    return sorted((c for c in captions if similarity(c)), key=similarity, reverse=True)[:count]

@@ -60,7 +60,7 @@ class MotionSource(ABC):
     """Arguments that define the data (all but `PLACES`), as JSON values. They are saved in the store."""
     actions: tuple[str, ...] = ()
     """Names of the action labels, in the order of their numbers; empty for sets without labels."""
-    captions_may_be_shared: ClassVar[bool] = False
+    captions_may_be_shared: bool = False
     """Whether the license allows checkpoints to contain captions."""
     published_split: bool = False
     """Whether the split is the one used in papers although it tests on clips seen in training or leaves no validation

@@ -1,0 +1,69 @@
+"""Every recipe trains and validates one step at its own widths, with few layers; one per family in two processes."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from distributed import GlooPool
+from fixtures import recipe
+from one_step import built, clips, shortened, two_steps
+
+from flame_mdm.config import recipes
+
+GENERATION = [name for name in recipes() if "process" in recipe(name)]
+
+
+def widths(name: str) -> str:
+    """What decides how a training step is computed."""
+    config = shortened(name)
+    options = [config["task"]["cond_drop_prob"] > 0, config["losses"], config["optimizer"]]
+    return repr([config[part] for part in ("denoiser", "process", "condition", "representation")] + options)
+
+
+DISTINCT = sorted({widths(name): name for name in reversed(GENERATION)}.values())
+FAMILIES = [
+    "humanml3d/flame",
+    "humanml3d/mdm",
+    "humanml3d/mdm_gru",
+    "humanml3d/mdm_unet",
+    "uestc/mdm",
+    "humanml3d/mfm_t5",
+]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", DISTINCT)
+def test_a_recipe_trains_and_validates_a_step(name):
+    task = built(name)
+    batch, optimizer = clips(task), task.configure_optimizers()
+    before = [parameter.detach().clone() for parameter in task.parameters()]
+    loss = task.training_step(batch, 0)
+    loss.backward()
+    assert loss.isfinite()
+    lacking = [key for key, value in task.named_parameters() if value.requires_grad and value.grad is None]
+    assert not lacking, "parameters without a gradient, on which DDP would stop"
+    optimizer.step()
+    moved = [not torch.equal(old, new) for old, new in zip(before, task.parameters(), strict=True)]
+    assert sum(moved) > 0.9 * len(moved)  # zero gradients, as of labels that are not in the batch, move nothing
+    task.eval()
+    with torch.no_grad():
+        task.validation_step(batch, 0)
+    values = {key: float(metric.compute()) for key, metric in task.val_losses.items()}  # type: ignore[operator]
+    assert values
+    assert all(value == value for value in values.values())
+    task.on_validation_epoch_end()
+
+
+@pytest.fixture(scope="module")
+def pool():
+    with GlooPool(2) as pool:
+        yield pool
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", FAMILIES)
+def test_a_family_trains_in_two_processes(pool, name):
+    (ours, total), (theirs, other) = pool.run(two_steps, (name,), (name,))
+    assert all(loss == loss for loss in (*ours, *theirs))
+    assert ours != theirs  # of their own batches
+    assert total == other  # and one set of weights

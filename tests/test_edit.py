@@ -458,7 +458,8 @@ def test_the_command_writes_the_original_beside_the_edits(checkpoint, store, tmp
         "samples=2",
     ]
     words += ["text=it's a (jump), $5", "region=in_between", "joints=[left_arm,head]", "seed=4"]
-    assert main(["edit", *words]) == 0
+    assert main(["edit", *words, "strength=0.8", "trajectory=true"]) == 0
+    assert (out / "trajectory.png").is_file()
     printed = capsys.readouterr().out
     assert "Largest change in the kept part: 0 in normalized features" in printed
     assert "m in world joint positions" in printed

@@ -11,13 +11,15 @@ import pytest
 
 from flame_mdm.__main__ import main
 
+WAITING = 12
+
 
 class Refused:
     """Runs commands on input that they must refuse, and collects the cases where they do not refuse it well.
 
     Attributes:
         every: of the cases, every so many are run; FLAME_MDM_FUZZ=all runs all.
-        seconds: longest time of a command.
+        seconds: most processor time that a command may take; it may wait, or be kept waiting, `WAITING` times as long.
         memory: bytes of address space that a command may add; None = any.
     """
 
@@ -45,8 +47,9 @@ class Refused:
             late = True
             raise TimeoutError
 
-        handler = signal.signal(signal.SIGALRM, alarm)
-        signal.alarm(self.seconds)
+        handlers = {signum: signal.signal(signum, alarm) for signum in (signal.SIGALRM, signal.SIGPROF)}
+        signal.setitimer(signal.ITIMER_PROF, self.seconds)  # of this process: other programs do not count
+        signal.alarm(WAITING * self.seconds)
         limits = resource.getrlimit(resource.RLIMIT_AS)
         if self.memory is not None:
             resource.setrlimit(resource.RLIMIT_AS, (address_space() + self.memory, limits[1]))
@@ -60,9 +63,11 @@ class Refused:
                 f" ({place.tb_frame.f_code.co_filename}:{place.tb_lineno})" if place else ""
             )
         finally:
+            signal.setitimer(signal.ITIMER_PROF, 0)
             signal.alarm(0)
             resource.setrlimit(resource.RLIMIT_AS, limits)
-            signal.signal(signal.SIGALRM, handler)
+            for signum, handler in handlers.items():
+                signal.signal(signum, handler)
         out, err = self.capture.readouterr()
         told = [
             f"no end after {self.seconds} s" if late else "",  # which code that catches every exception hides

@@ -12,6 +12,12 @@ export MAKEFLAGS
 
 .PHONY: $(COMMANDS) help setup test test-fast test-tools lint bench docs
 
+ifneq ($(filter $(COMMANDS),$(firstword $(MAKECMDGOALS))),)
+ifneq ($(words $(MAKECMDGOALS)),1)
+$(error $(MAKECMDGOALS): one command at a time; quote a value with spaces, as in TEXT="a person walks")
+endif
+endif
+
 $(COMMANDS): $(READY)
 	@$(VENV)/bin/python -m flame_mdm $@ --from-make
 

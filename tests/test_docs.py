@@ -150,6 +150,16 @@ def test_the_checks_can_fail():
 def test_make_forwards_every_command():
     make = shutil.which("make")
     assert make is not None
-    words = [make, "-n", "-s", "-o", ".venv/.ready", "-C", str(ROOT), *COMMANDS]
-    done = subprocess.run(words, capture_output=True, text=True, check=True)
-    assert done.stdout.split("\n")[:-1] == [f".venv/bin/python -m flame_mdm {name} --from-make" for name in COMMANDS]
+    words = [make, "-n", "-s", "-o", ".venv/.ready", "-C", str(ROOT)]
+    for name in COMMANDS:
+        done = subprocess.run([*words, name], capture_output=True, text=True, check=True)
+        assert done.stdout == f".venv/bin/python -m flame_mdm {name} --from-make\n"
+
+
+def test_make_refuses_a_text_without_quotes_before_it_samples():
+    make = shutil.which("make")
+    assert make is not None
+    words = [make, "-C", str(ROOT), "sample", "CKPT=x", "TEXT=a", "person", "walks"]
+    done = subprocess.run(words, capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert 'sample person walks: one command at a time; quote a value with spaces, as in TEXT="a' in done.stderr

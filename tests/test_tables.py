@@ -467,7 +467,7 @@ def test_malformed_specs_are_told_in_one_line(tmp_path, capsys, text, message):
 
 def test_an_unknown_table_names_those_there_are(capsys):
     assert main(["tables", "table=mdm_9"]) == 1
-    assert "no table is called 'mdm_9'; there are: " in capsys.readouterr().err
+    assert "no table is called 'mdm_9'. Did you mean mdm_" in capsys.readouterr().err
 
 
 def test_a_damaged_result_is_told(folder, capsys):

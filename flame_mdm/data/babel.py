@@ -174,8 +174,8 @@ class Babel(MotionSource):
             data = read_json(path)
         except FileNotFoundError:
             raise FileNotFoundError(
-                f"{path}: no such file; BABEL v1.0 is published at https://babel.is.tue.mpg.de: unpack it and set "
-                "data.source.path=/path/to/babel_v1.0_release"
+                f"{path}: no such file; BABEL v1.0 is published at https://babel.is.tue.mpg.de: unpack it, then run "
+                "`make prepare` with SOURCE=/path/to/babel_v1.0_release"
             ) from None
         key = "frame_anns" if path.stem.startswith("extra_") else "frame_ann"
         try:

@@ -390,5 +390,5 @@ def _not_found(what: str) -> FileNotFoundError:
     return FileNotFoundError(
         f"{what}; the data sets are published at "
         "https://github.com/BandaiNamcoResearchInc/Bandai-Namco-Research-Motiondataset (CC BY-NC 4.0): clone it, then "
-        "set data.source.path=/path/to/the/clone"
+        "run `make prepare` with SOURCE=/path/to/the/clone"
     )

@@ -143,7 +143,7 @@ def find(path: Path, name: str) -> Path:
             return found
     raise FileNotFoundError(
         f"{path}: no {name}; the data set is published with ACTOR (https://github.com/Mathux/ACTOR, prepare/"
-        "download_datasets.sh): unpack it and set data.source.path=/path/to/the/folder"
+        "download_datasets.sh): unpack it, then run `make prepare` with SOURCE=/path/to/the/folder"
     )
 
 

@@ -19,7 +19,7 @@ from typing import Annotated, Any, Literal
 from pydantic import FailFast, Field, model_validator
 
 from flame_mdm.config import EXPERIMENTS, Config, plain, settings
-from flame_mdm.errors import UserError, say
+from flame_mdm.errors import UserError, did_you_mean, say
 from flame_mdm.files import read_yaml, write_json, write_text
 from flame_mdm.reporting.page import page
 from flame_mdm.reporting.plots import standalone
@@ -192,7 +192,8 @@ def load_spec(name: str) -> Config:
     """
     path = Path(name) if name.endswith((".yaml", ".yml")) else SPECS / f"{name}.yaml"
     if not path.is_file() or path == PUBLISHED:
-        raise UserError(f"no table is called '{name}'; there are: {', '.join(spec_names())}")
+        names = spec_names()
+        raise UserError(f"no table is called '{name}'.{did_you_mean(name, names)} There are: {', '.join(names)}")
     spec = _load(path)
     try:
         check_shape(spec, Spec)

@@ -46,8 +46,9 @@ class Evaluate(Callback):
     ):
         if extractor not in (None, "none") and not Path(extractor).exists():
             raise UserError(
-                f"callbacks.evaluate.extractor={extractor}: no such file, so that no checkpoint can be chosen by it: "
-                f"{made_by(extractor)}. Or choose by the validation loss, as results will say: selection=loss"
+                f"callbacks.evaluate.extractor={extractor}: no such file, but it is needed to choose the best "
+                f"checkpoint: {made_by(extractor)}. Or choose by the validation loss with selection=loss; results "
+                "record the choice"
             )
         self.name, self.path, self.every_n_steps = protocol, extractor, every_n_steps
         self.samples, self.replications, self.batch_size = samples, replications, batch_size

@@ -475,7 +475,7 @@ def test_counts_are_of_clips_that_the_recipe_uses(tmp_path: Path, monkeypatch, c
     assert main(["browse", *words]) == 0
     for output in (prepared, capsys.readouterr().out):
         assert "clips: 4 of 9 (5 shorter than 24 frames) train, 0 val, 0 test" in output
-        assert "no test clips: own data gets some by a `split` column in captions.csv" in output
+        assert "no test clips. For your own data, add a `split` column to captions.csv" in output
     assert "legs 0.8" in prepared
     assert Store(tmp_path / "data" / "mine-humanml-clean-smpl22").info["dataset"] == "mine"
 

@@ -216,7 +216,7 @@ class MotionDataModule(LightningDataModule):
             for split, n in short.items()
         )
         empty = [split for split in short if not used[split]]
-        advice = [f"no {split} clips: own data gets some by a `split` column in captions.csv" for split in empty]
+        advice = [f"no {split} clips. For your own data, add a `split` column to captions.csv" for split in empty]
         return ["clips: " + ", ".join(each), *(() if store.info["published_split"] else advice)]
 
     def captions(self) -> list[str]:

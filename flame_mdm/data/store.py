@@ -239,7 +239,8 @@ def _check_entries(name: str, entries: list[Entry]) -> None:
     if len({entry.id for entry in entries}) != len(entries):
         raise ValueError(f"{name}: two clips have the same id")
     if not any(entry.split == "train" for entry in entries):
-        raise ValueError(f"{name}: no clip is in the training split; own data gets some by a `split` column")
+        advice = "For your own data, add a `split` column to captions.csv"
+        raise ValueError(f"{name}: no clip is in the training split. {advice}")
 
 
 def _header(frames: int, features: int) -> bytes:

@@ -179,7 +179,10 @@ class Protocol:
         entries = sorted(self.selected(clips), key=lambda clip: key("sample", *drawn, seed, replication, clip.id))
         if not entries:
             only = "".join(f" and {name}={value}" for name, value in self.only.items())
-            raise UserError(f"the split has no clip with at least {clips.crop.shortest()} frames{only} to evaluate on")
+            raise UserError(
+                f"the split has no clip with at least {clips.crop.shortest()} frames{only} to evaluate on. Choose "
+                "another with split=...; own data gets some by a `split` column in captions.csv"
+            )
         count = self.samples if purpose == "generated" else self.real_samples
         rows = []
         for number in range(len(entries) if count is None else count):

@@ -7,7 +7,7 @@ from functools import partial
 from pathlib import Path
 
 from flame_mdm.commands import OPTIONS, SAMPLING
-from flame_mdm.commands.sample import check_condition, check_request, default_folder
+from flame_mdm.commands.sample import check_condition, check_request, default_folder, summary
 from flame_mdm.config import Config, run
 from flame_mdm.errors import UserError, say
 
@@ -65,7 +65,7 @@ def write_edits(config: Config) -> None:
     shown = replace(original, text=f"original: {original.text or original.id}")
     facts = {"seed": config["seed"], "checkpoint": digest, "keep": edits[0].keep}
     write_motions(folder, [shown, *edits], facts, stages)
-    say(f"{len(edits)} motions of {len(original.joints)} frames: {folder / 'player.html'}, {folder / 'motions.gif'}")
+    say(summary(folder, edits))
     say(
         f"{edits[0].keep.mean():.0%} of the features are kept. Largest change in the kept part: "
         f"{max(e.feature_error for e in edits):.3g} in normalized features, "

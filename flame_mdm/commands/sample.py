@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,6 +14,7 @@ from flame_mdm.config import Config, run
 from flame_mdm.errors import UserError, say
 
 if TYPE_CHECKING:
+    from flame_mdm.formats.motion import Motion
     from flame_mdm.task import MotionGeneration
 
 USAGE = """
@@ -60,9 +61,7 @@ def sample(config: Config) -> None:
     digest, what = sha256(file), motions[0].text or "unconditioned"
     folder = Path(config["out"] or default_folder(model, digest, what, config["seed"], requested))
     write_motions(folder, motions, {"seed": config["seed"], "checkpoint": digest}, stages)
-    say(
-        f"{len(motions)} motions of {len(motions[0].joints)} frames: {folder / 'player.html'}, {folder / 'motions.gif'}"
-    )
+    say(summary(folder, motions))
 
 
 main = partial(
@@ -74,6 +73,12 @@ main = partial(
     text=("text", "ckpt", "out"),
     kinds={**SAMPLING, "seconds": "float", "shared_noise": "bool", "trajectory": "bool"},
 )
+
+
+def summary(folder: Path, motions: Sequence[Motion]) -> str:
+    """Returns the line that tells what was written to a folder."""
+    count = "1 motion" if len(motions) == 1 else f"{len(motions)} motions"
+    return f"{count} of {len(motions[0].joints)} frames: {folder / 'player.html'}, {folder / 'motions.gif'}"
 
 
 def default_folder(model: MotionGeneration, digest: str, what: str, seed: int, options: Mapping[str, Any]) -> Path:

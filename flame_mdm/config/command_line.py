@@ -10,6 +10,7 @@ import sys
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
+from itertools import groupby
 from pathlib import Path
 from types import FrameType
 from typing import Any, NoReturn
@@ -69,7 +70,11 @@ def run(
     if (not words and name is None) or any(word in ("-h", "--help") for word in words):
         say(*usage.strip().splitlines())
         if name is None:
-            say("", "experiments: " + ", ".join(recipes()))
+            say("", "experiments:")
+            for folder, names in groupby(recipes(), lambda recipe: recipe.rpartition("/")[0]):
+                say(
+                    f"  {folder + '/':13}{', '.join(name.rpartition('/')[2] for name in names)}".replace("  / ", "    ")
+                )
             say("parts: " + ", ".join(f"{group}=..." for group in groups()))
         return 0 if words else 2
     codes = [0]

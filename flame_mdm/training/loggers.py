@@ -59,6 +59,15 @@ class History(Logger):
             file.write(json.dumps({"step": step, **metrics}) + "\n")
 
 
+class TensorBoardRun(TensorBoardLogger):
+    """TensorBoard logger without Lightning's `epoch`, which is always 0: training is one pass over drawn batches."""
+
+    @rank_zero_only
+    def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:
+        """Logs numbers at a step."""
+        super().log_metrics({name: value for name, value in metrics.items() if name != "epoch"}, step)
+
+
 class Kept(TypedDict, total=False):
     """Content of `wandb.json`."""
 

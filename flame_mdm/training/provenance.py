@@ -39,7 +39,7 @@ class Provenance(Callback):
             **environment(),
             "device": _device(trainer),
             "parameters": sum(p.numel() for p in pl_module.parameters() if p.requires_grad),
-            "data": pl_module.facts,
+            "data": {name: value for name, value in pl_module.facts.items() if name not in ("words", "captions")},
         }
         write_json(folder / "provenance.json", facts)
         for logger in trainer.loggers:

@@ -293,7 +293,16 @@ def test_unknown_joints_are_listed(tmp_path: Path):
     bvh.write(bvh_of(("root", "tail"), WALK[:, :2], (-1, 0), 30.0), tmp_path / "cat.bvh")
     with pytest.raises(
         ValueError,
-        match=r"cat\.bvh: unknown skeleton\. .* missing: .*those of the file: root, tail",
+        match=r"cat\.bvh: unknown skeleton, like none of SMPL, Mixamo, .*those of the file: root, tail",
+    ):
+        only(tmp_path)
+
+
+def test_missing_joints_are_named_first(tmp_path: Path):
+    file = turning(tmp_path / "a.bvh")
+    file.write_text(file.read_text().replace("Spine2", "Back"))
+    with pytest.raises(
+        ValueError, match=r"a\.bvh: unknown skeleton\. Mixamo is the nearest known one; missing: Spine2\."
     ):
         only(tmp_path)
 
@@ -429,7 +438,7 @@ def test_check_lists_skeletons_and_all_failures(tmp_path: Path):
     mixamo(tmp_path / "c.bvh", INCH)
     (tmp_path / "d.bvh").write_text("HIERARCHY\n")
     lines = Folder(str(tmp_path)).check()
-    assert re.fullmatch(r"Mixamo, unit 0\.01, 30 fps: 1 motions, legs 0\.8\d m, head joint at 1\.\d\d m", lines[0])
+    assert re.fullmatch(r"Mixamo, unit 0\.01, 30 fps: 1 motion, legs 0\.8\d m, head joint at 1\.\d\d m", lines[0])
     assert re.match(r"error: .*b\.bvh and 1 more: the legs are", lines[1])
     assert re.match(r"error: .*d\.bvh, line 1: ", lines[2])
     assert re.fullmatch(r"error: 3 of 4 motions of .* cannot be prepared", lines[3])
@@ -539,8 +548,9 @@ def test_the_tutorial_works_as_it_is_written(
                 ran += 1
     assert ran == 6
     output = capsys.readouterr().out
-    assert "40 clips can be prepared: " in output
+    assert "40 clips can be prepared (motions: " in output
     assert "not computed: " in output
+    assert output.count("\nclips: ") == 3, "of preparation and two trainings"
     assert "mine as humanml-clean-smpl22 at 20 fps" in output
     assert list(tmp_path.glob("samples/mine/*/*/*.html"))
     assert set(read_skeleton(tmp_path / "mine" / "skeleton.yaml")["map"]) == set(SMPL22.joints)

@@ -113,7 +113,8 @@ class Folder(MotionSource):
         for skeleton, sizes in self._sizes.items():
             legs, heads = (sorted({f"{size[k]:.2f}" for size in sizes}) for k in (0, 1))
             legs, heads = (" to ".join(dict.fromkeys((values[0], values[-1]))) for values in (legs, heads))
-            lines.append(f"{skeleton}: {len(sizes)} motions, legs {legs} m, head joint at {heads} m")
+            many = f"{len(sizes)} motion" + "s" * (len(sizes) > 1)
+            lines.append(f"{skeleton}: {many}, legs {legs} m, head joint at {heads} m")
         return lines
 
     def check(self) -> list[str]:
@@ -130,13 +131,14 @@ class Folder(MotionSource):
             lines.append(f"error: {self.files[names[0]]}{more}{error}")
         try:
             self._check_upright()
-            splits = ", ".join(f"{count} {split}" for split, count in Counter(self.splits.values()).items())
+            counts = Counter(self.splits.values())
+            splits = ", ".join(f"{counts[split]} {split}" for split in get_args(Split))
         except (ValueError, UserError) as error:
             return [*lines, f"error: {error}"]
         if failed:
             count = sum(map(len, failed.values()))
             return [*lines, f"error: {count} of {len(self.files)} motions of {self.path} cannot be prepared"]
-        return [*lines, f"{self.name}: {self.count()} clips can be prepared: {splits}"]
+        return [*lines, f"{self.name}: {self.count()} clips can be prepared (motions: {splits})"]
 
     def _check_upright(self) -> None:
         for skeleton, sizes in self._sizes.items():

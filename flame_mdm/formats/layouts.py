@@ -263,10 +263,14 @@ def find_layout(path: Path, names: Sequence[str], given: Mapping[str, Any]) -> L
     """
     known = {"the map": Layout(given["map"])} if "map" in given else LAYOUTS | _TOELESS
     name, nearest = min(known.items(), key=lambda item: len(item[1].used - set(names)))
-    if missing := ", ".join(sorted(nearest.used - set(names)))[:500]:
-        which = f"the map in skeleton.yaml uses joints that the file lacks: {missing}"
-        if "map" not in given:
-            which = f"unknown skeleton. {name} is the nearest known one; missing: {missing}"
+    if missing := sorted(nearest.used - set(names)):
+        lacking = ", ".join(missing)[:500]
+        if "map" in given:
+            which = f"the map in skeleton.yaml uses joints that the file lacks: {lacking}"
+        elif len(missing) > len(SMPL22) / 2:
+            which = f"unknown skeleton, like none of {', '.join(LAYOUTS)}"
+        else:
+            which = f"unknown skeleton. {name} is the nearest known one; missing: {lacking}"
         raise ValueError(
             f"{path}: {which}. Map the joints of SMPL in skeleton.yaml (docs/own-data.md) to those of the file: "
             f"{', '.join(names)[:1000]}"

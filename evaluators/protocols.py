@@ -26,7 +26,7 @@ from flame_mdm.seeds import key
 from flame_mdm.task import MotionGeneration
 
 REGION = {"frames": "region"}
-"""Option name in protocol files, which never change -> current argument name of `flame_mdm.editing.kept_parts`."""
+"""Maps option names in protocol files, which never change, to arguments of `flame_mdm.editing.kept_parts`."""
 QUICK_REPLICATIONS, QUICK_SAMPLES = 2, 64
 
 
@@ -47,22 +47,22 @@ class Protocol:
     against a second draw of real motions.
 
     Args:
-        name: of the protocol.
-        version: of the protocol.
+        name: name of the protocol.
+        version: version of the protocol.
         condition: condition of the generated motions: "text", "action" or "none".
-        extractor: a mapping with the `_target_` of an `Extractor`, which is opened with a path; None = not needed.
+        extractor: a mapping with the `_target_` of an `Extractor`; the evaluation provides its path. None = not needed.
         metrics: mappings with the `_target_` of a metric, by name.
         replications: number of repetitions of the evaluation.
         samples: motions per replication. Clips are drawn at random, and repeatedly if there are too few. None = each
             clip of the split once.
-        real_samples: real motions per replication for comparisons of sets, drawn likewise; None = each clip once.
+        real_samples: real motions per replication in comparisons of sets, drawn likewise; None = each clip once.
         multimodality: a second evaluation with several motions per prompt; None = none.
         edit: `frames` (the region) and `joints` of `flame_mdm.editing.kept_parts`: motions are edits of real motions;
             None = motions are generated from scratch.
         smoothing: standard deviation, in frames, of a Gaussian filter over time that is applied to the features of
             generated motions before they are measured, with mirrored ends; None = no filter.
-        batch_size: motions per batch in a protocol that measures time, which first samples an untimed batch; None = the
-            batch size of the evaluation, 64 by default.
+        batch_size: motions per batch, if the protocol measures time; a first batch is not timed. None = the protocol
+            does not measure time and uses the batch size of the evaluation.
         only: attributes that evaluated clips must have; None = all clips of the split.
         expected: by data set or sha256 of the extractor, the values that real motions of the test split must have:
             metric -> [value, tolerance]. If they differ, nothing is generated.
@@ -91,13 +91,13 @@ class Protocol:
         expected: dict[str, dict[str, list[float]]] | None = None,
     ):
         if condition not in ("text", "action", "none"):
-            raise ValueError(f"protocol {name}: condition is text, action or none, not {condition}")
+            raise ValueError(f"protocol {name}: unknown condition: {condition}. Use text, action or none")
         if multimodality is not None and multimodality.keys() != Multimodality.__annotations__.keys():
             raise UserError(
-                f"protocol {name}: multimodality has the options {', '.join(multimodality)}. It needs "
+                f"protocol {name}: multimodality has the options {', '.join(multimodality)}. Give exactly "
                 f"{', '.join(Multimodality.__annotations__)}"
             )
-        make_metrics(metrics | (multimodality["metrics"] if multimodality else {}))  # refuses unknown options
+        make_metrics(metrics | (multimodality["metrics"] if multimodality else {}))  # raises if an option is unknown
         self.name, self.version, self.condition = name, version, condition
         self.extractor, self.metrics, self.replications, self.samples = extractor, metrics, replications, samples
         self.real_samples, self.multimodality, self.expected = real_samples, multimodality, expected or {}
@@ -167,7 +167,7 @@ class Protocol:
         extractor.check(representation, dataset)
         return extractor
 
-    # What is generated ------------------------------------------------------------------------------------------------
+    # Motions to generate ----------------------------------------------------------------------------------------------
 
     def selected(self, clips: Clips) -> list[Entry]:
         """Returns the clips of a split that the protocol evaluates on."""
@@ -331,12 +331,13 @@ class Protocol:
     ) -> dict[str, Any]:
         """Evaluates real motions of all replications, and then the motions of the source.
 
-        With several processes, the motions are divided among them; the first measures them, and all get the result.
+        If there are several processes, each generates a share of the motions. The first one measures them; all return
+        the result.
 
         Args:
-            source: of the motions; None = real motions only.
+            source: source of the motions; None = real motions only.
             clips: the split.
-            extractor: an opened extractor; None = metrics of features have no value.
+            extractor: an opened extractor; None = metrics that need features have no value.
             representation: of the motions, on the device to compute on.
             seed: of all random draws.
             batch_size: of the extractor.
@@ -378,7 +379,7 @@ class Protocol:
     def _evaluator(
         self, metrics: Mapping[str, Config], extractor: Extractor | None, representation: Representation, size: int
     ) -> Evaluator:
-        """Returns an evaluator of some metrics. With extractor=none, metrics of features have no value."""
+        """Returns an evaluator of some metrics. With extractor=none, metrics that need features have no value."""
         skip = extractor is None and self.extractor is not None
         return Evaluator(extractor, metrics, representation, batch_size=size, skip_features=skip)
 
@@ -406,7 +407,7 @@ class Protocol:
         return rows, self._paired(clips, evaluator, rows), real
 
     def _paired(self, clips: Clips, evaluator: Evaluator, rows: Sequence[Row]) -> Extracted:
-        """Returns the metric inputs of the real motions of rows."""
+        """Returns metric inputs computed from the real motions of rows."""
         motions = self.motions(rows, real_motions(clips, rows))
         motions.references = clips.store.references([row.clip.id for row in rows])
         return evaluator.extract(motions)
@@ -414,7 +415,7 @@ class Protocol:
     def _measure_real(self, clips: Clips, evaluator: Evaluator, seed: int, reasons: dict[str, str]) -> dict[str, Any]:
         """Returns the values of real motions.
 
-        The motions are read again later, since those of all replications might not fit in memory.
+        `_measure` reads the motions again, since those of all replications might not fit in memory.
         """
         found = []
         for replication in range(self.replications):
@@ -465,7 +466,7 @@ class Protocol:
         if several is not None and source is not None:
             summary |= self._measure_multimodality(source, jobs, clips, several, seed, world, reasons)
         if evaluator.extractor is None and self.extractor is not None:
-            reasons["extractor"] = "extractor=none: metrics of its features have no values"
+            reasons["extractor"] = "extractor=none: metrics that need features were not computed"
         return {
             "values": summary if source is not None else None,
             "not_computed": reasons,
@@ -506,7 +507,7 @@ class Protocol:
         return _summary(found)
 
     def _smoothed(self, features: list[np.ndarray]) -> list[np.ndarray]:
-        """Smooths motions as FLAME's code does, each within its own length."""
+        """Smooths each motion over time, without padding, as FLAME's code does."""
         sigma = self.smoothing
         return features if sigma is None else [gaussian_filter1d(motion, sigma, axis=0) for motion in features]
 
@@ -528,12 +529,13 @@ class Protocol:
         return lines
 
     def _unexpected(self, values: Mapping[str, Any], clips: Clips, extractor: Extractor | None) -> list[str]:
-        """Returns a line for each value of real motions that is not as expected.
+        """Returns a line for each value of real motions that differs from the expected one.
 
         Nothing is expected in a quick evaluation, or on splits other than the test split.
         """
+        # Without test clips (HumanAct12), the training clips are the test split, so they are checked.
         if self.quick or (clips.clips[0].split != "test" and clips.store.info["clips"]["test"]):
-            return []  # HumanAct12 has no test clips
+            return []
         names = [clips.store.info["dataset"], *([extractor.sha256] if extractor else [])]
         lines = []
         for metric, (wanted, tolerance) in (item for name in names for item in self.expected.get(name, {}).items()):

@@ -105,12 +105,13 @@ class EvaluationRequest:
 
 
 def evaluate(request: EvaluationRequest) -> None:
-    """Evaluates a checkpoint, files of motions or a baseline, and writes the JSON file.
+    """Evaluates a checkpoint, motion files or a baseline, and writes the result file.
 
     Raises:
-        UserError, FileNotFoundError, ValueError: If a file is missing, or parts do not match.
+        UserError, FileNotFoundError, ValueError: If a file is missing, or model, data, protocol and extractor
+            do not match.
     """
-    if request.out is not None:  # fails before hours of work, not after
+    if request.out is not None:  # checked here, before hours of work
         if Path(request.out).is_dir():
             raise UserError(f"out={request.out} is a folder. Name the JSON file to write")
         Path(request.out).parent.mkdir(parents=True, exist_ok=True)
@@ -120,7 +121,7 @@ def evaluate(request: EvaluationRequest) -> None:
 
 @contextmanager
 def _processes(device: str | None) -> Iterator[tuple[int, int, str]]:
-    """Joins the processes started by torchrun, if any. Gives rank, number of processes, and device of this process."""
+    """Joins the processes started by torchrun, if any. Yields rank, number of processes, and device of this process."""
     import torch
 
     rank, world, local = (int(os.environ.get(n, d)) for n, d in (("RANK", 0), ("WORLD_SIZE", 1), ("LOCAL_RANK", 0)))
@@ -342,7 +343,7 @@ def _overlaps(model: MotionGeneration | None, data: MotionDataModule) -> list[st
     trained = model.facts.get("fingerprint") if model is not None else None
     if not trained or trained == data.store.fingerprint:
         return []
-    return [f"the model was trained on data {trained}, but this is {data.store.fingerprint}: splits may overlap"]
+    return [f"training data {trained} and evaluated data {data.store.fingerprint} differ: splits may overlap"]
 
 
 def _describe(
@@ -401,9 +402,11 @@ def _describe(
 
 
 def _skeleton(request: EvaluationRequest, representation: Representation) -> dict[str, Any] | None:
-    """Gives SMPL's own offsets to a representation of its rotations, and returns whose the joints are.
+    """Sets the bone offsets of a representation of SMPL rotations from SMPL's model file, if it is given.
 
-    None for representations that hold the joints themselves.
+    Returns:
+        "stand_in": whether a stand-in skeleton is used, because the file is not given; "smpl_sha256": hash of the file.
+        None if motions are represented by joint positions, which need no skeleton.
 
     Raises:
         FileNotFoundError, ValueError: no such file, or no SMPL model.
@@ -428,7 +431,7 @@ def _excluded(data: MotionDataModule, split: Split) -> dict[str, int]:
 
 
 def _selection(model: MotionGeneration, file: Path) -> str:
-    """Returns the rule by which a checkpoint was selected among those of its run, judging by its name."""
+    """Returns how a checkpoint was selected among those of its run, judging by its file name."""
     best = (model.config.get("callbacks") or {}).get("best") or {}
     return f"best {best['monitor']}" if file.stem == "best" and "monitor" in best else f"none: {file.stem}"
 
@@ -440,18 +443,18 @@ def _digest(values: Any) -> str:
 def _show(report: Mapping[str, Any], out: Path) -> None:
     """Prints the values next to those of real motions."""
     protocol = report["protocol"]
-    mark = " QUICK, NOT A RESULT" if report["quick"] else ""
+    mark = " QUICK RUN, NOT FOR PUBLICATION" if report["quick"] else ""
     say(f"{protocol['name']} version {protocol['version']}, {report['data']['dataset']} {report['split']}{mark}")
     say(f"{'':32}{'real motions':>24}{report['baseline'] or 'generated':>24}")
     for name, value in report["values"].items():
         real = report["ground_truth"].get(name)
         say(f"{name:32}{_cell(real):>24}{_cell(value):>24}")
     for reason, count in report["data"]["excluded"].items():
-        say(f"left out of the data set: {count} {reason}")
+        say(f"excluded from the data set: {count} {reason}")
     for name, reason in report["not_computed"].items():
         say(f"not computed: {name}: {reason}")
     if report["skeleton"] and report["skeleton"]["stand_in"]:
-        say("warning: the joints are those of a stand-in skeleton; smpl=FILE, SMPL's model file, gives SMPL's own")
+        say("warning: joints were computed with a stand-in skeleton. Give SMPL's model file for its own: smpl=FILE")
     for reason in report["warnings"]:
         say(f"warning: {reason}")
     for reason in report["invalid_because"]:
@@ -490,7 +493,7 @@ def evaluate_missing(specs: Mapping[str, Config], results: Path, config: Config)
             names = ("device", "batch_size", "force", "data_root")
             general = {name: config[name] for name in names if config[name] is not None}
             if "batch_size" in read_yaml(protocol_file(keys["protocol"])):
-                general.pop("batch_size", None)  # a protocol that measures time has its own
+                general.pop("batch_size", None)  # protocols that measure time set the batch size
             evaluate(EvaluationRequest.of(options | general | keys | {"out": str(path)}))
         except (UserError, ValueError, OSError) as error:
             failed.append(f"{request.label}: {first_line(error)}")
@@ -499,7 +502,7 @@ def evaluate_missing(specs: Mapping[str, Config], results: Path, config: Config)
 
 
 def _outdated(path: Path, request: Request) -> bool:
-    """Returns whether a result's checkpoint or extractor has changed since (its hash differs)."""
+    """Returns whether the checkpoint or extractor of a result has changed, or SMPL's model file is now available."""
     result = read_result(path)
     if result.stand_in_skeleton and os.environ.get("FLAME_MDM_SMPL"):
         return True

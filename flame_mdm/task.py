@@ -33,20 +33,20 @@ class Task(LightningModule):
     config: Config
     """The recipe, saved in checkpoints."""
     facts: dict[str, Any]
-    steps: int | None = None
-    """Training steps of the checkpoint that was loaded; None if they are not known."""
     """Facts about the training data for sampling and evaluation: actions, maximum length, fingerprint."""
+    steps: int | None = None
+    """Number of training steps of the loaded checkpoint; None if unknown."""
 
     def __init__(self, condition: ConditionEncoder, representation: Representation, *, optimizer: Config, seed: int):
         super().__init__()
         self.condition, self.representation = condition, representation
         self.optimizer, self.seed = optimizer, seed
         self.config, self.facts = {}, {}
-        self.prepare_data_per_node = False  # machines share the folder of the data
+        self.prepare_data_per_node = False  # the machines of a cluster share the data folder
 
     @classmethod
     def build(cls, config: Config, representation: Representation, *, actions: Sequence[str] = ()) -> Self:
-        """Builds the parts of a recipe and joins them; sizes that follow from other parts are passed on here."""
+        """Builds the parts of a recipe and combines them. Derives sizes that depend on other parts."""
         raise NotImplementedError
 
     def describe(self) -> str:
@@ -58,7 +58,7 @@ class Task(LightningModule):
         self.condition.precompute(*self._captions())
 
     def setup(self, stage: str) -> None:
-        """Opens the captions encoded by `prepare_data`, and stores facts about the data."""
+        """Opens the captions encoded by `prepare_data`, and adds the facts about the data to `facts`."""
         self.condition.load_cache(*self._captions())
         # Buffers are equal in all processes. If DDP broadcast them in each forward pass, processes with more validation
         # batches than others would wait forever.
@@ -82,8 +82,8 @@ class Task(LightningModule):
     def on_train_start(self) -> None:
         """Enables gradient clipping for fused optimizers in bfloat16.
 
-        Lightning does not clip gradients for them with mixed precision, since these may be scaled; in bfloat16 they are
-        not.
+        With mixed precision, Lightning refuses to clip the gradients of fused optimizers, because they may be scaled.
+        In bfloat16, gradients are not scaled.
         """
         if self.trainer.precision == "bf16-mixed":
             for optimizer in self.trainer.optimizers:
@@ -105,7 +105,7 @@ class MotionGeneration(Task):
         guidance_scale: default of `generate`; 1 = off.
         sampler: default of `generate`, one that the process supports.
         num_inference_steps: default of `generate`.
-        seed: determines, together with step and rank, all draws of a training step.
+        seed: of all random draws in training, which are functions of (seed, batch number, rank).
         compile: compile the denoiser with torch.compile.
     """
 
@@ -142,7 +142,7 @@ class MotionGeneration(Task):
 
     @classmethod
     def build(cls, config: Config, representation: Representation, *, actions: Sequence[str] = ()) -> Self:
-        """Builds the parts of a recipe and joins them; sizes that follow from other parts are passed on here."""
+        """Builds the parts of a recipe and combines them. Derives sizes that depend on other parts."""
 
         def part(name: str, **derived: Any) -> Any:
             legal = parameters(config[name]["_target_"])
@@ -204,10 +204,10 @@ class MotionGeneration(Task):
         )
 
     def training_step(self, batch: MotionBatch, batch_idx: int) -> Tensor:
-        """Returns the loss of one batch; every draw is a function of (seed, batch number, rank)."""
+        """Returns the loss of one batch. Random draws are functions of (seed, batch number, rank)."""
         torch.manual_seed(key("step", self.seed, batch_idx, self.global_rank))
         cond = self.condition(batch)
-        if cond.null is not None:  # also with probability 0, so that every parameter has a gradient, as DDP requires
+        if cond.null is not None:  # even if the probability is 0, since DDP requires a gradient for every parameter
             cond = cond.drop(torch.rand(len(batch), device=self.device) < self.cond_drop_prob)
         terms = self.process.loss(self.denoiser, batch.x, batch.mask, cond, auxiliary=self.losses)
         means = {f"train/{name}": value.mean() for name, value in terms.items()}
@@ -215,7 +215,7 @@ class MotionGeneration(Task):
         return means["train/loss"]
 
     def validation_step(self, batch: MotionBatch, batch_idx: int) -> None:
-        """Updates the losses of the validation clips, with fixed times and noise per clip."""
+        """Accumulates the validation losses. Each clip always gets the same time and noise."""
         keys = torch.tensor([key("validation", name) for name in batch.ids], device=self.device)
         t = self.process.training_times(uniform(keys, (1,))[0][:, 0])
         noise = normal(keys, *batch.x.shape[1:])
@@ -230,7 +230,7 @@ class MotionGeneration(Task):
             metric.update(value)
 
     def on_validation_epoch_end(self) -> None:
-        """Logs the mean over all clips of all processes, with equal weights."""
+        """Logs each loss as the mean over all clips of all processes; every clip has the same weight."""
         for name, metric in self.val_losses.items():
             assert isinstance(metric, MeanMetric)
             self.log(f"val/{name}", metric.compute(), prog_bar=name == "loss")
@@ -254,8 +254,9 @@ class MotionGeneration(Task):
         """Samples motions for the conditions, lengths and ids of `batch`; its `x` is ignored.
 
         The noise of a motion is a function of (seed, replication, id), so the motion is the same in any batch.
-        `unconditioned` samples a conditional model with its null condition; `shared_noise` gives all motions the noise
-        of (seed, replication) alone; `trajectory` gets the normalized clean estimate (B, F, D) of each call.
+        `unconditioned` samples a conditional model with its null condition. With `shared_noise`, all motions get the
+        same noise, a function of (seed, replication) only. The normalized clean estimate (B, F, D) of each denoiser
+        call is appended to `trajectory`.
 
         Returns:
             (B, F, D) normalized, 0 past the end of each motion.
@@ -276,7 +277,7 @@ class MotionGeneration(Task):
             denoise = classifier_free_guidance(self.denoiser, scale, self.representation.features)
         mask, frames, features = batch.mask, batch.mask.shape[1], self.representation.features
         if not getattr(self.denoiser, "mask_padding", True):
-            # Frames attend to the padding, so the padded length must be that of training.
+            # This denoiser attends to padding, so the padded length must be the same as in training.
             mask = pad_to(mask, max(frames, self.facts.get("max_frames", 0)))
             if edit is not None:
                 known, keep = pad_to(edit.known, mask.shape[1]), ~pad_to(~edit.keep, mask.shape[1])

@@ -146,7 +146,7 @@ def test_a_result_counts_the_clips_that_were_left_out(runs, full, tmp_path, caps
     excluded = {"motions of HumanAct12": 1191, "test clips shorter than 50 frames": short}
     assert json.loads(out.read_text())["data"]["excluded"] == excluded
     assert short > 0
-    assert "left out of the data set: 1191 motions of HumanAct12" in capsys.readouterr().out
+    assert "excluded from the data set: 1191 motions of HumanAct12" in capsys.readouterr().out
     assert read_result(out).data.excluded == excluded
 
 
@@ -246,7 +246,7 @@ def test_quick_results_are_marked(runs, tmp_path, capsys):
     assert result["quick"]
     assert result["changed"] == {"replications": 2, "samples": 33}
     assert result["values"]["multimodality"]["mean"] is None
-    assert "QUICK, NOT A RESULT" in capsys.readouterr().out
+    assert "QUICK RUN, NOT FOR PUBLICATION" in capsys.readouterr().out
 
 
 def test_motions_of_others_are_measured_alike(runs, full, tmp_path):

@@ -212,13 +212,13 @@ def test_clips_left_out_of_the_data_set_are_in_the_footnotes(folder):
     excluded = {"motions of HumanAct12, as data.source.humanact12 is not given": 1191}
     data = {"dataset": "synthetic", "fingerprint": "f" * 16, "excluded": excluded}
     put(request, folder, result(0.5, 0.4, 9.0, data=data))
-    (note,) = [text for _, text in made(folder).parts[0].notes if "left out" in text]
-    assert "; left out of the data set: 1,191 motions of HumanAct12, as data.source.humanact12 is not given" in note
+    (note,) = [text for _, text in made(folder).parts[0].notes if "excluded from" in text]
+    assert "; excluded from the data set: 1,191 motions of HumanAct12, as data.source.humanact12 is not given" in note
     lengths = {"fingerprint": "f" * 16, "fps": 20.0, "lengths": [50, 60], "excluded": excluded}
     (folder / "results" / "lengths").mkdir()
     (folder / "results" / "lengths" / "mine.json").write_text(json.dumps(lengths))
     table = build("x", {"title": "Lengths", "parts": {"All": {"lengths": ["mine"]}}}, folder / "results")
-    assert table.parts[0].notes[1] == ("", f"mine; left out of the data set: 1,191 {next(iter(excluded))}")
+    assert table.parts[0].notes[1] == ("", f"mine; excluded from the data set: 1,191 {next(iter(excluded))}")
 
 
 def test_a_missing_extractor_is_noted_beside_a_missing_checkpoint(folder):

@@ -25,10 +25,10 @@ EXPERIMENTS = _PACKAGE / "experiments" if (_PACKAGE / "experiments").is_dir() el
 """Folder of the recipes: inside the installed package, or next to it in a clone."""
 
 LAUNCH = "launch"
-"""The group of `experiments/` with launchers, which start jobs elsewhere."""
+"""The folder of `experiments/` with launchers, which start jobs on a cluster."""
 
 LONGEST_WORD = 2**17
-"""Maximum length of a `key=value` in characters, which is also the limit of Linux. Hydra parses longer ones slowly."""
+"""Maximum length of a `key=value` argument in characters, as in Linux. Hydra parses longer ones slowly."""
 
 
 def groups() -> list[str]:
@@ -41,7 +41,7 @@ def _is_recipe_folder(folder: Path) -> bool:
 
 
 def recipes() -> list[str]:
-    """Returns the names of all experiments, as for `EXP=`."""
+    """Returns the names of all experiments, as used in `EXP=`."""
     files = (p for p in EXPERIMENTS.rglob("*.yaml") if "@package _global_" in p.read_text()[:200])
     return sorted(p.relative_to(EXPERIMENTS).with_suffix("").as_posix() for p in files)
 
@@ -51,7 +51,7 @@ def compose(name: str, overrides: Sequence[str] = ()) -> Config:
 
     Args:
         name: a file in `experiments/` without its suffix, or the path of a recipe or of a saved `config.yaml`.
-        overrides: in Hydra's grammar.
+        overrides: overrides in Hydra's grammar.
 
     Raises:
         UserError: If an experiment, group, option or key is unknown (with the nearest names), or a value is malformed.
@@ -62,7 +62,7 @@ def compose(name: str, overrides: Sequence[str] = ()) -> Config:
 
 
 def settings(name: str, overrides: Sequence[str] = ()) -> Config:
-    """Returns the keys of a command with a configuration, such as evaluate, with overrides.
+    """Composes the configuration of a command, such as `experiments/evaluate.yaml` of `evaluate`, with overrides.
 
     Raises:
         UserError: As for `compose`.
@@ -90,11 +90,11 @@ class Plan(NamedTuple):
     stem: str
     overrides: list[str]
     base: Config | None = None
-    """The recipe without overrides of single keys. Its values determine which kind of value a key takes."""
+    """The recipe without overrides of single keys. An override must have the type of the value in it."""
 
 
 def plan_composition(recipe: Recipe, overrides: Sequence[str]) -> Plan:
-    """Checks names and keys. A key that is only in the signature of its `_target_` is marked as new for Hydra."""
+    """Checks overrides and prepares them for Hydra. Keys that the recipe lacks but a `_target_` accepts get a `++`."""
     parsed = parse(overrides)
     if recipe.saved:
         _refuse_groups(parsed, recipe)
@@ -141,7 +141,7 @@ def find_recipe(name: str) -> Recipe:
             raise UserError(f"{name}: no such file. EXP takes an experiment or the path of a config.yaml")
         content = read_yaml(path)
         if not isinstance(content, dict):
-            raise UserError(f"{name}: not a recipe: it has no keys. Begin it with the defaults of another recipe")
+            raise UserError(f"{name}: not a recipe: it has no keys. Begin with `defaults:` and another recipe")
         saved = "defaults" not in content
         if saved:
             plain(content, name, but=RUN_DIR)
@@ -158,7 +158,9 @@ def parse(overrides: Sequence[str]) -> list[Override]:
     try:
         return OverridesParser.create().parse_overrides(list(overrides))
     except HydraException as error:
-        raise UserError(f"cannot read an override: {first_line(error)}. Write key=value, and text as 'a b'") from error
+        raise UserError(
+            f"cannot read an override: {first_line(error)}. Write key=value, and quote text: 'a b'"
+        ) from error
 
 
 def _is_group(override: Override) -> bool:
@@ -174,7 +176,7 @@ def _check_groups(overrides: Sequence[Override]) -> None:
         for option in _choices(override):
             if option not in options:
                 raise UserError(
-                    f"no {group} is called '{option}'.{did_you_mean(option, options)} There are: {', '.join(options)}"
+                    f"no {group} is called '{option}'.{did_you_mean(option, options)} Available: {', '.join(options)}"
                 )
         if group == LAUNCH and source_file("submitit") is None:
             raise UserError(

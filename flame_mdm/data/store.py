@@ -5,7 +5,7 @@ A store is a folder that is written once and never changed:
     features.npy     (N, D) float32, the concatenated frames of all clips, not normalized
     clips.jsonl      one clip per line: id, start, length, split, source, captions, action, attributes
     statistics.npz   mean and std (D,) of the training frames, used by the representation for normalization
-    references.npz   joints (F', J, 3) float32 at the frame rate of the recording by id, for clips that have them
+    references.npz   joints (F', J, 3) float32 by clip id, at the frame rate of the recording, if the data set has them
     store.json       representation, frame rate, options of the source, counts, hashes of the other files, fingerprint
 
 Verification adds a report to the folder, `verify.json`.
@@ -66,7 +66,7 @@ class Store:
         self.info: dict[str, Any] = _read_info(self.folder)
         for name in ("clips.jsonl", "statistics.npz"):
             if _sha256(self.folder / name) != self.info["sha256"].get(name):
-                raise _damaged(self.folder / name, "its hash is not the recorded one")
+                raise _damaged(self.folder / name, "its hash differs from the one in store.json")
         shape: list[int] = self.info["shape"]
         try:
             self.features: np.ndarray = read_npy(self.folder / "features.npy", mmap=True)
@@ -99,7 +99,7 @@ class Store:
         """Returns the joints of clips at the frame rate of their recording; None if a clip has none.
 
         Raises:
-            ValueError: they have changed since they were written.
+            ValueError: references.npz has changed since it was written.
         """
         if "references.npz" not in self.info["sha256"]:
             return None
@@ -118,7 +118,7 @@ class Store:
 
     def _check(self, name: str) -> None:
         if _sha256(self.folder / name) != self.info["sha256"].get(name):
-            raise _damaged(self.folder / name, "its hash is not the recorded one")
+            raise _damaged(self.folder / name, "its hash differs from the one in store.json")
 
 
 def write_store(folder: Path, source: MotionSource, representation: Representation) -> Store:
@@ -127,7 +127,8 @@ def write_store(folder: Path, source: MotionSource, representation: Representati
     If another process is writing the store, waits for it and opens the result.
 
     Raises:
-        FileNotFoundError, ValueError: from the data set, or because features are not finite; no files are left behind.
+        FileNotFoundError, ValueError: the data set cannot be read, or features are not finite. No files are left
+            behind.
     """
     total, before = source.count(), (folder / "store.json").exists()
     lock = folder.with_name(folder.name + ".lock")
@@ -162,7 +163,7 @@ def _write(folder: Path, source: MotionSource, representation: Representation, t
                         _append(file, folder, features.tobytes())
                     first, length = clip.window or (0, len(features))
                     if first < 0 or length < 1 or first + length > len(features):
-                        raise ValueError(f"clip {clip.id}: no window {clip.window} in {len(features)} frames")
+                        raise ValueError(f"clip {clip.id}: window {clip.window} exceeds {len(features)} frames")
                     entry = Entry(clip.id, begin + first, length, clip.split, clip.source, clip.captions, clip.action)
                     entries.append(replace(entry, attributes=dict(clip.attributes)))
                     if clip.reference is not None:
@@ -194,7 +195,7 @@ def _encode(clips: Sequence[Clip], representation: Representation) -> list[np.nd
     for clip in whole.values():
         if clip.encoded and clip.encoded != representation.name:
             raise ValueError(
-                f"clip {clip.id}: published as {clip.encoded}, cannot be converted to {representation.name}"
+                f"clip {clip.id}: published as {clip.encoded}, which cannot be converted to {representation.name}"
             )
     raw = [torch.from_numpy(np.ascontiguousarray(clip.motion)) for clip in whole.values() if not clip.encoded]
     try:
@@ -210,7 +211,7 @@ def _encode(clips: Sequence[Clip], representation: Representation) -> list[np.nd
             raise ValueError(f"clip {clip.id}: shape {features.shape}, not (frames, {representation.features})")
         if not np.isfinite(features).all():
             frame = int(np.argwhere(~np.isfinite(features).all(1))[0, 0])
-            raise ValueError(f"clip {clip.id}: the features of frame {frame} are not finite; exclude it by name")
+            raise ValueError(f"clip {clip.id}: the features of frame {frame} are not finite. Exclude it by name")
         arrays[key] = features
     return [arrays[id(clip.motion)] for clip in clips]
 
@@ -315,7 +316,7 @@ def _read_info(folder: Path) -> dict[str, Any]:
     except UserError as error:
         raise _damaged(folder / "store.json", str(error)) from error
     if not isinstance(info, dict) or info.get("format") != FORMAT:
-        raise ValueError(f"{folder}: not a store of format {FORMAT}, the one this version reads; prepare it again")
+        raise ValueError(f"{folder}: not a store of format {FORMAT}. Prepare the data set again")
     wrong = [name for name, kind in INFO.items() if not isinstance(info.get(name), kind)]
     if not wrong:
         counts, numbers = info["clips"], {"fps": info["fps"], "hours": info["hours"]}
@@ -332,13 +333,13 @@ def _read_info(folder: Path) -> dict[str, Any]:
 def _entries(path: Path, frames: int, actions: int) -> list[Entry]:
     clips: list[Entry] = []
     try:
-        with path.open(encoding="utf-8") as lines:  # captions may contain other line separators
+        with path.open(encoding="utf-8") as lines:  # not splitlines: captions may contain other line separators
             for line in lines:
                 clip = Entry(**parse_json(line))
                 if wrong := _wrong_field(clip, actions):
                     raise ValueError(f"no valid {wrong}: {getattr(clip, wrong)!r:.80}")
                 if clip.start < 0 or clip.length < 1 or clip.start + clip.length > frames:
-                    raise ValueError(f"{clip.id}: frames {clip.start} to {clip.start + clip.length} of {frames}")
+                    raise ValueError(f"{clip.id}: frames {clip.start} to {clip.start + clip.length} exceed {frames}")
                 clips.append(clip)
     except UnicodeDecodeError as error:
         raise _damaged(path, "not a UTF-8 text file") from error
@@ -363,7 +364,7 @@ def _wrong_field(clip: Entry, actions: int) -> str | None:
 
 
 def _damaged(path: Path, what: str) -> ValueError:
-    return ValueError(f"{path}: damaged: {what}; delete {path.parent} and prepare again")
+    return ValueError(f"{path}: damaged: {what}. Delete {path.parent} and prepare the data set again")
 
 
 def _sha256(path: Path) -> str:

@@ -432,7 +432,7 @@ def _evaluation(result: Result, timed: bool) -> dict[str, str]:
         * result.published_split,
         "force": "forced: real motions do not have the values that the protocol expects" * result.forced,
         "warnings": "; ".join(result.warnings),
-        "quick run": "QUICK, NOT A RESULT" * result.quick,
+        "quick run": "QUICK RUN, NOT FOR PUBLICATION" * result.quick,
     }
 
 
@@ -447,7 +447,7 @@ def _joints_of(result: Result) -> str:
 def _left_out(excluded: Mapping[str, int]) -> str:
     """Describes the clips that were left out of a data set, by reason."""
     listed = ", ".join(f"{count:,} {reason}" for reason, count in excluded.items())
-    return f"left out of the data set: {listed}" if listed else ""
+    return f"excluded from the data set: {listed}" if listed else ""
 
 
 def _line(row: Mapping[str, Any], found: Sequence[Result | None], values: Sequence[str], files: Sequence[str]) -> Line:

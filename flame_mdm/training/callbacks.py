@@ -45,14 +45,15 @@ class Interrupted(Exception):
 class Checkpoints(Checkpoint):
     """Writes `last.ckpt` periodically, at the last step and when interrupted, and keeps some checkpoints permanently.
 
-    SIGINT, SIGTERM, SIGUSR1 and SIGUSR2 stop training at the end of a step, or of the next step if there are several
-    processes; never during validation, where averaged and raw weights are swapped. A second SIGINT stops immediately,
-    as does a second SIGTERM more than one second after the first, since `timeout` sends two at once.
+    SIGINT, SIGTERM, SIGUSR1 and SIGUSR2 stop training at the end of the current step; with several processes, at the
+    end of the next one. Validation is never interrupted, since averaged weights replace the trained ones meanwhile. A
+    second SIGINT stops immediately. So does a second SIGTERM, if it comes more than one second after the first, since
+    `timeout` sends two at once.
 
     Args:
-        folder: of the checkpoints.
-        every_n_steps: interval of `last.ckpt`.
-        keep_every_n_steps: interval of the checkpoints that are kept; None = none.
+        folder: folder of the checkpoints.
+        every_n_steps: number of steps after which `last.ckpt` is rewritten.
+        keep_every_n_steps: number of steps after which a checkpoint is kept permanently; None = none is kept.
     """
 
     def __init__(self, folder: str, every_n_steps: int, keep_every_n_steps: int | None = None):
@@ -77,7 +78,7 @@ class Checkpoints(Checkpoint):
             _kill_workers()
             raise SystemExit(128 + signum)
         self.signum, self.noted = signum, time.monotonic()
-        # Not print: it is not reentrant, and the signal may have interrupted another print.
+        # print is not reentrant, and the signal may have interrupted another print.
         os.write(1, b"\nstopping at the end of this step; press Ctrl-C or send SIGTERM again to stop immediately\n")
 
     def on_train_batch_end(
@@ -88,7 +89,8 @@ class Checkpoints(Checkpoint):
         self.step = trainer.global_step
         signum = self.signum
         if trainer.world_size > 1:
-            # All processes act on the value exchanged one step ago, so that none waits for this step to end.
+            # All processes act on the signal exchanged in the previous step. Reading the one of this step would wait
+            # for the step to end on the device.
             signum, known = int(self.exchanged), torch.tensor(signum, device=pl_module.device)
             torch.distributed.all_reduce(known, torch.distributed.ReduceOp.MAX)
             self.exchanged = known
@@ -114,7 +116,7 @@ class Checkpoints(Checkpoint):
 
 def _kill_workers() -> None:
     """Kills the data loading processes, including suspended ones, for which Python would wait forever."""
-    signal.signal(signal.SIGCHLD, signal.SIG_DFL)  # otherwise torch raises an error for each
+    signal.signal(signal.SIGCHLD, signal.SIG_DFL)  # otherwise, torch's handler raises an error for each of them
     for process in active_children():
         process.kill()
 
@@ -126,8 +128,8 @@ class Measurements(Callback):
     training clips), `train/samples_per_second`, `train/seconds_per_step` (without validation) and, on CUDA,
     `train/gpu_memory_gib` (peak memory allocated by tensors).
 
-    Checkpoints contain in `facts.training` the `hours` that the run has trained, including validation, the number of
-    `processes`, and the peak `memory_gib`: of tensors on CUDA, otherwise of the first process.
+    Adds `facts.training` to checkpoints: `hours` of training so far, including validation; `processes`, their number;
+    and `memory_gib`, the peak memory of tensors on CUDA, otherwise of the first process.
     """
 
     def __init__(self) -> None:
@@ -243,7 +245,7 @@ class SampleMotions(Callback):
     """Samples fixed prompts with fixed noise: writes files to the run directory and logs a video.
 
     Args:
-        folder: for the samples of each step, such as `step_0001000/player.html`.
+        folder: folder of the samples; those of each step are in a subfolder, such as `step_0001000/player.html`.
         every_n_steps: minimum number of steps between samples, which are drawn at validation and after training.
         prompts: texts, action names, or (text, requested attributes) pairs; None = unconditioned motions. If a model
             is conditioned on actions and no prompt is one of them, its first actions are used instead.
@@ -279,7 +281,7 @@ class SampleMotions(Callback):
         assert isinstance(pl_module, MotionGeneration)
         actions = pl_module.facts["actions"]
         if isinstance(pl_module.condition, ActionLabels) and not set(self.texts) & set(actions):
-            # the prompts are texts, from a recipe for text with condition=action
+            # a text-to-motion recipe was overridden with condition=action, so its prompts are texts
             self.prompts = [(action, {"action": action}) for action in actions[: len(self.prompts)]]
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
@@ -295,12 +297,12 @@ class SampleMotions(Callback):
             self.write(trainer, pl_module)
 
     def on_fit_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        if self.written[0] != trainer.global_step:  # unless the last validation has written them
+        if self.written[0] != trainer.global_step:  # the last validation may have written them already
             self.write(trainer, pl_module)
         _, folder, values = self.written
         if trainer.is_global_zero:
             for name, value in values.items():
-                say(f"{name}: {'not requested' if value is None else f'{value:.3f}'}")
+                say(f"{name}: {'no prompt requests it' if value is None else f'{value:.3f}'}")
             say(f"player: {folder / 'player.html'} (open in any browser), animation: {folder / 'motions.gif'}")
 
     def write(self, trainer: Trainer, pl_module: LightningModule) -> None:

@@ -24,7 +24,7 @@ PACKAGES = ("flame-mdm", "torch", "lightning", "torchmetrics", "transformers", "
 class Provenance(Callback):
     """Writes `config.yaml` and `provenance.json` at the start of training, and prints a short summary.
 
-    Both files are also logged to the dashboard.
+    The loggers also get their contents.
     """
 
     def __init__(self, config: Config):
@@ -34,7 +34,7 @@ class Provenance(Callback):
         if not trainer.is_global_zero:
             return
         folder = Path(self.config["run"]["dir"])
-        save(movable(self.config), folder / "config.yaml", head="A saved run; EXP=path/to/this/file reproduces it.")
+        save(movable(self.config), folder / "config.yaml", head="A saved run. EXP=path/to/this/file repeats it.")
         facts = {
             **environment(),
             "device": _device(trainer),
@@ -58,9 +58,9 @@ class Provenance(Callback):
         if size > self.config["data"]["batch_size"]:
             times = f"{trainer.world_size} processes x {trainer.accumulate_grad_batches} accumulated"
             each, lr = self.config["data"]["batch_size"], self.config["optimizer"].get("lr")
-            say(f"batch: {size} clips = {each} x {times}; optimizer.lr={lr} is not scaled with it")
+            say(f"batch: {size} clips = {each} x {times}; optimizer.lr={lr} is not scaled with the batch size")
         passes = trainer.max_steps * size / len(module.train)
-        say(f"steps: {trainer.global_step} to {trainer.max_steps} of {size} clips, {passes:.0f} passes over the data")
+        say(f"steps: {trainer.global_step} to {trainer.max_steps}, {size} clips per step, {passes:.0f} epochs")
 
 
 def _device(trainer: Trainer) -> str:
@@ -70,7 +70,7 @@ def _device(trainer: Trainer) -> str:
 
 
 def environment() -> dict[str, Any]:
-    """Returns command, code version, machine and package versions, which are stored with every run and result."""
+    """Returns the command, code version, machine and package versions that every run and result records."""
     return {
         "command": sys.argv,
         "commit": _git("rev-parse", "HEAD"),

@@ -180,8 +180,8 @@ class Protocol:
         if not entries:
             only = "".join(f" and {name}={value}" for name, value in self.only.items())
             raise UserError(
-                f"the split has no clip with at least {clips.crop.shortest()} frames{only} to evaluate on. Choose "
-                "another with split=...; own data gets some by a `split` column in captions.csv"
+                f"the split has no clip with at least {clips.crop.shortest()} frames{only}. Choose another with "
+                "split=..., or, for your own data, add a `split` column to captions.csv"
             )
         count = self.samples if purpose == "generated" else self.real_samples
         rows = []

@@ -164,7 +164,7 @@ def test_version_2_compares_with_the_recordings_of_520_clips_at_100_fps(mmm, tmp
     before = json.loads(out.read_text())["values"]["temos/ape_root"]
     assert (before["mean"], before["n"]) == (0, 2)
     assert evaluated(mmm, out, "reconstruction_kit_version_2", "split=val") == 1
-    assert "no clip of 1 frames or more and ghosh_test=True" in capsys.readouterr().err
+    assert "the split has no clip with at least 1 frames and ghosh_test=True" in capsys.readouterr().err
 
 
 def test_stores_without_recordings_are_prepared_again_for_version_2(mmm, tmp_path, capsys):

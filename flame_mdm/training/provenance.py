@@ -35,11 +35,12 @@ class Provenance(Callback):
             return
         folder = Path(self.config["run"]["dir"])
         save(movable(self.config), folder / "config.yaml", head="A saved run. EXP=path/to/this/file repeats it.")
+        known: dict[str, Any] = pl_module.facts  # type: ignore[assignment]
         facts = {
             **environment(),
             "device": _device(trainer),
             "parameters": sum(p.numel() for p in pl_module.parameters() if p.requires_grad),
-            "data": {name: value for name, value in pl_module.facts.items() if name not in ("words", "captions")},
+            "data": {name: value for name, value in known.items() if name not in ("words", "captions")},
         }
         write_json(folder / "provenance.json", facts)
         for logger in trainer.loggers:

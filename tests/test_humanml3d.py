@@ -213,7 +213,7 @@ def test_the_command_tells_what_is_there_and_prepares_it(folder, tmp_path, capsy
     assert capsys.readouterr().out == "humanml3d: 12 clips can be prepared\n"
     assert prepare(words) == 0
     out = capsys.readouterr().out
-    assert "humanml3d as humanml-legacy-smpl22 at 20 fps: 8 train, 2 val, 2 test" in out
+    assert "humanml3d as humanml-legacy-smpl22 at 20 fps; 0.008 hours\nclips: 8 train, 2 val, 2 test" in out
     assert "2 names of train shorter than 40 frames" in out
 
 

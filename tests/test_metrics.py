@@ -586,7 +586,7 @@ def test_best_and_worst_of_several_are_chosen_by_the_root():
     values = {}
     for samples in (3, 1):
         metric = FlamePositionErrors(KIT21.parents, samples=samples)
-        metric.update(**motions, keys=torch.arange(6), groups=groups)
+        metric.update(**motions, keys=torch.arange(6), groups=groups)  # pyright: ignore[reportArgumentType]
         values |= metric.compute()
     joints = {"best": (1 + 20 * 4) / 21, "worst": (3 + 20 * 2) / 21}
     for which, root in (("best", 1), ("worst", 3)):
@@ -594,7 +594,7 @@ def test_best_and_worst_of_several_are_chosen_by_the_root():
         assert values[f"{which}_ape_mean_global"] == pytest.approx(joints[which], rel=1e-5)
     assert values["ape_root"] == pytest.approx(2, rel=1e-5)
     metric = FlamePositionErrors(KIT21.parents, samples=2)
-    metric.update(**motions, keys=torch.arange(6), groups=groups)
+    metric.update(**motions, keys=torch.arange(6), groups=groups)  # pyright: ignore[reportArgumentType]
     with pytest.raises(ValueError, match="2 of 2 prompts do not have 2 motions"):
         metric.compute()
 

@@ -79,7 +79,7 @@ def test_the_import_takes_every_weight_exactly_once(stem):
     for name in ("motion_encoder.CLS_TOKEN", "lm_projection.bias", "motion_encoder.motion_encoder.layers.0.norm2.bias"):
         with pytest.raises(ValueError, match="released"):
             import_mclip({k: v for k, v in state.items() if k != name})
-    with pytest.raises(ValueError, match="unknown extra"):
+    with pytest.raises(ValueError, match="unknown keys extra"):
         import_mclip({**state, "extra": torch.zeros(1)})
 
 

@@ -271,7 +271,8 @@ def test_sample_takes_every_option_of_sampling(trained, tmp_path):
     model = load(trained)
 
     def features(**change: Any) -> np.ndarray:
-        return generate(model, text, **({"shared_noise": True} | how | change))[0].features
+        options: dict[str, Any] = {"shared_noise": True} | how | change
+        return generate(model, text, **options)[0].features
 
     for name in ("motion_000.npz", "motion_001.npz"):  # of the same noise
         with np.load(out / name) as motion:

@@ -204,10 +204,10 @@ def test_long_names_are_shortened(attacked, bad, capfd):
 @pytest.mark.parametrize("length", [2001, 100_000, 1_000_000])
 def test_long_texts(attacked, bad, trained, length):
     for text in ("x" * length, "a person walks " * (length // 15 + 1)):
-        attacked("sample", f"ckpt={trained}", f"text={text}", says="characters. The limit is ")
+        attacked("sample", f"ckpt={trained}", f"text={text}", says=" characters are too many. Give at most ")
     (bad / "texts.txt").write_text("x" * length)
     words = [f"runs={trained.parent.parent} {motions(bad / 'real')}", f"texts={bad / 'texts.txt'}"]
-    attacked("compare", *words, says="characters. The limit is 2,000")
+    attacked("compare", *words, says="characters are too many. Give at most 2,000")
 
 
 def test_many_texts(trained):

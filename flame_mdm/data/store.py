@@ -17,7 +17,6 @@ import hashlib
 import io
 import json
 import shutil
-import zipfile
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from itertools import islice
@@ -148,12 +147,8 @@ def _write(folder: Path, source: MotionSource, representation: Representation, t
         entries: list[Entry] = []
         motion, begin, frames = None, 0, 0
         bar = tqdm(source.clips(representation.fps), f"preparing {source.name}", total, unit=" clips")
-        with (
-            bar as clips,
-            (partial / "features.npy").open("wb", buffering=0) as file,
-            writing(folder, partial),
-            zipfile.ZipFile(partial / "references.npz", "w") as references,
-        ):
+        references: dict[str, np.ndarray] = {}
+        with bar as clips, (partial / "features.npy").open("wb", buffering=0) as file:
             _append(file, folder, _header(frames, representation.features))
             for chunk in _batched(clips, CHUNK):
                 for clip, features in zip(chunk, _encode(chunk, representation), strict=True):
@@ -167,19 +162,18 @@ def _write(folder: Path, source: MotionSource, representation: Representation, t
                     entry = Entry(clip.id, begin + first, length, clip.split, clip.source, clip.captions, clip.action)
                     entries.append(replace(entry, attributes=dict(clip.attributes)))
                     if clip.reference is not None:
-                        with references.open(f"{clip.id}.npy", "w", force_zip64=True) as member:
-                            np.lib.format.write_array(member, np.asarray(clip.reference, np.float32))
+                        references[clip.id] = np.asarray(clip.reference, np.float32)
             _check_entries(source.name, entries)
             file.seek(0)
             _append(file, folder, _header(frames, representation.features))
-        if not references.namelist():
-            (partial / "references.npz").unlink()
         packed = np.load(partial / "features.npy", mmap_mode="r")
         mean, std = source.statistics() or _statistics(representation, packed, entries)
         lines = [json.dumps(asdict(entry), ensure_ascii=False, sort_keys=True) for entry in entries]
         with writing(folder, partial):
             (partial / "clips.jsonl").write_text("\n".join(lines) + "\n", encoding="utf-8")
             np.savez(partial / "statistics.npz", mean=mean, std=std)
+            if references:
+                np.savez(partial / "references.npz", **references)  # type: ignore[arg-type]
             info = _describe(partial, source, representation, entries, frames, mean, std)
             (partial / "store.json").write_text(json.dumps(info, indent=2) + "\n")
             shutil.rmtree(folder, ignore_errors=True)

@@ -16,6 +16,7 @@ from flame_mdm.config import Config, movable, save
 from flame_mdm.data.datamodule import MotionDataModule
 from flame_mdm.errors import say
 from flame_mdm.files import write_json
+from flame_mdm.task import Task
 from flame_mdm.training.loggers import log_config
 
 PACKAGES = ("flame-mdm", "torch", "lightning", "torchmetrics", "transformers", "numpy", "scipy")
@@ -33,6 +34,7 @@ class Provenance(Callback):
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         if not trainer.is_global_zero:
             return
+        assert isinstance(pl_module, Task)
         folder = Path(self.config["run"]["dir"])
         save(movable(self.config), folder / "config.yaml", head="A saved run. EXP=path/to/this/file repeats it.")
         known: dict[str, Any] = pl_module.facts  # type: ignore[assignment]

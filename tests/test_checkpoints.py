@@ -505,7 +505,7 @@ def test_push_writes_a_card_and_uploads_these_files_alone(trained, tmp_path, cap
     import huggingface_hub
 
     folder = tmp_path / "mine"
-    words = ["push", str(trained), "me/walker", f"folder={folder}"]
+    words = ["push", str(trained), "me/walker", f"out={folder}"]
     assert main([*words, "dry_run=true"]) == 0
     card = (folder / "README.md").read_text()
     assert card.startswith("---\nlicense: mit\n")

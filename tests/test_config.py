@@ -10,6 +10,7 @@ from flame_mdm import config
 from flame_mdm.__main__ import main
 from flame_mdm.config import check, command_line, compose, flatten, instantiate, parameters, recipes, trust
 from flame_mdm.errors import UserError
+from flame_mdm.files import read_yaml
 
 
 @pytest.mark.parametrize("name", recipes())
@@ -214,3 +215,10 @@ def test_an_unknown_command_is_one_line(capsys):
     assert capsys.readouterr().err == (
         "error: unknown command: trian. Did you mean train? `flame-mdm --help` lists the commands\n"
     )
+
+
+def test_no_key_of_a_command_is_the_name_of_a_folder_of_recipes():
+    """Hydra would take `folder=x` for a choice among the files of `experiments/folder`."""
+    folders = {path.name for path in config.EXPERIMENTS.iterdir() if path.is_dir()}
+    for path in config.EXPERIMENTS.glob("*.yaml"):
+        assert not folders & set(read_yaml(path)), path.name

@@ -436,7 +436,7 @@ def test_push_takes_names_not_paths(attacked, trained, name):
 def test_push_overwrites_only_its_own_files(attacked, bad, trained):
     for name in ("README.md", "config.yaml"):
         (bad / name).write_text("mine")
-        attacked("push", str(trained), "a/b", f"folder={bad}", "dry_run=true", says="not written by push")
+        attacked("push", str(trained), "a/b", f"out={bad}", "dry_run=true", says="not written by push")
         assert (bad / name).read_text() == "mine"
         assert not (bad / "model.safetensors").exists()
         (bad / name).unlink()

@@ -9,7 +9,7 @@ from flame_mdm.config import Config, run
 from flame_mdm.errors import UserError, say
 
 USAGE = """
-usage: flame-mdm push CKPT user/name [folder=FOLDER] [private=true] [dry_run=true]
+usage: flame-mdm push CKPT user/name [OUT] [private=true] [dry_run=true]
 
 Writes model.safetensors, config.yaml and a model card, and uploads them to the Hugging Face hub.
 Keys, with their defaults: experiments/push.yaml
@@ -23,11 +23,11 @@ def _push(config: Config) -> None:
     from flame_mdm.checkpoints.loading import find
 
     name, upload = str(config["repository"]), not config["dry_run"]
-    folder = config["folder"] or Path("push") / name.rpartition("/")[2]
+    folder = config["out"] or Path("push") / name.rpartition("/")[2]
     folder = push(find(config["ckpt"], config["which"]), name, folder, upload=upload, private=config["private"])
     say(f"{f'uploaded to {name}' if upload else 'not uploaded'}: {folder}")
 
 
 main = partial(
-    run, _push, usage=USAGE, name="push", objects=("ckpt", "repository"), text=("ckpt", "repository", "folder")
+    run, _push, usage=USAGE, name="push", objects=("ckpt", "repository", "out"), text=("ckpt", "repository", "out")
 )

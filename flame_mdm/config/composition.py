@@ -154,7 +154,7 @@ def find_recipe(name: str) -> Recipe:
 def parse(overrides: Sequence[str]) -> list[Override]:
     for word in overrides:
         if len(word) > LONGEST_WORD:
-            raise UserError(f"{word[:60]}…: has {len(word):,} characters. The limit is {LONGEST_WORD:,}")
+            raise UserError(f"{word[:60]}…: {len(word):,} characters are too many. Give at most {LONGEST_WORD:,}")
     try:
         return OverridesParser.create().parse_overrides(list(overrides))
     except HydraException as error:

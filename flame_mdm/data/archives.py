@@ -129,11 +129,14 @@ class _Bounded:
     """
 
     def __init__(self, file: IO[bytes], packed: int):
-        self.file, self.packed, self.total = file, packed, 0
+        self.file, self.packed, self.total, self.ended = file, packed, 0, 0
 
     def read(self, size: int) -> bytes:
         data = self.file.read(size)
         self.total += len(data)
+        self.ended += not data
+        if self.ended > 2:  # tarfile would go on to the end of a member that declares any size
+            raise EOFError("it ends too early")
         check_expansion(self.total, self.packed)
         return data
 

@@ -42,23 +42,23 @@ def advice(text: str, facts: Mapping[str, Any], max_words: int | None = None) ->
         facts: of the checkpoint; older checkpoints have no vocabulary, and nothing is said about them.
         max_words: maximum number of words that the text encoder reads; None = no such limit.
     """
-    lines, asked = [], words(text)
-    known = set(facts.get("words", asked))
-    if unseen := [word for word in dict.fromkeys(asked) if word not in known]:
+    lines, prompt = [], words(text)
+    known = set(facts.get("words", prompt))
+    if unseen := [word for word in dict.fromkeys(prompt) if word not in known]:
         line = f"never seen in training: {', '.join(unseen)}. The model guesses from the other words"
         near = ", ".join(f"'{caption}'" for caption in nearest(text, facts.get("captions", ())))
         lines.append(line + f". The nearest training captions: {near}" * bool(near))
-    if max_words is not None and len(asked) > max_words:
-        lines.append(f"only the first {max_words} words are read, not '{' '.join(asked[max_words:])}'")
+    if max_words is not None and len(prompt) > max_words:
+        lines.append(f"only the first {max_words} words are read, not '{' '.join(prompt[max_words:])}'")
     return lines
 
 
 def nearest(text: str, captions: Sequence[str], count: int = 3) -> list[str]:
     """Returns the captions that share the largest part of their words with a text, best first; none if none does."""
-    asked = set(words(text))
+    prompt = set(words(text))
 
     def similarity(caption: str) -> float:
         others = set(words(caption))
-        return len(asked & others) / (len(asked | others) or 1)
+        return len(prompt & others) / (len(prompt | others) or 1)
 
     return sorted((c for c in captions if similarity(c)), key=similarity, reverse=True)[:count]

@@ -89,7 +89,7 @@ class _Facts(TypedDict):
     dataset: NotRequired[str]  # unknown for released extractors
     fingerprint: NotRequired[str | None]
     training: NotRequired[dict[str, Number]]
-    words: NotRequired[list[str]]
+    vocabulary: NotRequired[list[str]]
     captions: NotRequired[list[str]]
 
 

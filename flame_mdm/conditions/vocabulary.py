@@ -24,10 +24,10 @@ def vocabulary(captions: Iterable[str], *, share: bool) -> dict[str, list[str]]:
         share: whether the license of the data allows to redistribute captions.
 
     Returns:
-        "words": all words, sorted; with `share` also "captions": up to `MAX_CAPTIONS` of them, evenly spaced.
+        "vocabulary": all words, sorted; with `share` also "captions": up to `MAX_CAPTIONS` of them, evenly spaced.
     """
     distinct = sorted(set(captions))
-    kept = {"words": sorted({word for caption in distinct for word in words(caption)})}
+    kept = {"vocabulary": sorted({word for caption in distinct for word in words(caption)})}
     if share:
         count = min(len(distinct), MAX_CAPTIONS)
         kept["captions"] = [distinct[number * len(distinct) // count] for number in range(count)]
@@ -43,7 +43,7 @@ def advice(text: str, facts: Mapping[str, Any], max_words: int | None = None) ->
         max_words: maximum number of words that the text encoder reads; None = no such limit.
     """
     lines, prompt = [], words(text)
-    known = set(facts.get("words", prompt))
+    known = set(facts.get("vocabulary", prompt))
     if unseen := [word for word in dict.fromkeys(prompt) if word not in known]:
         line = f"never seen in training: {', '.join(unseen)}. The model guesses from the other words"
         near = ", ".join(f"'{caption}'" for caption in nearest(text, facts.get("captions", ())))

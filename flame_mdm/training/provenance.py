@@ -42,7 +42,7 @@ class Provenance(Callback):
             **environment(),
             "device": _device(trainer),
             "parameters": sum(p.numel() for p in pl_module.parameters() if p.requires_grad),
-            "data": {name: value for name, value in known.items() if name not in ("words", "captions")},
+            "data": {name: value for name, value in known.items() if name not in ("vocabulary", "captions")},
         }
         write_json(folder / "provenance.json", facts)
         for logger in trainer.loggers:

@@ -274,6 +274,7 @@ def features_of(extractor: UnconstrainedExtractor, motion: torch.Tensor) -> torc
         return extractor.motions(motion, motion, mask)["features"]
 
 
+@pytest.mark.slow
 def test_unconditioned_motions_are_compared_with_the_reference_motions(tmp_path: Path, capsys):
     """24 joints as models generate them, y up, and the same as the 15 of the file, y down and not from the pelvis."""
     torch.manual_seed(0)
@@ -352,6 +353,7 @@ def test_arrays_of_python_2_are_read(tmp_path: Path):
     np.testing.assert_array_equal(restricted_pickle.read(tmp_path / "x.pkl"), numbers)
 
 
+@pytest.mark.slow
 def test_classifiers_see_smpls_joints_or_the_result_says_that_they_do_not(tmp_path: Path, capsys):
     write_humanact12(tmp_path / "raw")
     raw = ["data=humanact12", f"data_root={tmp_path}"]

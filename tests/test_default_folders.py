@@ -10,6 +10,8 @@ from conftest import TINY
 from flame_mdm.__main__ import main
 from flame_mdm.commands.sample import default_folder
 
+pytestmark = pytest.mark.slow
+
 
 def folder(
     experiment: Any,

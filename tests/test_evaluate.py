@@ -35,6 +35,8 @@ from flame_mdm.representations.rot6d import Rot6D
 from flame_mdm.runs import read_result
 from flame_mdm.task import MotionGeneration
 
+pytestmark = pytest.mark.slow
+
 DATA = ("data=synthetic", "data.source.clips=400")
 GENERATOR = ["data.source.clips=400", *TINY[1:], "callbacks.samples=null", "trainer.val_check_interval=2"]
 CLIP = [
@@ -174,7 +176,6 @@ main(["evaluate", *sys.argv[1:]])
 """The command, ended by the operating system while it writes the motions of the second replication."""
 
 
-@pytest.mark.slow
 def test_a_killed_evaluation_goes_on_to_the_same_result(runs, tmp_path, monkeypatch):
     words = ["ckpt=model/last.ckpt", f"extractor={runs.clip}", "replications=2", "out=result.json", "device=cpu"]
     folders = [tmp_path / "undisturbed", tmp_path / "killed"]
@@ -225,7 +226,6 @@ def test_other_metrics_need_no_new_motions(runs, full, tmp_path, monkeypatch):
     assert "extractor" in result["not_computed"]
 
 
-@pytest.mark.slow
 def test_the_batch_size_does_not_matter(runs, full, tmp_path):
     result = runs.result(tmp_path / "result.json", "replications=2", "batch_size=7")
     for kind in ("ground_truth", "values"):
@@ -366,7 +366,6 @@ def refused(runs: Runs, capsys, tmp_path: Path, *words: str) -> str:
     return lines[0]
 
 
-@pytest.mark.slow
 def test_what_does_not_fit_is_refused_in_one_line(runs, capsys, tmp_path):
     assert "needs a feature extractor" in refused(runs, capsys, tmp_path, "extractor=null")
     assert "not a MotionCLIPTask" in refused(runs, capsys, tmp_path, f"extractor={runs.model}")
@@ -403,7 +402,6 @@ def test_misspelt_options_of_metrics_are_refused_before_anything_is_generated(ru
         assert message in refused(runs, capsys, tmp_path, protocol_file(tmp_path, old, new))
 
 
-@pytest.mark.slow
 def test_missing_inputs_of_metrics_are_refused_before_anything_is_generated(runs, capsys, tmp_path, monkeypatch):
     monkeypatch.setattr(Generator, "_generate", lambda *_: pytest.fail("sampled"))
     metrics = "evaluators.metrics"
@@ -459,7 +457,6 @@ def test_released_classifiers_give_features_and_scores_of_their_data_alone(tmp_p
             extractor.check(representation, "bandai")
 
 
-@pytest.mark.slow
 def test_the_t2m_evaluator_is_read_from_a_folder(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"lacks finest\.tar, mean\.npy"):
         T2MExtractor(str(tmp_path))
@@ -605,7 +602,6 @@ def means(result: dict) -> dict[str, float | None]:
     return {f"{kind} {name}": v["mean"] for kind in ("ground_truth", "values") for name, v in result[kind].items()}
 
 
-@pytest.mark.slow
 def test_processes_share_the_sampling_and_get_one_result(runs, tmp_path):
     """Shares of unequal sizes, and shares of nothing."""
     with GlooPool(2) as pool:
@@ -649,13 +645,11 @@ def stopped(rank: int, world: int, runs: Runs) -> str:
     return "generated"
 
 
-@pytest.mark.slow
 def test_off_ground_truth_stops_all_processes_and_one_says_why(runs):
     with GlooPool(2) as pool:
         assert pool.run(stopped, *((rank, 2, runs) for rank in range(2))) == ["UserError", "SystemExit"]
 
 
-@pytest.mark.slow
 def test_torchrun_writes_one_result(runs, tmp_path):
     """And no thread of gloo is left, which could abort the process while Python shuts down."""
     script = tmp_path / "evaluate.py"
@@ -686,7 +680,6 @@ def baseline(runs: Runs, folder: Path, kind: str, *words: str) -> int:
     return main(["evaluate", f"baseline={kind}", *place, f"extractor={runs.clip}", "replications=1", out, *words])
 
 
-@pytest.mark.slow
 def test_baselines_show_what_each_metric_sees(runs, tmp_path):
     found, truth = {}, {}
     for kind in Baseline.KINDS:

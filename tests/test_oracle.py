@@ -18,6 +18,8 @@ from flame_mdm.processes.diffusion import GaussianDiffusion
 from flame_mdm.representations import Representation
 from flame_mdm.seeds import normal
 
+pytestmark = pytest.mark.slow
+
 METERS, FRAMES = 10.0, 60
 
 

@@ -216,6 +216,7 @@ class Progress(Callback):
             initial=trainer.global_step,
             total=trainer.max_steps if trainer.max_steps > 0 else None,
             unit="step",
+            smoothing=0,  # validation and sampling, which take part of the time, count as well
             dynamic_ncols=True,
             file=sys.stderr if self.screen else io.StringIO(),
             disable=not trainer.is_global_zero,

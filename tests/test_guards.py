@@ -15,6 +15,8 @@ from flame_mdm.errors import UserError
 from flame_mdm.processes.diffusion import GaussianDiffusion
 from flame_mdm.training.guards import LAST, PREVIOUS, AtomicCheckpoints, newest, only_run
 
+pytestmark = pytest.mark.slow
+
 QUICK = ["callbacks.samples=null", "callbacks.best=null", "callbacks.checkpoints.every_n_steps=2"]
 
 
@@ -78,7 +80,6 @@ def test_out_of_memory_names_the_batch(tiny, monkeypatch, capsys, error):
     assert message.count("\n") == 1
 
 
-@pytest.mark.slow
 def test_a_damaged_checkpoint_gives_way_to_the_one_before(tiny, tmp_path, capsys):
     assert main(["train", *words(tiny, 6)]) == 0
     folder = tmp_path / "run" / "checkpoints"
@@ -126,7 +127,6 @@ with only_run(pathlib.Path(sys.argv[1])):
 """
 
 
-@pytest.mark.slow
 def test_a_second_run_in_the_folder_is_refused_and_a_dead_one_taken_over(tiny, tmp_path, capsys):
     folder = tmp_path / "run"
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}

@@ -24,6 +24,8 @@ from flame_mdm.training import callbacks
 from flame_mdm.training.callbacks import Measurements
 from flame_mdm.training.loggers import History
 
+pytestmark = pytest.mark.slow
+
 RUN = [*TINY, "trainer.log_every_n_steps=2", "trainer.val_check_interval=4", "callbacks.checkpoints.every_n_steps=4"]
 EVALUATE = """# @package _global_
 defaults:
@@ -117,7 +119,6 @@ def test_memory_is_told_on_cuda(monkeypatch):
     assert logged["train/epochs"] == 1
 
 
-@pytest.mark.slow
 def test_a_resumed_history_is_that_of_the_uninterrupted_run(tmp_path, data_root):
     parts = run(tmp_path / "parts", data_root, "trainer.max_steps=4", "callbacks.samples=null")
     with (parts / "metrics.jsonl").open("a") as file:  # what a killed run leaves behind
@@ -162,7 +163,6 @@ def rows(file: Path) -> Iterator[dict[str, Any]]:
                 yield {item.key or "/".join(item.nested_key): json.loads(item.value_json) for item in items}
 
 
-@pytest.mark.slow
 def test_wandb_has_one_run_through_resume(tmp_path, data_root, monkeypatch):
     monkeypatch.setenv("WANDB_SILENT", "true")
     monkeypatch.setenv("WANDB_MODE", "offline")

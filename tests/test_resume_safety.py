@@ -26,6 +26,8 @@ from flame_mdm.training import callbacks
 from flame_mdm.training.callbacks import Checkpoints
 from flame_mdm.training.guards import AtomicCheckpoints, lost_worker, only_run
 
+pytestmark = pytest.mark.slow
+
 STORE = "synthetic-humanml-clean-smpl22"
 QUIET = ["callbacks.samples=null", "callbacks.best=null", "logger=csv", "callbacks.checkpoints.every_n_steps=2"]
 
@@ -189,7 +191,6 @@ def small_disk(tmp_path) -> Iterator[Path]:
     subprocess.run(["umount", str(folder)], check=True)
 
 
-@pytest.mark.slow
 def test_a_full_disk_ends_a_preparation_in_one_line(small_disk):
     """In a process of its own: one that writes through a memory map is killed (SIGBUS)."""
 
@@ -265,7 +266,6 @@ def running(pids: list[int]) -> list[int]:
     return [pid for pid in pids if Path(f"/proc/{pid}").exists()]
 
 
-@pytest.mark.slow
 def test_a_killed_loading_process_is_told_in_one_line(training, tmp_path, data_root):
     process, workers = training
     assert len(workers) >= 2
@@ -308,7 +308,6 @@ def test_what_torch_says_of_lost_workers_is_understood(tmp_path, monkeypatch, me
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.slow
 def test_a_second_sigterm_ends_a_run_whose_loading_processes_hang(training):
     process, workers = training
     for pid in workers:

@@ -35,6 +35,8 @@ from flame_mdm.files import MEBIBYTE
 from flame_mdm.formats import resampling
 from flame_mdm.formats.bvh import read
 
+pytestmark = pytest.mark.slow
+
 
 def header(shape: tuple[int, ...], dtype: str = "<f8") -> bytes:
     """The header of an .npy file that declares any shape."""
@@ -132,7 +134,6 @@ def prepared(attacked: Refused, bad: Path, change: Callable[[Path], Any], says: 
     attacked("prepare", "data=folder", f"source={place}", f"data_root={root}", says=says)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("case", MOTIONS)
 def test_motion_files(attacked: Refused, bad: Path, trained: Path, case: str):
     name, content, says = MOTIONS[case]
@@ -158,7 +159,6 @@ def test_arrays_and_json(attacked: Refused, bad: Path):
         attacked("convert", str(bad / name), "out=out.bvh", *(["fps=20"] if "npy" in name else []), says=says)
 
 
-@pytest.mark.slow
 def test_links_and_pipes(attacked: Refused, bad: Path, trained: Path):
     os.mkfifo(bad / "pipe")
     for ending in ("npz", "bvh", "npy", "json"):
@@ -170,7 +170,6 @@ def test_links_and_pipes(attacked: Refused, bad: Path, trained: Path):
                 attacked("edit", f"ckpt={trained}", f"motion={path}", "region=in_between", "text=a", says=str(path))
 
 
-@pytest.mark.slow
 def test_entries_of_data_folders(attacked: Refused, bad: Path):
     def loop(place: Path) -> None:
         (place / "loop").symlink_to(place)
@@ -215,7 +214,6 @@ TABLES: list[tuple[str, bytes, str]] = [
 ]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("number", range(len(TABLES)))
 def test_tables_of_data_folders(attacked: Refused, bad: Path, number: int):
     name, content, says = TABLES[number]
@@ -294,7 +292,6 @@ def archive_cases() -> Iterator[tuple[bytes, str]]:
     yield bytes(10240), "no file dataset-1"
 
 
-@pytest.mark.slow
 def test_archives(attacked: Refused, bad: Path, monkeypatch):
     monkeypatch.setattr("flame_mdm.files.ARRAYS_LIMIT", 4 * MEBIBYTE)  # packing more takes long
     path, root = bad / "set", bad.parent / "prepared"
@@ -307,7 +304,6 @@ def test_archives(attacked: Refused, bad: Path, monkeypatch):
     attacked("prepare", "data=bandai", f"source={path}", f"data_root={root}", says="a pipe")
 
 
-@pytest.mark.slow
 def test_a_tar_archive_of_many_members_takes_little_memory(tmp_path: Path):
     path = tmp_path / "a.tar.gz"
     path.write_bytes(gzip.compress(member("x") * 20_000 + bytes(1024)))
@@ -347,7 +343,6 @@ def no_children(before: list) -> bool:
     return False
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("case", ["killed", "memory", "bomb", "pipe"])
 def test_one_bad_task_ends_all_workers(case: str, tmp_path: Path):
     (tmp_path / "bomb").write_bytes(bvh_at("999999"))
@@ -397,7 +392,6 @@ PICKLES = {
 }
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("case", PICKLES)
 def test_pickles(attacked: Refused, bad: Path, case: str):
     content, says = PICKLES[case]
@@ -455,7 +449,6 @@ INFOS = [("hours", 10**400), ("fps", 10**400), ("clips", COUNTS | {"<b>x": 1}), 
 INFOS += [("clips", {"train": 1}), ("actions", [1])]
 
 
-@pytest.mark.slow
 def test_every_field_of_a_store_is_checked(attacked: Refused, bad: Path):
     place = bad / "synthetic-humanml-clean-smpl22"
     words = ("browse", "data=synthetic", f"data_root={bad}", "clips=1", "out=out.html")
@@ -491,7 +484,6 @@ def test_crops_are_checked(attacked: Refused, bad: Path):
         attacked("train", "quickstart", f"data_root={bad}", f"data.crop={crop}", says="data.crop")
 
 
-@pytest.mark.slow
 def test_samples_of_other_kinds(attacked: Refused, bad: Path):
     root = bad.parent / "prepared"
     whole: dict[str, Any] = {"ids": np.array(["a"]), "lengths": np.array([4]), "features": np.zeros((4, 2))}

@@ -92,8 +92,9 @@ class MotionsForText(_RPrecision):
 
     This is the definition of the code of Guo et al. 2022, which the tables of MDM and MFM use. Test pairs in random
     order are split into pools of 32; each text ranks the motions of its pool by Euclidean distance. Equal captions may
-    be in the same pool. In that code, a pool is a batch of the data loader, an incomplete last batch is dropped,
-    distances are float32, and a motion exactly at its text may rank last (square root of a negative number). Here,
+    be in the same pool. In that code, a pool is a batch of the data loader, and an incomplete last batch is dropped.
+    Distances are float32, so a motion whose features equal those of its text may rank last (square root of a negative
+    number). Here,
     pools are drawn at random, and the texts of an incomplete last pool rank the last 32 motions, so that every text
     counts once.
 

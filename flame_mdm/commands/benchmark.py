@@ -25,8 +25,8 @@ if TYPE_CHECKING:
 USAGE = """
 usage: flame-mdm benchmark NAME [out=FOLDER]
 
-Trains a motion-CLIP and a small model of each kind, evaluates them, and writes a table and a report page: the whole
-pipeline in one command. If interrupted, the same command continues where it stopped.
+Trains a motion-CLIP and a small model of each kind, evaluates them, and writes a table and a report page, all in one
+command. If interrupted, the same command continues where it stopped.
 NAME is a file in experiments/benchmark: synthetic, which needs no download, or bandai.
 """
 

@@ -123,6 +123,8 @@ class Trials:
         good = good and code in names
         self.good &= good
         print(f"| {number + 1} | {kill} | {names.get(code, f'exit code {code}')} | {found} |" + " WRONG" * (not good))
+        if code not in names:
+            print((self.folder / "log").read_text())
 
     def verdict(self, what: str, good: bool) -> None:
         self.good &= good

@@ -12,6 +12,7 @@ import pytest
 from conftest import TINY
 
 from flame_mdm.__main__ import main
+from flame_mdm.config.command_line import guarded
 from flame_mdm.data.store import Store
 
 pytestmark = pytest.mark.slow
@@ -100,3 +101,28 @@ def test_the_second_process_takes_over_from_one_that_is_killed(both, tmp_path):
     assert "preparing" in err
     assert [path.name for path in tmp_path.iterdir()] == [STORE], out
     Store(tmp_path / STORE).verify()
+
+
+@pytest.mark.parametrize(("signum", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
+@pytest.mark.parametrize("fails", [True, False])
+def test_a_library_that_fails_after_a_signal_does_not_hide_it(signum, code, fails, capsys):
+    def command() -> None:
+        try:
+            os.kill(os.getpid(), signum)
+            time.sleep(1)
+        finally:
+            if fails:
+                raise OSError("cannot close the file")
+
+    handlers = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
+    assert guarded(command, (signal.SIGINT, signal.SIGTERM)) == code
+    assert "cannot close" not in capsys.readouterr().err
+    assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == handlers
+
+
+def test_an_ignored_signal_stays_ignored():
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)  # as a shell does for a job in the background
+    try:
+        assert guarded(lambda: os.kill(os.getpid(), signal.SIGINT), (signal.SIGINT,)) == 0
+    finally:
+        signal.signal(signal.SIGINT, before)

@@ -9,7 +9,7 @@ import signal
 import sys
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from itertools import groupby
 from pathlib import Path
 from types import FrameType
@@ -82,8 +82,7 @@ def run(
     def serve(keyed: Sequence[str]) -> None:
         _serve(command, [_quoted(word, text) for word in keyed], name, codes, kinds or {})
 
-    with _stoppable() if name is not None else nullcontext():  # training has its own handler
-        return guarded(lambda: serve(words if name is None else _with_keys(words, objects))) or max(codes)
+    return guarded(lambda: serve(words if name is None else _with_keys(words, objects)), _signals(name)) or max(codes)
 
 
 def _with_keys(words: Sequence[str], objects: Sequence[str]) -> list[str]:
@@ -107,18 +106,33 @@ def _is_object(word: str) -> bool:
     return "=" not in word or path
 
 
+def _signals(name: str | None) -> tuple[int, ...]:
+    return (signal.SIGINT,) if name is None else (signal.SIGINT, signal.SIGTERM)  # training handles SIGTERM itself
+
+
 @contextmanager
-def _stoppable() -> Iterator[None]:
-    """Turns SIGTERM into an exception, so that partial files are cleaned up; the exit code is 143."""
+def _stoppable(signums: Sequence[int]) -> Iterator[None]:
+    """Turns signals into exceptions, so that partial files are cleaned up; the exit code is 128 + the signal."""
+    received: list[int] = []
+
+    def exception(number: int) -> BaseException:
+        return KeyboardInterrupt() if number == signal.SIGINT else SystemExit(128 + number)
 
     def stop(number: int, frame: FrameType | None) -> NoReturn:
-        raise SystemExit(128 + number)
+        received.append(number)
+        raise exception(number)
 
-    before = signal.signal(signal.SIGTERM, stop)
+    before = {n: signal.signal(n, stop) for n in signums if signal.getsignal(n) is not signal.SIG_IGN}
     try:
         yield
+    except Exception:
+        # The exception of a signal may come between any two steps of a library, whose cleanup can then fail.
+        if received:
+            raise exception(received[0]) from None
+        raise
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def _serve(
@@ -154,7 +168,7 @@ def _serve(
         if name is None:  # Lightning starts further processes with these words
             folder = _quoted(f"run.dir={plain['run']['dir']}", ("run.dir",))
             sys.argv = [sys.argv[0], "train", first, *task, folder]
-        code = guarded(lambda: command(plain))
+        code = guarded(lambda: command(plain), _signals(name))
         codes.append(code)
         return code
 
@@ -236,13 +250,14 @@ def _quoted(word: str, keys: Sequence[str]) -> str:
     return f"{key}='{escaped}'"
 
 
-def guarded(action: Callable[[], None]) -> int:
-    """Runs `action` and returns the exit code.
+def guarded(action: Callable[[], None], signums: Sequence[int] = ()) -> int:
+    """Runs `action` and returns the exit code; a signal of `signums` ends it after it has cleaned up.
 
     For an error that the user can fix, it prints one line and returns 1; FLAME_MDM_TRACEBACK=1 adds the traceback.
     """
     try:
-        action()
+        with _stoppable(signums):
+            action()
     except (UserError, ValueError, OSError, MemoryError, RecursionError, RuntimeError, ImportError) as error:
         memory = isinstance(error, MemoryError)
         memory |= not isinstance(error, UserError) and NO_MEMORY.search(str(error)) is not None

@@ -124,9 +124,12 @@ def _processes(device: str | None) -> Iterator[tuple[int, int, str]]:
     """Joins the processes started by torchrun, if any. Yields rank, number of processes, and device of this process."""
     import torch
 
+    from flame_mdm.checkpoints.loading import check_device
+
     rank, world, local = (int(os.environ.get(n, d)) for n, d in (("RANK", 0), ("WORLD_SIZE", 1), ("LOCAL_RANK", 0)))
     if device is None:
         device = f"cuda:{local % torch.cuda.device_count()}" if torch.cuda.is_available() else "cpu"
+    check_device(device)
     if world == 1:
         yield rank, world, device
         return

@@ -229,6 +229,29 @@ def test_command_names_the_data_sets(capsys):
     assert "data=NAME, one of: " in capsys.readouterr().err
 
 
+def test_own_data_are_shown_by_their_name(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    walk = next(Synthetic(clips=1).clips(20.0)).motion
+    Path("files").mkdir()
+    for name in ("a", "b"):
+        np.save(Path("files") / f"{name}.npy", walk)
+    (Path("files") / "skeleton.yaml").write_text("fps: 20\n")
+    (Path("files") / "captions.csv").write_text("id,text,split\na,a person walks,train\nb,a person walks,test\n")
+    assert main(["browse", "data=folder", "source=files", "data.name=my set", "data.source.mirror=true"]) == 0
+    shutil.rmtree("files")  # a prepared set is enough from here on
+    assert main(["browse", "my set", "page.html"]) == 0
+    assert [m["id"] for m in Page(Path("page.html")).motions] == ["a", "Ma", "b"], "with the options of its preparation"
+    capsys.readouterr()
+    assert main(["browse", "data=my set", "source=files", "out=page.html"]) == 0
+    assert "already prepared; source=files is not read" in capsys.readouterr().out
+    shutil.copytree("data/my set-humanml-clean-smpl22", "data/my set-smpl147")
+    assert main(["browse", "data=my set"]) == 1
+    assert "data=my set was prepared as humanml_clean and as smpl. Add rep" in capsys.readouterr().err
+    assert main(["browse", "data=my set", "representation=humanml_clean"]) == 0
+    assert main(["browse", "data=my"]) == 1
+    assert "no data is called 'my'" in capsys.readouterr().err
+
+
 @pytest.mark.tools
 @pytest.mark.skipif(shutil.which("chromium") is None, reason="chromium is not installed")
 def test_page_narrows_down_in_a_browser(store, tmp_path):

@@ -21,6 +21,9 @@ from flame_mdm.task import MotionGeneration, Task
 
 Which = Literal["last", "best"]
 
+NO_GPU = "PyTorch finds no GPU" if torch.version.cuda or torch.version.hip else "this PyTorch was built without CUDA"
+"""Why no GPU can be used, if PyTorch has none."""
+
 
 def find(source: str | Path, which: Which = "last") -> Path:
     """Returns the file of a model.
@@ -93,10 +96,7 @@ def load_task(path: Path, kind: type[Trained], device: str | torch.device = "cpu
         UserError: If it is not a checkpoint of this framework, holds another kind of task, is damaged, or its weights
             do not match its recipe.
     """
-    try:
-        torch.empty(0, device=device)
-    except (RuntimeError, AssertionError) as error:  # torch reports an absent device as either
-        raise UserError(f"device={device}: {str(error).splitlines()[0]}") from error
+    check_device(device)
     checkpoint = read_checkpoint(path)
     try:
         return _build(path, checkpoint, kind).eval().to(device)
@@ -104,6 +104,16 @@ def load_task(path: Path, kind: type[Trained], device: str | torch.device = "cpu
         raise
     except Exception as error:  # a nonsensical recipe may fail anywhere
         raise UserError(f"{path}: cannot build the model: {type(error).__name__}: {error}") from error
+
+
+def check_device(device: str | torch.device) -> None:
+    """Raises `UserError` if this machine has no such device."""
+    try:
+        torch.empty(0, device=device)
+    except (RuntimeError, AssertionError) as error:  # torch reports an absent device as either
+        gpus = [f"cuda:{number}" for number in range(torch.cuda.device_count())]
+        there = ", ".join(["cpu", *gpus]) + f" ({NO_GPU})" * (not gpus)
+        raise UserError(f"device={device}: this machine has only {there}. Drop device=, or change it") from error
 
 
 def _build(path: str | Path, checkpoint: dict[str, Any], kind: type[Trained]) -> Trained:

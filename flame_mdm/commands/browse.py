@@ -2,21 +2,29 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Sequence
 from functools import partial
+from glob import escape
 from pathlib import Path
 
+from flame_mdm.commands import data_node
 from flame_mdm.config import EXPERIMENTS, Config, instantiate, run
 from flame_mdm.errors import UserError, say
+from flame_mdm.files import read_yaml
 from flame_mdm.reporting.browse import choose, find, write_clips, write_page
 
 USAGE = """
-usage: flame-mdm browse data=NAME [split=train] [search="waves left"] [clips=200] [out=FILE.html]
+usage: flame-mdm browse data=NAME [source=PATH] [split=train] [search="waves left"] [clips=200] [out=FILE.html]
        flame-mdm browse data=NAME split=test clips=10 motions=FOLDER
 
+NAME is a data set, as for `prepare`, or the name of your own prepared set (data.name).
 Writes a single web page that opens from disk. It shows clips of a data set with their captions, mirrored copies next
 to their originals, a search field, a choice of splits, the distribution of clip lengths and other statistics.
 motions=FOLDER also writes the shown clips as motion files, to compare generated motions with them.
 """
+
+STORE = "store.json"
 
 
 def browse(config: Config) -> None:
@@ -26,14 +34,18 @@ def browse(config: Config) -> None:
         UserError: If no data set is named, no clip matches, or the folder `motions` holds other motions.
         FileNotFoundError, ValueError: If the raw data is missing or damaged.
     """
-    if "data" not in config:
-        names = sorted(path.stem for path in (EXPERIMENTS / "data").glob("*.yaml"))
-        raise UserError(f"no data set named. Add data=NAME, one of: {', '.join(names)}")
+    node = data_node(config)
     if config["clips"] < 1:
         raise UserError(f"clips={config['clips']}: must be at least 1")
 
+    from flame_mdm.data.store import Store
+
     representation = instantiate(config["representation"])
-    data = instantiate(config["data"], representation=representation)
+    data = instantiate(node, representation=representation)
+    if (data.folder / STORE).exists() and data.source.named_by_recipe:
+        data.source.options = Store(data.folder).info.get("source", {})  # own data are shown as they were prepared
+        if config["source"] is not None:
+            say(f"{data.folder}: already prepared; source={config['source']} is not read (prepare it with force=true)")
     data.prepare_data()
     store = data.open()
     if config["split"] not in (None, *store.info["clips"]):
@@ -55,4 +67,32 @@ def browse(config: Config) -> None:
         say(f"{config['motions']}: {len(clips)} motions")
 
 
-main = partial(run, browse, usage=USAGE, name="browse", objects=("data", "out"), text=("search", "out", "motions"))
+def prepared(words: Sequence[str]) -> list[str]:
+    """Replaces `data=NAME`, where NAME is a prepared set of the user's own motions, by the keys of that set.
+
+    Raises:
+        UserError: If NAME was prepared in several representations and none is chosen.
+    """
+    given = dict(word.partition("=")[::2] for word in words)
+    name, root = given.get("data", ""), Path(given.get("data_root", os.environ.get("FLAME_MDM_DATA", "data")))
+    if not name or (EXPERIMENTS / "data" / f"{name}.yaml").exists() or not any(root.glob(f"{escape(name)}-*/{STORE}")):
+        return list(words)
+    files = sorted((EXPERIMENTS / "representation").glob("*.yaml"))
+    found = [p.stem for p in files if (root / f"{name}-{instantiate(read_yaml(p)).name}" / STORE).exists()]
+    if "representation" in given:
+        found = []
+    if len(found) > 1:
+        raise UserError(f"data={name} was prepared as {' and as '.join(found)}. Add representation={found[0]}")
+    rest = [word for word in words if word != f"data={name}"]
+    return ["data=folder", f"data.name={name}", *(f"representation={option}" for option in found), *rest]
+
+
+main = partial(
+    run,
+    browse,
+    usage=USAGE,
+    name="browse",
+    objects=("data", "out"),
+    text=("search", "source", "data.name", "out", "motions"),
+    rewrite=prepared,
+)

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from functools import partial
 
-from flame_mdm.config import EXPERIMENTS, Config, instantiate, run
-from flame_mdm.errors import UserError, say
+from flame_mdm.commands import data_node
+from flame_mdm.config import Config, instantiate, run
+from flame_mdm.errors import say
 
 USAGE = """
 usage: flame-mdm prepare data=NAME [source=PATH] [representation=NAME] [check|verify|force=true]
@@ -22,14 +23,7 @@ def prepare(config: Config) -> None:
         UserError: If no data set is named, or the data set takes no source.
         FileNotFoundError, ValueError: If the raw data is missing or damaged.
     """
-    if "data" not in config:
-        names = sorted(path.stem for path in (EXPERIMENTS / "data").glob("*.yaml"))
-        raise UserError(f"no data set named. Add data=NAME, one of: {', '.join(names)}")
-    node = config["data"]
-    if config["source"] is not None:
-        if "path" not in node["source"]:
-            raise UserError(f"source={config['source']}: {node['name']} is generated and has no source. Drop source=")
-        node["source"]["path"] = str(config["source"])
+    node = data_node(config)
 
     from flame_mdm.data.store import write_store
     from flame_mdm.data.verify import deviations, lines, report

@@ -52,6 +52,7 @@ def run(
     objects: Sequence[str] = (),
     text: Sequence[str] = (),
     kinds: Mapping[str, str] | None = None,
+    rewrite: Callable[[Sequence[str]], Sequence[str]] = list,
 ) -> int:
     """Runs a command line `[OBJECT [OUT]] key=value ...` through Hydra and returns the exit code.
 
@@ -64,6 +65,7 @@ def run(
         objects: keys of the leading words that have no key, in this order; a key that ends with `*` takes all remaining
             words.
         text: keys whose values are taken literally, not parsed with Hydra's grammar.
+        rewrite: replaces the words, all `key=value`, before they are composed.
         kinds: annotations of keys whose values are checked, such as `{"seconds": "float"}`; null is always legal.
     """
     words = _make_variables() if "--from-make" in argv else list(argv)
@@ -79,10 +81,11 @@ def run(
         return 0 if words else 2
     codes = [0]
 
-    def serve(keyed: Sequence[str]) -> None:
+    def serve() -> None:
+        keyed = words if name is None else rewrite(_with_keys(words, objects))
         _serve(command, [_quoted(word, text) for word in keyed], name, codes, kinds or {})
 
-    return guarded(lambda: serve(words if name is None else _with_keys(words, objects)), _signals(name)) or max(codes)
+    return guarded(serve, _signals(name)) or max(codes)
 
 
 def _with_keys(words: Sequence[str], objects: Sequence[str]) -> list[str]:

@@ -17,6 +17,7 @@ from lightning.fabric.plugins.environments.slurm import SLURMEnvironment
 from lightning.fabric.plugins.environments.torchelastic import TorchElasticEnvironment
 from lightning.pytorch.callbacks import EMAWeightAveraging
 
+from flame_mdm.checkpoints.loading import NO_GPU
 from flame_mdm.config import Config, instantiate
 from flame_mdm.data.datamodule import MotionDataModule
 from flame_mdm.errors import UserError, say
@@ -34,6 +35,7 @@ def fit(folder: Path, config: Config) -> None:
         UserError, SystemExit: As for `flame-mdm train`.
     """
     _quiet()
+    check_devices(config["trainer"])
     torch.set_float32_matmul_precision("high")
     checkpoint, step = newest(folder / "checkpoints")
     most = config["trainer"]["max_steps"]
@@ -85,6 +87,26 @@ def fit(folder: Path, config: Config) -> None:
         if explained := lost or out_of_memory(error, callbacks, trainer.global_step):
             raise explained from error
         raise
+
+
+def check_devices(trainer: Config) -> None:
+    """Checks that this machine has the accelerator and the number of devices of a recipe.
+
+    `accelerator=cpu` may start any number of processes; `auto` starts one per core at most, since users mean GPUs.
+
+    Raises:
+        UserError: If not. Other accelerators than GPU and CPU are left to Lightning.
+    """
+    accelerator, devices = trainer.get("accelerator", "auto"), trainer.get("devices", 1)
+    gpus, cores = torch.cuda.device_count(), os.cpu_count() or 1
+    if torch.backends.mps.is_available() and accelerator in ("auto", "gpu"):
+        gpus = 1
+    if accelerator in ("gpu", "cuda") and not gpus:
+        raise UserError(f"trainer.accelerator={accelerator}: {NO_GPU}. Drop it to train on the CPU")
+    most = gpus if gpus and accelerator != "cpu" else cores
+    if accelerator in ("gpu", "cuda", "auto") and isinstance(devices, int) and devices > most:
+        there = f"this machine has {most} " + (f"GPU{'s' * (most > 1)}" if gpus else f"CPU cores, and {NO_GPU}")
+        raise UserError(f"trainer.devices={devices}: {there}. Give at most trainer.devices={most}")
 
 
 def _requeue() -> None:

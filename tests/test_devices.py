@@ -1,0 +1,50 @@
+"""Accelerators and devices that a machine does not have."""
+
+import os
+
+import pytest
+import torch
+
+from flame_mdm.__main__ import main
+from flame_mdm.checkpoints.loading import NO_GPU
+from flame_mdm.training.fit import check_devices
+
+
+@pytest.mark.parametrize(
+    ("gpus", "words", "message"),
+    [
+        (0, ["trainer.accelerator=gpu"], "trainer.accelerator=gpu: {none}. Drop it to train on the CPU"),
+        (0, ["trainer.accelerator=cuda"], "trainer.accelerator=cuda: {none}. Drop it to train on the CPU"),
+        (0, ["trainer.devices=99"], "trainer.devices=99: this machine has 3 CPU cores, and {none}. Give at most"),
+        (1, ["trainer.devices=2"], "trainer.devices=2: this machine has 1 GPU. Give at most trainer.devices=1"),
+        (
+            2,
+            ["trainer.devices=4", "trainer.accelerator=gpu"],
+            "trainer.devices=4: this machine has 2 GPUs. Give at most",
+        ),
+    ],
+)
+def test_training_names_what_is_missing(tmp_path, monkeypatch, capsys, gpus, words, message):
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: gpus)
+    monkeypatch.setattr(os, "cpu_count", lambda: 3)
+    assert main(["train", "quickstart", f"run.dir={tmp_path / 'run'}", f"data_root={tmp_path}", *words]) == 1
+    error = capsys.readouterr().err
+    assert message.format(none=NO_GPU) in error
+    assert error.count("\n") == 1
+
+
+def test_a_cpu_may_be_told_to_run_more_processes_than_cores(monkeypatch):
+    monkeypatch.setattr(os, "cpu_count", lambda: 1)
+    check_devices({"accelerator": "cpu", "devices": 2})
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+    check_devices({"accelerator": "auto", "devices": 2})
+    check_devices({"accelerator": "cpu", "devices": 8})
+
+
+@pytest.mark.parametrize("device", ["gpu", "cuda:77", "abacus"])
+def test_other_commands_name_the_devices_of_the_machine(trained, capsys, device):
+    for words in (["sample", str(trained), "text=a person walks"], ["evaluate", str(trained), "extractor=none"]):
+        assert main([*words, f"device={device}"]) == 1
+        error = capsys.readouterr().err
+        assert f"error: device={device}: this machine has only cpu" in error
+        assert error.count("\n") == 1

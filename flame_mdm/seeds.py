@@ -7,12 +7,16 @@ splittable pseudorandom number generators") and mapped to the normal distributio
 
 import hashlib
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any, TypeVar
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from flame_mdm.motion import Noise
+
+Counters = TypeVar("Counters", Tensor, np.ndarray)
 
 
 def key(*parts: str | int) -> int:
@@ -28,15 +32,30 @@ def _signed(value: int) -> int:
 _GOLDEN, _MIX1, _MIX2 = (_signed(v) for v in (0x9E3779B97F4A7C15, 0xBF58476D1CE4E5B9, 0x94D049BB133111EB))
 
 
-def _shift_right(x: Tensor, bits: int) -> Tensor:
+def _shift_right(x: Counters, bits: int) -> Counters:
     return (x >> bits) & ((1 << (64 - bits)) - 1)
 
 
-def _hash(x: Tensor) -> Tensor:
+def _hash(x: Counters) -> Counters:
     x = x + _GOLDEN
     x = (x ^ _shift_right(x, 30)) * _MIX1
     x = (x ^ _shift_right(x, 27)) * _MIX2
     return x ^ _shift_right(x, 31)
+
+
+def integers(keys: np.ndarray) -> Callable[[Any], np.ndarray]:
+    """Returns a function that draws uniform integers (B,) from 0 up to, and not including, its argument.
+
+    The argument is an integer below 2^31, or one for each key (B,) int64. Each call is another draw.
+    """
+    state = keys
+
+    def below(count: Any) -> np.ndarray:
+        nonlocal state
+        state = _hash(state)
+        return (_shift_right(state, 33) * count) >> 31
+
+    return below
 
 
 def uniform(keys: Tensor, shape: Sequence[int]) -> tuple[Tensor, Tensor]:

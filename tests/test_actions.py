@@ -223,9 +223,9 @@ def test_samples_are_those_of_actor(number: str, tmp_path: Path):
     data.prepare_data()
     data.setup("fit")
     low, high, drawn = (int(value) for value in arrays[f"a2m/shift_draw_{number}"])
-    starts = {int(data.train.frames(0, batch)[0]) for batch in range(400)}
+    starts = {int(data.train.draw([0], batch)[0][0]) for batch in range(400)}
     assert starts == set(range(max(low, 0), max(high, 0) + 1))
-    wanted = next(batch for batch in range(400) if data.train.frames(0, batch)[0] == max(drawn, 0))
+    wanted = next(batch for batch in range(400) if data.train.draw([0], batch)[0][0] == max(drawn, 0))
     _, sample, _, action = data.train[0, wanted]
     assert action == label
     np.testing.assert_allclose(sample.numpy(), expected, atol=2e-6)

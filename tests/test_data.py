@@ -13,6 +13,7 @@ from flame_mdm.data.store import Store, _fingerprint, write_store
 from flame_mdm.data.synthetic import Synthetic
 from flame_mdm.motion import collate
 from flame_mdm.representations.humanml import HumanML
+from flame_mdm.seeds import integers
 
 
 @pytest.fixture(scope="module")
@@ -162,12 +163,48 @@ def test_fixed_crops_repeat_the_last_frame_of_short_clips():
     np.testing.assert_array_equal(Whole(1, 10)(30, generator), np.arange(10))
 
 
+@pytest.mark.parametrize("crop", [Units(40, 196, 4), Whole(1, 90), Fixed(60)])
+def test_drawn_numbers_follow_the_rule(crop):
+    """Those of training are a function of seed, batch and clip; those of one clip do not depend on the others."""
+    frames = np.random.default_rng(0).integers(40, 300, 5000)
+    first, length = crop.draw(frames, integers(np.arange(5000)))
+    last = np.minimum(first + length, frames)
+    assert (first >= 0).all()
+    assert (length <= crop.longest()).all()
+    for count, begin, size in zip(frames[:50], first, length, strict=False):
+        assert begin + size <= count or isinstance(crop, Fixed)
+    for index in (0, 7, 4999):
+        alone = crop.draw(frames[[index]], integers(np.array([index])))
+        assert (alone[0][0], alone[1][0]) == (first[index], length[index])
+    assert (last <= frames).all()
+    fixed = crop.draw(frames, None)
+    for index in range(20):
+        given = crop(int(frames[index]), None)
+        assert (given[0], len(given)) == (fixed[0][index], fixed[1][index])
+    if isinstance(crop, Units):
+        whole = np.minimum(frames, 196) // 4 * 4
+        assert abs((length < whole).mean() - 1 / 3) < 0.02
+        spare = frames - length
+        assert abs((first / np.maximum(spare, 1))[spare > 20].mean() - 0.5) < 0.02
+
+
+def test_integers_are_uniform_and_independent():
+    below = integers(np.arange(60_000))
+    first, second, many = below(6), below(6), below(np.tile([1, 2, 3], 20_000))
+    expected = 60_000 / 36
+    counts = np.bincount(6 * first + second, minlength=36)
+    assert ((counts - expected) ** 2 / expected).sum() < 70  # chi-squared with 35 degrees: p < 0.0005 beyond
+    neighbors = np.bincount(6 * first[:-1] + first[1:], minlength=36)
+    assert ((neighbors - expected) ** 2 / expected).sum() < 70
+    assert [set(many[k::3].tolist()) for k in range(3)] == [{0}, {0, 1}, {0, 1, 2}]
+
+
 def test_samples_are_normalized_crops(store):
     clips = clips_of(store)
     name, x, text, _ = clips[3, 7]
-    frames = clips.frames(3, 7)
+    (first,), (length,), _ = clips.draw([3], 7)
     entry = clips.clips[3]
-    expected = (store.motion(entry)[frames] - store.mean) / store.std
+    expected = (store.motion(entry)[first : first + length] - store.mean) / store.std
     np.testing.assert_allclose(x.numpy(), expected, atol=1e-5)
     assert (name, text in entry.captions) == (entry.id, True)
     assert len({len(clips[3, batch][1]) for batch in range(20)}) > 1

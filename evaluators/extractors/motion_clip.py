@@ -238,7 +238,7 @@ class MotionCLIPTask(Task):
     def on_validation_epoch_start(self) -> None:
         """Chooses the metrics: R-precision needs 32 different captions, and is skipped on smaller sets."""
         clips = self.trainer.datamodule.val  # type: ignore[attr-defined]
-        enough = len({clips.caption(clip, -1) for clip in clips.clips}) >= POOL
+        enough = len({clips.caption(index, number) for index, number in enumerate(clips.evaluated)}) >= POOL
         self.measured: dict[str, Any] = dict(self.retrieval.items()) if enough else {}
 
     def validation_step(self, batch: MotionBatch, batch_idx: int) -> None:

@@ -2,31 +2,44 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Any
 
 import numpy as np
 
+Below = Callable[[Any], Any]
+"""Draws uniform integers from 0 up to, and not including, its argument: an integer, or one for each of B clips."""
 
-@runtime_checkable
-class Crop(Protocol):
+
+class Crop(ABC):
     """A rule that selects the frames of a training sample from a clip of any length."""
 
+    @abstractmethod
     def shortest(self) -> int:
         """Returns the minimum number of frames of a clip."""
-        ...
 
+    @abstractmethod
     def longest(self) -> int:
         """Returns the maximum number of frames of a sample."""
-        ...
+
+    @abstractmethod
+    def draw(self, frames: Any, below: Below | None) -> tuple[Any, Any]:
+        """Draws samples from clips with `frames` (B,) frames, or from one clip; without `below`, they are fixed.
+
+        Returns:
+            First frame and number of frames (B,) of the samples. Past the end of a clip, its last frame is repeated.
+        """
 
     def __call__(self, frames: int, generator: np.random.Generator | None) -> np.ndarray:
         """Returns the indices of the frames selected from a clip of `frames` frames; fixed without a generator."""
-        ...
+        first, length = self.draw(frames, generator.integers if generator else None)
+        return np.minimum(np.arange(length) + first, frames - 1)
 
 
 @dataclass(frozen=True)
-class Units:
+class Units(Crop):
     """HumanML3D and KIT (Guo et al. 2022): a multiple of `unit` frames, one unit shorter in one of three draws.
 
     A clip longer than `max_frames` gives a window of that length at a random position. Without a generator: the longest
@@ -50,17 +63,16 @@ class Units:
     def longest(self) -> int:
         return self.max_frames
 
-    def __call__(self, frames: int, generator: np.random.Generator | None) -> np.ndarray:
-        length = min(frames, self.max_frames) // self.unit * self.unit
-        if generator is None:
-            return np.arange(length)
-        if generator.integers(3) == 0 and length > self.unit:
-            length -= self.unit
-        return np.arange(length) + generator.integers(frames - length + 1)
+    def draw(self, frames: Any, below: Below | None) -> tuple[Any, Any]:
+        length = np.minimum(frames, self.max_frames) // self.unit * self.unit
+        if below is None:
+            return np.zeros_like(length), length
+        length = length - self.unit * ((below(3) == 0) & (length > self.unit))
+        return below(frames - length + 1), length
 
 
 @dataclass(frozen=True)
-class Whole:
+class Whole(Crop):
     """FLAME: the whole clip, cut after `max_frames`."""
 
     min_frames: int = 1
@@ -72,12 +84,13 @@ class Whole:
     def longest(self) -> int:
         return self.max_frames
 
-    def __call__(self, frames: int, generator: np.random.Generator | None) -> np.ndarray:
-        return np.arange(min(frames, self.max_frames))
+    def draw(self, frames: Any, below: Below | None) -> tuple[Any, Any]:
+        length = np.minimum(frames, self.max_frames)
+        return np.zeros_like(length), length
 
 
 @dataclass(frozen=True)
-class Fixed:
+class Fixed(Crop):
     """ACTOR's action data sets: always `frames` frames; short clips repeat their last frame, long ones give a window.
 
     As in ACTOR's code, the window never starts at the last possible frame. Without a generator: the first window.
@@ -92,7 +105,7 @@ class Fixed:
     def longest(self) -> int:
         return self.frames
 
-    def __call__(self, frames: int, generator: np.random.Generator | None) -> np.ndarray:
-        spare = max(0, frames - self.frames - 1)
-        start = 0 if generator is None else int(generator.integers(spare + 1))
-        return np.minimum(np.arange(self.frames) + start, frames - 1)
+    def draw(self, frames: Any, below: Below | None) -> tuple[Any, Any]:
+        spare = np.maximum(0, frames - self.frames - 1)
+        first = np.zeros_like(spare) if below is None else below(spare + 1)
+        return first, np.full_like(spare, self.frames)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -18,10 +19,10 @@ from torch.utils.data import DataLoader, Dataset, Sampler
 
 from flame_mdm.data import MotionSource, Split
 from flame_mdm.data.crops import Crop
-from flame_mdm.data.store import Entry, Store, write_store
+from flame_mdm.data.store import Store, write_store
 from flame_mdm.motion import collate
 from flame_mdm.representations import Representation
-from flame_mdm.seeds import key
+from flame_mdm.seeds import integers, key
 
 MAX_FRAMES = 100_000
 """Maximum number of frames of a sample; one hour at 20 frames per second has 72,000."""
@@ -41,28 +42,49 @@ class Clips(Dataset[Sample]):
         of_split = [clip for clip in store.clips if clip.split == split]
         self.clips = [clip for clip in of_split if clip.length >= crop.shortest()]
         self.too_short = len(of_split) - len(self.clips)
-        self.lengths = np.array([min(c.length, crop.longest()) for c in self.clips])
+        self.frames = np.array([clip.length for clip in self.clips], np.int64)
+        self.lengths = np.minimum(self.frames, crop.longest())
+        self.captions = np.array([len(clip.captions) for clip in self.clips], np.int64)
         self.mean, self.std = store.mean.astype(np.float32), store.std.astype(np.float32)
 
     def __len__(self) -> int:
         return len(self.clips)
 
     def __getitem__(self, draw: Draw) -> Sample:
-        index, batch = draw
-        clip = self.clips[index]
-        features = self.representation.rebase(self.store.motion(clip)[self.frames(index, batch)])
-        return clip.id, torch.from_numpy((features - self.mean) / self.std), self.caption(clip, batch), clip.action
+        return self.__getitems__([draw])[0]
 
-    def frames(self, index: int, batch: int) -> np.ndarray:
-        """Returns the indices of the frames of a clip in a batch."""
-        generator = None if batch < 0 else np.random.default_rng((self.seed, batch, index))
-        return self.crop(self.clips[index].length, generator)
+    def __getitems__(self, draws: Sequence[Draw]) -> list[Sample]:
+        """Returns the samples of a batch; the data loader calls this."""
+        samples: list[Sample] = []
+        indices = [index for index, _ in draws]
+        for index, first, length, caption in zip(indices, *self.draw(indices, draws[0][1]), strict=True):
+            clip = self.clips[index]
+            frames = np.minimum(np.arange(length) + first, clip.length - 1)
+            features = self.representation.rebase(self.store.motion(clip)[frames])
+            x = torch.from_numpy((features - self.mean) / self.std)
+            samples.append((clip.id, x, self.caption(index, caption), clip.action))
+        return samples
 
-    def caption(self, clip: Entry, batch: int) -> str | None:
-        """Returns the caption of a clip in a batch: a random one in training, always the same one in evaluation."""
-        if not clip.captions:
-            return None
-        return clip.captions[key("caption", self.seed, max(batch, -1), clip.id) % len(clip.captions)]
+    def draw(self, indices: Sequence[int], batch: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Returns first frame, number of frames and number of the caption (B,) of clips in a batch.
+
+        They are functions of (seed, batch, index); in evaluation (batch -1), they are always the same.
+        """
+        rows = np.asarray(indices)
+        if batch < 0:
+            return *self.crop.draw(self.frames[rows], None), self.evaluated[rows]
+        below = integers(key("sample", self.seed, batch) + rows)
+        return *self.crop.draw(self.frames[rows], below), below(self.captions[rows])
+
+    @cached_property
+    def evaluated(self) -> np.ndarray:
+        """Number (clips,) of the caption of each clip in evaluation, chosen by the id of the clip."""
+        draws = (key("caption", self.seed, -1, clip.id) % max(1, len(clip.captions)) for clip in self.clips)
+        return np.fromiter(draws, np.int64, len(self.clips))
+
+    def caption(self, index: int, number: int) -> str | None:
+        """Returns a caption of a clip; None if the clip has none."""
+        return self.clips[index].captions[number] if self.captions[index] else None
 
 
 class TrainingBatches(Sampler[list[Draw]]):

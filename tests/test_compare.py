@@ -2,13 +2,16 @@
 
 import json
 import re
-from html import unescape
+import shutil
+import subprocess
+from html import escape, unescape
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from test_report import a_run, result, run
+from test_visualize import Page
 
 from flame_mdm.__main__ import main
 from flame_mdm.commands.compare import read_texts
@@ -83,6 +86,29 @@ def test_a_page_puts_runs_side_by_side(three, tmp_path):
     assert "Quick run — not for publication" in text
     assert "mine/one 0.001953" in text, "curves are overlaid"
     assert page(three, tmp_path / "again.html") == text
+
+
+@pytest.mark.tools
+@pytest.mark.skipif(shutil.which("chromium") is None, reason="chromium is not installed")
+def test_columns_stay_readable_on_a_phone(three, tmp_path):
+    put(three[0], "x")
+    text = page(three, tmp_path / "out.html")
+    measure = """<script>document.getElementById("page").onload = (event) => {
+      const { body } = event.target.contentDocument, cells = [...body.querySelectorAll("th, td")];
+      const widths = cells.filter((cell) => cell.textContent).map((cell) => [cell.clientWidth, cell.textContent]);
+      document.title = JSON.stringify({ page: body.scrollWidth, widths });
+    }</script>"""
+    frame = f'<title></title><iframe id="page" width="390" srcdoc="{escape(text)}"></iframe>{measure}'
+    (tmp_path / "frame.html").write_text(frame, encoding="utf-8")
+    command = ["chromium", "--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-dev-shm-usage"]
+    command += ["--disable-background-networking", f"--user-data-dir={tmp_path / 'profile'}"]
+    command += ["--virtual-time-budget=1500", "--dump-dom", (tmp_path / "frame.html").as_uri()]
+    dump = subprocess.run(command, capture_output=True, check=True, timeout=60).stdout.decode()
+    (tmp_path / "dump.html").write_text(dump, encoding="utf-8")
+    seen = json.loads(Page(tmp_path / "dump.html").texts["title"])
+    assert seen["page"] <= 390, "tables scroll, not the page"
+    assert len(seen["widths"]) > 30
+    assert min(seen["widths"])[0] >= 50
 
 
 def test_runs_of_the_same_name_go_by_their_folders(tmp_path):

@@ -17,7 +17,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from flame_mdm.__main__ import main
 from flame_mdm.errors import UserError
 from flame_mdm.reporting.page import number, page, short
-from flame_mdm.reporting.plots import chart
+from flame_mdm.reporting.plots import chart, charts
 from flame_mdm.reporting.report import charted, constants, write_report
 from flame_mdm.runs import read_history, read_run
 from flame_mdm.training import callbacks
@@ -309,6 +309,25 @@ def test_curves_of_training_and_validation_share_a_chart():
         "Training curves": {"grad_norm": ["train"]},
     }
     assert constants(curves) == {"train/lr": 0.1}
+
+
+def test_single_points_are_rows_of_a_table():
+    drawn = charts(
+        {
+            "loss": ({"train": {1: 1.0, 2: 2.0}, "val": {1: 3.0}}, {}),
+            "fid": ({"val": {4: 2.5}}, {"val": {4: 0.25}}),
+            "skating": ({"samples": {1999: 0.5}, "val": {}}, {}),
+        }
+    )
+    assert len(drawn) == 2
+    assert "<polyline" in drawn[0]
+    rows = re.findall(r"<tr>(.*?)</tr>", drawn[1])
+    assert [re.findall(r">([^<>]*)</t[hd]>", row) for row in rows] == [
+        ["", "step", "val", "samples"],
+        ["fid", "5", "2.5 ± 0.25", "–"],
+        ["skating", "2k", "–", "0.5"],
+    ]
+    assert "<svg" not in drawn[1]
 
 
 def points(svg: str) -> list[tuple[float, float]]:

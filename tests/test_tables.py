@@ -18,7 +18,7 @@ from flame_mdm.errors import UserError
 from flame_mdm.reporting import tables
 from flame_mdm.reporting.rendering import Cell, Line, Table, latex, markdown, places
 from flame_mdm.reporting.study import wilson
-from flame_mdm.reporting.tables import Request, build, load_spec, requests, write
+from flame_mdm.reporting.tables import Request, build, load_spec, requests, spec_names, write
 
 SPEC = """
 title: "A table, 50 % & more_of_it"
@@ -463,6 +463,20 @@ def test_malformed_specs_are_told_in_one_line(tmp_path, capsys, text, message):
     assert message in error
     assert error.count("\n") == 1
     assert not (tmp_path / "out").exists()
+
+
+def test_an_index_lists_the_tables_with_their_measured_rows(tmp_path, capsys):
+    asked = ["table=mdm_8 flame_10", "evaluate=false", f"results={tmp_path / 'none'}", f"out={tmp_path}"]
+    assert main(["tables", *asked]) == 0
+    assert f"all tables: {tmp_path / 'index.html'}" in capsys.readouterr().out
+    rows = re.findall(r"<tr><td>(.*?)</tr>", (tmp_path / "index.html").read_text())
+    assert [re.sub(r"<[^>]*>", "|", row).strip("|") for row in rows] == [
+        "mdm_8|||MDM, table 8: learned parameters||5 of 5",
+        "flame_10|||FLAME, table 10: guidance scale, on HumanML3D||0 of 6",
+    ]
+    assert '<a href="mdm_8.html">' in rows[0]
+    names = spec_names()
+    assert names.index("flame_9") + 1 == names.index("flame_10")
 
 
 def test_an_unknown_table_names_those_there_are(capsys):

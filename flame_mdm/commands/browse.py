@@ -73,7 +73,7 @@ def prepared(words: Sequence[str]) -> list[str]:
     Raises:
         UserError: If NAME was prepared in several representations and none is chosen.
     """
-    given = dict(word.partition("=")[::2] for word in words)
+    given = dict(word.split("=", 1) for word in words if "=" in word)
     name, root = given.get("data", ""), Path(given.get("data_root", os.environ.get("FLAME_MDM_DATA", "data")))
     if not name or (EXPERIMENTS / "data" / f"{name}.yaml").exists() or not any(root.glob(f"{escape(name)}-*/{STORE}")):
         return list(words)

@@ -39,13 +39,15 @@ def tables(config: Config) -> None:
     failed = evaluate_missing(specs, results, config) if config["evaluate"] else []
     out = Path(config["out"])
     built = {name: build(name, spec, results) for name, spec in specs.items()}
+    counts = {}
     for name, table in built.items():
         write(table, out)
         lines = [line for part in table.parts for line in part.lines if line.kind == "measured"]
-        measured = sum(not line.state for line in lines)
-        say(f"{name}: {measured} of {len(lines)} rows measured: {out / name}.html, .md, .tex, .csv")
+        counts[name] = f"{sum(not line.state for line in lines)} of {len(lines)}"
+        say(f"{name}: {counts[name]} rows measured: {out / name}.html, .md, .tex, .csv")
     if len(specs) > 1:
-        write_text(out / "index.html", page("Tables", render("index.html", tables=built)))
+        write_text(out / "index.html", page("Tables", render("index.html", tables=built, measured=counts)))
+        say(f"all tables: {out / 'index.html'}")
     if failed:
         raise UserError(f"{len(failed)} evaluations failed: {'; '.join(failed)}")
 

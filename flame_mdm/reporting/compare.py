@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 from flame_mdm.config import flatten
 from flame_mdm.errors import UserError
 from flame_mdm.reporting.page import number, page, render
-from flame_mdm.reporting.plots import chart
-from flame_mdm.reporting.report import charted, evaluation_title, interval, last, marks, sampling
+from flame_mdm.reporting.plots import Curve, charts
+from flame_mdm.reporting.report import charted, evaluation_title, last, marks, printed, sampling
 from flame_mdm.runs import CONFIG, Result, Run, read_run
 
 if TYPE_CHECKING:
@@ -129,7 +129,7 @@ def _evaluations(runs: Mapping[str, Run]) -> list[tuple[str, list[str], list[lis
         results = [result for _, result in columns]
         real = results[0].ground_truth or {}
         rows = [
-            [name, interval(real.get(name)), *(interval((result.values or {}).get(name)) for result in results)]
+            [name, printed(real.get(name)), *(printed((result.values or {}).get(name)) for result in results)]
             for name in sorted({name for result in results for name in result.values or {}})
         ]
         heads = [f"{label} [{k}]" for k, (label, _) in enumerate(columns, 1)]
@@ -141,10 +141,11 @@ def _evaluations(runs: Mapping[str, Run]) -> list[tuple[str, list[str], list[lis
 def _charts(runs: Mapping[str, Run]) -> dict[str, list[Markup]]:
     names = {name for found in runs.values() for name in found.curves}
     groups: dict[str, list[Markup]] = {}
-    for heading, charts in charted({name: {0: 0.0} for name in names}).items():
-        for name in (f"{family}/{rest}" for rest, families in charts.items() for family in families):
-            lines = {label: found.curves[name] for label, found in runs.items() if name in found.curves}
-            widths = {label: runs[label].curves.get(f"{name}/ci", {}) for label in lines}
+    for heading, titles in charted({name: {0: 0.0} for name in names}).items():
+        shown: dict[str, tuple[dict[str, Curve], dict[str, Curve]]] = {}
+        for name in (f"{family}/{rest}" for rest, families in titles.items() for family in families):
+            lines: dict[str, Curve] = {k: found.curves[name] for k, found in runs.items() if name in found.curves}
             if len({value for line in lines.values() for value in line.values()}) > 1:
-                groups.setdefault(heading, []).append(chart(name, lines, widths))
+                shown[name] = lines, {label: runs[label].curves.get(f"{name}/ci", {}) for label in lines}
+        groups[heading] = charts(shown)
     return groups

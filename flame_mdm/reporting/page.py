@@ -54,6 +54,11 @@ def number(value: float | None) -> str:
     return f"{value:,.0f}" if abs(value) >= 10_000 else f"{value:.4g}"
 
 
+def interval(mean: float | None, half: float | None) -> str:
+    """Formats a mean and the half width of its interval, if there is one."""
+    return number(mean) + (f" ± {half:.2g}" if mean is not None and half is not None else "")
+
+
 def short(step: float) -> str:
     """Formats a number of steps: 1500 -> 1.5k."""
     for size, unit in ((1e6, "M"), (1e3, "k")):

@@ -8,8 +8,8 @@ from pathlib import Path
 
 from flame_mdm.errors import UserError
 from flame_mdm.files import write_text
-from flame_mdm.reporting.page import number, page, render
-from flame_mdm.reporting.plots import Curve, chart
+from flame_mdm.reporting.page import interval, number, page, render
+from flame_mdm.reporting.plots import Curve, charts
 from flame_mdm.runs import FAULT, HISTORY, Fault, Provenance, Result, Run, Value, read_json, read_run
 
 COST = ("lr", "grad_norm", "samples_per_second", "seconds_per_step", "gpu_memory_gib")
@@ -45,8 +45,8 @@ def write_report(folder: Path) -> Path:
         fault = read_json(folder / FAULT, Fault, "delete it to write the page without it")
     faulty = [[f"process {b.rank}, batch {b.batch}", b.loss, ", ".join(b.ids)] for b in fault.batches] if fault else []
     groups = {
-        heading: [chart(name, *_curves(run, name, families)) for name, families in charts.items()]
-        for heading, charts in charted(run.curves).items()
+        heading: charts({name: _curves(run, name, families) for name, families in found.items()})
+        for heading, found in charted(run.curves).items()
     }
     body = render(
         "report.html",
@@ -134,7 +134,7 @@ def constants(curves: Mapping[str, Curve]) -> dict[str, float]:
 
 def _values(result: Result) -> list[list[str]]:
     values, real = result.values or {}, result.ground_truth or {}
-    return [[name, interval(real.get(name)), interval(values.get(name))] for name in sorted(values | real)]
+    return [[name, printed(real.get(name)), printed(values.get(name))] for name in sorted(values | real)]
 
 
 def evaluation_title(result: Result) -> str:
@@ -170,11 +170,9 @@ def marks(result: Result) -> list[str]:
     return found + ([f"differs from the protocol: {changed}"] if changed and not result.quick else [])
 
 
-def interval(value: Value | None) -> str:
-    """Formats a mean and the half width of its interval."""
-    if value is None or value.mean is None:
-        return "–"
-    return number(value.mean) + (f" ± {value.ci:.2g}" if value.ci is not None else "")
+def printed(value: Value | None) -> str:
+    """Returns the value of a metric with its interval."""
+    return interval(value.mean, value.ci) if value else "–"
 
 
 def _provenance(facts: Provenance) -> list[list[str]]:

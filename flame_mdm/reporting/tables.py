@@ -177,8 +177,9 @@ class Spec(ClosedSchema):
 
 
 def spec_names() -> list[str]:
-    """Returns the names of all tables."""
-    return sorted(path.stem for path in SPECS.glob("*.yaml") if path != PUBLISHED)
+    """Returns the names of all tables, in the order of their numbers."""
+    names = [path.stem for path in SPECS.glob("*.yaml") if path != PUBLISHED]
+    return sorted(names, key=lambda name: re.sub(r"\d+", lambda number: number[0].zfill(3), name))
 
 
 def load_spec(name: str) -> Config:

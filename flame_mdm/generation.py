@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+import re
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Unpack
 
+import numpy as np
 import torch
 
 from flame_mdm.errors import UserError
@@ -16,7 +18,7 @@ from flame_mdm.files import atomic_folder
 from flame_mdm.formats.motion import Motion
 from flame_mdm.motion import Edit, MotionBatch, Sampling, length_mask
 from flame_mdm.task import MotionGeneration
-from flame_mdm.visualize import contact_sheet, write_gif, write_player
+from flame_mdm.visualize import contact_sheet, write_gif, write_mp4, write_player
 from flame_mdm.visualize.scene import shortened
 
 BATCH = 32
@@ -24,6 +26,8 @@ MAX_SAMPLES = 10_000
 """Maximum number of samples per request; they are kept in memory until all are complete."""
 STAGES = 10
 """Clean estimates shown of one sampling run: one per tenth of it, as in figure 5 of MFM."""
+OWN_FILES = re.compile(r"motion_\d{3,}\.npz|motions\.mp4|trajectory\.png")
+"""Files that some requests write and others do not."""
 TRAINED_ON = {
     "text": ("was trained on captions", 'text="a person walks"'),
     "action": ("was trained on action labels", "action=NAME"),
@@ -38,7 +42,7 @@ def generate(
     texts: str | Sequence[str] | None = None,
     *,
     actions: Sequence[str] | None = None,
-    seconds: float | None = None,
+    seconds: float | Sequence[float] | None = None,
     frames: int | Sequence[int] | None = None,
     samples: int = 1,
     seed: int = 0,
@@ -55,7 +59,8 @@ def generate(
     Args:
         model: from `flame_mdm.load`.
         texts, actions: conditions; one of the two, depending on the model's training, or neither.
-        seconds, frames: length; `frames` may be one length per motion. Default: 3 seconds, or the maximum if shorter.
+        seconds, frames: length of all motions, or a list with one length per text or action. Default: 3 seconds, or
+            the maximum if shorter.
         samples: motions per text.
         seed: seed of the noise.
         edit: part of a motion of that length to keep in every sample, with `known` and `keep` (1, F, D); see
@@ -155,18 +160,27 @@ def _finish(model: MotionGeneration, batch: MotionBatch, x: torch.Tensor, captio
 
 
 def _lengths(
-    model: MotionGeneration, requested: int, samples: int, seconds: float | None, frames: int | Sequence[int] | None
+    model: MotionGeneration,
+    requested: int,
+    samples: int,
+    seconds: float | Sequence[float] | None,
+    frames: int | Sequence[int] | None,
 ) -> list[int]:
     fps, longest = model.representation.fps, model.facts["max_frames"]
-    if seconds is not None and not (isinstance(seconds, int | float) and math.isfinite(seconds)):
-        raise UserError(f"seconds={seconds} is not a valid length")
     if seconds is not None and frames is not None:
         raise UserError("give seconds or frames, not both")
-    if frames is None:
-        frames = min(round(3 * fps), longest) if seconds is None else round(seconds * fps)
-    each = [frames] * requested if isinstance(frames, int) else list(frames)
-    if len(each) != requested:
-        raise UserError(f"{len(each)} lengths for {requested} motions")
+    key, scale, given = ("frames", 1, frames) if seconds is None else ("seconds", fps, seconds)
+    if given is None:
+        given = min(round(3 * fps), longest)
+    values: list[Any] = list(given) if isinstance(given, list | tuple | np.ndarray) else [given] * requested
+    if len(values) != requested:
+        prompts = "1 prompt" if requested == 1 else f"{requested} prompts"
+        raise UserError(f"{key}={given}: {len(values)} lengths for {prompts}. Give one length, or one per prompt")
+    for value in values:
+        number = isinstance(value, int | float | np.integer | np.floating) and abs(value) < 1e9
+        if not number or (key == "frames" and value % 1):
+            raise UserError(f"{key}={given} is not a valid length")
+    each = [round(value * scale) for value in values]
     for length in each:
         if length < 2:
             raise UserError(
@@ -188,23 +202,36 @@ def _action(model: MotionGeneration, name: str) -> int:
 
 
 def write_motions(
-    folder: Path, motions: Sequence[Motion], facts: dict[str, Any], stages: Sequence[Motion] | None = None
+    folder: Path,
+    motions: Sequence[Motion],
+    facts: dict[str, Any],
+    stages: Sequence[Motion] | None = None,
+    mp4: bool = False,
 ) -> None:
     """Writes `motion_000.npz` ..., `motions.gif`, `motions.png` and `player.html` into a folder, all or none.
 
-    Motions with higher numbers, which an earlier request may have left in the folder, are removed. `facts`, such as
-    seed and checkpoint hash, are added to each `.npz`; `stages` of a sampling run are drawn in `trajectory.png`.
+    Such files of an earlier request that are not written again are removed.
+
+    Args:
+        folder: where to write; other files in it are kept.
+        motions: the first eight are drawn.
+        facts: such as seed and checkpoint hash, added to each `.npz`.
+        stages: of a sampling run, drawn in `trajectory.png`.
+        mp4: also write `motions.mp4`.
     """
     scene = [replace(motion, text=motion.text or "unconditioned") for motion in motions]
     with atomic_folder(folder) as made:
         for number, motion in enumerate(motions):
             motion.save(made / f"motion_{number:03d}.npz", **facts)
         write_gif(made / "motions.gif", scene[:8])
+        if mp4:
+            write_mp4(made / "motions.mp4", scene[:8])
         contact_sheet(made / "motions.png", scene[:8])
         if stages:
             contact_sheet(made / "trajectory.png", stages)
         title = motions[0].text if len({motion.text for motion in motions}) == 1 else ""
         write_player(made / "player.html", scene, title or "Motions")
-    for stale in folder.glob("motion_[0-9]*.npz"):
-        if int(stale.stem.partition("_")[2]) >= len(motions):
-            stale.unlink()
+        written = {path.name for path in made.iterdir()}
+    for path in list(folder.iterdir()):
+        if OWN_FILES.fullmatch(path.name) and path.name not in written:
+            path.unlink()

@@ -2,6 +2,7 @@ import base64
 import json
 import shutil
 import subprocess
+import sys
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -10,12 +11,18 @@ import numpy as np
 import pytest
 from PIL import Image, ImageSequence
 
+from flame_mdm.errors import UserError
 from flame_mdm.files import atomic_write
 from flame_mdm.formats.motion import Motion
 from flame_mdm.representations.skeleton import SKELETONS, Skeleton
 from flame_mdm.visualize import contact_sheet, frames_array, write_gif, write_mp4, write_player
 from flame_mdm.visualize.render import SIDE_COLORS
 
+try:
+    import av
+except ImportError:
+    av: Any = None
+MP4 = pytest.mark.skipif(av is None, reason="av is not installed: pip install flame-mdm[video]")
 HOSTILE = "</script><img src=x onerror=alert(1)><!-- __TITLE__ \u2028 \"'&amp; &"
 
 
@@ -169,7 +176,7 @@ def test_gif_holds_a_motion_that_ended(tmp_path):
     assert (frames[8][:, 64:] != frames[15][:, 64:]).any()
 
 
-@pytest.mark.parametrize("write", [write_player, write_gif, contact_sheet])
+@pytest.mark.parametrize("write", [write_player, write_gif, pytest.param(write_mp4, marks=MP4), contact_sheet])
 def test_same_input_gives_the_same_bytes(tmp_path, write):
     for name in "ab":
         write(tmp_path / name, [walk(5, contacts=True, text="walks")])
@@ -203,21 +210,63 @@ def test_contact_sheet_shows_first_to_last_pose_of_each_motion(tmp_path):
     np.testing.assert_array_equal(sheet[sheet.shape[0] // 2 + 24 :][:60, :96], frames_array(motions[1], 96)[0][24:84])
 
 
+@MP4
+@pytest.mark.parametrize(("fps", "size"), [(20, 64), (12.5, 65), (29.97, 64), (120, 64)])
+def test_mp4_has_the_frames_of_the_motion(tmp_path, fps, size):
+    write_mp4(tmp_path / "m.mp4", [walk(12, fps, text="walks"), walk(5, fps)], size=size)
+    with av.open(str(tmp_path / "m.mp4")) as file:
+        stream, frames = file.streams.video[0], list(file.decode(video=0))
+        assert (stream.codec_context.name, stream.codec_context.pix_fmt) == ("h264", "yuv420p")
+        assert float(stream.average_rate or 0) == pytest.approx(fps, rel=1e-6)
+    assert len(frames) == 12
+    assert (frames[-1].time or 0) - (frames[0].time or 0) == pytest.approx(11 / fps, rel=1e-3)
+    assert frames[0].width == 2 * size
+    assert frames[0].height % 2 == 0
+    assert [path.name for path in tmp_path.iterdir()] == ["m.mp4"]
+
+
+@MP4
+def test_mp4_shows_what_the_gif_shows(tmp_path):
+    motions = [walk(8, text="walks"), walk(16)]
+    write_gif(tmp_path / "m.gif", motions, size=128)
+    write_mp4(tmp_path / "m.mp4", motions, size=128)
+    with Image.open(tmp_path / "m.gif") as image:
+        shown = np.stack([np.asarray(frame.convert("RGB"), int) for frame in ImageSequence.Iterator(image)])
+    with av.open(str(tmp_path / "m.mp4")) as file:
+        video = np.stack([frame.to_ndarray(format="rgb24") for frame in file.decode(video=0)])
+    assert len(video) == len(shown) == 16
+    shown = shown[:, : video.shape[1]]
+    off = np.abs(video[:, None] - shown[None]).mean((2, 3, 4))
+    assert (off.argmin(1) == np.arange(16)).all()
+    assert off.diagonal().max() < 2.5
+
+
+@MP4
+def test_mp4_keeps_the_colors(tmp_path):
+    write_mp4(tmp_path / "m.mp4", [walk(2)], size=512)
+    with av.open(str(tmp_path / "m.mp4")) as file:
+        video = next(file.decode(video=0)).to_ndarray(format="rgb24")
+    for side, color in SIDE_COLORS.items():
+        drawn = np.abs(frames_array(walk(2), 512)[0].astype(int) - color).max(-1) == 0
+        assert np.abs(np.median(video[:512][drawn], axis=0) - color).max() <= 4, side
+
+
 @pytest.mark.tools
 @pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="ffmpeg is not installed")
-def test_mp4_keeps_frames(tmp_path):
+@MP4
+def test_mp4_is_read_by_another_program(tmp_path):
     write_mp4(tmp_path / "m.mp4", [walk(12, 30)], size=65)
     command = ["ffmpeg", "-loglevel", "error", "-i", str(tmp_path / "m.mp4"), "-f", "rawvideo", "-pix_fmt", "gray", "-"]
     pixels = subprocess.run(command, capture_output=True, check=True).stdout
     assert len(pixels) % 12 == 0
     assert len(pixels) // 12 >= 64 * 64
-    assert [path.name for path in tmp_path.iterdir()] == ["m.mp4"]
 
 
-def test_mp4_without_ffmpeg_says_so(tmp_path, monkeypatch):
-    monkeypatch.setattr(shutil, "which", lambda name: None)
-    with pytest.raises(FileNotFoundError, match=r"m\.mp4: MP4 needs ffmpeg .* write a \.gif"):
+def test_mp4_without_its_package_says_what_to_install(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "av", None)
+    with pytest.raises(UserError, match=r'm\.mp4: MP4 needs the package av\. Run pip install "flame-mdm\[video\]", or'):
         write_mp4(tmp_path / "m.mp4", [walk(2)])
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_failure_leaves_the_old_file_and_nothing_else(tmp_path):
@@ -236,13 +285,8 @@ def test_a_failure_leaves_the_old_file_and_nothing_else(tmp_path):
     assert list(path.parent.iterdir()) == [path]
 
 
-@pytest.mark.parametrize(
-    "write", [write_player, write_gif, pytest.param(write_mp4, marks=pytest.mark.tools), contact_sheet]
-)
+@pytest.mark.parametrize("write", [write_player, write_gif, pytest.param(write_mp4, marks=MP4), contact_sheet])
 def test_every_writer_goes_through_a_temporary_name(tmp_path, monkeypatch, write):
-    if write is write_mp4 and shutil.which("ffmpeg") is None:
-        pytest.skip("ffmpeg is not installed")
-
     def full(*_):
         raise OSError("disk full")
 

@@ -8,9 +8,10 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from flame_mdm.commands.sample import read_prompts
 from flame_mdm.config import Config, run
 from flame_mdm.errors import UserError, say
-from flame_mdm.files import MEBIBYTE, read_text, write_json, write_text
+from flame_mdm.files import write_json, write_text
 from flame_mdm.reporting.compare import MOTIONS, ComparedRun, Prompt, comparison, find
 from flame_mdm.reporting.report import paths
 from flame_mdm.reporting.study import QUESTION, rating_page, tally
@@ -111,12 +112,11 @@ def read_texts(given: str) -> list[str]:
     """Returns texts that are separated by semicolons, or the lines of a .txt file, without duplicates.
 
     Raises:
-        UserError: If there is no text, or the file does not exist.
+        UserError: If there is no text, or the file does not exist or is not a text file.
     """
-    if given.endswith(".txt") and not Path(given).exists():
-        raise UserError(f"texts={given}: no such file")
-    parts = read_text(given, MEBIBYTE).splitlines() if given.endswith(".txt") else given.split(";")
-    texts = [part.strip() for part in parts if part.strip()]
+    if given.endswith(".txt"):
+        return list(dict.fromkeys(read_prompts(given, "texts")))
+    texts = [part.strip() for part in given.split(";") if part.strip()]
     if not texts:
         raise UserError(f'texts={given}: contains no text. Give texts="a person walks; a person jumps" or a .txt file')
     return list(dict.fromkeys(texts))

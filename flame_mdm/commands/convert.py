@@ -14,7 +14,7 @@ usage: flame-mdm convert MOTION OUT [fps=20] [unit=0.01] [up=z]
 Converts a motion file. The nearest skeleton.yaml in its folder or above applies (docs/own-data.md).
 Inputs: .npz written by `make sample`, .npz of AMASS, .bvh, .json, and .npy with joint positions.
 Outputs: .bvh and .glb for Blender and game engines, .npz in the layout of AMASS, and .json and .npy with joint
-positions. Units, axes and joint names: docs/formats.md
+positions; .mp4 and .gif to look at. Units, axes and joint names: docs/formats.md
 """
 
 

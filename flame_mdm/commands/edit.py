@@ -27,7 +27,7 @@ def write_edits(config: Config) -> None:
     Raises:
         UserError: If not exactly one condition is requested, or `flame_mdm.editing.edit` refuses the request.
     """
-    check_request(config)
+    texts = check_request(config)
     if config["motion"] is None:
         raise UserError("no motion to edit. Give motion=FILE (.npz, .bvh, .json, .npy) or motion=dataset:id")
 
@@ -40,7 +40,7 @@ def write_edits(config: Config) -> None:
 
     file = find(config["ckpt"], config["which"])
     model = load(file, config["device"] or ("cuda" if torch.cuda.is_available() else "cpu"))
-    check_condition(config, model)
+    check_condition(config, model, texts)
     original = read_motion(
         model.representation,
         str(config["motion"]),
@@ -52,7 +52,7 @@ def write_edits(config: Config) -> None:
     edits = edit(
         model,
         original,
-        None if config["text"] is None else str(config["text"]),
+        texts,
         actions=None if config["action"] is None else [str(config["action"])],
         stages=stages,
         **{key: config[key] for key in keys},
@@ -64,8 +64,8 @@ def write_edits(config: Config) -> None:
     folder = Path(config["out"] or default_folder(model, digest, what, config["seed"], requested))
     shown = replace(original, text=f"original: {original.text or original.id}")
     facts = {"seed": config["seed"], "checkpoint": digest, "keep": edits[0].keep}
-    write_motions(folder, [shown, *edits], facts, stages)
-    say(summary(folder, edits))
+    write_motions(folder, [shown, *edits], facts, stages, config["mp4"])
+    say(summary(folder, edits, config["mp4"]))
     say(
         f"{edits[0].keep.mean():.0%} of the features are kept. Largest change in the kept part: "
         f"{max(e.feature_error for e in edits):.3g} in normalized features, "
@@ -80,5 +80,13 @@ main = partial(
     name="edit",
     objects=("ckpt", "out"),
     text=("text", "ckpt", "motion", "out", "up"),
-    kinds={**SAMPLING, "method": "str", "until": "float", "resample": "int", "strength": "float", "trajectory": "bool"},
+    kinds={
+        **SAMPLING,
+        "method": "str",
+        "until": "float",
+        "resample": "int",
+        "strength": "float",
+        "trajectory": "bool",
+        "mp4": "bool",
+    },
 )

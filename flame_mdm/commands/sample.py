@@ -12,17 +12,22 @@ from typing import TYPE_CHECKING, Any
 from flame_mdm.commands import OPTIONS, SAMPLING
 from flame_mdm.config import Config, run
 from flame_mdm.errors import UserError, say
+from flame_mdm.files import MEBIBYTE, read_text
 
 if TYPE_CHECKING:
     from flame_mdm.formats.motion import Motion
     from flame_mdm.task import MotionGeneration
 
+LENGTHS = {"seconds": "float | list[float]", "frames": "int | list[int]"}
+"""Keys that take one value, or one per prompt, and the types of their values."""
 USAGE = """
 usage: flame-mdm sample ckpt=FILE text="a person walks in a circle" [seconds=3] [key=value ...]
+       flame-mdm sample ckpt=FILE prompts=FILE.txt [seconds=[2,3.5,...]] [mp4=true]
        flame-mdm sample ckpt=FILE action=walk
        flame-mdm sample ckpt=FILE unconditioned=true
 
-Writes motions (.npz), a GIF, and a player that opens in any browser.
+Writes motions (.npz), a GIF, and a player that opens in any browser. A file of prompts has one per line; each gets its
+own folder.
 Keys, with their defaults: experiments/sample.yaml
 """
 
@@ -31,9 +36,10 @@ def sample(config: Config) -> None:
     """Samples the requested motions and writes them.
 
     Raises:
-        UserError: If not exactly one condition is requested, or `generate` refuses the request.
+        UserError: If not exactly one condition is requested, the file of prompts cannot be read, or `generate` refuses
+            the request.
     """
-    check_request(config)
+    texts = check_request(config)
 
     import torch
 
@@ -44,12 +50,12 @@ def sample(config: Config) -> None:
     device = config["device"] or ("cuda" if torch.cuda.is_available() else "cpu")
     file = find(config["ckpt"], config["which"])
     model = load(file, device)
-    check_condition(config, model)
+    check_condition(config, model, texts)
     stages = [] if config["trajectory"] else None
     keys = ("seconds", "frames", *OPTIONS)
     motions = generate(
         model,
-        None if config["text"] is None else str(config["text"]),
+        texts,
         actions=None if config["action"] is None else [str(config["action"])],
         samples=config["samples"],
         seed=config["seed"],
@@ -58,10 +64,19 @@ def sample(config: Config) -> None:
         **{key: config[key] for key in keys},
     )
     requested = {key: config[key] for key in keys} | {"shared_noise": config["shared_noise"] or None}
-    digest, what = sha256(file), motions[0].text or "unconditioned"
-    folder = Path(config["out"] or default_folder(model, digest, what, config["seed"], requested))
-    write_motions(folder, motions, {"seed": config["seed"], "checkpoint": digest}, stages)
-    say(summary(folder, motions))
+    digest = sha256(file)
+    folders: dict[Path, list[Motion]] = {}
+    for number in range(len(motions) // config["samples"]):
+        part = motions[number * config["samples"] :][: config["samples"]]
+        options = {key: v[number] if isinstance(v, list) and key in LENGTHS else v for key, v in requested.items()}
+        folder = default_folder(model, digest, part[0].text or "unconditioned", config["seed"], options)
+        if config["out"]:
+            folder = Path(config["out"], folder.name if config["prompts"] is not None else "")
+        folders.setdefault(folder, []).extend(part)  # a prompt that is listed twice
+    for folder, made in folders.items():
+        facts = {"seed": config["seed"], "checkpoint": digest}
+        write_motions(folder, made, facts, stages if made[0] is motions[0] else None, config["mp4"])
+        say(summary(folder, made, config["mp4"]))
 
 
 main = partial(
@@ -70,15 +85,43 @@ main = partial(
     usage=USAGE,
     name="sample",
     objects=("ckpt", "out"),
-    text=("text", "ckpt", "out"),
-    kinds={**SAMPLING, "seconds": "float", "shared_noise": "bool", "trajectory": "bool"},
+    text=("text", "prompts", "ckpt", "out"),
+    kinds={
+        **SAMPLING,
+        **LENGTHS,
+        **{"shared_noise": "bool", "trajectory": "bool", "mp4": "bool"},
+    },
 )
 
 
-def summary(folder: Path, motions: Sequence[Motion]) -> str:
+def summary(folder: Path, motions: Sequence[Motion], mp4: bool = False) -> str:
     """Returns the line that tells what was written to a folder."""
     count = "1 motion" if len(motions) == 1 else f"{len(motions)} motions"
-    return f"{count} of {len(motions[0].joints)} frames: {folder / 'player.html'}, {folder / 'motions.gif'}"
+    files = ["player.html", "motions.gif", *["motions.mp4"] * mp4]
+    return f"{count} of {len(motions[0].joints)} frames: {', '.join(str(folder / file) for file in files)}"
+
+
+def read_prompts(path: str, key: str = "prompts") -> list[str]:
+    """Returns the lines of a text file that are not blank.
+
+    Args:
+        path: the file, UTF-8 or ASCII.
+        key: key of the command that names the file, for the messages.
+
+    Raises:
+        UserError: If the file does not exist, is not a text file, is larger than 1 MiB, or contains no text.
+    """
+    try:
+        text = read_text(path, MEBIBYTE)
+    except FileNotFoundError:
+        raise UserError(f"{key}={path}: no such file. Give a text file with one prompt per line") from None
+    except UserError as error:
+        raise UserError(f"{key}={error}") from error
+    if "\0" in text:
+        raise UserError(f"{key}={path}: not a text file. Give a text file with one prompt per line")
+    if not (prompts := [line.strip() for line in text.removeprefix("\ufeff").splitlines() if line.strip()]):
+        raise UserError(f"{key}={path}: contains no text. Write one prompt per line")
+    return prompts
 
 
 def default_folder(model: MotionGeneration, digest: str, what: str, seed: int, options: Mapping[str, Any]) -> Path:
@@ -104,17 +147,20 @@ def _clean(name: str) -> str:
     return re.sub(r"[^\w]+", "-", name).strip("-")
 
 
-def check_condition(config: Config, model: MotionGeneration) -> None:
+def check_condition(config: Config, model: MotionGeneration, texts: Sequence[str] | None) -> None:
     """Warns of words that the model has never seen.
 
     Raises:
         UserError: If no condition is requested; the message gives examples.
     """
-    if config["text"] is not None:
+    if texts is not None:
         from flame_mdm.conditions.vocabulary import advice
+        from flame_mdm.visualize.scene import shortened
 
-        for line in advice(str(config["text"]), model.facts, model.condition.max_words):
-            say(f"warning: {line}")
+        for text in dict.fromkeys(texts):
+            of = f"'{shortened(text, 60)}': " * (len(texts) > 1)
+            for line in advice(text, model.facts, model.condition.max_words):
+                say(f"warning: {of}{line}")
     elif config["action"] is None and not config["unconditioned"]:
         choices = {"text": model.facts.get("captions", ()), "action": model.facts["actions"], "none": ()}
         examples = list(choices[model.conditioned_on])
@@ -123,17 +169,27 @@ def check_condition(config: Config, model: MotionGeneration) -> None:
         raise UserError(f"say what to sample: {key}" + f", for example {shown}" * bool(shown))
 
 
-def check_request(config: Config) -> None:
-    """Checks that a checkpoint and at most one condition are requested.
+def check_request(config: Config) -> list[str] | None:
+    """Checks that a checkpoint and at most one condition are requested, and returns the texts if there are any.
 
     Raises:
-        UserError: If not.
+        UserError: If not, if the file of prompts cannot be read, or if MP4 is requested but cannot be written.
     """
-    conditions = [key for key in ("text", "action") if config[key] is not None]
+    conditions = [key for key in ("text", "prompts", "action") if config.get(key) is not None]
     conditions += ["unconditioned"] * config["unconditioned"]
     if config["ckpt"] is None:
         raise UserError("no checkpoint given. Add ckpt=runs/.../checkpoints/last.ckpt")
     if config["text"] is not None and not str(config["text"]).strip():
         raise UserError("the text is empty. Describe what the person does, or use unconditioned=true")
     if len(conditions) > 1:
-        raise UserError(f"give only one of text=..., action=... and unconditioned=true, not {' and '.join(conditions)}")
+        choices = f"text=..., {'prompts=..., ' * ('prompts' in config)}action=... and unconditioned=true"
+        raise UserError(f"give only one of {choices}, not {' and '.join(conditions)}")
+    if "prompts" in config and str(config["text"]).endswith(".txt") and Path(str(config["text"])).exists():
+        raise UserError(f"text={config['text']}: a file. To sample the prompts in it, give prompts={config['text']}")
+    if config["mp4"]:
+        from flame_mdm.visualize.render import video_package
+
+        video_package("mp4=true")
+    if config.get("prompts") is not None:
+        return read_prompts(str(config["prompts"]))
+    return None if config["text"] is None else [str(config["text"])]

@@ -45,6 +45,7 @@ KINDS: dict[str, tuple[type | tuple[type, ...], str]] = {
     "float": ((int, float), "a number"),
     "str": (str, "a text"),
     "list[int]": (list, "a list of whole numbers"),
+    "list[float]": (list, "a list of numbers"),
     "None": (type(None), "null"),
 }
 

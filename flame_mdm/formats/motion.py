@@ -110,7 +110,7 @@ class Motion:
         """Writes a motion file and returns a line that describes it.
 
         `.npz` contains joints, frame rate, text and features, and AMASS's keys if rotations are known. `.bvh` and
-        `.glb` contain rotations, `.json` and `.npy` joints.
+        `.glb` contain rotations, `.json` and `.npy` joints. `.gif` and `.mp4` are animations.
 
         Args:
             path: the file; its extension selects the format.
@@ -118,10 +118,11 @@ class Motion:
 
         Raises:
             ValueError: the extension is unknown, or `.bvh` or `.glb` is requested for another skeleton than SMPL's.
-            UserError: the file cannot be written.
+            UserError: the file cannot be written, or `.mp4` is requested and the package av is not installed.
         """
         path = Path(path)
         writers = {".bvh": _write_bvh, ".glb": _write_glb, ".npz": _write_npz, ".json": _write_json, ".npy": _write_npy}
+        writers |= {".gif": _write_video, ".mp4": _write_video}
         writer = writers.get(path.suffix.lower())
         if writer is None:
             raise ValueError(f"{path}: unknown kind of motion file. Use one of {', '.join(writers)}")
@@ -234,6 +235,16 @@ def _write_npy(motion: Motion, path: Path) -> str:
     with atomic_write(path) as temporary:
         np.save(temporary, motion.joints)
     return f"joints {motion.joints.shape} in meters, y up; the file does not contain the frame rate"
+
+
+def _write_video(motion: Motion, path: Path) -> str:
+    from flame_mdm.visualize import write_gif, write_mp4
+
+    if path.suffix.lower() == ".mp4":
+        write_mp4(path, [motion])
+        return "H.264 video"
+    write_gif(path, [motion])
+    return "animated GIF of at most 50 frames per second"
 
 
 def _error(motion: Motion, poses: Poses) -> str:

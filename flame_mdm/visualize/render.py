@@ -1,15 +1,17 @@
 """Still images and videos of motions, drawn with Pillow."""
 
 import math
-import shutil
-import subprocess
 from collections.abc import Callable, Iterator, Sequence
+from fractions import Fraction
+from importlib import import_module
 from pathlib import Path
+from types import ModuleType
 from typing import NamedTuple
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
+from flame_mdm.errors import UserError
 from flame_mdm.files import atomic_write
 from flame_mdm.visualize.scene import Shown, check_any, frame_at, head, radii, shortened, sides
 
@@ -20,6 +22,8 @@ SHADOW, TRAIL, CONTACT = (212, 216, 222), (122, 91, 208), (15, 157, 107)
 NEAR = 0.3
 """Distance from the camera in meters below which nothing is drawn."""
 LIT, DARK = 0.3, -0.45
+BT709 = 1
+"""Number of the color space of HD video, which players assume where a large video does not name one."""
 SMOOTH = 2
 """Images are drawn this many times larger and then reduced."""
 
@@ -61,29 +65,45 @@ def write_gif(path: str | Path, motions: Sequence[Shown], size: int = 256) -> No
 
 
 def write_mp4(path: str | Path, motions: Sequence[Shown], size: int = 384) -> None:
-    """Writes the animation of `write_gif` as H.264 video, with the program ffmpeg.
+    """Writes the animation of `write_gif` as H.264 video (yuv420p), with no limit on the frame rate.
 
     Raises:
-        FileNotFoundError: ffmpeg is not installed.
+        UserError: the package av is not installed.
         ValueError: there are no motions.
-        RuntimeError: ffmpeg failed.
     """
     path = Path(path)
     check_any(motions, path)
-    ffmpeg = shutil.which("ffmpeg")
-    if ffmpeg is None:
-        raise FileNotFoundError(f"{path}: MP4 needs ffmpeg on the PATH; install it, or write a .gif")
+    av = video_package(str(path))
     fps = max(motion.fps for motion in motions)
-    video = [np.asarray(image) for image in _video(motions, fps, size)]
-    height, width = (length // 2 * 2 for length in video[0].shape[:2])  # H.264 needs even sizes
-    with atomic_write(path) as temporary:
-        command = [ffmpeg, "-loglevel", "error", "-y", "-f", "rawvideo", "-pix_fmt", "rgb24"]
-        command += ["-s", f"{width}x{height}", "-r", str(fps), "-i", "-", "-c:v", "libx264", "-pix_fmt", "yuv420p"]
-        command += ["-threads", "1", "-fflags", "+bitexact", "-movflags", "+faststart", "-f", "mp4", str(temporary)]
-        pixels = b"".join(image[:height, :width].tobytes() for image in video)
-        run = subprocess.run(command, input=pixels, capture_output=True, check=False)
-        if run.returncode:
-            raise RuntimeError(f"{path}: ffmpeg failed: {run.stderr.decode(errors='replace').strip()}")
+    with atomic_write(path) as temporary, av.open(str(temporary), "w", "mp4", {"movflags": "+faststart"}) as file:
+        stream = file.add_stream("libx264", Fraction(fps).limit_denominator(1001), {"crf": "20"})
+        stream.thread_count = 1  # the same bytes on any number of cores
+        context = stream.codec_context
+        context.colorspace = context.color_primaries = context.color_trc = BT709
+        for image in _video(motions, fps, size):
+            if not context.is_open:
+                context.width, context.height = image.width // 2 * 2, image.height // 2 * 2  # H.264 needs even sizes
+            pixels = np.asarray(image)[: context.height, : context.width]
+            frame = av.VideoFrame.from_ndarray(pixels).reformat(format="yuv420p", dst_colorspace=BT709)
+            file.mux(stream.encode(frame))
+        file.mux(stream.encode())
+
+
+def video_package(name: str) -> ModuleType:
+    """Returns the package av, which writes MP4.
+
+    Args:
+        name: what needs it, for the error message.
+
+    Raises:
+        UserError: it is not installed.
+    """
+    try:
+        return import_module("av")
+    except ImportError:
+        raise UserError(
+            f'{name}: MP4 needs the package av. Run pip install "flame-mdm[video]", or write a GIF'
+        ) from None
 
 
 def contact_sheet(path: str | Path, motions: Sequence[Shown], frames: int = 6, size: int = 192) -> None:

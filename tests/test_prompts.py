@@ -1,0 +1,144 @@
+"""Several prompts in one request: a file of prompts, a length per prompt, and the video of each."""
+
+import importlib.util
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import flame_mdm
+from flame_mdm import generation
+from flame_mdm.__main__ import main
+from flame_mdm.errors import UserError
+from flame_mdm.formats.files import read
+
+PROMPTS = ["a person walks", "a person jumps: 100%, twice", "人が歩く"]
+
+
+@pytest.fixture
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def folders(root: Path) -> dict[str, Path]:
+    """The folders of motions below a folder, by the caption of their first motion."""
+    return {read(path).text: path.parent for path in sorted(root.rglob("motion_000.npz"))}
+
+
+def test_each_prompt_of_a_file_is_sampled_as_if_alone(here, trained, monkeypatch, capsys):
+    Path("p.txt").write_bytes(b"\xef\xbb\xbf" + "\r\n\r\n".join(f" {text} " for text in PROMPTS).encode())
+    asked, generate = [], generation.generate
+    monkeypatch.setattr(generation, "generate", lambda *a, **k: asked.append(a) or generate(*a, **k))
+    assert main(["sample", str(trained), "prompts=p.txt", "seconds=[1,1.5,1]", "samples=2"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert len(asked) == 1
+    assert [line[:22] for line in lines if "motions of" in line] == [f"2 motions of {f} frames" for f in (20, 30, 20)]
+    assert "warning: 'a person jumps: 100%, twice': never seen in training: 100" in "\n".join(lines)
+    together = folders(here / "samples")
+    assert list(together) == sorted(PROMPTS, key=lambda text: together[text])
+    for text, seconds in zip(PROMPTS, (1, 1.5, 1), strict=True):
+        kept = {path.name: path.read_bytes() for path in together[text].iterdir()}
+        assert len(kept) == 5
+        before = read(together[text] / "motion_001.npz")
+        assert main(["sample", str(trained), f"text={text}", f"seconds={seconds}", "samples=2"]) == 0
+        again = read(together[text] / "motion_001.npz")  # the same folder
+        np.testing.assert_allclose(again.joints, before.joints, atol=1e-4)
+        assert not {path.name for path in together[text].iterdir()} - kept.keys()
+    assert len(folders(here / "samples")) == 3
+
+
+def test_a_chosen_folder_gets_a_folder_per_prompt(here, trained):
+    Path("p.txt").write_text("a person walks\na person jumps\na person walks\n")
+    words = ["prompts=p.txt", "seconds=1", "samples=1", "trajectory=true", "out=mine"]
+    assert main(["sample", str(trained), *words]) == 0
+    assert sorted(path.name for path in Path("mine").iterdir()) == [
+        "a-person-jumps-seed0-seconds=1",
+        "a-person-walks-seed0-seconds=1",
+    ]
+    twice = [read(path) for path in sorted(Path("mine/a-person-walks-seed0-seconds=1").glob("motion_*.npz"))]
+    assert len(twice) == 2
+    assert np.abs(twice[0].joints - twice[1].joints).max() > 0.001
+    assert [path.parent.name[:14] for path in Path("mine").rglob("trajectory.png")] == ["a-person-walks"]
+
+
+@pytest.mark.parametrize(
+    ("content", "words", "message"),
+    [
+        (None, [], "prompts=p.txt: no such file. Give a text file with one prompt per line"),
+        (b"", [], "prompts=p.txt: contains no text. Write one prompt per line"),
+        (b" \n\t\r\n\n", [], "prompts=p.txt: contains no text"),
+        (b"PK\x03\x04\xff\xfe\x00", [], "prompts=p.txt: not a UTF-8 text file"),
+        ("walks".encode("utf-16"), [], "prompts=p.txt: not a UTF-8 text file"),
+        (bytes(100), [], "prompts=p.txt: not a text file"),
+        (b"a\n" * 2**20, [], "prompts=p.txt: 2 MiB, but such a file may have at most 1 MiB"),
+        (b"walks", ["prompts=."], "prompts=.: a folder, not a file"),
+        (
+            b"walks",
+            ["text=jumps"],
+            "give only one of text=..., prompts=..., action=... and unconditioned=true, not text",
+        ),
+        (b"walks", ["action=walk"], "not prompts and action"),
+        (
+            b"walks",
+            ["prompts=null", "text=p.txt"],
+            "text=p.txt: a file. To sample the prompts in it, give prompts=p.txt",
+        ),
+        (
+            b"walks\njumps",
+            ["seconds=[1,2,3]"],
+            "seconds=[1, 2, 3]: 3 lengths for 2 prompts. Give one length, or one per",
+        ),
+        (b"walks\njumps", ["seconds=[1,30]"], "30 seconds (600 frames) cannot be sampled"),
+        (b"walks\njumps", ["frames=[30,30.5]"], "frames=[30, 30.5] is not a valid length"),
+        (b"walks\njumps", ["seconds=[1,x]"], "seconds=[1, 'x'] is not a valid length"),
+        (b"walks", ["seconds=x"], "seconds=x: must be a number or a list of numbers"),
+        (b"walks\n" + b"a" * 3000, [], "3,000 characters are too many"),
+    ],
+)
+def test_a_bad_request_is_one_line_and_writes_nothing(here, trained, capsys, content, words, message):
+    if content is not None:
+        Path("p.txt").write_bytes(content)
+    assert main(["sample", str(trained), *([] if "prompts=" in str(words) else ["prompts=p.txt"]), *words]) == 1
+    captured = capsys.readouterr()
+    assert message in captured.err
+    assert captured.err.count("\n") == 1
+    assert not Path("samples").exists()
+
+
+def test_each_prompt_has_a_length_of_its_own(trained):
+    model = flame_mdm.load(trained)
+    motions = flame_mdm.generate(model, PROMPTS[:2], seconds=[1, 1.5], samples=2)
+    assert [(m.text, len(m.joints)) for m in motions] == [(PROMPTS[0], 20)] * 2 + [(PROMPTS[1], 30)] * 2
+    alone = flame_mdm.generate(model, PROMPTS[1], seconds=np.float32(1.5))[0]  # type: ignore[arg-type]
+    np.testing.assert_allclose(motions[2].joints, alone.joints, atol=1e-4)
+    assert [len(m.joints) for m in flame_mdm.generate(model, PROMPTS, frames=np.array([20, 21, 22]))] == [20, 21, 22]  # type: ignore[arg-type]
+    for given, message in (
+        ([1, 2], r"seconds=\[1, 2\]: 2 lengths for 1 prompt\. Give one length, or one per prompt"),
+        ([], "0 lengths for 1 prompt"),
+        ([[1]], "is not a valid length"),
+        ([float("nan")], "is not a valid length"),
+        (10**400, "is not a valid length"),
+        ("3", "seconds=3 is not a valid length"),
+    ):
+        with pytest.raises(UserError, match=message):
+            flame_mdm.generate(model, PROMPTS[0], seconds=given)  # type: ignore[arg-type]
+
+
+def test_a_video_is_written_when_asked_for(here, trained, monkeypatch, capsys):
+    words = ["sample", str(trained), "text=a person walks", "samples=2", "seconds=1", "out=out"]
+    if importlib.util.find_spec("av"):
+        assert main([*words, "mp4=true", "trajectory=true"]) == 0
+        assert capsys.readouterr().out.rstrip().endswith("out/motions.gif, out/motions.mp4")
+        assert b"ftyp" in Path("out/motions.mp4").read_bytes()[:12]
+        Path("out/motion_1_of_mine.npz").touch()
+        assert main(words) == 0
+        assert {path.name for path in Path("out").iterdir()} == {
+            *("motion_000.npz", "motion_001.npz", "motions.gif", "motions.png", "player.html"),
+            "motion_1_of_mine.npz",
+        }
+    monkeypatch.setitem(sys.modules, "av", None)
+    assert main([*words, "mp4=true", "out=other"]) == 1
+    assert 'error: mp4=true: MP4 needs the package av. Run pip install "flame-mdm[video]"' in capsys.readouterr().err
+    assert not Path("other").exists()

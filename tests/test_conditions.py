@@ -200,6 +200,59 @@ class TestLearned:
         assert together.token_mask is not None
         assert together.token_mask.sum(1).tolist() == [4, 8, 14, 4]
 
+    def test_repeated_captions_are_encoded_once_and_get_the_gradients_of_all(self):
+        encoder, captions = LearnedTokens(16, heads=2, dropout=0.0).eval(), [CAPTIONS[i] for i in (2, 0, 2, 1, 0)]
+        lengths: list[int] = []
+        encoder.norm.register_forward_hook(lambda _, __, tokens: lengths.append(len(tokens)))
+        weight = torch.randn(5, 16)
+        together = encoder(batch_of(captions))
+        assert lengths == [14 + 4 + 8], "neither a caption twice nor padding"
+        (together.pooled * weight + together.tokens.sum(1) * weight.flip(0)).sum().backward()
+        gradients = {name: p.grad.clone() for name, p in encoder.named_parameters() if p.grad is not None}
+        encoder.zero_grad()
+        for i, caption in enumerate(captions):
+            alone = encoder(batch_of([caption]))
+            size = alone.tokens.shape[1]
+            torch.testing.assert_close(together.pooled[i], alone.pooled[0], rtol=0, atol=1e-6)
+            torch.testing.assert_close(together.tokens[i, :size], alone.tokens[0], rtol=0, atol=1e-6)
+            assert together.token_mask is not None
+            assert together.token_mask[i].tolist() == [True] * size + [False] * (14 - size)
+            (alone.pooled * weight[i] + alone.tokens.sum(1) * weight[4 - i]).sum().backward()
+        expected = {name: p.grad for name, p in encoder.named_parameters() if p.grad is not None}
+        torch.testing.assert_close(gradients, expected, rtol=1e-5, atol=1e-5)
+
+    @pytest.mark.parametrize("place", ["attention", "dropout", "dropout1", "dropout2"])
+    def test_dropout_in_training_only_and_shared_by_repeated_captions(self, place: str):
+        encoder = LearnedTokens(16, heads=2, dropout=0.0)
+        if place == "attention":
+            encoder.layer.self_attn.dropout = 0.5
+        else:
+            getattr(encoder.layer, place).p = 0.5
+        first, second = (encoder(batch_of(CAPTIONS[:1] * 2)).pooled for _ in range(2))
+        assert torch.equal(first[0], first[1])
+        assert not torch.allclose(first, second)
+        encoder.eval()
+        assert torch.equal(encoder(batch_of(CAPTIONS)).pooled, encoder(batch_of(CAPTIONS)).pooled)
+
+    @pytest.mark.parametrize("training", [False, True])
+    def test_computes_the_transformer_layer_of_torch(self, training: bool):
+        """Weights of earlier versions, which called that layer on padded captions, give the same conditions."""
+        torch.manual_seed(0)
+        encoder = LearnedTokens(16, heads=2, dropout=0.0).train(training)
+        for parameter in encoder.parameters():
+            torch.nn.init.normal_(parameter, std=0.3)
+        cond = encoder(batch_of(CAPTIONS))
+        assert cond.token_mask is not None
+        rows = [torch.tensor(encoder.rows(caption)) for caption in CAPTIONS]
+        x = encoder.words(torch.nn.utils.rnn.pad_sequence(rows, batch_first=True)).sum(2)
+        x = encoder.layer(x + encoder.positions[: x.shape[1]], src_key_padding_mask=~cond.token_mask)
+        tokens = encoder.norm(x) * cond.token_mask[..., None]
+        torch.testing.assert_close(cond.tokens, tokens, rtol=0, atol=1e-6)
+        pooled = tokens.sum(1) / cond.token_mask.sum(1, keepdim=True)
+        torch.testing.assert_close(cond.pooled, pooled, rtol=0, atol=1e-6)
+        parts = {name.partition(".")[0] for name in encoder.state_dict()}
+        assert parts == {"words", "positions", "layer", "norm", "null"}
+
     def test_long_and_empty_captions(self):
         encoder = LearnedTokens(16, heads=2, max_words=3).eval()
         cond = encoder(batch_of(["", "a b c", "a b c d e"]))

@@ -1,12 +1,14 @@
 """Small text encoder that is trained with the model and needs no download."""
 
 import zlib
+from itertools import chain
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional
 
 from flame_mdm.conditions import ConditionEncoder, vocabulary
-from flame_mdm.motion import Condition, MotionBatch
+from flame_mdm.motion import Condition, MotionBatch, length_mask
 
 START = "<start>"
 """Inserted before every caption, so that the empty caption also has a token; no caption contains this word."""
@@ -19,6 +21,9 @@ class LearnedTokens(ConditionEncoder):
     embeddings"): no vocabulary is stored, and two words are confused only if both parts collide. The hash (CRC-32) is
     the same on every machine. Captions are lowercased, punctuation separates words, and words after `max_words` are
     dropped.
+
+    Each distinct caption of a batch is encoded once, so that samples with the same caption share its dropout. Linear
+    layers skip the padding.
 
     The pooled vector is the mean of the tokens, and the null token is the null vector, so that all parameters receive
     gradients whether a denoiser reads the pooled vector or the tokens.
@@ -57,13 +62,41 @@ class LearnedTokens(ConditionEncoder):
         if batch.text is None:
             raise ValueError("condition=learned needs captions, and this batch has none: choose data with captions")
         device = self.null.device
-        rows = [torch.tensor(self.rows(caption)) for caption in batch.text]
-        lengths = torch.tensor([len(r) for r in rows])
-        padded = nn.utils.rnn.pad_sequence(rows, batch_first=True).to(device)
-        token_mask = (torch.arange(padded.shape[1]) < lengths[:, None]).to(device)
-        x = self.words(padded).sum(2) + self.positions[: padded.shape[1]]
-        tokens = self.norm(self.layer(x, src_key_padding_mask=~token_mask)) * token_mask[..., None]
-        return Condition(tokens.sum(1) / token_mask.sum(1, keepdim=True), tokens, token_mask, self._null())
+        numbers = {caption: number for number, caption in enumerate(dict.fromkeys(batch.text))}
+        rows = [self.rows(caption) for caption in numbers]
+        token_mask = length_mask(torch.tensor([len(words) for words in rows]))
+        places = token_mask.flatten().nonzero()[:, 0].to(device)
+        token_mask = token_mask.to(device)
+        tokens = self._encode(torch.tensor(list(chain(*rows)), device=device), places, token_mask)
+        pooled = tokens.sum(1) / token_mask.sum(1, keepdim=True)
+        of_sample = torch.tensor([numbers[caption] for caption in batch.text], device=device)
+        return Condition(pooled[of_sample], tokens[of_sample], token_mask[of_sample], self._null())
+
+    def _encode(self, rows: Tensor, places: Tensor, token_mask: Tensor) -> Tensor:
+        """Encodes captions; padding takes part only in attention.
+
+        Args:
+            rows: (T, 2), rows of the table of all real tokens.
+            places: (T,), their places among the N * S of the padded captions.
+            token_mask: (N, S) bool, True = real token.
+
+        Returns:
+            (N, S, C), 0 past the end of each caption.
+        """
+
+        def pad(y: Tensor) -> Tensor:
+            padded = y.new_zeros(token_mask.numel(), y.shape[1])
+            return padded.index_copy(0, places, y).unflatten(0, token_mask.shape)
+
+        layer, attention = self.layer, self.layer.self_attn
+        x = self.words(rows).sum(1) + functional.embedding(places % token_mask.shape[1], self.positions)
+        qkv = pad(functional.linear(layer.norm1(x), attention.in_proj_weight, attention.in_proj_bias))
+        query, key, value = qkv.unflatten(2, (3, attention.num_heads, -1)).permute(2, 0, 3, 1, 4)
+        dropout = attention.dropout if self.training else 0.0
+        y = functional.scaled_dot_product_attention(query, key, value, token_mask[:, None, None], dropout)
+        x = x + layer.dropout1(attention.out_proj(y.transpose(1, 2).flatten(2).flatten(0, 1).index_select(0, places)))
+        x = x + layer.dropout2(layer.linear2(layer.dropout(functional.gelu(layer.linear1(layer.norm2(x))))))
+        return pad(self.norm(x))
 
     def _null(self) -> Condition:
         token_mask: Tensor = torch.ones(1, 1, dtype=torch.bool, device=self.null.device)

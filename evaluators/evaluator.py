@@ -6,6 +6,7 @@ import math
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,7 @@ from evaluators.extractors import Extractor
 from evaluators.metrics import make_metrics, missing_input, required_inputs, update_metrics
 from evaluators.metrics.attributes import ATTRIBUTES
 from evaluators.metrics.samples import TwoSets
+from evaluators.processes import dealt
 from flame_mdm.config import Config
 from flame_mdm.editing import kept_parts
 from flame_mdm.errors import UserError
@@ -68,7 +70,7 @@ class Extracted:
 
     Attributes:
         rows: tensors or lists of N entries, by the names in `evaluators.metrics`.
-        joints: (F, J, 3) each.
+        joints: (F, J, 3) each; empty if no metric needs them.
         kept: (F, J) each, True = kept by an edit; None if the motions are not edits.
     """
 
@@ -77,55 +79,58 @@ class Extracted:
     kept: list[Tensor] | None = None
 
     def __len__(self) -> int:
-        return len(self.joints)
+        return len(self.rows["keys"])
+
+    def without_joints(self) -> Extracted:
+        """Returns the inputs of metrics that do not read these joints."""
+        return Extracted(self.rows, [])
 
 
+@dataclass
 class Evaluator:
     """Computes metrics of motions.
 
-    For the same features, all values are bit-identical for any batch size and order. Metrics are computed by this
-    process alone, on the CPU.
+    For the same features, all values are bit-identical for any batch size and order. Several processes share the
+    feature pass: each extracts whole batches, so that features do not depend on the number of processes. Metrics are
+    computed by the first process, on the CPU.
 
-    Args:
+    Attributes:
         extractor: computes the features for metrics; None = no features.
         metrics: mappings with the `_target_` of a metric, by name; each replication uses a different seed.
         representation: of the motions.
         batch_size: of the extractor.
         skip_features: whether metrics of features have no value, instead of raising for lack of input.
+        rank, world: rank of this process, and number of processes.
     """
 
-    def __init__(
-        self,
-        extractor: Extractor | None,
-        metrics: Mapping[str, Config],
-        representation: Representation,
-        *,
-        batch_size: int = 64,
-        skip_features: bool = False,
-    ):
-        self.extractor, self.metrics, self.representation = extractor, metrics, representation
-        self.batch_size, self.skip_features = batch_size, skip_features
+    extractor: Extractor | None
+    metrics: Mapping[str, Config]
+    representation: Representation
+    batch_size: int = 64
+    skip_features: bool = False
+    rank: int = 0
+    world: int = 1
 
     @torch.no_grad()
     def extract(self, motions: Motions) -> Extracted:
-        """Runs the feature pass over motions.
+        """Runs the feature pass over motions, which are the same in all processes, and so is the result.
 
         Raises:
             UserError: If a motion contains NaN or infinity.
         """
-        for name, features in zip(motions.ids, motions.features, strict=True):
-            if not np.isfinite(features).all():
-                raise UserError(f"motion {name} is not finite. Did the model diverge?")
-        where = self.representation.mean.device
-        joints = [self.representation.decode(torch.from_numpy(x).to(where)).cpu() for x in motions.features]
         rows: dict[str, Any] = {"keys": self._keys(motions.ids)}
-        order = np.argsort([len(x) for x in joints], kind="stable")  # batches of similar lengths need little padding
-        if self.extractor is not None and len(motions):
-            size = self.batch_size
-            batches = [order[begin : begin + size].tolist() for begin in range(0, len(order), size)]
-            parts = [self._features(motions, joints, indices) for indices in batches]
-            back = torch.from_numpy(np.argsort(order, kind="stable"))
-            rows |= {name: torch.cat([part[name] for part in parts])[back] for name in parts[0]}
+        # Batches of similar lengths need little padding.
+        order = np.argsort([len(x) for x in motions.features], kind="stable").tolist()
+        batches = [order[begin : begin + self.batch_size] for begin in range(0, len(order), self.batch_size)]
+        parts = dealt(partial(self._batch, motions), batches, self.rank, self.world)
+        texts = [text for indices in batches if (text := self._texts(motions, indices)) is not None]
+        back = np.argsort(order, kind="stable")
+        joints = [motion for found, _ in parts for motion in found]
+        joints = [joints[i] for i in back]
+        if batches:
+            rows |= {name: torch.cat([features[name] for _, features in parts])[back] for name in parts[0][1]}
+        if texts:
+            rows["text"] = torch.cat(texts)[back]
         if motions.captions is not None:
             rows["text_keys"] = self._keys(motions.captions)
         if motions.labels is not None:
@@ -153,20 +158,29 @@ class Evaluator:
     def _keys(self, names: Sequence[str]) -> Tensor:
         return torch.tensor([key(name) for name in names], dtype=torch.long)
 
-    def _features(self, motions: Motions, joints: Sequence[Tensor], indices: Sequence[int]) -> dict[str, Tensor]:
-        assert self.extractor is not None
+    def _batch(self, motions: Motions, indices: Sequence[int]) -> tuple[list[Tensor], dict[str, Tensor]]:
+        """Returns joints and features of some motions."""
         where = self.representation.mean.device
+        lengths = [len(motions.features[i]) for i in indices]
         x = pad_sequence([torch.from_numpy(motions.features[i]) for i in indices], batch_first=True).to(where)
-        mask = length_mask(torch.tensor([len(motions.features[i]) for i in indices], device=where))
-        padded = pad_sequence([joints[i] for i in indices], batch_first=True).to(where)
-        found = self.extractor.motions(x, padded, mask)
-        rows = {"generated" if name == "features" else name: value.float().cpu() for name, value in found.items()}
-        if motions.captions is not None:
-            tokens = motions.tokens or [None] * len(motions)
-            text = self.extractor.texts([motions.captions[i] for i in indices], [tokens[i] for i in indices])
-            if text is not None:
-                rows["text"] = text.float().cpu()
-        return rows
+        if not x.isfinite().all():
+            name = next(motions.ids[i] for i in indices if not np.isfinite(motions.features[i]).all())
+            raise UserError(f"motion {name} is not finite. Did the model diverge?")
+        mask = length_mask(torch.tensor(lengths, device=where))
+        padded = self.representation.decode(x)
+        joints = [motion[:length].clone() for motion, length in zip(padded.cpu(), lengths, strict=True)]
+        if self.extractor is None:
+            return joints, {}
+        found = self.extractor.motions(x, padded.where(mask[..., None, None], 0.0), mask)
+        return joints, {"generated" if name == "features" else name: x.float().cpu() for name, x in found.items()}
+
+    def _texts(self, motions: Motions, indices: Sequence[int]) -> Tensor | None:
+        """Returns features of some captions, as every process computes them: an extractor may encode each only once."""
+        if self.extractor is None or motions.captions is None:
+            return None
+        tokens = motions.tokens or [None] * len(motions)
+        text = self.extractor.texts([motions.captions[i] for i in indices], [tokens[i] for i in indices])
+        return None if text is None else text.float().cpu()
 
     def score(
         self, generated: Extracted, paired: Extracted, real: Extracted, seed: int
@@ -182,12 +196,14 @@ class Evaluator:
 
         Returns:
             The values by name, `metric` or `metric/part`, None if not computable; and the reasons by metric, if there
-            are too few samples.
+            are too few samples. Both are empty in all processes but the first.
 
         Raises:
             UserError: If the motions lack an input that a metric needs.
             ValueError: If motions do not match in a metric that compares them one by one.
         """
+        if self.rank:
+            return {}, {}
         metrics = make_metrics(self.metrics, seed=key("metric", seed) % 2**32)
         usable = self.check(generated, metrics) if len(generated) else {}
         sets = {name: metric for name, metric in usable.items() if isinstance(metric, TwoSets)}
@@ -201,8 +217,9 @@ class Evaluator:
             joints, mask = _pad(generated.joints[part])
             if generated.kept is not None:
                 rows["kept"] = pad_sequence(generated.kept[part], batch_first=True)
-            real_joints, real_mask = _pad(paired.joints[part])
-            rows |= {"joints": joints, "mask": mask, "real_joints": real_joints, "real_mask": real_mask}
+            rows |= {"joints": joints, "mask": mask}
+            if paired.joints:
+                rows["real_joints"], rows["real_mask"] = _pad(paired.joints[part])
             rows |= {"references": paired.rows["references"][part]} if "references" in paired.rows else {}
             if "generated" in paired.rows:
                 rows["real"] = paired.rows["generated"][part]
@@ -226,6 +243,10 @@ class Evaluator:
                         value = None
                     values[f"{name}/{part}".rstrip("/")] = value
         return values, reasons
+
+    def reads(self, name: str) -> bool:
+        """Returns whether a metric requires an input."""
+        return any(name in required_inputs(metric) for metric in make_metrics(self.metrics).values())
 
     def check(self, motions: Extracted, metrics: Mapping[str, Metric] | None = None) -> dict[str, Metric]:
         """Returns the metrics that can be computed: all of them, or those that need no features.

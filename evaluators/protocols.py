@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypedDict
 
@@ -15,7 +16,8 @@ from evaluators.extractors import Extractor
 from evaluators.metrics import make_metrics
 from evaluators.metrics.confidence import mean_ci
 from evaluators.metrics.distribution import FrechetMotionDistance
-from evaluators.sources import Baseline, Generator, Row, SampleFolder, Samples, Source, real_motions, shared
+from evaluators.processes import shared
+from evaluators.sources import Baseline, Generator, Row, SampleFolder, Source, real_motions
 from flame_mdm.config import Config, instantiate
 from flame_mdm.data.datamodule import Clips
 from flame_mdm.data.store import Entry
@@ -331,8 +333,8 @@ class Protocol:
     ) -> dict[str, Any]:
         """Evaluates real motions of all replications, and then the motions of the source.
 
-        If there are several processes, each generates a share of the motions. The first one measures them; all return
-        the result.
+        If there are several processes, each generates and extracts a share of the batches. The first one computes the
+        metrics; all return the result.
 
         Args:
             source: source of the motions; None = real motions only.
@@ -353,10 +355,32 @@ class Protocol:
         Raises:
             UserError: If real motions do not have the expected values; nothing has been generated.
         """
-        evaluator = self._evaluator(self.metrics, extractor, representation, batch_size)
+        evaluator = Evaluator(
+            extractor,
+            self.metrics,
+            representation,
+            batch_size=batch_size,
+            skip_features=extractor is None and self.extractor is not None,  # with extractor=none
+            rank=rank,
+            world=world,
+        )
+        several = replace(evaluator, metrics=self.multimodality["metrics"]) if self.multimodality else None
         reasons: dict[str, str] = {}
-        truth = self._measure_real(clips, evaluator, seed, reasons) if ground_truth and not rank else None
-        invalid = shared(self._unexpected(truth, clips, extractor) if truth else [], world)
+        reference, truth = [], []
+        for replication in range(self.replications):
+            paired, real = self._real(clips, evaluator, seed, replication)
+            if ground_truth:
+                values, why = evaluator.score(paired, paired, real, key("draws", seed, replication))
+                truth.append((values, len(paired)))
+                reasons |= why
+            if source is not None:
+                for each in (evaluator, several):  # before motions are generated
+                    if each is not None:
+                        each.check(paired)
+                # All replications are kept in memory; joints, the largest part, only if metrics compare them.
+                reference.append((paired if evaluator.reads("real_joints") else paired.without_joints(), real))
+        report: dict[str, Any] = {"ground_truth": _summary(truth) if ground_truth else None, "values": None}
+        invalid = shared(self._unexpected(report["ground_truth"] or {}, clips, extractor), world)
         if invalid and source is not None and not force:
             if rank:
                 raise SystemExit(1)  # the first process prints the reason
@@ -364,47 +388,25 @@ class Protocol:
                 f"nothing was generated, because {'; '.join(invalid)}. Check the data and the extractor, or give "
                 "force=true: the result is then marked as not valid"
             )
-        result = None
-        if rank:
-            for name, rows, replication in self._jobs(source, clips, seed):
-                assert source is not None
-                source(name, rows, replication, rank, world)
-        else:
-            verdict = {"valid": not invalid, "invalid_because": invalid, "forced": bool(invalid) and source is not None}
-            result = {"ground_truth": truth} | self._measure(source, clips, evaluator, seed, world, reasons) | verdict
-        result = shared(result, world)
-        assert result is not None
-        return result
-
-    def _evaluator(
-        self, metrics: Mapping[str, Config], extractor: Extractor | None, representation: Representation, size: int
-    ) -> Evaluator:
-        """Returns an evaluator of some metrics. With extractor=none, metrics that need features have no value."""
-        skip = extractor is None and self.extractor is not None
-        return Evaluator(extractor, metrics, representation, batch_size=size, skip_features=skip)
-
-    def _jobs(self, source: Source | None, clips: Clips, seed: int) -> Iterator[tuple[str, list[Row], int]]:
-        """Yields the requests to the source, in order: the name of a file, the rows, the replication."""
-        if source is None:
-            return
-        for replication in range(self.replications):
-            yield f"rep_{replication}", self.rows(clips, seed, replication), replication
-        if self._has_several_per_prompt(source):
-            assert self.multimodality is not None
-            for replication in range(self.multimodality["replications"]):
-                yield f"multimodality_{replication}", self.prompts(clips, seed, replication), replication
+        report |= {"cost": _mean_cost([]), "warnings": []}
+        if source is not None:
+            report |= self._measure(source, clips, evaluator, reference, seed, reasons)
+        if source is not None and several is not None:
+            report["values"] |= self._measure_multimodality(source, clips, several, seed, reasons)
+        if extractor is None and self.extractor is not None:
+            reasons["extractor"] = "extractor=none: metrics that need features were not computed"
+        report |= {"not_computed": reasons, "seeds": [key("draws", seed, each) for each in range(self.replications)]}
+        report |= {"valid": not invalid, "invalid_because": invalid, "forced": bool(invalid) and source is not None}
+        return shared(report, world)
 
     def _has_several_per_prompt(self, source: Source | None) -> bool:
         return self.multimodality is not None and isinstance(source, Generator) and not self.quick
 
-    def _real(
-        self, clips: Clips, evaluator: Evaluator, seed: int, replication: int
-    ) -> tuple[list[Row], Extracted, Extracted]:
-        """Returns the rows of a replication, their real motions, and the real motions for comparisons of sets."""
-        rows = self.rows(clips, seed, replication)
+    def _real(self, clips: Clips, evaluator: Evaluator, seed: int, replication: int) -> tuple[Extracted, Extracted]:
+        """Returns the real motions of a replication, and real motions for comparisons of sets."""
         again = self.rows(clips, seed, replication, purpose="real")
         real = evaluator.reference() or evaluator.extract(self.motions(again, real_motions(clips, again)))
-        return rows, self._paired(clips, evaluator, rows), real
+        return self._paired(clips, evaluator, self.rows(clips, seed, replication)), real.without_joints()
 
     def _paired(self, clips: Clips, evaluator: Evaluator, rows: Sequence[Row]) -> Extracted:
         """Returns metric inputs computed from the real motions of rows."""
@@ -412,45 +414,22 @@ class Protocol:
         motions.references = clips.store.references([row.clip.id for row in rows])
         return evaluator.extract(motions)
 
-    def _measure_real(self, clips: Clips, evaluator: Evaluator, seed: int, reasons: dict[str, str]) -> dict[str, Any]:
-        """Returns the values of real motions.
-
-        `_measure` reads the motions again, since those of all replications might not fit in memory.
-        """
-        found = []
-        for replication in range(self.replications):
-            _, paired, real = self._real(clips, evaluator, seed, replication)
-            values, why = evaluator.score(paired, paired, real, key("draws", seed, replication))
-            found.append((values, len(paired)))
-            reasons |= why
-        return _summary(found)
-
     def _measure(
         self,
-        source: Source | None,
+        source: Source,
         clips: Clips,
         evaluator: Evaluator,
+        reference: Sequence[tuple[Extracted, Extracted]],
         seed: int,
-        world: int,
         reasons: dict[str, str],
     ) -> dict[str, Any]:
-        """Returns the values of the source's motions, on the first process."""
+        """Returns the values of the source's motions, compared with the real motions of each replication."""
         found: list[tuple[dict[str, float | None], int]] = []
         costs: list[dict[str, float]] = []
         warnings: list[str] = []
-        jobs = self._jobs(source, clips, seed)
-        several = None
-        if self.multimodality and source is not None:
-            several = self._evaluator(
-                self.multimodality["metrics"], evaluator.extractor, evaluator.representation, evaluator.batch_size
-            )
-        for replication in range(self.replications if source is not None else 0):
-            assert source is not None
-            rows, paired, real = self._real(clips, evaluator, seed, replication)
-            for each in (evaluator, several):  # before motions are generated
-                if each is not None and not replication:
-                    each.check(paired)
-            samples = _samples(source, next(jobs), world)
+        for replication, (paired, real) in enumerate(reference):
+            rows = self.rows(clips, seed, replication)
+            samples = source(f"rep_{replication}", rows, replication, evaluator.rank, evaluator.world)
             costs.append(samples.cost)
             if len(samples.rows) != len(rows):  # motions from another system may not cover all clips
                 wanted = {row.id for row in samples.rows}
@@ -462,28 +441,10 @@ class Protocol:
             reasons |= why
             if not replication:
                 warnings = self._warnings(generated, real)
-        summary = _summary(found)
-        if several is not None and source is not None:
-            summary |= self._measure_multimodality(source, jobs, clips, several, seed, world, reasons)
-        if evaluator.extractor is None and self.extractor is not None:
-            reasons["extractor"] = "extractor=none: metrics that need features were not computed"
-        return {
-            "values": summary if source is not None else None,
-            "not_computed": reasons,
-            "cost": _mean_cost(costs),
-            "seeds": [key("draws", seed, replication) for replication in range(self.replications)],
-            "warnings": warnings,
-        }
+        return {"values": _summary(found), "cost": _mean_cost(costs), "warnings": warnings}
 
     def _measure_multimodality(
-        self,
-        source: Source,
-        jobs: Iterator[tuple[str, list[Row], int]],
-        clips: Clips,
-        evaluator: Evaluator,
-        seed: int,
-        world: int,
-        reasons: dict[str, str],
+        self, source: Source, clips: Clips, evaluator: Evaluator, seed: int, reasons: dict[str, str]
     ) -> dict[str, Any]:
         """Returns the values of the metrics that need several motions per prompt."""
         assert self.multimodality is not None
@@ -492,8 +453,9 @@ class Protocol:
         for replication in range(self.multimodality["replications"]):
             motions = paired = nothing
             if self._has_several_per_prompt(source):
-                _, rows, _ = job = next(jobs)
-                samples = _samples(source, job, world)
+                rows = self.prompts(clips, seed, replication)
+                name = f"multimodality_{replication}"
+                samples = source(name, rows, replication, evaluator.rank, evaluator.world)
                 motions = evaluator.extract(self.motions(rows, self._smoothed(samples.features)))
                 prompts = rows[:: self.multimodality["samples"]]
                 real = self._paired(clips, evaluator, prompts)
@@ -551,17 +513,10 @@ def _tokens(row: Row, caption: str) -> list[str] | None:
     return tagged[row.clip.captions.index(caption)] if tagged and caption in row.clip.captions else None
 
 
-def _samples(source: Source, job: tuple[str, list[Row], int], world: int) -> Samples:
-    """Returns the motions of a request, on the first process."""
-    samples = source(*job, 0, world)
-    assert samples is not None
-    return samples
-
-
 def _select(extracted: Extracted, indices: list[int]) -> Extracted:
     rows = {n: v[indices] if isinstance(v, Tensor) else [v[i] for i in indices] for n, v in extracted.rows.items()}
     kept = None if extracted.kept is None else [extracted.kept[i] for i in indices]
-    return Extracted(rows, [extracted.joints[i] for i in indices], kept)
+    return Extracted(rows, [extracted.joints[i] for i in indices] if extracted.joints else [], kept)
 
 
 def _summary(found: Sequence[tuple[Mapping[str, float | None], int]]) -> dict[str, Any]:

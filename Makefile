@@ -48,7 +48,7 @@ lint: $(READY) ## check style and types
 	@$(VENV)/bin/pyright
 
 bench: $(READY) ## measure speed, as ratios within one run
-	@for name in features loading text sampling startup ddp; do \
+	@for name in features loading text sampling evaluation startup ddp; do \
 		echo "== $$name"; $(VENV)/bin/python benchmarks/$$name.py || exit 1; done
 
 docs: $(READY) ## regenerate docs/recipes.md and docs/hyperparameters.md from the recipes

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from evaluators.extractors import Extractor
 from evaluators.run import load_protocol
-from evaluators.sources import Baseline, Generator, Samples
+from evaluators.sources import Baseline, Generator, Row, Samples
 from flame_mdm.data.crops import Units
 from flame_mdm.data.datamodule import Clips
 from flame_mdm.data.store import Entry
@@ -53,7 +53,7 @@ class Windows(Generator):
     def __init__(self, clips: Clips):
         self.real = Baseline("real", clips, "text", 0)
 
-    def __call__(self, name: str, rows: list, replication: int, *_: int) -> Samples:
+    def __call__(self, name: str, rows: list[Row], replication: int, rank: int = 0, world: int = 1) -> Samples:
         return Samples(rows, self.real._real(rows, replication))
 
 
@@ -82,42 +82,38 @@ def random_clips(count: int) -> Clips:
 
 
 def main() -> None:
-    """Prints seconds per replication, and of all replications of the protocol."""
+    """Prints seconds per replication, and an estimate for the whole protocol."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--clips", type=int, default=4600)
     parser.add_argument("--protocol", default="text_to_motion_t2m")
-    parser.add_argument("--replications", type=int, default=2)
     parser.add_argument("--profile", action="store_true")
     args = parser.parse_args()
     torch.manual_seed(0)
     clips = random_clips(args.clips)
-    protocol = load_protocol(args.protocol, clips.representation)
-    full = protocol.replications, (protocol.multimodality or {"replications": 0})["replications"]
     extractor = Stub([caption for clip in clips.clips for caption in clip.captions])
-    times = {}
-    for several in (False, True):
+
+    def seconds(multimodality: bool, **size: Any) -> float:
         protocol = load_protocol(args.protocol, clips.representation)
-        changes = {"replications": 1 if several else args.replications, "samples": None, "quick": False}
-        protocol.change(**changes, clips=args.clips, multimodality=several)
-        profile = cProfile.Profile()
+        protocol.change(**{"samples": None, "quick": False} | size, clips=args.clips, multimodality=multimodality)
         start = time.perf_counter()
-        if args.profile:
-            profile.enable()
-        result = protocol.evaluate(Windows(clips), clips, extractor, clips.representation, batch_size=64)
-        profile.disable()
-        times[several] = time.perf_counter() - start
-        if args.profile:
-            pstats.Stats(profile).sort_stats("tottime").print_stats(40)
-            pstats.Stats(profile).sort_stats("cumtime").print_stats(60)
-        for kind in ("ground_truth", "values"):
-            for name, value in result[kind].items():
-                print(kind, name, repr(value["mean"]), repr(value["ci"]))
-    each = times[False] / args.replications
-    more = max(times[True] - each, 0)
-    print(f"{args.clips} motions, {torch.get_num_threads()} threads: {each:.2f} s per replication, ")
-    print(
-        f"multimodality {more:.2f} s per replication; {full[0]} and {full[1]}: {each * full[0] + more * full[1]:.0f} s"
-    )
+        protocol.evaluate(Windows(clips), clips, extractor, clips.representation, batch_size=64)
+        return time.perf_counter() - start
+
+    seconds(True, replications=1, samples=64)  # warms up
+    profile = cProfile.Profile()
+    if args.profile:
+        profile.enable()
+    once = seconds(False, replications=1)
+    profile.disable()
+    several = seconds(True, replications=1) - once
+    protocol = load_protocol(args.protocol, clips.representation)
+    again = protocol.multimodality["replications"] if protocol.multimodality else 0
+    total = once * protocol.replications + several * again
+    print(f"{args.protocol}, {args.clips} motions, {torch.get_num_threads()} threads, without networks")
+    print(f"{once:.2f} s per replication, {several:.2f} s per replication of multimodality")
+    print(f"{total:.0f} s for {protocol.replications} and {again} replications")
+    if args.profile:
+        pstats.Stats(profile).sort_stats("tottime").print_stats(40)
 
 
 if __name__ == "__main__":

@@ -27,8 +27,8 @@ from flame_mdm.motion import length_mask
 from flame_mdm.representations import Representation
 from flame_mdm.seeds import key
 
-CHUNK = 256
-"""Motions per metric update."""
+CHUNK = 64
+"""Motions per metric update; more do not fit into a processor's cache."""
 
 FEATURES = {"generated", "real", "text", "logits"}
 """Inputs of metrics that an extractor provides."""
@@ -160,12 +160,12 @@ class Evaluator:
 
     def _batch(self, motions: Motions, indices: Sequence[int]) -> tuple[list[Tensor], dict[str, Tensor]]:
         """Returns joints and features of some motions."""
+        for i in indices:
+            if not np.isfinite(motions.features[i]).all():
+                raise UserError(f"motion {motions.ids[i]} is not finite. Did the model diverge?")
         where = self.representation.mean.device
         lengths = [len(motions.features[i]) for i in indices]
         x = pad_sequence([torch.from_numpy(motions.features[i]) for i in indices], batch_first=True).to(where)
-        if not x.isfinite().all():
-            name = next(motions.ids[i] for i in indices if not np.isfinite(motions.features[i]).all())
-            raise UserError(f"motion {name} is not finite. Did the model diverge?")
         mask = length_mask(torch.tensor(lengths, device=where))
         padded = self.representation.decode(x)
         joints = [motion[:length].clone() for motion, length in zip(padded.cpu(), lengths, strict=True)]

@@ -7,7 +7,8 @@ from typing import Any, TypeVar
 
 import torch
 
-T, Item = TypeVar("T"), TypeVar("Item")
+T = TypeVar("T")
+Item = TypeVar("Item")
 
 
 def shared(value: T, world: int) -> T:

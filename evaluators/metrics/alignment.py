@@ -25,7 +25,7 @@ def retrieval_ranks(queries: Tensor, candidates: Tensor, pools: Tensor, own: Ten
         (N,) int64: the number of candidates that are closer, or equally close and earlier in the pool.
     """
     ranks = []
-    for query, pool, right in zip(queries.split(256), pools.split(256), own.split(256), strict=True):
+    for query, pool, right in zip(queries.split(16), pools.split(16), own.split(16), strict=True):
         distance = torch.linalg.vector_norm(query[:, None] - candidates[pool], dim=-1)
         at = distance.gather(1, right[:, None])
         earlier = torch.arange(pool.shape[1], device=pool.device) < right[:, None]

@@ -65,6 +65,8 @@ class MotionSource(ABC):
     published_split: bool = False
     """Whether the split is the one used in papers although it tests on clips seen in training or leaves no validation
     clips. Saved in the store and in every result."""
+    workers: int = 0
+    """Number of processes that read and encode; 0 = one per core, 1 = this process only."""
 
     def __new__(cls, *args: Any, **kwargs: Any) -> Self:
         """Keeps the arguments of the constructor as `options`."""

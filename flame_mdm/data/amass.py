@@ -18,7 +18,7 @@ import numpy as np
 import torch
 
 from flame_mdm.data import archives
-from flame_mdm.data.parallel import in_order
+from flame_mdm.data.parallel import cores, in_order
 from flame_mdm.files import read_npz
 from flame_mdm.formats.resampling import check_frames, frame_rate
 from flame_mdm.representations import rotation
@@ -218,7 +218,8 @@ class Amass:
                 tasks += [({k: self.files[k] for k in chunk}, {k: wanted[k] for k in chunk}) for chunk in chunks]
             else:
                 tasks.append((self.archives[subset], {key: wanted[key] for key in sorted(keys)}))
-        for results in in_order(partial(_run, function), tasks, min(workers, len(tasks))):
+        # An archive takes minutes: this process must not begin with one alone.
+        for results in in_order(partial(_run, function), tasks, min(workers or cores(), len(tasks))):
             yield from results
 
 

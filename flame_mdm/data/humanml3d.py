@@ -22,6 +22,7 @@ from flame_mdm.data import Clip, MotionSource, archives, restricted_pickle
 from flame_mdm.data.amass import Amass, Body, Recording, key_of, load_bodies, subset_of
 from flame_mdm.data.t2m import T2MFolder
 from flame_mdm.files import atomic_write, read_npy, read_text
+from flame_mdm.representations import Frames
 from flame_mdm.representations.humanml import HumanML
 
 FPS = 20
@@ -202,22 +203,15 @@ class HumanML3D(T2MFolder):
     def _write_statistics(self) -> None:
         """Writes mean and std over all motions of any length and split, including mirrored ones."""
         names = sorted(self._motions())
-        lengths = [len(self._load(name, mmap=True)) for name in names]
         representation = HumanML("smpl22", "legacy")
-        packed = self.path / "all_motions.partial"  # more than fits in memory
-        try:
-            with packed.open("wb") as file:
-                for name in names:
-                    motion = self._load(name)
-                    if motion.shape[1] != representation.features:
-                        raise ValueError(
-                            f"{self.path}: {name} has {motion.shape[1]} features; delete it and prepare again"
-                        )
-                    motion.astype(np.float32).tofile(file)
-            rows = np.memmap(packed, np.float32, "r+", shape=(sum(lengths), representation.features))
-            mean, std = representation.statistics(torch.from_numpy(rows))
-        finally:
-            packed.unlink(missing_ok=True)
+        frames = 0
+        for name in names:
+            length, features = self._load(name, mmap=True).shape
+            if features != representation.features:
+                raise ValueError(f"{self.path}: {name} has {features} features; delete it and prepare again")
+            frames += length
+        motions = Frames(lambda: (self._load(name).astype(np.float32) for name in names), frames)
+        mean, std = representation.statistics(motions)
         _save(self.path / "Std.npy", std.numpy())
         _save(self.path / "Mean.npy", mean.numpy())
 

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from flame_mdm.data import Clip, MotionSource, Split
+from flame_mdm.data.parallel import in_order
 from flame_mdm.data.t2m import SPLITS, T2MFolder
 from flame_mdm.files import TEXT_LIMIT, read_json, read_text, regular_file
 
@@ -43,14 +44,16 @@ class KITTemos(MotionSource):
     name = "kit-temos"
     shortest, longest = 10, 500
 
-    def __init__(self, path: str, splits: str, exclude: Sequence[str] = ()):
+    def __init__(self, path: str, splits: str, exclude: Sequence[str] = (), workers: int = 0):
         """Stores the arguments; reads no files.
 
         Args:
             path: folder with `NUMBER_fke.csv`, `NUMBER_annotations.json` and `NUMBER_meta.json`.
             splits: folder `datasets/kit-splits` of https://github.com/Mathux/TEMOS.
             exclude: numbers to leave out.
+            workers: number of processes; 0 = one per core, 1 = this process only.
         """
+        self.workers = workers
         self.path, self.splits, self.exclude = Path(path), Path(splits), frozenset(str(name) for name in exclude)
         self._excluded: Counter[str] = Counter()
 
@@ -117,12 +120,13 @@ class KITTemos(MotionSource):
         self._excluded = Counter({"motions by data.source.exclude": len(self.exclude)} if self.exclude else {})
         self._excluded.update(f"motions of {split} without a caption" for split in self._without_caption())
         for name, frames in self.frames.items():
-            split = self.names[name]
             if not self._fits(name):
                 limit = f"shorter than {self.shortest}" if frames < self.shortest else f"longer than {self.longest}"
-                self._excluded[f"motions of {split} {limit} frames"] += 1
-                continue
-            recording = read_joints(self.path / f"{name}_fke.csv", 1 if split == "test" else 8)
+                self._excluded[f"motions of {self.names[name]} {limit} frames"] += 1
+        names = [name for name in self.frames if self._fits(name)]
+        tasks = ((self.path / f"{name}_fke.csv", 1 if self.names[name] == "test" else 8) for name in names)
+        for name, recording in zip(names, in_order(_recording, tasks, self.workers), strict=True):
+            split = self.names[name]
             yield Clip(
                 id=name,
                 motion=recording[::8] if split == "test" else recording,
@@ -157,6 +161,10 @@ class KITTemos(MotionSource):
                 f"{file}: no such list of motions; get datasets/kit-splits of https://github.com/Mathux/TEMOS"
             )
         return read_text(file).split()
+
+
+def _recording(task: tuple[Path, int]) -> np.ndarray:
+    return read_joints(*task)
 
 
 def read_joints(path: Path, step: int = 8) -> np.ndarray:

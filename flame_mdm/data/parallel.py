@@ -8,12 +8,16 @@ import os
 import signal
 import socket
 import threading
+import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from itertools import islice
 from multiprocessing import active_children, get_context, parent_process
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import IO, TypeVar
 
@@ -24,44 +28,88 @@ Task = TypeVar("Task")
 Result = TypeVar("Result")
 
 
+PATIENCE = 2.0
+"""Seconds of work after which processes are started if their number is not given: starting one takes that long."""
+
+
+def cores() -> int:
+    """Returns the number of cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 def in_order(function: Callable[[Task], Result], tasks: Iterable[Task], workers: int = 0) -> Iterator[Result]:
     """Yields `function(task)` for each task, in the order of the tasks; reads only a few tasks ahead.
+
+    Nested calls, in which the results of one are tasks of the other, share their processes.
 
     Args:
         function: picklable, like the tasks and results.
         tasks: arguments of the calls.
-        workers: number of processes; 0 = one per core, 1 = this process only.
+        workers: number of processes; 1 = this process only, 0 = one per core as soon as the work takes `PATIENCE`
+            seconds.
 
     Raises:
         UserError: a worker died, for instance because the system ran out of memory.
     """
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    workers = workers or cores
-    if workers == 1:
-        yield from map(function, tasks)
-        return
-    others = active_children()
-    # Spawned, not forked: a fork would copy locks held by threads of this process, which may have used torch.
-    with ProcessPoolExecutor(workers, get_context("spawn"), _start_worker) as pool:
+    workers = 1 if not workers and cores() == 1 else workers
+    start, remaining = time.monotonic(), iter(tasks)
+    while workers == 1 or (not workers and _pool is None and time.monotonic() < start + PATIENCE):
+        for task in islice(remaining, 1):
+            yield function(task)
+            break
+        else:
+            return
+    workers = workers or cores()
+    with _shared_pool(workers) as pool:
         pending: deque[Future[Result]] = deque()
-        try:
-            for task in tasks:
-                pending.append(pool.submit(function, task))
-                if len(pending) > 2 * workers:
-                    yield _first(pending)
-            while pending:
+        for task in remaining:
+            pending.append(pool.submit(function, task))
+            if len(pending) > 2 * workers:
                 yield _first(pending)
-        except BaseException as error:  # an error or Ctrl-C must not wait for tasks that may take half an hour
-            pool.shutdown(wait=False, cancel_futures=True)
-            for process in set(active_children()) - set(others):
-                process.kill()  # a stopped process would not answer SIGTERM
-                process.join()
-            if isinstance(error, BrokenProcessPool):
-                raise UserError(
-                    "a worker process was killed, perhaps because memory ran out: use fewer processes "
-                    "(data.source.workers=1 also names the file)"
-                ) from error
-            raise
+        while pending:
+            yield _first(pending)
+
+
+@dataclass
+class _Pool:
+    executor: ProcessPoolExecutor
+    others: list[BaseProcess]
+    """Children of this process that do not belong to the pool."""
+    users: int = 0
+
+
+_pool: _Pool | None = None
+"""The pool in use, if any."""
+
+
+@contextmanager
+def _shared_pool(workers: int) -> Iterator[ProcessPoolExecutor]:
+    global _pool
+    if _pool is None:
+        # Spawned, not forked: a fork would copy locks held by threads of this process, which may have used torch.
+        executor = ProcessPoolExecutor(workers, get_context("spawn"), _start_worker)
+        _pool = _Pool(executor, active_children())
+    pool = _pool
+    pool.users += 1
+    try:
+        yield pool.executor
+    except BaseException as error:  # an error or Ctrl-C must not wait for tasks that may take half an hour
+        _pool = None
+        pool.executor.shutdown(wait=False, cancel_futures=True)
+        for process in set(active_children()) - set(pool.others):
+            process.kill()  # a stopped process would not answer SIGTERM
+            process.join()
+        if isinstance(error, BrokenProcessPool):
+            raise UserError(
+                "a worker process was killed, perhaps because memory ran out: use fewer processes "
+                "(data.source.workers=1 also names the file)"
+            ) from error
+        raise
+    finally:
+        pool.users -= 1
+        if not pool.users:
+            _pool = None
+            pool.executor.shutdown()
 
 
 def _first(pending: deque[Future[Result]]) -> Result:

@@ -13,13 +13,19 @@ Verification adds a report to the folder, `verify.json`.
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import io
 import json
+import pickle
 import shutil
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import asdict, dataclass, field, replace
-from itertools import islice
+import zipfile
+from array import array
+from collections import Counter, deque
+from collections.abc import Generator, Iterable, Iterator, Sequence
+from contextlib import ExitStack, closing
+from dataclasses import asdict, dataclass, field
+from itertools import chain, islice
 from pathlib import Path
 from typing import Any, get_args
 
@@ -28,14 +34,19 @@ import torch
 from tqdm import tqdm
 
 from flame_mdm.data import Clip, MotionSource, Split
-from flame_mdm.data.parallel import locked
+from flame_mdm.data.parallel import in_order, locked
 from flame_mdm.errors import UserError, first_line, say
 from flame_mdm.files import parse_json, read_json, read_npy, read_npz, regular_file, sha256, writing
-from flame_mdm.representations import Representation
+from flame_mdm.representations import Frames, Representation
 
 FORMAT = 1
-CHUNK = 64
+CHUNK = 4096
+"""Frames that are encoded together."""
+BLOCK = 8192
+"""Frames that are read together for the statistics."""
 SPLITS = get_args(Split)
+_Motion = tuple[str, str, np.ndarray]
+"""Clip that names a motion in errors, name of the representation or "", and the motion itself."""
 
 
 @dataclass(frozen=True)
@@ -144,37 +155,16 @@ def _write(folder: Path, source: MotionSource, representation: Representation, t
     try:
         with writing(folder, partial):
             partial.mkdir(parents=True)
-        entries: list[Entry] = []
-        motion, begin, frames = None, 0, 0
         bar = tqdm(source.clips(representation.fps), f"preparing {source.name}", total, unit=" clips")
-        references: dict[str, np.ndarray] = {}
-        with bar as clips, (partial / "features.npy").open("wb", buffering=0) as file:
-            _append(file, folder, _header(frames, representation.features))
-            for chunk in _batched(clips, CHUNK):
-                for clip, features in zip(chunk, _encode(chunk, representation), strict=True):
-                    if clip.motion is not motion:
-                        motion, begin = clip.motion, frames
-                        frames += len(features)
-                        _append(file, folder, features.tobytes())
-                    first, length = clip.window or (0, len(features))
-                    if first < 0 or length < 1 or first + length > len(features):
-                        raise ValueError(f"clip {clip.id}: window {clip.window} exceeds {len(features)} frames")
-                    entry = Entry(clip.id, begin + first, length, clip.split, clip.source, clip.captions, clip.action)
-                    entries.append(replace(entry, attributes=dict(clip.attributes)))
-                    if clip.reference is not None:
-                        references[clip.id] = np.asarray(clip.reference, np.float32)
-            _check_entries(source.name, entries)
-            file.seek(0)
-            _append(file, folder, _header(frames, representation.features))
-        packed = np.load(partial / "features.npy", mmap_mode="r")
-        mean, std = source.statistics() or _statistics(representation, packed, entries)
-        lines = [json.dumps(asdict(entry), ensure_ascii=False, sort_keys=True) for entry in entries]
+        writer = _Writer(folder, partial, representation.features)
+        with bar as clips, writer, closing(_encoded(clips, representation, source.workers)) as encoded:
+            for clip, features in encoded:
+                writer.add(source.name, clip, features)
+            writer.finish(source.name)
+        mean, std = source.statistics() or writer.statistics(representation)
         with writing(folder, partial):
-            (partial / "clips.jsonl").write_text("\n".join(lines) + "\n", encoding="utf-8")
             np.savez(partial / "statistics.npz", mean=mean, std=std)
-            if references:
-                np.savez(partial / "references.npz", **references)  # type: ignore[arg-type]
-            info = _describe(partial, source, representation, entries, frames, mean, std)
+            info = _describe(partial, source, representation, writer, mean, std)
             (partial / "store.json").write_text(json.dumps(info, indent=2) + "\n")
             shutil.rmtree(folder, ignore_errors=True)
             partial.rename(folder)
@@ -183,59 +173,160 @@ def _write(folder: Path, source: MotionSource, representation: Representation, t
         raise
 
 
-def _encode(clips: Sequence[Clip], representation: Representation) -> list[np.ndarray]:
-    """Returns the features of each clip's entire motion; encodes a motion shared by several clips once."""
-    whole = {id(clip.motion): clip for clip in clips}
-    for clip in whole.values():
-        if clip.encoded and clip.encoded != representation.name:
-            raise ValueError(
-                f"clip {clip.id}: published as {clip.encoded}, which cannot be converted to {representation.name}"
-            )
-    raw = [torch.from_numpy(np.ascontiguousarray(clip.motion)) for clip in whole.values() if not clip.encoded]
-    try:
-        fresh = iter(representation.encode_many(raw) if raw else [])
-    except ValueError as error:
-        if len(clips) == 1:
-            raise ValueError(f"clip {clips[0].id}: {error}") from error
-        return [features for clip in clips for features in _encode([clip], representation)]  # names the clip
-    arrays: dict[int, np.ndarray] = {}
-    for key, clip in whole.items():
-        features = np.asarray(clip.motion if clip.encoded else next(fresh).numpy(), np.float32)
-        if features.ndim != 2 or features.shape[1] != representation.features:
-            raise ValueError(f"clip {clip.id}: shape {features.shape}, not (frames, {representation.features})")
-        if not np.isfinite(features).all():
-            frame = int(np.argwhere(~np.isfinite(features).all(1))[0, 0])
-            raise ValueError(f"clip {clip.id}: the features of frame {frame} are not finite. Exclude it by name")
-        arrays[key] = features
-    return [arrays[id(clip.motion)] for clip in clips]
+class _Writer(ExitStack):
+    """Writes features.npy, clips.jsonl and references.npz clip by clip; memory grows by a few numbers per clip.
+
+    Args:
+        folder: the store, named in errors.
+        partial: its temporary folder.
+        features: number of features of a frame.
+    """
+
+    def __init__(self, folder: Path, partial: Path, features: int):
+        super().__init__()
+        self.folder, self.partial, self.features = folder, partial, features
+        self.splits: Counter[str] = Counter()
+        self.frames, self._begin, self._motion = 0, 0, None
+        self._split_of: dict[str, str] = {}  # source -> split
+        self._ids: set[str] = set()
+        self._training = array("q")  # start and end of each training clip
+        self._references: zipfile.ZipFile | None = None
+        self._packed = self.enter_context((partial / "features.npy").open("wb", buffering=0))
+        self._index = self.enter_context((partial / "clips.jsonl").open("wb", buffering=0))
+        self._append(self._packed, _header(0, features))
+
+    def add(self, name: str, clip: Clip, features: np.ndarray) -> None:
+        """Writes a clip of the data set `name`, and the features of its motion unless the previous clip has the same.
+
+        Raises:
+            ValueError: the clip exceeds its motion, or its id or split contradicts that of another clip.
+        """
+        if clip.motion is not self._motion:
+            self._motion, self._begin = clip.motion, self.frames
+            self.frames += len(features)
+            self._append(self._packed, features.tobytes())
+        first, length = clip.window or (0, len(features))
+        if first < 0 or length < 1 or first + length > len(features):
+            raise ValueError(f"clip {clip.id}: window {clip.window} exceeds {len(features)} frames")
+        if (other := self._split_of.setdefault(clip.source, clip.split)) != clip.split:
+            raise ValueError(f"{name}: clips of {clip.source} are in both {other} and {clip.split}")
+        if clip.id in self._ids:
+            raise ValueError(f"{name}: two clips have the same id, {clip.id}")
+        self._ids.add(clip.id)
+        self.splits[clip.split] += 1
+        start, attributes = self._begin + first, dict(clip.attributes)
+        if clip.split == "train":
+            self._training.extend((start, start + length))
+        entry = Entry(clip.id, start, length, clip.split, clip.source, clip.captions, clip.action, attributes)
+        self._append(self._index, (json.dumps(asdict(entry), ensure_ascii=False, sort_keys=True) + "\n").encode())
+        if clip.reference is not None:
+            with writing(self.folder, self.partial):
+                if self._references is None:
+                    self._references = self.enter_context(zipfile.ZipFile(self.partial / "references.npz", "w"))
+                with self._references.open(f"{clip.id}.npy", "w", force_zip64=True) as file:
+                    np.lib.format.write_array(file, np.asarray(clip.reference, np.float32))
+
+    def finish(self, name: str) -> None:
+        """Completes the files; raises `ValueError` if no clip of the data set `name` is in the training split."""
+        if not self.splits["train"]:
+            advice = "For your own data, add a `split` column to captions.csv"
+            raise ValueError(f"{name}: no clip is in the training split. {advice}")
+        self._packed.seek(0)
+        self._append(self._packed, _header(self.frames, self.features))
+        self.close()
+
+    def __exit__(self, *details: Any) -> bool | None:
+        with writing(self.folder, self.partial):  # a zip archive is completed when it is closed
+            return super().__exit__(*details)
+
+    def statistics(self, representation: Representation) -> tuple[np.ndarray, np.ndarray]:
+        """Returns mean and std of the training frames, which are read from the file."""
+        training = np.zeros(self.frames, bool)  # cuts may overlap; each frame counts once
+        for start, end in zip(self._training[::2], self._training[1::2], strict=True):
+            training[start:end] = True
+
+        def frames() -> Iterator[np.ndarray]:
+            with (self.partial / "features.npy").open("rb") as file:
+                file.seek(len(_header(0, self.features)))
+                for begin in range(0, self.frames, BLOCK):
+                    wanted = training[begin : begin + BLOCK]
+                    block = np.fromfile(file, np.float32, len(wanted) * self.features)
+                    yield block.reshape(len(wanted), self.features)[wanted]
+
+        mean, std = representation.statistics(Frames(frames, int(training.sum())))
+        return mean.numpy(), std.numpy()
+
+    def _append(self, file: io.RawIOBase, content: bytes) -> None:
+        """Writes all bytes. Through a memory map, a full disk would kill the process (SIGBUS)."""
+        left = memoryview(content)
+        with writing(self.folder / Path(file.name).name, self.folder):
+            while left:
+                left = left[file.write(left) or 0 :]
 
 
-def _batched(clips: Iterable[Clip], size: int) -> Iterator[list[Clip]]:
+def _encoded(clips: Iterable[Clip], representation: Representation, workers: int) -> Generator[tuple[Clip, np.ndarray]]:
+    """Yields each clip with the features of its entire motion, encoded in worker processes, each shared motion once."""
+    chunks: deque[tuple[list[Clip], list[int]]] = deque()
     iterator = iter(clips)
-    while chunk := list(islice(iterator, size)):
+    first = list(islice(iterator, 1))
+    if first and first[0].encoded:  # published features are only copied
+        workers = 1
+
+    def motions() -> Iterator[list[_Motion]]:
+        for chunk in _chunks(chain(first, iterator)):
+            whole = {id(clip.motion): (clip.id, clip.encoded, clip.motion) for clip in chunk}
+            chunks.append((chunk, list(whole)))
+            yield list(whole.values())
+
+    for arrays in in_order(functools.partial(_encode, pickle.dumps(representation)), motions(), workers):
+        chunk, keys = chunks.popleft()
+        features = dict(zip(keys, arrays, strict=True))
+        yield from ((clip, features[id(clip.motion)]) for clip in chunk)
+
+
+def _chunks(clips: Iterable[Clip]) -> Iterator[list[Clip]]:
+    """Yields consecutive clips whose motions have `CHUNK` frames together, or a single one that is longer."""
+    chunk: list[Clip] = []
+    frames = 0
+    for clip in clips:
+        fresh = 0 if chunk and clip.motion is chunk[-1].motion else len(clip.motion)
+        if chunk and fresh and frames + fresh > CHUNK:
+            yield chunk
+            chunk, frames = [], 0
+        chunk.append(clip)
+        frames += fresh
+    if chunk:
         yield chunk
 
 
-def _statistics(
-    representation: Representation, packed: np.ndarray, entries: list[Entry]
-) -> tuple[np.ndarray, np.ndarray]:
-    training = np.zeros(len(packed), bool)  # cuts may overlap; each frame counts once
-    for entry in entries:
-        training[entry.start : entry.start + entry.length] |= entry.split == "train"
-    mean, std = representation.statistics(torch.from_numpy(packed[training]))
-    return mean.numpy(), std.numpy()
+def _encode(representation: bytes, motions: Sequence[_Motion]) -> list[np.ndarray]:
+    """Returns the features of motions; `representation` is pickled, since PyTorch would share its tensors by files."""
+    encoder = _unpickled(representation)
+    for name, encoded, _ in motions:
+        if encoded and encoded != encoder.name:
+            raise ValueError(f"clip {name}: published as {encoded}, which cannot be converted to {encoder.name}")
+    raw = [torch.from_numpy(np.ascontiguousarray(motion)) for _, encoded, motion in motions if not encoded]
+    try:
+        fresh = iter(encoder.encode_many(raw) if raw else [])
+    except ValueError as error:
+        if len(motions) == 1:
+            raise ValueError(f"clip {motions[0][0]}: {error}") from error
+        return [features for motion in motions for features in _encode(representation, [motion])]  # names the clip
+    arrays = []
+    for name, encoded, motion in motions:
+        features = np.asarray(motion if encoded else next(fresh).numpy(), np.float32)
+        if features.ndim != 2 or features.shape[1] != encoder.features:
+            raise ValueError(f"clip {name}: shape {features.shape}, not (frames, {encoder.features})")
+        if not np.isfinite(features).all():
+            frame = int(np.argwhere(~np.isfinite(features).all(1))[0, 0])
+            raise ValueError(f"clip {name}: the features of frame {frame} are not finite. Exclude it by name")
+        arrays.append(features)
+    return arrays
 
 
-def _check_entries(name: str, entries: list[Entry]) -> None:
-    seen: dict[str, str] = {}
-    for entry in entries:
-        if seen.setdefault(entry.source, entry.split) != entry.split:
-            raise ValueError(f"{name}: clips of {entry.source} are in both {seen[entry.source]} and {entry.split}")
-    if len({entry.id for entry in entries}) != len(entries):
-        raise ValueError(f"{name}: two clips have the same id")
-    if not any(entry.split == "train" for entry in entries):
-        advice = "For your own data, add a `split` column to captions.csv"
-        raise ValueError(f"{name}: no clip is in the training split. {advice}")
+@functools.lru_cache(1)
+def _unpickled(representation: bytes) -> Representation:
+    return pickle.loads(representation)
 
 
 def _header(frames: int, features: int) -> bytes:
@@ -247,24 +338,14 @@ def _header(frames: int, features: int) -> bytes:
     return header.getvalue()
 
 
-def _append(file: io.RawIOBase, folder: Path, content: bytes) -> None:
-    """Writes all bytes of a part of features.npy. With a memory map, a full disk would kill the process (SIGBUS)."""
-    left = memoryview(content)
-    with writing(folder / "features.npy", folder):
-        while left:
-            left = left[file.write(left) or 0 :]
-
-
 def _describe(
     folder: Path,
     source: MotionSource,
     representation: Representation,
-    entries: list[Entry],
-    frames: int,
+    writer: _Writer,
     mean: np.ndarray,
     std: np.ndarray,
 ) -> dict[str, Any]:
-    splits = {split: sum(e.split == split for e in entries) for split in ("train", "val", "test")}
     return {
         "format": FORMAT,
         "dataset": source.name,
@@ -275,9 +356,9 @@ def _describe(
         "counts": source.counts(),
         "representation": representation.name,
         "fps": representation.fps,
-        "clips": splits,
-        "shape": [frames, representation.features],
-        "hours": round(frames / representation.fps / 3600, 3),
+        "clips": {split: writer.splits[split] for split in SPLITS},
+        "shape": [writer.frames, representation.features],
+        "hours": round(writer.frames / representation.fps / 3600, 3),
         "fingerprint": _fingerprint(folder, representation.name, representation.fps, mean, std),
         "sha256": {path.name: _sha256(path) for path in sorted(folder.iterdir())},
     }

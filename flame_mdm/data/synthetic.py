@@ -10,13 +10,14 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from flame_mdm.data import Clip, MotionSource, hashed_split
+from flame_mdm.data.parallel import in_order
 from flame_mdm.files import read_yaml
 
 # Offsets from the parent in meters, standing with hanging arms, facing +z; x for the left side, mirrored on the right.
@@ -474,6 +475,8 @@ SHARES = {"walk": 6, "turn": 2, "jump": 2, "wave": 2, "raise": 2, "kick": 2, "pu
 MAX_COUNT = {"jump": 3, "punch": 3, "kick": 2, "squat": 2}
 MIN_EVENT_SECONDS = 0.8
 """Minimum duration of a repetition in seconds; it limits how many fit into a clip."""
+AT_ONCE = 32
+"""Number of clips that a process makes at a time."""
 
 
 def _draw(rng: np.random.Generator, max_seconds: float) -> Attributes:
@@ -528,8 +531,10 @@ class Synthetic(MotionSource):
     captions_may_be_shared = True
     actions = tuple(MOTIONS)
 
-    def __init__(self, clips: int = 5000, seed: int = 0, min_seconds: float = 2.0, max_seconds: float = 3.0):
-        """Defines `clips` motions of `min_seconds` to `max_seconds`.
+    def __init__(
+        self, clips: int = 5000, seed: int = 0, min_seconds: float = 2.0, max_seconds: float = 3.0, workers: int = 0
+    ):
+        """Defines `clips` motions of `min_seconds` to `max_seconds`, made by `workers` processes (0 = one per core).
 
         Raises:
             ValueError: no clips, a negative seed, or durations below 2 s or out of order.
@@ -541,13 +546,18 @@ class Synthetic(MotionSource):
                 f"synthetic: min_seconds={min_seconds}, max_seconds={max_seconds}: give 2 <= min_seconds <= max_seconds"
             )
         self.size, self.seed, self.min_seconds, self.max_seconds = clips, seed, min_seconds, max_seconds
+        self.workers = workers
 
     def count(self) -> int:
         return self.size
 
     def clips(self, fps: float) -> Iterator[Clip]:
-        for index in range(self.size):
-            yield self.clip(index, fps)
+        tasks = (range(begin, min(begin + AT_ONCE, self.size)) for begin in range(0, self.size, AT_ONCE))
+        for clips in in_order(partial(self._several, fps), tasks, self.workers):
+            yield from clips
+
+    def _several(self, fps: float, indices: range) -> list[Clip]:
+        return [self.clip(index, fps) for index in indices]
 
     def clip(self, index: int, fps: float) -> Clip:
         """Returns clip number `index` with `round(seconds * fps) + 1` frames."""

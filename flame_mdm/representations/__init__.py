@@ -1,13 +1,42 @@
 """Motion representations: encoding of motions as features and decoding to joint positions."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
 from flame_mdm.representations.skeleton import Skeleton
+
+
+@dataclass(frozen=True)
+class Frames:
+    """The frames (N, D) of a data set, for `Representation.statistics`: they are read in parts, as often as needed.
+
+    Attributes:
+        arrays: returns all frames as arrays (F, D) of any length, each time in the same order.
+        count: number of frames.
+    """
+
+    arrays: Callable[[], Iterable[np.ndarray]]
+    count: int
+
+    def __len__(self) -> int:
+        return self.count
+
+    def split(self, size: int) -> Iterator[Tensor]:
+        """Yields consecutive parts (size, D), the last one shorter, like `Tensor.split`."""
+        pending: list[np.ndarray] = []
+        for array in self.arrays():
+            pending.append(array)
+            while sum(map(len, pending)) >= size:
+                joined = np.concatenate(pending)
+                pending = [joined[size:].copy()]
+                yield torch.from_numpy(joined[:size])
+        if sum(map(len, pending)):
+            yield torch.from_numpy(np.concatenate(pending))
 
 
 class Representation(nn.Module, ABC):
@@ -38,7 +67,7 @@ class Representation(nn.Module, ABC):
         """Decodes features (..., F, D) in the data's units to joints (..., F, J, 3), meters, y up. Differentiable."""
 
     @abstractmethod
-    def statistics(self, features: Tensor) -> tuple[Tensor, Tensor]:
+    def statistics(self, features: Tensor | Frames) -> tuple[Tensor, Tensor]:
         """Returns mean and std (D,) for normalization, from all training frames (N, D)."""
 
     @abstractmethod

@@ -9,7 +9,7 @@ import torch.nn.functional as F
 from scipy.ndimage import gaussian_filter1d
 from torch import Tensor
 
-from flame_mdm.representations import Representation, rotation
+from flame_mdm.representations import Frames, Representation, rotation
 from flame_mdm.representations.skeleton import SKELETONS
 
 LEGACY_SMOOTHING_FRAMES = 20
@@ -144,15 +144,16 @@ class HumanML(Representation):
         ground = root * root.new_tensor([1.0, 0.0, 1.0])
         return torch.cat([root[..., None, :], turned + ground[..., None, :]], -2) / self.units_per_metre
 
-    def statistics(self, features: Tensor) -> tuple[Tensor, Tensor]:
+    def statistics(self, features: Tensor | Frames) -> tuple[Tensor, Tensor]:
         """Returns the mean of each feature, and the std averaged over each entry of `slices`.
 
         Averaging preserves the relative scales within an entry. A constant entry (`SMALLEST_STD`) gets std 1, so that
         rounding errors are not amplified.
         """
-        chunks = features.split(1 << 16)  # the frames of a data set, in float64, would not fit in memory
-        mean = sum((chunk.double().sum(0) for chunk in chunks), torch.zeros(())) / len(features)
-        variance = sum(((chunk.double() - mean).square().sum(0) for chunk in chunks), torch.zeros(())) / len(features)
+        size, zero = 1 << 16, torch.zeros(())  # the frames of a data set would not fit in memory
+        mean = sum((chunk.double().sum(0) for chunk in features.split(size)), zero) / len(features)
+        squares = (chunk.double().sub_(mean).square_().sum(0) for chunk in features.split(size))
+        variance = sum(squares, zero) / len(features)
         std = variance.sqrt()
         for columns in self.slices.values():
             average = std[columns].mean()

@@ -6,7 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from flame_mdm.representations import Representation, rotation
+from flame_mdm.representations import Frames, Representation, rotation
 from flame_mdm.representations.skeleton import KIT21
 
 KNEES_AND_ELBOWS = [KIT21.joints.index(f"{side}_{part}") for part in ("knee", "elbow") for side in ("left", "right")]
@@ -85,11 +85,14 @@ class Rifke(Representation):
         part[list(joints)] = True
         return torch.cat([part[:1], part[1:].repeat_interleave(3), part[:1].expand(3)])
 
-    def statistics(self, features: Tensor) -> tuple[Tensor, Tensor]:
+    def statistics(self, features: Tensor | Frames) -> tuple[Tensor, Tensor]:
         """Returns mean and unbiased std of each feature; std 1 if it is constant."""
-        features = features.double()
-        std = features.std(0)
-        return features.mean(0).float(), torch.where(std > 0, std, 1.0).float()
+        size, zero = 1 << 16, torch.zeros(())  # the frames of a data set would not fit in memory
+        first = next(iter(features.split(1)))[0].double()  # relative to it, constant features are exactly 0
+        mean = first + sum((chunk.double().sub_(first).sum(0) for chunk in features.split(size)), zero) / len(features)
+        squares = (chunk.double().sub_(mean).square_().sum(0) for chunk in features.split(size))
+        std = (sum(squares, zero) / (len(features) - 1)).sqrt()
+        return mean.float(), torch.where(std > 0, std, 1.0).float()
 
 
 def upsample(joints: Tensor, factor: int = 8) -> Tensor:

@@ -7,7 +7,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from flame_mdm.representations import Representation, rotation
+from flame_mdm.representations import Frames, Representation, rotation
 from flame_mdm.representations.skeleton import SMPL24, forward_kinematics
 from flame_mdm.representations.smpl import ADULT, read_pose
 
@@ -49,6 +49,6 @@ class Rot6D(Representation):
         part[list(joints)] = True
         return torch.cat([part, part[:1]]).repeat_interleave(6)
 
-    def statistics(self, features: Tensor) -> tuple[Tensor, Tensor]:
+    def statistics(self, features: Tensor | Frames) -> tuple[Tensor, Tensor]:
         """Returns mean 0 and std 1: ACTOR and MDM train on features that are not normalized."""
         return torch.zeros(self.features), torch.ones(self.features)

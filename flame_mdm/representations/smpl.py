@@ -5,7 +5,7 @@ from collections.abc import Iterable, Sequence
 import torch
 from torch import Tensor
 
-from flame_mdm.representations import Representation, rotation
+from flame_mdm.representations import Frames, Representation, rotation
 from flame_mdm.representations.skeleton import SMPL24, forward_kinematics
 
 ADULT = (
@@ -77,6 +77,6 @@ class SMPL(Representation):
         part[list(joints)] = True
         return torch.cat([part[:1].expand(3), part.repeat_interleave(6)])
 
-    def statistics(self, features: Tensor) -> tuple[Tensor, Tensor]:
+    def statistics(self, features: Tensor | Frames) -> tuple[Tensor, Tensor]:
         """Returns mean 0 and std 1: FLAME trains on features that are not normalized."""
         return torch.zeros(self.features), torch.ones(self.features)

@@ -260,7 +260,11 @@ def _nodes(node: Any, known: dict[int, float]) -> float:
 
 
 def read_npz(
-    source: Path | IO[bytes], *, skip: Collection[str] = (), only: Collection[str] | None = None
+    source: Path | IO[bytes],
+    *,
+    skip: Collection[str] = (),
+    only: Collection[str] | None = None,
+    header: bool = False,
 ) -> dict[str, np.ndarray]:
     """Returns the arrays of an .npz file by name.
 
@@ -268,6 +272,7 @@ def read_npz(
         source: a path, or a seekable open file.
         skip: names of arrays not to read.
         only: names of arrays to read if they exist; None = all.
+        header: read only the first row of arrays of two and more dimensions; all their rows are that one.
 
     Raises:
         FileNotFoundError: the file does not exist.
@@ -278,7 +283,7 @@ def read_npz(
     if isinstance(source, Path):
         regular_file(source)
         with source.open("rb") as file:
-            return read_npz(file, skip=skip, only=only)
+            return read_npz(file, skip=skip, only=only, header=header)
     try:
         size = source.seek(0, os.SEEK_END)
         with zipfile.ZipFile(source) as archive:
@@ -289,31 +294,32 @@ def read_npz(
             for name, member in wanted.items():
                 check_member(member)
                 with archive.open(member) as file:
-                    arrays[name] = _array(file, member.file_size, name)
+                    arrays[name] = _array(file, member.file_size, name, header=header)
             return arrays
     except (*ZIP_ERRORS, OSError, ValueError) as error:
         raise ValueError(f"damaged, or not a file of plain arrays: {first_line(error)}") from error
 
 
-def read_npy(source: Path | IO[bytes], *, mmap: bool = False) -> np.ndarray:
+def read_npy(source: Path | IO[bytes], *, mmap: bool = False, header: bool = False) -> np.ndarray:
     """Returns the array of an .npy file; raises the errors of `read_npz`.
 
     Args:
         source: a path, or a seekable open file.
         mmap: memory-map the file, read-only, instead of loading it; requires a path.
+        header: as in `read_npz`.
     """
     if isinstance(source, Path):
         regular_file(source)
         with source.open("rb") as file:
-            return read_npy(file) if not mmap else _npy(file, mmap)
-    return _npy(source, mmap)
+            return read_npy(file, header=header) if not mmap else _npy(file, mmap, header)
+    return _npy(source, mmap, header)
 
 
-def _npy(file: IO[bytes], mmap: bool) -> np.ndarray:
+def _npy(file: IO[bytes], mmap: bool, header: bool) -> np.ndarray:
     size = file.seek(0, os.SEEK_END)
     file.seek(0)
     try:
-        return _array(file, size, "the array", mmap)
+        return _array(file, size, "the array", mmap, header)
     except ValueError as error:
         raise ValueError(f"damaged, or not a file of plain arrays: {first_line(error)}") from error
 
@@ -373,14 +379,14 @@ def check_expansion(expanded: int, packed: int) -> None:
         raise ValueError(f"its {_size(packed)} expand to {_size(expanded)}; motion data does not")
 
 
-def _array(file: IO[bytes], size: int, name: str, mmap: bool = False) -> np.ndarray:
+def _array(file: IO[bytes], size: int, name: str, mmap: bool = False, header: bool = False) -> np.ndarray:
     """Returns the array of an .npy file whose header declares exactly the size of the content.
 
     Args:
         file: open file, positioned at its beginning.
         size: size of the file in bytes.
         name: name of the array in error messages.
-        mmap: as in `read_npy`.
+        mmap, header: as in `read_npy`.
     """
     import numpy as np
 
@@ -400,11 +406,13 @@ def _array(file: IO[bytes], size: int, name: str, mmap: bool = False) -> np.ndar
     order = "F" if fortran else "C"
     if mmap and count:
         return np.memmap(file, dtype, "r", begin, shape, order)
-    content = bytearray(size - begin)
-    array = np.ndarray(shape, dtype, content, order=order)
+    header = header and bool(count) and len(shape) > 1 and not fortran
+    rows = (1, *shape[1:]) if header else shape
+    content = bytearray(math.prod(rows) * dtype.itemsize)
+    array = np.ndarray(rows, dtype, content, order=order)
     if _read_into(file, content) < len(content):
         raise ValueError(f"{name}: it ends too early")
-    return array
+    return np.broadcast_to(array, shape) if header else array
 
 
 def _read_into(file: Any, content: bytearray) -> int:

@@ -4,6 +4,7 @@ import csv
 import json
 import re
 import shlex
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ import torch
 from fixtures import ROOT
 
 from flame_mdm.__main__ import main
-from flame_mdm.data import hashed_split
+from flame_mdm.data import hashed_split, store
 from flame_mdm.data.crops import Units
 from flame_mdm.data.datamodule import MotionDataModule
 from flame_mdm.data.folder import Folder
@@ -438,10 +439,90 @@ def test_check_lists_skeletons_and_all_failures(tmp_path: Path):
     mixamo(tmp_path / "c.bvh", INCH)
     (tmp_path / "d.bvh").write_text("HIERARCHY\n")
     lines = Folder(str(tmp_path)).check()
-    assert re.fullmatch(r"Mixamo, unit 0\.01, 30 fps: 1 motion, legs 0\.8\d m, head joint at 1\.\d\d m", lines[0])
+    assert re.fullmatch(
+        r"Mixamo, unit 0\.01, 30 fps: 1 motion, 40 frames, 1\.3 s, legs 0\.8\d m, head joint at 1\.\d\d m", lines[0]
+    )
     assert re.match(r"error: .*b\.bvh and 1 more: the legs are", lines[1])
     assert re.match(r"error: .*d\.bvh, line 1: ", lines[2])
     assert re.fullmatch(r"error: 3 of 4 motions of .* cannot be prepared", lines[3])
+
+
+def write_amass(path: Path, frames: int = 90, width: int = 156) -> None:
+    poses, trans = np.zeros((frames, width)), np.tile([0.0, 0.0, 0.9], (frames, 1))
+    poses[:, 0] = np.pi / 2
+    np.savez_compressed(path, poses=poses, trans=trans, betas=np.zeros(16), gender="male", mocap_framerate=60.0)
+
+
+def test_check_reads_headers_only(tmp_path: Path):
+    long = mixamo(tmp_path / "long.bvh")
+    body = bvh.read(long)
+    bvh.write(replace(body, frames=np.tile(body.frames, (50, 1))), long)
+    text = long.read_text().splitlines()
+    assert len("\n".join(text)) > 2 * bvh.HEADER
+    long.write_text("\n".join([*text[:-1], "not a number"]) + "\n")
+    write_amass(tmp_path / "amass.npz")
+    np.savez_compressed(
+        tmp_path / "walk.npz", joints=np.where(np.arange(len(WALK))[:, None, None], np.nan, WALK), fps=30
+    )
+    lines = Folder(str(tmp_path)).check()
+    assert lines[0] == "AMASS, SMPL+H, 60 fps: 1 motion, 90 frames, 1.5 s"
+    assert lines[1].startswith("Mixamo, unit 0.01, 30 fps: 1 motion, 2,000 frames, 66.7 s, legs 0.8")
+    assert lines[2].startswith(f"SMPL, unit 1, 30 fps: 1 motion, {len(WALK)} frames, ")
+    assert len(lines) == 4, lines
+    with pytest.raises(ValueError, match=r"long\.bvh, line \d+: could not convert"):
+        only(tmp_path, exclude=["amass", "walk"])
+    with pytest.raises(ValueError, match=r"walk\.npz: numbers of joints in frame 1 are not finite"):
+        only(tmp_path, exclude=["amass", "long"])
+    long.write_text("\n".join(text[:-1200]) + "\n")
+    assert re.match(
+        r"error: .*long\.bvh, line \d+: the file ends after 800 frames, but must", Folder(str(tmp_path)).check()[2]
+    )
+
+
+def test_a_first_frame_in_an_unusual_pose_is_not_an_error(tmp_path: Path):
+    motion = WALK.copy()
+    for side in ("left", "right"):  # as when kneeling
+        ankle, foot = (SMPL22.joints.index(f"{side}_{name}") for name in ("ankle", "foot"))
+        motion[0, foot] = 2 * motion[0, ankle] - motion[0, foot]
+    np.savez(tmp_path / "a.npz", joints=motion, fps=30)
+    assert len(Folder(str(tmp_path)).check()) == 2
+    np.savez(tmp_path / "a.npz", joints=np.tile(motion[:1], (30, 1, 1)), fps=30)
+    assert "the toes point backwards" in Folder(str(tmp_path)).check()[0]
+
+
+@pytest.mark.parametrize("name", ["LAFAN1", "Xsens", "SOMA", "Bandai-Namco", "mixamorig1_", "mixamorig:"])
+def test_skeletons_are_known_by_name(name: str, tmp_path: Path):
+    if name in LAYOUTS:
+        file = bvh.read(mixamo(tmp_path / "a.bvh"))
+        first, last = (
+            [place if isinstance(place, str) else [*place][-1] for place in LAYOUTS[each].map.values()]
+            for each in ("Mixamo", name)
+        )
+        names = dict(zip(first, last, strict=True))
+        bvh.write(replace(file, joints=tuple(names.get(joint, joint) for joint in file.joints)), tmp_path / "a.bvh")
+    else:
+        mixamo(tmp_path / "a.bvh", prefix=name)
+    line = f"{name if name in LAYOUTS else 'Mixamo'}, unit 0.01, 30 fps: 1 motion, 40 frames, 1.3 s, legs "
+    assert Folder(str(tmp_path)).check()[0].startswith(line)
+
+
+def test_the_store_does_not_depend_on_the_number_of_workers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    place = tmp_path / "mine"
+    for number, inch in enumerate((1, INCH, 1)):
+        mixamo(place / f"{number}" / "a.bvh", inch)
+    skeleton(place / "1", "unit: 0.0254\n")
+    write_amass(place / "b.npz")
+    monkeypatch.setattr(store, "CHUNK", 60)
+    first, second = (
+        write_store(tmp_path / f"{workers}", Folder(str(place), mirror=True, workers=workers), HumanML()).folder
+        for workers in (1, 2)
+    )
+    assert [path.read_bytes() for path in sorted(first.iterdir())] == [
+        path.read_bytes() for path in sorted(second.iterdir())
+    ]
+    (place / "2" / "a.bvh").write_text("HIERARCHY\n")
+    with pytest.raises(ValueError, match=r"2/a\.bvh, line 1: "):
+        write_store(tmp_path / "none", Folder(str(place), workers=2), HumanML())
 
 
 @pytest.mark.parametrize("motions", [10, 12, 15, 20])

@@ -5,25 +5,28 @@ from __future__ import annotations
 import csv
 import hashlib
 import io
+import math
 import os
 import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 import torch
 
 from flame_mdm.data import Clip, MotionSource, Split, hashed_split
+from flame_mdm.data.parallel import in_order
 from flame_mdm.errors import UserError, printable
 from flame_mdm.files import read_json, read_text, regular_file
+from flame_mdm.formats import bvh
 from flame_mdm.formats.body import check_feet, check_size, head_height, leg_length
 from flame_mdm.formats.files import read_arrays, smpl_motion
-from flame_mdm.formats.layouts import Layout, array_layout, layout_name, read_bvh, read_skeleton, skeleton_file
-from flame_mdm.formats.resampling import resample
+from flame_mdm.formats.layouts import array_layout, layout_name, map_bvh, read_skeleton, skeleton_file
+from flame_mdm.formats.resampling import resample, resampled_frames
 from flame_mdm.representations import rotation
 from flame_mdm.representations.skeleton import SMPL22
 from flame_mdm.representations.smpl import SMPL
@@ -31,6 +34,8 @@ from flame_mdm.representations.smpl import SMPL
 MOTIONS = (".bvh", ".npz", ".npy", ".json")
 FORBIDDEN_CHARACTERS = re.compile("[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
 """Characters not allowed in the name of a motion: names are stored as text, one clip per line."""
+LOOK_FPS = 20.0
+"""Frame rate for which `Folder.check` says whether motions can be resampled."""
 SPLITTABLE = 10
 """Number of motions from which on each split has at least one."""
 TABLES = ("captions.csv", "captions.json")
@@ -45,6 +50,28 @@ class Note:
     action: str | None = None
     split: Split | None = None
     source: str | None = None
+
+
+Task = tuple[Path, str, dict[str, Any]]
+"""A motion, its skeleton.yaml or "", and the content of that file."""
+
+
+class Found(NamedTuple):
+    """What a motion file contains: skeleton with unit and frame rate, frames and seconds as recorded, sizes in meters.
+
+    `upright` is the mean of the vertical component of the trunk's direction. Rotations of SMPL have no size.
+    """
+
+    skeleton: str
+    frames: int
+    seconds: float
+    leg: float | None = None
+    head: float | None = None
+    upright: float | None = None
+
+
+class UnclearPose(Exception):
+    """The feet look wrong in a single frame, as those of a person who kneels."""
 
 
 class Folder(MotionSource):
@@ -63,6 +90,7 @@ class Folder(MotionSource):
         motion: Literal["joints", "smpl"] = "joints",
         mirror: bool = False,
         exclude: Sequence[str] = (),
+        workers: int = 0,
     ):
         """Stores the arguments; reads no files.
 
@@ -72,6 +100,7 @@ class Folder(MotionSource):
                 AMASS files contain.
             mirror: yield a mirrored copy after each clip of the training split; joints only.
             exclude: motions to leave out, by their path in the folder without extension.
+            workers: number of processes that read; 0 = one per core, 1 = this process only.
 
         Raises:
             ValueError: `motion` has another value, or `mirror` is combined with SMPL rotations.
@@ -79,8 +108,9 @@ class Folder(MotionSource):
         if motion not in ("joints", "smpl") or (mirror and motion == "smpl"):
             raise ValueError(f"data.source.motion={motion}, mirror={mirror}: give joints, or smpl with mirror=false")
         self.path, self.motion, self.mirror, self.exclude = Path(path), motion, mirror, tuple(exclude)
+        self.workers = workers
         self._skeletons: dict[Path, dict[str, Any]] = {}
-        self._sizes: dict[str, list[tuple[float, float, float]]] = {}
+        self._found: list[Found] = []
 
     def count(self) -> int:
         splits = Counter(self.splits.values())
@@ -91,12 +121,14 @@ class Folder(MotionSource):
 
     def clips(self, fps: float) -> Iterator[Clip]:
         self.actions = tuple(sorted({note.action for note in self.notes.values() if note.action is not None}))
-        self._sizes: dict[str, list[tuple[float, float, float]]] = {}
-        for name, path in self.files.items():
+        self._found = []
+        read = in_order(partial(_read, self.motion, fps), map(self._task, self.files.values()), self.workers)
+        for name, (motion, found) in zip(self.files, read, strict=True):
+            self._found.append(found)
             note, split = self.notes[name], self.splits[name]
             clip = Clip(
                 name.replace("/", "_"),
-                self._read(path, fps),
+                motion,
                 note.texts,
                 split,
                 note.source or name,
@@ -108,23 +140,39 @@ class Folder(MotionSource):
         self._check_upright()
 
     def findings(self) -> list[str]:
-        """Returns the skeletons found so far, with the range of their sizes."""
+        """Returns the skeletons found so far, with the lengths of their motions and the range of their sizes."""
         lines = []
-        for skeleton, sizes in self._sizes.items():
-            legs, heads = (sorted({f"{size[k]:.2f}" for size in sizes}) for k in (0, 1))
-            legs, heads = (" to ".join(dict.fromkeys((values[0], values[-1]))) for values in (legs, heads))
-            many = f"{len(sizes)} motion" + "s" * (len(sizes) > 1)
-            lines.append(f"{skeleton}: {many}, legs {legs} m, head joint at {heads} m")
+        for skeleton, motions in self._by_skeleton().items():
+            many = f"{len(motions)} motion" + "s" * (len(motions) > 1)
+            frames, seconds = (sum(getattr(motion, name) for motion in motions) for name in ("frames", "seconds"))
+            line = f"{skeleton}: {many}, {frames:,} frames, {seconds:,.1f} s"
+            for what, name in (("legs", "leg"), ("head joint at", "head")):
+                sizes = sorted(f"{size:.2f}" for motion in motions if (size := getattr(motion, name)) is not None)
+                line += f", {what} {' to '.join(dict.fromkeys((sizes[0], sizes[-1])))} m" if sizes else ""
+            lines.append(line)
         return lines
 
+    def _by_skeleton(self) -> dict[str, list[Found]]:
+        motions: dict[str, list[Found]] = {}
+        for found in self._found:
+            motions.setdefault(found.skeleton, []).append(found)
+        return motions
+
     def check(self) -> list[str]:
-        """Reads all motions and captions; returns a line per skeleton and per failure."""
-        self._sizes, failed = {}, {}
+        """Reads all captions and the header and first frame of each motion; returns lines on skeletons and failures."""
+        self._found = []
+        failed: dict[str, list[str]] = {}
+        tasks: dict[str, Task] = {}
         for name, path in self.files.items():
             try:
-                self._read(path, 20.0)
+                tasks[name] = self._task(path)
             except (ValueError, UserError) as error:
-                failed.setdefault(str(error).replace(str(path), ""), []).append(name)
+                failed.setdefault(f": {error}", []).append(name)
+        for name, found in zip(tasks, in_order(partial(_look, self.motion), tasks.values(), self.workers), strict=True):
+            if isinstance(found, str):
+                failed.setdefault(found.replace(str(self.files[name]), ""), []).append(name)
+            else:
+                self._found.append(found)
         lines = self.findings()
         for error, names in failed.items():
             more = f" and {len(names) - 1} more" * (len(names) > 1)
@@ -141,8 +189,9 @@ class Folder(MotionSource):
         return [*lines, f"{self.name}: {self.count()} clips can be prepared (motions: {splits})"]
 
     def _check_upright(self) -> None:
-        for skeleton, sizes in self._sizes.items():
-            if np.median([upright for _, _, upright in sizes]) < 0.3:
+        for skeleton, motions in self._by_skeleton().items():
+            upright = [motion.upright for motion in motions if motion.upright is not None]
+            if upright and np.median(upright) < 0.3:
                 raise ValueError(
                     f"{self.path}: the body is lying down in most motions ({skeleton}); set the axis `up` in "
                     "skeleton.yaml"
@@ -203,14 +252,14 @@ class Folder(MotionSource):
                 )
         return notes
 
-    def _skeleton(self, path: Path) -> tuple[str, dict[str, Any]]:
-        """Returns the name and the content of the nearest `skeleton.yaml` above a motion; empty without one."""
+    def _task(self, path: Path) -> Task:
+        """Returns a motion with the name and content of the nearest `skeleton.yaml` above it; "" and {} without one."""
         found = skeleton_file(path)
         if found is None:
-            return "", {}
+            return path, "", {}
         if found not in self._skeletons:
             self._skeletons[found] = read_skeleton(found)
-        return os.path.relpath(found), self._skeletons[found]
+        return path, os.path.relpath(found), self._skeletons[found]
 
     @cached_property
     def splits(self) -> dict[str, Split]:
@@ -232,62 +281,91 @@ class Folder(MotionSource):
         splits: dict[str, Split] = {**given, **drawn}
         return {name: note.split or splits[sources[name]] for name, note in self.notes.items()}
 
-    def _read(self, path: Path, fps: float) -> np.ndarray:
-        where, given = self._skeleton(path)
-        if path.suffix.lower() == ".bvh":
-            joints, _, layout = read_bvh(path, fps, given)
-            return self._checked(path, joints, layout, where)
-        data = read_arrays(path)
-        rate = data.setdefault("fps", given.get("fps"))
-        if rate is None:
-            raise ValueError(f"{path}: no frame rate in the file. Write it into skeleton.yaml, for example `fps: 30`")
-        if "poses" in data:
-            return self._from_smpl(path, data, fps)
-        layout, names = array_layout(path, data["joints"], given)
-        try:
-            moved = resample(data["joints"].astype(float), rate, fps)
-        except ValueError as error:
-            raise ValueError(f"{path}: {error}") from error
-        return self._checked(path, layout.apply(moved, names), replace(layout, fps=rate), where)
-
-    def _checked(self, path: Path, joints: np.ndarray, layout: Layout, where: str) -> np.ndarray:
-        """Returns the joints; raises `ValueError` if their size, feet or values are wrong."""
-        if self.motion == "smpl":
-            raise ValueError(f"{path}: contains no SMPL rotations; use AMASS .npz files, or set motion=joints")
-        if not np.isfinite(joints).all():
-            frame = int(np.argmin(np.isfinite(joints).all((1, 2))))
-            raise ValueError(f"{path}: numbers in frame {frame} are not finite")
-        leg = leg_length(joints)
-        try:
-            check_size(leg, layout.unit, layout.children)
-            check_feet(joints)
-        except ValueError as error:
-            raise ValueError(f"{path}: {error}") from error
-        trunk = joints[:, SMPL22.joints.index("neck")] - joints[:, 0]
-        upright = float((trunk[:, 1] / np.linalg.norm(trunk, axis=1)).mean())
-        name = f"{layout_name(layout)}, unit {layout.unit:.4g}, {layout.fps:g} fps" + f" ({where})" * bool(where)
-        self._sizes.setdefault(name, []).append((leg, head_height(joints), upright))
-        return joints
-
-    def _from_smpl(self, path: Path, data: dict[str, Any], fps: float) -> np.ndarray:
-        try:
-            translation, turns = smpl_motion(data, fps)
-        except ValueError as error:
-            raise ValueError(f"{path}: {error}") from error
-        angles = rotation.quaternion_to_axis_angle(turns).flatten(1).numpy()
-        motion = np.concatenate([translation.numpy(), angles], 1).astype(np.float32)
-        if self.motion == "smpl":
-            return motion
-        representation = SMPL()
-        joints = representation.decode(representation.encode(torch.from_numpy(motion)))
-        return joints[:, : len(SMPL22)].numpy()
-
     def _mirrored(self, clip: Clip, note: Note) -> Clip:
         action = clip.action
         if note.action is not None and _swapped(note.action) in self.actions:
             action = self.actions.index(_swapped(note.action))
         motion = SMPL22.mirror(torch.from_numpy(clip.motion)).numpy()
         return Clip(f"M{clip.id}", motion, [_swapped(text) for text in clip.captions], clip.split, clip.source, action)
+
+
+def _look(kind: str, task: Task) -> Found | str:
+    """Returns what the header and the first frame of a motion say, or the error."""
+    try:
+        try:
+            return _read(kind, LOOK_FPS, task, header=True)[1]
+        except UnclearPose:
+            return _read(kind, LOOK_FPS, task)[1]
+    except (ValueError, UserError) as error:
+        return str(error)
+
+
+def _read(kind: str, fps: float, task: Task, header: bool = False) -> tuple[np.ndarray, Found]:
+    """Reads and checks a motion: joints or, if `kind` is "smpl", a raw motion of the SMPL representation.
+
+    With `header`, reads only the header and the first frame, and returns that frame.
+
+    Raises:
+        UnclearPose: with `header`, the feet look wrong in the first frame.
+        UserError, ValueError: the file is damaged or wrong; the message names it.
+    """
+    path, where, given = task
+    try:
+        if path.suffix.lower() == ".bvh":
+            file = bvh.read_header(path) if header else bvh.read(path)
+            frames, rate = len(file.frames), file.fps
+            if header:
+                resampled_frames(frames, rate, fps, len(file.joints))
+                file = replace(file, frames=file.frames[:1])
+            joints, _, layout = map_bvh(path, file, None if header else fps, given)
+        else:
+            data = read_arrays(path, header)
+            rate = data.setdefault("fps", given.get("fps"))
+            if rate is None:
+                raise ValueError("no frame rate in the file. Write it into skeleton.yaml, for example `fps: 30`")
+            shape = data["poses" if "poses" in data else "joints"].shape
+            frames = shape[0]
+            if header:
+                resampled_frames(frames, rate, fps, math.prod(shape[1:]) // 3, slack=1e-6)
+                data |= {name: data[name][:1] for name in ("joints", "poses", "trans") if name in data}
+            if "poses" in data:
+                width = math.prod(shape[1:])
+                model = {72: "SMPL", 156: "SMPL+H", 165: "SMPL-X"}.get(width, f"{width // 3} joints")
+                found = Found(f"AMASS, {model}, {rate:g} fps" + f" ({where})" * bool(where), frames, frames / rate)
+                return _from_smpl(kind, data, None if header else fps), found
+            layout, names = array_layout(path, data["joints"], given)
+            moved = data["joints"].astype(float)
+            joints = layout.apply(moved if header else resample(moved, rate, fps), names)
+        if kind == "smpl":
+            raise ValueError("contains no SMPL rotations; use AMASS .npz files, or set motion=joints")
+        if not np.isfinite(joints).all():
+            frame = int(np.argmin(np.isfinite(joints).all((1, 2))))
+            raise ValueError(f"numbers in frame {frame} are not finite")
+        leg = leg_length(joints)
+        check_size(leg, layout.unit, layout.children)
+        try:
+            check_feet(joints)
+        except ValueError as error:
+            if header:
+                raise UnclearPose from error
+            raise
+        trunk = joints[:, SMPL22.joints.index("neck")] - joints[:, 0]
+        upright = float((trunk[:, 1] / np.linalg.norm(trunk, axis=1)).mean())
+        name = f"{layout_name(layout)}, unit {layout.unit:.4g}, {rate:g} fps" + f" ({where})" * bool(where)
+        return joints, Found(name, frames, frames / rate, leg, head_height(joints), upright)
+    except ValueError as error:
+        raise ValueError(str(error) if str(path) in str(error) else f"{path}: {error}") from error
+
+
+def _from_smpl(kind: str, data: dict[str, Any], fps: float | None) -> np.ndarray:
+    translation, turns = smpl_motion(data, fps)
+    angles = rotation.quaternion_to_axis_angle(turns).flatten(1).numpy()
+    motion = np.concatenate([translation.numpy(), angles], 1).astype(np.float32)
+    if kind == "smpl":
+        return motion
+    representation = SMPL()
+    joints = representation.decode(representation.encode(torch.from_numpy(motion)))
+    return joints[:, : len(SMPL22)].numpy()
 
 
 def _is_there(path: Path) -> bool:

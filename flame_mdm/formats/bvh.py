@@ -12,8 +12,10 @@ import math
 import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from decimal import Decimal
+from itertools import islice
 from pathlib import Path
 from typing import NoReturn
 
@@ -24,6 +26,8 @@ from flame_mdm.files import TEXT_LIMIT, regular_file, write_text
 from flame_mdm.formats.resampling import RATES, between, slerp
 
 CHANNELS = tuple(f"{axis}{kind}" for kind in ("position", "rotation") for axis in "XYZ")
+HEADER = 1 << 16
+"""Bytes that contain the hierarchy and the first frame of most files: 15 KiB for a body with all its fingers."""
 MAX_LABELED_LINE = 200
 """Maximum length of a line with a label. Python needs quadratic time for numbers with many digits."""
 
@@ -155,8 +159,24 @@ def read(path: str | Path) -> Bvh:
     return parse(Path(path).read_bytes(), str(path))
 
 
-def parse(data: bytes, name: str) -> Bvh:
-    """Reads the bytes of a BVH file; `name` is used in error messages.
+def read_header(path: str | Path) -> Bvh:
+    """Reads a BVH file as if all its frames were equal to the first; other frames are not read, nor checked.
+
+    Raises:
+        UserError, ValueError: as in `read`; a file whose beginning is damaged is read as a whole.
+    """
+    size = regular_file(path, TEXT_LIMIT)
+    with Path(path).open("rb") as file:
+        data = file.read(HEADER)
+    with suppress(ValueError):
+        found = parse(data[: data.rfind(b"\n") + 1], str(path), header=True)
+        if size >= 2 * found.frames.size:  # a number and a space
+            return found
+    return read(path)
+
+
+def parse(data: bytes, name: str, header: bool = False) -> Bvh:
+    """Reads the bytes of a BVH file; `name` is used in error messages. `header` repeats the first frame, see above.
 
     Raises:
         ValueError: as in `read`.
@@ -218,7 +238,7 @@ def parse(data: bytes, name: str) -> Bvh:
         tuple(channels),
         tuple(end_parents),
         np.array(end_offsets, float).reshape(-1, 3),
-        source.table(count, sum(map(len, channels))),
+        source.table(count, sum(map(len, channels)), header),
         fps,
     )
 
@@ -269,10 +289,10 @@ class _Source:
             self.fail(f"expected {expected}, found {line[:40] or 'the end of the file'}")
         return match[1]
 
-    def table(self, count: int, width: int) -> np.ndarray:
-        """Returns the numbers (count, width) float64 in all remaining lines."""
+    def table(self, count: int, width: int, header: bool) -> np.ndarray:
+        """Returns the numbers (count, width) float64 in all remaining lines; `header`: repeats those in the first."""
         rows, numbers = [], []
-        for number, line in self.lines:
+        for number, line in islice(self.lines, 1 if header else None):
             self.line = number
             try:
                 row = list(map(float, line.split()))
@@ -282,14 +302,14 @@ class _Source:
                 self.fail(f"{len(row)} numbers, but the joints have {width} channels")
             rows.append(row)
             numbers.append(number)
-        if len(rows) != count or not rows:
+        if len(rows) != (min(count, 1) if header else count) or not rows:
             self.fail(f"the file ends after {len(rows)} frames, but must have {max(count, 1)}")
         table = np.array(rows)
         finite = np.isfinite(table).all(1)
         if not finite.all():
             self.line = numbers[int(np.argmin(finite))]
             self.fail("number is not finite")
-        return table
+        return np.broadcast_to(table, (count, width)) if header else table
 
 
 def write(bvh: Bvh, path: str | Path) -> None:

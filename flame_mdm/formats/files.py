@@ -97,10 +97,11 @@ def read(
         raise ValueError(str(error) if str(path) in str(error) else f"{path}: {error}") from error
 
 
-def read_arrays(path: Path) -> dict[str, Any]:
+def read_arrays(path: Path, header: bool = False) -> dict[str, Any]:
     """Reads the arrays of an .npz, .json or .npy motion: joints, or poses and trans as in AMASS; and fps if present.
 
-    `posed_joints`, as in files of NVIDIA's Kimodo, are returned as joints.
+    `posed_joints`, as in files of NVIDIA's Kimodo, are returned as joints. With `header`, arrays of .npz and .npy files
+    repeat their first frame; the others are neither read nor checked.
 
     Raises:
         FileNotFoundError: the file does not exist.
@@ -110,9 +111,9 @@ def read_arrays(path: Path) -> dict[str, Any]:
     suffix = path.suffix.lower()
     try:
         if suffix == ".npz":
-            data: dict[str, Any] = read_npz(path, skip=("dmpls",))
+            data: dict[str, Any] = read_npz(path, skip=("dmpls",), header=header)
         elif suffix == ".npy":
-            data = {"joints": read_npy(path)}
+            data = {"joints": read_npy(path, header=header)}
         else:
             data = _read_json(path)
         if "posed_joints" in data:  # of NVIDIA's Kimodo, whose files do not contain their rate
@@ -121,7 +122,7 @@ def read_arrays(path: Path) -> dict[str, Any]:
             found = ", ".join(data) or "nothing"
             raise ValueError(f"contains {found}; a motion has joints and fps, or poses, trans and mocap_framerate")
         for name in {"joints", "poses", "trans"} & set(data):
-            _check_numbers(name, data[name])
+            _check_numbers(name, data[name], header)
         if "features" in data and (not _is_real(data["features"]) or data["features"].ndim != 2):
             raise ValueError("features are not an array (frames, features) of real numbers")
         if "poses" in data and data.get("trans", np.zeros(0)).shape != (len(data["poses"]), 3):
@@ -139,13 +140,13 @@ def _is_real(values: np.ndarray) -> bool:
     return values.dtype.kind in "fiu" and values.dtype.itemsize <= 8
 
 
-def _check_numbers(name: str, values: np.ndarray) -> None:
+def _check_numbers(name: str, values: np.ndarray, header: bool) -> None:
     if not _is_real(values):
         raise ValueError(f"{name} are not an array of real numbers")
     if not values.ndim or not len(values):
         raise ValueError(f"{name} of shape {values.shape} have no frames")
     check_frames(len(values))
-    if (beyond := ~(np.abs(values) < 1e6)).any():
+    if (beyond := ~(np.abs(values[:1] if header else values) < 1e6)).any():
         raise ValueError(f"numbers of {name} in frame {np.argwhere(beyond)[0][0]} are not finite, or exceed a million")
 
 

@@ -202,7 +202,11 @@ def read_bvh(
         ValueError: the file is damaged or has an unknown skeleton.
     """
     file = bvh.read(path)
-    file = file if rate is None else replace(file, fps=rate)
+    return map_bvh(path, file if rate is None else replace(file, fps=rate), fps, given)
+
+
+def map_bvh(path: Path, file: bvh.Bvh, fps: float | None, given: Mapping[str, Any]) -> tuple[np.ndarray, float, Layout]:
+    """Returns what `read_bvh` returns, of a file that is already read."""
     ended = file.with_end_joints()
     names = _plain(ended.joints, given)
     layout = find_layout(path, names, given)

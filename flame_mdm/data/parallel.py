@@ -10,7 +10,7 @@ import socket
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
@@ -37,7 +37,7 @@ def cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def in_order(function: Callable[[Task], Result], tasks: Iterable[Task], workers: int = 0) -> Iterator[Result]:
+def in_order(function: Callable[[Task], Result], tasks: Iterable[Task], workers: int = 0) -> Generator[Result]:
     """Yields `function(task)` for each task, in the order of the tasks; reads only a few tasks ahead.
 
     Nested calls, in which the results of one are tasks of the other, share their processes.
@@ -62,12 +62,16 @@ def in_order(function: Callable[[Task], Result], tasks: Iterable[Task], workers:
     workers = workers or cores()
     with _shared_pool(workers) as pool:
         pending: deque[Future[Result]] = deque()
-        for task in remaining:
-            pending.append(pool.submit(function, task))
-            if len(pending) > 2 * workers:
+        try:
+            for task in remaining:
+                pending.append(pool.submit(function, task))
+                if len(pending) > 2 * workers:
+                    yield _first(pending)
+            while pending:
                 yield _first(pending)
-        while pending:
-            yield _first(pending)
+        finally:
+            for future in pending:
+                future.cancel()
 
 
 @dataclass
@@ -94,6 +98,8 @@ def _shared_pool(workers: int) -> Iterator[ProcessPoolExecutor]:
     try:
         yield pool.executor
     except BaseException as error:  # an error or Ctrl-C must not wait for tasks that may take half an hour
+        if isinstance(error, GeneratorExit) and pool.users > 1:  # the others still need the pool
+            raise
         _pool = None
         pool.executor.shutdown(wait=False, cancel_futures=True)
         for process in set(active_children()) - set(pool.others):

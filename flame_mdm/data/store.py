@@ -17,7 +17,6 @@ import functools
 import hashlib
 import io
 import json
-import pickle
 import shutil
 import zipfile
 from array import array
@@ -256,7 +255,7 @@ class _Writer(ExitStack):
         mean, std = representation.statistics(Frames(frames, int(training.sum())))
         return mean.numpy(), std.numpy()
 
-    def _append(self, file: io.RawIOBase, content: bytes) -> None:
+    def _append(self, file: io.FileIO, content: bytes) -> None:
         """Writes all bytes. Through a memory map, a full disk would kill the process (SIGBUS)."""
         left = memoryview(content)
         with writing(self.folder / Path(file.name).name, self.folder):
@@ -278,7 +277,7 @@ def _encoded(clips: Iterable[Clip], representation: Representation, workers: int
             chunks.append((chunk, list(whole)))
             yield list(whole.values())
 
-    for arrays in in_order(functools.partial(_encode, pickle.dumps(representation)), motions(), workers):
+    for arrays in in_order(functools.partial(_encode, representation), motions(), workers):
         chunk, keys = chunks.popleft()
         features = dict(zip(keys, arrays, strict=True))
         yield from ((clip, features[id(clip.motion)]) for clip in chunk)
@@ -299,9 +298,8 @@ def _chunks(clips: Iterable[Clip]) -> Iterator[list[Clip]]:
         yield chunk
 
 
-def _encode(representation: bytes, motions: Sequence[_Motion]) -> list[np.ndarray]:
-    """Returns the features of motions; `representation` is pickled, since PyTorch would share its tensors by files."""
-    encoder = _unpickled(representation)
+def _encode(encoder: Representation, motions: Sequence[_Motion]) -> list[np.ndarray]:
+    """Returns the features of motions; published features are only checked."""
     for name, encoded, _ in motions:
         if encoded and encoded != encoder.name:
             raise ValueError(f"clip {name}: published as {encoded}, which cannot be converted to {encoder.name}")
@@ -311,7 +309,7 @@ def _encode(representation: bytes, motions: Sequence[_Motion]) -> list[np.ndarra
     except ValueError as error:
         if len(motions) == 1:
             raise ValueError(f"clip {motions[0][0]}: {error}") from error
-        return [features for motion in motions for features in _encode(representation, [motion])]  # names the clip
+        return [features for motion in motions for features in _encode(encoder, [motion])]  # names the clip
     arrays = []
     for name, encoded, motion in motions:
         features = np.asarray(motion if encoded else next(fresh).numpy(), np.float32)
@@ -322,11 +320,6 @@ def _encode(representation: bytes, motions: Sequence[_Motion]) -> list[np.ndarra
             raise ValueError(f"clip {name}: the features of frame {frame} are not finite. Exclude it by name")
         arrays.append(features)
     return arrays
-
-
-@functools.lru_cache(1)
-def _unpickled(representation: bytes) -> Representation:
-    return pickle.loads(representation)
 
 
 def _header(frames: int, features: int) -> bytes:

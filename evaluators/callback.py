@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from hydra.utils import get_class
 from lightning import Callback, LightningModule, Trainer
 
 from evaluators.run import open_protocol
 from flame_mdm.data.datamodule import MotionDataModule
-from flame_mdm.errors import UserError
+from flame_mdm.errors import UserError, say
 from flame_mdm.runs import made_by
 from flame_mdm.task import MotionGeneration
+from flame_mdm.training.callbacks import explained
 from flame_mdm.training.loggers import log_table
 
 
@@ -54,6 +56,7 @@ class Evaluate(Callback):
         self.samples, self.replications, self.batch_size = samples, replications, batch_size
         self.next = 0
         self.values: dict[str, float] = {}
+        self.latest: tuple[int, dict[str, float]] = (0, {})
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         assert isinstance(pl_module, MotionGeneration)
@@ -86,6 +89,7 @@ class Evaluate(Callback):
         name = f"val/{self.protocol.name}"
         known = {f"{name}/{k}": value for k, value in result["values"].items() if value["mean"] is not None}
         self.values = {k: value["mean"] for k, value in known.items()}
+        self.latest = (trainer.global_step, {k.removeprefix(f"{name}/"): v for k, v in self.values.items()})
         if self.replications > 1:
             self.values |= {f"{k}/ci": value["ci"] for k, value in known.items()}
         if trainer.is_global_zero:
@@ -99,3 +103,15 @@ class Evaluate(Callback):
     def on_validation_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         pl_module.log_dict(self.values)  # computed at the start, since averaged weights are swapped out by now
         self.values = {}
+
+    def on_fit_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        step, values = self.latest
+        if not values or not trainer.is_global_zero:
+            return
+        assert isinstance(pl_module, MotionGeneration)
+        found = self.protocol.evaluate(
+            None, self.clips, self.extractor, pl_module.representation, batch_size=self.batch_size
+        )
+        real = {name: value["mean"] for name, value in found["ground_truth"].items()}
+        say(f"evaluation after {step} steps, {self.protocol.name}, validation clips:")
+        say(*explained(values, real, {k: get_class(v["_target_"]) for k, v in self.protocol.metrics.items()}))

@@ -3,6 +3,7 @@
 import json
 import math
 import re
+import shlex
 import struct
 from collections.abc import Iterator
 from pathlib import Path
@@ -292,6 +293,39 @@ def test_a_run_without_a_history_has_a_report(tmp_path):
     (folder / "metrics.jsonl").unlink()
     assert "there is no metrics.jsonl in the folder" in write_report(folder).read_text()
     assert read_run(folder).label == "mine"
+
+
+# The end of training --------------------------------------------------------------------------------------------------
+
+
+def test_training_ends_with_what_its_numbers_mean(tmp_path, data_root, capsys, monkeypatch):
+    monkeypatch.delenv("MAKELEVEL", raising=False)
+    (tmp_path / "mine.yaml").write_text(EVALUATE)
+    folder = run(tmp_path / "run", data_root, "trainer.max_steps=4", recipe=str(tmp_path / "mine.yaml"))
+    out = capsys.readouterr().out
+    samples, evaluation = out.split("evaluation after 4 steps, synthetic, validation clips:\n")
+    curves = read_history(folder)
+    for text, name in ((samples, "samples"), (evaluation, "val/synthetic")):
+        ours, real = re.findall(r"^  foot_skating: (\S+) \(real motions: (\S+)\)$", text, re.MULTILINE)[0]
+        assert ours == number(curves[f"{name}/foot_skating"][3])
+        assert 0 <= float(real) < 0.05
+        assert "foot_skating: Foot skating ratio: fraction of frame transitions in which a foot that touches" in text
+        assert re.search(r"^  attributes/action: \S+ \(real motions: 1\)$", text, re.MULTILINE)
+    assert "fid: " not in evaluation, "it has no value without an extractor"
+    losses = re.findall(
+        r"^loss after 4 steps: (\S+) on the last batch, (\S+) on the validation clips", out, re.MULTILINE
+    )
+    assert losses[0][1] == f"{curves['val/loss'][3]:.4g}"
+    assert float(losses[0][0]) > 0
+    command = re.findall(r"^next: flame-mdm (sample .*)$", out, re.MULTILINE)[0]
+    assert main([*shlex.split(command), f"out={tmp_path / 'samples'}", "samples=1"]) == 0
+    assert f"flame-mdm evaluate {folder} extractor=none quick=true" in out
+
+
+def test_the_next_command_is_for_make_where_make_was_used(tmp_path, data_root, capsys, monkeypatch):
+    monkeypatch.setenv("MAKELEVEL", "1")
+    folder = run(tmp_path / "run", data_root, "trainer.max_steps=2", "condition=action", "callbacks.samples=null")
+    assert f"next: make sample CKPT={folder} ACTION=walk\n" in capsys.readouterr().out
 
 
 # Charts ---------------------------------------------------------------------------------------------------------------

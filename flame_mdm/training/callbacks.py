@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import io
 import os
+import shlex
 import signal
 import sys
 import time
-from collections.abc import Sequence
-from inspect import signature
+from collections.abc import Mapping, Sequence
+from inspect import getdoc, signature
 from itertools import zip_longest
 from multiprocessing import active_children
 from pathlib import Path
@@ -19,19 +20,24 @@ from typing import Any
 import torch
 from lightning import Callback, LightningModule, Trainer
 from lightning.pytorch.callbacks import Checkpoint
+from torch import Tensor
 from torch.nn.utils import get_total_norm
 from torchmetrics import Metric
 from tqdm import tqdm
 
 from flame_mdm.conditions.action import ActionLabels
-from flame_mdm.data.datamodule import MotionDataModule
+from flame_mdm.data.datamodule import Clips, MotionDataModule
 from flame_mdm.errors import say
 from flame_mdm.formats.motion import Motion
 from flame_mdm.generation import generate, write_motions
 from flame_mdm.motion import MotionBatch
+from flame_mdm.reporting.page import number
 from flame_mdm.reporting.report import write_report
 from flame_mdm.task import MotionGeneration, Task
 from flame_mdm.training.loggers import log_video
+
+REAL = 64
+"""Training clips that metrics of samples are compared with."""
 
 
 class Interrupted(Exception):
@@ -194,14 +200,58 @@ class Measurements(Callback):
 
 
 class Report(Callback):
-    """Writes `report.html` into the run directory at the end of training."""
+    """Prints the last losses at the end of training, writes `report.html`, and prints the next commands."""
 
     def __init__(self, folder: Path):
         self.folder = folder
 
     def on_fit_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        if trainer.is_global_zero:
-            say(f"report: {write_report(self.folder)}")
+        if not trainer.is_global_zero:
+            return
+        where = {"train/loss": "on the last batch", "val/loss": "on the validation clips"}
+        found = {text: trainer.callback_metrics.get(name) for name, text in where.items()}
+        losses = ", ".join(f"{value:.4g} {text}" for text, value in found.items() if value is not None)
+        say(f"loss after {trainer.global_step} steps: {losses} (lower is better; comparable within a recipe only)")
+        say(f"report: {write_report(self.folder)}")
+        if isinstance(pl_module, MotionGeneration):
+            facts, kind = pl_module.facts, pl_module.conditioned_on
+            key, names = {
+                "text": ("text", facts.get("captions", ())),
+                "action": ("action", facts["actions"]),
+                "none": ("unconditioned", ("true",)),
+            }[kind]
+            example = shlex.quote(next(iter(names), "a person walks"))
+            say(f"next: {_command('sample', self.folder, f'{key}={example}')}")
+            say(f"      {_command('evaluate', self.folder, 'extractor=none', 'quick=true')}")
+
+
+def _command(name: str, folder: Path, *words: str) -> str:
+    """Returns a command about a run, for make if make started this process."""
+    if "MAKELEVEL" not in os.environ:
+        return " ".join(("flame-mdm", name, str(folder), *words))
+    pairs = (word.partition("=") for word in (f"ckpt={folder}", *words))
+    return " ".join(("make", name, *(f"{key.upper()}={value}" for key, _, value in pairs)))
+
+
+def explained(
+    values: Mapping[str, float | None], real: Mapping[str, float | None], metrics: Mapping[str, type[Metric]]
+) -> list[str]:
+    """Returns lines that say what metrics mean, by their docstrings, with their values next to those of real motions.
+
+    Args:
+        values: by metric, or by metric/part; None = no value.
+        real: the same of real motions, as far as it is known.
+        metrics: classes by name.
+    """
+    lines = []
+    for name, metric in metrics.items():
+        known = {key: value for key, value in values.items() if key.partition("/")[0] == name and value is not None}
+        beside = {key: f" (real motions: {number(real[key])})" if real.get(key) is not None else "" for key in known}
+        if known:
+            better = {True: " Higher is better.", False: " Lower is better.", None: ""}[metric.higher_is_better]
+            lines.append(f"{name}: {(getdoc(metric) or '').partition(chr(10))[0]}{better}")
+            lines += [f"  {key}: {number(value)}{beside[key]}" for key, value in known.items()]
+    return lines
 
 
 class Progress(Callback):
@@ -302,8 +352,8 @@ class SampleMotions(Callback):
             self.write(trainer, pl_module)
         _, folder, values = self.written
         if trainer.is_global_zero:
-            for name, value in values.items():
-                say(f"{name}: {'no prompt requests it' if value is None else f'{value:.3f}'}")
+            real = self._measure_real(trainer.datamodule.train, pl_module) if values else {}  # type: ignore[attr-defined]
+            say(*explained(values, real, {name: type(metric) for name, metric in self.metrics.items()}))
             say(f"player: {folder / 'player.html'} (open in any browser), animation: {folder / 'motions.gif'}")
 
     def write(self, trainer: Trainer, pl_module: LightningModule) -> None:
@@ -320,7 +370,7 @@ class SampleMotions(Callback):
         if not trainer.is_global_zero:
             return
         write_motions(folder, motions, {"seed": 0, "step": step, "checkpoint": ""})
-        values = self.measure(motions)
+        values = self.measure([torch.from_numpy(m.joints) for m in motions], [wanted for _, wanted in self.prompts])
         for logger in trainer.loggers:
             # Lightning logs steps from 0: the values of this validation are logged at step - 1
             log_video(logger, "samples", folder / "motions.gif", step - 1)
@@ -342,16 +392,27 @@ class SampleMotions(Callback):
             seed=0,
         )
 
-    def measure(self, motions: Sequence[Motion]) -> dict[str, float | None]:
-        """Computes all metrics of the motions; a metric without a value is None."""
+    def _measure_real(self, clips: Clips, task: LightningModule) -> dict[str, float | None]:
+        """Computes all metrics of up to `REAL` training clips, which have the attributes that all prompts request."""
+        assert isinstance(task, MotionGeneration)
+        asked = [set(requested) for _, requested in self.prompts]
+        common, every = (set.intersection(*asked), set.union(*asked)) if asked else (set(), set())
+        usable = [k for k, clip in enumerate(clips.clips) if common <= clip.attributes.keys()]
+        chosen = usable[:: -(-len(usable) // REAL) or 1]
+        known = task.representation
+        decoded = (known.to_joints(clips[k, -1][1][None].to(known.mean.device))[0].cpu() for k in chosen)
+        wanted = [{name: v for name, v in clips.clips[k].attributes.items() if name in every} for k in chosen]
+        return self.measure(list(decoded), wanted) if chosen else {}
+
+    def measure(self, motions: Sequence[Tensor], requested: Sequence[dict[str, Any]]) -> dict[str, float | None]:
+        """Computes all metrics of motions (F, J, 3), in meters; a metric without a value is None."""
         values: dict[str, float | None] = {}
         for name, metric in self.metrics.items():
             metric.reset()
             metric.distributed_available_fn = bool  # returns False: no synchronization, this process has all motions
-            for motion, (_, requested) in zip(motions, self.prompts, strict=True):
-                joints = torch.from_numpy(motion.joints)[None]
-                mask = torch.ones(joints.shape[:2], dtype=torch.bool)
-                known = {"joints": joints, "mask": mask, "requested": [requested]}
+            for motion, wanted in zip(motions, requested, strict=True):
+                mask = torch.ones(1, len(motion), dtype=torch.bool)
+                known = {"joints": motion[None], "mask": mask, "requested": [wanted]}
                 metric.update(**{k: v for k, v in known.items() if k in signature(metric.update).parameters})
             result = metric.compute()
             parts = result if isinstance(result, dict) else {"": result}

@@ -6,7 +6,7 @@ B batch, F frames, D features, S condition tokens, C condition width. In all mas
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, TypedDict
 
 import torch
@@ -38,6 +38,18 @@ class MotionBatch:
 
     def __len__(self) -> int:
         return len(self.ids)
+
+    def to(self, device: torch.device) -> MotionBatch:
+        """Returns the batch on a device, without waiting for the copy."""
+        if self.x.device == device:
+            return self
+        action = None if self.action is None else sent(self.action, device)
+        return replace(self, x=sent(self.x, device), mask=sent(self.mask, device), action=action)
+
+    def pin_memory(self) -> MotionBatch:
+        """Returns the batch in memory that is copied to a GPU without waiting; the data loader calls this."""
+        action = None if self.action is None else self.action.pin_memory()
+        return replace(self, x=self.x.pin_memory(), mask=self.mask.pin_memory(), action=action)
 
 
 @dataclass
@@ -156,13 +168,30 @@ def length_mask(lengths: Tensor, frames: int | None = None) -> Tensor:
     return torch.arange(frames, device=lengths.device) < lengths[:, None]
 
 
-def collate(samples: Sequence[tuple[str, Tensor, str | None, int | None]]) -> MotionBatch:
-    """Joins (id, x (F, D), caption, action) samples into a batch padded with zeros to the longest."""
+def padded_length(length: int, multiple: int, most: int) -> int:
+    """Returns `length` rounded up to a multiple, but at most `most`."""
+    return min(-(-length // multiple) * multiple, max(most, length))
+
+
+def sent(x: Tensor, device: torch.device) -> Tensor:
+    """Returns a tensor on a device; a copy to a GPU does not wait for the GPU to complete earlier work."""
+    copied = device.type == "cuda" and x.device.type == "cpu"
+    return (x.pin_memory() if copied else x).to(device, non_blocking=copied)
+
+
+def collate(
+    samples: Sequence[tuple[str, Tensor, str | None, int | None]], multiple: int = 1, most: int = 0
+) -> MotionBatch:
+    """Joins (id, x (F, D), caption, action) samples into a batch.
+
+    The batch is padded with zeros to the longest sample, rounded up to a multiple of frames, but at most `most`.
+    """
     ids, motions, texts, actions = zip(*samples, strict=True)
     lengths = torch.tensor([len(x) for x in motions])
+    frames = padded_length(int(lengths.max()), multiple, most)
     return MotionBatch(
-        x=torch.nn.utils.rnn.pad_sequence(list(motions), batch_first=True),
-        mask=length_mask(lengths),
+        x=pad_to(torch.nn.utils.rnn.pad_sequence(list(motions), batch_first=True), frames),
+        mask=length_mask(lengths, frames),
         ids=list(ids),
         text=None if any(t is None for t in texts) else list(texts),
         action=None if any(a is None for a in actions) else torch.tensor(actions),

@@ -60,10 +60,12 @@ class Task(LightningModule):
     def setup(self, stage: str) -> None:
         """Opens the captions encoded by `prepare_data`, and adds the facts about the data to `facts`."""
         self.condition.load_cache(*self._captions())
+        data: MotionDataModule = self.trainer.datamodule  # type: ignore[attr-defined]
+        if device := data.place(self.condition.cache_size()):
+            self.condition.move_cache(device)
         # Buffers are equal in all processes. If DDP broadcast them in each forward pass, processes with more validation
         # batches than others would wait forever.
         self._ddp_params_and_buffers_to_ignore = [name for name, _ in self.named_buffers()]
-        data: MotionDataModule = self.trainer.datamodule  # type: ignore[attr-defined]
         self.facts |= {
             "dataset": data.store.info["dataset"],
             "fingerprint": data.store.fingerprint,

@@ -278,6 +278,7 @@ def test_workers_change_nothing(folder, workers, tmp_path):
         name="synthetic",
         batch_size=4,
         num_workers=workers,
+        resident=False,
         crop=Units(24, 60, 4),
     )
     module.prepare_data()

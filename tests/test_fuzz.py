@@ -208,6 +208,8 @@ def test_settings_of_training(refused, tmp_path, data_root):
         "task.cond_drop_prob": ("2", "-1", "x"),
         "task.guidance_scale": ("x", "null", "nan"),
         "data.num_workers": ("-1", "x"),
+        "data.resident": ("maybe", "3", "null"),
+        "data.pad_multiple": ("0", "-1", "x", "null"),
         "data.source.clips": ("0", "-1", "x", "null"),
         "data.crop": ("null", "3"),
         "data.name": ("null", "''"),

@@ -241,7 +241,7 @@ def test_unfinished_checkpoints_of_a_killed_run_are_removed(tmp_path):
 @pytest.fixture
 def training(tmp_path, data_root) -> Iterator[tuple[subprocess.Popen[str], list[int]]]:
     """A run with two loading processes, after its first checkpoint, and the ids of these."""
-    line = words(data_root, tmp_path / "run", "data.num_workers=2", "trainer.max_steps=1000000")
+    line = words(data_root, tmp_path / "run", "data.num_workers=2", "data.resident=false", "trainer.max_steps=1000000")
     process = subprocess.Popen(
         [sys.executable, "-m", "flame_mdm", "train", *line],
         stdout=subprocess.PIPE,

@@ -101,7 +101,7 @@ def test_training_learns(tiny):
     [
         [],
         pytest.param(["trainer.accumulate_grad_batches=2"], marks=pytest.mark.slow),
-        pytest.param(["ema=null", "data.num_workers=1"], marks=pytest.mark.slow),
+        pytest.param(["ema=null", "data.num_workers=1", "data.resident=false"], marks=pytest.mark.slow),
     ],
 )
 def test_a_resumed_run_is_the_uninterrupted_one(tiny, extra, tmp_path):

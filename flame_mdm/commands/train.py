@@ -19,6 +19,7 @@ Running the same command again resumes the run; run.name=other starts another ru
 
 FREE = (
     "data.num_workers",
+    "data.resident",
     "data.root",
     "data.source.path",
     "data.source.workers",

@@ -40,6 +40,13 @@ class ConditionEncoder(nn.Module, ABC):
             ValueError: the cache is damaged.
         """
 
+    def cache_size(self) -> int:
+        """Returns the size of the opened cache in bytes."""
+        return 0
+
+    def move_cache(self, device: torch.device) -> None:
+        """Moves the opened cache to a device."""
+
 
 class Unconditional(ConditionEncoder):
     """No condition: vectors and tokens of width 0, which are also the null."""

@@ -21,7 +21,7 @@ from tqdm import tqdm
 
 from flame_mdm.conditions import ConditionEncoder
 from flame_mdm.files import made_folder, sha256, writing
-from flame_mdm.motion import Condition, MotionBatch
+from flame_mdm.motion import Condition, MotionBatch, sent
 
 CAPTIONS_AT_ONCE = 64
 POOLINGS = ("projection", "mean", "pooler")
@@ -146,6 +146,13 @@ class PretrainedText(ConditionEncoder):
             raise FileNotFoundError(f"{path}: no cached embeddings of these captions; precompute them first")
         self._cache = CaptionCache(path)
 
+    def cache_size(self) -> int:
+        return self._cache.pooled.nbytes + self._cache.tokens.nbytes if self._cache else 0
+
+    def move_cache(self, device: torch.device) -> None:
+        if self._cache is not None:
+            self._cache.pooled, self._cache.tokens = self._cache.pooled.to(device), self._cache.tokens.to(device)
+
     def _distinct(self, captions: Sequence[str]) -> list[str]:
         """Returns each caption once, and "" for the null; longest first, so that batches have similar lengths."""
         return sorted({*captions, ""}, key=lambda caption: (-len(caption), caption))
@@ -204,6 +211,8 @@ class PretrainedText(ConditionEncoder):
 
     def _look_up(self, captions: Sequence[str], device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
         """Like `_encode`, but reads captions from the cache if possible."""
+        if self._cache is not None and all(caption in self._cache for caption in captions):
+            return self._cache.gather(captions, device)
         encoded = {c: self._cache[c] for c in captions if c in self._cache} if self._cache is not None else {}
         missing = sorted(set(captions) - set(encoded), key=len)
         if missing:
@@ -306,9 +315,10 @@ class Pretrained:
 
 
 class CaptionCache:
-    """Outputs of a language model on disk, memory-mapped: a folder with two arrays and an index.
+    """Outputs of a language model on disk: a folder with two arrays and an index.
 
-    The index contains the captions, the offsets of their tokens, and the sha256 of the arrays.
+    The index contains the captions, the offsets of their tokens, and the sha256 of the arrays. The arrays `pooled`
+    (N, C) and `tokens` (T, C) are memory-mapped until they are moved to a device; copies of the cache map the files.
     """
 
     POOLED, TOKENS, INDEX = "pooled.f32", "tokens.f16", "index.json"
@@ -322,9 +332,10 @@ class CaptionCache:
         self.folder = folder
         try:
             index = json.loads((folder / self.INDEX).read_text())
-            captions, self.offsets, features = index["captions"], index["offsets"], index["features"]
+            captions, features = index["captions"], index["features"]
+            self.offsets = np.array(index["offsets"], np.int64)
             self.sha256: dict[str, str] = index["sha256"]
-        except (OSError, ValueError, KeyError) as error:
+        except (OSError, ValueError, KeyError, OverflowError) as error:
             raise ValueError(f"{folder / self.INDEX} is damaged ({error})") from error
         self.rows = {caption: row for row, caption in enumerate(captions)}
         self.pooled = self._open(self.POOLED, np.float32, (len(captions), features))
@@ -339,7 +350,20 @@ class CaptionCache:
     def __getitem__(self, caption: str) -> tuple[np.ndarray, np.ndarray]:
         """Returns vector (C,) and tokens (S, C) of a caption."""
         row = self.rows[caption]
-        return self.pooled[row], self.tokens[self.offsets[row] : self.offsets[row + 1]]
+        tokens = self.tokens[self.offsets[row] : self.offsets[row + 1]]
+        return self.pooled[row].cpu().numpy(), tokens.cpu().numpy()
+
+    def gather(self, captions: Sequence[str], device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
+        """Returns vectors (N, C), tokens (N, S, C) and their mask (N, S) of captions, float32, on a device."""
+        rows = np.array([self.rows[caption] for caption in captions])
+        begin, lengths = self.offsets[rows], self.offsets[rows + 1] - self.offsets[rows]
+        where = torch.from_numpy(np.stack([rows, begin, lengths]))
+        row, first, length = sent(where, self.pooled.device)
+        steps = torch.arange(int(lengths.max()), device=row.device)
+        token_mask = steps < length[:, None]
+        places = (first[:, None] + steps).where(token_mask, 0)
+        pooled, tokens, token_mask = (sent(x, device) for x in (self.pooled[row], self.tokens[places], token_mask))
+        return pooled, tokens.float().masked_fill(~token_mask[..., None], 0), token_mask
 
     def verify(self) -> None:
         """Checks the hashes of the arrays.
@@ -384,10 +408,11 @@ class CaptionCache:
         index = {"captions": list(captions), "offsets": offsets, "features": features, "sha256": hashes}
         (folder / cls.INDEX).write_text(json.dumps(index))
 
-    def _open(self, name: str, dtype: type, shape: tuple[int, int]) -> np.ndarray:
+    def _open(self, name: str, dtype: type, shape: tuple[int, int]) -> Tensor:
         path = self.folder / name
         expected = shape[0] * shape[1] * np.dtype(dtype).itemsize
         size = path.stat().st_size if path.is_file() else 0
         if size != expected:
             raise ValueError(f"{path} is damaged ({size} bytes instead of {expected})")
-        return np.memmap(path, dtype, "r", shape=shape) if expected else np.zeros(shape, dtype)
+        # Mode "c" never changes the file; torch warns of arrays that cannot be written.
+        return torch.from_numpy(np.memmap(path, dtype, "c", shape=shape) if expected else np.zeros(shape, dtype))

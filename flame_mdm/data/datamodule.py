@@ -8,83 +8,29 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from functools import cached_property
+from functools import partial
+from itertools import islice
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
 from lightning import LightningDataModule
 from torch import Tensor
-from torch.utils.data import DataLoader, Dataset, Sampler
+from torch.utils.data import DataLoader, Sampler
 
 from flame_mdm.data import MotionSource, Split
+from flame_mdm.data.clips import Clips, Draw, Sample
 from flame_mdm.data.crops import Crop
+from flame_mdm.data.resident import SHARE, ResidentLoader, free_memory, resident_features
 from flame_mdm.data.store import Store, write_store
-from flame_mdm.motion import collate
+from flame_mdm.errors import UserError
+from flame_mdm.motion import MotionBatch, collate, padded_length
 from flame_mdm.representations import Representation
-from flame_mdm.seeds import integers, key
 
 MAX_FRAMES = 100_000
 """Maximum number of frames of a sample; one hour at 20 frames per second has 72,000."""
-Draw = tuple[int, int]
-"""(index of a clip, number of the batch that it is drawn for; -1 in evaluation)."""
-
-
-Sample = tuple[str, Tensor, str | None, int | None]
-"""(id, x (F, D), caption, action), input of `collate`."""
-
-
-class Clips(Dataset[Sample]):
-    """The clips of a split that are long enough for the crop rule, cropped at every draw, then normalized."""
-
-    def __init__(self, store: Store, split: Split, *, representation: Representation, crop: Crop, seed: int):
-        self.store, self.representation, self.crop, self.seed = store, representation, crop, seed
-        of_split = [clip for clip in store.clips if clip.split == split]
-        self.clips = [clip for clip in of_split if clip.length >= crop.shortest()]
-        self.too_short = len(of_split) - len(self.clips)
-        self.frames = np.array([clip.length for clip in self.clips], np.int64)
-        self.lengths = np.minimum(self.frames, crop.longest())
-        self.captions = np.array([len(clip.captions) for clip in self.clips], np.int64)
-        self.mean, self.std = store.mean.astype(np.float32), store.std.astype(np.float32)
-
-    def __len__(self) -> int:
-        return len(self.clips)
-
-    def __getitem__(self, draw: Draw) -> Sample:
-        return self.__getitems__([draw])[0]
-
-    def __getitems__(self, draws: Sequence[Draw]) -> list[Sample]:
-        """Returns the samples of a batch; the data loader calls this."""
-        samples: list[Sample] = []
-        indices = [index for index, _ in draws]
-        for index, first, length, caption in zip(indices, *self.draw(indices, draws[0][1]), strict=True):
-            clip = self.clips[index]
-            frames = np.minimum(np.arange(length) + first, clip.length - 1)
-            features = self.representation.rebase(self.store.motion(clip)[frames])
-            x = torch.from_numpy((features - self.mean) / self.std)
-            samples.append((clip.id, x, self.caption(index, caption), clip.action))
-        return samples
-
-    def draw(self, indices: Sequence[int], batch: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Returns first frame, number of frames and number of the caption (B,) of clips in a batch.
-
-        They are functions of (seed, batch, index); in evaluation (batch -1), they are always the same.
-        """
-        rows = np.asarray(indices)
-        if batch < 0:
-            return *self.crop.draw(self.frames[rows], None), self.evaluated[rows]
-        below = integers(key("sample", self.seed, batch) + rows)
-        return *self.crop.draw(self.frames[rows], below), below(self.captions[rows])
-
-    @cached_property
-    def evaluated(self) -> np.ndarray:
-        """Number (clips,) of the caption of each clip in evaluation, chosen by the id of the clip."""
-        draws = (key("caption", self.seed, -1, clip.id) % max(1, len(clip.captions)) for clip in self.clips)
-        return np.fromiter(draws, np.int64, len(self.clips))
-
-    def caption(self, index: int, number: int) -> str | None:
-        """Returns a caption of a clip; None if the clip has none."""
-        return self.clips[index].captions[number] if self.captions[index] else None
+Loader = DataLoader[Sample] | ResidentLoader
 
 
 class TrainingBatches(Sampler[list[Draw]]):
@@ -159,6 +105,10 @@ class MotionDataModule(LightningDataModule):
         num_workers: number of loading processes; 0 loads in the training process.
         crop: rule for the frames of a sample and the minimum length of a clip.
         seed: seed of the random draws.
+        resident: whether the data set is kept on the training device, where batches are gathered without workers. The
+            batches are the same. "auto": yes, if it takes at most a quarter of the free memory.
+        pad_multiple: batches are padded to multiples of this number of frames, at most to the longest sample of the
+            crop rule, so that compiled networks see few shapes.
     """
 
     def __init__(
@@ -172,19 +122,28 @@ class MotionDataModule(LightningDataModule):
         num_workers: int = 0,
         crop: Crop,
         seed: int = 0,
+        resident: bool | Literal["auto"] = "auto",
+        pad_multiple: int = 1,
     ):
         super().__init__()
         if batch_size < 1:
             raise ValueError(f"data.batch_size={batch_size}: a batch has at least one clip")
         if num_workers < 0 or not name:
             raise ValueError(f"data.num_workers={num_workers}, data.name='{name}': give 0 or more, and a name")
+        known = isinstance(resident, bool) or resident == "auto"
+        if not known or not 1 <= pad_multiple <= MAX_FRAMES:
+            raise ValueError(
+                f"data.resident={resident}, data.pad_multiple={pad_multiple}: give true, false or auto, and 1 or more"
+            )
         _check_crop(crop)
         if source.named_by_recipe:
             source.name = name
         self.source, self.representation = source, representation
         self.folder = Path(root) / f"{name}-{representation.name}"
         self.batch_size, self.num_workers, self.seed = batch_size, num_workers, seed
-        self.crop = crop
+        self.crop, self.resident, self.pad_multiple = crop, resident, pad_multiple
+        self.device: torch.device | None = None
+        self.features: Tensor | None = None
         self.prepare_data_per_node = False  # machines share the folder
 
     def prepare_data(self) -> None:
@@ -241,6 +200,17 @@ class MotionDataModule(LightningDataModule):
         advice = [f"no {split} clips. For your own data, add a `split` column to captions.csv" for split in empty]
         return ["clips: " + ", ".join(each), *(() if store.info["published_split"] else advice)]
 
+    def padding(self) -> float:
+        """Returns the share of padding in the frames of the first pass over the training clips."""
+        lengths, size = self.train.lengths, self.batch_size
+        batches = TrainingBatches(lengths, size, seed=self.seed, first=0, rank=0, world=1)
+        real = padded = 0
+        for draws in islice(batches, max(1, len(lengths) // size)):
+            _, drawn, _ = self.train.draw([index for index, _ in draws], draws[0][1])
+            real += drawn.sum()
+            padded += len(drawn) * padded_length(int(drawn.max()), self.pad_multiple, self.crop.longest())
+        return float(1 - real / padded)
+
     def captions(self) -> list[str]:
         """Returns all distinct captions of the store, sorted."""
         return sorted({caption for clip in self.open().clips for caption in clip.captions})
@@ -251,6 +221,37 @@ class MotionDataModule(LightningDataModule):
         self.train, self.val, self.test = (self.clips(split) for split in ("train", "val", "test"))
         if not len(self.train):
             raise ValueError(f"{self.folder}: no training clip has {self.crop.shortest()} frames or more")
+        self.features = None
+        self.place()
+
+    def place(self, more: int = 0) -> torch.device | None:
+        """Decides whether the data set is kept on the training device.
+
+        Args:
+            more: bytes that the text encoder needs there as well.
+
+        Returns:
+            The device, or None.
+
+        Raises:
+            UserError: `resident` is true, but the device has not enough free memory.
+        """
+        device = self.trainer.strategy.root_device if self.trainer else torch.device("cpu")
+        free, size = free_memory(device), 4 * self.store.features.size + more
+        if self.trainer and device.type == "cpu":
+            free //= self.trainer.num_devices
+        if self.resident is True and size > free:
+            raise UserError(
+                f"data.resident=true: {self.folder} and its captions take {size / 2**30:.1f} GiB, but {device} has "
+                f"{free / 2**30:.1f} GiB free. Set data.resident=auto"
+            )
+        fits = self.resident is True or (self.resident == "auto" and size <= free / SHARE)
+        self.device = device if fits else None
+        return self.device
+
+    def transfer_batch_to_device(self, batch: MotionBatch, device: torch.device, dataloader_idx: int) -> MotionBatch:
+        """Moves the tensors of a batch; Lightning would also visit each of its strings."""
+        return batch.to(device)
 
     def clips(self, split: Split) -> Clips:
         """Returns the clips of a split with their crop rule.
@@ -261,7 +262,7 @@ class MotionDataModule(LightningDataModule):
             split = "train"
         return Clips(self.store, split, representation=self.representation, crop=self.crop, seed=self.seed)
 
-    def train_dataloader(self) -> DataLoader[Sample]:
+    def train_dataloader(self) -> Loader:
         """Returns an endless loader that starts at the trainer's current step, so that a resumed run is unchanged."""
         trainer = self.trainer
         first = trainer.global_step * trainer.accumulate_grad_batches if trainer else 0
@@ -270,7 +271,7 @@ class MotionDataModule(LightningDataModule):
         sampler = TrainingBatches(lengths, size, seed=self.seed, first=first, rank=rank, world=world)
         return self._loader(self.train, sampler)
 
-    def val_dataloader(self) -> DataLoader[Sample]:
+    def val_dataloader(self) -> Loader:
         """Returns each validation clip once across all processes.
 
         With fewer clips than processes, every process gets all clips: a process without a batch would skip validation
@@ -279,21 +280,25 @@ class MotionDataModule(LightningDataModule):
         few = self.trainer is not None and len(self.val) < self.trainer.world_size
         return self._evaluation(self.val, alone=few)
 
-    def test_dataloader(self) -> DataLoader[Sample]:
+    def test_dataloader(self) -> Loader:
         """Returns each test clip once across all processes."""
         return self._evaluation(self.test)
 
-    def _evaluation(self, clips: Clips, alone: bool = False) -> DataLoader[Sample]:
+    def _evaluation(self, clips: Clips, alone: bool = False) -> Loader:
         trainer = None if alone else self.trainer
         rank, world = (trainer.global_rank, trainer.world_size) if trainer else (0, 1)
         return self._loader(clips, EvaluationBatches(clips.lengths, self.batch_size, rank=rank, world=world))
 
-    def _loader(self, clips: Clips, sampler: Sampler[list[Draw]]) -> DataLoader[Sample]:
+    def _loader(self, clips: Clips, sampler: Sampler[list[Draw]]) -> Loader:
+        if self.device is not None:
+            if self.features is None:
+                self.features = resident_features(self.store, self.representation, self.device)
+            return ResidentLoader(clips, sampler, self.features, self.pad_multiple)
         return DataLoader(
             clips,
             batch_sampler=sampler,
             num_workers=self.num_workers,
-            collate_fn=collate,
+            collate_fn=partial(collate, multiple=self.pad_multiple, most=self.crop.longest()),
             pin_memory=torch.cuda.is_available(),
             persistent_workers=self.num_workers > 0,
         )

@@ -3,12 +3,15 @@
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
 from flame_mdm.representations.skeleton import Skeleton
+
+Features = TypeVar("Features", np.ndarray, Tensor)
 
 
 @dataclass(frozen=True)
@@ -74,8 +77,8 @@ class Representation(nn.Module, ABC):
     def joint_features(self, joints: Iterable[int]) -> Tensor:
         """Returns (D,) bool, True for features of these joints; features of the root trajectory belong to joint 0."""
 
-    def rebase(self, features: np.ndarray) -> np.ndarray:
-        """Adapts the features (F, D) of a cut so that it starts like a complete motion; by default, returns them."""
+    def rebase(self, features: Features) -> Features:
+        """Adapts features (..., F, D) of cuts so that they start like complete motions; by default, returns them."""
         return features
 
     def normalize(self, features: Tensor) -> Tensor:

@@ -1,13 +1,13 @@
 """Features of the action data sets: SMPL rotations and root trajectory."""
 
 from collections.abc import Iterable, Sequence
+from copy import deepcopy
 
-import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from flame_mdm.representations import Frames, Representation, rotation
+from flame_mdm.representations import Features, Frames, Representation, rotation
 from flame_mdm.representations.skeleton import SMPL24, forward_kinematics
 from flame_mdm.representations.smpl import ADULT, read_pose
 
@@ -30,10 +30,11 @@ class Rot6D(Representation):
         rows = rotation.matrix_to_rot6d(rotations, "rows").flatten(1)
         return torch.cat([rows, F.pad(translation - translation[:1], (0, 3))], 1).float()
 
-    def rebase(self, features: np.ndarray) -> np.ndarray:
-        """Makes the root translation relative to the first frame of the cut."""
-        moved = features.copy()
-        moved[:, 144:147] -= features[:1, 144:147]
+    def rebase(self, features: Features) -> Features:
+        """Makes the root translation of cuts (..., F, D) relative to their first frame."""
+        moved = deepcopy(features)
+        translation = moved[..., 144:147]
+        translation -= features[..., :1, 144:147]
         return moved
 
     def decode(self, features: Tensor) -> Tensor:

@@ -57,6 +57,8 @@ class Provenance(Callback):
         say(f"{self.config['experiment']}: {task.describe()}, {count / 1e6:.2f} M trainable parameters")
         say(f"data: {data['dataset']} as {data['representation']}; {data['hours']} hours")
         say(*module.counts(module.store))
+        if module.pad_multiple > 1:
+            say(f"batches: padded to multiples of {module.pad_multiple} frames; {module.padding():.0%} is padding")
         say(f"device: {facts['device']}, {self.config['trainer']['precision']}")
         if size > self.config["data"]["batch_size"]:
             times = f"{trainer.world_size} processes x {trainer.accumulate_grad_batches} accumulated"

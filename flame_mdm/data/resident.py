@@ -1,0 +1,107 @@
+"""Data sets that are kept on the training device, where batches are gathered without workers and copies."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+from torch.utils.data import Sampler
+
+from flame_mdm.data.clips import Clips, Draw
+from flame_mdm.data.store import Store
+from flame_mdm.motion import MotionBatch, padded_length, sent
+from flame_mdm.representations import Representation
+
+SHARE = 4
+"""With `data.resident=auto`, data sets that take at most 1 / SHARE of the free memory of the device are kept there."""
+CHUNK = 1 << 16
+
+
+def free_memory(device: torch.device) -> int:
+    """Returns the free memory of a device in bytes; on a CPU, what the system or the container can still provide."""
+    if device.type == "cuda":
+        return torch.cuda.mem_get_info(device)[0]
+    if device.type != "cpu":
+        return 0
+    try:
+        lines = Path("/proc/meminfo").read_text().splitlines()
+        free = 1024 * next(int(line.split()[1]) for line in lines if line.startswith("MemAvailable:"))
+    except (OSError, StopIteration):
+        free = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    try:
+        limit, used = (Path(f"/sys/fs/cgroup/memory.{name}").read_text() for name in ("max", "current"))
+        return min(free, int(limit) - int(used))
+    except (OSError, ValueError):  # no container, or one without a limit
+        return free
+
+
+def resident_features(store: Store, representation: Representation, device: torch.device) -> Tensor:
+    """Returns all frames of a store (N, D) float32 on a device, and one more of zeros.
+
+    They are normalized, unless the representation adapts cuts: then, batches are normalized.
+    """
+    features = torch.empty(len(store.features) + 1, store.features.shape[1], device=device)
+    mean, std = store.mean.astype(np.float32), store.std.astype(np.float32)
+    for begin in range(0, len(store.features), CHUNK):
+        part = store.features[begin : begin + CHUNK]
+        part = np.array(part) if adapts_cuts(representation) else (part - mean) / std
+        features[begin : begin + len(part)] = torch.from_numpy(part)
+    features[-1] = 0
+    return features
+
+
+def adapts_cuts(representation: Representation) -> bool:
+    """Returns whether a representation has its own `rebase`."""
+    return type(representation).rebase is not Representation.rebase
+
+
+class ResidentLoader:
+    """Batches of a split, equal bit for bit to those of the data loader, gathered from features on the device.
+
+    Args:
+        clips: the split.
+        batches: the clips of each batch.
+        features: (N + 1, D) of `resident_features`.
+        multiple: batches are padded to multiples of this number of frames.
+    """
+
+    def __init__(self, clips: Clips, batches: Sampler[list[Draw]], features: Tensor, multiple: int):
+        self.clips, self.batches, self.features, self.multiple = clips, batches, features, multiple
+        self.begin = np.array([clip.start for clip in clips.clips], np.int64)
+        self.actions = np.array([-1 if clip.action is None else clip.action for clip in clips.clips], np.int64)
+        self.frames = torch.arange(clips.crop.longest(), device=features.device)
+        self.mean, self.std = (torch.from_numpy(values).to(features.device) for values in (clips.mean, clips.std))
+
+    def __len__(self) -> int:
+        return len(self.batches)  # type: ignore[arg-type]  # those of training have none
+
+    def __iter__(self) -> Iterator[MotionBatch]:
+        for draws in self.batches:
+            yield self._batch([index for index, _ in draws], draws[0][1])
+
+    def _batch(self, indices: Sequence[int], number: int) -> MotionBatch:
+        rows = np.asarray(indices)
+        first, length, caption = self.clips.draw(indices, number)
+        begin = self.begin[rows]
+        values = np.stack([begin + first, begin + self.clips.frames[rows] - 1, length, self.actions[rows]])
+        start, last, lengths, action = sent(torch.from_numpy(values), self.features.device)[..., None]
+        frames = self.frames[: padded_length(int(length.max()), self.multiple, len(self.frames))]
+        mask = frames < lengths
+        places = torch.minimum(start + frames, last).masked_fill(~mask, len(self.features) - 1)
+        x = F.embedding(places, self.features)
+        if adapts_cuts(self.clips.representation):
+            x = ((self.clips.representation.rebase(x) - self.mean) / self.std).masked_fill(~mask[..., None], 0)
+        entries = [self.clips.clips[index] for index in indices]
+        told = bool(self.clips.captions[rows].all())
+        return MotionBatch(
+            x=x,
+            mask=mask,
+            ids=[clip.id for clip in entries],
+            text=[clip.captions[n] for clip, n in zip(entries, caption.tolist(), strict=True)] if told else None,
+            action=None if (values[3] < 0).any() else action[:, 0],
+        )

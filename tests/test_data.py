@@ -12,7 +12,9 @@ from flame_mdm.data.datamodule import Clips, EvaluationBatches, MotionDataModule
 from flame_mdm.data.store import Store, _fingerprint, write_store
 from flame_mdm.data.synthetic import Synthetic
 from flame_mdm.motion import collate
+from flame_mdm.representations import Frames
 from flame_mdm.representations.humanml import HumanML
+from flame_mdm.representations.rifke import Rifke
 from flame_mdm.seeds import integers
 
 
@@ -304,3 +306,25 @@ def test_a_store_of_another_representation_is_refused(folder, tmp_path):
     )
     with pytest.raises(ValueError, match="the recipe has representation=humanml-legacy-smpl22"):
         module.open()
+
+
+def test_statistics_of_frames_read_in_parts_are_those_of_all_frames(tmp_path, monkeypatch):
+    rng = np.random.default_rng(0)
+    frames = (rng.normal(size=(997, 64)) * 10 ** rng.uniform(-2, 2, 64) + rng.normal(size=64)).astype(np.float32)
+    constant = torch.arange(64) >= 50
+    frames[:, 50:] = rng.normal(size=14)
+    parts = Frames(lambda: np.split(frames, np.sort(rng.integers(0, 997, 30))), 997)
+    for size in (1, 7, 64, 996, 997, 5000):
+        whole = torch.from_numpy(frames).split(size)
+        assert all(torch.equal(*pair) for pair in zip(parts.split(size), whole, strict=True))
+    mean, std = Rifke().statistics(parts)
+    whole = torch.from_numpy(frames).double()
+    assert torch.equal(mean, whole.mean(0).float())
+    assert torch.equal(std, torch.where(constant, 1.0, whole.std(0)).float())
+
+    monkeypatch.setattr("flame_mdm.data.store.BLOCK", 50)
+    store = write_store(tmp_path / "store", Synthetic(clips=40, seed=1), HumanML())
+    training = np.concatenate([store.motion(clip) for clip in store.clips if clip.split == "train"])
+    mean, std = HumanML().statistics(torch.from_numpy(training))
+    assert torch.equal(torch.from_numpy(store.mean), mean)
+    assert torch.equal(torch.from_numpy(store.std), std)

@@ -88,8 +88,7 @@ class Rifke(Representation):
     def statistics(self, features: Tensor | Frames) -> tuple[Tensor, Tensor]:
         """Returns mean and unbiased std of each feature; std 1 if it is constant."""
         size, zero = 1 << 16, torch.zeros(())  # the frames of a data set would not fit in memory
-        first = next(iter(features.split(1)))[0].double()  # relative to it, constant features are exactly 0
-        mean = first + sum((chunk.double().sub_(first).sum(0) for chunk in features.split(size)), zero) / len(features)
+        mean = sum((chunk.double().sum(0) for chunk in features.split(size)), zero) / len(features)
         squares = (chunk.double().sub_(mean).square_().sum(0) for chunk in features.split(size))
         std = (sum(squares, zero) / (len(features) - 1)).sqrt()
         return mean.float(), torch.where(std > 0, std, 1.0).float()

@@ -253,6 +253,14 @@ class TestLearned:
         parts = {name.partition(".")[0] for name in encoder.state_dict()}
         assert parts == {"words", "positions", "layer", "norm", "null"}
 
+    def test_rows_are_looked_up_once_per_caption(self, monkeypatch):
+        encoder = LearnedTokens(16, heads=2).eval()
+        first = encoder(batch_of(CAPTIONS))
+        monkeypatch.setattr(encoder, "rows", None)
+        again = encoder(batch_of(CAPTIONS))
+        assert torch.equal(first.pooled, again.pooled)
+        assert torch.equal(first.tokens, again.tokens)
+
     def test_long_and_empty_captions(self):
         encoder = LearnedTokens(16, heads=2, max_words=3).eval()
         cond = encoder(batch_of(["", "a b c", "a b c d e"]))
@@ -492,6 +500,42 @@ class TestCache:
         with pytest.warns(UserWarning, match=f"{name} is damaged .*; rebuilding it"):
             encoder.precompute(CAPTIONS, tmp_path)
         assert (folder / name).read_bytes() == intact
+
+    @pytest.mark.parametrize("tokens", [True, False])
+    @pytest.mark.parametrize("moved", [True, False])
+    def test_a_batch_is_gathered_bit_for_bit_from_the_arrays(self, models, tmp_path, tokens, moved):
+        encoder = PretrainedText(models["bert"], WIDTH, 30, "mean", tokens=tokens)
+        encoder.precompute([*CAPTIONS, "a person"], tmp_path)
+        live = encoder._look_up([*CAPTIONS, ""], torch.device("cpu"))
+        encoder.load_cache([*CAPTIONS, "a person"], tmp_path)
+        assert encoder.cache_size() > 0
+        if moved:
+            encoder.move_cache(torch.device("cpu"))
+        cache = encoder._cache
+        assert cache is not None
+        captions = [*CAPTIONS, ""]
+        pooled, rows, token_mask = cache.gather(captions, torch.device("cpu"))
+        assert (pooled.dtype, rows.dtype) == (torch.float32, torch.float32)
+        for number, caption in enumerate(captions):
+            vector, own = cache[caption]
+            assert pooled[number].numpy().tobytes() == vector.tobytes()
+            assert torch.equal(rows[number, : len(own)], torch.from_numpy(own).float())
+            assert not rows[number, len(own) :].any()
+            assert token_mask[number].tolist() == [True] * len(own) + [False] * (rows.shape[1] - len(own))
+        for a, b in zip(live, cache.gather(captions, torch.device("cpu")), strict=True):
+            torch.testing.assert_close(a, b)
+        # A caption outside the cache takes the way of the live encoder, the others keep their cached values.
+        mixed, mixed_rows, _ = encoder._look_up([*captions, "a man waves"], torch.device("cpu"))
+        assert torch.equal(mixed[: len(captions)], pooled)
+        assert torch.equal(mixed_rows[: len(captions), : rows.shape[1]], rows)
+
+    def test_copies_of_a_moved_cache_map_the_files(self, encoder, tmp_path):
+        encoder.precompute(CAPTIONS, tmp_path)
+        encoder.load_cache(CAPTIONS, tmp_path)
+        encoder.move_cache(torch.device("meta"))
+        assert encoder._cache.pooled.device.type == "meta"
+        copied = copy.deepcopy(encoder)
+        assert copied._cache.pooled.device.type == "cpu"
 
     def test_interruption_leaves_nothing_behind(self, encoder, tmp_path, monkeypatch):
         def interrupt(*_):

@@ -1,14 +1,13 @@
 """Small text encoder that is trained with the model and needs no download."""
 
 import zlib
-from itertools import chain
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
 from flame_mdm.conditions import ConditionEncoder, vocabulary
-from flame_mdm.motion import Condition, MotionBatch, length_mask
+from flame_mdm.motion import Condition, MotionBatch, length_mask, sent
 
 START = "<start>"
 """Inserted before every caption, so that the empty caption also has a token; no caption contains this word."""
@@ -50,6 +49,7 @@ class LearnedTokens(ConditionEncoder):
         )
         self.norm = nn.LayerNorm(features)
         self.null = nn.Parameter(0.02 * torch.randn(features))
+        self._known: dict[str, Tensor] = {}  # rows (T, 2) of the captions met so far
 
     def rows(self, caption: str) -> list[tuple[int, int]]:
         """Returns the two rows of the table for the start token and each word of a caption."""
@@ -63,13 +63,15 @@ class LearnedTokens(ConditionEncoder):
             raise ValueError("condition=learned needs captions, and this batch has none: choose data with captions")
         device = self.null.device
         numbers = {caption: number for number, caption in enumerate(dict.fromkeys(batch.text))}
-        rows = [self.rows(caption) for caption in numbers]
+        for caption in numbers.keys() - self._known.keys():
+            self._known[caption] = torch.tensor(self.rows(caption))
+        rows = [self._known[caption] for caption in numbers]
         token_mask = length_mask(torch.tensor([len(words) for words in rows]))
-        places = token_mask.flatten().nonzero()[:, 0].to(device)
-        token_mask = token_mask.to(device)
-        tokens = self._encode(torch.tensor(list(chain(*rows)), device=device), places, token_mask)
+        places = sent(token_mask.flatten().nonzero()[:, 0], device)
+        token_mask = sent(token_mask, device)
+        tokens = self._encode(sent(torch.cat(rows), device), places, token_mask)
         pooled = tokens.sum(1) / token_mask.sum(1, keepdim=True)
-        of_sample = torch.tensor([numbers[caption] for caption in batch.text], device=device)
+        of_sample = sent(torch.tensor([numbers[caption] for caption in batch.text]), device)
         return Condition(pooled[of_sample], tokens[of_sample], token_mask[of_sample], self._null())
 
     def _encode(self, rows: Tensor, places: Tensor, token_mask: Tensor) -> Tensor:

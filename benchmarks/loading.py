@@ -1,9 +1,9 @@
-"""Speed of the training loader compared to a training step: `python benchmarks/loading.py [clips]`.
+"""Speed of both ways to load batches compared to a training step: `python benchmarks/loading.py [clips]`.
 
-A synthetic data set is packed into a temporary folder. Loading in the training process, and forward, backward and
-update of the small MDM encoder, are measured in processor time of one core, which excludes other programs on the
-machine. Loading with workers is measured in wall time, which includes passing batches between processes and the load of
-the machine. Prints medians over the rounds.
+A synthetic data set is packed into a temporary folder. Batches gathered from memory (data.resident=true), batches of
+the data loader in the training process, and forward, backward and update of the small MDM encoder are measured in
+processor time of one core, which excludes other programs on the machine. Loading with workers is measured in wall time,
+which includes passing batches between processes and the load of the machine. Prints medians over the rounds.
 """
 
 import itertools
@@ -61,6 +61,7 @@ def main(clips: int) -> None:
     with tempfile.TemporaryDirectory() as folder:
         source, crop = Synthetic(clips), Units(24, 60, 4)
         data = MotionDataModule(source, HumanML(), root=folder, name="s", batch_size=BATCH, crop=crop)
+        data.resident = False
         data.prepare_data()
         data.setup("fit")
         loader = iter(data.train_dataloader())
@@ -70,21 +71,29 @@ def main(clips: int) -> None:
         endless = itertools.cycle(batches)
         wait = median(lambda: step(next(endless)), len(batches), time.process_time)
         load = median(lambda: next(loader), BATCHES, time.process_time)
+        data.resident = True
+        data.setup("fit")
+        gathered = iter(data.train_dataloader())
+        gather = median(lambda: next(gathered), BATCHES, time.process_time)
         lengths = torch.cat([batch.lengths for batch in batches]).float().mean()
         frames = statistics.mean(batch.x.shape[1] for batch in batches)
         print(
             f"{BATCH} clips per batch, {lengths:.0f} frames of {batches[0].x.shape[2]} features, padded to {frames:.0f}"
         )
-        print(f"a training step takes {1000 * wait:.0f} ms of one core, loading its batch {load / wait:.1%} of that")
+        print(f"a training step takes {1000 * wait:.0f} ms of one core")
+        print(f"its batch: {gather / wait:.1%} of that if gathered from memory, {load / wait:.1%} if loaded")
         print(f"{'loader':<26}{'ms/batch':>12}{'batches/s':>12}{'clips/s':>10}{'vs. target':>13}")
-        row("one core", load, 1)
+        row("resident, one core", gather, 1)
+        row("loader, one core", load, 1)
+        data.resident = False
+        data.setup("fit")
         for workers in (1, 2):
             data.num_workers = workers
             loader = iter(data.train_dataloader())
             for _ in range(BATCHES):  # starts the workers
                 next(loader)
             load = median(partial(next, loader), BATCHES, time.perf_counter)
-            row(f"{workers} worker{'s' * (workers > 1)}, wall time", load, workers)
+            row(f"loader, {workers} worker{'s' * (workers > 1)}, wall", load, workers)
 
 
 def row(name: str, seconds: float, workers: int) -> None:

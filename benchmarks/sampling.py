@@ -1,24 +1,28 @@
-"""Sampling time by sampler and number of steps: `python benchmarks/sampling.py`.
+"""Cost of sampling: `python benchmarks/sampling.py`.
 
-Uses two denoisers: a stub that costs almost nothing, to measure the sampling loop itself, and MDM's encoder. Samplers
-take turns within a run, so that a busy machine slows all of them. Prints medians over the runs and their ratio to the
-first row.
+Three tables: milliseconds per network call that the sampling loop itself takes, with a denoiser that returns a stored
+tensor; the samplers with MDM's encoder, which take turns within a run, so that a busy machine slows all of them; and
+latency at batch 1 and throughput at batch 64 of that encoder for 10, 50 and 1000 steps. Prints medians, and ratios to
+the first row.
 """
 
 import argparse
 import statistics
 import time
 from collections.abc import Callable
+from functools import partial
+from itertools import product
 
 import torch
 from torch import Tensor
 
 from flame_mdm.denoisers.mdm import MDMEncoder
-from flame_mdm.motion import Condition, Denoise
+from flame_mdm.motion import Condition, Denoise, Edit
 from flame_mdm.processes.diffusion import GaussianDiffusion
 from flame_mdm.processes.flow_matching import FlowMatching
 from flame_mdm.processes.guidance import classifier_free_guidance
 from flame_mdm.processes.samplers import CountedDenoise
+from flame_mdm.seeds import seeded_noise
 
 RUNS = [
     (GaussianDiffusion(), "ancestral", 50),
@@ -35,21 +39,76 @@ RUNS = [
 ]
 
 
-def stub(x_t: Tensor, t: Tensor, mask: Tensor, cond: Condition) -> Tensor:
-    """A denoiser with a single operation."""
-    return 0.5 * x_t
+LONGEST = 20.0
+"""Seconds above which a run is estimated from one with fewer steps."""
 
 
-@torch.no_grad()
+def inputs(batch: int, args: argparse.Namespace) -> tuple[Tensor, Tensor, Condition]:
+    """Returns noise (B, F, D), mask (B, F) and a condition with a null."""
+    null = Condition(torch.zeros(1, 512, device=args.device), torch.zeros(1, 0, 512, device=args.device), None)
+    noise = torch.randn(batch, args.frames, args.features, device=args.device)
+    pooled = torch.randn(batch, 512, device=args.device)
+    cond = Condition(pooled, torch.zeros(batch, 0, 512, device=args.device), None, null)
+    return noise, torch.ones(noise.shape[:2], dtype=torch.bool, device=args.device), cond
+
+
+def seconds(run: Callable[[], Tensor], repeats: int) -> float:
+    """Returns the median time of a run, after one that warms up."""
+    times = []
+    for _ in range(repeats + 1):
+        start = time.perf_counter()
+        run().sum().item()  # waits for the device
+        times.append(time.perf_counter() - start)
+    return statistics.median(times[1:])
+
+
+def measure_loops(args: argparse.Namespace) -> None:
+    """Prints the host cost of each sampler per network call, at batch 1, and that of drawing noise."""
+    fixed, mask, cond = inputs(1, args)
+    keep = torch.zeros_like(fixed, dtype=torch.bool)
+    keep[:, : args.frames // 4] = True
+    stored = {rows: torch.randn(rows, *fixed.shape[1:], device=args.device) for rows in (1, 2)}
+    guided = classifier_free_guidance(lambda x_t, *_: stored[len(x_t)], args.guidance_scale, args.features)
+    print(f"{'ms per call':<18}{'alone':>10}{'guided':>10}{'edited':>10}{'both':>10}")
+    for process, sampler in {(type(process), sampler): (process, sampler) for process, sampler, _ in RUNS}.values():
+        cells = []
+        for edit, denoise in product((None, Edit(fixed, keep, "x0")), (lambda x_t, *_: stored[len(x_t)], guided)):
+            if edit is not None and sampler == "dopri5":
+                continue
+            counted = CountedDenoise(denoise)
+            run = partial(process.sample, counted, lambda draw: fixed, mask, cond, sampler=sampler, edit=edit)
+            taken = seconds(partial(run, num_inference_steps=50), 2 * args.repeats)
+            cells.append(1e3 * taken * (2 * args.repeats + 1) / counted.calls)
+        print(f"{sampler:<18}" + "".join(f"{cell:>10.3f}" for cell in cells))
+    for batch in (1, 64):
+        ids = [str(number) for number in range(batch)]
+        noise = seeded_noise(ids, *fixed.shape[1:], seed=0, replication=0, like=fixed)
+        print(f"noise, batch {batch:<5}{1e3 * seconds(partial(noise, 1), 2 * args.repeats):>10.3f}")
+
+
+def measure_steps(denoise: Denoise, args: argparse.Namespace) -> None:
+    """Prints seconds per run and motions per second by batch size and number of steps of the ancestral sampler."""
+    print(f"{'batch':<6}{'steps':>6}{'s':>10}{'motions/s':>12}{'ratio':>8}")
+    guided = classifier_free_guidance(denoise, args.guidance_scale, args.features)
+    first = 0.0
+    for batch in (1, 64):
+        fixed, mask, cond = inputs(batch, args)
+        noise = seeded_noise([str(i) for i in range(batch)], *fixed.shape[1:], seed=0, replication=0, like=fixed)
+        run = partial(GaussianDiffusion().sample, guided, noise, mask, cond)
+        short = taken = seconds(partial(run, num_inference_steps=10), 3)
+        for steps in (10, 50, 1000):
+            estimate = short * steps / 10
+            if steps > 10:
+                taken = estimate if estimate > LONGEST else seconds(partial(run, num_inference_steps=steps), 1)
+            first = first or taken
+            how = "  estimated from 10 steps" if estimate > LONGEST else ""
+            print(f"{batch:<6}{steps:>6}{taken:>10.3f}{batch / taken:>12.2f}{taken / first:>8.1f}{how}")
+
+
 def measure(denoise: Denoise, args: argparse.Namespace) -> None:
     """Prints one row per sampler."""
-    mask = torch.ones(args.batch, args.frames, dtype=torch.bool, device=args.device)
-    null = Condition(torch.zeros(1, 512), torch.zeros(1, 0, 512), None)
-    cond = Condition(torch.randn(args.batch, 512), torch.zeros(args.batch, 0, 512), None, null)
-    for part in (cond, null):
-        part.pooled, part.tokens = part.pooled.to(args.device), part.tokens.to(args.device)
+    fixed, mask, cond = inputs(args.batch, args)
     guided = classifier_free_guidance(denoise, args.guidance_scale, args.features)
-    fixed = torch.randn(args.batch, args.frames, args.features, device=args.device)
     samples: list[Callable[[Denoise], Tensor]] = [
         lambda counted, process=process, sampler=sampler, count=count: process.sample(
             counted, lambda draw: fixed, mask, cond, sampler=sampler, num_inference_steps=count
@@ -75,26 +134,30 @@ def measure(denoise: Denoise, args: argparse.Namespace) -> None:
         )
 
 
+@torch.no_grad()
 def main() -> None:
-    """Measures both denoisers."""
+    """Prints the three tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--batch", type=int, default=4)
     parser.add_argument("--frames", type=int, default=60)
     parser.add_argument("--features", type=int, default=263)
-    parser.add_argument("--latent-dim", type=int, default=64)
-    parser.add_argument("--num-layers", type=int, default=2)
+    parser.add_argument("--latent-dim", type=int, default=128)
+    parser.add_argument("--num-layers", type=int, default=4)
     parser.add_argument("--guidance-scale", type=float, default=2.5)
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--device", default="cpu")
     args = parser.parse_args()
     torch.manual_seed(0)
     print(f"{args.batch} motions of {args.frames} x {args.features} on {args.device}, scale {args.guidance_scale}")
-    print("\nstub")
-    measure(stub, args)
+    print("\nloops alone")
+    measure_loops(args)
     size = {"latent_dim": args.latent_dim, "ff_size": 2 * args.latent_dim, "num_layers": args.num_layers}
     encoder = MDMEncoder(args.features, args.features, 512, num_heads=4, dropout=0.1, **size)
     print(f"\nMDMEncoder, {sum(p.numel() for p in encoder.parameters()):,} parameters")
-    measure(encoder.eval().to(args.device), args)
+    encoder = encoder.eval().to(args.device)
+    measure(encoder, args)
+    print("\nancestral, guided, with noise")
+    measure_steps(encoder, args)
 
 
 if __name__ == "__main__":

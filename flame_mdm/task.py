@@ -264,7 +264,8 @@ class MotionGeneration(Task):
             (B, F, D) normalized, 0 past the end of each motion.
         """
         was_training = self.training
-        self.eval()
+        if was_training:  # setting the mode of all modules takes as long as a small network
+            self.eval()
         chosen: dict[str, Any] = {name: value for name, value in sampling.items() if value is not None}
         scale = chosen.pop("guidance_scale", self.guidance_scale)
         if trajectory is not None:
@@ -294,5 +295,6 @@ class MotionGeneration(Task):
             edit=edit,
             **({"sampler": self.sampler, "num_inference_steps": self.num_inference_steps} | chosen),
         )
-        self.train(was_training)
+        if was_training:
+            self.train()
         return x[:, :frames]

@@ -66,6 +66,21 @@ def test_the_doubled_condition_is_made_once_a_run_and_follows_a_change():
     assert seen[3].pooled.flatten().tolist() == [1, 2, 10, 10]
 
 
+def test_the_doubled_mask_is_made_once_a_run_and_follows_a_change():
+    seen = []
+
+    def denoise(x_t, t, mask, cond):
+        seen.append(mask)
+        return x_t
+
+    guided = classifier_free_guidance(denoise, 2.0, 2)
+    for mask in (MASK, MASK, ~MASK, MASK):
+        guided(torch.zeros(2, 4, 2), torch.zeros(2), mask, COND)
+    assert seen[0] is seen[1]
+    assert torch.equal(seen[2], torch.cat([~MASK, ~MASK]))
+    assert torch.equal(seen[3], torch.cat([MASK, MASK]))
+
+
 def test_there_is_no_guidance_without_a_null():
     lone = Condition(COND.pooled, COND.tokens, None)
     with pytest.raises(ValueError, match="no null"):

@@ -146,9 +146,9 @@ class GaussianDiffusion(Process):
 
     def _to_x0(self, output: Tensor, x_t: Tensor, i: Tensor | int) -> Tensor:
         output = output[..., : x_t.shape[-1]]
-        signal, noise = self.schedule.at("signal", i, x_t), self.schedule.at("noise", i, x_t)
         if self.prediction == "x0":
             return output
+        signal, noise = self.schedule.at("signal", i, x_t), self.schedule.at("noise", i, x_t)
         if self.prediction == "epsilon":
             return (x_t - noise * output) / signal
         return signal * x_t - noise * output

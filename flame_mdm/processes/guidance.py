@@ -23,16 +23,17 @@ def classifier_free_guidance(denoise: Denoise, scale: float | Tensor, features: 
     if not isinstance(scale, Tensor) and scale == 1:
         return denoise
     strength = scale[:, None, None] if isinstance(scale, Tensor) else scale
-    # One doubled condition per sampling run, so that a denoiser can cache what it computes from it.
-    doubled: tuple[Condition, Condition] | None = None
+    # One doubled mask and condition per sampling run, so that a denoiser can cache what it computes from them.
+    seen: tuple[Tensor, Condition] | None = None
+    doubled: tuple[Tensor, Condition]
 
     def guided(x_t: Tensor, t: Tensor, mask: Tensor, cond: Condition) -> Tensor:
-        nonlocal doubled
-        if doubled is None or doubled[0] is not cond:
-            doubled = (cond, cond.with_null())
-        output = denoise(torch.cat([x_t, x_t]), torch.cat([t, t]), torch.cat([mask, mask]), doubled[1])
-        with_cond, null = output.chunk(2)
+        nonlocal seen, doubled
+        if seen is None or seen[0] is not mask or seen[1] is not cond:
+            seen, doubled = (mask, cond), (torch.cat([mask, mask]), cond.with_null())
+        with_cond, null = denoise(torch.cat([x_t, x_t]), torch.cat([t, t]), *doubled).chunk(2)
         mean = null[..., :features] + strength * (with_cond[..., :features] - null[..., :features])
-        return torch.cat([mean, with_cond[..., features:]], -1)
+        variance = with_cond[..., features:]
+        return torch.cat([mean, variance], -1) if variance.shape[-1] else mean
 
     return guided

@@ -50,8 +50,8 @@ def ddim_step(x_t: Tensor, x0_hat: Tensor, schedule: Schedule, i: int, noise: Te
     """Returns x_{t-1} of DDIM (Song et al. 2021, eq. 12 and 16); `noise` is needed if eta > 0."""
     epsilon = (x_t - schedule.at("signal", i, x_t) * x0_hat) / schedule.at("noise", i, x_t)
     # eq. 16: eta = 1 has the variance of the ancestral step.
-    variance = eta**2 * schedule.tables["posterior_variance"][i].item()
-    previous = schedule.tables["alphas_cumprod_prev"][i].item()
+    variance = eta**2 * schedule.at("posterior_variance", i, x_t)
+    previous = schedule.at("alphas_cumprod_prev", i, x_t)
     x = previous**0.5 * x0_hat + (1 - previous - variance) ** 0.5 * epsilon
     return x if noise is None else x + variance**0.5 * noise
 
@@ -131,7 +131,7 @@ def _descend(
                 kept = schedule.corrupt(edit.known, draw(), i - 1) if i else edit.known
                 x = torch.where(edit.keep, kept, x)
             if repeats_left:
-                beta = schedule.tables["betas"][i].item()
+                beta = schedule.at("betas", i, x)
                 x = (1 - beta) ** 0.5 * x + beta**0.5 * draw()
     return x
 

@@ -60,6 +60,7 @@ class Schedule:
             "log_betas": betas.log(),
             "large_log_variance": torch.cat([clipped[:1], betas[1:]]).log(),
         }
+        self._numbers: dict[str, list[float]] = {}
         self._moved: dict[tuple[str, torch.device, torch.dtype], Tensor] = {}
 
     def __len__(self) -> int:
@@ -68,7 +69,9 @@ class Schedule:
     def at(self, name: str, i: int | Tensor, x: Tensor) -> Tensor | float:
         """Returns a coefficient at step i: a number, or for steps (B,) a tensor (B, 1, 1) like x, at least float32."""
         if isinstance(i, int):
-            return self.tables[name][i].item()
+            if name not in self._numbers:
+                self._numbers[name] = self.tables[name].tolist()
+            return self._numbers[name][i]
         key = (name, x.device, torch.promote_types(x.dtype, torch.float32))
         if key not in self._moved:
             self._moved[key] = self.tables[name].to(*key[1:])

@@ -14,7 +14,8 @@ from torch import Tensor
 
 from flame_mdm.data.store import Store
 from flame_mdm.errors import UserError, did_you_mean
-from flame_mdm.formats.files import ENDINGS, read
+from flame_mdm.formats.body import check_size, leg_length
+from flame_mdm.formats.files import ENDINGS, from_array, read
 from flame_mdm.formats.layouts import find_skeleton
 from flame_mdm.formats.motion import Motion
 from flame_mdm.formats.resampling import resample as resample_joints
@@ -22,7 +23,7 @@ from flame_mdm.generation import generate
 from flame_mdm.motion import Edit, Sampling
 from flame_mdm.processes import Process
 from flame_mdm.representations import Representation
-from flame_mdm.representations.skeleton import Skeleton
+from flame_mdm.representations.skeleton import SMPL22, Skeleton
 from flame_mdm.task import MotionGeneration
 
 METHODS: dict[str, dict[str, Any]] = {
@@ -62,10 +63,11 @@ class Edited(Motion):
 
 def edit(
     model: MotionGeneration,
-    motion: str | Path | Motion,
+    motion: str | Path | Motion | np.ndarray | Tensor,
     texts: str | Sequence[str] | None = None,
     *,
-    actions: Sequence[str] | None = None,
+    actions: str | Sequence[str] | None = None,
+    fps: float | None = None,
     region: str | Ranges | None = None,
     region_seconds: Ranges | None = None,
     joints: str | Sequence[str] | None = None,
@@ -82,8 +84,10 @@ def edit(
 
     Args:
         model: from `flame_mdm.load`.
-        motion: a source that `read_motion` reads, its result, or a generated motion.
+        motion: a file or clip that `read_motion` reads; a motion, generated or read; or joints (F, J, 3) in meters, y
+            up, in the order of a known skeleton.
         texts, actions: conditions, as in `generate`; neither = unconditioned.
+        fps: frames per second of an array or an .npy file; for other files, it overrides that of the file.
         region: frames to resample, [begin, end) or several such ranges; or a task: "in_between" keeps the first and
             the last quarter, "prediction" ("prefix") the first, "suffix" the last, "interpolate" every fifth frame.
         region_seconds: ranges in seconds instead of `region`.
@@ -101,17 +105,22 @@ def edit(
     Raises:
         UserError: the mask keeps everything or nothing, a name is unknown, the process does not support the method, the
             motion is longer than those in training, or `read_motion` or `generate` raises it.
-        FileNotFoundError, ValueError: from `read_motion`.
+        FileNotFoundError, ValueError: from `read_motion`, or the joints or their skeleton do not fit the model.
     """
     representation = model.representation
-    motion = motion if isinstance(motion, Motion) else read_motion(representation, motion)
+    if isinstance(motion, str | Path):
+        motion = read_motion(representation, motion, fps=fps)
+    elif not isinstance(motion, Motion):
+        motion = from_array(motion, fps)
+    elif fps is not None and fps != motion.fps:
+        raise UserError(f"fps={fps:g}: this motion has {motion.fps:g} frames per second. Omit fps")
     original = with_features(representation, motion)
     features = original.features
     length = len(features)
-    if length > model.facts["max_frames"]:
+    if length > (longest := model.facts["max_frames"]):
         raise UserError(
-            f"{original.id}: {length} frames, but the model was trained on at most {model.facts['max_frames']} "
-            f"({model.facts['max_frames'] / original.fps:g} seconds): select a part with cut=[begin, end] in seconds"
+            f"{original.id or 'the motion'}: {length} frames, but the model was trained on at most {longest} "
+            f"({longest / original.fps:g} seconds): select a part with cut=[begin, end] in seconds"
         )
     keep, still = kept_parts(representation, length, region=region, region_seconds=region_seconds, joints=joints)
     if not keep.any() and strength is None:
@@ -358,13 +367,15 @@ def with_features(representation: Representation, motion: Motion) -> Motion:
     """Returns the motion if it has features of this representation, otherwise computes them from its joints.
 
     Raises:
-        ValueError: the features have another shape, the motion is too long, or its joints cannot be encoded.
+        ValueError: the features have another shape, the body has the wrong size, the motion is too long, or its joints
+            cannot be encoded.
     """
+    name = f"{motion.id}: " if motion.id else ""
     fits = motion.representation == representation.name and math.isclose(motion.fps, representation.fps)
     if fits:
         shape, size = motion.features.shape, representation.features
         if shape[1:] != (size,) or not np.isfinite(motion.features).all():
-            raise ValueError(f"{motion.id}: features of shape {shape}, not (frames, {size}), or not finite")
+            raise ValueError(f"{name}features of shape {shape}, not (frames, {size}), or not finite")
         return motion
     joints, skeleton = motion.joints.astype(float), representation.skeleton
     if skeleton.joints == motion.skeleton.joints[: len(skeleton)]:
@@ -372,8 +383,10 @@ def with_features(representation: Representation, motion: Motion) -> Motion:
     try:
         joints = resample_joints(joints, motion.fps, representation.fps, cubic=True)
         features = representation.encode(torch.from_numpy(joints)).numpy()
+        if motion.skeleton.joints[: len(SMPL22)] == SMPL22.joints:
+            check_size(leg_length(joints), 1.0, children=True)
     except ValueError as error:
-        raise ValueError(f"{motion.id}: {error}") from error
+        raise ValueError(f"{name}{error}") from error
     return _decoded(representation, features, motion.text, motion.id)
 
 

@@ -41,7 +41,7 @@ def generate(
     model: MotionGeneration,
     texts: str | Sequence[str] | None = None,
     *,
-    actions: Sequence[str] | None = None,
+    actions: str | Sequence[str] | None = None,
     seconds: float | Sequence[float] | None = None,
     frames: int | Sequence[int] | None = None,
     samples: int = 1,
@@ -80,12 +80,13 @@ def generate(
     if scale is not None and not math.isfinite(scale):
         raise UserError(f"guidance_scale={scale} is not a finite number")
     texts = [texts] if isinstance(texts, str) else texts
+    actions = [actions] if isinstance(actions, str) else actions
     kind = "text" if texts is not None else "action" if actions is not None else "none"
     if kind not in ("none", model.conditioned_on):
         trained, instead = TRAINED_ON[model.conditioned_on]
         raise UserError(f"{kind}={shortened((texts or actions or [''])[0], 60)}: this model {trained}. Give {instead}")
     requested = list(texts or actions or [""])
-    if texts is not None and not all(text.strip() for text in texts):
+    if texts is not None and not all(text.strip() for text in requested):
         raise UserError("empty text. Omit the text to sample without condition")
     for text in requested:
         if len(text) > MAX_TEXT_LENGTH:

@@ -6,19 +6,39 @@ import re
 import shlex
 import shutil
 import subprocess
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
-import yaml
 from fixtures import ROOT
 
 from flame_mdm.__main__ import COMMANDS
-from flame_mdm.config import EXPERIMENTS, recipes
+from flame_mdm.config import command_line
+from flame_mdm.data.synthetic import Synthetic
+from flame_mdm.formats.motion import Motion
 
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 OWN = ("mine", "my_", "NAME", "...")
 """Names in examples for files that readers write."""
+OPEN = "make prepare DATA=... SOURCE=..."
+MINE = "make train EXP=quickstart denoiser=mine"
+NOT_COMPOSED = {
+    "README.md": [OPEN, MINE],
+    "adding.md": [MINE, "make prepare DATA=my_set SOURCE=/path"],
+    "clusters.md": [
+        "make train EXP=humanml3d/mdm launch=slurm trainer.devices=4 trainer.num_nodes=2 hydra.launcher.partition=gpu",
+        "make train EXP=humanml3d/mdm launch=slurm seed=0,1,2 optimizer.lr=1e-4,2e-4",
+    ],
+    "data.md": ["make evaluate baseline=real data=bandai data.source.mirror=false ..."],
+    "evaluation.md": [f"make train EXP={folder}/..." for folder in ("motion_clip", "t2m", "classifier")],
+    "first-problems.md": ["make prepare DATA=... SOURCE=/path/to/what/you/downloaded", OPEN],
+    "own-data.md": ["make browse DATA=mine"],
+    "tables.md": ["make train EXP=..."],
+}
+"""Commands of each page that cannot be composed: they name a part that the reader writes (mine, my_set), or leave a name
+open (...). Those of clusters.md wait for launchers of recipes that are in a folder."""
 TARGETS = {"setup", "test", "test-fast", "test-tools", "lint", "bench", "docs", "help"}
 
 
@@ -69,46 +89,84 @@ def code(text: str) -> list[str]:
 
 
 def wrong_commands(text: str) -> list[str]:
-    """Returns commands that do not exist, or that have an unknown key, recipe or data set."""
+    """Returns commands that do not exist, or whose recipe, parts, keys or values are refused before any work."""
     wrong = []
-    for line in code(text):
+    for line in dict.fromkeys(code(text)):
         found = re.match(r"(?:torchrun .*-m |srun )?(make|flame-mdm|flame_mdm) ([a-z-]+)(.*)", line.strip())
         if found is None:
             continue
         program, command, rest = found.groups()
-        if command not in COMMANDS and not (program == "make" and command in TARGETS):
-            wrong.append(f"{program} {command}")
-            continue
-        legal = keys(command)
-        for word in shlex.split(rest, comments=True):
-            key, _, value = word.strip("[]").partition("=")
-            name = key.lower() if key.isupper() else key
-            names = {"exp": recipes() if command == "train" else (), "data": datasets()}.get(name, ())
-            unknown = bool(value) and bool(legal) and "." not in name and name not in legal
-            if unknown or (names and value not in names and not any(own in value for own in (*OWN, "runs/"))):
-                wrong.append(f"{program} {command} {word}")
+        words = shlex.split(rest, comments=True)
+        known = command in COMMANDS or (program == "make" and command in TARGETS)
+        if not known or (command in COMMANDS and words and not is_composed(program, command, words)):
+            wrong.append(" ".join([program, command, *words]))
     return wrong
 
 
-def keys(command: str) -> set[str]:
-    """Returns the keys of a command; empty if a recipe decides."""
-    file = EXPERIMENTS / f"{command}.yaml"
-    groups = {path.name for path in EXPERIMENTS.iterdir() if path.is_dir()}
-    return {*yaml.safe_load(file.read_text()), *groups} if file.exists() else set()
-
-
-def datasets() -> set[str]:
-    """Returns the names of the data sets."""
-    return {path.stem for path in (EXPERIMENTS / "data").glob("*.yaml")}
+def is_composed(program: str, command: str, words: list[str]) -> bool:
+    """Returns whether a command line is parsed, composed and checked without an error; its work is not done."""
+    main = importlib.import_module(f"flame_mdm.commands.{'import_released' if command == 'import' else command}").main
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(command_line, "hydra_main", lambda **_: lambda _: lambda: None)  # runs the jobs of a sweep
+        if program == "make":
+            if not all("=" in word for word in words):
+                return False
+            escaped = [re.sub(r"([\\ ])", r"\\\1", word) for word in words]
+            patch.setenv("MAKEFLAGS", " -- " + " ".join(reversed(escaped)))
+            words = ["--from-make"]
+        return main.func(lambda config: None, words, **main.keywords) == 0
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
-def test_links_names_paths_and_commands_of_a_page_exist(page):
+def test_links_names_paths_and_commands_of_a_page_exist(page, tmp_path, monkeypatch):
     text = page.read_text()
     assert broken_links(page, text) == []
     assert unknown_names(text) == []
     assert unknown_paths(text) == []
-    assert wrong_commands(text) == []
+    monkeypatch.chdir(tmp_path)
+    for name, content in re.findall(r"^`(\w+\.yaml)`:\n\n```yaml\n(.*?)^```", text, re.DOTALL | re.MULTILINE):
+        Path(name).write_text(content)
+    assert wrong_commands(text) == NOT_COMPOSED.get(page.name, [])
+
+
+def python_examples(text: str) -> list[tuple[str, str]]:
+    """Returns the Python blocks of a page, each with the reason why it is not run, or with ""."""
+    return re.findall(r"(?:^<!-- not run: (.+) -->\n)?^```python\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
+
+
+EXAMPLES = {page: found for page in PAGES if (found := python_examples(page.read_text()))}
+
+
+@pytest.mark.parametrize("page", EXAMPLES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_the_python_examples_of_a_page_run(page, trained, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    Path("runs/quickstart").mkdir(parents=True)
+    Path("runs/quickstart/default").symlink_to(trained.parent.parent)
+    walk = next(Synthetic(clips=20).clips(30.0)).motion
+    for name in ("walk.npz", "walk.bvh"):
+        Motion(walk, 30.0).save(name)
+    run_examples(EXAMPLES[page])
+
+
+def run_examples(examples: list[tuple[str, str]]) -> None:
+    """Runs blocks one after the other, as a reader would, and checks the shapes and texts that comments tell."""
+    names: dict[str, Any] = {"__name__": "example"}
+    for reason, block in examples:
+        if reason:
+            continue
+        exec(block, names)
+        for expression, shape in re.findall(r"^([\w.\[\]]+) +# (\(\d+(?:, \d+)+\))", block, re.MULTILINE):
+            assert str(eval(expression, names).shape) == shape, expression
+        for expression, text in re.findall(r"^([\w.\[\]]+) +# ([A-Z]\w+\(.*\))$", block, re.MULTILINE):
+            assert repr(eval(expression, names)) == text, expression
+
+
+def test_examples_that_do_not_run_are_counted():
+    """A block that needs registered data, a GPU or the network has `<!-- not run: REASON -->` above it."""
+    found = [reason for examples in EXAMPLES.values() for reason, _ in examples]
+    assert [reason for reason in found if reason] == []
+    assert len(found) >= 9
 
 
 def unknown_messages(text: str) -> list[str]:
@@ -144,7 +202,22 @@ def test_the_checks_can_fail():
     ]
     assert unknown_paths("experiments/base.yaml experiments/nothing.yaml") == ["experiments/nothing.yaml"]
     text = "```sh\nmake train EXP=quickstart a.b=1\n```\n    make trian\n`make edit FRAMEZ=1` `make train EXP=nothing`"
-    assert wrong_commands(text) == ["make trian", "make edit FRAMEZ=1", "make train EXP=nothing"]
+    text += " `make sample x` `flame-mdm sample seconds=soon` `make sample TEXT='a person' MP4=true` `make lint`"
+    assert wrong_commands(text) == [
+        *("make train EXP=quickstart a.b=1", "make trian", "make edit FRAMEZ=1", "make train EXP=nothing"),
+        *("make sample x", "flame-mdm sample seconds=soon"),
+    ]
+
+
+def test_the_examples_can_fail():
+    text = "```python\na = b\n```\n\n<!-- not run: needs a GPU -->\n```python\n1 / 0\n```\n"
+    assert python_examples(text) == [("", "a = b\n"), ("needs a GPU", "1 / 0\n")]
+    with pytest.raises(NameError):
+        run_examples(python_examples(text))
+    run_examples(python_examples(text)[1:])
+    for comment in ("(2, 3)", "Motion('x')"):
+        with pytest.raises(AssertionError):
+            run_examples([("", f"import numpy\nx = numpy.zeros(2)\nx    # {comment}\n")])
 
 
 def test_make_forwards_every_command():

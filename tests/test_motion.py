@@ -2,8 +2,10 @@
 
 import json
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,6 +19,7 @@ from flame_mdm.config import compose, instantiate
 from flame_mdm.data.folder import Folder
 from flame_mdm.data.synthetic import Synthetic
 from flame_mdm.editing import edit, read_motion
+from flame_mdm.errors import UserError
 from flame_mdm.formats.files import read
 from flame_mdm.formats.motion import Motion
 from flame_mdm.representations.humanml import HumanML
@@ -123,8 +126,91 @@ def test_a_motion_is_shown(walk: Motion, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.delitem(sys.modules, "IPython", raising=False)
     page = walk.show()
     assert "a person walks" in page.read_text()
-    monkeypatch.setitem(sys.modules, "IPython", SimpleNamespace())  # type: ignore[arg-type]
     monkeypatch.setitem(sys.modules, "IPython.display", SimpleNamespace(HTML=str))  # type: ignore[arg-type]
+    for shell in (None, SimpleNamespace()):  # imported by another package; in a terminal
+        monkeypatch.setitem(sys.modules, "IPython", SimpleNamespace(get_ipython=lambda shell=shell: shell))  # type: ignore[arg-type]
+        assert "a person walks" in walk.show().read_text()
+    notebook = SimpleNamespace(kernel=None)
+    monkeypatch.setitem(sys.modules, "IPython", SimpleNamespace(get_ipython=lambda: notebook))  # type: ignore[arg-type]
     shown = walk.show()
-    assert shown.startswith("<iframe sandbox=")
+    assert shown.startswith("<div><iframe sandbox=")
     assert "<script" not in shown
+
+
+def test_a_motion_prints_in_a_short_line(walk: Motion):
+    assert repr(Motion(walk.joints, 30.0, text="a person walks " * 20)) == (
+        f"Motion('{'a person walks ' * 3}a person walks…', {len(walk.joints)} frames, 30 fps, smpl22)"
+    )
+
+
+@pytest.mark.parametrize("name", ["walk", "walk.fbx", "walk.npz.txt", "."])
+def test_an_unknown_extension_is_refused(walk: Motion, tmp_path: Path, name: str):
+    known = r"\.bvh, \.glb, \.npz, \.json, \.npy, \.gif, \.mp4$"
+    with pytest.raises(ValueError, match=f"unknown kind of motion file. Use one of {known}"):
+        walk.save(tmp_path / name)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("name", ["new/walk.BVH", "walk.gif", "walk.MP4"])
+def test_the_extension_selects_the_format(walk: Motion, tmp_path: Path, name: str):
+    if name.endswith("MP4"):
+        pytest.importorskip("av")
+    begin = {"bvh": b"HIERARCHY", "gif": b"GIF89a", "mp4": b"\0\0\0\x20ftyp"}[name[-3:].lower()]
+    short = Motion(walk.joints[:5], 30.0)
+    assert short.save(tmp_path / name).startswith(f"{tmp_path / name}: 5 frames at 30 per second")
+    assert (tmp_path / name).read_bytes().startswith(begin)
+
+
+def test_arrays_are_edited(walk: Motion, model: MotionGeneration):
+    how: dict[str, Any] = {"region": "prediction", "num_inference_steps": 2}
+    expected = edit(model, walk, "a person jumps", **how)[0]
+    for joints in (walk.joints, torch.from_numpy(walk.joints), walk.joints.tolist()):
+        result = edit(model, joints, "a person jumps", fps=30, **how)[0]
+        np.testing.assert_array_equal(result.joints, expected.joints)
+        assert result.feature_error == 0
+
+
+@pytest.mark.parametrize(
+    ("change", "fps", "message"),
+    [
+        (lambda joints: joints, None, "an array has no frame rate: set it, for example with fps=20"),
+        (lambda joints: joints, 0, "fps is 0, not a number of frames per second"),
+        (lambda joints: joints, "fast", "fps is fast, not a number of frames per second"),
+        (
+            lambda joints: joints[:, :13],
+            30,
+            r"joints of shape \(79, 13, 3\), not \(frames, joints, 3\) with 22 \(smpl22\)",
+        ),
+        (lambda joints: joints[0], 30, r"joints of shape \(22, 3\), not \(frames, joints, 3\)"),
+        (lambda joints: joints[:0], 30, "have no frames"),
+        (
+            lambda joints: joints[:, :21],
+            30,
+            r"^motion: shape \(.*, 21, 3\), but humanml-clean-smpl22 takes \(frames, 22, 3\)",
+        ),
+        (lambda joints: joints * 100, 30, r"^the legs are 8\d\.\d m long .* The unit may be 0\.01 \(centimeters\)"),
+        (lambda joints: joints * np.nan, 30, "joints in frame 0 are not finite"),
+        (
+            lambda joints: np.tile(joints, (9, 1, 1)),
+            30,
+            "^the motion: .* frames, but the model was trained on at most 196",
+        ),
+        (lambda joints: None, 30, r"^NoneType: not a motion\. Give a path, a Motion, or an array of joints"),
+        (lambda joints: [Motion(joints, 30)], 30, "^list: not a motion"),
+        (lambda joints: Motion(joints, 30), 20, r"fps=20: this motion has 30 frames per second\. Omit fps"),
+        (lambda joints: Motion(joints * 100, 30, id="take"), None, "^take: the legs are"),
+    ],
+)
+def test_what_cannot_be_edited_is_refused_in_one_line(
+    walk: Motion, model: MotionGeneration, change: Callable[[Any], Any], fps: float | None, message: str
+):
+    with pytest.raises((UserError, ValueError), match=message) as caught:
+        edit(model, change(walk.joints), fps=fps, region="prediction")
+    assert "\n" not in str(caught.value)
+
+
+def test_no_text_is_not_an_unconditioned_motion(model: MotionGeneration):
+    with pytest.raises(UserError, match="empty text"):
+        flame_mdm.generate(model, [])
+    with pytest.raises(UserError, match="action=walk: this model was trained on captions"):
+        flame_mdm.generate(model, actions="walk")

@@ -97,6 +97,28 @@ def read(
         raise ValueError(str(error) if str(path) in str(error) else f"{path}: {error}") from error
 
 
+def from_array(joints: Any, fps: float | None) -> Motion:
+    """Returns a motion of joint positions.
+
+    Args:
+        joints: array or tensor (F, J, 3) in meters, y up, in the order of a known skeleton, which the number of joints
+            identifies.
+        fps: frames per second.
+
+    Raises:
+        ValueError: another shape, not numbers, or no frame rate.
+    """
+    values = joints.detach().cpu().numpy() if isinstance(joints, Tensor) else np.asarray(joints)
+    if not _is_real(values):
+        name = type(joints).__name__
+        raise ValueError(f"{name}: not a motion. Give a path, a Motion, or an array of joints (frames, joints, 3)")
+    _check_numbers("joints", values)
+    skeleton = _skeleton(values)
+    if fps is None:
+        raise ValueError("an array has no frame rate: set it, for example with fps=20")
+    return Motion(values, frame_rate(fps), skeleton)
+
+
 def read_arrays(path: Path, header: bool = False) -> dict[str, Any]:
     """Reads the arrays of an .npz, .json or .npy motion: joints, or poses and trans as in AMASS; and fps if present.
 

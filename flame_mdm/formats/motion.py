@@ -90,7 +90,9 @@ class Motion:
                 raise ValueError(f"{name}: contacts have shape {found}, expected (frames, feet) = {expected}")
 
     def __repr__(self) -> str:
-        name = self.text or self.id
+        from flame_mdm.visualize.scene import shortened
+
+        name = shortened(self.text or self.id, 60)
         return f"{type(self).__name__}({name!r}, {len(self.joints)} frames, {self.fps:g} fps, {self.skeleton.name})"
 
     def posed(self) -> Poses:
@@ -130,14 +132,15 @@ class Motion:
         return f"{path}: {len(self.joints)} frames at {self.fps:g} per second, {what}"
 
     def show(self) -> Any:
-        """Returns a player: an HTML display in a notebook, otherwise the path of a page to open in any browser."""
+        """Returns a player: a display in a Jupyter notebook, otherwise the path of a page to open in any browser."""
         from flame_mdm.visualize import player_page
 
         page = player_page([self], self.text or self.id or "Motion")
-        if "IPython" in sys.modules:
+        ipython = getattr(sys.modules.get("IPython"), "get_ipython", lambda: None)()
+        if hasattr(ipython, "kernel"):  # a notebook, not a terminal
             style = "width:100%;height:560px;border:0"
             frame = f'<iframe sandbox="allow-scripts allow-downloads" style="{style}" srcdoc="{escape(page)}"></iframe>'
-            return import_module("IPython.display").HTML(frame)
+            return import_module("IPython.display").HTML(f"<div>{frame}</div>")  # it warns of a bare iframe
         path = Path(tempfile.mkdtemp(prefix="flame_mdm_")) / "motion.html"
         write_text(path, page)
         return path

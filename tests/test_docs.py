@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import tempfile
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -37,8 +38,8 @@ NOT_COMPOSED = {
     "own-data.md": ["make browse DATA=mine"],
     "tables.md": ["make train EXP=..."],
 }
-"""Commands of each page that cannot be composed: they name a part that the reader writes (mine, my_set), or leave a name
-open (...). Those of clusters.md wait for launchers of recipes that are in a folder."""
+"""Commands of each page that are not composed: they name a part that the reader writes (mine, my_set), or leave a name
+open (...). Those of clusters.md wait until launchers are found for recipes in a folder."""
 TARGETS = {"setup", "test", "test-fast", "test-tools", "lint", "bench", "docs", "help"}
 
 
@@ -98,12 +99,13 @@ def wrong_commands(text: str) -> list[str]:
         program, command, rest = found.groups()
         words = shlex.split(rest, comments=True)
         known = command in COMMANDS or (program == "make" and command in TARGETS)
-        if not known or (command in COMMANDS and words and not is_composed(program, command, words)):
+        if not known or (command in COMMANDS and words and not is_composed(program, command, tuple(words))):
             wrong.append(" ".join([program, command, *words]))
     return wrong
 
 
-def is_composed(program: str, command: str, words: list[str]) -> bool:
+@cache
+def is_composed(program: str, command: str, words: tuple[str, ...]) -> bool:
     """Returns whether a command line is parsed, composed and checked without an error; its work is not done."""
     main = importlib.import_module(f"flame_mdm.commands.{'import_released' if command == 'import' else command}").main
     with pytest.MonkeyPatch.context() as patch:
@@ -113,7 +115,7 @@ def is_composed(program: str, command: str, words: list[str]) -> bool:
                 return False
             escaped = [re.sub(r"([\\ ])", r"\\\1", word) for word in words]
             patch.setenv("MAKEFLAGS", " -- " + " ".join(reversed(escaped)))
-            words = ["--from-make"]
+            words = ("--from-make",)
         return main.func(lambda config: None, words, **main.keywords) == 0
 
 

@@ -112,7 +112,7 @@ def from_array(joints: Any, fps: float | None) -> Motion:
     if not _is_real(values):
         name = type(joints).__name__
         raise ValueError(f"{name}: not a motion. Give a path, a Motion, or an array of joints (frames, joints, 3)")
-    _check_numbers("joints", values)
+    _check_numbers("joints", values, False)
     skeleton = _skeleton(values)
     if fps is None:
         raise ValueError("an array has no frame rate: set it, for example with fps=20")

@@ -155,10 +155,10 @@ def _write(folder: Path, source: MotionSource, representation: Representation, t
         with writing(folder, partial):
             partial.mkdir(parents=True)
         bar = tqdm(source.clips(representation.fps), f"preparing {source.name}", total, unit=" clips")
-        writer = _Writer(folder, partial, representation.features)
-        with bar as clips, writer, closing(_encoded(clips, representation, source.workers)) as encoded:
-            for clip, features in encoded:
-                writer.add(source.name, clip, features)
+        with bar as clips, _Writer(folder, partial, representation.features) as writer:
+            with closing(_encoded(clips, representation, source.workers)) as encoded:
+                for clip, features in encoded:
+                    writer.add(source.name, clip, features)
             writer.finish(source.name)
         mean, std = source.statistics() or writer.statistics(representation)
         with writing(folder, partial):
@@ -192,7 +192,7 @@ class _Writer(ExitStack):
         self._references: zipfile.ZipFile | None = None
         self._packed = self.enter_context((partial / "features.npy").open("wb", buffering=0))
         self._index = self.enter_context((partial / "clips.jsonl").open("wb", buffering=0))
-        self._append(self._packed, _header(0, features))
+        self._packed.seek(len(_header(0, features)))  # the header is written at the end
 
     def add(self, name: str, clip: Clip, features: np.ndarray) -> None:
         """Writes a clip of the data set `name`, and the features of its motion unless the previous clip has the same.

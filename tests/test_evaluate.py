@@ -16,7 +16,7 @@ import torch
 from conftest import TINY
 from distributed import GlooPool
 
-from evaluators.evaluator import Evaluator, Extracted
+from evaluators.evaluator import Evaluator, Extracted, Motions
 from evaluators.extractors import ClassifierExtractor, MotionCLIPExtractor, T2MExtractor
 from evaluators.extractors.action_gru import ActionGRU
 from evaluators.extractors.stgcn import UESTC, Unconstrained
@@ -620,6 +620,37 @@ def test_processes_share_the_sampling_and_get_one_result(runs, tmp_path):
         one, two = read_samples(file), read_samples(tmp_path / file.name)
         assert all(np.array_equal(one[name], two[name]) for name in ("ids", "features", "captions"))
     assert means(shares(0, 1, runs, 1, None)) == means(single[0])
+
+
+def of_baseline(rank: int, world: int, runs: Runs) -> tuple[dict, int]:
+    """The result of a baseline as one of several processes gets it, and the number of feature passes."""
+    data, passes = runs.data(), []
+    extract = Evaluator.extract
+
+    def counted(self: Evaluator, motions: Motions) -> Extracted:
+        passes.append(len(motions))
+        return extract(self, motions)
+
+    Evaluator.extract = counted
+    try:
+        protocol = load_protocol("synthetic", data.representation)
+        protocol.change(replications=2, samples=33, quick=False, clips=len(data.test), multimodality=False)
+        extractor = protocol.open_extractor(str(runs.clip), data.representation, "synthetic")
+        source = protocol.baseline("real", data.test, 0)
+        result = protocol.evaluate(
+            source, data.test, extractor, data.representation, batch_size=8, rank=rank, world=world
+        )
+    finally:
+        Evaluator.extract = extract
+    return result, len(passes)
+
+
+def test_real_motions_are_extracted_once_and_processes_share_any_source(runs):
+    with GlooPool(2) as pool:
+        both = pool.run(of_baseline, *((rank, 2, runs) for rank in range(2)))
+    alone, passes = of_baseline(0, 1, runs)
+    assert passes == 2 * 3, "real, real again for comparisons of sets, and measured; in each replication"
+    assert both == [(alone, passes)] * 2
 
 
 LEAVES_NO_THREADS = """

@@ -40,7 +40,7 @@ class MotionBatch:
         return len(self.ids)
 
     def to(self, device: torch.device) -> MotionBatch:
-        """Returns the batch on a device, without waiting for the copy."""
+        """Returns the batch on a device, without waiting for the copy; Lightning calls this."""
         if self.x.device == device:
             return self
         action = None if self.action is None else sent(self.action, device)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from lightning.fabric.utilities.apply_func import move_data_to_device
 from test_data import Broken, clip
 from test_training import STEPS, run
 
@@ -189,8 +190,8 @@ def test_training_gives_the_same_weights(tiny, tmp_path):
 def test_batches_move_without_their_strings(root):
     data = module(root, CROPS[0])
     batch = next(iter(loader(data, "train")))
-    assert data.transfer_batch_to_device(batch, torch.device("cpu"), 0) is batch
-    moved = data.transfer_batch_to_device(batch, torch.device("meta"), 0)
+    assert move_data_to_device(batch, torch.device("cpu")) is batch
+    moved = move_data_to_device(batch, torch.device("meta"))
     assert (moved.x.device.type, moved.mask.device.type) == ("meta", "meta")
     assert (moved.ids, moved.text) == (batch.ids, batch.text)
 

@@ -25,7 +25,7 @@ from flame_mdm.data.crops import Crop
 from flame_mdm.data.resident import SHARE, ResidentLoader, free_memory, resident_features
 from flame_mdm.data.store import Store, write_store
 from flame_mdm.errors import UserError
-from flame_mdm.motion import MotionBatch, collate, padded_length
+from flame_mdm.motion import collate, padded_length
 from flame_mdm.representations import Representation
 
 MAX_FRAMES = 100_000
@@ -248,10 +248,6 @@ class MotionDataModule(LightningDataModule):
         fits = self.resident is True or (self.resident == "auto" and size <= free / SHARE)
         self.device = device if fits else None
         return self.device
-
-    def transfer_batch_to_device(self, batch: MotionBatch, device: torch.device, dataloader_idx: int) -> MotionBatch:
-        """Moves the tensors of a batch; Lightning would also visit each of its strings."""
-        return batch.to(device)
 
     def clips(self, split: Split) -> Clips:
         """Returns the clips of a split with their crop rule.

@@ -25,6 +25,16 @@ def key(*parts: str | int) -> int:
     return int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "big") >> 1
 
 
+def seed_generator(number: int, device: torch.device) -> None:
+    """Seeds torch's generators of the processor and of `device`.
+
+    `torch.manual_seed` seeds those of all devices, and takes about a millisecond where CUDA is not initialized.
+    """
+    torch.default_generator.manual_seed(number)
+    if device.type != "cpu":
+        torch.get_device_module(device).manual_seed(number)
+
+
 def _signed(value: int) -> int:
     return value - (1 << 64) if value >= 1 << 63 else value
 

@@ -24,7 +24,7 @@ from flame_mdm.motion import Condition, Edit, MotionBatch, Sampling, pad_to
 from flame_mdm.processes import MAX_STEPS, Process
 from flame_mdm.processes.guidance import classifier_free_guidance
 from flame_mdm.representations import Representation
-from flame_mdm.seeds import key, normal, seeded_noise, uniform
+from flame_mdm.seeds import key, normal, seed_generator, seeded_noise, uniform
 
 
 class Task(LightningModule):
@@ -76,6 +76,10 @@ class Task(LightningModule):
         data: MotionDataModule = self.trainer.datamodule  # type: ignore[attr-defined]
         prompts = [text for c in self.trainer.callbacks for text in getattr(c, "texts", ())]  # type: ignore[attr-defined]
         return sorted({*data.captions(), *prompts}), data.folder.parent / "text"
+
+    def transfer_batch_to_device(self, batch: MotionBatch, device: torch.device, dataloader_idx: int) -> MotionBatch:
+        """Moves a batch; Lightning would search every caption for tensors."""
+        return batch.to(device)
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
         """Returns the optimizer of the recipe with all trainable parameters."""
@@ -207,14 +211,14 @@ class MotionGeneration(Task):
 
     def training_step(self, batch: MotionBatch, batch_idx: int) -> Tensor:
         """Returns the loss of one batch. Random draws are functions of (seed, batch number, rank)."""
-        torch.manual_seed(key("step", self.seed, batch_idx, self.global_rank))
+        seed_generator(key("step", self.seed, batch_idx, self.global_rank), self.device)
         cond = self.condition(batch)
         if cond.null is not None:  # even if the probability is 0, since DDP requires a gradient for every parameter
             cond = cond.drop(torch.rand(len(batch), device=self.device) < self.cond_drop_prob)
         terms = self.process.loss(self.denoiser, batch.x, batch.mask, cond, auxiliary=self.losses)
-        means = {f"train/{name}": value.mean() for name, value in terms.items()}
-        self.log_dict(means, batch_size=len(batch))
-        return means["train/loss"]
+        if (self.trainer.global_step + 1) % self.trainer.log_every_n_steps == 0:  # type: ignore[attr-defined]
+            self.log_dict({f"train/{name}": value.mean() for name, value in terms.items()}, batch_size=len(batch))
+        return terms["loss"].mean()
 
     def validation_step(self, batch: MotionBatch, batch_idx: int) -> None:
         """Accumulates the validation losses. Each clip always gets the same time and noise."""

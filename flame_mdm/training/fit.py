@@ -15,13 +15,13 @@ from hydra.utils import get_class
 from lightning import Callback, Trainer, seed_everything
 from lightning.fabric.plugins.environments.slurm import SLURMEnvironment
 from lightning.fabric.plugins.environments.torchelastic import TorchElasticEnvironment
-from lightning.pytorch.callbacks import EMAWeightAveraging
 
 from flame_mdm.checkpoints.loading import NO_GPU
 from flame_mdm.config import Config, instantiate
 from flame_mdm.data.datamodule import MotionDataModule
 from flame_mdm.errors import UserError, say
 from flame_mdm.task import Task
+from flame_mdm.training.averaging import MovingAverage
 from flame_mdm.training.callbacks import Interrupted, Measurements, Progress, Report
 from flame_mdm.training.guards import AtomicCheckpoints, lost_worker, newest, out_of_memory
 from flame_mdm.training.loggers import History
@@ -50,8 +50,7 @@ def fit(folder: Path, config: Config) -> None:
     task: Task = get_class(config["task"]["_target_"]).build(config, representation, actions=data.actions)
     callbacks: list[Callback] = [Provenance(config)]
     if config["ema"]:
-        # Before the callbacks that use averaged weights in validation. Buffers are copied, not averaged.
-        callbacks.append(EMAWeightAveraging(use_buffers=False, **config["ema"]))
+        callbacks.append(MovingAverage(**config["ema"]))  # before the callbacks that use averaged weights in validation
     callbacks += [instantiate(c) for c in config["callbacks"].values() if c]
     if config["trainer"].get("enable_progress_bar", True):
         callbacks.append(Progress())

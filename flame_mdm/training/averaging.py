@@ -1,0 +1,75 @@
+"""Moving average of the weights."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from lightning import LightningModule, Trainer
+from lightning.pytorch.callbacks import WeightAveraging
+from torch import Tensor
+
+
+class MovingAverage(WeightAveraging):
+    """Exponential moving average of the weights, which replaces them in validation and in the saved model.
+
+    Computes the same as Lightning's `EMAWeightAveraging`, but with one call for all parameters, which are listed once:
+    that class walks through all modules in every step, and on CUDA waits for the device. Buffers are copied, not
+    averaged.
+
+    Args:
+        decay: average = decay * average + (1 - decay) * weights.
+        update_every_n_steps: number of steps between updates.
+        update_starting_at_step: number of steps before the first update, which copies the weights.
+    """
+
+    def __init__(self, decay: float, update_every_n_steps: int = 1, update_starting_at_step: int = 0):
+        super().__init__(use_buffers=False)
+        self.decay = decay
+        self.update_every_n_steps, self.update_starting_at_step = update_every_n_steps, update_starting_at_step
+        self.averages: list[Tensor] = []
+        self.weights: list[Tensor] = []
+        self.begun = False
+
+    def should_update(self, step_idx: int | None = None, epoch_idx: int | None = None) -> bool:
+        """Whether step number `step_idx`, from 0, updates the average."""
+        return (
+            step_idx is not None
+            and step_idx >= self.update_starting_at_step
+            and step_idx % self.update_every_n_steps == 0
+        )
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        assert self._average_model is not None
+        self.averages = [p.detach() for p in self._average_model.module.parameters()]
+        self.weights = [p.detach() for p in pl_module.parameters()]
+        self.begun = int(self._average_model.n_averaged) > 0
+
+    def on_train_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        step = trainer.global_step
+        if step <= self._latest_update_step or not self.should_update(step - 1):
+            return
+        assert self._average_model is not None
+        # A weight of 1 copies exactly.
+        torch._foreach_lerp_(self.averages, self.weights, 1 - self.decay if self.begun else 1.0)
+        self._average_model.n_averaged += 1
+        self._latest_update_step, self.begun = step, True
+
+    def on_validation_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        self._copy_buffers(pl_module)
+        super().on_validation_epoch_start(trainer, pl_module)
+
+    def on_save_checkpoint(self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]) -> None:
+        self._copy_buffers(pl_module)
+        super().on_save_checkpoint(trainer, pl_module, checkpoint)
+
+    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        self._copy_buffers(pl_module)
+        super().on_train_end(trainer, pl_module)
+
+    def _copy_buffers(self, pl_module: LightningModule) -> None:
+        assert self._average_model is not None
+        for average, buffer in zip(self._average_model.module.buffers(), pl_module.buffers(), strict=True):
+            average.copy_(buffer)

@@ -43,6 +43,7 @@ class Attention(nn.Module):
         if num_heads < 1 or features % num_heads:
             raise ValueError(f"latent_dim ({features}) is not a multiple of num_heads ({num_heads})")
         self.num_heads, self.dropout = num_heads, dropout
+        self.attend = functional.scaled_dot_product_attention
         self.qkv = nn.Linear(features, 3 * features)
         self.out = nn.Linear(features, features)
         nn.init.xavier_uniform_(self.qkv.weight)
@@ -59,7 +60,7 @@ class Attention(nn.Module):
             query = functional.linear(x, weight[:size], bias[:size])
             key, value = functional.linear(memory, weight[size:], bias[size:]).chunk(2, -1)
         query, key, value = (y.unflatten(-1, (self.num_heads, -1)).transpose(1, 2) for y in (query, key, value))
-        y = functional.scaled_dot_product_attention(
+        y = self.attend(
             query,
             key,
             value,

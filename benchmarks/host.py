@@ -25,7 +25,7 @@ from flame_mdm.config import compose
 from flame_mdm.training import fit as training
 
 WARM, ROUNDS = 50, 3
-WORDS=sys.argv[2:]
+WORDS = sys.argv[2:]
 TINY = [
     *("data.source.clips=200", "data.batch_size=4", "denoiser.latent_dim=16", "denoiser.ff_size=16"),
     *("denoiser.num_layers=1", "denoiser.num_heads=2", "trainer.accelerator=cpu"),

@@ -31,12 +31,6 @@ class MotionBatch:
     text: list[str] | None = None
     action: Tensor | None = None
 
-    def to(self, device: torch.device) -> MotionBatch:
-        """Returns the batch on a device; copies from pinned memory do not wait for it."""
-        x, mask = (value.to(device, non_blocking=True) for value in (self.x, self.mask))
-        action = None if self.action is None else self.action.to(device, non_blocking=True)
-        return MotionBatch(x, mask, self.ids, self.text, action)
-
     @property
     def lengths(self) -> Tensor:
         """Number of real frames (B,) int64 of each motion."""

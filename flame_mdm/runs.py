@@ -104,6 +104,8 @@ class Checkpoint(Schema):
     parameters: Int | None = None
     prediction: str | None = None
     training_hours: Number | None = None
+    training_speed: str | None = None
+    training_precision: str | None = None
     training_memory_gib: Number | None = None
     edit: dict[str, Plain] = {}
 

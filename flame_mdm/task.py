@@ -77,10 +77,6 @@ class Task(LightningModule):
         prompts = [text for c in self.trainer.callbacks for text in getattr(c, "texts", ())]  # type: ignore[attr-defined]
         return sorted({*data.captions(), *prompts}), data.folder.parent / "text"
 
-    def transfer_batch_to_device(self, batch: MotionBatch, device: torch.device, dataloader_idx: int) -> MotionBatch:
-        """Moves a batch; Lightning would search every caption for tensors."""
-        return batch.to(device)
-
     def configure_optimizers(self) -> torch.optim.Optimizer:
         """Returns the optimizer of the recipe with all trainable parameters."""
         return instantiate(self.optimizer, params=[p for p in self.parameters() if p.requires_grad])

@@ -88,7 +88,7 @@ class _Facts(TypedDict):
     max_frames: int
     dataset: NotRequired[str]  # unknown for released extractors
     fingerprint: NotRequired[str | None]
-    training: NotRequired[dict[str, Number]]
+    training: NotRequired[dict[str, Number | str]]
     vocabulary: NotRequired[list[str]]
     captions: NotRequired[list[str]]
 

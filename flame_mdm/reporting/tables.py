@@ -486,6 +486,8 @@ def _line(row: Mapping[str, Any], found: Sequence[Result | None], values: Sequen
         "replications x motions": most + others,
         "seed": _text(first.seed),
         "device": first.device,
+        "speed of training": _text(checkpoint and checkpoint.training_speed),
+        "precision of training": _text(checkpoint and checkpoint.training_precision),
         "training hours": _text(checkpoint and checkpoint.training_hours),
         "peak memory of training, GiB": _text(checkpoint and checkpoint.training_memory_gib),
         "result": " ".join(dict.fromkeys(file for r, file in zip(found, files, strict=True) if r is not None)),

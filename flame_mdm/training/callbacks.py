@@ -135,7 +135,7 @@ class Measurements(Callback):
     `train/gpu_memory_gib` (peak memory allocated by tensors).
 
     Adds `facts.training` to checkpoints: `hours` of training so far, including validation; `processes`, their number;
-    and `memory_gib`, the peak memory of tensors on CUDA, otherwise of the first process.
+    `speed` and `precision`; and `memory_gib`, the peak memory of tensors on CUDA, otherwise of the first process.
     """
 
     def __init__(self) -> None:
@@ -162,6 +162,8 @@ class Measurements(Callback):
             "hours": self.earlier.get("hours", 0.0) + (time.perf_counter() - self.begin) / 3600,
             "memory_gib": max(self.earlier.get("memory_gib", 0.0), memory),
             "processes": trainer.world_size,
+            "speed": pl_module.config.get("speed", "reference"),
+            "precision": trainer.precision,
         }
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:

@@ -26,6 +26,7 @@ from flame_mdm.training.callbacks import Interrupted, Measurements, Progress, Re
 from flame_mdm.training.guards import AtomicCheckpoints, lost_worker, newest, out_of_memory
 from flame_mdm.training.loggers import History
 from flame_mdm.training.provenance import Provenance
+from flame_mdm.training.speed import accelerate
 
 
 def fit(folder: Path, config: Config) -> None:
@@ -48,6 +49,8 @@ def fit(folder: Path, config: Config) -> None:
     if checkpoint is not None:
         _same_data(checkpoint, data)
     task: Task = get_class(config["task"]["_target_"]).build(config, representation, actions=data.actions)
+    fast = config.get("speed") == "fast"
+    precision = accelerate(task, config) if fast else config["trainer"]["precision"]
     callbacks: list[Callback] = [Provenance(config)]
     if config["ema"]:
         callbacks.append(MovingAverage(**config["ema"]))  # before the callbacks that use averaged weights in validation
@@ -61,7 +64,7 @@ def fit(folder: Path, config: Config) -> None:
         # Lightning would save during a step, to a file that it then prefers to `last.ckpt`.
         plugins.append(SLURMEnvironment(auto_requeue=False))
     trainer: Trainer = instantiate(
-        config["trainer"] | {"enable_progress_bar": False},  # `Progress` instead
+        config["trainer"] | {"precision": precision, "enable_progress_bar": False},  # `Progress` instead
         logger=[*loggers, History(folder, step)],
         callbacks=callbacks,
         plugins=plugins,

@@ -59,7 +59,7 @@ class Provenance(Callback):
         say(*module.counts(module.store))
         if module.pad_multiple > 1:
             say(f"batches: padded to multiples of {module.pad_multiple} frames; {module.padding():.0%} is padding")
-        say(f"device: {facts['device']}, {self.config['trainer']['precision']}")
+        say(f"device: {facts['device']}, {trainer.precision}, speed={self.config.get('speed', 'reference')}")
         if size > self.config["data"]["batch_size"]:
             times = f"{trainer.world_size} processes x {trainer.accumulate_grad_batches} accumulated"
             each, lr = self.config["data"]["batch_size"], self.config["optimizer"].get("lr")

@@ -1,19 +1,64 @@
-"""`speed=fast`: lower precision, cheaper dropout and compilation, each only where it was measured to be faster."""
+"""`speed=fast`: bfloat16, compilation, and cheaper dropout and attention, each where it was measured to be faster."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor, nn
 
+from flame_mdm.config import Config
 from flame_mdm.denoisers.layers import Attention
+from flame_mdm.errors import say
+from flame_mdm.task import MotionGeneration, Task
 
+COMPILED_FROM = 5000
+"""Minimum number of training steps for which the network is compiled, which takes a minute or two."""
 BITS = 16
 
 
-class CheapDropout(nn.Module):
-    """Dropout that takes four decisions from one 64-bit random number; the probability is exact to 2^-17.
+def accelerate(task: Task, config: Config) -> str:
+    """Prepares a task for `speed=fast`, before training; returns the precision of the trainer.
 
-    On a CPU, torch's dropout draws a random number per element with one thread, which takes a fifth of a training step.
+    On CUDA: bfloat16 if the device supports it, and a compiled denoiser in runs of `COMPILED_FROM` steps or more.
+
+    On a CPU: bfloat16 if it has instructions for products in it; `CheapDropout`; attention by `attention`, without
+    dropout of its weights. On two cores of an AMD EPYC (Zen 5), a step of MDM's encoder takes 0.42 times as long at a
+    width of 128, and 0.28 times at 512. Compilation made no difference there.
+
+    A precision other than that of `reference` in the recipe stays.
+    """
+    trainer = config["trainer"]
+    precision: str = trainer["precision"]
+    device = trainer["accelerator"]
+    if device in ("auto", "gpu"):
+        device = "cuda" if torch.cuda.is_available() else "mps" if torch.backends.mps.is_available() else "cpu"
+    if device == "cuda":
+        supported = torch.cuda.is_bf16_supported(including_emulation=False)
+        if isinstance(task, MotionGeneration) and trainer["max_steps"] >= COMPILED_FROM:
+            say("compiling the network: the first steps take a minute or two, and less in later runs")
+            task.denoiser.compile()
+    elif device == "cpu":
+        has = torch.cpu.get_capabilities()
+        supported = has.get("avx512_bf16") or has.get("amx_bf16")
+        _simplify(task)
+    else:
+        supported = False
+    return "bf16-mixed" if supported and precision == "32-true" else precision
+
+
+def _simplify(network: nn.Module) -> None:
+    """Replaces all dropout by `CheapDropout`, and attention by `attention`."""
+    for module in list(network.modules()):
+        if isinstance(module, Attention):
+            module.attend = attention
+        for name, child in module.named_children():
+            if isinstance(child, nn.Dropout):
+                setattr(module, name, CheapDropout(child.p).train(child.training))
+
+
+class CheapDropout(nn.Module):
+    """Dropout that takes four decisions from one 64-bit random number, with a probability rounded to 2^-16.
+
+    On a CPU, torch draws one random number per element in a single thread, which takes a fifth of a training step.
     """
 
     def __init__(self, p: float):
@@ -29,22 +74,14 @@ class CheapDropout(nn.Module):
         return x * keep.to(x.dtype).mul_(1 / (1 - self.p))
 
 
-def attention(query: Tensor, key: Tensor, value: Tensor, attn_mask: Tensor | None, dropout_p: float) -> Tensor:
-    """Computes `scaled_dot_product_attention` without dropout, by two matrix products.
+def attention(
+    query: Tensor, key: Tensor, value: Tensor, attn_mask: Tensor | None = None, dropout_p: float = 0.0
+) -> Tensor:
+    """Computes `scaled_dot_product_attention` by two matrix products; ignores `dropout_p`.
 
-    On a CPU, torch's fused attention takes 1.1 to 2 times as long in float32, and 3 to 5 times in bfloat16.
+    On a CPU, torch's fused attention takes up to twice as long in float32, and 3 to 5 times as long in bfloat16.
     """
     weights = (query * query.shape[-1] ** -0.5) @ key.transpose(-1, -2)
     if attn_mask is not None:
         weights = weights.masked_fill(~attn_mask, torch.finfo(weights.dtype).min)
     return weights.softmax(-1) @ value
-
-
-def cheapen_dropout(network: nn.Module) -> None:
-    """Replaces all dropout by `CheapDropout`, and turns it off for the weights of attention."""
-    for module in list(network.modules()):
-        if isinstance(module, Attention):
-            module.attend = attention
-        for name, child in module.named_children():
-            if isinstance(child, nn.Dropout):
-                setattr(module, name, CheapDropout(child.p))

@@ -1,0 +1,160 @@
+"""`speed=fast`, the moving average, and the cost of a step that does not show in results."""
+
+import math
+from pathlib import Path
+
+import pytest
+import torch
+from conftest import TINY
+from lightning import LightningModule
+from lightning.pytorch.callbacks import EMAWeightAveraging
+from torch import nn
+from torch.nn import functional
+from torch.optim.swa_utils import AveragedModel
+
+from flame_mdm.__main__ import main
+from flame_mdm.checkpoints.files import read_checkpoint
+from flame_mdm.config import compose
+from flame_mdm.denoisers.layers import Transformer
+from flame_mdm.seeds import seed_generator
+from flame_mdm.training import speed
+from flame_mdm.training.averaging import MovingAverage
+from flame_mdm.training.speed import CheapDropout, attention
+
+CPU = torch.device("cpu")
+
+
+@pytest.mark.parametrize("p", [0.1, 0.5, 1e-3])
+def test_cheap_dropout_drops_with_its_probability(p):
+    layer, x = CheapDropout(p), torch.ones(1000, 1001)
+    seed_generator(1, CPU)
+    y = layer(x)
+    dropped = float((y == 0).double().mean())
+    assert abs(dropped - p) < 5 * math.sqrt(p * (1 - p) / x.numel()) + 2**-17
+    torch.testing.assert_close(y[y != 0].unique(), torch.tensor([1 / (1 - p)]))
+
+
+def test_the_decisions_of_cheap_dropout_are_independent():
+    layer = CheapDropout(0.5)
+    seed_generator(2, CPU)
+    keep = (layer(torch.ones(4_000_000)) != 0).double() - 0.5
+    for lag in (1, 2, 3, 4, 5, 8, 1024):  # four neighbors share one random number
+        correlation = float((keep[:-lag] * keep[lag:]).mean() * 4)
+        assert abs(correlation) < 5 / math.sqrt(len(keep)), lag
+    again = layer(torch.ones(4_000_000)) != 0
+    assert abs(float(((again.double() - 0.5) * keep).mean() * 4)) < 5 / math.sqrt(len(keep))
+
+
+def test_cheap_dropout_is_a_function_of_the_seed_and_passes_gradients():
+    layer, x = CheapDropout(0.3), torch.randn(7, 13, requires_grad=True)
+    seed_generator(3, CPU)
+    y = layer(x)
+    seed_generator(3, CPU)
+    assert torch.equal(y, layer(x))
+    y.sum().backward()
+    assert x.grad is not None
+    torch.testing.assert_close(x.grad, torch.where(y == 0, 0.0, 1 / 0.7))
+    assert torch.equal(layer.eval()(x), x)
+    assert layer.train()(x.to(torch.bfloat16)).dtype == torch.bfloat16
+
+
+def test_attention_by_matrix_products_is_the_fused_one():
+    query, key, value = torch.randn(3, 2, 4, 9, 8, dtype=torch.float64)
+    mask = torch.arange(9) < torch.tensor([9, 4])[:, None, None, None]
+    for m in (None, mask):
+        expected = functional.scaled_dot_product_attention(query, key, value, attn_mask=m)
+        torch.testing.assert_close(attention(query, key, value, attn_mask=m), expected)
+
+
+def test_a_simplified_network_computes_the_same_without_dropout():
+    network = Transformer(16, 32, 2, 4, 0.1, cross_attention=True)
+    x, memory, mask = torch.randn(3, 7, 16), torch.randn(3, 5, 16), torch.arange(7) < torch.tensor([[7], [3], [1]])
+    names = list(network.state_dict())
+    expected = network.eval()(x, mask, memory)
+    speed._simplify(network)
+    torch.testing.assert_close(network(x, mask, memory), expected)
+    assert list(network.state_dict()) == names
+    assert not any(isinstance(module, nn.Dropout) for module in network.modules())
+
+
+class Tiny(LightningModule):
+    def __init__(self) -> None:
+        super().__init__()
+        self.layer = nn.Linear(3, 2)
+        self.register_buffer("seen", torch.zeros(1))
+
+
+@pytest.mark.parametrize("options", [{}, {"update_every_n_steps": 2, "update_starting_at_step": 3}])
+def test_the_moving_average_is_that_of_lightning(options):
+    model = Tiny()
+    ours, theirs = MovingAverage(0.9, **options), EMAWeightAveraging(use_buffers=False, decay=0.9, **options)
+
+    class Trainer:
+        global_step = 0
+
+    trainer = Trainer()
+    for callback in (ours, theirs):
+        callback.setup(trainer, model, "fit")  # type: ignore[arg-type]
+    ours.on_train_start(trainer, model)  # type: ignore[arg-type]
+    for step in range(1, 12):
+        trainer.global_step = step
+        for p in model.parameters():
+            p.data.add_(torch.randn_like(p))
+        model.seen += 1
+        for callback in (ours, theirs):
+            for _ in range(2):  # a step of two accumulated batches
+                callback.on_train_batch_end(trainer, model, None, None, 0)  # type: ignore[arg-type]
+    checkpoints = [{"state_dict": model.state_dict()} for _ in range(2)]
+    for callback, checkpoint in zip((ours, theirs), checkpoints, strict=True):
+        callback.on_save_checkpoint(trainer, model, checkpoint)  # type: ignore[arg-type]
+        assert isinstance(callback._average_model, AveragedModel)
+    mine, lightnings = checkpoints
+    assert torch.equal(mine["averaging_state"]["n_averaged"], lightnings["averaging_state"]["n_averaged"])
+    for name, value in lightnings["state_dict"].items():
+        torch.testing.assert_close(mine["state_dict"][name], value)
+    assert float(mine["state_dict"]["seen"]) == 11
+
+
+def train(folder: Path, name: str, *words: str) -> dict[str, torch.Tensor]:
+    run = folder / name
+    shared = [f"data_root={folder / 'data'}", f"run.dir={run}", "callbacks.samples=null"]
+    assert main(["train", "quickstart", *TINY, *shared, *words]) == 0
+    return read_checkpoint(run / "checkpoints" / "last.ckpt")
+
+
+def test_fast_is_reproducible_resumes_exactly_and_is_recorded(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {"avx512_bf16": True})
+    options = ["denoiser.dropout=0.2", "callbacks.checkpoints.every_n_steps=4", "speed=fast"]
+    whole = train(tmp_path, "whole", *options, "trainer.max_steps=8")
+    assert "bf16-mixed, speed=fast" in capsys.readouterr().out
+    train(tmp_path, "parts", *options, "trainer.max_steps=4")
+    parts = train(tmp_path, "parts", *options, "trainer.max_steps=8")
+    assert all(torch.equal(value, parts["state_dict"][name]) for name, value in whole["state_dict"].items())
+    assert whole["facts"]["training"]["speed"] == "fast"
+    assert whole["facts"]["training"]["precision"] == "bf16-mixed"
+    reference = train(tmp_path, "reference", "speed=reference", "trainer.max_steps=8")
+    assert reference["facts"]["training"]["precision"] == "32-true"
+    assert not torch.equal(
+        reference["state_dict"]["denoiser.input.weight"], whole["state_dict"]["denoiser.input.weight"]
+    )
+
+
+@pytest.mark.parametrize(
+    ("has", "precision", "chosen"),
+    [
+        ({"amx_bf16": True}, "32-true", "bf16-mixed"),
+        ({"avx2": True}, "32-true", "32-true"),
+        ({"amx_bf16": True}, "16-mixed", "16-mixed"),
+    ],
+)
+def test_bfloat16_is_chosen_where_the_processor_computes_with_it(has, precision, chosen, monkeypatch):
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: has)
+    config = compose("quickstart", ["trainer.accelerator=cpu", f"trainer.precision={precision}"])
+    assert speed.accelerate(Tiny(), config) == chosen  # type: ignore[arg-type]
+
+
+def test_a_seed_gives_the_numbers_of_torch_manual_seed():
+    torch.manual_seed(5)
+    expected = torch.rand(4)
+    seed_generator(5, CPU)
+    assert torch.equal(torch.rand(4), expected)

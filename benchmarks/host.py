@@ -1,13 +1,14 @@
 """Cost of the framework per training step, compared to bare Lightning: `python benchmarks/host.py [steps]`.
 
 A transformer of one layer and width 16 is trained by the complete framework (loading, averaged weights, clipped
-gradients, checkpoints, progress bar off), so that almost all of the time is spent outside of the network. Bare Lightning
+gradients, checkpoints; progress bar off), so that most of the time is spent outside of the network. Bare Lightning
 trains one linear layer on a constant batch and logs a loss. Both run on one thread, alternate several times, and give
 the median time between the ends of two steps.
 """
 
 from __future__ import annotations
 
+import itertools
 import statistics
 import sys
 import tempfile
@@ -46,7 +47,7 @@ class Clock(Callback):
     def median(self) -> float:
         """Returns the median milliseconds between steps, without the first ones."""
         times = self.times[WARM:]
-        return 1000 * statistics.median(b - a for a, b in zip(times, times[1:], strict=False))
+        return 1000 * statistics.median(b - a for a, b in itertools.pairwise(times))
 
 
 class Bare(LightningModule):

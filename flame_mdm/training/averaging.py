@@ -31,6 +31,11 @@ class MovingAverage(WeightAveraging):
         self.weights: list[Tensor] = []
         self.begun = False
 
+    @property
+    def state_key(self) -> str:
+        """The name of this callback's state in checkpoints: Lightning's, as in earlier versions."""
+        return "EMAWeightAveraging"
+
     def should_update(self, step_idx: int | None = None, epoch_idx: int | None = None) -> bool:
         """Whether step number `step_idx`, from 0, updates the average."""
         return (

@@ -245,7 +245,8 @@ class MotionDataModule(LightningDataModule):
                 f"data.resident=true: {self.folder} and its captions take {size / 2**30:.1f} GiB, but {device} has "
                 f"{free / 2**30:.1f} GiB free. Set data.resident=auto"
             )
-        fits = self.resident is True or (self.resident == "auto" and size <= free / SHARE)
+        automatic = self.resident == "auto" and device.type in ("cpu", "cuda") and size <= free / SHARE
+        fits = self.resident is True or automatic
         self.device = device if fits else None
         return self.device
 

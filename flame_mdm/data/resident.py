@@ -23,11 +23,9 @@ CHUNK = 1 << 16
 
 
 def free_memory(device: torch.device) -> int:
-    """Returns the free memory of a device in bytes; on a CPU, what the system or the container can still provide."""
+    """Returns the free memory of a GPU in bytes; for other devices, what the system or the container can provide."""
     if device.type == "cuda":
         return torch.cuda.mem_get_info(device)[0]
-    if device.type != "cpu":
-        return 0
     try:
         lines = Path("/proc/meminfo").read_text().splitlines()
         free = 1024 * next(int(line.split()[1]) for line in lines if line.startswith("MemAvailable:"))

@@ -14,9 +14,11 @@ from torch.optim.swa_utils import AveragedModel
 
 from flame_mdm.__main__ import main
 from flame_mdm.checkpoints.files import read_checkpoint
-from flame_mdm.config import compose
+from flame_mdm.config import Config, compose, instantiate
+from flame_mdm.data.datamodule import MotionDataModule
 from flame_mdm.denoisers.layers import Transformer
 from flame_mdm.seeds import seed_generator
+from flame_mdm.task import MotionGeneration, Task
 from flame_mdm.training import speed
 from flame_mdm.training.averaging import MovingAverage
 from flame_mdm.training.speed import CheapDropout, attention
@@ -150,7 +152,34 @@ def test_fast_is_reproducible_resumes_exactly_and_is_recorded(tmp_path, monkeypa
 def test_bfloat16_is_chosen_where_the_processor_computes_with_it(has, precision, chosen, monkeypatch):
     monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: has)
     config = compose("quickstart", ["trainer.accelerator=cpu", f"trainer.precision={precision}"])
-    assert speed.accelerate(Tiny(), config) == chosen  # type: ignore[arg-type]
+    assert speed.accelerate(*parts(config), config) == chosen
+
+
+def parts(config: Config) -> tuple[Task, MotionDataModule]:
+    representation = instantiate(config["representation"])
+    return MotionGeneration.build(config, representation), instantiate(config["data"], representation=representation)
+
+
+@pytest.mark.parametrize(
+    ("words", "compiled", "multiple"),
+    [
+        (["trainer.max_steps=5000"], True, 32),
+        (["trainer.max_steps=4999"], False, 1),
+        (["trainer.max_steps=5000", "+denoiser.mask_padding=false"], True, 1),
+    ],
+)
+def test_long_runs_on_cuda_are_compiled_for_few_lengths(words, compiled, multiple, monkeypatch, capsys):
+    for name in ("is_available", "is_bf16_supported"):
+        monkeypatch.setattr(torch.cuda, name, lambda **_: True)
+    options = []
+    monkeypatch.setattr(nn.Module, "compile", lambda self, **chosen: options.append(chosen))
+    config = compose("quickstart", words)
+    task, data = parts(config)
+    assert speed.accelerate(task, data, config) == "bf16-mixed"
+    assert options == [{"dynamic": False}] * compiled
+    assert data.pad_multiple == multiple
+    assert ("compiling the network" in capsys.readouterr().out) == compiled
+    assert any(isinstance(module, nn.Dropout) for module in task.denoiser.modules())
 
 
 def test_a_seed_gives_the_numbers_of_torch_manual_seed():

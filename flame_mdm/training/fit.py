@@ -50,7 +50,7 @@ def fit(folder: Path, config: Config) -> None:
         _same_data(checkpoint, data)
     task: Task = get_class(config["task"]["_target_"]).build(config, representation, actions=data.actions)
     fast = config.get("speed") == "fast"
-    precision = accelerate(task, config) if fast else config["trainer"]["precision"]
+    precision = accelerate(task, data, config) if fast else config["trainer"]["precision"]
     callbacks: list[Callback] = [Provenance(config)]
     if config["ema"]:
         callbacks.append(MovingAverage(**config["ema"]))  # before the callbacks that use averaged weights in validation

@@ -28,10 +28,6 @@ MINE = "make train EXP=quickstart denoiser=mine"
 NOT_COMPOSED = {
     "README.md": [OPEN, MINE],
     "adding.md": [MINE, "make prepare DATA=my_set SOURCE=/path"],
-    "clusters.md": [
-        "make train EXP=humanml3d/mdm launch=slurm trainer.devices=4 trainer.num_nodes=2 hydra.launcher.partition=gpu",
-        "make train EXP=humanml3d/mdm launch=slurm seed=0,1,2 optimizer.lr=1e-4,2e-4",
-    ],
     "data.md": ["make evaluate baseline=real data=bandai data.source.mirror=false ..."],
     "evaluation.md": [f"make train EXP={folder}/..." for folder in ("motion_clip", "t2m", "classifier")],
     "first-problems.md": ["make prepare DATA=... SOURCE=/path/to/what/you/downloaded", OPEN],
@@ -39,7 +35,7 @@ NOT_COMPOSED = {
     "tables.md": ["make train EXP=..."],
 }
 """Commands of each page that are not composed: they name a part that the reader writes (mine, my_set), or leave a name
-open (...). Those of clusters.md wait until launchers are found for recipes in a folder."""
+open (...)."""
 TARGETS = {"setup", "test", "test-fast", "test-tools", "lint", "bench", "docs", "help"}
 
 

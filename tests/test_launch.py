@@ -92,12 +92,13 @@ def test_a_slurm_job_that_runs_out_of_time_is_requeued_and_ends_as_if_it_had_not
 
 
 @pytest.mark.slow
-def test_jobs_of_a_sweep_run_beside_one_another_in_folders_of_their_own(tiny, tmp_path):
+@pytest.mark.parametrize("recipe", ["quickstart", "synthetic/mdm"])
+def test_jobs_of_a_sweep_run_beside_one_another_in_folders_of_their_own(recipe, tiny, tmp_path):
     """On this machine; the first one is refused, as its folder holds another run."""
     words = [*tiny, "callbacks.samples=null", "callbacks.best=null", "trainer.max_steps=1"]
     (tmp_path / "run" / "seed=1").mkdir(parents=True)
     (tmp_path / "run" / "seed=1" / "config.yaml").write_text("seed: 5\n")
-    code, out, err = finish(spawn(["flame_mdm", "train", "quickstart", *words, "seed=1,2", "launch=local"]))
+    code, out, err = finish(spawn(["flame_mdm", "train", recipe, *words, "seed=1,2", "launch=local"]))
     assert code == 1, out + err
     assert str(tmp_path / "run" / ".submitit") in out
     logs = "\n".join(path.read_text() for path in (tmp_path / "run" / ".submitit").rglob("*log.err"))
@@ -125,6 +126,12 @@ def test_what_is_wrong_is_told_before_anything_is_submitted(words, message, tiny
     assert message in told
     assert told.count("\n") == 1
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("launcher", ["local", "slurm"])
+@pytest.mark.parametrize("recipe", ["humanml3d/mdm", "motion_clip/synthetic"])
+def test_launchers_are_found_for_recipes_in_folders(recipe, launcher):
+    assert compose(recipe, [f"launch={launcher}"]) == compose(recipe)
 
 
 def test_a_missing_launcher_names_the_extra(monkeypatch):

@@ -148,7 +148,8 @@ def find_recipe(name: str) -> Recipe:
         return Recipe(path.parent, path.stem, saved, None if saved else path.stem)
     if name not in recipes():
         raise UserError(f"unknown experiment '{name}'.{did_you_mean(name, recipes())} `make help` lists them all")
-    return Recipe(EXPERIMENTS, name, experiment=name)
+    path = EXPERIMENTS / name
+    return Recipe(path.parent, path.name, experiment=name)  # Hydra looks up `launch` relative to the recipe
 
 
 def parse(overrides: Sequence[str]) -> list[Override]:

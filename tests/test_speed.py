@@ -2,6 +2,7 @@
 
 import math
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -18,7 +19,7 @@ from flame_mdm.config import Config, compose, instantiate
 from flame_mdm.data.datamodule import MotionDataModule
 from flame_mdm.denoisers.layers import Transformer
 from flame_mdm.seeds import seed_generator
-from flame_mdm.task import MotionGeneration, Task
+from flame_mdm.task import MotionGeneration
 from flame_mdm.training import speed
 from flame_mdm.training.averaging import MovingAverage
 from flame_mdm.training.speed import CheapDropout, attention
@@ -102,7 +103,7 @@ def test_the_moving_average_is_that_of_lightning(options):
         trainer.global_step = step
         for p in model.parameters():
             p.data.add_(torch.randn_like(p))
-        model.seen += 1
+        model.get_buffer("seen").add_(1)
         for callback in (ours, theirs):
             for _ in range(2):  # a step of two accumulated batches
                 callback.on_train_batch_end(trainer, model, None, None, 0)  # type: ignore[arg-type]
@@ -117,7 +118,7 @@ def test_the_moving_average_is_that_of_lightning(options):
     assert float(mine["state_dict"]["seen"]) == 11
 
 
-def train(folder: Path, name: str, *words: str) -> dict[str, torch.Tensor]:
+def train(folder: Path, name: str, *words: str) -> dict[str, Any]:
     run = folder / name
     shared = [f"data_root={folder / 'data'}", f"run.dir={run}", "callbacks.samples=null"]
     assert main(["train", "quickstart", *TINY, *shared, *words]) == 0
@@ -155,7 +156,7 @@ def test_bfloat16_is_chosen_where_the_processor_computes_with_it(has, precision,
     assert speed.accelerate(*parts(config), config) == chosen
 
 
-def parts(config: Config) -> tuple[Task, MotionDataModule]:
+def parts(config: Config) -> tuple[MotionGeneration, MotionDataModule]:
     representation = instantiate(config["representation"])
     return MotionGeneration.build(config, representation), instantiate(config["data"], representation=representation)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import torch
 from torch import Tensor, nn
@@ -43,7 +44,7 @@ class Attention(nn.Module):
         if num_heads < 1 or features % num_heads:
             raise ValueError(f"latent_dim ({features}) is not a multiple of num_heads ({num_heads})")
         self.num_heads, self.dropout = num_heads, dropout
-        self.attend = functional.scaled_dot_product_attention
+        self.attend: Callable[..., Tensor] = functional.scaled_dot_product_attention
         self.qkv = nn.Linear(features, 3 * features)
         self.out = nn.Linear(features, features)
         nn.init.xavier_uniform_(self.qkv.weight)

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-import torch
 from lightning import LightningModule, Trainer
 from lightning.pytorch.callbacks import WeightAveraging
 from torch import Tensor
+from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 
 class MovingAverage(WeightAveraging):
@@ -25,7 +25,7 @@ class MovingAverage(WeightAveraging):
 
     def __init__(self, decay: float, update_every_n_steps: int = 1, update_starting_at_step: int = 0):
         super().__init__(use_buffers=False)
-        self.decay = decay
+        self.average = get_ema_multi_avg_fn(decay)
         self.update_every_n_steps, self.update_starting_at_step = update_every_n_steps, update_starting_at_step
         self.averages: list[Tensor] = []
         self.weights: list[Tensor] = []
@@ -57,8 +57,11 @@ class MovingAverage(WeightAveraging):
         if step <= self._latest_update_step or not self.should_update(step - 1):
             return
         assert self._average_model is not None
-        # A weight of 1 copies exactly.
-        torch._foreach_lerp_(self.averages, self.weights, 1 - self.decay if self.begun else 1.0)
+        if self.begun:
+            self.average(self.averages, self.weights, None)
+        else:
+            for average, weight in zip(self.averages, self.weights, strict=True):
+                average.copy_(weight)
         self._average_model.n_averaged += 1
         self._latest_update_step, self.begun = step, True
 

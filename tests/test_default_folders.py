@@ -25,6 +25,12 @@ def folder(
     return default_folder(model, digest, what, seed, options).as_posix()
 
 
+def test_prompts_share_no_folder_even_if_the_file_system_ignores_case():
+    texts = ["a person walks", "A person walks", "a Person walks", "a person-walks", "a person  walks", "a person_walks"]
+    texts += ["a perſon walks", "A PERSON WALKS", "straße", "strasse"]
+    assert len({folder("a", text).casefold() for text in texts}) == len(texts)
+
+
 def test_other_options_are_another_folder():
     assert folder("humanml3d/mdm") == "samples/humanml3d/mdm/default-step3000-f00d/a-person-walks-seed0"
     assert (

@@ -127,8 +127,9 @@ def read_prompts(path: str, key: str = "prompts") -> list[str]:
 def default_folder(model: MotionGeneration, digest: str, what: str, seed: int, options: Mapping[str, Any]) -> Path:
     """Returns `samples/<experiment>/<run>-step<steps>-<hash>/<what>-seed<seed>`, followed by all options not None.
 
-    Requests for different motions, and checkpoints with another `digest` (SHA-256), thus go to different folders. A
-    text that is not readable as a file name is followed by its hash. The names of experiment and run come from the
+    Requests for different motions, and checkpoints with another `digest` (SHA-256), thus go to different folders, also
+    where the file system ignores case. A text that differs from its readable file name, even by an upper-case letter, is
+    followed by its hash. The names of experiment and run come from the
     checkpoint, which may be untrusted; they are cleaned, so the folder is always within `samples`.
     """
     run = model.config.get("run")
@@ -136,7 +137,7 @@ def default_folder(model: MotionGeneration, digest: str, what: str, seed: int, o
     parts = [_clean(str(name or "model")), f"step{model.steps}" if model.steps is not None else "", digest[:6]]
     experiment = re.findall(r"[\w-][\w.-]*", str(model.config["experiment"]))
     short = _clean(what.lower())[:60]
-    if short != what.lower().replace(" ", "-"):
+    if short.replace("-", " ") != what or not what.isascii():  # file systems also fold other letters, such as ſ and s
         short = f"{short}-{hashlib.sha256(what.encode()).hexdigest()[:6]}".strip("-")
     values = {key: re.sub(r"[^\w.,-]+", "", str(value)) for key, value in options.items() if value is not None}
     suffix = "".join(f"-{key}={value}" for key, value in values.items())[:150]

@@ -71,7 +71,8 @@ def generate(
         sampling: options of `flame_mdm.motion.Sampling`, instead of the recipe's.
 
     Raises:
-        UserError: a text is empty or too long, an action is unknown, or the model was not trained for the length.
+        UserError: a text is not a string, empty or too long, an action is unknown, or the model was not trained for the
+            length.
     """
     steps, scale = sampling.get("num_inference_steps"), sampling.get("guidance_scale")
     for name, value, most in (("samples", samples, MAX_SAMPLES), ("num_inference_steps", steps, None)):
@@ -82,10 +83,13 @@ def generate(
     texts = [texts] if isinstance(texts, str) else texts
     actions = [actions] if isinstance(actions, str) else actions
     kind = "text" if texts is not None else "action" if actions is not None else "none"
+    requested = list(texts or actions or [""])
+    for value in requested:
+        if not isinstance(value, str):
+            raise UserError(f"{kind}={value!r} is not a string. Give a string, such as {kind}='walk'")
     if kind not in ("none", model.conditioned_on):
         trained, instead = TRAINED_ON[model.conditioned_on]
-        raise UserError(f"{kind}={shortened((texts or actions or [''])[0], 60)}: this model {trained}. Give {instead}")
-    requested = list(texts or actions or [""])
+        raise UserError(f"{kind}={shortened(requested[0], 60)}: this model {trained}. Give {instead}")
     if texts is not None and not all(text.strip() for text in requested):
         raise UserError("empty text. Omit the text to sample without condition")
     for text in requested:

@@ -209,6 +209,13 @@ def test_what_cannot_be_edited_is_refused_in_one_line(
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize("value", [3, None, b"walk"])
+def test_a_text_that_is_no_string_is_named(model: MotionGeneration, value: Any):
+    for kind in ("texts", "actions"):
+        with pytest.raises(UserError, match=rf"^{kind[:-1]}={value!r} is not a string\. Give a string"):
+            flame_mdm.generate(model, **{kind: ["walk", value]})
+
+
 def test_no_text_is_not_an_unconditioned_motion(model: MotionGeneration):
     with pytest.raises(UserError, match="empty text"):
         flame_mdm.generate(model, [])

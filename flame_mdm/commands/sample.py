@@ -137,7 +137,9 @@ def default_folder(model: MotionGeneration, digest: str, what: str, seed: int, o
     parts = [_clean(str(name or "model")), f"step{model.steps}" if model.steps is not None else "", digest[:6]]
     experiment = re.findall(r"[\w-][\w.-]*", str(model.config["experiment"]))
     short = _clean(what.lower())[:60]
-    if short.replace("-", " ") != what or not what.isascii():  # file systems also fold other letters, such as ſ and s
+    if (
+        short.replace("-", " ") != what or not what.isascii()
+    ):  # file systems also fold other letters, such as the long s
         short = f"{short}-{hashlib.sha256(what.encode()).hexdigest()[:6]}".strip("-")
     values = {key: re.sub(r"[^\w.,-]+", "", str(value)) for key, value in options.items() if value is not None}
     suffix = "".join(f"-{key}={value}" for key, value in values.items())[:150]

@@ -128,7 +128,7 @@ def default_folder(model: MotionGeneration, digest: str, what: str, seed: int, o
     """Returns `samples/<experiment>/<run>-step<steps>-<hash>/<what>-seed<seed>`, followed by all options not None.
 
     Requests for different motions, and checkpoints with another `digest` (SHA-256), thus go to different folders, also
-    where the file system ignores case. A text that differs from its readable file name, even by an upper-case letter, is
+    where the file system ignores case. A text that differs from its readable file name, even in case, is
     followed by its hash. The names of experiment and run come from the
     checkpoint, which may be untrusted; they are cleaned, so the folder is always within `samples`.
     """

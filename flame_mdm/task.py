@@ -212,7 +212,8 @@ class MotionGeneration(Task):
         if cond.null is not None:  # even if the probability is 0, since DDP requires a gradient for every parameter
             cond = cond.drop(torch.rand(len(batch), device=self.device) < self.cond_drop_prob)
         terms = self.process.loss(self.denoiser, batch.x, batch.mask, cond, auxiliary=self.losses)
-        if (self.trainer.global_step + 1) % self.trainer.log_every_n_steps == 0:  # type: ignore[attr-defined]
+        trainer = self._trainer  # None where a step is computed without one
+        if trainer is not None and (trainer.global_step + 1) % trainer.log_every_n_steps == 0:  # type: ignore[attr-defined]
             self.log_dict({f"train/{name}": value.mean() for name, value in terms.items()}, batch_size=len(batch))
         return terms["loss"].mean()
 

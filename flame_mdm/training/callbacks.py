@@ -162,7 +162,7 @@ class Measurements(Callback):
             "hours": self.earlier.get("hours", 0.0) + (time.perf_counter() - self.begin) / 3600,
             "memory_gib": max(self.earlier.get("memory_gib", 0.0), memory),
             "processes": trainer.world_size,
-            "speed": pl_module.config.get("speed", "reference"),
+            "speed": pl_module.config.get("run", {}).get("speed", "reference"),
             "precision": trainer.precision,
         }
 

@@ -49,7 +49,7 @@ def fit(folder: Path, config: Config) -> None:
     if checkpoint is not None:
         _same_data(checkpoint, data)
     task: Task = get_class(config["task"]["_target_"]).build(config, representation, actions=data.actions)
-    fast = config.get("speed") == "fast"
+    fast = config["run"].get("speed") == "fast"
     precision = accelerate(task, data, config) if fast else config["trainer"]["precision"]
     callbacks: list[Callback] = [Provenance(config)]
     if config["ema"]:

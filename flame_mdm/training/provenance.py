@@ -59,7 +59,8 @@ class Provenance(Callback):
         say(*module.counts(module.store))
         if module.pad_multiple > 1:
             say(f"batches: padded to multiples of {module.pad_multiple} frames; {module.padding():.0%} is padding")
-        say(f"device: {facts['device']}, {trainer.precision}, speed={self.config.get('speed', 'reference')}")
+        speed = self.config["run"].get("speed", "reference")
+        say(f"device: {facts['device']}, {trainer.precision}, speed={speed}")
         if size > self.config["data"]["batch_size"]:
             times = f"{trainer.world_size} processes x {trainer.accumulate_grad_batches} accumulated"
             each, lr = self.config["data"]["batch_size"], self.config["optimizer"].get("lr")

@@ -47,9 +47,8 @@ lint: $(READY) ## check style and types
 	@$(VENV)/bin/ruff format --check .
 	@$(VENV)/bin/pyright
 
-bench: $(READY) ## measure speed, as ratios within one run
-	@for name in features loading text sampling evaluation startup ddp; do \
-		echo "== $$name"; $(VENV)/bin/python benchmarks/$$name.py || exit 1; done
+bench: $(READY) ## measure speed, write docs/benchmarks/speed.md; ONLY=host,steps repeats some, DEVICE=cuda adds a GPU
+	@$(VENV)/bin/python benchmarks/run.py "only=$(ONLY)" "device=$(DEVICE)"
 
 docs: $(READY) ## regenerate docs/recipes.md and docs/hyperparameters.md from the recipes
 	@$(VENV)/bin/python docs/generate.py

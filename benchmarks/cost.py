@@ -42,13 +42,16 @@ def training_step(task: Task, batch: MotionBatch) -> Tensor:
     return task.network(batch.x, batch.mask).square().mean()  # type: ignore[operator]
 
 
-def cost(config: dict[str, Any]) -> tuple[float, float, int]:
-    """Returns the floating-point operations and bytes of a training step, and the trainable parameters."""
+def cost(config: dict[str, Any], rows: int = 0, frames: int = 0) -> tuple[float, float, int]:
+    """Returns the floating-point operations and bytes of a training step, and the trainable parameters.
+
+    The batch has `rows` motions of `frames` frames; by default (0), those of the recipe, at their maximum length.
+    """
     crop = instantiate(config["data"]["crop"])
     with torch.device("meta"):
         representation = instantiate(config["representation"])
         task = get_class(config["task"]["_target_"]).build(config, representation, actions=["walk", "run"])
-        rows, frames = config["data"]["batch_size"], crop.longest()
+        rows, frames = rows or config["data"]["batch_size"], frames or crop.longest()
         mask = torch.ones(rows, frames, dtype=torch.bool)
         batch = MotionBatch(torch.zeros(rows, frames, representation.features), mask, [str(i) for i in range(rows)])
         kept: dict[int, torch.UntypedStorage] = {}
@@ -68,6 +71,11 @@ def cost(config: dict[str, Any]) -> tuple[float, float, int]:
     return counter.get_total_flops(), 4 * copies * parameters + sum(s.nbytes() for s in kept.values()), parameters
 
 
+def hours(operations: float, steps: int, rate: float) -> float:
+    """Returns the hours of `steps` steps at `rate` floating-point operations per second."""
+    return operations * steps / rate / 3600
+
+
 def main() -> None:
     """Prints a row per recipe."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -81,10 +89,10 @@ def main() -> None:
         operations, size, parameters = cost(config)
         steps, rows = config["trainer"]["max_steps"], config["data"]["batch_size"]
         calls = config["task"].get("num_inference_steps", 0) * (1 + (config["task"].get("guidance_scale") != 1))
-        hours = operations * steps / options.tflops / 1e12 / 3600
+        duration = hours(operations, steps, 1e12 * options.tflops)
         print(
             f"| `{name}` | {parameters / 1e6:.1f} | {rows} | {steps:,} | "
-            f"{operations / 1e12:.2f} | {size / 2**30:.1f} | {hours:.0f} | {operations / 3e12 / rows * calls:.2f} |"
+            f"{operations / 1e12:.2f} | {size / 2**30:.1f} | {duration:.0f} | {operations / 3e12 / rows * calls:.2f} |"
         )
 
 

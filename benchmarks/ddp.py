@@ -13,6 +13,8 @@ import sys
 import tempfile
 from pathlib import Path
 
+from sections import Section, section, show
+
 STEPS, WARM = 50, 10
 SMALL = [
     *("data.source.clips=60", "denoiser.latent_dim=128", "denoiser.ff_size=256", "denoiser.num_layers=4"),
@@ -60,17 +62,28 @@ def step_seconds(folder: Path, processes: int, run: int) -> float:
     return statistics.median(json.loads((folder / "steps.json").read_text()))
 
 
-def main(runs: int) -> None:
-    """Prints the medians over alternating runs, and their ratio."""
+def measure(*words: str) -> Section:
+    """Measures with the number of runs in `words`."""
+    runs = int(words[0]) if words else 2
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         (folder / "clock.py").write_text(CLOCK)
         pairs = [(step_seconds(folder, 1, run), step_seconds(folder, 2, run)) for run in range(runs)]
     one, two = (statistics.median(values) for values in zip(*pairs, strict=True))
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    print(f"{cores} cores; milliseconds per step of 16 clips: one process {1000 * one:.1f}, two {1000 * two:.1f}")
-    print(f"ratio {statistics.median(two / one for one, two in pairs):.2f}")
+    ratio = statistics.median(two / one for one, two in pairs)
+    return section(
+        "Two processes",
+        "The same batches of 16 clips, by one process and by two with 8 clips each (DDP, gloo), one thread per "
+        f"process, on {cores} cores. With one core per process, the ideal ratio is 0.5. Median of {runs} "
+        "alternating runs.",
+        f"Two processes take {ratio:.2f} times the time of one for the same batch.",
+        steps=[
+            {"processes": "one", "ms per step": 1000 * one, "ratio": 1},
+            {"processes": "two", "ms per step": 1000 * two, "ratio": ratio},
+        ],
+    )
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]) if len(sys.argv) > 1 else 2)
+    show(measure(*sys.argv[1:]))

@@ -8,6 +8,7 @@ clips. What is left is the cost of the evaluation itself: reading and decoding m
 import argparse
 import cProfile
 import pstats
+import sys
 import time
 from collections.abc import Sequence
 from types import SimpleNamespace
@@ -15,6 +16,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from sections import Section, section, show
 from torch import Tensor
 
 from evaluators.extractors import Extractor
@@ -81,13 +83,13 @@ def random_clips(count: int) -> Clips:
     return Clips(store, "test", representation=representation, crop=Units(), seed=0)
 
 
-def main() -> None:
-    """Prints seconds per replication, and an estimate for the whole protocol."""
+def measure(*words: str) -> Section:
+    """Measures seconds per replication, and estimates those of the whole protocol."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--clips", type=int, default=4600)
     parser.add_argument("--protocol", default="text_to_motion_t2m")
     parser.add_argument("--profile", action="store_true")
-    args = parser.parse_args()
+    args = parser.parse_args(words)
     torch.manual_seed(0)
     clips = random_clips(args.clips)
     extractor = Stub([caption for clip in clips.clips for caption in clip.captions])
@@ -109,12 +111,18 @@ def main() -> None:
     protocol = load_protocol(args.protocol, clips.representation)
     again = protocol.multimodality["replications"] if protocol.multimodality else 0
     total = once * protocol.replications + several * again
-    print(f"{args.protocol}, {args.clips} motions, {torch.get_num_threads()} threads, without networks")
-    print(f"{once:.2f} s per replication, {several:.2f} s per replication of multimodality")
-    print(f"{total:.0f} s for {protocol.replications} and {again} replications")
     if args.profile:
         pstats.Stats(profile).sort_stats("tottime").print_stats(40)
+    rows = {"replication": once, "replication of multimodality": several, "whole protocol, estimated": total}
+    return section(
+        "Evaluation",
+        f"`{args.protocol}` with {args.clips:,} motions of HumanML3D's lengths, {protocol.replications} replications "
+        f"and {again} of multimodality, without networks: reading and decoding of motions, and metrics. "
+        f"{torch.get_num_threads()} threads.",
+        f"An evaluation of the size of HumanML3D takes {total / 60:.1f} minutes plus the networks.",
+        protocol=[{"part": k, "seconds": v, "ratio": v / once} for k, v in rows.items()],
+    )
 
 
 if __name__ == "__main__":
-    main()
+    show(measure(*sys.argv[1:]))

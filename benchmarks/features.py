@@ -1,21 +1,23 @@
 """Speed of HumanML3D's features on one core, compared to a loop over frames and joints.
 
-Run with `python benchmarks/features.py`.
+Run with `python benchmarks/features.py [rounds]`.
 """
 
 import statistics
+import sys
 import time
 from collections.abc import Callable
 
 import numpy as np
 import torch
+from sections import Section, section, show
 from torch import Tensor
 
 from flame_mdm.representations import rotation
 from flame_mdm.representations.humanml import HumanML
 from flame_mdm.representations.skeleton import SMPL22, forward_kinematics
 
-FRAMES, CLIPS, RUNS = 90, 16, 15
+FRAMES, CLIPS = 90, 16
 
 
 def motion(seed: int) -> Tensor:
@@ -54,18 +56,20 @@ def loop(joints: np.ndarray, heading: np.ndarray) -> np.ndarray:
     return np.array(rows)
 
 
-def rate(run: Callable[[], object], frames: int) -> float:
+def rate(run: Callable[[], object], frames: int, rounds: int) -> float:
     """Returns the median frames per second of processor time, which excludes other programs on the machine."""
     run()
     seconds = []
-    for _ in range(RUNS):
+    for _ in range(rounds):
         start = time.process_time()
         run()
         seconds.append(time.process_time() - start)
     return frames / statistics.median(seconds)
 
 
-def main() -> None:
+def measure(*words: str) -> Section:
+    """Measures with the number of rounds in `words`."""
+    rounds = int(words[0]) if words else 15
     torch.set_num_threads(1)
     motions = [motion(seed) for seed in range(CLIPS)]
     clean = HumanML()
@@ -76,19 +80,24 @@ def main() -> None:
     if difference > 1e-5:
         raise SystemExit(f"the features of the loop and of the representation differ by {difference:.1e}")
     features = torch.stack(clean.encode_many(motions))
-    rates = {
-        "encode, loop over frames and joints": rate(lambda: loop(joints.numpy(), heading), FRAMES),
-        "encode clean, one clip": rate(lambda: clean.encode(motions[0]), FRAMES),
-        f"encode clean, {CLIPS} clips": rate(lambda: clean.encode_many(motions), CLIPS * FRAMES),
-        "encode legacy, one clip": rate(lambda: legacy.encode(motions[0]), FRAMES),
-        f"encode legacy, {CLIPS} clips": rate(lambda: legacy.encode_many(motions), CLIPS * FRAMES),
-        f"decode, {CLIPS} clips": rate(lambda: clean.decode(features), CLIPS * FRAMES),
+    runs: dict[str, tuple[Callable[[], object], int]] = {
+        "encode, loop over frames and joints": (lambda: loop(joints.numpy(), heading), FRAMES),
+        "encode clean, one clip": (lambda: clean.encode(motions[0]), FRAMES),
+        f"encode clean, {CLIPS} clips": (lambda: clean.encode_many(motions), CLIPS * FRAMES),
+        "encode legacy, one clip": (lambda: legacy.encode(motions[0]), FRAMES),
+        f"encode legacy, {CLIPS} clips": (lambda: legacy.encode_many(motions), CLIPS * FRAMES),
+        f"decode, {CLIPS} clips": (lambda: clean.decode(features), CLIPS * FRAMES),
     }
-    loop_rate = next(iter(rates.values()))
-    print(f"{FRAMES} frames per clip, one core, median of {RUNS} runs")
-    for name, value in rates.items():
-        print(f"{name:<40}{value:>12,.0f} frames/s{value / loop_rate:>10,.1f}x")
+    rates = {name: rate(run, frames, rounds) for name, (run, frames) in runs.items()}
+    slow, _, fast, *_ = rates.values()
+    return section(
+        "HumanML3D's features",
+        f"Joint positions to 263 features and back, {FRAMES} frames per clip, one core, median of {rounds} rounds of "
+        "processor time, compared to a loop over frames and joints in NumPy.",
+        f"Features of {CLIPS} clips are computed {fast / slow:.0f} times as fast as in a loop over frames and joints.",
+        features=[{"what": k, "frames per second": v, "ratio": v / slow} for k, v in rates.items()],
+    )
 
 
 if __name__ == "__main__":
-    main()
+    show(measure(*sys.argv[1:]))

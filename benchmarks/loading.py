@@ -3,7 +3,7 @@
 A synthetic data set is packed into a temporary folder. Batches gathered from memory (data.resident=true), batches of
 the data loader in the training process, and forward, backward and update of the small MDM encoder are measured in
 processor time of one core, which excludes other programs on the machine. Loading with workers is measured in wall time,
-which includes passing batches between processes and the load of the machine. Prints medians over the rounds.
+which includes passing batches between processes and the load of the machine. Gives medians over the rounds.
 """
 
 import itertools
@@ -15,6 +15,7 @@ from collections.abc import Callable
 from functools import partial
 
 import torch
+from sections import Row, Section, section, show
 
 from flame_mdm.data.crops import Units
 from flame_mdm.data.datamodule import MotionDataModule
@@ -55,7 +56,9 @@ def median(run: Callable[[], object], times: int, clock: Callable[[], float]) ->
     return statistics.median(seconds)
 
 
-def main(clips: int) -> None:
+def measure(*words: str) -> Section:
+    """Measures with the number of clips in `words`."""
+    clips = int(words[0]) if words else 1000
     torch.manual_seed(0)
     torch.set_num_threads(1)
     with tempfile.TemporaryDirectory() as folder:
@@ -77,14 +80,8 @@ def main(clips: int) -> None:
         gather = median(lambda: next(gathered), BATCHES, time.process_time)
         lengths = torch.cat([batch.lengths for batch in batches]).float().mean()
         frames = statistics.mean(batch.x.shape[1] for batch in batches)
-        print(
-            f"{BATCH} clips per batch, {lengths:.0f} frames of {batches[0].x.shape[2]} features, padded to {frames:.0f}"
-        )
-        print(f"a training step takes {1000 * wait:.0f} ms of one core")
-        print(f"its batch: {gather / wait:.1%} of that if gathered from memory, {load / wait:.1%} if loaded")
-        print(f"{'loader':<26}{'ms/batch':>12}{'batches/s':>12}{'clips/s':>10}{'vs. target':>13}")
-        row("resident, one core", gather, 1)
-        row("loader, one core", load, 1)
+        rows = [row("resident, one core", gather, wait, 1), row("loader, one core", load, wait, 1)]
+        size = batches[0].x.shape[2]
         data.resident = False
         data.setup("fit")
         for workers in (1, 2):
@@ -92,15 +89,32 @@ def main(clips: int) -> None:
             loader = iter(data.train_dataloader())
             for _ in range(BATCHES):  # starts the workers
                 next(loader)
-            load = median(partial(next, loader), BATCHES, time.perf_counter)
-            row(f"loader, {workers} worker{'s' * (workers > 1)}, wall", load, workers)
+            taken = median(partial(next, loader), BATCHES, time.perf_counter)
+            rows.append(row(f"loader, {workers} worker{'s' * (workers > 1)}, wall time", taken, wait, workers))
+
+    return section(
+        "Loading of batches",
+        f"{BATCH} clips per batch, {lengths:.0f} frames of {size} features on average, padded to {frames:.0f}. "
+        "Resident batches (`data.resident=true`) are gathered from memory; the loader collates clips, in the training "
+        f"process or in workers. A training step of the small MDM encoder takes {1000 * wait:.0f} ms of one core. The "
+        f"target is {GOAL:,} clips per second and worker. Median of {ROUNDS} rounds of {BATCHES} batches.",
+        f"A resident batch is ready {load / gather:.1f} times as fast as one of the loader, and takes "
+        f"{gather / wait:.1%} of the time of a small training step.",
+        batches=rows,
+    )
 
 
-def row(name: str, seconds: float, workers: int) -> None:
-    """Prints the speed of one loader and its ratio to the target."""
+def row(name: str, seconds: float, step: float, workers: int) -> Row:
+    """Returns the speed of one loader, and its ratios to a training step and to the target."""
     rate = BATCH / seconds
-    print(f"{name:<26}{1000 * seconds:>12.2f}{1 / seconds:>12.1f}{rate:>10,.0f}{rate / workers / GOAL:>12.2f}x")
+    return {
+        "batches": name,
+        "ms per batch": 1000 * seconds,
+        "share of a step": f"{seconds / step:.1%}",
+        "clips per second": rate,
+        "ratio to the target": rate / workers / GOAL,
+    }
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]) if len(sys.argv) > 1 else 1000)
+    show(measure(*sys.argv[1:]))

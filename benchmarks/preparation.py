@@ -1,7 +1,7 @@
 """Speed and memory of `make prepare` at several sizes: `python benchmarks/preparation.py [frames ...]`.
 
 For each size, a fresh process prepares synthetic clips of about 51 frames in a temporary folder (1.1 KB of disk per
-frame), with one worker per core. Prints the maximum resident memory of the process and of its largest worker, of each
+frame), with one worker per core. Gives the maximum resident memory of the process and of its largest worker, of each
 the part that is not shared with other processes (sampled), and by how many bytes the process grows per frame.
 """
 
@@ -14,6 +14,7 @@ import threading
 import time
 from pathlib import Path
 
+from sections import Row, Section, section, show
 from tqdm import tqdm
 
 FRAMES_PER_CLIP = 51
@@ -29,7 +30,7 @@ def private(process: int) -> int:
     return 1024 * sum(int(line.split()[1]) for line in lines if line.startswith("Private_"))
 
 
-def measure(clips: int) -> None:
+def prepare(clips: int) -> None:
     """Prepares clips and prints frames, seconds, and bytes: resident and private, of this process and of a worker."""
     from flame_mdm.data.store import write_store
     from flame_mdm.data.synthetic import Synthetic
@@ -55,25 +56,33 @@ def measure(clips: int) -> None:
     print(frames, seconds, *resident, *peaks)
 
 
-def main(sizes: list[int]) -> None:
-    print(f"{'frames':>10}{'clips':>8}{'seconds':>9}{'frames/s':>10}{'clips/s':>9}{'main, MiB':>16}{'worker, MiB':>16}")
-    print(f"{'':>46}{'max':>8}{'private':>8}{'max':>8}{'private':>8}")
-    points = []
-    for size in sizes:
+def measure(*words: str) -> Section:
+    """Measures the numbers of frames in `words`."""
+    rows: list[Row] = []
+    points, rates = [], []
+    for size in [int(word) for word in words] or [250_000, 1_000_000]:
         clips = max(size // FRAMES_PER_CLIP, 1)
         line = [sys.executable, __file__, "--clips", str(clips)]
         values = subprocess.run(line, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, check=True, text=True).stdout
-        frames, seconds, main, worker, main_private, worker_private = map(float, values.split())
-        memory = "".join(f"{part / MEBIBYTE:>8.0f}" for part in (main, main_private, worker, worker_private))
-        print(f"{frames:>10,.0f}{clips:>8,}{seconds:>9.1f}{frames / seconds:>10,.0f}{clips / seconds:>9,.0f}{memory}")
-        points.append((frames, main))
+        frames, seconds, *memory = map(float, values.split())
+        names = ("main process, MiB", "worker, MiB", "private to main, MiB", "private to worker, MiB")
+        sizes = {name: part / MEBIBYTE for name, part in zip(names, memory, strict=True)}
+        rates.append(clips / seconds)
+        rows.append({"frames": frames, "seconds": seconds, "clips per second": rates[-1], **sizes})
+        points.append((frames, memory[0]))
     (few, small), (many, large) = points[0], points[-1]
-    if many > few:
-        print(f"growth of the main process: {(large - small) / (many - few):.0f} bytes per frame")
+    growth = (large - small) / (many - few) if many > few else 0
+    return section(
+        "Preparation of a data set",
+        f"`make prepare` with synthetic clips of about {FRAMES_PER_CLIP} frames, one worker per core. Memory is the "
+        "maximum during the run.",
+        f"Preparation handles {rates[-1]:,.0f} clips per second; its memory grows by {growth:.0f} bytes per frame.",
+        sizes=rows,
+    )
 
 
 if __name__ == "__main__":
     if "--clips" in sys.argv:
-        measure(int(sys.argv[-1]))
+        prepare(int(sys.argv[-1]))
     else:
-        main([int(frames) for frames in sys.argv[1:]] or [250_000, 1_000_000])
+        show(measure(*sys.argv[1:]))

@@ -2,18 +2,20 @@
 
 Three tables: milliseconds per network call that the sampling loop itself takes, with a denoiser that returns a stored
 tensor; the samplers with MDM's encoder, which take turns within a run, so that a busy machine slows all of them; and
-latency at batch 1 and throughput at batch 64 of that encoder for 10, 50 and 1000 steps. Prints medians, and ratios to
+latency at batch 1 and throughput at batch 64 of that encoder for 10, 50 and 1000 steps. Gives medians, and ratios to
 the first row.
 """
 
 import argparse
 import statistics
+import sys
 import time
 from collections.abc import Callable
 from functools import partial
 from itertools import product
 
 import torch
+from sections import Row, Section, section, show
 from torch import Tensor
 
 from flame_mdm.denoisers.mdm import MDMEncoder
@@ -62,33 +64,37 @@ def seconds(run: Callable[[], Tensor], repeats: int) -> float:
     return statistics.median(times[1:])
 
 
-def measure_loops(args: argparse.Namespace) -> None:
-    """Prints the host cost of each sampler per network call, at batch 1, and that of drawing noise."""
+def measure_loops(args: argparse.Namespace) -> list[Row]:
+    """Returns the host cost of each sampler per network call, at batch 1, and that of drawing noise."""
     fixed, mask, cond = inputs(1, args)
     keep = torch.zeros_like(fixed, dtype=torch.bool)
     keep[:, : args.frames // 4] = True
     stored = {rows: torch.randn(rows, *fixed.shape[1:], device=args.device) for rows in (1, 2)}
     guided = classifier_free_guidance(lambda x_t, *_: stored[len(x_t)], args.guidance_scale, args.features)
-    print(f"{'ms per call':<18}{'alone':>10}{'guided':>10}{'edited':>10}{'both':>10}")
+    rows: list[Row] = []
     for process, sampler in {(type(process), sampler): (process, sampler) for process, sampler, _ in RUNS}.values():
-        cells = []
+        cells: list[float | None] = []
         for edit, denoise in product((None, Edit(fixed, keep, "x0")), (lambda x_t, *_: stored[len(x_t)], guided)):
             if edit is not None and sampler == "dopri5":
+                cells.append(None)
                 continue
             counted = CountedDenoise(denoise)
             run = partial(process.sample, counted, lambda draw: fixed, mask, cond, sampler=sampler, edit=edit)
             taken = seconds(partial(run, num_inference_steps=50), 2 * args.repeats)
             cells.append(1e3 * taken * (2 * args.repeats + 1) / counted.calls)
-        print(f"{sampler:<18}" + "".join(f"{cell:>10.3f}" for cell in cells))
+        names = ("alone", "guided", "edited", "guided and edited")
+        rows.append({"sampler": sampler, **dict(zip(names, cells, strict=True))})
     for batch in (1, 64):
         ids = [str(number) for number in range(batch)]
         noise = seeded_noise(ids, *fixed.shape[1:], seed=0, replication=0, like=fixed)
-        print(f"noise, batch {batch:<5}{1e3 * seconds(partial(noise, 1), 2 * args.repeats):>10.3f}")
+        rows.append({"sampler": f"noise, batch {batch}", "alone": 1e3 * seconds(partial(noise, 1), 2 * args.repeats)})
+        rows[-1] |= dict.fromkeys(names[1:])
+    return rows
 
 
-def measure_steps(denoise: Denoise, args: argparse.Namespace) -> None:
-    """Prints seconds per run and motions per second by batch size and number of steps of the ancestral sampler."""
-    print(f"{'batch':<6}{'steps':>6}{'s':>10}{'motions/s':>12}{'ratio':>8}")
+def measure_steps(denoise: Denoise, args: argparse.Namespace) -> list[Row]:
+    """Returns seconds per run and motions per second by batch size and number of steps of the ancestral sampler."""
+    rows: list[Row] = []
     guided = classifier_free_guidance(denoise, args.guidance_scale, args.features)
     first = 0.0
     for batch in (1, 64):
@@ -101,12 +107,14 @@ def measure_steps(denoise: Denoise, args: argparse.Namespace) -> None:
             if steps > 10:
                 taken = estimate if estimate > LONGEST else seconds(partial(run, num_inference_steps=steps), 1)
             first = first or taken
-            how = "  estimated from 10 steps" if estimate > LONGEST else ""
-            print(f"{batch:<6}{steps:>6}{taken:>10.3f}{batch / taken:>12.2f}{taken / first:>8.1f}{how}")
+            how = ", estimated from 10" if estimate > LONGEST else ""
+            row: Row = {"batch": str(batch), "steps": f"{steps:,}{how}", "seconds": taken}
+            rows.append(row | {"motions per second": batch / taken, "ratio": taken / first})
+    return rows
 
 
-def measure(denoise: Denoise, args: argparse.Namespace) -> None:
-    """Prints one row per sampler."""
+def measure_samplers(denoise: Denoise, args: argparse.Namespace) -> list[Row]:
+    """Returns one row per sampler."""
     fixed, mask, cond = inputs(args.batch, args)
     guided = classifier_free_guidance(denoise, args.guidance_scale, args.features)
     samples: list[Callable[[Denoise], Tensor]] = [
@@ -126,17 +134,22 @@ def measure(denoise: Denoise, args: argparse.Namespace) -> None:
                 seconds[index].append(time.perf_counter() - start)
             calls[index] = counted.calls
     medians = [statistics.median(times) for times in seconds]
-    print(f"{'sampler':<18}{'steps':>6}{'NFE':>6}{'ms':>10}{'ms/NFE':>9}{'ratio':>8}")
-    for (_, sampler, count), nfe, median in zip(RUNS, calls, medians, strict=True):
-        steps = "-" if sampler == "dopri5" else count
-        print(
-            f"{sampler:<18}{steps:>6}{nfe:>6}{1e3 * median:>10.1f}{1e3 * median / nfe:>9.2f}{median / medians[0]:>8.2f}"
-        )
+    return [
+        {
+            "sampler": sampler,
+            "steps": "" if sampler == "dopri5" else str(count),
+            "network calls": nfe,
+            "ms": 1e3 * median,
+            "ms per call": 1e3 * median / nfe,
+            "ratio": median / medians[0],
+        }
+        for (_, sampler, count), nfe, median in zip(RUNS, calls, medians, strict=True)
+    ]
 
 
 @torch.no_grad()
-def main() -> None:
-    """Prints the three tables."""
+def measure(*words: str) -> Section:
+    """Measures the three tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--batch", type=int, default=4)
     parser.add_argument("--frames", type=int, default=60)
@@ -146,19 +159,26 @@ def main() -> None:
     parser.add_argument("--guidance-scale", type=float, default=2.5)
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--device", default="cpu")
-    args = parser.parse_args()
+    args = parser.parse_args(words)
     torch.manual_seed(0)
-    print(f"{args.batch} motions of {args.frames} x {args.features} on {args.device}, scale {args.guidance_scale}")
-    print("\nloops alone")
-    measure_loops(args)
     size = {"latent_dim": args.latent_dim, "ff_size": 2 * args.latent_dim, "num_layers": args.num_layers}
-    encoder = MDMEncoder(args.features, args.features, 512, num_heads=4, dropout=0.1, **size)
-    print(f"\nMDMEncoder, {sum(p.numel() for p in encoder.parameters()):,} parameters")
-    encoder = encoder.eval().to(args.device)
-    measure(encoder, args)
-    print("\nancestral, guided, with noise")
-    measure_steps(encoder, args)
+    encoder = MDMEncoder(args.features, args.features, 512, num_heads=4, dropout=0.1, **size).eval().to(args.device)
+    loops, samplers, steps = measure_loops(args), measure_samplers(encoder, args), measure_steps(encoder, args)
+    seconds = {(row["batch"], str(row["steps"])[:2]): row for row in steps}
+    latency, throughput = seconds["1", "10"]["seconds"], seconds["64", "10"]["motions per second"]
+    return section(
+        "Sampling",
+        f"MDM's encoder with {sum(p.numel() for p in encoder.parameters()):,} parameters, motions of {args.frames} "
+        f"frames of {args.features} features, on {args.device}, guidance {args.guidance_scale} (two rows per motion in "
+        "one call). Latency and throughput are those of the ancestral sampler, with noise; the samplers have "
+        f"{args.batch} motions per batch; the loops alone run without a network, at batch 1.",
+        f"With 10 steps, one motion takes {1000 * float(latency or 0):.0f} ms, and batches of 64 give "
+        f"{float(throughput or 0):.0f} motions per second.",
+        latency_at_batch_1_and_throughput_at_batch_64=steps,
+        samplers=samplers,
+        milliseconds_per_network_call_that_the_loop_itself_takes=loops,
+    )
 
 
 if __name__ == "__main__":
-    main()
+    show(measure(*sys.argv[1:]))

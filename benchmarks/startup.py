@@ -13,6 +13,8 @@ import tempfile
 import time
 from pathlib import Path
 
+from sections import Row, Section, section, show
+
 TINY = [
     *("data.source.clips=60", "data.batch_size=8", "denoiser.latent_dim=16", "denoiser.ff_size=16"),
     *("denoiser.num_layers=1", "denoiser.num_heads=2", "condition.features=16", "process.num_train_timesteps=10"),
@@ -31,8 +33,9 @@ def seconds(folder: Path, *words: str) -> float:
     return time.monotonic() - begin
 
 
-def main(runs: int) -> None:
-    """Prints a table."""
+def measure(*words: str) -> Section:
+    """Measures with the number of runs in `words`."""
+    runs = int(words[0]) if words else 2
     os.environ["OMP_NUM_THREADS"] = "1"
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -44,19 +47,27 @@ def main(runs: int) -> None:
             "evaluate": ([CKPT, *evaluation, "data_root=data"], ["seed={}", "out=result{}.json"]),
         }
         rows = {"python -c 'import torch'": (["-c", "import torch"], list[str]())}
-        for command, (words, varying) in work.items():
+        for command, (line, varying) in work.items():
             module = ["-m", "flame_mdm", command]
             rows[f"{command} --help"] = ([*module, "--help"], [])
-            rows[f"{command}, misspelled key"] = ([*module, *words[: command == "train"], "seeed=1"], [])
-            rows[f"{command}, minimal work"] = ([*module, *words], varying)
-        print("| | seconds | ratio |\n|---|---|---|")
-        base = 0.0
-        for row, (words, varying) in rows.items():
-            runs_of = ([*words, *(word.format(number) for word in varying)] for number in range(runs))
-            median = statistics.median(seconds(folder, *run) for run in runs_of)
-            base = base or median
-            print(f"| {row} | {median:.2f} | {median / base:.2f} |", flush=True)
+            rows[f"{command}, misspelled key"] = ([*module, *line[: command == "train"], "seeed=1"], [])
+            rows[f"{command}, minimal work"] = ([*module, *line], varying)
+        found: list[Row] = []
+        times: list[float] = []
+        for row, (line, varying) in rows.items():
+            runs_of = ([*line, *(word.format(number) for word in varying)] for number in range(runs))
+            times.append(statistics.median(seconds(folder, *run) for run in runs_of))
+            found.append({"command": f"`{row}`", "seconds": times[-1], "ratio": times[-1] / times[0]})
+    return section(
+        "Start of the commands",
+        "From the start of a process to its end, one thread. The work is minimal (one training step, one motion, one "
+        f"replication of eight motions), so that mainly imports are measured. Median of {runs}; "
+        "ratios to importing torch.",
+        f"`--help` answers in {times[1]:.1f} s, and a training starts in {times[3] / times[0]:.1f} times the time of "
+        "importing torch.",
+        commands=found,
+    )
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]) if len(sys.argv) > 1 else 2)
+    show(measure(*sys.argv[1:]))

@@ -2,7 +2,7 @@
 
     python benchmarks/text.py [captions per batch]
 
-Uses sentence-BERT from the extra `offline`, with tokens, so that nothing is downloaded. Prints medians and their ratio.
+Uses sentence-BERT from the extra `offline`, with tokens, so that nothing is downloaded. Gives medians and their ratio.
 """
 
 import itertools
@@ -13,6 +13,7 @@ import time
 from pathlib import Path
 
 import torch
+from sections import Section, section, show
 
 from flame_mdm.conditions.text import PretrainedText
 from flame_mdm.motion import MotionBatch
@@ -29,7 +30,9 @@ def median_ms(encoder: PretrainedText, batches: list[MotionBatch]) -> float:
     return statistics.median(times)
 
 
-def main(size: int) -> None:
+def measure(*words: str) -> Section:
+    """Measures with the number of captions per batch in `words`."""
+    size = int(words[0]) if words else 64
     encoder = PretrainedText(
         "sentence-transformers/all-MiniLM-L6-v2",
         features=384,
@@ -57,8 +60,17 @@ def main(size: int) -> None:
         encoder.load_cache(captions, Path(folder))
         encoder(batches[0])
         cached = median_ms(encoder, batches)
-    print(f"{size} captions per batch: live {live:.2f} ms, cached {cached:.2f} ms, ratio {live / cached:.0f}")
+    return section(
+        "Text encoding",
+        f"A batch of {size} captions, encoded by sentence-BERT (MiniLM, with tokens) or read from the cache of frozen "
+        f"encoders. Median of {REPEATS}.",
+        f"A batch of cached captions is {live / cached:.0f} times as fast as encoding it.",
+        captions=[
+            {"captions": "encoded", "ms": live, "ratio": live / cached},
+            {"captions": "cached", "ms": cached, "ratio": 1},
+        ],
+    )
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]) if len(sys.argv) > 1 else 64)
+    show(measure(*sys.argv[1:]))

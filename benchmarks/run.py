@@ -1,0 +1,119 @@
+"""Runs the benchmarks and writes docs/benchmarks/speed.md: `python benchmarks/run.py [only=a,b] [device=cuda]`.
+
+Each benchmark runs in a process, one after another. With `only`, the other sections keep their figures. `device=cuda`
+measures the sections that use a GPU, which are added to the page.
+"""
+
+import datetime
+import importlib
+import json
+import os
+import platform
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import torch
+from sections import body
+
+from flame_mdm.training.provenance import environment
+
+PAGE = Path(__file__).parent.parent / "docs" / "benchmarks" / "speed.md"
+SECTIONS = ["host", "steps", "loading", "ema", "sampling", "evaluation", "preparation", "features", "text", "startup"]
+SECTIONS += ["ddp"]
+ON_GPU = ["steps", "sampling"]
+HEAD = """# Speed
+
+`make bench` measures the speed of the framework and writes this page and [speed.json](speed.json). Every comparison is
+a ratio of two measurements in one run on an idle machine; the absolute figures next to it hold for that machine alone.
+`make bench ONLY=host,steps` repeats some sections, `make bench DEVICE=cuda` adds those of a GPU.
+[Which options to choose](../speed.md) is a page of its own.
+"""
+
+
+def machine() -> dict[str, str | int]:
+    """Returns the hardware and versions that a measurement depends on."""
+    has, facts = torch.cpu.get_capabilities(), environment()
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    found: dict[str, str | int] = {
+        "processor": has.get("cpu_name") or platform.processor(),
+        "cores": cores,
+        "bfloat16 instructions": " ".join(name for name in ("avx512_bf16", "amx_bf16") if has.get(name)) or "none",
+        "threads": torch.get_num_threads(),
+        "torch": facts["packages"]["torch"],
+        "lightning": facts["packages"]["lightning"],
+        "python": facts["python"],
+    }
+    if torch.cuda.is_available():
+        found["GPU"] = torch.cuda.get_device_name()
+    return found
+
+
+def child(name: str, out: str, *words: str) -> None:
+    """Measures one section and writes it as JSON."""
+    found = importlib.import_module(name).measure(*words)
+    Path(out).write_text(json.dumps(found))
+
+
+def run(name: str, *words: str) -> dict[str, Any]:
+    """Returns a section that is measured in another process."""
+    out = PAGE.with_suffix(f".{name}.part")
+    try:
+        line = [sys.executable, __file__, "--child", name, str(out), *words]
+        done = subprocess.run(line, capture_output=True, text=True, check=False)
+        if done.returncode:
+            raise SystemExit(f"{done.stdout}{done.stderr}\nbenchmarks/{name}.py failed")
+        return json.loads(out.read_text())
+    finally:
+        out.unlink(missing_ok=True)
+
+
+def render(sections: dict[str, Any]) -> str:
+    """Returns the page of the measured sections."""
+    order = sorted(sections, key=lambda name: (name.endswith("_cuda"), SECTIONS.index(name.removesuffix("_cuda"))))
+    machines = list(dict.fromkeys(json.dumps(sections[name]["machine"]) for name in order))
+    lines = [HEAD, "## In short\n", *(f"- {sections[name]['summary']}" for name in order), "\n## Machine\n"]
+    for number, facts in enumerate(machines, 1):
+        lines.append(f"{number}. " + ", ".join(f"{key}: {value}" for key, value in json.loads(facts).items()))
+    for name in order:
+        found = sections[name]
+        where = machines.index(json.dumps(found["machine"])) + 1
+        script = f"benchmarks/{name.removesuffix('_cuda')}.py"
+        title = found["title"] + " on a GPU" * name.endswith("_cuda")
+        lines += [f"\n## {title}\n", body(found), f"\n`{script}`, {found['date']}, machine {where}."]
+    return "\n".join(lines) + "\n"
+
+
+def main(*words: str) -> None:
+    """Measures the chosen sections and writes the page after each."""
+    options = dict(word.split("=", 1) for word in words)
+    device = options.get("device") or "cpu"
+    if device not in ("cpu", "cuda"):
+        raise SystemExit(f"DEVICE={device}: give cpu or cuda")
+    if device == "cuda" and not torch.cuda.is_available():
+        raise SystemExit("DEVICE=cuda: torch finds no CUDA GPU on this machine")
+    possible = ON_GPU if device == "cuda" else SECTIONS
+    chosen = options["only"].split(",") if options.get("only") else possible
+    if unknown := [name for name in chosen if name not in possible]:
+        raise SystemExit(f"ONLY={','.join(unknown)}: give some of {', '.join(possible)}")
+    data = PAGE.with_suffix(".json")
+    sections: dict[str, Any] = json.loads(data.read_text()) if data.exists() else {}
+    for number, name in enumerate(chosen, 1):
+        print(f"{number}/{len(chosen)} {name}", flush=True)
+        start = time.perf_counter()
+        found = run(name, *(["--device", "cuda"] if device == "cuda" else []))
+        found |= {"date": datetime.date.today().isoformat(), "machine": machine()}
+        sections[name + "_cuda" * (device == "cuda")] = found
+        data.write_text(json.dumps(sections, indent=1) + "\n")
+        PAGE.write_text(render(sections))
+        print(f"    {found['summary']} ({time.perf_counter() - start:.0f} s)", flush=True)
+    print(f"page: {PAGE}")
+
+
+if __name__ == "__main__":
+    if sys.argv[1:2] == ["--child"]:
+        child(*sys.argv[2:])
+    else:
+        main(*sys.argv[1:])

@@ -1,0 +1,234 @@
+"""Training steps in both speeds, compared to plain PyTorch: `python benchmarks/steps.py [--device cuda] [--quick]`.
+
+The full-size step is that of humanml3d/mdm with lengths as in HumanML3D. A plain PyTorch loop trains
+`nn.TransformerEncoder` of the same size on the same clips, padded to 196 frames, as the published codes do. Then follow
+a step of every network in its size for CPU runs, and the quickstart by the complete framework. All take turns in one
+run. On CUDA, the section also has the memory and an estimate of the hours of each published recipe.
+"""
+
+import argparse
+import sys
+import tempfile
+import warnings
+from collections.abc import Callable
+from copy import deepcopy
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from cost import cost, hours, training_step
+from host import framework
+from hydra.utils import get_class
+from sections import Row, Section, section, show, take_turns
+from torch import Tensor, nn
+
+from flame_mdm.config import compose, instantiate
+from flame_mdm.data.datamodule import TrainingBatches
+from flame_mdm.motion import MotionBatch
+from flame_mdm.training.speed import accelerate
+
+WIDTH, LONGEST = 263, 196
+BACKBONES = {
+    "MDM, encoder": ["synthetic/mdm"],
+    "MDM, decoder": ["synthetic/mdm_decoder"],
+    "MDM, decoder + token": ["synthetic/mdm_decoder", "+denoiser.input_token=condition"],
+    "MDM, GRU": ["synthetic/mdm_gru"],
+    "MDM, U-Net": ["synthetic/mdm_unet"],
+    "FLAME": ["synthetic/flame"],
+    "MFM": ["synthetic/mfm"],
+}
+RECIPES = [
+    *(f"humanml3d/{name}" for name in ("mdm", "mdm_decoder", "mdm_decoder_token", "mdm_gru", "mdm_unet", "mfm")),
+    *("humanml3d/flame", "kit/mdm", "kit/mfm", "kit/flame"),
+]
+SPEEDS = ("reference", "fast")
+
+
+class Peer(nn.Module):
+    """MDM's encoder in plain PyTorch: inputs (B, F, 263), a token for the condition, `nn.TransformerEncoder`."""
+
+    def __init__(self, width: int, layers: int) -> None:
+        super().__init__()
+        layer = nn.TransformerEncoderLayer(width, 4, 2 * width, 0.1, "gelu")
+        self.encoder = nn.TransformerEncoder(layer, layers)
+        self.input, self.output = nn.Linear(WIDTH, width), nn.Linear(width, WIDTH)
+        self.token, self.dropout = nn.Linear(512, width), nn.Dropout(0.1)
+
+    def forward(self, x: Tensor, mask: Tensor, cond: Tensor) -> Tensor:
+        tokens = self.dropout(torch.cat([self.token(cond)[None], self.input(x.transpose(0, 1))]))
+        padding = ~torch.cat([mask.new_ones(len(mask), 1), mask], 1)
+        return self.output(self.encoder(tokens, src_key_padding_mask=padding))[1:].transpose(0, 1)
+
+
+def peer_step(width: int, layers: int, device: str) -> Callable[[MotionBatch], None]:
+    """Returns a step of the plain PyTorch loop."""
+    model = Peer(width, layers).to(device).train()
+    optimizer = torch.optim.AdamW(model.parameters(), 1e-4)
+
+    def step(batch: MotionBatch) -> None:
+        output = model(batch.x, batch.mask, torch.zeros(len(batch), 512, device=device))
+        ((output - batch.x).square() * batch.mask[..., None]).sum().div(batch.mask.sum()).backward()
+        optimizer.step()
+        optimizer.zero_grad()
+
+    return step
+
+
+def recipe_step(config: dict[str, Any], speed: str, device: str) -> Callable[[MotionBatch], None]:
+    """Returns a step of a recipe, with a condition of the right shape instead of an encoded text."""
+    config = deepcopy(config)
+    config["trainer"]["accelerator"] = device
+    representation = instantiate(config["representation"])
+    task = get_class(config["task"]["_target_"]).build(config, representation).to(device).train()
+    half = speed == "fast" and accelerate(task, config) == "bf16-mixed"
+    optimizer, clip = task.configure_optimizers(), config["trainer"]["gradient_clip_val"]
+
+    def step(batch: MotionBatch) -> None:
+        with torch.device(device), torch.autocast(device, torch.bfloat16, enabled=half):
+            loss = training_step(task, batch)
+        loss.backward()
+        if clip:
+            nn.utils.clip_grad_norm_(task.parameters(), clip)
+        optimizer.step()
+        optimizer.zero_grad()
+
+    return step
+
+
+def batch_of(lengths: np.ndarray, frames: int, device: str) -> MotionBatch:
+    """Returns random motions of given lengths, padded to `frames`."""
+    mask = torch.arange(frames) < torch.from_numpy(lengths)[:, None]
+    x = torch.randn(len(lengths), frames, WIDTH) * mask[..., None]
+    return MotionBatch(x.to(device), mask.to(device), [str(i) for i in range(len(lengths))])
+
+
+def matrix_peak(device: str, size: int) -> dict[str, float]:
+    """Returns the measured floating-point operations per second of a matrix product, as used by each speed."""
+    rates = {}
+    for speed, dtype in zip(SPEEDS, (torch.float32, torch.bfloat16), strict=True):
+        a, b = (torch.randn(size, size, device=device).to(dtype) for _ in range(2))
+        rates[speed] = 2 * size**3 / take_turns({"matmul": partial(torch.mm, a, b)}, 9, device)["matmul"]
+    return rates
+
+
+def full_size(size: list[str], batches: int, peak: dict[str, float], device: str) -> tuple[list[Row], float, str]:
+    """Returns rows of the full-size step, the sustained rate of `fast`, and a text about the batches."""
+    config = compose("humanml3d/mdm", ["data.batch_size=16", *size])
+    rows = config["data"]["batch_size"]
+    lengths = 4 * np.random.default_rng(0).integers(10, 50, TrainingBatches.BUCKETS * rows)
+    world = TrainingBatches.BUCKETS // batches
+    sampler = iter(TrainingBatches(lengths, rows, seed=0, first=0, rank=0, world=world))
+    drawn = [lengths[[index for index, _ in next(sampler)]] for _ in range(batches)]
+    bucketed = [batch_of(chosen, int(chosen.max()), device) for chosen in drawn]
+    padded = [batch_of(chosen, LONGEST, device) for chosen in drawn]
+    real = sum(int(chosen.sum()) for chosen in drawn)
+    operations = sum(cost(config, rows, batch.x.shape[1])[0] for batch in bucketed)
+    width, layers = config["denoiser"]["latent_dim"], config["denoiser"]["num_layers"]
+    ways: dict[str, tuple[Callable[[MotionBatch], None], list[MotionBatch]]] = {
+        "plain PyTorch, padded to 196": (peer_step(width, layers, device), padded),
+        **{f"speed={speed}": (recipe_step(config, speed, device), bucketed) for speed in SPEEDS},
+    }
+
+    def run(step: Callable[[MotionBatch], None], all_batches: list[MotionBatch]) -> None:
+        for batch in all_batches:
+            step(batch)
+
+    times = take_turns({name: partial(run, *way) for name, way in ways.items()}, 3, device)
+    slowest = next(iter(times.values()))
+    found: list[Row] = []
+    for name, taken in times.items():
+        rate = peak.get(name.removeprefix("speed="))
+        row: Row = {"training": name, "ms per step": 1000 * taken / batches, "times as fast": slowest / taken}
+        share = f"{operations / taken / rate:.0%}" if rate else None
+        found.append(row | {"frames per second": real / taken, "share of the matrix peak": share})
+    mean = sum(batch.x.shape[1] for batch in bucketed) / batches
+    text = f"{rows} clips of {real / rows / batches:.0f} frames on average, padded to {mean:.0f} by the framework"
+    return found, operations / times["speed=fast"], text
+
+
+def backbones(rounds: int, peak: dict[str, float], device: str) -> list[Row]:
+    """Returns a row per network, in its size for CPU runs."""
+    found: list[Row] = []
+    lengths = np.random.default_rng(1).integers(36, 61, 32)
+    for name, words in BACKBONES.items():
+        config = compose(words[0], ["condition=none", *words[1:]])
+        batch = batch_of(lengths, int(lengths.max()), device)
+        operations, _, parameters = cost(config, len(batch), batch.x.shape[1])
+        runs = {speed: partial(recipe_step(config, speed, device), batch) for speed in SPEEDS}
+        times = take_turns(runs, rounds, device)
+        row: Row = {"network": name, "parameters, M": parameters / 1e6}
+        row |= {f"ms, {speed}": 1000 * taken for speed, taken in times.items()}
+        row["times as fast"] = times["reference"] / times["fast"]
+        row |= {f"frames per second, {speed}": int(lengths.sum()) / taken for speed, taken in times.items()}
+        row |= {f"share of peak, {s}": f"{operations / taken / peak[s]:.0%}" for s, taken in times.items()}
+        found.append(row)
+    return found
+
+
+def quickstart(steps: int, rounds: int) -> list[Row]:
+    """Returns a row per speed of the quickstart's step, trained by the complete framework."""
+    with tempfile.TemporaryDirectory() as name:
+        runs = [
+            [framework(steps, Path(name), "data.source.clips=600", f"speed={speed}") for speed in SPEEDS]
+            for _ in range(rounds)
+        ]
+    times = {speed: float(np.median(column)) for speed, column in zip(SPEEDS, zip(*runs, strict=True), strict=True)}
+    return [
+        {"training": f"speed={s}", "ms per step": t, "times as fast": times["reference"] / t} for s, t in times.items()
+    ]
+
+
+def recipe_hours(rate: float) -> list[Row]:
+    """Returns the estimated training time of each published recipe at `rate` floating-point operations per second."""
+    rows: list[Row] = []
+    for name in RECIPES:
+        config = compose(name)
+        operations, steps = cost(config)[0], config["trainer"]["max_steps"]
+        row: Row = {"recipe": f"`{name}`", "steps": steps, "TFLOP per step": operations / 1e12}
+        rows.append(row | {"hours": hours(operations, steps, rate)})
+    return rows
+
+
+def measure(*words: str) -> Section:
+    """Measures on the device in `words`."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--device", choices=["cpu", "cuda"], default="cpu")
+    parser.add_argument("--quick", action="store_true", help="tiny sizes, which show only that everything runs")
+    args = parser.parse_args(words)
+    quick, device = args.quick, args.device
+    warnings.filterwarnings("ignore")
+    torch.manual_seed(0)
+    torch.set_float32_matmul_precision("high")  # as in training
+    peak = matrix_peak(device, 64 if quick else 2048 if device == "cpu" else 8192)
+    size = ["data.batch_size=2", "denoiser.latent_dim=16", "denoiser.ff_size=32", "denoiser.num_layers=1"]
+    full, rate, batches = full_size(size if quick else [], 1 if quick else 8, peak, device)
+    tables = {"full_size": full}
+    if device == "cuda":
+        memory = torch.cuda.max_memory_allocated() / 2**30
+        batches += f"; at most {memory:.1f} GiB of memory for all three models together"
+    tables["networks_in_their_size_for_CPU_runs"] = backbones(1 if quick else 15, peak, device)
+    if device == "cpu":
+        tables["quickstart"] = quickstart(4 if quick else 150, 1 if quick else 2)
+    else:
+        tables["estimated_training_time_at_the_sustained_rate_of_fast"] = recipe_hours(rate)
+    reference, fast = full[1]["times as fast"], full[2]["times as fast"]
+    return section(
+        "Training steps",
+        f"The full-size step is that of `humanml3d/mdm` (8 layers of 512, dropout 0.1), {batches}. Lengths are uniform "
+        "from 40 to 196 frames, in units of 4, as a stand-in for HumanML3D's, and batches are those of the framework's "
+        "sampler. Plain PyTorch trains `nn.TransformerEncoder` with AdamW on the same clips, padded to 196 frames as "
+        "in the published codes, in float32. Everything takes turns; medians of 3 rounds over all batches. The share "
+        f"of the matrix peak compares the operations of a step with a measured matrix product: "
+        f"{peak['reference'] / 1e9:,.0f} GFLOP/s in float32 (`reference`) and {peak['fast'] / 1e9:,.0f} in bfloat16 "
+        "(`fast`). The small networks have 32 clips per batch and no text encoder; the quickstart is trained by the "
+        "complete framework, with its text encoder.",
+        f"At full size, `speed=reference` is {reference:.1f} times as fast as plain PyTorch, and `speed=fast` "
+        f"{fast:.1f} times.",
+        **tables,
+    )
+
+
+if __name__ == "__main__":
+    show(measure(*sys.argv[1:]))

@@ -1,0 +1,115 @@
+"""The benchmarks of speed: every script at a toy size, and the page that is rendered from their figures."""
+
+import json
+import math
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+sys.path.append(str(ROOT / "benchmarks"))  # the scripts import each other
+
+import cost  # noqa: E402
+import run  # noqa: E402
+import sections  # noqa: E402
+import steps  # noqa: E402
+
+from flame_mdm.config import compose  # noqa: E402
+
+TOY = {
+    "host": "12",
+    "steps": "--quick",
+    "loading": "100",
+    "ema": "1",
+    "sampling": "--frames 4 --latent-dim 16 --num-layers 1 --repeats 1",
+    "evaluation": "--clips 40",
+    "preparation": "2000",
+    "features": "1",
+    "text": "2",
+    "startup": "1",
+    "ddp": "1",
+}
+
+
+def stub(name: str, *words: str) -> dict[str, Any]:
+    return sections.section(f"Title of {name}", "A text.", f"Summary of {name}.", steps=[{"way": name, "ms": 1234.5}])
+
+
+@pytest.fixture
+def page(tmp_path, monkeypatch) -> Path:
+    monkeypatch.setattr(run, "PAGE", tmp_path / "speed.md")
+    monkeypatch.setattr(run, "run", stub)
+    return tmp_path / "speed.md"
+
+
+def test_the_page_is_rendered_from_the_figures_and_keeps_those_that_are_not_measured_again(page):
+    run.main("only=host,ema", "device=")
+    data = page.with_suffix(".json")
+    kept = json.loads(data.read_text())
+    kept["host"]["date"] = "2001-02-03"
+    data.write_text(json.dumps(kept))
+    run.main("only=ema")
+    again = json.loads(data.read_text())
+    assert again["host"] == kept["host"]
+    text = page.read_text()
+    assert text == run.render(again)
+    assert "| host | 1,234 |" in text
+    assert "`benchmarks/host.py`, 2001-02-03, machine 1." in text
+    assert text.index("## Title of host") < text.index("## Title of ema")
+    assert "torch: " in text.split("## Machine")[1].split("##")[0]
+
+
+def test_unknown_sections_and_devices_are_refused_in_one_line(page, monkeypatch):
+    for word, start in (("only=host,none", "ONLY=none: give some of host, "), ("device=tpu", "DEVICE=tpu: give cpu")):
+        with pytest.raises(SystemExit, match=start):
+            run.main(word)
+    monkeypatch.setattr(run.torch.cuda, "is_available", lambda: False)
+    with pytest.raises(SystemExit, match=r"^DEVICE=cuda: torch finds no CUDA GPU on this machine$"):
+        run.main("device=cuda")
+    assert not page.exists()
+
+
+def test_sections_of_a_gpu_are_added_to_the_page(page, monkeypatch):
+    run.main("only=steps")
+    monkeypatch.setattr(run.torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(run.torch.cuda, "get_device_name", lambda: "Some GPU")
+    run.main("device=cuda", "only=steps")
+    text = page.read_text()
+    assert text.index("## Title of steps\n") < text.index("## Title of steps on a GPU\n")
+    assert "GPU: Some GPU" in text
+    assert "machine 2." in text
+
+
+def test_hours_of_a_recipe_follow_from_the_sustained_rate(monkeypatch):
+    assert cost.hours(3.6e12, 500_000, 1e12) == pytest.approx(500)
+    monkeypatch.setattr(steps, "RECIPES", ["humanml3d/mdm"])
+    (slow,), (fast,) = steps.recipe_hours(1e12), steps.recipe_hours(4e12)
+    assert slow["hours"] == pytest.approx(slow["TFLOP per step"] * slow["steps"] / 3600)
+    assert fast["hours"] == pytest.approx(slow["hours"] / 4)
+
+
+def test_the_operations_of_a_step_grow_with_its_batch():
+    config = compose("synthetic/mdm_gru", ["condition=none"])
+    one, two = (cost.cost(config, rows, 20)[0] for rows in (4, 8))
+    assert 0 < one < two <= 2 * one
+
+
+def test_the_committed_page_is_rendered_from_the_committed_figures():
+    found = json.loads((ROOT / "docs" / "benchmarks" / "speed.json").read_text())
+    assert (ROOT / "docs" / "benchmarks" / "speed.md").read_text() == run.render(found)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", run.SECTIONS)
+def test_every_benchmark_runs_at_a_toy_size(name, tmp_path, monkeypatch):
+    monkeypatch.setattr(run, "PAGE", tmp_path / "speed.md")
+    found = run.run(name, *TOY[name].split())
+    assert list(tmp_path.iterdir()) == []
+    numbers = [value for rows in found["tables"].values() for row in rows for value in row.values()]
+    assert all(math.isfinite(value) for value in numbers if isinstance(value, int | float))
+    assert any(isinstance(value, float) for value in numbers)
+    columns = [{tuple(row) for row in rows} for rows in found["tables"].values()]
+    assert all(len(names) == 1 for names in columns)
+    assert found["title"] in run.render({name: found | {"date": "2001-02-03", "machine": run.machine()}})

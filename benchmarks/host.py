@@ -165,8 +165,8 @@ def measure(*words: str) -> Section:
     times = {"bare Lightning, one linear layer": lightning, "framework": averaged, "framework without EMA": plain}
     return section(
         "Host cost of a training step",
-        "An almost empty network: one transformer layer of width 16, 4 clips per batch, no text encoder. Most of its "
-        "step is the cost of the framework, which every other training pays as well. One thread, "
+        "An almost empty network: one transformer layer of width 16, 4 clips per batch, no text encoder. Its step has "
+        "almost no arithmetic: it is the time of calling torch, the framework and Lightning. One thread, "
         f"{ROUNDS} alternating runs of {steps} steps, median time between the ends of two steps. The second table "
         "times the parts of the framework's step one by one, outside of Lightning.",
         f"An almost empty training step takes {averaged:.1f} ms, {averaged / lightning:.1f} times bare Lightning's.",

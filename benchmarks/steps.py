@@ -14,6 +14,7 @@ from collections.abc import Callable
 from copy import deepcopy
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -26,7 +27,7 @@ from torch import Tensor, nn
 
 from flame_mdm.config import compose, instantiate
 from flame_mdm.data.datamodule import TrainingBatches
-from flame_mdm.motion import MotionBatch
+from flame_mdm.motion import MotionBatch, padded_length
 from flame_mdm.training.speed import accelerate
 
 WIDTH, LONGEST = 263, 196
@@ -76,13 +77,14 @@ def peer_step(width: int, layers: int, device: str) -> Callable[[MotionBatch], N
     return step
 
 
-def recipe_step(config: dict[str, Any], speed: str, device: str) -> Callable[[MotionBatch], None]:
-    """Returns a step of a recipe, with a condition of the right shape instead of an encoded text."""
+def recipe_step(config: dict[str, Any], speed: str, device: str) -> tuple[Callable[[MotionBatch], None], int]:
+    """Returns a step of a recipe, with zeros instead of an encoded text, and the multiple its batches are padded to."""
     config = deepcopy(config)
     config["trainer"]["accelerator"] = device
     representation = instantiate(config["representation"])
     task = get_class(config["task"]["_target_"]).build(config, representation).to(device).train()
-    half = speed == "fast" and accelerate(task, config) == "bf16-mixed"
+    data: Any = SimpleNamespace(pad_multiple=1)
+    half = speed == "fast" and accelerate(task, data, config) == "bf16-mixed"
     optimizer, clip = task.configure_optimizers(), config["trainer"]["gradient_clip_val"]
 
     def step(batch: MotionBatch) -> None:
@@ -94,7 +96,7 @@ def recipe_step(config: dict[str, Any], speed: str, device: str) -> Callable[[Mo
         optimizer.step()
         optimizer.zero_grad()
 
-    return step
+    return step, data.pad_multiple
 
 
 def batch_of(lengths: np.ndarray, frames: int, device: str) -> MotionBatch:
@@ -121,15 +123,20 @@ def full_size(size: list[str], batches: int, peak: dict[str, float], device: str
     world = TrainingBatches.BUCKETS // batches
     sampler = iter(TrainingBatches(lengths, rows, seed=0, first=0, rank=0, world=world))
     drawn = [lengths[[index for index, _ in next(sampler)]] for _ in range(batches)]
-    bucketed = [batch_of(chosen, int(chosen.max()), device) for chosen in drawn]
-    padded = [batch_of(chosen, LONGEST, device) for chosen in drawn]
+
+    def batches_of(multiple: int) -> list[MotionBatch]:
+        return [batch_of(chosen, padded_length(int(chosen.max()), multiple, LONGEST), device) for chosen in drawn]
+
+    bucketed = batches_of(1)
     real = sum(int(chosen.sum()) for chosen in drawn)
     operations = sum(cost(config, rows, batch.x.shape[1])[0] for batch in bucketed)
     width, layers = config["denoiser"]["latent_dim"], config["denoiser"]["num_layers"]
     ways: dict[str, tuple[Callable[[MotionBatch], None], list[MotionBatch]]] = {
-        "plain PyTorch, padded to 196": (peer_step(width, layers, device), padded),
-        **{f"speed={speed}": (recipe_step(config, speed, device), bucketed) for speed in SPEEDS},
+        "plain PyTorch, padded to 196": (peer_step(width, layers, device), batches_of(LONGEST)),
     }
+    for speed in SPEEDS:
+        step, multiple = recipe_step(config, speed, device)
+        ways[f"speed={speed}"] = step, batches_of(multiple)
 
     def run(step: Callable[[MotionBatch], None], all_batches: list[MotionBatch]) -> None:
         for batch in all_batches:
@@ -156,7 +163,7 @@ def backbones(rounds: int, peak: dict[str, float], device: str) -> list[Row]:
         config = compose(words[0], ["condition=none", *words[1:]])
         batch = batch_of(lengths, int(lengths.max()), device)
         operations, _, parameters = cost(config, len(batch), batch.x.shape[1])
-        runs = {speed: partial(recipe_step(config, speed, device), batch) for speed in SPEEDS}
+        runs = {speed: partial(recipe_step(config, speed, device)[0], batch) for speed in SPEEDS}
         times = take_turns(runs, rounds, device)
         row: Row = {"network": name, "parameters, M": parameters / 1e6}
         row |= {f"ms, {speed}": 1000 * taken for speed, taken in times.items()}

@@ -21,6 +21,7 @@ SECONDS = 120
 
 # SGD: Adam makes much of gradients that are 0 but for rounding.
 RUN = [
+    "speed=reference",
     *("data.batch_size=1", "ema=null", "logger=csv", "callbacks.best=null", "callbacks.checkpoints.every_n_steps=2"),
     *("trainer.val_check_interval=2", "trainer.log_every_n_steps=2", "trainer.gradient_clip_val=0.5"),
     *("optimizer._target_=torch.optim.SGD", "optimizer.lr=0.05"),

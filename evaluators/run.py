@@ -451,7 +451,8 @@ def _show(report: Mapping[str, Any], out: Path) -> None:
     say(f"{'':32}{'real motions':>24}{report['baseline'] or 'generated':>24}")
     for name, value in report["values"].items():
         real = report["ground_truth"].get(name)
-        say(f"{name:32}{_cell(real):>24}{_cell(value):>24}")
+        if any(found is not None and found["mean"] is not None for found in (real, value)):
+            say(f"{name:32}{_cell(real):>24}{_cell(value):>24}")
     for reason, count in report["data"]["excluded"].items():
         say(f"excluded from the data set: {count} {reason}")
     for name, reason in report["not_computed"].items():

@@ -202,7 +202,7 @@ def _new_frames(length: int, fps: float, region: str | Ranges | None, seconds: R
         if region not in kept:
             raise UserError(
                 f"region={region} is unknown.{did_you_mean(region, list(kept))} Give ranges [begin, end], or one of: "
-                f"{', '.join(kept)}"
+                f"{', '.join(kept)}. Body parts are given by joints="
             )
         return ~kept[region]
     ranges = region if region is not None else seconds

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 import re
 from collections import Counter
@@ -13,7 +14,7 @@ from typing import Any, Unpack
 import numpy as np
 import torch
 
-from flame_mdm.errors import UserError
+from flame_mdm.errors import UserError, did_you_mean
 from flame_mdm.files import atomic_folder
 from flame_mdm.formats.motion import Motion
 from flame_mdm.motion import Edit, MotionBatch, Sampling, length_mask
@@ -80,6 +81,10 @@ def generate(
             raise UserError(f"{name}={value}: give 1{f' to {most:,}' if most else ' or more'}")
     if scale is not None and not math.isfinite(scale):
         raise UserError(f"guidance_scale={scale} is not a finite number")
+    for name in sampling:
+        if name not in Sampling.__annotations__:
+            known = [*inspect.signature(generate).parameters, *Sampling.__annotations__]
+            raise UserError(f"generate has no option {name}.{did_you_mean(name, known)}")
     texts = [texts] if isinstance(texts, str) else texts
     actions = [actions] if isinstance(actions, str) else actions
     kind = "text" if texts is not None else "action" if actions is not None else "none"

@@ -55,6 +55,13 @@ def test_the_best_checkpoint_of_a_run_is_named(earlier, capsys):
     assert "which=newest: write last or best" in capsys.readouterr().err
 
 
+def test_a_folder_of_runs_lists_them(earlier, capsys):
+    assert main(["sample", "runs/quickstart", "text=a person walks"]) == 1
+    assert f"Name a run: {RUN}" in capsys.readouterr().err
+    assert main(["sample", f"{RUN[:-1]}", "text=a person walks"]) == 1
+    assert "no such checkpoint. Did you mean default?" in capsys.readouterr().err
+
+
 def test_a_store_opens(earlier):
     store = Store(Path("data/synthetic-humanml-clean-smpl22"))
     store.verify()

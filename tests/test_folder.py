@@ -2,8 +2,10 @@
 
 import csv
 import json
+import os
 import re
 import shlex
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -575,6 +577,44 @@ def test_counts_are_of_clips_that_the_recipe_uses(tmp_path: Path, monkeypatch, c
         assert "no test clips. For your own data, add a `split` column to captions.csv" in output
     assert "legs 0.8" in prepared
     assert Store(tmp_path / "data" / "mine-humanml-clean-smpl22").info["dataset"] == "mine"
+
+
+def test_what_a_folder_lacks_is_said(tmp_path: Path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "mine").mkdir()
+    for number in range(10):
+        np.savez(f"mine/{number}.npz", joints=WALK[:20], fps=20)
+    words = ["prepare", "data=folder", "data.name=mine", "data_root=data", "source=mine"]
+    assert main(words) == 0
+    said = capsys.readouterr().out
+    assert "all train clips are too short: lower data.crop.min_frames" in said
+    assert "no captions: add captions.csv and prepare again with force=true" in said
+    assert main(words) == 0
+    assert "changed since" not in capsys.readouterr().out
+    write_table(tmp_path / "mine", [{"id": str(n), "text": "walks"} for n in range(10)], "csv")
+    future = time.time() + 10
+    os.utime(tmp_path / "mine" / "captions.csv", (future, future))
+    assert main(words) == 0
+    assert "mine: captions.csv changed since: prepare with force=true to read them" in capsys.readouterr().out
+    assert main([*words, "force=true"]) == 0
+    said = capsys.readouterr().out
+    assert "changed since" not in said
+    assert "no captions" not in said
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["data=folder", "source="], "source= is empty. Give the folder"),
+        (["data=folder", "source=one.npz"], "one.npz: a file; give a folder"),
+        (["source=mine", "data.name=mine"], "data.name belongs to a data set, and none is named. Add data=NAME"),
+    ],
+)
+def test_what_was_typed_wrong_is_named(words: list[str], message: str, tmp_path: Path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    np.savez("one.npz", joints=WALK[:40], fps=20)
+    assert main(["prepare", *words]) == 1
+    assert message in capsys.readouterr().err
 
 
 def test_stores_of_earlier_versions_keep_their_name(tmp_path: Path):

@@ -209,6 +209,11 @@ def test_what_cannot_be_edited_is_refused_in_one_line(
     assert "\n" not in str(caught.value)
 
 
+def test_a_misspelt_option_is_named(model: MotionGeneration):
+    with pytest.raises(UserError, match=r"generate has no option second. Did you mean seconds"):
+        flame_mdm.generate(model, "a person walks", second=3)  # type: ignore[call-arg]
+
+
 @pytest.mark.parametrize("value", [3, None, b"walk"])
 def test_a_text_that_is_no_string_is_named(model: MotionGeneration, value: Any):
     for kind in ("texts", "actions"):

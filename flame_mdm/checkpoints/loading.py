@@ -14,7 +14,7 @@ from torch.utils._pytree import tree_leaves
 
 from flame_mdm.checkpoints.files import FILE, read_checkpoint
 from flame_mdm.config import Config, flatten, instantiate, trust
-from flame_mdm.errors import UserError, first_line
+from flame_mdm.errors import UserError, did_you_mean, first_line
 from flame_mdm.files import regular_file
 from flame_mdm.processes import MAX_STEPS
 from flame_mdm.task import MotionGeneration, Task
@@ -54,12 +54,16 @@ def find(source: str | Path, which: Which = "last") -> Path:
     if path.is_dir():
         if len(weights) != 1:
             there = ", ".join(file.name for file in weights) or "no .safetensors file"
-            raise UserError(f"{path}: this folder holds {there}. Name the file of the model")
+            runs = ", ".join(str(found.parent) for found in sorted(path.glob("*/checkpoints"))[:3])
+            raise UserError(
+                f"{path}: this folder holds {there}. Name {f'a run: {runs}' if runs else 'the file of the model'}"
+            )
         regular_file(weights[0])
         return weights[0]
     match = re.fullmatch(r"([\w.-]+/[\w.-]+)(?:@([\w./-]+))?", str(source))
     if match is None or path.suffix in (".ckpt", ".safetensors", ".pt") or path.parent.is_dir():
-        raise FileNotFoundError(f"{path}: no such checkpoint")
+        near = did_you_mean(path.name, [p.name for p in path.parent.iterdir()]) if path.parent.is_dir() else ""
+        raise FileNotFoundError(f"{path}: no such checkpoint.{near}".rstrip("."))
     from huggingface_hub import hf_hub_download, logging
 
     logging.set_verbosity_error()  # otherwise it reports every attempt to reach the hub

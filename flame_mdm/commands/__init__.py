@@ -26,6 +26,8 @@ def data_node(config: Config) -> Config:
         names = sorted(path.stem for path in (EXPERIMENTS / "data").glob("*.yaml"))
         raise UserError(f"no data set named. Add data=NAME, one of: {', '.join(names)}; folder is for your own motions")
     node = config["data"]
+    if config["source"] == "":
+        raise UserError("source= is empty. Give the folder of the data set, or drop it")
     if config["source"] is not None:
         if "path" not in node["source"]:
             raise UserError(f"source={config['source']}: {node['name']} is generated and has no source. Drop source=")

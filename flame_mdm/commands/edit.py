@@ -71,6 +71,8 @@ def write_edits(config: Config) -> None:
         f"{max(e.feature_error for e in edits):.3g} in normalized features, "
         f"{max(e.joint_error for e in edits):.3g} m in world joint positions"
     )
+    if max(e.joint_error for e in edits) > 0.01:
+        say("a kept part that follows a generated one begins where that one ends, so its place in the world may differ")
 
 
 main = partial(

@@ -42,7 +42,7 @@ def prepare(config: Config) -> None:
         return
     if (data.folder / "store.json").exists() and not config["force"]:
         store = data.open()
-        say(f"{data.folder}: already prepared (force=true rewrites it, verify=true checks it)")
+        say(f"{data.folder}: already prepared (force=true rewrites it, verify=true checks it)", *data.changed())
     else:
         store = write_store(data.folder, data.source, representation)
         say(*data.source.findings())

@@ -102,7 +102,7 @@ class PretrainedText(ConditionEncoder):
         if batch.text is None:
             raise ValueError(
                 f"text encoder {self._pretrained.model} needs captions, and this batch has none: "
-                "choose data with captions"
+                "add captions, or choose another condition"
             )
         captions = [*batch.text, ""] if self.encode_null else batch.text
         if self.freeze:

@@ -60,7 +60,9 @@ class LearnedTokens(ConditionEncoder):
 
     def forward(self, batch: MotionBatch) -> Condition:
         if batch.text is None:
-            raise ValueError("condition=learned needs captions, and this batch has none: choose data with captions")
+            raise ValueError(
+                "condition=learned needs captions, and this batch has none: add captions, or choose another condition"
+            )
         device = self.null.device
         numbers = {caption: number for number, caption in enumerate(dict.fromkeys(batch.text))}
         for caption in numbers.keys() - self._known.keys():

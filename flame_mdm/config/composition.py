@@ -147,7 +147,9 @@ def find_recipe(name: str) -> Recipe:
             plain(content, name, but=RUN_DIR)
         return Recipe(path.parent, path.stem, saved, None if saved else path.stem)
     if name not in recipes():
-        raise UserError(f"unknown experiment '{name}'.{did_you_mean(name, recipes())} `make help` lists them all")
+        raise UserError(
+            f"unknown experiment '{name}'.{did_you_mean(name, recipes())} `flame-mdm train --help` lists them all"
+        )
     path = EXPERIMENTS / name
     return Recipe(path.parent, path.name, experiment=name)  # Hydra looks up `launch` relative to the recipe
 

@@ -101,6 +101,8 @@ def walk(node: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...
 def unknown_key(config: Config, parts: Sequence[str], depth: int, node: Any) -> str:
     """Returns the error message for a key whose part `parts[depth]`, in the parent `node`, is unknown."""
     key = ".".join(parts)
+    if parts[0] == "data" and not depth:
+        return f"{key} belongs to a data set, and none is named. Add data=NAME, such as data=folder"
     known = {".".join([*path, str(name)]) for path, mapping in walk(config) for name in mapping}
     if isinstance(node, Mapping) and "_target_" in node:
         known |= {".".join([*parts[:depth], name]) for name in parameters(node["_target_"]) if name != "**"}

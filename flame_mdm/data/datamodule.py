@@ -24,7 +24,7 @@ from flame_mdm.data.clips import Clips, Draw, Sample
 from flame_mdm.data.crops import Crop
 from flame_mdm.data.resident import SHARE, ResidentLoader, free_memory, resident_features
 from flame_mdm.data.store import Store, write_store
-from flame_mdm.errors import UserError
+from flame_mdm.errors import UserError, say
 from flame_mdm.motion import collate, padded_length
 from flame_mdm.representations import Representation
 
@@ -148,7 +148,9 @@ class MotionDataModule(LightningDataModule):
 
     def prepare_data(self) -> None:
         """Writes the store if there is none; Lightning calls this in one process only."""
-        if not (self.folder / "store.json").exists():
+        if (self.folder / "store.json").exists():
+            say(*self.changed())
+        else:
             write_store(self.folder, self.source, self.representation)
 
     @property
@@ -197,8 +199,30 @@ class MotionDataModule(LightningDataModule):
             for split, n in short.items()
         )
         empty = [split for split in short if not used[split]]
-        advice = [f"no {split} clips. For your own data, add a `split` column to captions.csv" for split in empty]
+        advice = [
+            f"all {split} clips are too short: lower data.crop.min_frames"
+            if short[split]
+            else f"no {split} clips. For your own data, add a `split` column to captions.csv"
+            for split in empty
+        ]
+        if not store.info["actions"] and not any(clip.captions for clip in store.clips):
+            advice.append(
+                "no captions: add captions.csv and prepare again with force=true, or train with condition=none"
+            )
         return ["clips: " + ", ".join(each), *(() if store.info["published_split"] else advice)]
+
+    def changed(self) -> list[str]:
+        """Returns a line if files of the user's own data set were added or changed after it was prepared."""
+        if not self.source.named_by_recipe or not (folder := Path(getattr(self.source, "path", ""))).is_dir():
+            return []
+        when = (self.folder / "store.json").stat().st_mtime
+        newer = sorted(
+            str(path.relative_to(folder))
+            for path in folder.rglob("*")
+            if path.is_file() and path.stat().st_mtime > when
+        )
+        more = f" and {len(newer) - 1} more" * (len(newer) > 1)
+        return [f"{folder}: {newer[0]}{more} changed since: prepare with force=true to read them"] if newer else []
 
     def padding(self) -> float:
         """Returns the share of padding in the frames of the first pass over the training clips."""

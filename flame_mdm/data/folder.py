@@ -219,7 +219,7 @@ class Folder(MotionSource):
                     raise ValueError(f"{path}: has the same name as {found[name].name}; each motion needs its own name")
                 found[name] = path
         if not found:
-            what = "no motion in it" if self.path.is_dir() else "no such folder"
+            what = "no motion in it" if self.path.is_dir() else "a file" if self.path.exists() else "no such folder"
             raise FileNotFoundError(f"{self.path}: {what}; give a folder of {', '.join(MOTIONS)} files")
         unknown = sorted(set(self.exclude) - set(found))
         if unknown:

@@ -213,7 +213,8 @@ class Report(Callback):
         where = {"train/loss": "on the last batch", "val/loss": "on the validation clips"}
         found = {text: trainer.callback_metrics.get(name) for name, text in where.items()}
         losses = ", ".join(f"{value:.4g} {text}" for text, value in found.items() if value is not None)
-        say(f"loss after {trainer.global_step} steps: {losses} (lower is better; comparable within a recipe only)")
+        if losses:
+            say(f"loss after {trainer.global_step} steps: {losses} (lower is better; comparable within a recipe only)")
         say(f"report: {write_report(self.folder)}")
         if isinstance(pl_module, MotionGeneration):
             facts, kind = pl_module.facts, pl_module.conditioned_on

@@ -179,6 +179,7 @@ def test_humanact12_from_raw_file_to_batch(tmp_path: Path):
     assert data.store.info["published_split"] is False
     labels = [clip.action for clip in data.store.clips]
     assert labels == [k % 12 for k in range(360)]
+    assert batch.action is not None
     assert batch.action.tolist() == [labels[int(name[-4:])] for name in batch.ids]
     for split in ("train", "val", "test"):
         assert {clip.action for clip in data.store.clips if clip.split == split} == set(range(12))

@@ -217,8 +217,9 @@ def test_a_misspelt_option_is_named(model: MotionGeneration):
 @pytest.mark.parametrize("value", [3, None, b"walk"])
 def test_a_text_that_is_no_string_is_named(model: MotionGeneration, value: Any):
     for kind in ("texts", "actions"):
+        asked: dict[str, Any] = {kind: ["walk", value]}
         with pytest.raises(UserError, match=rf"^{kind[:-1]}={value!r} is not a string\. Give a string"):
-            flame_mdm.generate(model, **{kind: ["walk", value]})
+            flame_mdm.generate(model, **asked)
 
 
 def test_no_text_is_not_an_unconditioned_motion(model: MotionGeneration):

@@ -213,7 +213,7 @@ class MotionGeneration(Task):
             cond = cond.drop(torch.rand(len(batch), device=self.device) < self.cond_drop_prob)
         terms = self.process.loss(self.denoiser, batch.x, batch.mask, cond, auxiliary=self.losses)
         trainer = self._trainer  # None where a step is computed without one
-        if trainer is not None and (trainer.global_step + 1) % trainer.log_every_n_steps == 0:  # type: ignore[attr-defined]
+        if trainer is None or (trainer.global_step + 1) % trainer.log_every_n_steps == 0:  # type: ignore[attr-defined]
             self.log_dict({f"train/{name}": value.mean() for name, value in terms.items()}, batch_size=len(batch))
         return terms["loss"].mean()
 

@@ -47,7 +47,7 @@ def words(root: Path, clips: int = 100) -> list[str]:
 
 
 def test_a_preparation_that_is_stopped_leaves_nothing(tmp_path):
-    process = start("prepare", *words(tmp_path))
+    process = start("prepare", *words(tmp_path, 2000))
     wait_for(lambda: (tmp_path / f"{STORE}.partial").exists(), process)
     stopped(process)
     assert list(tmp_path.iterdir()) == []

@@ -1,5 +1,6 @@
 """The command that prepares and verifies data sets: reports, misuse, interruption, the same result on any machine."""
 
+import gc
 import hashlib
 import json
 import os
@@ -189,7 +190,7 @@ def test_the_fingerprint_does_not_depend_on_the_number_of_workers(
 
 
 LARGE = """
-import sys, resource, pathlib, numpy as np
+import sys, pathlib, numpy as np
 from flame_mdm.data import Clip, MotionSource
 from flame_mdm.data.store import write_store
 from flame_mdm.representations.humanml import HumanML
@@ -204,7 +205,8 @@ class Large(MotionSource):
             yield Clip(f"{number}", motion, ["a person walks"], "train", f"{number}", encoded="humanml-clean-smpl22")
 
 write_store(pathlib.Path(sys.argv[1], "large"), Large(), HumanML())
-print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+# Not ru_maxrss, which a process inherits from the one that started it.
+print(next(line.split()[1] for line in open('/proc/self/status') if line.startswith('VmHWM:')))
 """
 
 
@@ -232,14 +234,16 @@ def test_an_interrupted_preparation_leaves_nothing(
             os.kill(os.getpid(), how)
         return make(self, *arguments, **options)
 
+    gc.collect()  # readers that other tests left open end their processes
     before = signal.getsignal(signal.SIGTERM)
+    earlier = set(active_children())
     ignored = signal.signal(signal.SIGINT, signal.default_int_handler)  # it is, where the tests run in the background
     with monkeypatch.context() as patch:
         patch.setattr(Bandai, "_clip", interrupted)
         assert main(["prepare", *words, "data.source.workers=2"]) == code
     signal.signal(signal.SIGINT, ignored)
     assert not root.exists()
-    assert active_children() == []
+    assert set(active_children()) <= earlier
     assert signal.getsignal(signal.SIGTERM) is before
     assert main(["prepare", *words, "data.source.workers=1"]) == 0
     assert only_store(root).fingerprint == fingerprint

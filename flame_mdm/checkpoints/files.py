@@ -83,12 +83,20 @@ class _Recipe(TypedDict):
     denoiser: NotRequired[_Part]
 
 
+class _Training(TypedDict, total=False):
+    hours: Number
+    memory_gib: Number
+    processes: int
+    speed: str
+    precision: str
+
+
 class _Facts(TypedDict):
     actions: list[str]
     max_frames: int
     dataset: NotRequired[str]  # unknown for released extractors
     fingerprint: NotRequired[str | None]
-    training: NotRequired[dict[str, Number | str]]
+    training: NotRequired[_Training]
     vocabulary: NotRequired[list[str]]
     captions: NotRequired[list[str]]
 

@@ -25,8 +25,8 @@ def accelerate(task: Task, data: MotionDataModule, config: Config) -> str:
     On CUDA: bfloat16 if the device supports it, and a compiled denoiser in runs of `COMPILED_FROM` steps or more.
 
     On a CPU: bfloat16 if it has instructions for products in it; `CheapDropout`; attention by `attention`, without
-    dropout of its weights. On two cores of an AMD EPYC (Zen 5), a step of MDM's encoder takes 0.42 times as long at a
-    width of 128, and 0.28 times at 512. Compilation made no difference there.
+    dropout of its weights. On two cores of an AMD EPYC, a step of MDM's encoder is 1.7 times as fast at a width of 128,
+    and 3.6 times at 512 (docs/benchmarks/speed.md). Compilation made no difference there.
 
     A precision other than that of `reference` in the recipe stays.
     """

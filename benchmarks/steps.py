@@ -78,7 +78,7 @@ def peer_step(width: int, layers: int, device: str) -> Callable[[MotionBatch], N
 
 
 def recipe_step(config: dict[str, Any], speed: str, device: str) -> tuple[Callable[[MotionBatch], None], int]:
-    """Returns a step of a recipe, with zeros instead of an encoded text, and the multiple its batches are padded to."""
+    """Returns a training step of a recipe, with zeros in place of the text, and the multiple of frames it pads to."""
     config = deepcopy(config)
     config["trainer"]["accelerator"] = device
     representation = instantiate(config["representation"])

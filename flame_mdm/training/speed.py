@@ -1,4 +1,7 @@
-"""`speed=fast`: bfloat16, compilation, and cheaper dropout and attention, each where it was measured to be faster."""
+"""`speed=fast`: bfloat16, compilation, and cheaper dropout and attention.
+
+The choices for CPUs are measured (docs/benchmarks/speed.md), those for CUDA are not yet.
+"""
 
 from __future__ import annotations
 
@@ -12,10 +15,11 @@ from flame_mdm.errors import say
 from flame_mdm.task import MotionGeneration, Task
 
 COMPILED_FROM = 5000
-"""Minimum number of training steps for which the network is compiled, which takes a minute or two."""
+"""Minimum number of training steps for which the network is compiled: shorter runs would not make up for the time."""
 PAD_MULTIPLE = 32
 """Batches of a compiled network are padded to multiples of this number of frames, since each length is compiled."""
 MOST_SHAPES = 64
+"""Maximum number of lengths and modes for which the network is compiled; torch stops at 8 by default."""
 BITS = 16
 
 
@@ -38,7 +42,7 @@ def accelerate(task: Task, data: MotionDataModule, config: Config) -> str:
     if device == "cuda":
         supported = torch.cuda.is_bf16_supported(including_emulation=False)
         if isinstance(task, MotionGeneration) and trainer["max_steps"] >= COMPILED_FROM:
-            say("compiling the network: the first steps take a minute or two, and less in later runs")
+            say("compiling the network: the first steps take longer, and less so in later runs")
             if getattr(task.denoiser, "mask_padding", True):  # otherwise, padding changes what it learns
                 data.pad_multiple = max(data.pad_multiple, PAD_MULTIPLE)
             torch._dynamo.config.recompile_limit = MOST_SHAPES

@@ -25,7 +25,7 @@ from evaluators.metrics.alignment import (
     retrieval_ranks,
     whole_set_retrieval,
 )
-from evaluators.metrics.confidence import mean_ci
+from evaluators.metrics.confidence import bootstrap, mean_ci
 from evaluators.metrics.distribution import (
     FrechetMotionDistance,
     KernelMotionDistance,
@@ -895,6 +895,40 @@ def test_wrong_inputs_are_told(metric: Metric, change: Callable[..., dict[str, T
 def test_confidence_of_nothing_is_an_error():
     with pytest.raises(ValueError, match="no values"):
         mean_ci([])
+
+
+def test_bootstrap_of_a_mean_is_the_interval_in_closed_form():
+    generator = np.random.default_rng(0)
+    x = generator.normal(3, 2, 200)
+    value, low, high = bootstrap(200, lambda i: [x[i].mean(), -x[i].mean()], resamples=4000, seed=1)
+    half = 1.96 * x.std() / 200**0.5
+    np.testing.assert_allclose(value, [x.mean(), -x.mean()])
+    np.testing.assert_allclose(low, value - half, atol=0.05 * half)
+    np.testing.assert_allclose(high, value + half, atol=0.05 * half)
+    assert bootstrap(200, lambda i: x[i].mean(), seed=2) == bootstrap(200, lambda i: x[i].mean(), seed=2)
+    inside = 0
+    for trial in range(300):
+        y = generator.normal(1, 1, 60)
+        _, low, high = bootstrap(60, lambda i, y=y: y[i].mean(), resamples=200, seed=trial)
+        inside += low <= 1 <= high
+    assert 0.91 < inside / 300 < 0.98
+    with pytest.raises(ValueError, match="no motions"):
+        bootstrap(0, lambda i: 0.0)
+
+
+def test_bootstrap_of_a_distance_is_at_its_value_and_pairs_are_sharper():
+    generator = torch.Generator().manual_seed(0)
+    real, noise = torch.randn(2, 150, 8, generator=generator, dtype=torch.float64)
+
+    def distance(i: np.ndarray, scale: float) -> float:
+        return frechet_distance(scale * noise[i], real).item()
+
+    one, two = (bootstrap(150, lambda i, s=s: distance(i, s), resamples=300) for s in (1.0, 1.02))
+    assert one.low < one.value < one.high, "sets with repetitions are farther away, which is not the value's error"
+    assert one.low < two.value < one.high, "one by one, the two cannot be told apart"
+    paired = bootstrap(150, lambda i: distance(i, 1.02) - distance(i, 1.0), resamples=300)
+    assert paired.value == pytest.approx(two.value - one.value)
+    assert (paired.high - paired.low) < (one.high - one.low) / 4
 
 
 def test_normalized_features_compare_directions_alone():

@@ -1,0 +1,58 @@
+"""Near-miss captions: captions that name the action of a clip, but contradict it in one attribute."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from flame_mdm.data.store import Entry
+
+ACTION = ("action", "content")
+"""Names of the attribute that says what is done; clips without it have no near misses."""
+UNSAID = "normal"
+"""Value that captions do not mention: such captions are less exact, but not wrong."""
+
+_Stated = frozenset[tuple[str, str | int | float]]
+
+
+def near_misses(clips: Sequence[Entry]) -> list[dict[str, list[str]]]:
+    """Finds the near-miss captions of each clip among the captions of the other clips.
+
+    A caption of another clip is a near miss if both clips show the same action, and of the attributes that both have
+    (side, style, count, direction, speed, ...), exactly one differs. An attribute that only one of them has does not
+    matter: "walks backward" is a near miss of a slow walk forward.
+
+    Returns:
+        For each clip, its near misses by the name of the attribute that differs, sorted; {} if there are none.
+    """
+    stated = [_stated(clip) for clip in clips]
+    captions: dict[_Stated, set[str]] = {}
+    for own, clip in zip(stated, clips, strict=True):
+        captions.setdefault(own, set()).update(clip.captions)
+    found = {own: _contradicting(own, captions) for own in captions}
+    return [found[own] for own in stated]
+
+
+def _stated(clip: Entry) -> _Stated:
+    """Returns the attributes of a clip, its action as "action", without the words that other attributes state.
+
+    With side "left", "wave-left-hand" is "wave-{side}-hand", the same action as "wave-both-hands" with side "both".
+    """
+    known = {name: value for name, value in clip.attributes.items() if isinstance(value, str | int | float)}
+    action = next((str(known.pop(name)) for name in ACTION if name in known), "")
+    names = {str(value): f"{{{name}}}" for name, value in known.items()}
+    if action:
+        known["action"] = "-".join(names.get(word, word.removesuffix("s")) for word in action.split("-"))
+    return frozenset(known.items())
+
+
+def _contradicting(own: _Stated, captions: dict[_Stated, set[str]]) -> dict[str, list[str]]:
+    mine = dict(own)
+    wrong: dict[str, set[str]] = {}
+    for each, texts in captions.items():
+        other = dict(each)
+        if "action" not in mine or mine["action"] != other.get("action"):
+            continue
+        differing = [name for name in mine.keys() & other.keys() if mine[name] != other[name]]
+        if len(differing) == 1 and other[differing[0]] != UNSAID:
+            wrong.setdefault(differing[0], set()).update(texts - captions[own])
+    return {name: sorted(texts) for name, texts in sorted(wrong.items()) if texts}

@@ -11,6 +11,7 @@ import torch
 from t2m_folder import line, write_folder
 
 from evaluators.extractors import OwnT2MExtractor
+from evaluators.extractors.t2m import LearnedWords
 from evaluators.extractors.t2m_training import MatchingLoss, T2MTask, matching_loss
 from flame_mdm.__main__ import main
 from flame_mdm.config import compose, instantiate
@@ -163,6 +164,35 @@ def test_the_loss_is_the_published_one():
     motion[1, 0], text[1, 0] = 3.0, 4.0
     # own pairs at 0 and 1; wrong ones at 3 and 4, of a margin of 3.5
     assert matching_loss(motion, text, 3.5).item() == pytest.approx((0 + 1 + 0.5**2 + 0) / 2)
+
+
+def test_a_motion_that_a_text_describes_is_no_wrong_one():
+    motion, text = torch.randn(2, 5, 4, generator=torch.Generator().manual_seed(0))
+    fits = torch.eye(5, dtype=torch.bool)
+    assert matching_loss(motion, text, 3.0, fits) == matching_loss(motion, text, 3.0)
+    fits[2, 1] = fits[0, 4] = fits[0, 3] = True
+    near = (motion - text).norm(dim=1).square()
+    wrong = [(motion[other] - text[i]).norm() for i, other in enumerate((2, 0, 0, 2, 3))]
+    expected = torch.stack([n + (3 - far).clamp(min=0) ** 2 for n, far in zip(near, wrong, strict=True)]).mean()
+    torch.testing.assert_close(matching_loss(motion, text, 3.0, fits), expected)
+    nothing_wrong = torch.ones(5, 5, dtype=torch.bool)
+    torch.testing.assert_close(matching_loss(motion, text, 3.0, nothing_wrong), near.mean())
+
+
+@pytest.mark.slow
+def test_words_are_learned_from_captions_without_tags(words, tmp_path):
+    learned = fit(tmp_path, words, "task.words=learned", "trainer.max_steps=200", "trainer.val_check_interval=200")
+    assert logged(learned, "val/motions_for_text_top3")[199] > 0.5  # by chance 3 in 32
+    extractor = OwnT2MExtractor(str(learned))
+    features = extractor.texts(["Walks slowly.", "runs left"], [None, None])
+    assert torch.allclose(extractor.texts(["walks slowly"], [["another/VERB"]]), features[:1], atol=1e-5)
+    assert not torch.allclose(features[0], features[1], atol=0.1)
+    assert isinstance(extractor.task.words, LearnedWords)
+    text = extractor.task.words([["walks", "slowly"], ["word"] * 30])
+    assert text.vectors.shape == (2, 22, 300)
+    assert text.lengths.tolist() == [4, 22]
+    assert torch.equal(text.vectors[1, 1], text.vectors[1, 20])
+    assert not text.parts.any()
 
 
 def test_the_loss_of_validation_does_not_depend_on_batches():

@@ -17,6 +17,7 @@ from evaluators.extractors.stgcn import Unconstrained, load_uestc, load_unconstr
 from evaluators.extractors.t2m import WordVectors, load_t2m
 from evaluators.extractors.t2m_training import T2MTask
 from flame_mdm.checkpoints.loading import find, load_task
+from flame_mdm.conditions.vocabulary import words
 from flame_mdm.data.humanact12 import read_unconstrained
 from flame_mdm.errors import UserError
 from flame_mdm.files import sha256
@@ -189,9 +190,10 @@ class OwnT2MExtractor(_OwnExtractor):
         """Computes features of captions.
 
         Raises:
-            UserError: If a caption has no tokens.
+            UserError: If a caption has no tokens, and the evaluator needs them.
         """
-        return self.task.text(_tagged(self.path, tokens))
+        given = [words(caption) for caption in captions] if self.task.learns_words else tokens
+        return self.task.text(_tagged(self.path, given))
 
 
 def _tagged(path: Path, tokens: Sequence[Sequence[str] | None]) -> list[Sequence[str]]:

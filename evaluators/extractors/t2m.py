@@ -16,6 +16,7 @@ from torch import Tensor, nn
 from torch.nn.utils.rnn import pack_padded_sequence
 
 from evaluators.extractors.released import load_strictly, read_weights
+from flame_mdm.conditions.vocabulary import hashed
 from flame_mdm.data import restricted_pickle
 from flame_mdm.data.t2m import MAX_TOKENS, frame_tokens
 from flame_mdm.files import read_npy
@@ -107,6 +108,28 @@ class WordVectors:
         return Words(self.vectors[rows], parts.scatter_(2, numbers[..., None], 1), lengths)
 
 
+class LearnedWords(nn.Module):
+    """Word vectors learned with the evaluator, for data sets without tagged words; see `vocabulary.hashed`.
+
+    Parts of speech are unknown: their vectors are 0.
+
+    Args:
+        buckets: rows of the word table.
+    """
+
+    def __init__(self, buckets: int = 2048):
+        super().__init__()
+        self.table = nn.Embedding(buckets, _TextEncoder.WORD)
+        nn.init.normal_(self.table.weight, std=0.3)  # about the scale of GloVe vectors
+
+    def forward(self, captions: Sequence[Sequence[str]]) -> Words:
+        """Returns the text encoder's input for the words of captions; those after the 20th are dropped."""
+        framed, lengths = zip(*map(frame_tokens, captions), strict=True)
+        rows = [[hashed(token.partition("/")[0], self.table.num_embeddings) for token in tokens] for tokens in framed]
+        vectors = self.table(torch.tensor(rows, device=self.table.weight.device)).sum(2)
+        return Words(vectors, vectors.new_zeros(*vectors.shape[:2], len(PARTS_OF_SPEECH)), torch.tensor(lengths))
+
+
 class T2MEvaluator(nn.Module):
     """Embeds motions and captions in a joint space, for R-precision, MM-Dist, FID and diversity on HumanML3D and KIT.
 
@@ -169,10 +192,12 @@ class T2MEvaluator(nn.Module):
         if not self.keep_padding:
             x = x * mask[..., None]
         x = pad_to(x[:, : self.max_frames], self.max_frames)
-        return self.motion_encoder(self.movement_encoder(x[..., :-CONTACTS]), lengths // UNIT)
+        with torch.no_grad():  # it is frozen when texts and motions are matched
+            movements = self.movement_encoder(x[..., :-CONTACTS])
+        return self.motion_encoder(movements, lengths // UNIT)
 
     def text(self, words: Words) -> Tensor:
-        """Returns embeddings (B, E) of captions, given as output of `WordVectors`."""
+        """Returns embeddings (B, E) of captions, given as output of `WordVectors` or `LearnedWords`."""
         weight = self.text_encoder.input_emb.weight
         return self.text_encoder(words.vectors.to(weight), words.parts.to(weight), words.lengths)
 

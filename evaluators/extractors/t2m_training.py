@@ -10,9 +10,10 @@ import torch
 from torch import Tensor, nn
 from torchmetrics import MeanMetric
 
-from evaluators.extractors.t2m import CONTACTS, UNIT, T2MEvaluator, WordVectors
+from evaluators.extractors.t2m import CONTACTS, UNIT, LearnedWords, T2MEvaluator, WordVectors
 from evaluators.metrics.alignment import MotionsForText, MultimodalDistance, TextAndMotion
 from flame_mdm.conditions import Unconditional
+from flame_mdm.conditions.vocabulary import words as words_of
 from flame_mdm.config import Config, instantiate
 from flame_mdm.data.datamodule import MotionDataModule
 from flame_mdm.errors import UserError
@@ -51,23 +52,29 @@ class _SavedWords(WordVectors):
         self.rows, self.vectors = rows, vectors
 
 
-def matching_loss(motion: Tensor, text: Tensor, margin: float) -> Tensor:
+def matching_loss(motion: Tensor, text: Tensor, margin: float, fits: Tensor | None = None) -> Tensor:
     """Contrastive loss of Guo et al. 2022 (Hadsell et al. 2006, eq. 4, without its factor 1/2).
 
-    Each text is compared with its own motion, and with the motion of the previous pair. The authors shift the motions
-    by a random number of places instead; a shift of 0 pushes matching pairs apart.
+    Each text is compared with its own motion, and with that of the nearest previous pair that it does not fit. The
+    authors shift the motions by a random number of places instead, which also pushes matching pairs apart.
 
     Args:
         motion: (B, E) embeddings.
         text: (B, E) embeddings.
         margin: Euclidean distance beyond which a wrong pair adds no loss.
+        fits: (B, B) bool, True = the text of the row describes the motion of the column; None = only its own.
 
     Returns:
         (), squared distance.
     """
+    count = len(motion)
+    own = torch.arange(count, device=motion.device)
+    previous = (own[:, None] - 1 - own[: count - 1]) % count
+    wrong = torch.ones_like(previous, dtype=torch.bool) if fits is None else ~fits.gather(1, previous)
+    other = previous.gather(1, wrong.int().argmax(1, keepdim=True))[:, 0]
     near = torch.linalg.vector_norm(motion - text, dim=-1)
-    far = torch.linalg.vector_norm(motion.roll(1, 0) - text, dim=-1)
-    return (near.square() + (margin - far).clamp(min=0).square()).mean()
+    far = torch.linalg.vector_norm(motion[other] - text, dim=-1)
+    return (near.square() + (margin - far).clamp(min=0).square() * wrong.any(1)).mean()
 
 
 class MatchingLoss(TextAndMotion):
@@ -94,10 +101,13 @@ class T2MTask(Task):
     Until step `movement_steps`, the movement encoder is trained with a decoder to reconstruct motions. It is then
     frozen, and the encoders of text and motion are trained to match. Checkpoints contain the word vectors.
 
+    Many clips may share a caption, so a motion is a wrong one for a text only if the text is not among its captions.
+
     Args:
         network: the evaluator; its statistics are set to those of the data.
         representation: of the motions, whose last 4 features are contacts.
-        words: folder of our_vab_data.npy and our_vab_idx.pkl, see `WordVectors`; only read for training.
+        words: folder of our_vab_data.npy and our_vab_idx.pkl, see `WordVectors`, only read for training; "learned" for
+            data sets whose words are not tagged, see `LearnedWords`.
         movement_steps: steps of the first stage.
         sparsity: weight of the mean magnitude of movement vectors.
         smoothness: weight of the mean magnitude of differences of successive movement vectors.
@@ -127,8 +137,8 @@ class T2MTask(Task):
         self.decoder = _MovementDecoder(linear.out_features, first.out_channels, first.in_channels)
         self.word_folder, self.movement_steps = words, movement_steps
         self.sparsity, self.smoothness, self.margin = sparsity, smoothness, margin
-        self.words: WordVectors | None = None
-        self.tokens: dict[tuple[str, str], list[str]] = {}
+        self.words: WordVectors | LearnedWords | None = LearnedWords() if words == "learned" else None
+        self.tokens: dict[str, dict[str, list[str]]] = {}  # of the captions of each clip
         self.val_loss, self.val_reconstruction = MatchingLoss(margin), MeanMetric()
         self.retrieval, self.distance = MotionsForText(POOL), MultimodalDistance()
 
@@ -153,28 +163,37 @@ class T2MTask(Task):
         data: MotionDataModule = self.trainer.datamodule  # type: ignore[attr-defined]
         if data.batch_size < 2:
             raise UserError(f"data.batch_size={data.batch_size}: matching needs at least two motions per batch")
-        if not Path(self.word_folder).is_dir():
-            raise FileNotFoundError(
-                f"task.words={self.word_folder}: no such folder. Give that of our_vab_data.npy and our_vab_idx.pkl"
-            )
-        self.words = WordVectors(self.word_folder)
-        self.facts["words"] = {str(word): int(row) for word, row in self.words.rows.items()}
+        if not self.learns_words:
+            if not Path(self.word_folder).is_dir():
+                raise FileNotFoundError(
+                    f"task.words={self.word_folder}: no such folder. Give that of our_vab_data.npy and our_vab_idx.pkl"
+                )
+            self.words = WordVectors(self.word_folder)
+            self.facts["words"] = {str(word): int(row) for word, row in self.words.rows.items()}
         self.network.mean.copy_(self.representation.mean)
         self.network.std.copy_(self.representation.std)
         clips = [*data.train.clips, *data.val.clips]
-        bare = [clip.id for clip in clips if not clip.captions or not clip.attributes.get("tokens")]
+        for clip in clips:
+            tagged = map(words_of, clip.captions) if self.learns_words else clip.attributes.get("tokens", ())
+            # The first of equal captions counts.
+            self.tokens[clip.id] = dict(reversed(list(zip(clip.captions, tagged, strict=False))))
+        bare = [name for name, tokens in self.tokens.items() if not tokens]
         if bare:
             raise UserError(
                 f"{data.folder}: {len(bare)} clips have no captions with tagged words, such as {bare[0]}. This "
-                "evaluator needs a data set with tagged words, such as HumanML3D or KIT-ML"
+                "evaluator needs a data set with tagged words, such as HumanML3D or KIT-ML, or task.words=learned"
+                if not self.learns_words
+                else f"{data.folder}: {len(bare)} clips have no captions, such as {bare[0]}"
             )
-        for clip in clips:
-            for caption, tokens in zip(clip.captions, clip.attributes["tokens"], strict=True):
-                self.tokens.setdefault((clip.id, caption), tokens)
+
+    @property
+    def learns_words(self) -> bool:
+        """Whether word vectors are learned from captions without tagged words."""
+        return isinstance(self.words, LearnedWords)
 
     def get_extra_state(self) -> Tensor:
-        """Returns the word vectors (words, 300); `facts` maps words to rows."""
-        return self.words.vectors if self.words else torch.zeros(0)
+        """Returns the given word vectors (words, 300); `facts` maps words to rows."""
+        return self.words.vectors if isinstance(self.words, WordVectors) else torch.zeros(0)
 
     def set_extra_state(self, state: Tensor) -> None:
         """Restores the word vectors of a checkpoint.
@@ -182,7 +201,9 @@ class T2MTask(Task):
         Raises:
             UserError: If a resumed run is given other word vectors.
         """
-        if self.words is not None and not torch.equal(self.words.vectors, state.cpu()):
+        if self.learns_words:
+            return
+        if isinstance(self.words, WordVectors) and not torch.equal(self.words.vectors, state.cpu()):
             raise UserError(f"task.words={self.word_folder}: these are not the word vectors that this run began with")
         self.words = _SavedWords(self.facts["words"], state.cpu())
 
@@ -193,7 +214,7 @@ class T2MTask(Task):
         return self.network(x, mask)
 
     def text(self, tokens: Sequence[Sequence[str]]) -> Tensor:
-        """Returns features (B, E) of captions, given as "word/PART" tokens."""
+        """Returns features (B, E) of captions, given as "word/PART" tokens, or as words if they are learned."""
         assert self.words is not None
         return self.network.text(self.words(tokens))
 
@@ -207,7 +228,8 @@ class T2MTask(Task):
             terms = {name: value.mean() for name, value in self._reconstruct(batch).items()}
             loss = terms["reconstruction"] + self.sparsity * terms["sparsity"] + self.smoothness * terms["smoothness"]
         else:
-            loss = matching_loss(*self._embed(batch), self.margin)
+            fits = [[text in self.tokens[name] for name in batch.ids] for text in batch.text or ()]
+            loss = matching_loss(*self._embed(batch), self.margin, torch.tensor(fits, device=self.device))
         self.log("train/loss", loss, batch_size=len(batch))
         return loss + 0 * sum(parameter.sum() for parameter in self._idle())  # gives all a gradient, as DDP requires
 
@@ -224,6 +246,7 @@ class T2MTask(Task):
         """Returns the parameters that are not trained in the current stage."""
         movement = [*self.network.movement_encoder.parameters(), *self.decoder.parameters()]
         matching = [*self.network.text_encoder.parameters(), *self.network.motion_encoder.parameters()]
+        matching += self.words.parameters() if isinstance(self.words, LearnedWords) else []
         return matching if self._learns_movement else movement
 
     def _reconstruct(self, batch: MotionBatch) -> dict[str, Tensor]:
@@ -245,7 +268,7 @@ class T2MTask(Task):
     def _embed(self, batch: MotionBatch) -> tuple[Tensor, Tensor]:
         """Returns embeddings (B, E) of motions and of their captions."""
         assert batch.text is not None
-        tokens = [self.tokens[pair] for pair in zip(batch.ids, batch.text, strict=True)]
+        tokens = [self.tokens[name][text] for name, text in zip(batch.ids, batch.text, strict=True)]
         return self(self.representation.denormalize(batch.x), batch.mask), self.text(tokens)
 
     def validation_step(self, batch: MotionBatch, batch_idx: int) -> None:

@@ -1,7 +1,5 @@
 """Small text encoder that is trained with the model and needs no download."""
 
-import zlib
-
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
@@ -16,10 +14,8 @@ START = "<start>"
 class LearnedTokens(ConditionEncoder):
     """Hashed words, learned positions and one transformer layer; the null is one learned vector.
 
-    A word is the sum of two rows of the table, selected by two parts of its hash (Svenstrup et al. 2017, "Hash
-    embeddings"): no vocabulary is stored, and two words are confused only if both parts collide. The hash (CRC-32) is
-    the same on every machine. Captions are lowercased, punctuation separates words, and words after `max_words` are
-    dropped.
+    A word is the sum of two rows of the table, selected by its hash, see `vocabulary.hashed`. Captions are lowercased,
+    punctuation separates words, and words after `max_words` are dropped.
 
     Each distinct caption of a batch is encoded once, so that samples with the same caption share its dropout. Linear
     layers skip the padding.
@@ -54,9 +50,7 @@ class LearnedTokens(ConditionEncoder):
     def rows(self, caption: str) -> list[tuple[int, int]]:
         """Returns the two rows of the table for the start token and each word of a caption."""
         words = [START, *vocabulary.words(caption)[: self.max_words]]
-        # Not two hashes of the word with different prefixes: CRC is linear, so both would collide together.
-        hashes = [zlib.crc32(word.encode()) for word in words]
-        return [(h % self.buckets, h // self.buckets % self.buckets) for h in hashes]
+        return [vocabulary.hashed(word, self.buckets) for word in words]
 
     def forward(self, batch: MotionBatch) -> Condition:
         if batch.text is None:

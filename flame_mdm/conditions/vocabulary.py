@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import zlib
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -14,6 +15,17 @@ MAX_CAPTIONS = 1000
 def words(text: str) -> list[str]:
     """Returns the words of a text, lowercased, without punctuation."""
     return WORD.findall(text.lower())
+
+
+def hashed(word: str, buckets: int) -> tuple[int, int]:
+    """Returns the two rows of a table of `buckets` word vectors whose sum is the vector of a word.
+
+    They are two parts of its hash (Svenstrup et al. 2017, "Hash embeddings"): no vocabulary is stored, and two words
+    are confused only if both parts collide. The hash (CRC-32) is the same on every machine.
+    """
+    # Not two hashes of the word with different prefixes: CRC is linear, so both would collide together.
+    number = zlib.crc32(word.encode())
+    return number % buckets, number // buckets % buckets
 
 
 def vocabulary(captions: Iterable[str], *, share: bool) -> dict[str, list[str]]:

@@ -12,7 +12,6 @@ from typing import Any, Protocol
 
 import numpy as np
 import torch
-from tqdm import tqdm
 
 from evaluators.processes import dealt, shared
 from flame_mdm.data.datamodule import Clips
@@ -21,6 +20,7 @@ from flame_mdm.editing import kept_parts
 from flame_mdm.errors import UserError
 from flame_mdm.files import atomic_write, read_npz, regular_file
 from flame_mdm.motion import Edit, MotionBatch, length_mask, pad_to
+from flame_mdm.progress import ProgressBar
 from flame_mdm.representations import Representation
 from flame_mdm.seeds import key, normal
 from flame_mdm.task import MotionGeneration
@@ -125,7 +125,7 @@ class Generator:
         self.model, self.folder, self.options, self.clips = model, folder, dict(options), clips
         self.condition, self.batch_size, self.timed, self.parts = condition, batch_size, timed, parts
         self.how = self.options.pop("edit", {})
-        self.bar = tqdm(total=total, desc="generating", unit=" motions", disable=not progress)
+        self.bar = ProgressBar(total=total, desc="generating", unit=" motions", disable=not progress)
 
     def __call__(self, name: str, rows: list[Row], replication: int, rank: int = 0, world: int = 1) -> Samples:
         """Returns the motions of the rows, from the cache or else from the model; see `Source`.

@@ -13,12 +13,13 @@ from fixtures import ROOT
 FILES = sorted([*(ROOT / "flame_mdm").rglob("*.py"), *(ROOT / "evaluators").rglob("*.py")])
 
 AXES = {"denoisers", "processes", "conditions", "representations"}
-GROUND = {"errors", "losses", "files", "config", "motion", "seeds"}
+GROUND = {"errors", "losses", "files", "config", "motion", "seeds", "progress"}
 MODELS = GROUND | AXES | {"visualize", "formats", "data", "task"}
 ALL = MODELS | {"generation", "editing", "checkpoints", "runs", "reporting", "training"}
 MAY_IMPORT: dict[str, set[str]] = {
     "errors": set(),
     "losses": set(),
+    "progress": set(),
     "representations": {"errors"},
     "files": {"errors"},
     "motion": {"errors"},
@@ -151,6 +152,7 @@ def test_strings_outside_commands_name_no_module_of_the_evaluators():
         ("flame_mdm.files", "from flame_mdm.config import Config"),
         ("flame_mdm.motion", "from flame_mdm.seeds import key"),
         ("flame_mdm.seeds", "from flame_mdm.config import Config"),
+        ("flame_mdm.progress", "from flame_mdm.errors import say"),
         ("flame_mdm.config", "from flame_mdm.data import Clip"),
         ("flame_mdm.denoisers.mdm", "from flame_mdm.conditions.text import TextEncoder"),
         ("flame_mdm.processes.diffusion", "import flame_mdm.denoisers"),

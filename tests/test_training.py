@@ -22,7 +22,7 @@ from flame_mdm.config import compose, instantiate
 from flame_mdm.errors import UserError
 from flame_mdm.generation import generate
 from flame_mdm.motion import MotionBatch, length_mask
-from flame_mdm.training.callbacks import Progress
+from flame_mdm.progress import ProgressBar
 
 STEPS = ["trainer.val_check_interval=4", "callbacks.checkpoints.every_n_steps=4", "callbacks.samples=null"]
 
@@ -117,15 +117,16 @@ def test_a_resumed_run_is_the_uninterrupted_one(tiny, extra, tmp_path):
 
 def test_progress_counts_all_steps_and_shows_losses(tiny, capfd, monkeypatch):
     """Also after a resume; in a log file as plain lines, here one per step."""
-    monkeypatch.setattr(Progress, "SECONDS", 0.0)
+    monkeypatch.setattr(ProgressBar, "SECONDS", 0.0)
     overrides = [*tiny, *STEPS, "trainer.enable_progress_bar=true", "trainer.log_every_n_steps=2"]
     run(overrides, 6)
     run(overrides, 8)
     lines = [line for line in capfd.readouterr().err.splitlines() if line.startswith("training:")]
     counts = [re.search(r" (\d+/\d+) \[", line) for line in lines]
-    assert [found and found[1] for found in counts] == ["1/6", "2/6", "3/6", "4/6", "5/6", "6/6", "7/8", "8/8"]
-    assert "train/loss=" in lines[2]
-    assert "val/loss=" in lines[5]
+    steps = [*(f"{step}/6" for step in range(7)), "6/8", "7/8", "8/8"]
+    assert list(dict.fromkeys(found and found[1] for found in counts)) == steps
+    assert "train/loss=" in lines[3]
+    assert "val/loss=" in lines[6]
     assert not any("\r" in line for line in lines)
 
 

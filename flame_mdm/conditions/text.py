@@ -17,11 +17,11 @@ from typing import Any, Literal
 import numpy as np
 import torch
 from torch import Tensor, nn
-from tqdm import tqdm
 
 from flame_mdm.conditions import ConditionEncoder
 from flame_mdm.files import made_folder, sha256, writing
 from flame_mdm.motion import Condition, MotionBatch, sent
+from flame_mdm.progress import ProgressBar
 
 CAPTIONS_AT_ONCE = 64
 POOLINGS = ("projection", "mean", "pooler")
@@ -129,7 +129,7 @@ class PretrainedText(ConditionEncoder):
                 warnings.warn(f"{error}; rebuilding it", stacklevel=2)
                 shutil.rmtree(path)
         device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-        encoded = tqdm(
+        encoded = ProgressBar(
             self._encode_frozen(distinct, device),
             desc=f"encoding captions with {self._pretrained.model}",
             total=len(distinct),

@@ -14,11 +14,11 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from tqdm import tqdm
 
 from flame_mdm.data import Clip, MotionSource, Split, hashed_split
 from flame_mdm.data.amass import Amass, Recording, key_of
 from flame_mdm.files import read_json
+from flame_mdm.progress import ProgressBar
 
 FPS = 20.0
 
@@ -131,7 +131,7 @@ class Babel(MotionSource):
             labels = {part: self.labels(part) for part in PARTS}
             keys = dict.fromkeys(label.motion for part in PARTS for label in labels[part])
             measured = self.amass.each(keys, _measure, self.workers)
-            lengths = dict(tqdm(measured, "measuring the motions of AMASS", len(keys), unit=" motions"))
+            lengths = dict(ProgressBar(measured, "measuring the motions of AMASS", len(keys), unit=" motions"))
             self._windows = []
             trained = {label.motion for label in labels["train"]}
             for part in PARTS:

@@ -16,12 +16,12 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from tqdm import tqdm
 
 from flame_mdm.data import Clip, MotionSource, archives, restricted_pickle
 from flame_mdm.data.amass import Amass, Body, Recording, key_of, load_bodies, subset_of
 from flame_mdm.data.t2m import T2MFolder
 from flame_mdm.files import atomic_write, read_npy, read_text
+from flame_mdm.progress import ProgressBar
 from flame_mdm.representations import Frames
 from flame_mdm.representations.humanml import HumanML
 
@@ -183,7 +183,7 @@ class HumanML3D(T2MFolder):
                 recordings[row.key].append(row)
             joints = _humanact12_files(self.humanact12)
             try:
-                with tqdm(desc=f"creating {self.name}", total=len(todo), unit=" motions") as progress:
+                with ProgressBar(desc=f"creating {self.name}", total=len(todo), unit=" motions") as progress:
                     from_amass = {key: rows for key, rows in recordings.items() if not rows[0].humanact12}
                     for _, done in amass.each(from_amass, partial(_from_amass, write, self._bodies()), self.workers):
                         progress.update(done)

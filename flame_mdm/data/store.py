@@ -30,12 +30,12 @@ from typing import Any, get_args
 
 import numpy as np
 import torch
-from tqdm import tqdm
 
 from flame_mdm.data import Clip, MotionSource, Split
 from flame_mdm.data.parallel import in_order, locked
 from flame_mdm.errors import UserError, first_line, say
 from flame_mdm.files import parse_json, read_json, read_npy, read_npz, regular_file, sha256, writing
+from flame_mdm.progress import ProgressBar
 from flame_mdm.representations import Frames, Representation
 
 FORMAT = 1
@@ -154,7 +154,7 @@ def _write(folder: Path, source: MotionSource, representation: Representation, t
     try:
         with writing(folder, partial):
             partial.mkdir(parents=True)
-        bar = tqdm(source.clips(representation.fps), f"preparing {source.name}", total, unit=" clips")
+        bar = ProgressBar(source.clips(representation.fps), f"preparing {source.name}", total, unit=" clips")
         with bar as clips, _Writer(folder, partial, representation.features) as writer:
             with closing(_encoded(clips, representation, source.workers)) as encoded:
                 for clip, features in encoded:

@@ -11,12 +11,12 @@ from typing import Any, get_args
 
 import numpy as np
 import torch
-from tqdm import tqdm
 
 from flame_mdm.data import Split
 from flame_mdm.data.datamodule import MotionDataModule
 from flame_mdm.data.store import Entry, Store
 from flame_mdm.files import read_yaml, write_text
+from flame_mdm.progress import ProgressBar
 from flame_mdm.representations import Representation
 
 PUBLISHED = Path(__file__).with_name("published.yaml")
@@ -202,7 +202,7 @@ def _motions(store: Store) -> list[list[Entry]]:
 def _still(store: Store, representation: Representation) -> list[str]:
     """Returns the ids of clips without movement."""
     found = []
-    for group in tqdm(_motions(store), "looking for movement", unit=" motions"):
+    for group in ProgressBar(_motions(store), "looking for movement", unit=" motions"):
         joints = representation.decode(torch.from_numpy(np.array(store.motion(group[0]))))
         if float((joints - joints[:1]).norm(dim=-1).max()) < STILL_DISTANCE:
             found += [clip.id for clip in group]

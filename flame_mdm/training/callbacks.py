@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import os
 import shlex
 import signal
@@ -23,7 +22,6 @@ from lightning.pytorch.callbacks import Checkpoint
 from torch import Tensor
 from torch.nn.utils import get_total_norm
 from torchmetrics import Metric
-from tqdm import tqdm
 
 from flame_mdm.conditions.action import ActionLabels
 from flame_mdm.data.datamodule import Clips, MotionDataModule
@@ -31,6 +29,7 @@ from flame_mdm.errors import say
 from flame_mdm.formats.motion import Motion
 from flame_mdm.generation import generate, write_motions
 from flame_mdm.motion import MotionBatch
+from flame_mdm.progress import ProgressBar
 from flame_mdm.reporting.page import number
 from flame_mdm.reporting.report import write_report
 from flame_mdm.task import MotionGeneration, Task
@@ -258,23 +257,18 @@ def explained(
 
 
 class Progress(Callback):
-    """Progress bar over the steps of a run, with remaining time and losses; plain lines every 30 s in a log file."""
-
-    SECONDS = 30.0
+    """Progress bar over the steps of a run, with remaining time and losses."""
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        self.screen = sys.stderr.isatty()
-        self.bar = tqdm(
+        self.bar = ProgressBar(
             desc="training",
             initial=trainer.global_step,
             total=trainer.max_steps if trainer.max_steps > 0 else None,
             unit="step",
             smoothing=0,  # validation and sampling, which take part of the time, count as well
             dynamic_ncols=True,
-            file=sys.stderr if self.screen else io.StringIO(),
             disable=not trainer.is_global_zero,
         )
-        self.printed = time.monotonic()
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
         if self.bar.disable or trainer.global_step == self.bar.n:  # gradients are still being accumulated
@@ -283,9 +277,6 @@ class Progress(Callback):
             losses = {name: trainer.callback_metrics.get(name) for name in ("train/loss", "val/loss")}
             self.bar.set_postfix({n: f"{v:.4g}" for n, v in losses.items() if v is not None}, refresh=False)
         self.bar.update(trainer.global_step - self.bar.n)
-        if not self.screen and time.monotonic() >= self.printed + self.SECONDS:
-            self.printed = time.monotonic()
-            say(str(self.bar), error=True)
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         self.bar.close()

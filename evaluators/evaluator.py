@@ -133,6 +133,7 @@ class Evaluator:
             rows["text"] = torch.cat(texts)[back]
         if motions.captions is not None:
             rows["text_keys"] = self._keys(motions.captions)
+            rows["captions"] = motions.captions
         if motions.labels is not None:
             rows["labels"] = torch.tensor(motions.labels)
         if motions.groups is not None:
@@ -141,6 +142,9 @@ class Evaluator:
             rows["requested"] = [{k: v for k, v in each.items() if k in ATTRIBUTES} for each in motions.requested]
         if motions.references is not None:
             rows["references"] = [torch.from_numpy(joints) for joints in motions.references]
+        contacts = getattr(self.representation, "slices", {}).get("contacts")
+        if contacts is not None:
+            rows["contacts"] = [torch.from_numpy(x[:, contacts] > 0.5) for x in motions.features]
         kept = None
         if motions.edit is not None:
             kept = [kept_parts(self.representation, len(motion), **motions.edit)[1] for motion in joints]
@@ -217,6 +221,8 @@ class Evaluator:
             joints, mask = _pad(generated.joints[part])
             if generated.kept is not None:
                 rows["kept"] = pad_sequence(generated.kept[part], batch_first=True)
+            if "contacts" in rows:
+                rows["contacts"] = pad_sequence(rows["contacts"], batch_first=True)
             rows |= {"joints": joints, "mask": mask}
             if paired.joints:
                 rows["real_joints"], rows["real_mask"] = _pad(paired.joints[part])

@@ -250,7 +250,8 @@ def protocol_file(name: str) -> Path:
 def load_protocol(name: str, representation: Representation) -> Protocol:
     """Loads a protocol for motions of a representation.
 
-    Its file may use ${representation.fps}, ${representation.toes} and ${representation.parents}.
+    Its file may use ${representation.fps}, ${representation.feet}, ${representation.toes} and
+    ${representation.parents}.
 
     Args:
         name: a name in experiments/evaluation, or the path of a .yaml file.
@@ -263,7 +264,8 @@ def load_protocol(name: str, representation: Representation) -> Protocol:
 
     path = protocol_file(name)
     skeleton = representation.skeleton
-    facts = {"fps": representation.fps, "toes": list(skeleton.feet[1::2]), "parents": list(skeleton.parents)}
+    feet, parents = list(skeleton.feet), list(skeleton.parents)
+    facts = {"fps": representation.fps, "feet": feet, "toes": feet[1::2], "parents": parents}
     known = {f"${{representation.{fact}}}": value for fact, value in facts.items()}
 
     def filled(node: Any) -> Any:

@@ -489,6 +489,21 @@ def test_the_t2m_evaluator_is_read_from_a_folder(tmp_path):
         extractor.check(kit, "bandai")
 
 
+@pytest.mark.slow
+def test_metrics_of_2026(runs, tmp_path):
+    options = ["protocol=text_to_motion_2026", f"extractor={runs.clip}", "replications=1"]
+    values = {k: v["mean"] for k, v in runs.result(tmp_path / "text.json", *options)["values"].items()}
+    assert values["multi_positive_minilm/positives"] >= values["multi_positive_equal/positives"] >= 1
+    assert values["multi_positive_equal/single_top3"] == values["motions_for_text/top3"]
+    assert values["tmr/threshold_t2m_top10"] >= values["tmr/all_t2m_top10"] > 0
+    assert 0 < values["kimodo/contact_consistency"] <= 1, "the contacts are read from the features"
+    assert values["edge/pfc"] is None, "defined at 30 frames per second"
+    options = ["protocol=editing_in_between_2026", "replications=1"]
+    values = {k: v["mean"] for k, v in runs.result(tmp_path / "edit.json", *options)["values"].items()}
+    assert values["flowmdm/windows"] > 0
+    assert values["kimodo/fullbody_keyframe"] == pytest.approx(values["kept_drift/mean"], abs=0.01)
+
+
 @pytest.mark.parametrize(("condition", "protocol"), [("action", "action_to_motion_own"), ("none", "unconditioned")])
 def test_models_without_text_are_measured_by_protocols_of_their_own(runs, tmp_path, condition, protocol):
     words = [w for w in GENERATOR if not w.startswith("condition")]

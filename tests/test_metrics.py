@@ -42,6 +42,13 @@ from evaluators.metrics.diversity import (
     pair_distance,
 )
 from evaluators.metrics.physics import Floating, FootSkating, Jitter, Penetration, StaticShare
+from evaluators.metrics.published_physics import (
+    KimodoConstraints,
+    KimodoQuality,
+    MBenchQuality,
+    PhysicalFootContact,
+    TransitionJerk,
+)
 from evaluators.metrics.reconstruction import (
     DisplacementErrors,
     FlamePositionErrors,
@@ -50,6 +57,7 @@ from evaluators.metrics.reconstruction import (
     flame_parts,
     temos_parts,
 )
+from evaluators.metrics.retrieval import MultiPositiveRPrecision, TMRRetrieval
 from flame_mdm.motion import length_mask
 from flame_mdm.representations.skeleton import KIT21, SMPL22
 from flame_mdm.seeds import key
@@ -672,6 +680,13 @@ def all_metrics() -> dict[str, Metric]:
         "jitter": Jitter(20.0),
         "static": StaticShare(20.0),
         "skating": FootSkating(20.0),
+        "mbench": MBenchQuality(20.0),
+        "kimodo": KimodoQuality(20.0),
+        "kimodo_constraints": KimodoConstraints(),
+        "pfc": PhysicalFootContact(30.0),
+        "transitions": TransitionJerk(20.0, window=8),
+        "multi_positive": MultiPositiveRPrecision(),
+        "tmr": TMRRetrieval(),
     }
 
 
@@ -702,6 +717,8 @@ def evaluation(count: int = COUNT) -> dict[str, Tensor]:
         "real_mask": length_mask(lengths, frames),
         "real_keys": torch.tensor([key("real", i) for i in range(COUNT)]),
         "kept": torch.rand(COUNT, frames, 21, generator=generator) < 0.5,
+        "captions": np.array([f"Walk {i // 2}." for i in range(COUNT)]),
+        "contacts": torch.rand(COUNT, frames, 4, generator=generator) < 0.5,
     }
     return {name: value[:count] for name, value in values.items()}
 
@@ -710,9 +727,9 @@ def batches(values: dict[str, Tensor], indices: list[Tensor]) -> list[dict[str, 
     """Rows in batches, each cut to its longest motion."""
     result = []
     for index in indices:
-        batch = {name: value[index] for name, value in values.items()}
+        batch = {name: value[index.numpy() if name == "captions" else index] for name, value in values.items()}
         longest = int(batch["mask"].sum(1).max())
-        for name in ("joints", "mask", "real_joints", "real_mask", "kept"):
+        for name in ("joints", "mask", "real_joints", "real_mask", "kept", "contacts"):
             batch[name] = batch[name][:, :longest].contiguous()
         result.append(batch)
     return result
@@ -758,7 +775,7 @@ def test_draws_depend_on_the_seed(expected: dict[str, Any]):
     values = measure(metrics, batches(evaluation(), [torch.arange(COUNT)]))
     drawn = {name for name, metric in metrics.items() if hasattr(metric, "seed")}
     assert {name for name in values if values[name] != expected[name]} == drawn
-    assert len(drawn) == 8
+    assert len(drawn) == 10
 
 
 @pytest.fixture(scope="module")
@@ -810,6 +827,22 @@ def nothing() -> dict[str, Any]:
         "flame": errors,
         "displacement": ("ade", "fde"),
         "kept_drift": ("mean", "largest"),
+        "mbench": (*MBenchQuality.NAMES, "measured"),
+        "kimodo": (*KimodoQuality.NAMES, "measured"),
+        "kimodo_constraints": (*KimodoConstraints.NAMES, "root2d_err_p95"),
+        "pfc": ("pfc", "measured"),
+        "transitions": ("peak", "area", "windows"),
+        "multi_positive": (
+            *(f"{kind}{top}" for kind in ("", "single_", "chance_") for top in tops),
+            "proper",
+            "positives",
+        ),
+        "tmr": tuple(
+            f"{protocol}_{way}_{name}"
+            for protocol in ("all", "threshold", "dissimilar", "batches")
+            for way in ("t2m", "m2t")
+            for name in recalls
+        ),
     }
     return {name: dict.fromkeys(names[name]) if name in names else None for name in all_metrics()}
 
@@ -827,6 +860,9 @@ def test_nothing_given_is_none_never_0():
         (PrecisionRecall(), 3, "got 3 motions in the smaller set, needs at least 4"),
         (TextsForMotion(), 31, "got 31 different captions, needs at least 32"),
         (MotionsForText(), 31, "got 31 motions, needs at least 32"),
+        (MultiPositiveRPrecision(), 31, "got 31 motions, needs at least 32"),
+        (MBenchQuality(30.0), 45, "defined at 20 frames per second, but the motions have 30"),
+        (PhysicalFootContact(20.0), 45, "defined at 30 frames per second, but the motions have 20"),
         (
             MutualInformationDivergence(),
             12,

@@ -8,12 +8,14 @@ size.
 | generated | (B, E) | features of generated motions |
 | text | (B, E) | features of the texts they were generated for |
 | text_keys | (B,) int64 | keys of those captions; equal captions have equal keys |
+| captions | B strings | those captions |
 | logits | (B, A) | class scores of generated motions |
 | labels | (B,) int64 | classes they were generated for |
 | groups | (B,) int64 | keys of the prompts, if several motions are generated per prompt |
 | requested | B mappings | attributes of the motions as requested, see `attributes` |
 | joints | (B, F, J, 3) | generated motions in meters, y up, floor at y = 0 |
 | mask | (B, F) bool | True = real frame of a generated motion |
+| contacts | (B, F, 4) bool | contacts of `skeleton.feet` as generated, if the features have them |
 | kept | (B, F, J) bool | True = this joint of this frame was to be kept, if motions are edits |
 | keys | (B,) int64 | unique keys of generated motions |
 | real, real_joints, real_mask, real_keys | as above | the same for real motions |

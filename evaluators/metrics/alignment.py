@@ -118,11 +118,19 @@ class MotionsForText(_RPrecision):
         if self.normalize:
             generated, text = F.normalize(generated, dim=-1), F.normalize(text, dim=-1)
         self.need(count, self.pool, "motions")
-        order = generator.permutation(count)
-        start = np.minimum(np.arange(count) // self.pool * self.pool, count - self.pool)
-        pools = order[start[:, None] + np.arange(self.pool)]
-        queries = text[_tensor(order, text)]
-        return retrieval_ranks(queries, generated, _tensor(pools, text), _tensor(np.arange(count) - start, text))
+        order, pools, place = (_tensor(indices, text) for indices in own_pools(count, self.pool, generator))
+        return retrieval_ranks(text[order], generated, pools, place)
+
+
+def own_pools(count: int, pool: int, seed: int | np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Draws the pools of `MotionsForText`.
+
+    Returns:
+        The samples in random order (N,), the pool of each (N, P), and its own position there (N,).
+    """
+    order = np.random.default_rng(seed).permutation(count)
+    start = np.minimum(np.arange(count) // pool * pool, count - pool)
+    return order, order[start[:, None] + np.arange(pool)], np.arange(count) - start
 
 
 def _tensor(indices: np.ndarray, like: Tensor) -> Tensor:
@@ -200,18 +208,29 @@ class WholeSetRetrieval(TextAndMotion):
         return whole_set_retrieval(text @ motion.T, self.TOP)
 
 
-def whole_set_retrieval(similarity: Tensor, top: tuple[int, ...]) -> dict[str, float | None]:
+def whole_set_retrieval(
+    similarity: Tensor, top: tuple[int, ...], correct: Tensor | None = None
+) -> dict[str, float | None]:
     """Computes recall and median rank from similarities (N, N) of texts (rows) and motions (columns).
 
-    See `WholeSetRetrieval`.
+    See `WholeSetRetrieval`. `correct` (N, N) bool, symmetric: pairs that count as correct, of which the best one sets
+    the rank; None = the diagonal.
     """
     values: dict[str, float | None] = {}
     for way, table in (("t2m", similarity), ("m2t", similarity.T)):
-        own = table.diagonal()[:, None]
-        rank = (table > own).sum(1) + ((table == own).sum(1) - 1) / 2
+        rank = best_ranks(table, torch.eye(len(table), dtype=torch.bool) if correct is None else correct)
         values |= {f"{way}_top{k}": (rank < k).double().mean().item() for k in top}
         values[f"{way}_median"] = rank.double().quantile(0.5).item() + 1
     return values
+
+
+def best_ranks(similarity: Tensor, correct: Tensor) -> Tensor:
+    """Returns the mean rank (N,) of the best correct candidates, 0 = first: similarities and correctness (N, M).
+
+    Candidates with equal similarity share the mean of their ranks, so that halves occur.
+    """
+    own = similarity.where(correct, -torch.inf).amax(1, keepdim=True)
+    return (similarity > own).sum(1) + ((similarity == own).sum(1) - 1) / 2
 
 
 def mutual_information_divergence(real: Tensor, text: Tensor, generated: Tensor, eps: float) -> Tensor:

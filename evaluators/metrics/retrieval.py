@@ -1,0 +1,222 @@
+"""Retrieval with several correct answers: equal and similar captions, and the protocols of TMR."""
+
+from __future__ import annotations
+
+import functools
+import json
+import re
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from evaluators.metrics.alignment import best_ranks, own_pools, whole_set_retrieval
+from evaluators.metrics.samples import SampleMetric
+from flame_mdm.conditions import ConditionEncoder
+from flame_mdm.config import Config, instantiate
+from flame_mdm.motion import MotionBatch
+from flame_mdm.seeds import key
+
+SAME = 0.9
+"""Cosine above which TMR considers captions the same: its threshold 0.95 is of (cosine + 1) / 2."""
+
+
+@functools.cache
+def _encoder(config: str) -> ConditionEncoder:
+    return instantiate(json.loads(config)).eval()
+
+
+@functools.cache
+def embedding(config: str, caption: str) -> Tensor:
+    """Returns the vector (C,) of length 1 of a caption; `config` is the JSON of an encoder's mapping.
+
+    Captions are encoded one by one, so that a vector does not depend on the other captions.
+    """
+    empty = torch.zeros(1, 1, 1)
+    with torch.no_grad():
+        vector = _encoder(config)(MotionBatch(empty, empty[..., 0].bool(), [""], text=[caption])).pooled[0]
+    return F.normalize(vector, dim=0)
+
+
+def plain_caption(caption: str) -> str:
+    """Returns a caption in lower case, without punctuation and extra spaces."""
+    return " ".join(re.sub(r"[^\w\s]", "", caption.lower()).split())
+
+
+class _Captioned(SampleMetric):
+    """A metric of motions and captions, some of which are the same.
+
+    Args:
+        encoder: a mapping with the `_target_` of a text encoder, which decides with `cosine` what captions are the
+            same; None = only captions equal but for case, punctuation and spaces.
+        cosine: captions with a larger cosine are the same.
+        kwargs: options of `torchmetrics.Metric`.
+    """
+
+    higher_is_better = True
+
+    def __init__(self, encoder: Config | None = None, cosine: float = SAME, **kwargs: Any):
+        super().__init__(("keys", "generated", "text", "caption_keys", "meaning"), **kwargs)
+        self.encoder, self.cosine = None if encoder is None else json.dumps(encoder, sort_keys=True), cosine
+
+    def update(self, generated: Tensor, text: Tensor, captions: Sequence[str], keys: Tensor) -> None:
+        """Adds features of motions and of their texts, each (B, E), with the B captions and the keys (B,)."""
+        if not len(captions):
+            return
+        caption_keys = torch.tensor([key(plain_caption(caption)) for caption in captions])
+        meaning = torch.zeros(len(captions), 0)
+        if self.encoder is not None:
+            meaning = torch.stack([embedding(self.encoder, caption) for caption in captions])
+        self.keep(keys=keys, generated=generated, text=text, caption_keys=caption_keys, meaning=meaning)
+
+    def same(self, caption_keys: Tensor, meaning: Tensor) -> Tensor:
+        """Returns which captions are the same, (..., N, N) bool, from keys (..., N) and vectors (..., N, C)."""
+        return (caption_keys[..., None, :] == caption_keys[..., None]) | (meaning @ meaning.mT > self.cosine)
+
+
+class MultiPositiveRPrecision(_Captioned):
+    """R-precision, motions for a text, where the motions of the same captions are correct, too.
+
+    This is our definition; no paper has one. Pools are those of `MotionsForText`, to which `single_top1`, ... are equal
+    up to ties. In each pool, the motions of a text are its own and those whose captions are the same. `top1`, ... is
+    the fraction of texts with one of their motions among the k nearest, ties sharing their mean rank; `proper` is
+    R-precision of information retrieval: the fraction of their R motions among the R nearest. Since similar captions
+    raise all values, `chance_top1`, ... are those of a random order, and `positives` is the mean of R.
+
+    Args:
+        encoder, cosine: as for all metrics of this module.
+        pool: motions in a pool.
+        top: largest k.
+        seed: of the pools.
+        normalize: whether to rank by cosine instead of Euclidean distance, as for `MotionsForText`.
+        kwargs: options of `torchmetrics.Metric`.
+    """
+
+    def __init__(
+        self,
+        encoder: Config | None = None,
+        cosine: float = SAME,
+        pool: int = 32,
+        top: int = 3,
+        seed: int = 0,
+        normalize: bool = False,
+        **kwargs: Any,
+    ):
+        super().__init__(encoder, cosine, **kwargs)
+        self.pool, self.top, self.seed, self.normalize = pool, top, seed, normalize
+
+    def compute(self) -> dict[str, float | None]:
+        """Returns the values."""
+        rows = self.rows("keys", "generated", "text", "caption_keys", "meaning")
+        tops = range(1, self.top + 1)
+        if rows is None:
+            names = [f"{kind}top{k}" for kind in ("", "single_", "chance_") for k in tops]
+            return dict.fromkeys((*names, "proper", "positives"))
+        motion, text, caption_keys, meaning = rows
+        self.need(len(motion), self.pool, "motions")
+        if self.normalize:
+            motion, text = F.normalize(motion, dim=-1), F.normalize(text, dim=-1)
+        order, pools, place = (torch.from_numpy(x) for x in own_pools(len(motion), self.pool, self.seed))
+        similarity, correct = [], []
+        for query, pool in zip(order.split(16), pools.split(16), strict=True):
+            similarity.append(-torch.linalg.vector_norm(text[query, None] - motion[pool], dim=-1))
+            similar = (meaning[query, None] * meaning[pool]).sum(-1) > self.cosine
+            correct.append((caption_keys[query, None] == caption_keys[pool]) | similar | (query[:, None] == pool))
+        found = multi_positive(torch.cat(similarity), torch.cat(correct), self.top)
+        single = best_ranks(torch.cat(similarity), F.one_hot(place, self.pool).bool())
+        return found | {f"single_top{k}": (single < k).double().mean().item() for k in tops}
+
+
+def multi_positive(similarity: Tensor, correct: Tensor, top: int) -> dict[str, float | None]:
+    """Computes hit rates, R-precision and chance from similarity and correctness (N, M) of candidates."""
+    rank, count, size = best_ranks(similarity, correct), correct.sum(1), similarity.shape[1]
+    values: dict[str, float | None] = {f"top{k}": (rank < k).double().mean().item() for k in range(1, top + 1)}
+    missed = torch.ones(len(count), dtype=torch.float64)
+    for k in range(1, top + 1):
+        missed = missed * ((size - count - k + 1).clamp(min=0) / (size - k + 1))
+        values[f"chance_top{k}"] = (1 - missed).mean().item()
+    last = similarity.sort(1, descending=True).values.gather(1, count[:, None] - 1)
+    above, tied = similarity > last, similarity == last
+    share = (count - above.sum(1)) / tied.sum(1).double()
+    hits = (above & correct).sum(1) + (tied & correct).sum(1) * share
+    return values | {"proper": (hits / count).mean().item(), "positives": count.double().mean().item()}
+
+
+class TMRRetrieval(_Captioned):
+    """Retrieval by cosine with the protocols of Petrovich et al. 2023 (TMR, 6d74688), both ways.
+
+    `all`: all motions, the own one is correct; `threshold`: motions of the same captions are correct, too;
+    `dissimilar`: only among `subset` motions with different captions; `batches`: in batches of 32, the rest is left
+    out; their medians are averaged. Each has recall `t2m_top1`, ... in [0, 1] and median rank `t2m_median` (1 = best)
+    of motions for texts, and `m2t_` of texts for motions. TMR's encoder of captions is all-mpnet-base-v2.
+
+    TMR's lists of dissimilar motions and of batches are for HumanML3D and KIT; here, batches are drawn, and each motion
+    of the subset is that whose caption is the least similar to those taken before it, after the first by key.
+
+    Args:
+        encoder, cosine: as for all metrics of this module; without an encoder, `dissimilar` has no value.
+        subset: number of dissimilar motions, at most half of all.
+        ids: ids of the dissimilar motions, such as TMR's; None = chosen as above.
+        batch: size of the batches.
+        seed: of the batches.
+        kwargs: options of `torchmetrics.Metric`.
+    """
+
+    TOP = (1, 2, 3, 5, 10)
+
+    def __init__(
+        self,
+        encoder: Config | None = None,
+        cosine: float = SAME,
+        subset: int = 100,
+        ids: Sequence[str] | None = None,
+        batch: int = 32,
+        seed: int = 0,
+        **kwargs: Any,
+    ):
+        super().__init__(encoder, cosine, **kwargs)
+        self.subset, self.batch, self.seed = subset, batch, seed
+        self.ids = None if ids is None else [key(name) for name in ids]
+
+    def compute(self) -> dict[str, float | None]:
+        """Returns the values, such as `threshold_t2m_top1`."""
+        rows = self.rows("keys", "keys", "generated", "text", "caption_keys", "meaning")
+        ways = [f"{way}_{name}" for way in ("t2m", "m2t") for name in (*(f"top{k}" for k in self.TOP), "median")]
+        found = {protocol: dict.fromkeys(ways) for protocol in ("all", "threshold", "dissimilar", "batches")}
+        if rows is not None:
+            keys, motion, text, caption_keys, meaning = rows
+            similarity = F.normalize(text, dim=-1) @ F.normalize(motion, dim=-1).T
+            found["all"] = whole_set_retrieval(similarity, self.TOP)
+            found["threshold"] = whole_set_retrieval(similarity, self.TOP, self.same(caption_keys, meaning))
+            chosen = self._dissimilar(keys, meaning)
+            if len(chosen):
+                found["dissimilar"] = whole_set_retrieval(similarity[chosen][:, chosen], self.TOP)
+            order = np.random.default_rng(self.seed).permutation(len(motion))
+            batches = torch.from_numpy(order[: len(order) // self.batch * self.batch]).view(-1, self.batch)
+            if len(batches):
+                found["batches"] = batched_retrieval(similarity, batches, self.TOP)
+        return {f"{protocol}_{name}": value for protocol, values in found.items() for name, value in values.items()}
+
+    def _dissimilar(self, keys: Tensor, meaning: Tensor) -> Tensor:
+        """Returns the indices of the dissimilar motions, among all sorted by key; none without an encoder or ids."""
+        if self.ids is not None:
+            return torch.isin(keys, torch.tensor(self.ids)).nonzero()[:, 0]
+        if not meaning.shape[1]:
+            return torch.zeros(0, dtype=torch.long)
+        chosen = [0]
+        nearest = meaning @ meaning[0]
+        while len(chosen) < min(self.subset, len(meaning) // 2):
+            chosen.append(int(nearest.argmin()))
+            nearest = nearest.maximum(meaning @ meaning[chosen[-1]])
+        return torch.tensor(chosen)
+
+
+def batched_retrieval(similarity: Tensor, batches: Tensor, top: tuple[int, ...]) -> dict[str, float | None]:
+    """Returns the means over batches (N, B) of indices of `whole_set_retrieval` in each."""
+    found = [whole_set_retrieval(similarity[batch][:, batch], top) for batch in batches]
+    return {
+        name: float(np.mean([value for values in found if (value := values[name]) is not None])) for name in found[0]
+    }

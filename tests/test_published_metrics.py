@@ -1,0 +1,359 @@
+"""Metrics of 2023 to 2026: against the authors' code, and against closed forms."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+import torch
+from fixtures import golden, groups, meta
+from torch import Tensor
+
+from evaluators.metrics.alignment import MotionsForText, best_ranks, whole_set_retrieval
+from evaluators.metrics.distribution import frechet_distance
+from evaluators.metrics.published_physics import (
+    JERK_OF_REAL_MOTIONS,
+    KimodoQuality,
+    MBenchQuality,
+    PhysicalFootContact,
+    TransitionJerk,
+    constraint_errors,
+    kimodo_quality,
+    mbench_contact,
+    mbench_floating,
+    mbench_quality,
+    peak_and_area,
+    physical_foot_contact,
+    transition_jerk,
+)
+from evaluators.metrics.retrieval import (
+    MultiPositiveRPrecision,
+    TMRRetrieval,
+    batched_retrieval,
+    embedding,
+    multi_positive,
+    plain_caption,
+)
+from flame_mdm.representations import rotation
+from flame_mdm.representations.humanml import HumanML
+from flame_mdm.seeds import key
+
+FEET = (7, 10, 8, 11)
+MBENCH, PFC, KIMODO, FLOWMDM, TMR = (
+    golden(name) for name in ("mbench_quality", "pfc", "kimodo_metrics", "transition", "tmr_retrieval")
+)
+TOP = (1, 2, 3, 5, 10)
+one = pytest.mark.parametrize("stem", ["kimodo_metrics"])
+
+
+def cases(fixture: dict[str, np.ndarray], under: str, stem: str) -> list:
+    names = [name for name in groups(fixture, "joints") if name.startswith(f"in/{under}")]
+    return [pytest.param(name.removeprefix("in/"), id=f"{stem}-{name.removeprefix('in/')}") for name in names]
+
+
+def y_up(joints: np.ndarray) -> Tensor:
+    """Joints (..., 3) with z up as joints with y up."""
+    return torch.from_numpy(joints).double()[..., [0, 2, 1]] * torch.tensor([1.0, 1.0, -1.0])
+
+
+# The authors' code ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize("case", cases(MBENCH, "", "mbench_quality"))
+def test_mbench_equals_the_authors(case: str):
+    motion, toes = y_up(MBENCH[f"in/{case}/joints"]), [10, 11]
+    contact = mbench_contact(motion[:, toes])
+    np.testing.assert_array_equal(contact, MBENCH[f"out/{case}/contact"])
+    if f"aux/{case}/floating_parts" in MBENCH:
+        parts = mbench_floating(motion, motion[:, toes], contact)
+        np.testing.assert_array_equal(parts, MBENCH[f"aux/{case}/floating_parts"])
+    ours = mbench_quality(motion, toes)
+    for name, theirs in zip(
+        MBenchQuality.NAMES, ("jitter", "dynamic", "penetration", "sliding", "floating"), strict=True
+    ):
+        expected = float(MBENCH.get(f"f64/{case}/{theirs}", math.nan))  # without a value where the code fails
+        assert float(ours[name]) == pytest.approx(expected, rel=1e-8, abs=1e-8, nan_ok=True), name
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize("stem", ["mbench_quality"])
+def test_mbench_averages_motions_as_the_authors_do(stem: str):
+    metric = MBenchQuality(20.0)
+    for case in meta(MBENCH)["config"]["summary_over"]:
+        joints = y_up(MBENCH[f"in/{case}/joints"])[None]
+        metric.update(joints, torch.ones(joints.shape[:2], dtype=torch.bool), torch.tensor([key(case)]))
+    values = metric.compute()
+    for name, theirs in zip(
+        MBenchQuality.NAMES, ("jitter", "dynamic", "penetration", "sliding", "floating"), strict=True
+    ):
+        assert values[name] == pytest.approx(float(MBENCH[f"out/summary/{theirs}"][0]), abs=1e-6)
+    assert values["measured"] == 1
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize("case", cases(PFC, "", "pfc"))
+def test_physical_foot_contact_equals_the_authors(case: str):
+    ours = physical_foot_contact(y_up(PFC[f"in/{case}/joints"]), FEET)
+    expected = float(PFC.get(f"f64/{case}/pfc", math.nan))  # their code fails for two frames
+    assert ours == pytest.approx(expected, rel=1e-9, nan_ok=True)
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize("stem", ["pfc"])
+def test_physical_foot_contact_leaves_out_motions_without_a_value(stem: str):
+    metric, averaged = PhysicalFootContact(30.0), meta(PFC)["config"]["folder_mean_over"]
+    for case in (*averaged, "static", "steady_glide"):
+        joints = y_up(PFC[f"in/{case}/joints"])[None]
+        metric.update(joints, torch.ones(joints.shape[:2], dtype=torch.bool), torch.tensor([key(case)]))
+    expected = {"pfc": float(PFC["f64/folder_mean"]), "measured": len(averaged) / (len(averaged) + 2)}
+    assert metric.compute() == pytest.approx(expected, rel=1e-9)
+
+
+@pytest.mark.golden
+@one
+def test_kimodos_skating_equals_the_authors(stem: str):
+    joints, contacts, lengths = (
+        torch.from_numpy(KIMODO[f"in/quality/{n}"]) for n in ("joints", "foot_contacts", "lengths")
+    )
+    config = meta(KIMODO)["config"]
+    theirs = {
+        "skate_from_height": "foot_skate_from_height",
+        "skate_ratio": "foot_skate_ratio",
+        "skate_from_contacts": "foot_skate_from_pred_contacts",
+        "skate_max": "foot_skate_max_vel",
+        "contact_consistency": "foot_contact_consistency",
+    }
+    for row, length in enumerate(lengths.tolist()):
+        feet = joints[row, :length, config["foot_joint_idx"]].double()
+        ours = kimodo_quality(feet, contacts[row, :length], config["fps"])
+        for name, key_ in theirs.items():
+            assert float(ours[name]) == pytest.approx(float(KIMODO[f"f64/quality/{key_}"][row]), abs=2e-7), (name, row)
+    frames = torch.arange(joints.shape[1]) < lengths[:, None]
+    metric = KimodoQuality(config["fps"], config["foot_joint_idx"])
+    metric.update(joints, frames, torch.arange(len(joints)), contacts)
+    values = metric.compute()
+    for name, key_ in theirs.items():
+        assert values[name] == pytest.approx(float(KIMODO[f"f64/quality/{key_}"].mean()), abs=2e-6)
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize("case", cases(KIMODO, "c", "kimodo_metrics"))
+def test_kimodos_constraints_equal_the_authors(case: str):
+    errors = kimodo_errors(case)
+    names = {"root2d_err", "root2d_acc", "fullbody_keyframe", "end_effector"}
+    for name in names:
+        expected = float(KIMODO.get(f"f64/{case}/constraint_{name}", math.nan))
+        assert float(errors[name]) == pytest.approx(expected, abs=1e-7, nan_ok=True)
+
+
+def kimodo_errors(case: str) -> dict[str, Tensor]:
+    joints = torch.from_numpy(KIMODO[f"in/{case}/joints"]).double()
+    offsets: dict[str, list[Tensor]] = {
+        "root2d": [torch.zeros(0, 2)],
+        "full": [torch.zeros(0, 3)],
+        "ee": [torch.zeros(0, 3)],
+    }
+    for group in groups(KIMODO, "target"):
+        if group.startswith(f"in/{case}/"):
+            frames, target = (torch.from_numpy(KIMODO[f"{group}/{name}"]) for name in ("frames", "target"))
+            kind = group.rpartition("_")[2]
+            if kind == "root2d":
+                offset = joints[frames, 0][:, [0, 2]] - target
+            else:
+                which = torch.from_numpy(KIMODO[f"{group}/joint_idx"]) if kind == "ee" else torch.arange(22)
+                offset = (joints[frames] - target)[:, which].flatten(0, 1)
+            offsets[kind].append(offset)
+    return constraint_errors(*(torch.cat(offsets[kind]) for kind in ("root2d", "full", "ee")))
+
+
+@pytest.mark.golden
+@one
+def test_kimodos_percentile_is_over_motions(stem: str):
+    config = meta(KIMODO)["config"]["constraint_cases"]
+    means = torch.stack([kimodo_errors(case)["root2d_err"] for case, kinds in config.items() if "root2d" in kinds])
+    assert means.quantile(0.95).item() == pytest.approx(float(KIMODO["out/constraint_root2d_err_p95"]), abs=1e-7)
+
+
+@pytest.mark.golden
+@one
+def test_kimodos_retrieval_and_distances_equal_the_authors(stem: str):
+    text, motion, real = (torch.from_numpy(KIMODO[f"in/tmr/{n}"]).double() for n in ("text", "motion", "gt_motion"))
+    same = text @ text.T > 0.96  # their threshold 0.99 is converted to 0.98 of (cosine + 1) / 2
+    for group, query, gallery in (("t2m_R", text, motion), ("m2m_R", motion, real), ("t2m_gt_R", text, real)):
+        ours = whole_set_retrieval(query @ gallery.T, TOP, same)
+        for k in TOP:
+            assert ours[f"t2m_top{k}"] == pytest.approx(float(KIMODO[f"f64/tmr/{group}/R{k:02}"]) / 100, abs=1e-12)
+        assert ours["t2m_median"] == float(KIMODO[f"f64/tmr/{group}/MedR"])
+    alone = best_ranks(text @ motion.T, torch.eye(len(text), dtype=torch.bool))
+    ranks = torch.from_numpy(KIMODO["out/tmr/rank_per_sample"])
+    assert torch.equal((alone + 1).floor(), ranks.to(alone)) or torch.equal((alone + 1).ceil(), ranks.to(alone))
+    assert (alone < 3).double().mean().item() * 100 == pytest.approx(float(KIMODO["out/tmr/no_groups_R03"]))
+    for name, a, b in (("gen_gt", motion, real), ("gen_text", motion, text), ("gt_text", real, text)):
+        assert float(frechet_distance(a, b)) == pytest.approx(float(KIMODO[f"f64/tmr/FID/{name}"]), abs=1e-6)
+
+
+@pytest.mark.golden
+@one
+def test_angles_between_rotations_equal_the_reproductions(stem: str):
+    pred, target = (torch.from_numpy(KIMODO[f"in/geodesic/{name}"]).double() for name in ("pred", "target"))
+    angles = torch.rad2deg(rotation.matrix_to_axis_angle(pred @ target.mT).norm(dim=-1))
+    np.testing.assert_allclose(
+        angles, KIMODO["f64/geodesic/degrees"], atol=2e-2
+    )  # its arc cosine rounds near 0 and 180
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize("stem", ["transition"])
+def test_jerk_of_transitions_equals_the_authors(stem: str):
+    positions, lengths = FLOWMDM["in/joints/positions"], FLOWMDM["in/joints/lengths"]
+    curve = torch.zeros(positions.shape[1] - 3, dtype=torch.float64)
+    for motion, length, expected in zip(positions, lengths, FLOWMDM["f64/joints/jerk"], strict=True):
+        jerk = transition_jerk(torch.from_numpy(motion))
+        jerk[length - 3 :] = 0  # theirs: windows are padded
+        np.testing.assert_allclose(jerk, expected, atol=1e-9)
+        curve += jerk / len(positions)
+    peak, area = peak_and_area(curve, JERK_OF_REAL_MOTIONS[20])
+    assert (peak, area) == pytest.approx(
+        tuple(float(FLOWMDM[f"f64/joints/{n}"]) for n in ("peak_jerk", "auj")), rel=1e-9
+    )
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize("stem", ["transition"])
+def test_jerk_of_features_equals_the_authors(stem: str):
+    feats = torch.from_numpy(FLOWMDM["in/features/feats"]).double()
+    joints = HumanML(variant="legacy").decode(feats)
+    np.testing.assert_allclose(joints, FLOWMDM["out/features/positions"], atol=2e-6)
+    curves = torch.stack([transition_jerk(motion) for motion in joints])
+    for row, length in enumerate(FLOWMDM["in/features/lengths"]):
+        curves[row, length - 3 :] = 0
+    peak, area = peak_and_area(curves.mean(0), JERK_OF_REAL_MOTIONS[20])
+    assert peak == pytest.approx(float(FLOWMDM["f64/features/peak_jerk"]), rel=1e-7)
+    assert area == pytest.approx(float(FLOWMDM["f64/features/auj"]), rel=1e-7)
+
+
+def assert_recall(ours: dict, group: str, within: float = 1e-10):
+    for way in ("t2m", "m2t"):
+        for k in TOP:
+            value = ours[f"{way}_top{k}"] * 100
+            assert value == pytest.approx(float(TMR[f"{group}/{way}/R{k:02}"]), abs=within)
+        assert ours[f"{way}_median"] == float(TMR[f"{group}/{way}/MedR"])
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize("group", [pytest.param(g, id=f"tmr_retrieval-{g}") for g in groups(TMR, "ranks_t2m")])
+def test_ranks_equal_tmrs(group: str):
+    name = group.removeprefix("out/")
+    if name == "few_values_optimistic":
+        pytest.skip("TMR never uses its option to break ties in favor of the correct answer")
+    similarity = torch.from_numpy(TMR["in/few_values" if name == "few_values" else "in/sims"]).double()
+    if name == "nsim":
+        chosen = torch.from_numpy(TMR["in/nsim_idx"])
+        similarity = similarity[chosen][:, chosen]
+    correct = torch.eye(len(similarity), dtype=torch.bool)
+    if name.startswith("threshold"):
+        meaning = torch.from_numpy(TMR["in/sent_emb"]).double()
+        correct |= meaning @ meaning.T > 2 * float(name.partition("_")[2]) - 1
+    for way, table in (("t2m", similarity), ("m2t", similarity.T)):
+        if f"{group}/ranks_{way}" in TMR:
+            np.testing.assert_array_equal(best_ranks(table, correct), TMR[f"{group}/ranks_{way}"])
+    assert_recall(whole_set_retrieval(similarity, TOP, correct), group)
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize("stem", ["tmr_retrieval"])
+def test_small_batches_equal_tmrs(stem: str):
+    similarity, batches = torch.from_numpy(TMR["in/sims"]).double(), torch.from_numpy(TMR["out/guo/batches"])
+    assert_recall(batched_retrieval(similarity, batches, TOP), "out/guo")
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize("stem", ["tmr_retrieval"])
+def test_protocols_equal_tmrs_driver(stem: str, monkeypatch):
+    ids, chosen = TMR["in/keyids"].tolist(), TMR["in/nsim_idx"]
+    vectors = dict(zip(ids, torch.from_numpy(TMR["in/sent_emb"]), strict=True))
+    monkeypatch.setattr("evaluators.metrics.retrieval.embedding", lambda encoder, caption: vectors[caption])
+    metric = TMRRetrieval(encoder={"_target_": "stand-in"}, ids=[ids[i] for i in chosen])
+    motion, text = (torch.from_numpy(TMR[f"in/{kind}_latent"]) for kind in ("motion", "text"))
+    metric.update(motion, text, ids, torch.tensor([key(name) for name in ids]))
+    values = metric.compute()
+    for ours, theirs in (("all", "normal"), ("threshold", "threshold_0.95"), ("dissimilar", "nsim")):
+        part = {name.removeprefix(f"{ours}_"): value for name, value in values.items() if name.startswith(ours)}
+        # Their similarities are float32, which moves single queries whose answers are nearly equal.
+        assert_recall(part, f"out/driver_bs256/{theirs}", within=1.01 * 100 / len(ids))
+
+
+# Closed forms ---------------------------------------------------------------------------------------------------------
+
+
+def test_multi_positive_r_precision_of_an_example():
+    similarity = torch.tensor([[0.9, 0.8, 0.8, 0.1]])
+    values = multi_positive(similarity, torch.tensor([[True, False, True, False]]), 2)
+    assert values == pytest.approx(
+        {"top1": 1, "top2": 1, "proper": 0.75, "positives": 2, "chance_top1": 0.5, "chance_top2": 5 / 6}
+    )
+    values = multi_positive(similarity, torch.tensor([[False, True, True, False]]), 2)
+    assert (values["top1"], values["top2"], values["proper"]) == (0, 1, 0.5)
+
+
+def test_equal_captions_count_as_correct_and_the_classic_value_stays():
+    """Half of the captions are repeated: a motion ranks behind that of the same caption half of the time."""
+    count, generator = 96, torch.Generator().manual_seed(0)
+    text = torch.randn(count // 2, 4, generator=generator).repeat(2, 1)
+    motion = text + 1e-3 * torch.randn(text.shape, generator=generator)
+    captions = [f"A person {i % (count // 2)}" + ("." if i < count // 2 else " ") for i in range(count)]
+    keys = torch.arange(count)
+    metric, classic = MultiPositiveRPrecision(), MotionsForText()
+    metric.update(motion, text, captions, keys)
+    classic.update(motion, text, torch.arange(count) % (count // 2), keys)
+    values, single = ({name: value or 0 for name, value in m.compute().items()} for m in (metric, classic))
+    assert values["top1"] == values["proper"] == 1
+    assert values["single_top1"] == single["top1"] < 1
+    assert 1 < values["positives"] < 2
+    assert values["chance_top1"] == pytest.approx(values["positives"] / 32)
+
+
+def test_captions_are_compared_without_case_and_punctuation():
+    assert plain_caption("A man,  walking. ") == plain_caption("a man walking") != plain_caption("a man walks")
+
+
+@pytest.mark.slow
+def test_similar_captions_are_the_same_by_sentence_bert():
+    from fixtures import ROOT
+
+    from flame_mdm.files import read_yaml
+
+    metrics = read_yaml(ROOT / "experiments" / "evaluation" / "text_to_motion_2026.yaml")["metrics"]
+    encoder = metrics["tmr"]["encoder"]
+    assert metrics["multi_positive_minilm"]["encoder"] == encoder
+    walk, walks, jump = (
+        embedding(json.dumps(encoder), caption)
+        for caption in ("a person walks forward", "a person is walking forward", "someone does a handstand")
+    )
+    assert walk @ walks > 0.9 > walk @ jump
+    assert walk.norm().item() == pytest.approx(1, abs=1e-6)
+
+
+def test_dissimilar_captions_are_taken_first():
+    """Vectors on a quarter circle: the two ends are the most dissimilar."""
+    metric, keys = TMRRetrieval(subset=2), torch.arange(5)
+    angles = torch.linspace(0, math.pi / 2, 5)
+    assert metric._dissimilar(keys, torch.stack([angles.cos(), angles.sin()], 1)).tolist() == [0, 4]
+    assert not len(metric._dissimilar(keys, torch.zeros(5, 0)))
+
+
+def test_windows_of_transitions():
+    """A step of 1 m in one coordinate has third differences 1, -2, 1 around it; only whole windows count."""
+    joints = torch.zeros(2, 40, 22, 3)
+    joints[:, 20:, 3, 0] = 1
+    kept = torch.zeros(2, 40, 22, dtype=torch.bool)
+    kept[0, 20:] = True
+    kept[1, 3:] = True  # its window would begin before the motion
+    metric = TransitionJerk(20.0, window=10)
+    metric.update(joints, torch.ones(2, 40, dtype=torch.bool), kept, torch.arange(2))
+    real = JERK_OF_REAL_MOTIONS[20]
+    assert metric.compute() == pytest.approx({"peak": 2, "area": 4 - 3 * real + 4 * real, "windows": 1})
+    elsewhere = TransitionJerk(60.0, window=10)
+    elsewhere.update(joints, torch.ones(2, 40, dtype=torch.bool), kept, torch.arange(2))
+    assert elsewhere.compute() == {"peak": 2, "area": None, "windows": 1}

@@ -14,6 +14,7 @@ COMMANDS = {
     "sample": "generate motions from a checkpoint",
     "edit": "keep part of a motion and resample the rest",
     "evaluate": "evaluate a checkpoint under a protocol",
+    "audit": "audit an evaluator: what its metrics see, and from which strength",
     "tables": "render tables and figures from results",
     "benchmark": "train, evaluate and tabulate a set of small models",
     "prepare": "convert a data set to a packed store, or verify a store",

@@ -155,6 +155,56 @@ class Result(Schema):
         return self.skeleton.stand_in if self.skeleton else self.data.representation in ("smpl147", "rot6d-25")
 
 
+class AuditedGrade(ClosedSchema):
+    """One grade of a perturbation; by metric: value, half width of its 95 % interval, difference from real motions,
+    and half width of the interval of that difference; None if not computable.
+    """
+
+    grade: Number
+    values: dict[str, Annotated[list[Number | None], Field(min_length=4, max_length=4)]]
+
+
+class AuditedPerturbation(ClosedSchema):
+    """A perturbation of real motions, and its grades from weak to strong."""
+
+    name: str
+    group: str
+    about: str
+    unit: str
+    grades: Annotated[list[AuditedGrade], Field(min_length=1)]
+
+
+class AuditedExtractor(Extractor):
+    """The extractor of an audit."""
+
+    path: str
+
+
+class AuditCard(ClosedSchema):
+    """An evaluator audit, as `flame-mdm audit` writes it.
+
+    Attributes:
+        metrics: whether higher values are better; None = values near those of real motions.
+        real: value and half width of its 95 % interval, by metric.
+        truth: agreement with exact attributes: `auc` and `correlation`, by metric.
+    """
+
+    format: Int
+    extractor: AuditedExtractor | None
+    protocol: Protocol
+    data: Data
+    split: str
+    motions: Int
+    seed: Int
+    resamples: Int
+    environment: dict[str, Any]
+    metrics: dict[str, bool | None]
+    real: dict[str, Annotated[list[Number | None], Field(min_length=2, max_length=2)]]
+    perturbations: Annotated[list[AuditedPerturbation], Field(min_length=1)]
+    not_computed: dict[str, str]
+    truth: dict[str, dict[str, Number | None]]
+
+
 class RunName(Schema):
     """The keys `run` of a configuration."""
 

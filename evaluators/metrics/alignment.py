@@ -250,17 +250,30 @@ def mutual_information_divergence(real: Tensor, text: Tensor, generated: Tensor,
         generated: (M, E) features of motions generated for the first M texts.
         eps: added to the diagonal of covariances before they are inverted.
     """
-    count = len(generated)
-    both = torch.cat([real, text], 1)
-    fake = torch.cat([generated, text[:count]], 1)
-    value = real.new_zeros(())
+    return pointwise_mutual_information(real, text, generated, text[: len(generated)], eps).mean()
+
+
+def pointwise_mutual_information(
+    real: Tensor, text: Tensor, generated: Tensor, requested: Tensor, eps: float
+) -> Tensor:
+    """Computes the terms (M,) whose mean is MID; see `mutual_information_divergence`.
+
+    Args:
+        real: (N, E) features of real motions.
+        text: (N, T) features of their texts.
+        generated: (M, E) features of generated motions.
+        requested: (M, T) features of the texts they were generated for.
+        eps: added to the diagonal of covariances before they are inverted.
+    """
+    both, fake = torch.cat([real, text], 1), torch.cat([generated, requested], 1)
+    value = real.new_zeros(len(generated))
     for sign, true, seen in ((1, real, generated), (1, text, text), (-1, both, fake)):
-        center = true.mean(0)
-        a, b = true - center, seen - center
-        covariance, seen_covariance = a.T @ a / (len(a) - 1), b.T @ b / (len(b) - 1)
+        a, b = true - true.mean(0), seen - true.mean(0)
+        covariance = a.T @ a / (len(a) - 1)
         inverse = torch.linalg.inv(covariance + eps * torch.eye(len(covariance)).to(covariance))
         value += sign / 2 * torch.linalg.svdvals(covariance).log().sum()
-        value += sign / 2 * (inverse * seen_covariance.T).sum()
+        distance = (b @ inverse * b).sum(1) * len(b) / (len(b) - 1)
+        value += sign / 2 * (distance.mean() if seen is text else distance)
     return value
 
 

@@ -161,6 +161,12 @@ def _arms(smooth: np.ndarray, fps: float) -> dict[str, str | int]:
     return {"action": "stand"} if np.linalg.norm(moved, axis=-1).max() < 0.35 else {}
 
 
+def right_attributes(seen: Mapping[str, Any], wanted: Mapping[str, Any]) -> dict[str, bool]:
+    """Returns for each requested attribute whether it was read from the motion; `all` = both action and side."""
+    right = {name: seen.get(name) == value for name, value in wanted.items()}
+    return right | {"all": right["action"] and right.get("side", True)}
+
+
 class AttributeAccuracy(Metric):
     """Fraction of motions that show the requested value, by attribute.
 
@@ -196,10 +202,7 @@ class AttributeAccuracy(Metric):
             unknown = set(wanted) - set(ATTRIBUTES)
             if unknown or "action" not in wanted:
                 raise ValueError(f"attributes: {dict(wanted)} requested. Give an action, and only keys of {ATTRIBUTES}")
-            seen = read_attributes(motion[real].numpy(), self.fps)
-            right = {name: seen.get(name) == value for name, value in wanted.items()}
-            right["all"] = right["action"] and right.get("side", True)
-            for name, hit in right.items():
+            for name, hit in right_attributes(read_attributes(motion[real].numpy(), self.fps), wanted).items():
                 setattr(self, f"right_{name}", getattr(self, f"right_{name}") + int(hit))
                 setattr(self, f"requested_{name}", getattr(self, f"requested_{name}") + 1)
 

@@ -1,0 +1,171 @@
+"""Graded perturbations of real motions, to audit evaluators with: what a metric should see, or should ignore.
+
+Each function takes joints (F, J, 3) in meters, y up, and returns as many frames unless it says otherwise. Random draws
+come from a generator alone, so that the grades of a perturbation share theirs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from flame_mdm.formats.resampling import resample
+from flame_mdm.representations.humanml import HumanML
+
+Joints = np.ndarray
+Draws = np.random.Generator
+GROUND = np.array([1.0, 0.0, 1.0])
+WOBBLE = 1.0
+"""Frequency of the wobble, in Hz."""
+BLEND = 0.4
+"""Seconds over which the poses of another motion are blended in."""
+
+
+def jitter(joints: Joints, millimeters: float, draws: Draws) -> Joints:
+    """Adds Gaussian noise to all coordinates, independently per frame."""
+    return joints + millimeters / 1000 * draws.standard_normal(joints.shape)
+
+
+def wobble(joints: Joints, millimeters: float, draws: Draws, fps: float) -> Joints:
+    """Moves each joint along a line of its own, as a sine of 1 Hz with this amplitude."""
+    along = draws.standard_normal(joints.shape[1:])
+    phase = draws.uniform(0, 2 * np.pi, (1, joints.shape[1]))
+    sine = np.sin(2 * np.pi * WOBBLE / fps * np.arange(len(joints))[:, None] + phase)
+    return joints + millimeters / 1000 * sine[..., None] * along / np.linalg.norm(along, axis=-1, keepdims=True)
+
+
+def skate(joints: Joints, factor: float) -> Joints:
+    """Multiplies the horizontal speed of the root and keeps the poses, so that the feet slide."""
+    return joints + (factor - 1) * ((joints[:, :1] - joints[:1, :1]) * GROUND)
+
+
+def lift(joints: Joints, centimeters: float) -> Joints:
+    """Raises the body above the floor, or lowers it into the floor."""
+    return joints + np.array([0, centimeters / 100, 0])
+
+
+def resize(joints: Joints, percent: float) -> Joints:
+    """Makes all bones longer by this share; the root's track on the floor stays the same, and so does the floor."""
+    ground = joints[:, :1] * GROUND
+    return ground + (1 + percent / 100) * (joints - ground)
+
+
+def pop(joints: Joints, centimeters: float, draws: Draws, *, last: bool = False) -> Joints:
+    """Displaces the whole body in one random inner frame, or in the last frame, in a random direction."""
+    frame = int(draws.integers(1, len(joints) - 1))
+    way = draws.standard_normal(3)
+    popped = joints.copy()
+    popped[-1 if last else frame] += centimeters / 100 * way / np.linalg.norm(way)
+    return popped
+
+
+def freeze(joints: Joints, percent: float) -> Joints:
+    """Holds a frame for this share of the time, up to the end."""
+    moving = max(1, round(len(joints) * (1 - percent / 100)))
+    return joints[np.minimum(np.arange(len(joints)), moving - 1)]
+
+
+def play(joints: Joints, factor: float, fps: float) -> Joints:
+    """Plays faster, which shortens the motion, or slower, and cuts what exceeds its length."""
+    return resample(joints, fps * factor, fps)[: len(joints)]
+
+
+def through_rate(joints: Joints, rate: float, fps: float) -> Joints:
+    """Resamples to another frame rate and back, linearly; frames past the last new one repeat the last."""
+    back = resample(resample(joints, fps, rate), rate, fps)
+    return back[np.minimum(np.arange(len(joints)), len(back) - 1)]
+
+
+def crop(joints: Joints, percent: float) -> Joints:
+    """Removes this share of the time at the end."""
+    return joints[: max(3, round(len(joints) * (1 - percent / 100)))]
+
+
+def continue_with(joints: Joints, other: Joints, fps: float) -> Joints:
+    """Replaces the second half by that of another motion, from the same place; poses are blended over 0.4 seconds."""
+    half = len(joints) // 2
+    rest = other[len(other) // 2 :]
+    rest = rest[np.minimum(np.arange(len(joints) - half), len(rest) - 1)]
+    rest = rest + (joints[half - 1, 0] - rest[0, 0]) * GROUND
+    fading = np.maximum(0, 1 - np.arange(1, len(rest) + 1) / (BLEND * fps))[:, None, None]
+    return np.concatenate([joints[:half], rest + fading * (joints[half - 1] - rest[0])])
+
+
+def encode(representation: HumanML, motions: Sequence[Joints]) -> list[np.ndarray]:
+    """Encodes motions as features (F, D) float32, with as many rows as frames, and at their own height.
+
+    The representation needs one more frame, which continues the last step, and puts the lowest joint of a motion on the
+    floor, which would hide floating and sinking.
+    """
+    longer = [torch.from_numpy(np.concatenate([x, 2 * x[-1:] - x[-2:-1]])) for x in motions]
+    encoded = []
+    for joints, features in zip(motions, representation.encode_many(longer), strict=True):
+        height, positions = representation.slices["root_height"], representation.slices["positions"]
+        rise = float(joints[0, 0, 1]) * representation.units_per_metre - features[0, height]
+        features[:, height] += rise
+        features[:, positions.start + 1 : positions.stop : 3] += rise
+        encoded.append(features.numpy())
+    return encoded
+
+
+@dataclass(frozen=True)
+class Perturbation:
+    """A perturbation of a set of motions, and its grades.
+
+    Attributes:
+        name: unique name.
+        group: joints, meaning, set or plumbing.
+        about: what is done.
+        unit: of the grades. Shares ("% of motions", "% of captions", "% of actions") say how many are replaced.
+        grades: from weak to strong; () = not graded.
+        change: returns joints; arguments are joints, grade, generator and frames per second. None = it concerns
+            features, captions or the set, which `evaluators.audit` replaces.
+    """
+
+    name: str
+    group: str
+    about: str
+    unit: str = ""
+    grades: Sequence[float] = (1,)
+    change: Callable[[Joints, float, Draws, float], Joints] | None = None
+
+
+_P = Perturbation
+_CM, _PERCENT, _SHARES, _FEW = (1, 2, 5, 10), (1, 2, 5, 10, 20), (5, 10, 20, 50, 100), (1, 2, 5, 10, 20, 50, 100)
+PERTURBATIONS = [
+    _P("jitter", "joints", "noise on all joints, std", "mm", (1, 2, 5, 10, 20), lambda x, g, r, _: jitter(x, g, r)),
+    _P("wobble", "joints", "joints sway at 1 Hz, amplitude", "mm", (5, 10, 20, 50), wobble),
+    _P("skating", "joints", "root speed", "x", (1.05, 1.1, 1.25, 1.5, 2), lambda x, g, *_: skate(x, g)),
+    _P("floating", "joints", "above the floor", "cm", _CM, lambda x, g, *_: lift(x, g)),
+    _P("sinking", "joints", "below the floor", "cm", _CM, lambda x, g, *_: lift(x, -g)),
+    _P("longer bones", "joints", "all bones longer", "%", _PERCENT, lambda x, g, *_: resize(x, g)),
+    _P("shorter bones", "joints", "all bones shorter", "%", _PERCENT, lambda x, g, *_: resize(x, -g)),
+    _P("pop", "joints", "one frame displaced", "cm", _PERCENT, lambda x, g, r, _: pop(x, g, r)),
+    _P("last-frame pop", "joints", "last frame displaced", "cm", _PERCENT, lambda x, g, r, _: pop(x, g, r, last=True)),
+    _P("mirrored", "meaning", "left and right exchanged, captions kept", "% of motions", _SHARES),
+    _P("reversed", "meaning", "played backward", "% of motions", _SHARES),
+    _P("slower", "meaning", "played at this speed", "x", (0.9, 0.75, 0.5), lambda x, g, _, fps: play(x, g, fps)),
+    _P("faster", "meaning", "played at this speed", "x", (1.1, 1.25, 1.5, 2), lambda x, g, _, fps: play(x, g, fps)),
+    _P("frozen", "meaning", "held up to the end", "% of time", (10, 25, 50, 75, 100), lambda x, g, *_: freeze(x, g)),
+    _P("other half", "meaning", "second half of another motion", "% of motions", _SHARES),
+    _P("wrong captions", "meaning", "captions of random other motions", "% of captions", _FEW),
+    _P("near misses", "meaning", "captions wrong in one attribute", "% of captions", _FEW),
+    _P("missing actions", "set", "actions that never appear; others repeat", "% of actions", (10, 25, 50, 75)),
+    _P("memorized", "set", "training motions with the same captions", "% of motions", _SHARES),
+    _P("fewer", "set", "only so many motions", "motions", (256, 128, 64)),
+    _P("as stored", "plumbing", "features neither decoded nor encoded"),
+    _P("half precision", "plumbing", "features rounded to float16"),
+    _P(
+        "frame rate",
+        "plumbing",
+        "resampled and back",
+        "fps",
+        (30, 15, 10),
+        lambda x, g, _, fps: through_rate(x, g, fps),
+    ),
+    _P("cropped", "plumbing", "end removed", "% of time", (10, 25, 50), lambda x, g, *_: crop(x, g)),
+]
+"""All perturbations, apart from those that depend on the data: near misses by attribute, other representations."""

@@ -173,11 +173,11 @@ class _Scene:
         return sets
 
     def _memorized(self) -> list[np.ndarray]:
-        """Returns for each motion a training motion with the same captions, or else with the same action."""
+        """Returns for each motion a training motion with its captions, or else its action, or else the motion itself."""
         training, found = self.data.clips("train"), []
         for row in self.rows:
             same = [clip for clip in training.clips if clip.captions == row.clip.captions]
-            same = same or [clip for clip in training.clips if clip.action == row.clip.action]
+            same = same or [clip for clip in training.clips if clip.action == row.clip.action] or [row.clip]
             draws = self.draws("memorized", row.id)
             clip = same[int(draws.integers(len(same)))]
             found.append(Row(row.id, clip, training.crop(clip.length, draws), None, row.id))

@@ -12,12 +12,13 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 import torch.nn.functional as F
-from scipy.stats import hypergeom, rankdata, spearmanr
+from scipy.stats import hypergeom, rankdata
 from torch import Tensor
 from torchmetrics import Metric
 from tqdm import tqdm
 
 from evaluators.evaluator import Evaluator, Motions
+from evaluators.extractors import OwnExtractor
 from evaluators.metrics import alignment, make_metrics, physics, update_metrics
 from evaluators.metrics.attributes import ATTRIBUTES, AttributeAccuracy, read_attributes, right_attributes
 from evaluators.metrics.distribution import FrechetMotionDistance, frechet_distance
@@ -83,8 +84,10 @@ def audit(request: EvaluationRequest, resamples: int, cache: Path) -> AuditCard:
     extractor = protocol.open_extractor(request.extractor, representation, info["dataset"])
     rows = protocol.rows(clips, request.seed, 0)[: request.samples]
     again = {row.clip.id: row for row in protocol.rows(clips, request.seed, 0, purpose="real")}
+    recipe = extractor.task.config.get("experiment") if isinstance(extractor, OwnExtractor) else None
+    name = str(recipe or Path(str(request.extractor)).name)
     facts = {
-        "extractor": extractor and {"sha256": extractor.sha256, "path": str(request.extractor)},
+        "extractor": extractor and {"sha256": extractor.sha256, "name": name},
         "protocol": {"name": protocol.name, "version": protocol.version},
         "data": {name: info[name] for name in ("dataset", "fingerprint", "representation")}
         | {"frames": [data.crop.shortest(), data.crop.longest()]},
@@ -107,15 +110,16 @@ def audit(request: EvaluationRequest, resamples: int, cache: Path) -> AuditCard:
             bar.update()
         measure = _Measure(evaluator, inputs, texts, scene.draws("bootstrap"), resamples)
         base = measure(inputs[BASE], texts)
-        scores, perturbations = [measure.scores(inputs[BASE], texts)], []
+        changed, given = inputs[BASE], texts
+        scores, perturbations = [measure.scores(changed, given)], []
         for each in listed:
             grades = []
             for grade in each.grades:
-                condition = scene.condition(each, grade, inputs, texts)
-                grades.append({"grade": float(grade), "values": _differences(measure(*condition), base)})
+                changed, given = scene.condition(each, grade, inputs, texts)
+                grades.append({"grade": float(grade), "values": _differences(measure(changed, given), base)})
                 bar.update()
             if each.group == "meaning":
-                scores.append(measure.scores(*condition))
+                scores.append(measure.scores(changed, given))
             about = {name: getattr(each, name) for name in ("name", "group", "about", "unit")}
             perturbations.append({**about, "grades": grades})
     better = {name: measure.metrics[name.partition("/")[0]].higher_is_better for name in base}
@@ -173,7 +177,7 @@ class _Scene:
         return sets
 
     def _memorized(self) -> list[np.ndarray]:
-        """Returns for each motion a training motion with its captions, or else its action, or else the motion itself."""
+        """Returns for each motion a training motion with its captions, or else its action, or else itself."""
         training, found = self.data.clips("train"), []
         for row in self.rows:
             same = [clip for clip in training.clips if clip.captions == row.clip.captions]
@@ -213,7 +217,10 @@ class _Scene:
         for each in PERTURBATIONS:
             if each.unit == "% of captions":
                 kinds = [kind for kind in self.wrong if kind.partition(":")[0] == each.name] if captioned else []
-                found += [replace(each, name=kind) for kind in kinds]
+                for kind in kinds:
+                    most = 100 * sum(text is not None for text in self.wrong[kind]) / len(self.rows)
+                    grades = [*(grade for grade in each.grades if grade < most), round(most, 1)]
+                    found.append(replace(each, name=kind, grades=grades))
             elif each.unit == "motions":
                 found.append(replace(each, grades=[grade for grade in each.grades if grade < len(self.rows)]))
             elif each.unit != "% of actions" or len({row.clip.action for row in self.rows}) > 1:
@@ -270,7 +277,7 @@ def _inputs(evaluator: Evaluator, path: Path, ids: list[str], make: Callable[[],
             inputs["seen"] = np.array([json.dumps(read_attributes(x.numpy(), metric.fps)) for x in found.joints])
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_write(path) as temporary:
-        np.savez(temporary, **inputs)
+        np.savez(temporary, allow_pickle=False, **inputs)
     return inputs
 
 
@@ -437,6 +444,7 @@ def _agreement(
             score = np.concatenate([each[name] for each in scores]) * (-1 if name == "mm_dist" else 1)
             ranks, count = rankdata(score)[right], int(right.sum())
             auc = (ranks.sum() - count * (count + 1) / 2) / (count * (len(right) - count))
-            both = np.array([(grade[name][0], grade[TRUTH][0]) for grade in grades])
-            found[name] = {"auc": float(auc), "correlation": float(spearmanr(both[:, 0], both[:, 1]).statistic)}
+            both = np.array([(grade[name][0], grade[TRUTH][0]) for grade in grades if grade[name][0] is not None])
+            correlation = np.corrcoef(rankdata(both, axis=0).T)[0, 1]
+            found[name] = {"auc": float(auc), "correlation": float(correlation)}
     return found

@@ -175,9 +175,9 @@ class AuditedPerturbation(ClosedSchema):
 
 
 class AuditedExtractor(Extractor):
-    """The extractor of an audit."""
+    """The extractor of an audit, by its recipe or file."""
 
-    path: str
+    name: str
 
 
 class AuditCard(ClosedSchema):

@@ -72,13 +72,14 @@ class Extractor(ABC):
         return None
 
 
-class _OwnExtractor(Extractor):
+class OwnExtractor(Extractor):
     """A network trained with `make train`, loaded from its checkpoint.
 
     Raises:
         FileNotFoundError, UserError: If the checkpoint does not exist, or holds another network.
     """
 
+    task: Task
     trained: type[Task]
     recipes: str
     """Folder of the recipes that train it."""
@@ -104,7 +105,7 @@ class _OwnExtractor(Extractor):
             )
 
 
-class MotionCLIPExtractor(_OwnExtractor):
+class MotionCLIPExtractor(OwnExtractor):
     """A motion-CLIP trained with `make train EXP=motion_clip/...`."""
 
     trained, recipes = MotionCLIPTask, "motion_clip"
@@ -176,7 +177,7 @@ class T2MExtractor(Extractor):
         return self.network.text(self.words(_tagged(self.path, tokens), full_length=self.full_length))
 
 
-class OwnT2MExtractor(_OwnExtractor):
+class OwnT2MExtractor(OwnExtractor):
     """An evaluator of Guo et al. 2022 trained with `make train EXP=t2m/...`."""
 
     trained, recipes = T2MTask, "t2m"
@@ -306,7 +307,7 @@ class UnconstrainedExtractor(ClassifierExtractor):
         return torch.cat(found).float().cpu()
 
 
-class OwnClassifierExtractor(_OwnExtractor):
+class OwnClassifierExtractor(OwnExtractor):
     """An action classifier trained with `make train EXP=classifier/...`."""
 
     trained, recipes = ClassifierTask, "classifier"

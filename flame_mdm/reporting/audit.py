@@ -1,21 +1,237 @@
-"""Cards of evaluator audits."""
+"""Cards of evaluator audits: one page per extractor and data set, or two cards side by side."""
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
-from flame_mdm.runs import AuditCard, read_json
+from flame_mdm.errors import markdown_text
+from flame_mdm.files import write_text
+from flame_mdm.reporting.page import interval, number, page, render
+from flame_mdm.runs import AuditCard, AuditedPerturbation, Result, read_json
+
+FOLDERS = (Path("docs/benchmarks/audit"), Path("runs/audit"))
+"""Where the card of an extractor is looked for."""
+PHYSICS = ("foot_skating", "penetration", "floating", "jitter", "static_share")
+"""Metrics of joints, which are not expected to see the meaning of a motion."""
+ROUNDING = 1e-6
+"""Relative differences below this are not seen."""
+WIDE, HIGH = 132, 48
+LEGEND = (
+    "Smallest strength from which on the metric differs from real motions in a paired comparison; a → b: only from b "
+    "on does its value also leave the 95 % interval of real motions; –: never; ~: not monotone."
+)
+
+
+@dataclass(frozen=True)
+class Seen:
+    """How a metric responds to a perturbation.
+
+    Attributes:
+        grade: the smallest grade from which on the paired difference from real motions differs from 0; None = never.
+        outside: the same, of values that also leave the 95 % interval of real motions.
+        rewarded: whether the strongest grade is rated better than real motions.
+        monotone: whether each stronger grade differs at least as much, within its interval.
+    """
+
+    grade: float | None
+    outside: float | None
+    rewarded: bool
+    monotone: bool
+
+
+def seen(card: AuditCard, perturbation: AuditedPerturbation, metric: str) -> Seen | None:
+    """Returns how a metric responds to a perturbation; None if it was not computed at all grades."""
+    real, width = card.real[metric]
+    found = [(grade.grade, *grade.values[metric]) for grade in perturbation.grades]
+    if real is None or width is None:
+        return None
+    changes = [(grade, d, half) for grade, _, _, d, half in found if d is not None and half is not None]
+    if len(changes) < len(found):
+        return None
+
+    def since(least: float) -> float | None:
+        noticed = [abs(d) > max(half, least, ROUNDING * abs(real)) for _, d, half in changes]
+        first = max((i + 1 for i, flag in enumerate(noticed) if not flag), default=0)
+        return changes[first][0] if first < len(changes) else None
+
+    higher, strongest = card.metrics[metric], changes[-1][1]
+    rewarded = since(0) is not None and higher is not None and (strongest > 0) == higher
+    pairs = itertools.pairwise(changes)
+    return Seen(since(0), since(width), rewarded, all(abs(b) + half >= abs(a) for (_, a, _), (_, b, half) in pairs))
 
 
 def card_name(card: AuditCard) -> str:
     """Returns the name of the files of a card."""
-    return f"{card.data.dataset}-{card.extractor.sha256[:12] if card.extractor else 'none'}"
+    return _name(card.data.dataset, card.extractor.sha256 if card.extractor else None)
+
+
+def _name(dataset: str, sha256: str | None) -> str:
+    return f"{dataset}-{sha256[:12] if sha256 else 'none'}"
+
+
+def card_of(result: Result) -> Path | None:
+    """Returns the card of the extractor of a result, or of metrics of joints; None if it was not audited."""
+    name = _name(result.data.dataset, result.extractor.sha256 if result.extractor else None)
+    return next((path for folder in FOLDERS if (path := folder / f"{name}.html").exists()), None)
 
 
 def read_card(path: Path) -> AuditCard:
+    """Returns a card.
+
+    Raises:
+        UserError: The file is damaged.
+    """
     return read_json(path, AuditCard, "run `flame-mdm audit` again")
 
 
 def write_card(cards: Sequence[AuditCard], out: Path) -> list[Path]:
-    return []
+    """Writes one card, or two side by side, as a web page and as Markdown; returns the paths."""
+    names = [card_name(card) for card in cards]
+    title = " and ".join(f"Audit of {_evaluator(card)} on {card.data.dataset}" for card in cards)
+    body = render(
+        "audit.html",
+        title=title,
+        cards=[(_facts(card), findings(card), _truth(card)) for card in cards],
+        names=[_evaluator(card) for card in cards],
+        metrics=(metrics := list(dict.fromkeys(metric for card in cards for metric in card.metrics))),
+        rows=_rows(cards, metrics),
+        legend=LEGEND,
+        wide=WIDE,
+        high=HIGH,
+    )
+    path = out / "-and-".join(names)
+    write_text(path.with_name(f"{path.name}.html"), page(title, body))
+    write_text(path.with_name(f"{path.name}.md"), _markdown(cards, title, metrics))
+    return [path.with_name(f"{path.name}{suffix}") for suffix in (".html", ".md")]
+
+
+def _evaluator(card: AuditCard) -> str:
+    return f"{card.extractor.name} ({card.extractor.sha256[:12]})" if card.extractor else "metrics of joints"
+
+
+def _facts(card: AuditCard) -> list[list[str]]:
+    data, protocol, packages = card.data, card.protocol, card.environment.get("packages", {})
+    return [
+        ["extractor", f"{card.extractor.name}, sha256 {card.extractor.sha256}" if card.extractor else "none"],
+        ["data", f"{card.split} split of {data.dataset}, fingerprint {data.fingerprint}, {data.representation}"],
+        ["motions", f"{card.motions}" + (" of {} to {} frames".format(*data.frames) if data.frames else "")],
+        ["protocol", f"{protocol.name} version {protocol.version}, seed {card.seed}"],
+        ["intervals", f"95 %, from {card.resamples} bootstrap resamples of the motions"],
+        ["versions", ", ".join(f"{name} {version}" for name, version in packages.items())],
+        *([f"not computed: {name}", reason] for name, reason in card.not_computed.items()),
+    ]
+
+
+def _truth(card: AuditCard) -> list[list[str]]:
+    return [[name, number(each["auc"]), number(each["correlation"])] for name, each in card.truth.items()]
+
+
+def findings(card: AuditCard) -> list[str]:
+    """Returns what metrics do not see, or rate better than real motions, in plain sentences."""
+    table = {(p.name, m): seen(card, p, m) for p in card.perturbations for m in card.metrics}
+    noticed = {pair for pair, found in table.items() if found and found.grade is not None}
+    group = {p.name: p.group for p in card.perturbations}
+    wrong = [name for name in group if group[name] in ("joints", "meaning") and ":" not in name]
+    wanted = [name for name in group if name in wrong or name == "memorized"]
+    blind = [name for name in wanted if not any((name, metric) in noticed for metric in card.metrics)]
+    lines = [f"No metric sees: {', '.join(blind)}."] if blind else []
+    single = {m: [n for n in wrong if [x for x in card.metrics if (n, x) in noticed] == [m]] for m in card.metrics}
+    lines += [f"Only {metric} sees: {', '.join(names)}." for metric, names in single.items() if names]
+    for metric in card.metrics:
+        unseen = [n for n in wrong if (n, metric) not in noticed and n not in blind]
+        unseen = [n for n in unseen if group[n] == "joints" or metric not in PHYSICS]
+        if unseen and metric.partition("/")[2] in ("", "every", "top3"):
+            lines.append(f"{metric} does not see: {', '.join(unseen)}.")
+    for metric in card.metrics:
+        liked = [n for n in wrong if (found := table[n, metric]) and found.rewarded]
+        if liked:
+            lines.append(f"{metric} rates better than real motions: {', '.join(liked)}.")
+    for each in card.perturbations:
+        if each.name in ("fewer", "as stored") and "fid" in card.real:
+            grade, (real, _) = each.grades[-1], card.real["fid"]
+            what = f"of {grade.grade:g} real motions" if each.name == "fewer" else "of features as stored"
+            lines.append(
+                f"fid {what} is {number(grade.values['fid'][0])}; of all of them, decoded and encoded, {number(real)}."
+            )
+    return lines
+
+
+def _cell(card: AuditCard, perturbation: AuditedPerturbation | None, metric: str) -> tuple[str, str]:
+    """Returns the text of a cell of the summary, and its class."""
+    found = seen(card, perturbation, metric) if perturbation and metric in card.metrics else None
+    if found is None or found.grade is None:
+        return ("not computed", "faint") if found is None else ("–", "faint")
+    graded = perturbation is not None and len(perturbation.grades) > 1
+    first, then = (("–" if g is None else f"{g:g}" if graded else "yes") for g in (found.grade, found.outside))
+    text = (first if first == then else f"{first} → {then}") + " ~" * (not found.monotone)
+    return text, "bad" if found.rewarded else "seen" if first == then else "weak"
+
+
+def _rows(cards: Sequence[AuditCard], metrics: Sequence[str]) -> list[dict[str, object]]:
+    """Returns the perturbations of all cards, each with its cells and curves by metric."""
+    rows = []
+    listed = [{each.name: each for each in card.perturbations} for card in cards]
+    for name in dict.fromkeys(name for each in listed for name in each):
+        of = [each.get(name) for each in listed]
+        about = next(each for each in of if each)
+        pairs = list(zip(cards, of, strict=True))
+        curves = [(m, [c for card, each in pairs if each and (c := _curve(card, each, m))]) for m in metrics]
+        rows.append(
+            {
+                "about": about,
+                "cells": [[_cell(card, each, metric) for card, each in pairs] for metric in metrics],
+                "curves": [(metric, drawn) for metric, drawn in curves if drawn],
+            }
+        )
+    return rows
+
+
+def _curve(card: AuditCard, perturbation: AuditedPerturbation, metric: str) -> dict[str, str] | None:
+    """Returns a response curve over real motions and all grades; None if the metric never changes."""
+    if metric not in card.metrics:
+        return None
+    found = [card.real[metric], *(grade.values[metric][:2] for grade in perturbation.grades)]
+    points = [(i, value, half) for i, (value, half) in enumerate(found) if value is not None and half is not None]
+    real = card.real[metric][0]
+    if real is None or all(abs(value - real) <= ROUNDING * abs(real) for _, value, _ in points):
+        return None
+    low, high = min(v - h for _, v, h in points), max(v + h for _, v, h in points)
+
+    def at(step: int, value: float) -> str:
+        x = 3 + (WIDE - 6) * step / (len(found) - 1)
+        return f"{x:.0f},{3 + (HIGH - 6) * (high - value) / (high - low):.1f}"
+
+    rim = [at(i, v + h) for i, v, h in points] + [at(i, v - h) for i, v, h in reversed(points)]
+    return {
+        "line": " ".join(at(i, v) for i, v, _ in points),
+        "band": " ".join(rim),
+        "level": at(0, real).partition(",")[2],
+        "text": f"{number(real)} to {number(points[-1][1])}",
+    }
+
+
+def _markdown(cards: Sequence[AuditCard], title: str, metrics: Sequence[str]) -> str:
+    text = f"# {markdown_text(title)}\n"
+    for card in cards:
+        text += f"\n## {markdown_text(_evaluator(card))}\n\n" if len(cards) > 1 else "\n"
+        text += "".join(f"- {markdown_text(': '.join(fact))}\n" for fact in _facts(card))
+        text += "\nFindings:\n\n" + "".join(f"- {markdown_text(line)}\n" for line in findings(card))
+        for name, auc, correlation in _truth(card):
+            text += f"- {markdown_text(name)} against exact attributes: AUC {auc}, rank correlation {correlation}\n"
+        text += "\n| value | real motions |\n|---|---|\n"
+        text += "".join(f"| {m} | {markdown_text(interval(*pair))} |\n" for m, pair in card.real.items())
+    text += f"\n| seen from | {' | '.join(metrics)} |\n|---{'|---' * len(metrics)}|\n"
+    for row in _rows(cards, metrics):
+        about, cells = row["about"], row["cells"]
+        assert isinstance(about, AuditedPerturbation)
+        assert isinstance(cells, list)
+        head = f"{about.name} ({about.unit})" if about.unit else about.name
+        text += (
+            f"| {markdown_text(head)} | "
+            + " | ".join(markdown_text(" / ".join(t for t, _ in c)) for c in cells)
+            + " |\n"
+        )
+    return text + f"\n{LEGEND}\n"

@@ -1,0 +1,191 @@
+"""Evaluator audits: measurement, resumption, cards, and links to them."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+
+import evaluators.audit as audits
+from evaluators.audit import BASE, REAL, Text, _inputs, _Measure
+from evaluators.evaluator import Evaluator, Motions
+from evaluators.extractors import Extractor
+from evaluators.metrics.alignment import MotionsForText, TextsForMotion
+from evaluators.perturbations import PERTURBATIONS
+from evaluators.run import load_protocol
+from flame_mdm.__main__ import main
+from flame_mdm.data.synthetic import Synthetic
+from flame_mdm.reporting.audit import Seen, findings, read_card, seen, write_card
+from flame_mdm.representations.humanml import HumanML
+from flame_mdm.runs import AuditCard, AuditedPerturbation, check_shape
+from flame_mdm.seeds import key
+
+
+class Linear(Extractor):
+    """A random linear map of mean features, and a vector per caption."""
+
+    sha256 = "0" * 64
+
+    def check(self, representation, dataset): ...
+
+    def motions(self, features, joints, mask):
+        generator = torch.Generator().manual_seed(0)
+        mean = (features * mask[..., None]).sum(1) / mask.sum(1, keepdim=True)
+        return {"features": mean @ torch.randn(features.shape[-1], 3, generator=generator)}
+
+    def texts(self, captions, tokens):
+        rows = [torch.randn(3, generator=torch.Generator().manual_seed(key(text))) for text in captions]
+        return torch.stack(rows)
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    """Metric inputs of 40 clips from the audit and from an evaluation."""
+    representation = HumanML()
+    protocol = load_protocol("synthetic", representation)
+    names = [name for name in protocol.metrics if name != "diversity"]
+    evaluator = Evaluator(Linear(), {name: protocol.metrics[name] for name in names}, representation)
+    clips = list(Synthetic(clips=40, seed=5).clips(20.0))
+    features = [representation.encode(torch.from_numpy(np.asarray(clip.motion))).numpy() for clip in clips]
+    ids, captions = [clip.id for clip in clips], [clip.captions[0] + "." * i for i, clip in enumerate(clips)]
+    requested = [dict(clip.attributes) for clip in clips]
+    found = evaluator.extract(Motions(ids, features, captions, requested=requested))
+    other = evaluator.extract(Motions(ids, [x[8:] for x in features]))
+    values, _ = evaluator.score(found, found, other.without_joints(), 0)
+    folder = tmp_path_factory.mktemp("cache")
+    sets = {
+        name: _inputs(evaluator, folder / f"{name}.npz", ids, lambda x=x: x)
+        for name, x in ((BASE, features), ("as stored", features), (REAL, [x[8:] for x in features]))
+    }
+    texts = [Text(caption, None, attributes) for caption, attributes in zip(captions, requested, strict=True)]
+    measure = _Measure(evaluator, sets, texts, np.random.default_rng(0), 50)
+    return measure, sets, texts, values, found
+
+
+def test_values_without_resampling_are_those_of_an_evaluation(scene):
+    measure, sets, texts, values, _ = scene
+    found = measure(sets[BASE], texts)
+    compared = [name for name in found if name in values and "_for_" not in name]
+    assert {"fid", "mm_dist", "mclip_score", "mid", "jitter", "foot_skating", "attributes/action"} <= set(compared)
+    for name in compared:
+        assert found[name][0] == pytest.approx(values[name], rel=1e-9), name
+
+
+@pytest.mark.parametrize("metric", [TextsForMotion(), MotionsForText(normalize=True)])
+def test_retrieval_is_the_mean_over_pools(scene, metric):
+    measure, sets, texts, _, found = scene
+    name = {TextsForMotion: "texts_for_motion", MotionsForText: "motions_for_text"}[type(metric)]
+    drawn = []
+    for seed in range(60):
+        one = type(metric)(seed=seed, **({"normalize": True} if isinstance(metric, MotionsForText) else {}))
+        one.update(**{key: found.rows[key] for key in ("generated", "text", "text_keys", "keys")})
+        drawn.append(one.compute()["top3"])
+    assert measure(sets[BASE], texts)[f"{name}/top3"][0] == pytest.approx(np.mean(drawn), abs=0.02)
+
+
+def test_intervals_are_those_of_a_bootstrap_over_motions(scene):
+    measure, sets, texts, _, _ = scene
+    cosines = measure.scores(sets[BASE], texts)["mclip_score"]
+    resampled = measure(sets[BASE], texts)["mclip_score"][1:]
+    assert resampled.std() == pytest.approx(cosines.std() / len(cosines) ** 0.5, rel=0.25)
+    assert (measure(sets[BASE], texts)["fid"] == measure(sets[BASE], texts[::-1])["fid"]).all()  # captions alone
+
+
+@pytest.fixture(scope="module")
+def card() -> AuditCard:
+    """A card with a metric that sees from 2 on, clearly from 5, and one that rewards."""
+    grades = {1: 0.1, 2: 0.5, 5: 2.0}
+    values = [
+        {"grade": float(g), "values": {"fid": [1 + d, 0.3, d, 0.2], "jitter": [9 - d, 5.0, -d, 0.01]}}
+        for g, d in grades.items()
+    ]
+    each = {"group": "joints", "about": "noise <b>", "unit": "mm"}
+    still = [{"grade": 1.0, "values": {"fid": [1.0, 0.9, 0.0, 0.0], "jitter": [None] * 4}}]
+    content = {
+        "format": 1,
+        "extractor": {"sha256": "ab" * 32, "name": "motion_clip/x"},
+        "protocol": {"name": "text_to_motion", "version": 1},
+        "data": {"dataset": "x", "fingerprint": "f", "frames": [24, 60]},
+        "split": "test",
+        "motions": 40,
+        "seed": 0,
+        "resamples": 10,
+        "environment": {"packages": {"torch": "2"}},
+        "metrics": {"fid": False, "jitter": False},
+        "real": {"fid": [1.0, 0.9], "jitter": [9.0, 5.0]},
+        "perturbations": [{"name": "noise", "grades": values, **each}, {"name": "still", "grades": still, **each}],
+        "not_computed": {},
+        "truth": {"fid": {"auc": 0.9, "correlation": -0.5}},
+    }
+    return check_shape(content, AuditCard)
+
+
+def test_a_grade_is_seen_from_where_all_stronger_ones_differ(card):
+    noise, still = card.perturbations
+    assert seen(card, noise, "fid") == Seen(2.0, 5.0, rewarded=False, monotone=True)
+    assert seen(card, noise, "jitter") == Seen(1.0, None, rewarded=True, monotone=True)
+    assert seen(card, still, "fid") == Seen(None, None, rewarded=False, monotone=True)
+    assert seen(card, still, "jitter") is None
+    back = noise.model_dump()
+    back["grades"][2]["values"]["fid"] = [1.1, 0.3, 0.1, 0.2]
+    assert seen(card, check_shape(back, AuditedPerturbation), "fid") == Seen(None, None, rewarded=False, monotone=False)
+
+
+def test_findings_are_sentences(card):
+    assert findings(card) == [
+        "No metric sees: still.",
+        "jitter rates better than real motions: noise.",
+    ]
+
+
+def test_pages_escape_and_show_one_card_or_two(card, tmp_path):
+    page, text = write_card([card], tmp_path)
+    assert page.name == "x-abababababab.html"
+    assert "noise &lt;b&gt;" in page.read_text()
+    assert "2 → 5" in page.read_text()
+    assert "| noise (mm) | 2 → 5 | 1 → – |" in text.read_text()
+    other = card.model_copy(update={"extractor": None})
+    page, text = write_card([card, other], tmp_path)
+    assert page.name == "x-abababababab-and-x-none.html"
+    assert "| noise (mm) | 2 → 5 / 2 → 5 |" in text.read_text()
+    assert page.read_text().count("<polyline") == 4
+
+
+@pytest.mark.slow
+def test_an_audit_resumes_and_gives_the_same_card(tmp_path, monkeypatch, capsys):
+    names = ("jitter", "mirrored", "near misses", "missing actions", "memorized", "fewer", "half precision")
+    few = [each for each in PERTURBATIONS if each.name in names]
+    monkeypatch.setattr(audits, "PERTURBATIONS", few)
+    passes: list[int] = []
+    extract = Evaluator.extract
+    monkeypatch.setattr(Evaluator, "extract", lambda self, x: passes.append(len(x)) or extract(self, x))
+    assert main(["prepare", "synthetic", "data.source.clips=400", f"data_root={tmp_path}"]) == 0
+    clips = sum(
+        '"test"' in line for line in (next(tmp_path.glob("synthetic-*")) / "clips.jsonl").read_text().splitlines()
+    )
+    words = ["audit", "data=synthetic", "data.source.clips=400", f"data_root={tmp_path}", "resamples=10"]
+    words += ["extractor=none", f"out={tmp_path / 'out'}"]
+    assert main(words) == 0
+    path = tmp_path / "out" / "synthetic-none.json"
+    card, first = read_card(path), len(passes)
+    assert card.motions == clips == passes[0]
+    assert [each.name for each in card.perturbations][:2] == ["jitter", "mirrored"]
+    by_name = {each.name: each for each in card.perturbations}
+    truth = [grade.values["attributes/every"][0] for grade in by_name["near misses"].grades]
+    assert sorted(truth, reverse=True) == truth
+    assert card.real["attributes/every"][0] > 0.95 > truth[-1]  # exact attributes see every wrong caption
+    jitter = seen(card, by_name["jitter"], "jitter")
+    assert jitter is not None
+    assert jitter.grade == 1
+    assert "fid" not in card.metrics
+    assert card.not_computed == {"extractor": "metrics that need features"}
+    before = json.loads(path.read_text())
+    removed = sorted((tmp_path / "out" / "cache").glob("*/*.npz"))[0]
+    removed.unlink()
+    assert main(words) == 0
+    assert len(passes) == first + 1
+    again = json.loads(path.read_text())
+    assert {**before, "environment": 0} == {**again, "environment": 0}
+    assert main([*words[:-2], "extractor=missing.ckpt", words[-1]]) == 1
+    assert main(["audit", "data=synthetic"]) == 1
+    assert "extractor=none" in capsys.readouterr().err

@@ -1,6 +1,8 @@
 """Evaluator audits: measurement, resumption, cards, and links to them."""
 
 import json
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 import pytest

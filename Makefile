@@ -48,7 +48,7 @@ lint: $(READY) ## check style and types
 	@$(VENV)/bin/pyright
 
 bench: $(READY) ## measure speed, write docs/benchmarks/speed.md; ONLY=host,steps repeats some, DEVICE=cuda adds a GPU
-	@$(VENV)/bin/python benchmarks/run.py "only=$(ONLY)" "device=$(DEVICE)"
+	@$(VENV)/bin/python benchmarks/run.py "only=$(ONLY)" "device=$(DEVICE)" "runs=$(RUNS)"
 
 docs: $(READY) ## regenerate docs/recipes.md and docs/hyperparameters.md from the recipes
 	@$(VENV)/bin/python docs/generate.py

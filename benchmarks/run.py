@@ -1,7 +1,7 @@
 """Runs the benchmarks and writes docs/benchmarks/speed.md: `python benchmarks/run.py [only=a,b] [device=cuda]`.
 
 Each benchmark runs in a process, one after another. With `only`, the other sections keep their figures. `device=cuda`
-measures the sections that use a GPU, which are added to the page.
+measures the sections that use a GPU, which are added to the page. `only=quality runs=FOLDER` compares trained models.
 """
 
 import datetime
@@ -23,12 +23,14 @@ from flame_mdm.training.provenance import environment
 PAGE = Path(__file__).parent.parent / "docs" / "benchmarks" / "speed.md"
 SECTIONS = ["host", "steps", "loading", "ema", "sampling", "evaluation", "preparation", "features", "text", "startup"]
 SECTIONS += ["ddp"]
+ALL = [*SECTIONS, "quality"]  # which reads trained models, and is measured only if asked for
 ON_GPU = ["steps", "sampling"]
 HEAD = """# Speed
 
 `make bench` measures the speed of the framework and writes this page and [speed.json](speed.json). Every comparison is
-a ratio of two measurements in one run on an idle machine; the absolute figures next to it hold for that machine alone.
-`make bench ONLY=host,steps` repeats some sections, `make bench DEVICE=cuda` adds those of a GPU.
+a ratio of two measurements in one run, on an idle machine unless the section says otherwise; the absolute figures next
+to it hold for that machine alone. `make bench ONLY=host,steps` repeats some sections, `make bench DEVICE=cuda` adds
+those of a GPU. The quality of trained models is read from their runs: `make bench ONLY=quality RUNS=FOLDER`.
 [Which options to choose](../speed.md) is a page of its own.
 """
 
@@ -72,7 +74,7 @@ def run(name: str, *words: str) -> dict[str, Any]:
 
 def render(sections: dict[str, Any]) -> str:
     """Returns the page of the measured sections."""
-    order = sorted(sections, key=lambda name: (name.endswith("_cuda"), SECTIONS.index(name.removesuffix("_cuda"))))
+    order = sorted(sections, key=lambda name: (name.endswith("_cuda"), ALL.index(name.removesuffix("_cuda"))))
     machines = list(dict.fromkeys(json.dumps(sections[name]["machine"]) for name in order))
     lines = [HEAD, "## In short\n", *(f"- {sections[name]['summary']}" for name in order), "\n## Machine\n"]
     for number, facts in enumerate(machines, 1):
@@ -94,16 +96,19 @@ def main(*words: str) -> None:
         raise SystemExit(f"DEVICE={device}: give cpu or cuda")
     if device == "cuda" and not torch.cuda.is_available():
         raise SystemExit("DEVICE=cuda: torch finds no CUDA GPU on this machine")
-    possible = ON_GPU if device == "cuda" else SECTIONS
-    chosen = options["only"].split(",") if options.get("only") else possible
+    possible, usual = (ON_GPU, ON_GPU) if device == "cuda" else (ALL, SECTIONS)
+    chosen = options["only"].split(",") if options.get("only") else usual
     if unknown := [name for name in chosen if name not in possible]:
         raise SystemExit(f"ONLY={','.join(unknown)}: give some of {', '.join(possible)}")
+    if "quality" in chosen and not options.get("runs"):
+        raise SystemExit("ONLY=quality: give RUNS=..., a folder of trained and evaluated runs")
     data = PAGE.with_suffix(".json")
     sections: dict[str, Any] = json.loads(data.read_text()) if data.exists() else {}
     for number, name in enumerate(chosen, 1):
         print(f"{number}/{len(chosen)} {name}", flush=True)
         start = time.perf_counter()
-        found = run(name, *(["--device", "cuda"] if device == "cuda" else []))
+        given = [options["runs"]] if name == "quality" else ["--device", "cuda"] if device == "cuda" else []
+        found = run(name, *given)
         found |= {"date": datetime.date.today().isoformat(), "machine": machine()}
         sections[name + "_cuda" * (device == "cuda")] = found
         data.write_text(json.dumps(sections, indent=1) + "\n")

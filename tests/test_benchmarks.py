@@ -4,6 +4,7 @@ import json
 import math
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -12,11 +13,13 @@ ROOT = Path(__file__).parent.parent
 sys.path.append(str(ROOT / "benchmarks"))  # the scripts import each other
 
 import cost  # noqa: E402
+import quality  # noqa: E402
 import run  # noqa: E402
 import sections  # noqa: E402
 import steps  # noqa: E402
 
 from flame_mdm.config import compose  # noqa: E402
+from flame_mdm.runs import Run, Value  # noqa: E402
 
 TOY = {
     "host": "12",
@@ -62,7 +65,11 @@ def test_the_page_is_rendered_from_the_figures_and_keeps_those_that_are_not_meas
 
 
 def test_unknown_sections_and_devices_are_refused_in_one_line(page, monkeypatch):
-    for word, start in (("only=host,none", "ONLY=none: give some of host, "), ("device=tpu", "DEVICE=tpu: give cpu")):
+    for word, start in (
+        ("only=host,none", "ONLY=none: give some of host, "),
+        ("device=tpu", "DEVICE=tpu: give cpu"),
+        ("only=quality", "ONLY=quality: give RUNS="),
+    ):
         with pytest.raises(SystemExit, match=start):
             run.main(word)
     monkeypatch.setattr(run.torch.cuda, "is_available", lambda: False)
@@ -100,6 +107,40 @@ def test_the_operations_of_a_step_grow_with_its_batch():
 def test_the_committed_page_is_rendered_from_the_committed_figures():
     found = json.loads((ROOT / "docs" / "benchmarks" / "speed.json").read_text())
     assert (ROOT / "docs" / "benchmarks" / "speed.md").read_text() == run.render(found)
+
+
+def trained(folder: Path, speed: str, seed: int, loss: float, fid: float) -> Run:
+    keys: dict[str, Any] = {"speed": speed} if speed == "fast" else {}
+    config = {"data": {"name": "own"}, "trainer": {"max_steps": 1500}, "ema": {"decay": 0.9}, "run": keys, "seed": seed}
+    result: Any = SimpleNamespace(values={"fid": Value(mean=fid, ci=0.0, replications=1, n=9), "jitter": None})
+    return Run(folder, config, None, {"val/loss": {9: 100.0, 19: loss}}, {"evaluation/result.json": result})
+
+
+def test_quality_has_intervals_over_seeds_and_of_the_differences_of_equal_seeds(tmp_path, monkeypatch):
+    runs = {}
+    for seed, loss in enumerate((1.0, 2.0, 3.0)):
+        runs[f"a{seed}"] = trained(tmp_path, "reference", seed, loss, fid=5.0 + seed)
+        runs[f"b{seed}"] = trained(tmp_path, "fast", seed, loss + 0.1, fid=5.0 - 10 * seed)
+    for name in runs:
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "config.yaml").touch()
+    monkeypatch.setattr(quality, "read_run", lambda folder: runs[folder.name])
+    found = quality.measure(str(tmp_path))
+    ((caption, rows),) = found["tables"].items()
+    assert caption == "own, 1,500 steps, ema.decay=0.9, 3 seeds"
+    assert [row["metric"] for row in rows] == ["val/loss", "FID"]
+    assert rows[0]["speed=reference"] == "2.0 ± 2.5"  # 4.303 / sqrt(3)
+    assert rows[0]["fast − reference"].startswith("+0.100000 ± 0.0000")
+    assert rows[1]["fast − reference"] == "-11 ± 27"  # 11 times as much
+    assert found["summary"].startswith("In 1 of 2 figures of quality")
+    assert found["summary"].endswith("the others: val/loss (own).")
+    del runs["b2"]
+    (tmp_path / "b2" / "config.yaml").unlink()
+    with pytest.raises(SystemExit, match="needs the same two or more seeds in both speeds"):
+        quality.measure(str(tmp_path))
+    monkeypatch.setattr(quality, "read_run", lambda folder: Run(folder, runs["a0"].config, None, {}, {}))
+    with pytest.raises(SystemExit, match="not validated or not evaluated"):
+        quality.measure(str(tmp_path))
 
 
 @pytest.mark.slow

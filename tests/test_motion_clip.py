@@ -3,6 +3,7 @@
 import json
 import math
 import re
+from itertools import islice
 
 import pytest
 import torch
@@ -12,13 +13,16 @@ from torch.nn import functional
 
 from evaluators.extractors import MotionCLIPExtractor
 from evaluators.extractors.motion_clip import MotionCLIP, MotionCLIPTask, PooledLoss, import_mclip, info_nce
+from evaluators.extractors.motion_clip_calibrated import CalibratedMotionCLIPTask, calibration_error, noisy_copies
 from flame_mdm.__main__ import main
 from flame_mdm.checkpoints.files import read_checkpoint
 from flame_mdm.checkpoints.loading import load, load_task
 from flame_mdm.conditions.text import PretrainedText
 from flame_mdm.config import compose, instantiate
+from flame_mdm.data.synthetic import Synthetic
 from flame_mdm.errors import UserError
 from flame_mdm.motion import length_mask
+from flame_mdm.representations.humanml import HumanML
 from flame_mdm.representations.smpl import SMPL
 from flame_mdm.seeds import key
 
@@ -182,11 +186,16 @@ def pairs() -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     return motions, torch.tensor([9, 4, 7, 9, 2, 6]), texts
 
 
-def loss_and_gradients(first: int, last: int) -> tuple[float, dict[str, torch.Tensor]]:
+MEANING = torch.tensor([[1, 10], [2, 20], [3, 30], [1, 40], [4, 50], [5, 20]])
+
+
+def loss_and_gradients(first: int, last: int, hard: bool = False) -> tuple[float, dict[str, torch.Tensor]]:
     """Of the pairs first to last, with those of the other processes as negatives."""
     clip, (x, lengths, texts) = network(), pairs()
-    x, lengths, texts = x[first:last], lengths[first:last], texts[first:last]
-    loss = info_nce(clip(x, length_mask(lengths, 9)), clip.text(texts), clip.logit_scale)
+    x, lengths, texts, meaning = x[first:last], lengths[first:last], texts[first:last], MEANING[first:last]
+    wrong = clip.text(torch.stack([texts + 0.1, texts.flip(1)], 1))
+    more = {"meaning": meaning, "wrong_text": wrong} if hard else {}
+    loss = info_nce(clip(x, length_mask(lengths, 9)), clip.text(texts), clip.logit_scale, **more)
     loss.backward()
     gradients = {name: p.grad for name, p in clip.named_parameters() if p.grad is not None}
     assert gradients.keys() == dict(clip.named_parameters()).keys()
@@ -195,14 +204,39 @@ def loss_and_gradients(first: int, last: int) -> tuple[float, dict[str, torch.Te
 
 @pytest.mark.slow
 def test_two_processes_learn_what_one_learns_from_all_pairs():
-    loss, gradients = loss_and_gradients(0, 6)
     with GlooPool(2) as pool:
-        (loss_a, a), (loss_b, b) = pool.run(loss_and_gradients, (0, 3), (3, 6))
-    assert (loss_a + loss_b) / 2 == pytest.approx(loss, abs=1e-6)
-    for name, gradient in gradients.items():
-        torch.testing.assert_close((a[name] + b[name]) / 2, gradient, atol=1e-6, rtol=1e-4, msg=name)
-    alone, _ = loss_and_gradients(0, 3)
-    assert abs(alone - loss_a) > 0.1  # without the others' negatives the loss is another one
+        for hard in (False, True):
+            loss, gradients = loss_and_gradients(0, 6, hard)
+            (loss_a, a), (loss_b, b) = pool.run(loss_and_gradients, (0, 3, hard), (3, 6, hard))
+            assert (loss_a + loss_b) / 2 == pytest.approx(loss, abs=1e-6)
+            for name, gradient in gradients.items():
+                torch.testing.assert_close((a[name] + b[name]) / 2, gradient, atol=1e-6, rtol=1e-4, msg=name)
+            alone, _ = loss_and_gradients(0, 3, hard)
+            assert abs(alone - loss_a) > 0.05  # without the others' negatives the loss is another one
+
+
+def test_the_loss_with_hard_negatives_is_that_of_a_loop():
+    generator = torch.Generator().manual_seed(5)
+    motion, text = (functional.normalize(torch.randn(6, 8, generator=generator), dim=1) for _ in range(2))
+    wrong, scale = functional.normalize(torch.randn(6, 2, 8, generator=generator), dim=2), 7.0
+    total = 0.0
+    for i in range(6):
+        others = [j for j in range(6) if not (MEANING[i] == MEANING[j]).any()]
+        own = math.exp(scale * float(motion[i] @ text[i]))
+        texts = [float(motion[i] @ text[j]) for j in others] + [float(motion[i] @ each) for each in wrong[i]]
+        motions = [float(text[i] @ motion[j]) for j in others]
+        for negatives in (texts, motions):
+            total -= math.log(own / (own + sum(math.exp(scale * cosine) for cosine in negatives))) / 12
+    # Pairs 0 and 3 share the first number, 1 and 5 the second.
+    loss = info_nce(2 * motion, text, torch.tensor(math.log(scale)), meaning=MEANING, wrong_text=3 * wrong)
+    assert loss.item() == pytest.approx(total, rel=1e-5)
+
+
+def test_equal_captions_are_never_negatives():
+    motion, text, scale = torch.randn(4, 8), torch.randn(4, 8), torch.tensor(2.0)
+    same = torch.tensor([[1, 7], [2, 7], [3, 7], [4, 7]])
+    assert info_nce(motion, text, scale, meaning=same) == 0
+    assert info_nce(motion, text, scale, meaning=torch.arange(8).view(4, 2)) == info_nce(motion, text, scale)
 
 
 def test_the_loss_is_low_for_pairs_and_high_for_exchanged_ones():
@@ -229,6 +263,67 @@ def test_the_validation_loss_does_not_depend_on_batches_or_order():
         terms.append((ways[0] + ways[1]) / 2)
     assert values.pop() == pytest.approx(torch.cat(terms).mean().item(), rel=1e-6)
     assert PooledLoss().compute() is None
+
+
+# Calibration ----------------------------------------------------------------------------------------------------------
+
+
+def test_roughness_is_seen_and_does_not_depend_on_padding():
+    clip = network(roughness=True)
+    x, lengths = torch.randn(3, 20, 7), torch.tensor([20, 13, 1])
+    together = clip(x, length_mask(lengths))
+    for row, length in enumerate(lengths.tolist()):
+        alone = clip(x[row : row + 1, :length], torch.ones(1, length, dtype=torch.bool))
+        torch.testing.assert_close(alone[0], together[row], atol=1e-5, rtol=1e-5)
+    with torch.no_grad():  # nothing but the roughness reaches the transformer
+        clip.input.weight[:, :7] = 0
+    steady = torch.linspace(0, 3, 20)[:, None] * torch.randn(2, 1, 7)
+    mask = torch.ones(2, 20, dtype=torch.bool)
+    torch.testing.assert_close(clip(steady, mask), clip(0 * steady, mask), atol=1e-4, rtol=0)
+    assert not torch.allclose(clip(steady + 0.1 * torch.randn(2, 20, 7), mask), clip(steady, mask), atol=1e-3)
+
+
+def test_the_calibration_error_compares_distances_of_unit_vectors():
+    x = torch.tensor([[2.0, 0], [0, 3], [1, 1]])
+    y = torch.tensor([[5.0, 0], [1, 0], [-1, -1]])
+    strength = torch.tensor([0.25, 2**0.5, 1.0])  # the distances are 0, sqrt(2) and 2
+    assert calibration_error(x, y, strength).item() == pytest.approx((0.25 + 0 + 1) / 3)
+
+
+def walks(count: int) -> list[torch.Tensor]:
+    clips = (clip for clip in Synthetic(clips=60, seed=1).clips(20.0) if clip.attributes["action"] == "walk")
+    return [torch.from_numpy(clip.motion) for clip in islice(clips, count)]
+
+
+def test_noisy_copies_have_noise_of_the_stated_strength():
+    representation = HumanML()
+    encoded = representation.encode_many(walks(6))
+    representation.mean.copy_(encoded[0].mean(0))
+    lengths = torch.tensor([len(x) for x in encoded])
+    x = torch.nn.utils.rnn.pad_sequence([representation.normalize(x) for x in encoded], batch_first=True)
+    real = length_mask(lengths)
+    copies = noisy_copies(representation, x, lengths, torch.zeros(6))
+    assert torch.equal(copies[3:], x[3:])
+    assert not copies[~real].any()
+    joints = representation.to_joints(x)
+    before_last = real & length_mask(lengths - 1, x.shape[1])
+    torch.testing.assert_close(representation.to_joints(copies)[before_last], joints[before_last], atol=1e-4, rtol=0)
+
+    torch.manual_seed(4)
+    copies = noisy_copies(representation, x, lengths, torch.full((6,), 0.5))
+    height = representation.slices["root_height"]
+    moved = (copies - x)[..., height][:3][real[:3]]
+    assert moved.std().item() == pytest.approx(0.01, rel=0.15)
+    assert abs(moved.mean().item()) < 0.002  # the lowest joint is not put on the floor again
+    assert (copies - x)[3:][real[3:]].std().item() == pytest.approx(0.15, rel=0.02)
+    torch.manual_seed(4)
+    assert torch.equal(noisy_copies(representation, x, lengths, torch.full((6,), 0.5)), copies)
+
+
+def test_only_representations_of_joints_are_calibrated():
+    config = compose("motion_clip/synthetic_calibrated")
+    with pytest.raises(UserError, match=r"representation=smpl147: CalibratedMotionCLIPTask adds noise to joints"):
+        CalibratedMotionCLIPTask.build(config, SMPL())
 
 
 # Training -------------------------------------------------------------------------------------------------------------
@@ -283,6 +378,35 @@ def test_a_checkpoint_is_a_feature_extractor(trained):
 def test_a_feature_extractor_is_not_sampled_from(trained):
     with pytest.raises(UserError, match=r"last\.ckpt: holds a MotionCLIPTask, not a MotionGeneration"):
         load(trained)
+
+
+@pytest.mark.slow
+def test_a_calibrated_run_resumes_exactly(tmp_path, data_root, capsys):
+    """Checkpoints after four steps at once, and after two and two, are equal; near misses differ from step to step."""
+    options = [f"data_root={data_root}/clip", "trainer.val_check_interval=2", "callbacks.checkpoints.every_n_steps=2"]
+    weights = []
+    for stops in ((4,), (2, 4)):
+        folder = tmp_path / str(len(stops))
+        for steps in stops:
+            command = ["train", "motion_clip/synthetic_calibrated", *RUN, *options, f"run.dir={folder}"]
+            assert main([*command, f"trainer.max_steps={steps}"]) == 0, capsys.readouterr().err
+        weights.append(read_checkpoint(folder / "checkpoints" / "last.ckpt")["state_dict"])
+    assert weights[0].keys() == weights[1].keys()
+    assert all(torch.equal(value, weights[1][name]) for name, value in weights[0].items())
+    task = load_task(folder / "checkpoints" / "last.ckpt", MotionCLIPTask)
+    assert isinstance(task, CalibratedMotionCLIPTask)
+
+
+def test_near_misses_change_with_step_and_attribute():
+    task = CalibratedMotionCLIPTask.__new__(CalibratedMotionCLIPTask)
+    torch.nn.Module.__init__(task)
+    task.seed, task.near_misses = 0, {"a": [["left", "l"], ["twice"]], "b": []}
+    for step in range(20):
+        texts = [task.near_miss("a", number, step) for number in range(2)]
+        assert texts == [task.near_miss("a", number, step) for number in range(2)]
+        assert sorted(text == "twice" for text in texts) == [False, True]
+    assert {task.near_miss("a", 0, step) for step in range(20)} == {"left", "l", "twice"}
+    assert task.near_miss("b", 0, 0) == ""
 
 
 @pytest.mark.slow

@@ -48,6 +48,7 @@ class MotionCLIP(nn.Module):
         max_frames: int,
         embedding_dim: int,
         blind_features: int = 0,
+        roughness: bool = False,
     ):
         """Builds the network.
 
@@ -63,13 +64,16 @@ class MotionCLIP(nn.Module):
             embedding_dim: E, width of the joint space.
             blind_features: number of features at the beginning of each frame that are set to 0. It is 3 in FLAME's
                 code, whose motions begin with the root's translation: scores do not depend on position and height.
+            roughness: whether the absolute second differences of the features over time are inputs, too. They show
+                noise, which is lost in the mean over frames otherwise.
         """
         super().__init__()
+        self.roughness = roughness
         self.max_frames, self.blind_features, self.embedding_dim = max_frames, blind_features, embedding_dim
         self.cls = nn.Parameter(torch.randn(latent_dim))
         # Row 0, unused in the authors' code, is that of the longest motion: see the FLAME denoiser.
         self.length_embedding = nn.Embedding(max_frames, latent_dim)
-        self.input = nn.Linear(in_features, latent_dim)
+        self.input = nn.Linear((1 + roughness) * in_features, latent_dim)
         self.transformer = Transformer(latent_dim, ff_size, num_layers, num_heads, dropout, nn.ReLU)
         self.output = nn.Linear(latent_dim, embedding_dim)
         self.text_projection = nn.Linear(text_features, embedding_dim)
@@ -86,7 +90,10 @@ class MotionCLIP(nn.Module):
             raise ValueError(
                 f"a motion has {int(lengths.max())} frames, but this motion-CLIP takes at most {self.max_frames}"
             )
-        x = self.input(F.pad(x[..., self.blind_features :], (self.blind_features, 0)))
+        x = F.pad(x[..., self.blind_features :], (self.blind_features, 0))
+        if self.roughness:
+            x = torch.cat([x, F.pad(x.diff(n=2, dim=1).abs(), (0, 0, 2, 0))[:, : x.shape[1]]], -1)
+        x = self.input(x)
         length = self.length_embedding(lengths % self.max_frames)
         x = torch.cat([self.cls.expand(len(x), 1, -1), length[:, None], x], 1)
         x = x + cosine_first_sinusoid(torch.arange(x.shape[1], device=x.device), x.shape[-1]).to(x.dtype)
@@ -97,7 +104,14 @@ class MotionCLIP(nn.Module):
         return self.text_projection(pooled)
 
 
-def info_nce(motion: Tensor, text: Tensor, logit_scale: Tensor) -> Tensor:
+def info_nce(
+    motion: Tensor,
+    text: Tensor,
+    logit_scale: Tensor,
+    *,
+    meaning: Tensor | None = None,
+    wrong_text: Tensor | None = None,
+) -> Tensor:
     """Contrastive loss over the pairs of all processes.
 
     Oord et al. 2018, eq. 4; symmetric, as in Radford et al. 2021. Each process compares its own pairs with all motions
@@ -108,18 +122,32 @@ def info_nce(motion: Tensor, text: Tensor, logit_scale: Tensor) -> Tensor:
         motion: (B, E) features.
         text: (B, E) features.
         logit_scale: (), logarithm of the inverse temperature.
+        meaning: (B, M) int64. Pairs that are equal in one of the M numbers are not negatives of each other.
+        wrong_text: (B, K, E) features of texts that are negatives of one motion each.
 
     Returns:
         (), the mean of both cross-entropies.
     """
     motion, text = F.normalize(motion, dim=-1), F.normalize(text, dim=-1)
-    motions, texts, first = motion, text, 0
-    if torch.distributed.is_initialized() and torch.distributed.get_world_size() > 1:
-        motions, texts = torch.cat(all_gather(motion)), torch.cat(all_gather(text))
-        first = torch.distributed.get_rank() * len(motion)
-    own = torch.arange(len(motion), device=motion.device) + first
+    motions, texts = _of_all_processes(motion), _of_all_processes(text)
+    own = torch.arange(len(motion), device=motion.device)
+    if len(motions) > len(motion):
+        own = own + torch.distributed.get_rank() * len(motion)
     scale = logit_scale.exp()
-    return (F.cross_entropy(scale * motion @ texts.T, own) + F.cross_entropy(scale * text @ motions.T, own)) / 2
+    of_motion, of_text = scale * motion @ texts.T, scale * text @ motions.T
+    if meaning is not None:
+        same = (meaning[:, None] == _of_all_processes(meaning)).any(-1)
+        same[torch.arange(len(own)), own] = False
+        of_motion, of_text = of_motion.masked_fill(same, -torch.inf), of_text.masked_fill(same, -torch.inf)
+    if wrong_text is not None:
+        of_motion = torch.cat([of_motion, scale * (F.normalize(wrong_text, dim=-1) @ motion[..., None])[..., 0]], 1)
+    return (F.cross_entropy(of_motion, own) + F.cross_entropy(of_text, own)) / 2
+
+
+def _of_all_processes(x: Tensor) -> Tensor:
+    """Returns the rows of x (B, ...) of all processes, in the order of their ranks."""
+    several = torch.distributed.is_initialized() and torch.distributed.get_world_size() > 1
+    return torch.cat(all_gather(x)) if several else x
 
 
 class PooledLoss(TextAndMotion):

@@ -1,0 +1,163 @@
+"""Motion-CLIP calibrated by hard cases: near-miss captions, and copies of motions with noise of known strength."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Self
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+from torch.nn.utils.rnn import pad_sequence
+
+from evaluators.extractors.motion_clip import MotionCLIPTask, info_nce
+from evaluators.near_misses import near_misses
+from flame_mdm.config import Config
+from flame_mdm.errors import UserError
+from flame_mdm.motion import MotionBatch
+from flame_mdm.representations import Representation
+from flame_mdm.representations.humanml import HumanML
+from flame_mdm.seeds import key
+
+NEAR_MISSES = 2
+"""Near-miss captions per motion and step, of different attributes if possible."""
+JITTER = 0.02
+"""Standard deviation of joint positions, in meters, at which the strength of noise is 1."""
+FEATURE_NOISE = 0.3
+"""Standard deviation of normalized features at which it is 1; positions of joints then err by about 20 mm, too."""
+WEIGHT = 5.0
+"""Weight of `calibration_error`, compared with `info_nce`."""
+
+
+class CalibratedMotionCLIPTask(MotionCLIPTask):
+    """Trains motion-CLIP so that its distances have a known scale, and texts differ by their details.
+
+    - Texts: motions of clips with the same captions are not negatives of each other's captions. Near-miss captions (see
+      `near_misses`) are additional negatives.
+    - Motions: half of the motions have a noisy copy. The distance of both, scaled to length 1, is trained to be the
+      strength of the noise, drawn from [0, 1], small values more often. One half of the copies has white noise on the
+      joints and is encoded again, as motions from files are; the other half has white noise on normalized features, as
+      generated motions have. A copy that was only encoded again thus has distance 0.
+    """
+
+    representation: HumanML
+    meanings: dict[str, int]
+    near_misses: dict[str, list[list[str]]]
+
+    @classmethod
+    def build(cls, config: Config, representation: Representation, *, actions: Sequence[str] = ()) -> Self:
+        """Builds the task of a recipe.
+
+        Raises:
+            UserError: If the representation does not encode joints.
+        """
+        if not isinstance(representation, HumanML):
+            raise UserError(
+                f"representation={representation.name}: {cls.__name__} adds noise to joints and encodes them again, "
+                "which takes a representation such as humanml_clean. Train another recipe of motion_clip/..."
+            )
+        return super().build(config, representation, actions=actions)
+
+    def on_fit_start(self) -> None:
+        """Looks up the near misses of the training clips."""
+        super().on_fit_start()
+        clips = self.trainer.datamodule.train.clips  # type: ignore[attr-defined]
+        self.meanings = {clip.id: key("captions", *sorted(clip.captions)) for clip in clips}
+        found = zip(clips, near_misses(clips), strict=True)
+        self.near_misses = {clip.id: list(texts.values()) for clip, texts in found}
+
+    def training_step(self, batch: MotionBatch, batch_idx: int) -> Tensor:
+        """Returns the loss of one batch, with the pairs of the other processes as negatives."""
+        torch.manual_seed(key("step", self.seed, batch_idx, self.global_rank))
+        assert batch.text is not None
+        wrong = [self.near_miss(name, number, batch_idx) for name in batch.ids for number in range(NEAR_MISSES)]
+        cond = self.condition(replace(batch, text=batch.text + wrong))
+        if cond.null is not None:  # gives a learned null, which is not used here, a gradient, as DDP requires
+            cond = cond.drop(torch.zeros(len(cond.pooled), dtype=torch.bool, device=self.device))
+        text, wrong_text = self.network.text(cond.pooled).tensor_split([len(batch)])
+        meaning = [
+            [self.meanings[name], key("caption", text)] for name, text in zip(batch.ids, batch.text, strict=True)
+        ]
+
+        rows = torch.randperm(len(batch))[: (len(batch) + 1) // 2]
+        strength = torch.rand(len(rows)) ** 2
+        copies = noisy_copies(
+            self.representation, batch.x[rows.to(self.device)], batch.lengths[rows.to(self.device)], strength
+        )
+        rows, strength = rows.to(self.device), strength.to(self.device)
+        motion = self.network(torch.cat([batch.x, copies]), torch.cat([batch.mask, batch.mask[rows]]))
+        motion, copy = motion.tensor_split([len(batch)])
+        contrast = info_nce(
+            motion,
+            text,
+            self.network.logit_scale,
+            meaning=torch.tensor(meaning, device=self.device),
+            wrong_text=wrong_text.unflatten(0, (-1, NEAR_MISSES)),
+        )
+        error = calibration_error(motion[rows], copy, strength)
+        loss = contrast + WEIGHT * error
+        values = {
+            "loss": loss,
+            "contrast": contrast,
+            "calibration_error": error,
+            "temperature": (-self.network.logit_scale).exp(),
+        }
+        self.log_dict({f"train/{name}": value for name, value in values.items()}, batch_size=len(batch))
+        return loss
+
+    def near_miss(self, name: str, number: int, step: int) -> str:
+        """Returns a near miss of a clip, a function of (seed, step, clip, number); "" if the clip has none."""
+        attributes = self.near_misses[name]
+        if not attributes:
+            return ""
+        draw = key("near miss", self.seed, step, name)
+        texts = attributes[(draw + number) % len(attributes)]
+        return texts[key("text", draw, number) % len(texts)]
+
+
+def calibration_error(motion: Tensor, copy: Tensor, strength: Tensor) -> Tensor:
+    """Returns the mean absolute error of the distances of features (B, E), scaled to length 1, from `strength` (B,)."""
+    distance = torch.linalg.vector_norm(F.normalize(motion, dim=-1) - F.normalize(copy, dim=-1), dim=-1)
+    return (distance - strength).abs().mean()
+
+
+def noisy_copies(representation: HumanML, x: Tensor, lengths: Tensor, strength: Tensor) -> Tensor:
+    """Returns copies of normalized motions with noise, drawn from torch's generator of the processor.
+
+    Args:
+        representation: of the motions.
+        x: (B, F, D), 0 past the end of each motion.
+        lengths: (B,), number of frames.
+        strength: (B,) of the noise: on the joints of the first half of the motions, on the features of the others.
+
+    Returns:
+        (B, F, D), 0 past the end of each motion.
+    """
+    half, frames = (len(x) + 1) // 2, lengths.tolist()
+    joints = representation.to_joints(x[:half]).cpu()
+    noisy = [
+        motion[:length] + JITTER * amount * torch.randn(length, *motion.shape[1:])
+        for motion, length, amount in zip(joints, frames, strength, strict=False)
+    ]
+    copies = [representation.normalize(motion.to(x.device)) for motion in encode_windows(representation, noisy)]
+    for motion, length, amount in zip(x[half:], frames[half:], strength[half:], strict=True):
+        noise = FEATURE_NOISE * amount * torch.randn(length, x.shape[2])
+        copies.append(motion[:length] + noise.to(x.device))
+    return F.pad(pad_sequence(copies, batch_first=True), (0, 0, 0, x.shape[1] - max(frames)))
+
+
+def encode_windows(representation: HumanML, motions: Sequence[Tensor]) -> list[Tensor]:
+    """Encodes joints (F, J, 3) as features (F, D) float32, at their own height.
+
+    The representation needs one more frame, which continues the last step, and puts the lowest joint of a motion on the
+    floor: noise would raise all motions, and heights alone would reveal it.
+    """
+    longer = [torch.cat([x, 2 * x[-1:] - x[-2:-1]]) for x in motions]
+    encoded = representation.encode_many(longer)
+    height, positions = representation.slices["root_height"], representation.slices["positions"]
+    for joints, features in zip(motions, encoded, strict=True):
+        rise = joints[0, 0, 1] * representation.units_per_metre - features[0, height]
+        features[:, height] += rise
+        features[:, positions.start + 1 : positions.stop : 3] += rise
+    return encoded

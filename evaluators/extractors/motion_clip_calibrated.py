@@ -28,6 +28,8 @@ FEATURE_NOISE = 0.3
 """Standard deviation of normalized features at which it is 1; positions of joints then err by about 20 mm, too."""
 WEIGHT = 5.0
 """Weight of `calibration_error`, compared with `info_nce`."""
+LENGTH = 10.0
+"""Length of all features: the FID of noise of strength s, which moves all motions alike, is about (10 s)^2."""
 
 
 class CalibratedMotionCLIPTask(MotionCLIPTask):
@@ -39,6 +41,8 @@ class CalibratedMotionCLIPTask(MotionCLIPTask):
       strength of the noise, drawn from [0, 1], small values more often. One half of the copies has white noise on the
       joints and is encoded again, as motions from files are; the other half has white noise on normalized features, as
       generated motions have. A copy that was only encoded again thus has distance 0.
+
+    Features have the same length, since the lengths that cosines leave undetermined would disturb Euclidean distances.
     """
 
     representation: HumanML
@@ -58,6 +62,14 @@ class CalibratedMotionCLIPTask(MotionCLIPTask):
                 "which takes a representation such as humanml_clean. Train another recipe of motion_clip/..."
             )
         return super().build(config, representation, actions=actions)
+
+    def forward(self, x: Tensor, mask: Tensor) -> Tensor:
+        """Returns features (B, E) of length `LENGTH` of motions (B, F, D) in the data's units, with mask (B, F)."""
+        return LENGTH * F.normalize(super().forward(x, mask), dim=-1)
+
+    def text(self, captions: Sequence[str]) -> Tensor:
+        """Returns features (B, E) of length `LENGTH` of captions."""
+        return LENGTH * F.normalize(super().text(captions), dim=-1)
 
     def on_fit_start(self) -> None:
         """Looks up the near misses of the training clips."""

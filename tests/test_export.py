@@ -19,8 +19,10 @@ from flame_mdm.formats.motion import Motion, continuous_euler
 from flame_mdm.formats.poses import Poses, solve
 from flame_mdm.representations import rotation
 from flame_mdm.representations.rot6d import Rot6D
-from flame_mdm.representations.skeleton import KIT21, SMPL22, SMPL24
+from flame_mdm.representations.skeleton import KIT21, SMPL22, SMPL24, global_rotations
 from flame_mdm.representations.smpl import ADULT, SMPL
+from flame_mdm.visualize.body import figure as drawn_body
+from flame_mdm.visualize.body import mesh
 
 FPS = 20.0
 ROTATED = (".bvh", ".glb", ".npz")
@@ -367,27 +369,64 @@ def test_glb_holds_the_motion(tmp_path):
         assert ((turns[1:] * turns[:-1]).sum(1) > 0).all()
 
 
-def test_glb_has_a_figure_that_hangs_on_the_joints(tmp_path):
-    motion(two_circles()).save(tmp_path / "a.glb")
+@pytest.mark.parametrize("figure", ["body", "bones"])
+def test_glb_has_a_figure_that_hangs_on_the_joints(tmp_path, figure):
+    made = motion(two_circles())
+    made.save(tmp_path / "a.glb", figure=figure)
     file = Glb(tmp_path / "a.glb")
     skin, primitive = file.json["skins"][0], file.json["meshes"][0]["primitives"][0]
     assert skin["joints"] == list(range(22))
     rest = np.zeros((22, 3))
     for k, parent in enumerate(SMPL22.parents):
         rest[k] = np.array(file.json["nodes"][k]["translation"]) + (rest[parent] if parent >= 0 else 0)
-    bind = file.array(skin["inverseBindMatrices"]).reshape(22, 4, 4)
-    np.testing.assert_allclose(bind[:, 3, :3], -rest, atol=1e-6)
+    bind = file.array(skin["inverseBindMatrices"]).reshape(22, 4, 4).swapaxes(1, 2)
+    if figure == "bones":
+        np.testing.assert_allclose(bind[:, :3, 3], -rest, atol=1e-6)
     position, normal, joint, weight = (
         file.array(primitive["attributes"][key]) for key in ("POSITION", "NORMAL", "JOINTS_0", "WEIGHTS_0")
     )
     assert joint.max() < 22
-    np.testing.assert_array_equal(weight.sum(1), 1)
+    np.testing.assert_array_equal(weight.astype(int).sum(1), 255)
     np.testing.assert_allclose(np.linalg.norm(normal, axis=1), 1, atol=1e-5)
     assert 1.4 < np.ptp(position[:, 1]) < 2
     corners = position[file.array(primitive["indices"]).reshape(-1, 3)]
     outward = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals = normal[file.array(primitive["indices"]).reshape(-1, 3)].mean(1)
     assert ((outward * normals).sum(1) > 0).all()
+    if figure == "body":  # a program that reads the file shows what our pictures show, but for toes and the lift
+        world, drawn = global_rotations(made.posed().rotations, SMPL22.parents)[7].numpy(), drawn_body(made)
+        moves = np.tile(np.eye(4), (22, 1, 1))
+        moves[:, :3, :3], moves[:, :3, 3] = world, made.joints[7]
+        moves = moves @ bind
+        blended = (moves[joint] * weight[..., None, None] / 255).sum(1)
+        points = (blended[:, :3, :3] @ position[..., None])[..., 0] + blended[:, :3, 3]
+        shared = mesh().weights[:, [*range(10), *range(12, 22)]].sum(1) > 0.99
+        off = np.linalg.norm(points - drawn.skinned(7)[0] + [0, drawn.lift, 0], axis=1)
+        assert shared.mean() > 0.65
+        assert off[shared].max() < 0.003
+
+
+def test_a_bvh_file_may_begin_with_its_rest_pose(tmp_path):
+    made = motion(two_circles())
+    said = made.save(tmp_path / "a.bvh", rest_pose=True)
+    assert said.endswith("the first frame is the rest pose")
+    joints = read(tmp_path / "a.bvh").joints
+    np.testing.assert_allclose(joints[0], made.posed().rest(), atol=1e-4)
+    np.testing.assert_allclose(joints[1:], made.joints, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("file", "options", "says"),
+    [
+        ("a.glb", {"figure": "stick"}, "figure=stick: unknown. Use body or bones"),
+        ("a.bvh", {"figure": "bones"}, "figure is only for .glb"),
+        ("a.glb", {"rest_pose": True}, "rest_pose only for .bvh"),
+    ],
+)
+def test_figures_and_rest_poses_of_other_files_are_refused(tmp_path, file, options, says):
+    with pytest.raises(ValueError, match=says):
+        motion(two_circles()).save(tmp_path / file, **options)
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_motion_of_kit_is_written_as_joints_alone(tmp_path):

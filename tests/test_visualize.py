@@ -104,7 +104,7 @@ def test_player_is_one_file_without_references(tmp_path):
 def test_player_escapes_captions_ids_and_title(tmp_path):
     write_player(tmp_path / "p.html", [walk(text=HOSTILE, id=HOSTILE)], HOSTILE)
     page = Page(tmp_path / "p.html")
-    assert page.tags.count("script") == 2
+    assert page.tags.count("script") == 3
     assert "img" not in page.tags
     assert page.texts["title"] == page.texts["h1"] == HOSTILE
     assert (page.motions[0]["caption"], page.motions[0]["id"]) == (HOSTILE, HOSTILE)
@@ -112,7 +112,7 @@ def test_player_escapes_captions_ids_and_title(tmp_path):
 
 def test_player_of_twenty_clips_stays_small(tmp_path):
     write_player(tmp_path / "p.html", [walk(60, contacts=True, id=str(k)) for k in range(20)])
-    assert (tmp_path / "p.html").stat().st_size < 400_000
+    assert (tmp_path / "p.html").stat().st_size < 650_000
 
 
 @pytest.mark.tools
@@ -121,15 +121,28 @@ def test_player_of_twenty_clips_stays_small(tmp_path):
 def test_player_runs_in_a_browser(tmp_path, count):
     page = tmp_path / "p.html"
     write_player(page, [walk(contacts=True, text=HOSTILE, id=f"m{k}") for k in range(count)], "t")
-    # reports what the page's script made of the data: pixels of both sides in the first panel, clock, filter
+    # reports what the page's script made of the data: clock, filter, and pixels of both sides in the first panel: of a
+    # body in its clothes, of a body in the colors of its sides, and of a skeleton
     report = """<script>setTimeout(() => {
       goTo(7); redraw();
-      const { canvas } = motions[0], { data } = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height);
-      let blue = 0, orange = 0;
-      for (let i = 0; i < data.length; i += 4) {
-        blue += data[i + 2] > data[i] + 80; orange += data[i] > data[i + 2] + 80;
-      }
-      document.title = JSON.stringify({ blue, orange, frame: scrub.value, of: scrub.max, filter: !filter.hidden,
+      const seen = () => {
+        redraw();
+        const { canvas } = motions[0], context = canvas.getContext("2d");
+        const { data } = context.getImageData(0, 0, canvas.width, canvas.height);
+        let blue = 0, orange = 0, dark = 0;
+        for (let i = 0; i < data.length; i += 4) {
+          blue += data[i + 2] > data[i] + 80; orange += data[i] > data[i + 2] + 80;
+          dark += data[i] + data[i + 1] + data[i + 2] < 260;
+        }
+        return { blue, orange, dark };
+      };
+      const clothes = seen();
+      tint.click();
+      const sides = seen(), button = figure.textContent;
+      figure.click();
+      const sticks = seen();
+      document.title = JSON.stringify({ clothes, sides, sticks, buttons: [button, figure.textContent],
+        frame: scrub.value, of: scrub.max, filter: !filter.hidden,
         joint: motions[0].joints.length, images: document.images.length,
         caption: document.querySelector("figcaption p").textContent });
     }, 300)</script></body>"""
@@ -140,13 +153,18 @@ def test_player_runs_in_a_browser(tmp_path, count):
     dump = subprocess.run(command, capture_output=True, check=True, timeout=60).stdout.decode()
     (tmp_path / "dump.html").write_text(dump, encoding="utf-8")
     seen = json.loads(Page(tmp_path / "dump.html").texts["title"])
-    assert min(seen.pop("blue"), seen.pop("orange")) > 50
+    clothes, sides, sticks = (seen.pop(key) for key in ("clothes", "sides", "sticks"))
+    assert clothes["orange"] < 20
+    assert clothes["dark"] > 200  # trousers, shoes and hair
+    assert min(sides["blue"], sides["orange"], sticks["blue"], sticks["orange"]) > 50
+    assert sides["blue"] != sticks["blue"]
     assert seen == {
         "frame": "7",
         "of": "29",
         "filter": count > 12,
         "joint": 30 * 22 * 3,
         "images": 0,
+        "buttons": ["Skeleton", "Body"],
         "caption": HOSTILE,
     }
 
@@ -187,15 +205,15 @@ def limb_rows(image: np.ndarray, side: int) -> np.ndarray:
     return np.nonzero((np.abs(image.astype(int) - SIDE_COLORS[side]) < 12).all(-1))[0]
 
 
-def test_frames_show_both_sides_and_height():
-    motion = walk(3, skeleton=SKELETONS["smpl24"])
+def test_frames_show_both_sides_and_height_of_a_skeleton():
+    motion = walk(3, skeleton=SKELETONS["kit21"])
     frames = frames_array(motion, size=128)
     assert frames.shape == (3, 128, 128, 3)
     assert frames.dtype == np.uint8
     motion.joints[:, :, 1] += 0.3
     floating = frames_array(motion, size=128)
     for side in (-1, 1):
-        assert len(limb_rows(frames[0], side)) > 50
+        assert len(limb_rows(frames[0], side)) > 30
         lifted = limb_rows(frames[0], side).mean() - limb_rows(floating[0], side).mean()
         assert lifted == pytest.approx(0.3 * 2.05 * 128 / 5, rel=0.2)
 
@@ -243,12 +261,13 @@ def test_mp4_shows_what_the_gif_shows(tmp_path):
 
 @MP4
 def test_mp4_keeps_the_colors(tmp_path):
-    write_mp4(tmp_path / "m.mp4", [walk(2)], size=512)
+    motion = walk(2, skeleton=SKELETONS["kit21"])
+    write_mp4(tmp_path / "m.mp4", [motion], size=512)
     with av.open(str(tmp_path / "m.mp4")) as file:
         video = next(file.decode(video=0)).to_ndarray(format="rgb24")
     for side, color in SIDE_COLORS.items():
-        drawn = np.abs(frames_array(walk(2), 512)[0].astype(int) - color).max(-1) == 0
-        assert np.abs(np.median(video[:512][drawn], axis=0) - color).max() <= 4, side
+        drawn = np.abs(frames_array(motion, 512)[0].astype(int) - color).max(-1) == 0
+        assert np.abs(np.median(video[:512][drawn], axis=0) - color).max() <= 8, side
 
 
 @pytest.mark.tools

@@ -15,6 +15,7 @@ import numpy as np
 from flame_mdm.files import atomic_write
 from flame_mdm.formats.poses import Poses
 from flame_mdm.representations.skeleton import SMPL22
+from flame_mdm.visualize.body import ANCHORS, Figure, mesh
 from flame_mdm.visualize.render import SIDE_COLORS
 from flame_mdm.visualize.scene import radii, sides
 
@@ -25,27 +26,32 @@ SIDES = 10
 """Number of corners of a limb's cross section."""
 
 
-def write(path: Path, poses: Poses, fps: float, text: str, name: str) -> None:
+def write(path: Path, poses: Poses, fps: float, text: str, name: str, body: Figure | None = None) -> None:
     """Writes a .glb file in meters, y up; the rest pose faces +z, as the format requires.
 
     It contains one node per joint, named as in SMPL, one animation that rotates all nodes and moves the root, with one
-    key per frame in seconds, and one mesh of rounded limbs skinned to the joints.
+    key per frame in seconds, and one mesh skinned to the joints: a body, stored in an A-pose, or rounded limbs.
+
+    Args:
+        path: the file.
+        poses: the motion.
+        fps: frames per second.
+        text: the caption.
+        name: of the animation, if there is no caption.
+        body: the body of this motion; None = rounded limbs.
     """
     binary = _Binary()
     rest = poses.rest().numpy()
-    position, normal, color, joint, index = _figure(rest)
-    weight = np.tile(np.array([1, 0, 0, 0], np.float32), (len(joint), 1))
-    bind = np.tile(np.eye(4, dtype=np.float32), (len(rest), 1, 1))
-    bind[:, 3, :3] = -rest  # matrices are stored in column-major order
+    position, normal, color, joint, weight, index, bind = _limbs(rest) if body is None else _skin(body)
     attributes = {
         "POSITION": binary.add(position, VERTICES, bounds=True),
         "NORMAL": binary.add(normal, VERTICES),
-        "COLOR_0": binary.add(color, VERTICES),
+        "COLOR_0": binary.add(color, VERTICES, normalized=True),
         "JOINTS_0": binary.add(joint, VERTICES),
-        "WEIGHTS_0": binary.add(weight, VERTICES),
+        "WEIGHTS_0": binary.add(weight, VERTICES, normalized=True),
     }
     indices = binary.add(index, INDICES)
-    matrices = binary.add(bind.reshape(-1, 16))
+    matrices = binary.add(bind.mT.reshape(-1, 16))  # matrices are stored in column-major order
     times = binary.add(np.arange(len(poses.root), dtype=np.float32) / np.float32(fps), bounds=True)
     turns = poses.quaternions()[..., [1, 2, 3, 0]].float().numpy()
     curves = [("rotation", node, turns[:, node]) for node in range(len(rest))]
@@ -99,14 +105,16 @@ class _Binary:
         self.views: list[dict[str, int]] = []
         self.accessors: list[dict[str, Any]] = []
 
-    def add(self, array: np.ndarray, target: int | None = None, bounds: bool = False) -> int:
-        """Appends numbers (N,) or (N, K) and returns the index of their accessor."""
+    def add(self, array: np.ndarray, target: int | None = None, bounds: bool = False, normalized: bool = False) -> int:
+        """Appends numbers (N,) or (N, K) and returns the index of their accessor; `normalized`: bytes mean 0 to 1."""
         rows = array.reshape(len(array), -1)
         component = {"u1": UNSIGNED_BYTE, "u2": UNSIGNED_SHORT, "f4": FLOAT}[rows.dtype.str[1:]]
         view = {"buffer": 0, "byteOffset": len(self.data), "byteLength": rows.nbytes}
         self.views.append(view if target is None else {**view, "target": target})
         accessor: dict[str, Any] = {"bufferView": len(self.views) - 1, "componentType": component}
         accessor |= {"count": len(rows), "type": KINDS[rows.shape[1]]}
+        if normalized:
+            accessor["normalized"] = True
         if bounds:
             accessor |= {"min": rows.min(0).tolist(), "max": rows.max(0).tolist()}
         self.accessors.append(accessor)
@@ -115,8 +123,40 @@ class _Binary:
         return len(self.accessors) - 1
 
 
-def _figure(rest: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Returns the limbs of the rest pose: positions, normals, linear colors, joint (N, 4) of each vertex, triangles."""
+def _skin(body: Figure) -> tuple[np.ndarray, ...]:
+    """Returns the body in its stored pose, lifted onto the floor: see `_limbs`. Helper bones join their joints."""
+    figure, floor = mesh(), np.array([0, body.points[:, 1].min(), 0])
+    weights = figure.weights[:, : len(SMPL22)].copy()
+    np.add.at(weights.T, list(ANCHORS[len(SMPL22) :]), figure.weights[:, len(SMPL22) :].T)
+    joint = np.argsort(-weights, axis=1, kind="stable")[:, :4]
+    weight = np.rint(255 * np.take_along_axis(weights, joint, 1)).astype(int)
+    weight[:, 0] += 255 - weight.sum(1)
+    bind = np.tile(np.eye(4), (len(SMPL22), 1, 1))
+    bind[:, :3, :3] = body.neutral @ figure.turns[: len(SMPL22)].mT
+    bind[:, :3, 3] = -(bind[:, :3, :3] @ (body.joints - floor)[..., None])[..., 0]
+    return (
+        (body.points - floor).astype("<f4"),
+        figure.normals.astype("<f4"),
+        _linear(figure.colors),
+        np.where(weight > 0, joint, 0).astype("u1"),
+        weight.astype("u1"),
+        figure.triangles.astype("<u2").ravel(),
+        bind.astype("<f4"),
+    )
+
+
+def _linear(colors: np.ndarray) -> np.ndarray:
+    """Returns linear colors (N, 4) uint8 with alpha of colors (N, 3) from 0 to 255 as on screens."""
+    linear = np.rint(255 * (np.asarray(colors) / 255) ** 2.2)
+    return np.concatenate([linear, np.full((len(linear), 1), 255)], 1).astype("u1")
+
+
+def _limbs(rest: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Returns the limbs of the rest pose: a mesh with N corners.
+
+    Positions and normals (N, 3), linear colors (N, 4), joints and weights (N, 4), triangles, inverse bind matrices
+    (22, 4, 4).
+    """
     thickness, side_of, parents = radii(SMPL22), sides(SMPL22), SMPL22.parents
     limbs = []
     for joint, parent in enumerate(parents):
@@ -128,15 +168,24 @@ def _figure(rest: np.ndarray) -> tuple[np.ndarray, ...]:
                 up = rest[joint] - rest[parent]
                 up /= np.linalg.norm(up)
                 limbs.append((joint, 0, *_limb(rest[joint] + 0.05 * up, rest[joint] + 0.11 * up, 0.08, 0.09)))
-    starts = np.cumsum([0] + [len(position) for _, _, position, _, _ in limbs])
-    position = np.concatenate([position for _, _, position, _, _ in limbs]).astype("<f4")
-    normal = np.concatenate([normal for _, _, _, normal, _ in limbs]).astype("<f4")
-    color, moved = np.ones((len(position), 4), "<f4"), np.zeros((len(position), 4), "u1")
-    for (joint, side, *_), start, end in zip(limbs, starts[:-1], starts[1:], strict=True):
-        color[start:end, :3] = (np.array(SIDE_COLORS[side]) / 255) ** 2.2
-        moved[start:end, 0] = joint
-    index = np.concatenate([start + triangles for (*_, triangles), start in zip(limbs, starts[:-1], strict=True)])
-    return position, normal, color, moved, index.astype("<u2").ravel()
+    counts = [len(position) for _, _, position, _, _ in limbs]
+    starts = np.cumsum([0, *counts[:-1]])
+    color = np.repeat(np.array([SIDE_COLORS[side] for _, side, *_ in limbs]), counts, axis=0)
+    moved, weight = np.zeros((2, sum(counts), 4), "u1")
+    moved[:, 0], weight[:, 0] = np.repeat([joint for joint, *_ in limbs], counts), 255
+    bind = np.tile(np.eye(4, dtype="<f4"), (len(rest), 1, 1))
+    bind[:, :3, 3] = -rest
+    return (
+        np.concatenate([position for _, _, position, _, _ in limbs]).astype("<f4"),
+        np.concatenate([normal for _, _, _, normal, _ in limbs]).astype("<f4"),
+        _linear(color),
+        moved,
+        weight,
+        np.concatenate([start + triangles for (*_, triangles), start in zip(limbs, starts, strict=True)])
+        .astype("<u2")
+        .ravel(),
+        bind,
+    )
 
 
 def _limb(a: np.ndarray, b: np.ndarray, radius_a: float, radius_b: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -38,6 +38,8 @@ EULER = tuple("YXZ" if name.endswith("shoulder") else "YZX" for name in SMPL22.j
 """Euler order of each joint, chosen to keep gimbal lock (middle angle at 90 degrees) away from common poses: bent
 knees, elbows and hips, a hanging arm, a body that turns or bows."""
 CENTIMETER = 0.01
+FIGURES = ("body", "bones")
+"""Meshes of .glb files; the first is the default."""
 
 
 @dataclass(eq=False, repr=False)
@@ -108,7 +110,7 @@ class Motion:
             joints = joints[:, : len(SMPL22)]  # the last two are the hands
         return solve(joints, self.fps)
 
-    def save(self, path: str | Path, **facts: Any) -> str:
+    def save(self, path: str | Path, figure: str = "body", rest_pose: bool = False, **facts: Any) -> str:
         """Writes a motion file and returns a line that describes it.
 
         `.npz` contains joints, frame rate, text and features, and AMASS's keys if rotations are known. `.bvh` and
@@ -116,6 +118,8 @@ class Motion:
 
         Args:
             path: the file; its extension selects the format.
+            figure: the mesh of a `.glb` file: body, or bones for rounded limbs.
+            rest_pose: begin a `.bvh` file with a frame of the rest pose, arms out, which some programs expect.
             facts: additional entries of an `.npz` file, such as the seed.
 
         Raises:
@@ -128,7 +132,12 @@ class Motion:
         writer = writers.get(path.suffix.lower())
         if writer is None:
             raise ValueError(f"{path}: unknown kind of motion file. Use one of {', '.join(writers)}")
-        what = writer(self, path, facts) if writer is _write_npz else writer(self, path)
+        if figure not in FIGURES:
+            raise ValueError(f"figure={figure}: unknown. Use {' or '.join(FIGURES)}")
+        if (figure != FIGURES[0] and writer is not _write_glb) or (rest_pose and writer is not _write_bvh):
+            raise ValueError(f"{path}: figure is only for .glb files, and rest_pose only for .bvh files")
+        given = {_write_npz: (facts,), _write_glb: (figure,), _write_bvh: (rest_pose,)}
+        what = writer(self, path, *given.get(writer, ()))
         return f"{path}: {len(self.joints)} frames at {self.fps:g} per second, {what}"
 
     def show(self) -> Any:
@@ -177,12 +186,16 @@ def _write_npz(motion: Motion, path: Path, facts: dict[str, Any]) -> str:
     return what
 
 
-def _write_bvh(motion: Motion, path: Path) -> str:
+def _write_bvh(motion: Motion, path: Path, rest_pose: bool) -> str:
     poses = motion.posed()
     angles = np.round(np.degrees(continuous_euler(poses.rotations).numpy()), 6)
     rotations = [tuple(f"{axis}rotation" for axis in order) for order in EULER]
     root = np.round(poses.root.numpy() / CENTIMETER, 5)
     offsets = np.round(poses.offsets.numpy() / CENTIMETER, 5)
+    frames = np.concatenate([root, angles.reshape(len(angles), -1)], 1)
+    if rest_pose:
+        frames = np.concatenate([np.zeros_like(frames[:1]), frames])
+        frames[0, :3] = np.round(poses.rest()[0].numpy() / CENTIMETER, 5)
     offsets[0] = 0  # programs disagree on whether the root's channels replace its offset or add to it
     bvh.write(
         bvh.Bvh(
@@ -192,12 +205,12 @@ def _write_bvh(motion: Motion, path: Path) -> str:
             channels=(("Xposition", "Yposition", "Zposition", *rotations[0]), *rotations[1:]),
             end_parents=tuple(SMPL22.joints.index(name) for name in END_SITES),
             end_offsets=np.array(list(END_SITES.values())) / CENTIMETER,
-            frames=np.concatenate([root, angles.reshape(len(angles), -1)], 1),
+            frames=frames,
             fps=motion.fps,
         ),
         path,
     )
-    return f"centimeters, y up; {_error(motion, poses)}"
+    return f"centimeters, y up; {_error(motion, poses)}" + "; the first frame is the rest pose" * rest_pose
 
 
 def continuous_euler(matrices: Tensor) -> Tensor:
@@ -218,10 +231,13 @@ def continuous_euler(matrices: Tensor) -> Tensor:
     return torch.stack(chosen)
 
 
-def _write_glb(motion: Motion, path: Path) -> str:
+def _write_glb(motion: Motion, path: Path, figure: str) -> str:
+    from flame_mdm.visualize.body import try_figure
+
     poses = motion.posed()
-    glb.write(path, poses, motion.fps, motion.text, motion.id)
-    return f"meters, y up; {_error(motion, poses)}"
+    body, reason = try_figure(motion) if figure == FIGURES[0] else (None, "")
+    glb.write(path, poses, motion.fps, motion.text, motion.id, body)
+    return f"meters, y up; {_error(motion, poses)}" + (reason and f"; without a body: {reason}")
 
 
 def _write_json(motion: Motion, path: Path) -> str:

@@ -9,8 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from flame_mdm.files import write_text
+from flame_mdm.visualize.body import ANCHORS, MIRRORED, Figure, stored, try_figure
 from flame_mdm.visualize.scene import Shown, check_any, head, radii, shortened, sides
 
 MILLIMETER = 0.001
@@ -37,6 +39,9 @@ def player_page(
 ) -> str:
     """Returns a self-contained HTML page that plays motions side by side in 3D, with a shared clock and camera.
 
+    It shows a body, or the skeleton at the push of a button. Motions that no body fits are shown as skeletons, with the
+    reason in their caption.
+
     Positions are rounded to millimeters; a motion that spans more than 65 m is rounded to 1/65534 of its span.
 
     Args:
@@ -51,20 +56,23 @@ def player_page(
     blank = [""] * len(motions)
     packed = [_packed(*each) for each in zip(motions, groups or blank, beside or blank, strict=True)]
     # "<" never occurs in the data, so no caption can close the script element
+    fitting = any(each["body"] for each in packed)
     content = {
         "TITLE": html.escape(shortened(title)),
         "ABOUT": about and f"<details><summary>About these motions</summary><div>{about}</div></details>",
         "COLUMNS": str(columns),
+        "BODY": json.dumps(_mesh() if fitting else None, separators=(",", ":")),
         "DATA": json.dumps(packed, separators=(",", ":")).replace("<", "\\u003c"),
     }
     template = Path(__file__).with_suffix(".html").read_text(encoding="utf-8")
-    return re.sub("__(TITLE|ABOUT|COLUMNS|DATA)__", lambda match: content[match[1]], template)
+    return re.sub("__(TITLE|ABOUT|COLUMNS|BODY|DATA)__", lambda match: content[match[1]], template)
 
 
 def _packed(motion: Shown, group: str, beside: str) -> dict[str, Any]:
     low, high = motion.joints.min((0, 1)).astype(float), motion.joints.max((0, 1)).astype(float)
     center = (low + high) / 2
     step = max(MILLIMETER, float((high - low).max()) / 65534)
+    body, reason = try_figure(motion)
     return {
         "id": motion.id,
         "caption": shortened(motion.text),
@@ -79,9 +87,38 @@ def _packed(motion: Shown, group: str, beside: str) -> dict[str, Any]:
         "center": center.tolist(),
         "step": step,
         "joints": _base64(np.rint((motion.joints - center) / step).astype("<i2")),
+        "body": body and _packed_body(body),
+        "why": reason,
         "feet": [] if motion.contacts is None else list(motion.skeleton.feet),
         "contacts": "" if motion.contacts is None else _base64(motion.contacts.astype("u1")),
     }
+
+
+def _packed_body(body: Figure) -> dict[str, Any]:
+    """Returns proportions, and for each frame and bone a quaternion in 32 bits, exact to about 0.1 degrees.
+
+    The two highest bits tell which number of x, y, z, w is largest; the others follow, 10 bits each. They lie between
+    -0.71 and 0.71, and the largest one follows from them.
+    """
+    quaternions = Rotation.from_matrix(body.turns.reshape(-1, 3, 3)).as_quat()
+    largest = np.abs(quaternions).argmax(1)
+    quaternions *= np.sign(np.take_along_axis(quaternions, largest[:, None], 1))
+    others = quaternions[np.arange(4) != largest[:, None]].reshape(-1, 3)
+    bits = np.rint(np.clip(others / 2**0.5 + 0.5, 0, 1) * 1023).astype(np.uint32)
+    packed = (largest.astype(np.uint32) << 30) | (bits[:, 0] << 20) | (bits[:, 1] << 10) | bits[:, 2]
+    return {
+        "fit": _base64(body.fit.astype("<f4")),
+        "rest": _base64(body.joints.astype("<f4")),
+        "lift": round(float(body.lift), 5),
+        "turns": _base64(packed.astype("<u4")),
+    }
+
+
+def _mesh() -> dict[str, Any]:
+    half = stored()
+    names = ("points", "normals", "bones", "weights", "colors", "triangles")
+    joints = np.round(half["joints"], 5).ravel().tolist()
+    return {name: _base64(half[name]) for name in names} | {"joints": joints, "anchors": ANCHORS, "mirrored": MIRRORED}
 
 
 def _base64(array: np.ndarray) -> str:

@@ -9,10 +9,11 @@ from types import ModuleType
 from typing import NamedTuple
 
 import numpy as np
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image, ImageDraw, ImageFilter, ImageFont
 
 from flame_mdm.errors import UserError
 from flame_mdm.files import atomic_write
+from flame_mdm.visualize.body import MATERIALS, Figure, mesh, rasterize, shaded, try_figure
 from flame_mdm.visualize.scene import Shown, check_any, frame_at, head, radii, shortened, sides
 
 Color = tuple[int, int, int]
@@ -22,6 +23,9 @@ SHADOW, TRAIL, CONTACT = (212, 216, 222), (122, 91, 208), (15, 157, 107)
 NEAR = 0.3
 """Distance from the camera in meters below which nothing is drawn."""
 LIT, DARK = 0.3, -0.45
+YAW, PITCH = 0.6, 0.24
+TOWARD = np.array([math.sin(YAW) * math.cos(PITCH), math.sin(PITCH), math.cos(YAW) * math.cos(PITCH)])
+"""Direction from the body to the camera, which is in front, to the left and above."""
 BT709 = 1
 """Number of the color space of HD video, which players assume where a large video does not name one."""
 SMOOTH = 2
@@ -30,7 +34,8 @@ SMOOTH = 2
 
 def frames_array(motion: Shown, size: int = 256) -> np.ndarray:
     """Returns each frame of a motion as an image: (F, size, size, 3) uint8, for the video panels of loggers."""
-    return np.stack([np.asarray(_figure(motion, frame, size)) for frame in range(len(motion.joints))])
+    body, _ = try_figure(motion)
+    return np.stack([np.asarray(_figure(motion, body, frame, size)) for frame in range(len(motion.joints))])
 
 
 def write_gif(path: str | Path, motions: Sequence[Shown], size: int = 256) -> None:
@@ -124,10 +129,11 @@ def contact_sheet(path: str | Path, motions: Sequence[Shown], frames: int = 6, s
         raise ValueError(f"{path}: {frames} poses per row, expected at least 1")
     rows = []
     for motion in motions:
+        body, _ = try_figure(motion)
         row = Image.new("RGB", (frames * size, size), PAPER)
         pen = ImageDraw.Draw(row)
         for k, frame in enumerate(np.rint(np.linspace(0, len(motion.joints) - 1, frames)).astype(int).tolist()):
-            row.paste(_figure(motion, frame, size), (k * size, 0))
+            row.paste(_figure(motion, body, frame, size), (k * size, 0))
             pen.text((k * size + 8, 6), f"{frame / motion.fps:.2f} s", FAINT, _font(size))
         rows.append(_below(row, _caption(motion, row.width, _caption_lines([motion], row.width, size), size)))
     sheet = Image.new("RGB", (frames * size, sum(row.height for row in rows)), PAPER)
@@ -143,10 +149,12 @@ def _palette() -> Image.Image:
     """Returns one palette of all colors and their blends at smoothed edges, so that colors do not flicker."""
     limbs = [color for side in SIDE_COLORS.values() for color in (side, _shade(side, LIT), _shade(side, DARK))]
     drawn = np.array([*limbs, LINE, TEXT, FAINT, SHADOW, TRAIL, CONTACT])
+    light = np.linspace(0.4, 1.12, 26)[:, None]
+    body = np.concatenate([np.minimum(light * color, 255) for color in MATERIALS])
     grounds = np.array([PAPER, GROUND])
     blends = [back + part * (drawn - back) for back in grounds for part in (0.25, 0.5, 0.75)]
     image = Image.new("P", (1, 1))
-    image.putpalette(np.rint(np.concatenate([grounds, drawn, *blends])).astype("u1").tobytes())
+    image.putpalette(np.rint(np.concatenate([grounds, drawn, *blends, body])).astype("u1").tobytes())
     return image
 
 
@@ -158,12 +166,13 @@ def _video(motions: Sequence[Shown], fps: float, size: int) -> Iterator[Image.Im
     captions = [_caption(motion, size, lines, size) for motion in motions]
     frames = [-1] * len(motions)
     panels = [Image.new("RGB", (0, 0))] * len(motions)
+    bodies = [try_figure(motion)[0] for motion in motions]
     count = max(1, math.ceil(seconds * fps - 1e-6))
     for tick in range(count):
         for k, motion in enumerate(motions):
             if frame_at(motion, tick / fps) != frames[k]:
                 frames[k] = frame_at(motion, tick / fps)
-                panels[k] = _below(_figure(motion, frames[k], size), captions[k])
+                panels[k] = _below(_figure(motion, bodies[k], frames[k], size), captions[k])
         height = panels[0].height
         image = Image.new("RGB", (columns * size, math.ceil(len(motions) / columns) * height + 3), PAPER)
         for k, panel in enumerate(panels):
@@ -173,8 +182,15 @@ def _video(motions: Sequence[Shown], fps: float, size: int) -> Iterator[Image.Im
         yield image
 
 
-def _figure(motion: Shown, frame: int, size: int) -> Image.Image:
-    """Draws one pose on the ground, (size, size) pixels; the camera follows the root smoothed over one second."""
+def _figure(motion: Shown, body: Figure | None, frame: int, size: int) -> Image.Image:
+    """Draws one pose on the ground, (size, size) pixels; the camera follows the root smoothed over one second.
+
+    Args:
+        motion: the motion.
+        body: its body; None = its skeleton is drawn.
+        frame: the frame to draw.
+        size: width and height of the image.
+    """
     side = size * SMOOTH
     image = Image.new("RGB", (side, side), PAPER)
     pen = ImageDraw.Draw(image)
@@ -201,14 +217,21 @@ def _figure(motion: Shown, frame: int, size: int) -> Image.Image:
     if len(root) > 1:
         pen.line(_points(project(root)), TRAIL, round(1.5 * pixel))
     shadow = project(joints * floor)
+    dark = Image.new("L", image.size)
     for joint, parent in enumerate(motion.skeleton.parents):
         if parent >= 0:
-            _capsule(pen, shadow[parent], shadow[joint], 0.05, 0.05, SHADOW)
+            _capsule(ImageDraw.Draw(dark), shadow[parent], shadow[joint], 0.06, 0.06, 255)
+    image.paste(SHADOW, mask=dark.reduce(4).filter(ImageFilter.BoxBlur(size / 192)).resize(image.size))
     if motion.contacts is not None:
         for joint in np.array(motion.skeleton.feet)[motion.contacts[frame]]:
             cx, cy, scale = shadow[joint][:3]
             pen.ellipse((cx - 0.06 * scale, cy - 0.02 * scale, cx + 0.06 * scale, cy + 0.02 * scale), CONTACT)
-    for limb in sorted(_body(motion, joints, project), key=lambda limb: -limb.depth):
+    if body is not None:
+        points, normals = body.skinned(frame)
+        at, pixels = project(points), np.array(image)
+        rasterize(pixels, at[:, :2], at[:, 3], shaded(normals, mesh().colors, TOWARD), mesh().triangles)
+        return Image.fromarray(pixels).reduce(SMOOTH)
+    for limb in sorted(_limbs(motion, joints, project), key=lambda limb: -limb.depth):
         if min(limb.a[3], limb.b[3]) > NEAR:
             _draw(pen, limb, pixel)
     return image.reduce(SMOOTH)
@@ -219,9 +242,8 @@ def _camera(target: np.ndarray, side: int) -> Callable[[np.ndarray], np.ndarray]
 
     It maps points (N, 3) in meters to (N, 4): x, y, pixels per meter and depth.
     """
-    yaw, pitch, distance = 0.6, 0.24, 5.0
-    toward = np.array([math.sin(yaw) * math.cos(pitch), math.sin(pitch), math.cos(yaw) * math.cos(pitch)])
-    right = np.array([math.cos(yaw), 0, -math.sin(yaw)])
+    toward, distance = TOWARD, 5.0
+    right = np.array([math.cos(YAW), 0, -math.sin(YAW)])
     up = np.cross(toward, right)
 
     def project(points: np.ndarray) -> np.ndarray:
@@ -251,7 +273,7 @@ class Limb(NamedTuple):
         return float(self.a[3] + self.b[3]) / 2
 
 
-def _body(motion: Shown, joints: np.ndarray, project: Callable[[np.ndarray], np.ndarray]) -> list[Limb]:
+def _limbs(motion: Shown, joints: np.ndarray, project: Callable[[np.ndarray], np.ndarray]) -> list[Limb]:
     at, skeleton, parents = project(joints), motion.skeleton, motion.skeleton.parents
     thickness, side_of, top = radii(skeleton), sides(skeleton), head(skeleton)
     limbs = []
@@ -282,7 +304,7 @@ def _draw(pen: ImageDraw.ImageDraw, limb: Limb, rim: float) -> None:
 
 
 def _capsule(
-    pen: ImageDraw.ImageDraw, a: np.ndarray, b: np.ndarray, ra: float, rb: float, color: Color, grow: float = 0
+    pen: ImageDraw.ImageDraw, a: np.ndarray, b: np.ndarray, ra: float, rb: float, color: Color | int, grow: float = 0
 ) -> None:
     """Fills the convex hull of two circles of radius `ra` and `rb` meters, `grow` pixels wider."""
     (ax, ay, ra), (bx, by, rb) = (*a[:2], ra * a[2] + grow), (*b[:2], rb * b[2] + grow)

@@ -9,11 +9,20 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 
 if TYPE_CHECKING:  # drawing needs numpy and Pillow, not torch
+    from torch import Tensor
+
     from flame_mdm.representations.skeleton import Skeleton
 
 
 MAX_CAPTION_LENGTH = 2000
 """Maximum number of characters of a caption that are shown."""
+
+
+class Posed(Protocol):
+    """A body in motion, such as `flame_mdm.formats.poses.Poses`, which describes the attributes."""
+
+    offsets: Tensor
+    rotations: Tensor
 
 
 class Shown(Protocol):
@@ -31,6 +40,9 @@ class Shown(Protocol):
     def id(self) -> str: ...
     @property
     def contacts(self) -> np.ndarray | None: ...
+    @property
+    def poses(self) -> Posed | None: ...
+    def posed(self) -> Posed: ...
 
 
 def sides(skeleton: Skeleton) -> list[int]:

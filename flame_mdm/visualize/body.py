@@ -1,0 +1,357 @@
+"""The mannequin: its mesh, bound to the bone lengths of a clip and skinned to a motion. `mannequin.py` models it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from flame_mdm.errors import UserError
+from flame_mdm.representations.skeleton import SMPL22
+from flame_mdm.representations.smpl import ADULT
+from flame_mdm.visualize.scene import Shown, sides
+
+JOINT = {name: number for number, name in enumerate(SMPL22.joints)}
+TWISTED = {"hip": 0.4, "shoulder": 0.4, "elbow": 0.55}
+"""Joints whose limb has a helper bone, and how much of the twist about the limb this has: of the joint's own twist, and
+for the elbow of the twist of the wrist."""
+HELPERS = tuple((JOINT[f"{side}_{name}"], share) for side in ("left", "right") for name, share in TWISTED.items())
+"""Joint and share of the twist of each bone after the 22 joints."""
+ANCHORS = (*range(len(SMPL22)), *(joint for joint, _ in HELPERS))
+"""The joint at which each bone begins."""
+MIRRORED = (*SMPL22.mirrored, *(len(SMPL22) + (k + len(TWISTED)) % len(HELPERS) for k in range(len(HELPERS))))
+"""The bone that replaces each bone in a mirror image."""
+REST = np.array(ADULT[: len(SMPL22)])
+TRUNK = {"pelvis": 0.0, "spine1": 0.35, "spine2": 0.75, "spine3": 1.0}
+"""Joints of the trunk -> how much their width follows the shoulders rather than the hips."""
+WIDER, LONGER = (0.8, 1.25), (0.4, 2.5)
+"""Limits of the width of hips and shoulders relative to that of the limbs, and of the length of a limb."""
+LIMBS = tuple(JOINT[f"{side}_{name}"] for side in ("left", "right") for name in ("knee", "ankle", "elbow", "wrist"))
+SOLE = 0.026
+"""Height of the toe joint above the sole in meters."""
+SKIN, HAIR, SHIRT, TROUSERS, SHOES = MATERIALS = (
+    *((222, 186, 160), (96, 80, 70), (132, 164, 196)),
+    *((98, 106, 124), (64, 62, 66)),
+)
+"""Colors of the figure."""
+STANDING = 0.02
+"""A foot stands flat in frames in which it is at most this many meters above its lowest position."""
+TOES = (0.02, 0.09, np.radians(60))
+"""The toes stay flat while their joint is lower than the first height; above the second one they follow the foot. The
+last number is the largest bend."""
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """A closed mesh in its stored pose, an A-pose with the pelvis at 0.
+
+    Attributes:
+        points: (V, 3) in meters.
+        normals: (V, 3) unit vectors.
+        weights: (V, 28), of the 22 joints of SMPL and `HELPERS`; at most four are not 0.
+        colors: (V, 3) of the clothes, 0 to 255.
+        triangles: (T, 3), counterclockwise seen from outside.
+        joints: (22, 3) of the stored pose.
+        turns: (28, 3, 3), rotation of each bone in the world from the rest pose of SMPL to the stored pose.
+    """
+
+    points: np.ndarray
+    normals: np.ndarray
+    weights: np.ndarray
+    colors: np.ndarray
+    triangles: np.ndarray
+    joints: np.ndarray
+    turns: np.ndarray
+
+    def sides(self) -> np.ndarray:
+        """Returns for each vertex (V,) 1 = left, -1 = right, 0 = middle, and numbers between where they meet."""
+        return self.weights @ np.array(sides(SMPL22), float)[list(ANCHORS)]
+
+
+@cache
+def stored() -> dict[str, np.ndarray]:
+    """Returns the arrays of the asset, the left half of the figure; `mannequin.make` describes them.
+
+    Raises:
+        UserError: the file is missing or damaged.
+    """
+    path = Path(__file__).with_name("mannequin.npz")
+    try:
+        with np.load(path) as file:
+            return {name: file[name] for name in file.files}
+    except (OSError, ValueError) as error:
+        raise UserError(f"{path}: the figure cannot be read ({error}). Install flame-mdm again") from error
+
+
+@cache
+def mesh() -> Mesh:
+    """Returns the whole figure: the stored half and its mirror image.
+
+    Raises:
+        UserError: the file is missing or damaged.
+    """
+    half = stored()
+    points, bones = half["points"] / 20000, half["bones"].astype(int)
+    weights = np.zeros((len(points), len(ANCHORS)))
+    for bone, weight in zip(bones.T, half["weights"].T / 255, strict=True):
+        weights[np.arange(len(points)), bone] += weight
+    beside = points[:, 0] > 0
+    copies = np.arange(len(points))
+    copies[beside] = len(points) + np.arange(beside.sum())
+    flip = np.array([-1, 1, 1])
+    normals = half["normals"] / np.linalg.norm(half["normals"], axis=1, keepdims=True)
+    triangles = half["triangles"].astype(int)
+    return Mesh(
+        np.concatenate([points, points[beside] * flip]),
+        np.concatenate([normals, normals[beside] * flip]),
+        np.concatenate([weights, weights[beside][:, MIRRORED]]),
+        np.concatenate([half["colors"], half["colors"][beside]]).astype(float),
+        np.concatenate([triangles, copies[triangles[:, ::-1]]]),
+        half["joints"],
+        half["turns"][list(ANCHORS)],
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Figure:
+    """The mannequin with the bone lengths of a clip, and its motion. F frames, B = 28 bones.
+
+    Attributes:
+        fit: (22, 3, 3), linear map of each joint's part of the stored mesh to the clip's proportions.
+        joints: (22, 3) of the stored pose with the clip's bone lengths, pelvis at 0.
+        points: (V, 3), the mesh in that pose.
+        neutral: (22, 3, 3), rotation of each part of the mesh in the rest pose: of feet until their soles are flat, of
+            the head until it is upright.
+        turns: (F, B, 3, 3), rotation of each bone from the stored pose to each frame.
+        places: (F, B, 3), where each bone begins: at the motion's joints, lifted.
+        lift: height of a joint of the body above that of the motion: the thickness of the sole.
+    """
+
+    fit: np.ndarray
+    joints: np.ndarray
+    points: np.ndarray
+    neutral: np.ndarray
+    turns: np.ndarray
+    places: np.ndarray
+    lift: float
+
+    def skinned(self, frame: int) -> tuple[np.ndarray, np.ndarray]:
+        """Returns vertices and normals (V, 3) of a frame, by linear blend skinning."""
+        turns = self.turns[frame]
+        moves = self.places[frame] - (turns @ self.joints[list(ANCHORS), :, None])[..., 0]
+        blended = mesh().weights @ np.concatenate([turns.reshape(-1, 9), moves], 1)
+        turned = blended[:, :9].reshape(-1, 3, 3)
+        points = (turned @ self.points[..., None])[..., 0] + blended[:, 9:]
+        normals = (turned @ mesh().normals[..., None])[..., 0]
+        return points, normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
+
+
+def figure(motion: Shown) -> Figure:
+    """Binds the mannequin to a clip and computes the rotations of its bones.
+
+    The body's joints are the motion's, but higher by the thickness of the sole: in motions, the lowest joint is on the
+    floor. If rotations are solved for, positions determine neither the head's pitch, whose median is taken as upright,
+    nor the toes, which stay flat on the floor while the heel rises.
+
+    Raises:
+        ValueError: the skeleton is not SMPL's, or a limb is much longer or shorter than people's.
+        UserError: the figure's file is missing or damaged.
+    """
+    poses = motion.posed()
+    joints = motion.joints[:, : len(SMPL22)].astype(float)
+    world = _world(np.asarray(poses.rotations))
+    offsets = np.array(poses.offsets)
+    fit, wide = proportions(offsets)
+    neutral = np.tile(np.eye(3), (len(SMPL22), 1, 1))
+    for side in ("left", "right"):
+        ankle, toe = JOINT[f"{side}_ankle"], JOINT[f"{side}_foot"]
+        if motion.poses is None:
+            flat = _flat_foot(joints[:, ankle], joints[:, toe], offsets[toe])
+            neutral[ankle] = neutral[toe] = _between(flat, offsets[toe])
+            offsets[toe] = flat
+        drop, deep = offsets[toe, [1, 2]] / REST[toe, [1, 2]]
+        fit[ankle] = np.diag([wide, (drop * -REST[toe, 1] + wide * SOLE) / (SOLE - REST[toe, 1]), deep])
+    if motion.poses is None:
+        neck, head = JOINT["neck"], JOINT["head"]
+        bones = (joints[:, head] - joints[:, neck])[:, None]
+        usual = np.median((bones @ world[:, JOINT["spine3"]])[:, 0], 0)
+        neutral[head] = _between(offsets[head], usual).T
+    world = world @ neutral
+    if motion.poses is None:
+        for toe in (JOINT["left_foot"], JOINT["right_foot"]):
+            world[:, toe] = world[:, toe] @ _toes(world[:, toe], joints[:, toe, 1])
+    turns = mesh().turns
+    rest = np.zeros((len(SMPL22), 3))
+    for parent, joint in SMPL22.edges:
+        rest[joint] = rest[parent] + turns[parent] @ offsets[joint]
+    stretched = turns[: len(rest)] @ fit @ turns[: len(rest)].mT
+    return Figure(
+        stretched,
+        rest,
+        bound(stretched, rest),
+        neutral,
+        _with_helpers(world, offsets) @ turns.mT,
+        joints[:, list(ANCHORS)] + [0, SOLE * wide, 0],
+        SOLE * wide,
+    )
+
+
+def try_figure(motion: Shown) -> tuple[Figure | None, str]:
+    """Returns the figure of `figure`, or None and the reason why this motion is drawn as a skeleton."""
+    try:
+        return figure(motion), ""
+    except ValueError as error:
+        return None, str(error)
+
+
+def shaded(normals: np.ndarray, colors: np.ndarray, toward: np.ndarray) -> np.ndarray:
+    """Returns colors (V, 3) lit from above left of the camera, which looks against `toward` (3,)."""
+    right = np.array([toward[2], 0, -toward[0]]) / np.hypot(toward[0], toward[2])
+    light = toward - 0.7 * right + [0, 1.2, 0]
+    lit = np.maximum(normals @ (light / np.linalg.norm(light)), 0)
+    return np.clip(colors * (0.5 + 0.12 * normals[:, 1] + 0.52 * lit)[:, None], 0, 255)
+
+
+def bound(stretched: np.ndarray, rest: np.ndarray) -> np.ndarray:
+    """Returns the mesh (V, 3) with other proportions: linear maps (22, 3, 3) and joints (22, 3) of the stored pose."""
+    body, anchors = mesh(), list(ANCHORS)
+    moves = rest - (stretched @ body.joints[..., None])[..., 0]
+    blended = body.weights @ np.concatenate([stretched.reshape(-1, 9), moves], 1)[anchors]
+    return (blended[:, :9].reshape(-1, 3, 3) @ body.points[..., None])[..., 0] + blended[:, 9:]
+
+
+def proportions(offsets: np.ndarray) -> tuple[np.ndarray, float]:
+    """Compares a body with the mannequin.
+
+    Args:
+        offsets: (22, 3), position of each joint relative to its parent in the rest pose.
+
+    Returns:
+        The linear map (22, 3, 3) of each joint's part in the rest pose, and the ratio of widths.
+
+    Raises:
+        ValueError: a limb is much longer or shorter than people's.
+    """
+    lengths, usual = np.linalg.norm(offsets, axis=1), np.linalg.norm(REST, axis=1)
+    ratio = np.divide(lengths, usual, out=np.ones_like(lengths), where=usual > 0)
+    for joint in LIMBS:
+        if not LONGER[0] <= ratio[joint] <= LONGER[1]:
+            raise ValueError(
+                f"the bone that ends in {SMPL22.joints[joint]} is {lengths[joint]:.3g} m long, the body's is "
+                f"{usual[joint]:.3g} m. Is the unit right? Such a motion is drawn without a body"
+            )
+    wide = float(lengths[list(LIMBS)].sum() / usual[list(LIMBS)].sum())
+
+    def width(*names: str) -> float:
+        chosen = [JOINT[f"{side}_{name}"] for side in ("left", "right") for name in names]
+        return float(
+            np.clip(np.abs(offsets[chosen, 0]).sum() / np.abs(REST[chosen, 0]).sum(), *np.multiply(WIDER, wide))
+        )
+
+    hips, shoulders = width("hip"), width("collar", "shoulder")
+    fit = np.tile(wide * np.eye(3), (len(SMPL22), 1, 1))
+    for joint in range(len(SMPL22)):
+        name = SMPL22.joints[joint]
+        children = [child for child, parent in enumerate(SMPL22.parents) if parent == joint]
+        if name in TRUNK:
+            above = children[-1] if name == "pelvis" else children[0]
+            tall = np.clip(ratio[above], *np.multiply((0.6, 1.6), wide))
+            fit[joint] = np.diag([hips + TRUNK[name] * (shoulders - hips), tall, wide])
+        elif children and not name.endswith("ankle"):
+            along = REST[children[0]] / usual[children[0]]
+            long = np.clip(ratio[children[0]], *np.multiply((0.6, 1.6), wide))
+            fit[joint] += (long - wide) * np.outer(along, along)
+    return fit, wide
+
+
+def _world(rotations: np.ndarray) -> np.ndarray:
+    """Returns rotations (F, 22, 3, 3) in the world from those relative to parents."""
+    world = rotations.copy()
+    for parent, joint in SMPL22.edges:
+        world[:, joint] = world[:, parent] @ rotations[:, joint]
+    return world
+
+
+def _between(start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """Returns the smallest rotation (3, 3) that turns one direction into another."""
+    a, b = start / np.linalg.norm(start), end / np.linalg.norm(end)
+    axis = np.cross(a, b)
+    sine = np.linalg.norm(axis)
+    return Rotation.from_rotvec(axis / max(sine, 1e-9) * np.arctan2(sine, a @ b)).as_matrix()
+
+
+def _flat_foot(ankle: np.ndarray, toe: np.ndarray, offset: np.ndarray) -> np.ndarray:
+    """Returns the position of the toes relative to the ankle while the foot stands flat, in the rest pose."""
+    height = ankle[:, 1] + toe[:, 1]
+    flat = height <= height.min() + STANDING
+    length = np.linalg.norm(offset)
+    drop = np.clip(np.median((ankle - toe)[flat, 1]), 0.1 * length, 0.8 * length)
+    ahead = offset * [1, 0, 1] / np.linalg.norm(offset[[0, 2]])
+    return np.sqrt(length**2 - drop**2) * ahead - [0, drop, 0]
+
+
+def _toes(foot: np.ndarray, height: np.ndarray) -> np.ndarray:
+    """Returns rotations (F, 3, 3) of the toes relative to the foot, which has rotations (F, 3, 3) in the world."""
+    low, high, most = TOES
+    down = np.clip(np.arcsin(np.clip(-foot[:, 1, 2], -1, 1)), 0, most)
+    near = np.clip((high - height) / (high - low), 0, 1)
+    return Rotation.from_rotvec(np.outer(-down * near, [1, 0, 0])).as_matrix()
+
+
+def _with_helpers(world: np.ndarray, offsets: np.ndarray) -> np.ndarray:
+    """Appends the rotations of the helper bones to those of the joints (F, 22, 3, 3)."""
+    helpers = []
+    for joint, share in HELPERS:
+        child = SMPL22.parents.index(joint)
+        axis = offsets[child] / np.linalg.norm(offsets[child])
+        of_wrist = SMPL22.joints[joint].endswith("elbow")
+        above, below = (joint, child) if of_wrist else (SMPL22.parents[joint], joint)
+        turn = Rotation.from_matrix(world[:, above].mT @ world[:, below]).as_quat()
+        twist = 2 * np.arctan2(turn[:, :3] @ axis, turn[:, 3])
+        twist = (twist + np.pi) % (2 * np.pi) - np.pi
+        back = Rotation.from_rotvec(np.outer((share if of_wrist else share - 1) * twist, axis)).as_matrix()
+        helpers.append(world[:, joint] @ back)
+    return np.concatenate([world, np.stack(helpers, 1)], 1)
+
+
+def rasterize(image: np.ndarray, at: np.ndarray, depth: np.ndarray, colors: np.ndarray, triangles: np.ndarray) -> None:
+    """Draws triangles into an image, the nearest one at each pixel, with colors interpolated between their corners.
+
+    Args:
+        image: (height, width, 3) uint8, drawn into.
+        at: (V, 2) pixel coordinates, y down.
+        depth: (V,) distance from the camera.
+        colors: (V, 3), 0 to 255.
+        triangles: (T, 3), counterclockwise seen from outside; those seen from inside are not drawn.
+    """
+    height, width = image.shape[:2]
+    a, b, c = (at[triangles[:, k]] for k in range(3))
+    twice = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
+    seen = twice < -1e-9
+    triangles, a, b, c, twice = triangles[seen], a[seen], b[seen], c[seen], twice[seen]
+    low = np.clip(np.ceil(np.minimum(np.minimum(a, b), c) - 0.5), 0, [width, height]).astype(int)
+    high = np.clip(np.floor(np.maximum(np.maximum(a, b), c) + 0.5), 0, [width, height]).astype(int)
+    wide, tall = np.maximum(high - low, 0).T
+    count = wide * tall
+    of = np.repeat(np.arange(len(triangles)), count)  # the triangle of each pixel in a bounding box
+    step = np.arange(len(of)) - np.repeat(np.cumsum(count) - count, count)
+    x, y = low[of, 0] + step % wide[of], low[of, 1] + step // wide[of]
+    # shares of the second and third corner, from the first corner's offset to the middle of the pixel
+    (bx, by), (cx, cy) = ((corner - a).T / twice for corner in (b, c))
+    right, down = x + 0.5 - a[of, 0], y + 0.5 - a[of, 1]
+    second, third = right * cy[of] - down * cx[of], down * bx[of] - right * by[of]
+    inside = (second >= 0) & (third >= 0) & (second + third <= 1)
+    of, second, third, pixel = of[inside], second[inside], third[inside], (y * width + x)[inside]
+    corners = triangles[of]
+    near = depth[corners[:, 0]]
+    near = near + second * (depth[corners[:, 1]] - near) + third * (depth[corners[:, 2]] - near)
+    nearest = np.full(height * width, np.inf)
+    np.minimum.at(nearest, pixel, near)
+    seen = near == nearest[pixel]
+    corners, second, third = corners[seen], second[seen, None], third[seen, None]
+    first = 1 - second - third
+    mixed = first * colors[corners[:, 0]] + second * colors[corners[:, 1]] + third * colors[corners[:, 2]]
+    image.reshape(-1, 3)[pixel[seen]] = mixed

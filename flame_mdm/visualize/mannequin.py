@@ -1,0 +1,439 @@
+"""Maker of `mannequin.npz`, the figure that pictures and files show: `python -m flame_mdm.visualize.mannequin`
+
+The figure is modeled here; it contains no data of others. Ellipses along the bones of `ADULT`, with the
+widths and depths of an adult of 1.78 m, are joined by smooth unions into one surface. Its left half is triangulated
+and simplified; the right half is its mirror image. This needs two more packages:
+pip install scikit-image fast-simplification
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from importlib import import_module
+from pathlib import Path
+
+import numpy as np
+from scipy.interpolate import PchipInterpolator
+from scipy.spatial.transform import Rotation
+
+from flame_mdm.representations.skeleton import SMPL22
+from flame_mdm.representations.smpl import ADULT
+from flame_mdm.visualize.body import HAIR, HELPERS, JOINT, SHIRT, SHOES, SKIN, TROUSERS
+
+A_POSE = {"shoulder": (0, 0, -46), "elbow": (0, -14, 0), "hip": (0, 0, 4), "ankle": (0, 0, -4)}
+"""Degrees about x, y, z from the rest pose of SMPL to the pose in which the mesh is stored, for the left side. Arms
+mostly hang, so the skin is stretched less from here than from outstretched arms."""
+CELL = 0.005
+VERTICES = 1000
+"""Number of vertices of a half before it is mirrored."""
+SOLE = -0.981
+"""Height of the sole below the pelvis."""
+Field = Callable[[np.ndarray], np.ndarray]
+
+
+def tube(origin: np.ndarray, axes: np.ndarray, stations: str, power: float = 2.0) -> Field:
+    """Returns the approximate signed distance from a body with elliptic cross sections and round ends.
+
+    Args:
+        origin: where the length is 0.
+        axes: (3, 3) rows: the direction of the length, and those of the two half widths.
+        stations: length, the two coordinates of the center and the two half widths, in millimeters, of several cross
+            sections, separated by semicolons; interpolated without overshoot.
+        power: 2 = ellipses; larger ones are more like rectangles.
+    """
+    table = np.array(stations.replace(";", " ").split(), float).reshape(-1, 5) / 1000
+    shape = PchipInterpolator(table[:, 0], table[:, 1:])
+
+    def field(points: np.ndarray) -> np.ndarray:
+        length, u, v = np.moveaxis((points - origin) @ axes.T, -1, 0)
+        inside = np.clip(length, table[0, 0], table[-1, 0])
+        center_u, center_v, half_u, half_v = np.moveaxis(shape(inside), -1, 0)
+        thin = np.minimum(half_u, half_v)
+        ratio = (np.abs(u - center_u) / half_u) ** power + (np.abs(v - center_v) / half_v) ** power
+        ratio += (np.abs(length - inside) / thin) ** power
+        return (ratio ** (1 / power) - 1) * thin
+
+    return field
+
+
+def ellipsoid(center: Sequence[float], radii: Sequence[float]) -> Field:
+    """Returns the approximate signed distance from an ellipsoid with axes along x, y and z."""
+    middle, size = np.array(center), np.array(radii)
+    return lambda points: (np.linalg.norm((points - middle) / size, axis=-1) - 1) * size.min()
+
+
+def union(first: np.ndarray, second: np.ndarray, blend: float) -> np.ndarray:
+    """Joins two distances; surfaces closer than `blend` meters are rounded into each other."""
+    share = np.maximum(blend - np.abs(first - second), 0) / blend
+    return np.minimum(first, second) - share**2 * blend / 4
+
+
+def pose() -> tuple[np.ndarray, np.ndarray]:
+    """Returns the joints (22, 3) of the stored pose, pelvis at 0, and their world rotations (22, 3, 3)."""
+    places, turned = np.zeros((22, 3)), np.tile(np.eye(3), (22, 1, 1))
+    for joint, parent in enumerate(SMPL22.parents):
+        side, _, name = SMPL22.joints[joint].rpartition("_")
+        angles = np.array(A_POSE.get(name, (0, 0, 0))) * (1 if side == "left" else (1, -1, -1))
+        turn = Rotation.from_euler("xyz", angles, degrees=True).as_matrix()
+        if parent >= 0:
+            places[joint] = places[parent] + turned[parent] @ np.array(ADULT[joint])
+            turned[joint] = turned[parent] @ turn
+    return places, turned
+
+
+def frame(direction: np.ndarray, u: np.ndarray) -> np.ndarray:
+    """Returns axes (3, 3): the direction, then `u` made orthogonal to it, then the third one."""
+    along = direction / np.linalg.norm(direction)
+    across = u - (u @ along) * along
+    across /= np.linalg.norm(across)
+    return np.stack([along, across, np.cross(along, across)])
+
+
+def model() -> dict[str, Field]:
+    """Returns the parts of the left half; the legs and the arm are those of the left side."""
+    places, turned = pose()
+
+    def bone(start: str, end: str, u: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
+        at = JOINT[start]
+        return places[at], frame(places[JOINT[end]] - places[at], turned[at] @ np.array(u, float))
+
+    up = np.array([[0, 1, 0], [1, 0, 0], [0, 0, 1.0]])
+    zero = np.zeros(3)
+    parts = {
+        "torso": tube(
+            zero,
+            up,
+            "-135 0 -5 110 80; -85 0 -8 160 108; -20 0 -8 163 112; 60 0 0 148 102; 130 0 4 137 95; "
+            "200 0 4 141 100; 280 0 4 157 112; 350 0 2 168 117; 410 0 -12 166 106; 455 0 -28 150 80; "
+            "490 0 -38 105 55; 515 0 -42 60 45",
+            2.3,
+        ),
+        "buttock": ellipsoid((0.075, -0.075, -0.068), (0.072, 0.080, 0.058)),
+        "breast": ellipsoid((0.075, 0.335, 0.080), (0.075, 0.058, 0.036)),
+        "blade": ellipsoid((0.085, 0.385, -0.085), (0.065, 0.085, 0.030)),
+        "trapezius": tube(
+            np.array([0.0, 0.53, -0.050]),
+            frame(np.array([0.2, -0.062, -0.005]), np.array([0, 1.0, 0])),
+            "0 0 0 40 46; 80 -4 0 36 46; 180 -4 4 42 50",
+        ),
+    }
+    # axes of legs: down, to the left, forward
+    thigh = bone("left_hip", "left_knee", (1, 0, 0))
+    parts["thigh"] = tube(
+        *thigh,
+        "-30 22 0 74 85; 40 22 2 81 91; 120 14 8 79 86; 220 6 8 68 75; 320 0 3 55 61; 385 0 4 50 57; 410 0 4 48 55",
+    )
+    parts["calf"] = tube(
+        *bone("left_knee", "left_ankle", (1, 0, 0)),
+        "-15 0 5 47 53; 50 0 -4 48 53; 130 3 -14 53 59; 200 2 -13 48 54; 300 0 -6 36 42; "
+        "380 0 -4 31 37; 430 0 -4 33 40",
+    )
+    ankle = places[JOINT["left_ankle"]]
+    ahead = places[JOINT["left_foot"]] - ankle
+    forward = frame(ahead * [1, 0, 1], np.array([1.0, 0, 0]))
+    forward[2] = [0, 1, 0]
+    shoe = tube(
+        ankle * [1, 0, 1] + [0, SOLE, 0],
+        forward,
+        "-45 0 32 30 34; -10 0 40 35 44; 30 0 42 37 46; 70 0 34 42 38; 120 -2 25 48 29; "
+        "160 -5 21 46 24; 185 -10 19 36 20",
+        2.4,
+    )
+
+    def foot(points: np.ndarray) -> np.ndarray:
+        return -union(-shoe(points), -(SOLE - points[..., 1]), 0.012)
+
+    parts["foot"] = foot
+    # axes of arms: to the left along the bone, up, forward
+    parts["arm"] = tube(
+        *bone("left_shoulder", "left_elbow", (0, 1, 0)),
+        "-30 -14 2 40 46; 20 -10 2 50 56; 70 -4 3 50 54; 140 -2 4 43 48; 210 -1 0 36 41; 270 0 0 34 37",
+    )
+    parts["forearm"] = tube(
+        *bone("left_elbow", "left_wrist", (0, 1, 0)),
+        "-10 0 0 34 37; 50 0 3 37 42; 110 0 2 34 40; 190 0 0 26 32; 250 0 0 21 28; 275 0 0 20 28",
+    )
+    wrist = JOINT["left_wrist"]
+    hand_axes = frame(turned[wrist] @ np.array([1, -0.06, -0.04]), turned[wrist] @ np.array([0, 1.0, 0]))
+    palm = tube(
+        places[wrist],
+        hand_axes,
+        "-10 0 0 19 28; 30 0 2 18.5 36; 80 1 0 17 42; 105 0 0 14.5 41",
+        2.4,
+    )
+    fingers = [
+        tube(places[wrist], hand_axes, stations)
+        for stations in (
+            "80 0 31.5 9.6 9.6; 115 -1 36 9.6 9.6; 142 -7 38.7 9.1 9.1; 170 -20 40.5 7.7 7.7",
+            "80 0 10.8 10.2 10.2; 115 -1 12.3 10.2 10.2; 149 -7 13.2 9.7 9.7; 183 -20 13.8 8.2 8.2",
+            "80 0 -10.5 9.6 9.6; 115 -1 -12 9.6 9.6; 144 -7 -12.9 9.1 9.1; 174 -20 -13.5 7.7 7.7",
+            "80 0 -31 8.6 8.6; 115 -1 -36 8.6 8.6; 133 -7 -39 8.2 8.2; 152 -20 -41 6.9 6.9",
+        )
+    ]
+    thumb_axes = frame(hand_axes.T @ np.array([0.80, -0.25, 0.62]), hand_axes[1])
+    thumb = tube(
+        places[wrist] + hand_axes.T @ np.array([0.018, -0.004, 0.016]),
+        thumb_axes,
+        "0 0 0 15 17; 35 0 0 14.5 15.5; 65 0 -4 11.5 12; 88 0 -10 9 9.5",
+    )
+
+    def hand(points: np.ndarray) -> np.ndarray:
+        found = palm(points)
+        for finger in fingers:
+            found = union(found, finger(points), 0.008)
+        return union(found, thumb(points), 0.014)
+
+    parts["hand"] = hand
+    parts["neck"] = tube(
+        np.array([0, 0.47, -0.045]),
+        frame(np.array([0, 0.17, 0.045]), np.array([1.0, 0, 0])),
+        "-20 0 0 75 50; 40 0 0 56 56; 90 0 0 51 55; 170 0 0 52 58",
+    )
+    skull = ellipsoid((0, 0.712, 0.003), (0.074, 0.089, 0.095))
+    face = tube(
+        zero,
+        up,
+        "592 0 60 26 28; 605 0 50 41 43; 635 0 40 55 57; 670 0 32 63 67; 710 0 20 69 80; 745 0 12 66 80",
+    )
+    nose = tube(
+        np.array([0, 0.708, 0.098]),
+        frame(np.array([0, -0.045, 0.022]), np.array([1.0, 0, 0])),
+        "0 0 0 7 8; 30 0 0 9 10; 47 0 1 13 11",
+    )
+    brow = ellipsoid((0.030, 0.716, 0.089), (0.032, 0.008, 0.013))
+    eye = ellipsoid((0.031, 0.699, 0.106), (0.019, 0.012, 0.018))
+    cheek = ellipsoid((0.043, 0.668, 0.068), (0.022, 0.020, 0.020))
+    lips = ellipsoid((0, 0.637, 0.087), (0.026, 0.010, 0.012))
+    chin = ellipsoid((0, 0.604, 0.074), (0.022, 0.017, 0.018))
+    ear = tube(
+        np.array([0.0745, 0.690, -0.004]),
+        frame(np.array([0.08, -1, 0.25]), np.array([1.0, 0, 0.4])),
+        "-24 0 0 8 14; 0 0 0 9 16; 26 -3 0 7 9",
+    )
+    crown = ellipsoid((0, 0.719, -0.004), (0.081, 0.094, 0.101))
+
+    def bald(points: np.ndarray) -> np.ndarray:
+        found = union(skull(points), face(points), 0.03)
+        found = union(union(found, brow(points), 0.014), cheek(points), 0.03)
+        found = -union(-found, eye(points), 0.014)
+        found = union(union(union(found, nose(points), 0.014), lips(points), 0.010), chin(points), 0.025)
+        return union(found, ear(points), 0.006)
+
+    def head(points: np.ndarray) -> np.ndarray:
+        return union(bald(points), -union(-crown(points), hairline(points), 0.012), 0.004)
+
+    parts["head"] = head
+    return parts
+
+
+def hairline(points: np.ndarray) -> np.ndarray:
+    """Returns the distance of points of the head into the hair: above the forehead, and behind the ears."""
+    above = (points - [0, 0.757, 0.086]) @ np.array([0, 0.84, -0.54])
+    behind = np.minimum((points - [0, 0.70, 0.016]) @ np.array([0, 0.10, -0.99]), points[..., 1] - 0.652)
+    return np.maximum(above, behind)
+
+
+def surface(parts: dict[str, Field], points: np.ndarray) -> np.ndarray:
+    """Returns the signed distance of the whole body; points have x >= 0."""
+    mirrored = points * [-1, 1, 1]
+    leg = union(union(parts["thigh"](points), parts["calf"](points), 0.02), parts["foot"](points), 0.03)
+    seat = union(parts["torso"](points), parts["buttock"](points), 0.05)
+    body = union(seat, parts["breast"](points), 0.04)
+    body = union(union(body, parts["blade"](points), 0.05), parts["trapezius"](points), 0.05)
+    body = union(union(body, leg, 0.05), parts["thigh"](mirrored), 0.05)
+    arm = union(parts["arm"](points), parts["forearm"](points), 0.02)
+    body = union(union(body, arm, 0.05), parts["hand"](points), 0.015)
+    return union(union(body, parts["neck"](points), 0.05), parts["head"](points), 0.025)
+
+
+def gradient(distance: Field, points: np.ndarray) -> np.ndarray:
+    """Returns the gradient (N, 3) of a distance by central differences."""
+    steps = 1e-4 * np.eye(3)
+    return np.stack([distance(points + step) - distance(points - step) for step in steps], -1) / 2e-4
+
+
+def magnified(points: np.ndarray, inverse: bool = False) -> np.ndarray:
+    """Enlarges head and hand, so that they keep more of the vertices, and shrinks their surroundings in turn."""
+    places, turned = pose()
+    hand = places[JOINT["left_wrist"]] + turned[JOINT["left_wrist"]] @ np.array([0.09, 0, 0])
+    radii = np.linspace(0, 3, 6001)
+    for center, reach, growth in (((0, 0.69, 0.05), 0.15, 0.9), (hand, 0.12, 0.9))[:: -1 if inverse else 1]:
+        slope = np.where(radii < reach, growth, np.where(radii < reach * (1 + 2 * growth), -0.5, 0))
+        grown = radii + np.cumsum(slope) * radii[1]
+        offset = points - np.array(center)
+        distance = np.linalg.norm(offset, axis=1, keepdims=True)
+        known, wanted = (grown, radii) if inverse else (radii, grown)
+        points = np.array(center) + offset * np.interp(distance, known, wanted) / np.maximum(distance, 1e-9)
+    return points
+
+
+def triangulate(distance: Field) -> tuple[np.ndarray, np.ndarray]:
+    """Returns vertices (V, 3) and outward-facing triangles (T, 3) of the left half; its border is at x = 0."""
+    axes = [np.arange(low, high, CELL) for low, high in ((0, 0.76), (-1.01, 0.84), (-0.18, 0.22))]
+    grid = np.stack(np.meshgrid(*axes, indexing="ij"), -1)
+    values = np.concatenate([distance(part.reshape(-1, 3)).reshape(part.shape[:3]) for part in np.split(grid, 8)])
+    try:
+        measure, simplification = import_module("skimage.measure"), import_module("fast_simplification")
+    except ImportError as error:
+        raise SystemExit(f"{error.name} is missing. Run pip install scikit-image fast-simplification") from error
+    points, triangles, _, _ = measure.marching_cubes(values, 0.0, spacing=(CELL,) * 3)
+    points = points + [axis[0] for axis in axes]
+    share = 1 - 2 * VERTICES / len(triangles)
+    order = np.array([1, 2, 0])  # the result depends on the order of axes; this one keeps the border closed
+    points, triangles = simplification.simplify(
+        np.ascontiguousarray(magnified(points)[:, order], np.float32), triangles.astype(np.int32), share, agg=3
+    )
+    points = magnified(points[:, np.argsort(order)].astype(float), inverse=True)
+    edges = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), 1)
+    pairs, count = np.unique(edges, axis=0, return_counts=True)
+    border = np.unique(pairs[count == 1])
+    for step in range(12):
+        if step < 6:  # even out the triangles along the surface
+            sums, degree = np.zeros_like(points), np.zeros(len(points))
+            for a, b in (pairs.T, pairs.T[::-1]):
+                np.add.at(sums, a, points[b])
+                np.add.at(degree, a, 1)
+            points = points + 0.35 * (sums / degree[:, None] - points)
+        points[border, 0] = 0
+        slope = gradient(distance, points)
+        slope[border, 0] = 0
+        points = points - (distance(points) / np.maximum((slope**2).sum(1), 0.2))[:, None] * slope
+    volume = np.einsum("ij,ij->i", points[triangles[:, 0]], np.cross(points[triangles[:, 1]], points[triangles[:, 2]]))
+    return points, triangles if volume.sum() > 0 else triangles[:, ::-1]
+
+
+def smooth(low: float, high: float, value: np.ndarray) -> np.ndarray:
+    """Returns 0 below `low`, 1 above `high` and a smooth transition between."""
+    share = np.clip((value - low) / (high - low), 0, 1)
+    return share * share * (3 - 2 * share)
+
+
+def skin(points: np.ndarray, parts: dict[str, Field]) -> np.ndarray:
+    """Returns the weights (V, 22) of the joints, for points of the left half."""
+    places, turned = pose()
+
+    def beyond(name: str, normal: Sequence[float] | np.ndarray, width: float) -> np.ndarray:
+        """Returns how far points lie beyond a joint: 0.5 on the plane through it, 0 and 1 `width` meters from it."""
+        unit = np.array(normal, float) / np.linalg.norm(normal)
+        return smooth(-width, width, (points - places[JOINT[name]]) @ unit)
+
+    def along(name: str, local: Sequence[float]) -> np.ndarray:
+        return turned[JOINT[name]] @ np.array(local, float)
+
+    x, y = points[:, 0], points[:, 1]
+    arm = np.minimum(np.minimum(parts["arm"](points), parts["forearm"](points)), parts["hand"](points))
+    on_arm = smooth(-0.045, 0.015, parts["torso"](points) - arm) * (x > 0.08)
+    bend = along("left_shoulder", (1, 0, 0)) + along("left_collar", (0.8, 0.3, 0))
+    half_elbow = along("left_elbow", (1, 0, 0)) + along("left_shoulder", (1, 0, 0))
+    leg = (y < 0.1) * smooth(-0.05, 0.05, x) * (1 - on_arm)
+    throat = smooth(0.52, 0.57, y)
+    share = {
+        "left_hip": leg * beyond("left_hip", (0.42, -0.9, 0), 0.075),
+        "right_hip": (y < 0.1) * smooth(-0.05, 0.05, -x) * beyond("right_hip", (-0.42, -0.9, 0), 0.075),
+        "spine1": beyond("spine1", (0, 1, 0), 0.08),
+        "spine2": beyond("spine2", (0, 1, 0), 0.08),
+        "spine3": beyond("spine3", (0, 1, 0), 0.06),
+        "neck": beyond("neck", (0, 1, 0.3), 0.05) * (1 - smooth(0.06, 0.11, x) * (1 - throat)),
+        "head": beyond("head", (0, 0.8, 0.6), 0.035),
+        "left_collar": beyond("left_collar", (1, 0.15, 0), 0.07) * smooth(0.30, 0.44, y - on_arm) * (1 - throat),
+        "left_shoulder": beyond("left_shoulder", bend, 0.07) * on_arm,
+        "left_elbow": beyond("left_elbow", half_elbow, 0.05),
+        "left_wrist": beyond("left_wrist", along("left_wrist", (1, 0, 0)), 0.03),
+        "left_knee": beyond("left_knee", along("left_knee", (0, -1, -0.05)), 0.065),
+        "left_ankle": beyond("left_ankle", (0.0, -0.9, 0.45), 0.04),
+        "left_foot": beyond("left_foot", along("left_foot", (0.1, 0.15, 1)), 0.03),
+    }
+    for name in ("spine1", "spine2", "spine3", "left_collar"):
+        share[name] = np.maximum(share[name], on_arm)
+    whole = np.zeros((len(points), 22))  # weight of a joint and all below it
+    whole[:, 0] = 1
+    for joint, parent in enumerate(SMPL22.parents):
+        if parent >= 0 and SMPL22.joints[joint] in share:
+            whole[:, joint] = whole[:, parent] * share[SMPL22.joints[joint]]
+    weights = whole.copy()
+    for joint in reversed(range(22)):
+        children = [child for child, parent in enumerate(SMPL22.parents) if parent == joint]
+        below = whole[:, children].sum(1)
+        too_much = np.maximum(1, below / np.maximum(whole[:, joint], 1e-9))
+        for child in children:  # joints on both sides of the middle share what their parent has
+            for each in descendants(child):
+                weights[:, each] /= too_much
+        weights[:, joint] = whole[:, joint] - below / too_much
+    return weights
+
+
+def descendants(joint: int) -> list[int]:
+    """Returns a joint and all joints below it."""
+    return [joint] + [j for child, p in enumerate(SMPL22.parents) if p == joint for j in descendants(child)]
+
+
+def with_helpers(points: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Returns weights (V, 28): the upper part of limbs moves to helper bones, which turn less about the limb.
+
+    The forearm is the other way round: its lower half moves to a bone that takes part in the twist of the wrist.
+    """
+    places, _ = pose()
+    columns = []
+    for joint, _ in HELPERS:
+        bone = places[SMPL22.parents.index(joint)] - places[joint]
+        part = smooth(0.2, 0.75, (points - places[joint]) @ bone / (bone @ bone))
+        helper = weights[:, joint] * (part if SMPL22.joints[joint].endswith("elbow") else 1 - part)
+        weights[:, joint] -= helper
+        columns.append(helper)
+    return np.concatenate([weights, np.stack(columns, 1)], 1)
+
+
+def paint(points: np.ndarray) -> np.ndarray:
+    """Returns colors (V, 3), 0 to 255, of a half: hair, skin, shirt, trousers and shoes, blended at their borders."""
+    places, turned = pose()
+
+    def mixed(below: np.ndarray, above: tuple[int, int, int], share: np.ndarray) -> np.ndarray:
+        return below + share[:, None] * (np.array(above) - below)
+
+    elbow = (points - places[JOINT["left_elbow"]]) @ turned[JOINT["left_shoulder"]] @ np.array([1.0, 0, 0])
+    hand = smooth(-0.115, -0.07, elbow) * (points[:, 0] > 0.2)
+    color = mixed(np.tile(np.array(SHIRT, float), (len(points), 1)), SKIN, hand)
+    neck = points[:, 1] - 0.535 + 0.28 * points[:, 2]
+    color = mixed(color, SKIN, smooth(-0.018, 0.018, neck) * (points[:, 0] < 0.2))
+    color = mixed(color, HAIR, smooth(-0.006, 0.006, hairline(points)) * (points[:, 1] > 0.6))
+    belt = (points[:, 0] < 0.25) * smooth(-0.022, 0.022, 0.035 - points[:, 1])
+    color = mixed(color, TROUSERS, belt)
+    return mixed(color, SHOES, smooth(-0.016, 0.016, -0.888 - points[:, 1]))
+
+
+def make() -> dict[str, np.ndarray]:
+    """Returns the arrays of the asset, for the left half; `body.load` mirrors them.
+
+    `points` (V, 3) in units of 1/20 mm and `normals` (V, 3) in 1/127, of the stored pose with the pelvis at 0;
+    `bones` (V, 4) and `weights` (V, 4), which add up to 255; `colors` (V, 3); `triangles` (T, 3); `joints` (22, 3) and
+    `turns` (22, 3, 3), the stored pose.
+    """
+    parts = model()
+
+    def distance(points: np.ndarray) -> np.ndarray:
+        return surface(parts, points)
+
+    points, triangles = triangulate(distance)
+    normals = gradient(distance, points)
+    normals[points[:, 0] == 0, 0] = 0
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    weights = with_helpers(points, skin(points, parts))
+    bones = np.argsort(-weights, axis=1, kind="stable")[:, :4]
+    most = np.take_along_axis(weights, bones, 1)
+    most = np.floor(255 * most / most.sum(1, keepdims=True) + 0.5).astype(int)
+    most[:, 0] += 255 - most.sum(1)
+    places, turned = pose()
+    return {
+        "points": np.rint(points * 20000).astype("<i2"),
+        "normals": np.rint(normals * 127).astype("i1"),
+        "bones": np.where(most > 0, bones, 0).astype("u1"),
+        "weights": most.astype("u1"),
+        "colors": np.rint(paint(points)).astype("u1"),
+        "triangles": triangles.astype("<u2"),
+        "joints": places,
+        "turns": turned,
+    }
+
+
+if __name__ == "__main__":
+    np.savez_compressed(Path(__file__).with_suffix(".npz"), allow_pickle=False, **make())

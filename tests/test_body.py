@@ -1,0 +1,168 @@
+"""The mannequin: a sound mesh, bound to clips and skinned."""
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from flame_mdm.errors import UserError
+from flame_mdm.formats.motion import Motion, motion_of_poses
+from flame_mdm.formats.poses import Poses
+from flame_mdm.representations.skeleton import KIT21, SMPL22
+from flame_mdm.visualize import body, frames_array
+from flame_mdm.visualize.body import ANCHORS, JOINT, REST, figure, mesh, rasterize, try_figure
+
+
+def posed(frames: int = 1, scale: float = 1.0, **turns: tuple[float, float, float]) -> Motion:
+    """A body with some joints turned by degrees about x, y, z; the lowest joint of the rest pose is on the floor."""
+    rotations = np.tile(np.eye(3), (frames, 22, 1, 1))
+    for name, angles in turns.items():
+        rotations[:, JOINT[name]] = Rotation.from_euler("xyz", angles, degrees=True).as_matrix()
+    root = torch.tensor([[0.0, 0.955 * scale, 0.0]]).double().expand(frames, 3)
+    return motion_of_poses(Poses(torch.tensor(scale * REST), torch.tensor(rotations), root), 20)
+
+
+def volume(points: np.ndarray, triangles: np.ndarray) -> float:
+    a, b, c = (points[triangles[:, k]] for k in range(3))
+    return float((a * np.cross(b, c)).sum() / 6)
+
+
+def part_volume(points: np.ndarray, *joints: str) -> float:
+    """Volume of the part that belongs to some joints; each of its openings is closed by a cone."""
+    bones = [bone for bone, anchor in enumerate(ANCHORS) if SMPL22.joints[anchor] in joints]
+    triangles = mesh().triangles[(mesh().weights[:, bones].sum(1) > 0.5)[mesh().triangles].all(1)]
+    sides = {tuple(side) for side in triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2).tolist()}
+    after = {a: b for a, b in sides if (b, a) not in sides}
+    total = volume(points, triangles)
+    while after:
+        ring = [next(iter(after))]
+        while (following := after.pop(ring[-1])) != ring[0]:
+            ring.append(following)
+        middle = points[ring].mean(0)
+        total += sum(
+            middle @ np.cross(points[b], points[a]) / 6 for a, b in zip(ring, ring[1:] + ring[:1], strict=True)
+        )
+    return total
+
+
+def test_the_mesh_is_one_closed_symmetric_surface():
+    points, triangles = mesh().points, mesh().triangles
+    assert 1000 <= len(points) <= 3000
+    sides = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), 1)
+    found, count = np.unique(sides, axis=0, return_counts=True)
+    assert (count == 2).all()
+    assert len(points) - len(found) + len(triangles) == 2  # Euler: like a sphere
+    assert 0.05 < volume(points, triangles) < 0.09  # cubic meters; a person of 1.78 m has 0.07
+    assert 1.7 < np.ptp(points[:, 1]) < 1.85
+    assert {tuple(p) for p in points.round(5).tolist()} == {tuple(p) for p in (points * [-1, 1, 1]).round(5).tolist()}
+    np.testing.assert_allclose(mesh().weights.sum(1), 1)
+    assert ((mesh().weights > 0).sum(1) <= 4).all()
+    left = mesh().sides()
+    assert (left[points[:, 0] > 0.2] > 0.5).all()
+    assert (left[points[:, 0] < -0.2] < -0.5).all()
+
+
+def test_the_stored_pose_gives_the_stored_mesh():
+    turns = {"shoulder": (0, 0, -46), "elbow": (0, -14, 0), "hip": (0, 0, 4), "ankle": (0, 0, -4)}
+    both = {
+        f"{side}_{k}": (x, f * y, f * z) for side, f in (("left", 1), ("right", -1)) for k, (x, y, z) in turns.items()
+    }
+    points, _ = figure(posed(1, 1.0, **both)).skinned(0)
+    np.testing.assert_allclose(points - [0, 0.955 + body.SOLE, 0], mesh().points, atol=3e-3)  # it has a little twist
+
+
+def test_joints_of_the_body_are_those_of_the_motion_and_soles_are_on_the_floor():
+    motion = posed(
+        scale=0.93, left_hip=(-50, 10, 0), left_knee=(70, 0, 0), right_shoulder=(0, 30, 60), spine2=(15, 0, 9)
+    )
+    drawn = figure(motion)
+    np.testing.assert_allclose(drawn.places[0, :22] - [0, drawn.lift, 0], motion.joints[0], atol=1e-6)
+    points, normals = drawn.skinned(0)
+    assert points[:, 1].min() == pytest.approx(0, abs=0.004)  # the right foot stands
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1)
+    solved = Motion(motion.joints, 20)
+    assert figure(solved).skinned(0)[0][:, 1].min() == pytest.approx(0, abs=0.004)
+    moves = (drawn.turns[0, :22] @ drawn.joints[..., None])[..., 0]  # a rigid bone maps both its ends to joints
+    for parent, joint in SMPL22.edges:
+        end = drawn.places[0, parent] - moves[parent] + drawn.turns[0, parent] @ drawn.joints[joint]
+        assert np.linalg.norm(end - drawn.places[0, joint]) < 1e-4, SMPL22.joints[joint]
+
+
+@pytest.mark.parametrize(
+    ("turns", "part"),
+    [
+        ({"left_elbow": (0, -90, 0)}, ("left_shoulder", "left_elbow")),
+        ({"left_knee": (90, 0, 0)}, ("left_hip", "left_knee")),
+        ({"left_wrist": (90, 0, 0)}, ("left_elbow", "left_wrist")),  # twist
+        ({"left_shoulder": (60, 0, 0)}, ("left_shoulder",)),
+    ],
+)
+def test_bent_and_twisted_limbs_keep_nine_tenths_of_their_volume(turns, part):
+    drawn = figure(posed(**turns))
+    assert part_volume(drawn.skinned(0)[0], *part) > 0.9 * part_volume(drawn.points, *part)
+
+
+def test_a_twisted_wrist_turns_the_forearm_by_degrees():
+    drawn = figure(posed(left_wrist=(80, 0, 0)))
+    turned = Rotation.from_matrix(drawn.turns[0] @ figure(posed()).turns[0].mT).magnitude()
+    helper = next(bone for bone, joint in enumerate(ANCHORS[22:], 22) if SMPL22.joints[joint] == "left_elbow")
+    assert np.degrees(turned[[JOINT["left_elbow"], helper, JOINT["left_wrist"]]]) == pytest.approx([0, 44, 80], abs=1.5)
+
+
+def test_toes_bend_where_the_heel_rises_and_the_head_is_level():
+    raised = posed(left_ankle=(40, 0, 0), left_knee=(10, 0, 0), neck=(25, 0, 0))
+    raised.joints[:, :, 1] -= raised.joints[..., 10, 1].min()  # the toes stand on the floor
+    drawn = figure(Motion(np.concatenate([posed(3, neck=(25, 0, 0)).joints, raised.joints]), 20))
+    forward = drawn.turns @ mesh().turns @ np.array([0.0, 0, 1])
+    assert abs(forward[-1, JOINT["left_foot"], 1]) < 0.12
+    assert forward[-1, JOINT["left_ankle"], 1] < -0.4
+    assert abs(forward[0, JOINT["head"], 1]) < 0.05
+
+
+def test_the_nearest_triangle_is_drawn():
+    image = np.full((20, 20, 3), 255, np.uint8)
+    square = np.array([[2.0, 18], [18, 18], [18, 2], [2, 2]])
+    at, triangles = np.concatenate([square, square]), np.array([[0, 1, 2], [0, 2, 3]])
+    colors = np.repeat([[10.0, 20, 30], [200, 100, 0]], 4, axis=0)
+    rasterize(image, at, np.repeat([1.0, 2.0], 4), colors, np.concatenate([triangles, triangles + 4]))
+    assert (image[2:18, 2:18] == [10, 20, 30]).all()
+    assert (image[:, :2] == 255).all()
+    assert (image[18:] == 255).all()
+    rasterize(image, at, np.repeat([3.0, 0.5], 4), colors, triangles[:, ::-1])  # seen from inside
+    assert (image[2:18, 2:18] == [10, 20, 30]).all()
+
+
+def test_pictures_show_the_body_in_its_clothes():
+    image = frames_array(posed(), 192)[0].astype(int)
+    blue = (image[..., 2] > image[..., 0] + 25).nonzero()[0]
+    skin = (image[..., 0] > image[..., 2] + 30).nonzero()[0]
+    assert min(len(blue), len(skin)) > 100
+    assert skin.min() < blue.min()  # the face is above the shirt
+
+
+@pytest.mark.parametrize(
+    ("motion", "reason"),
+    [
+        (posed(scale=3.0), r"left_knee is 1\.17 m long, the body's is 0\.392 m\. Is the unit right\?"),
+        (
+            Motion(np.random.default_rng(0).normal(size=(3, 21, 3)), 20, KIT21),
+            "computed only for the 22 joints of SMPL",
+        ),
+        (Motion(np.zeros((3, 22, 3)), 20), "has no length"),
+    ],
+)
+def test_a_motion_that_no_body_fits_says_why(motion, reason):
+    with pytest.raises(ValueError, match=reason):
+        figure(motion)
+    assert try_figure(motion)[0] is None
+    assert frames_array(motion, 64).shape == (len(motion.joints), 64, 64, 3)  # its skeleton
+
+
+def test_a_damaged_asset_is_named(tmp_path, monkeypatch):
+    body.stored.cache_clear()
+    monkeypatch.setattr(body, "__file__", str(tmp_path / "body.py"))
+    with pytest.raises(UserError, match=r"mannequin\.npz: the figure cannot be read .* Install flame-mdm again"):
+        body.stored()
+    (tmp_path / "mannequin.npz").write_bytes(b"PK")
+    with pytest.raises(UserError, match=r"mannequin\.npz"):
+        body.stored()

@@ -10,10 +10,16 @@ import torch
 from fixtures import GOLDEN, Arrays, golden, groups, meta, needs_third_party, third_party
 from torch import Tensor, nn
 
+from evaluators.extractors import MARDMClipExtractor
 from evaluators.extractors.action_gru import NUM_ACTIONS, ActionGRU, load_action_gru
+from evaluators.extractors.mardm import MARDMClip
+from evaluators.extractors.released import load_strictly
 from evaluators.extractors.stgcn import STGCN, UESTC, JointSTGCN, Unconstrained, load_uestc, load_unconstrained
 from evaluators.extractors.t2m import PARTS_OF_SPEECH, T2MEvaluator, Words, WordVectors, load_t2m
+from flame_mdm.errors import UserError
 from flame_mdm.motion import length_mask
+from flame_mdm.representations.essential import Essential
+from flame_mdm.representations.humanml import HumanML
 
 FLIP = torch.tensor([1.0, -1.0, -1.0])
 
@@ -30,21 +36,27 @@ def assert_within(ours: Tensor, arrays: Arrays, name: str, like: str | None = No
 
 # T2M ------------------------------------------------------------------------------------------------------------------
 
+STATISTICS = (("mean", 0.0), ("std", 1.0))
+
 
 def t2m(arrays: Arrays, *, keep_padding: bool = False) -> T2MEvaluator:
-    state, features = weights(arrays), arrays["in/motions"].shape[2]
+    state = weights(arrays)
+    mardm = "in/feats" in arrays  # MARDM's evaluator sees 67 features and has statistics of its own
+    features = 67 if mardm else arrays["in/motions"].shape[2]
+    mean, std = (torch.from_numpy(arrays[f"in/{n}"]) if mardm else torch.full((features,), v) for n, v in STATISTICS)
     network = T2MEvaluator(
-        torch.zeros(features),
-        torch.ones(features),
+        mean,
+        std,
+        used_features=67 if mardm else None,
         movement_hidden=len(state["movement_encoder/main.0.weight"]),
         movement_latent=len(state["movement_encoder/out_net.weight"]),
         text_hidden=len(state["text_encoder/input_emb.weight"]),
         motion_hidden=len(state["motion_encoder/input_emb.weight"]),
         embedding=len(state["text_encoder/output_net.3.weight"]),
-        max_frames=arrays["in/motions"].shape[1],
+        max_frames=arrays["in/feats" if mardm else "in/motions"].shape[1],
         keep_padding=keep_padding,
     )
-    names = {name.replace("/", "."): value for name, value in state.items()}
+    names = {name.replace("/", "."): value for name, value in state.items() if "contrast" not in name}
     network.load_state_dict({"mean": network.mean, "std": network.std, **names})
     return network.eval()
 
@@ -199,6 +211,82 @@ def test_a_released_t2m_file_is_loaded_whole_or_not_at_all(tmp_path):
     torch.save(file, path)
     with pytest.raises(ValueError, match=r"finest\.tar: not the weights of _TextEncoder: Missing key.*hidden"):
         load_t2m(path, tmp_path / "mean.npy", tmp_path / "std.npy")
+
+
+# MARDM ----------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize("stem", ["essential67"])
+def test_mardms_evaluator_gives_the_authors_embeddings(stem):
+    arrays = golden(stem)
+    network, lengths = t2m(arrays), torch.from_numpy(arrays["in/lengths"])
+    features = torch.from_numpy(arrays["in/feats"])
+    with torch.no_grad():
+        motion = network(features, length_mask(lengths, features.shape[1]))
+        text = network.text(
+            Words(*(torch.from_numpy(arrays[f"in/{n}"]) for n in ("word_embs", "pos_onehot", "cap_lens")))
+        )
+        movements = network.movement_encoder(torch.from_numpy(arrays["out/normed"]))
+    assert_within(movements, arrays, "out/movements_unsorted", like="movements_unsorted")
+    assert_within(text, arrays, "out/text_embedding_unsorted", like="text_embedding_unsorted")
+    theirs = torch.from_numpy(arrays["out/align_idx"])
+    assert_within(motion[theirs], arrays, "out/motion_embedding", like="motion_embedding")
+    assert_within(text[theirs], arrays, "out/text_embedding", like="text_embedding")
+    cut = network(features[..., :67], length_mask(lengths, features.shape[1]))
+    assert torch.equal(cut, network(features, length_mask(lengths, features.shape[1])))
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize("stem", ["essential67"])
+def test_mardms_clip_gives_the_authors_vectors(stem):
+    arrays = golden(stem)
+    state = weights(arrays, "state/contrast_model/")
+    config = meta(arrays)["config"]
+    network = MARDMClip(
+        torch.from_numpy(arrays["in/mean"]),
+        torch.from_numpy(arrays["in/std"]),
+        width=state["out.weight"].shape[1],
+        hidden=len(state["textTransEncoder.layers.0.linear1.weight"]),
+        layers=config["clip_layers"],
+        heads=config["clip_heads"],
+        words=len(state["token_embedding.weight"]),
+        slots=len(state["positional_embedding"]),
+    )
+    load_strictly(network, state, stem)
+    features, lengths = torch.from_numpy(arrays["in/feats"]), torch.from_numpy(arrays["in/lengths"])
+    with torch.no_grad():
+        motion = network(features, length_mask(lengths, features.shape[1]))
+        text = network.text(torch.from_numpy(arrays["in/tokens"]))
+    assert_within(motion, arrays, "out/clip_motion", like="clip_motion")
+    assert_within(text, arrays, "out/clip_text", like="clip_text")
+    assert (motion * text).sum(-1).mean().item() == pytest.approx(float(arrays["out/clip_score"]), abs=1e-6)
+
+
+def test_released_evaluators_of_mardm_are_read(tmp_path):
+    """The files have the names and keys of the authors', and random weights."""
+    for name, value in STATISTICS:
+        np.save(tmp_path / f"{name}.npy", np.full(67, value))
+    made = T2MEvaluator(torch.zeros(67), torch.ones(67), used_features=67).eval()
+    assert list(made.state_dict()["movement_encoder.main.0.weight"].shape) == [512, 67, 4]
+    parts = ("movement_encoder", "text_encoder", "motion_encoder")
+    torch.save({name: made.get_submodule(name).state_dict() for name in parts}, tmp_path / "finest.tar")
+    x, mask = torch.randn(1, 40, 263), torch.ones(1, 40, dtype=torch.bool)
+    files = tmp_path / "finest.tar", tmp_path / "mean.npy", tmp_path / "std.npy"
+    assert torch.equal(load_t2m(*files)(x, mask), made(x[..., :67], mask))
+    with pytest.raises(ValueError, match="contains no weights under 'contrast_model'"):
+        MARDMClipExtractor(str(tmp_path))
+    clip = MARDMClip(torch.zeros(67), torch.ones(67)).eval()
+    torch.save({"contrast_model": clip.state_dict(), "epoch": 1}, tmp_path / "finest.tar")
+    extractor = MARDMClipExtractor(str(tmp_path))
+    with torch.no_grad():
+        vectors = extractor.motions(x, torch.zeros(0), mask)["features"]
+        assert torch.equal(vectors, clip(x, mask))
+        assert vectors.norm().item() == pytest.approx(1, abs=1e-6)
+    for representation in (HumanML(variant="legacy"), Essential(variant="legacy")):
+        extractor.check(representation, "humanml3d")
+    with pytest.raises(UserError, match="made for humanml-legacy-smpl22 of humanml3d, but"):
+        extractor.check(HumanML(), "humanml3d")
 
 
 # HumanAct12 -----------------------------------------------------------------------------------------------------------

@@ -42,7 +42,7 @@ def traveller(representation: Representation) -> Tensor:
     raw = torch.zeros(FRAMES + 1, 75)
     raw[:, 0] = METERS * torch.arange(FRAMES + 1) / FRAMES
     raw[:, 2] = 0.9
-    if representation.name.startswith(("smpl", "rot6d")):
+    if representation.name.startswith(("smpl", "rot6d", "motion272")):
         features = representation.encode(raw)
     else:
         skeleton = representation.skeleton

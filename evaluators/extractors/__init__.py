@@ -12,6 +12,7 @@ from torch import Tensor
 
 from evaluators.extractors.action_gru import ActionGRU, load_action_gru
 from evaluators.extractors.classifier import ClassifierTask
+from evaluators.extractors.mardm import MARDMClip, clip_tokens, load_mardm_clip
 from evaluators.extractors.motion_clip import MotionCLIPTask
 from evaluators.extractors.stgcn import Unconstrained, load_uestc, load_unconstrained
 from evaluators.extractors.t2m import WordVectors, load_t2m
@@ -93,7 +94,7 @@ class OwnExtractor(Extractor):
     def check(self, representation: Representation, dataset: str) -> None:
         """Checks that representation and data set are those of its training."""
         own, advice = self.task.representation, f"Train one with make train EXP={self.recipes}/..."
-        if (own.name, own.fps, own.features) != (representation.name, representation.fps, representation.features):
+        if not self._reads(representation):
             raise UserError(
                 f"extractor {self.path}: trained on {own.name} at {own.fps:g} frames per second, but the motions are "
                 f"{representation.name} at {representation.fps:g}. {advice}"
@@ -103,6 +104,10 @@ class OwnExtractor(Extractor):
                 f"extractor {self.path}: trained on the data set {self.task.facts['dataset']}, but the motions are "
                 f"from {dataset}. {advice}"
             )
+
+    def _reads(self, representation: Representation) -> bool:
+        own = self.task.representation
+        return (own.name, own.fps, own.features) == (representation.name, representation.fps, representation.features)
 
 
 class MotionCLIPExtractor(OwnExtractor):
@@ -128,10 +133,10 @@ class MotionCLIPExtractor(OwnExtractor):
 
 
 class T2MExtractor(Extractor):
-    """The evaluator of Guo et al. 2022 as released, from a folder with five files.
+    """The evaluator of Guo et al. 2022, or MARDM's first evaluator, as released, from a folder with five files.
 
     The files are finest.tar (from text_mot_match/model), mean.npy and std.npy (t2m_mean.npy and t2m_std.npy in MDM,
-    kit_... for KIT), our_vab_data.npy and our_vab_idx.pkl (GloVe).
+    kit_... for KIT, eval_mean.npy and eval_std.npy in MARDM), our_vab_data.npy and our_vab_idx.pkl (GloVe).
 
     Args:
         path: the folder.
@@ -156,9 +161,11 @@ class T2MExtractor(Extractor):
 
     def check(self, representation: Representation, dataset: str) -> None:
         """Checks that the motions have the published features of the data set with that number of features."""
-        made_for = {263: ("humanml-legacy-smpl22", "humanml3d"), 251: ("humanml-legacy-kit21", "kit")}
+        human, kit = ("humanml-legacy-smpl22", "humanml3d"), ("humanml-legacy-kit21", "kit")
+        made_for = {263: human, 67: human, 251: kit, 64: kit}
         wanted = made_for.get(len(self.network.mean), ("unknown features", "an unknown data set"))
-        if (representation.name, dataset) != wanted:
+        parts = {representation.part_of} if self.network.used <= representation.features else set()
+        if wanted[0] not in {representation.name, *parts} or dataset != wanted[1]:
             raise UserError(
                 f"extractor {self.path}: made for {wanted[0]} of {wanted[1]}, but the motions are "
                 f"{representation.name} of {dataset}"
@@ -177,11 +184,52 @@ class T2MExtractor(Extractor):
         return self.network.text(self.words(_tagged(self.path, tokens), full_length=self.full_length))
 
 
+class MARDMClipExtractor(Extractor):
+    """The second evaluator of MARDM as released, for its CLIP-score: `MotionCLIPScore` of its features.
+
+    Args:
+        path: a folder of finest.tar (from text_mot_match_clip/model), mean.npy and std.npy (eval_mean, eval_std).
+        device: to compute on.
+
+    Raises:
+        FileNotFoundError, ValueError: If a file is missing, or has other content.
+    """
+
+    FILES = ("finest.tar", "mean.npy", "std.npy")
+    network: MARDMClip
+
+    def __init__(self, path: str, device: str | torch.device = "cpu"):
+        folder = Path(path)
+        self.path, self.network = folder, load_mardm_clip(*(folder / name for name in self.FILES)).to(device)
+        self.sha256 = hashlib.sha256("".join(sha256(folder / name) for name in self.FILES).encode()).hexdigest()
+
+    def check(self, representation: Representation, dataset: str) -> None:
+        """Checks that the motions have the published features of HumanML3D, or the essential ones."""
+        if "humanml-legacy-smpl22" not in (representation.name, representation.part_of) or dataset != "humanml3d":
+            raise UserError(
+                f"extractor {self.path}: made for humanml-legacy-smpl22 of humanml3d, but the motions are "
+                f"{representation.name} of {dataset}"
+            )
+
+    def motions(self, features: Tensor, joints: Tensor, mask: Tensor) -> dict[str, Tensor]:
+        """Computes features of motions."""
+        return {"features": self.network(features, mask)}
+
+    def texts(self, captions: Sequence[str], tokens: Sequence[Sequence[str] | None]) -> Tensor:
+        """Computes features of captions."""
+        return self.network.text(clip_tokens(captions).to(self.network.mean.device))
+
+
 class OwnT2MExtractor(OwnExtractor):
     """An evaluator of Guo et al. 2022 trained with `make train EXP=t2m/...`."""
 
     trained, recipes = T2MTask, "t2m"
     task: T2MTask
+
+    def _reads(self, representation: Representation) -> bool:
+        own, used = self.task.representation, self.task.network.used  # it may see only features that both have
+        part = (representation.part_of, representation.fps) == (own.name, own.fps) and used <= representation.features
+        return part or super()._reads(representation)
 
     def motions(self, features: Tensor, joints: Tensor, mask: Tensor) -> dict[str, Tensor]:
         """Computes features of motions."""

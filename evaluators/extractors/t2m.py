@@ -153,6 +153,7 @@ class T2MEvaluator(nn.Module):
         embedding: int = 512,
         max_frames: int = 196,
         keep_padding: bool = False,
+        used_features: int | None = None,
     ):
         """Builds the networks; widths are those of the released weights.
 
@@ -167,12 +168,15 @@ class T2MEvaluator(nn.Module):
             max_frames: length to which every motion is padded.
             keep_padding: legacy option of MDM's code, which always samples 196 frames: the network sees the frames past
                 the end of a motion.
+            used_features: number of features that the network sees, from the first; MARDM's sees 67 (KIT: 64). None =
+                all but the contacts.
         """
         super().__init__()
         self.features, self.max_frames, self.keep_padding = embedding, max_frames, keep_padding
         self.register_buffer("mean", mean.float())
         self.register_buffer("std", std.float())
-        self.movement_encoder = _MovementEncoder(len(mean) - CONTACTS, movement_hidden, movement_latent)
+        self.used = used_features or len(mean) - CONTACTS
+        self.movement_encoder = _MovementEncoder(self.used, movement_hidden, movement_latent)
         self.text_encoder = _TextEncoder(text_hidden, embedding)
         self.motion_encoder = _Recurrent(movement_latent, motion_hidden, embedding)
 
@@ -188,12 +192,13 @@ class T2MEvaluator(nn.Module):
                 f"the T2M evaluator takes motions of {UNIT} to {self.max_frames} frames, "
                 f"but these have {int(lengths.min())} to {int(lengths.max())}"
             )
-        x = (x - self.mean) / self.std
+        used = slice(self.used)
+        x = (x[..., used] - self.mean[used]) / self.std[used]
         if not self.keep_padding:
             x = x * mask[..., None]
         x = pad_to(x[:, : self.max_frames], self.max_frames)
         with torch.no_grad():  # it is frozen when texts and motions are matched
-            movements = self.movement_encoder(x[..., :-CONTACTS])
+            movements = self.movement_encoder(x)
         return self.motion_encoder(movements, lengths // UNIT)
 
     def text(self, words: Words) -> Tensor:
@@ -266,12 +271,20 @@ def _read(path: Path) -> np.ndarray:
         raise ValueError(f"{path}: {error}") from error
 
 
+def read_statistics(path: Path) -> Tensor:
+    """Reads a mean or std (D,) that was released with an evaluator."""
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file. The evaluator needs the statistics released with it")
+    return torch.from_numpy(_read(path))
+
+
 def load_t2m(path: str | Path, mean: str | Path, std: str | Path, **options: Any) -> T2MEvaluator:
     """Loads the evaluator with the authors' weights.
 
     Args:
         path: text_mot_match/model/finest.tar of t2m or kit.
-        mean: the evaluator's mean.npy; in MDM, t2m_mean.npy or kit_mean.npy.
+        mean: the evaluator's mean.npy; in MDM, t2m_mean.npy or kit_mean.npy; in MARDM, eval_mean.npy, whose 67 or 64
+            features tell its evaluator apart.
         std: its std.npy.
         options: of `T2MEvaluator`.
 
@@ -279,11 +292,9 @@ def load_t2m(path: str | Path, mean: str | Path, std: str | Path, **options: Any
         FileNotFoundError: If a file does not exist.
         ValueError: If a file is damaged, or belongs to another data set.
     """
-    statistics = []
-    for file in (mean, std):
-        if not Path(file).is_file():
-            raise FileNotFoundError(f"{file}: no such file. The evaluator needs the statistics released with it")
-        statistics.append(torch.from_numpy(_read(Path(file))))
+    statistics = [read_statistics(Path(file)) for file in (mean, std)]
+    if len(statistics[0]) in (67, 64):  # MARDM's
+        options["used_features"] = len(statistics[0])
     network = T2MEvaluator(*statistics, **options)
     for name in ("movement_encoder", "text_encoder", "motion_encoder"):
         load_strictly(network.get_submodule(name), read_weights(path, name), path)

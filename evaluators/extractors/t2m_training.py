@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 from torchmetrics import MeanMetric
 
-from evaluators.extractors.t2m import CONTACTS, UNIT, LearnedWords, T2MEvaluator, WordVectors
+from evaluators.extractors.t2m import UNIT, LearnedWords, T2MEvaluator, WordVectors
 from evaluators.metrics.alignment import MotionsForText, MultimodalDistance, TextAndMotion
 from flame_mdm.conditions import Unconditional
 from flame_mdm.conditions.vocabulary import words as words_of
@@ -252,7 +252,7 @@ class T2MTask(Task):
     def _reconstruct(self, batch: MotionBatch) -> dict[str, Tensor]:
         """Returns loss terms (B,) of the movement autoencoder, over the real frames and vectors of each motion."""
         frames = batch.x.shape[1] // UNIT * UNIT
-        x, mask = batch.x[:, :frames, :-CONTACTS], batch.mask[:, :frames]
+        x, mask = batch.x[:, :frames, : self.network.used], batch.mask[:, :frames]
         latents = self.network.movement_encoder(x)
         units = mask[:, UNIT - 1 :: UNIT]
 

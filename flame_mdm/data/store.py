@@ -161,6 +161,7 @@ def _write(folder: Path, source: MotionSource, representation: Representation, t
                     writer.add(source.name, clip, features)
             writer.finish(source.name)
         mean, std = source.statistics() or writer.statistics(representation)
+        mean, std = mean[: representation.features], std[: representation.features]
         with writing(folder, partial):
             np.savez(partial / "statistics.npz", mean=mean, std=std)
             info = _describe(partial, source, representation, writer, mean, std)
@@ -301,7 +302,7 @@ def _chunks(clips: Iterable[Clip]) -> Iterator[list[Clip]]:
 def _encode(encoder: Representation, motions: Sequence[_Motion]) -> list[np.ndarray]:
     """Returns the features of motions; published features are only checked."""
     for name, encoded, _ in motions:
-        if encoded and encoded != encoder.name:
+        if encoded and encoded not in (encoder.name, encoder.part_of):
             raise ValueError(f"clip {name}: published as {encoded}, which cannot be converted to {encoder.name}")
     raw = [torch.from_numpy(np.ascontiguousarray(motion)) for _, encoded, motion in motions if not encoded]
     try:
@@ -313,6 +314,7 @@ def _encode(encoder: Representation, motions: Sequence[_Motion]) -> list[np.ndar
     arrays = []
     for name, encoded, motion in motions:
         features = np.asarray(motion if encoded else next(fresh).numpy(), np.float32)
+        features = features[:, : encoder.features] if encoded == encoder.part_of else features
         if features.ndim != 2 or features.shape[1] != encoder.features:
             raise ValueError(f"clip {name}: shape {features.shape}, not (frames, {encoder.features})")
         if not np.isfinite(features).all():

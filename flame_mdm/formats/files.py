@@ -18,13 +18,14 @@ from flame_mdm.formats.motion import AMASS_AXES, Motion, motion_of_poses
 from flame_mdm.formats.poses import Poses
 from flame_mdm.formats.resampling import between, check_frames, frame_rate, resample
 from flame_mdm.representations import rotation
+from flame_mdm.representations.motion272 import Motion272
 from flame_mdm.representations.skeleton import SKELETONS, SMPL22, Skeleton
 from flame_mdm.representations.smpl import ADULT, read_pose
 
 ENDINGS = (".npz", ".bvh", ".json", ".npy")
 CAMERA_AXES = torch.diag(torch.tensor([1.0, -1, -1], dtype=torch.float64))
 """Rotates the camera coordinates of the action data sets, y down, to y up."""
-ROTATED = {"smpl147": 147, "rot6d-25": 150}
+ROTATED = {"smpl147": 147, "rot6d-25": 150, "motion272": 272}
 """Representations that contain SMPL's rotations -> number of features."""
 KIMODO_FPS = 30.0
 JSON_LIMIT = 128 * MEBIBYTE
@@ -219,6 +220,9 @@ def _poses(data: dict[str, Any]) -> Poses | None:
     if data["features"].shape != expected:
         raise ValueError(f"features of shape {data['features'].shape}, but {representation} has {expected}")
     x = torch.from_numpy(data["features"]).double()
+    if representation == "motion272":
+        pelvis, turns = Motion272().poses(x)
+        return Poses(torch.tensor(ADULT[: len(SMPL22)], dtype=torch.float64), turns, pelvis)
     if representation == "smpl147":
         translation, rows, axes = x[:, :3], x[:, 3:], AMASS_AXES
     else:

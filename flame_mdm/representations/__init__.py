@@ -47,6 +47,8 @@ class Representation(nn.Module, ABC):
 
     mean: Tensor
     std: Tensor
+    part_of: str = ""
+    """Name of a representation whose first features these are, so that its published features can be cut."""
 
     def __init__(self, name: str, features: int, fps: float, skeleton: Skeleton):
         """`name` is saved in stores and checkpoints; features with different names are never mixed."""
@@ -92,3 +94,23 @@ class Representation(nn.Module, ABC):
     def to_joints(self, x: Tensor) -> Tensor:
         """Decodes normalized features (..., F, D) to joints (..., F, J, 3), meters, y up. Differentiable."""
         return self.decode(self.denormalize(x))
+
+
+SMALLEST_STD = 1e-4
+"""A group of features with a smaller std is constant up to rounding (positions in KIT's units round to 3e-5)."""
+
+
+def grouped_statistics(features: Tensor | Frames, groups: Iterable[slice]) -> tuple[Tensor, Tensor]:
+    """Returns the mean (D,) of each feature of frames (N, D), and the std averaged over each group of features.
+
+    A constant group (`SMALLEST_STD`) gets std 1, so that rounding errors are not amplified.
+    """
+    size, zero = 1 << 16, torch.zeros(())  # the frames of a data set would not fit in memory
+    mean = sum((chunk.double().sum(0) for chunk in features.split(size)), zero) / len(features)
+    squares = (chunk.double().sub_(mean).square_().sum(0) for chunk in features.split(size))
+    variance = sum(squares, zero) / len(features)
+    std = variance.sqrt()
+    for columns in groups:
+        average = std[columns].mean()
+        std[columns] = average if average > SMALLEST_STD else 1.0
+    return mean.float(), std.float()

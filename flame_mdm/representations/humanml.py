@@ -9,15 +9,12 @@ import torch.nn.functional as F
 from scipy.ndimage import gaussian_filter1d
 from torch import Tensor
 
-from flame_mdm.representations import Frames, Representation, rotation
+from flame_mdm.representations import Frames, Representation, grouped_statistics, rotation
 from flame_mdm.representations.skeleton import SKELETONS
 
 LEGACY_SMOOTHING_FRAMES = 20
 SMOOTHING_SECONDS = 1.0
 """Standard deviation of the Gaussian that removes arm swing from the heading: 20 frames at 20 fps, as published."""
-
-SMALLEST_STD = 1e-4
-"""A group of features with a smaller std is constant up to rounding (positions in KIT's units round to 3e-5)."""
 
 
 class HumanML(Representation):
@@ -147,18 +144,9 @@ class HumanML(Representation):
     def statistics(self, features: Tensor | Frames) -> tuple[Tensor, Tensor]:
         """Returns the mean of each feature, and the std averaged over each entry of `slices`.
 
-        Averaging preserves the relative scales within an entry. A constant entry (`SMALLEST_STD`) gets std 1, so that
-        rounding errors are not amplified.
+        Averaging preserves the relative scales within an entry.
         """
-        size, zero = 1 << 16, torch.zeros(())  # the frames of a data set would not fit in memory
-        mean = sum((chunk.double().sum(0) for chunk in features.split(size)), zero) / len(features)
-        squares = (chunk.double().sub_(mean).square_().sum(0) for chunk in features.split(size))
-        variance = sum(squares, zero) / len(features)
-        std = variance.sqrt()
-        for columns in self.slices.values():
-            average = std[columns].mean()
-            std[columns] = average if average > SMALLEST_STD else 1.0
-        return mean.float(), std.float()
+        return grouped_statistics(features, self.slices.values())
 
     def joint_features(self, joints: Iterable[int]) -> Tensor:
         """Returns (D,) bool, True for the features of these joints; the root features belong to joint 0.

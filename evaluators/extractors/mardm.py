@@ -1,0 +1,112 @@
+"""The CLIP-score evaluator of MARDM (Meng et al. 2025, "Rethinking Diffusion for Text-Driven Human Motion Generation").
+
+The networks load the released weights. MARDM's other evaluator is `evaluators.extractors.t2m` for 67 features.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from evaluators.extractors.released import load_strictly, read_weights
+from evaluators.extractors.t2m import read_statistics
+from flame_mdm.conditions.text import Pretrained
+from flame_mdm.denoisers.layers import sinusoid
+
+CLIP = ("openai/clip-vit-base-patch32", "3d74acf9a28c67741b2f4f2ea7635f0aaf6f0268")
+"""CLIP's tokenizer on the Hugging Face hub, the same for all sizes, and its commit."""
+
+
+def _transformer(width: int, heads: int, hidden: int, layers: int) -> nn.TransformerEncoder:
+    layer = nn.TransformerEncoderLayer(width, heads, hidden, 0.2, "gelu", batch_first=True)
+    return nn.TransformerEncoder(layer, layers, enable_nested_tensor=False)
+
+
+class _MotionEncoder(nn.Module):
+    """A transformer whose first token, which is learned, becomes the vector of the motion."""
+
+    def __init__(self, features: int, width: int, transformer: nn.TransformerEncoder):
+        super().__init__()
+        self.query_token = nn.Parameter(torch.zeros(1, width))
+        self.embed_motion, self.transformer = nn.Linear(features, width), transformer
+        self.out_ln, self.out = nn.LayerNorm(width), nn.Linear(width, 512)
+
+    def forward(self, x: Tensor, mask: Tensor) -> Tensor:
+        """(B, F, D) normalized, with mask (B, F) -> (B, 512)."""
+        hidden = torch.cat([self.query_token.expand(len(x), 1, -1), self.embed_motion(x)], 1)
+        hidden = hidden + sinusoid(torch.arange(hidden.shape[1], device=x.device), hidden.shape[2])
+        hidden = self.transformer(hidden, src_key_padding_mask=~F.pad(mask, (1, 0), value=True))
+        return self.out(self.out_ln(hidden[:, 0]))
+
+
+class MARDMClip(nn.Module):
+    """Embeds the essential features of motions, and captions, as vectors of length 1.
+
+    Args:
+        mean: (67,) of the features.
+        std: (67,) of the features.
+        width: of the transformers.
+        hidden: width of their linear layers.
+        layers: of each transformer.
+        heads: of each layer.
+        words: size of the vocabulary.
+        slots: tokens of a caption.
+    """
+
+    mean: Tensor
+    std: Tensor
+
+    def __init__(
+        self,
+        mean: Tensor,
+        std: Tensor,
+        *,
+        width: int = 512,
+        hidden: int = 1024,
+        layers: int = 8,
+        heads: int = 8,
+        words: int = 49408,
+        slots: int = 77,
+    ):
+        super().__init__()
+        self.register_buffer("mean", mean.float(), persistent=False)
+        self.register_buffer("std", std.float(), persistent=False)
+
+        self.motion_encoder = _MotionEncoder(len(mean), width, _transformer(width, heads, hidden, layers))
+        self.token_embedding = nn.Embedding(words, width)
+        self.positional_embedding = nn.Parameter(torch.zeros(slots, width))
+        self.textTransEncoder = _transformer(width, heads, hidden, layers)
+        self.text_ln, self.out = nn.LayerNorm(width), nn.Linear(width, 512)
+        self.logit_scale = nn.Parameter(torch.zeros(()))
+
+    def forward(self, x: Tensor, mask: Tensor) -> Tensor:
+        """Returns vectors (B, 512) of motions (B, F, D >= 67) in the data's units, with mask (B, F)."""
+        x = (x[..., : len(self.mean)] - self.mean) / self.std * mask[..., None]
+        return F.normalize(self.motion_encoder(x, mask), dim=-1)
+
+    def text(self, tokens: Tensor) -> Tensor:
+        """Returns vectors (B, 512) of captions, given as CLIP's tokens (B, S), 0 after the end."""
+        hidden = self.text_ln(self.textTransEncoder(self.token_embedding(tokens) + self.positional_embedding))
+        return F.normalize(self.out(hidden[torch.arange(len(tokens)), tokens.argmax(1)]), dim=-1)
+
+
+def clip_tokens(captions: Sequence[str]) -> Tensor:
+    """Returns CLIP's tokens (B, 77) of captions, 0 after the end; longer captions are cut."""
+    tokenizer = Pretrained(*CLIP, None, None).tokenizer
+    found = tokenizer(list(captions), padding="max_length", truncation=True, max_length=77, return_tensors="pt")
+    return found["input_ids"] * found["attention_mask"]
+
+
+def load_mardm_clip(path: Path, mean: Path, std: Path) -> MARDMClip:
+    """Loads the evaluator with the authors' weights: text_mot_match_clip/model/finest.tar, eval_mean and eval_std.
+
+    Raises:
+        FileNotFoundError: If a file does not exist.
+        ValueError: If a file is damaged, or belongs to another network.
+    """
+    network = MARDMClip(read_statistics(mean), read_statistics(std))
+    return load_strictly(network, read_weights(path, "contrast_model"), path)

@@ -1,0 +1,139 @@
+"""MotionStreamer's features: root velocity and turn, local joints and their velocities, SMPL's rotations."""
+
+from collections.abc import Iterable, Sequence
+from copy import deepcopy
+
+import torch
+from torch import Tensor
+
+from flame_mdm.representations import Features, Frames, Representation, grouped_statistics, rotation
+from flame_mdm.representations.skeleton import SMPL22, forward_kinematics
+from flame_mdm.representations.smpl import ADULT, read_pose
+
+
+class Motion272(Representation):
+    """272 features of Xiao et al. 2025 (MotionStreamer), one row per frame. Columns by name, in `slices`:
+
+    | name | width | content |
+    |---|---|---|
+    | root_velocity | 2 | x and z of the root's displacement from the last frame, in body coordinates of that frame |
+    | turn | 6 | rotation about y from the last frame's body coordinates to this frame's, 6D rows |
+    | positions | 66 | joints in body coordinates: the root is at x = z = 0, the lowest joint of the motion at y = 0 |
+    | velocities | 66 | differences of `positions` from the last frame: without the body's own motion and turn |
+    | rotations | 132 | SMPL's rotations as 6D rows, of the root in body coordinates |
+
+    In the first row, `turn` is the identity and velocities are 0. The heading is that of the root's rotation, so it
+    jumps when a body lies down. Motions begin at x = z = 0, facing +z. Raw motions are those of `read_pose`, whose z
+    axis is up; bones have the lengths of `offsets`, whereas the authors keep those of each subject.
+    """
+
+    def __init__(self, fps: float = 30.0, offsets: Sequence[Sequence[float]] = ADULT):
+        """`offsets` (24, 3) of the body, like `ADULT`; the first is from translation to pelvis."""
+        super().__init__("motion272", 272, fps, SMPL22)
+        ends = (0, 2, 8, 74, 140, 272)
+        names = ("root_velocity", "turn", "positions", "velocities", "rotations")
+        self.slices = {name: slice(*ends[i : i + 2]) for i, name in enumerate(names)}
+        self.offsets = offsets
+
+    def encode(self, motion: Tensor) -> Tensor:
+        """Encodes a raw motion (F, 3 + 3 K) as features (F, 272) float32.
+
+        Raises:
+            ValueError: fewer than 2 frames, or as in `read_pose`.
+        """
+        translation, rotations = read_pose(motion)
+        if len(motion) < 2:
+            raise ValueError("motion: 1 frame, but encoding needs at least 2; leave the motion out")
+        axes = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]], dtype=torch.float64)  # z up -> y up
+        rotations = torch.cat([(axes @ rotations[:, :1]), rotations[:, 1:22]], 1)
+        translation, rotations = face_forward(translation @ axes.T, rotations)
+        offsets = torch.tensor(self.offsets, dtype=torch.float64)[:22]
+        return self.features_of(
+            forward_kinematics(self.skeleton, rotations, offsets, translation + offsets[0]), rotations
+        )
+
+    def features_of(self, joints: Tensor, rotations: Tensor) -> Tensor:
+        """Returns features (F, 272) float32 of joints (F, 22, 3) and rotations (F, 22, 3, 3), y up, facing +z."""
+        joints = joints.double() - torch.stack([joints[0, 0, 0], joints[..., 1].min(), joints[0, 0, 2]])
+        inverse = _about_y(-_heading(rotations))
+        velocity = torch.zeros(len(joints), 3, dtype=torch.float64)
+        velocity[1:] = (inverse[:-1] @ joints[:, 0].diff(dim=0)[..., None])[..., 0]
+        turn = torch.eye(3, dtype=torch.float64).repeat(len(joints), 1, 1)
+        turn[1:] = inverse[1:] @ inverse[:-1].mT
+        local = joints - joints[:, :1] * joints.new_tensor([1.0, 0.0, 1.0])
+        local = local @ inverse.mT
+        moved = torch.zeros_like(local)
+        moved[1:] = local.diff(dim=0)
+        turned = torch.cat([(inverse @ rotations[:, 0])[:, None], rotations[:, 1:]], 1)
+        rows = [velocity[:, [0, 2]], rotation.matrix_to_rot6d(turn, "rows"), local.flatten(1), moved.flatten(1)]
+        return torch.cat([*rows, rotation.matrix_to_rot6d(turned, "rows").flatten(1)], 1).float()
+
+    def decode(self, features: Tensor) -> Tensor:
+        """Decodes velocity, turn and positions of features (..., F, 272) to joints (..., F, 22, 3). Differentiable."""
+        inverse, ground = self._root(features)
+        local = features[..., self.slices["positions"]].unflatten(-1, (22, 3))
+        return local @ inverse + ground[..., None, :]
+
+    def poses(self, features: Tensor) -> tuple[Tensor, Tensor]:
+        """Decodes features (..., F, 272) to the pelvis (..., F, 3) and SMPL's rotations (..., F, 22, 3, 3), y up."""
+        inverse, ground = self._root(features)
+        turned = rotation.rot6d_to_matrix(features[..., self.slices["rotations"]].unflatten(-1, (22, 6)), "rows")
+        height = features[..., self.slices["positions"]][..., 1:2] * features.new_tensor([0.0, 1.0, 0.0])
+        return ground + height, torch.cat(
+            [inverse.mT[..., None, :, :] @ turned[..., :1, :, :], turned[..., 1:, :, :]], -3
+        )
+
+    def _root(self, features: Tensor) -> tuple[Tensor, Tensor]:
+        """Returns rotations to body coordinates (..., F, 3, 3), and the root's x and z as vectors (..., F, 3)."""
+        inverse = rotation.rot6d_to_matrix(features[..., self.slices["turn"]], "rows")
+        step = 1
+        while step < features.shape[-2]:  # products of all turns so far, in log2(F) steps
+            inverse = torch.cat([inverse[..., :step, :, :], inverse[..., step:, :, :] @ inverse[..., :-step, :, :]], -3)
+            step *= 2
+        x, z = features[..., self.slices["root_velocity"]].unbind(-1)
+        velocity = torch.stack([x, torch.zeros_like(x), z], -1)
+        world = (velocity[..., 1:, None, :] @ inverse[..., :-1, :, :])[..., 0, :]
+        level = world * world.new_tensor([1.0, 0.0, 1.0])  # a generated turn need not be about y
+        return inverse, torch.cat([velocity[..., :1, :], level], -2).cumsum(-2)
+
+    def rebase(self, features: Features) -> Features:
+        """Sets the velocities and the turn in the first frame of cuts (..., F, D) to those of a complete motion."""
+        cut = deepcopy(features)
+        for name in ("root_velocity", "turn", "velocities"):
+            cut[..., 0, self.slices[name]] = 0.0
+        cut[..., 0, [2, 6]] = 1.0
+        return cut
+
+    def statistics(self, features: Tensor | Frames) -> tuple[Tensor, Tensor]:
+        """Returns the mean of each feature, and the std averaged over each entry of `slices`."""
+        return grouped_statistics(features, self.slices.values())
+
+    def joint_features(self, joints: Iterable[int]) -> Tensor:
+        """Returns (D,) bool, True for the features of these joints; velocity and turn of the root belong to joint 0."""
+        part = torch.zeros(22, dtype=torch.bool)
+        part[list(joints)] = True
+        return torch.cat([part[:1].expand(8), *(part.repeat_interleave(n) for n in (3, 3, 6))])
+
+
+def face_forward(translation: Tensor, rotations: Tensor) -> tuple[Tensor, Tensor]:
+    """Turns a motion, y up, about the origin, so that the root faces +z in the first frame.
+
+    Args:
+        translation: (F, 3).
+        rotations: (F, J, 3, 3), root first.
+
+    Returns:
+        Both, turned.
+    """
+    turn = _about_y(-_heading(rotations[:1]))
+    return translation @ turn[0].T, torch.cat([(turn @ rotations[:, 0])[:, None], rotations[:, 1:]], 1)
+
+
+def _heading(rotations: Tensor) -> Tensor:
+    """Returns the angle (F,) from +z towards +x of the z axis of the root, of rotations (F, J, 3, 3)."""
+    return torch.atan2(rotations[:, 0, 0, 2], rotations[:, 0, 2, 2])
+
+
+def _about_y(angle: Tensor) -> Tensor:
+    """(F,) -> rotations (F, 3, 3) about y."""
+    return rotation.axis_angle_to_matrix(angle[:, None] * angle.new_tensor([0.0, 1.0, 0.0]))

@@ -26,6 +26,7 @@ from flame_mdm.config import (
 )
 from flame_mdm.errors import UserError, first_line, say
 from flame_mdm.files import read_yaml, sha256, write_json
+from flame_mdm.reporting.audit import card_of
 from flame_mdm.reporting.tables import Request, count_lengths, requests
 from flame_mdm.runs import read_result
 
@@ -365,6 +366,7 @@ def _describe(
 
     info = data.store.info
     where = (model.representation if model else data.representation).mean.device
+    card = card_of(info["dataset"], extractor.sha256 if extractor else None)
     report: dict[str, Any] = {
         "format": FORMAT,
         "quick": request.quick,
@@ -387,6 +389,7 @@ def _describe(
         "extractor": extractor
         and {"path": str(request.extractor), "sha256": extractor.sha256, "data": extractor.fingerprint},
         "samples_sha256": None,
+        "audit": card.as_posix() if card else None,
         "baseline": request.baseline,
         "checkpoint": None,
         "device": torch.cuda.get_device_name(where) if where.type == "cuda" else "cpu",
@@ -465,6 +468,8 @@ def _show(report: Mapping[str, Any], out: Path) -> None:
         say(f"warning: {reason}")
     for reason in report["invalid_because"]:
         say(f"NOT VALID: {reason}")
+    if report["audit"] is None:
+        say(f"not audited: what this evaluator sees is not known. make audit DATA={report['data']['dataset']} tells")
     say(f"written: {out}")
 
 

@@ -148,6 +148,7 @@ class Result(Schema):
     warnings: list[str] = []
     cost: Cost | None = None
     skeleton: Skeleton | None = None
+    audit: str | None = None
 
     @property
     def stand_in_skeleton(self) -> bool:

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,8 @@ from evaluators.perturbations import PERTURBATIONS
 from evaluators.run import load_protocol
 from flame_mdm.__main__ import main
 from flame_mdm.data.synthetic import Synthetic
-from flame_mdm.reporting.audit import Seen, findings, read_card, seen, write_card
+from flame_mdm.reporting.audit import Seen, card_of, findings, read_card, seen, write_card
+from flame_mdm.reporting.rendering import Part, Table, fragment, markdown
 from flame_mdm.representations.humanml import HumanML
 from flame_mdm.runs import AuditCard, AuditedPerturbation, check_shape
 from flame_mdm.seeds import key
@@ -191,3 +193,19 @@ def test_an_audit_resumes_and_gives_the_same_card(tmp_path, monkeypatch, capsys)
     assert main([*words[:-2], "extractor=missing.ckpt", words[-1]]) == 1
     assert main(["audit", "data=synthetic"]) == 1
     assert "extractor=none" in capsys.readouterr().err
+
+
+def test_results_and_tables_link_to_the_card_of_their_extractor(card, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert card_of("x", "ab" * 32) is None
+    path, _ = write_card([card], Path("runs/audit"))
+    assert card_of("x", "ab" * 32) == path
+    assert card_of("x", None) is card_of("x", "cd" * 32) is None
+    part = Part(
+        "p", {}, [], [("a", f"extractor; audit {path}; <i>"), ("b", "not audited"), ("", f"https://e.com/{path}")]
+    )
+    table = Table("t", "t", [part], folder=Path("runs/tables"))
+    assert '<a href="../audit/x-abababababab.html">' in fragment(table)
+    assert fragment(table).count("<a ") == markdown(table).count("](") == 1
+    assert "](../audit/x-abababababab.html); " in markdown(table)
+    assert "&lt;i&gt;" in fragment(table)

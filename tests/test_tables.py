@@ -244,7 +244,7 @@ def test_footnotes_list_what_differs_and_group_rows(folder):
         (
             "a",
             "protocol synthetic version 1; test split of synthetic (fingerprint ffffffffffffffff); N = 400, 5 "
-            "replications; seed 0; extractor sha256 eeeeeeeeeeee",
+            "replications; seed 0; extractor sha256 eeeeeeeeeeee; not audited",
         ),
         ("b", "as a, but seed 1"),
     ]

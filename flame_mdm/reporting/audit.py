@@ -10,7 +10,7 @@ from pathlib import Path
 from flame_mdm.errors import markdown_text
 from flame_mdm.files import write_text
 from flame_mdm.reporting.page import interval, number, page, render
-from flame_mdm.runs import AuditCard, AuditedPerturbation, Result, read_json
+from flame_mdm.runs import AuditCard, AuditedPerturbation, read_json
 
 FOLDERS = (Path("docs/benchmarks/audit"), Path("runs/audit"))
 """Where the card of an extractor is looked for."""
@@ -72,9 +72,9 @@ def _name(dataset: str, sha256: str | None) -> str:
     return f"{dataset}-{sha256[:12] if sha256 else 'none'}"
 
 
-def card_of(result: Result) -> Path | None:
-    """Returns the card of the extractor of a result, or of metrics of joints; None if it was not audited."""
-    name = _name(result.data.dataset, result.extractor.sha256 if result.extractor else None)
+def card_of(dataset: str, sha256: str | None) -> Path | None:
+    """Returns the card of an extractor on a data set, or of metrics of joints; None if it was not audited."""
+    name = _name(dataset, sha256)
     return next((path for folder in FOLDERS if (path := folder / f"{name}.html").exists()), None)
 
 

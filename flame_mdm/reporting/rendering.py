@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import csv
 import io
+import os
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import groupby
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
@@ -29,6 +31,8 @@ KINDS = {
 }
 NO_RESULTS = ("NOT VALID", "QUICK")
 """States of rows whose values must not be mistaken for results."""
+CARD = re.compile(r"(?<![\w/.])((?:docs/benchmarks|runs)/audit/[\w.-]+\.html)")
+"""Paths of audit cards in footnotes."""
 SHARED = ("checkpoint sha256", "recipe", "sampler")
 """Facts that rows must have in common to be listed together as sources."""
 LEGEND = (
@@ -118,6 +122,16 @@ class Table:
     notes: list[str] = field(default_factory=list)
     drawn: dict[str, str] = field(default_factory=dict)
     """SVG of each figure that has points, by its name from `figure_names`."""
+    folder: Path = Path()
+    """Where it is written; links to audits are relative to it."""
+
+
+def _linked(table: Table, text: str) -> list[tuple[str, str]]:
+    """Splits a footnote into texts and their links; "" = no link."""
+    parts = CARD.split(text)
+    return [
+        (part, Path(os.path.relpath(part, table.folder)).as_posix() if i % 2 else "") for i, part in enumerate(parts)
+    ]
 
 
 def _blocks(part: Part) -> list[tuple[str, list[Line]]]:
@@ -173,7 +187,9 @@ def markdown(table: Table) -> str:
                 marks = f" <sup>{line.marks}</sup>" if line.marks else ""
                 page += f"| {markdown_text(_label(line))}{marks} | " + " | ".join(cells) + " |\n"
         for mark, text in part.notes:
-            page += f"\n{mark}: {markdown_text(text)}  " if mark else f"\n{markdown_text(text)}  "
+            parts = ((markdown_text(each), quote(link)) for each, link in _linked(table, text))
+            words = "".join(f"[{each}]({link})" if link else each for each, link in parts)
+            page += f"\n{mark}: {words}  " if mark else f"\n{words}  "
         page += "\n"
         for owner, _, name in figure_names(table):
             if owner is part and name in table.drawn:
@@ -291,6 +307,7 @@ def fragment(table: Table) -> Markup:
     """Returns the table as HTML, the body of a page."""
     figures = {part.name: [name for owner, _, name in figure_names(table) if owner is part] for part in table.parts}
     values = {"blocks": _blocks, "head": _head, "label": _label, "bad": NO_RESULTS, "figures": figures}
+    values["linked"] = _linked
     return render("table.html", table=table, sources=_sources(table), ranked=_is_ranked(table), **values)
 
 

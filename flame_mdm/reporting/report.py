@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import os
 import shlex
 from collections.abc import Mapping
 from pathlib import Path
 
 from flame_mdm.errors import UserError
 from flame_mdm.files import write_text
+from flame_mdm.reporting.audit import card_of
 from flame_mdm.reporting.page import interval, number, page, render
 from flame_mdm.reporting.plots import Curve, charts
 from flame_mdm.runs import FAULT, HISTORY, Fault, Provenance, Result, Run, Value, read_json, read_run
@@ -57,7 +59,8 @@ def write_report(folder: Path) -> Path:
         player=_player(run),
         step=int(run.samples.name.removeprefix("step_")) if run.samples else 0,
         evaluations=[
-            (evaluation_title(r), sampling(r), marks(r), r.not_computed, _values(r)) for r in run.results.values()
+            (evaluation_title(r), sampling(r), _card(folder, r), marks(r), r.not_computed, _values(r))
+            for r in run.results.values()
         ],
         groups=groups,
         history=HISTORY,
@@ -76,6 +79,12 @@ def write_report(folder: Path) -> Path:
 def last(curve: Curve) -> float | None:
     """Returns the last value of a curve; None if it is empty."""
     return curve[max(curve)] if curve else None
+
+
+def _card(folder: Path, result: Result) -> str:
+    """Returns the link from a run directory to the audit of the evaluator of a result; "" if there is none."""
+    card = card_of(result.data.dataset, result.extractor.sha256 if result.extractor else None)
+    return Path(os.path.relpath(card, folder)).as_posix() if card else ""
 
 
 def _facts(run: Run) -> list[str]:

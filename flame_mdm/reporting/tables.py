@@ -21,6 +21,7 @@ from pydantic import FailFast, Field, model_validator
 from flame_mdm.config import EXPERIMENTS, Config, plain, settings
 from flame_mdm.errors import UserError, did_you_mean, say
 from flame_mdm.files import read_yaml, write_json, write_text
+from flame_mdm.reporting.audit import card_of
 from flame_mdm.reporting.page import page
 from flame_mdm.reporting.plots import standalone
 from flame_mdm.reporting.rendering import WRITERS, Cell, Figure, Line, Part, Table, draw, figure_names, fragment, places
@@ -416,6 +417,7 @@ def _grouped(lines: Sequence[tuple[str, str]]) -> list[tuple[str, str]]:
 def _evaluation(result: Result, timed: bool) -> dict[str, str]:
     """Describes the evaluation of a result, and its time if that is shown. Only rows with the same one are compared."""
     protocol, data, extractor, cost = result.protocol, result.data, result.extractor, result.cost
+    card = card_of(data.dataset, extractor.sha256 if extractor else None)
     first = next((v for v in (result.values or {}).values() if v and v.n), None)  # later ones may have fewer motions
     changed = ", ".join(f"{k} = {v}" for k, v in result.changed.items())
     return {
@@ -426,6 +428,7 @@ def _evaluation(result: Result, timed: bool) -> dict[str, str]:
         "time": f"timed in batches of {cost.batch_size or 0:g} on {result.device}" if timed and cost else "",
         "seed": f"seed {result.seed}",
         "extractor": f"extractor sha256 {extractor.sha256[:12]}" if extractor else "no extractor",
+        "audit": f"audit {card.as_posix()}" if card else "not audited",
         "exclusions": _left_out(data.excluded),
         "skeleton": _joints_of(result),
         "changes": f"differs from the protocol: {changed}" if changed else "",
@@ -741,6 +744,7 @@ def _ratings(name: str, part: Config, reported: Config | None) -> Part:
 
 def write(table: Table, out: Path) -> str:
     """Writes a table in all formats and its figures; returns its HTML, without the head of the page."""
+    table.folder = out
     for part, figure, name in figure_names(table):
         if drawn := draw(part, figure, ABOUT):
             table.drawn[name] = drawn

@@ -24,6 +24,7 @@ from flame_mdm.config import Config
 from flame_mdm.editing import kept_parts
 from flame_mdm.errors import UserError
 from flame_mdm.motion import length_mask
+from flame_mdm.progress import ProgressBar
 from flame_mdm.representations import Representation
 from flame_mdm.seeds import key
 
@@ -208,30 +209,63 @@ class Evaluator:
         """
         if self.rank:
             return {}, {}
+        metrics, usable = self._metrics(generated, seed)
+        for begin in range(0, len(generated), CHUNK):
+            _update(usable, generated, paired, slice(begin, begin + CHUNK))
+        if "generated" in real.rows:
+            update_metrics(_two_sets(usable), real=real.rows["generated"], real_keys=real.rows["keys"])
+        return self._values(metrics)
+
+    def resample(
+        self, generated: Extracted, paired: Extracted, real: Extracted, seed: int, resamples: int
+    ) -> dict[str, list[float | None]]:
+        """Computes all metrics of `resamples` sets of motions drawn with replacement, for a bootstrap.
+
+        Both sets of comparisons of sets are drawn. The draws are functions of `seed` and the numbers of motions alone,
+        so that those of two models are of the same clips. Arguments as for `score`.
+
+        Returns:
+            (resamples,) values by name, None if not computable; empty in all processes but the first.
+        """
+        if self.rank or not len(generated) or not resamples:
+            return {}
+        metrics, usable = self._metrics(generated, seed)
+        # What each motion adds to the states of the metrics: a row of a list, or a part of a sum.
+        states = [(metric, state) for metric in usable.values() for state in metric._reductions]
+        sums: dict[tuple[Metric, str], list[Tensor]] = {
+            (metric, state): [] for metric, state in states if isinstance(getattr(metric, state), Tensor)
+        }
+        for i in range(len(generated)):
+            before = [getattr(metric, state).clone() for metric, state in sums]
+            _update(usable, generated, paired, slice(i, i + 1))
+            for (metric, state), old in zip(sums, before, strict=True):
+                sums[metric, state].append(getattr(metric, state) - old)
+        added = {where: torch.stack(parts) for where, parts in sums.items()}
+        lists = [(metric, state) for metric, state in states if (metric, state) not in sums and getattr(metric, state)]
+        added |= {(metric, state): torch.cat(getattr(metric, state)) for metric, state in lists}
+        generator = np.random.default_rng(key("bootstrap", seed))
+        drawn: list[dict[str, float | None]] = []
+        for _ in ProgressBar(range(resamples), desc="bootstrap", unit=" sets"):
+            own, others = (torch.from_numpy(generator.integers(n, size=n)) for n in (len(generated), len(real)))
+            for (metric, state), parts in added.items():
+                taken = torch.arange(len(own)) if state == "keys" else parts[own]  # a repeated motion has its own key
+                setattr(metric, state, taken.sum(0) if (metric, state) in sums else [taken])
+            for metric in _two_sets(usable).values():
+                for state, rows in (("real", real.rows["generated"][others]), ("real_keys", torch.arange(len(others)))):
+                    setattr(metric, state, [rows])
+            drawn.append(self._values(metrics)[0])
+        return {name: [values[name] for values in drawn] for name in drawn[0]}
+
+    def _metrics(self, generated: Extracted, seed: int) -> tuple[dict[str, Metric], dict[str, Metric]]:
+        """Returns all metrics, and those of them that can be computed."""
         metrics = make_metrics(self.metrics, seed=key("metric", seed) % 2**32)
-        usable = self.check(generated, metrics) if len(generated) else {}
-        sets = {name: metric for name, metric in usable.items() if isinstance(metric, TwoSets)}
-        others = {name: metric for name, metric in usable.items() if name not in sets}
         for metric in metrics.values():
             metric.distributed_available_fn = bool  # returns False: no synchronization, this process has all motions
-        for part in (slice(begin, begin + CHUNK) for begin in range(0, len(generated), CHUNK)):
-            rows = {name: values[part] for name, values in generated.rows.items()}
-            if sets:
-                update_metrics(sets, generated=rows["generated"], keys=rows["keys"])
-            joints, mask = _pad(generated.joints[part])
-            if generated.kept is not None:
-                rows["kept"] = pad_sequence(generated.kept[part], batch_first=True)
-            if "contacts" in rows:
-                rows["contacts"] = pad_sequence(rows["contacts"], batch_first=True)
-            rows |= {"joints": joints, "mask": mask}
-            if paired.joints:
-                rows["real_joints"], rows["real_mask"] = _pad(paired.joints[part])
-            rows |= {"references": paired.rows["references"][part]} if "references" in paired.rows else {}
-            if "generated" in paired.rows:
-                rows["real"] = paired.rows["generated"][part]
-            update_metrics(others, **rows)
-        if "generated" in real.rows:
-            update_metrics(sets, real=real.rows["generated"], real_keys=real.rows["keys"])
+            metric.compute_with_cache = False
+        return metrics, self.check(generated, metrics) if len(generated) else {}
+
+    def _values(self, metrics: Mapping[str, Metric]) -> tuple[dict[str, float | None], dict[str, str]]:
+        """Returns the values of metrics that have been updated, and the reasons for missing ones."""
         values: dict[str, float | None] = {}
         reasons: dict[str, str] = {}
         with warnings.catch_warnings():  # a metric without samples returns None
@@ -272,6 +306,30 @@ class Evaluator:
             elif not (self.skip_features and FEATURES.intersection(missing)):
                 raise UserError(missing_input(name, metric, missing[0]))
         return usable
+
+
+def _two_sets(metrics: Mapping[str, Metric]) -> dict[str, Metric]:
+    return {name: metric for name, metric in metrics.items() if isinstance(metric, TwoSets)}
+
+
+def _update(metrics: Mapping[str, Metric], generated: Extracted, paired: Extracted, part: slice) -> None:
+    """Updates metrics with some of the generated motions."""
+    rows = {name: values[part] for name, values in generated.rows.items()}
+    sets = _two_sets(metrics)
+    if sets:
+        update_metrics(sets, generated=rows["generated"], keys=rows["keys"])
+    joints, mask = _pad(generated.joints[part])
+    if generated.kept is not None:
+        rows["kept"] = pad_sequence(generated.kept[part], batch_first=True)
+    if "contacts" in rows:
+        rows["contacts"] = pad_sequence(rows["contacts"], batch_first=True)
+    rows |= {"joints": joints, "mask": mask}
+    if paired.joints:
+        rows["real_joints"], rows["real_mask"] = _pad(paired.joints[part])
+    rows |= {"references": paired.rows["references"][part]} if "references" in paired.rows else {}
+    if "generated" in paired.rows:
+        rows["real"] = paired.rows["generated"][part]
+    update_metrics({name: metric for name, metric in metrics.items() if name not in sets}, **rows)
 
 
 def _pad(joints: Sequence[Tensor]) -> tuple[Tensor, Tensor]:

@@ -330,6 +330,7 @@ class Protocol:
         world: int = 1,
         ground_truth: bool = True,
         force: bool = False,
+        resamples: int = 0,
     ) -> dict[str, Any]:
         """Evaluates real motions of all replications, and then the motions of the source.
 
@@ -346,11 +347,13 @@ class Protocol:
             rank, world: rank of this process, and number of processes.
             ground_truth: whether real motions are measured.
             force: generate even if real motions do not have the values that the protocol expects.
+            resamples: number of sets drawn from the motions of the first replication, for intervals by bootstrap.
 
         Returns:
-            "ground_truth" and "values": by metric, `mean`, `ci` (half width of the 95 % interval), `replications` and
-            `n` motions, each None if not computable; "not_computed": reasons by metric; "cost"; "seeds" of the draws
-            of metrics, by replication; "warnings"; "valid", "invalid_because" and "forced".
+            "ground_truth" and "values": by metric, `mean`, `ci` (half width of the 95 % interval), `replications`,
+            `n` motions and `each` value per replication, each None if not computable; of values, also `resampled`, the
+            values of the sets drawn by `resamples`; "not_computed": reasons by metric; "cost"; "seeds" of the draws of
+            metrics, by replication; "warnings"; "valid", "invalid_because" and "forced".
 
         Raises:
             UserError: If real motions do not have the expected values; nothing has been generated.
@@ -390,7 +393,7 @@ class Protocol:
             )
         report |= {"cost": _mean_cost([]), "warnings": []}
         if source is not None:
-            report |= self._measure(source, clips, evaluator, reference, seed, reasons)
+            report |= self._measure(source, clips, evaluator, reference, seed, reasons, resamples)
         if source is not None and several is not None:
             report["values"] |= self._measure_multimodality(source, clips, several, seed, reasons)
         if extractor is None and self.extractor is not None:
@@ -422,11 +425,13 @@ class Protocol:
         reference: Sequence[tuple[Extracted, Extracted]],
         seed: int,
         reasons: dict[str, str],
+        resamples: int,
     ) -> dict[str, Any]:
         """Returns the values of the source's motions, compared with the real motions of each replication."""
         found: list[tuple[dict[str, float | None], int]] = []
         costs: list[dict[str, float]] = []
         warnings: list[str] = []
+        resampled: dict[str, list[float | None]] = {}
         for replication, (paired, real) in enumerate(reference):
             rows = self.rows(clips, seed, replication)
             samples = source(f"rep_{replication}", rows, replication, evaluator.rank, evaluator.world)
@@ -441,7 +446,11 @@ class Protocol:
             reasons |= why
             if not replication:
                 warnings = self._warnings(generated, real)
-        return {"values": _summary(found), "cost": _mean_cost(costs), "warnings": warnings}
+                resampled = evaluator.resample(generated, paired, real, key("draws", seed, 0), resamples)
+        table = _summary(found)
+        for name, drawn in resampled.items():
+            table[name]["resampled"] = drawn
+        return {"values": table, "cost": _mean_cost(costs), "warnings": warnings}
 
     def _measure_multimodality(
         self, source: Source, clips: Clips, evaluator: Evaluator, seed: int, reasons: dict[str, str]
@@ -523,9 +532,10 @@ def _summary(found: Sequence[tuple[Mapping[str, float | None], int]]) -> dict[st
     """Returns means over replications; None if one replication has no value."""
     table = {}
     for name in found[0][0] if found else ():
-        values = [value for replication, _ in found if (value := replication[name]) is not None]
-        mean, ci = mean_ci(values) if len(values) == len(found) else (None, None)
-        table[name] = {"mean": mean, "ci": ci, "replications": len(found), "n": found[0][1]}
+        each = [values[name] for values, _ in found]
+        known = [value for value in each if value is not None]
+        mean, ci = mean_ci(known) if len(known) == len(each) else (None, None)
+        table[name] = {"mean": mean, "ci": ci, "replications": len(found), "n": found[0][1], "each": each}
     return table
 
 

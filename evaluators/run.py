@@ -40,6 +40,7 @@ if TYPE_CHECKING:  # commands check their keys before torch is imported
     from flame_mdm.task import MotionGeneration
 
 FORMAT = 1
+MIN_RESAMPLES = 100
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,6 +64,7 @@ class EvaluationRequest:
     seed: int = 0
     replications: int | None = None
     samples: int | None = None
+    resamples: int = 0
     multimodality: bool = True
     quick: bool = False
     force: bool = False
@@ -99,6 +101,8 @@ class EvaluationRequest:
             raise UserError("from_samples evaluates all motions of the files. Remove quick, samples and replications")
         if self.split not in ("train", "val", "test"):
             raise UserError(f"unknown split: {self.split}. Choose train, val or test")
+        if self.resamples and self.resamples < MIN_RESAMPLES:
+            raise UserError(f"resamples={self.resamples}: give 0, or {MIN_RESAMPLES} or more for a 95 % interval")
         if self.batch_size is not None and self.batch_size < 1:
             raise UserError(f"batch_size={self.batch_size}: must be at least 1")
         if self.guidance_scale is not None and not math.isfinite(self.guidance_scale):
@@ -197,6 +201,7 @@ def _evaluate(request: EvaluationRequest, rank: int, world: int, device: str) ->
         rank=rank,
         world=world,
         force=request.force,
+        resamples=request.resamples,
     )
     if rank:
         return

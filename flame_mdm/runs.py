@@ -57,12 +57,18 @@ class ClosedSchema(Schema):
 
 
 class Value(Schema):
-    """A metric over replications: mean, half-width of its 95 % interval, number of motions; None if not computable."""
+    """A metric over replications: mean, half-width of its 95 % interval, number of motions; None if not computable.
+
+    `each` is the value of each replication, and `resampled` that of each set of a bootstrap over the motions of the
+    first one. Results of earlier versions have neither.
+    """
 
     mean: Number | None
     ci: Number | None
     replications: Int | None
     n: Int | None
+    each: list[Number | None] = []
+    resampled: list[Number | None] = []
 
 
 class Protocol(Schema):

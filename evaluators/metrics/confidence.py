@@ -5,6 +5,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from flame_mdm.reporting.intervals import percentiles
+
 
 def mean_ci(values: Sequence[float]) -> tuple[float, float]:
     """Returns the mean of R replications, and the half width of its 95 % confidence interval.
@@ -38,9 +40,7 @@ def bootstrap(
 ) -> Interval:
     """Returns a statistic of `count` motions, with its 95 % interval by bootstrap over the motions.
 
-    Efron and Tibshirani 1993, chapter 13: percentiles over sets drawn with replacement. They are shifted so that the
-    mean over the sets is at the value of all motions, because Fréchet distances of sets with repetitions are larger
-    (section 10.6): the interval is that of the value for `count` motions.
+    Sets are drawn with replacement; the interval is that of `flame_mdm.reporting.intervals.percentiles`.
 
     For a difference of two models on the same texts and noise, the statistic subtracts both values of the same indices,
     `lambda i: fid(a[i]) - fid(b[i])`. The interval is then as narrow as the two are alike.
@@ -60,5 +60,4 @@ def bootstrap(
     generator = np.random.default_rng(seed)
     value = np.asarray(statistic(np.arange(count)), np.float64)
     drawn = np.stack([np.asarray(statistic(generator.integers(count, size=count))) for _ in range(resamples)])
-    low, high = np.percentile(drawn, (2.5, 97.5), axis=0) - drawn.mean(0) + value
-    return Interval(value, low, high)
+    return Interval(value, *percentiles(drawn, value))

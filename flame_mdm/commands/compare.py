@@ -12,12 +12,13 @@ from flame_mdm.commands.sample import read_prompts
 from flame_mdm.config import Config, run
 from flame_mdm.errors import UserError, say
 from flame_mdm.files import write_json, write_text
-from flame_mdm.reporting.compare import MOTIONS, ComparedRun, Prompt, comparison, find
+from flame_mdm.reporting.compare import HEAD, MOTIONS, ComparedRun, Prompt, comparison, find, grouped, in_common, tested
 from flame_mdm.reporting.report import paths
 from flame_mdm.reporting.study import QUESTION, rating_page, tally
 
 if TYPE_CHECKING:
     from flame_mdm.formats.motion import Motion
+    from flame_mdm.runs import Run
 
 USAGE = """
 usage: flame-mdm compare runs="A B C" [texts="a person walks; a person jumps"]
@@ -25,6 +26,8 @@ usage: flame-mdm compare runs="A B C" [texts="a person walks; a person jumps"]
        flame-mdm compare ratings="ann.json bob.json" out=ratings.json
 
 Compares runs side by side on one page: configuration differences, curves, evaluations and motions for the same prompts.
+If the runs have results of the same protocol, data and extractor, prints the difference of each metric with its 95 %
+intervals, and whether it is shown.
 rate=true writes a blind user study instead: a page that asks which of two motions fits a text better. ratings= counts
 the answers. FOLDER holds motion files, for example real motions: unless texts= is given, the runs are then sampled for
 the captions of these motions, at their lengths. Keys, with their defaults: experiments/compare.yaml
@@ -57,6 +60,7 @@ def compare(config: Config) -> None:
         out, content = Path(config["out"] or "runs/rate.html"), rating_page(compared, shown, config["seed"])
     else:
         out, content = Path(config["out"] or "runs/compare.html"), comparison(compared, shown)
+        say(*_tested({c.label: c.run for c in compared if c.run is not None}))
     write_text(out, content)
     say(out)
 
@@ -70,6 +74,16 @@ main = partial(
     text=("runs", "texts", "ratings", "out"),
     kinds={"seconds": "float", "seed": "int"},
 )
+
+
+def _tested(runs: Mapping[str, Run]) -> list[str]:
+    """Returns lines about the differences of evaluations that two runs have in common."""
+    lines = in_common(runs)
+    for title, columns in grouped(runs).items():
+        for heading, rows in tested(columns):
+            cells = [[*HEAD], *rows] if rows else []
+            lines += [title, heading, *("{:34}{:>12}{:>26}{:>26}  {}".format(*row) for row in cells), ""]
+    return lines
 
 
 def motions(compared: Sequence[ComparedRun], config: Config) -> list[dict[Prompt, Motion]]:

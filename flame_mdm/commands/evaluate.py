@@ -36,6 +36,7 @@ main = partial(
         **SAMPLING,
         "strength": "float",
         "replications": "int",
+        "resamples": "int",
         "batch_size": "int",
         "multimodality": "bool",
         "quick": "bool",

@@ -6,14 +6,17 @@ import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
 
 from flame_mdm.config import flatten
 from flame_mdm.errors import UserError
+from flame_mdm.reporting.intervals import paired_difference, percentiles
 from flame_mdm.reporting.page import number, page, render
 from flame_mdm.reporting.plots import Curve, charts
 from flame_mdm.reporting.report import charted, evaluation_title, last, marks, printed, sampling
-from flame_mdm.runs import CONFIG, Result, Run, read_run
+from flame_mdm.runs import CONFIG, Result, Run, Value, read_run
 
 if TYPE_CHECKING:
     from markupsafe import Markup
@@ -77,6 +80,9 @@ def comparison(compared: Sequence[ComparedRun], shown: Sequence[Mapping[Prompt, 
         differences=_differences(runs),
         player=_player(compared, shown),
         evaluations=_evaluations(runs),
+        unpaired=in_common(runs),
+        columns=HEAD,
+        explained=EXPLAINED,
         groups=_charts(runs),
     )
     return page("Comparison", body)
@@ -117,15 +123,121 @@ def _player(compared: Sequence[ComparedRun], shown: Sequence[Mapping[Prompt, Mot
     return player_page(scene, "", columns=len(compared)) if scene else ""
 
 
-def _evaluations(runs: Mapping[str, Run]) -> list[tuple[str, list[str], list[list[str]], list[Any]]]:
-    """Returns title, column titles, rows and notes of each table. Only comparable results share a table."""
+class Difference(NamedTuple):
+    """A metric of two results on the same texts and noise: second - first, with 95 % intervals where computable."""
+
+    metric: str
+    mean: float
+    over_replications: tuple[float, float] | None
+    over_motions: tuple[float, float] | None
+
+    @property
+    def shown(self) -> str:
+        """Whether the difference is shown: all intervals must exclude 0."""
+        found = [interval for interval in (self.over_replications, self.over_motions) if interval is not None]
+        if not found:
+            return "not tested: one replication"
+        if all(low > 0 for low, _ in found):
+            return "higher"
+        return "lower" if all(high < 0 for _, high in found) else "no difference shown"
+
+    @property
+    def cells(self) -> list[str]:
+        """The row of a table."""
+        intervals = [
+            f"[{number(x[0])}, {number(x[1])}]" if x else "–" for x in (self.over_replications, self.over_motions)
+        ]
+        return [self.metric, number(self.mean), *intervals, self.shown]
+
+
+HEAD = ["", "difference", "95 % over replications", "95 % over motions", ""]
+"""Column titles of differences."""
+EXPLAINED = (
+    "Differences of motions for the same texts and noise. Over replications: other captions, crops and noise; over "
+    "motions: other test clips (flame-mdm evaluate ... resamples=200). Neither covers another training run. A "
+    "difference is shown if no interval contains 0; of 20 metrics that do not differ, one is shown by chance."
+)
+
+
+def differences(first: Result, second: Result) -> list[Difference] | str:
+    """Returns the differences of all metrics of two results of the same evaluation, or why there are none.
+
+    The interval over replications is Student's for the paired replications, whose captions, crops and noise differ. The
+    one over motions is a bootstrap over the test clips, from the sets that `flame-mdm evaluate resamples=...` drew.
+    """
+    if invalid := [*first.invalid_because, *second.invalid_because]:
+        return f"not compared: not valid: {invalid[0]}"
+    paired = [(r.seed, r.data.frames, r.skeleton) for r in (first, second)]
+    if paired[0] != paired[1]:
+        return "not compared: other seed, limits of length or skeleton, so that the motions are not paired"
+    values = [result.values or {} for result in (first, second)]
+    names = sorted(values[0].keys() & values[1].keys())
+    found = [_difference(name, values[0][name], values[1][name]) for name in names]
+    return [difference for difference in found if difference is not None] or (
+        "not compared: no metric has values per replication of the same number of motions. Results of earlier versions "
+        "have none: evaluate both again; motions are not generated again"
+    )
+
+
+def _difference(name: str, first: Value | None, second: Value | None) -> Difference | None:
+    if first is None or second is None or first.n != second.n:
+        return None
+    if (each := _paired(first.each, second.each)) is None:
+        return None
+    mean, low, high = paired_difference(*each)
+    over_motions = None
+    if (drawn := _paired(first.resampled, second.resampled)) is not None:
+        bounds = percentiles(drawn[1] - drawn[0], mean)
+        over_motions = (float(bounds[0]), float(bounds[1]))
+    return Difference(name, mean, (low, high) if len(each[0]) > 1 else None, over_motions)
+
+
+def _paired(first: Sequence[float | None], second: Sequence[float | None]) -> np.ndarray | None:
+    """Returns the values (2, N) that both have; None if there are none, or one is missing."""
+    count = min(len(first), len(second))
+    values = np.array([first[:count], second[:count]], np.float64)  # None becomes NaN
+    return values if values.size and not np.isnan(values).any() else None
+
+
+def grouped(runs: Mapping[str, Run]) -> dict[str, list[tuple[str, Result]]]:
+    """Returns the results of the same protocol, data and extractor with the labels of their runs, by title."""
     groups: dict[str, list[tuple[str, Result]]] = {}
     for label, found in runs.items():
         for result in found.results.values():
             title = f"{evaluation_title(result)}, data {result.data.fingerprint}"
             groups.setdefault(title, []).append((label, result))
+    return dict(sorted(groups.items()))
+
+
+def in_common(runs: Mapping[str, Run]) -> list[str]:
+    """Returns why no evaluation can be compared, one line per run; [] if two runs have the same evaluation."""
+    groups = grouped(runs)
+    if len(runs) < 2 or any(len({label for label, _ in columns}) > 1 for columns in groups.values()):
+        return []
+    lines = ["No evaluation in common: differences need the same protocol, data and extractor."]
+    for label, found in runs.items():
+        titles = [title for title, columns in groups.items() if columns[0][0] == label]
+        lines.append(
+            f"{label}: {'; '.join(titles) or f'no evaluation. To evaluate: make evaluate CKPT={found.folder}'}"
+        )
+    return lines
+
+
+def tested(columns: Sequence[tuple[str, Result]]) -> list[tuple[str, list[list[str]]]]:
+    """Returns titles and rows of the differences of each result from the first; see `HEAD`."""
+    (first, base), *others = columns
     tables = []
-    for title, columns in sorted(groups.items()):
+    for place, (label, result) in enumerate(others, 2):
+        found = differences(base, result)
+        title = f"[{place}] {label} − [1] {first}"
+        tables.append((f"{title}: {found}", []) if isinstance(found, str) else (title, [each.cells for each in found]))
+    return tables
+
+
+def _evaluations(runs: Mapping[str, Run]) -> list[tuple[str, list[str], list[list[str]], list[Any], list[Any]]]:
+    """Returns title, column titles, rows, notes and differences of each table."""
+    tables = []
+    for title, columns in grouped(runs).items():
         results = [result for _, result in columns]
         real = results[0].ground_truth or {}
         rows = [
@@ -134,7 +246,7 @@ def _evaluations(runs: Mapping[str, Run]) -> list[tuple[str, list[str], list[lis
         ]
         heads = [f"{label} [{k}]" for k, (label, _) in enumerate(columns, 1)]
         notes = [(sampling(result), marks(result)) for result in results]
-        tables.append((title, ["", "real motions", *heads], rows, notes))
+        tables.append((title, ["", "real motions", *heads], rows, notes, tested(columns)))
     return tables
 
 

@@ -231,25 +231,25 @@ class Evaluator:
             return {}
         metrics, usable = self._metrics(generated, seed)
         # What each motion adds to the states of the metrics: a row of a list, or a part of a sum.
-        states = [(metric, state) for metric in usable.values() for state in metric._reductions]
-        sums: dict[tuple[Metric, str], list[Tensor]] = {
-            (metric, state): [] for metric, state in states if isinstance(getattr(metric, state), Tensor)
+        states = [(name, state) for name, metric in usable.items() for state in metric._reductions]
+        sums: dict[tuple[str, str], list[Tensor]] = {
+            (name, state): [] for name, state in states if isinstance(getattr(usable[name], state), Tensor)
         }
         for i in range(len(generated)):
-            before = [getattr(metric, state).clone() for metric, state in sums]
+            before = {(name, state): getattr(usable[name], state).clone() for name, state in sums}
             _update(usable, generated, paired, slice(i, i + 1))
-            for (metric, state), old in zip(sums, before, strict=True):
-                sums[metric, state].append(getattr(metric, state) - old)
+            for name, state in sums:
+                sums[name, state].append(getattr(usable[name], state) - before[name, state])
         added = {where: torch.stack(parts) for where, parts in sums.items()}
-        lists = [(metric, state) for metric, state in states if (metric, state) not in sums and getattr(metric, state)]
-        added |= {(metric, state): torch.cat(getattr(metric, state)) for metric, state in lists}
+        lists = [(name, state) for name, state in states if (name, state) not in sums and getattr(usable[name], state)]
+        added |= {(name, state): torch.cat(getattr(usable[name], state)) for name, state in lists}
         generator = np.random.default_rng(key("bootstrap", seed))
         drawn: list[dict[str, float | None]] = []
         for _ in ProgressBar(range(resamples), desc="bootstrap", unit=" sets"):
             own, others = (torch.from_numpy(generator.integers(n, size=n)) for n in (len(generated), len(real)))
-            for (metric, state), parts in added.items():
+            for (name, state), parts in added.items():
                 taken = torch.arange(len(own)) if state == "keys" else parts[own]  # a repeated motion has its own key
-                setattr(metric, state, taken.sum(0) if (metric, state) in sums else [taken])
+                setattr(usable[name], state, taken.sum(0) if (name, state) in sums else [taken])
             for metric in _two_sets(usable).values():
                 for state, rows in (("real", real.rows["generated"][others]), ("real_keys", torch.arange(len(others)))):
                     setattr(metric, state, [rows])

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.stats import ttest_rel
 from test_report import a_run, result, run
 from test_visualize import Page
 
@@ -17,6 +18,7 @@ from flame_mdm.__main__ import main
 from flame_mdm.commands.compare import read_texts
 from flame_mdm.errors import UserError
 from flame_mdm.reporting.compare import find
+from flame_mdm.reporting.intervals import paired_difference, percentiles
 from flame_mdm.reporting.study import tally
 
 PROMPTS = ("a person walks", "a person jumps", "a person <waves> & bows")
@@ -86,6 +88,75 @@ def test_a_page_puts_runs_side_by_side(three, tmp_path):
     assert "Quick run — not for publication" in text
     assert "mine/one 0.001953" in text, "curves are overlaid"
     assert page(three, tmp_path / "again.html") == text
+
+
+def of(mean: float, each: list[float], resampled: list[float], n: int = 64) -> dict[str, Any]:
+    return {"mean": mean, "ci": 0.1, "replications": len(each), "n": n, "each": each, "resampled": resampled}
+
+
+def test_paired_differences_are_those_of_student_and_of_the_draws():
+    first, second = np.random.default_rng(0).normal(size=(2, 9))
+    mean, low, high = paired_difference(first, second)
+    expected = ttest_rel(second, first)
+    assert mean == pytest.approx((second - first).mean())
+    assert (low, high) == pytest.approx(tuple(expected.confidence_interval(0.95)))
+    shifted = percentiles(np.arange(1001.0), 3.0)
+    assert shifted == pytest.approx((3 - 475, 3 + 475))
+
+
+def test_differences_are_shown_or_not(three, tmp_path, capsys):
+    draws = np.random.default_rng(0).normal(size=(2, 200))
+    same = {"fid": of(4.5, [4.4, 4.5, 4.6], [4.5 + x for x in draws[0]])}
+    values = {
+        # The noise of both is the same, so that a difference far below it is seen.
+        "fid": of(4.2, [4.1, 4.2, 4.31], [4.2 + x for x in draws[0]]),
+        "jitter": of(2.0, [2.0, 2.1, 1.9], []),
+        "few": of(2.0, [2.0], []),
+        "static": of(0.0, [0.0, 0.0, 0.0], [0.0] * 200),
+    }
+    other = {"jitter": of(1.9, [2.2, 1.5, 2.0], []), "few": of(1.0, [1.0], []), "static": values["static"]}
+    put(three[0], "x", values=same | other)
+    put(three[1], "x", values=values)
+    text = page(three[:2], tmp_path / "out.html")
+    lines = {line.split()[0]: line.split() for line in capsys.readouterr().out.splitlines() if line}
+    assert lines["fid"][1] == "-0.2967"
+    assert lines["fid"][-1] == "lower"
+    low, high = (float(x.strip("[],")) for x in lines["fid"][2:4])
+    assert low < -0.2967 < high < 0
+    assert lines["fid"][4:6] == ["[-0.2967,", "-0.2967]"]
+    assert lines["jitter"][-3:] == lines["static"][-3:] == ["no", "difference", "shown"]
+    assert lines["few"] == ["few", "1", "–", "–", "not", "tested:", "one", "replication"]
+    for words in (
+        "[2] mine/two − [1] mine/one",
+        "-0.2967",
+        "no difference shown",
+        "Neither covers another training run",
+    ):
+        assert words in text
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"seed": 1}, "not compared: other seed"),
+        ({"invalid_because": ["real motions are off"]}, "not compared: not valid: real motions are off"),
+        ({"values": {"fid": of(4.2, [4.1, 4.3], [], n=65)}}, "not compared: no metric has values per replication"),
+        ({"values": result()["values"]}, "evaluate both again; motions are not generated again"),
+        ({"protocol": {"name": "q", "version": 3}}, "mine/two: q version 3, synthetic test, data abc"),
+        ({"extractor": {"sha256": "0" * 64}}, "No evaluation in common"),
+        (None, "mine/two: no evaluation. To evaluate: make evaluate CKPT="),
+    ],
+)
+def test_what_is_not_paired_has_no_difference(three, tmp_path, capsys, changes, message):
+    values = {"fid": of(4.5, [4.4, 4.6], [])}
+    put(three[0], "x", values=values)
+    if changes is not None:
+        put(three[1], "x", **{"values": values, **changes})
+    text = page(three[:2], tmp_path / "out.html")
+    printed = capsys.readouterr().out
+    assert message in printed
+    assert message in unescape(text)
+    assert "95 %" not in printed
 
 
 @pytest.mark.tools

@@ -4,6 +4,7 @@ import json
 import math
 import os
 import pickle
+import re
 import shutil
 import signal
 import subprocess
@@ -33,6 +34,7 @@ from flame_mdm.errors import UserError
 from flame_mdm.motion import length_mask
 from flame_mdm.representations.rot6d import Rot6D
 from flame_mdm.runs import read_result
+from flame_mdm.seeds import key
 from flame_mdm.task import MotionGeneration
 
 pytestmark = pytest.mark.slow
@@ -112,6 +114,7 @@ def test_a_result_says_what_it_is_and_where_it_comes_from(runs, full):
     for name, value in result["values"].items():
         assert value["replications"] == 2
         assert value["n"] == (count if name != "multimodality" else 20 * 20)
+        assert value["mean"] is None or value["mean"] == pytest.approx(sum(value["each"]) / 2)
     assert result["values"]["attributes/action"]["ci"] is not None
     sha256 = protocol.sha256
     assert result["protocol"] == {"name": "synthetic", "version": 1, "sha256": sha256, "length_source": "ground truth"}
@@ -215,8 +218,9 @@ def test_other_metrics_need_no_new_motions(runs, full, tmp_path, monkeypatch):
     monkeypatch.setattr(Generator, "_generate", lambda *_: pytest.fail("sampled again"))
     model = full[1].parent / "model" / "checkpoints" / "last.ckpt"
     out = tmp_path / "result.json"
-    assert runs.evaluate(out, "replications=2", "extractor=none", model=model) == 0
+    assert runs.evaluate(out, "replications=2", "extractor=none", "resamples=100", model=model) == 0
     result = json.loads(out.read_text())
+    assert {len(value.pop("resampled", [])) for value in result["values"].values()} == {0, 100}  # not of multimodality
     of_joints = ("attributes", "foot_skating", "penetration", "floating", "jitter", "static_share")
     for name, value in result["values"].items():
         if name.startswith(of_joints):
@@ -311,6 +315,35 @@ def test_the_same_features_give_the_same_bits_in_any_order(runs, monkeypatch):
     assert other != values, "pools are drawn from the seed"
 
 
+def test_a_bootstrap_measures_each_motion_as_often_as_it_is_drawn(runs):
+    data = runs.data()
+    protocol = load_protocol("synthetic", data.representation)
+    extractor = protocol.open_extractor(str(runs.clip), data.representation, "synthetic")
+    metrics = {name: config for name, config in protocol.metrics.items() if name != "mid"}  # ill-conditioned
+    evaluator = Evaluator(extractor, metrics, data.representation)
+    first, second = (
+        evaluator.extract(protocol.motions(rows, real_motions(data.test, rows)))
+        for rows in (protocol.rows(data.test, 0, replication) for replication in range(2))
+    )
+
+    def taken(extracted: Extracted, indices: np.ndarray) -> Extracted:
+        rows = {
+            name: values[indices] if isinstance(values, torch.Tensor) else [values[i] for i in indices]
+            for name, values in extracted.rows.items()
+        }
+        return Extracted(rows | {"keys": torch.arange(len(indices))}, [extracted.joints[i] for i in indices])
+
+    drawn = evaluator.resample(first, first, second, 3, 2)
+    generator = np.random.default_rng(key("bootstrap", 3))
+    for number in range(2):
+        own, others = (generator.integers(len(first), size=len(first)) for _ in range(2))
+        values, _ = evaluator.score(taken(first, own), taken(first, own), taken(second, others), 3)
+        assert values.keys() == drawn.keys()
+        for name, value in values.items():
+            assert drawn[name][number] == (None if value is None else pytest.approx(value, rel=1e-5)), name
+    assert drawn["fid"][0] != drawn["fid"][1]
+
+
 def test_captions_crops_and_second_draws_are_functions_of_seed_replication_and_id(runs):
     data = runs.data()
     protocol = load_protocol("synthetic", data.representation)
@@ -367,6 +400,7 @@ def refused(runs: Runs, capsys, tmp_path: Path, *words: str) -> str:
 
 
 def test_what_does_not_fit_is_refused_in_one_line(runs, capsys, tmp_path):
+    assert "resamples=20: give 0, or 100 or more" in refused(runs, capsys, tmp_path, "resamples=20")
     assert "needs a feature extractor" in refused(runs, capsys, tmp_path, "extractor=null")
     assert "not a MotionCLIPTask" in refused(runs, capsys, tmp_path, f"extractor={runs.model}")
     assert "no such checkpoint" in refused(runs, capsys, tmp_path, f"extractor={tmp_path / 'none.ckpt'}")
@@ -529,6 +563,26 @@ def test_a_model_of_other_data_is_marked(runs, tmp_path):
     result = runs.result(out, *data, "quick=true", "extractor=none")
     assert not result["valid"]
     assert "splits may overlap" in result["invalid_because"][0]
+
+
+def test_an_extractor_that_may_have_seen_the_clips_is_marked(runs, tmp_path):
+    config, other = read_checkpoint(runs.model)["config"], tmp_path / "data"
+    config["data"] |= {"root": str(other), "source": config["data"]["source"] | {"clips": 240}}
+    instantiate(config["data"], representation=instantiate(config["representation"])).prepare_data()
+    quick = ["baseline=static", "data=synthetic", "protocol=synthetic", f"extractor={runs.clip}", "quick=true"]
+
+    def reasons(*words: str) -> list[str]:
+        out = tmp_path / "result.json"
+        assert main(["evaluate", *quick, f"out={out}", "device=cpu", *words]) == 0
+        result = json.loads(out.read_text())
+        assert result["valid"] == (not result["invalid_because"])
+        return result["invalid_because"]
+
+    (reason,) = reasons("data.source.clips=240", f"data_root={other}")
+    assert re.fullmatch(r"training data of the extractor \w+ and evaluated data \w+ differ: splits may overlap", reason)
+    same = ["data.source.clips=400", f"data_root={runs.folder / 'data'}"]
+    assert reasons(*same) == []
+    assert reasons(*same, "split=train") == ["the extractor was trained on the evaluated split, train"]
 
 
 @pytest.mark.parametrize("name", sorted(path.stem for path in (EXPERIMENTS / "evaluation").glob("*.yaml")))

@@ -256,6 +256,24 @@ def test_footnotes_list_what_differs_and_group_rows(folder):
     assert line.count("recipe synthetic/mdm") == 1
 
 
+def test_a_row_that_is_not_valid_is_reported_by_the_exit_code(folder, capsys):
+    words = [f"table={folder / 'spec.yaml'}", "evaluate=false", f"results={folder / 'results'}", f"out={folder / 'a'}"]
+    assert main(["tables", *words]) == 0
+    assert "NOT VALID" not in capsys.readouterr().err
+    (row,) = [asked[0] for row, asked in requests(_part(folder)) if row["label"] == "MFM"]
+    path = row.path(folder / "results")
+    reason = "training data of the extractor 1 and evaluated data 2 differ: splits may overlap"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"invalid_because": [reason], "valid": False}))
+    assert main(["tables", *words]) == 3
+    (line,) = [line for line in capsys.readouterr().err.splitlines() if "NOT VALID" in line]
+    assert line == f"NOT VALID: spec, Text-to-motion, MFM: {reason}"
+    (row,) = [line for line in (folder / "a" / "spec.md").read_text().splitlines() if line.startswith("| MFM")]
+    assert "(NOT VALID)" in row
+    assert "**" not in row, "not ranked"
+    best = next(line for line in (folder / "a" / "spec.md").read_text().splitlines() if line.startswith("| MDM"))
+    assert "**" in best
+
+
 def test_a_table_tells_how_its_checkpoints_were_chosen(folder):
     for row, asked in requests(_part(folder)):
         path = asked[0].path(folder / "results")

@@ -9,6 +9,8 @@ from flame_mdm.config import Config, run
 from flame_mdm.errors import UserError, say
 from flame_mdm.files import write_text
 
+INVALID = 3
+"""Exit code if a requested row is not valid."""
 USAGE = """
 usage: flame-mdm tables [table="NAME ..."] [evaluate=false] [out=FOLDER]
 
@@ -16,6 +18,7 @@ Renders tables and figures as Markdown, LaTeX, CSV and HTML. A table is describe
 your own file, which names checkpoints, a protocol and columns. Checkpoints without a result are evaluated first;
 evaluate=false uses existing results only. Without table=, all tables are rendered. Output is deterministic: the same
 results give the same bytes.
+Exit codes: 0; 1 = wrong input, or an evaluation failed; 3 = a requested row is NOT VALID, the tables are written.
 Keys, with their defaults: experiments/tables.yaml
 """
 
@@ -26,10 +29,11 @@ def tables(config: Config) -> None:
     Raises:
         UserError: If a spec is malformed, or an evaluation fails. After a failed evaluation, the tables are still
             written.
+        SystemExit: With code `INVALID` if a row is not valid; the tables are written, and each reason is printed.
     """
     from evaluators.run import evaluate_missing
     from flame_mdm.reporting.page import page, render
-    from flame_mdm.reporting.tables import build, load_spec, spec_names, write
+    from flame_mdm.reporting.tables import NOT_VALID, build, load_spec, spec_names, write
 
     names = str(config["table"]).split() if config["table"] is not None else spec_names()
     if not names:
@@ -40,16 +44,23 @@ def tables(config: Config) -> None:
     out = Path(config["out"])
     built = {name: build(name, spec, results) for name, spec in specs.items()}
     counts = {}
+    invalid = False
     for name, table in built.items():
         write(table, out)
         lines = [line for part in table.parts for line in part.lines if line.kind == "measured"]
         counts[name] = f"{sum(not line.state for line in lines)} of {len(lines)}"
         say(f"{name}: {counts[name]} rows measured: {out / name}.html, .md, .tex, .csv")
+        for part in table.parts:
+            for line in (line for line in part.lines if line.state == NOT_VALID):
+                invalid = True
+                say(f"NOT VALID: {name}, {part.name}, {line.label}: {line.facts['not valid because']}", error=True)
     if len(specs) > 1:
         write_text(out / "index.html", page("Tables", render("index.html", tables=built, measured=counts)))
         say(f"all tables: {out / 'index.html'}")
     if failed:
         raise UserError(f"{len(failed)} evaluations failed: {'; '.join(failed)}")
+    if invalid:
+        raise SystemExit(INVALID)
 
 
 main = partial(

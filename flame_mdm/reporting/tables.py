@@ -61,6 +61,8 @@ ABOUT = {
     "training_memory_gib": "peak memory of training, GiB",
 }
 """Labels of the values that a column may show besides metrics, and of the x-axes of figures."""
+NOT_VALID = "NOT VALID"
+"""State of a row that is shown, but not ranked."""
 MOST_ROWS, MOST_COLUMNS, MOST_FIGURES = 1_000, 100, 100
 """Limits of a table: rows after expanding lists of options, columns, and plots. Tables of papers have about 20 rows."""
 
@@ -466,7 +468,7 @@ def _line(row: Mapping[str, Any], found: Sequence[Result | None], values: Sequen
         if isinstance(value, int | float):
             line.options.setdefault(name, float(value))
     reasons = list(dict.fromkeys(reason for r in found if r is not None for reason in r.invalid_because))
-    line.state = "NOT VALID" if reasons else "QUICK" if first.quick else ""
+    line.state = NOT_VALID if reasons else "QUICK" if first.quick else ""
     checkpoint = first.checkpoint
     counts = {
         name: f"{entry.replications} x {entry.n}"

@@ -154,7 +154,7 @@ HEAD = ["", "difference", "95 % over replications", "95 % over motions", ""]
 """Column titles of differences."""
 EXPLAINED = (
     "Differences of motions for the same texts and noise. Over replications: other captions, crops and noise; over "
-    "motions: other test clips (flame-mdm evaluate ... resamples=200). Neither covers another training run. A "
+    "motions: other test clips (flame-mdm evaluate with resamples=200). Neither covers another training run. A "
     "difference is shown if no interval contains 0; of 20 metrics that do not differ, one is shown by chance."
 )
 

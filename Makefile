@@ -6,7 +6,7 @@
 PYTHON ?= python3
 VENV := .venv
 READY := $(VENV)/.ready
-COMMANDS := train sample edit evaluate audit tables benchmark prepare browse convert compare report import export push
+COMMANDS := train sample edit evaluate audit tables benchmark prepare browse inspect convert compare report import export push
 PYTEST := $(VENV)/bin/python -m pytest -n 2 --dist worksteal
 export MAKEFLAGS
 

@@ -19,6 +19,7 @@ COMMANDS = {
     "benchmark": "train, evaluate and tabulate a set of small models",
     "prepare": "convert a data set to a packed store, or verify a store",
     "browse": "show a prepared data set as a web page",
+    "inspect": "find physical faults of motions or of a data set",
     "convert": "convert a motion file",
     "compare": "compare runs side by side, or conduct a user study",
     "report": "write the report page of a run",

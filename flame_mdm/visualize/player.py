@@ -36,6 +36,7 @@ def player_page(
     columns: int = 0,
     groups: Sequence[str] = (),
     beside: Sequence[str] = (),
+    marks: Sequence[Sequence[tuple[int, int, str, str]]] = (),
 ) -> str:
     """Returns a self-contained HTML page that plays motions side by side in 3D, with a shared clock and camera.
 
@@ -52,9 +53,11 @@ def player_page(
         groups: for each motion, a name to filter by, such as its split; "" = none.
         beside: for each motion, the id of an earlier one to show it next to, such as the original of a mirrored copy;
             "" = none.
+        marks: for each motion, spans of its time line to mark: first frame, end (exclusive), kind and description.
     """
     blank = [""] * len(motions)
-    packed = [_packed(*each) for each in zip(motions, groups or blank, beside or blank, strict=True)]
+    rows = zip(motions, groups or blank, beside or blank, marks or [()] * len(motions), strict=True)
+    packed = [_packed(*each) for each in rows]
     # "<" never occurs in the data, so no caption can close the script element
     fitting = any(each["body"] for each in packed)
     content = {
@@ -68,7 +71,7 @@ def player_page(
     return re.sub("__(TITLE|ABOUT|COLUMNS|BODY|DATA)__", lambda match: content[match[1]], template)
 
 
-def _packed(motion: Shown, group: str, beside: str) -> dict[str, Any]:
+def _packed(motion: Shown, group: str, beside: str, marks: Sequence[tuple[int, int, str, str]]) -> dict[str, Any]:
     low, high = motion.joints.min((0, 1)).astype(float), motion.joints.max((0, 1)).astype(float)
     center = (low + high) / 2
     step = max(MILLIMETER, float((high - low).max()) / 65534)
@@ -78,6 +81,7 @@ def _packed(motion: Shown, group: str, beside: str) -> dict[str, Any]:
         "caption": shortened(motion.text),
         "group": group,
         "beside": beside,
+        "marks": list(marks),
         "fps": motion.fps,
         "frames": len(motion.joints),
         "parents": list(motion.skeleton.parents),

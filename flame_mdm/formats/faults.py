@@ -1,0 +1,121 @@
+"""Physical faults of motions: sliding feet, jumps, changing bones, penetration, impossible bends, freezing."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from scipy.ndimage import binary_opening
+
+from flame_mdm.formats.motion import Motion
+
+LOW = 0.05
+"""Height in meters above the floor below which a toe touches it."""
+LIMITS = {
+    "skating": (0.5, "m/s", "a toe near the floor (below 5 cm) slides for 0.4 s or more, longer than in a step"),
+    "pop": (200.0, "m/s^2", "a joint jumps: it accelerates and stops within two frames"),
+    "bone length": (0.1, "of its median", "a bone grows or shrinks, by at least 1 cm"),
+    "penetration": (0.05, "m", "a joint is below the floor, y = 0"),
+    "limit": (15.0, "degrees", "a knee bends forward, by more than this, or the angle in a knee or elbow is smaller"),
+    "frozen": (0.02, "m/s", "no joint moves faster, for a second or more"),
+}
+"""Fault -> limit, its unit, and what it is. docs/motion-faults.md has the share of real clips that each flags."""
+
+
+class Fault(NamedTuple):
+    """A fault of a joint, or of the body, in frames `start` to `end` (exclusive); `worst` in the unit of its limit."""
+
+    kind: str
+    joint: str
+    start: int
+    end: int
+    worst: float
+
+    def __str__(self) -> str:
+        unit = LIMITS[self.kind][1]
+        where = f"frame {self.start}" if self.end - self.start == 1 else f"frames {self.start} to {self.end - 1}"
+        return f"{self.kind}: {self.joint}, {where}, {self.worst:.3g} {unit} (limit {LIMITS[self.kind][0]:g})"
+
+
+def find_faults(motion: Motion) -> list[Fault]:
+    """Returns the faults of a motion, sorted by their first frame."""
+    joints, skeleton, fps = motion.joints.astype(float), motion.skeleton, motion.fps
+    names = skeleton.joints
+    step = np.linalg.norm(np.diff(joints, axis=0), axis=-1) * fps
+    found = [
+        *_runs("skating", names, *_skating(joints, skeleton.feet[1::2], fps), frames=math.ceil(0.4 * fps)),
+        *_runs("pop", names, *_pops(joints, fps)),
+        *_runs("bone length", names, *_stretched(joints, skeleton.edges)),
+        *_runs("penetration", names, -joints[..., 1] > LIMITS["penetration"][0], -joints[..., 1]),
+        *_runs("limit", names, *_bends(joints, names)),
+    ]
+    still = step.max(1, initial=0.0)[:, None]
+    frames = max(2, round(fps))
+    found += _runs("frozen", ("body",), still < LIMITS["frozen"][0], still, frames=frames)
+    return sorted(found, key=lambda fault: (fault.start, fault.kind, fault.joint))
+
+
+def _runs(kind: str, names: Sequence[str], flags: np.ndarray, values: np.ndarray, frames: int = 1) -> list[Fault]:
+    """Returns the runs of at least `frames` True in flags (F, J), with the largest of values (F, J)."""
+    found = []
+    for joint in np.flatnonzero(flags.any(0)).tolist():
+        flag = binary_opening(flags[:, joint], np.ones(frames)) if frames > 1 else flags[:, joint]
+        edges = np.flatnonzero(np.diff(np.r_[0, flag.astype(int), 0]))
+        for start, end in edges.reshape(-1, 2).tolist():
+            found.append(Fault(kind, names[joint], start, end, float(values[start:end, joint].max())))
+    return found
+
+
+def _skating(joints: np.ndarray, toes: Sequence[int], fps: float) -> tuple[np.ndarray, np.ndarray]:
+    speed = np.zeros(joints.shape[:2])
+    low = joints[:, toes, 1] < LOW
+    way = np.linalg.norm(np.diff(joints[:, toes][..., [0, 2]], axis=0), axis=-1) * fps
+    speed[:-1, toes] = way * (low[1:] & low[:-1])
+    return speed > LIMITS["skating"][0], speed
+
+
+def _pops(joints: np.ndarray, fps: float) -> tuple[np.ndarray, np.ndarray]:
+    """Finds frames in which a joint is far from the middle of its neighbors in time."""
+    size = np.zeros(joints.shape[:2])
+    size[1:-1] = np.linalg.norm(np.diff(joints, n=2, axis=0), axis=-1) * fps**2
+    return size > LIMITS["pop"][0], size
+
+
+def _stretched(joints: np.ndarray, edges: Sequence[tuple[int, int]]) -> tuple[np.ndarray, np.ndarray]:
+    change = np.zeros(joints.shape[:2])
+    flags = np.zeros(joints.shape[:2], bool)
+    for parent, joint in edges:
+        length = np.linalg.norm(joints[:, joint] - joints[:, parent], axis=-1)
+        usual = np.median(length)
+        change[:, joint] = np.abs(length - usual) / max(usual, 1e-6)
+        flags[:, joint] = (change[:, joint] > LIMITS["bone length"][0]) & (np.abs(length - usual) > 0.01)
+    return flags, change
+
+
+def _bends(joints: np.ndarray, names: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
+    """Finds knees that bend forward, judged by the direction of the foot, and knees and elbows folded into the limb."""
+    limit, flags, worst = LIMITS["limit"][0], np.zeros(joints.shape[:2], bool), np.zeros(joints.shape[:2])
+    for side in ("left", "right"):
+        for chain in (
+            (f"{side}_hip", f"{side}_knee", f"{side}_ankle"),
+            (f"{side}_shoulder", f"{side}_elbow", f"{side}_wrist"),
+        ):
+            upper, middle, lower = (joints[:, names.index(name)] for name in chain)
+            a, b = _unit(middle - upper), _unit(lower - middle)
+            bend = np.degrees(np.arccos(np.clip((a * b).sum(-1), -1, 1)))
+            at = names.index(chain[1])
+            flags[:, at], worst[:, at] = 180 - bend < limit, 180 - bend
+            if "knee" in chain[1]:
+                toes = _unit(joints[:, names.index(f"{side}_foot")] - lower)
+                front = toes - (toes * b).sum(-1, keepdims=True) * b
+                tilt = np.degrees(np.arcsin(np.clip(-(a * _unit(front)).sum(-1), -1, 1)))
+                forward = (tilt > limit) & (np.linalg.norm(front, axis=-1) > 0.5)  # a pointed foot has no front
+                flags[:, at] |= forward
+                worst[:, at] = np.where(forward, tilt, worst[:, at])
+    return flags, worst
+
+
+def _unit(vectors: np.ndarray) -> np.ndarray:
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-9)

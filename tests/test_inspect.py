@@ -1,0 +1,154 @@
+"""Faults of motions, and the command that shows them."""
+
+import json
+import math
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from flame_mdm.__main__ import main
+from flame_mdm.formats.faults import LIMITS, find_faults
+from flame_mdm.formats.motion import Motion
+from flame_mdm.representations.skeleton import SMPL22
+
+FPS, FRAMES = 20, 80
+HEIGHT = 0.9
+AT = {name: number for number, name in enumerate(SMPL22.joints)}
+
+
+def body() -> np.ndarray:
+    """Joints (80, 22, 3) of a body that stands on the floor, arms down, toes forward, and swings its arms."""
+    offsets = 0.1 * np.array(SMPL22.raw_offsets, float)
+    offsets[[4, 5, 7, 8], 1] = -0.4
+    offsets[[18, 19, 20, 21], 1] = -0.25
+    pose = np.zeros((22, 3))
+    for joint, parent in enumerate(SMPL22.parents):
+        pose[joint] = pose[parent] + offsets[joint] if parent >= 0 else 0
+    pose[:, 1] -= pose[:, 1].min()
+    joints = np.repeat(pose[None], FRAMES, 0)
+    swing = 0.5 * np.sin(2 * math.pi * np.arange(FRAMES) / FPS)
+    for side in ("left", "right"):
+        shoulder = joints[:, AT[f"{side}_shoulder"]]
+        for name in ("elbow", "wrist"):
+            arm = np.linalg.norm(joints[:, AT[f"{side}_{name}"]] - shoulder, axis=-1)
+            way = np.stack([np.zeros(FRAMES), -np.cos(swing), np.sin(swing)], 1)
+            joints[:, AT[f"{side}_{name}"]] = shoulder + arm[:, None] * way
+    return joints
+
+
+def kinds(joints: np.ndarray) -> set[tuple[str, str, int, int]]:
+    return {fault[:4] for fault in find_faults(Motion(joints, FPS))}
+
+
+def test_a_sound_motion_has_no_faults():
+    assert not find_faults(Motion(body(), FPS))
+
+
+def slide(joints: np.ndarray, frames: int) -> None:
+    joints[20 : 20 + frames, :, 0] += np.linspace(0, 0.05 * (frames - 1), frames)[:, None]  # 1 m/s
+    joints[20 + frames :, :, 0] += 0.05 * (frames - 1)
+
+
+def pop(joints: np.ndarray) -> None:
+    joints[30, AT["head"], 1] += 0.4
+
+
+def stretch(joints: np.ndarray) -> None:
+    joints[30:40, AT["head"]] += 0.5 * (joints[30:40, AT["head"]] - joints[30:40, AT["neck"]])
+
+
+def sink(joints: np.ndarray) -> None:
+    joints[30:40, :, 1] -= 0.06
+
+
+def knee(joints: np.ndarray) -> None:
+    joints[30:40, AT["left_hip"], 2] += 0.3  # the hip in front of the knee
+
+
+def fold(joints: np.ndarray) -> None:
+    joints[30:40, AT["left_wrist"]] = joints[30:40, AT["left_shoulder"]]
+
+
+def freeze(joints: np.ndarray) -> None:
+    joints[30:60] = joints[30]
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        (lambda joints: slide(joints, 9), {("skating", f"{side}_foot", 20, 28) for side in ("left", "right")}),
+        (lambda joints: slide(joints, 8), set()),  # as long as a step
+        (pop, {("pop", "head", 30, 31)}),
+        (stretch, {("bone length", "head", 30, 40)}),
+        (sink, {("penetration", f"{side}_{part}", 30, 40) for side in ("left", "right") for part in ("ankle", "foot")}),
+        (knee, {("limit", "left_knee", 30, 40)}),
+        (fold, {("limit", "left_elbow", 30, 40)}),
+        (freeze, {("frozen", "body", 30, 60)}),
+    ],
+)
+def test_faults_are_found_where_they_are(change: Callable[[np.ndarray], None], expected: set):
+    joints = body()
+    change(joints)
+    found = kinds(joints)
+    names = {kind for kind, *_ in expected}
+    assert {fault for fault in found if fault[0] in names} == expected
+    assert names <= LIMITS.keys()
+    if not expected:
+        assert not found
+
+
+def test_knees_may_bend_backward():
+    joints = body()
+    joints[:, AT["left_knee"], 2] += 0.3
+    assert not {fault for fault in kinds(joints) if fault[0] == "limit"}
+
+
+def page(path: Path) -> list[dict]:
+    match = re.search(r'<script type="application/json" id="data">(.*?)</script>', path.read_text(encoding="utf-8"))
+    assert match is not None
+    return json.loads(match[1])
+
+
+def test_the_command_prints_faults_marks_them_and_exits_with_3(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    joints = body()
+    Motion(joints, FPS).save("motions/good.npz")
+    sink(joints)
+    Motion(joints, FPS).save("motions/bad.npz")
+    assert main(["inspect", "motions/good.npz"]) == 0
+    assert "good: 0 of 1 motions with faults" in capsys.readouterr().out
+    assert main(["inspect", "motions", "both.html"]) == 3
+    printed = capsys.readouterr().out
+    assert "penetration: left_foot, frames 30 to 39, 0.06 m (limit 0.05)" in printed
+    assert "motions: 1 of 2 motions with faults" in printed
+    shown = page(tmp_path / "both.html")
+    assert [motion["id"] for motion in shown] == ["bad", "good"], "the worst first"
+    assert [30, 40, "penetration"] in [mark[:3] for mark in shown[0]["marks"]]
+    assert not shown[1]["marks"]
+
+
+def test_nothing_to_inspect_is_an_error(tmp_path, capsys):
+    (tmp_path / "empty").mkdir()
+    for words, message in (
+        ([], "no data set named"),
+        ([str(tmp_path / "empty")], "the folder has no motion files"),
+        ([str(tmp_path / "absent.npz")], "absent.npz"),
+        (["bandia"], "bandia"),
+        ([str(tmp_path / "absent.npz"), "clips=0"], "clips=0: must be at least 1"),
+    ):
+        assert main(["inspect", *words]) in (1, 2)
+        assert message in "".join(capsys.readouterr()) or not words
+
+
+def test_a_data_set_is_inspected(tmp_path, capsys):
+    data = ["data.source.clips=40", f"data_root={tmp_path}"]
+    assert main(["prepare", "synthetic", *data]) == 0
+    capsys.readouterr()
+    assert main(["inspect", "synthetic", str(tmp_path / "page.html"), "clips=3", *data]) == 0
+    printed = capsys.readouterr().out
+    assert "0 of 40 motions with faults" in printed
+    assert "the 3 worst motions" in printed
+    assert len(page(tmp_path / "page.html")) == 3

@@ -13,6 +13,7 @@ from torch.nn.utils.rnn import pad_sequence
 
 from evaluators.extractors.motion_clip import MotionCLIPTask, info_nce
 from evaluators.near_misses import near_misses
+from evaluators.perturbations import encode
 from flame_mdm.config import Config
 from flame_mdm.errors import UserError
 from flame_mdm.motion import MotionBatch
@@ -149,27 +150,12 @@ def noisy_copies(representation: HumanML, x: Tensor, lengths: Tensor, strength: 
     half, frames = (len(x) + 1) // 2, lengths.tolist()
     joints = representation.to_joints(x[:half]).cpu()
     noisy = [
-        motion[:length] + JITTER * amount * torch.randn(length, *motion.shape[1:])
+        (motion[:length] + JITTER * amount * torch.randn(length, *motion.shape[1:])).numpy()
         for motion, length, amount in zip(joints, frames, strength, strict=False)
     ]
-    copies = [representation.normalize(motion.to(x.device)) for motion in encode_windows(representation, noisy)]
+    encoded = (torch.from_numpy(features).to(x.device) for features in encode(representation, noisy))
+    copies = [representation.normalize(features) for features in encoded]
     for motion, length, amount in zip(x[half:], frames[half:], strength[half:], strict=True):
         noise = FEATURE_NOISE * amount * torch.randn(length, x.shape[2])
         copies.append(motion[:length] + noise.to(x.device))
     return F.pad(pad_sequence(copies, batch_first=True), (0, 0, 0, x.shape[1] - max(frames)))
-
-
-def encode_windows(representation: HumanML, motions: Sequence[Tensor]) -> list[Tensor]:
-    """Encodes joints (F, J, 3) as features (F, D) float32, at their own height.
-
-    The representation needs one more frame, which continues the last step, and puts the lowest joint of a motion on the
-    floor: noise would raise all motions, and heights alone would reveal it.
-    """
-    longer = [torch.cat([x, 2 * x[-1:] - x[-2:-1]]) for x in motions]
-    encoded = representation.encode_many(longer)
-    height, positions = representation.slices["root_height"], representation.slices["positions"]
-    for joints, features in zip(motions, encoded, strict=True):
-        rise = joints[0, 0, 1] * representation.units_per_metre - features[0, height]
-        features[:, height] += rise
-        features[:, positions.start + 1 : positions.stop : 3] += rise
-    return encoded

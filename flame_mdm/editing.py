@@ -15,6 +15,7 @@ from torch import Tensor
 from flame_mdm.data.store import Store
 from flame_mdm.errors import UserError, did_you_mean
 from flame_mdm.formats.body import check_size, leg_length
+from flame_mdm.formats.cleanup import cleaned
 from flame_mdm.formats.files import ENDINGS, from_array, read
 from flame_mdm.formats.layouts import find_skeleton
 from flame_mdm.formats.motion import Motion
@@ -78,6 +79,7 @@ def edit(
     samples: int = 1,
     seed: int = 0,
     stages: list[Motion] | None = None,
+    cleanup: bool = False,
     **sampling: Unpack[Sampling],
 ) -> list[Edited]:
     """Resamples part of a motion: `joints` in `region`, each by default all; with `strength`, as a variation of it.
@@ -100,7 +102,8 @@ def edit(
         resample: for FLAME's methods, how many times each step is repeated.
         strength: starts from the motion itself with noise added, and takes this fraction of the sampling steps, in
             (0, 1]: the smaller, the closer to the motion. Without region and joints, the entire motion is varied.
-        samples, seed, stages, sampling: as in `generate`.
+        samples, seed, stages, cleanup, sampling: as in `generate`. `cleanup` also changes the kept part, by millimeters
+            as a rule; `joint_error` says by how much.
 
     Raises:
         UserError: the mask keeps everything or nothing, a name is unknown, the process does not support the method, the
@@ -147,16 +150,14 @@ def edit(
     )
     # Normalization rounds, so kept values are compared with the input of the sampler.
     exact, std = representation.denormalize(known).cpu().numpy(), representation.std.cpu().numpy()
-    return [
-        Edited(
-            **vars(result),
-            original=original,
-            keep=keep.numpy(),
-            feature_error=float((np.abs(result.features - exact) / std)[keep.numpy()].max(initial=0)),
-            joint_error=float(np.linalg.norm(result.joints - original.joints, axis=-1)[still.numpy()].max(initial=0)),
-        )
-        for result in generated
-    ]
+    edits = []
+    for result in generated:
+        error = float((np.abs(result.features - exact) / std)[keep.numpy()].max(initial=0))
+        result = cleaned(result) if cleanup else result
+        moved = np.linalg.norm(result.joints - original.joints, axis=-1)[still.numpy()].max(initial=0)
+        facts = {"original": original, "keep": keep.numpy(), "feature_error": error, "joint_error": float(moved)}
+        edits.append(Edited(**vars(result), **facts))
+    return edits
 
 
 def kept_parts(

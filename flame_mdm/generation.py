@@ -16,6 +16,7 @@ import torch
 
 from flame_mdm.errors import UserError, did_you_mean
 from flame_mdm.files import atomic_folder
+from flame_mdm.formats.cleanup import cleaned
 from flame_mdm.formats.motion import Motion
 from flame_mdm.motion import Edit, MotionBatch, Sampling, length_mask
 from flame_mdm.task import MotionGeneration
@@ -50,6 +51,7 @@ def generate(
     edit: Edit | None = None,
     shared_noise: bool = False,
     stages: list[Motion] | None = None,
+    cleanup: bool = False,
     **sampling: Unpack[Sampling],
 ) -> list[Motion]:
     """Generates motions for texts or actions, `samples` of each; unconditioned motions if neither is given.
@@ -69,6 +71,8 @@ def generate(
         shared_noise: all motions get the same noise, so that they differ by their texts and lengths alone.
         stages: list that gets the clean estimates along the sampling of the first motion, at equal intervals, and that
             motion itself (MFM, figure 5).
+        cleanup: smooth the motions, keep bone lengths constant and feet in place where they touch the floor; see
+            `flame_mdm.formats.cleanup`. Such motions have no features.
         sampling: options of `flame_mdm.motion.Sampling`, instead of the recipe's.
 
     Raises:
@@ -136,7 +140,7 @@ def generate(
         results += _finish(model, batch, x, captions[part])
         if stages is not None and trajectory:
             stages += _stages(model, trajectory, results[0])
-    return results
+    return [cleaned(motion) for motion in results] if cleanup else results
 
 
 class _First(list[torch.Tensor]):

@@ -47,7 +47,7 @@ def write_edits(config: Config) -> None:
         **{key: config[key] for key in ("fps", "unit", "up", "cut", "data_root")},
     )
     keys = ("region", "region_seconds", "joints", "method", "until", "resample", "strength")
-    keys += ("samples", "seed", *OPTIONS)
+    keys += ("samples", "seed", "cleanup", *OPTIONS)
     stages = [] if config["trajectory"] else None
     edits = edit(
         model,
@@ -57,8 +57,8 @@ def write_edits(config: Config) -> None:
         stages=stages,
         **{key: config[key] for key in keys},
     )
-    requested = {key: config[key] for key in keys if key not in ("resample", "samples", "seed")}
-    requested["cut"] = config["cut"]
+    requested = {key: config[key] for key in keys if key not in ("resample", "samples", "seed", "cleanup")}
+    requested |= {"cut": config["cut"], "cleanup": config["cleanup"] or None}
     requested["resample"] = config["resample"] if config["resample"] != 1 else None
     digest, what = sha256(file), f"edit {Path(original.id).stem} {edits[0].text}"
     folder = Path(config["out"] or default_folder(model, digest, what, config["seed"], requested))
@@ -88,6 +88,7 @@ main = partial(
         "until": "float",
         "resample": "int",
         "strength": "float",
+        "cleanup": "bool",
         "trajectory": "bool",
         "mp4": "bool",
     },

@@ -61,9 +61,10 @@ def sample(config: Config) -> None:
         seed=config["seed"],
         shared_noise=config["shared_noise"],
         stages=stages,
+        cleanup=config["cleanup"],
         **{key: config[key] for key in keys},
     )
-    requested = {key: config[key] for key in keys} | {"shared_noise": config["shared_noise"] or None}
+    requested = {key: config[key] for key in keys} | {key: config[key] or None for key in ("shared_noise", "cleanup")}
     digest = sha256(file)
     folders: dict[Path, list[Motion]] = {}
     for number in range(len(motions) // config["samples"]):
@@ -89,7 +90,7 @@ main = partial(
     kinds={
         **SAMPLING,
         **LENGTHS,
-        **{"shared_noise": "bool", "trajectory": "bool", "mp4": "bool"},
+        **dict.fromkeys(("shared_noise", "cleanup", "trajectory", "mp4"), "bool"),
     },
 )
 

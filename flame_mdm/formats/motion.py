@@ -56,6 +56,7 @@ class Motion:
         features: (F, D) float32 features in the units of the data; empty if they are not known.
         representation: name of the representation of the features.
         contacts: (F, N) bool, True if a joint of `skeleton.feet` is on the floor; None = unknown.
+        cleanup: whether `flame_mdm.formats.cleanup` changed the joints.
 
     Raises:
         ValueError: wrong shapes, non-finite joints, or a frame rate that is not a positive number.
@@ -70,6 +71,7 @@ class Motion:
     features: np.ndarray = field(default_factory=lambda: np.zeros((0, 0), np.float32))
     representation: str = ""
     contacts: np.ndarray | None = None
+    cleanup: bool = False
 
     def __post_init__(self) -> None:
         name, skeleton = f"motion {self.id!r}", self.skeleton
@@ -165,7 +167,7 @@ def motion_of_poses(poses: Poses, fps: float, text: str = "", id: str = "") -> M
 
 def _write_npz(motion: Motion, path: Path, facts: dict[str, Any]) -> str:
     content: dict[str, Any] = {"joints": motion.joints, "features": motion.features, "fps": motion.fps}
-    content |= {"text": motion.text, "representation": motion.representation}
+    content |= {"text": motion.text, "representation": motion.representation, "cleanup": motion.cleanup}
     if not motion.features.size:
         del content["features"], content["representation"]
     what = f"{len(motion.skeleton)} joints in meters, y up"

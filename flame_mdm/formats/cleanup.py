@@ -1,0 +1,161 @@
+"""Cleanup of generated motion: smooth joints, constant bone lengths, feet that stay where they touch the floor."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from math import comb
+
+import numpy as np
+from scipy.linalg import solveh_banded
+from scipy.ndimage import gaussian_filter1d
+
+from flame_mdm.formats.motion import Motion
+from flame_mdm.representations.skeleton import Skeleton
+
+SMOOTHNESS = 0.03
+"""Weight of the squared third differences of a joint's path, relative to its squared change."""
+OUTLIER = 0.03
+"""Distance in meters from the smooth path at which a position has half its weight."""
+LOW = 0.07
+"""Height in meters above the floor from which on a toe is in the air."""
+SLOW = 0.5
+"""Speed in meters per second over the ground from which on a low toe is in the air, if the body stands."""
+SHARE, SHARE_PINNED = 0.5, 0.4
+"""Share of the body's speed added to `SLOW`, before and after the body follows its feet. A foot on the floor may slide
+along with a generated body; one in the air overtakes it."""
+DRIFT = 0.08
+"""Speed in meters per second up to which the body may slide over its feet; the legs make up for the difference."""
+REACH = 0.999
+"""Maximum distance from hip to ankle relative to the length of the straight leg, unless it was longer before."""
+
+
+def cleaned(motion: Motion) -> Motion:
+    """Returns the motion with joints from `cleanup`.
+
+    Features, rotations and contacts no longer fit and are dropped; exports compute rotations from the new joints.
+    """
+    joints = cleanup(motion.joints, motion.fps, motion.skeleton)
+    none = np.zeros((0, 0), np.float32)
+    return replace(motion, joints=joints, features=none, representation="", poses=None, contacts=None, cleanup=True)
+
+
+def cleanup(joints: np.ndarray, fps: float, skeleton: Skeleton) -> np.ndarray:
+    """Returns a motion without pops, stretched bones and sliding feet.
+
+    In this order: paths of the joints are smoothed, bones get their median lengths, the body moves over the ground so
+    that its feet in contact stand still on average, and two-bone inverse kinematics keeps each toe in place during its
+    contacts. Contacts are read from height and speed of the toes.
+
+    Args:
+        joints: (F, J, 3) in meters, y up.
+        fps: frames per second.
+        skeleton: of the J joints; its first two chains are the legs.
+
+    Returns:
+        (F, J, 3) float32. Motions of fewer than 4 frames are returned unchanged.
+    """
+    if len(joints) < 4:
+        return np.array(joints, np.float32)
+    motion = _constant_bones(_smooth(np.asarray(joints, float)), skeleton)
+    toes = [chain[-1] for chain in skeleton.chains[:2]]
+    motion = _follow_feet(motion, toes, fps)
+    contact = _contacts(motion[:, toes], motion[:, 0], fps, SHARE_PINNED)
+    for chain, weight in zip(skeleton.chains[:2], contact.T, strict=True):
+        _bend(motion, chain[1:], _pin(motion[:, chain[-1]], weight))
+    return motion.astype(np.float32)
+
+
+def _least_squares(frames: int, *terms: tuple[int, np.ndarray | float, np.ndarray | float]) -> np.ndarray:
+    """Returns x (frames, N) with the minimum sum of all terms: weight (n-th differences of x - target)^2.
+
+    Args:
+        frames: length of x.
+        terms: n, weight (frames - n,) or a number, and target (frames - n, N) or a number; one must be an array.
+    """
+    width = next(target.shape[1] for _, _, target in terms if isinstance(target, np.ndarray))
+    matrix, right = np.zeros((4, frames)), np.zeros((frames, width))
+    for order, weight, target in terms:
+        stencil = [(-1) ** (order - k) * comb(order, k) for k in range(order + 1)]
+        count = frames - order
+        weights = np.broadcast_to(np.asarray(weight, float), count)
+        for i, factor in enumerate(stencil):
+            right[i : i + count] += factor * weights[:, None] * target
+            for j in range(i, order + 1):
+                matrix[j - i, i : i + count] += factor * stencil[j] * weights
+    return solveh_banded(matrix, right, lower=True)
+
+
+def _smooth(motion: np.ndarray) -> np.ndarray:
+    """Returns smooth paths of the joints (Whittaker 1923); positions that jump for a few frames hardly bend them."""
+    smooth = motion.copy()
+    for joint in range(motion.shape[1]):
+        path, weight = motion[:, joint], np.ones(len(motion))
+        for _ in range(4):
+            smooth[:, joint] = _least_squares(len(path), (0, weight, path), (3, SMOOTHNESS, 0.0))
+            weight = 1 / (1 + (np.linalg.norm(path - smooth[:, joint], axis=-1) / OUTLIER) ** 2)
+    return smooth
+
+
+def _constant_bones(motion: np.ndarray, skeleton: Skeleton) -> np.ndarray:
+    """Returns the motion with bones in the same directions at their median lengths."""
+    out = motion.copy()
+    for parent, joint in skeleton.edges:
+        bone = motion[:, joint] - motion[:, parent]
+        length = np.linalg.norm(bone, axis=-1, keepdims=True)
+        out[:, joint] = out[:, parent] + bone * np.median(length) / np.maximum(length, 1e-6)
+    return out
+
+
+def _contacts(toes: np.ndarray, root: np.ndarray, fps: float, share: float) -> np.ndarray:
+    """Returns (F - 1, 2) in [0, 1]: how surely each toe (F, 2, 3) stands on the floor from a frame to the next."""
+    speed = np.linalg.norm(np.diff(toes[..., [0, 2]], axis=0), axis=-1) * fps
+    travel = np.linalg.norm(np.diff(root[:, [0, 2]], axis=0), axis=-1) * fps
+    travel = gaussian_filter1d(travel, 0.15 * fps, mode="nearest")
+    height = toes[..., 1] - np.percentile(toes[..., 1].min(1), 10)
+    height = np.maximum(np.maximum(height[1:], height[:-1]), 0)
+    relative = np.stack([height / LOW, speed / (SLOW + share * travel[:, None])])
+    return (np.clip(1 - relative**2, 0, 1) ** 2).prod(0)
+
+
+def _follow_feet(motion: np.ndarray, toes: list[int], fps: float) -> np.ndarray:
+    """Moves the body over the ground so that its feet in contact stand still on average."""
+    slides = np.diff(motion[:, toes], axis=0)[..., [0, 2]]
+    contact = weights = _contacts(motion[:, toes], motion[:, 0], fps, SHARE)
+    drift = np.zeros((len(slides), 2))
+    for _ in range(10):  # feet that move differently lose weight
+        mean = (weights[..., None] * slides).sum(1) / np.maximum(weights.sum(1), 1e-9)[:, None]
+        drift = _least_squares(len(slides), (0, weights.sum(1), mean), (0, 0.01, 0.0), (1, 1.0, 0.0))
+        weights = contact / (1 + (np.linalg.norm(slides - drift[:, None], axis=-1) * fps / 0.2) ** 2)
+    speed = np.linalg.norm(drift, axis=-1, keepdims=True) * fps
+    drift = drift * np.clip(1 - DRIFT / np.maximum(speed, 1e-9), 0, 1)
+    out = motion.copy()
+    out[1:, :, [0, 2]] -= drift.cumsum(0)[:, None]
+    return out
+
+
+def _pin(toe: np.ndarray, contact: np.ndarray) -> np.ndarray:
+    """Returns the shift (F, 3) over the ground that keeps a toe (F, 3) in place in contact and fades out between."""
+    shift = np.zeros_like(toe)
+    still = -np.diff(toe[:, [0, 2]], axis=0)
+    shift[:, [0, 2]] = _least_squares(len(toe), (1, 30 * contact, still), (0, 0.03, 0.0), (2, 0.1, 0.0))
+    return shift
+
+
+def _bend(motion: np.ndarray, leg: Sequence[int], shift: np.ndarray) -> None:
+    """Moves the foot of a leg (hip, knee, ankle, other joints of the foot) by `shift` (F, 3) and bends the knee."""
+    hip, knee, ankle, *foot = (motion[:, joint].copy() for joint in leg)
+    thigh, shin = (np.linalg.norm(bone[0]) for bone in (knee - hip, ankle - knee))
+    before = np.linalg.norm(ankle - hip, axis=-1, keepdims=True)
+    line = ankle + shift - hip
+    distance = np.linalg.norm(line, axis=-1, keepdims=True)
+    line /= np.maximum(distance, 1e-9)
+    reach = np.clip(distance, abs(thigh - shin) + 1e-3, np.maximum(before, REACH * (thigh + shin)))
+    forward = knee - hip
+    forward -= (forward * line).sum(-1, keepdims=True) * line
+    forward /= np.maximum(np.linalg.norm(forward, axis=-1, keepdims=True), 1e-9)
+    along = (thigh**2 - shin**2 + reach**2) / (2 * reach)
+    motion[:, leg[1]] = hip + along * line + np.sqrt(np.maximum(thigh**2 - along**2, 0)) * forward
+    moved = hip + reach * line - ankle
+    for joint, place in zip(leg[2:], (ankle, *foot), strict=True):
+        motion[:, joint] = place + moved

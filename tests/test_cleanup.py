@@ -1,0 +1,104 @@
+"""Cleanup of generated motion, on synthetic motions with known faults."""
+
+import numpy as np
+import pytest
+import torch
+
+from evaluators.metrics.attributes import read_attributes
+from evaluators.metrics.physics import FootSkating
+from flame_mdm.data.synthetic import Synthetic
+from flame_mdm.formats.cleanup import cleaned, cleanup
+from flame_mdm.formats.motion import Motion
+from flame_mdm.representations.skeleton import SKELETONS, SMPL22
+
+FPS = 20
+
+
+@pytest.fixture(scope="module")
+def clips() -> list:
+    """The first clips of the synthetic set."""
+    source = Synthetic(40)
+    return [source.clip(index, FPS) for index in range(40)]
+
+
+def skating(motions: list[np.ndarray]) -> float:
+    metric = FootSkating(FPS)
+    for motion in motions:
+        metric.update(torch.from_numpy(motion)[None], torch.ones(1, len(motion), dtype=torch.bool))
+    share = metric.compute()
+    assert share is not None
+    return share
+
+
+def peak(motion: np.ndarray) -> float:
+    """Maximum acceleration of a joint, in meters per squared frame."""
+    return float(np.linalg.norm(np.diff(motion, n=2, axis=0), axis=-1).max())
+
+
+def bones(motion: np.ndarray) -> np.ndarray:
+    return np.linalg.norm(SMPL22.bones(torch.from_numpy(motion)).numpy()[:, 1:], axis=-1)
+
+
+def test_real_motion_hardly_changes(clips):
+    after = [cleanup(clip.motion, FPS, SMPL22) for clip in clips]
+    change = [np.linalg.norm(new - clip.motion, axis=-1).mean() for new, clip in zip(after, clips, strict=True)]
+    assert np.mean(change) < 0.003
+    assert skating(after) <= skating([clip.motion for clip in clips]) + 0.005
+    for new, clip in zip(after, clips, strict=True):
+        assert clip.attributes.items() <= read_attributes(new, FPS).items()
+
+
+def test_faults_are_repaired(clips):
+    real = [clip.motion for clip in clips if clip.attributes["action"] == "walk"]
+    rng = np.random.default_rng(0)
+    faulty = []
+    for motion in real:
+        bad = motion + rng.normal(0, 0.008, motion.shape).astype(np.float32)  # trembling joints of changing bones
+        bad[..., 2] += 0.4 / FPS * np.arange(len(bad))[:, None]  # the body slides
+        bad[-3, 18:] += 0.3  # the arms pop in one of the last frames
+        faulty.append(bad)
+    after = [cleanup(motion, FPS, SMPL22) for motion in faulty]
+    assert skating(faulty) > 0.5
+    assert skating(after) < 0.05
+    assert np.mean([peak(motion) for motion in faulty]) > 3 * np.mean([peak(motion) for motion in real])
+    assert np.mean([peak(motion) for motion in after]) < 1.5 * np.mean([peak(motion) for motion in real])
+    for motion in after:
+        lengths = bones(motion)
+        assert np.abs(lengths / np.median(lengths, 0) - 1).max() < 1e-4
+
+
+def test_a_pinned_foot_keeps_its_leg():
+    motion = np.repeat(Synthetic(1).clip(0, FPS).motion[:1], 30, 0)
+    slide = motion.copy()
+    slide[:, [4, 7, 10], 0] += 0.03 * np.sin(np.arange(30) / 5)[:, None].astype(np.float32)
+    after = cleanup(slide, FPS, SMPL22)
+    assert np.ptp(slide[:, 10, 0]) > 0.05
+    assert np.ptp(after[:, 10, 0]) < 0.005
+    assert np.ptp(np.linalg.norm(after[:, 4] - after[:, 1], axis=-1)) < 1e-5
+
+
+@pytest.mark.parametrize("name", SKELETONS)
+@pytest.mark.parametrize("frames", [1, 3, 4, 5, 40])
+def test_any_length_and_skeleton(name, frames):
+    rng = np.random.default_rng(1)
+    joints = rng.normal(0, 0.3, (frames, len(SKELETONS[name]), 3)).cumsum(0)
+    after = cleanup(joints, 12.5, SKELETONS[name])
+    assert after.shape == joints.shape
+    assert np.isfinite(after).all()
+
+
+def test_what_no_longer_fits_is_dropped(tmp_path):
+    clip = Synthetic(1).clip(0, FPS)
+    features = np.zeros((len(clip.motion), 263), np.float32)
+    contacts = np.zeros((len(clip.motion), 4), bool)
+    motion = Motion(clip.motion, FPS, text="a", features=features, representation="x", contacts=contacts)
+    motion.poses = motion.posed()
+    after = cleaned(motion)
+    assert not motion.cleanup
+    assert after.cleanup
+    assert after.poses is None
+    assert after.contacts is None
+    assert not after.features.size
+    assert after.text == "a"
+    after.save(tmp_path / "a.npz")
+    assert np.load(tmp_path / "a.npz")["cleanup"]

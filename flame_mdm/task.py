@@ -10,7 +10,9 @@ from typing import Any, Literal, Self, Unpack
 
 import torch
 from lightning import LightningModule
+from lightning.pytorch.utilities.types import OptimizerLRScheduler
 from torch import Tensor
+from torch.optim.lr_scheduler import LambdaLR
 from torchmetrics import MeanMetric
 
 from flame_mdm.conditions import ConditionEncoder
@@ -77,9 +79,18 @@ class Task(LightningModule):
         prompts = [text for c in self.trainer.callbacks for text in getattr(c, "texts", ())]  # type: ignore[attr-defined]
         return sorted({*data.captions(), *prompts}), data.folder.parent / "text"
 
-    def configure_optimizers(self) -> torch.optim.Optimizer:
-        """Returns the optimizer of the recipe with all trainable parameters."""
-        return instantiate(self.optimizer, params=[p for p in self.parameters() if p.requires_grad])
+    def configure_optimizers(self) -> OptimizerLRScheduler:
+        """Returns the optimizer of the recipe with all trainable parameters, and the decay of its learning rate."""
+        optimizer = instantiate(self.optimizer, params=[p for p in self.parameters() if p.requires_grad])
+        share = self.config.get("lr_decay") or 0.0
+        if not 0 <= share <= 1:
+            raise UserError(f"lr_decay={share}: give the share of the training, from 0 to 1")
+        steps = self.trainer.max_steps
+        falling = share * steps
+        if not falling:
+            return optimizer
+        decay = LambdaLR(optimizer, lambda step: min(1.0, max(0, steps - step) / falling))
+        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": decay, "interval": "step"}}
 
     def on_train_start(self) -> None:
         """Enables gradient clipping for fused optimizers in bfloat16.

@@ -28,6 +28,7 @@ TINY = [
     "condition.features=16",
     "process.num_train_timesteps=10",
     "task.num_inference_steps=5",
+    "lr_decay=0",  # it depends on trainer.max_steps, which tests raise to resume
     "trainer.accelerator=cpu",
     "trainer.enable_progress_bar=false",
     "callbacks.samples.seconds=1.5",

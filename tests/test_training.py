@@ -19,6 +19,7 @@ from flame_mdm.__main__ import main
 from flame_mdm.checkpoints.files import read_checkpoint
 from flame_mdm.checkpoints.loading import load
 from flame_mdm.config import compose, instantiate
+from flame_mdm.editing import edit
 from flame_mdm.errors import UserError
 from flame_mdm.generation import generate
 from flame_mdm.motion import MotionBatch, length_mask
@@ -115,6 +116,21 @@ def test_a_resumed_run_is_the_uninterrupted_one(tiny, extra, tmp_path):
         assert all(torch.equal(a[name], b[name]) for name in a), key
 
 
+def test_a_decaying_learning_rate_resumes_where_it_was(tiny, tmp_path):
+    overrides = [*tiny, *STEPS, "lr_decay=0.5", "optimizer.lr=0.008", "callbacks.best=null"]
+    overrides += ["callbacks.checkpoints.keep_every_n_steps=6", "trainer.log_every_n_steps=1"]
+    whole = run(overrides, 8, tmp_path / "whole")
+    lines = (json.loads(line) for line in (tmp_path / "whole" / "metrics.jsonl").read_text().splitlines())
+    rates = [line["train/lr"] for line in lines if "train/lr" in line]
+    assert rates == pytest.approx([0.008] * 5 + [0.006, 0.004, 0.002])
+    parts = tmp_path / "parts" / "checkpoints" / "last.ckpt"
+    parts.parent.mkdir(parents=True)
+    parts.write_bytes((whole.parent / "step=0000006.ckpt").read_bytes())
+    run(overrides, 8, tmp_path / "parts")
+    a, b = weights(parts), weights(whole)
+    assert all(torch.equal(a[name], b[name]) for name in a)
+
+
 def test_progress_counts_all_steps_and_shows_losses(tiny, capfd, monkeypatch):
     """Also after a resume; in a log file as plain lines, here one per step."""
     monkeypatch.setattr(ProgressBar, "SECONDS", 0.0)
@@ -152,7 +168,7 @@ def test_a_folder_of_another_configuration_is_refused(tiny, capsys):
     run([*tiny, *STEPS], 2)
     assert main(["train", "quickstart", *tiny, *STEPS, "optimizer.lr=0.5", "trainer.max_steps=4"]) == 1
     message = capsys.readouterr().err
-    assert "optimizer.lr (0.001 there, 0.5 here)" in message
+    assert "optimizer.lr (0.002 there, 0.5 here)" in message
     assert "run.name=" in message
 
 
@@ -286,6 +302,22 @@ def test_sample_takes_every_option_of_sampling(trained, tmp_path):
         assert not np.allclose(features(num_inference_steps=5, **change), five)
     with Image.open(out / "trajectory.png") as sheet, Image.open(out / "motions.png") as motions:
         assert sheet.height / 5 == pytest.approx(motions.height / 2, rel=0.2)  # four estimates and the result
+
+
+def test_cleanup_is_noted_in_the_results(trained, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(["sample", f"ckpt={trained}", "text=a person walks", "samples=1", "seconds=1.5", "cleanup=true"]) == 0
+    (path,) = Path("samples").rglob("motion_000.npz")
+    assert path.parent.name.endswith("-cleanup=True")
+    model, raw = load(trained), generate(load(trained), "a person walks", seconds=1.5)[0]
+    with np.load(path) as motion:
+        assert motion["cleanup"]
+        assert "features" not in motion
+        assert not np.allclose(motion["joints"], raw.joints, atol=1e-3)
+    clean = edit(model, raw, "a person jumps", region="in_between", cleanup=True)[0]
+    assert clean.cleanup
+    assert clean.feature_error == 0
+    assert clean.joint_error > 0
 
 
 def test_shared_noise_is_that_of_no_text(trained):

@@ -456,6 +456,17 @@ def test_a_model_file_is_the_checkpoint(trained, tmp_path, capsys):
     assert files.read_model_file(again)["origin"]["steps"] == 7
 
 
+def test_half_precision_is_of_matrices_alone(trained, tmp_path):
+    whole, half = tmp_path / "whole.safetensors", tmp_path / "half.safetensors"
+    assert main(["export", str(trained), str(whole)]) == 0
+    assert main(["export", str(trained), str(half), "half=true"]) == 0
+    assert half.stat().st_size < 0.6 * whole.stat().st_size
+    for name, value in load_file(half).items():
+        assert value.dtype == (torch.float16 if value.ndim > 1 else torch.float32)
+        torch.testing.assert_close(load(half).state_dict()[name], load(whole).state_dict()[name], atol=1e-3, rtol=1e-3)
+    assert files.read_model_file(half)["origin"]["half_precision"]
+
+
 def test_a_model_file_does_not_tell_where_it_was_made(trained, tmp_path):
     file = hub.export(trained, tmp_path / "out")
     assert str(tmp_path).encode() not in file.read_bytes()

@@ -30,12 +30,14 @@ OTHER_LICENSE = (
 )
 
 
-def export(source: str | Path, out: str | Path) -> Path:
+def export(source: str | Path, out: str | Path, *, half: bool = False) -> Path:
     """Writes the model of a checkpoint as a model file, and returns its path.
 
     Args:
         source: as for `flame_mdm.load`.
         out: a .safetensors file, or a folder for `model.safetensors`.
+        half: writes the weight matrices in half precision; vectors, such as the statistics of the features, stay as
+            they are. Loaded models compute in single precision either way.
 
     Raises:
         FileNotFoundError, UserError: As for `flame_mdm.load`.
@@ -51,7 +53,11 @@ def export(source: str | Path, out: str | Path) -> Path:
     }
     out = out if out.suffix == ".safetensors" else out / FILE
     config = without_own_paths(checkpoint["config"])
-    write_model_file(out, checkpoint["state_dict"], config=config, facts=checkpoint["facts"], origin=origin)
+    state = checkpoint["state_dict"]
+    if half:
+        state = {name: value.half() if value.ndim > 1 else value for name, value in state.items()}
+        origin |= {"half_precision": True}
+    write_model_file(out, state, config=config, facts=checkpoint["facts"], origin=origin)
     return out
 
 

@@ -21,6 +21,9 @@ from flame_mdm.task import MotionGeneration, Task
 
 Which = Literal["last", "best"]
 
+SHIPPED = {path.stem: path for path in sorted((Path(__file__).parents[1] / "models").glob("*.safetensors"))}
+"""Models in this package, by name; `docs/checkpoints.md` says how they were trained."""
+
 NO_GPU = "PyTorch finds no GPU" if torch.version.cuda or torch.version.hip else "this PyTorch was built without CUDA"
 """Why no GPU can be used, if PyTorch has none."""
 
@@ -29,8 +32,8 @@ def find(source: str | Path, which: Which = "last") -> Path:
     """Returns the file of a model.
 
     Args:
-        source: a file; a run directory; a folder with one .safetensors file; or "user/name[@revision]" on the Hugging
-            Face hub.
+        source: a file; a run directory; a folder with one .safetensors file; the name of a model in this package, such
+            as "quickstart"; or "user/name[@revision]" on the Hugging Face hub. An existing path comes first.
         which: for a run directory, the last checkpoint or the one with the best validation result.
 
     Raises:
@@ -60,9 +63,12 @@ def find(source: str | Path, which: Which = "last") -> Path:
             )
         regular_file(weights[0])
         return weights[0]
+    if str(source) in SHIPPED:
+        return SHIPPED[str(source)]
     match = re.fullmatch(r"([\w.-]+/[\w.-]+)(?:@([\w./-]+))?", str(source))
     if match is None or path.suffix in (".ckpt", ".safetensors", ".pt") or path.parent.is_dir():
-        near = did_you_mean(path.name, [p.name for p in path.parent.iterdir()]) if path.parent.is_dir() else ""
+        there = [p.name for p in path.parent.iterdir()] if path.parent.is_dir() else []
+        near = did_you_mean(path.name, [*there, *SHIPPED])
         raise FileNotFoundError(f"{path}: no such checkpoint.{near}".rstrip("."))
     from huggingface_hub import hf_hub_download, logging
 

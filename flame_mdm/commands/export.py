@@ -8,7 +8,7 @@ from flame_mdm.config import Config, run
 from flame_mdm.errors import UserError, say
 
 USAGE = """
-usage: flame-mdm export CKPT OUT
+usage: flame-mdm export CKPT OUT [half=true]
 
 Writes the averaged weights of a checkpoint, its recipe and the metadata of its data set as one .safetensors file.
 """
@@ -20,7 +20,9 @@ def _export(config: Config) -> None:
     from flame_mdm.checkpoints.hub import export
     from flame_mdm.checkpoints.loading import find
 
-    say(f"written: {export(find(config['ckpt'], config['which']), config['out'])}")
+    say(f"written: {export(find(config['ckpt'], config['which']), config['out'], half=config['half'])}")
 
 
-main = partial(run, _export, usage=USAGE, name="export", objects=("ckpt", "out"), text=("ckpt", "out"))
+main = partial(
+    run, _export, usage=USAGE, name="export", objects=("ckpt", "out"), text=("ckpt", "out"), kinds={"half": "bool"}
+)

@@ -24,8 +24,9 @@ SLOW = 0.5
 SHARE, SHARE_PINNED = 0.5, 0.4
 """Share of the body's speed added to `SLOW`, before and after the body follows its feet. A foot on the floor may slide
 along with a generated body; one in the air overtakes it."""
-DRIFT = 0.08
-"""Speed in meters per second up to which the body may slide over its feet; the legs make up for the difference."""
+DRIFT = 0.2
+"""Speed in meters per second up to which the body may slide over its feet; the legs make up for the difference. From one
+and a half times this speed on, the body follows its feet entirely."""
 REACH = 0.999
 """Maximum distance from hip to ankle relative to the length of the straight leg, unless it was longer before."""
 
@@ -128,7 +129,7 @@ def _follow_feet(motion: np.ndarray, toes: list[int], fps: float) -> np.ndarray:
         drift = _least_squares(len(slides), (0, weights.sum(1), mean), (0, 0.01, 0.0), (1, 1.0, 0.0))
         weights = contact / (1 + (np.linalg.norm(slides - drift[:, None], axis=-1) * fps / 0.2) ** 2)
     speed = np.linalg.norm(drift, axis=-1, keepdims=True) * fps
-    drift = drift * np.clip(1 - DRIFT / np.maximum(speed, 1e-9), 0, 1)
+    drift = drift * np.clip(2 * speed / DRIFT - 2, 0, 1)
     out = motion.copy()
     out[1:, :, [0, 2]] -= drift.cumsum(0)[:, None]
     return out

@@ -17,12 +17,13 @@ from torch import Tensor
 from torchmetrics import Metric
 from tqdm import tqdm
 
-from evaluators.evaluator import Evaluator, Motions
+from evaluators.evaluator import Evaluator, Extracted, Motions
 from evaluators.extractors import OwnExtractor
 from evaluators.metrics import alignment, make_metrics, physics, update_metrics
 from evaluators.metrics.attributes import ATTRIBUTES, AttributeAccuracy, read_attributes, right_attributes
 from evaluators.metrics.distribution import FrechetMotionDistance, frechet_distance
 from evaluators.metrics.diversity import Diversity
+from evaluators.metrics.published_physics import MeanOverMotions
 from evaluators.near_misses import near_misses
 from evaluators.perturbations import PERTURBATIONS, Joints, Perturbation, continue_with, encode
 from evaluators.run import EvaluationRequest, _data, open_protocol
@@ -273,6 +274,8 @@ def _inputs(evaluator: Evaluator, path: Path, ids: list[str], make: Callable[[],
     for name, metric in make_metrics(evaluator.metrics).items():
         if type(metric) in TOTALS:
             inputs[name] = np.array([_totals(metric, joints) for joints in found.joints])
+        elif isinstance(metric, MeanOverMotions):
+            inputs |= _values(name, metric, found)
         elif isinstance(metric, AttributeAccuracy):
             inputs["seen"] = np.array([json.dumps(read_attributes(x.numpy(), metric.fps)) for x in found.joints])
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -289,6 +292,19 @@ def _totals(metric: Metric, joints: Tensor) -> list[float]:
     update_metrics({"": metric}, **given)
     states = [getattr(metric, state) for state in TOTALS[type(metric)]]
     return [float(sum(x.sum() for x in state) if isinstance(state, list) else state) for state in states]
+
+
+def _values(name: str, metric: MeanOverMotions, found: Extracted) -> Inputs:
+    """Returns the value, or 0, and whether it is defined, for each motion; nothing if no motion may have one."""
+    if metric.required_fps not in (None, metric.fps):
+        return {}
+    for i, joints in enumerate(found.joints):
+        rows = {row: found.rows[row][i : i + 1] for row in ("keys", "contacts") if row in found.rows}
+        rows |= {"contacts": rows["contacts"][0][None]} if "contacts" in rows else {}
+        update_metrics({name: metric}, joints=joints[None], mask=torch.ones(1, len(joints), dtype=torch.bool), **rows)
+    values, defined = (torch.cat(getattr(metric, state)).double().numpy() for state in ("values", "defined"))
+    parts = zip(metric.names, values.T, defined.T, strict=True)
+    return {f"{name}/{part}": np.stack([value, known], 1) for part, value, known in parts if known.any()}
 
 
 class _Measure:
@@ -345,7 +361,7 @@ class _Measure:
 
     def _pairs(self, inputs: Inputs, texts: Sequence[Text]) -> dict[str, np.ndarray]:
         """Returns value and weight (N, 2) of each motion or pair, by metric."""
-        found = {name: pair for name, pair in inputs.items() if name in self.metrics}
+        found = {name: pair for name, pair in inputs.items() if name.partition("/")[0] in self.metrics}
         if texts and "seen" in inputs and all("action" in text.requested for text in texts):
             read = [(json.loads(str(seen)), text.requested) for seen, text in zip(inputs["seen"], texts, strict=True)]
             right = [right_attributes(*each) for each in read]

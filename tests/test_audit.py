@@ -47,8 +47,9 @@ def scene(tmp_path_factory):
     """Metric inputs of 40 clips from the audit and from an evaluation."""
     representation = HumanML()
     protocol = load_protocol("synthetic", representation)
-    names = [name for name in protocol.metrics if name != "diversity"]
-    evaluator = Evaluator(Linear(), {name: protocol.metrics[name] for name in names}, representation)
+    physics = load_protocol("text_to_motion_2026", representation).metrics
+    metrics = protocol.metrics | {name: physics[name] for name in ("mbench", "kimodo", "edge")}
+    evaluator = Evaluator(Linear(), {k: v for k, v in metrics.items() if k != "diversity"}, representation)
     clips = list(Synthetic(clips=40, seed=5).clips(20.0))
     features = [representation.encode(torch.from_numpy(np.asarray(clip.motion))).numpy() for clip in clips]
     ids, captions = [clip.id for clip in clips], [clip.captions[0] + "." * i for i, clip in enumerate(clips)]
@@ -73,6 +74,8 @@ def test_values_without_resampling_are_those_of_an_evaluation(scene):
     assert {"fid", "mm_dist", "mclip_score", "mid", "jitter", "foot_skating", "attributes/action"} <= set(compared)
     for name in compared:
         assert found[name][0] == pytest.approx(values[name], rel=1e-9), name
+    assert {"mbench/foot_floating", "kimodo/skate_ratio", "kimodo/contact_consistency"} <= set(compared)
+    assert not any(name.startswith("edge") for name in found), "not defined at 20 frames per second"
 
 
 @pytest.mark.parametrize("metric", [TextsForMotion(), MotionsForText(normalize=True)])

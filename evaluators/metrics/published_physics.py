@@ -21,7 +21,7 @@ JERK_OF_REAL_MOTIONS: dict[float, float] = {20: 0.033031363, 30: 0.016383045}
 """Mean jerk of FlowMDM by frame rate: of HumanML3D at 20 frames per second, and of BABEL at 30."""
 
 
-class _MeanOverMotions(SampleMetric):
+class MeanOverMotions(SampleMetric):
     """Means over motions of values that each motion has, or does not have if they are undefined for it.
 
     Args:
@@ -63,7 +63,7 @@ class _MeanOverMotions(SampleMetric):
         return dict(zip(self.names, means, strict=True)) | {"measured": defined.all(1).double().mean().item()}
 
 
-class MBenchQuality(_MeanOverMotions):
+class MBenchQuality(MeanOverMotions):
     """Motion quality of MBench (ViMoGen, bf891de), in meters per frame at 20 frames per second.
 
     `jitter_degree`: mean length of the second difference of joint positions, plus the same relative to the root;
@@ -161,7 +161,7 @@ def _runs(true: Tensor) -> list[tuple[int, int]]:
     return list(zip(edges[::2], edges[1::2], strict=True))
 
 
-class KimodoQuality(_MeanOverMotions):
+class KimodoQuality(MeanOverMotions):
     """Foot skating of Kimodo (7330e7e), in m/s, from joints and from the contacts that the model predicts.
 
     `skate_from_height`: mean speed of toes that are lower than 5 cm; `skate_ratio`: fraction of their steps with more
@@ -214,7 +214,7 @@ def kimodo_quality(feet: Tensor, contacts: Tensor | None, fps: float) -> dict[st
     return found
 
 
-class KimodoConstraints(_MeanOverMotions):
+class KimodoConstraints(MeanOverMotions):
     """Constraint errors of Kimodo (7330e7e), for edits: distance of kept parts from the real motion, in meters.
 
     `root2d_err`: over the ground, of the root in frames that keep it, with its 95th percentile over motions,
@@ -256,7 +256,7 @@ def constraint_errors(root: Tensor, full: Tensor, parts: Tensor) -> dict[str, Te
     return dict(zip(KimodoConstraints.NAMES, (root.mean(), near, full.mean(), parts.mean()), strict=True))
 
 
-class PhysicalFootContact(_MeanOverMotions):
+class PhysicalFootContact(MeanOverMotions):
     """Physical foot contact score (PFC) of EDGE (17c3428), x 10^4: acceleration of the root without a planted foot.
 
     Mean over frames of the product of both feet's steps over the ground and the root's acceleration, which is divided

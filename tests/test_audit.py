@@ -1,5 +1,6 @@
 """Evaluator audits: measurement, resumption, cards, and links to them."""
 
+import csv
 import json
 from collections.abc import Mapping
 from pathlib import Path
@@ -8,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from fixtures import ROOT
 
 import evaluators.audit as audits
 from evaluators.audit import BASE, REAL, Text, _inputs, _Measure
@@ -18,7 +20,7 @@ from evaluators.perturbations import PERTURBATIONS
 from evaluators.run import load_protocol
 from flame_mdm.__main__ import main
 from flame_mdm.data.synthetic import Synthetic
-from flame_mdm.reporting.audit import Seen, card_of, findings, read_card, seen, write_card
+from flame_mdm.reporting.audit import PHYSICS, Seen, card_name, card_of, findings, read_card, seen, write_card
 from flame_mdm.reporting.rendering import Part, Table, fragment, markdown
 from flame_mdm.representations.humanml import HumanML
 from flame_mdm.runs import AuditCard, AuditedPerturbation, check_shape
@@ -212,3 +214,43 @@ def test_results_and_tables_link_to_the_card_of_their_extractor(card, tmp_path, 
     assert fragment(table).count("<a ") == markdown(table).count("](") == 1
     assert "](../audit/x-abababababab.html); " in markdown(table)
     assert "&lt;i&gt;" in fragment(table)
+
+
+def test_each_broken_model_is_ranked_last_by_a_headline_metric():
+    """Shuffled, noisy and static motions of the committed table of the synthetic set."""
+    with (ROOT / "docs" / "benchmarks" / "synthetic.csv").open(encoding="utf-8") as file:
+        rows = [row for row in csv.DictReader(file) if row["part"] == "Sanity-check baselines"]
+    broken = {"real motions, captions shuffled", "real motions, noise added", "the first frame, held"}
+    worst = {
+        name: max(broken, key=lambda label: sign * float(next(r for r in rows if r["row"] == label)[name]))
+        for name, sign in (("R precision (top 1)", -1), ("mCLIP score", -1), ("FID", 1), ("Jitter", 1))
+    }
+    assert set(worst.values()) == broken
+    assert worst["FID"] == "the first frame, held"
+    assert worst["Jitter"] == "real motions, noise added"
+    assert worst["mCLIP score"] == "real motions, captions shuffled"
+
+
+CARDS = sorted((ROOT / "docs" / "benchmarks" / "audit").glob("*.json"))
+
+
+@pytest.mark.parametrize("path", CARDS, ids=lambda path: path.stem)
+def test_committed_cards_are_complete_and_small(path, tmp_path):
+    card = read_card(path)
+    assert path.stem == card_name(card)
+    for written in write_card([card], tmp_path):
+        kept = path.with_suffix(written.suffix)
+        assert kept.read_bytes() == written.read_bytes(), f"flame-mdm audit cards={path} out={path.parent}"
+        assert kept.stat().st_size <= 300_000
+    assert card.motions >= 368
+    by_name = {each.name: each for each in card.perturbations}
+    jitter, frozen = (seen(card, by_name[name], "jitter") for name in ("jitter", "frozen"))
+    assert jitter is not None
+    assert jitter.grade == 1
+    assert frozen is not None
+    assert frozen.rewarded
+    for name in ("wrong captions", "near misses"):
+        found = {metric: seen(card, by_name[name], metric) for metric in card.metrics}
+        noticed = {metric for metric, response in found.items() if response and response.grade is not None}
+        assert "fid" not in noticed
+        assert bool(noticed) == any(not metric.startswith(PHYSICS) for metric in card.metrics)

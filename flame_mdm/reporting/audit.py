@@ -96,7 +96,7 @@ def write_card(cards: Sequence[AuditCard], out: Path) -> list[Path]:
         title=title,
         cards=[(_facts(card), findings(card), _truth(card)) for card in cards],
         names=[_evaluator(card) for card in cards],
-        metrics=(metrics := list(dict.fromkeys(metric for card in cards for metric in card.metrics))),
+        metrics=(metrics := _metrics(cards)),
         rows=_rows(cards, metrics),
         legend=LEGEND,
         wide=WIDE,
@@ -106,6 +106,12 @@ def write_card(cards: Sequence[AuditCard], out: Path) -> list[Path]:
     write_text(path.with_name(f"{path.name}.html"), page(title, body))
     write_text(path.with_name(f"{path.name}.md"), _markdown(cards, title, metrics))
     return [path.with_name(f"{path.name}{suffix}") for suffix in (".html", ".md")]
+
+
+def _metrics(cards: Sequence[AuditCard]) -> list[str]:
+    """Returns the metrics of all cards, exact attributes last."""
+    names = dict.fromkeys(metric for card in cards for metric in card.metrics)
+    return sorted(names, key=lambda name: name.startswith("attributes"))
 
 
 def _evaluator(card: AuditCard) -> str:

@@ -15,7 +15,6 @@ import torch.nn.functional as F
 from scipy.stats import hypergeom, rankdata
 from torch import Tensor
 from torchmetrics import Metric
-from tqdm import tqdm
 
 from evaluators.evaluator import Evaluator, Extracted, Motions
 from evaluators.extractors import OwnExtractor
@@ -32,6 +31,7 @@ from flame_mdm.config import EXPERIMENTS, instantiate
 from flame_mdm.data.datamodule import MotionDataModule
 from flame_mdm.errors import UserError
 from flame_mdm.files import atomic_write, read_npz, read_yaml
+from flame_mdm.progress import ProgressBar
 from flame_mdm.representations.humanml import HumanML
 from flame_mdm.runs import AuditCard, check_shape
 from flame_mdm.seeds import key
@@ -103,7 +103,7 @@ def audit(request: EvaluationRequest, resamples: int, cache: Path) -> AuditCard:
     captioned = protocol.condition == "text"
     texts = [_text(row, row.text) for row in rows] if captioned else []
     listed = scene.perturbations(captioned)
-    with tqdm(total=len(sets) + sum(len(each.grades) for each in listed), desc="audit", unit=" sets") as bar:
+    with ProgressBar(total=len(sets) + sum(len(each.grades) for each in listed), desc="audit", unit=" sets") as bar:
         inputs: dict[str, Inputs] = {}
         for name, make in sets.items():
             ids = [row.id for row in rows]
@@ -124,7 +124,13 @@ def audit(request: EvaluationRequest, resamples: int, cache: Path) -> AuditCard:
             about = {name: getattr(each, name) for name in ("name", "group", "about", "unit")}
             perturbations.append({**about, "grades": grades})
     better = {name: measure.metrics[name.partition("/")[0]].higher_is_better for name in base}
-    content = {"format": FORMAT, **facts, "resamples": resamples, "environment": environment(), "metrics": better}
+    content = {
+        "format": FORMAT,
+        **facts,
+        "resamples": resamples,
+        "packages": environment()["packages"],
+        "metrics": better,
+    }
     content |= {"real": {name: _interval(values) for name, values in base.items()}, "perturbations": perturbations}
     content |= {"not_computed": measure.reasons, "truth": _agreement(scores, perturbations)}
     return check_shape(content, AuditCard)

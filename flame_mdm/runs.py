@@ -204,7 +204,7 @@ class AuditCard(ClosedSchema):
     motions: Int
     seed: Int
     resamples: Int
-    environment: dict[str, Any]
+    packages: dict[str, str]
     metrics: dict[str, bool | None]
     real: dict[str, Annotated[list[Number | None], Field(min_length=2, max_length=2)]]
     perturbations: Annotated[list[AuditedPerturbation], Field(min_length=1)]

@@ -119,14 +119,14 @@ def _evaluator(card: AuditCard) -> str:
 
 
 def _facts(card: AuditCard) -> list[list[str]]:
-    data, protocol, packages = card.data, card.protocol, card.environment.get("packages", {})
+    data, protocol = card.data, card.protocol
     return [
         ["extractor", f"{card.extractor.name}, sha256 {card.extractor.sha256}" if card.extractor else "none"],
         ["data", f"{card.split} split of {data.dataset}, fingerprint {data.fingerprint}, {data.representation}"],
         ["motions", f"{card.motions}" + (" of {} to {} frames".format(*data.frames) if data.frames else "")],
         ["protocol", f"{protocol.name} version {protocol.version}, seed {card.seed}"],
         ["intervals", f"95 %, from {card.resamples} bootstrap resamples of the motions"],
-        ["versions", ", ".join(f"{name} {version}" for name, version in packages.items())],
+        ["versions", ", ".join(f"{name} {version}" for name, version in card.packages.items())],
         *([f"not computed: {name}", reason] for name, reason in card.not_computed.items()),
     ]
 

@@ -61,12 +61,12 @@ class Text(NamedTuple):
     requested: Mapping[str, Any]
 
 
-def audit(request: EvaluationRequest, resamples: int, cache: Path) -> AuditCard:
+def audit(request: EvaluationRequest, cache: Path) -> AuditCard:
     """Measures perturbations of the motions of a split; see docs/audit.md.
 
     Args:
-        request: data, protocol, extractor, split and seed; `samples` limits the number of motions.
-        resamples: bootstrap resamples of motions, for the intervals.
+        request: data, protocol, extractor, split and seed; `samples` limits the number of motions; `resamples` is the
+            number of bootstrap resamples of motions, for the intervals.
         cache: folder of the metric inputs of perturbed motions, with which a killed audit continues.
 
     Raises:
@@ -109,7 +109,7 @@ def audit(request: EvaluationRequest, resamples: int, cache: Path) -> AuditCard:
             ids = [row.id for row in rows]
             inputs[name] = _inputs(evaluator, cache / digest / f"{name.replace(' ', '-')}.npz", ids, make)
             bar.update()
-        measure = _Measure(evaluator, inputs, texts, scene.draws("bootstrap"), resamples)
+        measure = _Measure(evaluator, inputs, texts, scene.draws("bootstrap"), request.resamples)
         base = measure(inputs[BASE], texts)
         changed, given = inputs[BASE], texts
         scores, perturbations = [measure.scores(changed, given)], []
@@ -127,7 +127,7 @@ def audit(request: EvaluationRequest, resamples: int, cache: Path) -> AuditCard:
     content = {
         "format": FORMAT,
         **facts,
-        "resamples": resamples,
+        "resamples": request.resamples,
         "packages": environment()["packages"],
         "metrics": better,
     }

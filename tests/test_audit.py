@@ -172,7 +172,7 @@ def test_an_audit_resumes_and_gives_the_same_card(tmp_path, monkeypatch, capsys)
     clips = sum(
         '"test"' in line for line in (next(tmp_path.glob("synthetic-*")) / "clips.jsonl").read_text().splitlines()
     )
-    words = ["audit", "data=synthetic", "data.source.clips=400", f"data_root={tmp_path}", "resamples=10"]
+    words = ["audit", "data=synthetic", "data.source.clips=400", f"data_root={tmp_path}", "resamples=100"]
     words += ["extractor=none", f"out={tmp_path / 'out'}"]
     assert main(words) == 0
     path = tmp_path / "out" / "synthetic-none.json"

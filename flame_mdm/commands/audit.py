@@ -39,14 +39,14 @@ def audit(config: Config) -> None:
         raise UserError(
             "an audit needs a data set and an extractor. Give data=NAME and extractor=FILE, or extractor=none"
         )
-    if config["resamples"] < 2 or (config["samples"] or 64) < 8:
-        raise UserError(f"resamples={config['resamples']}, samples={config['samples']}: give 2 or more, and 8 or more")
+    if config["resamples"] == 0 or (config["samples"] or 64) < 8:
+        raise UserError(f"resamples={config['resamples']}, samples={config['samples']}: give 100, and 8 or more")
     from evaluators.audit import audit as measure
     from evaluators.run import EvaluationRequest
 
     protocol = config["protocol"] or ("synthetic" if config["data"]["name"] == "synthetic" else "text_to_motion")
     request = EvaluationRequest.of(config | {"baseline": "real", "protocol": protocol})
-    card = measure(request, config["resamples"], out / "cache")
+    card = measure(request, out / "cache")
     write_json(out / f"{card_name(card)}.json", card.model_dump(), indent=None)
     say(*write_card([card], out))
 

@@ -327,31 +327,36 @@ def rasterize(image: np.ndarray, at: np.ndarray, depth: np.ndarray, colors: np.n
         colors: (V, 3), 0 to 255.
         triangles: (T, 3), counterclockwise seen from outside; those seen from inside are not drawn.
     """
-    height, width = image.shape[:2]
-    a, b, c = (at[triangles[:, k]] for k in range(3))
-    twice = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
+    lowest = np.clip(np.floor(at.min(0)), 0, image.shape[1::-1]).astype(int)
+    highest = np.clip(np.ceil(at.max(0)), lowest, image.shape[1::-1]).astype(int)
+    width, height = highest - lowest
+    a, b, c = (at - lowest)[triangles.T]
+    (bx, by), (cx, cy) = (b - a).T, (c - a).T
+    twice = bx * cy - by * cx
     seen = twice < -1e-9
-    triangles, a, b, c, twice = triangles[seen], a[seen], b[seen], c[seen], twice[seen]
-    low = np.clip(np.ceil(np.minimum(np.minimum(a, b), c) - 0.5), 0, [width, height]).astype(int)
-    high = np.clip(np.floor(np.maximum(np.maximum(a, b), c) + 0.5), 0, [width, height]).astype(int)
-    wide, tall = np.maximum(high - low, 0).T
-    count = wide * tall
-    of = np.repeat(np.arange(len(triangles)), count)  # the triangle of each pixel in a bounding box
-    step = np.arange(len(of)) - np.repeat(np.cumsum(count) - count, count)
-    x, y = low[of, 0] + step % wide[of], low[of, 1] + step // wide[of]
-    # shares of the second and third corner, from the first corner's offset to the middle of the pixel
-    (bx, by), (cx, cy) = ((corner - a).T / twice for corner in (b, c))
-    right, down = x + 0.5 - a[of, 0], y + 0.5 - a[of, 1]
-    second, third = right * cy[of] - down * cx[of], down * bx[of] - right * by[of]
-    inside = (second >= 0) & (third >= 0) & (second + third <= 1)
-    of, second, third, pixel = of[inside], second[inside], third[inside], (y * width + x)[inside]
-    corners = triangles[of]
-    near = depth[corners[:, 0]]
-    near = near + second * (depth[corners[:, 1]] - near) + third * (depth[corners[:, 2]] - near)
-    nearest = np.full(height * width, np.inf)
+    low = np.clip(np.ceil(np.minimum(np.minimum(a, b), c) - 0.5), 0, [width, height]).T
+    high = np.clip(np.floor(np.maximum(np.maximum(a, b), c) + 0.5), 0, [width, height]).T
+    wide, tall = np.maximum(high - low, 0).astype(int)
+    count = np.where(seen, wide * tall, 0)
+    # shares of the second and third corner at a pixel: linear functions of its column and row in the bounding box
+    twice = np.where(seen, twice, 1)
+    right, down = low + 0.5 - a.T
+    table = [right * cy - down * cx, cy, -cx, down * bx - right * by, -by, bx]
+    table = np.stack([row / twice for row in table] + [wide, low[0] + low[1] * width]).astype(np.float32)
+    second, second_x, second_y, third, third_x, third_y, wide, first = np.repeat(table, count, axis=1)
+    step = np.arange(len(wide)) - np.repeat(np.cumsum(count) - count, count)
+    y, x = np.divmod(step.astype(np.float32), wide)
+    second += x * second_x + y * second_y
+    third += x * third_x + y * third_y
+    inside = np.flatnonzero((second >= 0) & (third >= 0) & (second + third <= 1))
+    corners = triangles[np.repeat(np.arange(len(triangles)), count)[inside]].T
+    second, third = second[inside], third[inside]
+    pixel = (first[inside] + x[inside] + y[inside] * width).astype(int)
+    shares = np.stack([1 - second - third, second, third])
+    near = (shares * depth.astype(np.float32)[corners]).sum(0)
+    nearest = np.full(width * height, np.inf, np.float32)
     np.minimum.at(nearest, pixel, near)
-    seen = near == nearest[pixel]
-    corners, second, third = corners[seen], second[seen, None], third[seen, None]
-    first = 1 - second - third
-    mixed = first * colors[corners[:, 0]] + second * colors[corners[:, 1]] + third * colors[corners[:, 2]]
-    image.reshape(-1, 3)[pixel[seen]] = mixed
+    seen = np.flatnonzero(near == nearest[pixel])
+    mixed = (shares[:, seen, None] * colors.astype(np.float32)[corners[:, seen]]).sum(0)
+    y, x = np.divmod(pixel[seen], width)
+    image[lowest[1] + y, lowest[0] + x] = mixed

@@ -217,11 +217,12 @@ def _figure(motion: Shown, body: Figure | None, frame: int, size: int) -> Image.
     if len(root) > 1:
         pen.line(_points(project(root)), TRAIL, round(1.5 * pixel))
     shadow = project(joints * floor)
-    dark = Image.new("L", image.size)
+    soft = shadow * [0.25, 0.25, 0.25, 1]  # drawn smaller and then enlarged
+    dark = Image.new("L", (side // 4, side // 4))
     for joint, parent in enumerate(motion.skeleton.parents):
         if parent >= 0:
-            _capsule(ImageDraw.Draw(dark), shadow[parent], shadow[joint], 0.06, 0.06, 255)
-    image.paste(SHADOW, mask=dark.reduce(4).filter(ImageFilter.BoxBlur(size / 192)).resize(image.size))
+            _capsule(ImageDraw.Draw(dark), soft[parent], soft[joint], 0.055, 0.055, 255)
+    image.paste(SHADOW, mask=dark.filter(ImageFilter.BoxBlur(size / 192)).resize(image.size))
     if motion.contacts is not None:
         for joint in np.array(motion.skeleton.feet)[motion.contacts[frame]]:
             cx, cy, scale = shadow[joint][:3]

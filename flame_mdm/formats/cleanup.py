@@ -25,8 +25,8 @@ SHARE, SHARE_PINNED = 0.5, 0.4
 """Share of the body's speed added to `SLOW`, before and after the body follows its feet. A foot on the floor may slide
 along with a generated body; one in the air overtakes it."""
 DRIFT = 0.2
-"""Speed in meters per second up to which the body may slide over its feet; the legs make up for the difference. From one
-and a half times this speed on, the body follows its feet entirely."""
+"""Speed in meters per second up to which the body may slide over its feet; the legs make up for the difference. From
+one and a half times this speed on, the body follows its feet entirely."""
 REACH = 0.999
 """Maximum distance from hip to ankle relative to the length of the straight leg, unless it was longer before."""
 

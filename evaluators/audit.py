@@ -431,13 +431,9 @@ def _distances(a: Tensor, b: Tensor) -> Tensor:
     return torch.cdist(a, b, compute_mode="donot_use_mm_for_euclid_dist")
 
 
-def _half_width(resampled: np.ndarray) -> float:
-    return float(1.96 * resampled.std())
-
-
 def _interval(values: np.ndarray) -> list[float | None]:
     """Returns the value and the half width of its 95 % interval; None if it cannot be computed."""
-    pair = [float(values[0]), _half_width(values[1:])]
+    pair = [float(values[0]), float(1.96 * values[1:].std())]
     return [float(f"{x:.6g}") for x in pair] if np.isfinite(pair).all() else [None, None]
 
 

@@ -123,7 +123,7 @@ def audit(request: EvaluationRequest, cache: Path) -> AuditCard:
                 scores.append(measure.scores(changed, given))
             about = {name: getattr(each, name) for name in ("name", "group", "about", "unit")}
             perturbations.append({**about, "grades": grades})
-    better = {name: measure.metrics[name.partition("/")[0]].higher_is_better for name in base}
+    better = {name: _higher_is_better(measure.metrics, *name.partition("/")[::2]) for name in base}
     content = {
         "format": FORMAT,
         **facts,
@@ -298,6 +298,12 @@ def _totals(metric: Metric, joints: Tensor) -> list[float]:
     update_metrics({"": metric}, **given)
     states = [getattr(metric, state) for state in TOTALS[type(metric)]]
     return [float(sum(x.sum() for x in state) if isinstance(state, list) else state) for state in states]
+
+
+def _higher_is_better(metrics: Mapping[str, Metric], name: str, part: str) -> bool | None:
+    metric = metrics[name]
+    other = metric.DIRECTIONS if isinstance(metric, MeanOverMotions) else {}
+    return other.get(part, metric.higher_is_better)
 
 
 def _values(name: str, metric: MeanOverMotions, found: Extracted) -> Inputs:

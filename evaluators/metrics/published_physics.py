@@ -32,6 +32,8 @@ class MeanOverMotions(SampleMetric):
     """
 
     higher_is_better = False
+    DIRECTIONS: Mapping[str, bool | None] = {}
+    """Values for which higher is better (True), or neither (None)."""
 
     def __init__(self, names: Sequence[str], fps: float, required_fps: float | None = None, **kwargs: Any):
         super().__init__(("keys", "values", "defined"), **kwargs)
@@ -82,6 +84,8 @@ class MBenchQuality(MeanOverMotions):
     """
 
     NAMES = ("jitter_degree", "dynamic_degree", "ground_penetration", "foot_sliding", "foot_floating")
+
+    DIRECTIONS: Mapping[str, bool | None] = {"dynamic_degree": None}
 
     def __init__(self, fps: float, toes: Sequence[int] = (10, 11), **kwargs: Any):
         super().__init__(self.NAMES, fps, MBENCH_FPS, **kwargs)
@@ -181,6 +185,7 @@ class KimodoQuality(MeanOverMotions):
 
     JOINTS, CONTACTS = ("skate_from_height", "skate_ratio", "low"), ("skate_from_contacts", "skate_max")
     NAMES = (*JOINTS, *CONTACTS, "contact_consistency")
+    DIRECTIONS: Mapping[str, bool | None] = {"low": None, "contact_consistency": True}
 
     def __init__(self, fps: float, feet: Sequence[int] = (7, 10, 8, 11), **kwargs: Any):
         super().__init__(self.NAMES, fps, **kwargs)

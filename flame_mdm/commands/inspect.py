@@ -53,7 +53,7 @@ def inspect(config: Config) -> None:
         frames = {frame for fault in faults for frame in range(fault.start, fault.end)}
         score = (len({fault.kind for fault in faults}), len(frames) / len(motion.joints))
         worst = sorted([*worst, (score, motion, faults)], key=lambda row: row[0], reverse=True)[: config["clips"]]
-    for _, motion, faults in worst if count <= config["clips"] else []:
+    for _, motion, faults in [row for row in worst if row[2]] if count <= config["clips"] else []:
         more = [f"  and {len(faults) - MOST_LINES} more"] if len(faults) > MOST_LINES else []
         say(motion.id, *(f"  {fault}" for fault in faults[:MOST_LINES]), *more)
     say(f"{name}: {faulty} of {count} motions with faults")

@@ -39,6 +39,9 @@ FREE = (
 )
 """Keys that may differ when a run is resumed."""
 
+ADDED = {"lr_decay": 0.0}
+"""Keys that the configurations of earlier versions do not have, with the values that they imply."""
+
 
 def train(config: Config) -> None:
     """Trains the composed experiment, or resumes the run in its directory.
@@ -66,7 +69,7 @@ def _same_run(folder: Path, config: Config) -> None:
     """Raises `UserError` if the folder holds a run with another configuration."""
     if not (folder / "config.yaml").exists():
         return
-    saved, wanted = flatten(movable(read_saved(folder / "config.yaml"))), flatten(movable(config))
+    saved, wanted = ADDED | flatten(movable(read_saved(folder / "config.yaml"))), flatten(movable(config))
     differing = [
         f"{key} ({saved.get(key, 'absent')} there, {wanted.get(key, 'absent')} here)"
         for key in sorted(saved.keys() | wanted.keys())

@@ -117,7 +117,7 @@ def built(folder: Path) -> tuple[Any, Any]:
 def loop(steps: int, folder: Path) -> float:
     """Returns milliseconds per step of a plain PyTorch loop that trains the same network on one batch."""
     data, task = built(folder)
-    optimizer, parameters = task.configure_optimizers(), list(task.parameters())
+    optimizer, parameters = task.make_optimizer(), list(task.parameters())
     batch = next(iter(data.train_dataloader()))
     cond, clock = task.condition(batch), Clock()
     for _ in range(steps):
@@ -132,7 +132,7 @@ def loop(steps: int, folder: Path) -> float:
 def parts(steps: int, folder: Path) -> dict[str, float]:
     """Returns the median milliseconds of each part of a step."""
     data, task = built(folder)
-    optimizer, parameters = task.configure_optimizers(), list(task.parameters())
+    optimizer, parameters = task.make_optimizer(), list(task.parameters())
     average = MovingAverage(0.998)
     average._average_model = AveragedModel(task)
     average.on_train_start(SimpleNamespace(), task)  # type: ignore[arg-type]

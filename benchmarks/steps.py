@@ -85,7 +85,7 @@ def recipe_step(config: dict[str, Any], speed: str, device: str) -> tuple[Callab
     task = get_class(config["task"]["_target_"]).build(config, representation).to(device).train()
     data: Any = SimpleNamespace(pad_multiple=1)
     half = speed == "fast" and accelerate(task, data, config) == "bf16-mixed"
-    optimizer, clip = task.configure_optimizers(), config["trainer"]["gradient_clip_val"]
+    optimizer, clip = task.make_optimizer(), config["trainer"]["gradient_clip_val"]
 
     def step(batch: MotionBatch) -> None:
         with torch.device(device), torch.autocast(device, torch.bfloat16, enabled=half):

@@ -79,9 +79,13 @@ class Task(LightningModule):
         prompts = [text for c in self.trainer.callbacks for text in getattr(c, "texts", ())]  # type: ignore[attr-defined]
         return sorted({*data.captions(), *prompts}), data.folder.parent / "text"
 
+    def make_optimizer(self) -> torch.optim.Optimizer:
+        """Returns the optimizer of the recipe with all trainable parameters."""
+        return instantiate(self.optimizer, params=[p for p in self.parameters() if p.requires_grad])
+
     def configure_optimizers(self) -> OptimizerLRScheduler:
-        """Returns the optimizer of the recipe with all trainable parameters, and the decay of its learning rate."""
-        optimizer = instantiate(self.optimizer, params=[p for p in self.parameters() if p.requires_grad])
+        """Returns the optimizer, and the decay of its learning rate over the last share `lr_decay` of the training."""
+        optimizer = self.make_optimizer()
         share = self.config.get("lr_decay") or 0.0
         if not 0 <= share <= 1:
             raise UserError(f"lr_decay={share}: give the share of the training, from 0 to 1")

@@ -77,7 +77,7 @@ def two_steps(name: str) -> tuple[list[float], float]:
     """
     task = built(name)
     task._ddp_params_and_buffers_to_ignore = [key for key, _ in task.named_buffers()]  # type: ignore[assignment]
-    step, optimizer = nn.parallel.DistributedDataParallel(Step(task)), task.configure_optimizers()
+    step, optimizer = nn.parallel.DistributedDataParallel(Step(task)), task.make_optimizer()
     torch.manual_seed(torch.distributed.get_rank())
     batch, losses = clips(task), []
     for number in range(2):

@@ -69,7 +69,7 @@ def reference(words: list[str], steps: int) -> dict[str, torch.Tensor]:
     rank = 0
     task.__class__ = type("OfRank", (MotionGeneration,), {"global_rank": property(lambda self: rank)})
     task.log_dict = lambda *_, **__: None  # type: ignore[method-assign]
-    optimizer = task.configure_optimizers()
+    optimizer = task.make_optimizer()
     streams = [
         iter(TrainingBatches(data.train.lengths, data.batch_size, seed=config["seed"], first=0, rank=r, world=2))
         for r in range(2)

@@ -152,7 +152,7 @@ def test_trains_and_samples(denoiser, process, condition, monkeypatch):
         return
     logged: dict[str, Tensor] = {}
     monkeypatch.setattr(task, "log_dict", lambda values, **_: logged.update(values))
-    optimizer = task.configure_optimizers()
+    optimizer = task.make_optimizer()
     reached: set[str] = set()
     task.train()
     for step in range(3):

@@ -35,7 +35,7 @@ FAMILIES = [
 @pytest.mark.parametrize("name", DISTINCT)
 def test_a_recipe_trains_and_validates_a_step(name):
     task = built(name)
-    batch, optimizer = clips(task), task.configure_optimizers()
+    batch, optimizer = clips(task), task.make_optimizer()
     before = [parameter.detach().clone() for parameter in task.parameters()]
     loss = task.training_step(batch, 0)
     loss.backward()

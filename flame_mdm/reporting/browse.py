@@ -124,10 +124,9 @@ def write_clips(
             given.add(caption)
             features = representation.rebase(store.motion(clip)[:longest])
             joints = representation.decode(torch.from_numpy(features.copy())).numpy()
-            facts = {"clip": clip.id, "split": clip.split, "data": store.fingerprint}
             motion = Motion(joints, representation.fps, representation.skeleton, caption, clip.id)
             motion.features, motion.representation = features, representation.name
-            motion.save(made / path.name, **facts)
+            motion.save(made / path.name, clip=clip.id, split=clip.split, data=store.fingerprint)
 
 
 def describe(store: Store) -> Markup:

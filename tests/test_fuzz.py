@@ -1024,7 +1024,7 @@ def test_damaged_results(refused, bad):
     for path in (in_table, in_run):
         path.parent.mkdir(parents=True)
         path.write_text(json.dumps(RESULT))
-    assert main(["tables", *words, f"out={bad / 'out'}"]) == 0
+    assert main(["tables", *words, f"out={bad / 'out'}"]) == 3  # written, but the result is not valid
     assert main(["report", str(run)]) == 0
     (run / "report.html").unlink()
     refused.watched.append(run)

@@ -118,7 +118,7 @@ def test_a_saved_motion_comes_back(tmp_path: Path, walk: Motion):
     np.testing.assert_array_equal(again.features, features)
     assert (again.text, again.fps, again.representation, again.poses) == ("é", 20.0, "mine", None)
     with np.load(tmp_path / "a.npz") as file:
-        assert list(file) == ["joints", "features", "fps", "text", "representation", "seed"]
+        assert list(file) == ["joints", "features", "fps", "text", "representation", "cleanup", "seed"]
 
 
 def test_a_motion_is_shown(walk: Motion, monkeypatch: pytest.MonkeyPatch):

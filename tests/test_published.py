@@ -174,8 +174,15 @@ def test_rows_are_checkpoints_of_recipes_that_fit(name):
         assert extracted(part.get("extractor", "")) == wanted_extractor(protocol, config)
 
 
+UNREAD = "humanml3d/mdm_motion272"
+"""Recipe of features that no evaluator reads."""
+
+
 @pytest.mark.parametrize("name", [n for n in recipes() if n.startswith(("humanml3d/", "kit/", "babel/"))])
 def test_papers_checkpoints_are_chosen_by_fid(name):
+    if name == UNREAD:
+        assert "evaluate" not in recipe(name)["callbacks"]
+        return
     callbacks = recipe(name)["callbacks"]
     evaluate = callbacks["evaluate"]
     protocol, _ = measures(evaluate["protocol"], name)

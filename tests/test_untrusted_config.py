@@ -461,8 +461,9 @@ def test_odd_statistics_of_released_models(attacked, bad):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("megabytes", [300, 600, 900])
+@pytest.mark.parametrize("megabytes", [300, 600, 800])
 def test_little_memory_is_one_line(trained, tmp_path, megabytes):
+    """While it imports and samples. With little more, it is OpenBLAS or Pillow that runs out, and not in our words."""
     program = (
         f"import resource; resource.setrlimit(resource.RLIMIT_AS, ({megabytes << 20},) * 2)\n"
         f"import sys; from flame_mdm.__main__ import main\nsys.exit(main(['sample', 'ckpt={trained}', {TEXT!r}]))"

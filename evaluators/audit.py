@@ -25,7 +25,7 @@ from evaluators.metrics.diversity import Diversity
 from evaluators.metrics.published_physics import MeanOverMotions
 from evaluators.near_misses import near_misses
 from evaluators.perturbations import PERTURBATIONS, Joints, Perturbation, continue_with, encode
-from evaluators.run import EvaluationRequest, _data, open_protocol
+from evaluators.run import EvaluationRequest, open_data, open_protocol
 from evaluators.sources import Row, real_motions
 from flame_mdm.config import EXPERIMENTS, instantiate
 from flame_mdm.data.datamodule import MotionDataModule
@@ -72,7 +72,7 @@ def audit(request: EvaluationRequest, cache: Path) -> AuditCard:
     Raises:
         UserError: If data, protocol and extractor do not match, or the data is not represented by joint positions.
     """
-    data = _data(request, None)
+    data = open_data(request, None)
     info, representation = data.store.info, data.representation.to(request.device or "cpu")
     if not isinstance(representation, HumanML):
         raise UserError(

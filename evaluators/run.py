@@ -155,7 +155,7 @@ def _evaluate(request: EvaluationRequest, rank: int, world: int, device: str) ->
 
     file = find(request.ckpt, request.which) if request.ckpt is not None else None
     model = load(file, device) if file is not None else None
-    data = _data(request, model)
+    data = open_data(request, model)
     representation = model.representation if model else data.representation.to(device)
     skeleton = _skeleton(request, representation)
     clips = data.clips(request.split)
@@ -322,7 +322,7 @@ def run_folder(checkpoint: Path) -> Path:
     return checkpoint.parent.parent if checkpoint.parent.name == "checkpoints" else checkpoint.parent
 
 
-def _data(request: EvaluationRequest, model: MotionGeneration | None) -> MotionDataModule:
+def open_data(request: EvaluationRequest, model: MotionGeneration | None) -> MotionDataModule:
     """Returns the prepared data, with its own representation. The model keeps the statistics of its training data."""
     from flame_mdm.data.datamodule import MotionDataModule
 

@@ -63,7 +63,7 @@ def pop(joints: Joints, centimeters: float, draws: Draws, *, last: bool = False)
 
 
 def freeze(joints: Joints, percent: float) -> Joints:
-    """Holds a frame for this share of the time, up to the end."""
+    """Repeats one frame until the end of the motion, for this share of its duration."""
     moving = max(1, round(len(joints) * (1 - percent / 100)))
     return joints[np.minimum(np.arange(len(joints)), moving - 1)]
 

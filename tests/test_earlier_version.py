@@ -36,7 +36,7 @@ THEN = [
     "lr_decay=0.0",
     "ema.decay=0.998",
 ]
-"""What the recipe said."""
+"""Settings of the recipe in that version."""
 
 
 @pytest.fixture

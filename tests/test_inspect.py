@@ -80,7 +80,7 @@ def freeze(joints: np.ndarray) -> None:
     ("change", "expected"),
     [
         (lambda joints: slide(joints, 9), {("skating", f"{side}_foot", 20, 28) for side in ("left", "right")}),
-        (lambda joints: slide(joints, 8), set()),  # as long as a step
+        (lambda joints: slide(joints, 8), set()),  # no longer than a step takes
         (pop, {("pop", "head", 30, 31)}),
         (stretch, {("bone length", "head", 30, 40)}),
         (sink, {("penetration", f"{side}_{part}", 30, 40) for side in ("left", "right") for part in ("ankle", "foot")}),

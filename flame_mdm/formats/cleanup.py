@@ -42,7 +42,7 @@ def cleaned(motion: Motion) -> Motion:
 
 
 def cleanup(joints: np.ndarray, fps: float, skeleton: Skeleton) -> np.ndarray:
-    """Returns a motion without pops, stretched bones and sliding feet.
+    """Removes pops, changes of bone lengths and sliding feet from a motion.
 
     In this order: paths of the joints are smoothed, bones get their median lengths, the body moves over the ground so
     that its feet in contact stand still on average, and two-bone inverse kinematics keeps each toe in place during its

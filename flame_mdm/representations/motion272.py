@@ -116,7 +116,7 @@ class Motion272(Representation):
 
 
 def face_forward(translation: Tensor, rotations: Tensor) -> tuple[Tensor, Tensor]:
-    """Turns a motion, y up, about the origin, so that the root faces +z in the first frame.
+    """Rotates a motion about the y axis through the origin, so that the root faces +z in the first frame.
 
     Args:
         translation: (F, 3).

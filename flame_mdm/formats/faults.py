@@ -14,12 +14,12 @@ from flame_mdm.formats.motion import Motion
 LOW = 0.05
 """Height in meters above the floor below which a toe touches it."""
 LIMITS = {
-    "skating": (0.5, "m/s", "a toe near the floor (below 5 cm) slides for 0.4 s or more, longer than in a step"),
-    "pop": (200.0, "m/s^2", "a joint jumps: it accelerates and stops within two frames"),
-    "bone length": (0.1, "of its median", "a bone grows or shrinks, by at least 1 cm"),
-    "penetration": (0.05, "m", "a joint is below the floor, y = 0"),
-    "limit": (15.0, "degrees", "a knee bends forward, by more than this, or the angle in a knee or elbow is smaller"),
-    "frozen": (0.02, "m/s", "no joint moves faster, for a second or more"),
+    "skating": (0.5, "m/s", "a toe below 5 cm moves faster than 0.5 m/s for 0.4 s or more, longer than a step takes"),
+    "pop": (200.0, "m/s^2", "a joint jumps: it accelerates by more than 200 m/s^2 and stops within two frames"),
+    "bone length": (0.1, "of its median", "the length of a bone differs from its median by more than 10 % and 1 cm"),
+    "penetration": (0.05, "m", "a joint is more than 5 cm below the floor, y = 0"),
+    "limit": (15.0, "degrees", "a knee bends forward by more than 15 degrees, or a knee or elbow is folded to less"),
+    "frozen": (0.02, "m/s", "no joint moves faster than 2 cm/s for a second or more"),
 }
 """Fault -> limit, its unit, and what it is. docs/motion-faults.md has the share of real clips that each flags."""
 

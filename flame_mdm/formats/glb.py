@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from flame_mdm.files import atomic_write
 from flame_mdm.formats.poses import Poses
@@ -30,7 +31,8 @@ def write(path: Path, poses: Poses, fps: float, text: str, name: str, body: Figu
     """Writes a .glb file in meters, y up; the rest pose faces +z, as the format requires.
 
     It contains one node per joint, named as in SMPL, one animation that rotates all nodes and moves the root, with one
-    key per frame in seconds, and one mesh skinned to the joints: a body, stored in an A-pose, or rounded limbs.
+    key per frame in seconds, and one mesh skinned to the joints: a body, stored in an A-pose, or rounded limbs. The
+    node above the joints lifts a body by the thickness of its soles; its toes bend as in pictures.
 
     Args:
         path: the file.
@@ -53,7 +55,8 @@ def write(path: Path, poses: Poses, fps: float, text: str, name: str, body: Figu
     indices = binary.add(index, INDICES)
     matrices = binary.add(bind.mT.reshape(-1, 16))  # matrices are stored in column-major order
     times = binary.add(np.arange(len(poses.root), dtype=np.float32) / np.float32(fps), bounds=True)
-    turns = poses.quaternions()[..., [1, 2, 3, 0]].float().numpy()
+    turned = poses if body is None else Poses(poses.offsets, torch.from_numpy(body.local()), poses.root)
+    turns = turned.quaternions()[..., [1, 2, 3, 0]].float().numpy()
     curves = [("rotation", node, turns[:, node]) for node in range(len(rest))]
     curves.append(("translation", 0, poses.root.float().numpy()))
     offsets = np.concatenate([rest[:1], poses.offsets.numpy()[1:]])
@@ -63,6 +66,7 @@ def write(path: Path, poses: Poses, fps: float, text: str, name: str, body: Figu
     for parent, child in SMPL22.edges:
         nodes[parent].setdefault("children", []).append(child)
     nodes.append({"name": "figure", "mesh": 0, "skin": 0})
+    nodes.append({"name": "lifted", "children": [0], "translation": [0, body.lift if body else 0, 0]})
     document = {
         "asset": {
             "version": "2.0",
@@ -70,7 +74,7 @@ def write(path: Path, poses: Poses, fps: float, text: str, name: str, body: Figu
             "extras": {"fps": fps, "text": text, "unit": "metre", "up": "y"},
         },
         "scene": 0,
-        "scenes": [{"nodes": [0, len(rest)]}],
+        "scenes": [{"nodes": [len(rest), len(rest) + 1]}],
         "nodes": nodes,
         "meshes": [{"primitives": [{"attributes": attributes, "indices": indices, "material": 0}]}],
         "materials": [{"pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 0.8}}],

@@ -148,6 +148,15 @@ class Figure:
         normals = (turned @ mesh().normals[..., None])[..., 0]
         return points, normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
 
+    def local(self) -> np.ndarray:
+        """Returns the rotations (F, 22, 3, 3) of the joints relative to their parents, with the bend of toes."""
+        count = len(SMPL22)
+        world = self.turns[:, :count] @ mesh().turns[:count] @ self.neutral.mT
+        local = world.copy()
+        for parent, joint in SMPL22.edges:
+            local[:, joint] = world[:, parent].mT @ world[:, joint]
+        return local
+
 
 def figure(motion: Shown) -> Figure:
     """Binds the mannequin to a clip and computes the rotations of its bones.

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Unpack
 
@@ -12,19 +11,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from flame_mdm.data.store import Store
 from flame_mdm.errors import UserError, did_you_mean
-from flame_mdm.formats.body import check_size, leg_length
 from flame_mdm.formats.cleanup import cleaned
-from flame_mdm.formats.files import ENDINGS, from_array, read
-from flame_mdm.formats.layouts import find_skeleton
+from flame_mdm.formats.files import from_array
 from flame_mdm.formats.motion import Motion
-from flame_mdm.formats.resampling import resample as resample_joints
 from flame_mdm.generation import generate
 from flame_mdm.motion import Edit, Sampling
 from flame_mdm.processes import Process
+from flame_mdm.reading import is_range, read_motion, with_features
 from flame_mdm.representations import Representation
-from flame_mdm.representations.skeleton import SMPL22, Skeleton
+from flame_mdm.representations.skeleton import find_joints
 from flame_mdm.task import MotionGeneration
 
 METHODS: dict[str, dict[str, Any]] = {
@@ -37,8 +33,6 @@ METHODS: dict[str, dict[str, Any]] = {
 
 MFM_STEPS, MFM_UNTIL = 25, 0.2
 """MFM overwrites "the first 6 time steps" and "0.2 time": both are true for 25 steps (i = 0 ... 5, i / 25 <= 0.2)."""
-
-LEG, ARM = ("hip", "knee", "ankle", "foot", "toes"), ("collar", "shoulder", "elbow", "wrist", "hand")
 
 Ranges = Sequence[float] | Sequence[Sequence[float]]
 
@@ -229,55 +223,6 @@ def _pairs(ranges: Ranges, name: str) -> list[tuple[float, float]]:
     return [(begin, end) for begin, end in listed]
 
 
-def is_range(value: Any) -> bool:
-    """Returns whether the value is a pair of finite numbers."""
-    return (
-        isinstance(value, list | tuple)
-        and len(value) == 2
-        and all(isinstance(v, int | float) and math.isfinite(v) for v in value)
-    )
-
-
-def part_names(skeleton: Skeleton) -> dict[str, list[int]]:
-    """Returns body parts by name, as indices of their joints.
-
-    lower_body is the root and the legs, as in MDM; upper_body is everything else.
-    """
-    sided = {
-        f"{side}_{limb}": [
-            i for i, name in enumerate(skeleton.joints) if name.removeprefix(f"{side}_") in words and side in name
-        ]
-        for side in ("left", "right")
-        for limb, words in (("arm", ARM), ("leg", LEG))
-    }
-    legs = sided["left_leg"] + sided["right_leg"]
-    lower = [0, *legs]
-    return sided | {
-        "arms": sided["left_arm"] + sided["right_arm"],
-        "legs": legs,
-        "lower_body": lower,
-        "upper_body": [joint for joint in range(len(skeleton)) if joint not in lower],
-    }
-
-
-def find_joints(skeleton: Skeleton, names: str | Sequence[str]) -> list[int]:
-    """Returns the indices of joints given by names of joints or body parts.
-
-    Raises:
-        UserError: a name is unknown; the message suggests similar ones.
-    """
-    known = part_names(skeleton) | {name: [i] for i, name in enumerate(skeleton.joints)}
-    found: set[int] = set()
-    for name in names if isinstance(names, list | tuple) else [names]:
-        if not isinstance(name, str) or name not in known:
-            raise UserError(
-                f"skeleton {skeleton.name} has no joint or part '{name}'.{did_you_mean(str(name), list(known))} "
-                f"Parts: {', '.join(part_names(skeleton))}; joints: {', '.join(skeleton.joints)}"
-            )
-        found.update(known[name])
-    return sorted(found)
-
-
 def method_options(
     process: Process,
     method: str | None = None,
@@ -309,104 +254,3 @@ def method_options(
             raise UserError(f"strength={strength:g}: give a number above 0, up to 1")
         how["strength"] = strength
     return how | {"resample": resample}
-
-
-# Reading motions ------------------------------------------------------------------------------------------------------
-
-
-def read_motion(
-    representation: Representation,
-    source: str | Path,
-    *,
-    fps: float | None = None,
-    unit: float | None = None,
-    up: str | None = None,
-    cut: Sequence[float] | None = None,
-    data_root: str | Path = "data",
-) -> Motion:
-    """Reads a motion to edit and computes the features of a model.
-
-    Args:
-        representation: the representation of the model.
-        source: a motion file of any kind that `flame_mdm.formats.files.read` reads; or `dataset:id`, a clip of a
-            prepared data set. Features of the same representation and frame rate are kept. Joints are resampled to the
-            frame rate of the model and made canonical by its representation.
-        fps, unit: of the file, as in `flame_mdm.formats.files.read`.
-        up: the axis of the file that points up (y, z or -y); other facts are those of the nearest `skeleton.yaml`.
-        cut: begin and end, in seconds, of the part to use.
-        data_root: folder of the prepared data sets.
-
-    Raises:
-        FileNotFoundError: the file or data set does not exist.
-        ValueError: the file is damaged, or this representation cannot encode the motion.
-        UserError: the clip is unknown, or `cut` is outside of the motion.
-    """
-    name = str(source)
-    if Path(source).suffix.lower() in ENDINGS:
-        given = find_skeleton(Path(source), up)
-        motion = replace(read(source, fps, unit, representation.fps, given), id=name)
-        motion = with_features(representation, motion)
-    elif ":" in name:
-        motion = _read_clip(representation, name, Path(data_root))
-    else:
-        raise UserError(
-            f"motion={name}: not a motion. Give a {', '.join(ENDINGS)} file, or dataset:id for a clip of a prepared "
-            "data set"
-        )
-    if cut is not None:
-        if not is_range(cut):
-            raise UserError(f"cut={cut}: write [begin, end], in seconds")
-        begin, end = (round(second * representation.fps) for second in cut)
-        if not 0 <= begin < end <= len(motion.features):
-            seconds = len(motion.features) / representation.fps
-            raise UserError(f"cut=[{cut[0]:g}, {cut[1]:g}] is not a range of {name}, which lasts {seconds:g} seconds")
-        motion = _decoded(representation, representation.rebase(motion.features[begin:end]), motion.text, name)
-    return motion
-
-
-def with_features(representation: Representation, motion: Motion) -> Motion:
-    """Returns the motion if it has features of this representation, otherwise computes them from its joints.
-
-    Raises:
-        ValueError: the features have another shape, the body has the wrong size, the motion is too long, or its joints
-            cannot be encoded.
-    """
-    name = f"{motion.id}: " if motion.id else ""
-    fits = motion.representation == representation.name and math.isclose(motion.fps, representation.fps)
-    if fits:
-        shape, size = motion.features.shape, representation.features
-        if shape[1:] != (size,) or not np.isfinite(motion.features).all():
-            raise ValueError(f"{name}features of shape {shape}, not (frames, {size}), or not finite")
-        return motion
-    joints, skeleton = motion.joints.astype(float), representation.skeleton
-    if skeleton.joints == motion.skeleton.joints[: len(skeleton)]:
-        joints = joints[:, : len(skeleton)]  # without the hands
-    try:
-        joints = resample_joints(joints, motion.fps, representation.fps, cubic=True)
-        features = representation.encode(torch.from_numpy(joints)).numpy()
-        if motion.skeleton.joints[: len(SMPL22)] == SMPL22.joints:
-            check_size(leg_length(joints), 1.0, children=True)
-    except ValueError as error:
-        raise ValueError(f"{name}{error}") from error
-    return _decoded(representation, features, motion.text, motion.id)
-
-
-def _decoded(representation: Representation, features: np.ndarray, text: str, name: str) -> Motion:
-    joints = representation.decode(torch.from_numpy(features)).numpy()
-    skeleton, known = representation.skeleton, representation.name
-    return Motion(joints, representation.fps, skeleton, text, name, features=features, representation=known)
-
-
-def _read_clip(representation: Representation, source: str, data_root: Path) -> Motion:
-    dataset, _, clip_id = source.partition(":")
-    store = Store(data_root / f"{dataset}-{representation.name}")
-    if store.info["fps"] != representation.fps:
-        raise ValueError(
-            f"{store.folder}: prepared at {store.info['fps']:g} fps, but the model has {representation.fps:g}"
-        )
-    clips = {clip.id: clip for clip in store.clips}
-    if clip_id not in clips:
-        raise UserError(f"{store.folder} has no clip '{clip_id}'.{did_you_mean(clip_id, list(clips))}")
-    clip = clips[clip_id]
-    text = clip.captions[0] if clip.captions else ""
-    return _decoded(representation, np.array(store.motion(clip)), text, source)

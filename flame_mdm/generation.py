@@ -18,7 +18,9 @@ from flame_mdm.errors import UserError, did_you_mean
 from flame_mdm.files import atomic_folder
 from flame_mdm.formats.cleanup import cleaned
 from flame_mdm.formats.motion import Motion
-from flame_mdm.motion import Edit, MotionBatch, Sampling, length_mask
+from flame_mdm.motion import Edit, MotionBatch, Sampling, length_mask, pad_to
+from flame_mdm.reading import read_motion, with_features
+from flame_mdm.sequences import Part, check_sequence, overlap, part_frames, read_parts, windows
 from flame_mdm.task import MotionGeneration
 from flame_mdm.visualize import contact_sheet, write_gif, write_mp4, write_player
 from flame_mdm.visualize.scene import shortened
@@ -49,6 +51,8 @@ def generate(
     samples: int = 1,
     seed: int = 0,
     edit: Edit | None = None,
+    after: str | Path | Motion | None = None,
+    loop: bool = False,
     shared_noise: bool = False,
     stages: list[Motion] | None = None,
     cleanup: bool = False,
@@ -56,18 +60,24 @@ def generate(
 ) -> list[Motion]:
     """Generates motions for texts or actions, `samples` of each; unconditioned motions if neither is given.
 
+    A text or action may have several parts, "walks forward @3 | turns left | sits down @2", with their seconds. They
+    are generated together as one motion, in windows that overlap; see docs/sequences.md. So is a single part with
+    seconds, "walks forward @10", which may be longer than the motions in training.
+
     A motion depends only on its text, its length, the sample number and the seed, not on other texts. If a text is
     given several times, sample numbers continue, so that its samples differ.
 
     Args:
         model: from `flame_mdm.load`.
         texts, actions: conditions; one of the two, depending on the model's training, or neither.
-        seconds, frames: length of all motions, or a list with one length per text or action. Default: 3 seconds, or
-            the maximum if shorter.
+        seconds, frames: length of all motions, or a list with one length per text or action; of a sequence, the length
+            of each part that gives none. Default: 3 seconds, or the maximum if shorter.
         samples: motions per text.
         seed: seed of the noise.
         edit: part of a motion of that length to keep in every sample, with `known` and `keep` (1, F, D); see
             `flame_mdm.commands.edit`.
+        after: a motion, or a file that `flame_mdm.reading.read_motion` reads, that the result begins with.
+        loop: the last frame leads to the first one. The body may be at another place by then.
         shared_noise: all motions get the same noise, so that they differ by their texts and lengths alone.
         stages: list that gets the clean estimates along the sampling of the first motion, at equal intervals, and that
             motion itself (MFM, figure 5).
@@ -108,25 +118,42 @@ def generate(
             )
     if len(requested) * samples > MAX_SAMPLES:
         raise UserError(f"{len(requested):,} texts with samples={samples}: at most {MAX_SAMPLES:,} motions per request")
+    parts = [[(text, None)] if kind == "none" else read_parts(text) for text in requested]
+    sequence = loop or after is not None or any(len(each) > 1 or each[0][1] is not None for each in parts)
+    if sequence and edit is not None:
+        raise UserError(f"{shortened(requested[0], 60)}: a sequence or loop cannot be edited in the same request")
+    if sequence:
+        check_sequence(model)
+    begun = None if after is None else _begun(model, after, loop)
     captions = [text for text in requested for _ in range(samples)]
     numbers: Counter[str] = Counter()
     ids = []
     for text in captions:
         ids.append(f"{text}#{numbers[text]}")
         numbers[text] += 1
-    lengths = _lengths(model, len(requested), samples, seconds, frames)
-    labels = None if actions is None else [_action(model, name) for name in captions]
+    lengths = _lengths(model, requested, parts if sequence else None, samples, seconds, frames, loop)
+    if begun is not None:  # its last frames are generated again, but kept
+        known = model.representation.normalize(begun[-overlap(model) :].to(model.device))
+        lengths = [[len(known) + each[0], *each[1:]] for each in lengths]
+    conditions = [[name for name, _ in each] for each in parts for _ in range(samples)]
+    labels = None if actions is None else [_action(model, name) for each in conditions for name in each]
     results = []
     for begin in range(0, len(ids), BATCH):
         part = slice(begin, begin + BATCH)
-        mask = length_mask(torch.tensor(lengths[part], device=model.device))
+        mask = length_mask(torch.tensor([sum(each) for each in lengths[part]], device=model.device))
         batch = MotionBatch(
             x=torch.zeros(*mask.shape, model.representation.features, device=model.device),
             mask=mask,
             ids=ids[part],
             text=captions[part] if texts is not None else None,
-            action=None if labels is None else torch.tensor(labels[part], device=model.device),
+            action=None if labels is None or sequence else torch.tensor(labels[part], device=model.device),
         )
+        covering = None
+        if sequence:
+            covering = windows(model, conditions[part], lengths[part], model.facts["actions"] if labels else None, loop)
+        if begun is not None:
+            padded = pad_to(known[None], mask.shape[1])
+            edit = Edit(padded, pad_to(torch.ones_like(known, dtype=torch.bool)[None], mask.shape[1]))
         trajectory = _First() if stages is not None and not begin else None
         x = model.generate(
             batch,
@@ -134,10 +161,11 @@ def generate(
             shared_noise=shared_noise,
             trajectory=trajectory,
             **sampling,
+            windows=covering,
             edit=edit and replace(edit, known=edit.known.expand_as(batch.x), keep=edit.keep.expand_as(batch.x)),
             unconditioned=texts is None and actions is None,
         )
-        results += _finish(model, batch, x, captions[part])
+        results += _finish(model, batch, x, captions[part], begun)
         if stages is not None and trajectory:
             stages += _stages(model, trajectory, results[0])
     return [cleaned(motion) for motion in results] if cleanup else results
@@ -160,10 +188,19 @@ def _stages(model: MotionGeneration, trajectory: Sequence[torch.Tensor], result:
     return [*stages, replace(result, text=f"result: {result.text}")]
 
 
-def _finish(model: MotionGeneration, batch: MotionBatch, x: torch.Tensor, captions: Sequence[str]) -> list[Motion]:
+def _finish(
+    model: MotionGeneration,
+    batch: MotionBatch,
+    x: torch.Tensor,
+    captions: Sequence[str],
+    begun: torch.Tensor | None = None,
+) -> list[Motion]:
     known, results = model.representation, []
     for row, length in enumerate(batch.lengths.tolist()):
         features = known.denormalize(x[row, :length].float())
+        if begun is not None:
+            before = begun.to(features)
+            features = torch.cat([before, features[min(len(before), overlap(model)) :]])
         joints = known.decode(features)
         if not torch.isfinite(joints).all():
             raise UserError(f"the model returned non-finite numbers for '{captions[row]}'")
@@ -173,29 +210,47 @@ def _finish(model: MotionGeneration, batch: MotionBatch, x: torch.Tensor, captio
     return results
 
 
+def _begun(model: MotionGeneration, after: str | Path | Motion, loop: bool) -> torch.Tensor:
+    """Returns the features (F, D) of the motion that is continued."""
+    if loop:
+        raise UserError("after= continues a motion, which cannot be a loop. Give after=... or loop=true")
+    known = model.representation
+    motion = with_features(known, after) if isinstance(after, Motion) else read_motion(known, after)
+    if (least := overlap(model)) > len(motion.features):
+        raise UserError(f"after={motion.id}: {len(motion.features)} frames are too short. Give at least {least}")
+    return torch.from_numpy(motion.features)
+
+
 def _lengths(
     model: MotionGeneration,
-    requested: int,
+    requested: Sequence[str],
+    parts: Sequence[Sequence[Part]] | None,
     samples: int,
     seconds: float | Sequence[float] | None,
     frames: int | Sequence[int] | None,
-) -> list[int]:
+    loop: bool,
+) -> list[list[int]]:
+    """Returns the number of frames of each part of each motion; motions that are not sequences have no `parts`."""
     fps, longest = model.representation.fps, model.facts["max_frames"]
     if seconds is not None and frames is not None:
         raise UserError("give seconds or frames, not both")
     key, scale, given = ("frames", 1, frames) if seconds is None else ("seconds", fps, seconds)
-    if given is None:
+    if given is None and parts is None:
         given = min(round(3 * fps), longest)
-    values: list[Any] = list(given) if isinstance(given, list | tuple | np.ndarray) else [given] * requested
-    if len(values) != requested:
-        prompts = "1 prompt" if requested == 1 else f"{requested} prompts"
+    values: list[Any] = list(given) if isinstance(given, list | tuple | np.ndarray) else [given] * len(requested)
+    if len(values) != len(requested):
+        prompts = "1 prompt" if len(requested) == 1 else f"{len(requested)} prompts"
         raise UserError(f"{key}={given}: {len(values)} lengths for {prompts}. Give one length, or one per prompt")
-    for value in values:
+    for value in values if given is not None else ():
         number = isinstance(value, int | float | np.integer | np.floating) and abs(value) < 1e9
         if not number or (key == "frames" and value % 1):
             raise UserError(f"{key}={given} is not a valid length")
-    each = [round(value * scale) for value in values]
-    for length in each:
+    if parts is not None:
+        usual = [None if value is None else value * scale / fps for value in values]
+        each = [part_frames(model, *row, loop) for row in zip(requested, parts, usual, strict=True)]
+    else:
+        each = [[round(value * scale)] for value in values]
+    for (length,) in each if parts is None else ():
         if length < 2:
             raise UserError(
                 f"{length / fps:g} seconds ({length} frames) are too short: give at least {2 / fps:g} seconds"
@@ -203,9 +258,10 @@ def _lengths(
         if length > longest:
             raise UserError(
                 f"{length / fps:g} seconds ({length} frames) cannot be sampled: the model was trained on motions of up "
-                f"to {longest / fps:g} seconds ({longest} frames at {fps:g} fps)"
+                f"to {longest / fps:g} seconds ({longest} frames at {fps:g} fps). Overlapping windows make longer "
+                f"ones: write the seconds in the text, 'walks @{length / fps:g}'"
             )
-    return [length for length in each for _ in range(samples)]
+    return [lengths for lengths in each for _ in range(samples)]
 
 
 def _action(model: MotionGeneration, name: str) -> int:

@@ -22,9 +22,10 @@ from flame_mdm.data.datamodule import MotionDataModule
 from flame_mdm.denoisers import Denoiser
 from flame_mdm.errors import UserError
 from flame_mdm.losses import MotionLosses
-from flame_mdm.motion import Condition, Edit, MotionBatch, Sampling, pad_to
+from flame_mdm.motion import Condition, Denoise, Edit, MotionBatch, Sampling, pad_to
 from flame_mdm.processes import MAX_STEPS, Process
 from flame_mdm.processes.guidance import classifier_free_guidance
+from flame_mdm.processes.windows import Windows, blended
 from flame_mdm.representations import Representation
 from flame_mdm.seeds import key, normal, seed_generator, seeded_noise, uniform
 
@@ -264,6 +265,7 @@ class MotionGeneration(Task):
         seed: int = 0,
         replication: int = 0,
         edit: Edit | None = None,
+        windows: Windows | None = None,
         unconditioned: bool = False,
         shared_noise: bool = False,
         trajectory: list[Tensor] | None = None,
@@ -274,7 +276,8 @@ class MotionGeneration(Task):
         The noise of a motion is a function of (seed, replication, id), so the motion is the same in any batch.
         `unconditioned` samples a conditional model with its null condition. With `shared_noise`, all motions get the
         same noise, a function of (seed, replication) only. The normalized clean estimate (B, F, D) of each denoiser
-        call is appended to `trajectory`.
+        call is appended to `trajectory`. With `windows`, motions may be longer than those in training, and the
+        conditions are those of the windows.
 
         Returns:
             (B, F, D) normalized, 0 past the end of each motion.
@@ -286,16 +289,19 @@ class MotionGeneration(Task):
         scale = chosen.pop("guidance_scale", self.guidance_scale)
         if trajectory is not None:
             chosen["trajectory"] = trajectory
-        denoise = self.denoiser
+        denoise: Denoise = self.denoiser
+        described = batch if windows is None else windows.batch
         if unconditioned and self.condition.features:
-            nothing = torch.zeros(len(batch), dtype=torch.long, device=batch.x.device)
-            cond = self.condition(replace(batch, text=[""] * len(batch), action=nothing)).drop(nothing == 0)
+            nothing = torch.zeros(len(described), dtype=torch.long, device=batch.x.device)
+            cond = self.condition(replace(described, text=[""] * len(described), action=nothing)).drop(nothing == 0)
         else:
-            cond = self.condition(batch)
+            cond = self.condition(described)
         if cond.null is not None and self.condition.features and not unconditioned:
             denoise = classifier_free_guidance(self.denoiser, scale, self.representation.features)
+        if windows is not None:
+            denoise = blended(denoise, windows)
         mask, frames, features = batch.mask, batch.mask.shape[1], self.representation.features
-        if not getattr(self.denoiser, "mask_padding", True):
+        if windows is None and not getattr(self.denoiser, "mask_padding", True):
             # This denoiser attends to padding, so the padded length must be the same as in training.
             mask = pad_to(mask, max(frames, self.facts.get("max_frames", 0)))
             if edit is not None:

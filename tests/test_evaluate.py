@@ -29,10 +29,10 @@ from flame_mdm.checkpoints.files import read_checkpoint
 from flame_mdm.checkpoints.loading import load
 from flame_mdm.config import EXPERIMENTS, compose, instantiate
 from flame_mdm.data.datamodule import MotionDataModule
-from flame_mdm.editing import find_joints
 from flame_mdm.errors import UserError
 from flame_mdm.motion import length_mask
 from flame_mdm.representations.rot6d import Rot6D
+from flame_mdm.representations.skeleton import find_joints
 from flame_mdm.runs import read_result
 from flame_mdm.seeds import key
 from flame_mdm.task import MotionGeneration

@@ -21,11 +21,11 @@ from flame_mdm.data.datamodule import MotionDataModule
 from flame_mdm.data.folder import Folder
 from flame_mdm.data.store import Store, write_store
 from flame_mdm.data.synthetic import Synthetic
-from flame_mdm.editing import read_motion
 from flame_mdm.errors import UserError
 from flame_mdm.formats import bvh
 from flame_mdm.formats.files import read
 from flame_mdm.formats.layouts import LAYOUTS, SOMA77, read_skeleton
+from flame_mdm.reading import read_motion
 from flame_mdm.representations.humanml import HumanML
 from flame_mdm.representations.skeleton import KIT21, SMPL22
 from flame_mdm.representations.smpl import ADULT, SMPL

@@ -34,9 +34,10 @@ def write_edits(config: Config) -> None:
     import torch
 
     from flame_mdm.checkpoints.loading import find, load
-    from flame_mdm.editing import edit, read_motion
+    from flame_mdm.editing import edit
     from flame_mdm.files import sha256
     from flame_mdm.generation import write_motions
+    from flame_mdm.reading import read_motion
 
     file = find(config["ckpt"], config["which"])
     model = load(file, config["device"] or ("cuda" if torch.cuda.is_available() else "cpu"))

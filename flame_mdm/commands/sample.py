@@ -20,8 +20,11 @@ if TYPE_CHECKING:
 
 LENGTHS = {"seconds": "float | list[float]", "frames": "int | list[int]"}
 """Keys that take one value, or one per prompt, and the types of their values."""
+TOGGLES = ("shared_noise", "cleanup", "loop")
+"""Keys that are true or false and change the motions."""
 USAGE = """
 usage: flame-mdm sample ckpt=FILE text="a person walks in a circle" [seconds=3] [key=value ...]
+       flame-mdm sample ckpt=FILE text="walks forward @3 | turns left | sits down @2.5" [after=walk.npz] [loop=true]
        flame-mdm sample ckpt=FILE prompts=FILE.txt [seconds=[2,3.5,...]] [mp4=true]
        flame-mdm sample ckpt=FILE action=walk
        flame-mdm sample ckpt=FILE unconditioned=true
@@ -59,12 +62,15 @@ def sample(config: Config) -> None:
         actions=None if config["action"] is None else [str(config["action"])],
         samples=config["samples"],
         seed=config["seed"],
+        after=config["after"],
+        loop=config["loop"],
         shared_noise=config["shared_noise"],
         stages=stages,
         cleanup=config["cleanup"],
         **{key: config[key] for key in keys},
     )
-    requested = {key: config[key] for key in keys} | {key: config[key] or None for key in ("shared_noise", "cleanup")}
+    requested = {key: config[key] for key in keys} | {key: config[key] or None for key in TOGGLES}
+    requested["after"] = config["after"]
     digest = sha256(file)
     folders: dict[Path, list[Motion]] = {}
     for number in range(len(motions) // config["samples"]):
@@ -86,11 +92,11 @@ main = partial(
     usage=USAGE,
     name="sample",
     objects=("ckpt", "out"),
-    text=("text", "prompts", "ckpt", "out"),
+    text=("text", "prompts", "ckpt", "out", "after"),
     kinds={
         **SAMPLING,
         **LENGTHS,
-        **dict.fromkeys(("shared_noise", "cleanup", "trajectory", "mp4"), "bool"),
+        **dict.fromkeys((*TOGGLES, "trajectory", "mp4"), "bool"),
     },
 )
 
@@ -159,10 +165,11 @@ def check_condition(config: Config, model: MotionGeneration, texts: Sequence[str
     """
     if texts is not None:
         from flame_mdm.conditions.vocabulary import advice
+        from flame_mdm.sequences import read_parts
         from flame_mdm.visualize.scene import shortened
 
-        for text in dict.fromkeys(texts):
-            of = f"'{shortened(text, 60)}': " * (len(texts) > 1)
+        for text in dict.fromkeys(part for each in texts for part, _ in read_parts(each)):
+            of = f"'{shortened(text, 60)}': " * (len(texts) > 1 or text not in texts)
             for line in advice(text, model.facts, model.condition.max_words):
                 say(f"warning: {of}{line}")
     elif config["action"] is None and not config["unconditioned"]:

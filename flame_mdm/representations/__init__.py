@@ -49,6 +49,8 @@ class Representation(nn.Module, ABC):
     std: Tensor
     part_of: str = ""
     """Name of a representation whose first features these are, so that its published features can be cut."""
+    relative: bool = True
+    """Whether the root trajectory is that from frame to frame, so that a part of the features is a motion, too."""
 
     def __init__(self, name: str, features: int, fps: float, skeleton: Skeleton):
         """`name` is saved in stores and checkpoints; features with different names are never mixed."""

@@ -19,6 +19,8 @@ class Rot6D(Representation):
     the camera. Not normalized. Raw motions are those of `read_pose`.
     """
 
+    relative = False
+
     def __init__(self, fps: float = 20.0, offsets: Sequence[Sequence[float]] = ADULT):
         """`offsets` (24, 3) of the body used for decoding, like `ADULT`."""
         super().__init__("rot6d-25", 150, fps, SMPL24)

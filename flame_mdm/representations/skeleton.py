@@ -7,6 +7,10 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
+from flame_mdm.errors import UserError, did_you_mean
+
+LEG, ARM = ("hip", "knee", "ankle", "foot", "toes"), ("collar", "shoulder", "elbow", "wrist", "hand")
+
 
 @dataclass(frozen=True)
 class Skeleton:
@@ -155,3 +159,43 @@ KIT21 = Skeleton(
 )
 
 SKELETONS: dict[str, Skeleton] = {skeleton.name: skeleton for skeleton in (SMPL22, SMPL24, KIT21)}
+
+
+def part_names(skeleton: Skeleton) -> dict[str, list[int]]:
+    """Returns body parts by name, as indices of their joints.
+
+    lower_body is the root and the legs, as in MDM; upper_body is everything else.
+    """
+    sided = {
+        f"{side}_{limb}": [
+            i for i, name in enumerate(skeleton.joints) if name.removeprefix(f"{side}_") in words and side in name
+        ]
+        for side in ("left", "right")
+        for limb, words in (("arm", ARM), ("leg", LEG))
+    }
+    legs = sided["left_leg"] + sided["right_leg"]
+    lower = [0, *legs]
+    return sided | {
+        "arms": sided["left_arm"] + sided["right_arm"],
+        "legs": legs,
+        "lower_body": lower,
+        "upper_body": [joint for joint in range(len(skeleton)) if joint not in lower],
+    }
+
+
+def find_joints(skeleton: Skeleton, names: str | Sequence[str]) -> list[int]:
+    """Returns the indices of joints given by names of joints or body parts.
+
+    Raises:
+        UserError: a name is unknown; the message suggests similar ones.
+    """
+    known = part_names(skeleton) | {name: [i] for i, name in enumerate(skeleton.joints)}
+    found: set[int] = set()
+    for name in names if isinstance(names, list | tuple) else [names]:
+        if not isinstance(name, str) or name not in known:
+            raise UserError(
+                f"skeleton {skeleton.name} has no joint or part '{name}'.{did_you_mean(str(name), list(known))} "
+                f"Parts: {', '.join(part_names(skeleton))}; joints: {', '.join(skeleton.joints)}"
+            )
+        found.update(known[name])
+    return sorted(found)

@@ -54,6 +54,8 @@ class SMPL(Representation):
     World coordinates as in AMASS: meters, z up, neither centered nor rotated. Raw motions are those of `read_pose`.
     """
 
+    relative = False
+
     def __init__(self, fps: float = 20.0, offsets: Sequence[Sequence[float]] = ADULT):
         """`offsets` (24, 3) of the body used for decoding, like `ADULT`; the first is from translation to pelvis."""
         super().__init__("smpl147", 147, fps, SMPL24)

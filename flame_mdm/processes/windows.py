@@ -1,0 +1,98 @@
+"""Long motions from overlapping windows: a wrapper with the same interface as the denoiser.
+
+At each sampling step, the denoiser sees all windows of a motion in one batch, each with its own condition, and their
+outputs are averaged where windows overlap (Bar-Tal et al. 2023, "MultiDiffusion"; Zhang et al. 2023, "DiffCollage").
+Outputs are affine in the clean estimate for equal x_t and t, so this blends the clean estimates.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from flame_mdm.motion import Condition, Denoise, MotionBatch, length_mask
+
+
+@dataclass
+class Windows:
+    """W windows of at most L frames that cover B motions.
+
+    Attributes:
+        batch: conditions and masks (W, L) of the windows; its `x` has no features.
+        rows: (W,) int64, the motion of each window.
+        frames: (W, L) int64, the frame of the motion at each frame of a window.
+        weights: (W, L), 0 past the end of a window; they sum to 1 at each frame of a motion.
+    """
+
+    batch: MotionBatch
+    rows: Tensor
+    frames: Tensor
+    weights: Tensor
+
+
+def blended(denoise: Denoise, windows: Windows) -> Denoise:
+    """Returns a denoiser of entire motions (B, F, D) that blends the outputs of `denoise` for their windows.
+
+    Its conditions are those of the windows.
+    """
+
+    def blend(x_t: Tensor, t: Tensor, mask: Tensor, cond: Condition) -> Tensor:
+        rows = windows.rows[:, None]
+        output = denoise(x_t[rows, windows.frames], t[windows.rows], windows.batch.mask, cond)
+        weighted = output * windows.weights[..., None].to(output.dtype)
+        total = output.new_zeros(*x_t.shape[:2], output.shape[-1])
+        return total.index_put((rows.expand_as(windows.frames), windows.frames), weighted, accumulate=True)
+
+    return blend
+
+
+def spans(lengths: Sequence[int], longest: int, overlap: int, loop: bool = False) -> list[tuple[int, int, int]]:
+    """Covers the consecutive parts of a motion with windows.
+
+    The windows of a part reach half the overlap into its neighbors. A part that does not fit into one window gets
+    several.
+
+    Args:
+        lengths: frames of each part.
+        longest: maximum number of frames of a window, more than `overlap`.
+        overlap: frames that two windows share, even.
+        loop: whether the first part follows the last one.
+
+    Returns:
+        Part, first frame and number of frames of each window. A loop has windows that begin before frame 0.
+    """
+    total, begin, found = sum(lengths), 0, []
+    for part, length in enumerate(lengths):
+        first = begin - overlap // 2 * (loop or begin > 0)
+        begin += length
+        size = begin + overlap // 2 * (loop or begin < total) - first
+        count = max(1, -(-(size - overlap) // (longest - overlap)))
+        each = -(-(size + (count - 1) * overlap) // count)
+        found += [(part, first + round(i * (size - each) / max(1, count - 1)), each) for i in range(count)]
+    return found
+
+
+def place(
+    windows: Sequence[tuple[int, int, int]], totals: Sequence[int], overlap: int, width: int, device: torch.device
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Returns rows, frames, mask (W, L) and weights of `Windows`.
+
+    The weight of a window rises over the overlap at its start and falls over the one at its end.
+
+    Args:
+        windows: motion, first frame and number of frames of each window.
+        totals: number of frames of each motion.
+        overlap: frames that two windows share.
+        width: L. Past its end, a window holds the frames that follow in the motion; its first frame follows the last.
+        device: of the tensors.
+    """
+    rows, first, size = torch.tensor(windows, device=device).T
+    mask, position = length_mask(size, width), torch.arange(width, device=device)
+    frames = (first[:, None] + position) % torch.tensor(totals, device=device)[rows, None]
+    ramp = torch.minimum(position + 0.5, size[:, None] - position - 0.5) / overlap
+    weights, index = ramp.clamp(0, 1) * mask, (rows[:, None].expand_as(frames), frames)
+    total = weights.new_zeros(len(totals), max(totals)).index_put(index, weights, accumulate=True)
+    return rows, frames, mask, weights / total[index]

@@ -1,0 +1,156 @@
+"""Sequences of actions: texts with parts, windows that cover them, continued motions and loops."""
+
+import itertools
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import flame_mdm
+from flame_mdm.__main__ import main
+from flame_mdm.errors import UserError
+from flame_mdm.formats.files import read
+from flame_mdm.motion import Condition, MotionBatch
+from flame_mdm.processes.windows import Windows, blended, place, spans
+from flame_mdm.sequences import overlap, read_parts
+
+
+@pytest.fixture(scope="module")
+def model() -> flame_mdm.MotionGeneration:
+    return flame_mdm.load("quickstart")
+
+
+def test_parts_of_a_text_and_their_seconds():
+    assert read_parts("walks forward @3 | turns left| sits down @ 2.5s") == [
+        ("walks forward", 3.0),
+        ("turns left", None),
+        ("sits down", 2.5),
+    ]
+    assert read_parts("a person walks") == [("a person walks", None)]
+
+
+@pytest.mark.parametrize("lengths", [[40], [30, 50, 24], [100], [200, 24, 61]])
+@pytest.mark.parametrize("loop", [False, True])
+def test_windows_cover_every_frame_and_share_the_overlap(lengths, loop):
+    found = spans(lengths, longest=60, overlap=16, loop=loop)
+    total = sum(lengths)
+    assert max(size for *_, size in found) <= 60
+    assert {part for part, _, _ in found} == set(range(len(lengths)))
+    if not loop:
+        assert found[0][1] == 0
+        assert found[-1][1] + found[-1][2] == total
+    for (_, first, size), (_, after, _) in itertools.pairwise(found):
+        assert first + size - after >= 16
+    rows, frames, mask, weights = place([(0, *span[1:]) for span in found], [total], 16, 60, torch.device("cpu"))
+    sums = torch.zeros(1, total).index_put((rows[:, None].expand_as(frames), frames), weights, accumulate=True)
+    torch.testing.assert_close(sums, torch.ones(1, total))
+    assert not weights[~mask].any()
+
+
+def test_one_window_changes_nothing_and_two_are_averaged():
+    x, t, mask = torch.randn(2, 20, 3), torch.tensor([5.0, 7.0]), torch.ones(2, 20, dtype=torch.bool)
+    cond = Condition(torch.zeros(3, 1), torch.zeros(3, 0, 1), None)
+
+    def covered(spans: list[tuple[int, int, int]], width: int) -> Windows:
+        rows, frames, real, weights = place(spans, [20, 20], 4, width, x.device)
+        return Windows(MotionBatch(torch.zeros(*real.shape, 0), real, ["a"] * len(rows)), rows, frames, weights)
+
+    def denoise(x_t, t, mask, cond):
+        return x_t * t[:, None, None]
+
+    whole = blended(denoise, covered([(0, 0, 20), (1, 0, 20)], 20))
+    assert torch.equal(whole(x, t, mask, cond), denoise(x, t, mask, cond))
+    number = torch.tensor([1.0, 2.0, 3.0])
+    three = [(0, 0, 12), (0, 8, 12), (1, 0, 20)]
+    several = blended(lambda x_t, *_: number[:, None, None].expand_as(x_t), covered(three, 20))
+    found = several(x, t, mask, cond)[..., 0]
+    expected = torch.tensor([1.0] * 8 + [1.125, 1.375, 1.625, 1.875] + [2.0] * 8)
+    torch.testing.assert_close(found[0], expected)
+    torch.testing.assert_close(found[1], torch.full((20,), 3.0))
+
+
+def test_a_sequence_is_one_motion_of_which_a_part_is_changed_by_its_text(model):
+    options = {"seconds": 1.5, "num_inference_steps": 5, "shared_noise": True}
+    bow, jump = (
+        flame_mdm.generate(model, f"a person walks forward @2 | a person {what}", **options)[0]
+        for what in ("bows", "jumps")
+    )
+    assert len(bow.joints) == len(jump.joints) == 70
+    assert bow.text == "a person walks forward @2 | a person bows"
+    moved = np.abs(bow.features - jump.features).mean(1)
+    assert moved[:30].max() < 0.2 * moved[50:].mean()
+
+
+def test_a_part_longer_than_training_and_one_as_long_as_training(model):
+    text = "a person walks forward"
+    long = flame_mdm.generate(model, f"{text} @20", num_inference_steps=5)[0]
+    assert len(long.joints) == 400
+    assert np.isfinite(long.joints).all()
+    same = flame_mdm.generate(model, f"{text} @2", num_inference_steps=5, shared_noise=True)[0]
+    plain = flame_mdm.generate(model, text, seconds=2, num_inference_steps=5, shared_noise=True)[0]
+    np.testing.assert_allclose(same.joints, plain.joints, atol=1e-5)
+    with pytest.raises(UserError, match="'walks @20'"):
+        flame_mdm.generate(model, text, seconds=20)
+
+
+def test_a_continued_motion_begins_with_it(model, tmp_path):
+    begin = flame_mdm.generate(model, "a person walks forward", seconds=2, num_inference_steps=5)[0]
+    begin.save(tmp_path / "walk.npz")
+    motion = flame_mdm.generate(
+        model, "a person bows", after=tmp_path / "walk.npz", seconds=1.5, num_inference_steps=5
+    )[0]
+    assert len(motion.joints) == 40 + 30
+    np.testing.assert_allclose(motion.joints[:40], begin.joints, atol=1e-5)
+    step = np.linalg.norm(np.diff(motion.joints, axis=0), axis=-1).max(1)
+    assert step[39] < 3 * step.max() / 2
+    short = flame_mdm.generate(model, "a person bows", frames=4, num_inference_steps=2)[0]
+    with pytest.raises(UserError, match="too short"):
+        flame_mdm.generate(model, "a person bows", after=short)
+
+
+def test_a_loop_has_no_seam(model):
+    """The raised arm of a loop comes down again. The window of a loop goes around it."""
+    shared = overlap(model)
+    ((_, first, size),) = spans([40], 60, shared, loop=True)
+    assert (first, size) == (-shared // 2, 40 + shared)
+
+    def seam(loop: bool) -> float:
+        text = "a person raises both arms"
+        features = flame_mdm.generate(model, text, seconds=2, loop=loop)[0].features[:, 4:67]
+        return float(np.abs(features[0] - features[-1]).max() / np.abs(np.diff(features, axis=0)).max())
+
+    assert seam(loop=True) < 1 < seam(loop=False)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("walks | | sits", "part 2 is empty"),
+        ("walks @fast", "seconds of a part are a number"),
+        ("walks @-1", "seconds of a part are a number"),
+        ("walks @0.2 | sits", "'walks': a part of 0.2 seconds is too short"),
+        ("walks @9999", "too long"),
+    ],
+)
+def test_bad_parts_give_one_clear_line(model, text, message):
+    with pytest.raises(UserError, match=message):
+        flame_mdm.generate(model, text)
+
+
+def test_a_loop_cannot_continue_a_motion(model):
+    with pytest.raises(UserError, match="loop"):
+        flame_mdm.generate(model, "walks", after="walk.npz", loop=True)
+
+
+def test_the_command_writes_a_sequence(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    words = ["text=a person walks @1 | a person bows", "frames=20", "samples=1", "num_inference_steps=3"]
+    assert main(["sample", "quickstart", *words, "out=first"]) == 0
+    assert "1 motion of 40 frames" in capsys.readouterr().out
+    assert main(["sample", "quickstart", *words, "after=first/motion_000.npz"]) == 0
+    (path,) = Path("samples").rglob("motion_000.npz")
+    assert "after" in path.parent.name
+    assert len(read(path).joints) == 80
+    assert main(["sample", "quickstart", "text=walks | ", "samples=1"]) == 1
+    assert "part 2 is empty" in capsys.readouterr().err

@@ -9,7 +9,7 @@ from flame_mdm.config import Config, run
 from flame_mdm.errors import UserError, say
 
 USAGE = """
-usage: flame-mdm convert MOTION OUT [fps=20] [unit=0.01] [up=z] [figure=bones] [rest_pose=true]
+usage: flame-mdm convert MOTION OUT [fps=20] [unit=0.01] [up=z] [figure=bones] [rest_pose=true] [rig=mixamo]
 
 Converts a motion file. The nearest skeleton.yaml in its folder or above applies (docs/own-data.md).
 Inputs: .npz written by `make sample`, .npz of AMASS, .bvh, .json, and .npy with joint positions.
@@ -39,7 +39,7 @@ def convert(config: Config) -> None:
     motion = read(path, config["fps"], config["unit"], given=given, any_size=copied)
     if out.suffix.lower() == ".npz":
         motion.poses = motion.posed()  # other programs expect AMASS's keys
-    say(motion.save(out, config["figure"], config["rest_pose"]))
+    say(motion.save(out, config["figure"], config["rest_pose"], config["rig"]))
     if motion.skeleton.joints[: len(SMPL22)] == SMPL22.joints:
         leg, head = leg_length(motion.joints), head_height(motion.joints)
         say(f"legs {leg:.2f} m, head joint at {head:.2f} m")
@@ -53,6 +53,6 @@ main = partial(
     usage=USAGE,
     name="convert",
     objects=("motion", "out"),
-    text=("motion", "out", "up", "figure"),
+    text=("motion", "out", "up", "figure", "rig"),
     kinds={"fps": "float", "unit": "float"},
 )

@@ -15,6 +15,8 @@ import torch
 
 from flame_mdm.files import atomic_write
 from flame_mdm.formats.poses import Poses
+from flame_mdm.formats.retarget import Rig, retarget
+from flame_mdm.representations import rotation
 from flame_mdm.representations.skeleton import SMPL22
 from flame_mdm.visualize.body import ANCHORS, Figure, mesh
 from flame_mdm.visualize.render import SIDE_COLORS
@@ -27,16 +29,17 @@ SIDES = 10
 """Number of corners of a limb's cross section."""
 
 
-def write(path: Path, poses: Poses, fps: float, text: str, name: str, body: Figure | None = None) -> None:
+def write(path: Path, poses: Poses, rig: Rig, fps: float, text: str, name: str, body: Figure | None = None) -> None:
     """Writes a .glb file in meters, y up; the rest pose faces +z, as the format requires.
 
-    It contains one node per joint, named as in SMPL, one animation that rotates all nodes and moves the root, with one
-    key per frame in seconds, and one mesh skinned to the joints: a body, stored in an A-pose, or rounded limbs. The
-    node above the joints lifts a body by the thickness of its soles; its toes bend as in pictures.
+    It contains one node per joint, one animation that rotates all nodes and moves the hips, with one key per frame in
+    seconds, and one mesh skinned to the joints: a body, stored in an A-pose, or rounded limbs. The node above the
+    joints lifts a body by the thickness of its soles; its toes bend as in pictures.
 
     Args:
         path: the file.
         poses: the motion.
+        rig: the skeleton, with the bone lengths of the motion.
         fps: frames per second.
         text: the caption.
         name: of the animation, if there is no caption.
@@ -53,18 +56,27 @@ def write(path: Path, poses: Poses, fps: float, text: str, name: str, body: Figu
         "WEIGHTS_0": binary.add(weight, VERTICES, normalized=True),
     }
     indices = binary.add(index, INDICES)
+    skinned = [rig.sources.index(number) for number in range(len(SMPL22))]
+    bind[:, :3] = rig.neutral[skinned].mT @ bind[:, :3]
+    others = [joint for joint, source in enumerate(rig.sources) if source < 0]
+    resting = np.tile(np.eye(4, dtype="f4"), (len(others), 1, 1))
+    resting[:, :3, :3] = rig.turns[others].mT
+    resting[:, :3, 3] = -(rig.turns[others].mT @ rig.places[others, :, None])[..., 0]
+    bind = np.concatenate([bind, resting])
     matrices = binary.add(bind.mT.reshape(-1, 16))  # matrices are stored in column-major order
     times = binary.add(np.arange(len(poses.root), dtype=np.float32) / np.float32(fps), bounds=True)
-    turned = poses if body is None else Poses(poses.offsets, torch.from_numpy(body.local()), poses.root)
-    turns = turned.quaternions()[..., [1, 2, 3, 0]].float().numpy()
-    curves = [("rotation", node, turns[:, node]) for node in range(len(rest))]
-    curves.append(("translation", 0, poses.root.float().numpy()))
-    offsets = np.concatenate([rest[:1], poses.offsets.numpy()[1:]])
+    moved = poses if body is None else Poses(poses.offsets, torch.from_numpy(body.local()), poses.root)
+    turns, root = retarget(moved, rig)
+    turns = quaternions(np.concatenate([rig.rest()[None], turns]))
+    curves = [("rotation", node, turns[1:, node]) for node in range(len(rig.joints))]
+    curves.append(("translation", rig.hips, root.astype("f4")))
     nodes: list[dict[str, Any]] = [
-        {"name": name, "translation": offset.tolist()} for name, offset in zip(SMPL22.joints, offsets, strict=True)
+        {"name": name, "translation": offset.tolist(), "rotation": turn.tolist()}
+        for name, offset, turn in zip(rig.joints, rig.offsets(), turns[0], strict=True)
     ]
-    for parent, child in SMPL22.edges:
-        nodes[parent].setdefault("children", []).append(child)
+    for joint, parent in enumerate(rig.parents):
+        if parent >= 0:
+            nodes[parent].setdefault("children", []).append(joint)
     nodes.append({"name": "figure", "mesh": 0, "skin": 0})
     nodes.append({"name": "lifted", "children": [0], "translation": [0, body.lift if body else 0, 0]})
     document = {
@@ -74,11 +86,11 @@ def write(path: Path, poses: Poses, fps: float, text: str, name: str, body: Figu
             "extras": {"fps": fps, "text": text, "unit": "metre", "up": "y"},
         },
         "scene": 0,
-        "scenes": [{"nodes": [len(rest), len(rest) + 1]}],
+        "scenes": [{"nodes": [len(rig.joints), len(rig.joints) + 1]}],
         "nodes": nodes,
         "meshes": [{"primitives": [{"attributes": attributes, "indices": indices, "material": 0}]}],
         "materials": [{"pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 0.8}}],
-        "skins": [{"joints": list(range(len(rest))), "skeleton": 0, "inverseBindMatrices": matrices}],
+        "skins": [{"joints": skinned + others, "skeleton": 0, "inverseBindMatrices": matrices}],
         "animations": [
             {
                 "name": text or name or "motion",
@@ -99,6 +111,12 @@ def write(path: Path, poses: Poses, fps: float, text: str, name: str, body: Figu
     chunks += struct.pack("<I4s", len(binary.data), b"BIN\0") + bytes(binary.data)
     with atomic_write(path) as temporary:
         temporary.write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks)
+
+
+def quaternions(matrices: np.ndarray) -> np.ndarray:
+    """Converts rotations (F, ..., 3, 3) to float32 quaternions x, y, z, w without sign changes between frames."""
+    turns = rotation.continuous(rotation.matrix_to_quaternion(torch.from_numpy(matrices)), dim=0)
+    return turns[..., [1, 2, 3, 0]].float().numpy()
 
 
 class _Binary:

@@ -107,6 +107,14 @@ _BANDAI_LIMBS: dict[str, Place] = {
     **{"hip": "UpperLeg_*", "knee": "LowerLeg_*", "ankle": "Foot_*", "foot": "Toes_*"},
     **{"collar": "Shoulder_*", "shoulder": "UpperArm_*", "elbow": "LowerArm_*", "wrist": "Hand_*"},
 }
+_UNREAL_LIMBS: dict[str, Place] = {
+    **{"hip": "thigh_*", "knee": "calf_*", "ankle": "foot_*", "foot": "ball_*"},
+    **{"collar": "clavicle_*", "shoulder": "upperarm_*", "elbow": "lowerarm_*", "wrist": "hand_*"},
+}
+_UNITY_LIMBS: dict[str, Place] = {
+    **{"hip": "*UpperLeg", "knee": "*LowerLeg", "ankle": "*Foot", "foot": "*Toes"},
+    **{"collar": "*Shoulder", "shoulder": "*UpperArm", "elbow": "*LowerArm", "wrist": "*Hand"},
+}
 _MIXAMO_MIDDLE: dict[str, Place] = {
     **{"pelvis": "Hips", "spine1": "Spine", "spine2": "Spine1", "spine3": "Spine2"},
     **{"neck": "Neck", "head": "Head"},
@@ -131,6 +139,22 @@ LAYOUTS: dict[str, Layout] = {
     "SMPL": Layout(dict(zip(SMPL22.joints, SMPL22.joints, strict=True))),
     "Mixamo": Layout(_body("Left", "Right", _MIXAMO_LIMBS, **_MIXAMO_MIDDLE), unit=0.01),
     "LAFAN1": Layout(_body("Left", "Right", {**_MIXAMO_LIMBS, "foot": "*Toe"}, **_MIXAMO_MIDDLE), unit=0.01),
+    "Unreal": Layout(
+        _body(
+            *("l", "r", _UNREAL_LIMBS),
+            **{"pelvis": "pelvis", "spine1": "spine_01", "spine2": "spine_02", "spine3": "spine_03"},
+            **{"neck": "neck_01", "head": "head"},
+        ),
+        unit=0.01,
+    ),
+    "Unity": Layout(
+        _body(
+            *("Left", "Right", _UNITY_LIMBS),
+            **{"pelvis": "Hips", "spine1": "Spine", "spine2": "Chest", "spine3": "UpperChest"},
+            **{"neck": "Neck", "head": "Head"},
+        ),
+        unit=0.01,
+    ),
     # Four joints between hips and neck; SMPL's spine3 is between the upper two.
     "Xsens": Layout(
         _body(

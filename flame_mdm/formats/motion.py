@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import sys
 import tempfile
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from html import escape
 from importlib import import_module
@@ -23,6 +24,7 @@ from torch import Tensor
 from flame_mdm.files import atomic_write, write_text
 from flame_mdm.formats import bvh, glb
 from flame_mdm.formats.poses import Poses, solve
+from flame_mdm.formats.retarget import CENTIMETER, SMPL_ORDERS, Rig, preset, retarget, smpl
 from flame_mdm.representations import rotation
 from flame_mdm.representations.skeleton import SMPL22, Skeleton
 from flame_mdm.representations.smpl import ADULT
@@ -34,10 +36,6 @@ END_SITES = {
     **{"left_wrist": ADULT[22], "right_wrist": ADULT[23]},
 }
 """Tips of head, toes and hands beyond the last joints, in meters; without them programs do not draw these bones."""
-EULER = tuple("YXZ" if name.endswith("shoulder") else "YZX" for name in SMPL22.joints)
-"""Euler order of each joint, chosen to keep gimbal lock (middle angle at 90 degrees) away from common poses: bent
-knees, elbows and hips, a hanging arm, a body that turns or bows."""
-CENTIMETER = 0.01
 FIGURES = ("body", "bones")
 """Meshes of .glb files; the first is the default."""
 
@@ -112,7 +110,9 @@ class Motion:
             joints = joints[:, : len(SMPL22)]  # the last two are the hands
         return solve(joints, self.fps)
 
-    def save(self, path: str | Path, figure: str = "body", rest_pose: bool = False, **facts: Any) -> str:
+    def save(
+        self, path: str | Path, figure: str = "body", rest_pose: bool = False, rig: str | None = None, **facts: Any
+    ) -> str:
         """Writes a motion file and returns a line that describes it.
 
         `.npz` contains joints, frame rate, text and features, and AMASS's keys if rotations are known. `.bvh` and
@@ -122,11 +122,13 @@ class Motion:
             path: the file; its extension selects the format.
             figure: the mesh of a `.glb` file: body, or bones for rounded limbs.
             rest_pose: begin a `.bvh` file with a frame of the rest pose, arms out, which some programs expect.
+            rig: the skeleton of a `.bvh` or `.glb` file, one of `flame_mdm.formats.retarget.presets`; default: SMPL's.
             facts: additional entries of an `.npz` file, such as the seed.
 
         Raises:
             ValueError: the extension is unknown, or `.bvh` or `.glb` is requested for another skeleton than SMPL's.
-            UserError: the file cannot be written, or `.mp4` is requested and the package av is not installed.
+            UserError: the file cannot be written, `.mp4` is requested and the package av is not installed, or the rig
+                is unknown.
         """
         path = Path(path)
         writers = {".bvh": _write_bvh, ".glb": _write_glb, ".npz": _write_npz, ".json": _write_json, ".npy": _write_npy}
@@ -138,7 +140,9 @@ class Motion:
             raise ValueError(f"figure={figure}: unknown. Use {' or '.join(FIGURES)}")
         if (figure != FIGURES[0] and writer is not _write_glb) or (rest_pose and writer is not _write_bvh):
             raise ValueError(f"{path}: figure is only for .glb files, and rest_pose only for .bvh files")
-        given = {_write_npz: (facts,), _write_glb: (figure,), _write_bvh: (rest_pose,)}
+        if rig is not None and writer not in (_write_bvh, _write_glb):
+            raise ValueError(f"{path}: rig is only for .bvh and .glb files, which contain a skeleton")
+        given = {_write_npz: (facts,), _write_glb: (figure, rig), _write_bvh: (rest_pose, rig)}
         what = writer(self, path, *given.get(writer, ()))
         return f"{path}: {len(self.joints)} frames at {self.fps:g} per second, {what}"
 
@@ -188,41 +192,59 @@ def _write_npz(motion: Motion, path: Path, facts: dict[str, Any]) -> str:
     return what
 
 
-def _write_bvh(motion: Motion, path: Path, rest_pose: bool) -> str:
+def _rig(poses: Poses, rig: str | None) -> Rig:
+    return smpl(poses) if rig is None else preset(rig, poses)
+
+
+def _write_bvh(motion: Motion, path: Path, rest_pose: bool, rig: str | None) -> str:
     poses = motion.posed()
-    angles = np.round(np.degrees(continuous_euler(poses.rotations).numpy()), 6)
-    rotations = [tuple(f"{axis}rotation" for axis in order) for order in EULER]
-    root = np.round(poses.root.numpy() / CENTIMETER, 5)
-    offsets = np.round(poses.offsets.numpy() / CENTIMETER, 5)
-    frames = np.concatenate([root, angles.reshape(len(angles), -1)], 1)
+    skeleton = _rig(poses, rig)
+    turns, root = retarget(poses, skeleton)
+    offsets = np.round(skeleton.offsets() / skeleton.unit, 5)
     if rest_pose:
-        frames = np.concatenate([np.zeros_like(frames[:1]), frames])
-        frames[0, :3] = np.round(poses.rest()[0].numpy() / CENTIMETER, 5)
-    offsets[0] = 0  # programs disagree on whether the root's channels replace its offset or add to it
+        turns = np.concatenate([skeleton.rest()[None], turns])
+        root = np.concatenate([skeleton.places[None, skeleton.hips], root])
+    angles = np.round(np.degrees(continuous_euler(torch.from_numpy(turns), skeleton.orders).numpy()), 6)
+    places = np.tile(offsets, (len(angles), 1, 1))
+    places[:, skeleton.hips] = np.round(root / skeleton.unit, 5)
+    moving = [skeleton.moving or joint <= skeleton.hips for joint in range(len(offsets))]
+    offsets[skeleton.hips] = 0  # programs disagree on whether the channels replace the offset or add to it
+    ends = {skeleton.sources.index(SMPL22.joints.index(name)): site for name, site in END_SITES.items()}
     bvh.write(
         bvh.Bvh(
-            joints=SMPL22.joints,
-            parents=SMPL22.parents,
+            joints=skeleton.joints,
+            parents=skeleton.parents,
             offsets=offsets,
-            channels=(("Xposition", "Yposition", "Zposition", *rotations[0]), *rotations[1:]),
-            end_parents=tuple(SMPL22.joints.index(name) for name in END_SITES),
-            end_offsets=np.array(list(END_SITES.values())) / CENTIMETER,
-            frames=frames,
+            channels=tuple(
+                ("Xposition", "Yposition", "Zposition") * moves + tuple(f"{axis}rotation" for axis in order)
+                for moves, order in zip(moving, skeleton.orders, strict=True)
+            ),
+            end_parents=tuple(ends),
+            end_offsets=np.stack([site @ skeleton.neutral[joint] for joint, site in ends.items()]) / skeleton.unit,
+            frames=np.concatenate(
+                [
+                    part
+                    for joint, moves in enumerate(moving)
+                    for part in ([places[:, joint]] * moves + [angles[:, joint]])
+                ],
+                axis=1,
+            ),
             fps=motion.fps,
         ),
         path,
     )
-    return f"centimeters, y up; {_error(motion, poses)}" + "; the first frame is the rest pose" * rest_pose
+    unit = "centimeters" if skeleton.unit == CENTIMETER else f"unit {skeleton.unit:.4g} m"
+    return f"{unit}, y up; {_error(motion, poses)}" + "; the first frame is the rest pose" * rest_pose
 
 
-def continuous_euler(matrices: Tensor) -> Tensor:
-    """Converts rotations (F, J, 3, 3) to Euler angles (F, J, 3) in the orders of `EULER`, radians, without jumps.
+def continuous_euler(matrices: Tensor, orders: Sequence[str] = SMPL_ORDERS) -> Tensor:
+    """Converts rotations (F, J, 3, 3) to Euler angles (F, J, 3) in the joints' `orders`, radians, without jumps.
 
     A rotation has two triples of angles, and full turns may be added to each angle. The angles nearest to the previous
     frame are used, so that programs can interpolate; two full turns of the body end at 720 degrees.
     """
     turn = 2 * torch.pi
-    first = torch.stack([rotation.matrix_to_euler(matrices[:, j], order) for j, order in enumerate(EULER)], 1)
+    first = torch.stack([rotation.matrix_to_euler(matrices[:, j], order) for j, order in enumerate(orders)], 1)
     second = torch.stack([first[..., 0] + torch.pi, torch.pi - first[..., 1], first[..., 2] + torch.pi], -1)
     chosen = [first[0]]
     for pair in torch.stack([first, second], -2)[1:]:
@@ -233,12 +255,12 @@ def continuous_euler(matrices: Tensor) -> Tensor:
     return torch.stack(chosen)
 
 
-def _write_glb(motion: Motion, path: Path, figure: str) -> str:
+def _write_glb(motion: Motion, path: Path, figure: str, rig: str | None) -> str:
     from flame_mdm.visualize.body import try_figure
 
     poses = motion.posed()
     body, reason = try_figure(motion) if figure == FIGURES[0] else (None, "")
-    glb.write(path, poses, motion.fps, motion.text, motion.id, body)
+    glb.write(path, poses, _rig(poses, rig), motion.fps, motion.text, motion.id, body)
     return f"meters, y up; {_error(motion, poses)}" + (reason and f"; without a body: {reason}")
 
 

@@ -6,7 +6,7 @@
 PYTHON ?= python3
 VENV := .venv
 READY := $(VENV)/.ready
-COMMANDS := train sample edit evaluate audit tables benchmark prepare browse inspect convert compare report import export push
+COMMANDS := train sample demo edit evaluate audit tables benchmark prepare browse inspect convert compare report import export push
 PYTEST := $(VENV)/bin/python -m pytest -n 2 --dist worksteal
 export MAKEFLAGS
 
@@ -30,7 +30,7 @@ setup: $(READY) ## install into .venv
 
 $(READY): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
-	$(VENV)/bin/python -m pip install -q -c constraints.txt -e '.[dev,offline,video]'
+	$(VENV)/bin/python -m pip install -q -c constraints.txt -e '.[dev,offline,video,demo]'
 	@touch $@
 
 test: $(READY) ## run all tests, except those that need outside tools

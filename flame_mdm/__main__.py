@@ -12,6 +12,7 @@ from flame_mdm.errors import UserError, did_you_mean, say
 COMMANDS = {
     "train": "train or resume a recipe",
     "sample": "generate motions from a checkpoint",
+    "demo": "ask for motions in the browser",
     "edit": "keep part of a motion and resample the rest",
     "evaluate": "evaluate a checkpoint under a protocol",
     "audit": "audit an evaluator: what its metrics see, and from which strength",

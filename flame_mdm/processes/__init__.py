@@ -24,6 +24,9 @@ class Process(nn.Module, ABC):
     edit_modes: Sequence[str] = ()
     """Modes of `Edit` that sampling supports; the first is the authors'."""
 
+    sampler_names: Sequence[str] = ()
+    """Values of `sampler` in `sample`."""
+
     @abstractmethod
     def out_features(self, features: int) -> int:
         """Returns the number of output channels of the denoiser for D = `features`: D, or 2D with learned variance."""

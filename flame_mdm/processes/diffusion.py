@@ -67,6 +67,7 @@ class GaussianDiffusion(Process):
     """Gaussian diffusion over T steps. t is the step 0 ... T - 1 as a float, passed unchanged to the denoiser."""
 
     edit_modes = ("x0", "x_t")
+    sampler_names = get_args(Sampler)
 
     def __init__(
         self,
@@ -258,8 +259,8 @@ class GaussianDiffusion(Process):
         Raises:
             ValueError: the sampler, number of steps, edit or eta is not supported.
         """
-        if sampler not in get_args(Sampler):
-            raise ValueError(f"unknown sampler '{sampler}': GaussianDiffusion has {', '.join(get_args(Sampler))}")
+        if sampler not in self.sampler_names:
+            raise ValueError(f"unknown sampler '{sampler}': GaussianDiffusion has {', '.join(self.sampler_names)}")
         if eta and (sampler != "ddim" or not 0 <= eta <= 1):
             raise ValueError(f"eta={eta} with sampler {sampler}: eta is an option of ddim, from 0 to 1")
         if edit is not None:

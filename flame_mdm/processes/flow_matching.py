@@ -19,6 +19,7 @@ class FlowMatching(Process):
     """Straight path from noise at t = 0 to motion at t = 1; the denoiser predicts its velocity and is passed 1000 t."""
 
     edit_modes = ("trajectory", "x0")
+    sampler_names = (*STEPS, "dopri5")
 
     def __init__(
         self,
@@ -145,8 +146,8 @@ class FlowMatching(Process):
         Raises:
             ValueError: the sampler, number of steps or edit is not supported.
         """
-        if sampler != "dopri5" and sampler not in STEPS:
-            raise ValueError(f"unknown sampler '{sampler}': FlowMatching has {', '.join(STEPS)}, dopri5")
+        if sampler not in self.sampler_names:
+            raise ValueError(f"unknown sampler '{sampler}': FlowMatching has {', '.join(self.sampler_names)}")
         if spacing != "linspace" or eta:
             raise ValueError(f"spacing={spacing}, eta={eta}: a flow takes equal steps without noise; leave them out")
         if not isinstance(num_inference_steps, int):

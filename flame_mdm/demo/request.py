@@ -1,0 +1,168 @@
+"""Requests of the demo: one form, one link, one command line and one Python program for the same motion."""
+
+from __future__ import annotations
+
+import json
+import shlex
+from collections.abc import Iterable
+from typing import Annotated, Any, Literal, TypeVar
+from urllib.parse import urlencode
+
+from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationError
+
+from flame_mdm.errors import UserError, did_you_mean, one_line
+from flame_mdm.visualize.scene import shortened
+
+MAX_TEXT, MAX_SECONDS, MAX_SAMPLES, MAX_STEPS, MAX_EDITS = 300, 30, 4, 1000, 8
+"""Limits of a request: characters, seconds, motions, sampling steps, edits."""
+MAX_SEED = 2**31 - 1
+
+Text = Annotated[str, StringConstraints(strip_whitespace=True, max_length=MAX_TEXT, pattern=r"^[^\x00-\x1f\x7f]*$")]
+Samples = Annotated[int, Field(ge=1, le=MAX_SAMPLES)]
+Seed = Annotated[int, Field(ge=0, le=MAX_SEED)]
+Part = Literal["left_arm", "right_arm", "left_leg", "right_leg", "arms", "legs", "upper_body", "lower_body"]
+RULES = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class Change(BaseModel):
+    """An edit of one of the motions so far: `joints` in `region_seconds` are resampled, the rest is kept.
+
+    Attributes:
+        motion: number of the edited motion, from 0.
+        text: what the person does in the new part; "" = unconditioned.
+        region_seconds: begin and end of the new part; None = all of the motion.
+        joints: body parts to resample; none = all.
+        strength: None = from noise; otherwise a variation of the motion, as in `flame_mdm.editing.edit`.
+    """
+
+    model_config = RULES
+    motion: Annotated[int, Field(ge=0, lt=MAX_SAMPLES)] = 0
+    text: Text = ""
+    region_seconds: tuple[Annotated[float, Field(ge=0)], Annotated[float, Field(gt=0)]] | None = None
+    joints: tuple[Part, ...] = ()
+    strength: Annotated[float, Field(gt=0, le=1)] | None = None
+    samples: Samples = 1
+    seed: Seed = 0
+
+
+class Request(BaseModel):
+    """Everything that determines the motions that the demo shows; keys are those of `flame-mdm sample`."""
+
+    model_config = RULES
+    model: str = "quickstart"
+    text: Text = ""
+    seconds: Annotated[float, Field(gt=0, le=MAX_SECONDS)] = 3.0
+    samples: Samples = 1
+    seed: Seed = 0
+    guidance_scale: Annotated[float, Field(ge=-100, le=100)] | None = None
+    num_inference_steps: Annotated[int, Field(ge=1, le=MAX_STEPS)] | None = None
+    sampler: Annotated[str, StringConstraints(pattern=r"^\w{1,40}$")] | None = None
+    cleanup: bool = True
+    edits: Annotated[tuple[Change, ...], Field(max_length=MAX_EDITS)] = ()
+
+    def query(self) -> str:
+        """Returns the query string of a link to this request; `parse_query` reads it."""
+        pairs = self.model_dump(exclude={"edits"}, exclude_none=True, mode="json")
+        pairs["cleanup"] = str(self.cleanup).lower()
+        edits = [change.model_dump_json(exclude_defaults=True) for change in self.edits]
+        return urlencode([*pairs.items(), *(("edit", text) for text in edits)])
+
+    def steps(self, kind: str) -> list[tuple[int | None, dict[str, Any]]]:
+        """Returns what makes the motions, in order: the number of the motion to edit, None for the first step, and the
+        arguments of `flame_mdm.generate` or `flame_mdm.edit`.
+
+        Motions are edited as the model made them and cleaned up at the end.
+
+        Args:
+            kind: what the model was trained on: text, action or none.
+        """
+        keys = ("guidance_scale", "num_inference_steps", "sampler")
+        shared = {key: value for key in keys if (value := getattr(self, key)) is not None}
+        found: list[tuple[int | None, dict[str, Any]]] = []
+        for part in (self, *self.edits):
+            given: dict[str, Any] = {} if kind == "none" or not part.text else {f"{kind}s": part.text}
+            if isinstance(part, Request):
+                given["seconds"] = part.seconds
+            else:
+                region = None if part.region_seconds is None else list(part.region_seconds)
+                chosen = {"region_seconds": region, "joints": list(part.joints) or None, "strength": part.strength}
+                given |= {key: value for key, value in chosen.items() if value is not None}
+            given |= {"samples": part.samples, "seed": part.seed, **shared}
+            found.append((None if isinstance(part, Request) else part.motion, given))
+        if self.cleanup:
+            found[-1][1]["cleanup"] = True
+        return found
+
+    def command(self, kind: str, device: str | None) -> str:
+        """Returns the command lines that write the same motions; `device` if it is not the default."""
+        lines, folder = [], "motions"
+        for number, (source, given) in enumerate(self.steps(kind)):
+            words = ["flame-mdm", "sample" if source is None else "edit", self.model]
+            if source is not None:  # the folder of an edit begins with the original
+                words.append(f"motion={folder}/motion_{source + (number > 1):03d}.npz")
+                folder = f"edit_{number}"
+            keys = {{"texts": "text", "actions": "action"}.get(key, key): value for key, value in given.items()}
+            keys |= {} if keys.keys() & {"text", "action"} else {"unconditioned": True}
+            keys |= {"device": device} if device else {}
+            words += [f"{key}={_word(value)}" for key, value in keys.items()]
+            lines.append(shlex.join([*words, f"out={folder}"]))
+        return "\n".join(lines)
+
+    def python(self, kind: str, device: str) -> str:
+        """Returns the lines of Python that make the same motions."""
+        lines = ["import flame_mdm", "", f"model = flame_mdm.load({self.model!r}{f', {device!r}' * (device != 'cpu')})"]
+        for source, given in self.steps(kind):
+            call = "generate(model" if source is None else f"edit(model, motions[{source}]"
+            options = "".join(f", {key}={value!r}" for key, value in given.items())
+            lines.append(f"motions = flame_mdm.{call}{options})")
+        return "\n".join([*lines, 'motions[0].save("motion.bvh")  # or .glb, .npz, .mp4'])
+
+
+def _word(value: Any) -> str:
+    if isinstance(value, list):
+        return f"[{','.join(map(str, value))}]"
+    return str(value).lower() if isinstance(value, bool) else str(value)
+
+
+def parse_query(pairs: Iterable[tuple[str, str]]) -> Request:
+    """Returns the request of a link's query string; keys that begin with "__" belong to the host and are skipped.
+
+    Raises:
+        UserError: a key is unknown or given twice, or a value is invalid.
+    """
+    found: dict[str, Any] = {}
+    edits: list[Any] = []
+    for key, value in pairs:
+        if key == "edit":
+            try:
+                edits.append(json.loads(value))
+            except (ValueError, RecursionError):
+                raise UserError(f"edit={_shown(value)}: not an edit of this page. Copy the whole link") from None
+        elif key in found:
+            raise UserError(f"{_shown(key)} is given twice. Remove one")
+        elif not key.startswith("__"):
+            found[key] = value
+    return checked(Request, found | ({"edits": edits} if edits else {}))
+
+
+Checked = TypeVar("Checked", bound=BaseModel)
+
+
+def checked(kind: type[Checked], values: dict[str, Any]) -> Checked:
+    """Returns a request or a change with these values; empty ones are left to the defaults.
+
+    Raises:
+        UserError: a value is invalid; the message quotes it.
+    """
+    try:
+        return kind(**{key: value for key, value in values.items() if value not in (None, "")})
+    except ValidationError as error:
+        first = error.errors()[0]
+        name = ".".join(str(part) for part in first["loc"])
+        if first["type"] == "extra_forbidden":
+            raise UserError(f"unknown option {_shown(name)}.{did_you_mean(name, kind.model_fields)}") from None
+        raise UserError(f"{name}={_shown(first['input'])}: {first['msg'].lower()}") from None
+
+
+def _shown(value: Any) -> str:
+    return shortened(one_line(str(value)[:500]), 60)

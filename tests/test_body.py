@@ -1,4 +1,6 @@
-"""The mannequin: a sound mesh, bound to clips and skinned."""
+"""Bodies: a sound mesh, bound to clips and skinned."""
+
+import sys
 
 import numpy as np
 import pytest
@@ -9,8 +11,12 @@ from flame_mdm.errors import UserError
 from flame_mdm.formats.motion import Motion, motion_of_poses
 from flame_mdm.formats.poses import Poses
 from flame_mdm.representations.skeleton import KIT21, SMPL22
-from flame_mdm.visualize import body, frames_array
-from flame_mdm.visualize.body import ANCHORS, JOINT, REST, figure, mesh, rasterize, try_figure
+from flame_mdm.representations.smpl import ADULT
+from flame_mdm.visualize import body, frames_array, player_page
+from flame_mdm.visualize.bodies import choose_body
+from flame_mdm.visualize.body import ANCHORS, JOINT, MANNEQUIN, Mesh, figure, mesh, rasterize, try_figure
+
+REST = np.array(ADULT[:22])
 
 
 def posed(frames: int = 1, scale: float = 1.0, **turns: tuple[float, float, float]) -> Motion:
@@ -68,7 +74,7 @@ def test_the_stored_pose_gives_the_stored_mesh():
         f"{side}_{k}": (x, f * y, f * z) for side, f in (("left", 1), ("right", -1)) for k, (x, y, z) in turns.items()
     }
     points, _ = figure(posed(1, 1.0, **both)).skinned(0)
-    np.testing.assert_allclose(points - [0, 0.955 + body.SOLE, 0], mesh().points, atol=3e-3)  # it has a little twist
+    np.testing.assert_allclose(points - [0, 0.955 + mesh().sole, 0], mesh().points, atol=4e-3)  # it has a little twist
 
 
 def test_joints_of_the_body_are_those_of_the_motion_and_soles_are_on_the_floor():
@@ -119,6 +125,14 @@ def test_toes_bend_where_the_heel_rises_and_the_head_is_level():
     assert abs(forward[0, JOINT["head"], 1]) < 0.05
 
 
+def test_a_long_bow_does_not_tip_the_head_back_later():
+    bowed = posed(30, pelvis=(70, 0, 0), neck=(30, 0, 0))
+    drawn = figure(Motion(np.concatenate([bowed.joints, posed(10).joints]), 20))
+    pitch = np.degrees(np.arcsin((drawn.turns @ mesh().turns)[:, JOINT["head"], 1, 2]))
+    assert pitch[-1] == pytest.approx(0, abs=2)
+    assert pitch[0] < -60
+
+
 def test_the_nearest_triangle_is_drawn():
     image = np.full((20, 20, 3), 255, np.uint8)
     square = np.array([[2.0, 18], [18, 18], [18, 2], [2, 2]])
@@ -158,11 +172,64 @@ def test_a_motion_that_no_body_fits_says_why(motion, reason):
     assert frames_array(motion, 64).shape == (len(motion.joints), 64, 64, 3)  # its skeleton
 
 
-def test_a_damaged_asset_is_named(tmp_path, monkeypatch):
-    body.stored.cache_clear()
-    monkeypatch.setattr(body, "__file__", str(tmp_path / "body.py"))
-    with pytest.raises(UserError, match=r"mannequin\.npz: the figure cannot be read .* Install flame-mdm again"):
-        body.stored()
-    (tmp_path / "mannequin.npz").write_bytes(b"PK")
-    with pytest.raises(UserError, match=r"mannequin\.npz"):
-        body.stored()
+def test_a_damaged_asset_is_named(tmp_path):
+    with pytest.raises(UserError, match=r"mannequin\.npz: the figure cannot be read .* Delete it"):
+        Mesh(tmp_path / "mannequin.npz")
+    (tmp_path / "a.npz").write_bytes(b"PK")
+    with pytest.raises(UserError, match=r"a\.npz"):
+        Mesh(tmp_path / "a.npz")
+    np.savez(tmp_path / "b.npz", **{**mesh().stored, "bones": mesh().stored["bones"] + 30})
+    with pytest.raises(UserError, match=r"b\.npz"):
+        Mesh(tmp_path / "b.npz")
+
+
+@pytest.fixture
+def cache(tmp_path, monkeypatch):
+    """An empty cache of figures, without network; the mannequin is drawn again afterwards."""
+
+    def refuse(*_: object) -> None:
+        raise OSError("no network")
+
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr("socket.socket.connect", refuse)
+    yield tmp_path / "flame-mdm"
+    body.use(MANNEQUIN)
+
+
+@pytest.mark.parametrize(
+    ("name", "says"),
+    [
+        ("smpl", "body=smpl: unknown. Use mannequin, anny, or anny with its shape"),
+        ("", "body=: unknown"),
+        ("mannequin age=1", "body=mannequin age=1: unknown"),
+        ("anny age=old", "age=old is not one of gender, age, height, weight with a number from 0 to 1"),
+        ("anny age=1.1", "age=1.1 is not one of"),
+        ("anny topology=smplx", "topology=smplx is not one of"),
+        ("anny", r'body=anny needs the package anny. Run pip install "flame-mdm\[body\]"'),
+    ],
+)
+def test_bodies_that_cannot_be_drawn_are_refused(cache, monkeypatch, name, says):
+    monkeypatch.setitem(sys.modules, "anny", None)
+    with pytest.raises(UserError, match=says):
+        choose_body(name)
+    assert len(mesh().points) == 2002
+    assert not cache.exists()
+
+
+@pytest.mark.tools
+def test_anny_is_made_once_without_network_and_drawn_like_the_mannequin(cache, tmp_path):
+    pytest.importorskip("anny", reason="anny is not installed: pip install flame-mdm[body]")
+    choose_body("anny age=0.9 gender=1")
+    (file,) = cache.iterdir()
+    written = file.stat().st_mtime_ns
+    choose_body("anny gender=1 age=0.9")
+    assert file.stat().st_mtime_ns == written
+    assert len(mesh().points) == 1229
+    motion = posed(left_knee=(60, 0, 0), left_hip=(-30, 0, 0))
+    drawn = figure(motion)
+    assert drawn.mesh is mesh()
+    np.testing.assert_allclose(drawn.places[0, :22] - [0, drawn.lift, 0], motion.joints[0], atol=1e-6)
+    assert drawn.skinned(0)[0][:, 1].min() == pytest.approx(0, abs=0.004)
+    for name in ("a.glb", "a.gif"):
+        motion.save(tmp_path / name)
+    assert len(player_page([motion])) > 60_000

@@ -39,7 +39,9 @@ def browse(config: Config) -> None:
         raise UserError(f"clips={config['clips']}: must be at least 1")
 
     from flame_mdm.data.store import Store
+    from flame_mdm.visualize.bodies import choose_body
 
+    choose_body(config["body"])
     representation = instantiate(config["representation"])
     data = instantiate(node, representation=representation)
     if (data.folder / STORE).exists() and data.source.named_by_recipe:
@@ -93,6 +95,6 @@ main = partial(
     usage=USAGE,
     name="browse",
     objects=("data", "out"),
-    text=("search", "source", "data.name", "out", "motions"),
+    text=("search", "source", "data.name", "out", "motions", "body"),
     rewrite=prepared,
 )

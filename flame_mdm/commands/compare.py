@@ -54,6 +54,9 @@ def compare(config: Config) -> None:
             )
         say(f"written: {out}")
         return
+    from flame_mdm.visualize.bodies import choose_body
+
+    choose_body(config["body"])
     compared = find(paths("runs", str(config["runs"])))
     shown = motions(compared, config)
     if config["rate"]:
@@ -71,7 +74,7 @@ main = partial(
     usage=USAGE,
     name="compare",
     objects=("runs*",),
-    text=("runs", "texts", "ratings", "out"),
+    text=("runs", "texts", "ratings", "out", "body"),
     kinds={"seconds": "float", "seed": "int"},
 )
 

@@ -31,7 +31,9 @@ def convert(config: Config) -> None:
     from flame_mdm.formats.files import read
     from flame_mdm.formats.layouts import find_skeleton
     from flame_mdm.representations.skeleton import SMPL22
+    from flame_mdm.visualize.bodies import choose_body
 
+    choose_body(config["body"])
     path, out = Path(str(config["motion"])), Path(str(config["out"]))
     given = find_skeleton(path, config["up"])
     # a BVH file keeps proportions in any unit; the other files are in meters
@@ -53,6 +55,6 @@ main = partial(
     usage=USAGE,
     name="convert",
     objects=("motion", "out"),
-    text=("motion", "out", "up", "figure", "rig"),
+    text=("motion", "out", "up", "figure", "rig", "body"),
     kinds={"fps": "float", "unit": "float"},
 )

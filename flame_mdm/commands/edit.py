@@ -38,7 +38,9 @@ def write_edits(config: Config) -> None:
     from flame_mdm.files import sha256
     from flame_mdm.generation import write_motions
     from flame_mdm.reading import read_motion
+    from flame_mdm.visualize.bodies import choose_body
 
+    choose_body(config["body"])
     file = find(config["ckpt"], config["which"])
     model = load(file, config["device"] or ("cuda" if torch.cuda.is_available() else "cpu"))
     check_condition(config, model, texts)
@@ -82,7 +84,7 @@ main = partial(
     usage=USAGE,
     name="edit",
     objects=("ckpt", "out"),
-    text=("text", "ckpt", "motion", "out", "up"),
+    text=("text", "ckpt", "motion", "out", "up", "body"),
     kinds={
         **SAMPLING,
         "method": "str",

@@ -43,7 +43,9 @@ def inspect(config: Config) -> None:
         raise UserError(f"clips={config['clips']}: must be at least 1")
     from flame_mdm.formats.faults import LIMITS, find_faults
     from flame_mdm.visualize import write_player
+    from flame_mdm.visualize.bodies import choose_body
 
+    choose_body(config["body"])
     name, count, motions = _files(config) if config["motion"] is not None else _clips(config)
     worst, kinds, faulty = [], Counter(), 0
     for motion in ProgressBar(motions, "inspecting", count, unit=" motions", disable=None if count > 1 else True):
@@ -107,7 +109,7 @@ main = partial(
     usage=USAGE,
     name="inspect",
     objects=("motion", "out"),
-    text=("motion", "out", "up", "data.name", "source"),
+    text=("motion", "out", "up", "data.name", "source", "body"),
     kinds={"fps": "float", "unit": "float"},
     rewrite=_named,
 )

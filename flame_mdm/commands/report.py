@@ -24,8 +24,11 @@ def report(config: Config) -> None:
     """
     if config["runs"] is None:
         raise UserError("no run named. Name a run directory: flame-mdm report runs/synthetic/mdm/default")
+    from flame_mdm.visualize.bodies import choose_body
+
+    choose_body(config["body"])
     for folder in paths("runs", str(config["runs"])):
         say(write_report(folder))
 
 
-main = partial(run, report, usage=USAGE, name="report", objects=("runs*",), text=("runs",))
+main = partial(run, report, usage=USAGE, name="report", objects=("runs*",), text=("runs", "body"))

@@ -49,7 +49,9 @@ def sample(config: Config) -> None:
     from flame_mdm.checkpoints.loading import find, load
     from flame_mdm.files import sha256
     from flame_mdm.generation import generate, write_motions
+    from flame_mdm.visualize.bodies import choose_body
 
+    choose_body(config["body"])
     device = config["device"] or ("cuda" if torch.cuda.is_available() else "cpu")
     file = find(config["ckpt"], config["which"])
     model = load(file, device)
@@ -92,7 +94,7 @@ main = partial(
     usage=USAGE,
     name="sample",
     objects=("ckpt", "out"),
-    text=("text", "prompts", "ckpt", "out", "after"),
+    text=("text", "prompts", "ckpt", "out", "after", "body"),
     kinds={
         **SAMPLING,
         **LENGTHS,

@@ -18,7 +18,7 @@ from flame_mdm.formats.poses import Poses
 from flame_mdm.formats.retarget import Rig, retarget
 from flame_mdm.representations import rotation
 from flame_mdm.representations.skeleton import SMPL22
-from flame_mdm.visualize.body import ANCHORS, Figure, mesh
+from flame_mdm.visualize.body import ANCHORS, Figure
 from flame_mdm.visualize.render import SIDE_COLORS
 from flame_mdm.visualize.scene import radii, sides
 
@@ -147,7 +147,7 @@ class _Binary:
 
 def _skin(body: Figure) -> tuple[np.ndarray, ...]:
     """Returns the body in its stored pose, lifted onto the floor: see `_limbs`. Helper bones join their joints."""
-    figure, floor = mesh(), np.array([0, body.points[:, 1].min(), 0])
+    figure, floor = body.mesh, np.array([0, body.points[:, 1].min(), 0])
     weights = figure.weights[:, : len(SMPL22)].copy()
     np.add.at(weights.T, list(ANCHORS[len(SMPL22) :]), figure.weights[:, len(SMPL22) :].T)
     joint = np.argsort(-weights, axis=1, kind="stable")[:, :4]

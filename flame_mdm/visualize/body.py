@@ -1,4 +1,4 @@
-"""The mannequin: its mesh, bound to the bone lengths of a clip and skinned to a motion. `mannequin.py` models it."""
+"""A body: its mesh, bound to the bone lengths of a clip and skinned to a motion. `mannequin.py` models one."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from scipy.spatial.transform import Rotation
 
 from flame_mdm.errors import UserError
 from flame_mdm.representations.skeleton import SMPL22
-from flame_mdm.representations.smpl import ADULT
 from flame_mdm.visualize.scene import Shown, sides
 
 JOINT = {name: number for number, name in enumerate(SMPL22.joints)}
@@ -22,21 +21,19 @@ HELPERS = tuple((JOINT[f"{side}_{name}"], share) for side in ("left", "right") f
 """Joint and share of the twist of each bone after the 22 joints."""
 ANCHORS = (*range(len(SMPL22)), *(joint for joint, _ in HELPERS))
 """The joint at which each bone begins."""
-MIRRORED = (*SMPL22.mirrored, *(len(SMPL22) + (k + len(TWISTED)) % len(HELPERS) for k in range(len(HELPERS))))
-"""The bone that replaces each bone in a mirror image."""
-REST = np.array(ADULT[: len(SMPL22)])
+MANNEQUIN = Path(__file__).with_name("mannequin.npz")
 TRUNK = {"pelvis": 0.0, "spine1": 0.35, "spine2": 0.75, "spine3": 1.0}
 """Joints of the trunk -> how much their width follows the shoulders rather than the hips."""
 WIDER, LONGER = (0.8, 1.25), (0.4, 2.5)
 """Limits of the width of hips and shoulders relative to that of the limbs, and of the length of a limb."""
 LIMBS = tuple(JOINT[f"{side}_{name}"] for side in ("left", "right") for name in ("knee", "ankle", "elbow", "wrist"))
-SOLE = 0.026
-"""Height of the toe joint above the sole in meters."""
 SKIN, HAIR, SHIRT, TROUSERS, SHOES = MATERIALS = (
     *((222, 186, 160), (96, 80, 70), (132, 164, 196)),
     *((98, 106, 124), (64, 62, 66)),
 )
 """Colors of the figure."""
+UPRIGHT = np.cos(np.radians(30))
+"""The head is level on average in frames in which the chest is tilted by less than this angle, given as its cosine."""
 STANDING = 0.02
 """A foot stands flat in frames in which it is at most this many meters above its lowest position."""
 TOES = (0.02, 0.09, np.radians(60))
@@ -44,11 +41,11 @@ TOES = (0.02, 0.09, np.radians(60))
 last number is the largest bend."""
 
 
-@dataclass(frozen=True, eq=False)
 class Mesh:
     """A closed mesh in its stored pose, an A-pose with the pelvis at 0.
 
     Attributes:
+        stored: the arrays of its file; `mannequin.packed` describes them.
         points: (V, 3) in meters.
         normals: (V, 3) unit vectors.
         weights: (V, 28), of the 22 joints of SMPL and `HELPERS`; at most four are not 0.
@@ -56,70 +53,63 @@ class Mesh:
         triangles: (T, 3), counterclockwise seen from outside.
         joints: (22, 3) of the stored pose.
         turns: (28, 3, 3), rotation of each bone in the world from the rest pose of SMPL to the stored pose.
+        rest: (22, 3), position of each joint relative to its parent in the rest pose of SMPL.
+        sole: height of the toe joints above the soles.
     """
 
-    points: np.ndarray
-    normals: np.ndarray
-    weights: np.ndarray
-    colors: np.ndarray
-    triangles: np.ndarray
-    joints: np.ndarray
-    turns: np.ndarray
+    def __init__(self, path: Path) -> None:
+        """Reads a file.
+
+        Raises:
+            UserError: the file is missing or damaged.
+        """
+        try:
+            with np.load(path) as file:
+                self.stored = {name: file[name] for name in file.files}
+            self.points, self.colors = self.stored["points"] / 20000, self.stored["colors"].astype(float)
+            self.normals = self.stored["normals"] / np.linalg.norm(self.stored["normals"], axis=1, keepdims=True)
+            self.triangles, self.joints = self.stored["triangles"].astype(int), self.stored["joints"]
+            self.weights = np.zeros((len(self.points), len(ANCHORS)))
+            for bone, weight in zip(self.stored["bones"].T, self.stored["weights"].T / 255, strict=True):
+                self.weights[np.arange(len(self.points)), bone] += weight
+            self.turns = self.stored["turns"][list(ANCHORS)]
+        except (OSError, ValueError, KeyError, IndexError) as error:
+            todo = "Install flame-mdm again" if path == MANNEQUIN else "Delete it; it is made again"
+            raise UserError(f"{path}: the figure cannot be read ({error}). {todo}") from error
+        above = self.joints - self.joints[[max(parent, 0) for parent in SMPL22.parents]]
+        self.rest = (self.turns[[max(parent, 0) for parent in SMPL22.parents]].mT @ above[..., None])[..., 0]
+        self.sole = float(self.joints[JOINT["left_foot"], 1] - self.points[:, 1].min())
 
     def sides(self) -> np.ndarray:
         """Returns for each vertex (V,) 1 = left, -1 = right, 0 = middle, and numbers between where they meet."""
         return self.weights @ np.array(sides(SMPL22), float)[list(ANCHORS)]
 
 
-@cache
-def stored() -> dict[str, np.ndarray]:
-    """Returns the arrays of the asset, the left half of the figure; `mannequin.make` describes them.
-
-    Raises:
-        UserError: the file is missing or damaged.
-    """
-    path = Path(__file__).with_name("mannequin.npz")
-    try:
-        with np.load(path) as file:
-            return {name: file[name] for name in file.files}
-    except (OSError, ValueError) as error:
-        raise UserError(f"{path}: the figure cannot be read ({error}). Install flame-mdm again") from error
+_read = cache(Mesh)
+_chosen = MANNEQUIN
 
 
-@cache
+def use(path: Path) -> None:
+    """Sets the file of the body that this process draws from now on; `bodies.choose_body` finds it by name."""
+    global _chosen
+    _chosen = path
+
+
 def mesh() -> Mesh:
-    """Returns the whole figure: the stored half and its mirror image.
+    """Returns the mesh of the chosen body.
 
     Raises:
-        UserError: the file is missing or damaged.
+        UserError: its file is missing or damaged.
     """
-    half = stored()
-    points, bones = half["points"] / 20000, half["bones"].astype(int)
-    weights = np.zeros((len(points), len(ANCHORS)))
-    for bone, weight in zip(bones.T, half["weights"].T / 255, strict=True):
-        weights[np.arange(len(points)), bone] += weight
-    beside = points[:, 0] > 0
-    copies = np.arange(len(points))
-    copies[beside] = len(points) + np.arange(beside.sum())
-    flip = np.array([-1, 1, 1])
-    normals = half["normals"] / np.linalg.norm(half["normals"], axis=1, keepdims=True)
-    triangles = half["triangles"].astype(int)
-    return Mesh(
-        np.concatenate([points, points[beside] * flip]),
-        np.concatenate([normals, normals[beside] * flip]),
-        np.concatenate([weights, weights[beside][:, MIRRORED]]),
-        np.concatenate([half["colors"], half["colors"][beside]]).astype(float),
-        np.concatenate([triangles, copies[triangles[:, ::-1]]]),
-        half["joints"],
-        half["turns"][list(ANCHORS)],
-    )
+    return _read(_chosen)
 
 
 @dataclass(frozen=True, eq=False)
 class Figure:
-    """The mannequin with the bone lengths of a clip, and its motion. F frames, B = 28 bones.
+    """A body with the bone lengths of a clip, and its motion. F frames, B = 28 bones.
 
     Attributes:
+        mesh: the body.
         fit: (22, 3, 3), linear map of each joint's part of the stored mesh to the clip's proportions.
         joints: (22, 3) of the stored pose with the clip's bone lengths, pelvis at 0.
         points: (V, 3), the mesh in that pose.
@@ -130,6 +120,7 @@ class Figure:
         lift: height of a joint of the body above that of the motion: the thickness of the sole.
     """
 
+    mesh: Mesh
     fit: np.ndarray
     joints: np.ndarray
     points: np.ndarray
@@ -142,16 +133,16 @@ class Figure:
         """Returns vertices and normals (V, 3) of a frame, by linear blend skinning."""
         turns = self.turns[frame]
         moves = self.places[frame] - (turns @ self.joints[list(ANCHORS), :, None])[..., 0]
-        blended = mesh().weights @ np.concatenate([turns.reshape(-1, 9), moves], 1)
+        blended = self.mesh.weights @ np.concatenate([turns.reshape(-1, 9), moves], 1)
         turned = blended[:, :9].reshape(-1, 3, 3)
         points = (turned @ self.points[..., None])[..., 0] + blended[:, 9:]
-        normals = (turned @ mesh().normals[..., None])[..., 0]
+        normals = (turned @ self.mesh.normals[..., None])[..., 0]
         return points, normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
 
     def local(self) -> np.ndarray:
         """Returns the rotations (F, 22, 3, 3) of the joints relative to their parents, with the bend of toes."""
         count = len(SMPL22)
-        world = self.turns[:, :count] @ mesh().turns[:count] @ self.neutral.mT
+        world = self.turns[:, :count] @ self.mesh.turns[:count] @ self.neutral.mT
         local = world.copy()
         for parent, joint in SMPL22.edges:
             local[:, joint] = world[:, parent].mT @ world[:, joint]
@@ -159,52 +150,58 @@ class Figure:
 
 
 def figure(motion: Shown) -> Figure:
-    """Binds the mannequin to a clip and computes the rotations of its bones.
+    """Binds the chosen body to a clip and computes the rotations of its bones.
 
     The body's joints are the motion's, but higher by the thickness of the sole: in motions, the lowest joint is on the
-    floor. If rotations are solved for, positions determine neither the head's pitch, whose median is taken as upright,
-    nor the toes, which stay flat on the floor while the heel rises.
+    floor. If rotations are solved for, positions determine neither the head's pitch, whose median while the chest is
+    upright is taken as level, nor the toes, which stay flat on the floor while the heel rises.
 
     Raises:
         ValueError: the skeleton is not SMPL's, or a limb is much longer or shorter than people's.
         UserError: the figure's file is missing or damaged.
     """
-    poses = motion.posed()
+    poses, body = motion.posed(), mesh()
     joints = motion.joints[:, : len(SMPL22)].astype(float)
     world = _world(np.asarray(poses.rotations))
     offsets = np.array(poses.offsets)
-    fit, wide = proportions(offsets)
+    fit, wide = proportions(body, offsets)
     neutral = np.tile(np.eye(3), (len(SMPL22), 1, 1))
     for side in ("left", "right"):
         ankle, toe = JOINT[f"{side}_ankle"], JOINT[f"{side}_foot"]
         if motion.poses is None:
             flat = _flat_foot(joints[:, ankle], joints[:, toe], offsets[toe])
-            neutral[ankle] = neutral[toe] = _between(flat, offsets[toe])
+            neutral[ankle] = neutral[toe] = between(flat, offsets[toe])
             offsets[toe] = flat
-        drop, deep = offsets[toe, [1, 2]] / REST[toe, [1, 2]]
-        fit[ankle] = np.diag([wide, (drop * -REST[toe, 1] + wide * SOLE) / (SOLE - REST[toe, 1]), deep])
+        _, high, long = body.rest[toe]
+        tall = (wide * body.sole - offsets[toe, 1]) / (body.sole - high)
+        fit[ankle] = np.diag([wide, tall, offsets[toe, 2] / long])
     if motion.poses is None:
         neck, head = JOINT["neck"], JOINT["head"]
-        bones = (joints[:, head] - joints[:, neck])[:, None]
-        usual = np.median((bones @ world[:, JOINT["spine3"]])[:, 0], 0)
-        neutral[head] = _between(offsets[head], usual).T
+        x, y, z = (joints[:, head] - joints[:, neck]).T
+        chest = world[:, JOINT["spine3"]]
+        upright = chest[:, 1, 1] > UPRIGHT if chest[:, 1, 1].max() > UPRIGHT else slice(None)
+        sine, cosine = chest[:, [0, 2], 2].T / np.linalg.norm(chest[:, [0, 2], 2], axis=1)
+        usual = np.median(np.stack([x * cosine - z * sine, y, x * sine + z * cosine], 1)[upright], 0)
+        neutral[head] = between(offsets[head], usual).T
     world = world @ neutral
     if motion.poses is None:
         for toe in (JOINT["left_foot"], JOINT["right_foot"]):
             world[:, toe] = world[:, toe] @ _toes(world[:, toe], joints[:, toe, 1])
-    turns = mesh().turns
+    turns = body.turns
     rest = np.zeros((len(SMPL22), 3))
     for parent, joint in SMPL22.edges:
         rest[joint] = rest[parent] + turns[parent] @ offsets[joint]
     stretched = turns[: len(rest)] @ fit @ turns[: len(rest)].mT
+    lift = wide * body.sole
     return Figure(
+        body,
         stretched,
         rest,
-        bound(stretched, rest),
+        bound(body, stretched, rest),
         neutral,
         _with_helpers(world, offsets) @ turns.mT,
-        joints[:, list(ANCHORS)] + [0, SOLE * wide, 0],
-        SOLE * wide,
+        joints[:, list(ANCHORS)] + [0, lift, 0],
+        lift,
     )
 
 
@@ -224,18 +221,19 @@ def shaded(normals: np.ndarray, colors: np.ndarray, toward: np.ndarray) -> np.nd
     return np.clip(colors * (0.5 + 0.12 * normals[:, 1] + 0.52 * lit)[:, None], 0, 255)
 
 
-def bound(stretched: np.ndarray, rest: np.ndarray) -> np.ndarray:
+def bound(body: Mesh, stretched: np.ndarray, rest: np.ndarray) -> np.ndarray:
     """Returns the mesh (V, 3) with other proportions: linear maps (22, 3, 3) and joints (22, 3) of the stored pose."""
-    body, anchors = mesh(), list(ANCHORS)
+    anchors = list(ANCHORS)
     moves = rest - (stretched @ body.joints[..., None])[..., 0]
     blended = body.weights @ np.concatenate([stretched.reshape(-1, 9), moves], 1)[anchors]
     return (blended[:, :9].reshape(-1, 3, 3) @ body.points[..., None])[..., 0] + blended[:, 9:]
 
 
-def proportions(offsets: np.ndarray) -> tuple[np.ndarray, float]:
-    """Compares a body with the mannequin.
+def proportions(body: Mesh, offsets: np.ndarray) -> tuple[np.ndarray, float]:
+    """Compares the bones of a clip with those of a mesh.
 
     Args:
+        body: the mesh.
         offsets: (22, 3), position of each joint relative to its parent in the rest pose.
 
     Returns:
@@ -244,7 +242,7 @@ def proportions(offsets: np.ndarray) -> tuple[np.ndarray, float]:
     Raises:
         ValueError: a limb is much longer or shorter than people's.
     """
-    lengths, usual = np.linalg.norm(offsets, axis=1), np.linalg.norm(REST, axis=1)
+    lengths, usual = np.linalg.norm(offsets, axis=1), np.linalg.norm(body.rest, axis=1)
     ratio = np.divide(lengths, usual, out=np.ones_like(lengths), where=usual > 0)
     for joint in LIMBS:
         if not LONGER[0] <= ratio[joint] <= LONGER[1]:
@@ -257,7 +255,7 @@ def proportions(offsets: np.ndarray) -> tuple[np.ndarray, float]:
     def width(*names: str) -> float:
         chosen = [JOINT[f"{side}_{name}"] for side in ("left", "right") for name in names]
         return float(
-            np.clip(np.abs(offsets[chosen, 0]).sum() / np.abs(REST[chosen, 0]).sum(), *np.multiply(WIDER, wide))
+            np.clip(np.abs(offsets[chosen, 0]).sum() / np.abs(body.rest[chosen, 0]).sum(), *np.multiply(WIDER, wide))
         )
 
     hips, shoulders = width("hip"), width("collar", "shoulder")
@@ -270,7 +268,7 @@ def proportions(offsets: np.ndarray) -> tuple[np.ndarray, float]:
             tall = np.clip(ratio[above], *np.multiply((0.6, 1.6), wide))
             fit[joint] = np.diag([hips + TRUNK[name] * (shoulders - hips), tall, wide])
         elif children and not name.endswith("ankle"):
-            along = REST[children[0]] / usual[children[0]]
+            along = body.rest[children[0]] / usual[children[0]]
             long = np.clip(ratio[children[0]], *np.multiply((0.6, 1.6), wide))
             fit[joint] += (long - wide) * np.outer(along, along)
     return fit, wide
@@ -284,7 +282,7 @@ def _world(rotations: np.ndarray) -> np.ndarray:
     return world
 
 
-def _between(start: np.ndarray, end: np.ndarray) -> np.ndarray:
+def between(start: np.ndarray, end: np.ndarray) -> np.ndarray:
     """Returns the smallest rotation (3, 3) that turns one direction into another."""
     a, b = start / np.linalg.norm(start), end / np.linalg.norm(end)
     axis = np.cross(a, b)

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from importlib import import_module
-from pathlib import Path
 
 import numpy as np
 from scipy.interpolate import PchipInterpolator
@@ -18,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from flame_mdm.representations.skeleton import SMPL22
 from flame_mdm.representations.smpl import ADULT
-from flame_mdm.visualize.body import HAIR, HELPERS, JOINT, SHIRT, SHOES, SKIN, TROUSERS
+from flame_mdm.visualize.body import HAIR, HELPERS, JOINT, MANNEQUIN, SHIRT, SHOES, SKIN, TROUSERS, TWISTED
 
 A_POSE = {"shoulder": (0, 0, -46), "elbow": (0, -14, 0), "hip": (0, 0, 4), "ankle": (0, 0, -4)}
 """Degrees about x, y, z from the rest pose of SMPL to the pose in which the mesh is stored, for the left side. Arms
@@ -367,12 +366,12 @@ def descendants(joint: int) -> list[int]:
     return [joint] + [j for child, p in enumerate(SMPL22.parents) if p == joint for j in descendants(child)]
 
 
-def with_helpers(points: np.ndarray, weights: np.ndarray) -> np.ndarray:
+def with_helpers(points: np.ndarray, weights: np.ndarray, places: np.ndarray) -> np.ndarray:
     """Returns weights (V, 28): the upper part of limbs moves to helper bones, which turn less about the limb.
 
     The forearm is the other way round: its lower half moves to a bone that takes part in the twist of the wrist.
+    `places` (22, 3) are the joints.
     """
-    places, _ = pose()
     columns = []
     for joint, _ in HELPERS:
         bone = places[SMPL22.parents.index(joint)] - places[joint]
@@ -402,12 +401,7 @@ def paint(points: np.ndarray) -> np.ndarray:
 
 
 def make() -> dict[str, np.ndarray]:
-    """Returns the arrays of the asset, for the left half; `body.load` mirrors them.
-
-    `points` (V, 3) in units of 1/20 mm and `normals` (V, 3) in 1/127, of the stored pose with the pelvis at 0;
-    `bones` (V, 4) and `weights` (V, 4), which add up to 255; `colors` (V, 3); `triangles` (T, 3); `joints` (22, 3) and
-    `turns` (22, 3, 3), the stored pose.
-    """
+    """Returns the arrays of the asset: the left half of the figure and its mirror image."""
     parts = model()
 
     def distance(points: np.ndarray) -> np.ndarray:
@@ -416,24 +410,56 @@ def make() -> dict[str, np.ndarray]:
     points, triangles = triangulate(distance)
     normals = gradient(distance, points)
     normals[points[:, 0] == 0, 0] = 0
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    weights = with_helpers(points, skin(points, parts))
+    places, turned = pose()
+    weights = with_helpers(points, skin(points, parts), places)
+    beside = points[:, 0] > 0
+    copies = np.arange(len(points))
+    copies[beside] = len(points) + np.arange(beside.sum())
+    flip = np.array([-1, 1, 1])
+    half = len(TWISTED)
+    mirrored = [*SMPL22.mirrored, *(22 + (k + half) % len(HELPERS) for k in range(len(HELPERS)))]
+    return packed(
+        np.concatenate([points, points[beside] * flip]),
+        np.concatenate([normals, normals[beside] * flip]),
+        np.concatenate([weights, weights[beside][:, mirrored]]),
+        np.concatenate([paint(points), paint(points)[beside]]),
+        np.concatenate([triangles, copies[triangles[:, ::-1]]]),
+        places,
+        turned,
+    )
+
+
+def packed(
+    points: np.ndarray,
+    normals: np.ndarray,
+    weights: np.ndarray,
+    colors: np.ndarray,
+    triangles: np.ndarray,
+    joints: np.ndarray,
+    turns: np.ndarray,
+) -> dict[str, np.ndarray]:
+    """Returns the arrays of the file of a body, which `body.Mesh` reads.
+
+    `points` (V, 3) in units of 1/20 mm and `normals` (V, 3) in 1/127, of the stored pose with the pelvis at 0;
+    `bones` (V, 4) and `weights` (V, 4), which add up to 255; `colors` (V, 3); `triangles` (T, 3); `joints` (22, 3) and
+    `turns` (22, 3, 3), the stored pose.
+    """
     bones = np.argsort(-weights, axis=1, kind="stable")[:, :4]
     most = np.take_along_axis(weights, bones, 1)
     most = np.floor(255 * most / most.sum(1, keepdims=True) + 0.5).astype(int)
     most[:, 0] += 255 - most.sum(1)
-    places, turned = pose()
+    normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
     return {
         "points": np.rint(points * 20000).astype("<i2"),
         "normals": np.rint(normals * 127).astype("i1"),
         "bones": np.where(most > 0, bones, 0).astype("u1"),
         "weights": most.astype("u1"),
-        "colors": np.rint(paint(points)).astype("u1"),
+        "colors": np.rint(colors).astype("u1"),
         "triangles": triangles.astype("<u2"),
-        "joints": places,
-        "turns": turned,
+        "joints": joints,
+        "turns": turns,
     }
 
 
 if __name__ == "__main__":
-    np.savez_compressed(Path(__file__).with_suffix(".npz"), allow_pickle=False, **make())
+    np.savez_compressed(MANNEQUIN, allow_pickle=False, **make())

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from flame_mdm.files import write_text
-from flame_mdm.visualize.body import ANCHORS, MIRRORED, Figure, stored, try_figure
+from flame_mdm.visualize.body import ANCHORS, Figure, mesh, try_figure
 from flame_mdm.visualize.scene import Shown, check_any, head, radii, shortened, sides
 
 MILLIMETER = 0.001
@@ -119,10 +119,10 @@ def _packed_body(body: Figure) -> dict[str, Any]:
 
 
 def _mesh() -> dict[str, Any]:
-    half = stored()
+    stored = mesh().stored
     names = ("points", "normals", "bones", "weights", "colors", "triangles")
-    joints = np.round(half["joints"], 5).ravel().tolist()
-    return {name: _base64(half[name]) for name in names} | {"joints": joints, "anchors": ANCHORS, "mirrored": MIRRORED}
+    joints = np.round(stored["joints"], 5).ravel().tolist()
+    return {name: _base64(stored[name]) for name in names} | {"joints": joints, "anchors": ANCHORS}
 
 
 def _base64(array: np.ndarray) -> str:

@@ -13,7 +13,7 @@ from PIL import Image, ImageDraw, ImageFilter, ImageFont
 
 from flame_mdm.errors import UserError
 from flame_mdm.files import atomic_write
-from flame_mdm.visualize.body import MATERIALS, Figure, mesh, rasterize, shaded, try_figure
+from flame_mdm.visualize.body import MATERIALS, Figure, rasterize, shaded, try_figure
 from flame_mdm.visualize.scene import Shown, check_any, frame_at, head, radii, shortened, sides
 
 Color = tuple[int, int, int]
@@ -230,7 +230,7 @@ def _figure(motion: Shown, body: Figure | None, frame: int, size: int) -> Image.
     if body is not None:
         points, normals = body.skinned(frame)
         at, pixels = project(points), np.array(image)
-        rasterize(pixels, at[:, :2], at[:, 3], shaded(normals, mesh().colors, TOWARD), mesh().triangles)
+        rasterize(pixels, at[:, :2], at[:, 3], shaded(normals, body.mesh.colors, TOWARD), body.mesh.triangles)
         return Image.fromarray(pixels).reduce(SMOOTH)
     for limb in sorted(_limbs(motion, joints, project), key=lambda limb: -limb.depth):
         if min(limb.a[3], limb.b[3]) > NEAR:

@@ -1,0 +1,185 @@
+"""Bodies to choose from: the mannequin, and Anny, a model of people of all ages and shapes (extra `body`).
+
+Brégier et al., "Human Mesh Modeling for Anny Body", 2026, https://arxiv.org/abs/2511.03589: (c) 2025 NAVER Corp.,
+Apache-2.0; its shapes and weights are those of MakeHuman and MPFB2, CC0. Topologies of SMPL and SMPL-X, which Anny
+downloads and which are not free for commercial use, are never built.
+"""
+
+from __future__ import annotations
+
+import os
+from concurrent.futures import ThreadPoolExecutor, wait
+from importlib import import_module
+from pathlib import Path
+
+import numpy as np
+
+from flame_mdm.errors import UserError
+from flame_mdm.files import atomic_write
+from flame_mdm.progress import ProgressBar
+from flame_mdm.representations.skeleton import SMPL22
+from flame_mdm.representations.smpl import ADULT
+from flame_mdm.visualize.body import HAIR, JOINT, MANNEQUIN, SHIRT, SHOES, SKIN, TROUSERS, Mesh, between, use
+from flame_mdm.visualize.mannequin import frame, hairline, packed, smooth, with_helpers
+
+SHAPE = {"gender": 0.5, "age": 2 / 3, "height": 0.45, "weight": 0.4}
+"""Anny's numbers and their defaults, 0 to 1: male to female, baby to old (2/3: a young adult), small to tall, light to
+heavy."""
+SECONDS = 90
+"""About how long Anny's model takes to build for the first time."""
+PARTS = {
+    "spine1": "spine04 spine03",
+    "spine2": "spine02",
+    "spine3": "spine01",
+    "neck": "neck01 neck02 neck03",
+    "head": "head eye",
+    "collar": "clavicle shoulder01",
+    "shoulder": "upperarm01 upperarm02",
+    "elbow": "lowerarm01 lowerarm02",
+    "wrist": "wrist finger metacarpal",
+    "hip": "upperleg01 upperleg02",
+    "knee": "lowerleg01 lowerleg02",
+    "ankle": "foot",
+    "foot": "toe",
+}
+"""Joint of SMPL -> beginnings of the names of Anny's bones that follow it; all others follow the pelvis."""
+HEADS = {"hip": "upperleg01", "knee": "lowerleg01", "ankle": "foot", "foot": "toe2-1", "shoulder": "upperarm01"} | {
+    **{"elbow": "lowerarm01", "wrist": "wrist", "head": "head"}
+}
+"""Joint of SMPL -> the bone of Anny that begins there."""
+CLOTHES = {"neck": SKIN, "head": SKIN, "wrist": SKIN, "ankle": SHOES, "foot": SHOES} | dict.fromkeys(
+    ("pelvis", "hip", "knee"), TROUSERS
+)
+
+
+def choose_body(body: str) -> None:
+    """Chooses the body of all pictures, pages and files that this process draws from now on.
+
+    Anny's figure is made once for each shape, with a progress bar, and kept in the user's cache.
+
+    Args:
+        body: mannequin; or anny, with numbers of `SHAPE`, such as "anny gender=1 age=0.9".
+
+    Raises:
+        UserError: the body or a number is unknown, or the package anny is needed and not installed.
+    """
+    name, *options = body.split() or [""]
+    if name not in ("mannequin", "anny") or (options and name != "anny"):
+        raise UserError(f'body={body}: unknown. Use mannequin, anny, or anny with its shape: body="anny age=0.9"')
+    use(_anny(body, options) if name == "anny" else MANNEQUIN)
+
+
+def _anny(body: str, options: list[str]) -> Path:
+    """Returns the file of Anny's figure; makes it if it does not exist."""
+    shape = dict(SHAPE)
+    for option in options:
+        key, _, value = option.partition("=")
+        try:
+            shape[key] = float(value) if key in SHAPE else np.nan
+        except ValueError:
+            shape[key] = np.nan
+        if not 0 <= shape[key] <= 1:
+            raise UserError(f"body={body}: {option} is not one of {', '.join(SHAPE)} with a number from 0 to 1")
+    folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "flame-mdm"
+    path = folder / f"anny1-{'-'.join(f'{key}{value:.3g}' for key, value in shape.items())}.npz"
+    if not path.exists():
+        figure = bake(shape)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with atomic_write(path) as temporary, temporary.open("wb") as file:
+            np.savez_compressed(file, allow_pickle=False, **figure)
+    return path
+
+
+def bake(shape: dict[str, float]) -> dict[str, np.ndarray]:
+    """Returns the arrays of the file of a figure of Anny: `mannequin.packed`.
+
+    Raises:
+        UserError: the package anny is not installed.
+    """
+    try:
+        package = import_module("anny")
+    except ImportError:
+        raise UserError('body=anny needs the package anny. Run pip install "flame-mdm[body]"') from None
+    with ProgressBar(desc="making the body, once", total=SECONDS, unit=" s") as bar, ThreadPoolExecutor(1) as pool:
+        built = pool.submit(package.Anny, rig="anny", topology="notoes_collapse10pc", skinning_method="lbs")
+        while not wait([built], 1).done:
+            bar.update(bar.n < SECONDS - 1)
+        model = built.result()
+        bar.update(SECONDS - bar.n)
+    made = model(phenotype_kwargs={**shape, "muscle": 0.5, "proportions": 0.5})
+    axes = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])  # Anny's z is up, and it faces -y
+    points, heads = (made[key][0].detach().numpy() @ axes.T for key in ("rest_vertices", "rest_bone_heads"))
+    bones = model.bone_labels
+    places = _joints(dict(zip(bones, heads, strict=True)))
+    weights = np.zeros((len(points), len(SMPL22)))
+    owner = np.array([_owner(bone) for bone in bones])[model.vertex_bone_indices.numpy()]
+    for joint, weight in zip(owner.T, model.vertex_bone_weights.detach().numpy().T, strict=True):
+        weights[np.arange(len(points)), joint] += weight
+    triangles = model.faces.numpy().astype(int)
+    sides = points[triangles[:, 1:]] - points[triangles[:, :1]]
+    normals = np.zeros_like(points)
+    np.add.at(normals, triangles.ravel(), np.repeat(np.cross(sides[:, 0], sides[:, 1]), 3, axis=0))
+    colors = _clothes(points - places[0], weights)
+    helped = with_helpers(points, weights, places)
+    return packed(points - places[0], normals, helped, colors, triangles, places - places[0], _turns(places))
+
+
+def _owner(bone: str) -> int:
+    """Returns the joint of SMPL that a bone of Anny follows."""
+    name, _, side = bone.partition(".")
+    for part, beginnings in PARTS.items():
+        if name.startswith(tuple(beginnings.split())):
+            return JOINT[part] if part in JOINT else JOINT[f"{'left' if side == 'L' else 'right'}_{part}"]
+    return JOINT["pelvis"]
+
+
+def _joints(heads: dict[str, np.ndarray]) -> np.ndarray:
+    """Returns SMPL's joints (22, 3) in Anny's rest pose, from the beginnings of Anny's bones."""
+    places = np.zeros((len(SMPL22), 3))
+    for joint, bone in HEADS.items():
+        for side in ("left", "right") if joint not in JOINT else ("",):
+            places[JOINT[f"{side}_{joint}" if side else joint]] = heads[f"{bone}.{side[0].upper()}" if side else bone]
+    places[JOINT["neck"]] = heads["neck01"] + [0, 0.02, 0]
+    hips = places[JOINT["left_hip"], 1]
+    spine = np.array([heads[f"spine0{k}"] for k in (5, 4, 3, 2, 1)] + [heads["neck01"]])
+    for joint, share in (("pelvis", 0.137), ("spine1", 0.339), ("spine2", 0.565), ("spine3", 0.653)):
+        height = hips + share * (places[JOINT["neck"], 1] - hips)
+        places[JOINT[joint]] = [0, height, np.interp(height, spine[:, 1], spine[:, 2])]
+    for side in ("left", "right"):
+        letter = side[0].upper()
+        places[JOINT[f"{side}_collar"]] = (heads[f"clavicle.{letter}"] + heads[f"shoulder01.{letter}"]) / 2
+    return places
+
+
+def _turns(places: np.ndarray) -> np.ndarray:
+    """Returns rotations (22, 3, 3) in the world from the rest pose of SMPL to joints (22, 3) in Anny's rest pose.
+
+    Pelvis, chest and head keep their direction, and feet stay level; arms are twisted so that elbows bend as SMPL's.
+    """
+    turns = np.tile(np.eye(3), (len(SMPL22), 1, 1))
+    usual = np.array(ADULT)
+    for parent, joint in SMPL22.edges:
+        name = SMPL22.joints[parent]
+        along, level = places[joint] - places[parent], [1, 0, 1] if name.endswith("ankle") else 1
+        if name not in ("pelvis", "spine3"):
+            turns[parent] = between(usual[joint] * level, along * level)
+    for side in ("left", "right"):
+        shoulder, elbow, wrist = (JOINT[f"{side}_{name}"] for name in ("shoulder", "elbow", "wrist"))
+        upper, lower = places[elbow] - places[shoulder], places[wrist] - places[elbow]
+        hinge, rest = np.cross(upper, lower), np.cross(usual[elbow], [0, 0, 1])
+        turns[shoulder] = frame(upper, hinge).T @ frame(usual[elbow], rest)
+        turns[elbow] = turns[wrist] = frame(lower, hinge).T @ frame(usual[wrist], rest)
+        turns[JOINT[f"{side}_foot"]] = turns[JOINT[f"{side}_ankle"]]
+    return turns
+
+
+def _clothes(points: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Returns colors (V, 3), 0 to 255, by the joint that a vertex follows; hair as that of the mannequin."""
+    table = np.array([CLOTHES.get(name.split("_")[-1], SHIRT) for name in SMPL22.joints], float)
+    colors = weights @ table
+    mannequin, head = Mesh(MANNEQUIN), weights[:, JOINT["head"]] > 0.5
+    usual = mannequin.points[mannequin.weights[:, JOINT["head"]] > 0.5]
+    own = points[head]
+    alike = usual.min(0) + (own - own.min(0)) / np.ptp(own, 0) * np.ptp(usual, 0)
+    colors[head] += smooth(-0.006, 0.006, hairline(alike))[:, None] * (np.array(HAIR) - colors[head])
+    return colors

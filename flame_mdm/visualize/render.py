@@ -222,7 +222,11 @@ def _figure(motion: Shown, body: Figure | None, frame: int, size: int) -> Image.
     for joint, parent in enumerate(motion.skeleton.parents):
         if parent >= 0:
             _capsule(ImageDraw.Draw(dark), soft[parent], soft[joint], 0.055, 0.055, 255)
-    image.paste(SHADOW, mask=dark.filter(ImageFilter.BoxBlur(size / 192)).resize(image.size))
+    dark = dark.filter(ImageFilter.BoxBlur(size / 192))
+    if box := dark.getbbox():  # enlarged with a margin, so that its edge is the same as that of the whole image
+        left, top, right, bottom = max(0, box[0] - 4), max(0, box[1] - 4), box[2] + 4, box[3] + 4
+        dark = dark.crop((left, top, right, bottom)).resize((4 * (right - left), 4 * (bottom - top)))
+        image.paste(SHADOW, (4 * left, 4 * top), dark)
     if motion.contacts is not None:
         for joint in np.array(motion.skeleton.feet)[motion.contacts[frame]]:
             cx, cy, scale = shadow[joint][:3]

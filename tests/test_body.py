@@ -12,7 +12,7 @@ from flame_mdm.formats.motion import Motion, motion_of_poses
 from flame_mdm.formats.poses import Poses
 from flame_mdm.representations.skeleton import KIT21, SMPL22
 from flame_mdm.representations.smpl import ADULT
-from flame_mdm.visualize import body, frames_array, player_page
+from flame_mdm.visualize import body, frames_array, player_page, render
 from flame_mdm.visualize.bodies import choose_body
 from flame_mdm.visualize.body import ANCHORS, JOINT, MANNEQUIN, Mesh, figure, mesh, rasterize, try_figure
 
@@ -170,6 +170,8 @@ def test_a_motion_that_no_body_fits_says_why(motion, reason):
         figure(motion)
     assert try_figure(motion)[0] is None
     assert frames_array(motion, 64).shape == (len(motion.joints), 64, 64, 3)  # its skeleton
+    drawn = try_figure(posed())[0]
+    assert render._lines(motion, None, 200, 200) == [*render._lines(motion, drawn, 200, 200), "(no body fits)"]
 
 
 def test_a_damaged_asset_is_named(tmp_path):

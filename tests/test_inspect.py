@@ -64,6 +64,11 @@ def sink(joints: np.ndarray) -> None:
     joints[30:40, :, 1] -= 0.06
 
 
+def float_(joints: np.ndarray, frames: int, speed: float) -> None:
+    joints[:, :, 0] += speed / FPS * np.arange(FRAMES)[:, None]
+    joints[30 : 30 + frames, :, 1] += 0.06
+
+
 def knee(joints: np.ndarray) -> None:
     joints[30:40, AT["left_hip"], 2] += 0.3  # the hip in front of the knee
 
@@ -84,6 +89,13 @@ def freeze(joints: np.ndarray) -> None:
         (pop, {("pop", "head", 30, 31)}),
         (stretch, {("bone length", "head", 30, 40)}),
         (sink, {("penetration", f"{side}_{part}", 30, 40) for side in ("left", "right") for part in ("ankle", "foot")}),
+        (lambda joints: float_(joints, 7, 0.0), {("floating", "body", 30, 36)}),
+        (lambda joints: float_(joints, 6, 0.0), set()),
+        (lambda joints: float_(joints, 16, 1.0), {("floating", "body", 30, 46)}),
+        (
+            lambda joints: float_(joints, 15, 1.0),
+            {("skating", f"{side}_foot", *span) for side in ("left", "right") for span in ((0, 29), (45, 79))},
+        ),
         (knee, {("limit", "left_knee", 30, 40)}),
         (fold, {("limit", "left_elbow", 30, 40)}),
         (freeze, {("frozen", "body", 30, 60)}),
@@ -135,7 +147,7 @@ def test_nothing_to_inspect_is_an_error(tmp_path, capsys):
     for words, message in (
         ([], "no data set named"),
         ([str(tmp_path / "empty")], "the folder has no motion files"),
-        ([str(tmp_path / "absent.npz")], "absent.npz"),
+        ([str(tmp_path / "absent.npz")], "absent.npz: no such file. Give a motion file (.npz"),
         (["bandia"], "bandia"),
         ([str(tmp_path / "absent.npz"), "clips=0"], "clips=0: must be at least 1"),
     ):

@@ -21,8 +21,8 @@ USAGE = """
 usage: flame-mdm inspect MOTION|FOLDER|DATASET [OUT.html] [split=train] [clips=24] [fps=20] [unit=0.01] [up=z]
 
 Finds physical faults of a motion file, of all motion files in a folder, or of a prepared data set: sliding feet, jumps,
-bones that change their length, joints below the floor, impossible bends, and bodies that freeze. Limits, and how many
-real clips each flags: docs/motion-faults.md
+bones that change their length, joints below the floor, bodies that float or freeze, and impossible bends. Limits, and
+how many real clips each flags: docs/motion-faults.md
 Prints the faults per frame and joint, and writes a player whose time line marks them; of a data set or a large folder,
 it shows the worst motions, at most `clips`. Exits with 3 if there are faults.
 """
@@ -74,6 +74,9 @@ def _files(config: Config) -> tuple[str, int, Iterator[Motion]]:
     from flame_mdm.formats.layouts import find_skeleton
 
     path = Path(str(config["motion"]))
+    if not path.exists():
+        kinds = ", ".join(ENDINGS)
+        raise UserError(f"{path}: no such file. Give a motion file ({kinds}), a folder of them, or a prepared data set")
     found = sorted(file for file in path.rglob("*") if file.suffix.lower() in ENDINGS) if path.is_dir() else [path]
     if not found:
         raise UserError(f"{path}: the folder has no motion files ({', '.join(ENDINGS)})")

@@ -1,4 +1,4 @@
-"""Physical faults of motions: sliding feet, jumps, changing bones, penetration, impossible bends, freezing."""
+"""Physical faults of motions: sliding feet, jumps, changing bones, penetration, floating, bends, freezing."""
 
 from __future__ import annotations
 
@@ -13,11 +13,18 @@ from flame_mdm.formats.motion import Motion
 
 LOW = 0.05
 """Height in meters above the floor below which a toe touches it."""
+STANDSTILL = 0.2
+"""Speed of the root in m/s below which the body does not jump: it is slower for only 0.04 s at the top of a jump."""
 LIMITS = {
     "skating": (0.5, "m/s", "a toe below 5 cm moves faster than 0.5 m/s for 0.4 s or more, longer than a step takes"),
     "pop": (200.0, "m/s^2", "a joint jumps: it accelerates by more than 200 m/s^2 and stops within two frames"),
     "bone length": (0.1, "of its median", "the length of a bone differs from its median by more than 10 % and 1 cm"),
     "penetration": (0.05, "m", "a joint is more than 5 cm below the floor, y = 0"),
+    "floating": (
+        LOW,
+        "m",
+        "no joint is within 5 cm of the floor for 0.8 s, longer than a jump, or for 0.3 s of standstill",
+    ),
     "limit": (15.0, "degrees", "a knee bends forward by more than 15 degrees, or a knee or elbow is folded to less"),
     "frozen": (0.02, "m/s", "no joint moves faster than 2 cm/s for a second or more"),
 }
@@ -51,6 +58,10 @@ def find_faults(motion: Motion) -> list[Fault]:
         *_runs("penetration", names, -joints[..., 1] > LIMITS["penetration"][0], -joints[..., 1]),
         *_runs("limit", names, *_bends(joints, names)),
     ]
+    height = joints[..., 1].min(1)[:, None]
+    aloft, slow = height > LOW, np.append(step[:, :1], step[-1:, :1], axis=0) < STANDSTILL
+    floats = [binary_opening(flag, np.ones((math.ceil(s * fps), 1))) for s, flag in ((0.8, aloft), (0.3, aloft & slow))]
+    found += _runs("floating", ("body",), floats[0] | floats[1], height)
     still = step.max(1, initial=0.0)[:, None]
     frames = max(2, round(fps))
     found += _runs("frozen", ("body",), still < LIMITS["frozen"][0], still, frames=frames)

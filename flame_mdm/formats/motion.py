@@ -282,12 +282,15 @@ def _write_npy(motion: Motion, path: Path) -> str:
 
 def _write_video(motion: Motion, path: Path) -> str:
     from flame_mdm.visualize import write_gif, write_mp4
+    from flame_mdm.visualize.body import try_figure
 
+    _, reason = try_figure(motion)
+    without = reason and f"; without a body: {reason}"
     if path.suffix.lower() == ".mp4":
         write_mp4(path, [motion])
-        return "H.264 video"
+        return f"H.264 video{without}"
     write_gif(path, [motion])
-    return "animated GIF of at most 50 frames per second"
+    return f"animated GIF of at most 50 frames per second{without}"
 
 
 def _error(motion: Motion, poses: Poses) -> str:

@@ -135,7 +135,8 @@ def contact_sheet(path: str | Path, motions: Sequence[Shown], frames: int = 6, s
         for k, frame in enumerate(np.rint(np.linspace(0, len(motion.joints) - 1, frames)).astype(int).tolist()):
             row.paste(_figure(motion, body, frame, size), (k * size, 0))
             pen.text((k * size + 8, 6), f"{frame / motion.fps:.2f} s", FAINT, _font(size))
-        rows.append(_below(row, _caption(motion, row.width, _caption_lines([motion], row.width, size), size)))
+        lines = _lines(motion, body, row.width, size)
+        rows.append(_below(row, _caption(lines, row.width, len(lines), size)))
     sheet = Image.new("RGB", (frames * size, sum(row.height for row in rows)), PAPER)
     top = 0
     for row in rows:
@@ -162,11 +163,11 @@ def _video(motions: Sequence[Shown], fps: float, size: int) -> Iterator[Image.Im
     """Yields images of the panels side by side, one every 1 / fps seconds, with a progress bar."""
     seconds = max(len(motion.joints) / motion.fps for motion in motions)
     columns = len(motions) if len(motions) < 4 else min(4, math.ceil(math.sqrt(len(motions))))
-    lines = _caption_lines(motions, size, size)
-    captions = [_caption(motion, size, lines, size) for motion in motions]
     frames = [-1] * len(motions)
     panels = [Image.new("RGB", (0, 0))] * len(motions)
     bodies = [try_figure(motion)[0] for motion in motions]
+    lines = [_lines(motion, body, size, size) for motion, body in zip(motions, bodies, strict=True)]
+    captions = [_caption(own, size, max(map(len, lines)), size) for own in lines]
     count = max(1, math.ceil(seconds * fps - 1e-6))
     for tick in range(count):
         for k, motion in enumerate(motions):
@@ -348,16 +349,17 @@ def _wrapped(text: str, width: int, size: int) -> list[str]:
     return [*lines[:2], f"{lines[2]} …"] if len(lines) > 3 else lines
 
 
-def _caption_lines(motions: Sequence[Shown], width: int, size: int) -> int:
-    return max(len(_wrapped(motion.text or motion.id, width, size)) for motion in motions)
+def _lines(motion: Shown, body: Figure | None, width: int, size: int) -> list[str]:
+    """Returns the lines of a motion's caption; the last one says so if it is drawn as a skeleton."""
+    return [*_wrapped(motion.text or motion.id, width, size), *["(no body fits)"] * (body is None)]
 
 
-def _caption(motion: Shown, width: int, lines: int, size: int) -> Image.Image:
-    """Draws the caption of a motion with room for `lines` lines; it is drawn once for all frames."""
+def _caption(texts: Sequence[str], width: int, lines: int, size: int) -> Image.Image:
+    """Draws lines of text with room for `lines` lines; it is drawn once for all frames."""
     line = round(max(10, size // 18) * 1.35)
     image = Image.new("RGB", (width, lines * line + 10), PAPER)
     pen = ImageDraw.Draw(image)
-    for k, text in enumerate(_wrapped(motion.text or motion.id, width, size)):
+    for k, text in enumerate(texts):
         pen.text((8, 4 + k * line), text, TEXT, _font(size))
     return image
 

@@ -61,7 +61,7 @@ def find_faults(motion: Motion) -> list[Fault]:
     height = joints[..., 1].min(1)[:, None]
     aloft, slow = height > LOW, np.append(step[:, :1], step[-1:, :1], axis=0) < STANDSTILL
     floats = [binary_opening(flag, np.ones((math.ceil(s * fps), 1))) for s, flag in ((0.8, aloft), (0.3, aloft & slow))]
-    found += _runs("floating", ("body",), floats[0] | floats[1], height)
+    found += _runs("floating", ("body",), np.logical_or(*floats), height)
     still = step.max(1, initial=0.0)[:, None]
     frames = max(2, round(fps))
     found += _runs("frozen", ("body",), still < LIMITS["frozen"][0], still, frames=frames)

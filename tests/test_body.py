@@ -214,7 +214,7 @@ def test_bodies_that_cannot_be_drawn_are_refused(cache, monkeypatch, name, says)
     monkeypatch.setitem(sys.modules, "anny", None)
     with pytest.raises(UserError, match=says):
         choose_body(name)
-    assert len(mesh().points) == 2002
+    assert len(mesh().points) == 2302
     assert not cache.exists()
 
 

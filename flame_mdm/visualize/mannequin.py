@@ -23,10 +23,12 @@ A_POSE = {"shoulder": (0, 0, -46), "elbow": (0, -14, 0), "hip": (0, 0, 4), "ankl
 """Degrees about x, y, z from the rest pose of SMPL to the pose in which the mesh is stored, for the left side. Arms
 mostly hang, so the skin is stretched less from here than from outstretched arms."""
 CELL = 0.005
-VERTICES = 1000
+VERTICES = 1150
 """Number of vertices of a half before it is mirrored."""
 SOLE = -0.981
 """Height of the sole below the pelvis."""
+LIPS, EYES = (192, 138, 120), (92, 74, 64)
+"""Colors of the face."""
 Field = Callable[[np.ndarray], np.ndarray]
 
 
@@ -192,7 +194,7 @@ def model() -> dict[str, Field]:
     face = tube(
         zero,
         up,
-        "592 0 60 26 28; 605 0 50 41 43; 635 0 40 55 57; 670 0 32 63 67; 710 0 20 69 80; 745 0 12 66 80",
+        "592 0 58 33 28; 605 0 50 46 43; 635 0 40 57 57; 670 0 32 63 67; 710 0 20 69 80; 745 0 12 66 80",
     )
     nose = tube(
         np.array([0, 0.708, 0.098]),
@@ -256,7 +258,7 @@ def magnified(points: np.ndarray, inverse: bool = False) -> np.ndarray:
     places, turned = pose()
     hand = places[JOINT["left_wrist"]] + turned[JOINT["left_wrist"]] @ np.array([0.09, 0, 0])
     radii = np.linspace(0, 3, 6001)
-    for center, reach, growth in (((0, 0.69, 0.05), 0.15, 0.9), (hand, 0.12, 0.9))[:: -1 if inverse else 1]:
+    for center, reach, growth in (((0, 0.67, 0.07), 0.13, 1.6), (hand, 0.12, 0.9))[:: -1 if inverse else 1]:
         slope = np.where(radii < reach, growth, np.where(radii < reach * (1 + 2 * growth), -0.5, 0))
         grown = radii + np.cumsum(slope) * radii[1]
         offset = points - np.array(center)
@@ -393,9 +395,14 @@ def paint(points: np.ndarray) -> np.ndarray:
     hand = smooth(-0.115, -0.07, elbow) * (points[:, 0] > 0.2)
     color = mixed(np.tile(np.array(SHIRT, float), (len(points), 1)), SKIN, hand)
     neck = points[:, 1] - 0.535 + 0.28 * points[:, 2]
-    color = mixed(color, SKIN, smooth(-0.018, 0.018, neck) * (points[:, 0] < 0.2))
+    color = mixed(color, SKIN, smooth(-0.024, 0.024, neck) * (points[:, 0] < 0.2))
     color = mixed(color, HAIR, smooth(-0.006, 0.006, hairline(points)) * (points[:, 1] > 0.6))
-    belt = (points[:, 0] < 0.25) * smooth(-0.022, 0.022, 0.035 - points[:, 1])
+    for center, size, shade in (
+        ((0, 0.637, 0.1), (0.026, 0.009, 0.03), LIPS),
+        ((0.031, 0.699, 0.1), (0.017, 0.008, 0.04), EYES),
+    ):
+        color = mixed(color, shade, smooth(-0.003, 0.003, -ellipsoid(center, size)(points)))
+    belt = (points[:, 0] < 0.25) * smooth(-0.03, 0.03, 0.035 - points[:, 1])
     color = mixed(color, TROUSERS, belt)
     return mixed(color, SHOES, smooth(-0.016, 0.016, -0.888 - points[:, 1]))
 
@@ -418,12 +425,17 @@ def make() -> dict[str, np.ndarray]:
     flip = np.array([-1, 1, 1])
     half = len(TWISTED)
     mirrored = [*SMPL22.mirrored, *(22 + (k + half) % len(HELPERS) for k in range(len(HELPERS)))]
+    triangles = np.concatenate([triangles, copies[triangles[:, ::-1]]])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    normals = np.concatenate([normals, normals[beside] * flip])
+    near = normals[triangles].sum(1)
+    np.add.at(normals, triangles.ravel(), np.repeat(near, 3, axis=0))  # folds are softer than the surface's gradient
     return packed(
         np.concatenate([points, points[beside] * flip]),
-        np.concatenate([normals, normals[beside] * flip]),
+        normals,
         np.concatenate([weights, weights[beside][:, mirrored]]),
         np.concatenate([paint(points), paint(points)[beside]]),
-        np.concatenate([triangles, copies[triangles[:, ::-1]]]),
+        triangles,
         places,
         turned,
     )

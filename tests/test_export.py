@@ -15,8 +15,9 @@ from flame_mdm.data.synthetic import Synthetic
 from flame_mdm.formats import bvh
 from flame_mdm.formats.files import read
 from flame_mdm.formats.layouts import LAYOUTS
-from flame_mdm.formats.motion import Motion, continuous_euler
+from flame_mdm.formats.motion import Motion
 from flame_mdm.formats.poses import Poses, solve
+from flame_mdm.formats.retarget import continuous_euler
 from flame_mdm.representations import rotation
 from flame_mdm.representations.rot6d import Rot6D
 from flame_mdm.representations.skeleton import KIT21, SMPL22, SMPL24, global_rotations

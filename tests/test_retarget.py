@@ -12,8 +12,10 @@ import torch
 from flame_mdm.__main__ import main
 from flame_mdm.data.synthetic import Synthetic
 from flame_mdm.errors import UserError
-from flame_mdm.formats import bvh
+from flame_mdm.formats import bvh, characters
+from flame_mdm.formats.characters import LIMBS, SIDES
 from flame_mdm.formats.files import read
+from flame_mdm.formats.glb import save as save_glb
 from flame_mdm.formats.motion import Motion
 from flame_mdm.formats.retarget import preset, presets, world_rotations
 from flame_mdm.representations.rotation import quaternion_to_matrix
@@ -181,3 +183,321 @@ def test_an_unknown_rig_is_refused(kick: Motion, tmp_path: Path, capsys: pytest.
     assert main(["convert", str(tmp_path / "a.npz"), str(tmp_path / "c.bvh"), "rig=unrael"]) == 1
     assert "rig=unrael: unknown. Did you mean unreal" in capsys.readouterr().err
     assert [path.name for path in sorted(tmp_path.iterdir())] == ["a.npz", "b.bvh"]
+
+
+# Own characters -------------------------------------------------------------------------------------------------------
+
+
+def odd_glb(path: Path, kick: Motion, turned: bool = True) -> None:
+    """Another character: A-pose, longer legs, odd names, centimeters and z up below a node with scale 0.01."""
+    poses = kick.posed()
+    longer = poses.offsets.clone()
+    longer[[4, 5, 7, 8]] *= 1.2  # legs
+    longer[[18, 19, 20, 21]] *= 0.9  # arms
+    longer[[10, 11]] *= 1.3  # feet
+    other = Motion(type(poses)(longer, poses.rotations, poses.root).joints().float().numpy(), 20.0)
+    other.save(path, rig="unreal")
+    document = read_glb(path)[0]
+    length = len(json.dumps(document, separators=(",", ":")).encode())
+    data = bytearray(path.read_bytes()[28 + length + -length % 4 :])
+    del document["animations"]
+    nodes, roots = document["nodes"], document["scenes"][0]["nodes"]
+    lifted = next(number for number, node in enumerate(nodes) if node["name"] == "lifted")
+    for node in nodes[: lifted - 1]:
+        node["translation"] = [100 * x for x in node["translation"]]
+        node["name"] = "Rig Bone-" + node["name"][::-1]
+    half = 0.5**0.5
+    nodes[lifted] |= {"scale": [0.01] * 3, "rotation": [half if turned else 0.0, 0, 0, half if turned else 1.0]}
+    if turned:  # a node that undoes it: the file is y up again
+        nodes.append({"name": "armature", "rotation": [-half, 0, 0, half], "children": [lifted]})
+        document["scenes"][0]["nodes"] = [len(nodes) - 1 if root == lifted else root for root in roots]
+    view = document["bufferViews"][document["accessors"][document["skins"][0]["inverseBindMatrices"]]["bufferView"]]
+    bind = np.frombuffer(data, "<f4", view["byteLength"] // 4, view["byteOffset"]).reshape(-1, 4, 4).copy()
+    bind[:, :, :3] *= 100  # of columns, as matrices are stored: the mesh stays in meters
+    data[view["byteOffset"] : view["byteOffset"] + view["byteLength"]] = bind.tobytes()
+    save_glb(path, document, data)
+
+
+def write_names(path: Path, **other: str | None) -> None:
+    """The file of names of `odd_glb`."""
+    real, names = presets()["unreal"], {}
+    for part, side, mark in (("trunk", "", ""), *((p, f"{s}_", s[0]) for s in SIDES for p in ("arm", "leg"))):
+        names |= {side + ours: "Rig Bone-" + theirs.replace("*", mark)[::-1] for theirs, ours in real[part].items()}
+    assert len(names) == len(SMPL22)
+    path.write_text("".join(f"{ours}: {json.dumps(theirs)}\n" for ours, theirs in {**names, **other}.items()))
+
+
+def limbs_off(found: dict[str, np.ndarray], joints: np.ndarray, limbs: tuple[str, ...] = tuple(LIMBS)) -> float:
+    """Median angle in degrees between the limbs of a character and those of a motion, of the worst limb."""
+    angles = []
+    for side in SIDES:
+        for start in limbs:
+            ours = joints[:, JOINT[f"{side}_{LIMBS[start]}"]] - joints[:, JOINT[f"{side}_{start}"]]
+            theirs = found[f"{side}_{LIMBS[start]}"] - found[f"{side}_{start}"]
+            cosine = (ours * theirs).sum(1) / np.linalg.norm(ours, axis=1) / np.linalg.norm(theirs, axis=1)
+            angles.append(float(np.median(np.degrees(np.arccos(np.clip(cosine, -1, 1))))))
+    return max(angles)
+
+
+def of_glb(path: Path, character: characters.Character) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    """Positions (F, 3) of SMPL's joints in a written character, and its vertices (F, V, 3)."""
+    document, arrays, worlds = glb_worlds(path)
+    assert isinstance(character.file, characters.glb.Glb)
+    found = {joint: worlds[:, character.file.nodes[number], :3, 3] for joint, number in character.map.items()}
+    return found, np.stack([skin(document, arrays, worlds[frame]) for frame in range(len(worlds))])
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_a_character_with_odd_names_scale_and_rest_pose(kick: Motion, tmp_path: Path, turned: bool):
+    hero = tmp_path / "hero.glb"
+    odd_glb(hero, kick, turned)
+    write_names(tmp_path / "hero.yaml")
+    line = kick.save(tmp_path / "out.glb", character=hero)
+    assert ", 22 of 2" in line
+    character = characters.read(hero)
+    found, points = of_glb(tmp_path / "out.glb", character)
+    assert limbs_off(found, kick.joints, ("shoulder", "elbow")) < 0.1
+    assert limbs_off(found, kick.joints, ("hip", "knee")) < 6  # the legs reach for the floor
+    feet = [JOINT["left_foot"], JOINT["right_foot"]]
+    standing = kick.joints[:, feet, 1].min(1) < 0.005
+    assert np.median(np.abs(points[standing, :, 1].min(1))) < 0.010
+    assert np.abs(points[standing, :, 1].min(1)).max() < 0.03
+    before, after = read_glb(hero)[0], read_glb(tmp_path / "out.glb")[0]
+    for part in ("meshes", "materials", "skins"):
+        assert after[part] == before[part]
+    for number, source in (("left_ankle", "left_foot"), ("right_ankle", "right_foot")):
+        foot = found[source] - found[number]
+        assert np.median(foot[standing, 2]) > 0  # it faces +z, as the motion does
+
+
+def test_a_character_in_its_own_proportions_is_the_motion(kick: Motion, tmp_path: Path):
+    """Bones as long as the motion's: every joint is where the motion's is, up to the height of the soles."""
+    for name, ending in (("lafan1", ".glb"), ("unreal", ".glb"), ("mixamo", ".glb")):
+        kick.save(tmp_path / f"hero{ending}", rig=name)
+        character = characters.read(tmp_path / f"hero{ending}")
+        kick.save(tmp_path / f"out{ending}", character=character)
+        found, _ = of_glb(tmp_path / "out.glb", character)
+        for side in SIDES:
+            for joint in ("hip", "knee", "ankle", "foot", "wrist"):
+                expected = kick.joints[:, JOINT[f"{side}_{joint}"]]
+                off = np.linalg.norm((found[f"{side}_{joint}"] - expected)[:, [0, 2]], axis=1)
+                assert np.median(off) < 0.012, (name, side, joint)
+
+
+@pytest.mark.parametrize("up", ["y", "z"])
+def test_a_bvh_character_keeps_its_skeleton(kick: Motion, tmp_path: Path, up: str):
+    kick.save(tmp_path / "hero.bvh", rig="unreal", rest_pose=True)
+    file = bvh.read(tmp_path / "hero.bvh")
+    if up == "z":
+        turn = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]])
+        file = characters.replace(file, offsets=file.offsets @ turn.T, end_offsets=file.end_offsets @ turn.T)
+        file = characters.replace(file, frames=np.zeros_like(file.frames[:1]))  # its rest pose is that of the offsets
+        bvh.write(file, tmp_path / "hero.bvh")
+    line = kick.save(tmp_path / "out.bvh", character=tmp_path / "hero.bvh")
+    assert "22 of 23 joints follow the motion, 1 keep their angle" in line
+    out = bvh.read(tmp_path / "out.bvh")
+    assert (out.joints, out.parents, out.channels) == (file.joints, file.parents, file.channels)
+    np.testing.assert_array_equal(out.offsets, file.offsets)
+    character = characters.read(tmp_path / "hero.bvh")
+    places = out.positions() @ character.rig.frame.T / 100
+    found = {joint: places[:, number] for joint, number in character.map.items()}
+    assert limbs_off(found, kick.joints, ("shoulder", "elbow")) < 0.1
+    assert limbs_off(found, kick.joints) < 1
+    low = places[:, [character.map["left_foot"], character.map["right_foot"]], 1]
+    np.testing.assert_allclose(np.median(low.min(1)), np.median(kick.joints[..., 1].min(1)), atol=0.01)
+
+
+def test_limbs_of_a_character_do_not_flip(kick: Motion, tmp_path: Path):
+    odd_glb(tmp_path / "hero.glb", kick)
+    write_names(tmp_path / "hero.yaml")
+    world = characters.moved(characters.read(tmp_path / "hero.glb"), kick)[0]
+    body = world_rotations(kick.posed().rotations.numpy())
+
+    def step(turns: np.ndarray) -> float:
+        trace = np.einsum("fjab,fjab->fj", turns[1:], turns[:-1])
+        return float(np.degrees(np.arccos(np.clip((trace - 1) / 2, -1, 1))).max())
+
+    assert step(world) < step(body) + 10
+
+
+def test_spines_of_other_lengths(kick: Motion, tmp_path: Path):
+    """The chest, from which the arms start, turns as the motion's, however many joints are below it."""
+    kick.save(tmp_path / "hero.bvh", rig="mixamo")
+    text = (tmp_path / "hero.bvh").read_text()
+    (tmp_path / "hero.bvh").write_text(text.replace("Spine2", "Thorax").replace("Spine1", "Lumbar"))
+    character = characters.read(tmp_path / "hero.bvh")
+    assert not {"spine2", "spine3"} & character.map.keys()
+    assert character.rig.sources[character.map["spine1"]] == JOINT["spine3"]
+
+
+# Bad input ------------------------------------------------------------------------------------------------------------
+
+
+def test_a_template_of_names_is_printed(kick: Motion, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    hero, out = tmp_path / "hero.glb", str(tmp_path / "out.glb")
+    odd_glb(hero, kick)
+    kick.save(tmp_path / "a.npz")
+    assert main(["convert", str(tmp_path / "a.npz"), out, f"character={hero}"]) == 1
+    printed = capsys.readouterr()
+    assert printed.out.startswith("# Joints of hero.glb: ")
+    assert {line.split(":")[0] for line in printed.out.splitlines()[1:]} == set(JOINT)
+    assert "no joint found for pelvis, left_hip" in printed.err
+    assert "hero.yaml" in printed.err
+    assert printed.err.count("\n") == 1
+    assert not (tmp_path / "out.glb").exists()
+    write_names(tmp_path / "hero.yaml")
+    assert main(["convert", str(tmp_path / "a.npz"), out, f"character={hero}"]) == 0
+
+
+@pytest.mark.parametrize(
+    ("other", "message"),
+    [
+        ({"left_nee": "x"}, r"hero\.yaml: left_nee is no joint of SMPL\. Did you mean left_knee"),
+        (
+            {"left_knee": "Rig Bone-l_flak"},
+            r"left_knee: .*hero\.glb has no joint Rig Bone-l_flak\. Did you mean Rig",
+        ),
+        ({"left_knee": "Rig Bone-r_flac"}, r"hero\.yaml: Rig Bone-r_flac is given for left_knee and for another joint"),
+        ({"left_knee": None}, r"no joint found for left_knee\. Write"),
+        ({"left_knee": "Rig Bone-l_hgiht", "left_hip": "Rig Bone-l_eflac"}, "upright|has no joint"),
+    ],
+)
+def test_wrong_names_are_refused(other: dict[str, str | None], message: str, kick: Motion, tmp_path: Path):
+    odd_glb(tmp_path / "hero.glb", kick)
+    write_names(tmp_path / "hero.yaml", **other)
+    with pytest.raises(UserError, match=message):
+        characters.read(tmp_path / "hero.glb")
+
+
+def changed(path: Path, change: Any) -> None:
+    """Rewrites a .glb file with a changed document."""
+    document = read_glb(path)[0]
+    length = len(json.dumps(document, separators=(",", ":")).encode())
+    data = path.read_bytes()[28 + length + -length % 4 :]
+    change(document)
+    save_glb(path, document, data)
+
+
+def lying(document: dict[str, Any]) -> None:
+    document["nodes"].append({"children": document["scenes"][0].pop("nodes"), "rotation": [0, 0, 0.5**0.5, 0.5**0.5]})
+    document["scenes"][0]["nodes"] = [len(document["nodes"]) - 1]
+
+
+def scaled(document: dict[str, Any]) -> None:
+    lying(document)
+    document["nodes"][-1] |= {"rotation": [0, 0, 0, 1], "scale": [1, 1, 2]}
+
+
+def mirrored(document: dict[str, Any]) -> None:
+    lying(document)
+    document["nodes"][-1] |= {"rotation": [0, 0, 0, 1], "scale": [-1, 1, 1]}
+
+
+def exchanged(document: dict[str, Any]) -> None:
+    swap = {"LeftUpLeg": "RightUpLeg", "LeftLeg": "RightLeg", "LeftFoot": "RightFoot", "LeftToeBase": "RightToeBase"}
+    swap |= {"LeftShoulder": "RightShoulder", "LeftArm": "RightArm", "LeftForeArm": "RightForeArm"}
+    swap |= {"LeftHand": "RightHand"}
+    swap |= {right: left for left, right in swap.items()}
+    for node in document["nodes"]:
+        plain = node["name"].removeprefix("mixamorig:")
+        node["name"] = swap.get(plain, plain)
+
+
+def two(document: dict[str, Any]) -> None:
+    count = len(document["nodes"])
+    document["nodes"].append({"name": "other"})
+    document["scenes"][0]["nodes"].append(count)
+    document["skins"].append({"joints": [count]})
+
+
+def twice(document: dict[str, Any]) -> None:
+    document["nodes"].append({"name": "mixamorig:LeftLeg"})
+    document["nodes"][0]["children"].append(len(document["nodes"]) - 1)
+    document["skins"][0]["joints"].append(len(document["nodes"]) - 1)
+    del document["skins"][0]["inverseBindMatrices"]
+
+
+def short(document: dict[str, Any]) -> None:
+    for node in document["nodes"]:
+        if node["name"] == "mixamorig:LeftForeArm":
+            node["translation"] = [0, 0, 0]
+    del document["skins"][0]["inverseBindMatrices"]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda document: document.pop("skins"), "0 skeletons with a skin"),
+        (two, "2 skeletons with a skin"),
+        (twice, "2 joints for left_knee: mixamorig:LeftLeg, mixamorig:LeftLeg"),
+        (short, "the bone from left_shoulder to left_elbow has no length"),
+        (lying, "the rest pose is not upright, it leans by 90 degrees"),
+        (scaled, r"mixamorig:Hips \(pelvis\) is mirrored or scaled unevenly"),
+        (mirrored, r"mixamorig:Hips \(pelvis\) is mirrored or scaled unevenly"),
+        (exchanged, "the toes point backward"),
+        (lambda document: document["nodes"][3]["children"].append(0), "damaged, or not glTF 2.0 in one file: a node"),
+        (lambda document: document["nodes"][0].update(rotation=[0, 0, 0, 0]), "damaged"),
+        (lambda document: document["nodes"][0].update(translation=["a", 0, 0]), "damaged"),
+        (lambda document: document["skins"][0].update(joints=[999]), "damaged"),
+        (lambda document: document["skins"][0].update(inverseBindMatrices=999), "damaged"),
+        (lambda document: document["buffers"][0].update(uri="hero.bin"), "its data are in another file"),
+    ],
+)
+def test_characters_that_cannot_be_used_are_refused(change: Any, message: str, kick: Motion, tmp_path: Path):
+    kick.save(tmp_path / "hero.glb", rig="mixamo")
+    changed(tmp_path / "hero.glb", change)
+    with pytest.raises((UserError, ValueError), match=message):
+        kick.save(tmp_path / "out.glb", character=tmp_path / "hero.glb")
+    assert not (tmp_path / "out.glb").exists()
+
+
+def test_damaged_files_are_refused(kick: Motion, tmp_path: Path):
+    kick.save(tmp_path / "hero.glb", rig="mixamo")
+    content = (tmp_path / "hero.glb").read_bytes()
+    for part in (b"", b"glTF", content[:15], content[:200], content[:5000], b"\0" * 100):
+        (tmp_path / "bad.glb").write_bytes(part)
+        with pytest.raises(ValueError, match=r"bad\.glb: (damaged|not a \.glb file)"):
+            characters.read(tmp_path / "bad.glb")
+    with pytest.raises(UserError, match=r"character=hero\.fbx: not a character\. Use a \.bvh or \.glb file"):
+        characters.read("hero.fbx")
+    with pytest.raises(FileNotFoundError):
+        characters.read(tmp_path / "missing.glb")
+    with pytest.raises(UserError, match=r"out\.bvh: this character is a \.glb file"):
+        kick.save(tmp_path / "out.bvh", character=tmp_path / "hero.glb")
+
+
+# Many files, and robots -----------------------------------------------------------------------------------------------
+
+
+def test_a_folder_is_converted(kick: Motion, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    kick.save(tmp_path / "in" / "a.npz")
+    kick.save(tmp_path / "in" / "below" / "b.json")
+    out = tmp_path / "out"
+    assert main(["convert", str(tmp_path / "in"), str(out), "format=bvh", "rig=mixamo"]) == 0
+    assert [str(path.relative_to(out)) for path in sorted(out.rglob("*.bvh"))] == ["a.bvh", "below/b.bvh"]
+    assert main(["convert", str(tmp_path / "in"), str(tmp_path / "on"), f"character={out / 'a.bvh'}"]) == 0
+    assert (tmp_path / "on" / "below" / "b.bvh").exists()
+    capsys.readouterr()
+    for words, message in (
+        ([str(tmp_path / "in"), str(out)], "is a folder: name the format"),
+        ([str(tmp_path / "in" / "a.npz"), str(tmp_path / "c.bvh"), "format=bvh"], "format=... is for folders"),
+        ([str(tmp_path / "empty"), str(out), "format=bvh"], "no motion files"),
+    ):
+        (tmp_path / "empty").mkdir(exist_ok=True)
+        assert main(["convert", *words]) == 1
+        assert message in capsys.readouterr().err
+
+
+def test_the_npz_has_the_keys_of_smplx_files(kick: Motion, tmp_path: Path):
+    kick.poses = kick.posed()
+    kick.save(tmp_path / "a.npz")
+    kick.poses = None
+    with np.load(tmp_path / "a.npz") as file:
+        assert file["pose_body"].shape == (len(kick.joints), 63)
+        assert file["root_orient"].shape == (len(kick.joints), 3)
+        np.testing.assert_array_equal(
+            np.concatenate([file["root_orient"], file["pose_body"]], 1), file["poses"][:, :66]
+        )
+        assert file["mocap_frame_rate"].item() == 20.0
+        assert file["betas"].shape == (16,)
+        assert str(file["gender"]) == "neutral"

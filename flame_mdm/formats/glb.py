@@ -7,13 +7,17 @@ from __future__ import annotations
 
 import json
 import struct
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from scipy.spatial.transform import Rotation
 
-from flame_mdm.files import atomic_write
+from flame_mdm.errors import first_line
+from flame_mdm.files import MEBIBYTE, atomic_write, parse_json, regular_file
 from flame_mdm.formats.poses import Poses
 from flame_mdm.formats.retarget import Rig, retarget
 from flame_mdm.representations import rotation
@@ -27,6 +31,8 @@ VERTICES, INDICES = 34962, 34963
 KINDS = {1: "SCALAR", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
 SIDES = 10
 """Number of corners of a limb's cross section."""
+LIMIT = 512 * MEBIBYTE
+"""Maximum size of a file that is read."""
 
 
 def write(path: Path, poses: Poses, rig: Rig, fps: float, text: str, name: str, body: Figure | None = None) -> None:
@@ -45,7 +51,7 @@ def write(path: Path, poses: Poses, rig: Rig, fps: float, text: str, name: str, 
         name: of the animation, if there is no caption.
         body: the body of this motion; None = rounded limbs.
     """
-    binary = _Binary()
+    binary = Binary()
     rest = poses.rest().numpy()
     position, normal, color, joint, weight, index, bind = _limbs(rest) if body is None else _skin(body)
     attributes = {
@@ -64,12 +70,12 @@ def write(path: Path, poses: Poses, rig: Rig, fps: float, text: str, name: str, 
     resting[:, :3, 3] = -(rig.turns[others].mT @ rig.places[others, :, None])[..., 0]
     bind = np.concatenate([bind, resting])
     matrices = binary.add(bind.mT.reshape(-1, 16))  # matrices are stored in column-major order
-    times = binary.add(np.arange(len(poses.root), dtype=np.float32) / np.float32(fps), bounds=True)
     moved = poses if body is None else Poses(poses.offsets, torch.from_numpy(body.local()), poses.root)
     turns, root = retarget(moved, rig)
     turns = quaternions(np.concatenate([rig.rest()[None], turns]))
     curves = [("rotation", node, turns[1:, node]) for node in range(len(rig.joints))]
     curves.append(("translation", rig.hips, root.astype("f4")))
+    animated = animation(binary, text or name or "motion", fps, curves)
     nodes: list[dict[str, Any]] = [
         {"name": name, "translation": offset.tolist(), "rotation": turn.tolist()}
         for name, offset, turn in zip(rig.joints, rig.offsets(), turns[0], strict=True)
@@ -91,24 +97,32 @@ def write(path: Path, poses: Poses, rig: Rig, fps: float, text: str, name: str, 
         "meshes": [{"primitives": [{"attributes": attributes, "indices": indices, "material": 0}]}],
         "materials": [{"pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 0.8}}],
         "skins": [{"joints": skinned + others, "skeleton": 0, "inverseBindMatrices": matrices}],
-        "animations": [
-            {
-                "name": text or name or "motion",
-                "samplers": [{"input": times, "output": binary.add(values)} for _, _, values in curves],
-                "channels": [
-                    {"sampler": sampler, "target": {"node": node, "path": kind}}
-                    for sampler, (kind, node, _) in enumerate(curves)
-                ],
-            }
-        ],
+        "animations": [animated],
         "accessors": binary.accessors,
         "bufferViews": binary.views,
         "buffers": [{"byteLength": len(binary.data)}],
     }
+    save(path, document, binary.data)
+
+
+def animation(binary: Binary, name: str, fps: float, curves: Sequence[tuple[str, int, np.ndarray]]) -> dict[str, Any]:
+    """Returns an animation of properties of nodes: property, node, values (F, K) in frames."""
+    times = binary.add(np.arange(len(curves[0][2]), dtype=np.float32) / np.float32(fps), bounds=True)
+    return {
+        "name": name,
+        "samplers": [{"input": times, "output": binary.add(values)} for _, _, values in curves],
+        "channels": [
+            {"sampler": sampler, "target": {"node": node, "path": kind}}
+            for sampler, (kind, node, _) in enumerate(curves)
+        ],
+    }
+
+
+def save(path: Path, document: dict[str, Any], data: bytes | bytearray) -> None:
+    """Writes a .glb file with a document and a binary part, whose length is a multiple of 4."""
     head = json.dumps(document, separators=(",", ":")).encode()
     head += b" " * (-len(head) % 4)
-    chunks = struct.pack("<I4s", len(head), b"JSON") + head
-    chunks += struct.pack("<I4s", len(binary.data), b"BIN\0") + bytes(binary.data)
+    chunks = struct.pack("<I4s", len(head), b"JSON") + head + struct.pack("<I4s", len(data), b"BIN\0") + bytes(data)
     with atomic_write(path) as temporary:
         temporary.write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks)
 
@@ -119,13 +133,112 @@ def quaternions(matrices: np.ndarray) -> np.ndarray:
     return turns[..., [1, 2, 3, 0]].float().numpy()
 
 
-class _Binary:
+@dataclass(frozen=True, eq=False)
+class Glb:
+    """A .glb file that is read. N nodes, in an order in which parents precede their children.
+
+    Attributes:
+        document: the JSON part.
+        data: the binary part.
+        nodes: index of each node in the document.
+        names: name of each node.
+        parents: number of each node's parent, -1 for a root.
+        worlds: (N, 4, 4), coordinates of each node to those of the world.
+        skins: for each skin, the numbers of its joints, their inverse bind matrices (K, 4, 4), which may be missing,
+            and the corners (C, 3) of boxes around its meshes.
+    """
+
+    document: dict[str, Any]
+    data: bytes
+    nodes: tuple[int, ...]
+    names: tuple[str, ...]
+    parents: tuple[int, ...]
+    worlds: np.ndarray
+    skins: tuple[tuple[list[int], np.ndarray, np.ndarray], ...]
+
+
+def read(path: Path) -> Glb:
+    """Reads nodes and skins of a .glb file.
+
+    Raises:
+        FileNotFoundError: the file does not exist.
+        UserError: the path is not a regular file, or the file is too large.
+        ValueError: the file is damaged, or not a .glb file of glTF 2.0.
+    """
+    regular_file(path, LIMIT)
+    content = path.read_bytes()
+    if content[:4] != b"glTF":
+        raise ValueError(f"{path}: not a .glb file")
+    try:
+        (size,) = struct.unpack_from("<I", content, 12)
+        document = parse_json(content[20 : 20 + size])
+        data = content[28 + size :]
+        nodes = document["nodes"]
+        below = [node.get("children", []) for node in nodes]
+        above = {child: number for number, children in enumerate(below) for child in children}
+        order = [number for number in range(len(nodes)) if number not in above]
+        if len(above) != sum(map(len, below)):
+            raise ValueError("a node has two parents")
+        for number in order:
+            order += below[number]
+        if len(order) != len(nodes):
+            raise ValueError("a node is its own parent")
+        rank = {number: k for k, number in enumerate(order)}
+        parents = tuple(rank[above[number]] if number in above else -1 for number in order)
+        worlds = np.stack([_matrix(nodes[number]) for number in order])
+        for k, parent in enumerate(parents):
+            worlds[k] = worlds[parent] @ worlds[k] if parent >= 0 else worlds[k]
+        skins = tuple(_read_skin(document, data, number, rank) for number in range(len(document.get("skins", ()))))
+        names = tuple(str(nodes[number].get("name", f"node {number}")) for number in order)
+        finite = np.isfinite(worlds).all() and all(np.isfinite(part).all() for _, *parts in skins for part in parts)
+        if not finite or document["buffers"][0].get("uri"):
+            raise ValueError("numbers are not finite" if not finite else "its data are in another file")
+    except (KeyError, TypeError, IndexError, AttributeError, OverflowError, struct.error, ValueError) as error:
+        raise ValueError(f"{path}: damaged, or not glTF 2.0 in one file: {first_line(error)}") from error
+    return Glb(document, data, tuple(order), names, parents, worlds, skins)
+
+
+def _matrix(node: dict[str, Any]) -> np.ndarray:
+    """Returns the matrix (4, 4) from a node's coordinates to those of its parent."""
+    if "matrix" in node:
+        return np.array(node["matrix"], float).reshape(4, 4).T
+    made = np.eye(4)
+    made[:3, :3] = Rotation.from_quat(node.get("rotation", [0, 0, 0, 1])).as_matrix() * node.get("scale", [1, 1, 1])
+    made[:3, 3] = node.get("translation", [0, 0, 0])
+    return made
+
+
+def _read_skin(
+    document: dict[str, Any], data: bytes, number: int, rank: dict[int, int]
+) -> tuple[list[int], np.ndarray, np.ndarray]:
+    skin, accessors = document["skins"][number], document["accessors"]
+    joints = [rank[joint] for joint in skin["joints"]]
+    binds = np.zeros((0, 4, 4))
+    if "inverseBindMatrices" in skin:
+        accessor = accessors[skin["inverseBindMatrices"]]
+        view = document["bufferViews"][accessor["bufferView"]]
+        if accessor["componentType"] != FLOAT or view.get("byteStride", 64) != 64:
+            raise ValueError("inverse bind matrices are not floats")
+        start = view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
+        values = np.frombuffer(data, "<f4", 16 * len(joints), start)
+        binds = values.reshape(-1, 4, 4).mT.astype(float)
+    corners = [np.zeros((0, 3))]
+    for node in document["nodes"]:
+        for part in document["meshes"][node["mesh"]]["primitives"] if node.get("skin") == number else ():
+            accessor = accessors[part["attributes"]["POSITION"]]
+            whole = {5120: 127, 5121: 255, 5122: 32767, 5123: 65535}.get(accessor["componentType"], 1)
+            box = np.array([accessor["min"], accessor["max"]], float) / (whole if accessor.get("normalized") else 1)
+            corners.append(np.stack([box[[i, j, k], [0, 1, 2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)]))
+    return joints, binds, np.concatenate(corners)
+
+
+class Binary:
     """The binary part of the file: concatenated arrays, with buffer views and accessors that describe them."""
 
-    def __init__(self) -> None:
-        self.data = bytearray()
-        self.views: list[dict[str, int]] = []
-        self.accessors: list[dict[str, Any]] = []
+    def __init__(self, data: bytes = b"", views: Sequence[Any] = (), accessors: Sequence[Any] = ()) -> None:
+        self.data = bytearray(data) + b"\0" * (-len(data) % 4)
+        self.views: list[dict[str, int]] = list(views)
+        self.accessors: list[dict[str, Any]] = list(accessors)
 
     def add(self, array: np.ndarray, target: int | None = None, bounds: bool = False, normalized: bool = False) -> int:
         """Appends numbers (N,) or (N, K) and returns the index of their accessor; `normalized`: bytes mean 0 to 1."""

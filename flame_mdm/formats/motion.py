@@ -10,7 +10,6 @@ from __future__ import annotations
 import json
 import sys
 import tempfile
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from html import escape
 from importlib import import_module
@@ -19,12 +18,12 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from flame_mdm.files import atomic_write, write_text
-from flame_mdm.formats import bvh, glb
+from flame_mdm.formats import bvh, characters, glb
+from flame_mdm.formats.characters import Character
 from flame_mdm.formats.poses import Poses, solve
-from flame_mdm.formats.retarget import CENTIMETER, SMPL_ORDERS, Rig, preset, retarget, smpl
+from flame_mdm.formats.retarget import CENTIMETER, Rig, continuous_euler, preset, retarget, smpl
 from flame_mdm.representations import rotation
 from flame_mdm.representations.skeleton import SMPL22, Skeleton
 from flame_mdm.representations.smpl import ADULT
@@ -111,7 +110,13 @@ class Motion:
         return solve(joints, self.fps)
 
     def save(
-        self, path: str | Path, figure: str = "body", rest_pose: bool = False, rig: str | None = None, **facts: Any
+        self,
+        path: str | Path,
+        figure: str = "body",
+        rest_pose: bool = False,
+        rig: str | None = None,
+        character: str | Path | Character | None = None,
+        **facts: Any,
     ) -> str:
         """Writes a motion file and returns a line that describes it.
 
@@ -123,12 +128,14 @@ class Motion:
             figure: the mesh of a `.glb` file: body, or bones for rounded limbs.
             rest_pose: begin a `.bvh` file with a frame of the rest pose, arms out, which some programs expect.
             rig: the skeleton of a `.bvh` or `.glb` file, one of `flame_mdm.formats.retarget.presets`; default: SMPL's.
+            character: a `.bvh` or `.glb` file, or what `flame_mdm.formats.characters.read` returned; the same kind of
+                file with this motion is written. The other options do not apply.
             facts: additional entries of an `.npz` file, such as the seed.
 
         Raises:
             ValueError: the extension is unknown, or `.bvh` or `.glb` is requested for another skeleton than SMPL's.
-            UserError: the file cannot be written, `.mp4` is requested and the package av is not installed, or the rig
-                is unknown.
+            UserError: the file cannot be written, `.mp4` is requested and the package av is not installed, the rig is
+                unknown, or the character cannot be used.
         """
         path = Path(path)
         writers = {".bvh": _write_bvh, ".glb": _write_glb, ".npz": _write_npz, ".json": _write_json, ".npy": _write_npy}
@@ -142,6 +149,11 @@ class Motion:
             raise ValueError(f"{path}: figure is only for .glb files, and rest_pose only for .bvh files")
         if rig is not None and writer not in (_write_bvh, _write_glb):
             raise ValueError(f"{path}: rig is only for .bvh and .glb files, which contain a skeleton")
+        if character is not None:
+            if figure != FIGURES[0] or rest_pose or rig is not None:
+                raise ValueError(f"{path}: figure, rest_pose and rig do not apply to a character's own file")
+            what = _write_character(self, path, character)
+            return f"{path}: {len(self.joints)} frames at {self.fps:g} per second, {what}"
         given = {_write_npz: (facts,), _write_glb: (figure, rig), _write_bvh: (rest_pose, rig)}
         what = writer(self, path, *given.get(writer, ()))
         return f"{path}: {len(self.joints)} frames at {self.fps:g} per second, {what}"
@@ -185,6 +197,8 @@ def _write_npz(motion: Motion, path: Path, facts: dict[str, Any]) -> str:
             "betas": np.zeros(16),
             "gender": "neutral",
             "mocap_framerate": motion.fps,
+            # names of AMASS's SMPL-X files, which GMR reads
+            **{"root_orient": turns[:, :3], "pose_body": turns[:, 3:], "mocap_frame_rate": motion.fps},
         }
         what += "; also in AMASS's format: SMPL+H poses in axis-angle, meters, z up, bone lengths of SMPL's body"
     with atomic_write(path) as temporary:
@@ -237,24 +251,6 @@ def _write_bvh(motion: Motion, path: Path, rest_pose: bool, rig: str | None) -> 
     return f"{unit}, y up; {_error(motion, poses)}" + "; the first frame is the rest pose" * rest_pose
 
 
-def continuous_euler(matrices: Tensor, orders: Sequence[str] = SMPL_ORDERS) -> Tensor:
-    """Converts rotations (F, J, 3, 3) to Euler angles (F, J, 3) in the joints' `orders`, radians, without jumps.
-
-    A rotation has two triples of angles, and full turns may be added to each angle. The angles nearest to the previous
-    frame are used, so that programs can interpolate; two full turns of the body end at 720 degrees.
-    """
-    turn = 2 * torch.pi
-    first = torch.stack([rotation.matrix_to_euler(matrices[:, j], order) for j, order in enumerate(orders)], 1)
-    second = torch.stack([first[..., 0] + torch.pi, torch.pi - first[..., 1], first[..., 2] + torch.pi], -1)
-    chosen = [first[0]]
-    for pair in torch.stack([first, second], -2)[1:]:
-        before = chosen[-1][:, None]
-        near = pair - turn * ((pair - before) / turn).round()
-        best = (near - before).square().sum(-1).argmin(-1)
-        chosen.append(near[torch.arange(len(near)), best])
-    return torch.stack(chosen)
-
-
 def _write_glb(motion: Motion, path: Path, figure: str, rig: str | None) -> str:
     from flame_mdm.visualize.body import try_figure
 
@@ -262,6 +258,11 @@ def _write_glb(motion: Motion, path: Path, figure: str, rig: str | None) -> str:
     body, reason = try_figure(motion) if figure == FIGURES[0] else (None, "")
     glb.write(path, poses, _rig(poses, rig), motion.fps, motion.text, motion.id, body)
     return f"meters, y up; {_error(motion, poses)}" + (reason and f"; without a body: {reason}")
+
+
+def _write_character(motion: Motion, path: Path, character: str | Path | Character) -> str:
+    made = character if isinstance(character, Character) else characters.read(character)
+    return characters.write(path, made, motion, motion.text or motion.id or "motion")
 
 
 def _write_json(motion: Motion, path: Path) -> str:

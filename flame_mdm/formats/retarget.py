@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from scipy.spatial.transform import Rotation
+from torch import Tensor
 
 from flame_mdm.errors import UserError, did_you_mean
 from flame_mdm.files import read_yaml
 from flame_mdm.formats.poses import Poses
+from flame_mdm.representations import rotation
 from flame_mdm.representations.skeleton import SMPL22
 
 JOINT = {name: number for number, name in enumerate(SMPL22.joints)}
@@ -39,6 +43,8 @@ class Rig:
         unit: meters per unit of length in BVH files.
         orders: of the Euler angles of each joint in BVH files.
         moving: every joint has channels of its position in BVH files, not only the pelvis and joints above it.
+        frame: (3, 3), rotation from the world of the file.
+        scales: (J,), units of the world per unit in the frame of each joint; none = 1.
     """
 
     joints: tuple[str, ...]
@@ -50,6 +56,8 @@ class Rig:
     orders: tuple[str, ...]
     unit: float = CENTIMETER
     moving: bool = False
+    frame: np.ndarray = field(default_factory=lambda: np.eye(3))
+    scales: np.ndarray = field(default_factory=lambda: np.ones(0))
 
     @property
     def hips(self) -> int:
@@ -57,15 +65,40 @@ class Rig:
         return self.sources.index(0)
 
     def offsets(self) -> np.ndarray:
-        """Returns the position (J, 3) of each joint in the frame of its parent, or in the world."""
-        above = [max(parent, 0) for parent in self.parents]
-        offsets = (self.turns[above].mT @ (self.places - self.places[above])[..., None])[..., 0]
-        return np.where(np.array(self.parents)[:, None] < 0, self.places, offsets)
+        """Returns the position (J, 3) of each joint in the frame of its parent, or in the world of the file."""
+        return np.stack([self.within(self.places[joint], joint) for joint in range(len(self.joints))])
+
+    def within(self, places: np.ndarray, joint: int) -> np.ndarray:
+        """Converts positions (..., 3) in the world to the frame of a joint's parent in the rest pose."""
+        parent = self.parents[joint]
+        if parent < 0:
+            return places @ self.frame
+        return (places - self.places[parent]) @ self.turns[parent] / (self.scales[parent] if len(self.scales) else 1)
 
     def rest(self) -> np.ndarray:
-        """Returns the rotation (J, 3, 3) of each joint relative to its parent, or in the world, in the rest pose."""
-        above = self.turns[[max(parent, 0) for parent in self.parents]]
-        return np.where(np.array(self.parents)[:, None, None] < 0, self.turns, above.mT @ self.turns)
+        """Returns the rotation (J, 3, 3) of each joint relative to its parent, or to the world of the file."""
+        return self.local(self.turns)
+
+    def local(self, turned: np.ndarray) -> np.ndarray:
+        """Converts rotations (..., J, 3, 3) in the world to those relative to parents, or to the world of the file."""
+        local = turned.copy()
+        for joint, parent in enumerate(self.parents):
+            above = turned[..., parent, :, :] if parent >= 0 else self.frame
+            local[..., joint, :, :] = np.swapaxes(above, -1, -2) @ turned[..., joint, :, :]
+        return local
+
+    def turned(self, body: np.ndarray) -> np.ndarray:
+        """Returns rotations (F, J, 3, 3) in the world, while SMPL's joints have the rotations `body` (F, 22, 3, 3).
+
+        Joints with a counterpart follow it; the others keep their angle to their parent.
+        """
+        rest, turned = self.rest(), np.tile(self.turns, (len(body), 1, 1, 1))
+        for joint, (parent, source) in enumerate(zip(self.parents, self.sources, strict=True)):
+            if source >= 0:
+                turned[:, joint] = body[:, source] @ self.neutral[joint]
+            elif parent >= 0:
+                turned[:, joint] = turned[:, parent] @ rest[joint]
+        return turned
 
 
 @cache
@@ -159,21 +192,12 @@ def _axes(axes: dict[str, Any], part: str, joint: str, bone: np.ndarray, right: 
 
 
 def retarget(poses: Poses, rig: Rig) -> tuple[np.ndarray, np.ndarray]:
-    """Moves a skeleton as a body moves.
-
-    Joints with a counterpart take its rotation in the world; the others keep their angle to their parent.
+    """Moves a skeleton with the bone lengths of a body as this body moves.
 
     Returns:
         Rotations (F, J, 3, 3) relative to parents, or of roots in the world; positions (F, 3) of the hips in the world.
     """
-    body = world_rotations(poses.rotations.numpy())
-    rest, turned = rig.rest(), np.tile(rig.turns, (len(body), 1, 1, 1))
-    local = np.tile(rest, (len(body), 1, 1, 1))
-    for joint, (parent, source) in enumerate(zip(rig.parents, rig.sources, strict=True)):
-        above = turned[:, parent] if parent >= 0 else np.eye(3)
-        turned[:, joint] = above @ rest[joint] if source < 0 else body[:, source] @ rig.neutral[joint]
-        local[:, joint] = np.swapaxes(above, -1, -2) @ turned[:, joint]
-    return local, poses.root.numpy()
+    return rig.local(rig.turned(world_rotations(poses.rotations.numpy()))), poses.root.numpy()
 
 
 def world_rotations(rotations: np.ndarray) -> np.ndarray:
@@ -182,3 +206,21 @@ def world_rotations(rotations: np.ndarray) -> np.ndarray:
     for parent, joint in SMPL22.edges:
         world[..., joint, :, :] = world[..., parent, :, :] @ rotations[..., joint, :, :]
     return world
+
+
+def continuous_euler(matrices: Tensor, orders: Sequence[str] = SMPL_ORDERS) -> Tensor:
+    """Converts rotations (F, J, 3, 3) to Euler angles (F, J, 3) in the joints' `orders`, radians, without jumps.
+
+    A rotation has two triples of angles, and full turns may be added to each angle. The angles nearest to the previous
+    frame are used, so that programs can interpolate; two full turns of the body end at 720 degrees.
+    """
+    turn = 2 * torch.pi
+    first = torch.stack([rotation.matrix_to_euler(matrices[:, j], order) for j, order in enumerate(orders)], 1)
+    second = torch.stack([first[..., 0] + torch.pi, torch.pi - first[..., 1], first[..., 2] + torch.pi], -1)
+    chosen = [first[0]]
+    for pair in torch.stack([first, second], -2)[1:]:
+        before = chosen[-1][:, None]
+        near = pair - turn * ((pair - before) / turn).round()
+        best = (near - before).square().sum(-1).argmin(-1)
+        chosen.append(near[torch.arange(len(near)), best])
+    return torch.stack(chosen)

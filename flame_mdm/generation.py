@@ -6,7 +6,7 @@ import inspect
 import math
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Unpack
@@ -21,6 +21,7 @@ from flame_mdm.formats.motion import Motion
 from flame_mdm.motion import Edit, MotionBatch, Sampling, length_mask, pad_to
 from flame_mdm.reading import read_motion, with_features
 from flame_mdm.sequences import Part, check_sequence, overlap, part_frames, read_parts, windows
+from flame_mdm.targets import read_targets
 from flame_mdm.task import MotionGeneration
 from flame_mdm.visualize import contact_sheet, write_gif, write_mp4, write_player
 from flame_mdm.visualize.scene import shortened
@@ -53,6 +54,7 @@ def generate(
     edit: Edit | None = None,
     after: str | Path | Motion | None = None,
     loop: bool = False,
+    targets: str | Path | Mapping[str, Any] | None = None,
     shared_noise: bool = False,
     stages: list[Motion] | None = None,
     cleanup: bool = False,
@@ -78,6 +80,7 @@ def generate(
             `flame_mdm.commands.edit`.
         after: a motion, or a file that `flame_mdm.reading.read_motion` reads, that the result begins with.
         loop: the last frame leads to the first one. The body may be at another place by then.
+        targets: places to reach in the world, a JSON file or its content; see docs/targets.md.
         shared_noise: all motions get the same noise, so that they differ by their texts and lengths alone.
         stages: list that gets the clean estimates along the sampling of the first motion, at equal intervals, and that
             motion itself (MFM, figure 5).
@@ -120,11 +123,12 @@ def generate(
         raise UserError(f"{len(requested):,} texts with samples={samples}: at most {MAX_SAMPLES:,} motions per request")
     parts = [[(text, None)] if kind == "none" else read_parts(text) for text in requested]
     sequence = loop or after is not None or any(len(each) > 1 or each[0][1] is not None for each in parts)
-    if sequence and edit is not None:
-        raise UserError(f"{shortened(requested[0], 60)}: a sequence or loop cannot be edited in the same request")
+    if edit is not None and (sequence or targets is not None):
+        raise UserError("an edit keeps a single motion: give neither parts, after, loop nor targets with it")
     if sequence:
         check_sequence(model)
-    begun = None if after is None else _begun(model, after, loop)
+    begun = None if after is None else _begun(model, after, loop or targets is not None)
+    wanted = None if targets is None else read_targets(model.representation, targets)
     captions = [text for text in requested for _ in range(samples)]
     numbers: Counter[str] = Counter()
     ids = []
@@ -151,6 +155,9 @@ def generate(
         covering = None
         if sequence:
             covering = windows(model, conditions[part], lengths[part], model.facts["actions"] if labels else None, loop)
+        if wanted is not None:
+            wanted.edit(model.representation, int(mask.sum(1).min()), model.device)  # refuses motions that are shorter
+            edit = wanted.edit(model.representation, mask.shape[1], model.device)
         if begun is not None:
             padded = pad_to(known[None], mask.shape[1])
             edit = Edit(padded, pad_to(torch.ones_like(known, dtype=torch.bool)[None], mask.shape[1]))
@@ -210,10 +217,10 @@ def _finish(
     return results
 
 
-def _begun(model: MotionGeneration, after: str | Path | Motion, loop: bool) -> torch.Tensor:
+def _begun(model: MotionGeneration, after: str | Path | Motion, more: bool) -> torch.Tensor:
     """Returns the features (F, D) of the motion that is continued."""
-    if loop:
-        raise UserError("after= continues a motion, which cannot be a loop. Give after=... or loop=true")
+    if more:
+        raise UserError("after= continues a motion: give neither loop nor targets with it")
     known = model.representation
     motion = with_features(known, after) if isinstance(after, Motion) else read_motion(known, after)
     if (least := overlap(model)) > len(motion.features):

@@ -12,7 +12,7 @@ from flame_mdm.motion import MotionBatch
 from flame_mdm.processes.windows import Windows, place, spans
 from flame_mdm.task import MotionGeneration
 
-OVERLAP = 0.75
+OVERLAP = 0.5
 """Seconds that neighboring windows share; see docs/sequences.md."""
 MAX_SECONDS = 600
 """Maximum length of a sequence; all its windows are denoised at the same time."""

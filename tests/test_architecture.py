@@ -15,7 +15,17 @@ FILES = sorted([*(ROOT / "flame_mdm").rglob("*.py"), *(ROOT / "evaluators").rglo
 AXES = {"denoisers", "processes", "conditions", "representations"}
 GROUND = {"errors", "losses", "files", "config", "motion", "seeds", "progress"}
 MODELS = GROUND | AXES | {"visualize", "formats", "data", "task"}
-ALL = MODELS | {"reading", "sequences", "generation", "editing", "checkpoints", "runs", "reporting", "training"}
+ALL = MODELS | {
+    "reading",
+    "sequences",
+    "targets",
+    "generation",
+    "editing",
+    "checkpoints",
+    "runs",
+    "reporting",
+    "training",
+}
 MAY_IMPORT: dict[str, set[str]] = {
     "errors": set(),
     "losses": set(),
@@ -36,7 +46,8 @@ MAY_IMPORT: dict[str, set[str]] = {
     "reporting": GROUND | {"representations", "visualize", "formats", "data", "runs"},
     "reading": MODELS,
     "sequences": MODELS,
-    "generation": MODELS | {"reading", "sequences"},
+    "targets": MODELS | {"reading"},
+    "generation": MODELS | {"reading", "sequences", "targets"},
     "editing": MODELS | {"generation", "reading"},
     "checkpoints": MODELS | {"runs"},
     "training": ALL - {"training"},
@@ -168,6 +179,7 @@ def test_strings_outside_commands_name_no_module_of_the_evaluators():
         ("flame_mdm.reporting.tables", "from flame_mdm.task import load"),
         ("flame_mdm.reading", "from flame_mdm.generation import generate"),
         ("flame_mdm.sequences", "from flame_mdm.generation import generate"),
+        ("flame_mdm.targets", "from flame_mdm.generation import generate"),
         ("flame_mdm.generation", "from flame_mdm.editing import edit"),
         ("flame_mdm.editing", "from flame_mdm.training.guards import newest"),
         ("flame_mdm.checkpoints.files", "from flame_mdm.reporting.rendering import markdown_text"),

@@ -65,7 +65,7 @@ def test_one_window_changes_nothing_and_two_are_averaged():
     three = [(0, 0, 12), (0, 8, 12), (1, 0, 20)]
     several = blended(lambda x_t, *_: number[:, None, None].expand_as(x_t), covered(three, 20))
     found = several(x, t, mask, cond)[..., 0]
-    expected = torch.tensor([1.0] * 8 + [1.125, 1.375, 1.625, 1.875] + [2.0] * 8)
+    expected = torch.tensor([1.0] * 8 + [1 + np.sin(np.pi / 16 * n) ** 2 for n in (1, 3, 5, 7)] + [2.0] * 8).float()
     torch.testing.assert_close(found[0], expected)
     torch.testing.assert_close(found[1], torch.full((20,), 3.0))
 

@@ -25,6 +25,7 @@ TOGGLES = ("shared_noise", "cleanup", "loop")
 USAGE = """
 usage: flame-mdm sample ckpt=FILE text="a person walks in a circle" [seconds=3] [key=value ...]
        flame-mdm sample ckpt=FILE text="walks forward @3 | turns left | sits down @2.5" [after=walk.npz] [loop=true]
+       flame-mdm sample ckpt=FILE text="walks forward" targets=path.json
        flame-mdm sample ckpt=FILE prompts=FILE.txt [seconds=[2,3.5,...]] [mp4=true]
        flame-mdm sample ckpt=FILE action=walk
        flame-mdm sample ckpt=FILE unconditioned=true
@@ -44,11 +45,13 @@ def sample(config: Config) -> None:
     """
     texts = check_request(config)
 
+    import numpy as np
     import torch
 
     from flame_mdm.checkpoints.loading import find, load
     from flame_mdm.files import sha256
     from flame_mdm.generation import generate, write_motions
+    from flame_mdm.targets import errors, read_targets
     from flame_mdm.visualize.bodies import choose_body
 
     choose_body(config["body"])
@@ -66,13 +69,14 @@ def sample(config: Config) -> None:
         seed=config["seed"],
         after=config["after"],
         loop=config["loop"],
+        targets=config["targets"],
         shared_noise=config["shared_noise"],
         stages=stages,
         cleanup=config["cleanup"],
         **{key: config[key] for key in keys},
     )
     requested = {key: config[key] for key in keys} | {key: config[key] or None for key in TOGGLES}
-    requested["after"] = config["after"]
+    requested |= {key: config[key] for key in ("after", "targets")}
     digest = sha256(file)
     folders: dict[Path, list[Motion]] = {}
     for number in range(len(motions) // config["samples"]):
@@ -86,6 +90,9 @@ def sample(config: Config) -> None:
         facts = {"seed": config["seed"], "checkpoint": digest}
         write_motions(folder, made, facts, stages if made[0] is motions[0] else None, config["mp4"])
         say(summary(folder, made, config["mp4"]))
+        if config["targets"] is not None:
+            off = [100 * errors(motion, read_targets(model.representation, config["targets"])) for motion in made]
+            say(f"distance from the targets: mean {np.mean(off):.1f} cm, max {np.max(off):.1f} cm")
 
 
 main = partial(
@@ -94,7 +101,7 @@ main = partial(
     usage=USAGE,
     name="sample",
     objects=("ckpt", "out"),
-    text=("text", "prompts", "ckpt", "out", "after", "body"),
+    text=("text", "prompts", "ckpt", "out", "after", "body", "targets"),
     kinds={
         **SAMPLING,
         **LENGTHS,

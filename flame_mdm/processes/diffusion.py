@@ -277,7 +277,7 @@ class GaussianDiffusion(Process):
             if self.clip_x0:
                 x0_hat = x0_hat.clamp(-1, 1)
             if edit is not None and edit.mode == "x0":
-                x0_hat = torch.where(edit.keep, edit.known, x0_hat)
+                x0_hat = edit.impose(x0_hat)
             if trajectory is not None:
                 trajectory.append(x0_hat * mask[..., None])
             return x0_hat, self.log_variance(output, x_t, i, schedule)

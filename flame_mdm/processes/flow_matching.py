@@ -170,12 +170,12 @@ class FlowMatching(Process):
                 return output
             x0_hat = self.to_x0(output, x, time)
             if imposed is not None:
-                x0_hat = torch.where(imposed.keep, imposed.known, x0_hat)
+                x0_hat = imposed.impose(x0_hat)
             straight = (x0_hat - (1 - self.sigma_min) * x) / (1 - (1 - self.sigma_min) * time[:, None, None])
             if self.prediction == "x0":
                 output = straight
             elif imposed is not None:
-                output = torch.where(imposed.keep, straight, output)
+                output = straight if imposed.guide else torch.where(imposed.keep, straight, output)
             if trajectory is not None:
                 trajectory.append(x0_hat * mask[..., None])
             return output

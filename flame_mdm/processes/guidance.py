@@ -1,9 +1,18 @@
-"""Guidance: wrappers with the same interface as the denoiser."""
+"""Guidance by a condition, a wrapper with the same interface as the denoiser, and by positions in the world."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from flame_mdm.motion import Condition, Denoise
+
+CLOSE, MOST_STEPS = 0.005, 8
+"""Largest error in meters that ends the search for a motion that reaches positions, and its maximum number of steps."""
+RELAXATION = 1e-3
+"""Variance of an error that may remain, relative to the variance of the position itself; it limits the changes."""
 
 
 def classifier_free_guidance(denoise: Denoise, scale: float | Tensor, features: int) -> Denoise:
@@ -37,3 +46,65 @@ def classifier_free_guidance(denoise: Denoise, scale: float | Tensor, features: 
         return torch.cat([mean, variance], -1) if variance.shape[-1] else mean
 
     return guided
+
+
+@dataclass
+class Positions:
+    """M coordinates of joints in the world: `values` (M,) in meters, at `frames`, `joints` and `axes` (M,) int64."""
+
+    frames: Tensor
+    joints: Tensor
+    axes: Tensor
+    values: Tensor
+
+    def of(self, joints: Tensor) -> Tensor:
+        """Returns these coordinates (..., M) of a motion (..., F, J, 3)."""
+        return joints[..., self.frames, self.joints, self.axes]
+
+
+def reach(
+    x: Tensor,
+    to_joints: Callable[[Tensor], Tensor],
+    wanted: Positions,
+    bones: Tensor,
+    free: Tensor,
+    smoothness: float,
+) -> Tensor:
+    """Returns the motions nearest to `x` whose joints reach positions in the world.
+
+    Gauss-Newton steps: of all changes that lead to the positions, the smallest one in normalized features, where
+    changes are smooth in time: their covariance between frames is that of a Gaussian process. Bones keep their lengths.
+
+    Args:
+        x: (B, F, D) normalized features.
+        to_joints: decodes (F, D) as joints (F, J, 3) in meters.
+        wanted: the positions.
+        bones: (3, N) int64: frame, parent and child of bones that the change could stretch.
+        free: (B, F, D) bool, features that may change.
+        smoothness: standard deviation in frames of the Gaussian process.
+    """
+    offset = torch.arange(-int(3 * smoothness), int(3 * smoothness) + 1, device=x.device)
+    kernel = torch.exp(-0.5 * (offset / smoothness) ** 2)
+    frames, parents, children = bones
+
+    def values(features: Tensor) -> Tensor:
+        joints = to_joints(features)
+        return torch.cat([wanted.of(joints), (joints[frames, children] - joints[frames, parents]).norm(dim=-1)])
+
+    changed = []
+    for motion, may in zip(x, free, strict=True):
+        joints = to_joints(motion)
+        usual = (joints[:, children] - joints[:, parents]).norm(dim=-1).median(0).values
+        for _ in range(MOST_STEPS):
+            error = torch.cat([wanted.values, usual]) - values(motion)
+            if error.abs().max() < CLOSE:
+                break
+            slope = torch.func.jacrev(values)(motion) * may  # (M + N, F, D)
+            rows = slope.movedim(1, 2).flatten(0, 1)[:, None]
+            smooth = F.conv1d(rows, kernel[None, None] / kernel.sum(), padding="same")[:, 0]
+            smooth = smooth.unflatten(0, (len(error), -1)).movedim(1, 2) * may
+            gram = torch.einsum("mfd,nfd->mn", smooth, slope).double()
+            gram += torch.diag(RELAXATION * gram.diagonal() + 1e-9)
+            motion = motion + torch.einsum("m,mfd->fd", torch.linalg.solve(gram, error.double()).to(x), smooth)
+        changed.append(motion)
+    return torch.stack(changed)

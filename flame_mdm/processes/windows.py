@@ -93,6 +93,6 @@ def place(
     mask, position = length_mask(size, width), torch.arange(width, device=device)
     frames = (first[:, None] + position) % torch.tensor(totals, device=device)[rows, None]
     ramp = torch.minimum(position + 0.5, size[:, None] - position - 0.5) / overlap
-    weights, index = ramp.clamp(0, 1) * mask, (rows[:, None].expand_as(frames), frames)
+    weights, index = torch.sin(ramp.clamp(0, 1) * torch.pi / 2) ** 2 * mask, (rows[:, None].expand_as(frames), frames)
     total = weights.new_zeros(len(totals), max(totals)).index_put(index, weights, accumulate=True)
     return rows, frames, mask, weights / total[index]

@@ -1,0 +1,204 @@
+"""Targets in the world: way points of the root, joint positions, and whole poses at given times."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from flame_mdm.errors import UserError, did_you_mean
+from flame_mdm.files import MEBIBYTE, read_text
+from flame_mdm.formats.motion import Motion
+from flame_mdm.motion import Edit
+from flame_mdm.processes.guidance import Positions, reach
+from flame_mdm.reading import read_motion
+from flame_mdm.representations import Representation, rotation
+
+SMOOTHNESS = 0.2
+"""Seconds over which a correction fades; see docs/targets.md."""
+FASTEST = 8.0
+"""Meters per second that no way point may require."""
+REACH = 2.5
+"""Meters above the floor up to which a joint can be, and from the place that the body moves to or from."""
+MOST = 600
+"""Maximum number of coordinates; they are solved for together in every step."""
+KEYS = {
+    "root": ({"time", "position"}, set[str]()),
+    "joints": ({"time", "joint", "position"}, set[str]()),
+    "poses": ({"time", "file"}, {"frame", "position", "heading"}),
+}
+"""Kinds of targets, with the keys that each entry must have and those that it may have."""
+
+
+@dataclass(frozen=True)
+class Targets:
+    """What motions should reach.
+
+    Attributes:
+        positions: coordinates in the world.
+        poses: frames and features (D,), in the data's units, of poses that may be anywhere on the floor.
+    """
+
+    positions: Positions
+    poses: tuple[tuple[int, Tensor], ...]
+
+    def edit(self, representation: Representation, frames: int, device: torch.device) -> Edit:
+        """Returns the edit of a motion of `frames` frames: poses are imposed, positions guide the clean estimates.
+
+        Raises:
+            UserError: a target is later than the last frame.
+        """
+        last = max([0, *self.positions.frames.tolist(), *(frame for frame, _ in self.poses)])
+        if last >= frames:
+            fps = representation.fps
+            raise UserError(
+                f"targets: {last / fps:g} seconds is after the end of the motion, which lasts {(frames - 1) / fps:g} "
+                "seconds. Give an earlier time, or more seconds"
+            )
+        known = torch.zeros(1, frames, representation.features, device=device)
+        keep = torch.zeros_like(known, dtype=torch.bool)
+        for frame, features in self.poses:
+            known[0, frame] = representation.normalize(features.to(device))
+            keep[0, frame] = representation.joint_features(range(1, len(representation.skeleton))).to(device)
+        wanted = Positions(*(x.to(device) for x in vars(self.positions).values()))
+        bones = self._bones(representation).to(device)
+        sigma = SMOOTHNESS * representation.fps
+
+        def guide(x0_hat: Tensor) -> Tensor:
+            imposed = torch.where(keep, known, x0_hat)
+            return reach(imposed, representation.to_joints, wanted, bones, ~keep.expand_as(x0_hat), sigma)
+
+        return Edit(known, keep, guide=guide if len(wanted.values) else None)
+
+    def _bones(self, representation: Representation) -> Tensor:
+        """Returns frame, parent and child (3, N) of all bones in frames in which other joints than the root move."""
+        frames = sorted(set(self.positions.frames[self.positions.joints > 0].tolist()))
+        found = [(frame, *edge) for frame in frames for edge in representation.skeleton.edges]
+        return torch.tensor(found, dtype=torch.long).reshape(-1, 3).T
+
+
+def errors(motion: Motion, targets: Targets) -> np.ndarray:
+    """Returns the distance in meters of a motion from each position; coordinates that are free count as reached."""
+    wanted = targets.positions
+    off = wanted.of(torch.from_numpy(motion.joints)) - wanted.values
+    places, index = torch.stack([wanted.frames, wanted.joints], 1).unique(dim=0, return_inverse=True)
+    return torch.zeros(len(places)).index_add(0, index, off**2).sqrt().numpy()
+
+
+def read_targets(representation: Representation, source: str | Path | Mapping[str, Any]) -> Targets:
+    """Reads targets from a JSON file, or from its content; docs/targets.md describes it.
+
+    Raises:
+        UserError: the file is not such a file, a joint is unknown, or a target cannot be reached.
+    """
+    name, folder = ("targets", Path()) if isinstance(source, Mapping) else (f"targets={source}", Path(source).parent)
+    content = source if isinstance(source, Mapping) else _read(source, name)
+    if not isinstance(content, Mapping) or not content or not content.keys() <= KEYS.keys():
+        raise UserError(f"{name}: give an object with {', '.join(KEYS)}, each a list. See docs/targets.md")
+    places: list[tuple[str, int, int, np.ndarray]] = []  # description, frame, joint, and a position with NaN = free
+    poses = []
+    for kind, entries in content.items():
+        for number, entry in enumerate(entries if isinstance(entries, Sequence) else [None]):
+            where = f"{name}: {kind}[{number}]"
+            needed, possible = KEYS[kind]
+            if not isinstance(entry, Mapping) or not needed <= entry.keys() <= needed | possible:
+                optional = f", and possibly {', '.join(sorted(possible))}" if possible else ""
+                raise UserError(f"{where} is {entry}. Give an object with {', '.join(sorted(needed))}{optional}")
+            (time,) = _numbers(entry, "time", where)
+            if not time >= 0:
+                raise UserError(f"{where}.time={entry['time']}: give seconds from the start of the motion")
+            frame = round(time * representation.fps)
+            if kind == "root":
+                x, z = _numbers(entry, "position", where, 2)
+                places.append((where, frame, 0, np.array([x, math.nan, z])))
+            elif kind == "joints":
+                joint = _joint(representation, entry["joint"], where)
+                places.append((where, frame, joint, np.array(_numbers(entry, "position", where, 3))))
+            elif entry.get("position") is None:
+                pose, features = _pose(representation, entry, folder, where)
+                poses.append((frame, features))
+                places.append((where, frame, 0, np.array([math.nan, pose[0, 1], math.nan])))
+            else:
+                x, z = _numbers(entry, "position", where, 2)
+                pose = _pose(representation, entry, folder, where)[0] + np.array([x, 0.0, z])
+                places += [(where, frame, joint, place) for joint, place in enumerate(pose)]
+    _check_reach(places, representation.fps)
+    rows = [
+        (frame, joint, axis, float(place[axis]))
+        for _, frame, joint, place in places
+        for axis in np.flatnonzero(~np.isnan(place)).tolist()
+    ]
+    if len(rows) > MOST:
+        raise UserError(f"{name}: {len(rows)} coordinates are too many. Give at most {MOST}")
+    frames, joints, axes = torch.tensor([row[:3] for row in rows], dtype=torch.long).reshape(-1, 3).T
+    return Targets(Positions(frames, joints, axes, torch.tensor([row[3] for row in rows])), tuple(poses))
+
+
+def _read(source: str | Path, name: str) -> Any:
+    try:
+        return json.loads(read_text(source, MEBIBYTE))
+    except FileNotFoundError:
+        raise UserError(f"{name}: no such file. Give a JSON file of targets, see docs/targets.md") from None
+    except json.JSONDecodeError as error:
+        raise UserError(f"{name}: not JSON: {error}") from None
+
+
+def _numbers(entry: Mapping[str, Any], key: str, where: str, count: int = 1) -> list[float]:
+    """Returns the numbers of an entry; NaN for null."""
+    listed = entry[key] if isinstance(entry[key], list | tuple) else [entry[key]]
+    values = [math.nan if value is None else value for value in listed]
+    if len(values) != count or not all(type(v) in (int, float) and not abs(v) > 1e4 for v in values):
+        numbers = f"{count} numbers in meters, null = free" if count > 1 else "a number"
+        raise UserError(f"{where}.{key}={entry[key]}: give {numbers}")
+    return values
+
+
+def _joint(representation: Representation, name: Any, where: str) -> int:
+    known = representation.skeleton.joints
+    if name not in known:
+        raise UserError(f"{where}: no joint '{name}'.{did_you_mean(str(name), known)} Joints: {', '.join(known)}")
+    return known.index(name)
+
+
+def _pose(
+    representation: Representation, entry: Mapping[str, Any], folder: Path, where: str
+) -> tuple[np.ndarray, Tensor]:
+    """Returns joints (J, 3) of a pose with the root at x = z = 0, and its features (D,)."""
+    file = str(entry["file"])
+    motion = read_motion(representation, folder / file if Path(file).suffix else file)
+    number = entry.get("frame", 0)
+    if type(number) is not int or not 0 <= number < len(motion.joints):
+        raise UserError(f"{where}.frame={number}: {file} has frames 0 to {len(motion.joints) - 1}")
+    pose = motion.joints[number].astype(float)
+    pose[:, [0, 2]] -= pose[0, [0, 2]]
+    if entry.get("heading") is not None:
+        (degrees,) = _numbers(entry, "heading", where)
+        right_hip, left_hip, right_shoulder, left_shoulder = pose[list(representation.skeleton.facing)]
+        left = left_hip - right_hip + left_shoulder - right_shoulder
+        turn = torch.tensor(math.radians(degrees) - math.atan2(-left[2], left[0]))
+        pose = rotation.rotate_y(torch.from_numpy(pose), turn).numpy()
+    return pose, torch.from_numpy(motion.features[number])
+
+
+def _check_reach(places: list[tuple[str, int, int, np.ndarray]], fps: float) -> None:
+    """Checks that heights are possible, and that a person can move from place to place in time."""
+    before, reached, begun = "the start", np.zeros(2), 0
+    for where, frame, _, place in sorted(places, key=lambda each: each[1]):
+        if not (np.isnan(place[1]) or -0.1 <= place[1] <= REACH):
+            raise UserError(f"{where}: height {place[1]:g} m is impossible. Give 0 to {REACH:g} meters above the floor")
+        if np.isnan(place[[0, 2]]).any():
+            continue
+        way, seconds = float(np.linalg.norm(place[[0, 2]] - reached)), (frame - begun) / fps
+        if way > FASTEST * seconds + REACH:
+            raise UserError(
+                f"{where}: {way:.1f} m from {before} in {seconds:g} seconds is impossible. Give more time, or a nearer "
+                f"place: people run at most {FASTEST:g} m/s"
+            )
+        before, reached, begun = where, place[[0, 2]], frame

@@ -1,0 +1,114 @@
+"""Targets in the world: way points, joint positions and poses."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import flame_mdm
+from flame_mdm.__main__ import main
+from flame_mdm.errors import UserError
+from flame_mdm.processes.guidance import Positions, reach
+from flame_mdm.targets import errors, read_targets
+
+TEXT = "a person walks forward"
+
+
+@pytest.fixture(scope="module")
+def model() -> flame_mdm.MotionGeneration:
+    return flame_mdm.load("quickstart")
+
+
+def test_a_linear_decoder_is_solved_exactly_and_changes_least():
+    """Two of six features decide on the position: both change by half, and smoothly in time."""
+    x, index = torch.zeros(1, 9, 6), torch.tensor([4])
+
+    def to_joints(features: torch.Tensor) -> torch.Tensor:
+        place = features[..., 0] + features[..., 1]
+        return torch.stack([place, features[..., 2], features[..., 3]], -1)[..., None, :]
+
+    wanted = Positions(index, torch.tensor([0]), torch.tensor([0]), torch.tensor([2.0]))
+    free = torch.ones_like(x, dtype=torch.bool)
+    bones = torch.zeros(3, 0, dtype=torch.long)
+    found = reach(x, to_joints, wanted, bones, free, smoothness=1.0)[0]
+    assert found[4, :2].tolist() == pytest.approx([1.0, 1.0], abs=1e-2)
+    assert found[5, 0] == pytest.approx(float(found[4, 0] * np.exp(-0.5)), rel=1e-4)
+    assert not found[:, 2:].any()
+    free[..., 1] = False
+    found = reach(x, to_joints, wanted, bones, free, smoothness=1.0)[0]
+    assert found[4, :2].tolist() == pytest.approx([2.0, 0.0], abs=1e-2)
+
+
+def test_way_points_joints_and_poses_are_reached(model, tmp_path):
+    bow = flame_mdm.generate(model, "a person bows", seconds=2, num_inference_steps=10)[0]
+    bow.save(tmp_path / "bow.npz")
+    content = {
+        "root": [{"time": 1, "position": [0.3, 0.4]}, {"time": 2, "position": [None, 1.2]}],
+        "joints": [{"time": 1.5, "joint": "right_wrist", "position": [None, 1.3, None]}],
+        "poses": [{"time": 2.4, "file": "bow.npz", "frame": 20}],
+    }
+    (tmp_path / "targets.json").write_text(json.dumps(content))
+    targets = read_targets(model.representation, tmp_path / "targets.json")
+    assert len(targets.positions.values) == 2 + 1 + 1 + 1
+    motion, plain = (
+        flame_mdm.generate(model, TEXT, seconds=2.5, num_inference_steps=10, targets=given)[0]
+        for given in (tmp_path / "targets.json", None)
+    )
+    assert errors(motion, targets).max() < 0.03 < errors(plain, targets).max()
+    local = slice(4, 4 + 21 * 3)
+    np.testing.assert_allclose(motion.features[48, local], bow.features[20, local], atol=1e-5)
+    bones = np.linalg.norm(motion.joints[30, 18:22] - motion.joints[30, 16:20], axis=-1)
+    usual = np.median(np.linalg.norm(motion.joints[:, 18:22] - motion.joints[:, 16:20], axis=-1), 0)
+    np.testing.assert_allclose(bones, usual, rtol=0.05)
+
+
+def test_a_pose_at_a_place_faces_its_heading(model, tmp_path):
+    flame_mdm.generate(model, "a person bows", seconds=2, num_inference_steps=5)[0].save(tmp_path / "bow.npz")
+    entry = {"time": 1.0, "file": str(tmp_path / "bow.npz"), "frame": 5, "position": [0.2, 0.5], "heading": 90}
+    positions = read_targets(model.representation, {"poses": [entry]}).positions
+    pose = positions.values.reshape(22, 3)
+    assert pose[0, [0, 2]].tolist() == pytest.approx([0.2, 0.5])
+    left = (pose[1] - pose[2] + pose[16] - pose[17]).numpy()
+    assert np.degrees(np.arctan2(-left[2], left[0])) == pytest.approx(90, abs=1e-3)
+
+
+def test_targets_of_a_sequence(model):
+    targets = {"root": [{"time": t, "position": [0.1 * t, 0.3 * t]} for t in (1, 2, 3, 4)]}
+    motion = flame_mdm.generate(model, f"{TEXT} @2.4 | {TEXT} @2.4", targets=targets, num_inference_steps=10)[0]
+    assert errors(motion, read_targets(model.representation, targets)).max() < 0.05
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ([], "give an object with root, joints, poses"),
+        ({"path": []}, "give an object with root, joints, poses"),
+        ({"root": [[0, 1]]}, r"root\[0\] is \[0, 1\]. Give an object with position, time"),
+        ({"root": [{"time": 1, "position": [1]}]}, r"root\[0\].position=\[1\]: give 2 numbers"),
+        ({"root": [{"time": -1, "position": [0, 0]}]}, "seconds from the start"),
+        ({"root": [{"time": 1, "position": [0, "x"]}]}, "give 2 numbers"),
+        ({"root": [{"time": 1, "position": [0, 30]}]}, "30.0 m from the start in 1 seconds is impossible"),
+        ({"root": [{"time": 9, "position": [0, 1]}]}, "9 seconds is after the end of the motion, which lasts"),
+        ({"joints": [{"time": 1, "joint": "left_rist", "position": [0, 1, 0]}]}, "no joint 'left_rist'.*left_wrist"),
+        ({"joints": [{"time": 1, "joint": "head", "position": [0, 9, 0]}]}, "height 9 m is impossible"),
+        ({"poses": [{"time": 1, "file": "no.npz"}]}, "no.npz"),
+    ],
+)
+def test_bad_targets_give_one_clear_line(model, content, message, tmp_path):
+    (tmp_path / "t.json").write_text(json.dumps(content))
+    with pytest.raises((UserError, FileNotFoundError), match=message) as raised:
+        flame_mdm.generate(model, TEXT, seconds=2, targets=tmp_path / "t.json")
+    assert "\n" not in str(raised.value)
+
+
+def test_the_command_prints_the_distance(model, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    Path("t.json").write_text('{"root": [{"time": 1.5, "position": [0.5, 0.5]}]}')
+    words = [f"text={TEXT}", "samples=1", "seconds=2", "num_inference_steps=10", "targets=t.json"]
+    assert main(["sample", "quickstart", *words]) == 0
+    assert "distance from the targets: mean " in capsys.readouterr().out
+    Path("t.json").write_text("{")
+    assert main(["sample", "quickstart", *words]) == 1
+    assert "targets=t.json: not JSON" in capsys.readouterr().err

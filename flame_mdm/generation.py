@@ -6,7 +6,7 @@ import inspect
 import math
 import re
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Unpack
@@ -17,6 +17,7 @@ import torch
 from flame_mdm.errors import UserError, did_you_mean
 from flame_mdm.files import atomic_folder
 from flame_mdm.formats.cleanup import cleaned
+from flame_mdm.formats.faults import find_faults
 from flame_mdm.formats.motion import Motion
 from flame_mdm.motion import Edit, MotionBatch, Sampling, length_mask, pad_to
 from flame_mdm.reading import read_motion, with_features
@@ -50,6 +51,8 @@ def generate(
     seconds: float | Sequence[float] | None = None,
     frames: int | Sequence[int] | None = None,
     samples: int = 1,
+    candidates: int = 1,
+    score: Callable[[Sequence[Motion]], Sequence[float]] | None = None,
     seed: int = 0,
     edit: Edit | None = None,
     after: str | Path | Motion | None = None,
@@ -75,6 +78,9 @@ def generate(
         seconds, frames: length of all motions, or a list with one length per text or action; of a sequence, the length
             of each part that gives none. Default: 3 seconds, or the maximum if shorter.
         samples: motions per text.
+        candidates: how many motions are generated for each one that is returned: of those without faults
+            (`flame_mdm.formats.faults`), if there are any, the one with the highest score.
+        score: scores motions, higher is better; None = the number of faulty frames decides.
         seed: seed of the noise.
         edit: part of a motion of that length to keep in every sample, with `known` and `keep` (1, F, D); see
             `flame_mdm.commands.edit`.
@@ -93,9 +99,14 @@ def generate(
             length.
     """
     steps, scale = sampling.get("num_inference_steps"), sampling.get("guidance_scale")
-    for name, value, most in (("samples", samples, MAX_SAMPLES), ("num_inference_steps", steps, None)):
-        if isinstance(value, int) and not 1 <= value <= (most or value):
-            raise UserError(f"{name}={value}: give 1{f' to {most:,}' if most else ' or more'}")
+    for name, value in (("samples", samples), ("candidates", candidates)):
+        if not 1 <= value <= MAX_SAMPLES:
+            raise UserError(f"{name}={value}: give 1 to {MAX_SAMPLES:,}")
+    if stages is not None and candidates > 1:
+        raise UserError("the estimates along the sampling are those of one motion: omit candidates, or trajectory")
+    if steps is not None and isinstance(steps, int) and steps < 1:
+        raise UserError(f"num_inference_steps={steps}: give 1 or more")
+    samples *= candidates
     if scale is not None and not math.isfinite(scale):
         raise UserError(f"guidance_scale={scale} is not a finite number")
     for name in sampling:
@@ -173,9 +184,25 @@ def generate(
             unconditioned=texts is None and actions is None,
         )
         results += _finish(model, batch, x, captions[part], begun)
+        if sequence:
+            for motion, names, each in zip(results[begin:], conditions[part], lengths[part], strict=True):
+                ends = np.cumsum([len(motion.joints) - sum(each[1:]), *each[1:]]).tolist()
+                motion.parts = tuple(zip(names, [0 if begun is None else len(begun), *ends], ends, strict=False))
         if stages is not None and trajectory:
             stages += _stages(model, trajectory, results[0])
+    groups = [results[begin : begin + candidates] for begin in range(0, len(results), candidates)]
+    results = results if candidates == 1 else [best(group, score) for group in groups]
     return [cleaned(motion) for motion in results] if cleanup else results
+
+
+def best(candidates: Sequence[Motion], score: Callable[[Sequence[Motion]], Sequence[float]] | None = None) -> Motion:
+    """Returns the best of several motions for the same request; see `generate`."""
+    faulty = [len({frame for f in find_faults(x) for frame in range(f.start, f.end)}) for x in candidates]
+    if score is None:
+        return candidates[faulty.index(min(faulty))]
+    passed = [motion for motion, frames in zip(candidates, faulty, strict=True) if not frames] or candidates
+    scores = list(score(passed))
+    return passed[scores.index(max(scores))]
 
 
 class _First(list[torch.Tensor]):

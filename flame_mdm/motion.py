@@ -114,7 +114,8 @@ class Edit:
         blend: for "x_t", replace the kept part "after" each step (FLAME, eq. 6), which ends in the known motion itself,
             or "before" each call of the denoiser (FLAME's code), which ends in the model's version of it.
         resample: for "x_t", how many times each step is repeated, after adding noise again (RePaint, algorithm 1).
-        guide: for "x0", changes the clean estimate (B, F, D) of each step before the kept part overwrites it.
+        guide: for "x0", returns the clean estimate (B, F, D) of each step, before the kept part overwrites it, from the
+            function that estimates it and x_t.
         strength: fraction of the sampling steps to take, in (0, 1]. Sampling starts from `known`, as noisy as the first
             of these steps (SDEdit; of N steps, MDM's code skips `skip_timesteps` = (1 - strength) N). None: from noise.
     """
@@ -126,11 +127,12 @@ class Edit:
     blend: Literal["after", "before"] = "after"
     resample: int = 1
     strength: float | None = None
-    guide: Callable[[Tensor], Tensor] | None = None
+    guide: Callable[[Callable[[Tensor], Tensor], Tensor], Tensor] | None = None
 
-    def impose(self, x0_hat: Tensor) -> Tensor:
-        """Returns the clean estimate (B, F, D) of mode "x0"."""
-        return torch.where(self.keep, self.known, x0_hat if self.guide is None else self.guide(x0_hat))
+    def impose(self, clean: Callable[[Tensor], Tensor], x_t: Tensor) -> Tensor:
+        """Returns the clean estimate (B, F, D) of mode "x0"; `clean` estimates it from x_t without the edit."""
+        x0_hat = clean(x_t) if self.guide is None else self.guide(clean, x_t)
+        return torch.where(self.keep, self.known, x0_hat)
 
     def steps(self, total: int) -> int:
         """Returns how many of `total` sampling steps are taken, at least one."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ from flame_mdm.errors import UserError, did_you_mean
 from flame_mdm.files import MEBIBYTE, read_text
 from flame_mdm.formats.motion import Motion
 from flame_mdm.motion import Edit
-from flame_mdm.processes.guidance import Positions, reach
+from flame_mdm.processes.guidance import Positions, reach, steer
 from flame_mdm.reading import read_motion
 from flame_mdm.representations import Representation, rotation
 
@@ -71,7 +71,8 @@ class Targets:
         bones = self._bones(representation).to(device)
         sigma = SMOOTHNESS * representation.fps
 
-        def guide(x0_hat: Tensor) -> Tensor:
+        def guide(clean: Callable[[Tensor], Tensor], x_t: Tensor) -> Tensor:
+            x0_hat = clean(steer(clean, x_t, representation.to_joints, wanted))
             imposed = torch.where(keep, known, x0_hat)
             return reach(imposed, representation.to_joints, wanted, bones, ~keep.expand_as(x0_hat), sigma)
 

@@ -1,6 +1,7 @@
 """Sequences of actions: texts with parts, windows that cover them, continued motions and loops."""
 
 import itertools
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -8,9 +9,12 @@ import pytest
 import torch
 
 import flame_mdm
+from evaluators.selection import text_fit
 from flame_mdm.__main__ import main
 from flame_mdm.errors import UserError
+from flame_mdm.formats.faults import find_faults
 from flame_mdm.formats.files import read
+from flame_mdm.generation import best
 from flame_mdm.motion import Condition, MotionBatch
 from flame_mdm.processes.windows import Windows, blended, place, spans
 from flame_mdm.sequences import overlap, read_parts
@@ -154,3 +158,58 @@ def test_the_command_writes_a_sequence(tmp_path, monkeypatch, capsys):
     assert len(read(path).joints) == 80
     assert main(["sample", "quickstart", "text=walks | ", "samples=1"]) == 1
     assert "part 2 is empty" in capsys.readouterr().err
+
+
+class _Scores:
+    """Prefers the motion whose root goes farthest, and remembers how many it saw."""
+
+    def __init__(self) -> None:
+        self.seen: list[int] = []
+
+    def __call__(self, motions: Sequence[flame_mdm.Motion]) -> list[float]:
+        self.seen.append(len(motions))
+        return [float(np.linalg.norm(motion.joints[-1, 0])) for motion in motions]
+
+
+def test_the_best_of_several_candidates_is_kept(model):
+    text, options = "a person walks forward", {"seconds": 1.5, "num_inference_steps": 4}
+    several = flame_mdm.generate(model, text, samples=6, **options)
+    score = _Scores()
+    chosen = flame_mdm.generate(model, text, samples=2, candidates=3, score=score, **options)
+    assert len(chosen) == len(score.seen) == 2
+    for motion, group in zip(chosen, (several[:3], several[3:]), strict=True):
+        faultless = [each for each in group if not find_faults(each)] or group
+        np.testing.assert_allclose(motion.joints, faultless[int(np.argmax(score(faultless)))].joints, atol=1e-4)
+
+
+def test_without_a_score_the_fewest_faulty_frames_decide():
+    joints = np.tile(np.linspace(0, 1, 22)[None, :, None], (20, 1, 3)) + np.linspace(0, 1, 20)[:, None, None]
+    worse, better = joints.copy(), joints.copy()
+    worse[5, 3, 0] += 5
+    worse[9, 3, 0] += 5
+    better[5, 3, 0] += 5
+    motions = [flame_mdm.Motion(each, 20) for each in (worse, better)]
+    assert best(motions) is motions[1]
+    assert best(motions, lambda given: [2.0, 1.0]) is motions[0]
+
+
+def test_bad_candidates_give_one_clear_line(model):
+    with pytest.raises(UserError, match="candidates=0"):
+        flame_mdm.generate(model, "walks", candidates=0)
+    with pytest.raises(UserError, match="one motion"):
+        flame_mdm.generate(model, "walks", candidates=2, stages=[])
+
+
+def test_the_parts_of_a_motion(model):
+    text = "a person walks @1 | a person bows @1.5"
+    (motion,) = flame_mdm.generate(model, text, num_inference_steps=2)
+    assert motion.parts == (("a person walks", 0, 20), ("a person bows", 20, 50))
+    (after,) = flame_mdm.generate(model, text, num_inference_steps=2, after=motion)
+    assert after.parts == (("a person walks", 50, 70), ("a person bows", 70, 100))
+    assert len(after.joints) == 100
+
+
+def test_a_motion_clip_scores_the_parts(model, tmp_path):
+    with pytest.raises(FileNotFoundError, match="no such"):
+        text_fit(str(tmp_path / "none.ckpt"), model)
+    assert main(["sample", "quickstart", "text=walks", "scorer=none.ckpt"]) == 1

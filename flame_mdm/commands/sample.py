@@ -44,6 +44,8 @@ def sample(config: Config) -> None:
             the request.
     """
     texts = check_request(config)
+    if config["scorer"] is not None and (texts is None or config["candidates"] == 1):
+        raise UserError(f"scorer={config['scorer']} chooses among motions for a text: give text=... and candidates=8")
 
     import numpy as np
     import torch
@@ -61,11 +63,18 @@ def sample(config: Config) -> None:
     check_condition(config, model, texts)
     stages = [] if config["trajectory"] else None
     keys = ("seconds", "frames", *OPTIONS)
+    score = None
+    if config["scorer"] is not None:
+        from evaluators.selection import text_fit
+
+        score = text_fit(str(config["scorer"]), model, device)
     motions = generate(
         model,
         texts,
         actions=None if config["action"] is None else [str(config["action"])],
         samples=config["samples"],
+        candidates=config["candidates"],
+        score=score,
         seed=config["seed"],
         after=config["after"],
         loop=config["loop"],
@@ -76,7 +85,8 @@ def sample(config: Config) -> None:
         **{key: config[key] for key in keys},
     )
     requested = {key: config[key] for key in keys} | {key: config[key] or None for key in TOGGLES}
-    requested |= {key: config[key] for key in ("after", "targets")}
+    requested |= {key: config[key] for key in ("after", "targets", "scorer")}
+    requested["candidates"] = config["candidates"] if config["candidates"] != 1 else None
     digest = sha256(file)
     folders: dict[Path, list[Motion]] = {}
     for number in range(len(motions) // config["samples"]):
@@ -101,10 +111,11 @@ main = partial(
     usage=USAGE,
     name="sample",
     objects=("ckpt", "out"),
-    text=("text", "prompts", "ckpt", "out", "after", "body", "targets"),
+    text=("text", "prompts", "ckpt", "out", "after", "body", "targets", "scorer"),
     kinds={
         **SAMPLING,
         **LENGTHS,
+        "candidates": "int",
         **dict.fromkeys((*TOGGLES, "trajectory", "mp4"), "bool"),
     },
 )

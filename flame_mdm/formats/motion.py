@@ -54,6 +54,7 @@ class Motion:
         representation: name of the representation of the features.
         contacts: (F, N) bool, True if a joint of `skeleton.feet` is on the floor; None = unknown.
         cleanup: whether `flame_mdm.formats.cleanup` changed the joints.
+        parts: text, first and last frame (exclusive) of each part of a sequence; () = one part.
 
     Raises:
         ValueError: wrong shapes, non-finite joints, or a frame rate that is not a positive number.
@@ -69,6 +70,7 @@ class Motion:
     representation: str = ""
     contacts: np.ndarray | None = None
     cleanup: bool = False
+    parts: tuple[tuple[str, int, int], ...] = ()
 
     def __post_init__(self) -> None:
         name, skeleton = f"motion {self.id!r}", self.skeleton

@@ -272,12 +272,15 @@ class GaussianDiffusion(Process):
 
         def estimate(x_t: Tensor, i: int) -> tuple[Tensor, Tensor | float]:
             t = torch.full((len(x_t),), float(steps[i]), device=x_t.device)
-            output = denoise(x_t, t, mask, cond).to(x_t.dtype)
-            x0_hat = self._to_x0(output, x_t, steps[i])
-            if self.clip_x0:
-                x0_hat = x0_hat.clamp(-1, 1)
-            if edit is not None and edit.mode == "x0":
-                x0_hat = edit.impose(x0_hat)
+            output = x_t
+
+            def clean(x_t: Tensor) -> Tensor:
+                nonlocal output
+                output = denoise(x_t, t, mask, cond).to(x_t.dtype)
+                x0_hat = self._to_x0(output, x_t, steps[i])
+                return x0_hat.clamp(-1, 1) if self.clip_x0 else x0_hat
+
+            x0_hat = edit.impose(clean, x_t) if edit is not None and edit.mode == "x0" else clean(x_t)
             if trajectory is not None:
                 trajectory.append(x0_hat * mask[..., None])
             return x0_hat, self.log_variance(output, x_t, i, schedule)

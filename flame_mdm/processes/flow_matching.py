@@ -164,13 +164,17 @@ class FlowMatching(Process):
             # Filling a tensor on the device with a number needs no copy and no synchronization.
             precision = torch.promote_types(x.dtype, torch.float32)
             time = t.expand(len(x)) if isinstance(t, Tensor) else x.new_full((len(x),), t, dtype=precision)
-            output = denoise(x, self.table_time(time), mask, cond).to(x.dtype)
+            output = x
+
+            def clean(x: Tensor) -> Tensor:
+                nonlocal output
+                output = denoise(x, self.table_time(time), mask, cond).to(x.dtype)
+                return self.to_x0(output, x, time)
+
             imposed = edit if edit is not None and edit.mode == "x0" else None
+            x0_hat = clean(x) if imposed is None else imposed.impose(clean, x)
             if self.prediction == "velocity" and trajectory is None and imposed is None:
                 return output
-            x0_hat = self.to_x0(output, x, time)
-            if imposed is not None:
-                x0_hat = imposed.impose(x0_hat)
             straight = (x0_hat - (1 - self.sigma_min) * x) / (1 - (1 - self.sigma_min) * time[:, None, None])
             if self.prediction == "x0":
                 output = straight

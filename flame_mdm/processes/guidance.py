@@ -9,6 +9,8 @@ from torch import Tensor
 
 from flame_mdm.motion import Condition, Denoise
 
+STEERING_STEPS = 2
+"""Gradient steps before each step of the sampler; docs/targets.md has the errors and costs of other numbers."""
 CLOSE, MOST_STEPS = 0.005, 8
 """Largest error in meters that ends the search for a motion that reaches positions, and its maximum number of steps."""
 RELAXATION = 1e-3
@@ -60,6 +62,30 @@ class Positions:
     def of(self, joints: Tensor) -> Tensor:
         """Returns these coordinates (..., M) of a motion (..., F, J, 3)."""
         return joints[..., self.frames, self.joints, self.axes]
+
+
+def steer(
+    clean: Callable[[Tensor], Tensor], x_t: Tensor, to_joints: Callable[[Tensor], Tensor], wanted: Positions
+) -> Tensor:
+    """Returns noisy motions whose clean estimates are nearer to positions in the world.
+
+    Steps along the gradient through the denoiser (Chung et al. 2023, "Diffusion posterior sampling"), of Polyak's
+    length, so that there is no scale to choose. The entire body adapts, since the denoiser decides how.
+
+    Args:
+        clean: returns the clean estimates (B, F, D) of noisy motions (B, F, D).
+        x_t: (B, F, D).
+        to_joints: decodes (B, F, D) as joints (B, F, J, 3) in meters.
+        wanted: the positions.
+    """
+    for _ in range(STEERING_STEPS):
+        with torch.enable_grad():
+            x = x_t.detach().requires_grad_()
+            loss = (wanted.of(to_joints(clean(x))) - wanted.values).square().sum(-1)
+            (slope,) = torch.autograd.grad(loss.sum(), x)
+        length = loss.detach() / slope.square().sum((1, 2)).clamp(min=1e-9)
+        x_t = x_t - length[:, None, None] * slope
+    return x_t
 
 
 def reach(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -18,6 +18,7 @@ from torchmetrics import Metric
 from evaluators.extractors import Extractor
 from evaluators.metrics import make_metrics, missing_input, required_inputs, update_metrics
 from evaluators.metrics.attributes import ATTRIBUTES
+from evaluators.metrics.memorization import TrainingMotions, poses
 from evaluators.metrics.samples import TwoSets
 from evaluators.processes import dealt
 from flame_mdm.config import Config
@@ -102,6 +103,7 @@ class Evaluator:
         batch_size: of the extractor.
         skip_features: whether metrics of features have no value, instead of raising for lack of input.
         rank, world: rank of this process, and number of processes.
+        training: motions that generated ones may be copies of; None = this is not measured.
     """
 
     extractor: Extractor | None
@@ -111,6 +113,7 @@ class Evaluator:
     skip_features: bool = False
     rank: int = 0
     world: int = 1
+    training: TrainingMotions | None = None
 
     @torch.no_grad()
     def extract(self, motions: Motions) -> Extracted:
@@ -141,6 +144,8 @@ class Evaluator:
             rows["groups"] = self._keys(motions.groups)
         if motions.requested is not None and all("action" in attributes for attributes in motions.requested):
             rows["requested"] = [{k: v for k, v in each.items() if k in ATTRIBUTES} for each in motions.requested]
+        if motions.requested is not None and all("content" in attributes for attributes in motions.requested):
+            rows["sides"] = [(each["content"], each.get("side", "")) for each in motions.requested]
         if motions.references is not None:
             rows["references"] = [torch.from_numpy(joints) for joints in motions.references]
         contacts = getattr(self.representation, "slices", {}).get("contacts")
@@ -149,7 +154,18 @@ class Evaluator:
         kept = None
         if motions.edit is not None:
             kept = [kept_parts(self.representation, len(motion), **motions.edit)[1] for motion in joints]
+        if self.training is not None and joints:
+            rows["nearest"] = self.training.nearest(joints, rows.get("generated"))
         return Extracted(rows, joints, kept)
+
+    def training_motions(self, whole: Motions, windows: Motions) -> TrainingMotions:
+        """Returns the training motions to which others are compared: all their frames, and features of windows."""
+        extracted = self.extract(windows)
+        facing = self.representation.skeleton.facing
+        joints = replace(self, extractor=None).extract(whole).joints
+        found = [poses(motion, facing) for motion in joints]
+        lengths = torch.tensor([len(motion) for motion in found])
+        return TrainingMotions(torch.cat(found), lengths, extracted.rows.get("generated"), facing)
 
     @torch.no_grad()
     def reference(self) -> Extracted | None:
@@ -297,6 +313,7 @@ class Evaluator:
         given = {*motions.rows, "joints", "mask", "real_joints", "real_mask"}
         given |= {"real"} if "generated" in motions.rows else set()
         given |= {"kept"} if motions.kept is not None else set()
+        given |= {"real_nearest"} if "nearest" in motions.rows else set()
         usable = {}
         for name, metric in (make_metrics(self.metrics) if metrics is None else metrics).items():
             needed = ["generated", "keys"] if isinstance(metric, TwoSets) else required_inputs(metric)
@@ -327,6 +344,7 @@ def _update(metrics: Mapping[str, Metric], generated: Extracted, paired: Extract
     if paired.joints:
         rows["real_joints"], rows["real_mask"] = _pad(paired.joints[part])
     rows |= {"references": paired.rows["references"][part]} if "references" in paired.rows else {}
+    rows |= {"real_nearest": paired.rows["nearest"][part]} if "nearest" in paired.rows else {}
     if "generated" in paired.rows:
         rows["real"] = paired.rows["generated"][part]
     update_metrics({name: metric for name, metric in metrics.items() if name not in sets}, **rows)

@@ -16,6 +16,7 @@ from evaluators.extractors import Extractor
 from evaluators.metrics import make_metrics
 from evaluators.metrics.confidence import mean_ci
 from evaluators.metrics.distribution import FrechetMotionDistance
+from evaluators.metrics.memorization import TrainingMotions
 from evaluators.processes import shared
 from evaluators.sources import Baseline, Generator, Row, SampleFolder, Source, real_motions
 from flame_mdm.config import Config, instantiate
@@ -331,6 +332,7 @@ class Protocol:
         ground_truth: bool = True,
         force: bool = False,
         resamples: int = 0,
+        training: Clips | None = None,
     ) -> dict[str, Any]:
         """Evaluates real motions of all replications, and then the motions of the source.
 
@@ -348,12 +350,15 @@ class Protocol:
             ground_truth: whether real motions are measured.
             force: generate even if real motions do not have the values that the protocol expects.
             resamples: number of sets drawn from the motions of the first replication, for intervals by bootstrap.
+            training: the training split, for metrics that look for copies of its motions.
 
         Returns:
             "ground_truth" and "values": by metric, `mean`, `ci` (half width of the 95 % interval), `replications`,
             `n` motions and `each` value per replication, each None if not computable; of values, also `resampled`, the
-            values of the sets drawn by `resamples`; "not_computed": reasons by metric; "cost"; "seeds" of the draws of
-            metrics, by replication; "warnings"; "valid", "invalid_because" and "forced".
+            values of the sets drawn by `resamples`; "nearest": sorted distances in meters, from the nearest training
+            motion, of the "generated" and "real" motions of the first replication, if a metric reads them;
+            "not_computed": reasons by metric; "cost"; "seeds" of the draws of metrics, by replication; "warnings";
+            "valid", "invalid_because" and "forced".
 
         Raises:
             UserError: If real motions do not have the expected values; nothing has been generated.
@@ -368,6 +373,8 @@ class Protocol:
             world=world,
         )
         several = replace(evaluator, metrics=self.multimodality["metrics"]) if self.multimodality else None
+        if evaluator.reads("nearest") and training is not None:
+            evaluator.training = self._training(training, evaluator, seed)
         reasons: dict[str, str] = {}
         reference, truth = [], []
         for replication in range(self.replications):
@@ -402,13 +409,20 @@ class Protocol:
         report |= {"valid": not invalid, "invalid_because": invalid, "forced": bool(invalid) and source is not None}
         return shared(report, world)
 
+    def _training(self, clips: Clips, evaluator: Evaluator, seed: int) -> TrainingMotions:
+        """Returns the training motions: a window of each for its features, and all frames."""
+        windows = self.rows(clips, seed, 0, purpose="training")
+        whole = [replace(row, frames=np.arange(row.clip.length)) for row in windows]
+        return evaluator.training_motions(*(self.motions(some, real_motions(clips, some)) for some in (whole, windows)))
+
     def _has_several_per_prompt(self, source: Source | None) -> bool:
         return self.multimodality is not None and isinstance(source, Generator) and not self.quick
 
     def _real(self, clips: Clips, evaluator: Evaluator, seed: int, replication: int) -> tuple[Extracted, Extracted]:
         """Returns the real motions of a replication, and real motions for comparisons of sets."""
         again = self.rows(clips, seed, replication, purpose="real")
-        real = evaluator.reference() or evaluator.extract(self.motions(again, real_motions(clips, again)))
+        once = replace(evaluator, training=None)
+        real = evaluator.reference() or once.extract(self.motions(again, real_motions(clips, again)))
         return self._paired(clips, evaluator, self.rows(clips, seed, replication)), real.without_joints()
 
     def _paired(self, clips: Clips, evaluator: Evaluator, rows: Sequence[Row]) -> Extracted:
@@ -432,6 +446,7 @@ class Protocol:
         costs: list[dict[str, float]] = []
         warnings: list[str] = []
         resampled: dict[str, list[float | None]] = {}
+        nearest: dict[str, list[float]] = {}
         for replication, (paired, real) in enumerate(reference):
             rows = self.rows(clips, seed, replication)
             samples = source(f"rep_{replication}", rows, replication, evaluator.rank, evaluator.world)
@@ -444,13 +459,16 @@ class Protocol:
             values, why = evaluator.score(generated, paired, real, key("draws", seed, replication))
             found.append((values, len(generated)))
             reasons |= why
+            if not replication and "nearest" in generated.rows:
+                sets = {"generated": generated, "real": paired}
+                nearest = {name: _sorted_distances(each.rows["nearest"]) for name, each in sets.items()}
             if not replication:
                 warnings = self._warnings(generated, real)
                 resampled = evaluator.resample(generated, paired, real, key("draws", seed, 0), resamples)
         table = _summary(found)
         for name, drawn in resampled.items():
             table[name]["resampled"] = drawn
-        return {"values": table, "cost": _mean_cost(costs), "warnings": warnings}
+        return {"values": table, "cost": _mean_cost(costs), "warnings": warnings, "nearest": nearest}
 
     def _measure_multimodality(
         self, source: Source, clips: Clips, evaluator: Evaluator, seed: int, reasons: dict[str, str]
@@ -520,6 +538,11 @@ def _tokens(row: Row, caption: str) -> list[str] | None:
     """Returns the "word/PART" tokens of a caption of the clip, if the data has them."""
     tagged = row.clip.attributes.get("tokens")
     return tagged[row.clip.captions.index(caption)] if tagged and caption in row.clip.captions else None
+
+
+def _sorted_distances(nearest: Tensor) -> list[float]:
+    """Returns distances of joints in meters, rounded to 0.1 mm, for a figure."""
+    return [round(distance, 4) for distance in nearest[:, 0].sort().values.tolist()]
 
 
 def _select(extracted: Extracted, indices: list[int]) -> Extracted:

@@ -202,6 +202,7 @@ def _evaluate(request: EvaluationRequest, rank: int, world: int, device: str) ->
         world=world,
         force=request.force,
         resamples=request.resamples,
+        training=data.clips("train"),
     )
     if rank:
         return
@@ -421,6 +422,7 @@ def _describe(
             "averaged_weights": bool(model.config.get("ema")),
             "parameters": sum(p.numel() for p in model.parameters() if p.requires_grad),
             "prediction": {"epsilon": "noise"}.get(model.process.prediction, model.process.prediction),
+            "training_steps": model.steps,
             **{f"training_{name}": value for name, value in model.facts.get("training", {}).items()},
         }
     return report

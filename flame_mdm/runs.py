@@ -109,7 +109,9 @@ class Checkpoint(Schema):
     averaged_weights: bool | None = None
     parameters: Int | None = None
     prediction: str | None = None
+    training_steps: Int | None = None
     training_hours: Number | None = None
+    training_device: str | None = None
     training_speed: str | None = None
     training_precision: str | None = None
     training_memory_gib: Number | None = None
@@ -155,6 +157,7 @@ class Result(Schema):
     cost: Cost | None = None
     skeleton: Skeleton | None = None
     audit: str | None = None
+    nearest: dict[str, list[Number]] = {}
 
     @property
     def stand_in_skeleton(self) -> bool:

@@ -320,6 +320,42 @@ def test_split_of_the_published_takes():
             assert split == splits[2, content, style, (number - 1) // 5 * 5 + 1]
 
 
+def test_compositional_split_holds_out_whole_combinations():
+    takes = published()
+    splits = {take: split_of(*take, "compositional") for take in takes}
+    assert Counter(splits.values()) == {"train": 2324, "val": 279, "test": 473}
+
+    def words(take: tuple[int, str, str, int]) -> set[str]:
+        """Captions of a take and of its mirror image, which training also sees."""
+        _, content, style, _ = take
+        contents = {content, bandai.swap_sides(content)}
+        return {c for name in contents for c in captions(name, style, side_of(name))}
+
+    seen = [take for take, split in splits.items() if split != "test"]
+    held_out = [take for take, split in splits.items() if split == "test"]
+    assert not set().union(*map(words, seen)) & set().union(*map(words, held_out))
+    training = [take for take, split in splits.items() if split == "train"]
+    for part in (1, 2):  # content, style: each is seen, in other combinations
+        assert {take[part] for take in held_out} <= {take[part] for take in training}
+    assert {style for dataset, _, style, _ in held_out if dataset == 2} == set(STYLES_2)
+    # Other takes stay where they are, except test takes, which are used for training.
+    before = {take: split_of(*take) for take in seen}
+    assert all(splits[take] == ("train" if split == "test" else split) for take, split in before.items())
+
+
+def test_takes_of_the_compositional_split(tiny):
+    for id_, rule, split in (
+        ("dataset-2_walk_elderly_006", "compositional", "test"),
+        ("dataset-1_walk_old_001", "compositional", "test"),
+        ("dataset-2_walk_elderly_006", "takes", "train"),
+    ):
+        assert split_of(int(id_[8]), *id_.split("_")[1:3], int(id_[-3:]), rule) == split
+    takes = [clip.id for clip in clips(tiny, split="compositional") if clip.split == "test"]
+    assert takes == []
+    with pytest.raises(ValueError, match=r"data.source.split=random: give takes or compositional"):
+        Bandai(str(tiny), split="random")  # pyright: ignore[reportArgumentType]
+
+
 def test_captions_of_all_takes():
     for dataset, content, style, _ in published():
         side = side_of(content)

@@ -783,6 +783,24 @@ def baseline(runs: Runs, folder: Path, kind: str, *words: str) -> int:
     return main(["evaluate", f"baseline={kind}", *place, f"extractor={runs.clip}", "replications=1", out, *words])
 
 
+def test_training_motions_are_their_own_nearest(runs, tmp_path):
+    protocol = tmp_path / "copies.yaml"
+    protocol.write_text(
+        "_target_: evaluators.protocols.Protocol\n_recursive_: false\nname: copies\nversion: 1\ncondition: text\n"
+        "extractor: {_target_: evaluators.extractors.MotionCLIPExtractor}\nreplications: 1\nsamples: 30\n"
+        "metrics: {nearest: {_target_: evaluators.metrics.memorization.NearestTraining}}\n"
+    )
+    found = {}
+    for split in ("train", "test"):
+        assert baseline(runs, tmp_path, "real", f"protocol={protocol}", f"split={split}") == 0
+        found[split] = read_result(tmp_path / "real.json")
+    distance = {split: result.values["nearest/joints"].mean for split, result in found.items()}
+    assert distance["train"] == 0
+    assert distance["test"] > 0.001
+    assert found["train"].nearest == {"generated": [0.0] * 30, "real": [0.0] * 30}
+    assert found["test"].nearest["real"] == sorted(found["test"].nearest["real"])
+
+
 def test_baselines_show_what_each_metric_sees(runs, tmp_path):
     found, truth = {}, {}
     for kind in Baseline.KINDS:

@@ -16,7 +16,7 @@ from evaluators.run import _outdated
 from flame_mdm.__main__ import main
 from flame_mdm.errors import UserError
 from flame_mdm.reporting import tables
-from flame_mdm.reporting.rendering import Cell, Line, Table, latex, markdown, places
+from flame_mdm.reporting.rendering import Cell, Figure, Line, Part, Table, cumulative, draw, latex, markdown, places
 from flame_mdm.reporting.study import wilson
 from flame_mdm.reporting.tables import Request, build, load_spec, requests, spec_names, write
 
@@ -469,6 +469,10 @@ spec:
         ("title: x\nparts: {a: {columns: {F: fid}, rows: []}}", 'parts.a.columns.F is "fid", not a mapping'),
         ("title: x\nparts: {a: {columns: {A: {value: fid}}, rows: [{ckpt: x}]}}", "parts.a.rows.0 has no label"),
         ("title: x\nparts: {a: {columns: {A: {value: fid}}, rows: [{label: x, ckpt: x}]}}", "needs a protocol"),
+        (
+            "title: x\nparts: {a: {lengths: [kit]}}\nfigures: [{part: a, x: nfe}]",
+            "x=nfe needs y, a column or several of a",
+        ),
         ("title: [", "not a readable YAML file"),
         ("- 1", "not a mapping"),
     ],
@@ -509,6 +513,23 @@ def test_a_damaged_result_is_told(folder, capsys):
     assert main(["tables", *words, "evaluate=false"]) == 1
     assert "not a JSON file" in (error := capsys.readouterr().err)
     assert "delete it, then run `flame-mdm evaluate` or `flame-mdm tables` again" in error
+
+
+def test_distances_from_the_training_motions_are_drawn():
+    real = Line("Real motions", "real", [], nearest=[0.01 * i for i in range(1, 1001)])
+    copied = Line("copies", "measured", [], nearest=[0.0, 0.0, 0.5, 1.0])
+    part = Part("Text", {}, [real, copied, Line("unmeasured", "measured", [])])
+    drawn = draw(part, Figure("nearest", []), {})
+    assert drawn is not None
+    assert "distance from the nearest training motion, m" in drawn
+    assert "copies" in drawn
+    assert "unmeasured" not in drawn
+    assert draw(Part("Text", {}, [Line("unmeasured", "measured", [])]), Figure("nearest", []), {}) is None
+    shares = cumulative(real.nearest)
+    assert len(shares) == 100
+    assert shares[-1] == (10.0, 1.0)
+    assert all(share == pytest.approx(distance / 10) for distance, share in shares)
+    assert cumulative(copied.nearest) == [(0.0, 0.25), (0.0, 0.5), (0.5, 0.75), (1.0, 1.0)]
 
 
 def test_places():

@@ -13,12 +13,14 @@ size.
 | labels | (B,) int64 | classes they were generated for |
 | groups | (B,) int64 | keys of the prompts, if several motions are generated per prompt |
 | requested | B mappings | attributes of the motions as requested, see `attributes` |
+| sides | B pairs of strings | requested content and side of the motions of the Bandai set, see `attributes` |
 | joints | (B, F, J, 3) | generated motions in meters, y up, floor at y = 0 |
 | mask | (B, F) bool | True = real frame of a generated motion |
 | contacts | (B, F, 4) bool | contacts of `skeleton.feet` as generated, if the features have them |
 | kept | (B, F, J) bool | True = this joint of this frame was to be kept, if motions are edits |
 | keys | (B,) int64 | unique keys of generated motions |
 | real, real_joints, real_mask, real_keys | as above | the same for real motions |
+| nearest, real_nearest | (B, 1 or 2) | distances from the nearest training motion, see `memorization` |
 | references | B of (F', J, 3) | real motions at the frame rate of their recording |
 
 A key is `flame_mdm.seeds.key` of an id (and of the sample number, if there are several samples). Metrics that compare

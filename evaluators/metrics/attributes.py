@@ -40,11 +40,7 @@ def read_attributes(joints: np.ndarray, fps: float) -> dict[str, str | int]:
     if not _is_a_body(joints, smooth):
         return {}
     floor = np.percentile(smooth[:, TOES, 1], 10)
-    across = (smooth[:, HIPS[0]] - smooth[:, HIPS[1]] + smooth[:, SHOULDERS[0]] - smooth[:, SHOULDERS[1]])[:, [0, 2]]
-    left = across / np.linalg.norm(across, axis=-1, keepdims=True)
-    forward = np.stack([-left[:, 1], left[:, 0]], -1)
-    yaw = np.unwrap(np.arctan2(forward[:, 0], forward[:, 1]))
-    turned = np.degrees(yaw[-3:].mean() - yaw[:3].mean())
+    forward, left, turned = _heading(smooth)
 
     walked = _locomotion(smooth, forward, left, turned, fps)
     if walked:
@@ -65,6 +61,15 @@ def read_attributes(joints: np.ndarray, fps: float) -> dict[str, str | int]:
     if abs(turned) > 45:
         return {"action": "turn", "direction": "left" if turned > 0 else "right"}
     return _arms(smooth, fps)
+
+
+def _heading(smooth: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+    """Returns the directions (F, 2) forward and left on the ground, and the turn to the left in degrees."""
+    across = (smooth[:, HIPS[0]] - smooth[:, HIPS[1]] + smooth[:, SHOULDERS[0]] - smooth[:, SHOULDERS[1]])[:, [0, 2]]
+    left = across / np.linalg.norm(across, axis=-1, keepdims=True)
+    forward = np.stack([-left[:, 1], left[:, 0]], -1)
+    yaw = np.unwrap(np.arctan2(forward[:, 0], forward[:, 1]))
+    return forward, left, float(np.degrees(yaw[-3:].mean() - yaw[:3].mean()))
 
 
 def _is_a_body(joints: np.ndarray, smooth: np.ndarray) -> bool:
@@ -214,3 +219,65 @@ class AttributeAccuracy(Metric):
             else None
             for name in (*ATTRIBUTES, "all")
         }
+
+
+def read_side(joints: np.ndarray, content: str, fps: float) -> str:
+    """Reads the side of a motion of the Bandai set: left or right.
+
+    Args:
+        joints: (F, 22, 3) in meters, y up.
+        content: of the set's contents with a side: walk-turn-left and -right are read from the turn of the body,
+            walk-left and -right from the direction of travel, all others from the hand that rises higher above its
+            shoulder. The name's own side is not used.
+        fps: frames per second.
+    """
+    smooth = gaussian_filter1d(np.asarray(joints, np.float64), 0.05 * fps, axis=0, mode="nearest")
+    if content.startswith("walk"):
+        _, left, turned = _heading(smooth)
+        travel = (np.diff(smooth[:, PELVIS][:, [0, 2]], axis=0) * left[1:]).sum()
+        toward = turned if content.startswith("walk-turn") else travel
+    else:
+        heights = (smooth[:, WRISTS, 1] - smooth[:, SHOULDERS, 1]).max(0)
+        toward = heights[0] - heights[1]
+    return "left" if toward > 0 else "right"
+
+
+class SideAccuracy(Metric):
+    """Share of motions that show the requested side, left or right, on the Bandai set; see `read_side`.
+
+    Args:
+        fps: frames per second of the motions.
+    """
+
+    higher_is_better = True
+    full_state_update = False
+
+    def __init__(self, fps: float, **kwargs: Any):
+        super().__init__(**kwargs)
+        self.fps = fps
+        for name in ("hand", "path"):
+            self.add_state(f"right_{name}", tensor(0), dist_reduce_fx="sum")
+            self.add_state(f"requested_{name}", tensor(0), dist_reduce_fx="sum")
+
+    def update(self, joints: Tensor, mask: Tensor, sides: Sequence[tuple[str, str]]) -> None:
+        """Adds motions: joints (B, F, 22, 3) in meters, mask (B, F), and B pairs of content and side.
+
+        Pairs with another side than left and right are ignored.
+        """
+        for motion, real, (content, side) in zip(joints.detach().cpu(), mask.cpu(), sides, strict=True):
+            if side in SIDES:
+                name = "path" if content.startswith("walk") else "hand"
+                hit = read_side(motion[real].numpy(), content, self.fps) == side
+                setattr(self, f"right_{name}", getattr(self, f"right_{name}") + int(hit))
+                setattr(self, f"requested_{name}", getattr(self, f"requested_{name}") + 1)
+
+    def compute(self) -> dict[str, float | None]:
+        """Returns the accuracy in [0, 1] of `hand`, of `path` (turns and sideways walks), and of `all`; chance is 0.5.
+
+        None if no motion has a side.
+        """
+        right, requested = (
+            {name: int(getattr(self, f"{kind}_{name}")) for name in ("hand", "path")} for kind in ("right", "requested")
+        )
+        right["all"], requested["all"] = sum(right.values()), sum(requested.values())
+        return {name: right[name] / count if count else None for name, count in requested.items()}

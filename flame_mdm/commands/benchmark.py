@@ -27,7 +27,7 @@ usage: flame-mdm benchmark NAME [out=FOLDER]
 
 Trains a motion-CLIP and a small model of each kind, evaluates them, and writes a table and a report page, all in one
 command. If interrupted, the same command continues where it stopped.
-NAME is a file in experiments/benchmark: synthetic, which needs no download, or bandai.
+NAME is a file in experiments/benchmark: synthetic, which needs no download, bandai, or bandai_full, for one GPU.
 """
 
 

@@ -13,7 +13,7 @@ from contextlib import closing
 from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path, PurePosixPath
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -87,6 +87,13 @@ WRONG_SIDE = (
 SIDES = {"bye": "right", "guide": "right", "respond": "left", "byebye": "both"}  # not part of the name
 
 
+HELD_OUT = frozenset(
+    (content, style) for group in WORDS["held_out"] for content in group["contents"] for style in group["styles"]
+)
+"""Combinations of content and style that training never sees with the compositional split."""
+SplitRule = Literal["takes", "compositional"]
+
+
 FILE = re.compile(r"dataset-([12])_([^_]+)_([^_]+)_(\d+)\.bvh")
 
 
@@ -119,6 +126,7 @@ class Bandai(MotionSource):
         mirror: bool = True,
         workers: int = 0,
         exclude: Sequence[str] = (),
+        split: SplitRule = "takes",
     ):
         """Stores the arguments; reads no files.
 
@@ -128,10 +136,15 @@ class Bandai(MotionSource):
             mirror: yield a mirrored copy after each clip of the training split.
             workers: number of processes that read and convert; 0 = one per core, 1 = this process only.
             exclude: takes to leave out, by the name of the BVH file without extension.
+            split: "takes" holds out takes of combinations of content and style that training sees; "compositional"
+                holds out the combinations `HELD_OUT`, whose contents and styles training sees only in others.
 
         Raises:
-            ValueError: `motion` has another value.
+            ValueError: `motion` or `split` has another value.
         """
+        if split not in get_args(SplitRule):
+            raise ValueError(f"data.source.split={split}: give takes or compositional")
+        self.split: SplitRule = split
         if motion not in ("joints", "smpl"):
             raise ValueError(f"data.source.motion={motion}: give joints or smpl")
         self.path, self.mirror, self.workers, self.exclude = Path(path), mirror, workers, tuple(exclude)
@@ -184,7 +197,7 @@ class Bandai(MotionSource):
             unknown = set(self.exclude) - set(names)
             if unknown:
                 raise ValueError(f"data.source.exclude: {self.path} has no {', '.join(sorted(unknown))}")
-            self._found = [_take(id_) for id_ in sorted(set(names) - set(self.exclude))]
+            self._found = [_take(id_, self.split) for id_ in sorted(set(names) - set(self.exclude))]
         return self._found
 
     def _motions(self, ids: set[str], fps: float) -> Generator[tuple[str, np.ndarray]]:
@@ -309,13 +322,20 @@ def captions(content: str, style: str, side: str) -> list[str]:
     return [" ".join(caption.split()).replace(" ,", ",") for caption in filled]
 
 
-def split_of(dataset: int, content: str, style: str, number: int) -> Split:
+def split_of(dataset: int, content: str, style: str, number: int, rule: SplitRule = "takes") -> Split:
     """Returns the split of a take, determined by its name.
+
+    With the rule "compositional", the combinations `HELD_OUT` are the test split, and other test takes are used for
+    training.
 
     Neighboring takes come from one session and look alike, so blocks of five go to one split. Data set 1 has a single
     take of most combinations, so there each combination goes to one split. The normal takes of walk-turn-left and
     -right overlap in time across names and are all used for training.
     """
+    if rule == "compositional":
+        if (content, style) in HELD_OUT:
+            return "test"
+        return "val" if split_of(dataset, content, style, number) == "val" else "train"
     if dataset == 1:
         draw = _hash(f"dataset-1_{content}_{style}") % 20
         return "test" if draw < 2 else "val" if draw == 2 else "train"
@@ -339,13 +359,13 @@ def _hash(text: str) -> int:
     return int(hashlib.sha1(text.encode()).hexdigest()[:8], 16)
 
 
-def _take(id_: str) -> Take:
+def _take(id_: str, rule: SplitRule) -> Take:
     name, content, style, number = id_.split("_")
     dataset = int(name[-1])
     contents, styles = (CONTENTS_1, STYLES_1) if dataset == 1 else (TAKES_2, STYLES_2)
     if content not in contents or style not in styles:
         raise ValueError(f"{id_}.bvh: data set {dataset} has no content {content} with style {style}")
-    split = split_of(dataset, content, style, int(number))
+    split = split_of(dataset, content, style, int(number), rule)
     return Take(id_, dataset, swap_sides(content) if id_ in WRONG_SIDE else content, style, split)
 
 

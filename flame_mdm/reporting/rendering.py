@@ -58,6 +58,10 @@ class Cell:
     place: int = 0
 
 
+NEAREST = "nearest"
+"""`Figure.x` of the cumulative distribution of the distances from the nearest training motion."""
+
+
 @dataclass
 class Line:
     """One row of a table.
@@ -70,6 +74,7 @@ class Line:
         state: "" if the row is complete and valid, otherwise the reason: "no checkpoint", "NOT VALID".
         options: numbers for the x-axis of figures, such as num_inference_steps.
         facts: provenance of its values, for the CSV file and the list below the table.
+        nearest: sorted distances of its motions from the nearest training motion, in meters.
     """
 
     label: str
@@ -79,11 +84,12 @@ class Line:
     state: str = ""
     options: dict[str, float] = field(default_factory=dict)
     facts: dict[str, str] = field(default_factory=dict)
+    nearest: list[float] = field(default_factory=list)
 
 
 @dataclass
 class Figure:
-    """A figure that plots columns of a part over an option of its rows; see `draw`."""
+    """A figure that plots columns of a part over an option of its rows, or the distances of `NEAREST`; see `draw`."""
 
     x: str
     y: list[str]
@@ -325,12 +331,30 @@ def draw(part: Part, figure: Figure | str, labels: Mapping[str, str]) -> str | N
     if isinstance(figure, str):
         edges, counts = part.histograms[figure]
         return svg(figure, [Panel(Histogram(edges, {"motions": counts}, "frames"), "frames", shortened(figure, 40))])
+    if figure.x == NEAREST:
+        lines = [line for line in part.lines if line.nearest and not line.state]
+        series = [
+            Series(
+                shortened(one_line(line.label), 60),
+                cumulative(line.nearest),
+                kind="dashed" if line.kind == "real" else "line",
+            )
+            for line in lines
+        ]
+        return svg(part.name, [Panel(series, "distance from the nearest training motion, m", "share of motions")])
     panels = []
     for column in figure.y:
         series, levels = _series(part, figure, column)
         head = f"{shortened(one_line(column), 40)} {ARROWS[part.columns[column]]}".strip()
         panels.append(Panel(series, labels.get(figure.x, figure.x), head, figure.log, levels=levels))
     return svg(part.name, panels)
+
+
+def cumulative(values: Sequence[float]) -> list[tuple[float, float]]:
+    """Returns the share of values up to each value, at most 100 points."""
+    count = len(values)
+    ranks = sorted({round(i * (count - 1) / 99) for i in range(100)})
+    return [(values[rank], (rank + 1) / count) for rank in ranks]
 
 
 def _series(part: Part, figure: Figure, column: str) -> tuple[list[Series], list[float]]:

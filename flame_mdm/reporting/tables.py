@@ -24,7 +24,19 @@ from flame_mdm.files import read_yaml, write_json, write_text
 from flame_mdm.reporting.audit import card_of
 from flame_mdm.reporting.page import page
 from flame_mdm.reporting.plots import standalone
-from flame_mdm.reporting.rendering import WRITERS, Cell, Figure, Line, Part, Table, draw, figure_names, fragment, places
+from flame_mdm.reporting.rendering import (
+    NEAREST,
+    WRITERS,
+    Cell,
+    Figure,
+    Line,
+    Part,
+    Table,
+    draw,
+    figure_names,
+    fragment,
+    places,
+)
 from flame_mdm.reporting.study import Ratings, wilson
 from flame_mdm.runs import (
     Checkpoint,
@@ -57,7 +69,9 @@ ABOUT = {
     "batch_size": "batch size",
     "parameters": "parameters, M",
     "prediction": "prediction",
+    "training_steps": "training steps",
     "training_hours": "training hours",
+    "training_device": "device of training",
     "training_memory_gib": "peak memory of training, GiB",
 }
 """Labels of the values that a column may show besides metrics, and of the x-axes of figures."""
@@ -149,11 +163,13 @@ class PartSpec(Options):
 
 
 class FigureSpec(ClosedSchema):
-    """A figure that plots columns of a part over an option of its rows."""
+    """A figure that plots columns of a part over an option of its rows; x: nearest plots the distances of its motions
+    from the nearest training motion.
+    """
 
     part: str
     x: str
-    y: str | list[str]
+    y: str | list[str] = Field([])
     log: bool = False
     points: bool = False
 
@@ -171,8 +187,10 @@ class Spec(ClosedSchema):
         _at_most("figures", sum(len(_list(figure.y)) for figure in self.figures), MOST_FIGURES)
         for figure in self.figures:
             part = self.parts.get(figure.part)
-            if part is None or figure.x not in ABOUT:
-                raise ValueError(f"a figure needs a part of the table and x, one of {', '.join(ABOUT)}")
+            if part is None or figure.x not in (*ABOUT, NEAREST):
+                raise ValueError(f"a figure needs a part of the table and x, one of {', '.join([*ABOUT, NEAREST])}")
+            if not _list(figure.y) and figure.x != NEAREST:
+                raise ValueError(f"figure: x={figure.x} needs y, a column or several of {figure.part}")
             for column in _list(figure.y):
                 if column not in part.columns:
                     raise ValueError(f"figure: y={column} is not a column of {figure.part}")
@@ -371,6 +389,7 @@ def _measured(name: str, part: Config, reported: Config | None, results: Path, f
         lines.append(line)
         if line.marks and line.marks not in truths:
             truth = Line("Real motions", "real", [_truth(r, v) for r, v in zip(found, values, strict=True)], line.marks)
+            truth.nearest = next((r.nearest["real"] for r in found if r is not None and "real" in r.nearest), [])
             truths[line.marks] = truth
     lines = [line for line in truths.values() if any(line.cells)] + lines
     notes = [*marks.notes, *_grouped(todo)]
@@ -467,6 +486,7 @@ def _line(row: Mapping[str, Any], found: Sequence[Result | None], values: Sequen
         value = _about(result, name) if result is not None and name in ABOUT else None
         if isinstance(value, int | float):
             line.options.setdefault(name, float(value))
+    line.nearest = first.nearest.get("generated", [])
     reasons = list(dict.fromkeys(reason for r in found if r is not None for reason in r.invalid_because))
     line.state = NOT_VALID if reasons else "QUICK" if first.quick else ""
     checkpoint = first.checkpoint
@@ -493,7 +513,9 @@ def _line(row: Mapping[str, Any], found: Sequence[Result | None], values: Sequen
         "device": first.device,
         "speed of training": _text(checkpoint and checkpoint.training_speed),
         "precision of training": _text(checkpoint and checkpoint.training_precision),
+        "training steps": _text(checkpoint and checkpoint.training_steps),
         "training hours": _text(checkpoint and checkpoint.training_hours),
+        "device of training": _text(checkpoint and checkpoint.training_device),
         "peak memory of training, GiB": _text(checkpoint and checkpoint.training_memory_gib),
         "result": " ".join(dict.fromkeys(file for r, file in zip(found, files, strict=True) if r is not None)),
         "not valid because": "; ".join(reasons),

@@ -34,6 +34,7 @@ from flame_mdm.reporting.page import number
 from flame_mdm.reporting.report import write_report
 from flame_mdm.task import MotionGeneration, Task
 from flame_mdm.training.loggers import log_video
+from flame_mdm.training.provenance import device_name
 
 REAL = 64
 """Training clips that metrics of samples are compared with."""
@@ -134,7 +135,8 @@ class Measurements(Callback):
     `train/gpu_memory_gib` (peak memory allocated by tensors).
 
     Adds `facts.training` to checkpoints: `hours` of training so far, including validation; `processes`, their number;
-    `speed` and `precision`; and `memory_gib`, the peak memory of tensors on CUDA, otherwise of the first process.
+    `device`, their number and its name, or the number of threads of a CPU; `speed` and `precision`; and `memory_gib`,
+    the peak memory of tensors on CUDA, otherwise of the first process.
     """
 
     def __init__(self) -> None:
@@ -161,6 +163,7 @@ class Measurements(Callback):
             "hours": self.earlier.get("hours", 0.0) + (time.perf_counter() - self.begin) / 3600,
             "memory_gib": max(self.earlier.get("memory_gib", 0.0), memory),
             "processes": trainer.world_size,
+            "device": device_name(trainer),
             "speed": pl_module.config.get("run", {}).get("speed", "reference"),
             "precision": trainer.precision,
         }

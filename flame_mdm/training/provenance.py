@@ -40,7 +40,7 @@ class Provenance(Callback):
         known: dict[str, Any] = pl_module.facts  # type: ignore[assignment]
         facts = {
             **environment(),
-            "device": _device(trainer),
+            "device": device_name(trainer),
             "parameters": sum(p.numel() for p in pl_module.parameters() if p.requires_grad),
             "data": {name: value for name, value in known.items() if name not in ("vocabulary", "captions")},
         }
@@ -69,10 +69,12 @@ class Provenance(Callback):
         say(f"steps: {trainer.global_step} to {trainer.max_steps}, {size} clips per step, {passes:.0f} epochs")
 
 
-def _device(trainer: Trainer) -> str:
+def device_name(trainer: Trainer) -> str:
+    """Returns the number of processes and the device of each, such as "1 x cpu, 2 threads"."""
     where = trainer.strategy.root_device
     name = torch.cuda.get_device_name(where) if where.type == "cuda" else where.type
-    return f"{trainer.world_size} x {name}"
+    threads = f", {torch.get_num_threads()} threads" if where.type == "cpu" else ""
+    return f"{trainer.world_size} x {name}{threads}"
 
 
 def environment() -> dict[str, Any]:

@@ -1,0 +1,121 @@
+"""Memorization: distance of generated motions from the training motions, compared to that of held-out real motions."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from evaluators.metrics.samples import SampleMetric
+
+STEP = 4
+"""Every fourth frame of a motion is compared, which takes a quarter of the time. A copy still has distance 0."""
+CLOSE = 0.01
+"""Share of the held-out real motions that are closer to a training motion than the limit of a copy."""
+
+
+def poses(joints: Tensor, facing: Sequence[int]) -> Tensor:
+    """Returns joints (F, J, 3) relative to the pelvis on the ground, turned to face z in every frame, as (F, 3J).
+
+    Two motions with the same poses differ only in the path and the direction in which they move.
+
+    Args:
+        joints: in meters, y up.
+        facing: `Skeleton.facing`.
+    """
+    right_hip, left_hip, right_shoulder, left_shoulder = facing
+    left = joints[:, left_hip] - joints[:, right_hip] + joints[:, left_shoulder] - joints[:, right_shoulder]
+    left = torch.nn.functional.normalize(left[:, [0, 2]], dim=-1)[:, None]
+    local = joints - joints[:, :1] * joints.new_tensor([1.0, 0.0, 1.0])
+    across = (local[..., [0, 2]] * left).sum(-1)
+    ahead = local[..., 2] * left[..., 0] - local[..., 0] * left[..., 1]
+    return torch.stack([across, local[..., 1], ahead], -1).flatten(1)
+
+
+@dataclass
+class TrainingMotions:
+    """The training motions that a motion may be a copy of.
+
+    Attributes:
+        poses: (N, 3J) of all frames of all motions, one after another; see the function `poses`.
+        lengths: (M,) frames of each motion.
+        features: (M, E) of the extractor; None without an extractor.
+        facing: `Skeleton.facing`.
+    """
+
+    poses: Tensor
+    lengths: Tensor
+    features: Tensor | None
+    facing: Sequence[int]
+
+    def nearest(self, joints: Sequence[Tensor], features: Tensor | None) -> Tensor:
+        """Returns the distances (B, 2), without features (B, 1), of motions from the nearest training motion.
+
+        The first is the root mean square distance of the joints in meters, over all joints and every fourth frame, from
+        the best window of the same length; infinite if no training motion is as long. The second is the distance of the
+        features.
+
+        Args:
+            joints: (F, J, 3) each.
+            features: (B, E); None without an extractor.
+        """
+        squares = self.poses.square().sum(-1)
+        left = torch.cat([torch.arange(int(length), 0, -1) for length in self.lengths])  # frames to the motion's end
+        found = torch.stack([self._closest(poses(motion, self.facing), squares, left) for motion in joints])
+        if features is None or self.features is None:
+            return found[:, None]
+        exact = "donot_use_mm_for_euclid_dist"  # matrix products would cancel in a copy
+        return torch.stack([found, torch.cdist(features, self.features, compute_mode=exact).min(1).values], 1)
+
+    def _closest(self, motion: Tensor, squares: Tensor, left: Tensor) -> Tensor:
+        compared = motion[::STEP]
+        starts = len(squares) - len(motion) + 1
+        if starts < 1:
+            return motion.new_tensor(torch.inf)
+        inner = compared @ self.poses.T
+        total = squares.new_zeros(starts)
+        for number, frame in enumerate(range(0, len(motion), STEP)):
+            total += squares[frame : frame + starts] - 2 * inner[number, frame : frame + starts]
+        total[left[:starts] < len(motion)] = torch.inf
+        best = int(total.argmin())
+        if total[best].isinf():
+            return total[best]
+        # Computed again from the differences, since the expanded square rounds to about a millimeter.
+        difference = compared - self.poses[best : best + len(motion) : STEP]
+        return (difference.square().sum() / (difference.numel() / 3)).sqrt()
+
+
+class NearestTraining(SampleMetric):
+    """Distance from the nearest training motion, and the share of motions that are closer than held-out real motions.
+
+    A motion counts as a copy if its joints are closer to a training motion than those of all but `CLOSE` of the
+    held-out real motions. So about 1 % of the real motions count as copies, and all motions of a model that repeats the
+    training set.
+
+    Args:
+        kwargs: options of `torchmetrics.Metric`.
+    """
+
+    def __init__(self, **kwargs: Any):
+        super().__init__(("keys", "nearest", "real_nearest"), **kwargs)
+
+    def update(self, keys: Tensor, nearest: Tensor, real_nearest: Tensor) -> None:
+        """Adds the distances of generated motions and of the real motions paired with them, and keys (B,)."""
+        self.keep(keys=keys, nearest=nearest, real_nearest=real_nearest)
+
+    def compute(self) -> dict[str, float | None]:
+        """Returns medians `joints` (meters) and `features`, and `copies` in [0, 1]; None without motions."""
+        rows = self.rows("keys", "nearest", "real_nearest")
+        if rows is None:
+            return {"joints": None, "features": None, "copies": None}
+        nearest, real = rows
+        joints, *features = nearest.quantile(0.5, dim=0).tolist()
+        limit = real[:, 0].quantile(CLOSE)
+        return {
+            "joints": joints,
+            "features": features[0] if features else None,
+            "copies": (nearest[:, 0] < limit).double().mean().item(),
+        }

@@ -1,0 +1,120 @@
+"""Distance from the training motions, against brute force and closed forms."""
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from evaluators.metrics.attributes import SideAccuracy, read_side
+from evaluators.metrics.memorization import STEP, NearestTraining, TrainingMotions, poses
+from flame_mdm.representations.skeleton import SMPL22
+
+FACING = SMPL22.facing
+
+
+def walk(seed: int, frames: int) -> torch.Tensor:
+    """Returns joints (F, 22, 3) of a body whose joints wander."""
+    generator = np.random.default_rng(seed)
+    body = generator.normal(0, 0.3, (22, 3)) + generator.normal(0, 0.03, (frames, 22, 3)).cumsum(0)
+    body[:, list(FACING)] += [(-0.9, 1, 0), (0.9, 1, 0), (-0.9, 2, 0), (0.9, 2, 0)]
+    return torch.from_numpy(body)
+
+
+def moved(joints: torch.Tensor, yaw: float, shift: tuple[float, float]) -> torch.Tensor:
+    turn = torch.from_numpy(Rotation.from_euler("y", yaw).as_matrix())
+    return joints @ turn.T + torch.tensor([shift[0], 0.0, shift[1]])
+
+
+def training(motions: list[torch.Tensor], features: torch.Tensor | None = None) -> TrainingMotions:
+    lengths = torch.tensor([len(motion) for motion in motions])
+    return TrainingMotions(torch.cat([poses(motion, FACING) for motion in motions]), lengths, features, FACING)
+
+
+def test_poses_face_forward_on_the_spot():
+    motion = walk(0, 12)
+    still = poses(motion, FACING)
+    torch.testing.assert_close(poses(moved(motion, 1.3, (2.0, -5.0)), FACING), still)
+    local = still.unflatten(1, (22, 3))
+    assert local[:, 0, [0, 2]].abs().max() == 0
+    torch.testing.assert_close(local[:, 0, 1], motion[:, 0, 1])
+    torch.testing.assert_close(
+        local.square().sum((1, 2)), (motion - motion[:, :1] * torch.tensor([1.0, 0, 1])).square().sum((1, 2))
+    )
+    right_hip, left_hip, right_shoulder, left_shoulder = FACING
+    across = local[:, left_hip] - local[:, right_hip] + local[:, left_shoulder] - local[:, right_shoulder]
+    assert across[:, 0].min() > 0
+    torch.testing.assert_close(across[:, 2], torch.zeros(12, dtype=torch.float64), atol=1e-12, rtol=0)
+
+
+def test_windows_of_training_motions_have_distance_zero():
+    motions = [walk(seed, frames) for seed, frames in enumerate((30, 50, 41))]
+    features = torch.randn(3, 5, generator=torch.Generator().manual_seed(0))
+    copies = [moved(motions[1][7:43], 0.8, (3, 4)), motions[2], motions[0][:24]]
+    found = training(motions, features).nearest(copies, features[[1, 2, 0]])
+    torch.testing.assert_close(found, torch.zeros(3, 2).to(found), atol=1e-9, rtol=0)
+
+
+def test_nearest_is_that_of_all_windows():
+    motions = [walk(seed, frames) for seed, frames in enumerate((30, 50, 20))]
+    # A window across the end of a motion is none; the third motion is too short for the second query.
+    across = torch.cat([motions[0][-12:], motions[1][:13]])
+    queries = [walk(9, 20), walk(8, 28), across]
+    found = training(motions).nearest(queries, None)
+    assert found.shape == (3, 1)
+    for query, distance in zip(queries, found[:, 0], strict=True):
+        compared = poses(query, FACING)[::STEP].numpy()
+        windows = [
+            poses(motion, FACING)[first : first + len(query) : STEP].numpy()
+            for motion in motions
+            for first in range(len(motion) - len(query) + 1)
+        ]
+        best = min(np.sqrt(((compared - window) ** 2).reshape(-1, 3).sum(1).mean()) for window in windows)
+        assert distance.item() == pytest.approx(best, rel=1e-9)
+        assert best > 0.05
+
+
+def test_copies_are_counted():
+    metric = NearestTraining()
+    real = torch.linspace(0.1, 0.2, 100, dtype=torch.float64)[:, None]
+    nearest = torch.cat([torch.zeros(40, 1, dtype=torch.float64), torch.full((60, 1), 0.3, dtype=torch.float64)])
+    metric.update(torch.arange(100), nearest, real)
+    assert metric.compute() == {"joints": pytest.approx(0.3), "features": None, "copies": 0.4}
+    itself = NearestTraining()
+    itself.update(torch.arange(100), real.expand(-1, 2), real.expand(-1, 2))
+    values = itself.compute()
+    assert values["copies"] == 0.01
+    assert values["features"] == pytest.approx(0.15)
+    assert NearestTraining().compute() == {"joints": None, "features": None, "copies": None}
+
+
+def raised(side: str, turn: float) -> np.ndarray:
+    """Returns a body that raises a hand, turns by `turn` degrees to the left and walks to its left if turn > 0."""
+    body = np.zeros((40, 22, 3))
+    for joint, name in enumerate(SMPL22.joints):
+        body[:, joint, 0] = 0.2 if "left" in name else -0.2 if "right" in name else 0
+        body[:, joint, 1] = 1.4 if "shoulder" in name else 0.9
+    body[10:20, SMPL22.joints.index(f"{side}_wrist"), 1] = 1.8
+    angles = np.linspace(0, turn, 40)
+    rotated = np.stack([Rotation.from_euler("y", a, degrees=True).apply(f) for a, f in zip(angles, body, strict=True)])
+    rotated[..., 0] += np.sign(turn) * np.linspace(0, 0.5, 40)[:, None]
+    return rotated
+
+
+def test_sides_are_read_from_the_motion():
+    left, right = raised("left", 60), raised("right", -60)
+    for content in ("wave-left-hand", "wave-right-hand", "walk-turn-left", "walk-left"):
+        assert read_side(left, content, 20) == "left"
+        assert read_side(right, content, 20) == "right"
+    metric = SideAccuracy(fps=20)
+    joints = torch.from_numpy(np.stack([left, left, right, right]))
+    wanted = [
+        ("bye", "left"),
+        ("walk-turn-right", "right"),
+        ("raise-up-right-hand", "right"),
+        ("wave-both-hands", "both"),
+    ]
+    metric.update(joints, torch.ones(4, 40, dtype=torch.bool), wanted)
+    assert metric.compute() == {"hand": 1.0, "path": 0.0, "all": pytest.approx(2 / 3)}
+    metric.reset()
+    metric.update(joints[:1], torch.ones(1, 40, dtype=torch.bool), [("walk", "")])
+    assert metric.compute() == {"hand": None, "path": None, "all": None}

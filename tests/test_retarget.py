@@ -1,7 +1,10 @@
 """Motions on the skeletons of other programs."""
 
 import json
+import os
 import struct
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -50,7 +53,7 @@ def read_glb(path: Path) -> tuple[dict[str, Any], list[np.ndarray]]:
 def glb_worlds(path: Path) -> tuple[dict[str, Any], list[np.ndarray], np.ndarray]:
     """The document and arrays of a .glb file, and the matrices (F, N, 4, 4) of its nodes in the frames."""
     document, arrays = read_glb(path)
-    animation = document["animations"][-1]
+    animation = document["animations"][0]
     frames = max(len(arrays[sampler["input"]]) for sampler in animation["samplers"])
     nodes = document["nodes"]
     parts = {
@@ -501,3 +504,49 @@ def test_the_npz_has_the_keys_of_smplx_files(kick: Motion, tmp_path: Path):
         assert file["mocap_frame_rate"].item() == 20.0
         assert file["betas"].shape == (16,)
         assert str(file["gender"]) == "neutral"
+
+
+# In Blender -----------------------------------------------------------------------------------------------------------
+
+BLENDER = os.environ.get("FLAME_MDM_BLENDER", sys.executable)
+"""A Python that has the package bpy."""
+
+
+@pytest.mark.tools
+@pytest.mark.parametrize("ending", [".glb", ".bvh"])
+@pytest.mark.parametrize("name", [None, "mixamo", "unreal", "lafan1", "soma", "geno", "hero"])
+def test_blender_shows_the_pose(name: str | None, ending: str, kick: Motion, tmp_path: Path):
+    if subprocess.run([BLENDER, "-c", "import bpy"], capture_output=True).returncode:
+        pytest.skip("no package bpy: set FLAME_MDM_BLENDER to a Python that has it")
+    path = tmp_path / f"a{ending}"
+    if name == "hero":
+        if ending == ".glb":
+            odd_glb(tmp_path / "hero.glb", kick)
+            write_names(tmp_path / "hero.yaml")
+        else:
+            kick.save(tmp_path / "hero.bvh", rig="unreal", rest_pose=True)
+        character = characters.read(tmp_path / f"hero{ending}")
+        kick.save(path, character=character)
+        names = [character.rig.joints[number] for number in character.map.values()]
+        _, places, _ = characters.moved(character, kick)
+        expected = places[:, list(character.map.values())] * (1 if ending == ".glb" else 0.01)
+    else:
+        kick.save(path, rig=name)
+        rig = preset(name, kick.posed()) if name else None
+        names = rig.joints if rig else SMPL22.joints
+        expected = np.full((len(kick.joints), len(names), 3), np.nan)
+        for joint, source in enumerate(rig.sources if rig else range(len(names))):
+            expected[:, joint] = kick.joints[:, source] if source >= 0 else np.nan
+        lift = [node["translation"] for node in read_glb(path)[0]["nodes"][-1:]] if ending == ".glb" else [[0, 0, 0]]
+        expected += np.array(lift[0])
+    script = Path(__file__).with_name("blender.py")
+    done = subprocess.run([BLENDER, script, path, "20"], capture_output=True, text=True, check=True)
+    found = json.loads(next(line for line in done.stdout.splitlines() if line.startswith("FOUND"))[5:])
+    assert [frame for frame, _ in found] == [0, (len(kick.joints) - 1) // 2, len(kick.joints) - 1]
+    compared = 0
+    for frame, places in found:
+        for joint, place in zip(names, expected[frame], strict=True):
+            if joint in places and np.isfinite(place).all():
+                np.testing.assert_allclose(places[joint], place, atol=1e-4, err_msg=f"{joint}, frame {frame}")
+                compared += 1
+    assert compared >= 3 * len(SMPL22)

@@ -40,6 +40,9 @@ SNAP = 8
 """Degrees from an axis within which a character is taken to face along it."""
 BEND = 0.15
 """Sine of the bend of an elbow or knee in the rest pose above which it tells how the limb is twisted."""
+GROUND = 0.1
+"""Height in meters up to which the lowest joint of a clip is taken to be on the floor: recordings have it a little
+above."""
 STRAIGHT = 0.05
 """Distance of the knee from the line of a leg, in thighs, at which the bend tells as much as the thigh's front side."""
 REACH = 0.999
@@ -332,6 +335,8 @@ def moved(character: Character, motion: Shown) -> tuple[np.ndarray, np.ndarray, 
     neutral[JOINT["neck"]] = neutral[JOINT["head"]]
     turned = world_rotations(body.local()) @ neutral
     joints = motion.joints[:, : len(SMPL22)].astype(float)
+    lowest = joints[..., 1].min()
+    joints[..., 1] -= lowest if abs(lowest) <= GROUND else 0
     size = _leg([offsets[JOINT[f"{s}_{name}"]] for s in SIDES for name in ("knee", "ankle")])
     own = [character.place(f"{s}_{b}") - character.place(f"{s}_{a}") for s in SIDES for a, b in LEGS]
     scale = _leg(own) / size
@@ -407,7 +412,7 @@ def _turns(start: np.ndarray, end: np.ndarray) -> np.ndarray:
 def write(path: Path, character: Character, motion: Shown, name: str) -> str:
     """Writes the character's file with a motion, and returns a line that describes it.
 
-    A .glb file keeps its content and gets a further animation; a .bvh file gets other frames.
+    A .glb file keeps its content and gets a further animation, the first one; a .bvh file gets other frames.
 
     Raises:
         UserError: the file cannot be written, or a joint of a .bvh file cannot turn.
@@ -467,7 +472,8 @@ def _write_glb(
         if source >= 0:
             curves.append(("rotation", file.nodes[joint], turns[1:, joint]))
     curves.append(("translation", file.nodes[rig.hips], rig.within(places[:, rig.hips], rig.hips).astype("f4")))
-    document.setdefault("animations", []).append(glb.animation(binary, name, fps, curves))
+    # programs show the first animation
+    document["animations"] = [glb.animation(binary, name, fps, curves), *document.get("animations", [])]
     document |= {"accessors": binary.accessors, "bufferViews": binary.views}
     document["buffers"][0]["byteLength"] = len(binary.data)
     glb.save(path, document, binary.data)

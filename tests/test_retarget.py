@@ -340,6 +340,7 @@ def test_a_template_of_names_is_printed(kick: Motion, tmp_path: Path, capsys: py
     hero, out = tmp_path / "hero.glb", str(tmp_path / "out.glb")
     odd_glb(hero, kick)
     kick.save(tmp_path / "a.npz")
+    (tmp_path / "hero.yaml").touch()  # as a shell does that redirects the output
     assert main(["convert", str(tmp_path / "a.npz"), out, f"character={hero}"]) == 1
     printed = capsys.readouterr()
     assert printed.out.startswith("# Joints of hero.glb: ")

@@ -189,8 +189,8 @@ def _names(path: Path, names: Mapping[int, str]) -> dict[str, int]:
         UnknownJoints: needed joints are missing.
     """
     listed = path.with_suffix(".yaml")
-    if listed.exists():
-        chosen = read_yaml(listed)
+    chosen = read_yaml(listed) if listed.exists() else None
+    if chosen:
         if not isinstance(chosen, dict) or not all(isinstance(name, str | None) for name in chosen.values()):
             raise UserError(f"{listed}: not a list of names, each on a line such as `left_knee: Calf L`")
         if unknown := next((joint for joint in chosen if joint not in JOINT), None):

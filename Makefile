@@ -30,7 +30,7 @@ setup: $(READY) ## install into .venv
 
 $(READY): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
-	$(VENV)/bin/python -m pip install -q -c constraints.txt -e '.[dev,offline,video,demo]'
+	$(VENV)/bin/python -m pip install -q -c constraints.txt -e '.[dev,offline,video,demo,docs]'
 	@touch $@
 
 test: $(READY) ## run all tests, except those that need outside tools
@@ -50,5 +50,6 @@ lint: $(READY) ## check style and types
 bench: $(READY) ## measure speed, write docs/benchmarks/speed.md; ONLY=host,steps repeats some, DEVICE=cuda adds a GPU
 	@$(VENV)/bin/python benchmarks/run.py "only=$(ONLY)" "device=$(DEVICE)" "runs=$(RUNS)"
 
-docs: $(READY) ## regenerate docs/recipes.md and docs/hyperparameters.md from the recipes
+docs: $(READY) ## write the pages that are generated from the code, and build the site in build/docs
 	@$(VENV)/bin/python docs/generate.py
+	@$(VENV)/bin/python -m sphinx -W --keep-going -q docs build/docs

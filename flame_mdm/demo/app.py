@@ -22,10 +22,6 @@ from fastapi.responses import PlainTextResponse, Response
 from starlette.requests import Request as WebRequest
 
 from flame_mdm.demo.request import (
-    MAX_SAMPLES,
-    MAX_SECONDS,
-    MAX_SEED,
-    MAX_STEPS,
     MAX_TEXT,
     Request,
     parse_query,
@@ -33,6 +29,7 @@ from flame_mdm.demo.request import (
 from flame_mdm.demo.studio import FORMATS, Studio
 from flame_mdm.errors import UserError, first_line, markdown_text
 from flame_mdm.formats.motion import Motion
+from flame_mdm.formats.retarget import presets
 from flame_mdm.visualize import player_page
 
 QUEUE = 64
@@ -46,6 +43,7 @@ POLICY = (
 """Nothing is loaded from other servers, so the page works, and stays private, without the internet."""
 FONTS = {"font": ["system-ui", "sans-serif"], "font_mono": ["ui-monospace", "monospace"]}
 PARTS = ("left_arm", "right_arm", "left_leg", "right_leg", "upper_body", "lower_body")
+RIGGED = (".bvh", ".glb")
 VARIED = 0.5
 """Strength of the variations of a motion."""
 EMPTY = '<div class="empty">Describe a motion, then press Generate</div>'
@@ -87,6 +85,7 @@ def serve(sources: Sequence[str], host: str = "127.0.0.1", port: int = 7860, dev
         listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             listening.bind((host, port))
+            listening.listen()
         except (OSError, OverflowError) as error:
             raise UserError(f"host={host} port={port}: {first_line(error)}. Choose another port") from error
         studio = Studio(sources, device or ("cuda" if torch.cuda.is_available() else "cpu"))
@@ -118,12 +117,13 @@ def web_app(studio: Studio, device: str | None = None) -> FastAPI:
     @app.get("/motion{extension}")
     def motion_file(extension: str, web: WebRequest) -> Response:
         pairs = web.query_params.multi_items()
+        chosen = {key: value for key, value in pairs if key in ("motion", "rig")}
+        number = chosen.get("motion", "0")
         try:
-            number = next((value for key, value in pairs if key == "motion"), "0")
             if not number.isdecimal() or len(number) > 3:
                 raise UserError(f"motion={number[:20]}: not a number of a motion")
-            request = parse_query([pair for pair in pairs if pair[0] != "motion"])
-            content = studio.file(request, int(number), extension)
+            request = parse_query([pair for pair in pairs if pair[0] not in chosen])
+            content = studio.file(request, int(number), extension, chosen.get("rig"))
         except (UserError, ValueError) as error:
             return PlainTextResponse(first_line(error), 400)
         name = f"{'-'.join(request.text.lower().split())[:60] or 'motion'}-{number}{extension}"
@@ -153,7 +153,7 @@ def page(studio: Studio, device: str | None) -> gr.Blocks:
     def show(query: str, web: gr.Request, progress: gr.Progress = gr.Progress()) -> Shown:  # noqa: B008
         stop = stops[str(web.session_hash)] = Event()
         try:
-            request = parse_query(parse_qsl(query, max_num_fields=50))
+            request = _read(query)
             model = studio.model(request.model)
             steps = (request.num_inference_steps or model.num_inference_steps) * (1 + len(request.edits))
             motions = studio.motions(
@@ -177,8 +177,8 @@ def page(studio: Studio, device: str | None) -> gr.Blocks:
     def fill(query: str) -> list[Any]:
         query = query or Request(model=names[0], text=_examples(studio, names[0])[0]).query()
         try:
-            values = parse_query(parse_qsl(query, max_num_fields=50)).model_dump()
-        except UserError:  # `show` says why
+            values = _read(query).model_dump()
+        except (UserError, ValueError):  # `show` says why
             return [query, *[gr.skip()] * len(FORM)]
         return [query, *(values[key] for key in FORM)]
 
@@ -186,22 +186,20 @@ def page(studio: Studio, device: str | None) -> gr.Blocks:
         given = dict(zip(FORM, values, strict=True))
         return urlencode({key: value for key, value in given.items() if value is not None})
 
-    def change(query: str, motion: int, text: str, begin: Any, end: Any, parts: list[str], seed: Any) -> str:
-        whole = begin is None and end is None
-        seconds = dict(parse_qsl(query)).get("seconds", "3")
-        region = None if whole else [begin or 0, float(seconds) if end is None else end]
+    def change(query: str, motion: int, text: str, begin: str, end: str, parts: list[str], seed: Any) -> str:
+        region = [begin or 0, end or _read(query).seconds] if begin or end else None
         edit = {"motion": motion, "text": text, "region_seconds": region, "joints": parts, "seed": seed}
         return _with_edit(query, edit)
 
     def vary(query: str, motion: int, seed: Any) -> str:
-        text = dict(parse_qsl(query)).get("text", "")
+        text = _text(_read(query))
         return _with_edit(query, {"motion": motion, "text": text, "strength": VARIED, "samples": 3, "seed": seed})
 
     with gr.Blocks(title="flame_mdm", analytics_enabled=False) as blocks:
         gr.Markdown("# Ask for a motion", elem_id="title")
         with gr.Row(elem_id="stage"):
             with gr.Column(elem_id="ask"):
-                text = gr.Textbox(label="What the person does", max_length=MAX_TEXT, lines=2, autofocus=True)
+                text = gr.Textbox(label="What the person does; several actions: walks @2 | waves @3", max_length=MAX_TEXT, lines=2, autofocus=True)
                 with gr.Row():
                     go = gr.Button("Generate", variant="primary")
                     cancel = gr.Button("Cancel")
@@ -214,44 +212,34 @@ def page(studio: Studio, device: str | None) -> gr.Blocks:
                     components=[text], samples=[[text] for text in _examples(studio, names[0])], label="Examples"
                 )
                 with gr.Row():
-                    seconds = gr.Number(3, label="Seconds", minimum=0.1, maximum=MAX_SECONDS, step=0.5, min_width=90)
-                    seed = gr.Number(0, label="Seed", minimum=0, maximum=MAX_SEED, precision=0, min_width=90)
-                    samples = gr.Number(
-                        1, label="Samples", minimum=1, maximum=MAX_SAMPLES, step=1, precision=0, min_width=90
-                    )
+                    seconds = gr.Number(3, label="Seconds", step=0.5, min_width=90)
+                    seed = gr.Number(0, label="Seed", precision=0, min_width=90)
+                    samples = gr.Number(1, label="Samples", precision=0, min_width=90)
                 with gr.Accordion("Model and sampling", open=len(names) > 1):
                     model = gr.Dropdown(names, value=names[0], label="Model")
                     with gr.Row():
-                        guidance = gr.Number(
-                            None, placeholder="model's", label="Guidance", minimum=-100, maximum=100, min_width=90
-                        )
-                        steps = gr.Number(
-                            None,
-                            placeholder="model's",
-                            label="Steps",
-                            minimum=1,
-                            maximum=MAX_STEPS,
-                            step=1,
-                            precision=0,
-                            min_width=90,
-                        )
+                        guidance = gr.Textbox(label="Guidance", placeholder="model's", max_length=9, min_width=90)
+                        steps = gr.Textbox(label="Steps", placeholder="model's", max_length=9, min_width=90)
                         sampler = gr.Dropdown(_samplers(studio, names[0]), value=None, label="Sampler", min_width=120)
-                    gr.Markdown("Empty: the value of the model.")
                     cleanup = gr.Checkbox(True, label="Clean up: smooth motion, feet that do not slide")
                 with gr.Accordion("Words the model knows", open=False):
                     words = gr.Markdown(_vocabulary(studio, names[0]))
         chosen = gr.Radio([("1", 0)], value=0, label="Motion to edit", visible=False)
-        with gr.Accordion("Keep a part of this motion, change the rest"):
+        with gr.Accordion("Keep a part of this motion, change the rest", elem_id="edit"):
             gr.Markdown("Choose a time, body parts, or both. They change; everything else is kept.")
             with gr.Row():
-                begin = gr.Number(
-                    None, placeholder="start", label="Change from second", minimum=0, step=0.25, min_width=120
-                )
-                end = gr.Number(None, placeholder="end", label="to second", minimum=0, step=0.25, min_width=120)
+                begin = gr.Textbox(label="Change from second", placeholder="start", max_length=9, min_width=120)
+                end = gr.Textbox(label="to second", placeholder="end", max_length=9, min_width=120)
                 parts = gr.Dropdown(PARTS, multiselect=True, label="Body parts that change", min_width=220)
             with gr.Row():
-                new = gr.Textbox(label="What the person does there", max_length=MAX_TEXT, scale=3, min_width=220)
-                again = gr.Number(0, label="Seed", minimum=0, maximum=MAX_SEED, precision=0, min_width=90)
+                new = gr.Textbox(
+                    label="What the person does there",
+                    placeholder="empty: anything that fits",
+                    max_length=MAX_TEXT,
+                    scale=3,
+                    min_width=220,
+                )
+                again = gr.Number(0, label="Seed", precision=0, min_width=90)
             with gr.Row():
                 apply = gr.Button("Change")
                 variations = gr.Button("Three variations of the whole motion")
@@ -310,32 +298,37 @@ FORM = ("model", "text", "seconds", "seed", "samples", "guidance_scale", "num_in
 """Keys of `Request`, in the order of the fields of the form."""
 
 
+def _read(query: str) -> Request:
+    return parse_query(parse_qsl(query, max_num_fields=50))
+
+
+def _text(request: Request) -> str:
+    """Returns the text that the shown motions follow."""
+    return request.edits[-1].text if request.edits else request.text
+
+
 def _with_edit(query: str, edit: dict[str, Any]) -> str:
     return f"{query}&{urlencode({'edit': json.dumps({key: value for key, value in edit.items() if value})})}"
 
 
 def _shown(studio: Studio, device: str | None, request: Request, motions: Sequence[Motion]) -> Shown:
     kind = studio.model(request.model).conditioned_on
-    scene, text = list(motions), request.text
+    scene = list(motions)
     if request.edits:  # next to the motion before the last edit
         *before, last = request.edits
         original = studio.motions(request.model_copy(update={"edits": tuple(before)}))[last.motion]
-        scene, text = [replace(original, text=f"before: {original.text}"), *motions], last.text
-    title = text or "Motion"
-    links = "".join(
-        f"<div>{f'Motion {number + 1}' * (len(motions) > 1)}"
-        + "".join(
-            f'<a href="motion{extension}?{escape(request.query())}&amp;motion={number}" download>{name}</a>'
-            for extension, name in FORMATS.items()
-        )
-        + "</div>"
-        for number in range(len(motions))
-    )
-    frame = (
-        f'<iframe title="Player" sandbox="allow-scripts allow-downloads" srcdoc="{escape(player_page(scene, title))}">'
-    )
+        scene.insert(0, replace(original, text=f"before: {original.text}"))
+    query = escape(request.query())
+    links = ""
+    for number in range(len(motions)):
+        address = f"?{query}&amp;motion={number}"
+        files = [(f"motion{extension}{address}", name) for extension, name in FORMATS.items()]
+        rigs = [(f"motion{end}{address}&amp;rig={rig}", f"{rig} {end[1:]}") for rig in presets() for end in RIGGED]
+        links += f"<div>{f'Motion {number + 1}' * (len(motions) > 1)}{_links(files)}</div>"
+        links += f"<details><summary>for other skeletons</summary><div>{_links(rigs)}</div></details>"
+    player = escape(player_page(scene, _text(request) or "Motion"))
     return Shown(
-        player=f"{frame}</iframe>",
+        player=f'<iframe title="Player" sandbox="allow-scripts allow-downloads" srcdoc="{player}"></iframe>',
         notes="".join(f'<p class="warning">{escape(line)}</p>' for line in studio.advice(request)),
         query=request.query(),
         files=links,
@@ -343,6 +336,10 @@ def _shown(studio: Studio, device: str | None, request: Request, motions: Sequen
         python=request.python(kind, studio.device),
         chosen=gr.Radio([(str(k + 1), k) for k in range(len(motions))], value=0, visible=len(motions) > 1),
     )
+
+
+def _links(files: Sequence[tuple[str, str]]) -> str:
+    return "".join(f'<a href="{address}" download>{name}</a>' for address, name in files)
 
 
 def _examples(studio: Studio, name: str) -> list[str]:

@@ -12,12 +12,13 @@ from typing import Any
 
 from flame_mdm.checkpoints.loading import find, load
 from flame_mdm.conditions.vocabulary import advice
-from flame_mdm.demo.request import Request
+from flame_mdm.demo.request import MAX_SECONDS, Request
 from flame_mdm.editing import edit
 from flame_mdm.errors import UserError, did_you_mean
 from flame_mdm.formats.cleanup import cleaned
 from flame_mdm.formats.motion import Motion
 from flame_mdm.generation import generate
+from flame_mdm.sequences import read_parts
 from flame_mdm.task import MotionGeneration
 
 KEPT = 64
@@ -77,7 +78,10 @@ class Studio:
             model = self.model(request.model)
             if model.conditioned_on != "none" and not request.text:
                 raise UserError("the text is empty. Describe what the person does")
-            steps = [(source, dict(given)) for source, given in request.steps(model.conditioned_on)]
+            parts = read_parts(request.text) if request.text else []
+            if sum(seconds or request.seconds for _, seconds in parts) > MAX_SECONDS:
+                raise UserError(f"the parts are too long: give at most {MAX_SECONDS} seconds in total")
+            steps = request.steps(model.conditioned_on)
             cleanup = bool(steps[-1][1].pop("cleanup", False))
             calls, deadline = 0, time.monotonic() + TIME_LIMIT
 
@@ -118,11 +122,11 @@ class Studio:
             return []
         return [line for text in texts for line in advice(text, model.facts, model.condition.max_words)]
 
-    def file(self, request: Request, number: int, extension: str) -> bytes:
+    def file(self, request: Request, number: int, extension: str, rig: str | None = None) -> bytes:
         """Returns the bytes of a motion file; `number` counts the motions of the request from 0.
 
         Raises:
-            UserError: there is no such motion or format, or as in `motions`.
+            UserError, ValueError: there is no such motion, format or rig, or as in `motions`.
         """
         if extension not in FORMATS:
             raise UserError(f"{extension[:20]}: not a format of this page. Use {', '.join(FORMATS)}")
@@ -131,5 +135,5 @@ class Studio:
             raise UserError(f"motion={number}: there are {len(motions)} motions, numbered from 0")
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder, f"motion{extension}")
-            motions[number].save(path)
+            motions[number].save(path, rig=rig)
             return path.read_bytes()

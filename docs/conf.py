@@ -1,0 +1,43 @@
+"""Settings of the docs site, which `make docs` builds in build/docs.
+
+The pages are plain Markdown, so they read the same on a code host. The start page is the README; the sidebar follows
+docs/index.md.
+"""
+
+import re
+from pathlib import Path
+from typing import Any
+
+DOCS = Path(__file__).parent
+
+project = html_title = "flame_mdm"
+extensions = ["myst_parser"]
+exclude_patterns = ["space"]
+html_theme = "furo"
+html_show_sphinx = False
+myst_heading_anchors = 3
+
+
+def sidebar(index: str) -> str:
+    """Returns the sidebar: the links of docs/index.md by section, then all other pages; each page once."""
+    sections = [(part.splitlines()[0], re.findall(r"\]\(([\w/-]+)\.md[)#]", part)) for part in index.split("\n## ")[1:]]
+    pages = sorted(str(path.relative_to(DOCS).with_suffix("")) for path in DOCS.rglob("*.md"))
+    seen, trees = {"index"}, ""
+    for title, listed in [*sections, ("Results of audits", [page for page in pages if "/audit/" in page])]:
+        new = [page for page in dict.fromkeys(listed) if page not in seen]
+        seen.update(new)
+        trees += f"\n```{{toctree}}\n:hidden:\n:caption: {title}\n\n" + "\n".join(new) + "\n```\n"
+    return trees
+
+
+def start_page(app: Any, name: str, source: list[str]) -> None:
+    """Replaces the list of pages by the README and the sidebar; links to the README lead there."""
+    if name == "index":
+        readme = (DOCS.parent / "README.md").read_text(encoding="utf-8")
+        source[0] = readme.replace("](docs/", "](") + sidebar(source[0])
+    source[0] = re.sub(r"\]\((\.\./)+README\.md", lambda match: f"]({'../' * name.count('/')}index.md", source[0])
+
+
+def setup(app: Any) -> None:
+    """Registers the start page."""
+    app.connect("source-read", start_page)

@@ -14,7 +14,7 @@ project = html_title = "flame_mdm"
 extensions = ["myst_parser"]
 exclude_patterns = ["space"]
 html_theme = "furo"
-html_show_sphinx = False
+html_show_sphinx = html_show_copyright = False
 myst_heading_anchors = 3
 
 

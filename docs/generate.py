@@ -194,16 +194,20 @@ def signature(found: Any, name: str) -> str:
     except ValueError:  # of a typed dictionary
         fields = found.__annotations__.items()
         return f"{name}(*, " + ", ".join(f"{key}: {_type(kind)}" for key, kind in fields) + ")"
-    short = str(given).replace("'", "")
-    short = re.sub(r"<factory>|<object object at \w+>", "...", short)
+    short = _plain(str(given))
     if len(name + short) <= 110:
         return name + short
-    parts = [re.sub(r"<factory>", "...", str(part).replace("'", "")) for part in given.parameters.values()]
+    parts = [_plain(str(part)) for part in given.parameters.values()]
     kinds = [part.kind for part in given.parameters.values()]
     if inspect.Parameter.KEYWORD_ONLY in kinds and inspect.Parameter.VAR_POSITIONAL not in kinds:
         parts.insert(kinds.index(inspect.Parameter.KEYWORD_ONLY), "*")
     end = "" if given.return_annotation is given.empty else f" -> {_type(given.return_annotation)}"
     return f"{name}(\n    " + ",\n    ".join(parts) + f",\n){end}"
+
+
+def _plain(text: str) -> str:
+    """Returns a signature without the quotes of its annotations."""
+    return re.sub(r"(: |-> )'([^']*)'", r"\1\2", text).replace("<factory>", "...")
 
 
 def _type(kind: Any) -> str:

@@ -51,7 +51,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "editing": MODELS | {"generation", "reading"},
     "checkpoints": MODELS | {"runs"},
     "training": ALL - {"training"},
-    "demo": MODELS | {"generation", "editing", "checkpoints"},
+    "demo": MODELS | {"sequences", "generation", "editing", "checkpoints"},
     "__init__": MODELS | {"generation", "editing", "checkpoints"},
     "evaluators": ALL,
     "commands": ALL | {"evaluators", "demo"},

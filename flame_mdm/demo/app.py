@@ -199,7 +199,12 @@ def page(studio: Studio, device: str | None) -> gr.Blocks:
         gr.Markdown("# Ask for a motion", elem_id="title")
         with gr.Row(elem_id="stage"):
             with gr.Column(elem_id="ask"):
-                text = gr.Textbox(label="What the person does; several actions: walks @2 | waves @3", max_length=MAX_TEXT, lines=2, autofocus=True)
+                text = gr.Textbox(
+                    label="What the person does; several actions: walks @2 | waves @3",
+                    max_length=MAX_TEXT,
+                    lines=2,
+                    autofocus=True,
+                )
                 with gr.Row():
                     go = gr.Button("Generate", variant="primary")
                     cancel = gr.Button("Cancel")
@@ -243,10 +248,10 @@ def page(studio: Studio, device: str | None) -> gr.Blocks:
             with gr.Row():
                 apply = gr.Button("Change")
                 variations = gr.Button("Three variations of the whole motion")
-        with gr.Accordion("The same motion by link, command line and Python", open=False):
+        with gr.Accordion("The same motion by link, command line and Python", open=False, elem_id="same"):
             link = gr.Textbox(label="Link", interactive=False, buttons=["copy"], elem_id="link")
-            command = gr.Code(label="Command line", language="shell", interactive=False, wrap_lines=True)
-            python = gr.Code(label="Python", language="python", interactive=False, wrap_lines=True)
+            command = gr.Code(label="Command line", language="shell", lines=2, interactive=False, wrap_lines=True)
+            python = gr.Code(label="Python", language="python", lines=2, interactive=False, wrap_lines=True)
         asked = gr.Textbox(visible="hidden", elem_id="asked")
         query = gr.Textbox(visible="hidden", elem_id="query")
 

@@ -117,10 +117,11 @@ class Studio:
     def advice(self, request: Request) -> list[str]:
         """Returns warnings of words that the model has never seen."""
         model = self.model(request.model)
-        texts = dict.fromkeys(part.text for part in (request, *request.edits) if part.text)
         if model.conditioned_on != "text":
             return []
-        return [line for text in texts for line in advice(text, model.facts, model.condition.max_words)]
+        texts = [part.text for part in (request, *request.edits) if part.text]
+        parts = dict.fromkeys(words for text in texts for words, _ in read_parts(text))
+        return [line for words in parts for line in advice(words, model.facts, model.condition.max_words)]
 
     def file(self, request: Request, number: int, extension: str, rig: str | None = None) -> bytes:
         """Returns the bytes of a motion file; `number` counts the motions of the request from 0.

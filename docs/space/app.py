@@ -1,0 +1,5 @@
+"""A public demo on a Hugging Face Space; README.md says how to create one."""
+
+from flame_mdm.demo.app import serve
+
+serve(["quickstart"], host="0.0.0.0", port=7860)

@@ -1,0 +1,87 @@
+"""The notebook runs, and the docs site is complete: no broken link, every page within three clicks."""
+
+import importlib.util
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from fixtures import ROOT
+
+
+@pytest.mark.slow
+def test_the_notebook_runs(tmp_path):
+    nbclient = pytest.importorskip("nbclient", reason="nbclient is not installed")
+    nbformat = pytest.importorskip("nbformat")
+    notebook = nbformat.read(ROOT / "docs" / "first-steps.ipynb", as_version=4)
+    assert not any(cell.get("outputs") for cell in notebook.cells)
+    nbclient.NotebookClient(notebook, timeout=120, resources={"metadata": {"path": str(tmp_path)}}).execute()
+    outputs = [str(output) for cell in notebook.cells for output in cell.get("outputs", ())]
+    assert "<iframe" in "".join(outputs)
+    assert "60 frames at 20 per second" in "".join(outputs)
+    assert {path.name for path in tmp_path.iterdir()} == {"walk.glb", "walk.bvh", "samples.html"}
+    assert not [output for output in outputs if "stderr" in output]
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory) -> Path:
+    if importlib.util.find_spec("sphinx") is None:
+        pytest.skip("sphinx is not installed")
+    folder = tmp_path_factory.mktemp("site")
+    build(ROOT / "docs", folder)
+    return folder
+
+
+def build(source: Path, folder: Path) -> str:
+    words = [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", str(source), str(folder)]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=250, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stderr
+
+
+def links(page: Path) -> list[str]:
+    """Pages that the body of a page links to, in order."""
+    body = page.read_text().partition('<article role="main"')[2].partition("</article>")[0]
+    found = re.findall(r'href="([^"#:]+\.html)', body)
+    return [str((page.parent / link).resolve()) for link in found]
+
+
+@pytest.mark.slow
+def test_every_page_is_within_three_clicks_of_the_start(site):
+    clicks, new = {str(site / "index.html"): 0}, [str(site / "index.html")]
+    while new:
+        page = new.pop(0)
+        for link in links(Path(page)):
+            assert Path(link).exists(), f"{page}: {link}"
+            if link not in clicks:
+                clicks[link] = clicks[page] + 1
+                new.append(link)
+    pages = {str(site / path.relative_to(ROOT / "docs").with_suffix(".html")) for path in (ROOT / "docs").rglob("*.md")}
+    pages -= {str(site / "space" / "README.html")}
+    assert pages - {page for page, count in clicks.items() if count <= 3} == set()
+    goals = {"sampling": 1, "demo": 1, "own-data": 1, "humanml3d-to-table": 1, "tables": 1, "api": 1, "recipes": 1}
+    assert {goal: clicks[str(site / f"{goal}.html")] for goal in goals} == goals
+    start = (site / "index.html").read_text()
+    assert "flame-mdm sample quickstart" in re.sub("<[^>]+>", "", start)  # a first motion, without any click
+
+
+@pytest.mark.slow
+def test_the_site_is_searchable_and_loads_nothing_from_elsewhere(site):
+    index = (site / "searchindex.js").read_text()
+    assert all(word in index for word in ("guidanc", "retarget", "flame_mdm.load"))
+    for page in (site / "index.html", site / "api.html"):
+        assert (
+            re.findall(r'(?:<script[^>]* src|<link[^>]* rel="stylesheet"[^>]* href)="(?:https?:)?//', page.read_text())
+            == []
+        )
+
+
+@pytest.mark.slow
+def test_a_broken_link_fails_the_build(site, tmp_path):
+    (tmp_path / "conf.py").write_text("extensions = ['myst_parser']\nmyst_heading_anchors = 3\n")
+    (tmp_path / "index.md").write_text("# Title\n\n[there](#title)\n")
+    build(tmp_path, tmp_path / "out")
+    (tmp_path / "index.md").write_text("# Title\n\n[gone](nowhere.md) [gone](#no-heading)\n")
+    with pytest.raises(AssertionError, match=r"nowhere\.md"):
+        build(tmp_path, tmp_path / "out")

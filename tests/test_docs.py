@@ -124,7 +124,7 @@ def test_links_names_paths_and_commands_of_a_page_exist(page, tmp_path, monkeypa
     monkeypatch.chdir(tmp_path)
     for name, content in re.findall(r"^`(\w+\.yaml)`:\n\n```yaml\n(.*?)^```", text, re.DOTALL | re.MULTILINE):
         Path(name).write_text(content)
-    assert wrong_commands(text) == NOT_COMPOSED.get(page.name, [])
+    assert wrong_commands(text) == NOT_COMPOSED.get(str(page.relative_to(ROOT)).removeprefix("docs/"), [])
 
 
 def python_examples(text: str) -> list[tuple[str, str]]:

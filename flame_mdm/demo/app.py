@@ -19,6 +19,7 @@ import gradio as gr
 import uvicorn
 from fastapi import FastAPI
 from fastapi.responses import PlainTextResponse, Response
+from gradio import themes
 from starlette.requests import Request as WebRequest
 
 from flame_mdm.demo.request import (
@@ -41,7 +42,7 @@ POLICY = (
     "img-src 'self' data: blob:; font-src 'self' data:; connect-src 'self'; frame-src 'self'; worker-src 'self' blob:"
 )
 """Nothing is loaded from other servers, so the page works, and stays private, without the internet."""
-FONTS = {"font": ["system-ui", "sans-serif"], "font_mono": ["ui-monospace", "monospace"]}
+FONT, MONO = ("system-ui", "sans-serif"), ("ui-monospace", "monospace")
 PARTS = ("left_arm", "right_arm", "left_leg", "right_leg", "upper_body", "lower_body")
 RIGGED = (".bvh", ".glb")
 VARIED = 0.5
@@ -135,7 +136,7 @@ def web_app(studio: Studio, device: str | None = None) -> FastAPI:
         app,
         page(studio, device),
         path="/",
-        theme=gr.themes.Default(primary_hue="blue", **FONTS),
+        theme=themes.Default(primary_hue="blue", font=FONT, font_mono=MONO),
         css_paths=Path(__file__).with_name("page.css"),
         footer_links=[],
         ssr_mode=False,
@@ -149,16 +150,19 @@ def page(studio: Studio, device: str | None) -> gr.Blocks:
     """Returns the page; arguments as for `web_app`."""
     stops: dict[str, Event] = {}
     names = list(studio.files)
+    samplers = list(studio.model(names[0]).process.sampler_names)
 
     def show(query: str, web: gr.Request, progress: gr.Progress = gr.Progress()) -> Shown:  # noqa: B008
         stop = stops[str(web.session_hash)] = Event()
         try:
             request = _read(query)
             model = studio.model(request.model)
-            steps = (request.num_inference_steps or model.num_inference_steps) * (1 + len(request.edits))
-            motions = studio.motions(
-                request, lambda calls: progress((calls, max(steps, calls + 1)), "Generating", unit="steps"), stop
-            )
+            total = (request.num_inference_steps or model.num_inference_steps) * (1 + len(request.edits))
+
+            def report(calls: int) -> None:
+                progress((calls, max(total, calls + 1)), "Generating", unit="steps")
+
+            motions = studio.motions(request, report, stop)
             return _shown(studio, device, request, motions)
         except (UserError, ValueError) as error:
             note = f'<p class="error" role="alert">{escape(first_line(error))}</p>'
@@ -195,16 +199,17 @@ def page(studio: Studio, device: str | None) -> gr.Blocks:
         text = _text(_read(query))
         return _with_edit(query, {"motion": motion, "text": text, "strength": VARIED, "samples": 3, "seed": seed})
 
+    def switch(name: str) -> list[Any]:
+        samples = [[text] for text in _examples(studio, name)]
+        choices = list(studio.model(name).process.sampler_names)
+        return [gr.Dataset(samples=samples), gr.Dropdown(choices=choices, value=None), _vocabulary(studio, name)]
+
     with gr.Blocks(title="flame_mdm", analytics_enabled=False) as blocks:
         gr.Markdown("# Ask for a motion", elem_id="title")
         with gr.Row(elem_id="stage"):
             with gr.Column(elem_id="ask"):
-                text = gr.Textbox(
-                    label="What the person does; several actions: walks @2 | waves @3",
-                    max_length=MAX_TEXT,
-                    lines=2,
-                    autofocus=True,
-                )
+                gr.Markdown("Several actions: `walks @2 | waves @3`")
+                text = gr.Textbox(label="What the person does", max_length=MAX_TEXT, lines=2, autofocus=True)
                 with gr.Row():
                     go = gr.Button("Generate", variant="primary")
                     cancel = gr.Button("Cancel")
@@ -213,9 +218,8 @@ def page(studio: Studio, device: str | None) -> gr.Blocks:
                 player = gr.HTML(EMPTY, elem_id="player")
                 files = gr.HTML(elem_id="files")
             with gr.Column(elem_id="options"):
-                examples = gr.Dataset(
-                    components=[text], samples=[[text] for text in _examples(studio, names[0])], label="Examples"
-                )
+                known = [[example] for example in _examples(studio, names[0])]
+                examples = gr.Dataset(components=[text], samples=known, label="Examples")
                 with gr.Row():
                     seconds = gr.Number(3, label="Seconds", step=0.5, min_width=90)
                     seed = gr.Number(0, label="Seed", precision=0, min_width=90)
@@ -225,25 +229,19 @@ def page(studio: Studio, device: str | None) -> gr.Blocks:
                     with gr.Row():
                         guidance = gr.Textbox(label="Guidance", placeholder="model's", max_length=9, min_width=90)
                         steps = gr.Textbox(label="Steps", placeholder="model's", max_length=9, min_width=90)
-                        sampler = gr.Dropdown(_samplers(studio, names[0]), value=None, label="Sampler", min_width=120)
+                        sampler = gr.Dropdown(samplers, value=None, label="Sampler", min_width=120)
                     cleanup = gr.Checkbox(True, label="Clean up: smooth motion, feet that do not slide")
                 with gr.Accordion("Words the model knows", open=False):
                     words = gr.Markdown(_vocabulary(studio, names[0]))
-        chosen = gr.Radio([("1", 0)], value=0, label="Motion to edit", visible=False)
         with gr.Accordion("Keep a part of this motion, change the rest", elem_id="edit"):
             gr.Markdown("Choose a time, body parts, or both. They change; everything else is kept.")
+            chosen = gr.Radio([("1", 0)], value=0, label="Motion to edit", visible=False)
             with gr.Row():
                 begin = gr.Textbox(label="Change from second", placeholder="start", max_length=9, min_width=120)
                 end = gr.Textbox(label="to second", placeholder="end", max_length=9, min_width=120)
                 parts = gr.Dropdown(PARTS, multiselect=True, label="Body parts that change", min_width=220)
             with gr.Row():
-                new = gr.Textbox(
-                    label="What the person does there",
-                    placeholder="empty: anything that fits",
-                    max_length=MAX_TEXT,
-                    scale=3,
-                    min_width=220,
-                )
+                new = gr.Textbox(label="What the person does there", max_length=MAX_TEXT, scale=3, min_width=220)
                 again = gr.Number(0, label="Seed", precision=0, min_width=90)
             with gr.Row():
                 apply = gr.Button("Change")
@@ -258,42 +256,22 @@ def page(studio: Studio, device: str | None) -> gr.Blocks:
         form = [model, text, seconds, seed, samples, guidance, steps, sampler, cleanup]
         outputs = list(Shown(player, notes, query, files, command, python, chosen))
         quick: dict[str, Any] = {"queue": False, "show_progress": "hidden", "api_visibility": "private"}
+        edit = [query, chosen, new, begin, end, parts, again]
         first = [
             blocks.load(fill, asked, [asked, *form], js="() => location.search.slice(1)", **quick),
             *(each(compose, form, asked, **quick) for each in (go.click, text.submit)),
-            *(
-                each(change, [query, chosen, new, begin, end, parts, again], asked, **quick)
-                for each in (apply.click, new.submit)
-            ),
+            *(each(change, edit, asked, **quick) for each in (apply.click, new.submit)),
             variations.click(vary, [query, chosen, again], asked, **quick),
+            examples.click(lambda row: row[0], examples, text, **quick).then(compose, form, asked, **quick),
         ]
-        running = [
-            event.then(
-                show,
-                asked,
-                outputs,
-                show_progress_on=player,
-                concurrency_limit=1,
-                concurrency_id="model",
-                api_name="generate",
-                api_visibility="public" if event is first[0] else "private",
-            )
-            for event in first
-        ]
+        run: dict[str, Any] = {"show_progress_on": player, "concurrency_limit": 1, "concurrency_id": "model"}
+        hidden: dict[str, Any] = {"api_visibility": "private"}
+        running: list[Any] = [first[0].then(show, asked, outputs, api_name="generate", **run)]
+        running += [event.then(show, asked, outputs, **run, **hidden) for event in first[1:]]
         for event in running:
             event.then(None, query, link, js=SHOW_LINK, **quick)
         cancel.click(halt, None, notes, cancels=running, **quick)
-        examples.click(lambda row: row[0], examples, text, **quick).then(compose, form, asked, **quick)
-        model.change(
-            lambda name: [
-                gr.Dataset(samples=[[text] for text in _examples(studio, name)]),
-                gr.Dropdown(choices=_samplers(studio, name), value=None),
-                _vocabulary(studio, name),
-            ],
-            model,
-            [examples, sampler, words],
-            **quick,
-        )
+        model.change(switch, model, [examples, sampler, words], **quick)
         blocks.unload(leave)
     blocks.queue(max_size=QUEUE, default_concurrency_limit=1)
     return blocks
@@ -352,10 +330,6 @@ def _examples(studio: Studio, name: str) -> list[str]:
     model = studio.model(name)
     known = list(model.facts["actions"] if model.conditioned_on == "action" else model.facts.get("captions", ()))
     return known[:: max(1, len(known) // 6)][:6] or ["a person walks"]
-
-
-def _samplers(studio: Studio, name: str) -> list[str]:
-    return list(studio.model(name).process.sampler_names)
 
 
 def _vocabulary(studio: Studio, name: str) -> str:

@@ -44,9 +44,8 @@ def build(source: Path, folder: Path) -> str:
 
 
 def links(page: Path) -> list[str]:
-    """Pages that the body of a page links to, in order."""
-    body = page.read_text().partition('<article role="main"')[2].partition("</article>")[0]
-    found = re.findall(r'href="([^"#:]+\.html)', body)
+    """Pages that a page and its sidebar link to."""
+    found = re.findall(r'href="([^"#:]+\.html)', page.read_text())
     return [str((page.parent / link).resolve()) for link in found]
 
 

@@ -72,7 +72,8 @@ class Bench:
             "jitter, m/s³": jitter.compute() or 0.0,
             "with faults": float(np.mean([bool(find_faults(motion)) for motion in motions])),
         }
-        if len(motions) == len(self.wanted) and all("action" in each for each in self.wanted):
+        single = all(len(motion.parts) < 2 for motion in motions) and len(motions) == len(self.wanted)
+        if single and all("action" in each for each in self.wanted):
             pairs = zip(motions, self.wanted, strict=True)
             right = [right_attributes(read_attributes(m.joints, fps), each)["all"] for m, each in pairs]
             found = {"attributes right": float(np.mean(right))} | found

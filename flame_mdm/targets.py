@@ -155,7 +155,7 @@ def _numbers(entry: Mapping[str, Any], key: str, where: str, count: int = 1) -> 
     """Returns the numbers of an entry; NaN for null."""
     listed = entry[key] if isinstance(entry[key], list | tuple) else [entry[key]]
     values = [math.nan if value is None else value for value in listed]
-    if len(values) != count or not all(type(v) in (int, float) and not abs(v) > 1e4 for v in values):
+    if len(values) != count or not all(isinstance(v, int | float) and not abs(v) > 1e4 for v in values):
         numbers = f"{count} numbers in meters, null = free" if count > 1 else "a number"
         raise UserError(f"{where}.{key}={entry[key]}: give {numbers}")
     return values

@@ -166,7 +166,7 @@ def reaching(bench: Bench) -> Rows:
     return rows | {"real motion": {"error, cm": 0.0} | bench.values(bench.real)}
 
 
-def candidates(bench: Bench, judge: str, count: int = 8) -> Rows:
+def candidates(bench: Bench, judge: str, count: int = 5) -> Rows:
     """Compares the best of N motions of 10 steps with one motion of 10 N steps."""
     texts = [motion.text for motion in bench.real]
     select, bench.fit = bench.fit, text_fit(judge, bench.model)

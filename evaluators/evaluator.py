@@ -148,7 +148,7 @@ class Evaluator:
             rows["sides"] = [(each["content"], each.get("side", "")) for each in motions.requested]
         if motions.references is not None:
             rows["references"] = [torch.from_numpy(joints) for joints in motions.references]
-        contacts = getattr(self.representation, "slices", {}).get("contacts")
+        contacts = self.representation.slices.get("contacts")
         if contacts is not None:
             rows["contacts"] = [torch.from_numpy(x[:, contacts] > 0.5) for x in motions.features]
         kept = None

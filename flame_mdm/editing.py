@@ -147,7 +147,7 @@ def edit(
     edits = []
     for result in generated:
         error = float((np.abs(result.features - exact) / std)[keep.numpy()].max(initial=0))
-        result = cleaned(result) if cleanup else result
+        result = cleaned(result, representation.contacts(result.features)) if cleanup else result
         moved = np.linalg.norm(result.joints - original.joints, axis=-1)[still.numpy()].max(initial=0)
         facts = {"original": original, "keep": keep.numpy(), "feature_error": error, "joint_error": float(moved)}
         edits.append(Edited(**vars(result), **facts))

@@ -192,7 +192,8 @@ def generate(
             stages += _stages(model, trajectory, results[0])
     groups = [results[begin : begin + candidates] for begin in range(0, len(results), candidates)]
     results = results if candidates == 1 else [best(group, score) for group in groups]
-    return [cleaned(motion) for motion in results] if cleanup else results
+    contacts = model.representation.contacts
+    return [cleaned(motion, contacts(motion.features)) for motion in results] if cleanup else results
 
 
 def best(candidates: Sequence[Motion], score: Callable[[Sequence[Motion]], Sequence[float]] | None = None) -> Motion:

@@ -13,7 +13,7 @@ from scipy.ndimage import gaussian_filter1d
 from flame_mdm.formats.motion import Motion
 from flame_mdm.representations.skeleton import Skeleton
 
-SMOOTHNESS = 0.03
+SMOOTHNESS = 0.034
 """Weight of the squared third differences of a joint's path, relative to its squared change."""
 OUTLIER = 0.03
 """Distance in meters from the smooth path at which a position has half its weight."""
@@ -31,27 +31,30 @@ REACH = 0.999
 """Maximum distance from hip to ankle relative to the length of the straight leg, unless it was longer before."""
 
 
-def cleaned(motion: Motion) -> Motion:
+def cleaned(motion: Motion, contacts: np.ndarray | None = None) -> Motion:
     """Returns the motion with joints from `cleanup`.
 
     Features, rotations and contacts no longer fit and are dropped; exports compute rotations from the new joints.
     """
-    joints = cleanup(motion.joints, motion.fps, motion.skeleton)
+    joints = cleanup(motion.joints, motion.fps, motion.skeleton, contacts)
     none = np.zeros((0, 0), np.float32)
     return replace(motion, joints=joints, features=none, representation="", poses=None, contacts=None, cleanup=True)
 
 
-def cleanup(joints: np.ndarray, fps: float, skeleton: Skeleton) -> np.ndarray:
+def cleanup(joints: np.ndarray, fps: float, skeleton: Skeleton, contacts: np.ndarray | None = None) -> np.ndarray:
     """Removes pops, changes of bone lengths and sliding feet from a motion.
 
     In this order: paths of the joints are smoothed, bones get their median lengths, the body moves over the ground so
     that its feet in contact stand still on average, and two-bone inverse kinematics keeps each toe in place during its
-    contacts. Contacts are read from height and speed of the toes.
+    contacts.
 
     Args:
         joints: (F, J, 3) in meters, y up.
         fps: frames per second.
         skeleton: of the J joints; its first two chains are the legs.
+        contacts: (F, N), how surely each of `skeleton.feet` stands on the floor from a frame to the next, 0 to 1, as
+            models predict it for some representations: more reliable than height and speed of toes that slide, from
+            which contacts are read otherwise.
 
     Returns:
         (F, J, 3) float32. Motions of fewer than 4 frames are returned unchanged.
@@ -61,7 +64,10 @@ def cleanup(joints: np.ndarray, fps: float, skeleton: Skeleton) -> np.ndarray:
     motion = _constant_bones(_smooth(np.asarray(joints, float)), skeleton)
     toes = [chain[-1] for chain in skeleton.chains[:2]]
     motion = _follow_feet(motion, toes, fps)
-    contact = _contacts(motion[:, toes], motion[:, 0], fps, SHARE_PINNED)
+    if contacts is None:
+        contact = _contacts(motion[:, toes], motion[:, 0], fps, SHARE_PINNED)
+    else:
+        contact = np.clip(2 * contacts[:-1, [skeleton.feet.index(toe) for toe in toes]] - 0.5, 0, 1)
     for chain, weight in zip(skeleton.chains[:2], contact.T, strict=True):
         _bend(motion, chain[1:], _pin(motion[:, chain[-1]], weight))
     return motion.astype(np.float32)

@@ -1,7 +1,7 @@
 """Motion representations: encoding of motions as features and decoding to joint positions."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -51,6 +51,8 @@ class Representation(nn.Module, ABC):
     """Name of a representation whose first features these are, so that its published features can be cut."""
     relative: bool = True
     """Whether the root trajectory is that from frame to frame, so that a part of the features is a motion, too."""
+    slices: Mapping[str, slice] = {}
+    """Columns of the features by name."""
 
     def __init__(self, name: str, features: int, fps: float, skeleton: Skeleton):
         """`name` is saved in stores and checkpoints; features with different names are never mixed."""
@@ -80,6 +82,14 @@ class Representation(nn.Module, ABC):
     @abstractmethod
     def joint_features(self, joints: Iterable[int]) -> Tensor:
         """Returns (D,) bool, True for features of these joints; features of the root trajectory belong to joint 0."""
+
+    def contacts(self, features: Features) -> Features | None:
+        """Returns the columns (..., F, N) of features for contacts of `skeleton.feet` with the floor, about 0 to 1.
+
+        None if there are none.
+        """
+        columns = self.slices.get("contacts")
+        return None if columns is None else features[..., columns]
 
     def rebase(self, features: Features) -> Features:
         """Adapts features (..., F, D) of cuts so that they start like complete motions; by default, returns them."""

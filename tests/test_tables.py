@@ -532,6 +532,18 @@ def test_distances_from_the_training_motions_are_drawn():
     assert cumulative(copied.nearest) == [(0.0, 0.25), (0.0, 0.5), (0.5, 0.75), (1.0, 1.0)]
 
 
+def test_results_with_distances_are_drawn(folder):
+    spec = (folder / "spec.yaml").read_text().partition("figures:")[0]
+    (folder / "spec.yaml").write_text(spec + "figures: [{part: Text-to-motion, x: nearest}]\n")
+    (_, asked), *_ = requests(load_spec(str(folder / "spec.yaml"))["parts"]["Text-to-motion"])
+    nearest = {"generated": [0.01, 0.02], "real": [0.03, 0.07]}
+    put(asked[0], folder, result(0.544, 0.611, 9.559) | {"nearest": nearest})
+    table = made(folder)
+    write(table, folder / "out")
+    assert [line.nearest for line in table.parts[0].lines if line.nearest] == [[0.03, 0.07], [0.01, 0.02]]
+    assert "share of motions" in (folder / "out" / "spec-text-to-motion-figure.svg").read_text()
+
+
 def test_places():
     assert places([3.0, 1.0, None, 2.0], "lower", None) == [0, 1, 0, 2]
     assert places([3.0, 1.0, 2.0], "higher", None) == [1, 0, 2]

@@ -315,7 +315,7 @@ def build(name: str, spec: Config, results: Path) -> Table:
     parts = []
     for part_name, part in spec["parts"].items():
         figures = [
-            Figure(f["x"], _list(f["y"]), f.get("log", False), f.get("points", False))
+            Figure(f["x"], _list(f.get("y", [])), f.get("log", False), f.get("points", False))
             for f in spec.get("figures", [])
             if f["part"] == part_name
         ]

@@ -112,7 +112,8 @@ class Studio:
                 hook.remove()
             while len(self._made) > KEPT:
                 self._made.popitem(last=False)
-        return [cleaned(motion) for motion in motions] if cleanup else motions
+        contacts = model.representation.contacts
+        return [cleaned(motion, contacts(motion.features)) for motion in motions] if cleanup else motions
 
     def advice(self, request: Request) -> list[str]:
         """Returns warnings of words that the model has never seen."""

@@ -3,7 +3,7 @@
 import json
 import sys
 
-import bpy
+import bpy  # pyright: ignore[reportMissingImports]
 
 path, fps = sys.argv[1], int(sys.argv[2])
 bpy.ops.wm.read_factory_settings(use_empty=True)

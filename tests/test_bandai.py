@@ -18,7 +18,18 @@ from scipy.spatial.transform import Rotation
 
 from flame_mdm.__main__ import main
 from flame_mdm.data import Clip, bandai
-from flame_mdm.data.bandai import CONTENTS_1, JOINTS, STYLES_1, STYLES_2, TAKES_2, Bandai, captions, side_of, split_of
+from flame_mdm.data.bandai import (
+    CONTENTS_1,
+    JOINTS,
+    STYLES_1,
+    STYLES_2,
+    TAKES_2,
+    Bandai,
+    SplitRule,
+    captions,
+    side_of,
+    split_of,
+)
 from flame_mdm.data.store import Store
 from flame_mdm.formats import bvh
 from flame_mdm.representations.skeleton import SKELETONS, SMPL22, SMPL24
@@ -344,12 +355,14 @@ def test_compositional_split_holds_out_whole_combinations():
 
 
 def test_takes_of_the_compositional_split(tiny):
-    for id_, rule, split in (
+    cases: tuple[tuple[str, SplitRule, str], ...] = (
         ("dataset-2_walk_elderly_006", "compositional", "test"),
         ("dataset-1_walk_old_001", "compositional", "test"),
         ("dataset-2_walk_elderly_006", "takes", "train"),
-    ):
-        assert split_of(int(id_[8]), *id_.split("_")[1:3], int(id_[-3:]), rule) == split
+    )
+    for id_, rule, split in cases:
+        _, content, style, take = id_.split("_")
+        assert split_of(int(id_[8]), content, style, int(take), rule) == split
     takes = [clip.id for clip in clips(tiny, split="compositional") if clip.split == "test"]
     assert takes == []
     with pytest.raises(ValueError, match=r"data.source.split=random: give takes or compositional"):

@@ -112,3 +112,15 @@ def test_the_command_prints_the_distance(model, tmp_path, monkeypatch, capsys):
     Path("t.json").write_text("{")
     assert main(["sample", "quickstart", *words]) == 1
     assert "targets=t.json: not JSON" in capsys.readouterr().err
+
+
+def test_a_target_that_the_text_does_not_suggest_does_not_stretch_bones(model):
+    """Steering may not leave what the denoiser was trained on."""
+    target = {"joints": [{"time": 1.5, "joint": "right_wrist", "position": [-0.5, 1.5, 0.2]}]}
+    before, after = (
+        np.linalg.norm(m.skeleton.bones(torch.from_numpy(m.joints)).numpy()[:, 1:], axis=-1)
+        for m in (
+            flame_mdm.generate(model, "a person stands still", seconds=3, seed=1, targets=t)[0] for t in (None, target)
+        )
+    )
+    assert np.abs(np.median(after, 0) / np.median(before, 0) - 1).max() < 0.05

@@ -11,6 +11,9 @@ from flame_mdm.motion import Condition, Denoise
 
 STEERING_STEPS = 2
 """Gradient steps before each step of the sampler; docs/targets.md has the errors and costs of other numbers."""
+STEERING_LIMIT = 0.02
+"""Maximum length of such a step, as RMS over the normalized features. Where the denoiser hardly reacts to x_t, longer
+steps leave what it was trained on: arms grew by a third."""
 CLOSE, MOST_STEPS = 0.005, 8
 """Largest error in meters that ends the search for a motion that reaches positions, and its maximum number of steps."""
 RELAXATION = 1e-3
@@ -70,7 +73,7 @@ def steer(
     """Returns noisy motions whose clean estimates are nearer to positions in the world.
 
     Steps along the gradient through the denoiser (Chung et al. 2023, "Diffusion posterior sampling"), of Polyak's
-    length, so that there is no scale to choose. The entire body adapts, since the denoiser decides how.
+    length up to `STEERING_LIMIT`. The entire body adapts, since the denoiser decides how.
 
     Args:
         clean: returns the clean estimates (B, F, D) of noisy motions (B, F, D).
@@ -83,8 +86,9 @@ def steer(
             x = x_t.detach().requires_grad_()
             loss = (wanted.of(to_joints(clean(x))) - wanted.values).square().sum(-1)
             (slope,) = torch.autograd.grad(loss.sum(), x)
-        length = loss.detach() / slope.square().sum((1, 2)).clamp(min=1e-9)
-        x_t = x_t - length[:, None, None] * slope
+        norm = slope.square().sum((1, 2)).clamp(min=1e-9).sqrt()
+        length = (loss.detach() / norm).clamp(max=STEERING_LIMIT * slope[0].numel() ** 0.5)
+        x_t = x_t - (length / norm)[:, None, None] * slope
     return x_t
 
 

@@ -46,7 +46,7 @@ def interval(sample: Sequence[float]) -> tuple[float, float]:
 def shown(sample: Sequence[float], sign: str = "") -> str:
     """Returns mean and half width with as many decimals as the half width has in two significant digits."""
     mean, half = interval(sample)
-    decimals = next((n for n in range(6) if half >= 10 ** (1 - n)), 6)
+    decimals = next((n for n in range(6) if half >= 10 ** (1 - n)), 6 if half else 2)
     return f"{mean:{sign},.{decimals}f} ± {half:,.{decimals}f}"
 
 

@@ -200,12 +200,13 @@ def combined(files: Sequence[str]) -> str:
     return table(rows)
 
 
-def main(out: str, part: str, model: str = "", clip: str = "", seed: str = "0", *words: str) -> None:
+def main(out: str, *words: str) -> None:
     """Measures a part for one seed, or prints the table of several."""
     if out == "table":
-        print(combined([part, *filter(None, (model, clip)), *([seed] if clip else []), *words]))
+        print(combined(words))
         return
-    options = dict(word.split("=", 1) for word in words)
+    part, model, clip, seed, *rest = words
+    options = dict(word.split("=", 1) for word in rest)
     bench = Bench(model, clip, int(seed), int(options.get("clips", 6)))
     measured = {"transitions": transitions, "targets": reaching}
     rows = measured[part](bench) if part in measured else candidates(bench, options["judge"])

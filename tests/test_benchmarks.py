@@ -130,7 +130,7 @@ def test_quality_has_intervals_over_seeds_and_of_the_differences_of_equal_seeds(
     assert caption == "own, 1,500 steps, ema.decay=0.9, 3 seeds"
     assert [row["metric"] for row in rows] == ["val/loss", "FID"]
     assert rows[0]["speed=reference"] == "2.0 ± 2.5"  # 4.303 / sqrt(3)
-    assert rows[0]["fast − reference"].startswith("+0.100000 ± 0.0000")
+    assert rows[0]["fast − reference"].startswith("+0.10 ± 0.00")
     assert rows[1]["fast − reference"] == "-11 ± 27"  # 11 times as much
     assert found["summary"].startswith("In 1 of 2 figures of quality")
     assert found["summary"].endswith("the others: val/loss (own).")

@@ -264,7 +264,7 @@ def test_downloads_are_the_shown_motion(server):
     status, body = get(f"{server}/motion.npz?{EDITED.query()}&motion=1")
     assert status == 200
     with np.load(io.BytesIO(body)) as content:
-        np.testing.assert_array_equal(content["joints"], motion.joints)
+        np.testing.assert_allclose(content["joints"], motion.joints, atol=1e-5)  # other numbers of threads
     assert get(f"{server}/motion.npz?{EDITED.query()}&motion=2")[0] == 400
     for rig in presets():
         assert get(f"{server}/motion.bvh?{EDITED.query()}&rig={rig}")[1].startswith(b"HIERARCHY")

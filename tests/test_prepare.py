@@ -271,7 +271,7 @@ WHERE = {
 
 def test_every_set_is_covered_here():
     sets = {path.stem for path in (EXPERIMENTS / "data").glob("*.yaml")}
-    assert sets == {*WHERE, "synthetic", "humanact12_unconstrained"}
+    assert sets == {*WHERE, "synthetic", "humanact12_unconstrained", "bandai_compositional"}
 
 
 @pytest.mark.parametrize("data", WHERE)

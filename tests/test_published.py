@@ -38,7 +38,7 @@ def models(part: Config) -> list[Config]:
 
 def trained(row: Config) -> str:
     """The recipe of the checkpoint of a row."""
-    found = re.fullmatch(r"runs/(.+)/default/checkpoints/(best|last)\.ckpt", row["ckpt"])
+    found = re.fullmatch(r"runs/(.+)/[^/]+/checkpoints/(best|last)\.ckpt", row["ckpt"])
     assert found, row
     return found[1]
 
@@ -219,8 +219,8 @@ def test_small_models_say_what_they_predict():
         part = next(iter(SPECS[name]["parts"].values()))
         assert part["columns"]["Predicts"] == {"value": "prediction"}
         for row in models(part):
-            prediction = recipe(trained(row))["process"]["prediction"]
-            assert name != "synthetic" or f"| {row['label']} <sup>a</sup> | {prediction} |" in page
+            process = recipe(trained(row))["process"]
+            assert name != "synthetic" or f"| {row['label']} <sup>a</sup> | {process['prediction']} |" in page
 
 
 @pytest.mark.parametrize("name", sorted(path.stem for path in (EXPERIMENTS / "evaluation").glob("*.yaml")))

@@ -67,7 +67,7 @@ def test_a_run_leaves_what_a_user_looks_for(trained):
     assert checkpoint["config"]["experiment"] == "quickstart"
     assert checkpoint["global_step"] == 6
     training = checkpoint["facts"].pop("training")
-    assert training.keys() == {"hours", "memory_gib", "processes", "speed", "precision"}
+    assert training.keys() == {"hours", "memory_gib", "processes", "speed", "precision", "device"}
     facts = json.loads((folder / "provenance.json").read_text())["data"]
     assert facts == {name: fact for name, fact in checkpoint["facts"].items() if name not in ("vocabulary", "captions")}
     assert not list(folder.rglob("*.partial"))

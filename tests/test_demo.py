@@ -38,12 +38,16 @@ EDITED = Request(
     ),
 )  # fmt: skip
 
+PATH = Request(text="a person walks @1 | a person waves", path=((0.4, 0.5), (0.123456789, 1.2)), **FAST)
+
 
 def parsed(query: str) -> Request:
     return parse_query(parse_qsl(query))
 
 
-@pytest.mark.parametrize("request_", [Request(text="a person walks"), EDITED, Request(text="ü & = # % + ' \" <b>")])
+@pytest.mark.parametrize(
+    "request_", [Request(text="a person walks"), EDITED, PATH, Request(text="ü & = # % + ' \" <b>")]
+)
 def test_a_link_reproduces_its_request(request_):
     assert parsed(request_.query()) == request_
     assert parsed(request_.query() + "&__theme=dark") == request_
@@ -53,6 +57,14 @@ def test_a_link_names_every_option_that_is_not_left_to_the_model():
     keys = [key for key, _ in parse_qsl(EDITED.query())]
     sampling = ["guidance_scale", "num_inference_steps", "sampler", "cleanup"]
     assert keys == ["model", "text", "seconds", "samples", "seed", *sampling, "edit", "edit"]
+
+
+def test_way_points_are_reached_at_a_constant_speed_just_before_the_end():
+    asked = Request(text="a person walks @4 | a person waves", seconds=1.2, path=((0.0, 3.0), (1.0, 3.0)))
+    points = asked.targets("text")["root"]
+    assert points == [{"time": 3.75, "position": [0.0, 3.0]}, {"time": 5.0, "position": [1.0, 3.0]}]
+    assert asked.targets("none")["root"][1]["time"] == 1.0  # the text is not used: no parts
+    assert parsed("path=0,3 1,3") == Request(path=((0, 3), (1, 3)))
 
 
 BAD = {
@@ -81,6 +93,12 @@ BAD = {
     "text=walks+|": "part 2 is empty",
     f"text={'x' * 100_000}": "string should have at most 300 characters",
     "text=" + quote("a\x00b\x1b[31m"): "text=",
+    "path=0,nan": "path.0.1=nan: input should be a finite number",
+    "path=0,1+20.5,0": "path.1.0=20.5: input should be less than or equal to 20",
+    "path=0,1+2": "path=0,1 2: give way points as x,z in meters, such as 0,1 0.5,2",
+    "path=0,x": "path.0.1=x: input should be a valid number",
+    "path=0,19": "root[0]: 19.0 m from the start in 0.8 seconds is impossible",
+    "path=" + "+".join(["0,1"] * 17): "should have at most 16 items",
     "file=/etc/passwd": "unknown option file",
     "seed=1&seed=2": "seed is given twice",
     "edit=<script>alert(1)</script>": "edit=<script>",
@@ -112,11 +130,14 @@ def test_the_command_lines_and_the_python_lines_give_the_same_motions(tmp_path, 
 
     monkeypatch.chdir(tmp_path)
     studio = Studio(["quickstart"], "cpu")
-    for asked in (Request(text="a person walks", **FAST), EDITED):
+    for asked in (PATH, Request(text="a person walks", **FAST), EDITED):
         ours = studio.motions(asked)
         names: dict[str, Any] = {}
         exec(asked.python("text", "cpu"), names)
         for line in asked.command("text", None).splitlines():
+            if line.startswith("echo "):
+                subprocess.run(line, shell=True, check=True)
+                continue
             program, *words = shlex.split(line)
             assert (program, main(words)) == ("flame-mdm", 0)
         folder = Path(words[-1].removeprefix("out="))
@@ -327,6 +348,67 @@ def test_a_person_uses_the_page(server, tmp_path):
         assert tab.errors == []
         tab.size(390, 844)
         assert tab.run("document.documentElement.scrollWidth <= innerWidth")
+
+
+@pytest.mark.tools
+@pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed")
+def test_a_person_writes_a_sequence_in_rows_and_draws_a_path(server, tmp_path):
+    text = "document.querySelector('#text textarea').value"
+    with browser(tmp_path / "profile") as tab:
+        tab.open(f"{server}/?{urlencode({'text': 'a person walks', **FAST})}")
+        tab.wait("!!document.querySelector('#files a')", 60)
+        click(tab, "+ Add an action")
+        tab.send("Input.insertText", text="a person stands")
+        tab.type("[aria-label='Seconds of action 1']", "2")
+        assert tab.run(text) == "a person walks @2 | a person stands"
+        click(tab, "+ Add an action")
+        tab.wait("document.querySelectorAll('#parts .part').length === 3")
+        tab.click("[aria-label='Remove action 3']")
+        tab.type("#text textarea", "a person walks @1.5 | <b> | stands @2")
+        rows = "[...document.querySelectorAll('#parts .part')]"
+        values = f"{rows}.map(row => [...row.querySelectorAll('input')].map(input => input.value))"
+        tab.wait(f"{rows}.length === 3")
+        assert tab.run(values) == [["a person walks", "1.5"], ["<b>", ""], ["stands", "2"]]
+        for left in (2, 0):  # a single action needs no row
+            tab.click("[aria-label='Remove action 2']")
+            tab.wait(f"{rows}.length === {left}")
+        assert tab.run(text) == "a person walks @1.5"
+
+        tab.run("[...document.querySelectorAll('button')].find(b => b.innerText.includes('Path on')).click()")
+        tab.wait("document.querySelector('#floor output')?.textContent.includes('Click to add')")
+        for right, down in ((0.4, 0.5), (0.45, 0.4), (0.6, 0.45)):
+            tab.run("document.querySelector('#floor svg').scrollIntoView({block: 'center'})")
+            x, y, width, height = tab.run(
+                "(r => [r.x, r.y, r.width, r.height])(document.querySelector('#floor svg').getBoundingClientRect())"
+            )
+            for kind in ("mousePressed", "mouseReleased"):
+                at = {"x": x + right * width, "y": y + down * height}
+                tab.send("Input.dispatchMouseEvent", type=kind, **at, button="left", clickCount=1)
+        tab.wait("document.querySelectorAll('#floor circle').length === 3")
+        tab.click("[data-point='2'] circle")  # removes it
+        tab.wait("document.querySelectorAll('#floor circle').length === 2")
+        drawn = tab.run("document.querySelector('#path textarea, #path input').value")
+        assert drawn == "0.6,0.75 0.3,1.2"  # the view: x from 3 (left) to -3, z from 3 (top) to -1.5
+        click(tab, "Generate")
+        tab.wait("location.search.includes('path=')")
+        address = tab.wait(
+            "[...document.querySelectorAll('#files a')].map(a => a.href).find(h => /npz.*path=/.test(h))"
+        )
+        joints = joints_of(address)
+        points = parsed(address.partition("?")[2]).targets("text")["root"]
+        assert [point["position"] for point in points] == [[0.6, 0.75], [0.3, 1.2]]
+        for point in points:
+            assert np.abs(joints[round(20 * point["time"]), 0, [0, 2]] - point["position"]).max() < 0.03
+
+        link = tab.run("location.href")
+        tab.open("about:blank")
+        tab.open(link)  # shows the path
+        tab.wait("document.querySelectorAll('#floor circle').length === 2")
+        click(tab, "Clear")
+        tab.wait("!document.querySelector('#floor circle')")
+        click(tab, "Generate")
+        tab.wait("location.search && !location.search.includes('path=')")
+        assert tab.errors == []
 
 
 def click(tab: Any, label: str) -> None:

@@ -31,6 +31,7 @@ from flame_mdm.demo.studio import FORMATS, Studio
 from flame_mdm.errors import UserError, first_line, markdown_text
 from flame_mdm.formats.motion import Motion
 from flame_mdm.formats.retarget import presets
+from flame_mdm.processes.guidance import STEERING_STEPS
 from flame_mdm.visualize import player_page
 
 QUEUE = 64
@@ -48,6 +49,10 @@ RIGGED = (".bvh", ".glb")
 VARIED = 0.5
 """Strength of the variations of a motion."""
 EMPTY = '<div class="empty">Describe a motion, then press Generate</div>'
+PARTS_EDITOR = """<div id="parts"><div class="head"><span>Action</span><span>Seconds</span></div>
+<div class="list"></div><button type="button" class="add">+ Add an action</button></div>"""
+PATH_EDITOR = """<div id="floor"><svg role="img" aria-label="Floor from above; the person starts at the triangle"></svg>
+<div><output></output><button type="button" class="clear">Clear</button></div></div>"""
 SHOW_LINK = "(query) => { history.replaceState(null, '', '?' + query); return location.href }"
 
 
@@ -138,6 +143,7 @@ def web_app(studio: Studio, device: str | None = None) -> FastAPI:
         path="/",
         theme=themes.Default(primary_hue="blue", font=FONT, font_mono=MONO),
         css_paths=Path(__file__).with_name("page.css"),
+        head=f"<script>{Path(__file__).with_name('page.js').read_text(encoding='utf-8')}</script>",
         footer_links=[],
         ssr_mode=False,
         run_history=False,
@@ -157,7 +163,8 @@ def page(studio: Studio, device: str | None) -> gr.Blocks:
         try:
             request = _read(query)
             model = studio.model(request.model)
-            total = (request.num_inference_steps or model.num_inference_steps) * (1 + len(request.edits))
+            runs = 1 + len(request.edits) + STEERING_STEPS * bool(request.path)
+            total = (request.num_inference_steps or model.num_inference_steps) * runs
 
             def report(calls: int) -> None:
                 progress((calls, max(total, calls + 1)), "Generating", unit="steps")
@@ -183,8 +190,8 @@ def page(studio: Studio, device: str | None) -> gr.Blocks:
         try:
             values = _read(query).model_dump()
         except (UserError, ValueError):  # `show` says why
-            return [query, *[gr.skip()] * len(FORM)]
-        return [query, *(values[key] for key in FORM)]
+            return [query, *[gr.skip()] * (1 + len(FORM))]
+        return [query, gr.Accordion(open=bool(values["path"])), *(values[key] for key in FORM)]
 
     def compose(*values: Any) -> str:
         given = dict(zip(FORM, values, strict=True))
@@ -208,8 +215,13 @@ def page(studio: Studio, device: str | None) -> gr.Blocks:
         gr.Markdown("# Ask for a motion", elem_id="title")
         with gr.Row(elem_id="stage"):
             with gr.Column(elem_id="ask"):
-                gr.Markdown("Several actions: `walks @2 | waves @3`")
-                text = gr.Textbox(label="What the person does", max_length=MAX_TEXT, lines=2, autofocus=True)
+                label = "What the person does"
+                text = gr.Textbox(label=label, max_length=MAX_TEXT, lines=2, autofocus=True, elem_id="text")
+                gr.HTML(PARTS_EDITOR, js_on_load="editor()")
+                with gr.Accordion("Path on the floor", open=False) as floor:
+                    gr.HTML(PATH_EDITOR, js_on_load="editor()")
+                    label = "Way points: meters to the left, meters ahead"
+                    path = gr.Textbox(label=label, placeholder="0,1 0.5,2", max_length=MAX_TEXT, elem_id="path")
                 with gr.Row():
                     go = gr.Button("Generate", variant="primary")
                     cancel = gr.Button("Cancel")
@@ -253,12 +265,12 @@ def page(studio: Studio, device: str | None) -> gr.Blocks:
         asked = gr.Textbox(visible="hidden", elem_id="asked")
         query = gr.Textbox(visible="hidden", elem_id="query")
 
-        form = [model, text, seconds, seed, samples, guidance, steps, sampler, cleanup]
+        form = [model, text, seconds, seed, samples, guidance, steps, sampler, cleanup, path]
         outputs = list(Shown(player, notes, query, files, command, python, chosen))
         quick: dict[str, Any] = {"queue": False, "show_progress": "hidden", "api_visibility": "private"}
         edit = [query, chosen, new, begin, end, parts, again]
         first = [
-            blocks.load(fill, asked, [asked, *form], js="() => location.search.slice(1)", **quick),
+            blocks.load(fill, asked, [asked, floor, *form], js="() => location.search.slice(1)", **quick),
             *(each(compose, form, asked, **quick) for each in (go.click, text.submit)),
             *(each(change, edit, asked, **quick) for each in (apply.click, new.submit)),
             variations.click(vary, [query, chosen, again], asked, **quick),
@@ -272,12 +284,25 @@ def page(studio: Studio, device: str | None) -> gr.Blocks:
             event.then(None, query, link, js=SHOW_LINK, **quick)
         cancel.click(halt, None, notes, cancels=running, **quick)
         model.change(switch, model, [examples, sampler, words], **quick)
+        for event in (text.change, seconds.change, path.change):
+            event(None, [text, seconds, path], None, js="(...values) => editor(...values)", **quick)
         blocks.unload(leave)
     blocks.queue(max_size=QUEUE, default_concurrency_limit=1)
     return blocks
 
 
-FORM = ("model", "text", "seconds", "seed", "samples", "guidance_scale", "num_inference_steps", "sampler", "cleanup")
+FORM = (
+    "model",
+    "text",
+    "seconds",
+    "seed",
+    "samples",
+    "guidance_scale",
+    "num_inference_steps",
+    "sampler",
+    "cleanup",
+    "path",
+)
 """Keys of `Request`, in the order of the fields of the form."""
 
 

@@ -5,23 +5,49 @@ from __future__ import annotations
 import json
 import shlex
 from collections.abc import Iterable
+from itertools import accumulate, pairwise
+from math import dist
 from typing import Annotated, Any, Literal, TypeVar
 from urllib.parse import urlencode
 
-from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationError
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainSerializer, StringConstraints, ValidationError
+from pydantic_core import PydanticCustomError
 
 from flame_mdm.errors import UserError, did_you_mean, one_line
+from flame_mdm.sequences import read_parts
 from flame_mdm.visualize.scene import shortened
 
 MAX_TEXT, MAX_SECONDS, MAX_SAMPLES, MAX_STEPS, MAX_EDITS = 300, 30, 4, 1000, 8
 """Limits of a request: characters, seconds, motions, sampling steps, edits."""
 MAX_SEED = 2**31 - 1
+MAX_WAY_POINTS, FAR = 16, 20.0
+"""Limits of a path: way points, and meters from the start along x and z."""
+ARRIVAL = 0.2
+"""Seconds before the end of the motion at which the last way point is reached."""
 
 Text = Annotated[str, StringConstraints(strip_whitespace=True, max_length=MAX_TEXT, pattern=r"^[^\x00-\x1f\x7f]*$")]
 Samples = Annotated[int, Field(ge=1, le=MAX_SAMPLES)]
 Seed = Annotated[int, Field(ge=0, le=MAX_SEED)]
 Part = Literal["left_arm", "right_arm", "left_leg", "right_leg", "arms", "legs", "upper_body", "lower_body"]
+Coordinate = Annotated[float, Field(ge=-FAR, le=FAR)]
 RULES = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+def _way_points(value: Any) -> Any:
+    if isinstance(value, str):
+        value = [point.split(",") for point in value.split()]
+        if any(len(point) != 2 for point in value):
+            raise PydanticCustomError("path", "give way points as x,z in meters, such as 0,1 0.5,2")
+    return value
+
+
+Path = Annotated[
+    tuple[tuple[Coordinate, Coordinate], ...],
+    Field(max_length=MAX_WAY_POINTS),
+    BeforeValidator(_way_points),
+    PlainSerializer(lambda path: " ".join(f"{x},{z}" for x, z in path)),
+]
+"""Way points; in a link and on the page "x,z x,z ..."."""
 
 
 class Change(BaseModel):
@@ -46,7 +72,12 @@ class Change(BaseModel):
 
 
 class Request(BaseModel):
-    """Everything that determines the motions that the demo shows; keys are those of `flame-mdm sample`."""
+    """Everything that determines the motions that the demo shows; keys are those of `flame-mdm sample`.
+
+    Attributes:
+        path: way points of the root over the floor, x and z in meters. Their times are proportional to the distance
+            along the path from the start, x = z = 0, and the last is reached `ARRIVAL` seconds before the end.
+    """
 
     model_config = RULES
     model: str = "quickstart"
@@ -58,14 +89,23 @@ class Request(BaseModel):
     num_inference_steps: Annotated[int, Field(ge=1, le=MAX_STEPS)] | None = None
     sampler: Annotated[str, StringConstraints(pattern=r"^\w{1,40}$")] | None = None
     cleanup: bool = True
+    path: Path = ()
     edits: Annotated[tuple[Change, ...], Field(max_length=MAX_EDITS)] = ()
 
     def query(self) -> str:
         """Returns the query string of a link to this request; `parse_query` reads it."""
-        pairs = self.model_dump(exclude={"edits"}, exclude_none=True, mode="json")
-        pairs["cleanup"] = str(self.cleanup).lower()
+        given = self.model_dump(exclude={"edits"}, mode="json") | {"cleanup": str(self.cleanup).lower()}
+        pairs = {key: value for key, value in given.items() if value not in (None, "")}
         edits = [change.model_dump_json(exclude_defaults=True) for change in self.edits]
         return urlencode([*pairs.items(), *(("edit", text) for text in edits)])
+
+    def targets(self, kind: str) -> dict[str, Any]:
+        """Returns the targets of `flame_mdm.generate` that lead along the path; `kind` as for `steps`."""
+        parts = read_parts(self.text) if self.text and kind != "none" else [("", None)]
+        end = sum(seconds or self.seconds for _, seconds in parts) - ARRIVAL
+        way = list(accumulate(dist(*pair) for pair in pairwise([(0.0, 0.0), *self.path])))
+        times = [round(end * done / (way[-1] or 1.0), 3) for done in way]
+        return {"root": [{"time": time, "position": list(at)} for time, at in zip(times, self.path, strict=True)]}
 
     def steps(self, kind: str) -> list[tuple[int | None, dict[str, Any]]]:
         """Returns what makes the motions, in order: the number of the motion to edit, None for the first step, and the
@@ -83,6 +123,7 @@ class Request(BaseModel):
             given: dict[str, Any] = {} if kind == "none" or not part.text else {f"{kind}s": part.text}
             if isinstance(part, Request):
                 given["seconds"] = part.seconds
+                given |= {"targets": part.targets(kind)} if part.path else {}
             else:
                 region = None if part.region_seconds is None else list(part.region_seconds)
                 chosen = {"region_seconds": region, "joints": list(part.joints) or None, "strength": part.strength}
@@ -104,6 +145,9 @@ class Request(BaseModel):
             keys = {{"texts": "text", "actions": "action"}.get(key, key): value for key, value in given.items()}
             keys |= {} if keys.keys() & {"text", "action"} else {"unconditioned": True}
             keys |= {"device": device} if device else {}
+            if "targets" in keys:
+                lines.append(f"echo {shlex.quote(json.dumps(keys['targets']))} > path.json")
+                keys["targets"] = "path.json"
             words += [f"{key}={_word(value)}" for key, value in keys.items()]
             lines.append(shlex.join([*words, f"out={folder}"]))
         return "\n".join(lines)

@@ -1,0 +1,78 @@
+// Rows of a sequence and a path on the floor. Both show and change fields of the form, which alone hold the values.
+const editor = (() => {
+  const FAR = 20  // meters that a way point may be from the start
+  const field = (id) => document.querySelector(`#${id} textarea, #${id} input`)
+  const write = (id, value) => {
+    field(id).value = value
+    field(id).dispatchEvent(new Event('input', { bubbles: true }))
+  }
+  const parse = (text) => text.split('|').map((part) => part.match(/^([^]*?)(?:@([^@]*))?$/).slice(1).map((s) => (s || '').trim()))
+  const join = (rows) => rows.map(([words, seconds]) => words + (seconds && ` @${seconds}`)).join(' | ')
+  const read = () => [...document.querySelectorAll('#parts .part')].map((row) =>
+    [...row.querySelectorAll('input')].map((input) => input.value.replace(/[|@]/g, ' ').trim()))
+  const points = (path) => path.trim().split(/\s+/).map((point) => point.split(',').map(Number))
+    .filter((point) => point.length === 2 && point.every(Number.isFinite))
+  let shown = ['', 3, '']
+
+  function drawParts(text) {
+    const rows = parse(text), several = rows.length > 1
+    if (several && join(rows) === join(read())) return
+    document.querySelector('#parts').classList.toggle('several', several)
+    document.querySelector('#parts .list').replaceChildren(...(several ? rows : []).map((values, index) => {
+      const row = Object.assign(document.createElement('div'), { className: 'part', innerHTML:
+        `<input aria-label="Action ${index + 1}" placeholder="What the person does next">
+        <input aria-label="Seconds of action ${index + 1}" inputmode="decimal" placeholder="${shown[1]}">
+        <button type="button" class="remove" aria-label="Remove action ${index + 1}">×</button>` })
+      row.querySelectorAll('input').forEach((input, column) => { input.value = values[column] })
+      return row
+    }))
+  }
+
+  function drawPath(way, seconds) {
+    const svg = document.querySelector('#floor svg'), line = [[0, 0], ...way]
+    const far = Math.max(3, 1.2 * seconds, ...way.map(([x, z]) => Math.max(Math.abs(x), z, -2 * z) + 0.5))
+    const size = Math.min(FAR, Math.ceil(far)), unit = size / 100, step = size > 8 ? 5 : 1
+    const grid = Array.from({ length: 2 * FAR / step + 1 }, (_, k) => k * step - FAR)
+    svg.setAttribute('viewBox', `${-size} ${-size} ${2 * size} ${1.5 * size}`)
+    svg.innerHTML = `<path class="grid" d="${grid.map((at) => `M${at},${-FAR}V${FAR}M${-FAR},${at}H${FAR}`).join('')}" />
+      <text class="scale" x="${4 * unit - size}" y="${size / 2 - 4 * unit}" font-size="${7 * unit}">1 square = ${step} m</text>
+      <polyline points="${line.map(([x, z]) => `${-x},${-z}`).join(' ')}" />
+      <path class="start" d="M0,${-7 * unit}L${5 * unit},${5 * unit}H${-5 * unit}Z" />` +
+      way.map(([x, z], index) => `<g data-point="${index}"><circle cx="${-x}" cy="${-z}" r="${6 * unit}" />
+        <text x="${-x}" y="${2.6 * unit - z}" font-size="${7.5 * unit}">${index + 1}</text></g>`).join('')
+    const meters = way.reduce((sum, [x, z], index) => sum + Math.hypot(x - line[index][0], z - line[index][1]), 0)
+    document.querySelector('#floor output').textContent = way.length
+      ? `${meters.toFixed(1)} m in ${+seconds.toFixed(2)} s: ${(meters / seconds).toFixed(1)} m/s`
+      : 'Seen from above. Click to add way points, in order; click one to remove it.'
+    document.querySelector('#floor .clear').hidden = !way.length
+  }
+
+  document.addEventListener('input', (event) => {
+    if (event.target.closest('#parts')) write('text', join(read()))
+  })
+  document.addEventListener('click', (event) => {
+    const row = event.target.closest('#parts .remove')?.parentElement, floor = event.target.closest('#floor svg')
+    if (row) {
+      write('text', join(read().filter((_, index) => row.parentElement.children[index] !== row)))
+    } else if (event.target.closest('#parts .add')) {
+      const text = join([...parse(field('text').value), ['', '']])
+      drawParts(text)
+      document.querySelector('#parts .part:last-child input').focus()
+      write('text', text)
+    } else if (event.target.closest('#floor .clear')) {
+      write('path', '')
+    } else if (floor) {
+      const hit = event.target.closest('[data-point]'), way = points(field('path').value)
+      const at = new DOMPoint(event.clientX, event.clientY).matrixTransform(floor.getScreenCTM().inverse())
+      if (hit) way.splice(+hit.dataset.point, 1)
+      else way.push([-at.x, -at.y].map((meters) => +meters.toFixed(2) || 0))
+      write('path', way.map(String).join(' '))
+    }
+  })
+  return (...values) => {  // without values: again, since an editor has appeared
+    if (values.length) shown = [values[0] || '', values[1] || 3, values[2] || '']
+    if (document.querySelector('#parts')) drawParts(shown[0])
+    const seconds = parse(shown[0]).reduce((sum, part) => sum + (parseFloat(part[1]) || shown[1]), 0)
+    if (document.querySelector('#floor')) drawPath(points(shown[2]), seconds)
+  }
+})()

@@ -49,10 +49,10 @@ RIGGED = (".bvh", ".glb")
 VARIED = 0.5
 """Strength of the variations of a motion."""
 EMPTY = '<div class="empty">Describe a motion, then press Generate</div>'
-PARTS_EDITOR = """<div id="parts"><div class="head"><span>Action</span><span>Seconds</span></div>
-<div class="list"></div><button type="button" class="add">+ Add an action</button></div>"""
-PATH_EDITOR = """<div id="floor"><svg role="img" aria-label="Floor from above; the person starts at the triangle"></svg>
-<div><output></output><button type="button" class="clear">Clear</button></div></div>"""
+EDITORS = """<div id="parts"><div class="head"><span>Action</span><span>Seconds</span></div>
+<div class="list"></div><button type="button" class="add">+ Add an action</button></div>
+<details id="floor"><summary>Path on the floor</summary><svg role="img" aria-label="Floor from above"></svg>
+<div><output></output><button type="button" class="clear">Clear</button></div></details>"""
 SHOW_LINK = "(query) => { history.replaceState(null, '', '?' + query); return location.href }"
 
 
@@ -190,8 +190,8 @@ def page(studio: Studio, device: str | None) -> gr.Blocks:
         try:
             values = _read(query).model_dump()
         except (UserError, ValueError):  # `show` says why
-            return [query, *[gr.skip()] * (1 + len(FORM))]
-        return [query, gr.Accordion(open=bool(values["path"])), *(values[key] for key in FORM)]
+            return [query, *[gr.skip()] * len(FORM)]
+        return [query, *(values[key] for key in FORM)]
 
     def compose(*values: Any) -> str:
         given = dict(zip(FORM, values, strict=True))
@@ -217,11 +217,9 @@ def page(studio: Studio, device: str | None) -> gr.Blocks:
             with gr.Column(elem_id="ask"):
                 label = "What the person does"
                 text = gr.Textbox(label=label, max_length=MAX_TEXT, lines=2, autofocus=True, elem_id="text")
-                gr.HTML(PARTS_EDITOR, js_on_load="editor()")
-                with gr.Accordion("Path on the floor", open=False) as floor:
-                    gr.HTML(PATH_EDITOR, js_on_load="editor()")
-                    label = "Way points: meters to the left, meters ahead"
-                    path = gr.Textbox(label=label, placeholder="0,1 0.5,2", max_length=MAX_TEXT, elem_id="path")
+                gr.HTML(EDITORS, js_on_load="editor()")
+                label = "Way points: meters to the left, meters ahead"
+                path = gr.Textbox(label=label, placeholder="0,1 0.5,2", max_length=MAX_TEXT, elem_id="path")
                 with gr.Row():
                     go = gr.Button("Generate", variant="primary")
                     cancel = gr.Button("Cancel")
@@ -242,7 +240,9 @@ def page(studio: Studio, device: str | None) -> gr.Blocks:
                         guidance = gr.Textbox(label="Guidance", placeholder="model's", max_length=9, min_width=90)
                         steps = gr.Textbox(label="Steps", placeholder="model's", max_length=9, min_width=90)
                         sampler = gr.Dropdown(samplers, value=None, label="Sampler", min_width=120)
-                    cleanup = gr.Checkbox(True, label="Clean up: smooth motion, feet that do not slide")
+                    cleanup = gr.Checkbox(
+                        True, label="Clean up: smooth motion, feet that do not slide (not with a path)"
+                    )
                 with gr.Accordion("Words the model knows", open=False):
                     words = gr.Markdown(_vocabulary(studio, names[0]))
         with gr.Accordion("Keep a part of this motion, change the rest", elem_id="edit"):
@@ -270,7 +270,7 @@ def page(studio: Studio, device: str | None) -> gr.Blocks:
         quick: dict[str, Any] = {"queue": False, "show_progress": "hidden", "api_visibility": "private"}
         edit = [query, chosen, new, begin, end, parts, again]
         first = [
-            blocks.load(fill, asked, [asked, floor, *form], js="() => location.search.slice(1)", **quick),
+            blocks.load(fill, asked, [asked, *form], js="() => location.search.slice(1)", **quick),
             *(each(compose, form, asked, **quick) for each in (go.click, text.submit)),
             *(each(change, edit, asked, **quick) for each in (apply.click, new.submit)),
             variations.click(vary, [query, chosen, again], asked, **quick),

@@ -2,10 +2,8 @@
 const editor = (() => {
   const FAR = 20  // meters that a way point may be from the start
   const field = (id) => document.querySelector(`#${id} textarea, #${id} input`)
-  const write = (id, value) => {
-    field(id).value = value
-    field(id).dispatchEvent(new Event('input', { bubbles: true }))
-  }
+  const write = (id, value) =>
+    Object.assign(field(id), { value }).dispatchEvent(new Event('input', { bubbles: true }))
   const parse = (text) => text.split('|').map((part) => part.match(/^([^]*?)(?:@([^@]*))?$/).slice(1).map((s) => (s || '').trim()))
   const join = (rows) => rows.map(([words, seconds]) => words + (seconds && ` @${seconds}`)).join(' | ')
   const read = () => [...document.querySelectorAll('#parts .part')].map((row) =>
@@ -33,6 +31,7 @@ const editor = (() => {
     const far = Math.max(3, 1.2 * seconds, ...way.map(([x, z]) => Math.max(Math.abs(x), z, -2 * z) + 0.5))
     const size = Math.min(FAR, Math.ceil(far)), unit = size / 100, step = size > 8 ? 5 : 1
     const grid = Array.from({ length: 2 * FAR / step + 1 }, (_, k) => k * step - FAR)
+    document.querySelector('#floor').open ||= way.length > 0
     svg.setAttribute('viewBox', `${-size} ${-size} ${2 * size} ${1.5 * size}`)
     svg.innerHTML = `<path class="grid" d="${grid.map((at) => `M${at},${-FAR}V${FAR}M${-FAR},${at}H${FAR}`).join('')}" />
       <text class="scale" x="${4 * unit - size}" y="${size / 2 - 4 * unit}" font-size="${7 * unit}">1 square = ${step} m</text>
@@ -44,7 +43,6 @@ const editor = (() => {
     document.querySelector('#floor output').textContent = way.length
       ? `${meters.toFixed(1)} m in ${+seconds.toFixed(2)} s: ${(meters / seconds).toFixed(1)} m/s`
       : 'Seen from above. Click to add way points, in order; click one to remove it.'
-    document.querySelector('#floor .clear').hidden = !way.length
   }
 
   document.addEventListener('input', (event) => {
@@ -65,14 +63,14 @@ const editor = (() => {
       const hit = event.target.closest('[data-point]'), way = points(field('path').value)
       const at = new DOMPoint(event.clientX, event.clientY).matrixTransform(floor.getScreenCTM().inverse())
       if (hit) way.splice(+hit.dataset.point, 1)
-      else way.push([-at.x, -at.y].map((meters) => +meters.toFixed(2) || 0))
+      else way.push([-at.x, -at.y].map((meters) => +meters.toFixed(1) || 0))
       write('path', way.map(String).join(' '))
     }
   })
-  return (...values) => {  // without values: again, since an editor has appeared
+  return (...values) => {  // without values: the editors have appeared
     if (values.length) shown = [values[0] || '', values[1] || 3, values[2] || '']
-    if (document.querySelector('#parts')) drawParts(shown[0])
-    const seconds = parse(shown[0]).reduce((sum, part) => sum + (parseFloat(part[1]) || shown[1]), 0)
-    if (document.querySelector('#floor')) drawPath(points(shown[2]), seconds)
+    if (!document.querySelector('#floor')) return
+    drawParts(shown[0])
+    drawPath(points(shown[2]), parse(shown[0]).reduce((sum, part) => sum + (parseFloat(part[1]) || shown[1]), 0))
   }
 })()

@@ -20,10 +20,8 @@ from flame_mdm.visualize.scene import shortened
 MAX_TEXT, MAX_SECONDS, MAX_SAMPLES, MAX_STEPS, MAX_EDITS = 300, 30, 4, 1000, 8
 """Limits of a request: characters, seconds, motions, sampling steps, edits."""
 MAX_SEED = 2**31 - 1
-MAX_WAY_POINTS, FAR = 16, 20.0
-"""Limits of a path: way points, and meters from the start along x and z."""
-ARRIVAL = 0.2
-"""Seconds before the end of the motion at which the last way point is reached."""
+MAX_WAY_POINTS, FAR = 16, 20.0  # a path: way points, and meters along x and z
+ARRIVAL = 0.2  # seconds before the end of the motion at which the last way point is reached
 
 Text = Annotated[str, StringConstraints(strip_whitespace=True, max_length=MAX_TEXT, pattern=r"^[^\x00-\x1f\x7f]*$")]
 Samples = Annotated[int, Field(ge=1, le=MAX_SAMPLES)]
@@ -130,7 +128,7 @@ class Request(BaseModel):
                 given |= {key: value for key, value in chosen.items() if value is not None}
             given |= {"samples": part.samples, "seed": part.seed, **shared}
             found.append((None if isinstance(part, Request) else part.motion, given))
-        if self.cleanup:
+        if self.cleanup and not self.path:  # cleanup moves the root off the way points, by 0.3 m in one example
             found[-1][1]["cleanup"] = True
         return found
 

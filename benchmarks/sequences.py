@@ -1,9 +1,10 @@
 """Sequences, targets and candidates: `python benchmarks/sequences.py OUT.json PART MODEL CLIP SEED [clips=6]`.
 
-PART is transitions, targets or candidates. MODEL generates motions, CLIP is a motion-CLIP that scores how well they fit
-their texts; `judge=` is another one, with which those that CLIP has selected are evaluated. Texts and targets are those
-of test clips of the data set on which MODEL was trained (folder: $FLAME_MDM_DATA). `python benchmarks/sequences.py
-table OUT*.json` prints means over the seeds and their 95 % intervals by Student's t.
+PART is transitions, targets or candidates. MODEL generates the motions, and the motion-CLIP in the checkpoint CLIP
+measures how well they fit their texts. For candidates, CLIP selects motions, and `judge=` is a second motion-CLIP that
+measures the selected ones. For targets, `steps=` is the number of sampling steps. Texts and targets come from test
+clips of the data set that MODEL was trained on, in the folder $FLAME_MDM_DATA. `python benchmarks/sequences.py table
+OUT*.json` prints the means over the seeds and their 95 % intervals by Student's t.
 """
 
 from __future__ import annotations
@@ -135,7 +136,7 @@ def wanted(kind: str, real: Motion) -> dict[str, Any]:
     }
 
 
-def reaching(bench: Bench) -> Rows:
+def reaching(bench: Bench, steps: int | None) -> Rows:
     """Compares ways to reach targets from real motions, in centimeters as Kimodo."""
     known, steer, reach = bench.model.representation, targets.steer, targets.reach
     skip = lambda clean, x_t, *_: x_t  # noqa: E731
@@ -146,7 +147,7 @@ def reaching(bench: Bench) -> Rows:
             targets.reach = reach if "correction" in method else lambda x, *_: x
             motions = []
             for real in bench.real:
-                options: dict[str, Any] = {"frames": len(real.joints)}
+                options: dict[str, Any] = {"frames": len(real.joints), "num_inference_steps": steps}
                 if method == "imputation":
                     x = known.normalize(torch.from_numpy(real.features))[None]
                     keep = torch.zeros_like(x, dtype=torch.bool)
@@ -208,8 +209,10 @@ def main(out: str, *words: str) -> None:
     part, model, clip, seed, *rest = words
     options = dict(word.split("=", 1) for word in rest)
     bench = Bench(model, clip, int(seed), int(options.get("clips", 6)))
-    measured = {"transitions": transitions, "targets": reaching}
-    rows = measured[part](bench) if part in measured else candidates(bench, options["judge"])
+    if part == "targets":
+        rows = reaching(bench, int(options["steps"]) if "steps" in options else None)
+    else:
+        rows = transitions(bench) if part == "transitions" else candidates(bench, options["judge"])
     Path(out).write_text(json.dumps(rows, indent=1) + "\n")
 
 

@@ -4,7 +4,10 @@ import os
 
 os.environ["HF_HUB_OFFLINE"] = "1"  # before transformers is imported
 
+import time
 from collections.abc import Iterator
+from multiprocessing import active_children
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 
 import pytest
@@ -34,6 +37,15 @@ TINY = [
     "callbacks.samples.seconds=1.5",
 ]
 """Overrides that make the quick-start experiment train in a second."""
+
+
+def no_children(before: list[BaseProcess]) -> bool:
+    """Whether the only child processes are those of `before`. A process that ended may take a moment to be noticed."""
+    for _ in range(500):
+        if not set(active_children()) - set(before):
+            return True
+        time.sleep(0.01)
+    return False
 
 
 @pytest.fixture(scope="session")

@@ -6,6 +6,7 @@ from itertools import islice
 from multiprocessing import active_children
 
 import pytest
+from conftest import no_children
 
 from flame_mdm.data import parallel
 from flame_mdm.data.parallel import in_order
@@ -62,7 +63,4 @@ def test_an_error_ends_the_other_tasks():
     with pytest.raises(ValueError, match="non-negative"):
         list(in_order(time.sleep, [-1, 100, 100, 100], workers=2))
     assert time.monotonic() - start < 60
-    while left := [child for child in active_children() if child not in before]:
-        # Ended, but the pool's thread may be about to note it.
-        assert time.monotonic() - start < 60, left
-        time.sleep(0.01)
+    assert no_children(before)

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import TINY
+from conftest import TINY, no_children
 from t2m_folder import line, write_folder
 from test_actions import write_humanact12, write_uestc
 from test_babel import small  # noqa: F401  a fixture
@@ -236,14 +236,14 @@ def test_an_interrupted_preparation_leaves_nothing(
 
     gc.collect()  # readers that other tests left open end their processes
     before = signal.getsignal(signal.SIGTERM)
-    earlier = set(active_children())
+    earlier = active_children()
     ignored = signal.signal(signal.SIGINT, signal.default_int_handler)  # it is, where the tests run in the background
     with monkeypatch.context() as patch:
         patch.setattr(Bandai, "_clip", interrupted)
         assert main(["prepare", *words, "data.source.workers=2"]) == code
     signal.signal(signal.SIGINT, ignored)
     assert not root.exists()
-    assert set(active_children()) <= earlier
+    assert no_children(earlier)
     assert signal.getsignal(signal.SIGTERM) is before
     assert main(["prepare", *words, "data.source.workers=1"]) == 0
     assert only_store(root).fingerprint == fingerprint

@@ -21,6 +21,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from conftest import no_children
 from refusals import Refused, carry_out
 from test_fuzz import body, bvh
 
@@ -333,14 +334,6 @@ def test_recordings_of_amass_are_bounded(tmp_path: Path):
 
 
 # Workers --------------------------------------------------------------------------------------------------------------
-
-
-def no_children(before: list) -> bool:
-    for _ in range(500):
-        if not set(active_children()) - set(before):
-            return True
-        time.sleep(0.01)
-    return False
 
 
 @pytest.mark.parametrize("case", ["killed", "memory", "bomb", "pipe"])

@@ -19,6 +19,7 @@ from flame_mdm.runs import CONFIG, Run, read_run
 
 METRICS = {
     "attributes/all": "requested attributes, share right",
+    "sides/all": "side, share right",
     "fid": "FID",
     "texts_for_motion/top3": "R precision, top 3",
     "foot_skating": "foot skating, share of frames",

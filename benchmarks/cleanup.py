@@ -1,8 +1,8 @@
 """Faults of generated motion after each step of cleanup: `python benchmarks/cleanup.py MODEL MODEL ...`.
 
-The models are trained with different seeds on one data set. They generate a motion for each test clip, with its caption
-and length, in 10 sampling steps (folder of the data set: $FLAME_MDM_DATA). Prints a Markdown table of the means over the
-models and their 95 % intervals by Student's t, and the values of the real motions.
+The models are trained with different seeds on one data set (folder: $FLAME_MDM_DATA). They generate a motion for each
+test clip, with its caption and length, in 10 sampling steps. Prints a Markdown table of the means over the models and
+their 95 % intervals by Student's t, and the values of the real motions.
 """
 
 from __future__ import annotations

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from importlib import import_module
 from itertools import takewhile
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, is_typeddict
 
 from flame_mdm.config import EXPERIMENTS, recipes
 from flame_mdm.files import read_yaml
@@ -189,11 +189,10 @@ def find(name: str) -> Any:
 
 def signature(found: Any, name: str) -> str:
     """Returns the call of a function or class, one argument per line if it is long."""
-    try:
-        given = inspect.signature(found)
-    except ValueError:  # of a typed dictionary
+    if is_typeddict(found):
         fields = found.__annotations__.items()
         return f"{name}(*, " + ", ".join(f"{key}: {_type(kind)}" for key, kind in fields) + ")"
+    given = inspect.signature(found)
     short = _plain(str(given))
     if len(name + short) <= 110:
         return name + short

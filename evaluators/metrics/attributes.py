@@ -172,22 +172,37 @@ def right_attributes(seen: Mapping[str, Any], wanted: Mapping[str, Any]) -> dict
     return right | {"all": right["action"] and right.get("side", True)}
 
 
-class AttributeAccuracy(Metric):
+class _Accuracy(Metric):
+    """Counts of right and of requested values, by name."""
+
+    higher_is_better = True
+    full_state_update = False
+    names: tuple[str, ...]
+
+    def __init__(self, fps: float, **kwargs: Any):
+        super().__init__(**kwargs)
+        self.fps = fps
+        for name in self.names:
+            self.add_state(f"right_{name}", tensor(0), dist_reduce_fx="sum")
+            self.add_state(f"requested_{name}", tensor(0), dist_reduce_fx="sum")
+
+    def _add(self, name: str, right: bool) -> None:
+        setattr(self, f"right_{name}", getattr(self, f"right_{name}") + int(right))
+        setattr(self, f"requested_{name}", getattr(self, f"requested_{name}") + 1)
+
+    def _share(self, *names: str) -> float | None:
+        right, requested = (sum(int(getattr(self, f"{k}_{n}")) for n in names) for k in ("right", "requested"))
+        return right / requested if requested else None
+
+
+class AttributeAccuracy(_Accuracy):
     """Fraction of motions that show the requested value, by attribute.
 
     Args:
         fps: frames per second of the motions.
     """
 
-    higher_is_better = True
-    full_state_update = False
-
-    def __init__(self, fps: float, **kwargs: Any):
-        super().__init__(**kwargs)
-        self.fps = fps
-        for name in (*ATTRIBUTES, "all"):
-            self.add_state(f"right_{name}", tensor(0), dist_reduce_fx="sum")
-            self.add_state(f"requested_{name}", tensor(0), dist_reduce_fx="sum")
+    names = (*ATTRIBUTES, "all")
 
     def update(self, joints: Tensor, mask: Tensor, requested: Sequence[Mapping[str, str | int | float]]) -> None:
         """Adds motions.
@@ -208,17 +223,11 @@ class AttributeAccuracy(Metric):
             if unknown or "action" not in wanted:
                 raise ValueError(f"attributes: {dict(wanted)} requested. Give an action, and only keys of {ATTRIBUTES}")
             for name, hit in right_attributes(read_attributes(motion[real].numpy(), self.fps), wanted).items():
-                setattr(self, f"right_{name}", getattr(self, f"right_{name}") + int(hit))
-                setattr(self, f"requested_{name}", getattr(self, f"requested_{name}") + 1)
+                self._add(name, hit)
 
     def compute(self) -> dict[str, float | None]:
         """Returns the accuracy in [0, 1] by attribute, None if never requested; `all` = both action and side right."""
-        return {
-            name: int(getattr(self, f"right_{name}")) / requested
-            if (requested := int(getattr(self, f"requested_{name}")))
-            else None
-            for name in (*ATTRIBUTES, "all")
-        }
+        return {name: self._share(name) for name in self.names}
 
 
 def read_side(joints: np.ndarray, content: str, fps: float) -> str:
@@ -242,22 +251,14 @@ def read_side(joints: np.ndarray, content: str, fps: float) -> str:
     return "left" if toward > 0 else "right"
 
 
-class SideAccuracy(Metric):
+class SideAccuracy(_Accuracy):
     """Share of motions that show the requested side, left or right, on the Bandai set; see `read_side`.
 
     Args:
         fps: frames per second of the motions.
     """
 
-    higher_is_better = True
-    full_state_update = False
-
-    def __init__(self, fps: float, **kwargs: Any):
-        super().__init__(**kwargs)
-        self.fps = fps
-        for name in ("hand", "path"):
-            self.add_state(f"right_{name}", tensor(0), dist_reduce_fx="sum")
-            self.add_state(f"requested_{name}", tensor(0), dist_reduce_fx="sum")
+    names = ("hand", "path")
 
     def update(self, joints: Tensor, mask: Tensor, sides: Sequence[tuple[str, str]]) -> None:
         """Adds motions: joints (B, F, 22, 3) in meters, mask (B, F), and B pairs of content and side.
@@ -267,17 +268,11 @@ class SideAccuracy(Metric):
         for motion, real, (content, side) in zip(joints.detach().cpu(), mask.cpu(), sides, strict=True):
             if side in SIDES:
                 name = "path" if content.startswith("walk") else "hand"
-                hit = read_side(motion[real].numpy(), content, self.fps) == side
-                setattr(self, f"right_{name}", getattr(self, f"right_{name}") + int(hit))
-                setattr(self, f"requested_{name}", getattr(self, f"requested_{name}") + 1)
+                self._add(name, read_side(motion[real].numpy(), content, self.fps) == side)
 
     def compute(self) -> dict[str, float | None]:
         """Returns the accuracy in [0, 1] of `hand`, of `path` (turns and sideways walks), and of `all`; chance is 0.5.
 
         None if no motion has a side.
         """
-        right, requested = (
-            {name: int(getattr(self, f"{kind}_{name}")) for name in ("hand", "path")} for kind in ("right", "requested")
-        )
-        right["all"], requested["all"] = sum(right.values()), sum(requested.values())
-        return {name: right[name] / count if count else None for name, count in requested.items()}
+        return {name: self._share(name) for name in self.names} | {"all": self._share(*self.names)}

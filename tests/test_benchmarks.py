@@ -16,6 +16,7 @@ import cost  # noqa: E402
 import quality  # noqa: E402
 import run  # noqa: E402
 import sections  # noqa: E402
+import seeds  # noqa: E402
 import steps  # noqa: E402
 
 from flame_mdm.config import compose  # noqa: E402
@@ -112,7 +113,9 @@ def test_the_committed_page_is_rendered_from_the_committed_figures():
 def trained(folder: Path, speed: str, seed: int, loss: float, fid: float) -> Run:
     keys: dict[str, Any] = {"speed": speed} if speed == "fast" else {}
     config = {"data": {"name": "own"}, "trainer": {"max_steps": 1500}, "ema": {"decay": 0.9}, "run": keys, "seed": seed}
-    result: Any = SimpleNamespace(values={"fid": Value(mean=fid, ci=0.0, replications=1, n=9), "jitter": None})
+    values = {"fid": Value(mean=fid, ci=0.0, replications=1, n=9), "jitter": None}
+    model = SimpleNamespace(parameters=1_500_000 + seed, training_hours=0.1 * (1 + seed))
+    result: Any = SimpleNamespace(values=values, checkpoint=model)
     return Run(folder, config, None, {"val/loss": {9: 100.0, 19: loss}}, {"evaluation/result.json": result})
 
 
@@ -141,6 +144,19 @@ def test_quality_has_intervals_over_seeds_and_of_the_differences_of_equal_seeds(
     monkeypatch.setattr(quality, "read_run", lambda folder: Run(folder, runs["a0"].config, None, {}, {}))
     with pytest.raises(SystemExit, match="not validated or not evaluated"):
         quality.measure(str(tmp_path))
+
+
+def test_a_row_of_several_seeds(tmp_path, monkeypatch, capsys):
+    for seed in range(3):
+        (tmp_path / f"bandai-gru-{seed}").mkdir()
+        (tmp_path / f"bandai-gru-{seed}" / "config.yaml").touch()
+    monkeypatch.setattr(
+        seeds, "read_run", lambda folder: trained(folder, "fast", s := int(folder.name[-1]), s + 1.0, 5.0 + s)
+    )
+    seeds.main(f"{tmp_path}/bandai-gru")
+    assert capsys.readouterr().out.splitlines()[2] == "| gru | 1,500 | 3 | 1.50 | 12.0 | 6.0 ± 2.5 |"
+    with pytest.raises(SystemExit, match=r"bandai-g: 0 runs .*bandai-g-0"):
+        seeds.main(f"{tmp_path}/bandai-g")
 
 
 @pytest.mark.slow

@@ -102,13 +102,15 @@ def atomic_folder(path: str | Path) -> Iterator[Path]:
 def writing(path: Path, temporary: Path) -> Iterator[None]:
     """Converts an `OSError` about `temporary`, a file or folder that becomes `path`, to a `UserError` about `path`.
 
-    Errors that name other files, and errors without `errno`, are not converted.
+    So are errors about a folder above it, which could not be made. Errors that name other files, and errors without
+    `errno`, are not converted.
     """
     try:
         yield
     except OSError as error:
         name = Path(str(error.filename or temporary))
-        if error.errno is None or not (name.is_relative_to(temporary) or name.is_relative_to(path)):
+        within = name.is_relative_to(temporary) or name.is_relative_to(path) or path.is_relative_to(name)
+        if error.errno is None or not within:
             raise
         raise UserError(f"{path}: cannot be written: {write_failure(error, path)}") from error
 

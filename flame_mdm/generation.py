@@ -138,7 +138,7 @@ def generate(
         raise UserError("an edit keeps a single motion: give neither parts, after, loop nor targets with it")
     if sequence:
         check_sequence(model)
-    begun = None if after is None else _begun(model, after, loop or targets is not None)
+    begun = None if after is None else _begun(model, after, "loop" if loop else "targets" if targets is not None else None)
     wanted = None if targets is None else read_targets(model.representation, targets)
     captions = [text for text in requested for _ in range(samples)]
     numbers: Counter[str] = Counter()
@@ -245,10 +245,11 @@ def _finish(
     return results
 
 
-def _begun(model: MotionGeneration, after: str | Path | Motion, more: bool) -> torch.Tensor:
-    """Returns the features (F, D) of the motion that is continued."""
-    if more:
-        raise UserError("after= continues a motion: give neither loop nor targets with it")
+def _begun(model: MotionGeneration, after: str | Path | Motion, other: str | None) -> torch.Tensor:
+    """Returns the features (F, D) of the motion that is continued; `other` is an option that excludes it."""
+    if other is not None:
+        name = after.id if isinstance(after, Motion) else after
+        raise UserError(f"after={name}: a motion that continues another cannot have {other}. Give one of the two")
     known = model.representation
     motion = with_features(known, after) if isinstance(after, Motion) else read_motion(known, after)
     if (least := overlap(model)) > len(motion.features):

@@ -58,8 +58,7 @@ def read_motion(
         motion = _read_clip(representation, name, Path(data_root))
     else:
         raise UserError(
-            f"motion={name}: not a motion. Give a {', '.join(ENDINGS)} file, or dataset:id for a clip of a prepared "
-            "data set"
+            f"{name}: not a motion. Give a {', '.join(ENDINGS)} file, or dataset:id for a clip of a prepared data set"
         )
     if cut is not None:
         if not is_range(cut):

@@ -59,8 +59,8 @@ class Targets:
         if last >= frames:
             fps = representation.fps
             raise UserError(
-                f"targets: {last / fps:g} seconds is after the end of the motion, which lasts {(frames - 1) / fps:g} "
-                "seconds. Give an earlier time, or more seconds"
+                f"targets: {last / fps:g} seconds is after the end of the motion, whose last frame is at "
+                f"{(frames - 1) / fps:g} seconds. Give an earlier time, or more seconds"
             )
         known = torch.zeros(1, frames, representation.features, device=device)
         keep = torch.zeros_like(known, dtype=torch.bool)

@@ -184,6 +184,11 @@ def test_a_request_stops_within_a_step_and_the_next_one_runs():
             studio.motions(asked.model_copy(update={"seed": 1}))
 
 
+def test_the_demo_refuses_a_wrong_port(capsys):
+    assert main(["demo", "port=99999"]) == 1
+    assert "port=99999: give a number from 0 to 65535" in capsys.readouterr().err
+
+
 def test_the_demo_names_the_missing_package(monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "gradio", None)
     assert main(["demo"]) == 1

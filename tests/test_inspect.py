@@ -129,7 +129,7 @@ def test_the_command_prints_faults_marks_them_and_exits_with_3(tmp_path, capsys,
     joints = body()
     Motion(joints, FPS).save("motions/good.npz")
     sink(joints)
-    Motion(joints, FPS).save("motions/bad.npz")
+    Motion(joints, FPS).save("motions/walks-after=good.npz/bad.npz")  # samples are in such folders
     assert main(["inspect", "motions/good.npz"]) == 0
     assert "good: 0 of 1 motions with faults" in capsys.readouterr().out
     assert main(["inspect", "motions", "both.html"]) == 3

@@ -432,6 +432,7 @@ def short(document: dict[str, Any]) -> None:
     ("change", "message"),
     [
         (lambda document: document.pop("skins"), "0 skeletons with a skin"),
+        (lambda document: [document.pop(key) for key in ("skins", "meshes", "buffers")], "0 skeletons with a skin"),
         (two, "2 skeletons with a skin"),
         (twice, "2 joints for left_knee: mixamorig:LeftLeg, mixamorig:LeftLeg"),
         (short, "the bone from left_shoulder to left_elbow has no length"),
@@ -486,6 +487,9 @@ def test_a_folder_is_converted(kick: Motion, tmp_path: Path, capsys: pytest.Capt
         ([str(tmp_path / "in"), str(out)], "is a folder: name the format"),
         ([str(tmp_path / "in" / "a.npz"), str(tmp_path / "c.bvh"), "format=bvh"], "format=... is for folders"),
         ([str(tmp_path / "empty"), str(out), "format=bvh"], "no motion files"),
+        ([str(tmp_path / "in" / "a.npz"), str(tmp_path / "in" / "." / "a.npz")], "the same file as the input"),
+        ([str(tmp_path / "in"), str(tmp_path / "in"), "format=json"], "b.json: the same file as the input"),
+        ([str(tmp_path / "in" / "a.npz"), "/proc/none/a.bvh"], "/proc/none/a.bvh: cannot be written"),
     ):
         (tmp_path / "empty").mkdir(exist_ok=True)
         assert main(["convert", *words]) == 1

@@ -142,9 +142,15 @@ def test_bad_parts_give_one_clear_line(model, text, message):
         flame_mdm.generate(model, text)
 
 
-def test_a_loop_cannot_continue_a_motion(model):
-    with pytest.raises(UserError, match="loop"):
-        flame_mdm.generate(model, "walks", after="walk.npz", loop=True)
+@pytest.mark.parametrize("other", [{"loop": True}, {"targets": "path.json"}], ids=["loop", "targets"])
+def test_a_loop_or_targets_cannot_continue_a_motion(model, other):
+    with pytest.raises(UserError, match=rf"^after=walk\.npz: a motion .* cannot have {next(iter(other))}\."):
+        flame_mdm.generate(model, "walks", after="walk.npz", **other)
+
+
+def test_only_a_motion_can_be_continued(model):
+    with pytest.raises(UserError, match=r"^notes\.txt: not a motion\. Give a \.npz"):
+        flame_mdm.generate(model, "walks", after="notes.txt")
 
 
 def test_the_command_writes_a_sequence(tmp_path, monkeypatch, capsys):
@@ -213,7 +219,13 @@ def test_the_parts_of_a_motion(model):
     assert len(after.joints) == 100
 
 
-def test_a_motion_clip_scores_the_parts(model, tmp_path):
+def test_a_scorer_is_a_motion_clip(model, tmp_path, capsys):
     with pytest.raises(FileNotFoundError, match="no such"):
         text_fit(str(tmp_path / "none.ckpt"), model)
-    assert main(["sample", "quickstart", "text=walks", "scorer=none.ckpt"]) == 1
+    for words, message in (
+        (["scorer=none.ckpt"], "scorer=none.ckpt chooses among motions for a text"),
+        (["scorer=none.ckpt", "candidates=2"], "scorer: none.ckpt: no such checkpoint. Give a run"),
+        (["scorer=quickstart", "candidates=2"], "holds a MotionGeneration, not a MotionCLIPTask"),
+    ):
+        assert main(["sample", "quickstart", "text=walks", *words]) == 1
+        assert message in capsys.readouterr().err

@@ -68,8 +68,8 @@ def find(source: str | Path, which: Which = "last") -> Path:
     match = re.fullmatch(r"([\w.-]+/[\w.-]+)(?:@([\w./-]+))?", str(source))
     if match is None or path.suffix in (".ckpt", ".safetensors", ".pt") or path.parent.is_dir():
         there = [p.name for p in path.parent.iterdir()] if path.parent.is_dir() else []
-        near = did_you_mean(path.name, [*there, *SHIPPED])
-        raise FileNotFoundError(f"{path}: no such checkpoint.{near}".rstrip("."))
+        advice = did_you_mean(path.name, [*there, *SHIPPED]) or " Give a run, a .ckpt or .safetensors file, or quickstart"
+        raise FileNotFoundError(f"{path}: no such checkpoint.{advice}")
     from huggingface_hub import hf_hub_download, logging
 
     logging.set_verbosity_error()  # otherwise it reports every attempt to reach the hub
@@ -135,7 +135,7 @@ def _build(path: str | Path, checkpoint: dict[str, Any], kind: type[Trained]) ->
             raise UserError(f"{path}: damaged: its recipe has no {name}")
     built = get_class(config["task"]["_target_"])
     if not issubclass(built, kind):
-        raise UserError(f"{path}: holds a {built.__name__}, not a {kind.__name__}")
+        raise UserError(f"{path}: holds a {built.__name__}, not a {kind.__name__}. Give another checkpoint")
     with _Sizes(path, checkpoint["state_dict"], parts):
         representation = instantiate(config["representation"])
         task = built.build(config, representation, actions=facts["actions"])

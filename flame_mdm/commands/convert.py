@@ -69,6 +69,8 @@ def _convert(config: Config, path: Path, out: Path, character: Character | None)
     from flame_mdm.representations.skeleton import SMPL22
     from flame_mdm.visualize.bodies import choose_body
 
+    if out.exists() and out.samefile(path):
+        raise UserError(f"{out}: the same file as the input, which stays as it is. Choose another name for the output")
     choose_body(config["body"])
     given = find_skeleton(path, config["up"])
     # a BVH file keeps proportions in any unit; the other files are in meters

@@ -21,8 +21,10 @@ def demo(config: Config) -> None:
     """Serves the page until interrupted.
 
     Raises:
-        UserError: If gradio is not installed, the port is in use, or a model cannot be found or loaded.
+        UserError: If gradio is not installed, the port is invalid or in use, or a model cannot be found or loaded.
     """
+    if not 0 <= config["port"] <= 65535:
+        raise UserError(f"port={config['port']}: give a number from 0 to 65535; 0 is any free port")
     try:
         import gradio  # noqa: F401
     except ImportError as error:

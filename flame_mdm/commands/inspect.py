@@ -77,7 +77,8 @@ def _files(config: Config) -> tuple[str, int, Iterator[Motion]]:
     if not path.exists():
         kinds = ", ".join(ENDINGS)
         raise UserError(f"{path}: no such file. Give a motion file ({kinds}), a folder of them, or a prepared data set")
-    found = sorted(file for file in path.rglob("*") if file.suffix.lower() in ENDINGS) if path.is_dir() else [path]
+    below = sorted(file for file in path.rglob("*") if file.suffix.lower() in ENDINGS and not file.is_dir())
+    found = below if path.is_dir() else [path]
     if not found:
         raise UserError(f"{path}: the folder has no motion files ({', '.join(ENDINGS)})")
     motions = (read(f, config["fps"], config["unit"], given=find_skeleton(f, config["up"])) for f in found)

@@ -67,7 +67,10 @@ def sample(config: Config) -> None:
     if config["scorer"] is not None:
         from evaluators.selection import text_fit
 
-        score = text_fit(str(config["scorer"]), model, device)
+        try:
+            score = text_fit(str(config["scorer"]), model, device)
+        except (UserError, FileNotFoundError) as error:
+            raise UserError(f"scorer: {error}") from error
     motions = generate(
         model,
         texts,

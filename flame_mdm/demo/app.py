@@ -92,7 +92,7 @@ def serve(sources: Sequence[str], host: str = "127.0.0.1", port: int = 7860, dev
         try:
             listening.bind((host, port))
             listening.listen()
-        except (OSError, OverflowError) as error:
+        except OSError as error:
             raise UserError(f"host={host} port={port}: {first_line(error)}. Choose another port") from error
         studio = Studio(sources, device or ("cuda" if torch.cuda.is_available() else "cpu"))
         with tempfile.TemporaryDirectory(prefix="flame_mdm_demo_") as folder:

@@ -191,7 +191,7 @@ def read(path: Path) -> Glb:
         skins = tuple(_read_skin(document, data, number, rank) for number in range(len(document.get("skins", ()))))
         names = tuple(str(nodes[number].get("name", f"node {number}")) for number in order)
         finite = np.isfinite(worlds).all() and all(np.isfinite(part).all() for _, *parts in skins for part in parts)
-        if not finite or document["buffers"][0].get("uri"):
+        if not finite or any("uri" in buffer for buffer in document.get("buffers", [])):
             raise ValueError("numbers are not finite" if not finite else "its data are in another file")
     except (KeyError, TypeError, IndexError, AttributeError, OverflowError, struct.error, ValueError) as error:
         raise ValueError(f"{path}: damaged, or not glTF 2.0 in one file: {first_line(error)}") from error

@@ -138,7 +138,8 @@ def generate(
         raise UserError("an edit keeps a single motion: give neither parts, after, loop nor targets with it")
     if sequence:
         check_sequence(model)
-    begun = None if after is None else _begun(model, after, "loop" if loop else "targets" if targets is not None else None)
+    other = "loop" if loop else "targets" if targets is not None else None
+    begun = None if after is None else _begun(model, after, other)
     wanted = None if targets is None else read_targets(model.representation, targets)
     captions = [text for text in requested for _ in range(samples)]
     numbers: Counter[str] = Counter()

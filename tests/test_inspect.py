@@ -137,7 +137,7 @@ def test_the_command_prints_faults_marks_them_and_exits_with_3(tmp_path, capsys,
     assert "penetration: left_foot, frames 30 to 39, 0.06 m (limit 0.05)" in printed
     assert "motions: 1 of 2 motions with faults" in printed
     shown = page(tmp_path / "both.html")
-    assert [motion["id"] for motion in shown] == ["bad", "good"], "the worst first"
+    assert [motion["id"] for motion in shown] == ["walks-after=good.npz/bad", "good"], "the worst first"
     assert [30, 40, "penetration"] in [mark[:3] for mark in shown[0]["marks"]]
     assert not shown[1]["marks"]
 

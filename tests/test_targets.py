@@ -90,7 +90,7 @@ def test_targets_of_a_sequence(model):
         ({"root": [{"time": -1, "position": [0, 0]}]}, "seconds from the start"),
         ({"root": [{"time": 1, "position": [0, "x"]}]}, "give 2 numbers"),
         ({"root": [{"time": 1, "position": [0, 30]}]}, "30.0 m from the start in 1 seconds is impossible"),
-        ({"root": [{"time": 9, "position": [0, 1]}]}, "9 seconds is after the end of the motion, whose last frame is at 1.95 seconds"),
+        ({"root": [{"time": 9, "position": [0, 1]}]}, "9 seconds is after .* last frame is at 1.95 seconds"),
         ({"joints": [{"time": 1, "joint": "left_rist", "position": [0, 1, 0]}]}, "no joint 'left_rist'.*left_wrist"),
         ({"joints": [{"time": 1, "joint": "head", "position": [0, 9, 0]}]}, "height 9 m is impossible"),
         ({"poses": [{"time": 1, "file": "no.npz"}]}, "no.npz"),

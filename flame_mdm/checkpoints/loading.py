@@ -68,7 +68,8 @@ def find(source: str | Path, which: Which = "last") -> Path:
     match = re.fullmatch(r"([\w.-]+/[\w.-]+)(?:@([\w./-]+))?", str(source))
     if match is None or path.suffix in (".ckpt", ".safetensors", ".pt") or path.parent.is_dir():
         there = [p.name for p in path.parent.iterdir()] if path.parent.is_dir() else []
-        advice = did_you_mean(path.name, [*there, *SHIPPED]) or " Give a run, a .ckpt or .safetensors file, or quickstart"
+        near = did_you_mean(path.name, [*there, *SHIPPED])
+        advice = near or " Give a run, a .ckpt or .safetensors file, or quickstart"
         raise FileNotFoundError(f"{path}: no such checkpoint.{advice}")
     from huggingface_hub import hf_hub_download, logging
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -81,8 +82,12 @@ def _files(config: Config) -> tuple[str, int, Iterator[Motion]]:
     found = below if path.is_dir() else [path]
     if not found:
         raise UserError(f"{path}: the folder has no motion files ({', '.join(ENDINGS)})")
-    motions = (read(f, config["fps"], config["unit"], given=find_skeleton(f, config["up"])) for f in found)
-    return path.resolve().stem, len(found), motions
+
+    def motion(file: Path) -> Motion:
+        known = read(file, config["fps"], config["unit"], given=find_skeleton(file, config["up"]))
+        return known if file == path else replace(known, id=file.relative_to(path).with_suffix("").as_posix())
+
+    return path.resolve().stem, len(found), map(motion, found)
 
 
 def _clips(config: Config) -> tuple[str, int, Iterator[Motion]]:

@@ -23,7 +23,7 @@ LENGTHS = {"seconds": "float | list[float]", "frames": "int | list[int]"}
 TOGGLES = ("shared_noise", "cleanup", "loop")
 """Keys that are true or false and change the motions."""
 USAGE = """
-usage: flame-mdm sample ckpt=FILE text="a person walks in a circle" [seconds=3] [key=value ...]
+usage: flame-mdm sample ckpt=FILE text="a person walks in a circle clockwise" [seconds=3] [key=value ...]
        flame-mdm sample ckpt=FILE text="walks forward @3 | turns left | sits down @2.5" [after=walk.npz] [loop=true]
        flame-mdm sample ckpt=FILE text="walks forward" targets=path.json
        flame-mdm sample ckpt=FILE prompts=FILE.txt [seconds=[2,3.5,...]] [mp4=true]

@@ -135,7 +135,7 @@ def generate(
     parts = [[(text, None)] if kind == "none" else read_parts(text) for text in requested]
     sequence = loop or after is not None or any(len(each) > 1 or each[0][1] is not None for each in parts)
     if edit is not None and (sequence or targets is not None):
-        raise UserError("an edit keeps a single motion: give neither parts, after, loop nor targets with it")
+        raise UserError("an edit keeps a single motion: give neither parts (|), after, loop nor targets with it")
     if sequence:
         check_sequence(model)
     other = "loop" if loop else "targets" if targets is not None else None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -101,12 +101,16 @@ def read_targets(representation: Representation, source: str | Path | Mapping[st
     """
     name, folder = ("targets", Path()) if isinstance(source, Mapping) else (f"targets={source}", Path(source).parent)
     content = source if isinstance(source, Mapping) else _read(source, name)
-    if not isinstance(content, Mapping) or not content or not content.keys() <= KEYS.keys():
+    if not isinstance(content, Mapping) or not content:
         raise UserError(f"{name}: give an object with {', '.join(KEYS)}, each a list. See docs/targets.md")
+    if unknown := [str(key) for key in content if key not in KEYS]:
+        raise UserError(f"{name}: unknown key '{unknown[0]}'.{did_you_mean(unknown[0], KEYS)} Use {', '.join(KEYS)}")
     places: list[tuple[str, int, int, np.ndarray]] = []  # description, frame, joint, and a position with NaN = free
     poses = []
     for kind, entries in content.items():
-        for number, entry in enumerate(entries if isinstance(entries, Sequence) else [None]):
+        if not isinstance(entries, list | tuple):
+            raise UserError(f"{name}: {kind} is {entries}, not a list. See docs/targets.md")
+        for number, entry in enumerate(entries):
             where = f"{name}: {kind}[{number}]"
             needed, possible = KEYS[kind]
             if not isinstance(entry, Mapping) or not needed <= entry.keys() <= needed | possible:
@@ -157,7 +161,7 @@ def _numbers(entry: Mapping[str, Any], key: str, where: str, count: int = 1) -> 
     values = [math.nan if value is None else value for value in listed]
     if len(values) != count or not all(isinstance(v, int | float) and not abs(v) > 1e4 for v in values):
         numbers = f"{count} numbers in meters, null = free" if count > 1 else "a number"
-        raise UserError(f"{where}.{key}={entry[key]}: give {numbers}")
+        raise UserError(f"{where}.{key}={entry[key]!r}: give {numbers}")
     return values
 
 

@@ -477,6 +477,8 @@ def test_damaged_files_are_refused(kick: Motion, tmp_path: Path):
 def test_a_folder_is_converted(kick: Motion, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     kick.save(tmp_path / "in" / "a.npz")
     kick.save(tmp_path / "in" / "below" / "b.json")
+    kick.save(tmp_path / "double" / "a.npz")
+    kick.save(tmp_path / "double" / "a.json")
     out = tmp_path / "out"
     assert main(["convert", str(tmp_path / "in"), str(out), "format=bvh", "rig=mixamo"]) == 0
     assert [str(path.relative_to(out)) for path in sorted(out.rglob("*.bvh"))] == ["a.bvh", "below/b.bvh"]
@@ -489,7 +491,9 @@ def test_a_folder_is_converted(kick: Motion, tmp_path: Path, capsys: pytest.Capt
         ([str(tmp_path / "empty"), str(out), "format=bvh"], "no motion files"),
         ([str(tmp_path / "in" / "a.npz"), str(tmp_path / "in" / "." / "a.npz")], "the same file as the input"),
         ([str(tmp_path / "in"), str(tmp_path / "in"), "format=json"], "b.json: the same file as the input"),
+        ([str(tmp_path / "double"), str(out), "format=bvh"], "another motion has the same name"),
         ([str(tmp_path / "in" / "a.npz"), "/proc/none/a.bvh"], "/proc/none/a.bvh: cannot be written"),
+        ([str(tmp_path / "missing.npz"), str(tmp_path / "in" / "a.npz")], "missing.npz: no such file"),
     ):
         (tmp_path / "empty").mkdir(exist_ok=True)
         assert main(["convert", *words]) == 1

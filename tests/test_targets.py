@@ -84,7 +84,9 @@ def test_targets_of_a_sequence(model):
     ("content", "message"),
     [
         ([], "give an object with root, joints, poses"),
-        ({"path": []}, "give an object with root, joints, poses"),
+        ({"roots": []}, "unknown key 'roots'. Did you mean root?"),
+        ({"root": {"time": 1, "position": [0, 1]}}, "root is {.*}, not a list"),
+        ({"root": [{"time": "1", "position": [0, 1]}]}, r"root\[0\].time='1': give a number"),
         ({"root": [[0, 1]]}, r"root\[0\] is \[0, 1\]. Give an object with position, time"),
         ({"root": [{"time": 1, "position": [1]}]}, r"root\[0\].position=\[1\]: give 2 numbers"),
         ({"root": [{"time": -1, "position": [0, 0]}]}, "seconds from the start"),

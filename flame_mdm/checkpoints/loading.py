@@ -69,7 +69,7 @@ def find(source: str | Path, which: Which = "last") -> Path:
     if match is None or path.suffix in (".ckpt", ".safetensors", ".pt") or path.parent.is_dir():
         there = [p.name for p in path.parent.iterdir()] if path.parent.is_dir() else []
         near = did_you_mean(path.name, [*there, *SHIPPED])
-        advice = near or " Give a run, a .ckpt or .safetensors file, or quickstart"
+        advice = near or " Give a run, or a .ckpt or .safetensors file"
         raise FileNotFoundError(f"{path}: no such checkpoint.{advice}")
     from huggingface_hub import hf_hub_download, logging
 

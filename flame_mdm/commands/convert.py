@@ -58,8 +58,11 @@ def convert(config: Config) -> None:
     found = sorted(file for file in path.rglob("*") if file.suffix.lower() in ENDINGS and file.is_file())
     if not found:
         raise UserError(f"{path}: no motion files ({', '.join(ENDINGS)})")
-    for file in ProgressBar(found, desc="convert", unit="file"):
-        _convert(config, file, out / file.relative_to(path).with_suffix(f".{ending}"), character)
+    outputs = {out / file.relative_to(path).with_suffix(f".{ending}"): file for file in found}
+    if double := [file for file in found if file not in outputs.values()]:
+        raise UserError(f"{double[0]}: another motion has the same name, so both would become one file. Rename one")
+    for target, file in ProgressBar(outputs.items(), desc="convert", unit="file"):
+        _convert(config, file, target, character)
 
 
 def _convert(config: Config, path: Path, out: Path, character: Character | None) -> None:
@@ -69,13 +72,13 @@ def _convert(config: Config, path: Path, out: Path, character: Character | None)
     from flame_mdm.representations.skeleton import SMPL22
     from flame_mdm.visualize.bodies import choose_body
 
-    if out.exists() and out.samefile(path):
-        raise UserError(f"{out}: the same file as the input, which stays as it is. Choose another name for the output")
     choose_body(config["body"])
     given = find_skeleton(path, config["up"])
     # a BVH file keeps proportions in any unit; the other files are in meters
     copied = path.suffix.lower() == out.suffix.lower() == ".bvh"
     motion = read(path, config["fps"], config["unit"], given=given, any_size=copied)
+    if out.exists() and out.samefile(path):
+        raise UserError(f"{out}: the same file as the input, which stays as it is. Choose another name for the output")
     if out.suffix.lower() == ".npz":
         motion.poses = motion.posed()  # other programs expect AMASS's keys
     say(motion.save(out, config["figure"], config["rest_pose"], config["rig"], character))

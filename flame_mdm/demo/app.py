@@ -93,7 +93,7 @@ def serve(sources: Sequence[str], host: str = "127.0.0.1", port: int = 7860, dev
             listening.bind((host, port))
             listening.listen()
         except OSError as error:
-            raise UserError(f"host={host} port={port}: {first_line(error)}. Choose another port") from error
+            raise UserError(f"host={host} port={port}: {error.strerror}. Choose another host or port") from error
         studio = Studio(sources, device or ("cuda" if torch.cuda.is_available() else "cpu"))
         with tempfile.TemporaryDirectory(prefix="flame_mdm_demo_") as folder:
             os.environ["GRADIO_TEMP_DIR"] = folder

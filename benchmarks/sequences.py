@@ -4,7 +4,8 @@ PART is transitions, targets or candidates. MODEL generates the motions, and the
 measures how well they fit their texts. For candidates, CLIP selects motions, and `judge=` is a second motion-CLIP that
 measures the selected ones. For targets, `steps=` is the number of sampling steps. Texts and targets come from test
 clips of the data set that MODEL was trained on, in the folder $FLAME_MDM_DATA. `python benchmarks/sequences.py table
-OUT*.json` prints the means over the seeds and their 95 % intervals by Student's t.
+OUT*.json` prints the means over the seeds and their 95 % intervals by Student's t; with `differences` in place of
+`table`, those of the differences from the motions without targets.
 """
 
 from __future__ import annotations
@@ -190,21 +191,31 @@ def candidates(bench: Bench, judge: str, count: int = 5) -> Rows:
     return {name: bench.values(motions) for name, motions in rows.items()}
 
 
-def combined(files: Sequence[str]) -> str:
-    """Returns a Markdown table of the means over the seeds."""
+def combined(files: Sequence[str], paired: bool = False) -> str:
+    """Returns a Markdown table of the means over the seeds.
+
+    If `paired`, those of the differences from the row "KIND: none" of the same seed.
+    """
     seeds = [json.loads(Path(file).read_text()) for file in files]
     columns = list(dict.fromkeys(name for row in seeds[0].values() for name in row))
     rows = []
     for name, values in seeds[0].items():
-        cells = {c: shown([seed[name][c] for seed in seeds]) if c in values else "" for c in columns}
+        base = f"{name.split(':')[0]}: none"
+        if paired and (base == name or base not in seeds[0]):
+            continue
+        found = {
+            c: [seed[name][c] - (seed[base][c] if paired else 0) for seed in seeds] for c in columns if c in values
+        }
+        sign = "+" if paired else ""
+        cells = {c: shown([round(v, 3) for v in found[c]], sign) if c in found else "" for c in columns}
         rows.append({"": name, **cells})
     return table(rows)
 
 
 def main(out: str, *words: str) -> None:
     """Measures a part for one seed, or prints the table of several."""
-    if out == "table":
-        print(combined(words))
+    if out in ("table", "differences"):
+        print(combined(words, out == "differences"))
         return
     part, model, clip, seed, *rest = words
     options = dict(word.split("=", 1) for word in rest)

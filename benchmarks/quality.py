@@ -81,7 +81,7 @@ def measure(*words: str) -> Section:
         "Quality in both speeds",
         "Each speed is trained with several seeds, and evaluated once on the test motions. Means over the seeds, with "
         "95 % intervals by Student's t. The differences are those of runs with the same seed, which begin with the "
-        "same weights and see the same batches.",
+        "same weights and see the same batches. [Commands](../speed.md#quality).",
         f"In {total - len(differing)} of {total} figures of quality, the interval of `fast` − `reference` contains 0"
         + (f"; the others: {', '.join(differing)}." if differing else "."),
         **tables,

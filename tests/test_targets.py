@@ -126,3 +126,10 @@ def test_a_target_that_the_text_does_not_suggest_does_not_stretch_bones(model):
         )
     )
     assert np.abs(np.median(after, 0) / np.median(before, 0) - 1).max() < 0.05
+
+
+def test_bones_keep_their_lengths_around_a_target(model):
+    target = {"joints": [{"time": 1.5, "joint": "right_wrist", "position": [None, 1.4, None]}]}
+    motion = flame_mdm.generate(model, "a person walks forward", seconds=3, targets=target)[0]
+    bones = np.linalg.norm(motion.skeleton.bones(torch.from_numpy(motion.joints)).numpy()[:, 1:], axis=-1)
+    assert np.abs(bones / np.median(bones, 0) - 1).max() < 0.15  # 0.6, if kept in the frame of the target alone

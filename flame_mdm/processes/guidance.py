@@ -103,13 +103,15 @@ def reach(
     """Returns the motions nearest to `x` whose joints reach positions in the world.
 
     Gauss-Newton steps: of all changes that lead to the positions, the smallest one in normalized features, where
-    changes are smooth in time: their covariance between frames is that of a Gaussian process. Bones keep their lengths.
+    changes are smooth in time: their covariance between frames is that of a Gaussian process. Bones get their median
+    lengths in the frames of the positions, where they are part of the conditions, and keep theirs in the frames around,
+    where a change of half the size would shorten a bone that turns.
 
     Args:
         x: (B, F, D) normalized features.
         to_joints: decodes (F, D) as joints (F, J, 3) in meters.
         wanted: the positions.
-        bones: (3, N) int64: frame, parent and child of bones that the change could stretch.
+        bones: (3, N) int64: frame, parent and child of bones that the change could stretch; all bones of a frame.
         free: (B, F, D) bool, features that may change.
         smoothness: standard deviation in frames of the Gaussian process.
     """
@@ -121,6 +123,8 @@ def reach(
         joints = to_joints(features)
         return torch.cat([wanted.of(joints), (joints[frames, children] - joints[frames, parents]).norm(dim=-1)])
 
+    around = frames.unique()
+    near = torch.exp(-0.5 * ((torch.arange(x.shape[1], device=x.device)[:, None] - around) / smoothness) ** 2)
     changed = []
     for motion, may in zip(x, free, strict=True):
         joints = to_joints(motion)
@@ -136,5 +140,31 @@ def reach(
             gram = torch.einsum("mfd,nfd->mn", smooth, slope).double()
             gram += torch.diag(RELAXATION * gram.diagonal() + 1e-9)
             motion = motion + torch.einsum("m,mfd->fd", torch.linalg.solve(gram, error.double()).to(x), smooth)
+        if len(around):
+            edges = bones[1:, frames == around[0]]
+            before = (joints[:, edges[1]] - joints[:, edges[0]]).norm(dim=-1)
+            weight = near.amax(1, keepdim=True)
+            lengths = weight * before.median(0).values + (1 - weight) * before
+            motion = _with_bones(motion, to_joints, edges, lengths, may)
         changed.append(motion)
     return torch.stack(changed)
+
+
+def _with_bones(
+    motion: Tensor, to_joints: Callable[[Tensor], Tensor], edges: Tensor, lengths: Tensor, free: Tensor
+) -> Tensor:
+    """Returns the nearest motion (F, D) whose bones (2, N) have `lengths` (F, N) in each frame."""
+
+    def found(frame: Tensor) -> Tensor:
+        joints = to_joints(frame[None])[0]
+        return (joints[edges[1]] - joints[edges[0]]).norm(dim=-1)
+
+    for _ in range(MOST_STEPS):
+        error = lengths - torch.func.vmap(found)(motion)
+        if error.abs().max() < CLOSE:
+            break
+        slope = torch.func.vmap(torch.func.jacrev(found))(motion) * free[:, None]  # (F, N, D)
+        gram = (slope @ slope.mT).double()
+        gram = gram + torch.diag_embed(RELAXATION * gram.diagonal(dim1=1, dim2=2) + 1e-9)
+        motion = motion + (torch.linalg.solve(gram, error.double()).to(motion)[..., None] * slope).sum(1)
+    return motion

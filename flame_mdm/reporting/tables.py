@@ -280,11 +280,10 @@ def requests(part: Mapping[str, Any]) -> Iterator[tuple[dict[str, Any], list[Req
 
 
 def _spread_label(part: Mapping[str, Any], row: Mapping[str, Any], single: Mapping[str, Any]) -> str:
-    """Returns the label of an expanded row, with the values of its lists that no column shows."""
+    """Returns the label of an expanded row, with the values of its lists of several that no column shows."""
     shown = {column["value"] for column in part["columns"].values()}
-    options = [
-        f"{ABOUT[name]} {single[name]}" for name in SWEPT if isinstance(row.get(name), list) and name not in shown
-    ]
+    swept = [name for name in SWEPT if name not in shown and len(_list(row.get(name))) > 1]
+    options = [f"{ABOUT[name]} {single[name]}" for name in swept]
     return f"{row['label']} ({', '.join(options)})" if options else row["label"]
 
 

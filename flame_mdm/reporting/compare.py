@@ -256,7 +256,7 @@ def _charts(runs: Mapping[str, Run]) -> dict[str, list[Markup]]:
     for heading, titles in charted({name: {0: 0.0} for name in names}).items():
         shown: dict[str, tuple[dict[str, Curve], dict[str, Curve]]] = {}
         for name in (f"{family}/{rest}" for rest, families in titles.items() for family in families):
-            lines: dict[str, Curve] = {k: found.curves[name] for k, found in runs.items() if name in found.curves}
+            lines: dict[str, Curve] = {k: found.curves.get(name, {}) for k, found in runs.items()}  # one color per run
             if len({value for line in lines.values() for value in line.values()}) > 1:
                 shown[name] = lines, {label: runs[label].curves.get(f"{name}/ci", {}) for label in lines}
         groups[heading] = charts(shown)

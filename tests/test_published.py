@@ -7,6 +7,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any, get_args
 
+import numpy as np
 import pytest
 import yaml
 from fixtures import recipe
@@ -136,9 +137,9 @@ def test_rows_are_sampled_in_ways_that_their_processes_have(name):
         config = recipe(trained(row))
         diffusion = config["process"]["_target_"].endswith("GaussianDiffusion")
         assert row.get("sampler", config["task"]["sampler"]) in (get_args(Sampler) if diffusion else STEPS)
-        steps = row.get("num_inference_steps", 1)
         if diffusion:
-            assert max(steps if isinstance(steps, list) else [steps]) <= config["process"]["num_train_timesteps"]
+            steps = row.get("num_inference_steps", 1)  # a number, several numbers, or lists of the steps themselves
+            assert np.max(steps) <= config["process"]["num_train_timesteps"]
         assert "until" not in row or not diffusion
 
 

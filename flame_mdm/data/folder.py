@@ -208,7 +208,7 @@ class Folder(MotionSource):
         """
         found: dict[str, Path] = {}
         for path in sorted(self.path.rglob("*")) if self.path.is_dir() else ():
-            if path.suffix.lower() in MOTIONS and path != self.path / TABLES[1] and not path.is_dir():
+            if path.suffix.lower() in MOTIONS and path != self.path / TABLES[1]:
                 name = path.relative_to(self.path).with_suffix("").as_posix()
                 if FORBIDDEN_CHARACTERS.search(name):
                     raise UserError(

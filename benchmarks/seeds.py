@@ -6,14 +6,13 @@ The runs of a row are FOLDER/NAME-0, FOLDER/NAME-1 and so on, each trained with 
 
 from __future__ import annotations
 
-import statistics
 import sys
 from pathlib import Path
 
 from quality import METRICS, shown, values
 from sections import Row, table
 
-from flame_mdm.runs import CONFIG, Run, read_run
+from flame_mdm.runs import CONFIG, read_run
 
 
 def main(*names: str) -> None:
@@ -26,15 +25,10 @@ def main(*names: str) -> None:
         measured = [values(run) for run in runs]
         row: Row = {"": name.name.split("-", 1)[-1], "steps": f"{runs[0].config['trainer']['max_steps']:,}"}
         row["seeds"] = str(len(runs))
-        row["parameters, M"] = f"{_median(runs, 'parameters') / 1e6:.2f}"
-        row["minutes"] = f"{60 * _median(runs, 'training_hours'):.1f}"
+        model = list(runs[0].results.values())[-1].checkpoint
+        row["parameters, M"] = f"{model.parameters / 1e6:.2f}" if model and model.parameters else ""
         rows.append(row | {m: shown([each[m] for each in measured]) for m in METRICS.values() if m in measured[0]})
     print(table(rows))
-
-
-def _median(runs: list[Run], fact: str) -> float:
-    newest = [list(run.results.values())[-1].checkpoint for run in runs]
-    return statistics.median(getattr(checkpoint, fact) for checkpoint in newest if checkpoint is not None)
 
 
 if __name__ == "__main__":

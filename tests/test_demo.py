@@ -369,6 +369,7 @@ def test_a_person_writes_a_sequence_in_rows_and_draws_a_path(server, tmp_path):
         click(tab, "+ Add an action")
         tab.wait("document.querySelectorAll('#parts .part').length === 3")
         tab.click("[aria-label='Remove action 3']")
+        tab.wait("document.querySelectorAll('#parts .part').length === 2")
         tab.type("#text textarea", "a person walks @1.5 | <b> | stands @2")
         rows = "[...document.querySelectorAll('#parts .part')]"
         values = f"{rows}.map(row => [...row.querySelectorAll('input')].map(input => input.value))"

@@ -4,8 +4,8 @@ PART is transitions, targets or candidates. MODEL generates the motions, and the
 measures how well they fit their texts. For candidates, CLIP selects motions, and `judge=` is a second motion-CLIP that
 measures the selected ones. For targets, `steps=` is the number of sampling steps. Texts and targets come from test
 clips of the data set that MODEL was trained on, in the folder $FLAME_MDM_DATA. `python benchmarks/sequences.py table
-OUT*.json` prints the means over the seeds and their 95 % intervals by Student's t; with `differences` in place of
-`table`, those of the differences from the motions without targets.
+OUT*.json` prints the means over the seeds and their 95 % intervals by Student's t. `differences` instead of `table`
+compares each row with the motions without targets.
 """
 
 from __future__ import annotations

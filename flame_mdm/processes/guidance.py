@@ -10,7 +10,7 @@ from torch import Tensor
 from flame_mdm.motion import Condition, Denoise
 
 STEERING_STEPS = 2
-"""Gradient steps before each step of the sampler; docs/targets.md has the errors and costs of other numbers."""
+"""Gradient steps before each step of the sampler."""
 STEERING_LIMIT = 0.02
 """Maximum length of such a step, as RMS over the normalized features. Where the denoiser hardly reacts to x_t, longer
 steps leave what it was trained on: arms grew by a third."""

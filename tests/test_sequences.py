@@ -189,11 +189,8 @@ def test_the_best_of_several_candidates_is_kept(model):
 
 
 def test_without_a_score_the_fewest_faulty_frames_decide():
-    joints = np.tile(np.linspace(0, 1, 22)[None, :, None], (20, 1, 3)) + np.linspace(0, 1, 20)[:, None, None] * [
-        1,
-        0,
-        1,
-    ]
+    moved = np.linspace(0, 1, 20)[:, None, None] * np.array([1, 0, 1])
+    joints = np.tile(np.linspace(0, 1, 22)[None, :, None], (20, 1, 3)) + moved
     worse, better = joints.copy(), joints.copy()
     worse[5, 3, 0] += 5
     worse[9, 3, 0] += 5

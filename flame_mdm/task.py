@@ -122,7 +122,7 @@ class MotionGeneration(Task):
         cond_drop_prob: probability that a training sample gets the null condition.
         guidance_scale: default of `generate`; 1 = off.
         sampler: default of `generate`, one that the process supports.
-        num_inference_steps: default of `generate`.
+        num_inference_steps: default of `generate`: a number, or, of diffusion, the steps themselves.
         seed: of all random draws in training, which are functions of (seed, batch number, rank).
         compile: compile the denoiser with torch.compile.
     """
@@ -139,7 +139,7 @@ class MotionGeneration(Task):
         cond_drop_prob: float,
         guidance_scale: float,
         sampler: str,
-        num_inference_steps: int,
+        num_inference_steps: int | list[int],
         seed: int = 0,
         compile: bool = False,
     ):
@@ -148,8 +148,11 @@ class MotionGeneration(Task):
             raise UserError(f"task.cond_drop_prob={cond_drop_prob}: give a probability from 0 to 1")
         if not math.isfinite(guidance_scale):
             raise UserError(f"task.guidance_scale={guidance_scale} is not a finite number")
-        if type(num_inference_steps) is not int or not 1 <= num_inference_steps <= MAX_STEPS:
-            raise UserError(f"task.num_inference_steps={num_inference_steps}: give a number from 1 to {MAX_STEPS:,}")
+        # Process.sample checks lists further.
+        counts = num_inference_steps if isinstance(num_inference_steps, list) else [num_inference_steps or -1]
+        if not all(type(count) is int and 0 <= count <= MAX_STEPS for count in counts):
+            given = f"task.num_inference_steps={num_inference_steps}"
+            raise UserError(f"{given}: give a number from 1 to {MAX_STEPS:,}, or a list of steps")
         self.denoiser, self.process = denoiser, process
         self.losses = MotionLosses(representation.to_joints, representation.skeleton.feet, **losses)
         self.cond_drop_prob = cond_drop_prob

@@ -280,6 +280,20 @@ def test_sampling_writes_motions_and_a_player(trained, tmp_path, capsys):
     assert "player.html" in capsys.readouterr().out
 
 
+def test_recipes_may_list_the_sampling_steps(data_root, tmp_path):
+    from conftest import TINY
+
+    words = [f"data_root={data_root}", "callbacks.samples=null", "task.num_inference_steps=[0,2,5,9]"]
+    model = load(run([*TINY, *words], 1, tmp_path / "run"))
+
+    def features(**options: Any) -> np.ndarray:
+        return generate(model, "a person walks", frames=20, **options)[0].features
+
+    default, chosen, other = features(), features(num_inference_steps=[0, 2, 5, 9]), features(num_inference_steps=4)
+    np.testing.assert_array_equal(default, chosen)
+    assert not np.allclose(default, other)
+
+
 def test_sample_takes_every_option_of_sampling(trained, tmp_path):
     out, text = tmp_path / "samples", "a person walks"
     how: dict[str, Any] = {"frames": 40, "sampler": "ddim", "eta": 0.5, "num_inference_steps": [0, 2, 5, 9]}

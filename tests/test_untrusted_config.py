@@ -337,9 +337,14 @@ def test_odd_frame_rates(attacked, changed, value):
     attacked("sample", f"ckpt={changed(config__representation__fps=value)}", TEXT, says="fps")
 
 
-@pytest.mark.parametrize("value", [None, 0, -1, "x", 1.5, True])
+@pytest.mark.parametrize("value", [None, 0, -1, "x", 1.5, True, ["x"], [0, 10**9], [0, True], [-1, 2]])
 def test_odd_sampling_steps(attacked, changed, value):
     attacked("sample", f"ckpt={changed(config__task__num_inference_steps=value)}", TEXT, says="num_inference_steps")
+
+
+@pytest.mark.parametrize("value", [[], [3], [3, 1], [0, 99_999]])
+def test_odd_lists_of_sampling_steps(attacked, changed, value):
+    attacked("sample", f"ckpt={changed(config__task__num_inference_steps=value)}", TEXT, says="sampling steps must be")
 
 
 @pytest.mark.slow

@@ -164,7 +164,8 @@ def page(studio: Studio, device: str | None) -> gr.Blocks:
             request = _read(query)
             model = studio.model(request.model)
             runs = 1 + len(request.edits) + STEERING_STEPS * bool(request.path)
-            total = (request.num_inference_steps or model.num_inference_steps) * runs
+            steps = request.num_inference_steps or model.num_inference_steps
+            total = (len(steps) if isinstance(steps, list) else steps) * runs
 
             def report(calls: int) -> None:
                 progress((calls, max(total, calls + 1)), "Generating", unit="steps")

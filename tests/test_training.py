@@ -68,6 +68,7 @@ def test_a_run_leaves_what_a_user_looks_for(trained):
     assert checkpoint["global_step"] == 6
     training = checkpoint["facts"].pop("training")
     assert training.keys() == {"hours", "memory_gib", "processes", "speed", "precision", "device"}
+    assert re.fullmatch(r"1 x (?!cpu).+, \d+ threads?", training["device"]), "names the processor"
     facts = json.loads((folder / "provenance.json").read_text())["data"]
     assert facts == {name: fact for name, fact in checkpoint["facts"].items() if name not in ("vocabulary", "captions")}
     assert not list(folder.rglob("*.partial"))

@@ -70,11 +70,17 @@ class Provenance(Callback):
 
 
 def device_name(trainer: Trainer) -> str:
-    """Returns the number of processes and the device of each, such as "1 x cpu, 2 threads"."""
+    """Returns the number of processes and the device of each, such as "1 x NVIDIA H200", "1 x AMD EPYC, 2 threads"."""
     where = trainer.strategy.root_device
-    name = torch.cuda.get_device_name(where) if where.type == "cuda" else where.type
-    threads = f", {torch.get_num_threads()} threads" if where.type == "cpu" else ""
-    return f"{trainer.world_size} x {name}{threads}"
+    if where.type == "cuda":
+        name = torch.cuda.get_device_name(where)
+    elif where.type == "cpu":
+        threads = torch.get_num_threads()
+        processor = torch.cpu.get_capabilities().get("cpu_name") or platform.machine()
+        name = f"{processor}, {threads} thread{'s' if threads > 1 else ''}"
+    else:
+        name = where.type
+    return f"{trainer.world_size} x {name}"
 
 
 def environment() -> dict[str, Any]:

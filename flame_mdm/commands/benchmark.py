@@ -25,9 +25,10 @@ if TYPE_CHECKING:
 USAGE = """
 usage: flame-mdm benchmark NAME [out=FOLDER]
 
-Trains a motion-CLIP and a small model of each kind, evaluates them, and writes a table and a report page, all in one
-command. If interrupted, the same command continues where it stopped.
-NAME is a file in experiments/benchmark: synthetic, which needs no download, bandai, or bandai_full, for one GPU.
+Trains a motion-CLIP and a model of each kind, evaluates them, and writes a table and a report page, all in one command.
+If interrupted, the same command continues where it stopped.
+NAME is a file in experiments/benchmark: synthetic and synthetic_medium, which need no download, bandai, or bandai_full,
+for one GPU.
 """
 
 

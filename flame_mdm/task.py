@@ -33,6 +33,8 @@ from flame_mdm.seeds import key, normal, seed_generator, seeded_noise, uniform
 class Task(LightningModule):
     """Base class of all models that `make train` trains; a recipe names the class in `task._target_`."""
 
+    noun = "a model"
+    """What its checkpoints hold, for messages."""
     config: Config
     """The recipe, saved in checkpoints."""
     facts: dict[str, Any]
@@ -126,6 +128,8 @@ class MotionGeneration(Task):
         seed: of all random draws in training, which are functions of (seed, batch number, rank).
         compile: compile the denoiser with torch.compile.
     """
+
+    noun = "a motion generator"
 
     def __init__(
         self,

@@ -402,7 +402,7 @@ def refused(runs: Runs, capsys, tmp_path: Path, *words: str) -> str:
 def test_what_does_not_fit_is_refused_in_one_line(runs, capsys, tmp_path):
     assert "resamples=20: give 0, or 100 or more" in refused(runs, capsys, tmp_path, "resamples=20")
     assert "needs a feature extractor" in refused(runs, capsys, tmp_path, "extractor=null")
-    assert "not a MotionCLIPTask" in refused(runs, capsys, tmp_path, f"extractor={runs.model}")
+    assert "holds a motion generator, not a motion-CLIP" in refused(runs, capsys, tmp_path, f"extractor={runs.model}")
     assert "no such checkpoint" in refused(runs, capsys, tmp_path, f"extractor={tmp_path / 'none.ckpt'}")
     assert "synthetic" in refused(runs, capsys, tmp_path, "protocol=synthetical")
     assert "condition text" in refused(runs, capsys, tmp_path, "protocol=action_to_motion")

@@ -222,7 +222,7 @@ def test_a_scorer_is_a_motion_clip(model, tmp_path, capsys):
     for words, message in (
         (["scorer=none.ckpt"], "scorer=none.ckpt chooses among motions for a text"),
         (["scorer=none.ckpt", "candidates=2"], "scorer: none.ckpt: no such checkpoint. Give a run"),
-        (["scorer=quickstart", "candidates=2"], "holds a MotionGeneration, not a MotionCLIPTask"),
+        (["scorer=quickstart", "candidates=2"], "holds a motion generator, not a motion-CLIP"),
     ):
         assert main(["sample", "quickstart", "text=walks", *words]) == 1
         assert message in capsys.readouterr().err

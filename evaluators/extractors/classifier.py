@@ -36,6 +36,8 @@ class ClassifierTask(Task):
         seed: determines the random draws of a training step, together with the step and the rank.
     """
 
+    noun = "an action classifier"
+
     def __init__(
         self,
         network: ActionGRU | JointSTGCN,

@@ -185,6 +185,8 @@ class MotionCLIPTask(Task):
         seed: determines the dropout of a training step, together with the step and the rank.
     """
 
+    noun = "a motion-CLIP"
+
     def __init__(
         self,
         network: MotionCLIP,

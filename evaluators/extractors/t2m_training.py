@@ -116,6 +116,8 @@ class T2MTask(Task):
         seed: determines the dropout of a training step, together with the step and the rank.
     """
 
+    noun = "a trained evaluator of Guo et al."
+
     def __init__(
         self,
         network: T2MEvaluator,

@@ -136,7 +136,8 @@ def _build(path: str | Path, checkpoint: dict[str, Any], kind: type[Trained]) ->
             raise UserError(f"{path}: damaged: its recipe has no {name}")
     built = get_class(config["task"]["_target_"])
     if not issubclass(built, kind):
-        raise UserError(f"{path}: holds a {built.__name__}, not a {kind.__name__}. Give another checkpoint")
+        found = built.noun if issubclass(built, Task) else built.__name__
+        raise UserError(f"{path}: holds {found}, not {kind.noun}. Give another checkpoint")
     with _Sizes(path, checkpoint["state_dict"], parts):
         representation = instantiate(config["representation"])
         task = built.build(config, representation, actions=facts["actions"])

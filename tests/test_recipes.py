@@ -117,7 +117,7 @@ def test_the_parts_of_a_recipe_fit(name):
         assert task["sampler"] in get_args(Sampler)
         steps, total = task["num_inference_steps"], config["process"]["num_train_timesteps"]
         assert 2 <= (len(steps) if isinstance(steps, list) else steps) <= total
-        assert not isinstance(steps, list) or (steps == sorted(set(steps)) and 0 <= steps[0] and steps[-1] < total)
+        assert not isinstance(steps, list) or (steps == sorted(set(steps)) and steps[0] >= 0 and steps[-1] < total)
     else:
         assert task["sampler"] in SOLVERS
     assert task["guidance_scale"] == 1 or task["cond_drop_prob"] > 0, "guided, but never trained without condition"

@@ -182,6 +182,7 @@ class MotionGeneration(Task):
             in_features=width,
             out_features=process.out_features(width),
             cond_features=condition.features,
+            length_unit=_length_unit(config),
         )
         options = {k: v for k, v in config["task"].items() if k != "_target_"}
         task = cls(
@@ -327,3 +328,10 @@ class MotionGeneration(Task):
         if was_training:
             self.train()
         return x[:, :frames]
+
+
+def _length_unit(config: Config) -> Any:
+    """Returns the number of which all lengths in training are multiples; 1 for imported models without a data set."""
+    data = config.get("data")
+    crop = data.get("crop") if isinstance(data, dict) else None
+    return crop.get("unit", 1) if isinstance(crop, dict) else 1

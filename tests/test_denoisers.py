@@ -257,6 +257,21 @@ def test_flame_knows_lengths_up_to_max_frames() -> None:
         flame(*batch([12, 3], frames=14))
 
 
+def test_flame_rounds_lengths_down_to_those_of_its_training() -> None:
+    flame, exact = (FLAME(D, D, C, **TRANSFORMER, max_frames=20, length_unit=unit).double() for unit in (4, 1))
+    exact.load_state_dict(flame.state_dict())
+    rows = []
+    for network in (flame, exact):
+        network.length_embedding.register_forward_hook(lambda _, inputs, __: rows.append(inputs[0].tolist()))  # type: ignore[union-attr]
+        network(*batch([12, 3, 15], frames=15))
+    assert rows == [[12, 4, 12], [12, 3, 15]]
+    x_t, t, mask, cond = batch([12, 8, 4], frames=12)
+    assert torch.equal(flame(x_t, t, mask, cond), exact(x_t, t, mask, cond))
+    for unit in (0, -4, 1.5, "4", True):
+        with pytest.raises(ValueError, match="length_unit"):
+            FLAME(D, D, C, **TRANSFORMER, max_frames=20, length_unit=unit)  # type: ignore[arg-type]
+
+
 def test_token_positions_do_not_move_the_frames() -> None:
     """Absent tokens shift no frame: masked tokens and fewer tokens are the same."""
     encoder = MDMEncoder(D, D, C, **TRANSFORMER, max_tokens=5).double().eval()

@@ -34,6 +34,7 @@ class FLAME(Denoiser):
         length_token: bool = True,
         cross_attention: bool = True,
         condition_frames: bool = False,
+        length_unit: int = 1,
     ):
         """Builds the network.
 
@@ -51,9 +52,16 @@ class FLAME(Denoiser):
             cross_attention: False gives a transformer encoder over ML, TS, CLS and frames (table 4, first two rows).
             condition_frames: also add TS and CLS to every frame. A small network then learns to follow the text in
                 fewer steps than from tokens alone.
+            length_unit: ML embeds the length rounded down to a multiple of this. `task.build` passes the unit of the
+                windows in training: ML knows no other lengths.
+
+        Raises:
+            ValueError: `length_unit` is not a positive whole number.
         """
         super().__init__()
-        self.max_frames, self.condition_frames = max_frames, condition_frames
+        if type(length_unit) is not int or length_unit < 1:
+            raise ValueError(f"length_unit is {length_unit}: choose a number of frames, 1 or more")
+        self.max_frames, self.condition_frames, self.length_unit = max_frames, condition_frames, length_unit
         # A table of max_frames rows is enough for the lengths 1 to max_frames: row 0, which the authors' code never
         # reads, is used for the longest motion.
         self.length_embedding = nn.Embedding(max_frames, latent_dim) if length_token else None
@@ -80,6 +88,7 @@ class FLAME(Denoiser):
                     f"a motion of {int(lengths.max())} frames is too long for the length token: "
                     f"increase denoiser.max_frames ({self.max_frames})"
                 )
+            lengths = (lengths // self.length_unit * self.length_unit).clamp(min=self.length_unit)
             prefix.insert(0, self.length_embedding(lengths % self.max_frames))
         if self.pooled_projection is not None:
             prefix.append(self.pooled_projection(cond.pooled))

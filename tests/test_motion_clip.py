@@ -376,7 +376,7 @@ def test_a_checkpoint_is_a_feature_extractor(trained):
 
 @pytest.mark.slow
 def test_a_feature_extractor_is_not_sampled_from(trained):
-    with pytest.raises(UserError, match=r"last\.ckpt: holds a MotionCLIPTask, not a MotionGeneration"):
+    with pytest.raises(UserError, match=r"last\.ckpt: holds a motion-CLIP, not a motion generator"):
         load(trained)
 
 

@@ -15,7 +15,6 @@ import threading
 from pathlib import Path
 
 from sections import Row, Section, section, show
-from tqdm import tqdm
 
 FRAMES_PER_CLIP = 51
 MEBIBYTE = 2**20
@@ -48,7 +47,6 @@ def prepare(clips: int) -> None:
             peaks[:] = max(peaks[0], private(multiprocessing.current_process().pid or 0)), max(peaks[1], *workers, 0)
 
     threading.Thread(target=watch, daemon=True).start()
-    tqdm.monitor_interval = 0
     with tempfile.TemporaryDirectory() as folder:
         start = spent()
         store = write_store(Path(folder, "store"), Synthetic(clips), HumanML())

@@ -3,20 +3,33 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import IO, Any
 
 from tqdm import tqdm
+
+from flame_mdm import errors
 
 
 class ProgressBar(tqdm):
     """tqdm's bar in a terminal; elsewhere, a plain line at the beginning, about every 30 seconds, and at the end."""
 
     SECONDS = 30.0
+    monitor_interval = 0  # tqdm would swallow the exception of a signal that comes while its monitor thread starts
 
     def __init__(self, *args: Any, **options: Any):
-        rare = {} if sys.stderr.isatty() else {"mininterval": self.SECONDS, "maxinterval": self.SECONDS}
-        super().__init__(*args, **rare, **options)
+        rare = {} if sys.stderr.isatty() else {"mininterval": self.SECONDS}
+        super().__init__(*args, miniters=1, **rare, **options)
+
+    def __iter__(self) -> Iterator[Any]:
+        for item in super().__iter__():
+            _stop()
+            yield item
+
+    def update(self, n: float | None = 1) -> bool | None:
+        """See tqdm; raises the exception of a signal that a library has swallowed."""
+        _stop()
+        return super().update(n)
 
     @staticmethod
     def status_printer(file: IO[str]) -> Callable[[str], None]:
@@ -33,3 +46,8 @@ class ProgressBar(tqdm):
                 end = "\n"
 
         return write
+
+
+def _stop() -> None:
+    if errors.stopped_by is not None:
+        raise errors.stopped_by

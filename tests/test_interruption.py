@@ -14,6 +14,7 @@ from conftest import TINY
 from flame_mdm.__main__ import main
 from flame_mdm.config.command_line import guarded
 from flame_mdm.data.store import Store
+from flame_mdm.progress import ProgressBar
 
 pytestmark = pytest.mark.slow
 
@@ -118,6 +119,26 @@ def test_a_library_that_fails_after_a_signal_does_not_hide_it(signum, code, fail
     assert guarded(command, (signal.SIGINT, signal.SIGTERM)) == code
     assert "cannot close" not in capsys.readouterr().err
     assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == handlers
+
+
+@pytest.mark.parametrize("advance", [lambda bar: [None for _ in bar], lambda bar: bar.update()])
+def test_a_signal_that_a_library_swallows_stops_the_next_step_of_a_progress_bar(advance, capsys):
+    class Unfinished:
+        def __del__(self) -> None:
+            os.kill(os.getpid(), signal.SIGTERM)
+            time.sleep(1)
+
+    def command() -> None:
+        bar = ProgressBar(range(3))
+        Unfinished()  # Python swallows exceptions of __del__, and prints them
+        advance(bar)
+        raise AssertionError("it went on")
+
+    before = sys.unraisablehook
+    assert guarded(command, (signal.SIGTERM,)) == 143
+    assert "Traceback" not in capsys.readouterr().err
+    assert sys.unraisablehook is before
+    assert list(ProgressBar(range(3))) == [0, 1, 2], "the next command is not stopped"
 
 
 def test_an_ignored_signal_stays_ignored():

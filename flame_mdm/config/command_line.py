@@ -20,6 +20,7 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf
 
+from flame_mdm import errors
 from flame_mdm.config.building import plain
 from flame_mdm.config.composition import (
     EXPERIMENTS,
@@ -123,7 +124,9 @@ def _stoppable(signums: Sequence[int]) -> Iterator[None]:
 
     def stop(number: int, frame: FrameType | None) -> NoReturn:
         received.append(number)
-        raise exception(number)
+        sys.unraisablehook = lambda _: None  # of objects that were being created or deleted
+        errors.stopped_by = exception(number)
+        raise errors.stopped_by
 
     before = {n: signal.signal(n, stop) for n in signums if signal.getsignal(n) is not signal.SIG_IGN}
     try:
@@ -136,6 +139,7 @@ def _stoppable(signums: Sequence[int]) -> Iterator[None]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+        errors.stopped_by = None
 
 
 def _serve(
@@ -258,6 +262,7 @@ def guarded(action: Callable[[], None], signums: Sequence[int] = ()) -> int:
 
     For an error that the user can fix, it prints one line and returns 1; FLAME_MDM_TRACEBACK=1 adds the traceback.
     """
+    hook = sys.unraisablehook
     try:
         with _stoppable(signums):
             action()
@@ -278,4 +283,6 @@ def guarded(action: Callable[[], None], signums: Sequence[int] = ()) -> int:
     except KeyboardInterrupt:
         say("interrupted", error=True)
         return 130
+    finally:
+        sys.unraisablehook = hook
     return 0

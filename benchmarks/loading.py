@@ -1,4 +1,4 @@
-"""Speed of both ways to load batches compared to a training step: `python benchmarks/loading.py [clips]`.
+"""Speed of both ways to load batches compared to a training step: `python benchmarks/loading.py [clips batches]`.
 
 A synthetic data set is packed into a temporary folder. Batches gathered from memory (data.resident=true), batches of
 the data loader in the training process, and forward, backward and update of the small MDM encoder are measured in
@@ -25,7 +25,7 @@ from flame_mdm.losses import masked_mse
 from flame_mdm.motion import Condition, MotionBatch
 from flame_mdm.representations.humanml import HumanML
 
-BATCH, BATCHES, ROUNDS = 64, 60, 5
+BATCH, ROUNDS = 64, 5
 GOAL = 5000
 """Target clips per second and worker."""
 
@@ -57,8 +57,8 @@ def median(run: Callable[[], object], times: int, clock: Callable[[], float]) ->
 
 
 def measure(*words: str) -> Section:
-    """Measures with the number of clips in `words`."""
-    clips = int(words[0]) if words else 1000
+    """Measures with the numbers of clips and of batches per round in `words`."""
+    clips, count = (int(word) for word in words or (1000, 60))
     torch.manual_seed(0)
     torch.set_num_threads(1)
     with tempfile.TemporaryDirectory() as folder:
@@ -73,11 +73,11 @@ def measure(*words: str) -> Section:
         step(batches[0])
         endless = itertools.cycle(batches)
         wait = median(lambda: step(next(endless)), len(batches), time.process_time)
-        load = median(lambda: next(loader), BATCHES, time.process_time)
+        load = median(lambda: next(loader), count, time.process_time)
         data.resident = True
         data.setup("fit")
         gathered = iter(data.train_dataloader())
-        gather = median(lambda: next(gathered), BATCHES, time.process_time)
+        gather = median(lambda: next(gathered), count, time.process_time)
         lengths = torch.cat([batch.lengths for batch in batches]).float().mean()
         frames = statistics.mean(batch.x.shape[1] for batch in batches)
         rows = [row("resident, one core", gather, wait, 1), row("loader, one core", load, wait, 1)]
@@ -87,9 +87,9 @@ def measure(*words: str) -> Section:
         for workers in (1, 2):
             data.num_workers = workers
             loader = iter(data.train_dataloader())
-            for _ in range(BATCHES):  # starts the workers
+            for _ in range(count):  # starts the workers
                 next(loader)
-            taken = median(partial(next, loader), BATCHES, time.perf_counter)
+            taken = median(partial(next, loader), count, time.perf_counter)
             rows.append(row(f"loader, {workers} worker{'s' * (workers > 1)}, wall time", taken, wait, workers))
 
     return section(
@@ -97,7 +97,7 @@ def measure(*words: str) -> Section:
         f"{BATCH} clips per batch, {lengths:.0f} frames of {size} features on average, padded to {frames:.0f}. "
         "Resident batches (`data.resident=true`) are gathered from memory; the loader collates clips, in the training "
         f"process or in workers. A training step of the small MDM encoder takes {1000 * wait:.0f} ms of one core. The "
-        f"target is {GOAL:,} clips per second and worker. Median of {ROUNDS} rounds of {BATCHES} batches.",
+        f"target is {GOAL:,} clips per second and worker. Median of {ROUNDS} rounds of {count} batches.",
         f"A resident batch is ready {load / gather:.1f} times as fast as one of the loader, and takes "
         f"{gather / wait:.1%} of the time of a small training step.",
         batches=rows,

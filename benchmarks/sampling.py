@@ -41,10 +41,6 @@ RUNS = [
 ]
 
 
-LONGEST = 20.0
-"""Seconds above which a run is estimated from one with fewer steps."""
-
-
 def inputs(batch: int, args: argparse.Namespace) -> tuple[Tensor, Tensor, Condition]:
     """Returns noise (B, F, D), mask (B, F) and a condition with a null."""
     null = Condition(torch.zeros(1, 512, device=args.device), torch.zeros(1, 0, 512, device=args.device), None)
@@ -105,9 +101,9 @@ def measure_steps(denoise: Denoise, args: argparse.Namespace) -> list[Row]:
         for steps in (10, 50, 1000):
             estimate = short * steps / 10
             if steps > 10:
-                taken = estimate if estimate > LONGEST else seconds(partial(run, num_inference_steps=steps), 1)
+                taken = estimate if estimate > args.longest else seconds(partial(run, num_inference_steps=steps), 1)
             first = first or taken
-            how = ", estimated from 10" if estimate > LONGEST else ""
+            how = ", estimated from 10" if estimate > args.longest else ""
             row: Row = {"batch": str(batch), "steps": f"{steps:,}{how}", "seconds": taken}
             rows.append(row | {"motions per second": batch / taken, "ratio": taken / first})
     return rows
@@ -158,6 +154,7 @@ def measure(*words: str) -> Section:
     parser.add_argument("--num-layers", type=int, default=4)
     parser.add_argument("--guidance-scale", type=float, default=2.5)
     parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--longest", type=float, default=20, help="seconds above which more steps are estimated")
     parser.add_argument("--device", default="cpu")
     args = parser.parse_args(words)
     torch.manual_seed(0)

@@ -25,9 +25,9 @@ from flame_mdm.runs import Run, Value  # noqa: E402
 TOY = {
     "host": "12",
     "steps": "--quick",
-    "loading": "100",
+    "loading": "100 3",
     "ema": "1",
-    "sampling": "--frames 4 --latent-dim 16 --num-layers 1 --repeats 1",
+    "sampling": "--frames 4 --latent-dim 16 --num-layers 1 --repeats 1 --longest 0",
     "evaluation": "--clips 40",
     "preparation": "2000",
     "features": "1",

@@ -13,6 +13,7 @@ from datetime import timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from flame_mdm.checkpoints.files import weights_sha256
 from flame_mdm.config import (
     EXPERIMENTS,
     Config,
@@ -538,6 +539,7 @@ def _outdated(path: Path, request: Request) -> bool:
         return True
     for used, key in ((result.checkpoint, "ckpt"), (result.extractor, "extractor")):
         file = Path(str(request.keys.get(key)))
-        if file.is_file() and (used is None or used.sha256 != sha256(file)):
+        weights = key == "extractor" and file.suffix in (".ckpt", ".safetensors")
+        if file.is_file() and (used is None or used.sha256 != (weights_sha256 if weights else sha256)(file)):
             return True
     return False

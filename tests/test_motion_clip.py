@@ -16,6 +16,7 @@ from evaluators.extractors.motion_clip import MotionCLIP, MotionCLIPTask, Pooled
 from evaluators.extractors.motion_clip_calibrated import CalibratedMotionCLIPTask, calibration_error, noisy_copies
 from flame_mdm.__main__ import main
 from flame_mdm.checkpoints.files import read_checkpoint
+from flame_mdm.checkpoints.hub import export
 from flame_mdm.checkpoints.loading import load, load_task
 from flame_mdm.conditions.text import PretrainedText
 from flame_mdm.config import compose, instantiate
@@ -372,6 +373,14 @@ def test_a_checkpoint_is_a_feature_extractor(trained):
     facts = read_checkpoint(trained)["facts"]
     assert facts["dataset"] == "synthetic"
     assert facts["fingerprint"]
+
+
+@pytest.mark.slow
+def test_an_exported_extractor_is_the_same_extractor(trained, tmp_path):
+    exported = MotionCLIPExtractor(str(export(trained, tmp_path)))
+    assert exported.sha256 == MotionCLIPExtractor(str(trained)).sha256
+    halves = MotionCLIPExtractor(str(export(trained, tmp_path / "half.safetensors", half=True)))
+    assert halves.sha256 != exported.sha256
 
 
 @pytest.mark.slow

@@ -9,11 +9,13 @@ import re
 from pathlib import Path
 
 import pytest
+import torch
 from conftest import TINY
 
 import evaluators.run
 from evaluators.run import _outdated
 from flame_mdm.__main__ import main
+from flame_mdm.checkpoints.files import weights_sha256
 from flame_mdm.errors import UserError
 from flame_mdm.reporting import tables
 from flame_mdm.reporting.rendering import Cell, Figure, Line, Part, Table, cumulative, draw, latex, markdown, places
@@ -617,28 +619,35 @@ parts:
     assert files(Path("runs/tables"))["mine.md"] != first["mine.md"]
 
 
+def clip_file(folder: Path, weight: float, steps: int) -> str:
+    """Writes an extractor and returns the sha256 of its weights."""
+    facts = {"actions": [], "max_frames": 60}
+    content = {"config": {"experiment": "motion_clip/synthetic"}, "facts": facts, "global_step": steps}
+    torch.save(content | {"state_dict": {"w": torch.tensor([weight])}}, folder / "clip.ckpt")
+    return weights_sha256(folder / "clip.ckpt")
+
+
 def test_a_result_is_outdated_when_checkpoint_or_extractor_are_others_now(folder):
     (request,) = [asked[0] for row, asked in requests(_part(folder)) if row["label"] == "MDM"]
-    hashes = {
-        part: hashlib.sha256((folder / name).read_bytes()).hexdigest()
-        for part, name in (("checkpoint", "mdm.ckpt"), ("extractor", "clip.ckpt"))
-    }
     content = json.loads(request.path(folder / "results").read_text())
-    for part, value in hashes.items():
-        content[part]["sha256"] = value
+    content["checkpoint"]["sha256"] = hashlib.sha256((folder / "mdm.ckpt").read_bytes()).hexdigest()
+    content["extractor"]["sha256"] = clip_file(folder, 1.0, 600)
     path = put(request, folder, content)
     assert not _outdated(path, request)
-    for name in ("mdm.ckpt", "clip.ckpt"):
-        (folder / name).write_bytes(b"trained anew")
-        assert _outdated(path, request)
-        (folder / name).write_bytes(b"")
+    clip_file(folder, 1.0, 700)
+    assert not _outdated(path, request), "the weights are the same"
+    clip_file(folder, 2.0, 600)
+    assert _outdated(path, request)
+    clip_file(folder, 1.0, 600)
+    (folder / "mdm.ckpt").write_bytes(b"trained anew")
+    assert _outdated(path, request)
 
 
 def test_a_result_of_a_stand_in_skeleton_is_outdated_once_smpl_is_there(folder, monkeypatch):
     (request,) = [asked[0] for row, asked in requests(_part(folder)) if row["label"] == "MDM"]
-    hashes = {name: hashlib.sha256((folder / name).read_bytes()).hexdigest() for name in ("mdm.ckpt", "clip.ckpt")}
     content = json.loads(request.path(folder / "results").read_text())
-    content["checkpoint"]["sha256"], content["extractor"]["sha256"] = hashes["mdm.ckpt"], hashes["clip.ckpt"]
+    content["checkpoint"]["sha256"] = hashlib.sha256((folder / "mdm.ckpt").read_bytes()).hexdigest()
+    content["extractor"]["sha256"] = clip_file(folder, 1.0, 600)
     path = put(request, folder, content | {"skeleton": {"stand_in": True, "smpl_sha256": None}})
     assert not _outdated(path, request)
     monkeypatch.setenv("FLAME_MDM_SMPL", "SMPL_NEUTRAL.pkl")

@@ -17,6 +17,7 @@ from evaluators.extractors.motion_clip import MotionCLIPTask
 from evaluators.extractors.stgcn import Unconstrained, load_uestc, load_unconstrained
 from evaluators.extractors.t2m import WordVectors, load_t2m
 from evaluators.extractors.t2m_training import T2MTask
+from flame_mdm.checkpoints.files import weights_sha256
 from flame_mdm.checkpoints.loading import find, load_task
 from flame_mdm.conditions.vocabulary import words
 from flame_mdm.data.humanact12 import read_unconstrained
@@ -31,7 +32,7 @@ class Extractor(ABC):
     """A network that computes features of motions, and of texts if it supports them.
 
     Attributes:
-        sha256: of its files. Values of extractors with different hashes are not comparable.
+        sha256: of its weights or files. Values of extractors with different hashes are not comparable.
         fingerprint: of the data it was trained on, if known.
     """
 
@@ -86,9 +87,9 @@ class OwnExtractor(Extractor):
     """Folder of the recipes that train it."""
 
     def __init__(self, path: str, device: str | torch.device = "cpu"):
-        file = find(path)
-        self.path, self.sha256 = file, sha256(file)
-        self.task = load_task(file, self.trained, device)
+        self.path = find(path)
+        self.task = load_task(self.path, self.trained, device)
+        self.sha256 = weights_sha256(self.path)
         self.fingerprint = self.task.facts.get("fingerprint")
 
     def check(self, representation: Representation, dataset: str) -> None:

@@ -219,6 +219,17 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
     return checked(path, checkpoint)
 
 
+def weights_sha256(path: Path) -> str:
+    """Returns the sha256 of the names, types, shapes and values of the weights in a checkpoint or model file.
+
+    All files with the same weights have the same, whatever else they hold.
+
+    Raises:
+        FileNotFoundError, UserError: As for `read_checkpoint`.
+    """
+    return _sha256(read_checkpoint(path)["state_dict"])
+
+
 def without_own_paths(config: Mapping[str, Any]) -> dict[str, Any]:
     """Returns a recipe with default paths of data and run in place of absolute paths on this machine."""
     default = {

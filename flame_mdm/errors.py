@@ -12,8 +12,8 @@ from collections.abc import Iterable
 MAX_LINE = 2_000
 """Maximum number of characters shown of an error line. The framework's own messages are shorter."""
 stopped_by: BaseException | None = None
-"""The exception of a signal that the running command received. A library may have swallowed it, so progress bars raise
-it again at their next step."""
+"""The exception of the first signal that the running command received. Progress bars raise it again at their next
+step, because a library may have swallowed it."""
 
 
 class UserError(Exception):

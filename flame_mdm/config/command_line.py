@@ -117,24 +117,22 @@ def _signals(name: str | None) -> tuple[int, ...]:
 @contextmanager
 def _stoppable(signums: Sequence[int]) -> Iterator[None]:
     """Turns signals into exceptions, so that partial files are cleaned up; the exit code is 128 + the signal."""
-    received: list[int] = []
 
     def exception(number: int) -> BaseException:
         return KeyboardInterrupt() if number == signal.SIGINT else SystemExit(128 + number)
 
     def stop(number: int, frame: FrameType | None) -> NoReturn:
-        received.append(number)
         sys.unraisablehook = lambda _: None  # of objects that were being created or deleted
-        errors.stopped_by = exception(number)
-        raise errors.stopped_by
+        errors.stopped_by = errors.stopped_by or exception(number)
+        raise exception(number)
 
     before = {n: signal.signal(n, stop) for n in signums if signal.getsignal(n) is not signal.SIG_IGN}
     try:
         yield
     except Exception:
         # The exception of a signal may come between any two steps of a library, whose cleanup can then fail.
-        if received:
-            raise exception(received[0]) from None
+        if errors.stopped_by is not None:
+            raise errors.stopped_by from None
         raise
     finally:
         for number, handler in before.items():

@@ -222,7 +222,8 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
 def weights_sha256(path: Path) -> str:
     """Returns the sha256 of the names, types, shapes and values of the weights in a checkpoint or model file.
 
-    All files with the same weights have the same, whatever else they hold.
+    It depends on nothing else in the file: a checkpoint and a model file exported from it in full precision have the
+    same one.
 
     Raises:
         FileNotFoundError, UserError: As for `read_checkpoint`.

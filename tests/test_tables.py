@@ -639,7 +639,7 @@ def test_a_result_is_outdated_when_checkpoint_or_extractor_are_others_now(folder
     clip_file(folder, 2.0, 600)
     assert _outdated(path, request)
     clip_file(folder, 1.0, 600)
-    (folder / "mdm.ckpt").write_bytes(b"trained anew")
+    (folder / "mdm.ckpt").write_bytes(b"trained again")
     assert _outdated(path, request)
 
 

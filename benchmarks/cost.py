@@ -19,8 +19,8 @@ from hydra.utils import get_class
 from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode
 
+from flame_mdm.batch import Condition, MotionBatch
 from flame_mdm.config import compose, instantiate
-from flame_mdm.motion import Condition, MotionBatch
 from flame_mdm.task import MotionGeneration, Task
 
 TOKENS = 30

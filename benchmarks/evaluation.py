@@ -19,8 +19,8 @@ import torch
 from sections import Section, section, show
 from torch import Tensor
 
+from evaluators.evaluation import load_protocol
 from evaluators.extractors import Extractor
-from evaluators.run import load_protocol
 from evaluators.sources import Baseline, Generator, Row, Samples
 from flame_mdm.data.crops import Units
 from flame_mdm.data.datamodule import Clips

@@ -17,12 +17,12 @@ from functools import partial
 import torch
 from sections import Row, Section, section, show
 
+from flame_mdm.batch import Condition, MotionBatch
 from flame_mdm.data.crops import Units
 from flame_mdm.data.datamodule import MotionDataModule
 from flame_mdm.data.synthetic import Synthetic
 from flame_mdm.denoisers.mdm import MDMEncoder
 from flame_mdm.losses import masked_mse
-from flame_mdm.motion import Condition, MotionBatch
 from flame_mdm.representations.humanml import HumanML
 
 BATCH, ROUNDS = 64, 5

@@ -15,7 +15,7 @@ from pathlib import Path
 from scipy.stats import t
 from sections import Row, Section, section, show
 
-from flame_mdm.runs import CONFIG, Run, read_run
+from flame_mdm.schemas import CONFIG, Run, read_run
 
 METRICS = {
     "attributes/all": "requested attributes, share right",

@@ -18,8 +18,8 @@ import torch
 from sections import Row, Section, section, show
 from torch import Tensor
 
+from flame_mdm.batch import Condition, Denoise, Edit
 from flame_mdm.denoisers.mdm import MDMEncoder
-from flame_mdm.motion import Condition, Denoise, Edit
 from flame_mdm.processes.diffusion import GaussianDiffusion
 from flame_mdm.processes.flow_matching import FlowMatching
 from flame_mdm.processes.guidance import classifier_free_guidance

@@ -12,7 +12,7 @@ from pathlib import Path
 from quality import METRICS, shown, values
 from sections import Row, table
 
-from flame_mdm.runs import CONFIG, read_run
+from flame_mdm.schemas import CONFIG, read_run
 
 
 def main(*names: str) -> None:

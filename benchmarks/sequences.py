@@ -27,12 +27,12 @@ from evaluators.metrics.attributes import ATTRIBUTES, read_attributes, right_att
 from evaluators.metrics.physics import FootSkating, Jitter
 from evaluators.metrics.published_physics import peak_and_area, transition_jerk
 from evaluators.selection import text_fit
-from flame_mdm import targets
+from flame_mdm.batch import Edit
 from flame_mdm.data.store import Store
 from flame_mdm.formats.faults import find_faults
 from flame_mdm.formats.motion import Motion
-from flame_mdm.generation import best
-from flame_mdm.motion import Edit
+from flame_mdm.sampling import targets
+from flame_mdm.sampling.generation import best
 
 PARTS, PART_FRAMES, WINDOW = 4, 50, 30
 Rows = dict[str, dict[str, float]]

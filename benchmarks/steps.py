@@ -25,9 +25,9 @@ from hydra.utils import get_class
 from sections import Row, Section, section, show, take_turns
 from torch import Tensor, nn
 
+from flame_mdm.batch import MotionBatch, padded_length
 from flame_mdm.config import compose, instantiate
 from flame_mdm.data.datamodule import TrainingBatches
-from flame_mdm.motion import MotionBatch, padded_length
 from flame_mdm.training.speed import accelerate
 
 WIDTH, LONGEST = 263, 196

@@ -15,8 +15,8 @@ from pathlib import Path
 import torch
 from sections import Section, section, show
 
+from flame_mdm.batch import MotionBatch
 from flame_mdm.conditions.text import PretrainedText
-from flame_mdm.motion import MotionBatch
 
 REPEATS = 15
 

@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Any, NamedTuple, is_typeddict
 
 from flame_mdm.config import EXPERIMENTS, recipes
-from flame_mdm.files import read_yaml
 from flame_mdm.reporting.settings import LABELS, values
 from flame_mdm.reporting.tables import PUBLISHED, load_spec
+from flame_mdm.safe_io import read_yaml
 
 HEAD = "<!-- Written by docs/generate.py; do not edit. -->\n"
 
@@ -143,17 +143,17 @@ def _text(value: Any) -> str:
 # Python API -----------------------------------------------------------------------------------------------------------
 
 API = {
-    "Motions from a model": ["flame_mdm.load", "flame_mdm.generate", "flame_mdm.edit", "flame_mdm.motion.Sampling"],
+    "Motions from a model": ["flame_mdm.load", "flame_mdm.generate", "flame_mdm.edit", "flame_mdm.batch.Sampling"],
     "Motions and files": [
-        *("flame_mdm.Motion", "flame_mdm.editing.Edited", "flame_mdm.formats.files.read"),
+        *("flame_mdm.Motion", "flame_mdm.sampling.editing.Edited", "flame_mdm.formats.readers.read"),
         *("flame_mdm.formats.cleanup.cleaned", "flame_mdm.visualize.write_player"),
     ],
     "Parts of a model": [
         *("flame_mdm.MotionGeneration", "flame_mdm.denoisers.Denoiser", "flame_mdm.processes.Process"),
         *("flame_mdm.conditions.ConditionEncoder", "flame_mdm.representations.Representation"),
-        *("flame_mdm.motion.MotionBatch", "flame_mdm.motion.Condition", "flame_mdm.motion.Edit"),
+        *("flame_mdm.batch.MotionBatch", "flame_mdm.batch.Condition", "flame_mdm.batch.Edit"),
     ],
-    "Evaluation": ["evaluators.evaluator.Evaluator", "evaluators.run.evaluate"],
+    "Evaluation": ["evaluators.evaluator.Evaluator", "evaluators.evaluation.evaluate"],
 }
 """Public names, by section."""
 SECTION = re.compile(r"^(Args|Attributes|Returns|Raises):$")

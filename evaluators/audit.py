@@ -16,6 +16,7 @@ from scipy.stats import hypergeom, rankdata
 from torch import Tensor
 from torchmetrics import Metric
 
+from evaluators.evaluation import EvaluationRequest, open_data, open_protocol
 from evaluators.evaluator import Evaluator, Extracted, Motions
 from evaluators.extractors import OwnExtractor
 from evaluators.metrics import alignment, make_metrics, physics, update_metrics
@@ -25,15 +26,14 @@ from evaluators.metrics.diversity import Diversity
 from evaluators.metrics.published_physics import MeanOverMotions
 from evaluators.near_misses import near_misses
 from evaluators.perturbations import PERTURBATIONS, Joints, Perturbation, continue_with, encode
-from evaluators.run import EvaluationRequest, open_data, open_protocol
 from evaluators.sources import Row, real_motions
 from flame_mdm.config import EXPERIMENTS, instantiate
 from flame_mdm.data.datamodule import MotionDataModule
 from flame_mdm.errors import UserError
-from flame_mdm.files import atomic_write, read_npz, read_yaml
 from flame_mdm.progress import ProgressBar
 from flame_mdm.representations.humanml import HumanML
-from flame_mdm.runs import AuditCard, check_shape
+from flame_mdm.safe_io import atomic_write, read_npz, read_yaml
+from flame_mdm.schemas import AuditCard, check_shape
 from flame_mdm.seeds import key
 from flame_mdm.training.provenance import environment
 

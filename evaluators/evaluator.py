@@ -15,18 +15,18 @@ from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 from torchmetrics import Metric
 
+from evaluators.collectives import dealt
 from evaluators.extractors import Extractor
 from evaluators.metrics import make_metrics, missing_input, required_inputs, update_metrics
 from evaluators.metrics.attributes import ATTRIBUTES
 from evaluators.metrics.memorization import TrainingMotions, poses
 from evaluators.metrics.samples import TwoSets
-from evaluators.processes import dealt
+from flame_mdm.batch import length_mask
 from flame_mdm.config import Config
-from flame_mdm.editing import kept_parts
 from flame_mdm.errors import UserError
-from flame_mdm.motion import length_mask
 from flame_mdm.progress import ProgressBar
 from flame_mdm.representations import Representation
+from flame_mdm.sampling.editing import kept_parts
 from flame_mdm.seeds import key
 
 CHUNK = 64
@@ -48,7 +48,7 @@ class Motions:
         labels: classes of motions with action labels.
         groups: names of the prompts, if several motions share a prompt.
         requested: requested attributes, if the data has them.
-        edit: parts kept from real motions, as `region` and `joints` of `flame_mdm.editing.kept_parts`.
+        edit: parts kept from real motions, as `region` and `joints` of `flame_mdm.sampling.editing.kept_parts`.
         references: of real motions, joints (F', J, 3) at the frame rate of the recording, if the data has them.
     """
 

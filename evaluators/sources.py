@@ -13,15 +13,15 @@ from typing import Any, Protocol
 import numpy as np
 import torch
 
-from evaluators.processes import dealt, shared
+from evaluators.collectives import dealt, shared
+from flame_mdm.batch import Edit, MotionBatch, length_mask, pad_to
 from flame_mdm.data.datamodule import Clips
 from flame_mdm.data.store import Entry
-from flame_mdm.editing import kept_parts
 from flame_mdm.errors import UserError
-from flame_mdm.files import atomic_write, read_npz, regular_file
-from flame_mdm.motion import Edit, MotionBatch, length_mask, pad_to
 from flame_mdm.progress import ProgressBar
 from flame_mdm.representations import Representation
+from flame_mdm.safe_io import atomic_write, read_npz, regular_file
+from flame_mdm.sampling.editing import kept_parts
 from flame_mdm.seeds import key, normal
 from flame_mdm.task import MotionGeneration
 
@@ -103,7 +103,7 @@ class Generator:
         condition: "text", "action" or "none".
         batch_size: motions per batch.
         timed: whether to sample a first batch once more, untimed, since it is slower than the others.
-        parts: `region` and `joints` of `flame_mdm.editing.kept_parts`: the motions are edits of real motions.
+        parts: `region` and `joints` of `flame_mdm.sampling.editing.kept_parts`: the motions are edits of real motions.
         total: number of motions in the whole evaluation, for the progress bar.
         progress: whether to show a progress bar.
     """

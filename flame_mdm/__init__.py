@@ -18,9 +18,9 @@ if "OMP_WAIT_POLICY" not in os.environ:
 
 if TYPE_CHECKING:
     from flame_mdm.checkpoints.loading import load
-    from flame_mdm.editing import edit
     from flame_mdm.formats.motion import Motion
-    from flame_mdm.generation import generate
+    from flame_mdm.sampling.editing import edit
+    from flame_mdm.sampling.generation import generate
     from flame_mdm.task import MotionGeneration
 
 __all__ = ["Motion", "MotionGeneration", "edit", "generate", "load"]

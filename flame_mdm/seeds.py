@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from flame_mdm.motion import Noise
+from flame_mdm.batch import Noise
 
 Counters = TypeVar("Counters", Tensor, np.ndarray)
 

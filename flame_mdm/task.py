@@ -15,6 +15,7 @@ from torch import Tensor
 from torch.optim.lr_scheduler import LambdaLR
 from torchmetrics import MeanMetric
 
+from flame_mdm.batch import Condition, Denoise, Edit, MotionBatch, Sampling, pad_to
 from flame_mdm.conditions import ConditionEncoder
 from flame_mdm.conditions.vocabulary import vocabulary
 from flame_mdm.config import Config, instantiate, parameters
@@ -22,7 +23,6 @@ from flame_mdm.data.datamodule import MotionDataModule
 from flame_mdm.denoisers import Denoiser
 from flame_mdm.errors import UserError
 from flame_mdm.losses import MotionLosses
-from flame_mdm.motion import Condition, Denoise, Edit, MotionBatch, Sampling, pad_to
 from flame_mdm.processes import MAX_STEPS, Process
 from flame_mdm.processes.guidance import classifier_free_guidance
 from flame_mdm.processes.windows import Windows, blended

@@ -6,7 +6,7 @@ from fixtures import Arrays, meta
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from flame_mdm.motion import Condition, Denoise
+from flame_mdm.batch import Condition, Denoise
 from flame_mdm.processes.schedules import timesteps
 
 NO_CONDITION = Condition(torch.zeros(1, 1), torch.zeros(1, 0, 1), None)

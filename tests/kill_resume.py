@@ -28,7 +28,7 @@ from typing import Any
 
 import torch
 
-from flame_mdm.checkpoints.files import read_checkpoint
+from flame_mdm.checkpoints.model_files import read_checkpoint
 from flame_mdm.commands import evaluate, prepare, train
 from flame_mdm.data.store import Store
 from flame_mdm.task import MotionGeneration

@@ -8,9 +8,9 @@ import torch
 from fixtures import recipe
 from torch import Tensor, nn
 
+from flame_mdm.batch import Condition, MotionBatch, length_mask
 from flame_mdm.conditions import ConditionEncoder
 from flame_mdm.config import instantiate
-from flame_mdm.motion import Condition, MotionBatch, length_mask
 from flame_mdm.task import MotionGeneration
 
 FRAMES, ACTIONS = 24, 40

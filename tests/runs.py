@@ -12,9 +12,9 @@ from pathlib import Path
 import pytest
 import torch
 
+from flame_mdm.batch import MotionBatch, collate
 from flame_mdm.config import compose, instantiate
 from flame_mdm.data.datamodule import TrainingBatches
-from flame_mdm.motion import MotionBatch, collate
 from flame_mdm.task import MotionGeneration
 
 SECONDS = 120

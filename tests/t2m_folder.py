@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from flame_mdm.data.verify import PUBLISHED
-from flame_mdm.files import read_yaml
+from flame_mdm.safe_io import read_yaml
 
 Texts = Mapping[str, tuple[int, list[str]]]
 """Name -> number of frames, lines of the text file."""

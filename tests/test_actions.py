@@ -31,7 +31,7 @@ from flame_mdm.data.uestc import TRAIN_SUBJECTS, UESTC, front_view
 from flame_mdm.representations import rotation
 from flame_mdm.representations.rot6d import Rot6D
 from flame_mdm.representations.skeleton import SMPL24
-from flame_mdm.runs import read_result
+from flame_mdm.schemas import read_result
 
 # Pickles
 

@@ -13,28 +13,18 @@ from fixtures import ROOT
 FILES = sorted([*(ROOT / "flame_mdm").rglob("*.py"), *(ROOT / "evaluators").rglob("*.py")])
 
 AXES = {"denoisers", "processes", "conditions", "representations"}
-GROUND = {"errors", "losses", "files", "config", "motion", "seeds", "progress"}
+GROUND = {"errors", "losses", "safe_io", "config", "batch", "seeds", "progress"}
 MODELS = GROUND | AXES | {"visualize", "formats", "data", "task"}
-ALL = MODELS | {
-    "reading",
-    "sequences",
-    "targets",
-    "generation",
-    "editing",
-    "checkpoints",
-    "runs",
-    "reporting",
-    "training",
-}
+ALL = MODELS | {"sampling", "checkpoints", "schemas", "reporting", "training"}
 MAY_IMPORT: dict[str, set[str]] = {
     "errors": set(),
     "losses": set(),
     "progress": {"errors"},
     "representations": {"errors"},
-    "files": {"errors"},
-    "motion": {"errors"},
-    "seeds": {"errors", "motion"},
-    "config": {"errors", "files"},
+    "safe_io": {"errors"},
+    "batch": {"errors"},
+    "seeds": {"errors", "batch"},
+    "config": {"errors", "safe_io"},
     "denoisers": GROUND,
     "processes": GROUND,
     "conditions": GROUND,
@@ -42,17 +32,13 @@ MAY_IMPORT: dict[str, set[str]] = {
     "formats": GROUND | {"representations", "visualize"},
     "data": GROUND | {"representations", "visualize", "formats"},
     "task": GROUND | AXES | {"data"},
-    "runs": GROUND,
-    "reporting": GROUND | {"representations", "visualize", "formats", "data", "runs"},
-    "reading": MODELS,
-    "sequences": MODELS,
-    "targets": MODELS | {"reading"},
-    "generation": MODELS | {"reading", "sequences", "targets"},
-    "editing": MODELS | {"generation", "reading"},
-    "checkpoints": MODELS | {"runs"},
+    "schemas": GROUND,
+    "reporting": GROUND | {"representations", "visualize", "formats", "data", "schemas"},
+    "sampling": MODELS,
+    "checkpoints": MODELS | {"schemas"},
     "training": ALL - {"training"},
-    "demo": MODELS | {"sequences", "generation", "editing", "checkpoints"},
-    "__init__": MODELS | {"generation", "editing", "checkpoints"},
+    "demo": MODELS | {"sampling", "checkpoints"},
+    "__init__": MODELS | {"sampling", "checkpoints"},
     "evaluators": ALL,
     "commands": ALL | {"evaluators", "demo"},
     "__main__": GROUND | {"commands"},
@@ -144,12 +130,12 @@ def test_the_rules_are_those_of_the_design():
     assert cycle(MAY_IMPORT) == []
     assert [name for name, parts in MAY_IMPORT.items() if "evaluators" in parts] == ["commands"]
     assert [name for name, parts in MAY_IMPORT.items() if "commands" in parts] == ["__main__"]
-    assert not reachable("reporting") & {"task", "denoisers", "checkpoints", "generation", "evaluators"}
+    assert not reachable("reporting") & {"task", "denoisers", "checkpoints", "sampling", "evaluators"}
     assert all(not MAY_IMPORT[axis] & AXES for axis in AXES)
     assert not reachable("visualize") & {"formats", "data", "task"}
     assert not reachable("formats") & {"data", "task"}
     assert not reachable("data") & {"task", "checkpoints"}
-    assert not reachable("task") & {"checkpoints", "generation"}
+    assert not reachable("task") & {"checkpoints", "sampling"}
 
 
 def test_strings_outside_commands_name_no_module_of_the_evaluators():
@@ -160,35 +146,31 @@ def test_strings_outside_commands_name_no_module_of_the_evaluators():
 @pytest.mark.parametrize(
     ("name", "line"),
     [
-        ("flame_mdm.errors", "import flame_mdm.files"),
-        ("flame_mdm.losses", "from flame_mdm import motion"),
-        ("flame_mdm.representations.smpl", "from flame_mdm.motion import MotionBatch"),
-        ("flame_mdm.files", "from flame_mdm.config import Config"),
-        ("flame_mdm.motion", "from flame_mdm.seeds import key"),
+        ("flame_mdm.errors", "import flame_mdm.safe_io"),
+        ("flame_mdm.losses", "from flame_mdm import batch"),
+        ("flame_mdm.representations.smpl", "from flame_mdm.batch import MotionBatch"),
+        ("flame_mdm.safe_io", "from flame_mdm.config import Config"),
+        ("flame_mdm.batch", "from flame_mdm.seeds import key"),
         ("flame_mdm.seeds", "from flame_mdm.config import Config"),
-        ("flame_mdm.progress", "from flame_mdm.files import sha256"),
+        ("flame_mdm.progress", "from flame_mdm.safe_io import sha256"),
         ("flame_mdm.config", "from flame_mdm.data import Clip"),
         ("flame_mdm.denoisers.mdm", "from flame_mdm.conditions.text import TextEncoder"),
         ("flame_mdm.processes.diffusion", "import flame_mdm.denoisers"),
         ("flame_mdm.conditions", "from flame_mdm.representations import Representation"),
-        ("flame_mdm.visualize.player", "from flame_mdm.formats.files import read"),
-        ("flame_mdm.formats.files", "def f():\n    from flame_mdm.data.folder import read_bvh"),
+        ("flame_mdm.visualize.player", "from flame_mdm.formats.readers import read"),
+        ("flame_mdm.formats.readers", "def f():\n    from flame_mdm.data.folder import read_bvh"),
         ("flame_mdm.data.store", "from flame_mdm.task import MotionGeneration"),
-        ("flame_mdm.task", "from flame_mdm.checkpoints import files as checkpoints"),
-        ("flame_mdm.runs", "from flame_mdm.reporting.tables import build"),
+        ("flame_mdm.task", "from flame_mdm.checkpoints import model_files as checkpoints"),
+        ("flame_mdm.schemas", "from flame_mdm.reporting.tables import build"),
         ("flame_mdm.reporting.tables", "from flame_mdm.task import load"),
-        ("flame_mdm.reading", "from flame_mdm.generation import generate"),
-        ("flame_mdm.sequences", "from flame_mdm.generation import generate"),
-        ("flame_mdm.targets", "from flame_mdm.generation import generate"),
-        ("flame_mdm.generation", "from flame_mdm.editing import edit"),
-        ("flame_mdm.editing", "from flame_mdm.training.guards import newest"),
-        ("flame_mdm.checkpoints.files", "from flame_mdm.reporting.rendering import markdown_text"),
-        ("flame_mdm.training.callbacks", "from evaluators.run import evaluate"),
+        ("flame_mdm.sampling.editing", "from flame_mdm.training.guards import newest"),
+        ("flame_mdm.checkpoints.model_files", "from flame_mdm.reporting.rendering import markdown_text"),
+        ("flame_mdm.training.callbacks", "from evaluators.evaluation import evaluate"),
         ("flame_mdm.demo.app", "from flame_mdm.reporting.page import write"),
         ("flame_mdm", "from flame_mdm.reporting.report import write_report"),
-        ("evaluators.run", "from flame_mdm.commands.tables import main"),
+        ("evaluators.evaluation", "from flame_mdm.commands.tables import main"),
         ("flame_mdm.commands.train", "from flame_mdm.__main__ import main"),
-        ("flame_mdm.__main__", "if TYPE_CHECKING:\n    from evaluators import run"),
+        ("flame_mdm.__main__", "if TYPE_CHECKING:\n    from evaluators import evaluation"),
     ],
 )
 def test_the_rule_of_each_part_can_fail(name, line):
@@ -208,8 +190,8 @@ def test_the_check_of_imports_can_fail():
 
 
 def test_the_check_of_strings_can_fail():
-    text = '"""See evaluators.run."""\nmodule = "evaluators.protocols:change"\nimport_module(f"evaluators.{module}")\n'
-    assert strings_with_evaluators(text) == ["evaluators.protocols:change"]
+    text = '"""See evaluators.run."""\nmodule = "evaluators.protocol:change"\nimport_module(f"evaluators.{module}")\n'
+    assert strings_with_evaluators(text) == ["evaluators.protocol:change"]
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(ROOT)))

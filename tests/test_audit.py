@@ -13,17 +13,17 @@ from fixtures import ROOT
 
 import evaluators.audit as audits
 from evaluators.audit import BASE, REAL, Text, _inputs, _Measure
+from evaluators.evaluation import load_protocol
 from evaluators.evaluator import Evaluator, Motions
 from evaluators.extractors import Extractor
 from evaluators.metrics.alignment import MotionsForText, TextsForMotion
 from evaluators.perturbations import PERTURBATIONS
-from evaluators.run import load_protocol
 from flame_mdm.__main__ import main
 from flame_mdm.data.synthetic import Synthetic
 from flame_mdm.reporting.audit import PHYSICS, Seen, card_name, card_of, findings, read_card, seen, write_card
 from flame_mdm.reporting.rendering import Part, Table, fragment, markdown
 from flame_mdm.representations.humanml import HumanML
-from flame_mdm.runs import AuditCard, AuditedPerturbation, check_shape
+from flame_mdm.schemas import AuditCard, AuditedPerturbation, check_shape
 from flame_mdm.seeds import key
 
 

@@ -20,7 +20,7 @@ import seeds  # noqa: E402
 import steps  # noqa: E402
 
 from flame_mdm.config import compose  # noqa: E402
-from flame_mdm.runs import Run, Value  # noqa: E402
+from flame_mdm.schemas import Run, Value  # noqa: E402
 
 TOY = {
     "host": "12",

@@ -14,7 +14,7 @@ from flame_mdm.__main__ import main
 from flame_mdm.data import Clip, MotionSource
 from flame_mdm.data.store import Entry, Store, write_store
 from flame_mdm.data.synthetic import Synthetic
-from flame_mdm.formats.files import read
+from flame_mdm.formats.readers import read
 from flame_mdm.reporting.browse import choose, describe, find, motion, write_clips, write_page
 from flame_mdm.representations.humanml import HumanML
 from flame_mdm.representations.rot6d import Rot6D

@@ -14,13 +14,13 @@ from fixtures import GOLDEN, Arrays, golden, meta
 from safetensors.torch import load_file, save_file
 
 from flame_mdm.__main__ import main
-from flame_mdm.checkpoints import files, hub
+from flame_mdm.batch import Condition, MotionBatch
+from flame_mdm.checkpoints import hub, model_files
 from flame_mdm.checkpoints.loading import load
 from flame_mdm.checkpoints.released import import_flame, import_mdm, released_state
 from flame_mdm.config import compose, instantiate
 from flame_mdm.errors import UserError
-from flame_mdm.generation import generate
-from flame_mdm.motion import Condition, MotionBatch
+from flame_mdm.sampling.generation import generate
 from flame_mdm.task import MotionGeneration
 
 MDM = [
@@ -452,8 +452,8 @@ def test_a_model_file_is_the_checkpoint(trained, tmp_path, capsys):
     assert np.array_equal(a, b)
     assert list(file.parent.iterdir()) == [file]
     again = hub.export(file, tmp_path / "again")
-    assert files.read_model_file(again)["origin"] == files.read_model_file(file)["origin"]
-    assert files.read_model_file(again)["origin"]["steps"] == 7
+    assert model_files.read_model_file(again)["origin"] == model_files.read_model_file(file)["origin"]
+    assert model_files.read_model_file(again)["origin"]["steps"] == 7
 
 
 def test_half_precision_is_of_matrices_alone(trained, tmp_path):
@@ -464,14 +464,14 @@ def test_half_precision_is_of_matrices_alone(trained, tmp_path):
     for name, value in load_file(half).items():
         assert value.dtype == (torch.float16 if value.ndim > 1 else torch.float32)
         torch.testing.assert_close(load(half).state_dict()[name], load(whole).state_dict()[name], atol=1e-3, rtol=1e-3)
-    assert files.read_model_file(half)["origin"]["half_precision"]
+    assert model_files.read_model_file(half)["origin"]["half_precision"]
 
 
 def test_a_model_file_does_not_tell_where_it_was_made(trained, tmp_path):
     file = hub.export(trained, tmp_path / "out")
     assert str(tmp_path).encode() not in file.read_bytes()
     assert str(tmp_path.parent).encode() not in file.read_bytes()
-    assert files.read_model_file(file)["config"]["data"]["root"] == "data"
+    assert model_files.read_model_file(file)["config"]["data"]["root"] == "data"
 
 
 def test_damaged_and_foreign_files_are_one_line(trained, tmp_path):
@@ -548,7 +548,7 @@ def test_push_writes_a_card_and_uploads_these_files_alone(trained, tmp_path, cap
 
 
 def test_the_license_follows_the_data(trained, tmp_path):
-    model = files.read_model_file(hub.export(trained, tmp_path))
+    model = model_files.read_model_file(hub.export(trained, tmp_path))
     model["facts"]["dataset"] = "bandai"
     assert "license: cc-by-nc-4.0" in hub.card(model, "me/walker")
     model["facts"]["dataset"] = "humanml3d"

@@ -16,10 +16,10 @@ from evaluators.extractors.action_gru import ActionGRU
 from evaluators.extractors.classifier import ClassifierTask
 from evaluators.extractors.stgcn import JointSTGCN
 from flame_mdm.__main__ import main
+from flame_mdm.batch import MotionBatch, length_mask
 from flame_mdm.config import compose, instantiate
 from flame_mdm.data.synthetic import Synthetic
 from flame_mdm.errors import UserError
-from flame_mdm.motion import MotionBatch, length_mask
 from flame_mdm.representations.humanml import HumanML
 from flame_mdm.representations.rot6d import Rot6D
 

@@ -8,9 +8,9 @@ import pytest
 import torch
 from torch import Tensor
 
+from flame_mdm.batch import Condition, MotionBatch, length_mask
 from flame_mdm.config import EXPERIMENTS, compose, parameters
 from flame_mdm.denoisers import Denoiser
-from flame_mdm.motion import Condition, MotionBatch, length_mask
 from flame_mdm.processes import Process
 from flame_mdm.processes.diffusion import Sampler
 from flame_mdm.processes.flow_matching import STEPS as SOLVERS

@@ -12,11 +12,11 @@ from fixtures import ROOT
 from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 
+from flame_mdm.batch import Condition, MotionBatch
 from flame_mdm.conditions import ConditionEncoder, Unconditional
 from flame_mdm.conditions.action import ActionLabels
 from flame_mdm.conditions.text import CaptionCache, Pretrained, PretrainedText
 from flame_mdm.conditions.tokens import LearnedTokens
-from flame_mdm.motion import Condition, MotionBatch
 
 EXPERIMENTS = ROOT / "experiments"
 WORDS = [

@@ -10,7 +10,7 @@ from flame_mdm import config
 from flame_mdm.__main__ import main
 from flame_mdm.config import check, command_line, compose, flatten, instantiate, parameters, recipes, trust
 from flame_mdm.errors import UserError
-from flame_mdm.files import read_yaml
+from flame_mdm.safe_io import read_yaml
 
 
 @pytest.mark.parametrize("name", recipes())
@@ -94,7 +94,7 @@ def test_signatures_are_read_through_reexports_bases_and_dataclasses():
     assert {"lr", "weight_decay", "fused"} <= parameters("torch.optim.AdamW")
     assert {"max_steps", "devices"} <= parameters("lightning.Trainer")
     assert {"monitor", "save_top_k"} <= parameters("lightning.pytorch.callbacks.ModelCheckpoint")
-    assert {"keep", "known", "mode"} <= parameters("flame_mdm.motion.Edit")
+    assert {"keep", "known", "mode"} <= parameters("flame_mdm.batch.Edit")
     with pytest.raises(UserError, match="no such class"):
         parameters("torch.optim.Adamm")
 

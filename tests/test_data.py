@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 import torch
 
+from flame_mdm.batch import collate
 from flame_mdm.data import Clip, MotionSource, Split
 from flame_mdm.data.crops import Fixed, Units, Whole
 from flame_mdm.data.datamodule import Clips, EvaluationBatches, MotionDataModule, TrainingBatches
 from flame_mdm.data.store import Store, _fingerprint, write_store
 from flame_mdm.data.synthetic import Synthetic
-from flame_mdm.motion import collate
 from flame_mdm.representations import Frames
 from flame_mdm.representations.humanml import HumanML
 from flame_mdm.representations.rifke import Rifke

@@ -26,7 +26,7 @@ from fixtures import ROOT
 from flame_mdm.__main__ import main
 from flame_mdm.demo.request import MAX_EDITS, Change, Request, checked, parse_query
 from flame_mdm.errors import UserError
-from flame_mdm.formats.files import read
+from flame_mdm.formats.readers import read
 from flame_mdm.formats.retarget import presets
 
 FAST = {"seconds": 1.0, "num_inference_steps": 3}

@@ -8,12 +8,12 @@ from fixtures import ROOT
 from hydra.utils import get_class, instantiate
 from omegaconf import OmegaConf
 
+from flame_mdm.batch import Condition, length_mask
 from flame_mdm.denoisers import Denoiser
 from flame_mdm.denoisers.flame import FLAME
 from flame_mdm.denoisers.layers import sinusoid
 from flame_mdm.denoisers.mdm import MDMDecoder, MDMEncoder
 from flame_mdm.denoisers.unet import MaskedGroupNorm, MDMUNet
-from flame_mdm.motion import Condition, length_mask
 
 CONFIGS = sorted((ROOT / "experiments" / "denoiser").glob("*.yaml"))
 TINY = {"latent_dim": 16, "ff_size": 24, "num_layers": 2, "num_heads": 2, "channels": [8, 8, 16], "num_groups": 4}

@@ -16,10 +16,10 @@ from torchmetrics import MeanMetric
 
 from evaluators.extractors.motion_clip import MotionCLIPTask
 from flame_mdm.__main__ import main
-from flame_mdm.checkpoints.files import read_checkpoint
+from flame_mdm.batch import collate
+from flame_mdm.checkpoints.model_files import read_checkpoint
 from flame_mdm.commands import train
 from flame_mdm.config import compose, instantiate, run
-from flame_mdm.motion import collate
 from flame_mdm.task import MotionGeneration
 
 pytestmark = pytest.mark.slow

@@ -194,7 +194,7 @@ def test_messages_on_the_page_of_first_problems_are_those_of_the_code():
 def test_the_checks_can_fail():
     assert unknown_messages("**`unknown experiment '…'`** **`unknown … x'`** `no message`") == ["unknown … x'"]
     assert broken_links(PAGES[0], "[a](docs/data.md#x) [b](docs/nothing.md) [c](https://d.e)") == ["docs/nothing.md"]
-    assert unknown_names("flame_mdm.load evaluators.run.evaluate flame_mdm.nothing flame_mdm.config.nothing") == [
+    assert unknown_names("flame_mdm.load evaluators.audit flame_mdm.nothing flame_mdm.config.nothing") == [
         "flame_mdm.config.nothing",
         "flame_mdm.nothing",
     ]

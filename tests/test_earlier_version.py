@@ -16,9 +16,9 @@ from fixtures import ROOT
 
 import flame_mdm
 from flame_mdm.__main__ import main
-from flame_mdm.checkpoints.files import read_checkpoint, weights_sha256
+from flame_mdm.checkpoints.model_files import read_checkpoint, weights_sha256
 from flame_mdm.data.store import Store
-from flame_mdm.files import sha256
+from flame_mdm.safe_io import sha256
 
 RUN = "runs/quickstart/default"
 CLIP = "runs/motion_clip/synthetic/default"

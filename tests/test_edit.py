@@ -14,17 +14,17 @@ from flame_mdm.config import compose, instantiate
 from flame_mdm.data import bandai
 from flame_mdm.data.store import write_store
 from flame_mdm.data.synthetic import Synthetic
-from flame_mdm.editing import Edited, edit
 from flame_mdm.errors import UserError
 from flame_mdm.formats import bvh
 from flame_mdm.formats.motion import Motion
 from flame_mdm.formats.resampling import resample
-from flame_mdm.generation import generate, write_motions
-from flame_mdm.reading import read_motion
 from flame_mdm.representations.humanml import HumanML
 from flame_mdm.representations.rot6d import Rot6D
 from flame_mdm.representations.skeleton import KIT21, SMPL22, SMPL24, find_joints, part_names
 from flame_mdm.representations.smpl import SMPL
+from flame_mdm.sampling.editing import Edited, edit
+from flame_mdm.sampling.generation import generate, write_motions
+from flame_mdm.sampling.reading import read_motion
 from flame_mdm.seeds import seeded_noise
 from flame_mdm.task import MotionGeneration
 

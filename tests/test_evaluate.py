@@ -17,23 +17,23 @@ import torch
 from conftest import TINY
 from distributed import GlooPool
 
+from evaluators.evaluation import load_protocol
 from evaluators.evaluator import Evaluator, Extracted, Motions
 from evaluators.extractors import ClassifierExtractor, MotionCLIPExtractor, T2MExtractor
 from evaluators.extractors.action_gru import ActionGRU
 from evaluators.extractors.stgcn import UESTC, Unconstrained
 from evaluators.extractors.t2m import T2MEvaluator
-from evaluators.run import load_protocol
 from evaluators.sources import Baseline, Generator, read_samples, real_motions
 from flame_mdm.__main__ import main
-from flame_mdm.checkpoints.files import read_checkpoint
+from flame_mdm.batch import length_mask
 from flame_mdm.checkpoints.loading import load
+from flame_mdm.checkpoints.model_files import read_checkpoint
 from flame_mdm.config import EXPERIMENTS, compose, instantiate
 from flame_mdm.data.datamodule import MotionDataModule
 from flame_mdm.errors import UserError
-from flame_mdm.motion import length_mask
 from flame_mdm.representations.rot6d import Rot6D
 from flame_mdm.representations.skeleton import find_joints
-from flame_mdm.runs import read_result
+from flame_mdm.schemas import read_result
 from flame_mdm.seeds import key
 from flame_mdm.task import MotionGeneration
 
@@ -786,7 +786,7 @@ def baseline(runs: Runs, folder: Path, kind: str, *words: str) -> int:
 def test_training_motions_are_their_own_nearest(runs, tmp_path):
     protocol = tmp_path / "copies.yaml"
     protocol.write_text(
-        "_target_: evaluators.protocols.Protocol\n_recursive_: false\nname: copies\nversion: 1\ncondition: text\n"
+        "_target_: evaluators.protocol.Protocol\n_recursive_: false\nname: copies\nversion: 1\ncondition: text\n"
         "extractor: {_target_: evaluators.extractors.MotionCLIPExtractor}\nreplications: 1\nsamples: 30\n"
         "metrics: {nearest: {_target_: evaluators.metrics.memorization.NearestTraining}}\n"
     )

@@ -13,10 +13,10 @@ from flame_mdm.__main__ import main
 from flame_mdm.data import amass
 from flame_mdm.data.synthetic import Synthetic
 from flame_mdm.formats import bvh
-from flame_mdm.formats.files import read
 from flame_mdm.formats.layouts import LAYOUTS
 from flame_mdm.formats.motion import Motion
 from flame_mdm.formats.poses import Poses, solve
+from flame_mdm.formats.readers import read
 from flame_mdm.formats.retarget import continuous_euler
 from flame_mdm.representations import rotation
 from flame_mdm.representations.rot6d import Rot6D

@@ -16,8 +16,8 @@ from evaluators.extractors.mardm import MARDMClip
 from evaluators.extractors.released import load_strictly
 from evaluators.extractors.stgcn import STGCN, UESTC, JointSTGCN, Unconstrained, load_uestc, load_unconstrained
 from evaluators.extractors.t2m import PARTS_OF_SPEECH, T2MEvaluator, Words, WordVectors, load_t2m
+from flame_mdm.batch import length_mask
 from flame_mdm.errors import UserError
-from flame_mdm.motion import length_mask
 from flame_mdm.representations.essential import Essential
 from flame_mdm.representations.humanml import HumanML
 

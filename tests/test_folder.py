@@ -23,12 +23,12 @@ from flame_mdm.data.store import Store, write_store
 from flame_mdm.data.synthetic import Synthetic
 from flame_mdm.errors import UserError
 from flame_mdm.formats import bvh
-from flame_mdm.formats.files import read
 from flame_mdm.formats.layouts import LAYOUTS, SOMA77, read_skeleton
-from flame_mdm.reading import read_motion
+from flame_mdm.formats.readers import read
 from flame_mdm.representations.humanml import HumanML
 from flame_mdm.representations.skeleton import KIT21, SMPL22
 from flame_mdm.representations.smpl import ADULT, SMPL
+from flame_mdm.sampling.reading import read_motion
 
 WALK = next(c for c in Synthetic(clips=30).clips(30.0) if c.attributes["action"] == "walk").motion.astype(float)
 """(F, 22, 3) metres, y up, 30 frames a second."""

@@ -24,7 +24,7 @@ from refusals import one_line
 from test_report import a_run
 
 from flame_mdm.__main__ import main
-from flame_mdm.checkpoints.files import read_checkpoint
+from flame_mdm.checkpoints.model_files import read_checkpoint
 from flame_mdm.formats.motion import END_SITES
 from flame_mdm.representations.skeleton import SMPL22
 
@@ -341,7 +341,7 @@ def test_evaluations(refused, trained, bad):
     (bad / "broken.yaml").write_text("a: [\n")
     (bad / "bare.yaml").write_text("name: x\n")
     (bad / "foreign.yaml").write_text("_target_: os.system\ncommand: ls\n")
-    (bad / "part.yaml").write_text("_target_: evaluators.protocols.Protocol\nname: x\n")
+    (bad / "part.yaml").write_text("_target_: evaluators.protocol.Protocol\nname: x\n")
     (bad / "folder.yaml").mkdir()
     values = {
         "ckpt": ("", "none.ckpt", "/", "null", str(bad / "empty")),

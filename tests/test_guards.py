@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from flame_mdm.__main__ import main
-from flame_mdm.checkpoints.files import read_checkpoint
+from flame_mdm.checkpoints.model_files import read_checkpoint
 from flame_mdm.config import compose, instantiate
 from flame_mdm.errors import UserError
 from flame_mdm.processes.diffusion import GaussianDiffusion

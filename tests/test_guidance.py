@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from flame_mdm.motion import Condition, length_mask
+from flame_mdm.batch import Condition, length_mask
 from flame_mdm.processes.guidance import classifier_free_guidance
 from flame_mdm.processes.samplers import CountedDenoise
 

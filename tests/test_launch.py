@@ -12,7 +12,7 @@ from fixtures import ROOT
 from runs import RUN, TWO, alarm, finish, free_port, reference, spawn
 
 from flame_mdm.__main__ import main
-from flame_mdm.checkpoints.files import read_checkpoint
+from flame_mdm.checkpoints.model_files import read_checkpoint
 from flame_mdm.config import compose
 from flame_mdm.errors import UserError
 

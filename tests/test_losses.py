@@ -10,8 +10,8 @@ from analytic import NO_CONDITION, assert_golden, flow_field, motions
 from fixtures import golden, groups, meta
 from torch import Tensor
 
+from flame_mdm.batch import length_mask
 from flame_mdm.losses import MotionLosses, masked_mse
-from flame_mdm.motion import length_mask
 from flame_mdm.processes.diffusion import GaussianDiffusion
 from flame_mdm.processes.flow_matching import FlowMatching
 

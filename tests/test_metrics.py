@@ -58,7 +58,7 @@ from evaluators.metrics.reconstruction import (
     temos_parts,
 )
 from evaluators.metrics.retrieval import MultiPositiveRPrecision, TMRRetrieval
-from flame_mdm.motion import length_mask
+from flame_mdm.batch import length_mask
 from flame_mdm.reporting.intervals import percentiles
 from flame_mdm.representations.skeleton import KIT21, SMPL22
 from flame_mdm.seeds import key

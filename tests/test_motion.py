@@ -18,12 +18,12 @@ from flame_mdm.commands import compare
 from flame_mdm.config import compose, instantiate
 from flame_mdm.data.folder import Folder
 from flame_mdm.data.synthetic import Synthetic
-from flame_mdm.editing import edit
 from flame_mdm.errors import UserError
-from flame_mdm.formats.files import read
 from flame_mdm.formats.motion import Motion
-from flame_mdm.reading import read_motion
+from flame_mdm.formats.readers import read
 from flame_mdm.representations.humanml import HumanML
+from flame_mdm.sampling.editing import edit
+from flame_mdm.sampling.reading import read_motion
 from flame_mdm.task import MotionGeneration
 
 REPRESENTATION = HumanML()

@@ -15,14 +15,14 @@ from evaluators.extractors import MotionCLIPExtractor
 from evaluators.extractors.motion_clip import MotionCLIP, MotionCLIPTask, PooledLoss, import_mclip, info_nce
 from evaluators.extractors.motion_clip_calibrated import CalibratedMotionCLIPTask, calibration_error, noisy_copies
 from flame_mdm.__main__ import main
-from flame_mdm.checkpoints.files import read_checkpoint
+from flame_mdm.batch import length_mask
 from flame_mdm.checkpoints.hub import export
 from flame_mdm.checkpoints.loading import load, load_task
+from flame_mdm.checkpoints.model_files import read_checkpoint
 from flame_mdm.conditions.text import PretrainedText
 from flame_mdm.config import compose, instantiate
 from flame_mdm.data.synthetic import Synthetic
 from flame_mdm.errors import UserError
-from flame_mdm.motion import length_mask
 from flame_mdm.representations.humanml import HumanML
 from flame_mdm.representations.smpl import SMPL
 from flame_mdm.seeds import key

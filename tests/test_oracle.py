@@ -10,12 +10,12 @@ from analytic import NO_CONDITION
 from fixtures import recipe
 from torch import Tensor
 
+from flame_mdm.batch import Denoise, Edit
 from flame_mdm.config import instantiate, recipes
-from flame_mdm.editing import METHODS
-from flame_mdm.motion import Denoise, Edit
 from flame_mdm.processes import Process
 from flame_mdm.processes.diffusion import GaussianDiffusion
 from flame_mdm.representations import Representation
+from flame_mdm.sampling.editing import METHODS
 from flame_mdm.seeds import normal
 
 pytestmark = pytest.mark.slow

@@ -16,8 +16,8 @@ from hypothesis import strategies as st
 from omegaconf import OmegaConf
 from torch import Tensor
 
+from flame_mdm.batch import length_mask
 from flame_mdm.losses import masked_mean, masked_mse
-from flame_mdm.motion import length_mask
 from flame_mdm.processes.diffusion import GaussianDiffusion, LossAwareTimesteps
 from flame_mdm.processes.flow_matching import FlowMatching
 from flame_mdm.processes.schedules import build_schedule, timesteps

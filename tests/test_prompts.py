@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 import flame_mdm
-from flame_mdm import generation
 from flame_mdm.__main__ import main
 from flame_mdm.errors import UserError
-from flame_mdm.formats.files import read
+from flame_mdm.formats.readers import read
+from flame_mdm.sampling import generation
 
 PROMPTS = ["a person walks", "a person jumps: 100%, twice", "人が歩く"]
 

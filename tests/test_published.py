@@ -12,8 +12,8 @@ import pytest
 import yaml
 from fixtures import recipe
 
+from evaluators.evaluation import load_protocol
 from evaluators.evaluator import Evaluator, Motions
-from evaluators.run import load_protocol
 from flame_mdm.config import EXPERIMENTS, Config, instantiate, recipes
 from flame_mdm.errors import UserError
 from flame_mdm.processes.diffusion import Sampler

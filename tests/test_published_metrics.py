@@ -322,7 +322,7 @@ def test_captions_are_compared_without_case_and_punctuation():
 def test_similar_captions_are_the_same_by_sentence_bert():
     from fixtures import ROOT
 
-    from flame_mdm.files import read_yaml
+    from flame_mdm.safe_io import read_yaml
 
     metrics = read_yaml(ROOT / "experiments" / "evaluation" / "text_to_motion_2026.yaml")["metrics"]
     encoder = metrics["tmr"]["encoder"]

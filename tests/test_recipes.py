@@ -8,8 +8,8 @@ import pytest
 import torch
 from fixtures import ROOT, recipe
 
+from flame_mdm.batch import Condition
 from flame_mdm.config import instantiate, recipes
-from flame_mdm.motion import Condition
 from flame_mdm.processes.diffusion import Sampler
 from flame_mdm.processes.flow_matching import STEPS as SOLVERS
 from flame_mdm.reporting.settings import value

@@ -13,7 +13,8 @@ from lightning.fabric.utilities.apply_func import move_data_to_device
 from test_data import Broken, clip
 from test_training import STEPS, run
 
-from flame_mdm.checkpoints.files import read_checkpoint
+from flame_mdm.batch import MotionBatch
+from flame_mdm.checkpoints.model_files import read_checkpoint
 from flame_mdm.config import Config, compose, instantiate
 from flame_mdm.data import datamodule, resident
 from flame_mdm.data.crops import Crop, Fixed, Units, Whole
@@ -21,7 +22,6 @@ from flame_mdm.data.datamodule import MotionDataModule
 from flame_mdm.data.resident import ResidentLoader, free_memory
 from flame_mdm.data.synthetic import Synthetic
 from flame_mdm.errors import UserError
-from flame_mdm.motion import MotionBatch
 from flame_mdm.representations.humanml import HumanML
 from flame_mdm.representations.rot6d import Rot6D
 

@@ -17,9 +17,9 @@ from flame_mdm.data.synthetic import Synthetic
 from flame_mdm.errors import UserError
 from flame_mdm.formats import bvh, characters
 from flame_mdm.formats.characters import LIMBS, SIDES
-from flame_mdm.formats.files import read
 from flame_mdm.formats.glb import save as save_glb
 from flame_mdm.formats.motion import Motion
+from flame_mdm.formats.readers import read
 from flame_mdm.formats.retarget import preset, presets, world_rotations
 from flame_mdm.representations.rotation import quaternion_to_matrix
 from flame_mdm.representations.skeleton import SMPL22

@@ -18,8 +18,8 @@ from hydra.utils import instantiate
 from torch import Tensor
 from torchdiffeq import odeint
 
+from flame_mdm.batch import Condition, Denoise, Edit, Noise, length_mask
 from flame_mdm.checkpoints.released import Released, import_flame, import_mdm
-from flame_mdm.motion import Condition, Denoise, Edit, Noise, length_mask
 from flame_mdm.processes.diffusion import GaussianDiffusion
 from flame_mdm.processes.flow_matching import STEPS, FlowMatching
 from flame_mdm.processes.guidance import classifier_free_guidance

@@ -11,13 +11,13 @@ import torch
 import flame_mdm
 from evaluators.selection import text_fit
 from flame_mdm.__main__ import main
+from flame_mdm.batch import Condition, MotionBatch
 from flame_mdm.errors import UserError
 from flame_mdm.formats.faults import find_faults
-from flame_mdm.formats.files import read
-from flame_mdm.generation import best
-from flame_mdm.motion import Condition, MotionBatch
+from flame_mdm.formats.readers import read
 from flame_mdm.processes.windows import Windows, blended, place, spans
-from flame_mdm.sequences import overlap, read_parts
+from flame_mdm.sampling.generation import best
+from flame_mdm.sampling.sequences import overlap, read_parts
 
 
 @pytest.fixture(scope="module")

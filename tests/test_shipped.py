@@ -9,7 +9,7 @@ from evaluators.metrics.attributes import read_attributes
 from flame_mdm.__main__ import main
 from flame_mdm.checkpoints.loading import SHIPPED, find
 from flame_mdm.data.synthetic import prompts
-from flame_mdm.files import sha256
+from flame_mdm.safe_io import sha256
 
 
 def test_the_model_follows_its_prompts():

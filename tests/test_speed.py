@@ -14,7 +14,7 @@ from torch.nn import functional
 from torch.optim.swa_utils import AveragedModel
 
 from flame_mdm.__main__ import main
-from flame_mdm.checkpoints.files import read_checkpoint
+from flame_mdm.checkpoints.model_files import read_checkpoint
 from flame_mdm.config import Config, compose, instantiate
 from flame_mdm.data.datamodule import MotionDataModule
 from flame_mdm.denoisers.layers import Transformer

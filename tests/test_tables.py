@@ -12,10 +12,10 @@ import pytest
 import torch
 from conftest import TINY
 
-import evaluators.run
-from evaluators.run import _outdated
+import evaluators.evaluation
+from evaluators.evaluation import _outdated
 from flame_mdm.__main__ import main
-from flame_mdm.checkpoints.files import weights_sha256
+from flame_mdm.checkpoints.model_files import weights_sha256
 from flame_mdm.errors import UserError
 from flame_mdm.reporting import tables
 from flame_mdm.reporting.rendering import Cell, Figure, Line, Part, Table, cumulative, draw, latex, markdown, places
@@ -344,7 +344,7 @@ def test_times_are_compared_in_batches_of_the_same_size_alone(folder):
 def test_the_batch_size_of_the_command_is_not_that_of_timed_rows(folder, monkeypatch):
     (folder / "timed.yaml").write_text(TIMED.format(folder=folder))
     asked = []
-    monkeypatch.setattr(evaluators.run, "evaluate", asked.append)
+    monkeypatch.setattr(evaluators.evaluation, "evaluate", asked.append)
     words = [f"results={folder / 'none'}", f"out={folder / 'out'}", "batch_size=256"]
     assert main(["tables", f"table={folder / 'timed.yaml'}", *words]) == 0
     assert [request.batch_size for request in asked] == [1, 64, None]

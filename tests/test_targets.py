@@ -11,7 +11,7 @@ import flame_mdm
 from flame_mdm.__main__ import main
 from flame_mdm.errors import UserError
 from flame_mdm.processes.guidance import Positions, reach
-from flame_mdm.targets import errors, read_targets
+from flame_mdm.sampling.targets import errors, read_targets
 
 TEXT = "a person walks forward"
 

@@ -16,14 +16,14 @@ from torchmetrics import MeanMetric
 
 import flame_mdm
 from flame_mdm.__main__ import main
-from flame_mdm.checkpoints.files import read_checkpoint
+from flame_mdm.batch import MotionBatch, length_mask
 from flame_mdm.checkpoints.loading import load
+from flame_mdm.checkpoints.model_files import read_checkpoint
 from flame_mdm.config import compose, instantiate
-from flame_mdm.editing import edit
 from flame_mdm.errors import UserError
-from flame_mdm.generation import generate
-from flame_mdm.motion import MotionBatch, length_mask
 from flame_mdm.progress import ProgressBar
+from flame_mdm.sampling.editing import edit
+from flame_mdm.sampling.generation import generate
 
 STEPS = ["trainer.val_check_interval=4", "callbacks.checkpoints.every_n_steps=4", "callbacks.samples=null"]
 

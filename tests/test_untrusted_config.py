@@ -18,10 +18,10 @@ from conftest import TINY
 from fixtures import ROOT
 from refusals import one_line
 
-from evaluators.run import load_protocol
-from flame_mdm.checkpoints.files import KEY, read_checkpoint, read_model_file
+from evaluators.evaluation import load_protocol
 from flame_mdm.checkpoints.hub import card, export
 from flame_mdm.checkpoints.loading import load
+from flame_mdm.checkpoints.model_files import KEY, read_checkpoint, read_model_file
 from flame_mdm.config import compose, instantiate, parameters, plain
 from flame_mdm.errors import UserError
 

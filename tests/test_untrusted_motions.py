@@ -32,9 +32,9 @@ from flame_mdm.data.amass import read as read_amass
 from flame_mdm.data.parallel import in_order
 from flame_mdm.data.store import Store
 from flame_mdm.errors import UserError
-from flame_mdm.files import MEBIBYTE
 from flame_mdm.formats import resampling
 from flame_mdm.formats.bvh import read
+from flame_mdm.safe_io import MEBIBYTE
 
 pytestmark = pytest.mark.slow
 
@@ -294,7 +294,7 @@ def archive_cases() -> Iterator[tuple[bytes, str]]:
 
 
 def test_archives(attacked: Refused, bad: Path, monkeypatch):
-    monkeypatch.setattr("flame_mdm.files.ARRAYS_LIMIT", 4 * MEBIBYTE)  # packing more takes long
+    monkeypatch.setattr("flame_mdm.safe_io.ARRAYS_LIMIT", 4 * MEBIBYTE)  # packing more takes long
     path, root = bad / "set", bad.parent / "prepared"
     for content, says in archive_cases():
         path.write_bytes(content)

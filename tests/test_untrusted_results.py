@@ -22,19 +22,19 @@ from test_tables import SPEC, put
 import flame_mdm
 from evaluators.sources import Row, _write, read_samples
 from flame_mdm.__main__ import main
-from flame_mdm.checkpoints import files, hub
+from flame_mdm.checkpoints import hub, model_files
 from flame_mdm.commands import benchmark
 from flame_mdm.errors import UserError, say
-from flame_mdm.files import atomic_folder, atomic_write, write_json
-from flame_mdm.formats.files import read
 from flame_mdm.formats.motion import Motion
-from flame_mdm.generation import write_motions
+from flame_mdm.formats.readers import read
 from flame_mdm.reporting.page import POLICY, page
 from flame_mdm.reporting.plots import Panel, Series, svg
 from flame_mdm.reporting.rendering import Cell, Line, Part, Table, comma_separated, draw, latex, markdown
 from flame_mdm.reporting.rendering import Figure as Plot
 from flame_mdm.reporting.tables import build, load_spec, requests, write
 from flame_mdm.representations.skeleton import SMPL22
+from flame_mdm.safe_io import atomic_folder, atomic_write, write_json
+from flame_mdm.sampling.generation import write_motions
 from flame_mdm.visualize import contact_sheet, player_page, write_gif
 
 pytestmark = pytest.mark.slow
@@ -303,7 +303,7 @@ def full(*_: Any, **__: Any) -> None:
 
 @pytest.mark.parametrize("name", ["Motion.save", "write_gif", "contact_sheet", "write_player"])
 def test_a_sample_folder_is_whole_or_absent(attacked, trained, monkeypatch, name):
-    monkeypatch.setattr(f"flame_mdm.generation.{name}", full)
+    monkeypatch.setattr(f"flame_mdm.sampling.generation.{name}", full)
     attacked("sample", f"ckpt={trained}", TEXT, "seconds=1", says="No space left on device")
     attacked("sample", f"ckpt={trained}", TEXT, "seconds=1", "out=new/folder", says="No space left on device")
 
@@ -450,7 +450,7 @@ def test_push_overwrites_only_its_own_files(attacked, bad, trained):
 
 
 def test_a_card_is_a_table_of_text(trained, tmp_path):
-    model = files.read_model_file(hub.export(trained, tmp_path))
+    model = model_files.read_model_file(hub.export(trained, tmp_path))
     model["origin"]["file"] = HOSTILE
     card = hub.card(model, "me/walker")
     assert "\n# Heading" not in card

@@ -12,9 +12,9 @@ import pytest
 from PIL import Image, ImageSequence
 
 from flame_mdm.errors import UserError
-from flame_mdm.files import atomic_write
 from flame_mdm.formats.motion import Motion
 from flame_mdm.representations.skeleton import SKELETONS, Skeleton
+from flame_mdm.safe_io import atomic_write
 from flame_mdm.visualize import contact_sheet, frames_array, write_gif, write_mp4, write_player
 from flame_mdm.visualize.render import SIDE_COLORS
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from flame_mdm.checkpoints.files import read_checkpoint
+from flame_mdm.checkpoints.model_files import read_checkpoint
 from flame_mdm.conditions.vocabulary import MAX_CAPTIONS, advice, nearest, vocabulary, words
 
 CAPTIONS = ["A person walks forward.", "a person waves with the left hand", "someone jumps"]

@@ -17,13 +17,13 @@ from evaluators.extractors.motion_clip import MotionCLIPTask
 from evaluators.extractors.stgcn import Unconstrained, load_uestc, load_unconstrained
 from evaluators.extractors.t2m import WordVectors, load_t2m
 from evaluators.extractors.t2m_training import T2MTask
-from flame_mdm.checkpoints.files import weights_sha256
 from flame_mdm.checkpoints.loading import find, load_task
+from flame_mdm.checkpoints.model_files import weights_sha256
 from flame_mdm.conditions.vocabulary import words
 from flame_mdm.data.humanact12 import read_unconstrained
 from flame_mdm.errors import UserError
-from flame_mdm.files import sha256
 from flame_mdm.representations import Representation
+from flame_mdm.safe_io import sha256
 from flame_mdm.seeds import key
 from flame_mdm.task import Task
 

@@ -14,11 +14,11 @@ from torchmetrics import MeanMetric
 from evaluators.extractors.action_gru import ActionGRU
 from evaluators.extractors.stgcn import JointSTGCN
 from evaluators.metrics.accuracy import ActionAccuracy
+from flame_mdm.batch import MotionBatch
 from flame_mdm.conditions import Unconditional
 from flame_mdm.config import Config, instantiate, parameters
 from flame_mdm.data.datamodule import MotionDataModule
 from flame_mdm.errors import UserError
-from flame_mdm.motion import MotionBatch
 from flame_mdm.representations import Representation
 from flame_mdm.seeds import key
 from flame_mdm.task import Task

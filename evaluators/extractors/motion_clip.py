@@ -14,12 +14,12 @@ from torch.distributed.nn.functional import all_gather
 
 from evaluators.extractors.released import load_strictly
 from evaluators.metrics.alignment import MotionsForText, TextAndMotion, TextsForMotion
+from flame_mdm.batch import MotionBatch
 from flame_mdm.checkpoints.released import _ENCODER_LAYER, _count_layers, _layer_names, _renamed, _shape, released_state
 from flame_mdm.conditions import ConditionEncoder
 from flame_mdm.config import Config, instantiate
 from flame_mdm.denoisers.flame import cosine_first_sinusoid
 from flame_mdm.denoisers.layers import Transformer, with_prefix
-from flame_mdm.motion import MotionBatch
 from flame_mdm.representations import Representation
 from flame_mdm.seeds import key
 from flame_mdm.task import Task

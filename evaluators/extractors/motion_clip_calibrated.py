@@ -14,9 +14,9 @@ from torch.nn.utils.rnn import pad_sequence
 from evaluators.extractors.motion_clip import MotionCLIPTask, info_nce
 from evaluators.near_misses import near_misses
 from evaluators.perturbations import encode
+from flame_mdm.batch import MotionBatch
 from flame_mdm.config import Config
 from flame_mdm.errors import UserError
-from flame_mdm.motion import MotionBatch
 from flame_mdm.representations import Representation
 from flame_mdm.representations.humanml import HumanML
 from flame_mdm.seeds import key

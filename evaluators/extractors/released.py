@@ -8,7 +8,7 @@ from typing import TypeVar
 
 from torch import Tensor, nn
 
-from flame_mdm.files import read_torch
+from flame_mdm.safe_io import read_torch
 
 Network = TypeVar("Network", bound=nn.Module)
 

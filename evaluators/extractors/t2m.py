@@ -16,11 +16,11 @@ from torch import Tensor, nn
 from torch.nn.utils.rnn import pack_padded_sequence
 
 from evaluators.extractors.released import load_strictly, read_weights
+from flame_mdm.batch import pad_to
 from flame_mdm.conditions.vocabulary import hashed
 from flame_mdm.data import restricted_pickle
 from flame_mdm.data.t2m import MAX_TOKENS, frame_tokens
-from flame_mdm.files import read_npy
-from flame_mdm.motion import pad_to
+from flame_mdm.safe_io import read_npy
 
 UNIT = 4
 """Frames per vector of the movement encoder."""

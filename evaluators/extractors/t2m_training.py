@@ -12,12 +12,12 @@ from torchmetrics import MeanMetric
 
 from evaluators.extractors.t2m import UNIT, LearnedWords, T2MEvaluator, WordVectors
 from evaluators.metrics.alignment import MotionsForText, MultimodalDistance, TextAndMotion
+from flame_mdm.batch import MotionBatch
 from flame_mdm.conditions import Unconditional
 from flame_mdm.conditions.vocabulary import words as words_of
 from flame_mdm.config import Config, instantiate
 from flame_mdm.data.datamodule import MotionDataModule
 from flame_mdm.errors import UserError
-from flame_mdm.motion import MotionBatch
 from flame_mdm.representations import Representation
 from flame_mdm.seeds import key
 from flame_mdm.task import Task

@@ -15,9 +15,9 @@ from torch import Tensor
 
 from evaluators.metrics.alignment import best_ranks, own_pools, whole_set_retrieval
 from evaluators.metrics.samples import SampleMetric
+from flame_mdm.batch import MotionBatch
 from flame_mdm.conditions import ConditionEncoder
 from flame_mdm.config import Config, instantiate
-from flame_mdm.motion import MotionBatch
 from flame_mdm.seeds import key
 
 SAME = 0.9

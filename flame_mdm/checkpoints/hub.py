@@ -7,11 +7,17 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from flame_mdm.checkpoints.files import FILE, read_checkpoint, read_model_file, without_own_paths, write_model_file
 from flame_mdm.checkpoints.loading import find
+from flame_mdm.checkpoints.model_files import (
+    FILE,
+    read_checkpoint,
+    read_model_file,
+    without_own_paths,
+    write_model_file,
+)
 from flame_mdm.config import save
 from flame_mdm.errors import UserError, first_line, markdown_text
-from flame_mdm.files import read_text, sha256, write_text
+from flame_mdm.safe_io import read_text, sha256, write_text
 
 WRITTEN = {"README.md": "library_name: flame-mdm", "config.yaml": "The recipe of this model."}
 """Files that `push` writes next to the model, and a text in each that identifies it as written by `push`."""

@@ -17,7 +17,7 @@ from pydantic import Field
 from torch import Tensor
 from typing_extensions import TypedDict
 
-from flame_mdm.checkpoints.files import FILE, MOST_FRAMES, check_weights, without_own_paths, write_model_file
+from flame_mdm.checkpoints.model_files import FILE, MOST_FRAMES, check_weights, without_own_paths, write_model_file
 from flame_mdm.config import EXPERIMENTS, Config, instantiate, plain
 from flame_mdm.data.humanact12 import HumanAct12
 from flame_mdm.denoisers import Denoiser
@@ -25,9 +25,9 @@ from flame_mdm.denoisers.flame import FLAME
 from flame_mdm.denoisers.gru import MDMGRU
 from flame_mdm.denoisers.mdm import MDMDecoder, MDMEncoder
 from flame_mdm.errors import UserError, first_line
-from flame_mdm.files import check_torch, read_npy, read_yaml, sha256
 from flame_mdm.processes import MAX_STEPS
-from flame_mdm.runs import Number, check_shape
+from flame_mdm.safe_io import check_torch, read_npy, read_yaml, sha256
+from flame_mdm.schemas import Number, check_shape
 from flame_mdm.task import MotionGeneration
 
 # Prefixes of the authors' keys -> ours, inside and outside of layers.

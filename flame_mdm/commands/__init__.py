@@ -10,7 +10,7 @@ OPTIONS = {
     "eta": "float",
     "spacing": "Literal['linspace', 'stride']",
 }
-"""Keys of `flame_mdm.motion.Sampling`, and the types of their values."""
+"""Keys of `flame_mdm.batch.Sampling`, and the types of their values."""
 
 SAMPLING = {"samples": "int", "seed": "int", **OPTIONS}
 """Keys that all sampling commands share, and the types of their values."""

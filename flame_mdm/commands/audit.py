@@ -7,9 +7,9 @@ from pathlib import Path
 
 from flame_mdm.config import Config, run
 from flame_mdm.errors import UserError, say
-from flame_mdm.files import write_json
 from flame_mdm.reporting.audit import card_name, read_card, write_card
 from flame_mdm.reporting.report import paths
+from flame_mdm.safe_io import write_json
 
 USAGE = """
 usage: flame-mdm audit data=NAME extractor=FILE|none [key=value ...]
@@ -42,7 +42,7 @@ def audit(config: Config) -> None:
     if config["resamples"] == 0 or (config["samples"] or 64) < 8:
         raise UserError(f"resamples={config['resamples']}, samples={config['samples']}: give 100, and 8 or more")
     from evaluators.audit import audit as measure
-    from evaluators.run import EvaluationRequest
+    from evaluators.evaluation import EvaluationRequest
 
     protocol = config["protocol"] or ("synthetic" if config["data"]["name"] == "synthetic" else "text_to_motion")
     request = EvaluationRequest.of(config | {"baseline": "real", "protocol": protocol})

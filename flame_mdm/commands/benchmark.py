@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING
 
 from flame_mdm.config import EXPERIMENTS, Config, run, settings
 from flame_mdm.errors import UserError, say
-from flame_mdm.files import read_yaml, write_json, write_text
 from flame_mdm.reporting.page import page, render
 from flame_mdm.reporting.rendering import Table
 from flame_mdm.reporting.tables import build, load_spec, write
-from flame_mdm.runs import Number, newest_samples, read_json
+from flame_mdm.safe_io import read_yaml, write_json, write_text
+from flame_mdm.schemas import Number, newest_samples, read_json
 
 if TYPE_CHECKING:
     from markupsafe import Markup
@@ -52,7 +52,7 @@ def benchmark(config: Config) -> None:
     options = settings("tables") | {name: config[name] for name in ("device", "batch_size", "data_root")}
     results = Path(options["results"])
     begin = time.monotonic()
-    from evaluators.run import evaluate_missing
+    from evaluators.evaluation import evaluate_missing
 
     failed = evaluate_missing({plan["table"]: spec}, results, options) if config["evaluate"] else []
     times.add("evaluation", time.monotonic() - begin)

@@ -11,8 +11,8 @@ from pathlib import Path
 from flame_mdm.commands import data_node
 from flame_mdm.config import EXPERIMENTS, Config, instantiate, run
 from flame_mdm.errors import UserError, say
-from flame_mdm.files import read_yaml
 from flame_mdm.reporting.browse import choose, find, write_clips, write_page
+from flame_mdm.safe_io import read_yaml
 
 USAGE = """
 usage: flame-mdm browse data=NAME [source=PATH] [split=train] [search="waves left"] [clips=200] [out=FILE.html]

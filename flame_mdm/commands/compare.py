@@ -11,14 +11,14 @@ from typing import TYPE_CHECKING
 from flame_mdm.commands.sample import read_prompts
 from flame_mdm.config import Config, run
 from flame_mdm.errors import UserError, say
-from flame_mdm.files import write_json, write_text
 from flame_mdm.reporting.compare import HEAD, MOTIONS, ComparedRun, Prompt, comparison, find, grouped, in_common, tested
 from flame_mdm.reporting.report import paths
 from flame_mdm.reporting.study import QUESTION, rating_page, tally
+from flame_mdm.safe_io import write_json, write_text
 
 if TYPE_CHECKING:
     from flame_mdm.formats.motion import Motion
-    from flame_mdm.runs import Run
+    from flame_mdm.schemas import Run
 
 USAGE = """
 usage: flame-mdm compare runs="A B C" [texts="a person walks; a person jumps"]
@@ -119,7 +119,7 @@ def motions(compared: Sequence[ComparedRun], config: Config) -> list[dict[Prompt
 
 def _read(folder: Path) -> dict[Prompt, Motion]:
     """Returns the motions of a folder; equal captions are numbered."""
-    from flame_mdm.formats.files import read
+    from flame_mdm.formats.readers import read
 
     files = [path for path in sorted(folder.iterdir()) if path.suffix.lower() in MOTIONS and path.name[0] != "."]
     return _by_prompt([read(path) for path in files])
@@ -153,7 +153,7 @@ def _sampled(compared_run: ComparedRun, wanted: Mapping[Prompt, float | None], c
     import torch
 
     from flame_mdm.checkpoints.loading import load
-    from flame_mdm.generation import generate
+    from flame_mdm.sampling.generation import generate
 
     model = load(compared_run.folder, "cuda" if torch.cuda.is_available() else "cpu")
     fps, longest = model.representation.fps, model.facts["max_frames"]

@@ -39,7 +39,7 @@ def convert(config: Config) -> None:
     if config["motion"] is None or config["out"] is None:
         raise UserError("name an input and an output file: flame-mdm convert motion.npz walk.bvh")
     from flame_mdm.formats import characters
-    from flame_mdm.formats.files import ENDINGS
+    from flame_mdm.formats.readers import ENDINGS
 
     path, out, hero = Path(str(config["motion"])), Path(str(config["out"])), config["character"]
     try:
@@ -67,8 +67,8 @@ def convert(config: Config) -> None:
 
 def _convert(config: Config, path: Path, out: Path, character: Character | None) -> None:
     from flame_mdm.formats.body import LEG, head_height, leg_length
-    from flame_mdm.formats.files import read
     from flame_mdm.formats.layouts import find_skeleton
+    from flame_mdm.formats.readers import read
     from flame_mdm.representations.skeleton import SMPL22
     from flame_mdm.visualize.bodies import choose_body
 

@@ -25,7 +25,7 @@ def write_edits(config: Config) -> None:
     """Edits a motion as configured, and writes the original and the results.
 
     Raises:
-        UserError: If not exactly one condition is requested, or `flame_mdm.editing.edit` refuses the request.
+        UserError: If not exactly one condition is requested, or `flame_mdm.sampling.editing.edit` refuses the request.
     """
     texts = check_request(config)
     if config["motion"] is None:
@@ -34,10 +34,10 @@ def write_edits(config: Config) -> None:
     import torch
 
     from flame_mdm.checkpoints.loading import find, load
-    from flame_mdm.editing import edit
-    from flame_mdm.files import sha256
-    from flame_mdm.generation import write_motions
-    from flame_mdm.reading import read_motion
+    from flame_mdm.safe_io import sha256
+    from flame_mdm.sampling.editing import edit
+    from flame_mdm.sampling.generation import write_motions
+    from flame_mdm.sampling.reading import read_motion
     from flame_mdm.visualize.bodies import choose_body
 
     choose_body(config["body"])

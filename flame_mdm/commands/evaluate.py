@@ -20,7 +20,7 @@ Keys, with their defaults: experiments/evaluate.yaml; protocols: experiments/eva
 
 
 def _evaluate(config: Config) -> None:
-    from evaluators.run import EvaluationRequest, evaluate
+    from evaluators.evaluation import EvaluationRequest, evaluate
 
     evaluate(EvaluationRequest.of(config))
 

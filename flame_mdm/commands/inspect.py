@@ -71,8 +71,8 @@ def inspect(config: Config) -> None:
 
 def _files(config: Config) -> tuple[str, int, Iterator[Motion]]:
     """Returns a name, the number of motions, and the motions of a file or folder."""
-    from flame_mdm.formats.files import ENDINGS, read
     from flame_mdm.formats.layouts import find_skeleton
+    from flame_mdm.formats.readers import ENDINGS, read
 
     path = Path(str(config["motion"]))
     if not path.exists():

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from flame_mdm.commands import OPTIONS, SAMPLING
 from flame_mdm.config import Config, run
 from flame_mdm.errors import UserError, say
-from flame_mdm.files import MEBIBYTE, read_text
+from flame_mdm.safe_io import MEBIBYTE, read_text
 
 if TYPE_CHECKING:
     from flame_mdm.formats.motion import Motion
@@ -51,9 +51,9 @@ def sample(config: Config) -> None:
     import torch
 
     from flame_mdm.checkpoints.loading import find, load
-    from flame_mdm.files import sha256
-    from flame_mdm.generation import generate, write_motions
-    from flame_mdm.targets import errors, read_targets
+    from flame_mdm.safe_io import sha256
+    from flame_mdm.sampling.generation import generate, write_motions
+    from flame_mdm.sampling.targets import errors, read_targets
     from flame_mdm.visualize.bodies import choose_body
 
     choose_body(config["body"])
@@ -188,7 +188,7 @@ def check_condition(config: Config, model: MotionGeneration, texts: Sequence[str
     """
     if texts is not None:
         from flame_mdm.conditions.vocabulary import advice
-        from flame_mdm.sequences import read_parts
+        from flame_mdm.sampling.sequences import read_parts
         from flame_mdm.visualize.scene import shortened
 
         for text in dict.fromkeys(part for each in texts for part, _ in read_parts(each)):

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from flame_mdm.config import Config, run
 from flame_mdm.errors import UserError, say
-from flame_mdm.files import write_text
+from flame_mdm.safe_io import write_text
 
 INVALID = 3
 """Exit code if a requested row is not valid."""
@@ -31,7 +31,7 @@ def tables(config: Config) -> None:
             written.
         SystemExit: With code `INVALID` if a row is not valid; the tables are written, and each reason is printed.
     """
-    from evaluators.run import evaluate_missing
+    from evaluators.evaluation import evaluate_missing
     from flame_mdm.reporting.page import page, render
     from flame_mdm.reporting.tables import NOT_VALID, build, load_spec, spec_names, write
 

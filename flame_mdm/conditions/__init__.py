@@ -8,7 +8,7 @@ from typing import Literal
 import torch
 from torch import nn
 
-from flame_mdm.motion import Condition, MotionBatch
+from flame_mdm.batch import Condition, MotionBatch
 
 
 class ConditionEncoder(nn.Module, ABC):

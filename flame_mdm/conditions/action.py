@@ -3,8 +3,8 @@
 import torch
 from torch import nn
 
+from flame_mdm.batch import Condition, MotionBatch
 from flame_mdm.conditions import ConditionEncoder
-from flame_mdm.motion import Condition, MotionBatch
 
 
 class ActionLabels(ConditionEncoder):

@@ -18,10 +18,10 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from flame_mdm.batch import Condition, MotionBatch, sent
 from flame_mdm.conditions import ConditionEncoder
-from flame_mdm.files import made_folder, sha256, writing
-from flame_mdm.motion import Condition, MotionBatch, sent
 from flame_mdm.progress import ProgressBar
+from flame_mdm.safe_io import made_folder, sha256, writing
 
 CAPTIONS_AT_ONCE = 64
 POOLINGS = ("projection", "mean", "pooler")

@@ -4,8 +4,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from flame_mdm.batch import Condition, MotionBatch, length_mask, sent
 from flame_mdm.conditions import ConditionEncoder, vocabulary
-from flame_mdm.motion import Condition, MotionBatch, length_mask, sent
 
 START = "<start>"
 """Inserted before every caption, so that the empty caption also has a token; no caption contains this word."""

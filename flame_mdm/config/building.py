@@ -15,7 +15,7 @@ from omegaconf import OmegaConf
 
 from flame_mdm.config.signatures import Config, definition, walk
 from flame_mdm.errors import UserError, first_line
-from flame_mdm.files import read_yaml, write_text
+from flame_mdm.safe_io import read_yaml, write_text
 
 TRUSTED = (
     "flame_mdm.task",

@@ -18,7 +18,7 @@ from omegaconf.errors import OmegaConfBaseException
 from flame_mdm.config.building import RUN_DIR, current_names, plain
 from flame_mdm.config.signatures import Config, check, check_same_kinds, parameters, source_file, unknown_key
 from flame_mdm.errors import UserError, did_you_mean, first_line
-from flame_mdm.files import read_yaml
+from flame_mdm.safe_io import read_yaml
 
 _PACKAGE = Path(__file__).parent.parent
 EXPERIMENTS = _PACKAGE / "experiments" if (_PACKAGE / "experiments").is_dir() else _PACKAGE.parent / "experiments"

@@ -19,10 +19,10 @@ import torch
 
 from flame_mdm.data import archives
 from flame_mdm.data.parallel import cores, in_order
-from flame_mdm.files import read_npz
 from flame_mdm.formats.resampling import check_frames, frame_rate
 from flame_mdm.representations import rotation
 from flame_mdm.representations.skeleton import SMPL22, forward_kinematics
+from flame_mdm.safe_io import read_npz
 
 SUBSETS = {
     "ACCAD": ("ACCD",),

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from flame_mdm.errors import first_line
-from flame_mdm.files import MEBIBYTE, ZIP_ERRORS, check_expansion, check_member, regular_file
+from flame_mdm.safe_io import MEBIBYTE, ZIP_ERRORS, check_expansion, check_member, regular_file
 
 MEMBER_LIMIT = 512 * MEBIBYTE
 """Maximum size of one unpacked member in bytes. Motions, captions and arrays are far smaller."""

@@ -17,8 +17,8 @@ import numpy as np
 
 from flame_mdm.data import Clip, MotionSource, Split, hashed_split
 from flame_mdm.data.amass import Amass, Recording, key_of
-from flame_mdm.files import read_json
 from flame_mdm.progress import ProgressBar
+from flame_mdm.safe_io import read_json
 
 FPS = 20.0
 

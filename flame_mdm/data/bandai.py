@@ -20,10 +20,10 @@ from scipy.spatial.transform import Rotation
 
 from flame_mdm.data import Clip, MotionSource, Split, archives
 from flame_mdm.data.parallel import in_order
-from flame_mdm.files import TEXT_LIMIT, read_yaml, regular_file
 from flame_mdm.formats import bvh
 from flame_mdm.formats.layouts import LAYOUTS
 from flame_mdm.representations.skeleton import SMPL22
+from flame_mdm.safe_io import TEXT_LIMIT, read_yaml, regular_file
 
 _PLACES = LAYOUTS["Bandai-Namco"].map
 JOINTS = {name: place if isinstance(place := _PLACES[name], str) else next(iter(place)) for name in SMPL22.joints}

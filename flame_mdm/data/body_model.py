@@ -10,8 +10,8 @@ from scipy.sparse import csc_matrix
 
 from flame_mdm.data import restricted_pickle
 from flame_mdm.errors import first_line
-from flame_mdm.files import read_npz
 from flame_mdm.representations.skeleton import SMPL24
+from flame_mdm.safe_io import read_npz
 
 Offsets = tuple[tuple[float, float, float], ...]
 

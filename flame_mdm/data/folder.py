@@ -21,15 +21,15 @@ import torch
 from flame_mdm.data import Clip, MotionSource, Split, hashed_split
 from flame_mdm.data.parallel import in_order
 from flame_mdm.errors import UserError, printable
-from flame_mdm.files import read_json, read_text, regular_file
 from flame_mdm.formats import bvh
 from flame_mdm.formats.body import check_feet, check_size, head_height, leg_length
-from flame_mdm.formats.files import read_arrays, smpl_motion
 from flame_mdm.formats.layouts import array_layout, layout_name, map_bvh, read_skeleton, skeleton_file
+from flame_mdm.formats.readers import read_arrays, smpl_motion
 from flame_mdm.formats.resampling import resample, resampled_frames
 from flame_mdm.representations import rotation
 from flame_mdm.representations.skeleton import SMPL22
 from flame_mdm.representations.smpl import SMPL
+from flame_mdm.safe_io import read_json, read_text, regular_file
 
 MOTIONS = (".bvh", ".npz", ".npy", ".json")
 FORBIDDEN_CHARACTERS = re.compile("[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")

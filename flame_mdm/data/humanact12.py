@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from flame_mdm.data import Clip, MotionSource, Split, restricted_pickle
-from flame_mdm.files import read_npy
+from flame_mdm.safe_io import read_npy
 
 FPS = 20.0
 """Frames per second at which the authors' code plays the action data sets; frames are not resampled."""

@@ -20,10 +20,10 @@ import torch
 from flame_mdm.data import Clip, MotionSource, archives, restricted_pickle
 from flame_mdm.data.amass import Amass, Body, Recording, key_of, load_bodies, subset_of
 from flame_mdm.data.t2m import T2MFolder
-from flame_mdm.files import atomic_write, read_npy, read_text
 from flame_mdm.progress import ProgressBar
 from flame_mdm.representations import Frames
 from flame_mdm.representations.humanml import HumanML
+from flame_mdm.safe_io import atomic_write, read_npy, read_text
 
 FPS = 20
 

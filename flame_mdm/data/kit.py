@@ -17,7 +17,7 @@ import numpy as np
 from flame_mdm.data import Clip, MotionSource, Split
 from flame_mdm.data.parallel import in_order
 from flame_mdm.data.t2m import SPLITS, T2MFolder
-from flame_mdm.files import TEXT_LIMIT, read_json, read_text, regular_file
+from flame_mdm.safe_io import TEXT_LIMIT, read_json, read_text, regular_file
 
 UNITS_PER_METER = 640
 MMM_FPS = 100

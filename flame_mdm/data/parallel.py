@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import IO, TypeVar
 
 from flame_mdm.errors import UserError, say
-from flame_mdm.files import made_folder
+from flame_mdm.safe_io import made_folder
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")

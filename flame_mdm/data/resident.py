@@ -12,9 +12,9 @@ import torch.nn.functional as F
 from torch import Tensor
 from torch.utils.data import Sampler
 
+from flame_mdm.batch import MotionBatch, padded_length, sent
 from flame_mdm.data.clips import Clips, Draw
 from flame_mdm.data.store import Store
-from flame_mdm.motion import MotionBatch, padded_length, sent
 from flame_mdm.representations import Representation
 
 SHARE = 4

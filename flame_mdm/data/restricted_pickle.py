@@ -21,7 +21,7 @@ from typing import IO, Any
 import numpy as np
 
 from flame_mdm.errors import first_line
-from flame_mdm.files import ARRAYS_LIMIT, INFLATION, regular_file
+from flame_mdm.safe_io import ARRAYS_LIMIT, INFLATION, regular_file
 
 DTYPE = re.compile(r"[biufcSU]\d{1,9}|O8?")
 NODE = 32

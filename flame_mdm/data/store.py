@@ -34,9 +34,9 @@ import torch
 from flame_mdm.data import Clip, MotionSource, Split
 from flame_mdm.data.parallel import in_order, locked
 from flame_mdm.errors import UserError, first_line, say
-from flame_mdm.files import parse_json, read_json, read_npy, read_npz, regular_file, sha256, writing
 from flame_mdm.progress import ProgressBar
 from flame_mdm.representations import Frames, Representation
+from flame_mdm.safe_io import parse_json, read_json, read_npy, read_npz, regular_file, sha256, writing
 
 FORMAT = 1
 CHUNK = 4096

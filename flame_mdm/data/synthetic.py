@@ -18,7 +18,7 @@ import numpy as np
 
 from flame_mdm.data import Clip, MotionSource, hashed_split
 from flame_mdm.data.parallel import in_order
-from flame_mdm.files import read_yaml
+from flame_mdm.safe_io import read_yaml
 
 # Offsets from the parent in meters, standing with hanging arms, facing +z; x for the left side, mirrored on the right.
 HIP, SPINE1, SPINE2, SPINE3 = (0.075, -0.075, 0.0), (0.0, 0.131, -0.015), (0.0, 0.142, 0.0), (0.0, 0.057, 0.01)

@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from flame_mdm.data import Clip, MotionSource, Split, archives
-from flame_mdm.files import read_npy, read_text
+from flame_mdm.safe_io import read_npy, read_text
 
 TAG_FPS = 20
 """Frames per second of the tags `from` and `to`, also in KIT-ML, whose motions have 12.5."""

@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from flame_mdm.data import Clip, MotionSource, Split, restricted_pickle
 from flame_mdm.data.humanact12 import check_fps, columns, find
-from flame_mdm.files import read_text
+from flame_mdm.safe_io import read_text
 
 TRAIN_SUBJECTS = (
     *(1, 2, 6, 12, 13, 16, 21, 24, 28, 29, 30, 31, 33, 35, 39, 41, 42, 45, 47, 50, 52, 54, 55, 57, 59, 61, 63),

@@ -15,9 +15,9 @@ import torch
 from flame_mdm.data import Split
 from flame_mdm.data.datamodule import MotionDataModule
 from flame_mdm.data.store import Entry, Store
-from flame_mdm.files import read_yaml, write_text
 from flame_mdm.progress import ProgressBar
 from flame_mdm.representations import Representation
+from flame_mdm.safe_io import read_yaml, write_text
 
 PUBLISHED = Path(__file__).with_name("published.yaml")
 SPLITS: tuple[Split, ...] = get_args(Split)

@@ -14,7 +14,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainSeriali
 from pydantic_core import PydanticCustomError
 
 from flame_mdm.errors import UserError, did_you_mean, one_line
-from flame_mdm.sequences import read_parts
+from flame_mdm.sampling.sequences import read_parts
 from flame_mdm.visualize.scene import shortened
 
 MAX_TEXT, MAX_SECONDS, MAX_SAMPLES, MAX_STEPS, MAX_EDITS = 300, 30, 4, 1000, 8
@@ -56,7 +56,7 @@ class Change(BaseModel):
         text: what the person does in the new part; "" = unconditioned.
         region_seconds: begin and end of the new part; None = all of the motion.
         joints: body parts to resample; none = all.
-        strength: None = from noise; otherwise a variation of the motion, as in `flame_mdm.editing.edit`.
+        strength: None = from noise; otherwise a variation of the motion, as in `flame_mdm.sampling.editing.edit`.
     """
 
     model_config = RULES

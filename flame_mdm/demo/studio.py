@@ -13,12 +13,12 @@ from typing import Any
 from flame_mdm.checkpoints.loading import find, load
 from flame_mdm.conditions.vocabulary import advice
 from flame_mdm.demo.request import MAX_SECONDS, Request
-from flame_mdm.editing import edit
 from flame_mdm.errors import UserError, did_you_mean
 from flame_mdm.formats.cleanup import cleaned
 from flame_mdm.formats.motion import Motion
-from flame_mdm.generation import generate
-from flame_mdm.sequences import read_parts
+from flame_mdm.sampling.editing import edit
+from flame_mdm.sampling.generation import generate
+from flame_mdm.sampling.sequences import read_parts
 from flame_mdm.task import MotionGeneration
 
 KEPT = 64

@@ -4,7 +4,7 @@ from abc import ABC, abstractmethod
 
 from torch import Tensor, nn
 
-from flame_mdm.motion import Condition
+from flame_mdm.batch import Condition
 
 
 class Denoiser(nn.Module, ABC):

@@ -5,9 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from flame_mdm.batch import Condition
 from flame_mdm.denoisers import Denoiser
 from flame_mdm.denoisers.layers import TimeAndCondition, sinusoid
-from flame_mdm.motion import Condition
 
 
 class MDMGRU(Denoiser):

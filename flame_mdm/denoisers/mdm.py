@@ -7,9 +7,9 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
+from flame_mdm.batch import Condition
 from flame_mdm.denoisers import Denoiser
 from flame_mdm.denoisers.layers import TimeAndCondition, Transformer, sinusoid, with_prefix
-from flame_mdm.motion import Condition
 
 
 class MDMEncoder(Denoiser):

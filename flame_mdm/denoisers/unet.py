@@ -12,9 +12,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from flame_mdm.batch import Condition
 from flame_mdm.denoisers import Denoiser
 from flame_mdm.denoisers.layers import TimeAndCondition
-from flame_mdm.motion import Condition
 
 
 class MDMUNet(Denoiser):

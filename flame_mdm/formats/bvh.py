@@ -22,8 +22,8 @@ from typing import NoReturn
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from flame_mdm.files import TEXT_LIMIT, regular_file, write_text
 from flame_mdm.formats.resampling import RATES, between, slerp
+from flame_mdm.safe_io import TEXT_LIMIT, regular_file, write_text
 
 CHANNELS = tuple(f"{axis}{kind}" for kind in ("position", "rotation") for axis in "XYZ")
 HEADER = 1 << 16

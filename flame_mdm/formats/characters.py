@@ -18,12 +18,12 @@ import numpy as np
 import torch
 
 from flame_mdm.errors import UserError, did_you_mean
-from flame_mdm.files import read_yaml
 from flame_mdm.formats import bvh, glb
 from flame_mdm.formats.layouts import LAYOUTS
 from flame_mdm.formats.retarget import JOINT, Rig, continuous_euler, presets, world_rotations
 from flame_mdm.representations import rotation
 from flame_mdm.representations.skeleton import SMPL22
+from flame_mdm.safe_io import read_yaml
 from flame_mdm.visualize.body import figure
 from flame_mdm.visualize.scene import Shown
 

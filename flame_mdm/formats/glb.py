@@ -17,11 +17,11 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from flame_mdm.errors import first_line
-from flame_mdm.files import MEBIBYTE, atomic_write, parse_json, regular_file
 from flame_mdm.formats.poses import Poses
 from flame_mdm.formats.retarget import Rig, retarget
 from flame_mdm.representations import rotation
 from flame_mdm.representations.skeleton import SMPL22
+from flame_mdm.safe_io import MEBIBYTE, atomic_write, parse_json, regular_file
 from flame_mdm.visualize.body import ANCHORS, Figure
 from flame_mdm.visualize.render import SIDE_COLORS
 from flame_mdm.visualize.scene import radii, sides

@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 
 from flame_mdm.errors import UserError
-from flame_mdm.files import read_yaml, regular_file
 from flame_mdm.formats import bvh
 from flame_mdm.formats.resampling import RATES
 from flame_mdm.representations.skeleton import KIT21, SMPL22
+from flame_mdm.safe_io import read_yaml, regular_file
 
 UP = {
     "y": ((1, 0, 0), (0, 1, 0), (0, 0, 1)),

@@ -19,7 +19,6 @@ from typing import Any
 import numpy as np
 import torch
 
-from flame_mdm.files import atomic_write, write_text
 from flame_mdm.formats import bvh, characters, glb
 from flame_mdm.formats.characters import Character
 from flame_mdm.formats.poses import Poses, solve
@@ -27,6 +26,7 @@ from flame_mdm.formats.retarget import CENTIMETER, Rig, continuous_euler, preset
 from flame_mdm.representations import rotation
 from flame_mdm.representations.skeleton import SMPL22, Skeleton
 from flame_mdm.representations.smpl import ADULT
+from flame_mdm.safe_io import atomic_write, write_text
 
 AMASS_AXES = torch.tensor([[-1.0, 0, 0], [0, 0, 1], [0, 1, 0]], dtype=torch.float64)
 """Converts AMASS's coordinates, z up, to y up as in HumanML3D: (-x, z, y). It is its own inverse."""

@@ -14,10 +14,10 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from flame_mdm.errors import UserError, did_you_mean
-from flame_mdm.files import read_yaml
 from flame_mdm.formats.poses import Poses
 from flame_mdm.representations import rotation
 from flame_mdm.representations.skeleton import SMPL22
+from flame_mdm.safe_io import read_yaml
 
 JOINT = {name: number for number, name in enumerate(SMPL22.joints)}
 DIRECTIONS = {

@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 
 from torch import Tensor, nn
 
-from flame_mdm.motion import Condition, Denoise, Edit, Noise
+from flame_mdm.batch import Condition, Denoise, Edit, Noise
 
 Auxiliary = Callable[[Tensor, Tensor, Tensor], dict[str, Tensor]]
 """(x0_hat (B, F, D), x (B, F, D), mask (B, F)) -> weighted per-sample losses (B,) of the clean estimate, by name."""

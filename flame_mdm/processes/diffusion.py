@@ -7,8 +7,8 @@ from typing import Literal, get_args
 import torch
 from torch import Tensor, nn
 
+from flame_mdm.batch import Condition, Denoise, Edit, Noise
 from flame_mdm.losses import masked_mean, masked_mse
-from flame_mdm.motion import Condition, Denoise, Edit, Noise
 from flame_mdm.processes import Auxiliary, Process, samplers
 from flame_mdm.processes.schedules import Schedule, ScheduleName, build_schedule, timesteps
 

@@ -6,8 +6,8 @@ from typing import Literal, get_args
 import torch
 from torch import Tensor
 
+from flame_mdm.batch import Condition, Denoise, Edit, Noise
 from flame_mdm.losses import masked_mse
-from flame_mdm.motion import Condition, Denoise, Edit, Noise
 from flame_mdm.processes import Auxiliary, Process, samplers
 from flame_mdm.processes.diffusion import check_edit
 

@@ -7,7 +7,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from flame_mdm.motion import Condition, Denoise
+from flame_mdm.batch import Condition, Denoise
 
 STEERING_STEPS = 2
 """Gradient steps before each step of the sampler."""

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from torchdiffeq import odeint
 
-from flame_mdm.motion import Condition, Denoise, Edit, Noise
+from flame_mdm.batch import Condition, Denoise, Edit, Noise
 from flame_mdm.processes.schedules import Schedule
 
 Estimate = Callable[[Tensor, int], tuple[Tensor, Tensor | float]]

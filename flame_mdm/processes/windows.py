@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from flame_mdm.motion import Condition, Denoise, MotionBatch, length_mask
+from flame_mdm.batch import Condition, Denoise, MotionBatch, length_mask
 
 
 @dataclass

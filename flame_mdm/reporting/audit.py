@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from flame_mdm.errors import markdown_text
-from flame_mdm.files import write_text
 from flame_mdm.reporting.page import interval, number, page, render
-from flame_mdm.runs import AuditCard, AuditedPerturbation, read_json
+from flame_mdm.safe_io import write_text
+from flame_mdm.schemas import AuditCard, AuditedPerturbation, read_json
 
 FOLDERS = (Path("docs/benchmarks/audit"), Path("runs/audit"))
 """Where the card of an extractor is looked for."""

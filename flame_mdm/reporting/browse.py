@@ -12,9 +12,9 @@ import numpy as np
 from markupsafe import Markup
 
 from flame_mdm.errors import UserError
-from flame_mdm.files import atomic_folder
 from flame_mdm.reporting.page import render
 from flame_mdm.reporting.plots import Histogram, Panel, standalone, svg
+from flame_mdm.safe_io import atomic_folder
 
 if TYPE_CHECKING:
     from flame_mdm.data.store import Entry, Store

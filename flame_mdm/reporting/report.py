@@ -8,11 +8,11 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from flame_mdm.errors import UserError
-from flame_mdm.files import write_text
 from flame_mdm.reporting.audit import card_of
 from flame_mdm.reporting.page import interval, number, page, render
 from flame_mdm.reporting.plots import Curve, charts
-from flame_mdm.runs import FAULT, HISTORY, Fault, Provenance, Result, Run, Value, read_json, read_run
+from flame_mdm.safe_io import write_text
+from flame_mdm.schemas import FAULT, HISTORY, Fault, Provenance, Result, Run, Value, read_json, read_run
 
 COST = ("lr", "grad_norm", "samples_per_second", "seconds_per_step", "gpu_memory_gib")
 """Training curves about speed and optimization rather than losses."""
@@ -101,7 +101,7 @@ def _facts(run: Run) -> list[str]:
 def _player(run: Run) -> str:
     if run.samples is None:
         return ""
-    from flame_mdm.formats.files import read
+    from flame_mdm.formats.readers import read
     from flame_mdm.visualize import player_page
 
     # Written again from the motions: `player.html` may be untrusted, and its scripts would run in the report.

@@ -16,7 +16,7 @@ from pydantic import Field
 from flame_mdm.errors import UserError
 from flame_mdm.reporting.compare import ComparedRun, Prompt, shared
 from flame_mdm.reporting.page import page, render
-from flame_mdm.runs import Int, Schema, read_json
+from flame_mdm.schemas import Int, Schema, read_json
 
 if TYPE_CHECKING:
     from flame_mdm.formats.motion import Motion

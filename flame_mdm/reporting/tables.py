@@ -20,7 +20,6 @@ from pydantic import FailFast, Field, model_validator
 
 from flame_mdm.config import EXPERIMENTS, Config, plain, settings
 from flame_mdm.errors import UserError, did_you_mean, say
-from flame_mdm.files import read_yaml, write_json, write_text
 from flame_mdm.reporting.audit import card_of
 from flame_mdm.reporting.page import page
 from flame_mdm.reporting.plots import standalone
@@ -38,7 +37,8 @@ from flame_mdm.reporting.rendering import (
     places,
 )
 from flame_mdm.reporting.study import Ratings, wilson
-from flame_mdm.runs import (
+from flame_mdm.safe_io import read_yaml, write_json, write_text
+from flame_mdm.schemas import (
     Checkpoint,
     ClosedSchema,
     Int,

@@ -23,15 +23,15 @@ from torch import Tensor
 from torch.nn.utils import get_total_norm
 from torchmetrics import Metric
 
+from flame_mdm.batch import MotionBatch
 from flame_mdm.conditions.action import ActionLabels
 from flame_mdm.data.datamodule import Clips, MotionDataModule
 from flame_mdm.errors import say
 from flame_mdm.formats.motion import Motion
-from flame_mdm.generation import generate, write_motions
-from flame_mdm.motion import MotionBatch
 from flame_mdm.progress import ProgressBar
 from flame_mdm.reporting.page import number
 from flame_mdm.reporting.report import write_report
+from flame_mdm.sampling.generation import generate, write_motions
 from flame_mdm.task import MotionGeneration, Task
 from flame_mdm.training.loggers import log_video
 from flame_mdm.training.provenance import device_name

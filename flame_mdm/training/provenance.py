@@ -15,7 +15,7 @@ from lightning import Callback, LightningModule, Trainer
 from flame_mdm.config import Config, movable, save
 from flame_mdm.data.datamodule import MotionDataModule
 from flame_mdm.errors import say
-from flame_mdm.files import write_json
+from flame_mdm.safe_io import write_json
 from flame_mdm.task import Task
 from flame_mdm.training.loggers import log_config
 

@@ -15,10 +15,10 @@ from pathlib import Path
 import numpy as np
 
 from flame_mdm.errors import UserError
-from flame_mdm.files import atomic_write
 from flame_mdm.progress import ProgressBar
 from flame_mdm.representations.skeleton import SMPL22
 from flame_mdm.representations.smpl import ADULT
+from flame_mdm.safe_io import atomic_write
 from flame_mdm.visualize.body import HAIR, JOINT, MANNEQUIN, SHIRT, SHOES, SKIN, TROUSERS, Mesh, between, use
 from flame_mdm.visualize.mannequin import frame, hairline, packed, smooth, with_helpers
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from flame_mdm.files import write_text
+from flame_mdm.safe_io import write_text
 from flame_mdm.visualize.body import ANCHORS, Figure, mesh, try_figure
 from flame_mdm.visualize.scene import Shown, check_any, head, radii, shortened, sides
 

@@ -12,7 +12,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFilter, ImageFont
 
 from flame_mdm.errors import UserError
-from flame_mdm.files import atomic_write
+from flame_mdm.safe_io import atomic_write
 from flame_mdm.visualize.body import MATERIALS, Figure, rasterize, shaded, try_figure
 from flame_mdm.visualize.scene import Shown, check_any, frame_at, head, radii, shortened, sides
 

@@ -14,9 +14,9 @@ import torch
 from flame_mdm.data.store import Store
 from flame_mdm.errors import UserError, did_you_mean
 from flame_mdm.formats.body import check_size, leg_length
-from flame_mdm.formats.files import ENDINGS, read
 from flame_mdm.formats.layouts import find_skeleton
 from flame_mdm.formats.motion import Motion
+from flame_mdm.formats.readers import ENDINGS, read
 from flame_mdm.formats.resampling import resample as resample_joints
 from flame_mdm.representations import Representation
 from flame_mdm.representations.skeleton import SMPL22
@@ -36,10 +36,10 @@ def read_motion(
 
     Args:
         representation: the representation of the model.
-        source: a motion file of any kind that `flame_mdm.formats.files.read` reads; or `dataset:id`, a clip of a
+        source: a motion file of any kind that `flame_mdm.formats.readers.read` reads; or `dataset:id`, a clip of a
             prepared data set. Features of the same representation and frame rate are kept. Joints are resampled to the
             frame rate of the model and made canonical by its representation.
-        fps, unit: of the file, as in `flame_mdm.formats.files.read`.
+        fps, unit: of the file, as in `flame_mdm.formats.readers.read`.
         up: the axis of the file that points up (y, z or -y); other facts are those of the nearest `skeleton.yaml`.
         cut: begin and end, in seconds, of the part to use.
         data_root: folder of the prepared data sets.

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 
 import torch
 
+from flame_mdm.batch import MotionBatch
 from flame_mdm.errors import UserError
-from flame_mdm.motion import MotionBatch
 from flame_mdm.processes.windows import Windows, place, spans
 from flame_mdm.task import MotionGeneration
 

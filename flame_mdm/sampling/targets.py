@@ -13,13 +13,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from flame_mdm.batch import Edit
 from flame_mdm.errors import UserError, did_you_mean
-from flame_mdm.files import MEBIBYTE, read_text
 from flame_mdm.formats.motion import Motion
-from flame_mdm.motion import Edit
 from flame_mdm.processes.guidance import Positions, reach, steer
-from flame_mdm.reading import read_motion
 from flame_mdm.representations import Representation, rotation
+from flame_mdm.safe_io import MEBIBYTE, read_text
+from flame_mdm.sampling.reading import read_motion
 
 SMOOTHNESS = 0.2
 """Seconds over which a correction fades; see docs/targets.md."""

@@ -11,25 +11,25 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 from torch import Tensor
 
+from evaluators.collectives import shared
 from evaluators.evaluator import Evaluator, Extracted, Motions
 from evaluators.extractors import Extractor
 from evaluators.metrics import make_metrics
 from evaluators.metrics.confidence import mean_ci
 from evaluators.metrics.distribution import FrechetMotionDistance
 from evaluators.metrics.memorization import TrainingMotions
-from evaluators.processes import shared
 from evaluators.sources import Baseline, Generator, Row, SampleFolder, Source, real_motions
 from flame_mdm.config import Config, instantiate
 from flame_mdm.data.datamodule import Clips
 from flame_mdm.data.store import Entry
-from flame_mdm.editing import MFM_STEPS, method_options
 from flame_mdm.errors import UserError
 from flame_mdm.representations import Representation
+from flame_mdm.sampling.editing import MFM_STEPS, method_options
 from flame_mdm.seeds import key
 from flame_mdm.task import MotionGeneration
 
 REGION = {"frames": "region"}
-"""Maps option names in protocol files, which never change, to arguments of `flame_mdm.editing.kept_parts`."""
+"""Maps option names in protocol files, which never change, to arguments of `flame_mdm.sampling.editing.kept_parts`."""
 QUICK_REPLICATIONS, QUICK_SAMPLES = 2, 64
 
 
@@ -60,7 +60,7 @@ class Protocol:
             clip of the split once.
         real_samples: real motions per replication in comparisons of sets, drawn likewise; None = each clip once.
         multimodality: a second evaluation with several motions per prompt; None = none.
-        edit: `frames` (the region) and `joints` of `flame_mdm.editing.kept_parts`: motions are edits of real motions;
+        edit: `frames` (the region) and `joints` of `sampling.editing.kept_parts`: motions are edits of real motions;
             None = motions are generated from scratch.
         smoothing: standard deviation, in frames, of a Gaussian filter over time that is applied to the features of
             generated motions before they are measured, with mirrored ends; None = no filter.
@@ -255,7 +255,7 @@ class Protocol:
     ) -> dict[str, Any]:
         """Returns the sampling options of a model: those given, otherwise those of its recipe.
 
-        `method`, `until` and `strength` are for edits, as in `flame_mdm.editing`.
+        `method`, `until` and `strength` are for edits, as in `flame_mdm.sampling.editing`.
 
         Raises:
             UserError: If an editing option is given but nothing is edited, or the model's process does not allow it.

@@ -14,15 +14,15 @@ from typing import Any, Unpack
 import numpy as np
 import torch
 
+from flame_mdm.batch import Edit, MotionBatch, Sampling, length_mask, pad_to
 from flame_mdm.errors import UserError, did_you_mean
-from flame_mdm.files import atomic_folder
 from flame_mdm.formats.cleanup import cleaned
 from flame_mdm.formats.faults import find_faults
 from flame_mdm.formats.motion import Motion
-from flame_mdm.motion import Edit, MotionBatch, Sampling, length_mask, pad_to
-from flame_mdm.reading import read_motion, with_features
-from flame_mdm.sequences import Part, check_sequence, overlap, part_frames, read_parts, windows
-from flame_mdm.targets import read_targets
+from flame_mdm.safe_io import atomic_folder
+from flame_mdm.sampling.reading import read_motion, with_features
+from flame_mdm.sampling.sequences import Part, check_sequence, overlap, part_frames, read_parts, windows
+from flame_mdm.sampling.targets import read_targets
 from flame_mdm.task import MotionGeneration
 from flame_mdm.visualize import contact_sheet, write_gif, write_mp4, write_player
 from flame_mdm.visualize.scene import shortened
@@ -84,7 +84,7 @@ def generate(
         seed: seed of the noise.
         edit: part of a motion of that length to keep in every sample, with `known` and `keep` (1, F, D); see
             `flame_mdm.commands.edit`.
-        after: a motion, or a file that `flame_mdm.reading.read_motion` reads, that the result begins with.
+        after: a motion, or a file that `flame_mdm.sampling.reading.read_motion` reads, that the result begins with.
         loop: the last frame leads to the first one. The body may be at another place by then.
         targets: places to reach in the world, a JSON file or its content; see docs/targets.md.
         shared_noise: all motions get the same noise, so that they differ by their texts and lengths alone.
@@ -92,7 +92,7 @@ def generate(
             motion itself (MFM, figure 5).
         cleanup: smooth the motions, keep bone lengths constant and feet in place where they touch the floor; see
             `flame_mdm.formats.cleanup`. Such motions have no features.
-        sampling: options of `flame_mdm.motion.Sampling`, instead of the recipe's.
+        sampling: options of `flame_mdm.batch.Sampling`, instead of the recipe's.
 
     Raises:
         UserError: a text is not a string, empty or too long, an action is unknown, or the model was not trained for the

@@ -11,16 +11,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from flame_mdm.batch import Edit, Sampling
 from flame_mdm.errors import UserError, did_you_mean
 from flame_mdm.formats.cleanup import cleaned
-from flame_mdm.formats.files import from_array
 from flame_mdm.formats.motion import Motion
-from flame_mdm.generation import generate
-from flame_mdm.motion import Edit, Sampling
+from flame_mdm.formats.readers import from_array
 from flame_mdm.processes import Process
-from flame_mdm.reading import is_range, read_motion, with_features
 from flame_mdm.representations import Representation
 from flame_mdm.representations.skeleton import find_joints
+from flame_mdm.sampling.generation import generate
+from flame_mdm.sampling.reading import is_range, read_motion, with_features
 from flame_mdm.task import MotionGeneration
 
 METHODS: dict[str, dict[str, Any]] = {

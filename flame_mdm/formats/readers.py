@@ -11,7 +11,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from flame_mdm.files import MEBIBYTE, read_json, read_npy, read_npz, regular_file
 from flame_mdm.formats.body import check_size, leg_length
 from flame_mdm.formats.layouts import array_layout, read_bvh
 from flame_mdm.formats.motion import AMASS_AXES, Motion, motion_of_poses
@@ -21,6 +20,7 @@ from flame_mdm.representations import rotation
 from flame_mdm.representations.motion272 import Motion272
 from flame_mdm.representations.skeleton import SKELETONS, SMPL22, Skeleton
 from flame_mdm.representations.smpl import ADULT, read_pose
+from flame_mdm.safe_io import MEBIBYTE, read_json, read_npy, read_npz, regular_file
 
 ENDINGS = (".npz", ".bvh", ".json", ".npy")
 CAMERA_AXES = torch.diag(torch.tensor([1.0, -1, -1], dtype=torch.float64))

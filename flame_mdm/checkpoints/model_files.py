@@ -16,8 +16,8 @@ from typing_extensions import TypedDict
 
 from flame_mdm.config import current_names, plain
 from flame_mdm.errors import UserError
-from flame_mdm.files import atomic_write, parse_json, read_torch
-from flame_mdm.runs import Number, check_shape
+from flame_mdm.safe_io import atomic_write, parse_json, read_torch
+from flame_mdm.schemas import Number, check_shape
 
 if TYPE_CHECKING:
     from torch import Tensor

@@ -13,7 +13,7 @@ from datetime import timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from flame_mdm.checkpoints.files import weights_sha256
+from flame_mdm.checkpoints.model_files import weights_sha256
 from flame_mdm.config import (
     EXPERIMENTS,
     Config,
@@ -26,14 +26,14 @@ from flame_mdm.config import (
     trust,
 )
 from flame_mdm.errors import UserError, first_line, say
-from flame_mdm.files import read_yaml, sha256, write_json
 from flame_mdm.reporting.audit import card_of
 from flame_mdm.reporting.tables import Request, count_lengths, requests
-from flame_mdm.runs import read_result
+from flame_mdm.safe_io import read_yaml, sha256, write_json
+from flame_mdm.schemas import read_result
 
 if TYPE_CHECKING:  # commands check their keys before torch is imported
     from evaluators.extractors import Extractor
-    from evaluators.protocols import Protocol
+    from evaluators.protocol import Protocol
     from flame_mdm.checkpoints.loading import Which
     from flame_mdm.data import Split
     from flame_mdm.data.datamodule import Clips, MotionDataModule
@@ -268,7 +268,7 @@ def load_protocol(name: str, representation: Representation) -> Protocol:
     Raises:
         UserError: If the protocol does not exist or cannot be read.
     """
-    from evaluators.protocols import Protocol
+    from evaluators.protocol import Protocol
 
     path = protocol_file(name)
     skeleton = representation.skeleton
@@ -283,13 +283,13 @@ def load_protocol(name: str, representation: Representation) -> Protocol:
 
     config = filled(read_yaml(path))
     if not isinstance(config, dict) or "_target_" not in config:
-        raise UserError(f"{path}: not a protocol: it has no _target_, such as evaluators.protocols.Protocol")
+        raise UserError(f"{path}: not a protocol: it has no _target_, such as evaluators.protocol.Protocol")
     plain(config, path)
     config = current_names(config)
     check(config)
     protocol = instantiate(config)
     if not isinstance(protocol, Protocol):
-        raise UserError(f"{path}: not a protocol: {config['_target_']}. Name evaluators.protocols.Protocol")
+        raise UserError(f"{path}: not a protocol: {config['_target_']}. Name evaluators.protocol.Protocol")
     protocol.sha256 = _digest(original_names(config))
     return protocol
 

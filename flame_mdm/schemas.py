@@ -11,7 +11,7 @@ from typing import Annotated, Any, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
 
-from flame_mdm import files
+from flame_mdm import safe_io
 from flame_mdm.config import Config, read_saved
 from flame_mdm.errors import UserError, did_you_mean
 
@@ -23,9 +23,9 @@ SAMPLES = "samples/step_*"
 
 MAX_INTEGER = 2**63 - 1
 """Maximum integer in a file; larger ones overflow when they are plotted or logged."""
-LIMIT = 4 * files.MEBIBYTE
+LIMIT = 4 * safe_io.MEBIBYTE
 """Maximum size of a file of results, ratings, lengths or provenance. Typical files have 10 to 300 KiB."""
-HISTORY_LIMIT = 256 * files.MEBIBYTE
+HISTORY_LIMIT = 256 * safe_io.MEBIBYTE
 """Maximum size of a history; a million steps logged every 50 steps take about 20 MiB."""
 
 T = TypeVar("T")
@@ -352,7 +352,7 @@ def read_json(path: Path, kind: type[T] | Any, remedy: str = "") -> T:
     """
     message = f"; {remedy}" if remedy else ""
     try:
-        content = files.read_json(path, LIMIT)
+        content = safe_io.read_json(path, LIMIT)
     except UserError as error:
         raise UserError(f"{error}{message}") from error
     try:
@@ -463,7 +463,7 @@ def records(path: Path) -> list[dict[str, Any]]:
     """
     if not path.exists():
         return []
-    *lines, _ = files.read_text(path, HISTORY_LIMIT).split("\n")
+    *lines, _ = safe_io.read_text(path, HISTORY_LIMIT).split("\n")
     found = []
     for place, line in enumerate(lines, 1):
         try:

@@ -1,0 +1,1 @@
+"""Sampling: requests, generation, editing, sequences of texts, and targets in the world."""

@@ -4,48 +4,20 @@ import os
 
 os.environ["HF_HUB_OFFLINE"] = "1"  # before transformers is imported
 
-import time
 from collections.abc import Iterator
-from multiprocessing import active_children
-from multiprocessing.process import BaseProcess
 from pathlib import Path
 
 import pytest
 import torch
 from hypothesis import settings
-from refusals import Refused
+from support.refusals import Refused
+from support.runs import TINY
 
 from flame_mdm.__main__ import main
 
 torch.set_num_threads(1)
 settings.register_profile("repeatable", derandomize=True, deadline=None)
 settings.load_profile("repeatable")  # the same examples on every machine
-
-TINY = [
-    "data.source.clips=60",
-    "data.batch_size=8",
-    "denoiser.latent_dim=16",
-    "denoiser.ff_size=16",
-    "denoiser.num_layers=1",
-    "denoiser.num_heads=2",
-    "condition.features=16",
-    "process.num_train_timesteps=10",
-    "task.num_inference_steps=5",
-    "lr_decay=0",  # it depends on trainer.max_steps, which tests raise to resume
-    "trainer.accelerator=cpu",
-    "trainer.enable_progress_bar=false",
-    "callbacks.samples.seconds=1.5",
-]
-"""Overrides that make the quick-start experiment train in a second."""
-
-
-def no_children(before: list[BaseProcess]) -> bool:
-    """Whether the only child processes are those of `before`. A process that ended may take a moment to be noticed."""
-    for _ in range(500):
-        if not set(active_children()) - set(before):
-            return True
-        time.sleep(0.01)
-    return False
 
 
 @pytest.fixture(scope="session")
@@ -60,7 +32,7 @@ def tiny(tmp_path: Path, data_root: Path) -> list[str]:
     return [*TINY, f"data_root={data_root}", f"run.dir={tmp_path / 'run'}"]
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def trained(tmp_path_factory, data_root) -> Path:
     """A checkpoint of a tiny model; its data is prepared."""
     folder = tmp_path_factory.mktemp("trained")

@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from fixtures import golden
 from scipy.sparse import csc_matrix
+from support.fixtures import golden
 
 from evaluators.extractors import UnconstrainedExtractor
 from evaluators.extractors.action_gru import ActionGRU

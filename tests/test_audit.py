@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from fixtures import ROOT
+from support.fixtures import ROOT
 
 import evaluators.audit as audits
 from evaluators.audit import BASE, REAL, Text, _inputs, _Measure

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from fixtures import Arrays, golden
+from support.fixtures import Arrays, golden
 
 from flame_mdm.data.amass import read
 from flame_mdm.data.babel import FPS, Babel, Window

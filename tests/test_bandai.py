@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from conftest import no_children
-from fixtures import SHARED, needs_third_party, third_party
 from scipy.spatial.transform import Rotation
+from support.fixtures import SHARED, needs_third_party, third_party
+from support.runs import no_children
 
 from flame_mdm.__main__ import main
 from flame_mdm.data import Clip, bandai

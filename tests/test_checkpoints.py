@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from fixtures import GOLDEN, Arrays, golden, meta
 from safetensors.torch import load_file, save_file
+from support.fixtures import GOLDEN, Arrays, golden, meta
 
 from flame_mdm.__main__ import main
 from flame_mdm.batch import Condition, MotionBatch

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from conftest import TINY
-from distributed import GlooPool
+from support.distributed import GlooPool
+from support.runs import TINY
 
 from evaluators.extractors import OwnClassifierExtractor
 from evaluators.extractors.action_gru import ActionGRU

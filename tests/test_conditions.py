@@ -8,9 +8,9 @@ from typing import Any, Literal
 
 import pytest
 import torch
-from fixtures import ROOT
 from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
+from support.fixtures import ROOT
 
 from flame_mdm.batch import Condition, MotionBatch
 from flame_mdm.conditions import ConditionEncoder, Unconditional

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from conftest import TINY
+from support.runs import TINY
 
 from flame_mdm.__main__ import main
 from flame_mdm.commands.sample import default_folder

@@ -20,8 +20,8 @@ from urllib.parse import parse_qsl, quote, urlencode
 
 import numpy as np
 import pytest
-from browser import CHROMIUM, browser
-from fixtures import ROOT
+from support.browser import CHROMIUM, browser
+from support.fixtures import ROOT
 
 from flame_mdm.__main__ import main
 from flame_mdm.demo.request import MAX_EDITS, Change, Request, checked, parse_query

@@ -4,9 +4,9 @@ from pathlib import Path
 
 import pytest
 import torch
-from fixtures import ROOT
 from hydra.utils import get_class, instantiate
 from omegaconf import OmegaConf
+from support.fixtures import ROOT
 
 from flame_mdm.batch import Condition, length_mask
 from flame_mdm.denoisers import Denoiser

@@ -11,7 +11,7 @@ from typing import cast
 
 import pytest
 import torch
-from runs import RUN, TWO, alarm, finish, reference, spawn
+from support.runs import RUN, TWO, alarm, finish, reference, spawn
 from torchmetrics import MeanMetric
 
 from evaluators.extractors.motion_clip import MotionCLIPTask

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from fixtures import ROOT
+from support.fixtures import ROOT
 
 from flame_mdm.__main__ import COMMANDS
 from flame_mdm.config import command_line

@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from fixtures import ROOT
+from support.fixtures import ROOT
 
 
 @pytest.mark.slow

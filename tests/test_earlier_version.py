@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from fixtures import ROOT
+from support.fixtures import ROOT
 
 import flame_mdm
 from flame_mdm.__main__ import main

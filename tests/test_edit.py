@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from conftest import TINY
+from support.runs import TINY
 
 import flame_mdm
 from flame_mdm.__main__ import main

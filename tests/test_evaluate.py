@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from conftest import TINY
-from distributed import GlooPool
+from support.distributed import GlooPool
+from support.runs import TINY
 
 from evaluators.evaluation import load_protocol
 from evaluators.evaluator import Evaluator, Extracted, Motions

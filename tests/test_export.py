@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 import numpy as np
 import pytest
 import torch
-from analytic import euler_to_matrix
+from support.analytic import euler_to_matrix
 from torch import Tensor
 
 from flame_mdm.__main__ import main

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from fixtures import GOLDEN, Arrays, golden, groups, meta, needs_third_party, third_party
+from support.fixtures import GOLDEN, Arrays, golden, groups, meta, needs_third_party, third_party
 from torch import Tensor, nn
 
 from evaluators.extractors import MARDMClipExtractor

@@ -14,7 +14,7 @@ ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1"}
 @pytest.mark.slow
 def test_kills_at_random_moments_change_nothing():
     done = subprocess.run(
-        [sys.executable, str(ROOT / "tests" / "kill_resume.py"), "4"],
+        [sys.executable, str(ROOT / "tests" / "support" / "kill_resume.py"), "4"],
         capture_output=True,
         text=True,
         env=ENVIRONMENT,

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from fixtures import ROOT
+from support.fixtures import ROOT
 
 from flame_mdm.__main__ import main
 from flame_mdm.data import hashed_split, store

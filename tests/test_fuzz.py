@@ -19,8 +19,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from conftest import TINY
-from refusals import one_line
+from support.refusals import one_line
+from support.runs import TINY
 from test_report import a_run
 
 from flame_mdm.__main__ import main

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from fixtures import golden, groups
-from t2m_folder import line, published, write_folder
+from support.fixtures import golden, groups
+from support.t2m_folder import line, published, write_folder
 
 from flame_mdm.commands.prepare import main as prepare
 from flame_mdm.data import amass, humanml3d, t2m

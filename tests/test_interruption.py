@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from conftest import TINY
+from support.runs import TINY
 
 from flame_mdm.__main__ import main
 from flame_mdm.config.command_line import guarded

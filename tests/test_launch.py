@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 import torch
-from fixtures import ROOT
-from runs import RUN, TWO, alarm, finish, free_port, reference, spawn
+from support.fixtures import ROOT
+from support.runs import RUN, TWO, alarm, finish, free_port, reference, spawn
 
 from flame_mdm.__main__ import main
 from flame_mdm.checkpoints.model_files import read_checkpoint

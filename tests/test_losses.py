@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from analytic import NO_CONDITION, assert_golden, flow_field, motions
-from fixtures import golden, groups, meta
+from support.analytic import NO_CONDITION, assert_golden, flow_field, motions
+from support.fixtures import golden, groups, meta
 from torch import Tensor
 
 from flame_mdm.batch import length_mask

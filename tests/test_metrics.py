@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 import torch
-from distributed import GlooPool
-from fixtures import golden, groups
+from support.distributed import GlooPool
+from support.fixtures import golden, groups
 from torch import Tensor
 from torchmetrics import Metric
 

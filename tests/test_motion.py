@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from conftest import TINY
+from support.runs import TINY
 
 import flame_mdm
 from flame_mdm.__main__ import main

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from fixtures import golden, groups, meta
+from support.fixtures import golden, groups, meta
 from torch import Tensor
 
 from flame_mdm.representations import rotation

@@ -7,8 +7,8 @@ from itertools import islice
 
 import pytest
 import torch
-from distributed import GlooPool
-from fixtures import GOLDEN, Arrays, golden, meta
+from support.distributed import GlooPool
+from support.fixtures import GOLDEN, Arrays, golden, meta
 from torch.nn import functional
 
 from evaluators.extractors import MotionCLIPExtractor

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 import torch
-from distributed import GlooPool
-from fixtures import recipe
-from one_step import built, clips, shortened, two_steps
+from support.distributed import GlooPool
+from support.fixtures import recipe
+from support.one_step import built, clips, shortened, two_steps
 
 from flame_mdm.config import recipes
 

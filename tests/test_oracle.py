@@ -6,8 +6,8 @@ from typing import Any
 
 import pytest
 import torch
-from analytic import NO_CONDITION
-from fixtures import recipe
+from support.analytic import NO_CONDITION
+from support.fixtures import recipe
 from torch import Tensor
 
 from flame_mdm.batch import Denoise, Edit

@@ -6,7 +6,7 @@ from itertools import islice
 from multiprocessing import active_children
 
 import pytest
-from conftest import no_children
+from support.runs import no_children
 
 from flame_mdm.data import parallel
 from flame_mdm.data.parallel import in_order

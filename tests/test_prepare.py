@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import TINY, no_children
-from t2m_folder import line, write_folder
+from support.runs import TINY, no_children
+from support.t2m_folder import line, write_folder
 from test_actions import write_humanact12, write_uestc
 from test_babel import small  # noqa: F401  a fixture
 from test_bandai import TAKES, synthetic_take

@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from analytic import NO_CONDITION, assert_golden, flow_field, linear_denoiser, motions, spaced
-from fixtures import ROOT, golden, meta
 from hydra.utils import instantiate
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from omegaconf import OmegaConf
+from support.analytic import NO_CONDITION, assert_golden, flow_field, linear_denoiser, motions, spaced
+from support.fixtures import ROOT, golden, meta
 from torch import Tensor
 
 from flame_mdm.batch import length_mask

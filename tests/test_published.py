@@ -10,7 +10,7 @@ from typing import Any, get_args
 import numpy as np
 import pytest
 import yaml
-from fixtures import recipe
+from support.fixtures import recipe
 
 from evaluators.evaluation import load_protocol
 from evaluators.evaluator import Evaluator, Motions

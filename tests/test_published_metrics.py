@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from fixtures import golden, groups, meta
+from support.fixtures import golden, groups, meta
 from torch import Tensor
 
 from evaluators.metrics.alignment import MotionsForText, best_ranks, whole_set_retrieval
@@ -320,7 +320,7 @@ def test_captions_are_compared_without_case_and_punctuation():
 
 @pytest.mark.slow
 def test_similar_captions_are_the_same_by_sentence_bert():
-    from fixtures import ROOT
+    from support.fixtures import ROOT
 
     from flame_mdm.safe_io import read_yaml
 

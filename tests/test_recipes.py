@@ -6,7 +6,7 @@ from typing import Any, get_args
 
 import pytest
 import torch
-from fixtures import ROOT, recipe
+from support.fixtures import ROOT, recipe
 
 from flame_mdm.batch import Condition
 from flame_mdm.config import instantiate, recipes

@@ -12,7 +12,7 @@ from typing import Any, cast
 
 import pytest
 import torch
-from conftest import TINY
+from support.runs import TINY
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from flame_mdm.__main__ import main

@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from fixtures import ROOT, SHARED, Arrays, golden, groups, load, needs_third_party, third_party
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
+from support.fixtures import ROOT, SHARED, Arrays, golden, groups, load, needs_third_party, third_party
 from torch import Tensor
 
 from flame_mdm.representations import Representation, rotation

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import TINY
+from support.runs import TINY
 
 from flame_mdm.commands import browse, evaluate, prepare, train
 from flame_mdm.conditions.text import CaptionCache

@@ -548,7 +548,7 @@ def test_blender_shows_the_pose(name: str | None, ending: str, kick: Motion, tmp
             expected[:, joint] = kick.joints[:, source] if source >= 0 else np.nan
         lift = [node["translation"] for node in read_glb(path)[0]["nodes"][-1:]] if ending == ".glb" else [[0, 0, 0]]
         expected += np.array(lift[0])
-    script = Path(__file__).with_name("blender.py")
+    script = Path(__file__).parent / "support" / "blender.py"
     done = subprocess.run([BLENDER, script, path, "20"], capture_output=True, text=True, check=True)
     found = json.loads(next(line for line in done.stdout.splitlines() if line.startswith("FOUND"))[5:])
     assert [frame for frame, _ in found] == [0, (len(kick.joints) - 1) // 2, len(kick.joints) - 1]

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 import torch
-from fixtures import golden, groups
+from support.fixtures import golden, groups
 
 from flame_mdm.representations.rifke import Rifke, upsample
 

@@ -1,10 +1,10 @@
 import numpy as np
 import pytest
 import torch
-from analytic import euler_to_matrix
-from fixtures import golden
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.analytic import euler_to_matrix
+from support.fixtures import golden
 from torch import Tensor
 
 from flame_mdm.representations import rotation

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from analytic import NO_CONDITION, assert_golden, flow_field, linear_denoiser, motions, spaced
 from diffusers.schedulers.scheduling_ddim import DDIMScheduler
 from diffusers.schedulers.scheduling_ddpm import DDPMScheduler
 from diffusers.schedulers.scheduling_dpmsolver_multistep import DPMSolverMultistepScheduler
-from fixtures import Arrays, golden, groups, meta
 from hydra.utils import instantiate
+from support.analytic import NO_CONDITION, assert_golden, flow_field, linear_denoiser, motions, spaced
+from support.fixtures import Arrays, golden, groups, meta
 from torch import Tensor
 from torchdiffeq import odeint
 

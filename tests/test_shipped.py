@@ -2,7 +2,7 @@
 
 import numpy as np
 import torch
-from fixtures import ROOT
+from support.fixtures import ROOT
 
 import flame_mdm
 from evaluators.metrics.attributes import read_attributes

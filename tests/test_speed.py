@@ -6,9 +6,9 @@ from typing import Any
 
 import pytest
 import torch
-from conftest import TINY
 from lightning import LightningModule
 from lightning.pytorch.callbacks import EMAWeightAveraging
+from support.runs import TINY
 from torch import nn
 from torch.nn import functional
 from torch.optim.swa_utils import AveragedModel

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from conftest import TINY
+from support.runs import TINY
 
 import evaluators.evaluation
 from evaluators.evaluation import _outdated

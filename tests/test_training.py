@@ -42,7 +42,7 @@ def run(overrides: list[str], steps: int, folder: Path | None = None) -> Path:
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory, data_root):
     """Checkpoint of a tiny experiment after 6 steps."""
-    from conftest import TINY
+    from support.runs import TINY
 
     folder = tmp_path_factory.mktemp("trained")
     return run([*TINY, f"data_root={data_root}", f"run.dir={folder}", "trainer.val_check_interval=3"], 6)
@@ -282,7 +282,7 @@ def test_sampling_writes_motions_and_a_player(trained, tmp_path, capsys):
 
 
 def test_recipes_may_list_the_sampling_steps(data_root, tmp_path):
-    from conftest import TINY
+    from support.runs import TINY
 
     words = [f"data_root={data_root}", "callbacks.samples=null", "task.num_inference_steps=[0,2,5,9]"]
     model = load(run([*TINY, *words], 1, tmp_path / "run"))

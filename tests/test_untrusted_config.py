@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from conftest import TINY
-from fixtures import ROOT
-from refusals import one_line
+from support.fixtures import ROOT
+from support.refusals import one_line
+from support.runs import TINY
 
 from evaluators.evaluation import load_protocol
 from flame_mdm.checkpoints.hub import card, export

@@ -21,8 +21,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import no_children
-from refusals import Refused, carry_out
+from support.refusals import Refused, carry_out
+from support.runs import no_children
 from test_fuzz import body, bvh
 
 from evaluators.sources import read_samples

@@ -5,13 +5,13 @@ from __future__ import annotations
 from typing import Any
 
 import torch
-from fixtures import recipe
 from torch import Tensor, nn
 
 from flame_mdm.batch import Condition, MotionBatch, length_mask
 from flame_mdm.conditions import ConditionEncoder
 from flame_mdm.config import instantiate
 from flame_mdm.task import MotionGeneration
+from support.fixtures import recipe
 
 FRAMES, ACTIONS = 24, 40
 

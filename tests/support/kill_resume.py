@@ -1,6 +1,6 @@
 """Kills training, preparation and evaluation at random times and resumes them.
 
-Usage: `python tests/kill_resume.py [kills]`, by default 20 kills of each command. Signals alternate between
+Usage: `python tests/support/kill_resume.py [kills]`, by default 20 kills of each command. Signals alternate between
 SIGKILL and SIGTERM; every fourth kill of training is a SIGKILL halfway through writing a checkpoint. Training is killed
 after a random number of steps plus up to 50 ms, the other commands at a random time up to the duration of an
 uninterrupted run; kills that come too late do not count. The final outputs must equal those of uninterrupted runs:

@@ -15,7 +15,7 @@ import pytest
 
 from flame_mdm.config import compose
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parent.parent.parent
 GOLDEN = Path(os.environ.get("FLAME_MDM_GOLDEN", ROOT / "tests" / "golden"))
 SHARED = Path(os.environ.get("FLAME_MDM_SHARED", ROOT.parent / "shared"))
 

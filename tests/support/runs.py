@@ -7,6 +7,9 @@ import signal
 import socket
 import subprocess
 import sys
+import time
+from multiprocessing import active_children
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 
 import pytest
@@ -18,6 +21,23 @@ from flame_mdm.data.datamodule import TrainingBatches
 from flame_mdm.task import MotionGeneration
 
 SECONDS = 120
+
+TINY = [
+    "data.source.clips=60",
+    "data.batch_size=8",
+    "denoiser.latent_dim=16",
+    "denoiser.ff_size=16",
+    "denoiser.num_layers=1",
+    "denoiser.num_heads=2",
+    "condition.features=16",
+    "process.num_train_timesteps=10",
+    "task.num_inference_steps=5",
+    "lr_decay=0",  # it depends on trainer.max_steps, which tests raise to resume
+    "trainer.accelerator=cpu",
+    "trainer.enable_progress_bar=false",
+    "callbacks.samples.seconds=1.5",
+]
+"""Overrides that make the quick-start experiment train in a second."""
 
 # SGD: Adam makes much of gradients that are 0 but for rounding.
 RUN = [
@@ -111,3 +131,12 @@ def finish(process: subprocess.Popen[str]) -> tuple[int, str, str]:
         out, err = process.communicate()
         pytest.fail(f"the processes hang\n{out}\n{err}")
     return process.returncode, out, err
+
+
+def no_children(before: list[BaseProcess]) -> bool:
+    """Whether the only child processes are those of `before`. A process that ended may take a moment to be noticed."""
+    for _ in range(500):
+        if not set(active_children()) - set(before):
+            return True
+        time.sleep(0.01)
+    return False

@@ -2,12 +2,12 @@
 
 import numpy as np
 import torch
-from fixtures import Arrays, meta
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from flame_mdm.batch import Condition, Denoise
 from flame_mdm.processes.schedules import timesteps
+from support.fixtures import Arrays, meta
 
 NO_CONDITION = Condition(torch.zeros(1, 1), torch.zeros(1, 0, 1), None)
 

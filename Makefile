@@ -48,7 +48,7 @@ lint: $(READY) ## check style and types
 	@$(VENV)/bin/pyright
 
 bench: $(READY) ## measure speed, write docs/benchmarks/speed.md; ONLY=host,steps repeats some, DEVICE=cuda adds a GPU
-	@$(VENV)/bin/python benchmarks/run.py "only=$(ONLY)" "device=$(DEVICE)" "runs=$(RUNS)"
+	@$(VENV)/bin/python benchmarks/run.py "only=$(ONLY)" "device=$(DEVICE)"
 
 docs: $(READY) ## write the pages that are generated from the code, and build the site in build/docs
 	@$(VENV)/bin/python docs/generate.py

@@ -1,7 +1,7 @@
 """Runs the benchmarks and writes docs/benchmarks/speed.md: `python benchmarks/run.py [only=a,b] [device=cuda]`.
 
 Each benchmark runs in a process, one after another. With `only`, the other sections keep their figures. `device=cuda`
-measures the sections that use a GPU, which are added to the page. `only=quality runs=FOLDER` compares trained models.
+measures the sections that use a GPU, which are added to the page. Sections whose script is gone keep their figures.
 """
 
 import datetime
@@ -21,42 +21,39 @@ from sections import body
 from flame_mdm.training.provenance import environment
 
 PAGE = Path(__file__).parent.parent / "docs" / "benchmarks" / "speed.md"
-SECTIONS = ["host", "steps", "loading", "ema", "sampling", "evaluation", "preparation", "features", "text", "startup"]
-SECTIONS += ["ddp"]
-ALL = [*SECTIONS, "quality"]  # which reads trained models, and is measured only if asked for
+SECTIONS = ["host", "steps", "loading", "sampling", "evaluation", "startup", "ddp"]
 ON_GPU = ["steps", "sampling"]
 HEAD = """# Speed
 
 `make bench` measures the speed of the framework and writes this page and [speed.json](speed.json). Every comparison is
 a ratio of two measurements in one run, on an idle machine unless the section says otherwise; the absolute figures next
 to it hold for that machine alone. `make bench ONLY=host,steps` repeats some sections, `make bench DEVICE=cuda` adds
-those of a GPU. The quality of trained models is read from their runs: `make bench ONLY=quality RUNS=FOLDER`.
+those of a GPU. Sections that name a commit were measured once, by a script of that commit.
 [Which options to choose](../speed.md) is a page of its own.
 """
 
 
 def machine() -> dict[str, str | int]:
     """Returns the hardware and versions that a measurement depends on."""
-    has, facts = torch.cpu.get_capabilities(), environment()
+    has, software = torch.cpu.get_capabilities(), environment()
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    found: dict[str, str | int] = {
+    facts: dict[str, str | int] = {
         "processor": has.get("cpu_name") or platform.processor(),
         "cores": cores,
         "bfloat16 instructions": " ".join(name for name in ("avx512_bf16", "amx_bf16") if has.get(name)) or "none",
         "threads": torch.get_num_threads(),
-        "torch": facts["packages"]["torch"],
-        "lightning": facts["packages"]["lightning"],
-        "python": facts["python"],
+        "torch": software["packages"]["torch"],
+        "lightning": software["packages"]["lightning"],
+        "python": software["python"],
     }
     if torch.cuda.is_available():
-        found["GPU"] = torch.cuda.get_device_name()
-    return found
+        facts["GPU"] = torch.cuda.get_device_name()
+    return facts
 
 
 def child(name: str, out: str, *words: str) -> None:
     """Measures one section and writes it as JSON."""
-    found = importlib.import_module(name).measure(*words)
-    Path(out).write_text(json.dumps(found))
+    Path(out).write_text(json.dumps(importlib.import_module(name).measure(*words)))
 
 
 def run(name: str, *words: str) -> dict[str, Any]:
@@ -74,18 +71,23 @@ def run(name: str, *words: str) -> dict[str, Any]:
 
 def render(sections: dict[str, Any]) -> str:
     """Returns the page of the measured sections."""
-    order = sorted(sections, key=lambda name: (name.endswith("_cuda"), ALL.index(name.removesuffix("_cuda"))))
+    order = sorted(sections, key=lambda name: ("script" in sections[name], name.endswith("_cuda"), _rank(name)))
     machines = list(dict.fromkeys(json.dumps(sections[name]["machine"]) for name in order))
     lines = [HEAD, "## In short\n", *(f"- {sections[name]['summary']}" for name in order), "\n## Machine\n"]
     for number, facts in enumerate(machines, 1):
         lines.append(f"{number}. " + ", ".join(f"{key}: {value}" for key, value in json.loads(facts).items()))
     for name in order:
-        found = sections[name]
-        where = machines.index(json.dumps(found["machine"])) + 1
-        script = f"benchmarks/{name.removesuffix('_cuda')}.py"
-        title = found["title"] + " on a GPU" * name.endswith("_cuda")
-        lines += [f"\n## {title}\n", body(found), f"\n`{script}`, {found['date']}, machine {where}."]
+        section = sections[name]
+        where = machines.index(json.dumps(section["machine"])) + 1
+        script = section.get("script", f"benchmarks/{name.removesuffix('_cuda')}.py")
+        title = section["title"] + " on a GPU" * name.endswith("_cuda")
+        lines += [f"\n## {title}\n", body(section), f"\n`{script}`, {section['date']}, machine {where}."]
     return "\n".join(lines) + "\n"
+
+
+def _rank(name: str) -> int:
+    name = name.removesuffix("_cuda")
+    return SECTIONS.index(name) if name in SECTIONS else len(SECTIONS)
 
 
 def main(*words: str) -> None:
@@ -96,24 +98,21 @@ def main(*words: str) -> None:
         raise SystemExit(f"DEVICE={device}: give cpu or cuda")
     if device == "cuda" and not torch.cuda.is_available():
         raise SystemExit("DEVICE=cuda: torch finds no CUDA GPU on this machine")
-    possible, usual = (ON_GPU, ON_GPU) if device == "cuda" else (ALL, SECTIONS)
-    chosen = options["only"].split(",") if options.get("only") else usual
+    possible = ON_GPU if device == "cuda" else SECTIONS
+    chosen = options["only"].split(",") if options.get("only") else possible
     if unknown := [name for name in chosen if name not in possible]:
         raise SystemExit(f"ONLY={','.join(unknown)}: give some of {', '.join(possible)}")
-    if "quality" in chosen and not options.get("runs"):
-        raise SystemExit("ONLY=quality: give RUNS=..., a folder of trained and evaluated runs")
     data = PAGE.with_suffix(".json")
     sections: dict[str, Any] = json.loads(data.read_text()) if data.exists() else {}
     for number, name in enumerate(chosen, 1):
         print(f"{number}/{len(chosen)} {name}", flush=True)
         start = time.perf_counter()
-        given = [options["runs"]] if name == "quality" else ["--device", "cuda"] if device == "cuda" else []
-        found = run(name, *given)
-        found |= {"date": datetime.date.today().isoformat(), "machine": machine()}
-        sections[name + "_cuda" * (device == "cuda")] = found
+        section = run(name, *(["--device", "cuda"] if device == "cuda" else []))
+        section |= {"date": datetime.date.today().isoformat(), "machine": machine()}
+        sections[name + "_cuda" * (device == "cuda")] = section
         data.write_text(json.dumps(sections, indent=1) + "\n")
         PAGE.write_text(render(sections))
-        print(f"    {found['summary']} ({time.perf_counter() - start:.0f} s)", flush=True)
+        print(f"    {section['summary']} ({time.perf_counter() - start:.0f} s)", flush=True)
     print(f"page: {PAGE}")
 
 

@@ -33,15 +33,15 @@ def table(rows: list[Row]) -> str:
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
-def body(found: Section) -> str:
+def body(content: Section) -> str:
     """Returns the text and tables of a section as Markdown."""
-    tables = (f"{caption[:1].upper()}{caption[1:]}:\n\n{table(rows)}" for caption, rows in found["tables"].items())
-    return "\n\n".join([found["text"], *tables])
+    tables = (f"{caption[:1].upper()}{caption[1:]}:\n\n{table(rows)}" for caption, rows in content["tables"].items())
+    return "\n\n".join([content["text"], *tables])
 
 
-def show(found: Section) -> None:
+def show(content: Section) -> None:
     """Prints a section."""
-    print(f"{body(found)}\n\n{found['summary']}")
+    print(f"{body(content)}\n\n{content['summary']}")
 
 
 def take_turns(runs: Mapping[str, Callable[[], object]], rounds: int, device: str = "cpu") -> dict[str, float]:

@@ -52,12 +52,12 @@ def measure(*words: str) -> Section:
             rows[f"{command} --help"] = ([*module, "--help"], [])
             rows[f"{command}, misspelled key"] = ([*module, *line[: command == "train"], "seeed=1"], [])
             rows[f"{command}, minimal work"] = ([*module, *line], varying)
-        found: list[Row] = []
+        rows: list[Row] = []
         times: list[float] = []
         for row, (line, varying) in rows.items():
             runs_of = ([*line, *(word.format(number) for word in varying)] for number in range(runs))
             times.append(statistics.median(seconds(folder, *run) for run in runs_of))
-            found.append({"command": f"`{row}`", "seconds": times[-1], "ratio": times[-1] / times[0]})
+            rows.append({"command": f"`{row}`", "seconds": times[-1], "ratio": times[-1] / times[0]})
     return section(
         "Start of the commands",
         "From the start of a process to its end, one thread. The work is minimal (one training step, one motion, one "
@@ -65,7 +65,7 @@ def measure(*words: str) -> Section:
         "ratios to importing torch.",
         f"`--help` answers in {times[1]:.1f} s, and a training starts in {times[3] / times[0]:.1f} times the time of "
         "importing torch.",
-        commands=found,
+        commands=rows,
     )
 
 

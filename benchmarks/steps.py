@@ -144,20 +144,20 @@ def full_size(size: list[str], batches: int, peak: dict[str, float], device: str
 
     times = take_turns({name: partial(run, *way) for name, way in ways.items()}, 3, device)
     slowest = next(iter(times.values()))
-    found: list[Row] = []
+    table: list[Row] = []
     for name, taken in times.items():
         rate = peak.get(name.removeprefix("speed="))
         row: Row = {"training": name, "ms per step": 1000 * taken / batches, "times as fast": slowest / taken}
         share = f"{operations / taken / rate:.0%}" if rate else None
-        found.append(row | {"frames per second": real / taken, "share of the matrix peak": share})
+        table.append(row | {"frames per second": real / taken, "share of the matrix peak": share})
     mean = sum(batch.x.shape[1] for batch in bucketed) / batches
     text = f"{rows} clips of {real / rows / batches:.0f} frames on average, padded to {mean:.0f} by the framework"
-    return found, operations / times["speed=fast"], text
+    return table, operations / times["speed=fast"], text
 
 
 def backbones(names: Sequence[str], rounds: int, peak: dict[str, float], device: str) -> list[Row]:
     """Returns a row per network of `BACKBONES`, in its size for CPU runs."""
-    found: list[Row] = []
+    rows: list[Row] = []
     lengths = np.random.default_rng(1).integers(36, 61, 32)
     for name in names:
         config = compose(BACKBONES[name][0], ["condition=none", *BACKBONES[name][1:]])
@@ -170,8 +170,8 @@ def backbones(names: Sequence[str], rounds: int, peak: dict[str, float], device:
         row["times as fast"] = times["reference"] / times["fast"]
         row |= {f"frames per second, {speed}": int(lengths.sum()) / taken for speed, taken in times.items()}
         row |= {f"share of peak, {s}": f"{operations / taken / peak[s]:.0%}" for s, taken in times.items()}
-        found.append(row)
-    return found
+        rows.append(row)
+    return rows
 
 
 def quickstart(clips: int, steps: int, rounds: int) -> list[Row]:

@@ -4,7 +4,6 @@ import json
 import math
 import sys
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -13,25 +12,18 @@ ROOT = Path(__file__).parent.parent
 sys.path.append(str(ROOT / "benchmarks"))  # the scripts import each other
 
 import cost  # noqa: E402
-import quality  # noqa: E402
 import run  # noqa: E402
 import sections  # noqa: E402
-import seeds  # noqa: E402
 import steps  # noqa: E402
 
 from flame_mdm.config import compose  # noqa: E402
-from flame_mdm.schemas import Run, Value  # noqa: E402
 
 TOY = {
     "host": "12",
     "steps": "--quick",
     "loading": "100 3",
-    "ema": "1",
     "sampling": "--frames 4 --latent-dim 16 --num-layers 1 --repeats 1 --longest 0",
     "evaluation": "--clips 40",
-    "preparation": "2000",
-    "features": "1",
-    "text": "2",
     "startup": "1",
     "ddp": "1",
 }
@@ -49,19 +41,19 @@ def page(tmp_path, monkeypatch) -> Path:
 
 
 def test_the_page_is_rendered_from_the_figures_and_keeps_those_that_are_not_measured_again(page):
-    run.main("only=host,ema", "device=")
+    run.main("only=host,steps", "device=")
     data = page.with_suffix(".json")
     kept = json.loads(data.read_text())
     kept["host"]["date"] = "2001-02-03"
     data.write_text(json.dumps(kept))
-    run.main("only=ema")
+    run.main("only=steps")
     again = json.loads(data.read_text())
     assert again["host"] == kept["host"]
     text = page.read_text()
     assert text == run.render(again)
     assert "| host | 1,234 |" in text
     assert "`benchmarks/host.py`, 2001-02-03, machine 1." in text
-    assert text.index("## Title of host") < text.index("## Title of ema")
+    assert text.index("## Title of host") < text.index("## Title of steps")
     assert "torch: " in text.split("## Machine")[1].split("##")[0]
 
 
@@ -69,7 +61,6 @@ def test_unknown_sections_and_devices_are_refused_in_one_line(page, monkeypatch)
     for word, start in (
         ("only=host,none", "ONLY=none: give some of host, "),
         ("device=tpu", "DEVICE=tpu: give cpu"),
-        ("only=quality", "ONLY=quality: give RUNS="),
     ):
         with pytest.raises(SystemExit, match=start):
             run.main(word)
@@ -108,55 +99,6 @@ def test_the_operations_of_a_step_grow_with_its_batch():
 def test_the_committed_page_is_rendered_from_the_committed_figures():
     found = json.loads((ROOT / "docs" / "benchmarks" / "speed.json").read_text())
     assert (ROOT / "docs" / "benchmarks" / "speed.md").read_text() == run.render(found)
-
-
-def trained(folder: Path, speed: str, seed: int, loss: float, fid: float) -> Run:
-    keys: dict[str, Any] = {"speed": speed} if speed == "fast" else {}
-    config = {"data": {"name": "own"}, "trainer": {"max_steps": 1500}, "ema": {"decay": 0.9}, "run": keys, "seed": seed}
-    values = {"fid": Value(mean=fid, ci=0.0, replications=1, n=9), "jitter": None}
-    model = SimpleNamespace(parameters=1_500_000)
-    result: Any = SimpleNamespace(values=values, checkpoint=model)
-    return Run(folder, config, None, {"val/loss": {9: 100.0, 19: loss}}, {"evaluation/result.json": result})
-
-
-def test_quality_has_intervals_over_seeds_and_of_the_differences_of_equal_seeds(tmp_path, monkeypatch):
-    runs = {}
-    for seed, loss in enumerate((1.0, 2.0, 3.0)):
-        runs[f"a{seed}"] = trained(tmp_path, "reference", seed, loss, fid=5.0 + seed)
-        runs[f"b{seed}"] = trained(tmp_path, "fast", seed, loss + 0.1, fid=5.0 - 10 * seed)
-    for name in runs:
-        (tmp_path / name).mkdir()
-        (tmp_path / name / "config.yaml").touch()
-    monkeypatch.setattr(quality, "read_run", lambda folder: runs[folder.name])
-    found = quality.measure(str(tmp_path))
-    ((caption, rows),) = found["tables"].items()
-    assert caption == "own, 1,500 steps, ema.decay=0.9, 3 seeds"
-    assert [row["metric"] for row in rows] == ["val/loss", "FID"]
-    assert rows[0]["speed=reference"] == "2.0 ± 2.5"  # 4.303 / sqrt(3)
-    assert rows[0]["fast − reference"].startswith("+0.10 ± 0.00")
-    assert rows[1]["fast − reference"] == "-11 ± 27"  # 11 times as much
-    assert found["summary"].startswith("In 1 of 2 figures of quality")
-    assert found["summary"].endswith("the others: val/loss (own).")
-    del runs["b2"]
-    (tmp_path / "b2" / "config.yaml").unlink()
-    with pytest.raises(SystemExit, match="needs the same two or more seeds in both speeds"):
-        quality.measure(str(tmp_path))
-    monkeypatch.setattr(quality, "read_run", lambda folder: Run(folder, runs["a0"].config, None, {}, {}))
-    with pytest.raises(SystemExit, match="not validated or not evaluated"):
-        quality.measure(str(tmp_path))
-
-
-def test_a_row_of_several_seeds(tmp_path, monkeypatch, capsys):
-    for seed in range(3):
-        (tmp_path / f"bandai-gru-{seed}").mkdir()
-        (tmp_path / f"bandai-gru-{seed}" / "config.yaml").touch()
-    monkeypatch.setattr(
-        seeds, "read_run", lambda folder: trained(folder, "fast", s := int(folder.name[-1]), s + 1.0, 5.0 + s)
-    )
-    seeds.main(f"{tmp_path}/bandai-gru")
-    assert capsys.readouterr().out.splitlines()[2] == "| gru | 1,500 | 3 | 1.50 | 6.0 ± 2.5 |"
-    with pytest.raises(SystemExit, match=r"bandai-g: 0 runs .*bandai-g-0"):
-        seeds.main(f"{tmp_path}/bandai-g")
 
 
 @pytest.mark.slow

@@ -375,6 +375,8 @@ def read_samples(path: Path) -> dict[str, np.ndarray]:
     """
     try:
         content = read_npz(path)
+    except UserError:
+        raise
     except ValueError as error:
         raise UserError(f"{path}: {error}. Delete it or write it again") from error
     frames = {name: content[name] for name in ("features", "joints") if name in content}

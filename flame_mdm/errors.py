@@ -16,7 +16,7 @@ stopped_by: BaseException | None = None
 step, because a library may have swallowed it."""
 
 
-class UserError(Exception):
+class UserError(ValueError):
     """An error that the user can fix; commands print its message in one line and exit with code 1."""
 
 

@@ -204,6 +204,8 @@ def read_json(path: str | Path, limit: int = TEXT_LIMIT) -> Any:
     """
     try:
         return parse_json(read_text(path, limit))
+    except UserError:
+        raise
     except ValueError as error:
         raise UserError(f"{path}: not a JSON file: {error}") from error
 

@@ -286,6 +286,8 @@ class ClassifierExtractor(Extractor):
         read, self.dataset, self.reads = CLASSIFIERS[kind]
         try:
             self.network = read(path).to(device)
+        except UserError:
+            raise
         except ValueError as error:
             raise UserError(
                 f"{error}. For classifiers of make train EXP=classifier/..., use protocol=action_to_motion_own"

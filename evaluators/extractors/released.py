@@ -8,6 +8,7 @@ from typing import TypeVar
 
 from torch import Tensor, nn
 
+from flame_mdm.errors import UserError
 from flame_mdm.safe_io import read_torch
 
 Network = TypeVar("Network", bound=nn.Module)
@@ -29,6 +30,8 @@ def read_weights(path: str | Path, key: str | None = None) -> dict[str, Tensor]:
         raise FileNotFoundError(f"{path}: no such file. Give the path of the weights released by the authors")
     try:
         content = read_torch(path)
+    except UserError:
+        raise
     except ValueError as error:
         raise ValueError(
             f"{path}: damaged, or it holds objects other than plain weights, which are not read. Download it again, or "

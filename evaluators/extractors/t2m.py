@@ -20,6 +20,7 @@ from flame_mdm.batch import pad_to
 from flame_mdm.conditions.vocabulary import hashed
 from flame_mdm.data import restricted_pickle
 from flame_mdm.data.t2m import MAX_TOKENS, frame_tokens
+from flame_mdm.errors import UserError
 from flame_mdm.safe_io import read_npy
 
 UNIT = 4
@@ -267,6 +268,8 @@ def _read(path: Path) -> np.ndarray:
         if array.dtype.kind not in "fiu":
             raise ValueError(f"an array of {array.dtype}, not of numbers")
         return array
+    except UserError:
+        raise
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
 

@@ -214,6 +214,8 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
         return read_model_file(path)
     try:
         checkpoint = read_torch(path)
+    except UserError:
+        raise
     except ValueError as error:
         raise UserError(f"{path}: damaged, or not a checkpoint of this framework") from error
     return checked(path, checkpoint)

@@ -564,6 +564,8 @@ def _statistics(folder: Path) -> tuple[Any, Any]:
             found.append(torch.from_numpy(read_npy(folder / name)))
             if found[-1].is_complex():
                 raise TypeError("complex numbers")
+        except UserError:
+            raise
         except (ValueError, EOFError, TypeError) as error:
             raise UserError(f"{folder / name}: damaged, or not an array of numbers") from error
     return found[0], found[1]

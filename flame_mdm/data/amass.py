@@ -19,6 +19,7 @@ import torch
 
 from flame_mdm.data import archives
 from flame_mdm.data.parallel import cores, in_order
+from flame_mdm.errors import UserError
 from flame_mdm.formats.resampling import check_frames, frame_rate
 from flame_mdm.representations import rotation
 from flame_mdm.representations.skeleton import SMPL22, forward_kinematics
@@ -119,6 +120,8 @@ def read(file: Path | bytes, name: str) -> Recording:
     """
     try:
         data = read_npz(io.BytesIO(file) if isinstance(file, bytes) else file, skip=("dmpls", "marker_data"))
+    except UserError:
+        raise
     except ValueError as error:
         raise ValueError(f"{name}: {error}; download it again") from error
     width = data["poses"].shape[-1] if "poses" in data and data["poses"].ndim else 0
@@ -317,6 +320,8 @@ def _load_body(folder: Path, gender: str) -> Body:
         parents = arrays["kintree_table"][0, 1:22]
         if {array.dtype.kind for array in arrays.values()} - set("fiu"):
             raise ValueError("its arrays do not all contain real numbers")
+    except UserError:
+        raise
     except (ValueError, KeyError, IndexError) as error:
         raise ValueError(f"{path}: damaged or not an SMPL+H model: {error}") from error
     vertices = regressor.shape[1:]

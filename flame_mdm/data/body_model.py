@@ -9,7 +9,7 @@ import numpy as np
 from scipy.sparse import csc_matrix
 
 from flame_mdm.data import restricted_pickle
-from flame_mdm.errors import first_line
+from flame_mdm.errors import UserError, first_line
 from flame_mdm.representations.skeleton import SMPL24
 from flame_mdm.safe_io import read_npz
 
@@ -46,6 +46,8 @@ def load_offsets(path: Path) -> Offsets:
         joints = regressor @ template
         if not np.isfinite(joints).all():
             raise ValueError("non-finite numbers")
+    except UserError:
+        raise
     except (KeyError, TypeError, IndexError, ValueError) as error:
         raise ValueError(f"{path}: not a SMPL model of 24 joints: {first_line(error)}") from error
     offsets = joints - np.concatenate([np.zeros((1, 3)), joints[list(SMPL24.parents[1:])]])

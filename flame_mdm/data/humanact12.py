@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from flame_mdm.data import Clip, MotionSource, Split, restricted_pickle
+from flame_mdm.errors import UserError
 from flame_mdm.safe_io import read_npy
 
 FPS = 20.0
@@ -123,6 +124,8 @@ def read_unconstrained(path: Path) -> np.ndarray:
     """
     try:
         data = read_npy(path)
+    except UserError:
+        raise
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
     if data.dtype.kind not in "fiu" or data.ndim != 4 or data.shape[1] < 15 or data.shape[2] != 3:

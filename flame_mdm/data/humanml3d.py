@@ -20,6 +20,7 @@ import torch
 from flame_mdm.data import Clip, MotionSource, archives, restricted_pickle
 from flame_mdm.data.amass import Amass, Body, Recording, key_of, load_bodies, subset_of
 from flame_mdm.data.t2m import T2MFolder
+from flame_mdm.errors import UserError
 from flame_mdm.progress import ProgressBar
 from flame_mdm.representations import Frames
 from flame_mdm.representations.humanml import HumanML
@@ -264,6 +265,8 @@ def _read_joints(source: Path | tuple[Path, str]) -> np.ndarray:
     file = source if isinstance(source, Path) else "/".join(map(str, source))
     try:
         joints = read_npy(source if isinstance(source, Path) else io.BytesIO(archives.read_member(*source)))
+    except UserError:
+        raise
     except ValueError as error:
         raise ValueError(f"{file}: {error}") from error
     if joints.dtype.kind not in "fiu":

@@ -19,6 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from flame_mdm.data import Clip, MotionSource, Split, archives
+from flame_mdm.errors import UserError
 from flame_mdm.safe_io import read_npy, read_text
 
 TAG_FPS = 20
@@ -260,6 +261,8 @@ class T2MFolder(MotionSource):
     def _array(self, path: Path, mmap: bool = False) -> np.ndarray:
         try:
             return read_npy(path, mmap=mmap)
+        except UserError:
+            raise
         except FileNotFoundError:
             raise FileNotFoundError(f"{path}: no such file; {self.get_it}") from None
         except ValueError as error:

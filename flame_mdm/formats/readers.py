@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from flame_mdm.errors import UserError
 from flame_mdm.formats.body import check_size, leg_length
 from flame_mdm.formats.layouts import array_layout, read_bvh
 from flame_mdm.formats.motion import AMASS_AXES, Motion, motion_of_poses
@@ -154,6 +155,8 @@ def read_arrays(path: Path, header: bool = False) -> dict[str, Any]:
         rate = next((key for key in (keys if "joints" in data else keys[::-1]) if key in data), None)
         if rate is not None:
             data["fps"] = frame_rate(data[rate], rate)
+    except UserError:
+        raise
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
     return data

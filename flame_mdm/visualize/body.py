@@ -209,6 +209,8 @@ def try_figure(motion: Shown) -> tuple[Figure | None, str]:
     """Returns the figure of `figure`, or None and the reason why this motion is drawn as a skeleton."""
     try:
         return figure(motion), ""
+    except UserError:
+        raise
     except ValueError as error:
         return None, str(error)
 

@@ -28,9 +28,9 @@ __all__ = ["Motion", "MotionGeneration", "edit", "generate", "load"]
 _MODULES = {
     "load": "checkpoints.loading",
     "MotionGeneration": "task",
-    "generate": "generation",
+    "generate": "sampling.generation",
     "Motion": "formats.motion",
-    "edit": "editing",
+    "edit": "sampling.editing",
 }
 
 

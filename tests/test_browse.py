@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from test_visualize import HOSTILE, Page, unpacked
+from support.motions import HOSTILE, Page, unpacked
 
 from flame_mdm.__main__ import main
 from flame_mdm.data import Clip, MotionSource

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.stats import ttest_rel
+from support.motions import Page
 from test_report import a_run, result, run
-from test_visualize import Page
 
 from flame_mdm.__main__ import main
 from flame_mdm.commands.compare import read_texts

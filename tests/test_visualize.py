@@ -3,17 +3,17 @@ import json
 import shutil
 import subprocess
 import sys
-from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from PIL import Image, ImageSequence
+from support.motions import HOSTILE, Page, sway, unpacked
 
 from flame_mdm.errors import UserError
 from flame_mdm.formats.motion import Motion
-from flame_mdm.representations.skeleton import SKELETONS, Skeleton
+from flame_mdm.representations.skeleton import SKELETONS
 from flame_mdm.safe_io import atomic_write
 from flame_mdm.visualize import contact_sheet, frames_array, write_gif, write_mp4, write_player
 from flame_mdm.visualize.render import SIDE_COLORS
@@ -23,57 +23,10 @@ try:
 except ImportError:
     av: Any = None
 MP4 = pytest.mark.skipif(av is None, reason="av is not installed: pip install flame-mdm[video]")
-HOSTILE = "</script><img src=x onerror=alert(1)><!-- __TITLE__ \u2028 \"'&amp; &"
-
-
-def walk(
-    frames: int = 30, fps: float = 20, skeleton: Skeleton = SKELETONS["smpl22"], contacts: bool = False, **names: Any
-) -> Motion:
-    """A figure that stands on its rest pose, sways and moves forward."""
-    bones = 0.2 * np.array(skeleton.raw_offsets, dtype=float)
-    pose = np.zeros((len(bones), 3))
-    for joint, parent in enumerate(skeleton.parents[1:], 1):
-        pose[joint] = pose[parent] + bones[joint]
-    pose[:, 1] -= pose[:, 1].min()
-    time = np.arange(frames)[:, None, None] / fps
-    joints = pose + np.random.default_rng(0).normal(0, 0.05, pose.shape) * np.sin(6 * time) + time * [0, 0, 1.2]
-    touch = np.arange(frames * len(skeleton.feet)).reshape(frames, -1) % 3 == 0
-    return Motion(joints, fps, skeleton, contacts=touch if contacts else None, **names)
-
-
-class Page(HTMLParser):
-    """Tags of a page, and the text of its elements by id or tag."""
-
-    def __init__(self, path: Path):
-        super().__init__()
-        self.tags: list[str] = []
-        self.texts: dict[str, str] = {}
-        self.inside = ""
-        self.source = path.read_text(encoding="utf-8")
-        self.feed(self.source)
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.tags.append(tag)
-        self.inside = dict(attrs).get("id") or tag
-
-    def handle_endtag(self, tag: str) -> None:
-        self.inside = ""
-
-    def handle_data(self, data: str) -> None:
-        self.texts[self.inside] = self.texts.get(self.inside, "") + data
-
-    @property
-    def motions(self) -> list[dict]:
-        return json.loads(self.texts["data"])
-
-
-def unpacked(packed: dict) -> np.ndarray:
-    quanta = np.frombuffer(base64.b64decode(packed["joints"]), "<i2").reshape(packed["frames"], -1, 3)
-    return packed["center"] + quanta * packed["step"]
 
 
 def test_player_holds_the_joints_to_half_a_millimetre(tmp_path):
-    motions = [walk(contacts=True), walk(7, 12.5, SKELETONS["kit21"])]  # lengths, rates and skeletons may differ
+    motions = [sway(contacts=True), sway(7, 12.5, SKELETONS["kit21"])]  # lengths, rates and skeletons may differ
     write_player(tmp_path / "p.html", motions, "t")
     for packed, motion in zip(Page(tmp_path / "p.html").motions, motions, strict=True):
         np.testing.assert_allclose(unpacked(packed), motion.joints, rtol=0, atol=0.0005 + 1e-6)
@@ -84,7 +37,7 @@ def test_player_holds_the_joints_to_half_a_millimetre(tmp_path):
 
 
 def test_player_rounds_a_huge_motion_coarser_instead_of_wrapping_around(tmp_path):
-    motion = walk()
+    motion = sway()
     motion.joints *= 1000
     write_player(tmp_path / "p.html", [motion])
     span = np.ptp(motion.joints, axis=(0, 1)).max()
@@ -94,7 +47,7 @@ def test_player_rounds_a_huge_motion_coarser_instead_of_wrapping_around(tmp_path
 
 
 def test_player_is_one_file_without_references(tmp_path):
-    write_player(tmp_path / "p.html", [walk()], "t")
+    write_player(tmp_path / "p.html", [sway()], "t")
     page = Page(tmp_path / "p.html")
     assert not {"link", "img", "iframe"} & set(page.tags)
     for reference in ("http:", "https:", "src=", "href=", "url(", "@import", "import(", "fetch(", "XMLHttpRequest"):
@@ -102,7 +55,7 @@ def test_player_is_one_file_without_references(tmp_path):
 
 
 def test_player_escapes_captions_ids_and_title(tmp_path):
-    write_player(tmp_path / "p.html", [walk(text=HOSTILE, id=HOSTILE)], HOSTILE)
+    write_player(tmp_path / "p.html", [sway(text=HOSTILE, id=HOSTILE)], HOSTILE)
     page = Page(tmp_path / "p.html")
     assert page.tags.count("script") == 3
     assert "img" not in page.tags
@@ -111,7 +64,7 @@ def test_player_escapes_captions_ids_and_title(tmp_path):
 
 
 def test_player_of_twenty_clips_stays_small(tmp_path):
-    write_player(tmp_path / "p.html", [walk(60, contacts=True, id=str(k)) for k in range(20)])
+    write_player(tmp_path / "p.html", [sway(60, contacts=True, id=str(k)) for k in range(20)])
     assert (tmp_path / "p.html").stat().st_size < 650_000
 
 
@@ -120,7 +73,7 @@ def test_player_of_twenty_clips_stays_small(tmp_path):
 @pytest.mark.parametrize("count", [1, 13])
 def test_player_runs_in_a_browser(tmp_path, count):
     page = tmp_path / "p.html"
-    write_player(page, [walk(contacts=True, text=HOSTILE, id=f"m{k}") for k in range(count)], "t")
+    write_player(page, [sway(contacts=True, text=HOSTILE, id=f"m{k}") for k in range(count)], "t")
     # reports what the page's script made of the data: clock, filter, and pixels of both sides in the first panel: of a
     # body in its clothes, of a body in the colors of its sides, and of a skeleton
     report = """<script>setTimeout(() => {
@@ -174,7 +127,7 @@ def test_player_runs_in_a_browser(tmp_path, count):
     [(20, 30, 30), (30, 30, 30), (12.5, 10, 10), (100, 100, 50), (120, 120, 40)],
 )
 def test_gif_keeps_frames_and_time(tmp_path, fps, frames, shown):
-    write_gif(tmp_path / "m.gif", [walk(frames, fps, text="walks")], size=64)
+    write_gif(tmp_path / "m.gif", [sway(frames, fps, text="walks")], size=64)
     with Image.open(tmp_path / "m.gif") as image:
         durations = [frame.info["duration"] for frame in ImageSequence.Iterator(image)]
         assert image.info["loop"] == 0
@@ -185,7 +138,7 @@ def test_gif_keeps_frames_and_time(tmp_path, fps, frames, shown):
 
 
 def test_gif_holds_a_motion_that_ended(tmp_path):
-    write_gif(tmp_path / "m.gif", [walk(8), walk(16)], size=64)
+    write_gif(tmp_path / "m.gif", [sway(8), sway(16)], size=64)
     with Image.open(tmp_path / "m.gif") as image:
         assert image.width == 128
         frames = [np.asarray(frame.convert("RGB"))[:64] for frame in ImageSequence.Iterator(image)]
@@ -197,7 +150,7 @@ def test_gif_holds_a_motion_that_ended(tmp_path):
 @pytest.mark.parametrize("write", [write_player, write_gif, pytest.param(write_mp4, marks=MP4), contact_sheet])
 def test_same_input_gives_the_same_bytes(tmp_path, write):
     for name in "ab":
-        write(tmp_path / name, [walk(5, contacts=True, text="walks")])
+        write(tmp_path / name, [sway(5, contacts=True, text="walks")])
     assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
 
 
@@ -206,7 +159,7 @@ def limb_rows(image: np.ndarray, side: int) -> np.ndarray:
 
 
 def test_frames_show_both_sides_and_height_of_a_skeleton():
-    motion = walk(3, skeleton=SKELETONS["kit21"])
+    motion = sway(3, skeleton=SKELETONS["kit21"])
     frames = frames_array(motion, size=128)
     assert frames.shape == (3, 128, 128, 3)
     assert frames.dtype == np.uint8
@@ -219,7 +172,7 @@ def test_frames_show_both_sides_and_height_of_a_skeleton():
 
 
 def test_contact_sheet_shows_first_to_last_pose_of_each_motion(tmp_path):
-    motions = [walk(30, text="walks"), walk(4, text="walks briefly")]
+    motions = [sway(30, text="walks"), sway(4, text="walks briefly")]
     contact_sheet(tmp_path / "sheet.png", motions, frames=3, size=96)
     sheet = np.asarray(Image.open(tmp_path / "sheet.png"))
     assert sheet.shape[1:] == (3 * 96, 3)
@@ -231,7 +184,7 @@ def test_contact_sheet_shows_first_to_last_pose_of_each_motion(tmp_path):
 @MP4
 @pytest.mark.parametrize(("fps", "size"), [(20, 64), (12.5, 65), (29.97, 64), (120, 64)])
 def test_mp4_has_the_frames_of_the_motion(tmp_path, fps, size):
-    write_mp4(tmp_path / "m.mp4", [walk(12, fps, text="walks"), walk(5, fps)], size=size)
+    write_mp4(tmp_path / "m.mp4", [sway(12, fps, text="walks"), sway(5, fps)], size=size)
     with av.open(str(tmp_path / "m.mp4")) as file:
         stream, frames = file.streams.video[0], list(file.decode(video=0))
         assert (stream.codec_context.name, stream.codec_context.pix_fmt) == ("h264", "yuv420p")
@@ -245,7 +198,7 @@ def test_mp4_has_the_frames_of_the_motion(tmp_path, fps, size):
 
 @MP4
 def test_mp4_shows_what_the_gif_shows(tmp_path):
-    motions = [walk(8, text="walks"), walk(16)]
+    motions = [sway(8, text="walks"), sway(16)]
     write_gif(tmp_path / "m.gif", motions, size=128)
     write_mp4(tmp_path / "m.mp4", motions, size=128)
     with Image.open(tmp_path / "m.gif") as image:
@@ -261,7 +214,7 @@ def test_mp4_shows_what_the_gif_shows(tmp_path):
 
 @MP4
 def test_mp4_keeps_the_colors(tmp_path):
-    motion = walk(2, skeleton=SKELETONS["kit21"])
+    motion = sway(2, skeleton=SKELETONS["kit21"])
     write_mp4(tmp_path / "m.mp4", [motion], size=512)
     with av.open(str(tmp_path / "m.mp4")) as file:
         video = next(file.decode(video=0)).to_ndarray(format="rgb24")
@@ -274,7 +227,7 @@ def test_mp4_keeps_the_colors(tmp_path):
 @pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="ffmpeg is not installed")
 @MP4
 def test_mp4_is_read_by_another_program(tmp_path):
-    write_mp4(tmp_path / "m.mp4", [walk(12, 30)], size=65)
+    write_mp4(tmp_path / "m.mp4", [sway(12, 30)], size=65)
     command = ["ffmpeg", "-loglevel", "error", "-i", str(tmp_path / "m.mp4"), "-f", "rawvideo", "-pix_fmt", "gray", "-"]
     pixels = subprocess.run(command, capture_output=True, check=True).stdout
     assert len(pixels) % 12 == 0
@@ -284,7 +237,7 @@ def test_mp4_is_read_by_another_program(tmp_path):
 def test_mp4_without_its_package_says_what_to_install(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "av", None)
     with pytest.raises(UserError, match=r'm\.mp4: MP4 needs the package av\. Run pip install "flame-mdm\[video\]", or'):
-        write_mp4(tmp_path / "m.mp4", [walk(2)])
+        write_mp4(tmp_path / "m.mp4", [sway(2)])
     assert list(tmp_path.iterdir()) == []
 
 
@@ -311,7 +264,7 @@ def test_every_writer_goes_through_a_temporary_name(tmp_path, monkeypatch, write
 
     monkeypatch.setattr(Path, "replace", full)
     with pytest.raises(OSError, match="disk full"):
-        write(tmp_path / "out.mp4", [walk(2)])
+        write(tmp_path / "out.mp4", [sway(2)])
     assert list(tmp_path.iterdir()) == []
 
 
@@ -323,11 +276,11 @@ def test_nothing_to_show_is_an_error(tmp_path, write):
 
 def test_contact_sheet_without_poses_is_an_error(tmp_path):
     with pytest.raises(ValueError, match=r"c\.png: 0 poses per row"):
-        contact_sheet(tmp_path / "c.png", [walk()], frames=0)
+        contact_sheet(tmp_path / "c.png", [sway()], frames=0)
 
 
 def damaged() -> np.ndarray:
-    joints = walk(4).joints
+    joints = sway(4).joints
     joints[2, 5, 1] = np.nan
     return joints
 

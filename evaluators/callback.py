@@ -10,7 +10,7 @@ from lightning import Callback, LightningModule, Trainer
 from evaluators.evaluation import open_protocol
 from flame_mdm.data.datamodule import MotionDataModule
 from flame_mdm.errors import UserError, say
-from flame_mdm.schemas import made_by
+from flame_mdm.runs import made_by
 from flame_mdm.task import MotionGeneration
 from flame_mdm.training.callbacks import explained
 from flame_mdm.training.loggers import log_table

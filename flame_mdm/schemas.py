@@ -1,33 +1,21 @@
-"""Run directories and result files: layout, typed schema, and readers whose errors name file and key."""
+"""Typed schemas of files, and readers whose errors name file and key; results of evaluations and audits."""
 
 from __future__ import annotations
 
 import functools
 import json
-import re
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
 
 from flame_mdm import safe_io
-from flame_mdm.config import Config, read_saved
 from flame_mdm.errors import UserError, did_you_mean
-
-CONFIG, PROVENANCE, FAULT = "config.yaml", "provenance.json", "bad_batch.json"
-HISTORY = "metrics.jsonl"
-"""Training curves, one line per log step."""
-RESULTS = "evaluation/**/result*.json"
-SAMPLES = "samples/step_*"
 
 MAX_INTEGER = 2**63 - 1
 """Maximum integer in a file; larger ones overflow when they are plotted or logged."""
 LIMIT = 4 * safe_io.MEBIBYTE
 """Maximum size of a file of results, ratings, lengths or provenance. Typical files have 10 to 300 KiB."""
-HISTORY_LIMIT = 256 * safe_io.MEBIBYTE
-"""Maximum size of a history; a million steps logged every 50 steps take about 20 MiB."""
-
 T = TypeVar("T")
 Int = Annotated[int, Field(gt=-(2**63), lt=2**63)]
 Number = Annotated[float, Field(gt=-1e300, lt=1e300)]
@@ -215,64 +203,6 @@ class AuditCard(ClosedSchema):
     truth: dict[str, dict[str, Number | None]]
 
 
-class RunName(Schema):
-    """The keys `run` of a configuration."""
-
-    name: str | Int | Number = "default"
-
-
-class TrainerSteps(Schema):
-    """The keys `trainer` of a configuration."""
-
-    max_steps: Int
-
-
-class Recipe(Schema):
-    """The configuration of a run, with the keys that pages read."""
-
-    experiment: str | None
-    run: RunName
-    trainer: TrainerSteps
-
-
-class TrainedOn(Schema):
-    """The key `data` of a provenance file, which may contain other facts about the data."""
-
-    model_config = ConfigDict(strict=True, extra="allow")
-    fingerprint: str = "–"
-
-
-class Provenance(Schema):
-    """Command, code, machine, versions, device, parameters and data of a run."""
-
-    command: list[str]
-    commit: str | None
-    python: str
-    machine: str
-    packages: dict[str, str]
-    data: TrainedOn
-    changed: str | None = None
-    device: str = "–"
-    parameters: Int | None = None
-
-
-class FaultyBatch(Schema):
-    """The part of a batch in one process."""
-
-    rank: Int
-    batch: Int
-    loss: str
-    ids: list[str]
-
-
-class Fault(Schema):
-    """The batch that stopped a run."""
-
-    step: Int
-    usual_loss: str
-    batches: list[FaultyBatch]
-
-
 # Reading --------------------------------------------------------------------------------------------------------------
 
 EXPECTED = {
@@ -361,14 +291,6 @@ def read_json(path: Path, kind: type[T] | Any, remedy: str = "") -> T:
         raise UserError(f"{path}: damaged: {error}{message}") from error
 
 
-def made_by(path: str | Path) -> str:
-    """Returns how to get a missing checkpoint or extractor: the command that creates it, or where to find it."""
-    name = Path(path).as_posix()
-    recipe = re.fullmatch(r"runs/(.+)/default/checkpoints/.+", name)
-    where = f"{name} is missing" + '; see "Extractors" in docs/evaluation.md' * name.startswith("assets/")
-    return f"make train EXP={recipe[1]}" if recipe else where
-
-
 def read_result(path: Path) -> Result:
     """Returns a result of `flame-mdm evaluate`.
 
@@ -376,105 +298,3 @@ def read_result(path: Path) -> Result:
         UserError: the file is damaged.
     """
     return read_json(path, Result, "delete it, then run `flame-mdm evaluate` or `flame-mdm tables` again")
-
-
-@dataclass
-class Run:
-    """Content of a run directory.
-
-    Attributes:
-        folder: the directory.
-        config: the recipe saved by the run.
-        provenance: None before training began.
-        curves: name -> step -> value.
-        results: path of a result file within the folder -> evaluation.
-    """
-
-    folder: Path
-    config: Config
-    provenance: Provenance | None
-    curves: dict[str, dict[int, float]]
-    results: dict[str, Result]
-
-    @property
-    def label(self) -> str:
-        """Recipe and name of the run; only the recipe for a run with the default name."""
-        name = self.config["run"].get("name", "default")
-        return str(self.config["experiment"]) + (f"/{name}" if name != "default" else "")
-
-    @property
-    def samples(self) -> Path | None:
-        """Folder of the newest samples."""
-        return newest_samples(self.folder, "motion_000.npz")
-
-    @property
-    def steps(self) -> int:
-        """Number of training steps that the curves cover."""
-        trained = (curve for name, curve in self.curves.items() if name.startswith(("train/", "samples/")))
-        return max((max(curve) + 1 for curve in trained), default=0)
-
-
-def newest_samples(folder: Path, file: str) -> Path | None:
-    """Returns the newest folder of samples in a run directory that contains `file`."""
-    found = (path.parent for path in folder.glob(f"{SAMPLES}/{file}"))
-    return max((path for path in found if path.name.removeprefix("step_").isdecimal()), default=None)
-
-
-def read_run(folder: Path) -> Run:
-    """Returns the content of a run directory.
-
-    Raises:
-        UserError: the folder is not a run directory, or a file is damaged.
-    """
-    path = folder / CONFIG
-    if not path.exists():
-        raise UserError(f"{folder}: contains no {CONFIG}; give a run directory, such as runs/synthetic/mdm/default")
-    config = read_saved(path)
-    try:
-        check_shape(config, Recipe)
-    except ValueError as error:
-        raise UserError(f"{path}: not the configuration of a run: {error}") from error
-    origin = folder / PROVENANCE
-    remedy = "delete it; the page then omits it"
-    results = {path.relative_to(folder).as_posix(): read_result(path) for path in sorted(folder.glob(RESULTS))}
-    provenance: Provenance | None = read_json(origin, Provenance, remedy) if origin.exists() else None
-    return Run(folder, config, provenance, read_history(folder), results)
-
-
-def read_history(folder: Path) -> dict[str, dict[int, float]]:
-    """Returns the curves of a run, name -> step -> value, sorted; {} if the run has no history.
-
-    Raises:
-        UserError: the file is damaged.
-    """
-    curves: dict[str, dict[int, float]] = {}
-    for record in records(folder / HISTORY):
-        for name, value in record.items():
-            if name not in ("step", "epoch"):
-                curves.setdefault(name, {})[record["step"]] = value
-    return {name: dict(sorted(curve.items())) for name, curve in sorted(curves.items())}
-
-
-def records(path: Path) -> list[dict[str, Any]]:
-    """Returns the lines of a history; ignores an incomplete last line, left by a killed process.
-
-    Raises:
-        UserError: another line is damaged.
-    """
-    if not path.exists():
-        return []
-    *lines, _ = safe_io.read_text(path, HISTORY_LIMIT).split("\n")
-    found = []
-    for place, line in enumerate(lines, 1):
-        try:
-            record = json.loads(line)
-            if not isinstance(record, dict) or type(record.get("step")) is not int or not 0 <= record["step"] < 2**63:
-                raise ValueError("it has no integer step")
-            wrong = [name for name, value in record.items() if type(value) not in (int, float)]
-            if wrong or any(type(value) is int and abs(value) >= 2**63 for value in record.values()):
-                raise ValueError(f"{', '.join(wrong) or 'a value'} should be a number")
-            "".join(record).encode()  # a lone surrogate cannot be written again
-        except (ValueError, RecursionError) as error:
-            raise UserError(f"{path}: line {place} is damaged; delete that line ({error})") from error
-        found.append(record)
-    return found

@@ -15,7 +15,7 @@ FILES = sorted([*(ROOT / "flame_mdm").rglob("*.py"), *(ROOT / "evaluators").rglo
 AXES = {"denoisers", "processes", "conditions", "representations"}
 GROUND = {"errors", "losses", "safe_io", "config", "batch", "seeds", "progress"}
 MODELS = GROUND | AXES | {"visualize", "formats", "data", "task"}
-ALL = MODELS | {"sampling", "checkpoints", "schemas", "reporting", "training"}
+ALL = MODELS | {"sampling", "checkpoints", "schemas", "runs", "reporting", "training"}
 MAY_IMPORT: dict[str, set[str]] = {
     "errors": set(),
     "losses": set(),
@@ -33,7 +33,8 @@ MAY_IMPORT: dict[str, set[str]] = {
     "data": GROUND | {"representations", "visualize", "formats"},
     "task": GROUND | AXES | {"data"},
     "schemas": GROUND,
-    "reporting": GROUND | {"representations", "visualize", "formats", "data", "schemas"},
+    "runs": GROUND | {"schemas"},
+    "reporting": GROUND | {"representations", "visualize", "formats", "data", "schemas", "runs"},
     "sampling": MODELS,
     "checkpoints": MODELS | {"schemas"},
     "training": ALL - {"training"},
@@ -161,7 +162,8 @@ def test_strings_outside_commands_name_no_module_of_the_evaluators():
         ("flame_mdm.formats.readers", "def f():\n    from flame_mdm.data.folder import read_bvh"),
         ("flame_mdm.data.store", "from flame_mdm.task import MotionGeneration"),
         ("flame_mdm.task", "from flame_mdm.checkpoints import model_files as checkpoints"),
-        ("flame_mdm.schemas", "from flame_mdm.reporting.tables import build"),
+        ("flame_mdm.schemas", "from flame_mdm.runs import read_run"),
+        ("flame_mdm.runs", "from flame_mdm.reporting.tables import build"),
         ("flame_mdm.reporting.tables", "from flame_mdm.task import load"),
         ("flame_mdm.sampling.editing", "from flame_mdm.training.guards import newest"),
         ("flame_mdm.checkpoints.model_files", "from flame_mdm.reporting.rendering import markdown_text"),

@@ -20,7 +20,7 @@ from flame_mdm.errors import UserError
 from flame_mdm.reporting.page import number, page, short
 from flame_mdm.reporting.plots import chart, charts
 from flame_mdm.reporting.report import charted, constants, write_report
-from flame_mdm.schemas import read_history, read_run
+from flame_mdm.runs import read_history, read_run
 from flame_mdm.training import callbacks
 from flame_mdm.training.callbacks import Measurements
 from flame_mdm.training.loggers import History

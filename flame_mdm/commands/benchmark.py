@@ -16,8 +16,9 @@ from flame_mdm.errors import UserError, say
 from flame_mdm.reporting.page import page, render
 from flame_mdm.reporting.rendering import Table
 from flame_mdm.reporting.tables import build, load_spec, write
+from flame_mdm.runs import newest_samples
 from flame_mdm.safe_io import read_yaml, write_json, write_text
-from flame_mdm.schemas import Number, newest_samples, read_json
+from flame_mdm.schemas import Number, read_json
 
 if TYPE_CHECKING:
     from markupsafe import Markup

@@ -18,7 +18,7 @@ from flame_mdm.safe_io import write_json, write_text
 
 if TYPE_CHECKING:
     from flame_mdm.formats.motion import Motion
-    from flame_mdm.schemas import Run
+    from flame_mdm.runs import Run
 
 USAGE = """
 usage: flame-mdm compare runs="A B C" [texts="a person walks; a person jumps"]

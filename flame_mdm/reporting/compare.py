@@ -16,7 +16,8 @@ from flame_mdm.reporting.intervals import paired_difference, percentiles
 from flame_mdm.reporting.page import number, page, render
 from flame_mdm.reporting.plots import Curve, charts
 from flame_mdm.reporting.report import charted, evaluation_title, last, marks, printed, sampling
-from flame_mdm.schemas import CONFIG, Result, Run, Value, read_run
+from flame_mdm.runs import CONFIG, Run, read_run
+from flame_mdm.schemas import Result, Value
 
 if TYPE_CHECKING:
     from markupsafe import Markup

@@ -11,8 +11,9 @@ from flame_mdm.errors import UserError
 from flame_mdm.reporting.audit import card_of
 from flame_mdm.reporting.page import interval, number, page, render
 from flame_mdm.reporting.plots import Curve, charts
+from flame_mdm.runs import FAULT, HISTORY, Fault, Provenance, Run, read_run
 from flame_mdm.safe_io import write_text
-from flame_mdm.schemas import FAULT, HISTORY, Fault, Provenance, Result, Run, Value, read_json, read_run
+from flame_mdm.schemas import Result, Value, read_json
 
 COST = ("lr", "grad_norm", "samples_per_second", "seconds_per_step", "gpu_memory_gib")
 """Training curves about speed and optimization rather than losses."""

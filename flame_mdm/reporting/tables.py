@@ -37,6 +37,7 @@ from flame_mdm.reporting.rendering import (
     places,
 )
 from flame_mdm.reporting.study import Ratings, wilson
+from flame_mdm.runs import made_by
 from flame_mdm.safe_io import read_yaml, write_json, write_text
 from flame_mdm.schemas import (
     Checkpoint,
@@ -47,7 +48,6 @@ from flame_mdm.schemas import (
     Schema,
     Value,
     check_shape,
-    made_by,
     read_json,
     read_result,
 )

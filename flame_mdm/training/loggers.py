@@ -15,8 +15,9 @@ from omegaconf import OmegaConf
 from typing_extensions import TypedDict
 
 from flame_mdm.config import Config
+from flame_mdm.runs import HISTORY, records
 from flame_mdm.safe_io import write_json, write_text
-from flame_mdm.schemas import HISTORY, read_json, records
+from flame_mdm.schemas import read_json
 
 
 class History(Logger):

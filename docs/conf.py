@@ -11,7 +11,10 @@ from typing import Any
 DOCS = Path(__file__).parent
 
 project = html_title = "flame_mdm"
-extensions = ["myst_parser"]
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
+autodoc_default_options = {"members": True, "member-order": "bysource"}
+autodoc_typehints = "none"  # signatures as they are written
+autodoc_preserve_defaults = True
 exclude_patterns = ["space"]
 html_theme = "furo"
 html_show_sphinx = html_show_copyright = False

@@ -1,14 +1,12 @@
-"""Writes recipes.md and hyperparameters.md from the recipes, and api.md from the docstrings: `make docs`."""
+"""Writes recipes.md and hyperparameters.md from the recipes: `make docs`."""
 
 from __future__ import annotations
 
-import inspect
 import re
 from collections.abc import Mapping
-from importlib import import_module
 from itertools import takewhile
 from pathlib import Path
-from typing import Any, NamedTuple, is_typeddict
+from typing import Any, NamedTuple
 
 from flame_mdm.config import EXPERIMENTS, recipes
 from flame_mdm.reporting.settings import LABELS, values
@@ -140,100 +138,7 @@ def _text(value: Any) -> str:
     return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
-# Python API -----------------------------------------------------------------------------------------------------------
-
-API = {
-    "Motions from a model": ["flame_mdm.load", "flame_mdm.generate", "flame_mdm.edit", "flame_mdm.batch.Sampling"],
-    "Motions and files": [
-        *("flame_mdm.Motion", "flame_mdm.sampling.editing.Edited", "flame_mdm.formats.readers.read"),
-        *("flame_mdm.formats.cleanup.cleaned", "flame_mdm.visualize.write_player"),
-    ],
-    "Parts of a model": [
-        *("flame_mdm.MotionGeneration", "flame_mdm.denoisers.Denoiser", "flame_mdm.processes.Process"),
-        *("flame_mdm.conditions.ConditionEncoder", "flame_mdm.representations.Representation"),
-        *("flame_mdm.batch.MotionBatch", "flame_mdm.batch.Condition", "flame_mdm.batch.Edit"),
-    ],
-    "Evaluation": ["evaluators.evaluator.Evaluator", "evaluators.evaluation.evaluate"],
-}
-"""Public names, by section."""
-SECTION = re.compile(r"^(Args|Attributes|Returns|Raises):$")
-
-
-def api_page() -> str:
-    """Returns the reference of the public Python API, written from signatures and docstrings."""
-    page = f"""# Python API
-
-{HEAD}
-Names that user code may rely on. `flame_mdm.load`, `generate`, `edit` and `Motion` are imported at first use, so
-`import flame_mdm` is immediate. [Sampling](sampling.md), [editing](editing.md) and [motion files](formats.md) show them
-in use; [adding a part](adding.md) shows how to extend the base classes.
-"""
-    for section, names in API.items():
-        page += f"\n## {section}\n"
-        for name in names:
-            found: Any = find(name)
-            page += f"\n### {name}\n\n```text\n{signature(found, name)}\n```\n\n{markdown(found)}"
-            if inspect.isclass(found):
-                methods = vars(found).items()
-                for method, value in methods:
-                    if inspect.isfunction(value) and not method.startswith("_") and value.__doc__:
-                        page += f"\n**{method}**\n\n```text\n{signature(value, method)}\n```\n\n{markdown(value)}"
-    return page
-
-
-def find(name: str) -> Any:
-    """Returns the object of a dotted name."""
-    module, _, attribute = name.rpartition(".")
-    return getattr(import_module(module), attribute)
-
-
-def signature(found: Any, name: str) -> str:
-    """Returns the call of a function or class, one argument per line if it is long."""
-    if is_typeddict(found):
-        fields = found.__annotations__.items()
-        return f"{name}(*, " + ", ".join(f"{key}: {_type(kind)}" for key, kind in fields) + ")"
-    given = inspect.signature(found)
-    short = _plain(str(given))
-    if len(name + short) <= 110:
-        return name + short
-    parts = [_plain(str(part)) for part in given.parameters.values()]
-    kinds = [part.kind for part in given.parameters.values()]
-    if inspect.Parameter.KEYWORD_ONLY in kinds and inspect.Parameter.VAR_POSITIONAL not in kinds:
-        parts.insert(kinds.index(inspect.Parameter.KEYWORD_ONLY), "*")
-    end = "" if given.return_annotation is given.empty else f" -> {_type(given.return_annotation)}"
-    return f"{name}(\n    " + ",\n    ".join(parts) + f",\n){end}"
-
-
-def _plain(text: str) -> str:
-    """Returns a signature without the quotes of its annotations."""
-    return re.sub(r"(: |-> )'([^']*)'", r"\1\2", text).replace("<factory>", "...")
-
-
-def _type(kind: Any) -> str:
-    text = kind if isinstance(kind, str) else getattr(kind, "__forward_arg__", None) or str(kind)
-    return text.replace("'", "").removeprefix("typing.")
-
-
-def markdown(found: Any) -> str:
-    """Returns a docstring as Markdown: its sections as lists."""
-    lines: list[str] = []
-    section = ""
-    for line in (inspect.getdoc(found) or "").splitlines():
-        if match := SECTION.match(line):
-            section = match[1]
-            lines += [f"{'Arguments' if section == 'Args' else section}:", ""]
-        elif section and line.startswith("    "):
-            item = re.match(r" {4}(\w[\w., ]*): (.*)", line)
-            if item and section != "Returns":
-                lines.append(f"- `{item[1]}`: {item[2]}")
-            else:
-                lines.append(f"  {line.strip()}" if lines[-1] else f"- {line.strip()}")
-        else:
-            lines.append(line)
-    return "\n".join(lines) + "\n"
-
-
-PAGES = {"recipes.md": recipes_page, "hyperparameters.md": hyperparameters_page, "api.md": api_page}
+PAGES = {"recipes.md": recipes_page, "hyperparameters.md": hyperparameters_page}
 
 if __name__ == "__main__":
     for name, write in PAGES.items():

@@ -13,7 +13,6 @@ from datetime import timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from flame_mdm.checkpoints.model_files import weights_sha256
 from flame_mdm.config import (
     EXPERIMENTS,
     Config,
@@ -22,14 +21,11 @@ from flame_mdm.config import (
     instantiate,
     original_names,
     plain,
-    settings,
     trust,
 )
-from flame_mdm.errors import UserError, first_line, say
+from flame_mdm.errors import UserError, say
 from flame_mdm.reporting.audit import card_of
-from flame_mdm.reporting.tables import Request, count_lengths, requests
 from flame_mdm.safe_io import read_yaml, sha256, write_json
-from flame_mdm.schemas import read_result
 
 if TYPE_CHECKING:  # commands check their keys before torch is imported
     from evaluators.extractors import Extractor
@@ -495,51 +491,3 @@ def _show(report: Mapping[str, Any], out: Path) -> None:
 
 def _cell(value: Mapping[str, Any] | None) -> str:
     return "-" if value is None or value["mean"] is None else f"{value['mean']:.4g} +- {value['ci']:.2g}"
-
-
-# Evaluations for tables -----------------------------------------------------------------------------------------------
-
-
-def evaluate_missing(specs: Mapping[str, Config], results: Path, config: Config) -> list[str]:
-    """Runs the evaluations of specs whose results are missing or outdated.
-
-    Returns:
-        One line per failed evaluation.
-    """
-    wanted: dict[Path, Request] = {}
-    for spec in specs.values():
-        for part in spec["parts"].values():
-            for dataset in part.get("lengths", []):
-                count_lengths(dataset, results, config)
-            for _, row in requests(part) if "columns" in part else ():
-                wanted |= {request.path(results): request for request in row if not request.absent}
-    missing = {path: request for path, request in wanted.items() if not path.exists() or _outdated(path, request)}
-    failed = []
-    for number, (path, request) in enumerate(missing.items()):
-        say(f"evaluating {number + 1} of {len(missing)}: {request.label}")
-        keys = dict(request.keys)
-        try:
-            dotted = [f"{name}={keys.pop(name)}" for name in list(keys) if name == "data" or "." in name]
-            options = settings("evaluate", dotted)
-            names = ("device", "batch_size", "force", "data_root")
-            general = {name: config[name] for name in names if config[name] is not None}
-            if "batch_size" in read_yaml(protocol_file(keys["protocol"])):
-                general.pop("batch_size", None)  # protocols that measure time set the batch size
-            evaluate(EvaluationRequest.of(options | general | keys | {"out": str(path)}))
-        except (UserError, ValueError, OSError) as error:
-            failed.append(f"{request.label}: {first_line(error)}")
-            say(f"failed: {failed[-1]}")
-    return failed
-
-
-def _outdated(path: Path, request: Request) -> bool:
-    """Returns whether the checkpoint or extractor of a result has changed, or SMPL's model file is now available."""
-    result = read_result(path)
-    if result.stand_in_skeleton and os.environ.get("FLAME_MDM_SMPL"):
-        return True
-    for used, key in ((result.checkpoint, "ckpt"), (result.extractor, "extractor")):
-        file = Path(str(request.keys.get(key)))
-        weights = key == "extractor" and file.suffix in (".ckpt", ".safetensors")
-        if file.is_file() and (used is None or used.sha256 != (weights_sha256 if weights else sha256)(file)):
-            return True
-    return False

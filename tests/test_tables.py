@@ -13,9 +13,9 @@ import torch
 from support.runs import TINY
 
 import evaluators.evaluation
-from evaluators.evaluation import _outdated
 from flame_mdm.__main__ import main
 from flame_mdm.checkpoints.model_files import weights_sha256
+from flame_mdm.commands.tables import outdated
 from flame_mdm.errors import UserError
 from flame_mdm.reporting import tables
 from flame_mdm.reporting.rendering import Cell, Figure, Line, Part, Table, cumulative, draw, latex, markdown, places
@@ -633,14 +633,14 @@ def test_a_result_is_outdated_when_checkpoint_or_extractor_are_others_now(folder
     content["checkpoint"]["sha256"] = hashlib.sha256((folder / "mdm.ckpt").read_bytes()).hexdigest()
     content["extractor"]["sha256"] = clip_file(folder, 1.0, 600)
     path = put(request, folder, content)
-    assert not _outdated(path, request)
+    assert not outdated(path, request)
     clip_file(folder, 1.0, 700)
-    assert not _outdated(path, request), "the weights are the same"
+    assert not outdated(path, request), "the weights are the same"
     clip_file(folder, 2.0, 600)
-    assert _outdated(path, request)
+    assert outdated(path, request)
     clip_file(folder, 1.0, 600)
     (folder / "mdm.ckpt").write_bytes(b"trained again")
-    assert _outdated(path, request)
+    assert outdated(path, request)
 
 
 def test_a_result_of_a_stand_in_skeleton_is_outdated_once_smpl_is_there(folder, monkeypatch):
@@ -649,8 +649,8 @@ def test_a_result_of_a_stand_in_skeleton_is_outdated_once_smpl_is_there(folder, 
     content["checkpoint"]["sha256"] = hashlib.sha256((folder / "mdm.ckpt").read_bytes()).hexdigest()
     content["extractor"]["sha256"] = clip_file(folder, 1.0, 600)
     path = put(request, folder, content | {"skeleton": {"stand_in": True, "smpl_sha256": None}})
-    assert not _outdated(path, request)
+    assert not outdated(path, request)
     monkeypatch.setenv("FLAME_MDM_SMPL", "SMPL_NEUTRAL.pkl")
-    assert _outdated(path, request)
+    assert outdated(path, request)
     put(request, folder, content | {"skeleton": {"stand_in": False, "smpl_sha256": "5" * 64}})
-    assert not _outdated(path, request)
+    assert not outdated(path, request)

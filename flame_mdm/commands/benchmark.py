@@ -11,6 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from flame_mdm.commands.tables import evaluate_missing
 from flame_mdm.config import EXPERIMENTS, Config, run, settings
 from flame_mdm.errors import UserError, say
 from flame_mdm.reporting.page import page, render
@@ -53,8 +54,6 @@ def benchmark(config: Config) -> None:
     options = settings("tables") | {name: config[name] for name in ("device", "batch_size", "data_root")}
     results = Path(options["results"])
     begin = time.monotonic()
-    from evaluators.evaluation import evaluate_missing
-
     failed = evaluate_missing({plan["table"]: spec}, results, options) if config["evaluate"] else []
     times.add("evaluation", time.monotonic() - begin)
     table = build(plan["table"], spec, results)

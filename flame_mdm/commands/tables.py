@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from flame_mdm.config import Config, run
-from flame_mdm.errors import UserError, say
-from flame_mdm.safe_io import write_text
+from flame_mdm.config import Config, instantiate, run, settings
+from flame_mdm.errors import UserError, first_line, say
+from flame_mdm.safe_io import read_yaml, sha256, write_json, write_text
+
+if TYPE_CHECKING:
+    from flame_mdm.reporting.tables import Request
 
 INVALID = 3
 """Exit code if a requested row is not valid."""
@@ -31,7 +37,6 @@ def tables(config: Config) -> None:
             written.
         SystemExit: With code `INVALID` if a row is not valid; the tables are written, and each reason is printed.
     """
-    from evaluators.evaluation import evaluate_missing
     from flame_mdm.reporting.page import page, render
     from flame_mdm.reporting.tables import NOT_VALID, build, load_spec, spec_names, write
 
@@ -61,6 +66,76 @@ def tables(config: Config) -> None:
         raise UserError(f"{len(failed)} evaluations failed: {'; '.join(failed)}")
     if invalid:
         raise SystemExit(INVALID)
+
+
+def evaluate_missing(specs: Mapping[str, Config], results: Path, config: Config) -> list[str]:
+    """Runs the evaluations of specs whose results are missing or outdated, and counts lengths of data sets.
+
+    Returns:
+        One line per failed evaluation.
+    """
+    from evaluators.evaluation import EvaluationRequest, evaluate, protocol_file
+    from flame_mdm.reporting.tables import requests
+
+    listed: dict[Path, Request] = {}
+    for part in (part for spec in specs.values() for part in spec["parts"].values()):
+        for dataset in part.get("lengths", []):
+            count_lengths(dataset, results, config)
+        for _, row in requests(part) if "columns" in part else ():
+            listed |= {request.path(results): request for request in row if not request.absent}
+    missing = {path: request for path, request in listed.items() if not path.exists() or outdated(path, request)}
+    failed = []
+    for number, (path, request) in enumerate(missing.items()):
+        say(f"evaluating {number + 1} of {len(missing)}: {request.label}")
+        keys = dict(request.keys)
+        try:
+            dotted = [f"{name}={keys.pop(name)}" for name in list(keys) if name == "data" or "." in name]
+            options = settings("evaluate", dotted)
+            names = ("device", "batch_size", "force", "data_root")
+            general = {name: config[name] for name in names if config[name] is not None}
+            if "batch_size" in read_yaml(protocol_file(keys["protocol"])):
+                general.pop("batch_size", None)  # protocols that measure time set the batch size
+            evaluate(EvaluationRequest.of(options | general | keys | {"out": str(path)}))
+        except (UserError, OSError) as error:
+            failed.append(f"{request.label}: {first_line(error)}")
+            say(f"failed: {failed[-1]}")
+    return failed
+
+
+def outdated(path: Path, request: Request) -> bool:
+    """Returns whether the checkpoint or extractor of a result has changed, or SMPL's model file is now available."""
+    from flame_mdm.checkpoints.model_files import weights_sha256
+    from flame_mdm.schemas import read_result
+
+    result = read_result(path)
+    if result.stand_in_skeleton and os.environ.get("FLAME_MDM_SMPL"):
+        return True
+    for used, key in ((result.checkpoint, "ckpt"), (result.extractor, "extractor")):
+        file = Path(str(request.keys.get(key)))
+        weights = key == "extractor" and file.suffix in (".ckpt", ".safetensors")
+        if file.is_file() and (used is None or used.sha256 != (weights_sha256 if weights else sha256)(file)):
+            return True
+    return False
+
+
+def count_lengths(dataset: str, results: Path, config: Config) -> None:
+    """Writes the motion lengths of a data set to `results`; prints a message if the data set is not prepared."""
+    from flame_mdm.reporting.tables import Lengths
+
+    options = settings("browse", [f"data={dataset}"])
+    node = options["data"] | ({"root": config["data_root"]} if config["data_root"] else {})
+    data = instantiate(node, representation=instantiate(options["representation"]))
+    if not (data.folder / "store.json").exists():
+        say(f"{dataset}: not prepared, so its lengths are omitted. To prepare it: make prepare DATA={dataset}")
+        return
+    store = data.open()
+    counted = Lengths(
+        fingerprint=store.fingerprint,
+        fps=store.info["fps"],
+        lengths=sorted(clip.length for clip in store.clips),
+        excluded=store.info["excluded"],
+    )
+    write_json(results / "lengths" / f"{dataset}.json", counted.model_dump(), indent=None)
 
 
 main = partial(

@@ -18,8 +18,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import FailFast, Field, model_validator
 
-from flame_mdm.config import EXPERIMENTS, Config, plain, settings
-from flame_mdm.errors import UserError, did_you_mean, say
+from flame_mdm.config import EXPERIMENTS, Config, plain
+from flame_mdm.errors import UserError, did_you_mean
 from flame_mdm.reporting.audit import card_of
 from flame_mdm.reporting.page import page
 from flame_mdm.reporting.plots import standalone
@@ -38,7 +38,7 @@ from flame_mdm.reporting.rendering import (
 )
 from flame_mdm.reporting.study import Ratings, wilson
 from flame_mdm.runs import made_by
-from flame_mdm.safe_io import read_yaml, write_json, write_text
+from flame_mdm.safe_io import read_yaml, write_text
 from flame_mdm.schemas import (
     Checkpoint,
     ClosedSchema,
@@ -681,25 +681,8 @@ def _setting(value: Any) -> str:
     return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
-def count_lengths(dataset: str, results: Path, config: Config) -> None:
-    """Writes the motion lengths of a data set to `results`; prints a message if the data set is not prepared."""
-    from flame_mdm.config import instantiate
-
-    options = settings("browse", [f"data={dataset}"])
-    node = options["data"] | ({"root": config["data_root"]} if config["data_root"] else {})
-    data = instantiate(node, representation=instantiate(options["representation"]))
-    if not (data.folder / "store.json").exists():
-        say(f"{dataset}: not prepared, so its lengths are omitted. To prepare it: make prepare DATA={dataset}")
-        return
-    store = data.open()
-    lengths = sorted(clip.length for clip in store.clips)
-    content = {"fingerprint": store.fingerprint, "fps": store.info["fps"], "lengths": lengths}
-    content["excluded"] = store.info["excluded"]
-    write_json(results / "lengths" / f"{dataset}.json", content, indent=None)
-
-
 class Lengths(Schema):
-    """Motion lengths of a data set, in frames, as `count_lengths` writes them."""
+    """Motion lengths of a data set, in frames."""
 
     fingerprint: str
     fps: Annotated[Number, Field(gt=0)]

@@ -27,6 +27,7 @@ from flame_mdm.errors import UserError
 from flame_mdm.progress import ProgressBar
 from flame_mdm.representations import Representation
 from flame_mdm.sampling.editing import kept_parts
+from flame_mdm.sampling.request import EditRequest
 from flame_mdm.seeds import key
 
 CHUNK = 64
@@ -153,7 +154,7 @@ class Evaluator:
             rows["contacts"] = [torch.from_numpy(x[:, contacts] > 0.5) for x in motions.features]
         kept = None
         if motions.edit is not None:
-            kept = [kept_parts(self.representation, len(motion), **motions.edit)[1] for motion in joints]
+            kept = [kept_parts(self.representation, len(motion), EditRequest(**motions.edit))[1] for motion in joints]
         if self.training is not None and joints:
             rows["nearest"] = self.training.nearest(joints, rows.get("generated"))
         return Extracted(rows, joints, kept)

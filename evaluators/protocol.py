@@ -24,7 +24,9 @@ from flame_mdm.data.datamodule import Clips
 from flame_mdm.data.store import Entry
 from flame_mdm.errors import UserError
 from flame_mdm.representations import Representation
-from flame_mdm.sampling.editing import MFM_STEPS, method_options
+from flame_mdm.sampler_options import SamplerOptions
+from flame_mdm.sampling.editing import method_options
+from flame_mdm.sampling.request import EditRequest
 from flame_mdm.seeds import key
 from flame_mdm.task import MotionGeneration
 
@@ -263,18 +265,17 @@ class Protocol:
         if self.edit is None and (method, until, strength) != (None, None, None):
             raise UserError(f"protocol {self.name} does not edit motions. Remove method, until and strength")
         how: dict[str, Any] = {}
+        options = SamplerOptions(
+            guidance_scale=guidance_scale,
+            sampler=sampler,
+            num_inference_steps=num_inference_steps,
+            eta=eta,
+            spacing=spacing,
+        )
         if self.edit is not None:
-            how["edit"] = method_options(model.process, method, until, strength=strength)
-        if num_inference_steps is None:
-            along = how and how["edit"]["mode"] == "trajectory"
-            num_inference_steps = MFM_STEPS if along else model.num_inference_steps
-        return {
-            "guidance_scale": model.guidance_scale if guidance_scale is None else guidance_scale,
-            "sampler": sampler or model.sampler,
-            "num_inference_steps": num_inference_steps,
-            **{name: value for name, value in (("eta", eta), ("spacing", spacing)) if value is not None},
-            **how,
-        }
+            editing = EditRequest(method=method, until=until, strength=strength)
+            how["edit"], options = method_options(model.process, editing, options)
+        return options.over(model.sampler_options).chosen() | how
 
     def generator(
         self,

@@ -22,6 +22,7 @@ from flame_mdm.progress import ProgressBar
 from flame_mdm.representations import Representation
 from flame_mdm.safe_io import atomic_write, read_npz, regular_file
 from flame_mdm.sampling.editing import kept_parts
+from flame_mdm.sampling.request import EditRequest
 from flame_mdm.seeds import key, normal
 from flame_mdm.task import MotionGeneration
 
@@ -218,7 +219,7 @@ class Generator:
         for motion in real_motions(self.clips, rows):
             x = torch.from_numpy(motion).to(self.model.device)
             known.append(pad_to(representation.normalize(x)[None], longest))
-            kept, _ = kept_parts(representation, len(motion), **(self.parts or {}))
+            kept, _ = kept_parts(representation, len(motion), EditRequest(**self.parts or {}))
             keep.append(~pad_to(~kept[None].to(x.device), longest))
         return Edit(torch.cat(known), torch.cat(keep), **self.how)
 

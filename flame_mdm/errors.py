@@ -34,6 +34,11 @@ def did_you_mean(name: str, names: Iterable[str]) -> str:
     return f" Did you mean {', '.join(near)}?" if near else ""
 
 
+def shortened(text: str, most: int = MAX_LINE) -> str:
+    """Returns a text of at most `most` characters; a longer one ends in an ellipsis."""
+    return text if len(text) <= most else f"{text[: most - 1]}…"
+
+
 def printable(text: str) -> str:
     r"""Returns the text with control and direction characters escaped (`\x1b`, `\u202e`), so that a file name or
     a message from an untrusted file cannot control the terminal.

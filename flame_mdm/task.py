@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -23,10 +22,11 @@ from flame_mdm.data.datamodule import MotionDataModule
 from flame_mdm.denoisers import Denoiser
 from flame_mdm.errors import UserError
 from flame_mdm.losses import MotionLosses
-from flame_mdm.processes import MAX_STEPS, Process
+from flame_mdm.processes import Process
 from flame_mdm.processes.guidance import classifier_free_guidance
 from flame_mdm.processes.windows import Windows, blended
 from flame_mdm.representations import Representation
+from flame_mdm.sampler_options import SamplerOptions
 from flame_mdm.seeds import key, normal, seed_generator, seeded_noise, uniform
 
 
@@ -150,13 +150,12 @@ class MotionGeneration(Task):
         super().__init__(condition, representation, optimizer=optimizer, seed=seed)
         if not 0 <= cond_drop_prob <= 1:
             raise UserError(f"task.cond_drop_prob={cond_drop_prob}: give a probability from 0 to 1")
-        if not math.isfinite(guidance_scale):
-            raise UserError(f"task.guidance_scale={guidance_scale} is not a finite number")
-        # Process.sample checks lists further.
-        counts = num_inference_steps if isinstance(num_inference_steps, list) else [num_inference_steps or -1]
-        if not all(type(count) is int and 0 <= count <= MAX_STEPS for count in counts):
-            given = f"task.num_inference_steps={num_inference_steps}"
-            raise UserError(f"{given}: give a number from 1 to {MAX_STEPS:,}, or a list of steps")
+        try:
+            self.sampler_options = SamplerOptions(
+                guidance_scale=guidance_scale, sampler=sampler, num_inference_steps=num_inference_steps
+            )
+        except UserError as error:
+            raise UserError(f"task.{error}") from error
         self.denoiser, self.process = denoiser, process
         self.losses = MotionLosses(representation.to_joints, representation.skeleton.feet, **losses)
         self.cond_drop_prob = cond_drop_prob

@@ -2,6 +2,8 @@
 
 import ast
 import re
+import subprocess
+import sys
 from collections.abc import Mapping
 from functools import cache
 from graphlib import CycleError, TopologicalSorter
@@ -13,11 +15,12 @@ from support.fixtures import ROOT
 FILES = sorted([*(ROOT / "flame_mdm").rglob("*.py"), *(ROOT / "evaluators").rglob("*.py")])
 
 AXES = {"denoisers", "processes", "conditions", "representations"}
-GROUND = {"errors", "losses", "safe_io", "config", "batch", "seeds", "progress"}
+GROUND = {"errors", "sampler_options", "losses", "safe_io", "config", "batch", "seeds", "progress"}
 MODELS = GROUND | AXES | {"visualize", "formats", "data", "task"}
 ALL = MODELS | {"sampling", "checkpoints", "schemas", "runs", "reporting", "training"}
 MAY_IMPORT: dict[str, set[str]] = {
     "errors": set(),
+    "sampler_options": {"errors"},
     "losses": set(),
     "progress": {"errors"},
     "representations": {"errors"},
@@ -148,6 +151,7 @@ def test_strings_outside_commands_name_no_module_of_the_evaluators():
     ("name", "line"),
     [
         ("flame_mdm.errors", "import flame_mdm.safe_io"),
+        ("flame_mdm.sampler_options", "from flame_mdm.processes import Process"),
         ("flame_mdm.losses", "from flame_mdm import batch"),
         ("flame_mdm.representations.smpl", "from flame_mdm.batch import MotionBatch"),
         ("flame_mdm.safe_io", "from flame_mdm.config import Config"),
@@ -203,6 +207,11 @@ def test_modules_and_public_classes_say_what_they_are(path):
     for node in tree.body:
         if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
             assert ast.get_docstring(node), node.name
+
+
+def test_requests_are_checked_before_torch_is_imported():
+    code = "import sys, flame_mdm.sampling.request; sys.exit('torch' in sys.modules or 'numpy' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=False).returncode == 0
 
 
 def test_files_are_nouns_not_drawers():

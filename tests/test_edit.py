@@ -358,7 +358,10 @@ def _npz(folder: Path, **arrays) -> Path:
         ({"joints": "uper_body"}, "no joint or part 'uper_body'. Did you mean upper_body"),
         ({"joints": ["left_hnad"]}, "Did you mean left_hip"),
         ({"region": "suffix", "method": "mfm"}, "method=mfm is not supported by GaussianDiffusion; .* mdm, flame"),
-        ({"region": "suffix", "method": "repaint"}, "this model supports: mdm, flame, flame_code"),
+        (
+            {"region": "suffix", "method": "repaint"},
+            "method=repaint is unknown. Choose from mdm, flame, flame_code, mfm",
+        ),
         ({"region": "suffix", "until": 0.3}, "until=0.3 is an option of method=mfm, not of mdm"),
         ({"region": "suffix", "resample": 3}, "resample=3 is an option of method=flame"),
     ],

@@ -17,7 +17,8 @@ from flame_mdm.formats.faults import find_faults
 from flame_mdm.formats.readers import read
 from flame_mdm.processes.windows import Windows, blended, place, spans
 from flame_mdm.sampling.generation import best
-from flame_mdm.sampling.sequences import overlap, read_parts
+from flame_mdm.sampling.request import read_parts
+from flame_mdm.sampling.sequences import overlap
 
 
 @pytest.fixture(scope="module")

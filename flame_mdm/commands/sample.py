@@ -188,7 +188,7 @@ def check_condition(config: Config, model: MotionGeneration, texts: Sequence[str
     """
     if texts is not None:
         from flame_mdm.conditions.vocabulary import advice
-        from flame_mdm.sampling.sequences import read_parts
+        from flame_mdm.sampling.request import read_parts
         from flame_mdm.visualize.scene import shortened
 
         for text in dict.fromkeys(part for each in texts for part, _ in read_parts(each)):

@@ -14,7 +14,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainSeriali
 from pydantic_core import PydanticCustomError
 
 from flame_mdm.errors import UserError, did_you_mean, one_line
-from flame_mdm.sampling.sequences import read_parts
+from flame_mdm.sampling.request import read_parts
 from flame_mdm.visualize.scene import shortened
 
 MAX_TEXT, MAX_SECONDS, MAX_SAMPLES, MAX_STEPS, MAX_EDITS = 300, 30, 4, 1000, 8

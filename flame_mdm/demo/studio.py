@@ -18,7 +18,7 @@ from flame_mdm.formats.cleanup import cleaned
 from flame_mdm.formats.motion import Motion
 from flame_mdm.sampling.editing import edit
 from flame_mdm.sampling.generation import generate
-from flame_mdm.sampling.sequences import read_parts
+from flame_mdm.sampling.request import read_parts
 from flame_mdm.task import MotionGeneration
 
 KEPT = 64

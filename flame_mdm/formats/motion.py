@@ -93,7 +93,7 @@ class Motion:
                 raise ValueError(f"{name}: contacts have shape {found}, expected (frames, feet) = {expected}")
 
     def __repr__(self) -> str:
-        from flame_mdm.visualize.scene import shortened
+        from flame_mdm.errors import shortened
 
         name = shortened(self.text or self.id, 60)
         return f"{type(self).__name__}({name!r}, {len(self.joints)} frames, {self.fps:g} fps, {self.skeleton.name})"

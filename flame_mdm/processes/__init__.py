@@ -6,13 +6,10 @@ from collections.abc import Callable, Sequence
 from torch import Tensor, nn
 
 from flame_mdm.batch import Condition, Denoise, Edit, Noise
+from flame_mdm.sampler_options import MAX_STEPS as MAX_STEPS
 
 Auxiliary = Callable[[Tensor, Tensor, Tensor], dict[str, Tensor]]
 """(x0_hat (B, F, D), x (B, F, D), mask (B, F)) -> weighted per-sample losses (B,) of the clean estimate, by name."""
-
-
-MAX_STEPS = 100_000
-"""Maximum number of steps of a diffusion or sampler."""
 
 
 class Process(nn.Module, ABC):

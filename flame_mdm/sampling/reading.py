@@ -6,7 +6,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -20,6 +19,7 @@ from flame_mdm.formats.readers import ENDINGS, read
 from flame_mdm.formats.resampling import resample as resample_joints
 from flame_mdm.representations import Representation
 from flame_mdm.representations.skeleton import SMPL22
+from flame_mdm.sampling.request import is_range
 
 
 def read_motion(
@@ -117,12 +117,3 @@ def _read_clip(representation: Representation, source: str, data_root: Path) -> 
     clip = clips[clip_id]
     text = clip.captions[0] if clip.captions else ""
     return _decoded(representation, np.array(store.motion(clip)), text, source)
-
-
-def is_range(value: Any) -> bool:
-    """Returns whether the value is a pair of finite numbers."""
-    return (
-        isinstance(value, list | tuple)
-        and len(value) == 2
-        and all(isinstance(v, int | float) and math.isfinite(v) for v in value)
-    )

@@ -1,8 +1,7 @@
-"""Sequences of actions: texts with parts, and the windows that cover them."""
+"""Lengths of motions, and the windows that cover sequences of actions."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 import torch
@@ -10,6 +9,7 @@ import torch
 from flame_mdm.batch import MotionBatch
 from flame_mdm.errors import UserError
 from flame_mdm.processes.windows import Windows, place, spans
+from flame_mdm.sampling.request import Part, SamplingRequest
 from flame_mdm.task import MotionGeneration
 
 OVERLAP = 0.5
@@ -17,79 +17,63 @@ OVERLAP = 0.5
 MAX_SECONDS = 600
 """Maximum length of a sequence; all its windows are denoised at the same time."""
 
-Part = tuple[str, float | None]
-"""Text of a part, and its seconds if the text gives them."""
-
-
-def read_parts(text: str) -> list[Part]:
-    """Splits "walks @3 | sits down" into parts: [("walks", 3.0), ("sits down", None)].
-
-    Raises:
-        UserError: a part is empty, or its length is not a number above 0.
-    """
-    parts: list[Part] = []
-    for part in text.split("|"):
-        words, at, number = (piece.strip() for piece in part.rpartition("@"))
-        if not at:
-            words, number = number, ""
-        try:
-            seconds = float(number.removesuffix("s")) if at else None
-        except ValueError:
-            seconds = math.nan
-        if seconds is not None and not 0 < seconds < math.inf:
-            raise UserError(f"'{part.strip()}': the seconds of a part are a number above 0, as in 'walks forward @3'")
-        if not words:
-            raise UserError(f"'{text}': part {len(parts) + 1} is empty. Say what happens in each: 'walks | sits'")
-        parts.append((words, seconds))
-    return parts
-
-
-def check_sequence(model: MotionGeneration) -> None:
-    """Checks that features of frames do not depend on where the motion began.
-
-    Raises:
-        UserError: they are positions in the world.
-    """
-    if not model.representation.relative:
-        raise UserError(
-            f"representation {model.representation.name} has positions in the world, so that windows of a sequence do "
-            "not fit together. Use a model of humanml3d features"
-        )
-
 
 def overlap(model: MotionGeneration) -> int:
     """Returns the number of frames that neighboring windows share, which is even."""
     return 2 * round(min(OVERLAP * model.representation.fps, model.facts["max_frames"] / 3) / 2)
 
 
-def part_frames(
-    model: MotionGeneration, text: str, parts: Sequence[Part], default: float | None, loop: bool
+def motion_lengths(model: MotionGeneration, request: SamplingRequest) -> list[list[int]]:
+    """Returns the number of frames of each part of the motion of each prompt.
+
+    Raises:
+        UserError: If a motion is too short or too long for the model.
+    """
+    fps, longest = model.representation.fps, model.facts["max_frames"]
+    frames = request.lengths(fps)
+    if request.is_sequence:
+        rows = zip(request.prompts, request.parts, frames, strict=True)
+        return [_part_lengths(model, text, parts, usual, request.loop) for text, parts, usual in rows]
+    lengths = [min(round(3 * fps), longest) if length is None else round(length) for length in frames]
+    for length in lengths:
+        if length < 2:
+            raise UserError(
+                f"{length / fps:g} seconds ({length} frames) are too short: give at least {2 / fps:g} seconds"
+            )
+        if length > longest:
+            raise UserError(
+                f"{length / fps:g} seconds ({length} frames) cannot be sampled: the model was trained on motions of up "
+                f"to {longest / fps:g} seconds ({longest} frames at {fps:g} fps). Overlapping windows make longer "
+                f"ones: write the seconds in the text, 'walks @{length / fps:g}'"
+            )
+    return [[length] for length in lengths]
+
+
+def _part_lengths(
+    model: MotionGeneration, text: str, parts: Sequence[Part], usual: float | None, loop: bool
 ) -> list[int]:
-    """Returns the number of frames of each part.
+    """Returns the number of frames of each part of a sequence.
 
     Args:
         model: the model.
         text: all parts, for messages.
         parts: of the text.
-        default: seconds of parts that give none; None = 3 seconds, or what fits into one window if that is shorter.
+        usual: frames of parts that give no seconds; None = 3 seconds, or what fits into one window if that is shorter.
         loop: whether the sequence is a loop.
-
-    Raises:
-        UserError: a part is shorter than an overlap, or all of them are too long.
     """
     fps, shared = model.representation.fps, overlap(model)
-    several = loop or len(parts) > 1
-    usual = min(3.0, (model.facts["max_frames"] - shared * several) / fps) if default is None else default
-    found = [round((usual if seconds is None else seconds) * fps) for _, seconds in parts]
-    for (name, _), frames in zip(parts, found, strict=True):
-        if frames < shared:
+    if usual is None:
+        usual = min(3 * fps, model.facts["max_frames"] - shared * (loop or len(parts) > 1))
+    lengths = [round(usual if seconds is None else seconds * fps) for _, seconds in parts]
+    for (name, _), length in zip(parts, lengths, strict=True):
+        if length < shared:
             raise UserError(
-                f"'{name}': a part of {frames / fps:g} seconds is too short. Give at least {shared / fps:g} seconds, "
+                f"'{name}': a part of {length / fps:g} seconds is too short. Give at least {shared / fps:g} seconds, "
                 "which it shares with its neighbors"
             )
-    if sum(found) > MAX_SECONDS * fps:
-        raise UserError(f"'{text}': {sum(found) / fps:g} seconds are too long. Give at most {MAX_SECONDS}")
-    return found
+    if sum(lengths) > MAX_SECONDS * fps:
+        raise UserError(f"'{text}': {sum(lengths) / fps:g} seconds are too long. Give at most {MAX_SECONDS}")
+    return lengths
 
 
 def windows(
@@ -109,17 +93,17 @@ def windows(
         loop: whether the end of each sequence leads to its start.
     """
     longest, shared, device = model.facts["max_frames"], overlap(model), model.device
-    found = [(row, *span) for row, each in enumerate(lengths) for span in spans(each, longest, shared, loop)]
-    named = [conditions[row][part] for row, part, _, _ in found]
+    covering = [(row, *span) for row, parts in enumerate(lengths) for span in spans(parts, longest, shared, loop)]
+    names = [conditions[row][part] for row, part, _, _ in covering]
     # A denoiser that attends to its padding sees as many frames as in training.
-    width = max(size for *_, size in found) if getattr(model.denoiser, "mask_padding", True) else longest
-    placed = [(row, first, size) for row, _, first, size in found]
-    rows, frames, mask, weights = place(placed, [sum(each) for each in lengths], shared, width, device)
+    width = max(size for *_, size in covering) if getattr(model.denoiser, "mask_padding", True) else longest
+    positions = [(row, first, size) for row, _, first, size in covering]
+    rows, frames, mask, weights = place(positions, [sum(parts) for parts in lengths], shared, width, device)
     batch = MotionBatch(
         x=torch.zeros(*mask.shape, 0, device=device),
         mask=mask,
-        ids=named,
-        text=named if actions is None else None,
-        action=None if actions is None else torch.tensor([actions.index(name) for name in named], device=device),
+        ids=names,
+        text=names if actions is None else None,
+        action=None if actions is None else torch.tensor([actions.index(name) for name in names], device=device),
     )
     return Windows(batch, rows, frames, weights)

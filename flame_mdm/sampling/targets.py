@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -49,20 +49,20 @@ class Targets:
     positions: Positions
     poses: tuple[tuple[int, Tensor], ...]
 
-    def edit(self, representation: Representation, frames: int, device: torch.device) -> Edit:
-        """Returns the edit of a motion of `frames` frames: poses are imposed, positions guide the clean estimates.
+    def edit(self, representation: Representation, lengths: Sequence[int], device: torch.device) -> Edit:
+        """Returns the edit of motions of these lengths: poses are imposed, positions guide the clean estimates.
 
         Raises:
-            UserError: a target is later than the last frame.
+            UserError: If a target is later than the last frame of a motion.
         """
         last = max([0, *self.positions.frames.tolist(), *(frame for frame, _ in self.poses)])
-        if last >= frames:
+        if last >= min(lengths):
             fps = representation.fps
             raise UserError(
                 f"targets: {last / fps:g} seconds is after the end of the motion, whose last frame is at "
-                f"{(frames - 1) / fps:g} seconds. Give an earlier time, or more seconds"
+                f"{(min(lengths) - 1) / fps:g} seconds. Give an earlier time, or more seconds"
             )
-        known = torch.zeros(1, frames, representation.features, device=device)
+        known = torch.zeros(1, max(lengths), representation.features, device=device)
         keep = torch.zeros_like(known, dtype=torch.bool)
         for frame, features in self.poses:
             known[0, frame] = representation.normalize(features.to(device))

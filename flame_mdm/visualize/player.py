@@ -11,9 +11,10 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from flame_mdm.errors import shortened
 from flame_mdm.safe_io import write_text
 from flame_mdm.visualize.body import ANCHORS, Figure, mesh, try_figure
-from flame_mdm.visualize.scene import Shown, check_any, head, radii, shortened, sides
+from flame_mdm.visualize.scene import Shown, check_any, head, radii, sides
 
 MILLIMETER = 0.001
 

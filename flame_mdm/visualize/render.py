@@ -11,10 +11,10 @@ from typing import NamedTuple
 import numpy as np
 from PIL import Image, ImageDraw, ImageFilter, ImageFont
 
-from flame_mdm.errors import UserError
+from flame_mdm.errors import UserError, shortened
 from flame_mdm.safe_io import atomic_write
 from flame_mdm.visualize.body import MATERIALS, Figure, rasterize, shaded, try_figure
-from flame_mdm.visualize.scene import Shown, check_any, frame_at, head, radii, shortened, sides
+from flame_mdm.visualize.scene import Shown, check_any, frame_at, head, radii, sides
 
 Color = tuple[int, int, int]
 SIDE_COLORS: dict[int, Color] = {1: (47, 127, 209), -1: (226, 112, 42), 0: (140, 149, 163)}

@@ -8,14 +8,12 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
+from flame_mdm.errors import shortened as shortened
+
 if TYPE_CHECKING:  # drawing needs numpy and Pillow, not torch
     from torch import Tensor
 
     from flame_mdm.representations.skeleton import Skeleton
-
-
-MAX_CAPTION_LENGTH = 2000
-"""Maximum number of characters of a caption that are shown."""
 
 
 class Posed(Protocol):
@@ -66,11 +64,6 @@ def radii(skeleton: Skeleton) -> list[float]:
 def frame_at(motion: Shown, seconds: float) -> int:
     """Returns the frame shown at a time; past its end a motion stays at its last frame."""
     return min(int(seconds * motion.fps + 1e-6), len(motion.joints) - 1)
-
-
-def shortened(text: str, most: int = MAX_CAPTION_LENGTH) -> str:
-    """Returns a text of at most `most` characters; a longer one ends in an ellipsis."""
-    return text if len(text) <= most else f"{text[: most - 1]}…"
 
 
 def check_any(motions: Sequence[Shown], path: Path) -> None:

@@ -1,0 +1,84 @@
+"""Options of the samplers, shared by Python, command line, demo, evaluation and tables."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields, replace
+from typing import Any
+
+from flame_mdm.errors import UserError, did_you_mean
+
+MAX_STEPS = 100_000
+"""Maximum number of steps of a diffusion or sampler."""
+SPACINGS = ("linspace", "stride")
+"""How diffusion places a number of steps; see `flame_mdm.processes.schedules.timesteps`."""
+
+
+def option(default: Any, help: str) -> Any:
+    """Returns a dataclass field with a help text, which the command line and the demo show."""
+    return field(default=default, metadata={"help": help})
+
+
+@dataclass(frozen=True, kw_only=True)
+class SamplerOptions:
+    """How motions are sampled. None = the value of the recipe or, if the recipe has none, of the sampler.
+
+    A sampler declares which of the options it has (`flame_mdm.processes.samplers`); `flame_mdm.processes.Process`
+    refuses the others.
+
+    Raises:
+        UserError: If a value is invalid for every model.
+    """
+
+    guidance_scale: float | None = option(None, "scale of classifier-free guidance; 1 = off. Default: the recipe's")
+    sampler: str | None = option(
+        None,
+        "ancestral, ddim or dpm_solver_pp_2m for diffusion; euler, midpoint, heun, rk4 or dopri5 for flow matching. "
+        "Default: the recipe's",
+    )
+    num_inference_steps: int | Sequence[int] | None = option(
+        None,
+        "number of sampling steps; for diffusion also the steps themselves, such as [0,2,5,9]. Default: the recipe's",
+    )
+    eta: float | None = option(None, "randomness of the sampler ddim, from 0 (default) to 1")
+    spacing: str | None = option(None, "how diffusion places a number of steps: linspace (default) or stride")
+
+    def __post_init__(self) -> None:
+        for name in ("guidance_scale", "eta"):
+            value = getattr(self, name)
+            if value is not None and not (isinstance(value, int | float) and math.isfinite(value)):
+                raise UserError(f"{name}={value} is not a finite number")
+        if self.eta is not None and not 0 <= self.eta <= 1:
+            raise UserError(f"eta={self.eta:g}: give a number from 0 to 1")
+        if self.sampler is not None and not isinstance(self.sampler, str):
+            raise UserError(f"sampler={self.sampler!r}: give the name of a sampler")
+        if self.spacing is not None and self.spacing not in SPACINGS:
+            raise UserError(f"unknown spacing '{self.spacing}': choose from {', '.join(SPACINGS)}")
+        steps = self.num_inference_steps
+        if isinstance(steps, list | tuple):
+            object.__setattr__(self, "num_inference_steps", tuple(steps))
+            if not all(type(step) is int and 0 <= step <= MAX_STEPS for step in steps):
+                raise UserError(f"num_inference_steps={list(steps)}: give a number of steps, or a list of steps from 0")
+        elif steps is not None and not (type(steps) is int and 1 <= steps <= MAX_STEPS):
+            raise UserError(f"num_inference_steps={steps}: give a number from 1 to {MAX_STEPS:,}, or a list of steps")
+
+    def chosen(self) -> dict[str, Any]:
+        """Returns the options that are not None, as plain values."""
+        values = {option.name: getattr(self, option.name) for option in fields(self)}
+        return {k: list(v) if isinstance(v, tuple) else v for k, v in values.items() if v is not None}
+
+    def over(self, defaults: SamplerOptions) -> SamplerOptions:
+        """Returns these options, with `defaults` for those that are None."""
+        return replace(defaults, **self.chosen())
+
+
+def check_names(keywords: Sequence[str], names: Sequence[str], function: str) -> None:
+    """Checks the names of keyword arguments.
+
+    Raises:
+        UserError: If a keyword is not one of `names`; the message suggests similar ones.
+    """
+    for keyword in keywords:
+        if keyword not in names:
+            raise UserError(f"{function} has no option {keyword}.{did_you_mean(keyword, names)}")

@@ -1,0 +1,335 @@
+"""What a user asks of a model, checked once: by Python, the command line, the demo and evaluation.
+
+This module does not import torch, so that a request can be refused at once.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from functools import cached_property
+from numbers import Integral, Real
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from flame_mdm.errors import UserError, did_you_mean, shortened
+from flame_mdm.sampler_options import SamplerOptions, check_names, option
+
+if TYPE_CHECKING:
+    from flame_mdm.formats.motion import Motion
+    from flame_mdm.task import MotionGeneration
+
+MAX_SAMPLES = 10_000
+"""Maximum number of samples per request; they are kept in memory until all are complete."""
+MAX_TEXT_LENGTH = 2000
+"""Maximum number of characters of a text; captions of the data sets are far shorter."""
+TRAINED_ON = {
+    "text": ("was trained on captions", 'text="a person walks"'),
+    "action": ("was trained on action labels", "action=NAME"),
+    "none": ("was trained without texts and labels", "unconditioned=true"),
+}
+METHODS: dict[str, dict[str, Any]] = {
+    "mdm": {"mode": "x0"},
+    "flame": {"mode": "x_t", "blend": "after"},
+    "flame_code": {"mode": "x_t", "blend": "before"},
+    "mfm": {"mode": "trajectory", "until": 0.2},
+}
+"""Editing methods of the papers, as options of `flame_mdm.batch.Edit`."""
+REGIONS = ("in_between", "prediction", "prefix", "suffix", "interpolate")
+"""Editing tasks that name the frames to resample; see `EditRequest`."""
+
+Part = tuple[str, float | None]
+"""Text of a part of a sequence, and its seconds if the text gives them."""
+Ranges = Sequence[float] | Sequence[Sequence[float]]
+
+
+@dataclass(frozen=True, kw_only=True)
+class EditRequest:
+    """Which part of a motion to resample: `joints` in the frames of `region`, by default all; and how.
+
+    Raises:
+        UserError: If a value is invalid for every model and motion.
+    """
+
+    region: str | Ranges | None = option(
+        None,
+        "frames to resample: in_between (keeps the first and the last quarter), prediction = prefix (keeps the "
+        "first), suffix (keeps the last), interpolate (keeps every fifth frame), or one or more [begin, end]",
+    )
+    region_seconds: Ranges | None = option(None, "one or more [begin, end] in seconds, instead of region")
+    joints: str | Sequence[str] | None = option(
+        None, "joints to resample: upper_body, lower_body, legs, arms, left_arm ... or [names]. Default: all"
+    )
+    method: str | None = option(
+        None,
+        "mdm overwrites the clean estimate (exact); flame blends after each step, as in the paper (exact); "
+        "flame_code blends before each call, as in FLAME's code; mfm overwrites the early part of the path. "
+        "Default: mdm for diffusion, mfm for flow matching",
+    )
+    until: float | None = option(None, "for mfm: flow time up to which the path is overwritten, default 0.2")
+    resample: int = option(1, "for flame and flame_code: how many times each sampling step is taken")
+    strength: float | None = option(
+        None,
+        "starts from the motion with noise added, and takes this fraction of the sampling steps, above 0 and up to "
+        "1: the smaller, the closer to the motion",
+    )
+
+    def __post_init__(self) -> None:
+        if self.region is not None and self.region_seconds is not None:
+            raise UserError("give region or region_seconds, not both")
+        if isinstance(self.region, str) and self.region not in REGIONS:
+            raise UserError(
+                f"region={self.region} is unknown.{did_you_mean(self.region, REGIONS)} Give ranges [begin, end], or "
+                f"one of: {', '.join(REGIONS)}. Body parts are given by joints="
+            )
+        for name in ("region", "region_seconds"):
+            self.ranges(name)
+        if self.method is not None and self.method not in METHODS:
+            raise UserError(
+                f"method={self.method} is unknown.{did_you_mean(self.method, METHODS)} Choose from {', '.join(METHODS)}"
+            )
+        if type(self.resample) is not int or self.resample < 1:
+            raise UserError(f"resample={self.resample}: give a whole number, 1 or more")
+        if self.strength is not None and not 0 < self.strength <= 1:
+            raise UserError(f"strength={self.strength:g}: give a number above 0, up to 1")
+        if self.method is not None:
+            self.method_options(self.method)
+
+    def ranges(self, name: str) -> list[tuple[float, float]] | None:
+        """Returns the ranges of the field `name`; None if it has none."""
+        value: Any = getattr(self, name)
+        if value is None or isinstance(value, str):
+            return None
+        listed = [value] if is_range(value) else value
+        if not isinstance(listed, list | tuple) or not listed or not all(map(is_range, listed)):
+            raise UserError(f"{name}={value}: write [begin, end], or several ranges as [[begin, end], [begin, end]]")
+        return [(begin, end) for begin, end in listed]
+
+    def method_options(self, method: str) -> dict[str, Any]:
+        """Returns the options of `flame_mdm.batch.Edit` for a method that the process supports.
+
+        Raises:
+            UserError: If the method does not have an option of this request.
+        """
+        options = dict(METHODS[method])
+        if self.until is not None and options["mode"] != "trajectory":
+            raise UserError(f"until={self.until:g} is an option of method=mfm, not of {method}")
+        if self.resample != 1 and options["mode"] != "x_t":
+            raise UserError(f"resample={self.resample} is an option of method=flame and flame_code, not of {method}")
+        if self.until is not None:
+            options["until"] = self.until
+        if self.strength is not None:
+            options["strength"] = self.strength
+        return options | {"resample": self.resample}
+
+
+@dataclass(frozen=True, kw_only=True)
+class SamplingRequest:
+    """Motions to sample, for texts or actions; unconditioned if neither is given.
+
+    A text or action may have several parts, "walks forward @3 | turns left | sits down @2", with their seconds. They
+    are generated together as one motion, in windows that overlap; see docs/sequences.md. So is a single part with
+    seconds, "walks forward @10", which may be longer than the motions in training.
+
+    A single text, action or list of lengths is stored as a tuple.
+
+    Raises:
+        UserError: If a value is invalid for every model, or two values contradict each other.
+    """
+
+    texts: str | Sequence[str] | None = option(
+        None,
+        'what the person does; several actions in a row: "walks forward @3 | turns left | sits down @2" (seconds)',
+    )
+    actions: str | Sequence[str] | None = option(None, "a label, for models trained on labels")
+    seconds: float | Sequence[float] | None = option(
+        None,
+        "length, or a list with one per text or action; of a sequence, the length of each part that gives none. "
+        "Default: 3, or the longest motion in training if that is shorter",
+    )
+    frames: int | Sequence[int] | None = option(None, "the same in frames, instead of seconds")
+    samples: int = option(1, "motions per text or action")
+    candidates: int = option(
+        1, "motions generated for each one that is kept: the best without faults, if there is one without"
+    )
+    seed: int = option(0, "seed of the noise")
+    after: str | Path | Motion | None = option(None, "FILE or dataset:id: a motion that the result continues")
+    loop: bool = option(False, "the last frame leads to the first one")
+    targets: str | Path | Mapping[str, Any] | None = option(
+        None, "a JSON file of places to reach: way points, joints, poses; see docs/targets.md"
+    )
+    shared_noise: bool = option(
+        False, "all motions get the same noise, so that they differ by their texts and lengths alone"
+    )
+    cleanup: bool = option(False, "smooth motions, constant bone lengths, feet that do not slide")
+    options: SamplerOptions = field(default_factory=SamplerOptions)
+    editing: EditRequest | None = None
+
+    @classmethod
+    def of(cls, function: str, editing: bool = False, /, **keywords: Any) -> SamplingRequest:
+        """Returns the request of keyword arguments: fields of this class, of `SamplerOptions` and of `EditRequest`.
+
+        Args:
+            function: name of the function that got the keywords, for messages.
+            editing: whether the request is an edit; the keywords may then be those of `EditRequest`.
+            keywords: the values.
+
+        Raises:
+            UserError: If a keyword is unknown, or a value is invalid.
+        """
+        names = [entry.name for entry in fields(cls) if entry.name not in ("options", "editing")]
+        sampler = [entry.name for entry in fields(SamplerOptions)]
+        edits = [entry.name for entry in fields(EditRequest)] if editing else []
+        check_names(list(keywords), [*names, *sampler, *edits], function)
+        values = {name: keywords[name] for name in names if name in keywords}
+        options = SamplerOptions(**{name: keywords[name] for name in sampler if name in keywords})
+        edit = EditRequest(**{name: keywords[name] for name in edits if name in keywords}) if editing else None
+        return cls(**values, options=options, editing=edit)
+
+    def __post_init__(self) -> None:
+        for name in ("texts", "actions", "seconds", "frames"):
+            value = getattr(self, name)
+            value = value.tolist() if hasattr(value, "tolist") else value  # an array or a number of numpy
+            if isinstance(value, str) and name in ("texts", "actions"):
+                value = (value,)
+            object.__setattr__(self, name, tuple(value) if isinstance(value, list | tuple) else value)
+        for name in ("samples", "candidates"):
+            value = getattr(self, name)
+            if not isinstance(value, Integral) or not 1 <= value <= MAX_SAMPLES:
+                raise UserError(f"{name}={value}: give 1 to {MAX_SAMPLES:,}")
+        if not isinstance(self.seed, Integral):
+            raise UserError(f"seed={self.seed!r}: give a whole number")
+        self._check_prompts()
+        self._check_lengths()
+        other = "loop" if self.loop else "targets" if self.targets is not None else None
+        if self.after is not None and other is not None:
+            name = self.after if isinstance(self.after, str | Path) else self.after.id
+            raise UserError(f"after={name}: a motion that continues another cannot have {other}. Give one of the two")
+        if self.editing is not None:
+            self.check_edit()
+            if self.seconds is not None or self.frames is not None:
+                raise UserError("an edit is as long as its motion: omit seconds and frames, or give cut=[begin, end]")
+
+    def _check_prompts(self) -> None:
+        if self.texts is not None and self.actions is not None:
+            raise UserError("give texts or actions, not both")
+        for prompt in self.prompts:
+            if not isinstance(prompt, str):
+                raise UserError(f"{self.kind}={prompt!r} is not a string. Give a string, such as {self.kind}='walk'")
+            if len(prompt) > MAX_TEXT_LENGTH:
+                raise UserError(
+                    f"{shortened(prompt, 60)}: {len(prompt):,} characters are too many. Give at most "
+                    f"{MAX_TEXT_LENGTH:,}"
+                )
+        if self.texts is not None and not all(text.strip() for text in self.prompts):
+            raise UserError("empty text. Omit the text to sample without condition")
+        if len(self.prompts) * self.samples * self.candidates > MAX_SAMPLES:
+            raise UserError(
+                f"{len(self.prompts):,} texts with samples={self.samples * self.candidates}: at most {MAX_SAMPLES:,} "
+                "motions per request"
+            )
+        _ = self.parts  # raises if a part is invalid
+
+    def _check_lengths(self) -> None:
+        if self.seconds is not None and self.frames is not None:
+            raise UserError("give seconds or frames, not both")
+        name, value = ("frames", self.frames) if self.seconds is None else ("seconds", self.seconds)
+        if value is None:
+            return
+        lengths = list(value) if isinstance(value, tuple) else [value] * len(self.prompts)
+        shown = f"{name}={lengths if isinstance(value, tuple) else value}"
+        if len(lengths) != len(self.prompts):
+            prompts = "1 prompt" if len(self.prompts) == 1 else f"{len(self.prompts)} prompts"
+            raise UserError(f"{shown}: {len(lengths)} lengths for {prompts}. Give one length, or one per prompt")
+        for length in lengths:
+            if not isinstance(length, Real) or not abs(length) < 1e9 or (name == "frames" and length % 1):
+                raise UserError(f"{shown} is not a valid length")
+
+    def check_edit(self) -> None:
+        """Checks that a request to edit a motion asks for nothing else.
+
+        Raises:
+            UserError: If it asks for a sequence or targets.
+        """
+        if self.is_sequence or self.targets is not None:
+            raise UserError("an edit keeps a single motion: give neither parts (|), after, loop nor targets with it")
+
+    @property
+    def kind(self) -> Literal["text", "action", "none"]:
+        """The condition of the motions."""
+        return "text" if self.texts is not None else "action" if self.actions is not None else "none"
+
+    @property
+    def prompts(self) -> tuple[str, ...]:
+        """The texts or actions; a single empty text if there are none."""
+        return tuple(self.texts or self.actions or ("",))
+
+    @cached_property
+    def parts(self) -> list[list[Part]]:
+        """The parts of each prompt; see `read_parts`."""
+        return [[(prompt, None)] if self.kind == "none" else read_parts(prompt) for prompt in self.prompts]
+
+    @property
+    def is_sequence(self) -> bool:
+        """Whether motions are generated in windows: prompts have parts or seconds, or they loop or continue one."""
+        timed = any(len(parts) > 1 or parts[0][1] is not None for parts in self.parts)
+        return self.loop or self.after is not None or timed
+
+    def lengths(self, fps: float) -> list[float | None]:
+        """Returns the length of each prompt in frames, not rounded; None where the request gives none."""
+        value, scale = (self.frames, 1.0) if self.seconds is None else (self.seconds, fps)
+        values = value if isinstance(value, tuple) else [value] * len(self.prompts)
+        return [None if length is None else length * scale for length in values]
+
+
+def check_model(request: SamplingRequest, model: MotionGeneration) -> None:
+    """Checks that a model can do what is requested; the planning of a sampling run also checks the lengths.
+
+    Raises:
+        UserError: If the model was not trained for the condition, does not know the action, or cannot generate
+            sequences.
+    """
+    if request.kind not in ("none", model.conditioned_on):
+        trained, instead = TRAINED_ON[model.conditioned_on]
+        raise UserError(f"{request.kind}={shortened(request.prompts[0], 60)}: this model {trained}. Give {instead}")
+    if request.is_sequence and not model.representation.relative:
+        raise UserError(
+            f"representation {model.representation.name} has positions in the world, so that windows of a sequence do "
+            "not fit together. Use a model of humanml3d features"
+        )
+    for name in [name for parts in request.parts for name, _ in parts] if request.kind == "action" else ():
+        if name not in (actions := model.facts["actions"]):
+            raise UserError(f"unknown action '{name}'; this model knows: {', '.join(actions) or 'none'}")
+
+
+def read_parts(text: str) -> list[Part]:
+    """Splits "walks @3 | sits down" into parts: [("walks", 3.0), ("sits down", None)].
+
+    Raises:
+        UserError: If a part is empty, or its length is not a number above 0.
+    """
+    parts: list[Part] = []
+    for part in text.split("|"):
+        words, at, number = (piece.strip() for piece in part.rpartition("@"))
+        if not at:
+            words, number = number, ""
+        try:
+            seconds = float(number.removesuffix("s")) if at else None
+        except ValueError:
+            seconds = math.nan
+        if seconds is not None and not 0 < seconds < math.inf:
+            raise UserError(f"'{part.strip()}': the seconds of a part are a number above 0, as in 'walks forward @3'")
+        if not words:
+            raise UserError(f"'{text}': part {len(parts) + 1} is empty. Say what happens in each: 'walks | sits'")
+        parts.append((words, seconds))
+    return parts
+
+
+def is_range(value: Any) -> bool:
+    """Returns whether the value is a pair of finite numbers."""
+    return (
+        isinstance(value, list | tuple)
+        and len(value) == 2
+        and all(isinstance(v, int | float) and math.isfinite(v) for v in value)
+    )

@@ -41,12 +41,11 @@ FORMAT = 1
 BASE, REAL = "decoded and encoded", "reference"
 """Sets of motions that all others are compared with: those of grade 0, and the real ones of set metrics."""
 TOTALS: dict[type[Metric], tuple[str, str]] = {
-    physics.FootSkating: ("skating", "steps"),
-    physics.StaticShare: ("static", "motions"),
+    **dict.fromkeys((physics.FootSkating, physics.StaticShare), ("hits", "total")),
     **dict.fromkeys((physics.Penetration, physics.Floating, physics.Jitter), ("total", "frames")),
 }
 """States of metrics of joints: their value is the sum of the first over motions, divided by that of the second."""
-TRUTH = "attributes/every"
+TRUTH = "attributes/all"
 """Share of motions that show every requested attribute."""
 
 Inputs = dict[str, np.ndarray]
@@ -315,7 +314,7 @@ def _values(name: str, metric: MeanOverMotions, found: Extracted) -> Inputs:
         rows |= {"contacts": rows["contacts"][0][None]} if "contacts" in rows else {}
         update_metrics({name: metric}, joints=joints[None], mask=torch.ones(1, len(joints), dtype=torch.bool), **rows)
     values, defined = (torch.cat(getattr(metric, state)).double().numpy() for state in ("values", "defined"))
-    parts = zip(metric.names, values.T, defined.T, strict=True)
+    parts = zip(metric.NAMES, values.T, defined.T, strict=True)
     return {f"{name}/{part}": np.stack([value, known], 1) for part, value, known in parts if known.any()}
 
 
@@ -377,9 +376,8 @@ class _Measure:
         if texts and "seen" in inputs and all("action" in text.requested for text in texts):
             read = [(json.loads(str(seen)), text.requested) for seen, text in zip(inputs["seen"], texts, strict=True)]
             right = [right_attributes(*each) for each in read]
-            right = [each | {"every": all(each.values())} for each in right]
             name = next(name for name, metric in self.metrics.items() if isinstance(metric, AttributeAccuracy))
-            for part in (*ATTRIBUTES, "all", "every"):
+            for part in AttributeAccuracy.names:
                 if any(part in each for each in right):
                     found[f"{name}/{part}"] = np.array([[each.get(part, False), part in each] for each in right], float)
         if not texts or "features" not in inputs:

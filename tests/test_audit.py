@@ -180,9 +180,9 @@ def test_an_audit_resumes_and_gives_the_same_card(tmp_path, monkeypatch, capsys)
     assert card.motions == clips == passes[0]
     assert [each.name for each in card.perturbations][:2] == ["jitter", "mirrored"]
     by_name = {each.name: each for each in card.perturbations}
-    truth = [grade.values["attributes/every"][0] or 0 for grade in by_name["near misses"].grades]
+    truth = [grade.values["attributes/all"][0] or 0 for grade in by_name["near misses"].grades]
     assert sorted(truth, reverse=True) == truth
-    assert (card.real["attributes/every"][0] or 0) > 0.95 > truth[-1]  # exact attributes see every wrong caption
+    assert (card.real["attributes/all"][0] or 0) > 0.95 > truth[-1]  # exact attributes see every wrong caption
     jitter = seen(card, by_name["jitter"], "jitter")
     assert jitter is not None
     assert jitter.grade == 1

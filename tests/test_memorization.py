@@ -114,7 +114,7 @@ def test_sides_are_read_from_the_motion():
         ("wave-both-hands", "both"),
     ]
     metric.update(joints, torch.ones(4, 40, dtype=torch.bool), wanted)
-    assert metric.compute() == {"hand": 1.0, "path": 0.0, "all": pytest.approx(2 / 3)}
+    assert metric.compute() == {"hand": 1.0, "path": 0.0, "hand_or_path": pytest.approx(2 / 3)}
     metric.reset()
     metric.update(joints[:1], torch.ones(1, 40, dtype=torch.bool), [("walk", "")])
-    assert metric.compute() == {"hand": None, "path": None, "all": None}
+    assert metric.compute() == {"hand": None, "path": None, "hand_or_path": None}

@@ -20,10 +20,8 @@ from evaluators.metrics.alignment import (
     MultimodalDistance,
     MutualInformationDivergence,
     TextsForMotion,
-    WholeSetRetrieval,
     mutual_information_divergence,
     retrieval_ranks,
-    whole_set_retrieval,
 )
 from evaluators.metrics.confidence import mean_ci
 from evaluators.metrics.distribution import (
@@ -57,7 +55,7 @@ from evaluators.metrics.reconstruction import (
     flame_parts,
     temos_parts,
 )
-from evaluators.metrics.retrieval import MultiPositiveRPrecision, TMRRetrieval
+from evaluators.metrics.retrieval import MultiPositiveRPrecision, TMRRetrieval, whole_set_retrieval
 from flame_mdm.batch import length_mask
 from flame_mdm.reporting.intervals import percentiles
 from flame_mdm.representations.skeleton import KIT21, SMPL22
@@ -313,9 +311,9 @@ def test_temos_parts_equal_the_authors(stem: str):
 @pytest.mark.golden
 @one
 def test_whole_set_retrieval_equals_the_authors(stem: str):
-    values = whole_set_retrieval(tensor("tmr/sims"), WholeSetRetrieval.TOP)
+    values = whole_set_retrieval(tensor("tmr/sims"), TMRRetrieval.TOP)
     for way in ("t2m", "m2t"):
-        for k in WholeSetRetrieval.TOP:
+        for k in TMRRetrieval.TOP:
             assert values[f"{way}_top{k}"] == pytest.approx(float(array(f"tmr/{way}_R{k:02}")) / 100, rel=1e-12)
         assert values[f"{way}_median"] == float(array(f"tmr/{way}_MedR"))
 
@@ -663,7 +661,6 @@ def all_metrics() -> dict[str, Metric]:
         "motions_for_text": MotionsForText(pool=8),
         "mm_dist": MultimodalDistance(),
         "mclip": MotionCLIPScore(),
-        "retrieval": WholeSetRetrieval(),
         "mid": MutualInformationDivergence(),
         "diversity_text": Diversity(pairs=30, replace=False),
         "diversity_action": Diversity(pairs=50, replace=True),

@@ -26,9 +26,9 @@ size.
 A key is `flame_mdm.seeds.key` of an id (and of the sample number, if there are several samples). Metrics that compare
 motions one by one (MID, position and displacement errors) take real motions in the order of the generated ones.
 
-`compute()` returns a number, a dict of numbers by name, or None if the metric was given nothing. It raises ValueError
-if a number would be meaningless, for example with too few samples. For the same features, values are bit-identical for
-any batch size, order and number of processes; random draws depend on `seed` alone.
+`compute()` returns a number, or a dict of numbers by name; None without samples. It raises UserError if a number would
+be meaningless, for example with too few samples. For the same features, values are bit-identical for any batch size,
+order and number of processes; random draws depend on `seed` alone.
 """
 
 from __future__ import annotations
@@ -81,8 +81,8 @@ def update_metrics(metrics: Mapping[str, Metric], **features: Any) -> None:
         missing = [needed for needed in required_inputs(metric) if needed not in features]
         if missing:
             raise UserError(missing_input(name, metric, missing[0]))
-        taken = inspect.signature(metric.update).parameters.keys() & features
-        metric.update(**{name: features[name] for name in taken})
+        accepted = inspect.signature(metric.update).parameters.keys() & features
+        metric.update(**{name: features[name] for name in accepted})
 
 
 def missing_input(name: str, metric: Metric, needed: str) -> str:

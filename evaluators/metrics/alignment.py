@@ -1,8 +1,6 @@
-"""Alignment of generated motions with their texts: R-precision, distances, retrieval and MID."""
+"""Alignment of generated motions with their texts: R-precision, distances and MID."""
 
 from __future__ import annotations
-
-from typing import Any
 
 import numpy as np
 import torch
@@ -33,44 +31,44 @@ def retrieval_ranks(queries: Tensor, candidates: Tensor, pools: Tensor, own: Ten
     return torch.cat(ranks)
 
 
-class _RPrecision(SampleMetric):
-    higher_is_better = True
+class RPrecision(SampleMetric):
+    """R-precision: the fraction of queries with fewer than k candidates before the correct one, `top1`, `top2`, ...
 
-    def __init__(self, pool: int = 32, top: int = 3, seed: int = 0, **kwargs: Any):
-        super().__init__(("keys", "generated", "text", "text_keys"), **kwargs)
-        self.pool, self.top, self.seed = pool, top, seed
+    Args:
+        pool: candidates in a pool, including the correct one.
+        top: largest k.
+        seed: of the random draws.
+    """
+
+    higher_is_better = True
+    states = ("generated", "text", "text_keys")
+
+    def __init__(self, pool: int = 32, top: int = 3, seed: int = 0):
+        super().__init__()
+        self.pool, self.seed = pool, seed
+        self.names = [f"top{k}" for k in range(1, top + 1)]
 
     def update(self, generated: Tensor, text: Tensor, text_keys: Tensor, keys: Tensor) -> None:
         """Adds features of motions and of their texts, each (B, E), with the keys of captions and motions (B,)."""
         self.keep(keys=keys, generated=generated, text=text, text_keys=text_keys)
 
-    def compute(self) -> dict[str, float | None]:
-        """Returns `top1`, `top2`, ...: the fraction of queries with fewer than k candidates before the correct one."""
-        rows = self.rows("keys", "generated", "text", "text_keys")
-        if rows is None:
-            return {f"top{k}": None for k in range(1, self.top + 1)}
-        generated, text, text_keys = rows
+    def value(self, generated: Tensor, text: Tensor, text_keys: Tensor) -> dict[str, float | None]:
+        """Returns the fractions."""
         ranks = self.ranks(generated, text, text_keys, np.random.default_rng(self.seed))
-        return {f"top{k}": int((ranks < k).sum()) / len(ranks) for k in range(1, self.top + 1)}
+        return {name: int((ranks < k).sum()) / len(ranks) for k, name in enumerate(self.names, 1)}
 
     def ranks(self, generated: Tensor, text: Tensor, text_keys: Tensor, generator: np.random.Generator) -> Tensor:
         """Returns the rank (N,) of the correct candidate for each query, 0 = first."""
         raise NotImplementedError
 
 
-class TextsForMotion(_RPrecision):
+class TextsForMotion(RPrecision):
     """R-precision, texts for a motion: is the motion's text among the k nearest of 32?
 
     This is the definition of the papers (FLAME, "Evaluation Metrics"; MDM, B.2; MFM, 9.1) and of FLAME's code. Each
     generated motion ranks its own text and 31 others, drawn without replacement from captions that differ from it, by
     Euclidean distance. In FLAME's code, a pool is as large as the batch, so the last pools are smaller; here, all pools
     have 32 texts. The own text is at a random position, so that an extractor that cannot tell texts apart gets k / 32.
-
-    Args:
-        pool: texts in a pool, including the own one.
-        top: largest k.
-        seed: of the random draws.
-        kwargs: options of `torchmetrics.Metric`.
     """
 
     def ranks(self, generated: Tensor, text: Tensor, text_keys: Tensor, generator: np.random.Generator) -> Tensor:
@@ -80,36 +78,32 @@ class TextsForMotion(_RPrecision):
         others = self.pool - 1
         drawn = np.stack([generator.choice(len(first) - 1, others, replace=False) for _ in own])
         pools = np.concatenate([drawn + (drawn >= own[:, None]), own[:, None]], 1)
-        place = generator.integers(self.pool, size=len(own))
+        position = generator.integers(self.pool, size=len(own))
         rows = np.arange(len(own))
-        pools[rows, others], pools[rows, place] = pools[rows, place], own
+        pools[rows, others], pools[rows, position] = pools[rows, position], own
         texts = text[torch.from_numpy(first).to(text.device)]
-        return retrieval_ranks(generated, texts, _tensor(pools, text), _tensor(place, text))
+        return retrieval_ranks(generated, texts, _tensor(pools, text), _tensor(position, text))
 
 
-class MotionsForText(_RPrecision):
+class MotionsForText(RPrecision):
     """R-precision, motions for a text: is the text's motion among the k nearest of 32?
 
     This is the definition of the code of Guo et al. 2022, which the tables of MDM and MFM use. Test pairs in random
     order are split into pools of 32; each text ranks the motions of its pool by Euclidean distance. Equal captions may
     be in the same pool. In that code, a pool is a batch of the data loader, and an incomplete last batch is dropped.
     Distances are float32, so a motion whose features equal those of its text may rank last (square root of a negative
-    number). Here,
-    pools are drawn at random, and the texts of an incomplete last pool rank the last 32 motions, so that every text
-    counts once.
+    number). Here, pools are drawn at random, and the texts of an incomplete last pool rank the last 32 motions, so that
+    every text counts once.
 
     Args:
-        pool: motions in a pool.
-        top: largest k.
-        seed: of the random draws.
+        pool, top, seed: see `RPrecision`.
         normalize: whether to scale features to length 1 first, which ranks by cosine. An extractor trained with
             cosines, such as motion-CLIP, does not constrain lengths; the motions with the shortest features would be
             nearest to every text.
-        kwargs: options of `torchmetrics.Metric`.
     """
 
-    def __init__(self, pool: int = 32, top: int = 3, seed: int = 0, normalize: bool = False, **kwargs: Any):
-        super().__init__(pool, top, seed, **kwargs)
+    def __init__(self, pool: int = 32, top: int = 3, seed: int = 0, normalize: bool = False):
+        super().__init__(pool, top, seed)
         self.normalize = normalize
 
     def ranks(self, generated: Tensor, text: Tensor, text_keys: Tensor, generator: np.random.Generator) -> Tensor:
@@ -118,8 +112,8 @@ class MotionsForText(_RPrecision):
         if self.normalize:
             generated, text = F.normalize(generated, dim=-1), F.normalize(text, dim=-1)
         self.need(count, self.pool, "motions")
-        order, pools, place = (_tensor(indices, text) for indices in own_pools(count, self.pool, generator))
-        return retrieval_ranks(text[order], generated, pools, place)
+        order, pools, position = (_tensor(indices, text) for indices in own_pools(count, self.pool, generator))
+        return retrieval_ranks(text[order], generated, pools, position)
 
 
 def own_pools(count: int, pool: int, seed: int | np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -138,14 +132,9 @@ def _tensor(indices: np.ndarray, like: Tensor) -> Tensor:
 
 
 class TextAndMotion(SampleMetric):
-    """A metric of pairs of motion and text.
+    """A metric of pairs of motion and text."""
 
-    Args:
-        kwargs: options of `torchmetrics.Metric`.
-    """
-
-    def __init__(self, **kwargs: Any):
-        super().__init__(("keys", "generated", "text"), **kwargs)
+    states = ("generated", "text")
 
     def update(self, generated: Tensor, text: Tensor, keys: Tensor) -> None:
         """Adds features of motions and of their texts, each (B, E), with the keys of the motions (B,)."""
@@ -159,22 +148,19 @@ class MultimodalDistance(TextAndMotion):
 
     Args:
         normalize: whether to scale features to length 1 first, as for `MotionsForText`; the value is then in [0, 2].
-        kwargs: options of `torchmetrics.Metric`.
     """
 
     higher_is_better = False
 
-    def __init__(self, normalize: bool = False, **kwargs: Any):
-        super().__init__(**kwargs)
+    def __init__(self, normalize: bool = False):
+        super().__init__()
         self.normalize = normalize
 
-    def compute(self) -> float | None:
+    def value(self, generated: Tensor, text: Tensor) -> float:
         """Returns the mean distance, in units of the features."""
-        rows = self.rows("keys", "generated", "text")
-        if rows is None:
-            return None
-        motion, text = (F.normalize(x, dim=-1) for x in rows) if self.normalize else rows
-        return torch.linalg.vector_norm(motion - text, dim=-1).mean().item()
+        if self.normalize:
+            generated, text = F.normalize(generated, dim=-1), F.normalize(text, dim=-1)
+        return torch.linalg.vector_norm(generated - text, dim=-1).mean().item()
 
 
 class MotionCLIPScore(TextAndMotion):
@@ -182,55 +168,9 @@ class MotionCLIPScore(TextAndMotion):
 
     higher_is_better = True
 
-    def compute(self) -> float | None:
+    def value(self, generated: Tensor, text: Tensor) -> float:
         """Returns the mean cosine."""
-        rows = self.rows("keys", "generated", "text")
-        return None if rows is None else F.cosine_similarity(rows[0], rows[1]).mean().item()
-
-
-class WholeSetRetrieval(TextAndMotion):
-    """Retrieval among all test samples by cosine, protocol "all" of Petrovich et al. 2023 (TMR).
-
-    Ties get their mean rank. Unlike R-precision, values decrease as the test set grows.
-    """
-
-    higher_is_better = True
-    TOP = (1, 2, 3, 5, 10)
-
-    def compute(self) -> dict[str, float | None]:
-        """Returns recall `t2m_top1`, ... in [0, 1] and median rank `t2m_median` (1 = best); `m2t_` is the reverse."""
-        rows = self.rows("keys", "generated", "text")
-        if rows is None:
-            return {
-                f"{way}_{name}": None for way in ("t2m", "m2t") for name in (*(f"top{k}" for k in self.TOP), "median")
-            }
-        motion, text = (F.normalize(x, dim=-1) for x in rows)
-        return whole_set_retrieval(text @ motion.T, self.TOP)
-
-
-def whole_set_retrieval(
-    similarity: Tensor, top: tuple[int, ...], correct: Tensor | None = None
-) -> dict[str, float | None]:
-    """Computes recall and median rank from similarities (N, N) of texts (rows) and motions (columns).
-
-    See `WholeSetRetrieval`. `correct` (N, N) bool, symmetric: pairs that count as correct, of which the best one sets
-    the rank; None = the diagonal.
-    """
-    values: dict[str, float | None] = {}
-    for way, table in (("t2m", similarity), ("m2t", similarity.T)):
-        rank = best_ranks(table, torch.eye(len(table), dtype=torch.bool) if correct is None else correct)
-        values |= {f"{way}_top{k}": (rank < k).double().mean().item() for k in top}
-        values[f"{way}_median"] = rank.double().quantile(0.5).item() + 1
-    return values
-
-
-def best_ranks(similarity: Tensor, correct: Tensor) -> Tensor:
-    """Returns the mean rank (N,) of the best correct candidates, 0 = first: similarities and correctness (N, M).
-
-    Candidates with equal similarity share the mean of their ranks, so that halves occur.
-    """
-    own = similarity.where(correct, -torch.inf).amax(1, keepdim=True)
-    return (similarity > own).sum(1) + ((similarity == own).sum(1) - 1) / 2
+        return F.cosine_similarity(generated, text).mean().item()
 
 
 def mutual_information_divergence(real: Tensor, text: Tensor, generated: Tensor, eps: float) -> Tensor:
@@ -285,24 +225,20 @@ class MutualInformationDivergence(SampleMetric):
 
     Args:
         eps: added to the diagonal of covariances before they are inverted. 5e-4 in FLAME, 0 in the authors' release.
-        kwargs: options of `torchmetrics.Metric`.
     """
 
     higher_is_better = True
+    states = ("generated", "text", "real")
 
-    def __init__(self, eps: float = 5e-4, **kwargs: Any):
-        super().__init__(("keys", "generated", "text", "real"), **kwargs)
+    def __init__(self, eps: float = 5e-4):
+        super().__init__()
         self.eps = eps
 
     def update(self, generated: Tensor, text: Tensor, real: Tensor, keys: Tensor) -> None:
         """Adds features (B, E) of generated motions, of their texts and of the real motions, with keys (B,)."""
         self.keep(keys=keys, generated=generated, text=text, real=real)
 
-    def compute(self) -> float | None:
+    def value(self, generated: Tensor, text: Tensor, real: Tensor) -> float:
         """Returns the divergence."""
-        rows = self.rows("keys", "generated", "text", "real")
-        if rows is None:
-            return None
-        generated, text, real = rows
         self.need(len(text), real.shape[1] + text.shape[1] + 1, "samples, one more than features of motion and text")
         return mutual_information_divergence(real, text, generated, self.eps).item()

@@ -11,8 +11,9 @@ from typing import Any
 
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
-from torch import Tensor, tensor
-from torchmetrics import Metric
+from torch import Tensor
+
+from evaluators.metrics.samples import Share
 
 PELVIS, NECK, HEAD = 0, 12, 15
 HIPS, ANKLES, TOES, SHOULDERS, ELBOWS, WRISTS = (1, 2), (7, 8), (10, 11), (16, 17), (18, 19), (20, 21)
@@ -166,43 +167,28 @@ def _arms(smooth: np.ndarray, fps: float) -> dict[str, str | int]:
     return {"action": "stand"} if np.linalg.norm(moved, axis=-1).max() < 0.35 else {}
 
 
-def right_attributes(seen: Mapping[str, Any], wanted: Mapping[str, Any]) -> dict[str, bool]:
-    """Returns for each requested attribute whether it was read from the motion; `all` = both action and side."""
-    right = {name: seen.get(name) == value for name, value in wanted.items()}
-    return right | {"all": right["action"] and right.get("side", True)}
+def right_attributes(seen: Mapping[str, Any], requested: Mapping[str, Any]) -> dict[str, bool]:
+    """Returns for each requested attribute whether it was read from the motion, and for combinations of them.
+
+    `action_and_side`: both are right, or the action if no side was requested; `all`: every requested attribute is.
+    """
+    right = {name: seen.get(name) == value for name, value in requested.items()}
+    return right | {"action_and_side": right["action"] and right.get("side", True), "all": all(right.values())}
 
 
-class _Accuracy(Metric):
-    """Counts of right and of requested values, by name."""
-
-    higher_is_better = True
-    full_state_update = False
-    names: tuple[str, ...]
-
-    def __init__(self, fps: float, **kwargs: Any):
-        super().__init__(**kwargs)
-        self.fps = fps
-        for name in self.names:
-            self.add_state(f"right_{name}", tensor(0), dist_reduce_fx="sum")
-            self.add_state(f"requested_{name}", tensor(0), dist_reduce_fx="sum")
-
-    def _add(self, name: str, right: bool) -> None:
-        setattr(self, f"right_{name}", getattr(self, f"right_{name}") + int(right))
-        setattr(self, f"requested_{name}", getattr(self, f"requested_{name}") + 1)
-
-    def _share(self, *names: str) -> float | None:
-        right, requested = (sum(int(getattr(self, f"{k}_{n}")) for n in names) for k in ("right", "requested"))
-        return right / requested if requested else None
-
-
-class AttributeAccuracy(_Accuracy):
-    """Fraction of motions that show the requested value, by attribute.
+class AttributeAccuracy(Share):
+    """Fraction of motions that show the requested value, by attribute; see `right_attributes`.
 
     Args:
         fps: frames per second of the motions.
     """
 
-    names = (*ATTRIBUTES, "all")
+    higher_is_better = True
+    names = (*ATTRIBUTES, "action_and_side", "all")
+
+    def __init__(self, fps: float):
+        super().__init__()
+        self.fps = fps
 
     def update(self, joints: Tensor, mask: Tensor, requested: Sequence[Mapping[str, str | int | float]]) -> None:
         """Adds motions.
@@ -218,16 +204,12 @@ class AttributeAccuracy(_Accuracy):
         """
         if len(requested) != len(joints):
             raise ValueError(f"attributes: {len(joints)} motions but {len(requested)} sets of requested attributes")
-        for motion, real, wanted in zip(joints.detach().cpu(), mask.cpu(), requested, strict=True):
-            unknown = set(wanted) - set(ATTRIBUTES)
-            if unknown or "action" not in wanted:
-                raise ValueError(f"attributes: {dict(wanted)} requested. Give an action, and only keys of {ATTRIBUTES}")
-            for name, hit in right_attributes(read_attributes(motion[real].numpy(), self.fps), wanted).items():
-                self._add(name, hit)
-
-    def compute(self) -> dict[str, float | None]:
-        """Returns the accuracy in [0, 1] by attribute, None if never requested; `all` = both action and side right."""
-        return {name: self._share(name) for name in self.names}
+        for motion, real, attributes in zip(joints.detach().cpu(), mask.cpu(), requested, strict=True):
+            if set(attributes) - set(ATTRIBUTES) or "action" not in attributes:
+                raise ValueError(
+                    f"attributes: {dict(attributes)} requested. Give an action, and only keys of {ATTRIBUTES}"
+                )
+            self.count(right_attributes(read_attributes(motion[real].numpy(), self.fps), attributes))
 
 
 def read_side(joints: np.ndarray, content: str, fps: float) -> str:
@@ -251,14 +233,21 @@ def read_side(joints: np.ndarray, content: str, fps: float) -> str:
     return "left" if toward > 0 else "right"
 
 
-class SideAccuracy(_Accuracy):
+class SideAccuracy(Share):
     """Share of motions that show the requested side, left or right, on the Bandai set; see `read_side`.
+
+    `hand` is about gestures, `path` about turns and sideways walks, `hand_or_path` about both; chance is 0.5.
 
     Args:
         fps: frames per second of the motions.
     """
 
-    names = ("hand", "path")
+    higher_is_better = True
+    names = ("hand", "path", "hand_or_path")
+
+    def __init__(self, fps: float):
+        super().__init__()
+        self.fps = fps
 
     def update(self, joints: Tensor, mask: Tensor, sides: Sequence[tuple[str, str]]) -> None:
         """Adds motions: joints (B, F, 22, 3) in meters, mask (B, F), and B pairs of content and side.
@@ -267,12 +256,5 @@ class SideAccuracy(_Accuracy):
         """
         for motion, real, (content, side) in zip(joints.detach().cpu(), mask.cpu(), sides, strict=True):
             if side in SIDES:
-                name = "path" if content.startswith("walk") else "hand"
-                self._add(name, read_side(motion[real].numpy(), content, self.fps) == side)
-
-    def compute(self) -> dict[str, float | None]:
-        """Returns the accuracy in [0, 1] of `hand`, of `path` (turns and sideways walks), and of `all`; chance is 0.5.
-
-        None if no motion has a side.
-        """
-        return {name: self._share(name) for name in self.names} | {"all": self._share(*self.names)}
+                right = read_side(motion[real].numpy(), content, self.fps) == side
+                self.count({"path" if content.startswith("walk") else "hand": right, "hand_or_path": right})

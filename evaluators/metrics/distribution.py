@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import torch
 from torch import Tensor
@@ -33,14 +31,11 @@ class FrechetMotionDistance(TwoSets):
 
     higher_is_better = False
 
-    def compute(self) -> float | None:
+    def value(self, generated: Tensor, real: Tensor) -> float:
         """Returns the distance, at least 0."""
-        sets = self.sets()
-        if sets is None:
-            return None
-        for name, features in zip(("generated", "real"), sets, strict=True):
+        for name, features in (("generated", generated), ("real", real)):
             self.need(len(features), 2, f"{name} motions")
-        return max(frechet_distance(*sets).item(), 0.0)  # rounding may give a value slightly below 0
+        return max(frechet_distance(generated, real).item(), 0.0)  # rounding may give a value slightly below 0
 
 
 def polynomial_mmd2(a: Tensor, b: Tensor) -> Tensor:
@@ -64,33 +59,25 @@ class KernelMotionDistance(TwoSets):
         replace: whether to draw with replacement, as the code of MoDi and MDM does if there are more real motions than
             `subset_size`. Samples that are drawn twice then increase the value.
         seed: of the random draws.
-        kwargs: options of `torchmetrics.Metric`.
     """
 
     higher_is_better = False
+    names = ("mean", "std")
 
-    def __init__(
-        self, subsets: int = 100, subset_size: int = 1000, replace: bool = False, seed: int = 0, **kwargs: Any
-    ):
-        super().__init__(**kwargs)
+    def __init__(self, subsets: int = 100, subset_size: int = 1000, replace: bool = False, seed: int = 0):
+        super().__init__()
         self.subsets, self.subset_size, self.replace, self.seed = subsets, subset_size, replace, seed
 
-    def compute(self) -> dict[str, float | None]:
+    def value(self, generated: Tensor, real: Tensor) -> dict[str, float | None]:
         """Returns `mean` and `std` (N in the denominator) over the subsets."""
-        sets = self.sets()
-        if sets is None:
-            return {"mean": None, "std": None}
-        for name, features in zip(("generated", "real"), sets, strict=True):
+        for name, features in (("generated", generated), ("real", real)):
             self.need(len(features), self.subset_size, f"{name} motions for subsets of {self.subset_size}")
         generator = np.random.default_rng(self.seed)
-        values = []
-        for _ in range(self.subsets):
-            a, b = (
-                x[torch.from_numpy(generator.choice(len(x), self.subset_size, replace=self.replace)).to(x.device)]
-                for x in sets
-            )
-            values.append(polynomial_mmd2(a, b))
-        mmd2 = torch.stack(values)
+
+        def subset(x: Tensor) -> Tensor:
+            return x[torch.from_numpy(generator.choice(len(x), self.subset_size, replace=self.replace)).to(x.device)]
+
+        mmd2 = torch.stack([polynomial_mmd2(subset(generated), subset(real)) for _ in range(self.subsets)])
         return {"mean": mmd2.mean().item(), "std": mmd2.std(unbiased=False).item()}
 
 
@@ -118,23 +105,20 @@ class PrecisionRecall(TwoSets):
 
     Args:
         neighbors: k, 3 in MoDi and MDM.
-        kwargs: options of `torchmetrics.Metric`.
     """
 
     higher_is_better = True
+    names = ("precision", "recall")
 
-    def __init__(self, neighbors: int = 3, **kwargs: Any):
-        super().__init__(**kwargs)
+    def __init__(self, neighbors: int = 3):
+        super().__init__()
         self.neighbors = neighbors
 
-    def compute(self) -> dict[str, float | None]:
+    def value(self, generated: Tensor, real: Tensor) -> dict[str, float | None]:
         """Returns `precision` and `recall`."""
-        sets = self.sets()
-        if sets is None:
-            return {"precision": None, "recall": None}
-        size = min(len(features) for features in sets)
+        size = min(len(generated), len(real))
         self.need(size, self.neighbors + 1, "motions in the smaller set")
-        generated, real = (features[:size] for features in sets)
+        generated, real = generated[:size], real[:size]
         return {
             "precision": manifold_coverage(generated, real, self.neighbors).item(),
             "recall": manifold_coverage(real, generated, self.neighbors).item(),

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import torch
 from torch import Tensor
 
-from evaluators.metrics.samples import SampleMetric, by_group, real_frames
+from evaluators.metrics.samples import SampleMetric, real_frames
+from flame_mdm.errors import UserError
 
 
 def pair_distance(a: Tensor, b: Tensor) -> float:
@@ -27,25 +26,21 @@ class Diversity(SampleMetric):
         pairs: number of pairs.
         replace: whether a motion may be drawn twice for the same side.
         seed: of the random draws.
-        kwargs: options of `torchmetrics.Metric`.
     """
 
     higher_is_better = None
+    states = ("generated",)
 
-    def __init__(self, pairs: int, replace: bool, seed: int = 0, **kwargs: Any):
-        super().__init__(("keys", "generated"), **kwargs)
+    def __init__(self, pairs: int, replace: bool, seed: int = 0):
+        super().__init__()
         self.pairs, self.replace, self.seed = pairs, replace, seed
 
     def update(self, generated: Tensor, keys: Tensor) -> None:
         """Adds features (B, E) of motions, with keys (B,)."""
         self.keep(keys=keys, generated=generated)
 
-    def compute(self) -> float | None:
+    def value(self, features: Tensor) -> float:
         """Returns the mean distance, in units of the features."""
-        rows = self.rows("keys", "generated")
-        if rows is None:
-            return None
-        (features,) = rows
         self.need(len(features), 2 if self.replace else self.pairs, f"motions for {self.pairs} pairs")
         generator = np.random.default_rng(self.seed)
         first, second = (
@@ -55,33 +50,28 @@ class Diversity(SampleMetric):
         return pair_distance(features[first], features[second])
 
 
-class _PerPrompt(SampleMetric):
+class PromptMultimodality(SampleMetric):
     """Multimodality of several motions per prompt, the same number for each prompt."""
 
     higher_is_better = None
-
-    def __init__(self, samples: int, seed: int = 0, **kwargs: Any):
-        super().__init__(("keys", "generated", "groups"), **kwargs)
-        self.samples, self.seed = samples, seed
+    states = ("generated", "groups")
+    samples: int
+    """Motions per prompt."""
 
     def update(self, generated: Tensor, groups: Tensor, keys: Tensor) -> None:
         """Adds features (B, E) of motions, with the keys (B,) of their prompts and of the motions."""
         self.keep(keys=keys, generated=generated, groups=groups)
 
-    def compute(self) -> float | None:
+    def value(self, features: Tensor, groups: Tensor) -> float:
         """Returns the mean distance, in units of the features."""
-        rows = self.rows("keys", "generated", "groups")
-        if rows is None:
-            return None
-        features, groups = rows
-        return self.distance(features[by_group(self, groups, self.samples)])
+        return self.distance(features[self.by_group(groups, self.samples)])
 
     def distance(self, features: Tensor) -> float:
         """Returns the mean distance within features (C, S, E) of S motions of each of C prompts."""
         raise NotImplementedError
 
 
-class TextMultimodality(_PerPrompt):
+class TextMultimodality(PromptMultimodality):
     """Multimodality of Guo et al. 2022 (MDM, B.2; MFM, eq. 12): 10 random pairs out of 30 motions per text.
 
     As in their code, two sets of 10 are drawn without replacement from the 30, with the same indices for all texts; a
@@ -92,12 +82,11 @@ class TextMultimodality(_PerPrompt):
         samples: motions per text.
         pairs: pairs per text.
         seed: of the random draws.
-        kwargs: options of `torchmetrics.Metric`.
     """
 
-    def __init__(self, samples: int = 30, pairs: int = 10, seed: int = 0, **kwargs: Any):
-        super().__init__(samples, seed, **kwargs)
-        self.pairs = pairs
+    def __init__(self, samples: int = 30, pairs: int = 10, seed: int = 0):
+        super().__init__()
+        self.samples, self.pairs, self.seed = samples, pairs, seed
 
     def distance(self, features: Tensor) -> float:
         """Returns the mean distance of the drawn pairs."""
@@ -109,7 +98,7 @@ class TextMultimodality(_PerPrompt):
         return pair_distance(features[:, first], features[:, second])
 
 
-class PairedMultimodality(_PerPrompt):
+class PairedMultimodality(PromptMultimodality):
     """Multimodality of FLAME (eq. 19): two sets of 10 motions per text, compared one by one.
 
     FLAME published no code for it. Its Table 3 has 10 motions per text, but eq. 19 uses two sets of 10. This is the
@@ -117,11 +106,11 @@ class PairedMultimodality(_PerPrompt):
 
     Args:
         samples: motions in each of the two sets.
-        kwargs: options of `torchmetrics.Metric`.
     """
 
-    def __init__(self, samples: int = 10, **kwargs: Any):
-        super().__init__(2 * samples, **kwargs)
+    def __init__(self, samples: int = 10):
+        super().__init__()
+        self.samples = 2 * samples
 
     def distance(self, features: Tensor) -> float:
         """Returns the mean distance between the first and second half of each prompt's motions."""
@@ -139,25 +128,21 @@ class ActionMultimodality(SampleMetric):
     Args:
         pairs: pairs per class.
         seed: of the random draws.
-        kwargs: options of `torchmetrics.Metric`.
     """
 
     higher_is_better = None
+    states = ("generated", "labels")
 
-    def __init__(self, pairs: int = 20, seed: int = 0, **kwargs: Any):
-        super().__init__(("keys", "generated", "labels"), **kwargs)
+    def __init__(self, pairs: int = 20, seed: int = 0):
+        super().__init__()
         self.pairs, self.seed = pairs, seed
 
     def update(self, generated: Tensor, labels: Tensor, keys: Tensor) -> None:
         """Adds features (B, E) of motions, with their classes and keys (B,)."""
         self.keep(keys=keys, generated=generated, labels=labels)
 
-    def compute(self) -> float | None:
+    def value(self, features: Tensor, labels: Tensor) -> float:
         """Returns the mean distance, in units of the features."""
-        rows = self.rows("keys", "generated", "labels")
-        if rows is None:
-            return None
-        features, labels = rows
         generator = np.random.default_rng(self.seed)
         pairs = []
         for label in labels.unique():
@@ -179,34 +164,30 @@ class JointVariance(SampleMetric):
 
     Args:
         samples: motions per text.
-        kwargs: options of `torchmetrics.Metric`.
     """
 
     higher_is_better = None
+    states = ("groups",)
     motions: list[Tensor]
 
-    def __init__(self, samples: int = 10, **kwargs: Any):
-        super().__init__(("keys", "groups", "motions"), **kwargs)
+    def __init__(self, samples: int = 10):
+        super().__init__()
         self.samples = samples
+        self.add_state("motions", [], dist_reduce_fx="cat")
 
     def update(self, joints: Tensor, mask: Tensor, groups: Tensor, keys: Tensor) -> None:
         """Adds motions (B, F, J, 3) with masks (B, F), and the keys (B,) of their prompts and of the motions."""
-        motions = real_frames("JointVariance", joints, mask)
-        for _, motion in zip(keys, motions, strict=True):
-            self.motions.append(motion)
+        self.motions += real_frames("JointVariance", joints, mask)
         self.keep(keys=keys, groups=groups)
 
-    def compute(self) -> float | None:
+    def value(self, groups: Tensor) -> float:
         """Returns the variance."""
-        rows = self.rows("keys", "groups")
-        if rows is None:
-            return None
         motions = [self.motions[index] for index in self.order("keys").tolist()]
         values = []
-        for members in by_group(self, rows[0], self.samples).tolist():
+        for members in self.by_group(groups, self.samples).tolist():
             lengths = {len(motions[index]) for index in members}
             if len(lengths) > 1:
-                raise ValueError(
+                raise UserError(
                     f"JointVariance: motions of one text have {sorted(lengths)} frames. Generate them at one length"
                 )
             joints = torch.stack([motions[index] for index in members]).double()

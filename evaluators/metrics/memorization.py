@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -64,11 +63,11 @@ class TrainingMotions:
         """
         squares = self.poses.square().sum(-1)
         left = torch.cat([torch.arange(int(length), 0, -1) for length in self.lengths])  # frames to the motion's end
-        found = torch.stack([self._closest(poses(motion, self.facing), squares, left) for motion in joints])
+        of_joints = torch.stack([self._closest(poses(motion, self.facing), squares, left) for motion in joints])
         if features is None or self.features is None:
-            return found[:, None]
+            return of_joints[:, None]
         exact = "donot_use_mm_for_euclid_dist"  # matrix products would cancel in a copy
-        return torch.stack([found, torch.cdist(features, self.features, compute_mode=exact).min(1).values], 1)
+        return torch.stack([of_joints, torch.cdist(features, self.features, compute_mode=exact).min(1).values], 1)
 
     def _closest(self, motion: Tensor, squares: Tensor, left: Tensor) -> Tensor:
         compared = motion[::STEP]
@@ -94,24 +93,17 @@ class NearestTraining(SampleMetric):
     A motion counts as a copy if its joints are closer to a training motion than those of all but `CLOSE` of the
     held-out real motions. So about 1 % of the real motions count as copies, and all motions of a model that repeats the
     training set.
-
-    Args:
-        kwargs: options of `torchmetrics.Metric`.
     """
 
-    def __init__(self, **kwargs: Any):
-        super().__init__(("keys", "nearest", "real_nearest"), **kwargs)
+    states = ("nearest", "real_nearest")
+    names = ("joints", "features", "copies")
 
     def update(self, keys: Tensor, nearest: Tensor, real_nearest: Tensor) -> None:
         """Adds the distances of generated motions and of the real motions paired with them, and keys (B,)."""
         self.keep(keys=keys, nearest=nearest, real_nearest=real_nearest)
 
-    def compute(self) -> dict[str, float | None]:
-        """Returns medians `joints` (meters) and `features`, and `copies` in [0, 1]; None without motions."""
-        rows = self.rows("keys", "nearest", "real_nearest")
-        if rows is None:
-            return {"joints": None, "features": None, "copies": None}
-        nearest, real = rows
+    def value(self, nearest: Tensor, real: Tensor) -> dict[str, float | None]:
+        """Returns medians `joints` (meters) and `features`, and `copies` in [0, 1]."""
         joints, *features = nearest.quantile(0.5, dim=0).tolist()
         limit = real[:, 0].quantile(CLOSE)
         return {

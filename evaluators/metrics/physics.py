@@ -2,21 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 from torch import Tensor
-from torchmetrics import Metric
 
-from evaluators.metrics.samples import SampleMetric, real_frames
-
-HEIGHT = 0.05
-"""Height in meters above the floor, y = 0, below which a toe joint touches it."""
-SPEED = 0.5
-"""Speed over the ground, in meters per second, above which a toe joint on the floor slides."""
+from evaluators.metrics.samples import SampleMetric, Share, real_frames
+from flame_mdm.formats.faults import LIMITS, LOW
 
 
-class FootSkating(Metric):
+class FootSkating(Share):
     """Foot skating ratio: fraction of frame transitions in which a foot that touches the floor slides.
 
     A toe joint touches the floor if it is below 5 cm in two adjacent frames, and slides if it moves more than 2.5 cm
@@ -31,39 +24,28 @@ class FootSkating(Metric):
     """
 
     higher_is_better = False
-    full_state_update = False
-    skating: Tensor
-    steps: Tensor
 
-    def __init__(self, fps: float, toes: tuple[int, ...] = (10, 11), **kwargs: Any):
-        super().__init__(**kwargs)
+    def __init__(self, fps: float, toes: tuple[int, ...] = (10, 11)):
+        super().__init__()
         self.fps, self.toes = fps, list(toes)
-        self.add_state("skating", torch.tensor(0), dist_reduce_fx="sum")
-        self.add_state("steps", torch.tensor(0), dist_reduce_fx="sum")
 
     def update(self, joints: Tensor, mask: Tensor) -> None:
         """Adds motions: joints (B, F, J, 3) in meters, y up; mask (B, F) bool, True = real frame."""
         real_frames("FootSkating", joints, mask)
         toes = joints[:, :, self.toes].double()
         moved = (toes[:, 1:, :, [0, 2]] - toes[:, :-1, :, [0, 2]]).norm(dim=-1)
-        low = toes[..., 1] < HEIGHT
-        slides = (low[:, 1:] & low[:, :-1] & (moved * self.fps > SPEED)).any(-1)
+        low = toes[..., 1] < LOW
+        slides = (low[:, 1:] & low[:, :-1] & (moved * self.fps > LIMITS["skating"][0])).any(-1)
         real = mask[:, 1:] & mask[:, :-1]
-        self.skating += (slides & real).sum()
-        self.steps += real.sum()
-
-    def compute(self) -> float | None:
-        """Returns the ratio in [0, 1]; None if no motion has two frames."""
-        return int(self.skating) / int(self.steps) if int(self.steps) else None
+        self.hits += (slides & real).sum()
+        self.total += real.sum()
 
 
-class _MeanOverFrames(SampleMetric):
-    """Mean of a per-frame value over all frames of all motions."""
+class MeanOverFrames(SampleMetric):
+    """Mean of a value per frame over all frames of all motions."""
 
     higher_is_better = False
-
-    def __init__(self, **kwargs: Any):
-        super().__init__(("keys", "total", "frames"), **kwargs)
+    states = ("total", "frames")
 
     def update(self, joints: Tensor, mask: Tensor, keys: Tensor) -> None:
         """Adds motions (B, F, J, 3) in meters, y up, with masks (B, F) and keys (B,)."""
@@ -73,59 +55,55 @@ class _MeanOverFrames(SampleMetric):
             total = torch.stack([v.sum() for v in values])
             self.keep(keys=keys, total=total[:, None], frames=total.new_tensor([[len(v)] for v in values]))
 
-    def compute(self) -> float | None:
+    def value(self, total: Tensor, frames: Tensor) -> float | None:
         """Returns the mean; None if there is no frame to measure."""
-        rows = self.rows("keys", "total", "frames")
-        if rows is None or not rows[1].sum():
-            return None
-        return (rows[0].sum() / rows[1].sum()).item()
+        return (total.sum() / frames.sum()).item() if frames.sum() else None
 
     def frame_values(self, motion: Tensor) -> Tensor:
         """(F, J, 3) -> (F',), one value per frame that can be measured."""
         raise NotImplementedError
 
 
-class _OffTheFloor(_MeanOverFrames):
-    def __init__(self, tolerance: float = 0.005, **kwargs: Any):
-        super().__init__(**kwargs)
+class DistanceFromFloor(MeanOverFrames):
+    """Mean distance of the lowest joint from the floor, y = 0, in meters, on one side of it.
+
+    Args:
+        tolerance: distance in meters that counts as 0.
+    """
+
+    side: int
+
+    def __init__(self, tolerance: float = 0.005):
+        super().__init__()
         self.tolerance = tolerance
 
+    def frame_values(self, motion: Tensor) -> Tensor:
+        """Returns the distance in each frame."""
+        distance = self.side * motion[..., 1].amin(1)
+        return torch.where(distance > self.tolerance, distance, 0.0)
 
-class Penetration(_OffTheFloor):
+
+class Penetration(DistanceFromFloor):
     """Mean depth of the lowest joint below the floor, y = 0, in meters.
 
     Yuan et al. 2023 (PhysDiff) measure the lowest vertex of a mesh instead. In both cases, depths up to 5 mm count as
     0.
-
-    Args:
-        tolerance: depth in meters that counts as 0.
-        kwargs: options of `torchmetrics.Metric`.
     """
 
-    def frame_values(self, motion: Tensor) -> Tensor:
-        """Returns the depth in each frame."""
-        depth = -motion[..., 1].amin(1)
-        return torch.where(depth > self.tolerance, depth, 0.0)
+    side = -1
 
 
-class Floating(_OffTheFloor):
+class Floating(DistanceFromFloor):
     """Mean height of the lowest joint above the floor, y = 0, in meters.
 
     Jumps count as floating, too: compare with the value of real motions. Yuan et al. 2023 (PhysDiff) measure the lowest
     vertex of a mesh instead. In both cases, heights up to 5 mm count as 0.
-
-    Args:
-        tolerance: height in meters that counts as 0.
-        kwargs: options of `torchmetrics.Metric`.
     """
 
-    def frame_values(self, motion: Tensor) -> Tensor:
-        """Returns the height in each frame."""
-        height = motion[..., 1].amin(1)
-        return torch.where(height > self.tolerance, height, 0.0)
+    side = 1
 
 
-class Jitter(_MeanOverFrames):
+class Jitter(MeanOverFrames):
     """Mean jerk of the joints, the third derivative of their positions, in m/s^3.
 
     Computed by third differences, as in Yi et al. 2022 (PIP). It grows with the frame rate: compare only values for
@@ -133,11 +111,10 @@ class Jitter(_MeanOverFrames):
 
     Args:
         fps: frames per second of the motions.
-        kwargs: options of `torchmetrics.Metric`.
     """
 
-    def __init__(self, fps: float, **kwargs: Any):
-        super().__init__(**kwargs)
+    def __init__(self, fps: float):
+        super().__init__()
         self.fps = fps
 
     def frame_values(self, motion: Tensor) -> Tensor:
@@ -145,7 +122,7 @@ class Jitter(_MeanOverFrames):
         return motion.diff(n=3, dim=0).norm(dim=-1).mean(1) * self.fps**3
 
 
-class StaticShare(Metric):
+class StaticShare(Share):
     """Fraction of motions that hardly move: less than 3 cm/s on average over joints and frames.
 
     A generator that stands still has many static motions, but so do real data sets with standing people: compare with
@@ -154,28 +131,18 @@ class StaticShare(Metric):
     Args:
         fps: frames per second of the motions.
         speed: meters per second below which a motion counts as static.
-        kwargs: options of `torchmetrics.Metric`.
     """
 
     higher_is_better = False
-    full_state_update = False
-    static: Tensor
-    motions: Tensor
 
-    def __init__(self, fps: float, speed: float = 0.03, **kwargs: Any):
-        super().__init__(**kwargs)
+    def __init__(self, fps: float, speed: float = 0.03):
+        super().__init__()
         self.fps, self.speed = fps, speed
-        self.add_state("static", torch.tensor(0), dist_reduce_fx="sum")
-        self.add_state("motions", torch.tensor(0), dist_reduce_fx="sum")
 
     def update(self, joints: Tensor, mask: Tensor) -> None:
         """Adds motions: joints (B, F, J, 3) in meters, y up; mask (B, F). Motions with one frame are ignored."""
         for motion in real_frames("StaticShare", joints, mask):
             moved = motion.double().diff(dim=0).norm(dim=-1)
             if len(moved):
-                self.static += (moved.mean() * self.fps < self.speed).long()
-                self.motions += 1
-
-    def compute(self) -> float | None:
-        """Returns the fraction in [0, 1]; None if no motion has two frames."""
-        return int(self.static) / int(self.motions) if int(self.motions) else None
+                self.hits += (moved.mean() * self.fps < self.speed).long()
+                self.total += 1

@@ -8,15 +8,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import torch
 from scipy.signal import find_peaks
 from torch import Tensor
 
 from evaluators.metrics.samples import SampleMetric, real_frames
+from flame_mdm.errors import UserError
 
-MBENCH_FPS, PFC_FPS = 20, 30
+PFC_FPS = 30
 JERK_OF_REAL_MOTIONS: dict[float, float] = {20: 0.033031363, 30: 0.016383045}
 """Mean jerk of FlowMDM by frame rate: of HumanML3D at 20 frames per second, and of BABEL at 30."""
 
@@ -24,45 +24,45 @@ JERK_OF_REAL_MOTIONS: dict[float, float] = {20: 0.033031363, 30: 0.016383045}
 class MeanOverMotions(SampleMetric):
     """Means over motions of values that each motion has, or does not have if they are undefined for it.
 
+    `measured` is the fraction of motions that have all values.
+
     Args:
-        names: of the values.
         fps: frames per second of the motions.
-        required_fps: the only frame rate at which the values are defined; None = any.
-        kwargs: options of `torchmetrics.Metric`.
     """
 
     higher_is_better = False
+    states = ("values", "defined")
+    NAMES: tuple[str, ...]
+    """Names of the values of a motion."""
     DIRECTIONS: Mapping[str, bool | None] = {}
     """Values for which higher is better (True), or neither (None)."""
+    required_fps: float | None = None
+    """The only frame rate at which the values are defined; None = any."""
 
-    def __init__(self, names: Sequence[str], fps: float, required_fps: float | None = None, **kwargs: Any):
-        super().__init__(("keys", "values", "defined"), **kwargs)
-        self.names, self.fps, self.required_fps = tuple(names), fps, required_fps
+    def __init__(self, fps: float = 0):
+        super().__init__()
+        self.fps, self.names = fps, (*self.NAMES, "measured")
 
-    def keep_values(self, keys: Tensor, found: Sequence[Mapping[str, Tensor | float]]) -> None:
+    def keep_values(self, keys: Tensor, motions: Sequence[Mapping[str, Tensor | float]]) -> None:
         """Adds the values of motions by name; NaN = undefined."""
-        if found:
-            values = torch.tensor([[float(each[name]) for name in self.names] for each in found], dtype=torch.float64)
+        if motions:
+            values = torch.tensor([[float(m[name]) for name in self.NAMES] for m in motions], dtype=torch.float64)
             self.keep(keys=keys, values=values.nan_to_num(), defined=~values.isnan())
 
-    def compute(self) -> dict[str, float | None]:
-        """Returns the mean of each value, and `measured`, the fraction of motions that have all of them.
+    def value(self, values: Tensor, defined: Tensor) -> dict[str, float | None]:
+        """Returns the mean of each value, and `measured`.
 
         Raises:
-            ValueError: If the values are not defined at the frame rate of the motions.
+            UserError: If the values are not defined at the frame rate of the motions.
         """
-        rows = self.rows("keys", "values", "defined")
-        if rows is None:
-            return dict.fromkeys((*self.names, "measured"))
         if self.required_fps and self.fps != self.required_fps:
-            raise ValueError(
+            raise UserError(
                 f"{type(self).__name__}: defined at {self.required_fps:g} frames per second, but the motions have "
                 f"{self.fps:g}"
             )
-        values, defined = rows
-        counts = defined.sum(0).tolist()
-        means = [total / count if count else None for total, count in zip(values.sum(0).tolist(), counts, strict=True)]
-        return dict(zip(self.names, means, strict=True)) | {"measured": defined.all(1).double().mean().item()}
+        sums = zip(values.sum(0).tolist(), defined.sum(0).tolist(), strict=True)
+        means = [total / count if count else None for total, count in sums]
+        return dict(zip(self.names, (*means, defined.all(1).double().mean().item()), strict=True))
 
 
 class MBenchQuality(MeanOverMotions):
@@ -80,15 +80,14 @@ class MBenchQuality(MeanOverMotions):
     Args:
         fps: frames per second of the motions; at other rates than 20 there is no value.
         toes: indices of the left and the right toe.
-        kwargs: options of `torchmetrics.Metric`.
     """
 
     NAMES = ("jitter_degree", "dynamic_degree", "ground_penetration", "foot_sliding", "foot_floating")
-
     DIRECTIONS: Mapping[str, bool | None] = {"dynamic_degree": None}
+    required_fps = 20
 
-    def __init__(self, fps: float, toes: Sequence[int] = (10, 11), **kwargs: Any):
-        super().__init__(self.NAMES, fps, MBENCH_FPS, **kwargs)
+    def __init__(self, fps: float, toes: Sequence[int] = (10, 11)):
+        super().__init__(fps)
         self.toes = list(toes)
 
     def update(self, joints: Tensor, mask: Tensor, keys: Tensor) -> None:
@@ -144,17 +143,17 @@ def mbench_floating(motion: Tensor, feet: Tensor, contact: Tensor) -> tuple[int,
     carried = (contact.any(1) & (bad | ~contact).all(1) & ~resting).sum()
     runs = [_runs(~contact[:, foot]) for foot in range(contact.shape[1])]
     lagging = 0
-    for foot, found in enumerate(runs):
-        for begin, end in found:
+    for foot, in_the_air in enumerate(runs):
+        for begin, end in in_the_air:
             part = slice(begin, end)
             if end - begin >= 4 and 2 * int(resting[part].sum()) <= end - begin:
                 lagging += int((rate[part, foot] < 0.4).sum())
     swinging = 0
     for begin, end in ((max(a, c), min(b, d)) for a, b in runs[0] for c, d in runs[1]):
         if end - begin >= 4:
-            way = feet[begin + 1 : end, 0] - feet[begin, 0]
-            way = way / (way.norm(dim=-1, keepdim=True) + 1e-6)
-            angles = torch.rad2deg(torch.acos((way @ way[-1]).clamp(-1, 1)))
+            path = feet[begin + 1 : end, 0] - feet[begin, 0]
+            path = path / (path.norm(dim=-1, keepdim=True) + 1e-6)
+            angles = torch.rad2deg(torch.acos((path @ path[-1]).clamp(-1, 1)))
             swinging += end - begin if len(find_peaks(angles.numpy())[0]) > 2 else 0
     return int(carried), lagging, swinging
 
@@ -180,15 +179,14 @@ class KimodoQuality(MeanOverMotions):
     Args:
         fps: frames per second of the motions.
         feet: indices of left heel, left toe, right heel and right toe.
-        kwargs: options of `torchmetrics.Metric`.
     """
 
     JOINTS, CONTACTS = ("skate_from_height", "skate_ratio", "low"), ("skate_from_contacts", "skate_max")
     NAMES = (*JOINTS, *CONTACTS, "contact_consistency")
     DIRECTIONS: Mapping[str, bool | None] = {"low": None, "contact_consistency": True}
 
-    def __init__(self, fps: float, feet: Sequence[int] = (7, 10, 8, 11), **kwargs: Any):
-        super().__init__(self.NAMES, fps, **kwargs)
+    def __init__(self, fps: float, feet: Sequence[int] = (7, 10, 8, 11)):
+        super().__init__(fps)
         self.feet = list(feet)
 
     def update(self, joints: Tensor, mask: Tensor, keys: Tensor, contacts: Tensor | None = None) -> None:
@@ -201,22 +199,22 @@ class KimodoQuality(MeanOverMotions):
 
 def kimodo_quality(feet: Tensor, contacts: Tensor | None, fps: float) -> dict[str, Tensor | float]:
     """Computes the values of `KimodoQuality` from feet (F, 4, 3) and contacts (F, 4) bool; undefined ones are NaN."""
-    found: dict[str, Tensor | float] = dict.fromkeys(KimodoQuality.NAMES, math.nan)
+    values: dict[str, Tensor | float] = dict.fromkeys(KimodoQuality.NAMES, math.nan)
     if len(feet) < 2:
-        return found
+        return values
     speed = feet.double().diff(dim=0).norm(dim=-1) * fps
     low, toes = feet[:, 1::2, 1] < 0.05, speed[:, 1::2]
     first, both = low[:-1], low[:-1] & low[1:]
-    found["skate_from_height"] = (toes * first).sum() / (first.sum() + 1e-6)
-    found["skate_ratio"] = ((toes > 0.2) & both).sum() / (both.sum() + 1e-6)
-    found["low"] = first.double().mean()
+    values["skate_from_height"] = (toes * first).sum() / (first.sum() + 1e-6)
+    values["skate_ratio"] = ((toes > 0.2) & both).sum() / (both.sum() + 1e-6)
+    values["low"] = first.double().mean()
     if contacts is not None:
         on = contacts[:-1]
-        found["skate_from_contacts"] = (speed * on).sum() / (on.sum() + 1e-6)
-        found["skate_max"] = (speed * on).max()
+        values["skate_from_contacts"] = (speed * on).sum() / (on.sum() + 1e-6)
+        values["skate_max"] = (speed * on).max()
         heuristic = (speed < 0.15) & (feet[:-1, :, 1] < 0.10)
-        found["contact_consistency"] = (heuristic == on).double().mean()
-    return found
+        values["contact_consistency"] = (heuristic == on).double().mean()
+    return values
 
 
 class KimodoConstraints(MeanOverMotions):
@@ -226,32 +224,30 @@ class KimodoConstraints(MeanOverMotions):
     `root2d_err_p95`; `root2d_acc`: fraction of those frames with at most 10 cm; `fullbody_keyframe`: of all joints in
     frames that keep all; `end_effector`: of the kept joints in other frames. The code compares the root with a smoothed
     trajectory that the user draws; here, it is that of the real motion.
-
-    Args:
-        kwargs: options of `torchmetrics.Metric`.
     """
 
     NAMES = ("root2d_err", "root2d_acc", "fullbody_keyframe", "end_effector")
 
-    def __init__(self, **kwargs: Any):
-        super().__init__(self.NAMES, 0, **kwargs)
+    def __init__(self):
+        super().__init__()
+        self.names = (*self.NAMES, "root2d_err_p95")
 
     def update(self, joints: Tensor, real_joints: Tensor, mask: Tensor, kept: Tensor, keys: Tensor) -> None:
         """Adds motions and their real ones (B, F, J, 3), mask (B, F), kept parts (B, F, J) bool, and keys (B,)."""
         motions = real_frames("KimodoConstraints", joints, mask)
         parts = kept[mask].split(mask.sum(1).tolist())
-        found = []
+        errors = []
         for motion, real, part in zip(motions, real_joints, parts, strict=True):
             off, full = motion.double() - real[: len(motion)], part.all(1)
-            found.append(constraint_errors(off[part[:, 0], 0][:, [0, 2]], off[full], off[part & ~full[:, None]]))
-        self.keep_values(keys, found)
+            errors.append(constraint_errors(off[part[:, 0], 0][:, [0, 2]], off[full], off[part & ~full[:, None]]))
+        self.keep_values(keys, errors)
 
-    def compute(self) -> dict[str, float | None]:
-        """Returns the means and the percentile."""
-        values, rows = super().compute(), self.rows("keys", "values", "defined")
-        del values["measured"]  # few edits have all kinds of constraints
-        roots = None if rows is None else rows[0][rows[1][:, 0], 0]
-        return values | {"root2d_err_p95": None if roots is None or not len(roots) else roots.quantile(0.95).item()}
+    def value(self, values: Tensor, defined: Tensor) -> dict[str, float | None]:
+        """Returns the means and the percentile; few edits have all kinds of constraints, so there is no `measured`."""
+        means = list(super().value(values, defined).values())[:-1]
+        roots = values[defined[:, 0], 0]
+        percentile = roots.quantile(0.95).item() if len(roots) else None
+        return dict(zip(self.names, (*means, percentile), strict=True))
 
 
 def constraint_errors(root: Tensor, full: Tensor, parts: Tensor) -> dict[str, Tensor]:
@@ -272,11 +268,13 @@ class PhysicalFootContact(MeanOverMotions):
         fps: frames per second of the motions; at other rates than 30 there is no value. Steps are in meters per frame,
             so that half the rate would give about four times the score.
         feet: indices of left ankle, left toe, right ankle and right toe.
-        kwargs: options of `torchmetrics.Metric`.
     """
 
-    def __init__(self, fps: float, feet: Sequence[int] = (7, 10, 8, 11), **kwargs: Any):
-        super().__init__(("pfc",), fps, PFC_FPS, **kwargs)
+    NAMES = ("pfc",)
+    required_fps = PFC_FPS
+
+    def __init__(self, fps: float, feet: Sequence[int] = (7, 10, 8, 11)):
+        super().__init__(fps)
         self.feet = list(feet)
 
     def update(self, joints: Tensor, mask: Tensor, keys: Tensor) -> None:
@@ -312,13 +310,14 @@ class TransitionJerk(SampleMetric):
         fps: frames per second of the motions. The published jerk of real motions is of HumanML3D at 20 frames per
             second and of BABEL at 30; at other rates there is no area.
         window: frames of a window; None = as published, 60 at 20 frames per second and otherwise 30.
-        kwargs: options of `torchmetrics.Metric`.
     """
 
     higher_is_better = False
+    states = ("total", "windows")
+    names = ("peak", "area", "windows")
 
-    def __init__(self, fps: float, window: int | None = None, **kwargs: Any):
-        super().__init__(("keys", "total", "windows"), **kwargs)
+    def __init__(self, fps: float, window: int | None = None):
+        super().__init__()
         self.real, self.window = JERK_OF_REAL_MOTIONS.get(round(fps, 6)), window or (60 if fps == 20 else 30)
 
     def update(self, joints: Tensor, mask: Tensor, kept: Tensor, keys: Tensor) -> None:
@@ -334,13 +333,10 @@ class TransitionJerk(SampleMetric):
         if totals:
             self.keep(keys=keys, total=torch.stack(totals), windows=torch.tensor(counts))
 
-    def compute(self) -> dict[str, float | None]:
+    def value(self, total: Tensor, windows: Tensor) -> dict[str, float | None]:
         """Returns `peak`, `area` and `windows`."""
-        rows = self.rows("keys", "total", "windows")
-        count = 0 if rows is None else int(rows[1].sum())
-        if rows is None or not count:
-            return {"peak": None, "area": None, "windows": None if rows is None else 0}
-        peak, area = peak_and_area(rows[0].sum(0) / count, self.real)
+        count = int(windows.sum())
+        peak, area = peak_and_area(total.sum(0) / count, self.real) if count else (None, None)
         return {"peak": peak, "area": area, "windows": count}
 
 

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
 
 import torch
 from torch import Tensor
 
-from evaluators.metrics.samples import SampleMetric, by_group, real_frames
+from evaluators.metrics.samples import SampleMetric, real_frames
 from flame_mdm.errors import UserError
 from flame_mdm.representations import rotation
 from flame_mdm.representations.rifke import Rifke, upsample
@@ -52,7 +51,7 @@ def flame_parts(joints: Tensor, root: Tensor, parents: Sequence[int]) -> dict[st
     return {"root": root, "trajectory": root[:, [0, 2]], "mean_local": bones, "mean_global": joints}
 
 
-class _PositionErrors(SampleMetric):
+class PositionErrors(SampleMetric):
     """APE and AVE by part. Each clip adds a sum of position errors, its number of frames, and its variance errors.
 
     Args:
@@ -60,14 +59,17 @@ class _PositionErrors(SampleMetric):
             smallest and the largest APE of the root, which also provide all other values.
         upsampling: frames of a recording per frame of a motion. Above 1, motions are interpolated and compared with
             the recordings.
-        kwargs: options of `torchmetrics.Metric`.
     """
 
     higher_is_better = False
+    states = ("groups", "position", "variance", "frames")
 
-    def __init__(self, samples: int = 1, upsampling: int = 1, **kwargs: Any):
-        super().__init__(("keys", "groups", "position", "variance", "frames"), **kwargs)
+    def __init__(self, samples: int = 1, upsampling: int = 1):
+        super().__init__()
         self.samples, self.upsampling = samples, upsampling
+        self.ranked = {"best_": False, "worst_": True} if samples > 1 else {"": False}
+        errors = [f"{error}_{part}" for error in ("ape", "ave") for part in PARTS]
+        self.names = [f"{prefix}{error}" for prefix in self.ranked for error in errors]
 
     def update(
         self,
@@ -85,10 +87,10 @@ class _PositionErrors(SampleMetric):
         motions. `references` are the real motions (F', J, 3) at the frame rate of their recordings.
 
         Raises:
-            ValueError: If a motion has fewer than two frames.
-            UserError: If motions are compared at the frame rate of the recordings, but there are no references.
+            UserError: If a motion has fewer than two frames, or motions are compared at the frame rate of the
+                recordings, but there are no references.
         """
-        rows, name = [], type(self).__name__
+        name = type(self).__name__
         generated, real_motions = real_frames(name, joints, mask), real_frames(name, real_joints, real_mask)
         if self.upsampling > 1:
             if references is None:
@@ -97,43 +99,37 @@ class _PositionErrors(SampleMetric):
                     "force=true"
                 )
             generated, real_motions = [upsample(motion, self.upsampling) for motion in generated], list(references)
+        position, variance, frames = [], [], []
         for motion, real in zip(generated, real_motions, strict=True):
             a, b = self.parts(motion.double()), self.parts(real.double())
             length = min(len(a["root"]), len(b["root"]))
             self.need(length, 2, "frames of a motion")
             a, b = ({part: values[:length] for part, values in x.items()} for x in (a, b))
-            rows.append(torch.stack([self.position_errors(a, b), self.variance_errors(a, b)]))
-            rows[-1] = torch.cat([rows[-1], rows[-1].new_full((2, 1), length)], 1)
-        if rows:
-            values = torch.stack(rows)
+            position.append(self.position_errors(a, b))
+            variance.append(self.variance_errors(a, b))
+            frames.append([length])
+        if frames:
             self.keep(
                 keys=keys,
                 groups=keys if groups is None or self.samples == 1 else groups,
-                position=values[:, 0, :4],
-                variance=values[:, 1, :4],
-                frames=values[:, :1, 4],
+                position=torch.stack(position),
+                variance=torch.stack(variance),
+                frames=position[0].new_tensor(frames),
             )
 
-    def compute(self) -> dict[str, float | None]:
+    def value(self, groups: Tensor, position: Tensor, variance: Tensor, frames: Tensor) -> dict[str, float | None]:
         """Returns `ape_root`, `ape_trajectory`, `ape_mean_local`, `ape_mean_global`, and the same with `ave_`.
 
         With several motions per text, the names have the prefix `best_` or `worst_`.
         """
-        rows = self.rows("keys", "groups", "position", "variance", "frames")
-        names = [f"{error}_{part}" for error in ("ape", "ave") for part in PARTS]
-        several = {"best_": False, "worst_": True} if self.samples > 1 else {"": False}
-        if rows is None:
-            return {f"{which}{name}": None for which in several for name in names}
-        groups, position, variance, frames = rows
-        texts = by_group(self, groups, self.samples)
+        texts = self.by_group(groups, self.samples)
         root = (position[:, 0] / frames[:, 0])[texts]
-        found: dict[str, float | None] = {}
-        for which, descending in several.items():
-            rank = root.argsort(dim=1, descending=descending, stable=True)[:, :1]
-            chosen = texts.gather(1, rank)[:, 0]
-            values = torch.cat([self.average(position[chosen], frames[chosen]), variance[chosen].mean(0)])
-            found |= dict(zip([f"{which}{name}" for name in names], values.tolist(), strict=True))
-        return found
+        values: list[float] = []
+        for descending in self.ranked.values():
+            first = root.argsort(dim=1, descending=descending, stable=True)[:, :1]
+            chosen = texts.gather(1, first)[:, 0]
+            values += self.average(position[chosen], frames[chosen]).tolist() + variance[chosen].mean(0).tolist()
+        return dict(zip(self.names, values, strict=True))
 
     def parts(self, joints: Tensor) -> dict[str, Tensor]:
         """Returns the compared quantities of a whole motion (F, J, 3), by the names of `PARTS`."""
@@ -152,7 +148,7 @@ class _PositionErrors(SampleMetric):
         raise NotImplementedError
 
 
-class TemosPositionErrors(_PositionErrors):
+class TemosPositionErrors(PositionErrors):
     """APE and AVE of TEMOS (Petrovich et al. 2022), used by FLAME on KIT (eq. 16 to 18, Table 2).
 
     APE is the distance of `temos_parts`, averaged over joints, and over all frames of all clips. AVE is the distance of
@@ -162,17 +158,17 @@ class TemosPositionErrors(_PositionErrors):
 
     Args:
         units_per_metre: KIT units per meter of `joints`, as in the KIT representations.
-        kwargs: `samples` and `upsampling`, see `_PositionErrors`; options of `torchmetrics.Metric`.
+        samples, upsampling: see `PositionErrors`.
     """
 
-    def __init__(self, units_per_metre: float = 640.0, **kwargs: Any):
-        super().__init__(**kwargs)
+    def __init__(self, units_per_metre: float = 640.0, samples: int = 1, upsampling: int = 1):
+        super().__init__(samples, upsampling)
         self.units_per_metre = units_per_metre
 
     def parts(self, joints: Tensor) -> dict[str, Tensor]:
         """Returns `temos_parts` in thousands of KIT units."""
         if joints.shape[1] != 21:
-            raise ValueError(f"TemosPositionErrors: {joints.shape[1]} joints, but defined only for KIT's 21 (MMM)")
+            raise UserError(f"TemosPositionErrors: {joints.shape[1]} joints, but defined only for KIT's 21 (MMM)")
         return {part: values / 1000 for part, values in temos_parts(joints * self.units_per_metre).items()}
 
     def position_errors(self, a: Mapping[str, Tensor], b: Mapping[str, Tensor]) -> Tensor:
@@ -189,7 +185,7 @@ class TemosPositionErrors(_PositionErrors):
         return position.sum(0) / frames.sum(0)
 
 
-class FlamePositionErrors(_PositionErrors):
+class FlamePositionErrors(PositionErrors):
     """APE and AVE as in FLAME's code, which its tables do not use. In meters and square meters.
 
     Compares `flame_parts`. The error of the trajectory is the sum of the distances along its two axes; the local error
@@ -199,11 +195,11 @@ class FlamePositionErrors(_PositionErrors):
 
     Args:
         parents: parent of each joint of the skeleton, -1 for the root.
-        kwargs: `samples` motions per text, see `_PositionErrors`; options of `torchmetrics.Metric`.
+        samples: motions per text, see `PositionErrors`.
     """
 
-    def __init__(self, parents: Sequence[int], **kwargs: Any):
-        super().__init__(**kwargs)
+    def __init__(self, parents: Sequence[int], samples: int = 1):
+        super().__init__(samples)
         self.parents = tuple(parents)
 
     def parts(self, joints: Tensor) -> dict[str, Tensor]:
@@ -236,9 +232,8 @@ class DisplacementErrors(SampleMetric):
     """
 
     higher_is_better = False
-
-    def __init__(self, **kwargs: Any):
-        super().__init__(("keys", "errors"), **kwargs)
+    states = ("errors",)
+    names = ("ade", "fde")
 
     def update(
         self,
@@ -257,28 +252,24 @@ class DisplacementErrors(SampleMetric):
             real_joints: the real motions.
             real_mask: (B, F').
             keys: of the motions.
-            kept: (B, F, J), True = this joint of this frame was given; None = all were generated.
+            kept: (B, F, J), True = this joint of this frame was kept; None = all were generated.
 
         Raises:
-            ValueError: If nothing of a motion was generated.
+            UserError: If nothing of a motion was generated.
         """
         errors = []
-        for distance, given in _distances(type(self).__name__, joints, mask, real_joints, real_mask, kept):
-            new = ~given
+        for distance, old in _distances(type(self).__name__, joints, mask, real_joints, real_mask, kept):
+            new = ~old
             if not new.any():
-                raise ValueError("DisplacementErrors: a motion has no generated frame to compare")
+                raise UserError("DisplacementErrors: a motion has no generated frame to compare")
             last = int(new.any(1).nonzero()[-1])
             errors.append(torch.stack([distance[new].mean(), distance[last][new[last]].mean()]))
         if errors:
             self.keep(keys=keys, errors=torch.stack(errors))
 
-    def compute(self) -> dict[str, float | None]:
+    def value(self, errors: Tensor) -> dict[str, float | None]:
         """Returns `ade` and `fde`."""
-        rows = self.rows("keys", "errors")
-        if rows is None:
-            return {"ade": None, "fde": None}
-        ade, fde = rows[0].mean(0).tolist()
-        return {"ade": ade, "fde": fde}
+        return dict(zip(self.names, errors.mean(0).tolist(), strict=True))
 
 
 class KeptDrift(SampleMetric):
@@ -289,29 +280,23 @@ class KeptDrift(SampleMetric):
     """
 
     higher_is_better = False
-
-    def __init__(self, **kwargs: Any):
-        super().__init__(("keys", "drift"), **kwargs)
+    states = ("drift",)
+    names = ("mean", "largest")
 
     def update(
         self, joints: Tensor, mask: Tensor, real_joints: Tensor, real_mask: Tensor, keys: Tensor, kept: Tensor
     ) -> None:
         """Adds edits and their original motions; arguments as for `DisplacementErrors`."""
-        drift, of = [], []
-        name = type(self).__name__
-        for number, (distance, given) in enumerate(_distances(name, joints, mask, real_joints, real_mask, kept)):
-            if given.any():
-                drift.append(torch.stack([distance[given].mean(), distance[given].max()]))
-                of.append(number)
-        if drift:
-            self.keep(keys=keys[of], drift=torch.stack(drift))
+        pairs = list(_distances(type(self).__name__, joints, mask, real_joints, real_mask, kept))
+        edited = [number for number, (_, old) in enumerate(pairs) if old.any()]
+        kept_distances = [pairs[number][0][pairs[number][1]] for number in edited]
+        if edited:
+            drift = torch.stack([torch.stack([distance.mean(), distance.max()]) for distance in kept_distances])
+            self.keep(keys=keys[edited], drift=drift)
 
-    def compute(self) -> dict[str, float | None]:
+    def value(self, drift: Tensor) -> dict[str, float | None]:
         """Returns `mean`, over the kept joints and frames of a motion and then over motions, and `largest`."""
-        rows = self.rows("keys", "drift")
-        if rows is None:
-            return {"mean": None, "largest": None}
-        return {"mean": rows[0][:, 0].mean().item(), "largest": rows[0][:, 1].max().item()}
+        return {"mean": drift[:, 0].mean().item(), "largest": drift[:, 1].max().item()}
 
 
 def _distances(
@@ -324,5 +309,5 @@ def _distances(
     for number, (motion, real) in enumerate(motions):
         length = min(len(motion), len(real))
         distance = (motion[:length].double() - real[:length].double()).norm(dim=-1)
-        given = torch.zeros_like(distance, dtype=torch.bool) if kept is None else kept[number][mask[number]][:length]
-        yield distance, given
+        old = torch.zeros_like(distance, dtype=torch.bool) if kept is None else kept[number][mask[number]][:length]
+        yield distance, old

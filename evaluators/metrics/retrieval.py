@@ -6,14 +6,13 @@ import functools
 import json
 import re
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from evaluators.metrics.alignment import best_ranks, own_pools, whole_set_retrieval
+from evaluators.metrics.alignment import own_pools
 from evaluators.metrics.samples import SampleMetric
 from flame_mdm.batch import MotionBatch
 from flame_mdm.conditions import ConditionEncoder
@@ -46,20 +45,43 @@ def plain_caption(caption: str) -> str:
     return " ".join(re.sub(r"[^\w\s]", "", caption.lower()).split())
 
 
-class _Captioned(SampleMetric):
+def whole_set_retrieval(similarity: Tensor, top: tuple[int, ...], correct: Tensor | None = None) -> dict[str, float]:
+    """Computes recall and median rank from similarities (N, N) of texts (rows) and motions (columns).
+
+    `correct` (N, N) bool, symmetric: pairs that count as correct, of which the best one sets the rank; None = the
+    diagonal.
+    """
+    values: dict[str, float] = {}
+    for way, table in (("t2m", similarity), ("m2t", similarity.T)):
+        rank = best_ranks(table, torch.eye(len(table), dtype=torch.bool) if correct is None else correct)
+        values |= {f"{way}_top{k}": (rank < k).double().mean().item() for k in top}
+        values[f"{way}_median"] = rank.double().quantile(0.5).item() + 1
+    return values
+
+
+def best_ranks(similarity: Tensor, correct: Tensor) -> Tensor:
+    """Returns the mean rank (N,) of the best correct candidates, 0 = first: similarities and correctness (N, M).
+
+    Candidates with equal similarity share the mean of their ranks, so that halves occur.
+    """
+    own = similarity.where(correct, -torch.inf).amax(1, keepdim=True)
+    return (similarity > own).sum(1) + ((similarity == own).sum(1) - 1) / 2
+
+
+class CaptionMetric(SampleMetric):
     """A metric of motions and captions, some of which are the same.
 
     Args:
         encoder: a mapping with the `_target_` of a text encoder, which decides with `cosine` what captions are the
             same; None = only captions equal but for case, punctuation and spaces.
         cosine: captions with a larger cosine are the same.
-        kwargs: options of `torchmetrics.Metric`.
     """
 
     higher_is_better = True
+    states = ("generated", "text", "caption_keys", "meaning")
 
-    def __init__(self, encoder: Config | None = None, cosine: float = SAME, **kwargs: Any):
-        super().__init__(("keys", "generated", "text", "caption_keys", "meaning"), **kwargs)
+    def __init__(self, encoder: Config | None = None, cosine: float = SAME):
+        super().__init__()
         self.encoder, self.cosine = None if encoder is None else json.dumps(encoder, sort_keys=True), cosine
 
     def update(self, generated: Tensor, text: Tensor, captions: Sequence[str], keys: Tensor) -> None:
@@ -77,7 +99,7 @@ class _Captioned(SampleMetric):
         return (caption_keys[..., None, :] == caption_keys[..., None]) | (meaning @ meaning.mT > self.cosine)
 
 
-class MultiPositiveRPrecision(_Captioned):
+class MultiPositiveRPrecision(CaptionMetric):
     """R-precision, motions for a text, where the motions of the same captions are correct, too.
 
     This is our definition; no paper has one. Pools are those of `MotionsForText`, to which `single_top1`, ... are equal
@@ -92,7 +114,6 @@ class MultiPositiveRPrecision(_Captioned):
         top: largest k.
         seed: of the pools.
         normalize: whether to rank by cosine instead of Euclidean distance, as for `MotionsForText`.
-        kwargs: options of `torchmetrics.Metric`.
     """
 
     def __init__(
@@ -103,31 +124,26 @@ class MultiPositiveRPrecision(_Captioned):
         top: int = 3,
         seed: int = 0,
         normalize: bool = False,
-        **kwargs: Any,
     ):
-        super().__init__(encoder, cosine, **kwargs)
+        super().__init__(encoder, cosine)
         self.pool, self.top, self.seed, self.normalize = pool, top, seed, normalize
+        tops = [f"{kind}top{k}" for kind in ("", "single_", "chance_") for k in range(1, top + 1)]
+        self.names = (*tops, "proper", "positives")
 
-    def compute(self) -> dict[str, float | None]:
+    def value(self, motion: Tensor, text: Tensor, caption_keys: Tensor, meaning: Tensor) -> dict[str, float | None]:
         """Returns the values."""
-        rows = self.rows("keys", "generated", "text", "caption_keys", "meaning")
-        tops = range(1, self.top + 1)
-        if rows is None:
-            names = [f"{kind}top{k}" for kind in ("", "single_", "chance_") for k in tops]
-            return dict.fromkeys((*names, "proper", "positives"))
-        motion, text, caption_keys, meaning = rows
         self.need(len(motion), self.pool, "motions")
         if self.normalize:
             motion, text = F.normalize(motion, dim=-1), F.normalize(text, dim=-1)
-        order, pools, place = (torch.from_numpy(x) for x in own_pools(len(motion), self.pool, self.seed))
+        order, pools, position = (torch.from_numpy(x) for x in own_pools(len(motion), self.pool, self.seed))
         similarity, correct = [], []
         for query, pool in zip(order.split(16), pools.split(16), strict=True):
             similarity.append(-torch.linalg.vector_norm(text[query, None] - motion[pool], dim=-1))
             similar = (meaning[query, None] * meaning[pool]).sum(-1) > self.cosine
             correct.append((caption_keys[query, None] == caption_keys[pool]) | similar | (query[:, None] == pool))
-        found = multi_positive(torch.cat(similarity), torch.cat(correct), self.top)
-        single = best_ranks(torch.cat(similarity), F.one_hot(place, self.pool).bool())
-        return found | {f"single_top{k}": (single < k).double().mean().item() for k in tops}
+        values = multi_positive(torch.cat(similarity), torch.cat(correct), self.top)
+        single = best_ranks(torch.cat(similarity), F.one_hot(position, self.pool).bool())
+        return values | {f"single_top{k}": (single < k).double().mean().item() for k in range(1, self.top + 1)}
 
 
 def multi_positive(similarity: Tensor, correct: Tensor, top: int) -> dict[str, float | None]:
@@ -145,7 +161,7 @@ def multi_positive(similarity: Tensor, correct: Tensor, top: int) -> dict[str, f
     return values | {"proper": (hits / count).mean().item(), "positives": count.double().mean().item()}
 
 
-class TMRRetrieval(_Captioned):
+class TMRRetrieval(CaptionMetric):
     """Retrieval by cosine with the protocols of Petrovich et al. 2023 (TMR, 6d74688), both ways.
 
     `all`: all motions, the own one is correct; `threshold`: motions of the same captions are correct, too;
@@ -162,10 +178,10 @@ class TMRRetrieval(_Captioned):
         ids: ids of the dissimilar motions, such as TMR's; None = chosen as above.
         batch: size of the batches.
         seed: of the batches.
-        kwargs: options of `torchmetrics.Metric`.
     """
 
     TOP = (1, 2, 3, 5, 10)
+    PROTOCOLS = ("all", "threshold", "dissimilar", "batches")
 
     def __init__(
         self,
@@ -175,34 +191,34 @@ class TMRRetrieval(_Captioned):
         ids: Sequence[str] | None = None,
         batch: int = 32,
         seed: int = 0,
-        **kwargs: Any,
     ):
-        super().__init__(encoder, cosine, **kwargs)
+        super().__init__(encoder, cosine)
         self.subset, self.batch, self.seed = subset, batch, seed
         self.ids = None if ids is None else [key(name) for name in ids]
+        values = [f"{way}_{name}" for way in ("t2m", "m2t") for name in (*(f"top{k}" for k in self.TOP), "median")]
+        self.names = [f"{protocol}_{value}" for protocol in self.PROTOCOLS for value in values]
 
-    def compute(self) -> dict[str, float | None]:
-        """Returns the values, such as `threshold_t2m_top1`."""
-        rows = self.rows("keys", "keys", "generated", "text", "caption_keys", "meaning")
-        ways = [f"{way}_{name}" for way in ("t2m", "m2t") for name in (*(f"top{k}" for k in self.TOP), "median")]
-        found = {protocol: dict.fromkeys(ways) for protocol in ("all", "threshold", "dissimilar", "batches")}
-        if rows is not None:
-            keys, motion, text, caption_keys, meaning = rows
-            similarity = F.normalize(text, dim=-1) @ F.normalize(motion, dim=-1).T
-            found["all"] = whole_set_retrieval(similarity, self.TOP)
-            found["threshold"] = whole_set_retrieval(similarity, self.TOP, self.same(caption_keys, meaning))
-            chosen = self._dissimilar(keys, meaning)
-            if len(chosen):
-                found["dissimilar"] = whole_set_retrieval(similarity[chosen][:, chosen], self.TOP)
-            order = np.random.default_rng(self.seed).permutation(len(motion))
-            batches = torch.from_numpy(order[: len(order) // self.batch * self.batch]).view(-1, self.batch)
-            if len(batches):
-                found["batches"] = batched_retrieval(similarity, batches, self.TOP)
-        return {f"{protocol}_{name}": value for protocol, values in found.items() for name, value in values.items()}
+    def value(self, motion: Tensor, text: Tensor, caption_keys: Tensor, meaning: Tensor) -> dict[str, float | None]:
+        """Returns the values, such as `threshold_t2m_top1`; None for protocols that do not apply."""
+        similarity = F.normalize(text, dim=-1) @ F.normalize(motion, dim=-1).T
+        values = {
+            "all": whole_set_retrieval(similarity, self.TOP),
+            "threshold": whole_set_retrieval(similarity, self.TOP, self.same(caption_keys, meaning)),
+        }
+        chosen = self._dissimilar(meaning)
+        if len(chosen):
+            values["dissimilar"] = whole_set_retrieval(similarity[chosen][:, chosen], self.TOP)
+        order = np.random.default_rng(self.seed).permutation(len(motion))
+        batches = torch.from_numpy(order[: len(order) // self.batch * self.batch]).view(-1, self.batch)
+        if len(batches):
+            values["batches"] = batched_retrieval(similarity, batches, self.TOP)
+        computed = {f"{protocol}_{name}": x for protocol, result in values.items() for name, x in result.items()}
+        return dict.fromkeys(self.names) | computed
 
-    def _dissimilar(self, keys: Tensor, meaning: Tensor) -> Tensor:
+    def _dissimilar(self, meaning: Tensor) -> Tensor:
         """Returns the indices of the dissimilar motions, among all sorted by key; none without an encoder or ids."""
         if self.ids is not None:
+            keys = torch.cat(list(self.keys)).sort().values
             return torch.isin(keys, torch.tensor(self.ids)).nonzero()[:, 0]
         if not meaning.shape[1]:
             return torch.zeros(0, dtype=torch.long)
@@ -214,9 +230,7 @@ class TMRRetrieval(_Captioned):
         return torch.tensor(chosen)
 
 
-def batched_retrieval(similarity: Tensor, batches: Tensor, top: tuple[int, ...]) -> dict[str, float | None]:
+def batched_retrieval(similarity: Tensor, batches: Tensor, top: tuple[int, ...]) -> dict[str, float]:
     """Returns the means over batches (N, B) of indices of `whole_set_retrieval` in each."""
-    found = [whole_set_retrieval(similarity[batch][:, batch], top) for batch in batches]
-    return {
-        name: float(np.mean([value for values in found if (value := values[name]) is not None])) for name in found[0]
-    }
+    results = [whole_set_retrieval(similarity[batch][:, batch], top) for batch in batches]
+    return {name: float(np.mean([result[name] for result in results])) for name in results[0]}

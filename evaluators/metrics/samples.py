@@ -1,13 +1,19 @@
-"""Base classes of metrics that collect samples, sort them by key, and compute the value from all of them."""
+"""Base classes of metrics: shares of events, and values computed from all samples, sorted by key."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
 from torchmetrics import Metric
 from torchmetrics.utilities import dim_zero_cat
+
+from flame_mdm.errors import UserError
+
+Value = float | dict[str, float | None] | None
+"""What `compute` returns: a number, or numbers by name; None without samples."""
 
 
 def real_frames(name: str, joints: Tensor, mask: Tensor) -> list[Tensor]:
@@ -16,42 +22,81 @@ def real_frames(name: str, joints: Tensor, mask: Tensor) -> list[Tensor]:
     Without padding, sums over a motion round the same way in every batch.
 
     Raises:
-        ValueError: If a motion contains NaN or infinity; the message begins with `name`.
+        UserError: If a motion contains NaN or infinity; the message begins with `name`.
     """
     frames = joints.detach()[mask]
     motions = list(frames.split(mask.sum(1).tolist()))
     # A sum is finite only if all numbers are, and is faster to compute.
     bad = 0 if frames.sum().isfinite() else sum(not bool(motion.isfinite().all()) for motion in motions)
     if bad:
-        raise ValueError(f"{name}: {bad} of {len(motions)} motions are not finite. Did the model diverge?")
+        raise UserError(f"{name}: {bad} of {len(motions)} motions are not finite. Did the model diverge?")
     return motions
 
 
-class SampleMetric(Metric):
-    """A metric that keeps one row per sample and computes its value from all rows, sorted by key.
+class MotionMetric(Metric):
+    """Base class of all metrics.
 
-    The value therefore does not depend on the batches, their order or the number of processes. Processes may hold any
-    number of samples, including none.
-
-    Args:
-        sets: names of tensors that belong together row by row; the first name of each set is that of the keys.
-        kwargs: options of `torchmetrics.Metric`.
+    Attributes:
+        names: names of the values; empty if there is only one.
     """
 
     full_state_update = False
-
-    def __init__(self, *sets: tuple[str, ...], **kwargs: Any):
-        super().__init__(**kwargs)
-        for name in (name for names in sets for name in names):
-            self.add_state(name, [], dist_reduce_fx="cat")
+    names: Sequence[str] = ()
 
     @property
     def update_called(self) -> bool:
         """Always True: a metric without samples returns None, without a warning."""
         return True
 
+    def need(self, count: int, least: int, what: str) -> None:
+        """Raises `UserError` if `count` is less than `least`."""
+        if count < least:
+            raise UserError(f"{type(self).__name__}: got {count} {what}, needs at least {least}")
+
+
+class Share(MotionMetric):
+    """A share of events, or one share per name. Counts are whole numbers, so sums do not depend on their order."""
+
+    hits: Tensor
+    total: Tensor
+
+    def __init__(self):
+        super().__init__()
+        for state in ("hits", "total"):
+            self.add_state(state, torch.zeros(len(self.names) or 1, dtype=torch.long), dist_reduce_fx="sum")
+
+    def count(self, events: Mapping[str, bool]) -> None:
+        """Counts one event for some of the names: True = a hit."""
+        for name, hit in events.items():
+            self.hits[self.names.index(name)] += int(hit)
+            self.total[self.names.index(name)] += 1
+
+    def compute(self) -> Any:
+        """Returns the share in [0, 1], or one by name; None for what was never counted."""
+        counts = zip(self.hits.tolist(), self.total.tolist(), strict=True)
+        shares = [hits / total if total else None for hits, total in counts]
+        return dict(zip(self.names, shares, strict=True)) if self.names else shares[0]
+
+
+class SampleMetric(MotionMetric):
+    """A metric that keeps one row per sample and computes its value from all rows, sorted by key.
+
+    The value therefore does not depend on the batches, their order or the number of processes. Processes may hold any
+    number of samples, including none. `update` passes rows to `keep`; `value` is the formula.
+
+    Attributes:
+        states: names of the kept rows, in the order of the arguments of `value`. Each row also has a key.
+    """
+
+    states: tuple[str, ...]
+
+    def __init__(self):
+        super().__init__()
+        for name in ("keys", *self.states):
+            self.add_state(name, [], dist_reduce_fx="cat")
+
     def keep(self, **rows: Tensor) -> None:
-        """Adds rows of one set.
+        """Adds rows by the names of their states, which include the keys.
 
         Raises:
             ValueError: If the tensors have different numbers of rows.
@@ -62,11 +107,22 @@ class SampleMetric(Metric):
         for name, values in rows.items():
             getattr(self, name).append(values.detach())
 
+    def compute(self) -> Any:
+        """Returns the `value` of all rows; None, or None by name, if there are none."""
+        rows = self.rows("keys", *self.states)
+        if rows is None:
+            return dict.fromkeys(self.names) if self.names else None
+        return self.value(*rows)
+
+    def value(self, *rows: Tensor) -> Value:
+        """Computes the value from all rows, in the order of their keys."""
+        raise NotImplementedError
+
     def rows(self, keys: str, *names: str) -> list[Tensor] | None:
-        """Returns the rows of a set in the order of their keys, floats as float64; None if there are none.
+        """Returns rows in the order of their keys, floats as float64; None if there are none.
 
         Raises:
-            ValueError: If a sample was given twice, or contains NaN or infinity.
+            UserError: If a sample was given twice, or contains NaN or infinity.
         """
         if not getattr(self, keys):
             return None
@@ -78,7 +134,7 @@ class SampleMetric(Metric):
                 values = values.double()
                 bad = int((~values.isfinite().reshape(len(values), -1).all(1)).sum())
                 if bad:
-                    raise ValueError(
+                    raise UserError(
                         f"{type(self).__name__}: {bad} of {len(values)} rows of {name!r} are not finite. "
                         "Look for damaged motions in the data, or a model that diverged"
                     )
@@ -86,24 +142,34 @@ class SampleMetric(Metric):
         return sorted_rows if len(order) else None
 
     def order(self, keys: str) -> Tensor:
-        """Returns the indices that sort a set by its keys.
+        """Returns the indices that sort samples by their keys.
 
         Raises:
-            ValueError: If two samples have the same key.
+            UserError: If two samples have the same key.
         """
         values, order = dim_zero_cat(getattr(self, keys)).sort()
         twice = int((values[1:] == values[:-1]).sum())
         if twice:
-            raise ValueError(
+            raise UserError(
                 f"{type(self).__name__}: {twice} samples were given twice ({keys}). Evaluate each once: use a sampler "
                 "that does not pad, and a different key for each sample of a prompt"
             )
         return order
 
-    def need(self, count: int, least: int, what: str) -> None:
-        """Raises `ValueError` if `count` is less than `least`."""
-        if count < least:
-            raise ValueError(f"{type(self).__name__}: got {count} {what}, needs at least {least}")
+    def by_group(self, groups: Tensor, samples: int) -> Tensor:
+        """Returns the indices (C, S) of the samples of each group.
+
+        Raises:
+            UserError: If a group does not have S samples.
+        """
+        names, sizes = groups.unique(return_counts=True)
+        wrong = int((sizes != samples).sum())
+        if wrong:
+            raise UserError(
+                f"{type(self).__name__}: {wrong} of {len(names)} prompts do not have {samples} motions but "
+                f"{int(sizes.min())} to {int(sizes.max())}. Generate {samples} for each"
+            )
+        return groups.argsort(stable=True).unflatten(0, (len(names), samples))
 
     def _sync_dist(self, dist_sync_fn: Any = None, process_group: Any | None = None) -> None:
         """Gathers the rows of all processes. The default of torchmetrics fails if a process has none."""
@@ -115,27 +181,15 @@ class SampleMetric(Metric):
             setattr(self, name, [rows.to(self.device) for part in gathered for rows in part[name]])
 
 
-def by_group(metric: SampleMetric, groups: Tensor, samples: int) -> Tensor:
-    """Returns the indices (C, S) of the samples of each group.
-
-    Raises:
-        ValueError: If a group does not have S samples.
-    """
-    names, sizes = groups.unique(return_counts=True)
-    wrong = int((sizes != samples).sum())
-    if wrong:
-        raise ValueError(
-            f"{type(metric).__name__}: {wrong} of {len(names)} prompts do not have {samples} motions but "
-            f"{int(sizes.min())} to {int(sizes.max())}. Generate {samples} for each"
-        )
-    return groups.argsort(stable=True).unflatten(0, (len(names), samples))
-
-
 class TwoSets(SampleMetric):
     """A metric that compares the set of features of generated motions with that of real motions."""
 
-    def __init__(self, **kwargs: Any):
-        super().__init__(("keys", "generated"), ("real_keys", "real"), **kwargs)
+    states = ("generated",)
+
+    def __init__(self):
+        super().__init__()
+        for name in ("real_keys", "real"):
+            self.add_state(name, [], dist_reduce_fx="cat")
 
     def update(
         self,
@@ -145,25 +199,25 @@ class TwoSets(SampleMetric):
         real_keys: Tensor | None = None,
     ) -> None:
         """Adds generated (B, E) and real (R, E) features with their keys, in the same call or separately."""
-        for name, features, ids in (("generated", generated, keys), ("real", real, real_keys)):
+        for name, features, of in (("generated", generated, keys), ("real", real, real_keys)):
             if features is not None:
                 key_name = "keys" if name == "generated" else "real_keys"
-                if ids is None:
+                if of is None:
                     raise ValueError(f"{type(self).__name__}: {name!r} given without {key_name!r}")
-                self.keep(**{key_name: ids, name: features})
+                self.keep(**{key_name: of, name: features})
 
-    def sets(self) -> tuple[Tensor, Tensor] | None:
-        """Returns generated (N, E) and real (M, E) features, float64, sorted by key; None if a set is empty.
+    def compute(self) -> Any:
+        """Returns the value of generated (N, E) and real (M, E) features; None, or None by name, if a set is empty.
 
         Raises:
-            ValueError: If the two have different widths.
+            UserError: If the two have different widths.
         """
         generated, real = self.rows("keys", "generated"), self.rows("real_keys", "real")
         if generated is None or real is None:
-            return None
+            return dict.fromkeys(self.names) if self.names else None
         widths = generated[0].shape[1], real[0].shape[1]
         if widths[0] != widths[1]:
-            raise ValueError(
+            raise UserError(
                 f"{type(self).__name__}: generated motions have {widths[0]} features, but real ones have {widths[1]}"
             )
-        return generated[0], real[0]
+        return self.value(generated[0], real[0])

@@ -149,7 +149,7 @@ def findings(card: AuditCard) -> list[str]:
     for metric in card.metrics:
         unseen = [n for n in wrong if (n, metric) not in noticed and n not in blind]
         unseen = [n for n in unseen if group[n] == "joints" or metric not in PHYSICS]
-        if unseen and metric.partition("/")[2] in ("", "every", "top3"):
+        if unseen and metric.partition("/")[2] in ("", "all", "top3"):
             lines.append(f"{metric} does not see: {', '.join(unseen)}.")
     for metric in card.metrics:
         liked = [n for n in wrong if (found := table[n, metric]) and found.rewarded]

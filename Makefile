@@ -7,10 +7,10 @@ PYTHON ?= python3
 VENV := .venv
 READY := $(VENV)/.ready
 COMMANDS := train sample demo edit evaluate audit tables benchmark prepare browse inspect convert compare report import export push
-PYTEST := $(VENV)/bin/python -m pytest -n 2 --dist worksteal
+PYTEST := $(VENV)/bin/python -m pytest -n 2 --dist loadfile
 export MAKEFLAGS
 
-.PHONY: $(COMMANDS) help setup test test-fast test-tools lint bench docs
+.PHONY: $(COMMANDS) help setup test test-fast test-tools test-robustness lint bench docs
 
 ifneq ($(filter $(COMMANDS),$(firstword $(MAKECMDGOALS))),)
 ifneq ($(words $(MAKECMDGOALS)),1)
@@ -34,13 +34,17 @@ $(READY): pyproject.toml constraints.txt
 	@touch $@
 
 test: $(READY) ## run all tests, except those that need outside tools
-	@$(PYTEST) -m "not tools"
+	@$(PYTEST) -m "not tools and not robustness"
 
 test-fast: $(READY) ## run the tests that take a few seconds at most
-	@$(PYTEST) -m "not tools and not slow"
+	@$(PYTEST) -m "not tools and not robustness and not slow"
 
 test-tools: $(READY) ## run the tests that need outside tools: a browser, ffmpeg
 	@$(PYTEST) -m tools
+
+test-robustness: $(READY) ## run all malformed inputs, process kills and full disks; before a release, and after changes to readers
+	@FLAME_MDM_FUZZ=all $(PYTEST) --timeout 1800 -m robustness tests
+	@FLAME_MDM_FUZZ=all $(PYTEST) --timeout 1800 -m "not robustness and not tools" tests/test_fuzz.py tests/test_untrusted_*.py
 
 lint: $(READY) ## check style and types
 	@$(VENV)/bin/ruff check .

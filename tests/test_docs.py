@@ -36,7 +36,7 @@ NOT_COMPOSED = {
 }
 """Commands of each page that are not composed: they name a part that the reader writes (mine, my_set), or leave a name
 open (...)."""
-TARGETS = {"setup", "test", "test-fast", "test-tools", "lint", "bench", "docs", "help"}
+TARGETS = {"setup", "test", "test-fast", "test-tools", "test-robustness", "lint", "bench", "docs", "help"}
 
 
 def broken_links(page: Path, text: str) -> list[str]:

@@ -11,10 +11,12 @@ from collections.abc import Callable
 
 import torch
 from torch import Tensor
-from torchdiffeq import odeint
 
 from flame_mdm.batch import Condition, Denoise, Edit, Noise
 from flame_mdm.processes.schedules import Schedule
+
+with torch.device("cpu"):  # it holds tensors, and a network may be built on "meta" while this module is imported
+    from torchdiffeq import odeint
 
 Estimate = Callable[[Tensor, int], tuple[Tensor, Tensor | float]]
 """(x_t (B, F, D), step i) -> clean estimate (B, F, D) and log-variance of x_{t-1}, a number or (B, F, D)."""

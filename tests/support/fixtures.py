@@ -5,15 +5,18 @@ or weights of third parties are read from `FLAME_MDM_SHARED` (default: a folder 
 that need them skip where that folder is absent.
 """
 
+import hashlib
 import json
 import os
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
-from flame_mdm.config import compose
+from flame_mdm.config import compose, recipes
+from flame_mdm.safe_io import write_json
 
 ROOT = Path(__file__).parent.parent.parent
 GOLDEN = Path(os.environ.get("FLAME_MDM_GOLDEN", ROOT / "tests" / "golden"))
@@ -21,8 +24,26 @@ SHARED = Path(os.environ.get("FLAME_MDM_SHARED", ROOT.parent / "shared"))
 
 Arrays = dict[str, np.ndarray]
 
-recipe = cache(compose)
-"""Composed recipes by name, shared by the test modules of a process."""
+GENERATION = [name for name in recipes() if name.partition("/")[0] not in ("classifier", "motion_clip", "t2m")]
+"""Names of the recipes of models that generate motions."""
+
+
+@cache
+def recipe(name: str) -> dict[str, Any]:
+    """The composed recipe; composed once for all test processes, since this takes a third of a second."""
+    file = ROOT / ".pytest_cache" / f"recipes-{_digest()}" / f"{name.replace('/', '.')}.json"
+    if not file.exists():
+        write_json(file, compose(name))
+    return json.loads(file.read_text())
+
+
+@cache
+def _digest() -> str:
+    """Hash of all files that decide how a recipe is composed."""
+    files = [*(ROOT / "experiments").rglob("*.yaml"), *(ROOT / "flame_mdm" / "config").glob("*.py")]
+    content = b"".join(str(path.relative_to(ROOT)).encode() + path.read_bytes() for path in sorted(files))
+    return hashlib.sha256(content).hexdigest()[:16]
+
 
 needs_third_party = pytest.mark.skipif(
     not SHARED.is_dir(), reason=f"third-party fixtures are not redistributed and {SHARED} does not exist"

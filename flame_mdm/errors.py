@@ -11,6 +11,8 @@ from collections.abc import Iterable
 
 MAX_LINE = 2_000
 """Maximum number of characters shown of an error line. The framework's own messages are shorter."""
+DIRECTIONS = re.compile("[\u061c\u200e\u200f\u202a-\u202e\u2066-\u2069]")
+"""Bidirectional control characters of Unicode."""
 stopped_by: BaseException | None = None
 """The exception of the first signal that the running command received. Progress bars raise it again at their next
 step, because a library may have swallowed it."""
@@ -35,7 +37,12 @@ def did_you_mean(name: str, names: Iterable[str]) -> str:
 
 
 def shortened(text: str, most: int = MAX_LINE) -> str:
-    """Returns a text of at most `most` characters; a longer one ends in an ellipsis."""
+    r"""Returns a text of at most `most` characters; a longer one ends in an ellipsis.
+
+    Characters that change the direction of the text after them are escaped (`\u202e`), so that a caption cannot
+    rearrange a page.
+    """
+    text = DIRECTIONS.sub(lambda match: _escaped(match[0]), text[: most + 1])
     return text if len(text) <= most else f"{text[: most - 1]}…"
 
 

@@ -4,28 +4,18 @@ import sys
 
 import numpy as np
 import pytest
-import torch
 from scipy.spatial.transform import Rotation
+from support.motions import posed
 
 from flame_mdm.errors import UserError
-from flame_mdm.formats.motion import Motion, motion_of_poses
-from flame_mdm.formats.poses import Poses
+from flame_mdm.formats.motion import Motion
 from flame_mdm.representations.skeleton import KIT21, SMPL22
 from flame_mdm.representations.smpl import ADULT
-from flame_mdm.visualize import body, frames_array, player_page, render
-from flame_mdm.visualize.bodies import choose_body
-from flame_mdm.visualize.body import ANCHORS, JOINT, MANNEQUIN, Mesh, figure, mesh, rasterize, try_figure
+from flame_mdm.visualize import frames_array, player_page, render
+from flame_mdm.visualize.bodies import load_body
+from flame_mdm.visualize.body import ANCHORS, JOINT, Mesh, fit_body, mannequin, rasterize, try_fit
 
 REST = np.array(ADULT[:22])
-
-
-def posed(frames: int = 1, scale: float = 1.0, **turns: tuple[float, float, float]) -> Motion:
-    """A body with some joints turned by degrees about x, y, z; the lowest joint of the rest pose is on the floor."""
-    rotations = np.tile(np.eye(3), (frames, 22, 1, 1))
-    for name, angles in turns.items():
-        rotations[:, JOINT[name]] = Rotation.from_euler("xyz", angles, degrees=True).as_matrix()
-    root = torch.tensor([[0.0, 0.955 * scale, 0.0]]).double().expand(frames, 3)
-    return motion_of_poses(Poses(torch.tensor(scale * REST), torch.tensor(rotations), root), 20)
 
 
 def volume(points: np.ndarray, triangles: np.ndarray) -> float:
@@ -36,7 +26,7 @@ def volume(points: np.ndarray, triangles: np.ndarray) -> float:
 def part_volume(points: np.ndarray, *joints: str) -> float:
     """Volume of the part that belongs to some joints; each of its openings is closed by a cone."""
     bones = [bone for bone, anchor in enumerate(ANCHORS) if SMPL22.joints[anchor] in joints]
-    triangles = mesh().triangles[(mesh().weights[:, bones].sum(1) > 0.5)[mesh().triangles].all(1)]
+    triangles = mannequin().triangles[(mannequin().weights[:, bones].sum(1) > 0.5)[mannequin().triangles].all(1)]
     sides = {tuple(side) for side in triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2).tolist()}
     after = {a: b for a, b in sides if (b, a) not in sides}
     total = volume(points, triangles)
@@ -52,7 +42,7 @@ def part_volume(points: np.ndarray, *joints: str) -> float:
 
 
 def test_the_mesh_is_one_closed_symmetric_surface():
-    points, triangles = mesh().points, mesh().triangles
+    points, triangles = mannequin().points, mannequin().triangles
     assert 1000 <= len(points) <= 3000
     sides = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), 1)
     found, count = np.unique(sides, axis=0, return_counts=True)
@@ -61,9 +51,9 @@ def test_the_mesh_is_one_closed_symmetric_surface():
     assert 0.05 < volume(points, triangles) < 0.09  # cubic meters; a person of 1.78 m has 0.07
     assert 1.7 < np.ptp(points[:, 1]) < 1.85
     assert {tuple(p) for p in points.round(5).tolist()} == {tuple(p) for p in (points * [-1, 1, 1]).round(5).tolist()}
-    np.testing.assert_allclose(mesh().weights.sum(1), 1)
-    assert ((mesh().weights > 0).sum(1) <= 4).all()
-    left = mesh().sides()
+    np.testing.assert_allclose(mannequin().weights.sum(1), 1)
+    assert ((mannequin().weights > 0).sum(1) <= 4).all()
+    left = mannequin().sides()
     assert (left[points[:, 0] > 0.2] > 0.5).all()
     assert (left[points[:, 0] < -0.2] < -0.5).all()
 
@@ -73,25 +63,27 @@ def test_the_stored_pose_gives_the_stored_mesh():
     both = {
         f"{side}_{k}": (x, f * y, f * z) for side, f in (("left", 1), ("right", -1)) for k, (x, y, z) in turns.items()
     }
-    points, _ = figure(posed(1, 1.0, **both)).skinned(0)
-    np.testing.assert_allclose(points - [0, 0.955 + mesh().sole, 0], mesh().points, atol=4e-3)  # it has a little twist
+    points, _ = fit_body(posed(1, 1.0, **both)).skinned(0)
+    np.testing.assert_allclose(
+        points - [0, 0.955 + mannequin().sole, 0], mannequin().points, atol=4e-3
+    )  # a little twist
 
 
 def test_joints_of_the_body_are_those_of_the_motion_and_soles_are_on_the_floor():
     motion = posed(
         scale=0.93, left_hip=(-50, 10, 0), left_knee=(70, 0, 0), right_shoulder=(0, 30, 60), spine2=(15, 0, 9)
     )
-    drawn = figure(motion)
-    np.testing.assert_allclose(drawn.places[0, :22] - [0, drawn.lift, 0], motion.joints[0], atol=1e-6)
+    drawn = fit_body(motion)
+    np.testing.assert_allclose(drawn.starts[0, :22] - [0, drawn.lift, 0], motion.joints[0], atol=1e-6)
     points, normals = drawn.skinned(0)
     assert points[:, 1].min() == pytest.approx(0, abs=0.004)  # the right foot stands
     np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1)
     solved = Motion(motion.joints, 20)
-    assert figure(solved).skinned(0)[0][:, 1].min() == pytest.approx(0, abs=0.004)
+    assert fit_body(solved).skinned(0)[0][:, 1].min() == pytest.approx(0, abs=0.004)
     moves = (drawn.turns[0, :22] @ drawn.joints[..., None])[..., 0]  # a rigid bone maps both its ends to joints
     for parent, joint in SMPL22.edges:
-        end = drawn.places[0, parent] - moves[parent] + drawn.turns[0, parent] @ drawn.joints[joint]
-        assert np.linalg.norm(end - drawn.places[0, joint]) < 1e-4, SMPL22.joints[joint]
+        end = drawn.starts[0, parent] - moves[parent] + drawn.turns[0, parent] @ drawn.joints[joint]
+        assert np.linalg.norm(end - drawn.starts[0, joint]) < 1e-4, SMPL22.joints[joint]
 
 
 @pytest.mark.parametrize(
@@ -104,13 +96,13 @@ def test_joints_of_the_body_are_those_of_the_motion_and_soles_are_on_the_floor()
     ],
 )
 def test_bent_and_twisted_limbs_keep_nine_tenths_of_their_volume(turns, part):
-    drawn = figure(posed(**turns))
+    drawn = fit_body(posed(**turns))
     assert part_volume(drawn.skinned(0)[0], *part) > 0.9 * part_volume(drawn.points, *part)
 
 
 def test_a_twisted_wrist_turns_the_forearm_by_degrees():
-    drawn = figure(posed(left_wrist=(80, 0, 0)))
-    turned = Rotation.from_matrix(drawn.turns[0] @ figure(posed()).turns[0].mT).magnitude()
+    drawn = fit_body(posed(left_wrist=(80, 0, 0)))
+    turned = Rotation.from_matrix(drawn.turns[0] @ fit_body(posed()).turns[0].mT).magnitude()
     helper = next(bone for bone, joint in enumerate(ANCHORS[22:], 22) if SMPL22.joints[joint] == "left_elbow")
     assert np.degrees(turned[[JOINT["left_elbow"], helper, JOINT["left_wrist"]]]) == pytest.approx([0, 44, 80], abs=1.5)
 
@@ -118,8 +110,8 @@ def test_a_twisted_wrist_turns_the_forearm_by_degrees():
 def test_toes_bend_where_the_heel_rises_and_the_head_is_level():
     raised = posed(left_ankle=(40, 0, 0), left_knee=(10, 0, 0), neck=(25, 0, 0))
     raised.joints[:, :, 1] -= raised.joints[..., 10, 1].min()  # the toes stand on the floor
-    drawn = figure(Motion(np.concatenate([posed(3, neck=(25, 0, 0)).joints, raised.joints]), 20))
-    forward = drawn.turns @ mesh().turns @ np.array([0.0, 0, 1])
+    drawn = fit_body(Motion(np.concatenate([posed(3, neck=(25, 0, 0)).joints, raised.joints]), 20))
+    forward = drawn.turns @ mannequin().turns @ np.array([0.0, 0, 1])
     assert abs(forward[-1, JOINT["left_foot"], 1]) < 0.12
     assert forward[-1, JOINT["left_ankle"], 1] < -0.4
     assert abs(forward[0, JOINT["head"], 1]) < 0.05
@@ -127,8 +119,8 @@ def test_toes_bend_where_the_heel_rises_and_the_head_is_level():
 
 def test_a_long_bow_does_not_tip_the_head_back_later():
     bowed = posed(30, pelvis=(70, 0, 0), neck=(30, 0, 0))
-    drawn = figure(Motion(np.concatenate([bowed.joints, posed(10).joints]), 20))
-    pitch = np.degrees(np.arcsin((drawn.turns @ mesh().turns)[:, JOINT["head"], 1, 2]))
+    drawn = fit_body(Motion(np.concatenate([bowed.joints, posed(10).joints]), 20))
+    pitch = np.degrees(np.arcsin((drawn.turns @ mannequin().turns)[:, JOINT["head"], 1, 2]))
     assert pitch[-1] == pytest.approx(0, abs=2)
     assert pitch[0] < -60
 
@@ -167,10 +159,10 @@ def test_pictures_show_the_body_in_its_clothes():
 )
 def test_a_motion_that_no_body_fits_says_why(motion, reason):
     with pytest.raises(ValueError, match=reason):
-        figure(motion)
-    assert try_figure(motion)[0] is None
+        fit_body(motion)
+    assert try_fit(motion)[0] is None
     assert frames_array(motion, 64).shape == (len(motion.joints), 64, 64, 3)  # its skeleton
-    drawn = try_figure(posed())[0]
+    drawn = try_fit(posed())[0]
     assert render._lines(motion, None, 200, 200) == [*render._lines(motion, drawn, 200, 200), "(no body fits)"]
 
 
@@ -180,22 +172,21 @@ def test_a_damaged_asset_is_named(tmp_path):
     (tmp_path / "a.npz").write_bytes(b"PK")
     with pytest.raises(UserError, match=r"a\.npz"):
         Mesh(tmp_path / "a.npz")
-    np.savez(tmp_path / "b.npz", **{**mesh().stored, "bones": mesh().stored["bones"] + 30})
+    np.savez(tmp_path / "b.npz", **{**mannequin().stored, "bones": mannequin().stored["bones"] + 30})
     with pytest.raises(UserError, match=r"b\.npz"):
         Mesh(tmp_path / "b.npz")
 
 
 @pytest.fixture
 def cache(tmp_path, monkeypatch):
-    """An empty cache of figures, without network; the mannequin is drawn again afterwards."""
+    """An empty cache of figures, without network."""
 
     def refuse(*_: object) -> None:
         raise OSError("no network")
 
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setattr("socket.socket.connect", refuse)
-    yield tmp_path / "flame-mdm"
-    body.use(MANNEQUIN)
+    return tmp_path / "flame-mdm"
 
 
 @pytest.mark.parametrize(
@@ -213,25 +204,26 @@ def cache(tmp_path, monkeypatch):
 def test_bodies_that_cannot_be_drawn_are_refused(cache, monkeypatch, name, says):
     monkeypatch.setitem(sys.modules, "anny", None)
     with pytest.raises(UserError, match=says):
-        choose_body(name)
-    assert len(mesh().points) == 2302
+        load_body(name)
     assert not cache.exists()
 
 
 @pytest.mark.tools
 def test_anny_is_made_once_without_network_and_drawn_like_the_mannequin(cache, tmp_path):
     pytest.importorskip("anny", reason="anny is not installed: pip install flame-mdm[body]")
-    choose_body("anny age=0.9 gender=1")
+    body = load_body("anny age=0.9 gender=1")
     (file,) = cache.iterdir()
     written = file.stat().st_mtime_ns
-    choose_body("anny gender=1 age=0.9")
+    load_body("anny gender=1 age=0.9")
     assert file.stat().st_mtime_ns == written
-    assert len(mesh().points) == 1229
+    assert (len(body.points), len(mannequin().points)) == (1229, 2302)
     motion = posed(left_knee=(60, 0, 0), left_hip=(-30, 0, 0))
-    drawn = figure(motion)
-    assert drawn.mesh is mesh()
-    np.testing.assert_allclose(drawn.places[0, :22] - [0, drawn.lift, 0], motion.joints[0], atol=1e-6)
+    drawn = fit_body(motion, body)
+    assert drawn.mesh is body
+    np.testing.assert_allclose(drawn.starts[0, :22] - [0, drawn.lift, 0], motion.joints[0], atol=1e-6)
     assert drawn.skinned(0)[0][:, 1].min() == pytest.approx(0, abs=0.004)
     for name in ("a.glb", "a.gif"):
-        motion.save(tmp_path / name)
-    assert len(player_page([motion])) > 60_000
+        motion.save(tmp_path / name, body=body)
+        motion.save(tmp_path / f"mannequin_{name}")
+        assert (tmp_path / name).read_bytes() != (tmp_path / f"mannequin_{name}").read_bytes()
+    assert 60_000 < len(player_page([motion], body=body)) < len(player_page([motion]))

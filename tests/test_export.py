@@ -22,8 +22,7 @@ from flame_mdm.representations import rotation
 from flame_mdm.representations.rot6d import Rot6D
 from flame_mdm.representations.skeleton import KIT21, SMPL22, SMPL24, global_rotations
 from flame_mdm.representations.smpl import ADULT, SMPL
-from flame_mdm.visualize.body import figure as drawn_body
-from flame_mdm.visualize.body import mesh
+from flame_mdm.visualize.body import fit_body, mannequin
 
 FPS = 20.0
 ROTATED = (".bvh", ".glb", ".npz")
@@ -398,13 +397,13 @@ def test_glb_has_a_figure_that_hangs_on_the_joints(tmp_path, figure):
     assert lifted["children"] == [0]
     assert lifted["translation"][1] == pytest.approx(0.026 if figure == "body" else 0, abs=0.003)
     if figure == "body":  # a program that reads the file shows what our pictures show
-        world, drawn = global_rotations(file.rotations().double(), SMPL22.parents)[7].numpy(), drawn_body(made)
+        world, drawn = global_rotations(file.rotations().double(), SMPL22.parents)[7].numpy(), fit_body(made)
         moves = np.tile(np.eye(4), (22, 1, 1))
         moves[:, :3, :3], moves[:, :3, 3] = world, made.joints[7] + np.array(lifted["translation"])
         moves = moves @ bind
         blended = (moves[joint] * weight[..., None, None] / 255).sum(1)
         points = (blended[:, :3, :3] @ position[..., None])[..., 0] + blended[:, :3, 3]
-        shared = mesh().weights[:, :22].sum(1) > 0.99
+        shared = mannequin().weights[:, :22].sum(1) > 0.99
         off = np.linalg.norm(points - drawn.skinned(7)[0], axis=1)
         assert shared.mean() > 0.65
         assert off[shared].max() < 0.003

@@ -17,12 +17,13 @@ from flame_mdm.data.synthetic import Synthetic
 from flame_mdm.errors import UserError
 from flame_mdm.formats import bvh, characters
 from flame_mdm.formats.characters import LIMBS, SIDES
-from flame_mdm.formats.glb import save as save_glb
+from flame_mdm.formats.glb import Binary
 from flame_mdm.formats.motion import Motion
 from flame_mdm.formats.readers import read
-from flame_mdm.formats.retarget import preset, presets, world_rotations
+from flame_mdm.formats.retarget import joint_names, preset, presets
 from flame_mdm.representations.rotation import quaternion_to_matrix
 from flame_mdm.representations.skeleton import SMPL22
+from flame_mdm.visualize.body import world_rotations
 
 BLENDED = {"cmu": ("spine1", "left_collar", "right_collar"), "100style": ("spine3",)}
 """Joints that the reader of these skeletons places between two of the file's."""
@@ -139,7 +140,7 @@ def test_local_axes_are_those_of_the_skeleton(name: str, joint: str, axis: str, 
     rig = preset(name, kick.posed())
     number = rig.joints.index(joint)
     if isinstance(toward, str):
-        toward = rig.places[rig.joints.index(toward)] - rig.places[number]
+        toward = rig.positions[rig.joints.index(toward)] - rig.positions[number]
         toward /= np.linalg.norm(toward)
     found = rig.neutral[number][:, "xyz".index(axis)]
     np.testing.assert_allclose(found, toward, atol=0.12)  # limbs of SMPL's T-pose slope a little
@@ -218,14 +219,12 @@ def odd_glb(path: Path, kick: Motion, turned: bool = True) -> None:
     bind = np.frombuffer(data, "<f4", view["byteLength"] // 4, view["byteOffset"]).reshape(-1, 4, 4).copy()
     bind[:, :, :3] *= 100  # of columns, as matrices are stored: the mesh stays in meters
     data[view["byteOffset"] : view["byteOffset"] + view["byteLength"]] = bind.tobytes()
-    save_glb(path, document, data)
+    Binary(data, document["bufferViews"], document["accessors"]).save(path, document)
 
 
 def write_names(path: Path, **other: str | None) -> None:
     """The file of names of `odd_glb`."""
-    real, names = presets()["unreal"], {}
-    for part, side, mark in (("trunk", "", ""), *((p, f"{s}_", s[0]) for s in SIDES for p in ("arm", "leg"))):
-        names |= {side + ours: "Rig Bone-" + theirs.replace("*", mark)[::-1] for theirs, ours in real[part].items()}
+    names = {joint: "Rig Bone-" + name[::-1] for joint, name in joint_names(presets()["unreal"]).items()}
     assert len(names) == len(SMPL22)
     path.write_text("".join(f"{ours}: {json.dumps(theirs)}\n" for ours, theirs in {**names, **other}.items()))
 
@@ -361,7 +360,10 @@ def test_a_template_of_names_is_printed(kick: Motion, tmp_path: Path, capsys: py
             {"left_knee": "Rig Bone-l_flak"},
             r"left_knee: .*hero\.glb has no joint Rig Bone-l_flak\. Did you mean Rig",
         ),
-        ({"left_knee": "Rig Bone-r_flac"}, r"hero\.yaml: Rig Bone-r_flac is given for left_knee and for another joint"),
+        (
+            {"left_knee": "Rig Bone-r_flac"},
+            r"hero\.yaml: Rig Bone-r_flac is listed for left_knee and for another",
+        ),
         ({"left_knee": None}, r"no joint found for left_knee\. Write"),
         ({"left_knee": "Rig Bone-l_hgiht", "left_hip": "Rig Bone-l_eflac"}, "upright|has no joint"),
     ],
@@ -379,12 +381,18 @@ def changed(path: Path, change: Any) -> None:
     length = len(json.dumps(document, separators=(",", ":")).encode())
     data = path.read_bytes()[28 + length + -length % 4 :]
     change(document)
-    save_glb(path, document, data)
+    Binary(data, document["bufferViews"], document["accessors"]).save(path, document)
 
 
 def lying(document: dict[str, Any]) -> None:
     document["nodes"].append({"children": document["scenes"][0].pop("nodes"), "rotation": [0, 0, 0.5**0.5, 0.5**0.5]})
     document["scenes"][0]["nodes"] = [len(document["nodes"]) - 1]
+
+
+def unskinned(document: dict[str, Any]) -> None:
+    del document["skins"]
+    for node in document["nodes"]:
+        node.pop("skin", None)
 
 
 def scaled(document: dict[str, Any]) -> None:
@@ -431,8 +439,8 @@ def short(document: dict[str, Any]) -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda document: document.pop("skins"), "0 skeletons with a skin"),
-        (lambda document: [document.pop(key) for key in ("skins", "meshes", "buffers")], "0 skeletons with a skin"),
+        (unskinned, "0 skeletons with a skin"),
+        (lambda document: document.pop("skins"), "damaged, .* skin of a node: there is no number 0, only 0 of them"),
         (two, "2 skeletons with a skin"),
         (twice, "2 joints for left_knee: mixamorig:LeftLeg, mixamorig:LeftLeg"),
         (short, "the bone from left_shoulder to left_elbow has no length"),

@@ -63,6 +63,13 @@ def test_player_escapes_captions_ids_and_title(tmp_path):
     assert (page.motions[0]["caption"], page.motions[0]["id"]) == (HOSTILE, HOSTILE)
 
 
+def test_a_text_cannot_rearrange_the_page(tmp_path):
+    write_player(tmp_path / "p.html", [sway(text="walks \u202egnp.exe", id="a\u2066b")], "\u202etitle")
+    page = Page(tmp_path / "p.html")
+    shown = (page.motions[0]["caption"], page.motions[0]["id"], page.texts["h1"])
+    assert shown == (r"walks \u202egnp.exe", r"a\u2066b", r"\u202etitle")
+
+
 def test_player_of_twenty_clips_stays_small(tmp_path):
     write_player(tmp_path / "p.html", [sway(60, contacts=True, id=str(k)) for k in range(20)])
     assert (tmp_path / "p.html").stat().st_size < 650_000

@@ -39,9 +39,9 @@ def browse(config: Config) -> None:
         raise UserError(f"clips={config['clips']}: must be at least 1")
 
     from flame_mdm.data.store import Store
-    from flame_mdm.visualize.bodies import choose_body
+    from flame_mdm.visualize.bodies import load_body
 
-    choose_body(config["body"])
+    body = load_body(config["body"])
     representation = instantiate(config["representation"])
     data = instantiate(node, representation=representation)
     if (data.folder / STORE).exists() and data.source.named_by_recipe:
@@ -61,7 +61,7 @@ def browse(config: Config) -> None:
     title = f"{store.info['dataset']}: {len(clips)} of {matching} clips"
     title += f" in {config['split']}" * (config["split"] is not None) + f" with '{search}'" * bool(search)
     out = Path(config["out"] or Path("runs") / "browse" / f"{data.folder.name}.html")
-    write_page(out, store, representation, clips, title)
+    write_page(out, store, representation, clips, title, body)
     say(f"{out}: {len(clips)} of {matching} clips, {out.stat().st_size / 1e6:.1f} MB")
     say(*data.counts(store))
     if config["motions"] is not None:

@@ -54,15 +54,16 @@ def compare(config: Config) -> None:
             )
         say(f"written: {out}")
         return
-    from flame_mdm.visualize.bodies import choose_body
+    from flame_mdm.visualize.bodies import load_body
 
-    choose_body(config["body"])
+    body = load_body(config["body"])
     compared = find(paths("runs", str(config["runs"])))
     shown = motions(compared, config)
     if config["rate"]:
-        out, content = Path(config["out"] or "runs/rate.html"), rating_page(compared, shown, config["seed"])
+        out = Path(config["out"] or "runs/rate.html")
+        content = rating_page(compared, shown, config["seed"], body)
     else:
-        out, content = Path(config["out"] or "runs/compare.html"), comparison(compared, shown)
+        out, content = Path(config["out"] or "runs/compare.html"), comparison(compared, shown, body)
         say(*_tested({c.label: c.run for c in compared if c.run is not None}))
     write_text(out, content)
     say(out)

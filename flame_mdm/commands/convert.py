@@ -38,13 +38,13 @@ def convert(config: Config) -> None:
     """
     if config["motion"] is None or config["out"] is None:
         raise UserError("name an input and an output file: flame-mdm convert motion.npz walk.bvh")
-    from flame_mdm.formats import characters
+    from flame_mdm.formats import characters, joint_names
     from flame_mdm.formats.readers import ENDINGS
 
     path, out, hero = Path(str(config["motion"])), Path(str(config["out"])), config["character"]
     try:
         character = None if hero is None else characters.read(hero)
-    except characters.UnknownJoints as error:
+    except joint_names.UnknownJoints as error:
         say(*error.template)
         raise
     if not path.is_dir():
@@ -70,9 +70,9 @@ def _convert(config: Config, path: Path, out: Path, character: Character | None)
     from flame_mdm.formats.layouts import find_skeleton
     from flame_mdm.formats.readers import read
     from flame_mdm.representations.skeleton import SMPL22
-    from flame_mdm.visualize.bodies import choose_body
+    from flame_mdm.visualize.bodies import load_body
 
-    choose_body(config["body"])
+    body = load_body(config["body"])
     given = find_skeleton(path, config["up"])
     # a BVH file keeps proportions in any unit; the other files are in meters
     copied = path.suffix.lower() == out.suffix.lower() == ".bvh"
@@ -81,7 +81,7 @@ def _convert(config: Config, path: Path, out: Path, character: Character | None)
         raise UserError(f"{out}: the same file as the input, which stays as it is. Choose another name for the output")
     if out.suffix.lower() == ".npz":
         motion.poses = motion.posed()  # other programs expect AMASS's keys
-    say(motion.save(out, config["figure"], config["rest_pose"], config["rig"], character))
+    say(motion.save(out, config["figure"], config["rest_pose"], config["rig"], character, body))
     if motion.skeleton.joints[: len(SMPL22)] == SMPL22.joints:
         leg, head = leg_length(motion.joints), head_height(motion.joints)
         say(f"legs {leg:.2f} m, head joint at {head:.2f} m")

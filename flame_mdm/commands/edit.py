@@ -38,9 +38,9 @@ def write_edits(config: Config) -> None:
     from flame_mdm.sampling.editing import edit
     from flame_mdm.sampling.generation import write_motions
     from flame_mdm.sampling.reading import read_motion
-    from flame_mdm.visualize.bodies import choose_body
+    from flame_mdm.visualize.bodies import load_body
 
-    choose_body(config["body"])
+    body = load_body(config["body"])
     file = find(config["ckpt"], config["which"])
     model = load(file, config["device"] or ("cuda" if torch.cuda.is_available() else "cpu"))
     check_condition(config, model, texts)
@@ -67,7 +67,7 @@ def write_edits(config: Config) -> None:
     folder = Path(config["out"] or default_folder(model, digest, what, config["seed"], requested))
     shown = replace(original, text=f"original: {original.text or original.id}")
     facts = {"seed": config["seed"], "checkpoint": digest, "keep": edits[0].keep}
-    write_motions(folder, [shown, *edits], facts, stages, config["mp4"])
+    write_motions(folder, [shown, *edits], facts, stages, config["mp4"], body)
     say(summary(folder, edits, config["mp4"]))
     say(
         f"{edits[0].keep.mean():.0%} of the features are kept. Largest change in the kept part: "

@@ -44,9 +44,9 @@ def inspect(config: Config) -> None:
         raise UserError(f"clips={config['clips']}: must be at least 1")
     from flame_mdm.formats.faults import LIMITS, find_faults
     from flame_mdm.visualize import write_player
-    from flame_mdm.visualize.bodies import choose_body
+    from flame_mdm.visualize.bodies import load_body
 
-    choose_body(config["body"])
+    body = load_body(config["body"])
     name, count, motions = _files(config) if config["motion"] is not None else _clips(config)
     worst, kinds, faulty = [], Counter(), 0
     for motion in ProgressBar(motions, "inspecting", count, unit=" motions", disable=None if count > 1 else True):
@@ -63,7 +63,7 @@ def inspect(config: Config) -> None:
     say(*(f"  {kind:12} {kinds[kind]:6} ({kinds[kind] / count:.1%}): {LIMITS[kind][2]}" for kind in LIMITS))
     out = Path(config["out"] or Path("runs") / "inspect" / f"{name}.html")
     marks = [[(f.start, f.end, f.kind, str(f)) for f in faults] for _, _, faults in worst]
-    write_player(out, [motion for _, motion, _ in worst], f"Faults of {name}", marks=marks)
+    write_player(out, [motion for _, motion, _ in worst], f"Faults of {name}", marks=marks, body=body)
     say(f"{out}: the {len(worst)} worst motions (open in any browser)" if count > len(worst) else f"player: {out}")
     if faulty:
         raise SystemExit(FAULTY)

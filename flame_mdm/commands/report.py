@@ -24,11 +24,11 @@ def report(config: Config) -> None:
     """
     if config["runs"] is None:
         raise UserError("no run named. Name a run directory: flame-mdm report runs/synthetic/mdm/default")
-    from flame_mdm.visualize.bodies import choose_body
+    from flame_mdm.visualize.bodies import load_body
 
-    choose_body(config["body"])
+    body = load_body(config["body"])
     for folder in paths("runs", str(config["runs"])):
-        say(write_report(folder))
+        say(write_report(folder, body))
 
 
 main = partial(run, report, usage=USAGE, name="report", objects=("runs*",), text=("runs", "body"))

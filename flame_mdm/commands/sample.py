@@ -54,9 +54,9 @@ def sample(config: Config) -> None:
     from flame_mdm.safe_io import sha256
     from flame_mdm.sampling.generation import generate, write_motions
     from flame_mdm.sampling.targets import errors, read_targets
-    from flame_mdm.visualize.bodies import choose_body
+    from flame_mdm.visualize.bodies import load_body
 
-    choose_body(config["body"])
+    body = load_body(config["body"])
     device = config["device"] or ("cuda" if torch.cuda.is_available() else "cpu")
     file = find(config["ckpt"], config["which"])
     model = load(file, device)
@@ -101,7 +101,7 @@ def sample(config: Config) -> None:
         folders.setdefault(folder, []).extend(part)  # a prompt that is listed twice
     for folder, made in folders.items():
         facts = {"seed": config["seed"], "checkpoint": digest}
-        write_motions(folder, made, facts, stages if made[0] is motions[0] else None, config["mp4"])
+        write_motions(folder, made, facts, stages if made[0] is motions[0] else None, config["mp4"], body)
         say(summary(folder, made, config["mp4"]))
         if config["targets"] is not None:
             off = [100 * errors(motion, read_targets(model.representation, config["targets"])) for motion in made]
@@ -188,8 +188,8 @@ def check_condition(config: Config, model: MotionGeneration, texts: Sequence[str
     """
     if texts is not None:
         from flame_mdm.conditions.vocabulary import advice
+        from flame_mdm.errors import shortened
         from flame_mdm.sampling.request import read_parts
-        from flame_mdm.visualize.scene import shortened
 
         for text in dict.fromkeys(part for each in texts for part, _ in read_parts(each)):
             of = f"'{shortened(text, 60)}': " * (len(texts) > 1 or text not in texts)

@@ -13,9 +13,8 @@ from urllib.parse import urlencode
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainSerializer, StringConstraints, ValidationError
 from pydantic_core import PydanticCustomError
 
-from flame_mdm.errors import UserError, did_you_mean, one_line
+from flame_mdm.errors import UserError, did_you_mean, one_line, shortened
 from flame_mdm.sampling.request import read_parts
-from flame_mdm.visualize.scene import shortened
 
 MAX_TEXT, MAX_SECONDS, MAX_SAMPLES, MAX_STEPS, MAX_EDITS = 300, 30, 4, 1000, 8
 """Limits of a request: characters, seconds, motions, sampling steps, edits."""

@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 
+from flame_mdm.errors import UserError
 from flame_mdm.representations.skeleton import SMPL22
 
 LEG = (0.6, 1.2)
@@ -33,7 +34,7 @@ def head_height(joints: np.ndarray) -> float:
 
 
 def check_size(leg: float, unit: float, children: bool = False) -> None:
-    """Raises `ValueError` if a leg is too short or too long; the message says which unit would fit.
+    """Raises `UserError` if a leg is too short or too long; the message says which unit would fit.
 
     Args:
         leg: length of the leg in meters, if `unit` is right.
@@ -47,7 +48,7 @@ def check_size(leg: float, unit: float, children: bool = False) -> None:
     name = min(fitting, key=lambda name: abs(math.log(leg / unit * fitting[name] / USUAL_LEG)), default=None)
     right = f"{fitting[name]:.6g}" if name else f"{unit * USUAL_LEG / leg:.2g}" if leg else "..."
     small = " If these are children, set `children: true`." * (not children and CHILD <= leg < LEG[0])
-    raise ValueError(
+    raise UserError(
         f"the legs are {leg:.3g} m long (unit {unit:.6g}), but people's are {shortest:g} to {LEG[1]:g} m.{small} "
         f"{f'The unit may be {right} ({name})' if name else 'The unit is wrong'}: set `unit: {right}` in skeleton.yaml"
         f" (unit={right} in convert and edit)"
@@ -55,18 +56,18 @@ def check_size(leg: float, unit: float, children: bool = False) -> None:
 
 
 def check_feet(joints: np.ndarray) -> None:
-    """Raises `ValueError` if a foot of SMPL's joints (F, 22, 3) has no length, or the toes point backwards."""
+    """Raises `UserError` if a foot of SMPL's joints (F, 22, 3) has no length, or the toes point backwards."""
     at = {name: joints[:, number] for number, name in enumerate(SMPL22.joints)}
     for side in ("left", "right"):
         if _bone(joints, f"{side}_ankle", f"{side}_foot") < FOOT:
-            raise ValueError(
+            raise UserError(
                 f"the {side} foot has no length: {side}_foot and {side}_ankle are the same point. Map {side}_foot in "
                 "skeleton.yaml to the toes, or to the end site of the ankle, such as LeftAnkle.end"
             )
     across, trunk = at["left_hip"] - at["right_hip"], at["neck"] - at["pelvis"]
     toes = at["left_foot"] + at["right_foot"] - at["left_ankle"] - at["right_ankle"]
     if np.median((np.cross(across, trunk) * toes).sum(1)) < 0:
-        raise ValueError(
+        raise UserError(
             "the toes point backwards: left and right are swapped, or the axes are mirrored (mirrored: true in "
             "skeleton.yaml)"
         )

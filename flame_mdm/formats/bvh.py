@@ -11,7 +11,7 @@ import itertools
 import math
 import re
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from decimal import Decimal
@@ -22,12 +22,17 @@ from typing import NoReturn
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from flame_mdm.formats.resampling import RATES, between, slerp
+from flame_mdm.errors import UserError
+from flame_mdm.formats.resampling import RATES, frame_pairs, slerp
 from flame_mdm.safe_io import TEXT_LIMIT, regular_file, write_text
 
 CHANNELS = tuple(f"{axis}{kind}" for kind in ("position", "rotation") for axis in "XYZ")
 HEADER = 1 << 16
 """Bytes that contain the hierarchy and the first frame of most files: 15 KiB for a body with all its fingers."""
+MAX_JOINTS = 4096
+"""Maximum number of joints and end sites of a file."""
+LARGEST = 1e9
+"""Largest number that is read."""
 MAX_LABELED_LINE = 200
 """Maximum length of a line with a label. Python needs quadratic time for numbers with many digits."""
 
@@ -118,9 +123,9 @@ class Bvh:
             Rotations (F', J, 3, 3) and translations (F', J, 3), F' = floor((F - 1) * fps / self.fps) + 1.
 
         Raises:
-            ValueError: the resampled motion would have too many frames.
+            UserError: If the resampled motion would have too many frames.
         """
-        before, after, share = between(len(self.frames), self.fps, fps, len(self.joints), slack=0)
+        before, after, share = frame_pairs(len(self.frames), self.fps, fps, len(self.joints), slack=0)
         translations = self.translations()
         moved = (1 - share[:, None, None]) * translations[before] + share[:, None, None] * translations[after]
         return slerp(self.rotations(), before, after, share), moved
@@ -152,8 +157,8 @@ def read(path: str | Path) -> Bvh:
     """Reads a BVH file.
 
     Raises:
-        UserError: the path is not a regular file, or the file is too large.
-        ValueError: the file is not a complete and valid BVH file; the message names file and line.
+        FileNotFoundError: If the file does not exist.
+        UserError: If it is not a complete and valid BVH file; the message names file and line.
     """
     regular_file(path, TEXT_LIMIT)
     return parse(Path(path).read_bytes(), str(path))
@@ -163,15 +168,15 @@ def read_header(path: str | Path) -> Bvh:
     """Reads a BVH file as if all its frames were equal to the first; other frames are not read, nor checked.
 
     Raises:
-        UserError, ValueError: as in `read`; a file whose beginning is damaged is read as a whole.
+        FileNotFoundError, UserError: If `read` raises it; a file whose beginning is damaged is read as a whole.
     """
     size = regular_file(path, TEXT_LIMIT)
-    with Path(path).open("rb") as file:
-        data = file.read(HEADER)
-    with suppress(ValueError):
-        found = parse(data[: data.rfind(b"\n") + 1], str(path), header=True)
-        if size >= 2 * found.frames.size:  # a number and a space
-            return found
+    with Path(path).open("rb") as stream:
+        data = stream.read(HEADER)
+    with suppress(UserError):
+        file = parse(data[: data.rfind(b"\n") + 1], str(path), header=True)
+        if size >= 2 * file.frames.size:  # a number and a space
+            return file
     return read(path)
 
 
@@ -179,7 +184,7 @@ def parse(data: bytes, name: str, header: bool = False) -> Bvh:
     """Reads the bytes of a BVH file; `name` is used in error messages. `header` repeats the first frame, see above.
 
     Raises:
-        ValueError: as in `read`.
+        UserError: If `read` raises it.
     """
     source = _Source(data, name)
     joints: list[str] = []
@@ -192,6 +197,8 @@ def parse(data: bytes, name: str, header: bool = False) -> Bvh:
 
     while (keyword := source.token().upper()) != "MOTION":
         joint = blocks[-1] if blocks else None
+        if len(joints) + len(end_parents) > MAX_JOINTS:
+            source.fail(f"more than {MAX_JOINTS} joints and end sites")
         if (keyword == "ROOT" and joint is None) or (keyword == "JOINT" and joint is not None and joint >= 0):
             blocks.append(len(joints))
             joints.append(source.token())
@@ -260,7 +267,7 @@ class _Source:
         self.tokens = ((number, token) for number, line in self.lines for token in line.split())
 
     def fail(self, what: str) -> NoReturn:
-        raise ValueError(f"{self.name}, line {self.line}: {what}")
+        raise UserError(f"{self.name}, line {self.line}: {what}")
 
     def token(self, expected: str = "") -> str:
         """Returns the next word of the hierarchy; it must be `expected` (case-insensitive) if that is given."""
@@ -277,7 +284,7 @@ class _Source:
             value = float(token)
         except ValueError:
             value = math.nan
-        if not math.isfinite(value):
+        if not abs(value) <= LARGEST:
             self.fail(f"expected a number, found {token[:40]}")
         return value
 
@@ -305,42 +312,39 @@ class _Source:
         if len(rows) != (min(count, 1) if header else count) or not rows:
             self.fail(f"the file ends after {len(rows)} frames, but must have {max(count, 1)}")
         table = np.array(rows)
-        finite = np.isfinite(table).all(1)
-        if not finite.all():
-            self.line = numbers[int(np.argmin(finite))]
-            self.fail("number is not finite")
+        valid = (np.abs(table) <= LARGEST).all(1)
+        if not valid.all():
+            self.line = numbers[int(np.argmin(valid))]
+            self.fail("number is not finite, or too large")
         return np.broadcast_to(table, (count, width)) if header else table
 
 
 def write(bvh: Bvh, path: str | Path) -> None:
     """Writes a BVH file that `read` converts back to the same numbers; joints are in depth-first order."""
-    order: list[int] = []
-    columns = bvh.columns()
-
-    def block(head: str, offset: np.ndarray, inside: Iterator[str]) -> Iterator[str]:
-        yield head
-        yield "{"
-        yield f"\tOFFSET {_numbers(offset)}"
-        yield from (f"\t{line}" for line in inside)
-        yield "}"
-
-    def inside(joint: int) -> Iterator[str]:
-        order.append(joint)
-        yield " ".join(["CHANNELS", str(len(bvh.channels[joint])), *bvh.channels[joint]])
-        for child, parent in enumerate(bvh.parents):
-            if parent == joint:
-                yield from block(f"JOINT {bvh.joints[child]}", bvh.offsets[child], inside(child))
-        for parent, offset in zip(bvh.end_parents, bvh.end_offsets, strict=True):
-            if parent == joint:
-                yield from block("End Site", offset, iter(()))
-
-    lines = ["HIERARCHY"]
+    children: list[list[int]] = [[] for _ in bvh.joints]  # -1, -2, ... are end sites
     for joint, parent in enumerate(bvh.parents):
-        if parent < 0:
-            lines += block(f"ROOT {bvh.joints[joint]}", bvh.offsets[joint], inside(joint))
+        if parent >= 0:
+            children[parent].append(joint)
+    for end, parent in enumerate(bvh.end_parents):
+        children[parent].append(-1 - end)
+    lines, order, columns = ["HIERARCHY"], list[int](), bvh.columns()
+    stack = [(0, joint, False) for joint, parent in enumerate(bvh.parents) if parent < 0][::-1]
+    while stack:
+        depth, joint, closing = stack.pop()
+        indent = "\t" * depth
+        if closing:
+            lines.append(f"{indent}}}")
+            continue
+        head = "End Site" if joint < 0 else f"{'JOINT' if depth else 'ROOT'} {bvh.joints[joint]}"
+        offset = bvh.end_offsets[-1 - joint] if joint < 0 else bvh.offsets[joint]
+        lines += [f"{indent}{head}", f"{indent}{{", f"{indent}\tOFFSET {_numbers(offset)}"]
+        stack.append((depth, joint, True))
+        if joint >= 0:
+            order.append(joint)
+            lines.append(" ".join([f"{indent}\tCHANNELS", str(len(bvh.channels[joint])), *bvh.channels[joint]]))
+            stack += [(depth + 1, child, False) for child in reversed(children[joint])]
     lines += ["MOTION", f"Frames: {len(bvh.frames)}", f"Frame Time: {1 / bvh.fps!r}"]
-    frames = bvh.frames[:, np.r_[tuple(columns[joint] for joint in order)]]
-    lines += map(_numbers, frames)
+    lines += map(_numbers, bvh.frames[:, np.r_[tuple(columns[joint] for joint in order)]])
     write_text(path, "\n".join(lines) + "\n")
 
 

@@ -1,4 +1,4 @@
-"""glTF 2.0 binary files (.glb): a skinned figure and its motion, for Blender, game engines and web viewers.
+"""glTF 2.0 binary files (.glb): one validated document for every reader, and the binary part of files that are written.
 
 Khronos Group, "glTF 2.0 Specification", https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html
 """
@@ -7,145 +7,246 @@ from __future__ import annotations
 
 import json
 import struct
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
 import torch
+from pydantic import BaseModel, ConfigDict, FailFast, Field, FiniteFloat, ValidationError
 from scipy.spatial.transform import Rotation
 
-from flame_mdm.errors import first_line
-from flame_mdm.formats.poses import Poses
-from flame_mdm.formats.retarget import Rig, retarget
+from flame_mdm.errors import UserError, first_line
 from flame_mdm.representations import rotation
-from flame_mdm.representations.skeleton import SMPL22
 from flame_mdm.safe_io import MEBIBYTE, atomic_write, parse_json, regular_file
-from flame_mdm.visualize.body import ANCHORS, Figure
-from flame_mdm.visualize.render import SIDE_COLORS
-from flame_mdm.visualize.scene import radii, sides
 
 UNSIGNED_BYTE, UNSIGNED_SHORT, FLOAT = 5121, 5123, 5126
-VERTICES, INDICES = 34962, 34963
+BYTES = {5120: 1, UNSIGNED_BYTE: 1, 5122: 2, UNSIGNED_SHORT: 2, 5125: 4, FLOAT: 4}
+"""Component type of an accessor -> bytes per number."""
+WHOLE = {5120: 127, UNSIGNED_BYTE: 255, 5122: 32767, UNSIGNED_SHORT: 65535}
+"""Component type of a normalized accessor -> the integer that means 1."""
+NUMBERS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
+"""Type of an accessor -> numbers per element."""
 KINDS = {1: "SCALAR", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
-SIDES = 10
-"""Number of corners of a limb's cross section."""
-LIMIT = 512 * MEBIBYTE
-"""Maximum size of a file that is read."""
+LIMIT, DOCUMENT_LIMIT = 512 * MEBIBYTE, 16 * MEBIBYTE
+"""Maximum size of a file that is read, and of its JSON part, which takes many times its size in memory."""
+MAX_NODES, MAX_ITEMS = 4096, 65_536
+"""Maximum number of nodes, and of all other items of one list. Characters have some hundreds of nodes."""
+LARGEST = 1e9
+"""Largest coordinate or matrix entry that is read."""
+
+# The document ---------------------------------------------------------------------------------------------------------
+
+Item = TypeVar("Item")
+Index = Annotated[int, Field(ge=0, lt=2**40)]
+"""Index into another list of the document, or a number of bytes. Optional ones are -1 if they are missing."""
+Number = Annotated[float, Field(ge=-LARGEST, le=LARGEST, allow_inf_nan=False)]
+Items = Annotated[list[Item], Field(max_length=MAX_ITEMS), FailFast()]
+NodeItems = Annotated[list[Item], Field(max_length=MAX_NODES), FailFast()]
+Vector = Annotated[list[Number], Field(min_length=3, max_length=3)]
 
 
-def write(path: Path, poses: Poses, rig: Rig, fps: float, text: str, name: str, body: Figure | None = None) -> None:
-    """Writes a .glb file in meters, y up; the rest pose faces +z, as the format requires.
+class _Object(BaseModel):
+    """A part of the document. Types are strict, and other keys are ignored."""
 
-    It contains one node per joint, one animation that rotates all nodes and moves the hips, with one key per frame in
-    seconds, and one mesh skinned to the joints: a body, stored in an A-pose, or rounded limbs. The node above the
-    joints lifts a body by the thickness of its soles; its toes bend as in pictures.
+    model_config = ConfigDict(strict=True)
 
-    Args:
-        path: the file.
-        poses: the motion.
-        rig: the skeleton, with the bone lengths of the motion.
-        fps: frames per second.
-        text: the caption.
-        name: of the animation, if there is no caption.
-        body: the body of this motion; None = rounded limbs.
+
+class _Node(_Object):
+    name: Annotated[str, Field(max_length=1000)] = ""
+    children: NodeItems[Index] = []
+    mesh: Index = -1
+    skin: Index = -1
+    matrix: Annotated[list[Number], Field(min_length=16, max_length=16)] | None = None
+    translation: Vector = [0, 0, 0]
+    rotation: Annotated[list[Number], Field(min_length=4, max_length=4)] = [0, 0, 0, 1]
+    scale: Vector = [1, 1, 1]
+
+    def local(self) -> np.ndarray:
+        """Returns the matrix (4, 4) from the node's coordinates to those of its parent."""
+        if self.matrix is not None:
+            return np.array(self.matrix, float).reshape(4, 4).T
+        matrix = np.eye(4)
+        matrix[:3, :3] = Rotation.from_quat(self.rotation).as_matrix() * self.scale
+        matrix[:3, 3] = self.translation
+        return matrix
+
+
+class _Primitive(_Object):
+    attributes: dict[str, Index]
+    indices: Index = -1
+
+
+class _Mesh(_Object):
+    primitives: Items[_Primitive]
+
+
+class _Skin(_Object):
+    joints: Annotated[list[Index], Field(min_length=1, max_length=MAX_NODES)]
+    inverseBindMatrices: Index = -1
+    skeleton: Index = -1
+
+
+class _Buffer(_Object):
+    byteLength: Index
+    uri: str | None = None
+
+
+class _View(_Object):
+    buffer: Index
+    byteOffset: Index = 0
+    byteLength: Index
+    byteStride: Index = 0
+
+
+class _Accessor(_Object):
+    bufferView: Index = -1
+    byteOffset: Index = 0
+    componentType: Literal[5120, 5121, 5122, 5123, 5125, 5126]
+    type: Literal["SCALAR", "VEC2", "VEC3", "VEC4", "MAT2", "MAT3", "MAT4"]
+    count: Index
+    normalized: bool = False
+    min: Annotated[list[FiniteFloat], Field(max_length=16)] = []
+    max: Annotated[list[FiniteFloat], Field(max_length=16)] = []
+
+
+class _Sampler(_Object):
+    input: Index
+    output: Index
+
+
+class _Target(_Object):
+    node: Index = -1
+
+
+class _Channel(_Object):
+    sampler: Index
+    target: _Target
+
+
+class _Animation(_Object):
+    samplers: Items[_Sampler]
+    channels: Items[_Channel]
+
+
+class _SceneNodes(_Object):
+    nodes: NodeItems[Index] = []
+
+
+class _Asset(_Object):
+    version: Annotated[str, Field(pattern=r"^2\.\d+$")]
+
+
+class _Document(_Object):
+    asset: _Asset
+    scene: Index = -1
+    scenes: NodeItems[_SceneNodes] = []
+    nodes: NodeItems[_Node] = []
+    meshes: NodeItems[_Mesh] = []
+    skins: Annotated[list[_Skin], Field(max_length=256), FailFast()] = []
+    buffers: NodeItems[_Buffer] = []
+    bufferViews: Items[_View] = []
+    accessors: Items[_Accessor] = []
+    animations: NodeItems[_Animation] = []
+
+    def indices(self) -> Iterator[tuple[str, Sequence[object], int]]:
+        """Yields what each index of the document is for, the list that it points into, and the index."""
+        yield "scene", self.scenes, self.scene
+        for node in self.nodes:
+            yield from (("child", self.nodes, child) for child in node.children)
+            yield from (("mesh of a node", self.meshes, node.mesh), ("skin of a node", self.skins, node.skin))
+        for skin in self.skins:
+            yield from (("joint of a skin", self.nodes, joint) for joint in (*skin.joints, skin.skeleton))
+            yield "inverseBindMatrices", self.accessors, skin.inverseBindMatrices
+        for primitive in (primitive for mesh in self.meshes for primitive in mesh.primitives):
+            used = (*primitive.attributes.values(), primitive.indices)
+            yield from (("accessor of a mesh", self.accessors, accessor) for accessor in used)
+        yield from (("bufferView of an accessor", self.bufferViews, accessor.bufferView) for accessor in self.accessors)
+        yield from (("buffer of a bufferView", self.buffers, view.buffer) for view in self.bufferViews)
+        for animation in self.animations:
+            for sampler in animation.samplers:
+                yield from (("accessor of an animation", self.accessors, k) for k in (sampler.input, sampler.output))
+            for channel in animation.channels:
+                yield "sampler of an animation", animation.samplers, channel.sampler
+                yield "node of an animation", self.nodes, channel.target.node
+        yield from (("node of a scene", self.nodes, node) for scene in self.scenes for node in scene.nodes)
+
+    def check(self, size: int) -> None:
+        """Checks indices, byte ranges and rotations.
+
+        Args:
+            size: of the binary part in bytes.
+
+        Raises:
+            ValueError: If a part does not fit the others.
+        """
+        for purpose, items, index in self.indices():
+            if index >= len(items):
+                raise ValueError(f"{purpose}: there is no number {index}, only {len(items)} of them")
+        if any(buffer.uri is not None for buffer in self.buffers):
+            raise ValueError("its data are in another file")
+        lengths = [buffer.byteLength for buffer in self.buffers]
+        if lengths and lengths[0] > size:
+            raise ValueError(f"a buffer of {lengths[0]} bytes, but the file has {size}")
+        for number, view in enumerate(self.bufferViews):
+            if view.byteOffset + view.byteLength > lengths[view.buffer]:
+                raise ValueError(f"bufferView {number} is longer than its buffer")
+        for number, accessor in enumerate(self.accessors):
+            width = BYTES[accessor.componentType] * NUMBERS[accessor.type]
+            view = self.bufferViews[accessor.bufferView] if accessor.bufferView >= 0 else None
+            last = (accessor.count - 1) * ((view and view.byteStride) or width)
+            if view and accessor.count and accessor.byteOffset + last + width > view.byteLength:
+                raise ValueError(f"accessor {number} is longer than its bufferView")
+        if any(not np.linalg.norm(node.rotation) > 1e-6 for node in self.nodes):
+            raise ValueError("a node has a rotation of length 0")
+        drawn = [len(self.meshes[node.mesh].primitives) for node in self.nodes if min(node.mesh, node.skin) >= 0]
+        if sum(drawn) > MAX_ITEMS:
+            raise ValueError(f"{sum(drawn):,} parts of meshes with a skin, but at most {MAX_ITEMS:,} are read")
+
+
+def _ordered(nodes: Sequence[_Node]) -> tuple[list[int], dict[int, int]]:
+    """Returns the indices of nodes in an order in which parents precede their children, and the parents of children.
+
+    Raises:
+        ValueError: If a node has two parents or is its own ancestor.
     """
-    binary = Binary()
-    rest = poses.rest().numpy()
-    position, normal, color, joint, weight, index, bind = _limbs(rest) if body is None else _skin(body)
-    attributes = {
-        "POSITION": binary.add(position, VERTICES, bounds=True),
-        "NORMAL": binary.add(normal, VERTICES),
-        "COLOR_0": binary.add(color, VERTICES, normalized=True),
-        "JOINTS_0": binary.add(joint, VERTICES),
-        "WEIGHTS_0": binary.add(weight, VERTICES, normalized=True),
-    }
-    indices = binary.add(index, INDICES)
-    skinned = [rig.sources.index(number) for number in range(len(SMPL22))]
-    bind[:, :3] = rig.neutral[skinned].mT @ bind[:, :3]
-    others = [joint for joint, source in enumerate(rig.sources) if source < 0]
-    resting = np.tile(np.eye(4, dtype="f4"), (len(others), 1, 1))
-    resting[:, :3, :3] = rig.turns[others].mT
-    resting[:, :3, 3] = -(rig.turns[others].mT @ rig.places[others, :, None])[..., 0]
-    bind = np.concatenate([bind, resting])
-    matrices = binary.add(bind.mT.reshape(-1, 16))  # matrices are stored in column-major order
-    moved = poses if body is None else Poses(poses.offsets, torch.from_numpy(body.local()), poses.root)
-    turns, root = retarget(moved, rig)
-    turns = quaternions(np.concatenate([rig.rest()[None], turns]))
-    curves = [("rotation", node, turns[1:, node]) for node in range(len(rig.joints))]
-    curves.append(("translation", rig.hips, root.astype("f4")))
-    animated = animation(binary, text or name or "motion", fps, curves)
-    nodes: list[dict[str, Any]] = [
-        {"name": name, "translation": offset.tolist(), "rotation": turn.tolist()}
-        for name, offset, turn in zip(rig.joints, rig.offsets(), turns[0], strict=True)
-    ]
-    for joint, parent in enumerate(rig.parents):
-        if parent >= 0:
-            nodes[parent].setdefault("children", []).append(joint)
-    nodes.append({"name": "figure", "mesh": 0, "skin": 0})
-    nodes.append({"name": "lifted", "children": [0], "translation": [0, body.lift if body else 0, 0]})
-    document = {
-        "asset": {
-            "version": "2.0",
-            "generator": "flame_mdm",
-            "extras": {"fps": fps, "text": text, "unit": "metre", "up": "y"},
-        },
-        "scene": 0,
-        "scenes": [{"nodes": [len(rig.joints), len(rig.joints) + 1]}],
-        "nodes": nodes,
-        "meshes": [{"primitives": [{"attributes": attributes, "indices": indices, "material": 0}]}],
-        "materials": [{"pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 0.8}}],
-        "skins": [{"joints": skinned + others, "skeleton": 0, "inverseBindMatrices": matrices}],
-        "animations": [animated],
-        "accessors": binary.accessors,
-        "bufferViews": binary.views,
-        "buffers": [{"byteLength": len(binary.data)}],
-    }
-    save(path, document, binary.data)
+    above = {child: number for number, node in enumerate(nodes) for child in node.children}
+    if len(above) != sum(len(node.children) for node in nodes):
+        raise ValueError("a node has two parents")
+    order = [number for number in range(len(nodes)) if number not in above]
+    for number in order:
+        order += nodes[number].children
+    if len(order) != len(nodes):
+        raise ValueError("a node is its own parent")
+    return order, above
 
 
-def animation(binary: Binary, name: str, fps: float, curves: Sequence[tuple[str, int, np.ndarray]]) -> dict[str, Any]:
-    """Returns an animation of properties of nodes: property, node, values (F, K) in frames."""
-    times = binary.add(np.arange(len(curves[0][2]), dtype=np.float32) / np.float32(fps), bounds=True)
-    return {
-        "name": name,
-        "samplers": [{"input": times, "output": binary.add(values)} for _, _, values in curves],
-        "channels": [
-            {"sampler": sampler, "target": {"node": node, "path": kind}}
-            for sampler, (kind, node, _) in enumerate(curves)
-        ],
-    }
+# Reading --------------------------------------------------------------------------------------------------------------
 
 
-def save(path: Path, document: dict[str, Any], data: bytes | bytearray) -> None:
-    """Writes a .glb file with a document and a binary part, whose length is a multiple of 4."""
-    head = json.dumps(document, separators=(",", ":")).encode()
-    head += b" " * (-len(head) % 4)
-    chunks = struct.pack("<I4s", len(head), b"JSON") + head + struct.pack("<I4s", len(data), b"BIN\0") + bytes(data)
-    with atomic_write(path) as temporary:
-        temporary.write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks)
+@dataclass(frozen=True, eq=False)
+class Skin:
+    """A skin: numbers of its K joints, inverse bind matrices (K, 4, 4) or (0, 4, 4), corners (C, 3) of its meshes."""
 
-
-def quaternions(matrices: np.ndarray) -> np.ndarray:
-    """Converts rotations (F, ..., 3, 3) to float32 quaternions x, y, z, w without sign changes between frames."""
-    turns = rotation.continuous(rotation.matrix_to_quaternion(torch.from_numpy(matrices)), dim=0)
-    return turns[..., [1, 2, 3, 0]].float().numpy()
+    joints: list[int]
+    binds: np.ndarray
+    corners: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
 class Glb:
-    """A .glb file that is read. N nodes, in an order in which parents precede their children.
+    """A valid .glb file. N nodes, in an order in which parents precede their children.
 
     Attributes:
-        document: the JSON part.
+        document: the JSON part, with the lists `buffers`, `bufferViews` and `accessors`.
         data: the binary part.
         nodes: index of each node in the document.
         names: name of each node.
         parents: number of each node's parent, -1 for a root.
+        locals: (N, 4, 4), coordinates of each node to those of its parent.
         worlds: (N, 4, 4), coordinates of each node to those of the world.
-        skins: for each skin, the numbers of its joints, their inverse bind matrices (K, 4, 4), which may be missing,
-            and the corners (C, 3) of boxes around its meshes.
+        skins: skins of meshes.
     """
 
     document: dict[str, Any]
@@ -153,83 +254,103 @@ class Glb:
     nodes: tuple[int, ...]
     names: tuple[str, ...]
     parents: tuple[int, ...]
+    locals: np.ndarray
     worlds: np.ndarray
-    skins: tuple[tuple[list[int], np.ndarray, np.ndarray], ...]
+    skins: tuple[Skin, ...]
 
 
 def read(path: Path) -> Glb:
-    """Reads nodes and skins of a .glb file.
+    """Reads and validates a .glb file.
 
     Raises:
-        FileNotFoundError: the file does not exist.
-        UserError: the path is not a regular file, or the file is too large.
-        ValueError: the file is damaged, or not a .glb file of glTF 2.0.
+        FileNotFoundError: If the file does not exist.
+        UserError: If the file is not a regular file, is too large or damaged, or is not glTF 2.0 in one file.
     """
     regular_file(path, LIMIT)
     content = path.read_bytes()
     if content[:4] != b"glTF":
-        raise ValueError(f"{path}: not a .glb file")
+        raise UserError(f"{path}: not a .glb file")
     try:
-        (size,) = struct.unpack_from("<I", content, 12)
-        document = parse_json(content[20 : 20 + size])
-        data = content[28 + size :]
-        nodes = document["nodes"]
-        below = [node.get("children", []) for node in nodes]
-        above = {child: number for number, children in enumerate(below) for child in children}
-        order = [number for number in range(len(nodes)) if number not in above]
-        if len(above) != sum(map(len, below)):
-            raise ValueError("a node has two parents")
-        for number in order:
-            order += below[number]
-        if len(order) != len(nodes):
-            raise ValueError("a node is its own parent")
+        document, data = _chunks(content)
+        parts = _Document.model_validate(document)
+        parts.check(len(data))
+        order, above = _ordered(parts.nodes)
         rank = {number: k for k, number in enumerate(order)}
         parents = tuple(rank[above[number]] if number in above else -1 for number in order)
-        worlds = np.stack([_matrix(nodes[number]) for number in order])
-        for k, parent in enumerate(parents):
-            worlds[k] = worlds[parent] @ worlds[k] if parent >= 0 else worlds[k]
-        skins = tuple(_read_skin(document, data, number, rank) for number in range(len(document.get("skins", ()))))
-        names = tuple(str(nodes[number].get("name", f"node {number}")) for number in order)
-        finite = np.isfinite(worlds).all() and all(np.isfinite(part).all() for _, *parts in skins for part in parts)
-        if not finite or any("uri" in buffer for buffer in document.get("buffers", [])):
-            raise ValueError("numbers are not finite" if not finite else "its data are in another file")
-    except (KeyError, TypeError, IndexError, AttributeError, OverflowError, struct.error, ValueError) as error:
-        raise ValueError(f"{path}: damaged, or not glTF 2.0 in one file: {first_line(error)}") from error
-    return Glb(document, data, tuple(order), names, parents, worlds, skins)
+        with np.errstate(all="ignore"):
+            local = np.array([parts.nodes[number].local() for number in order]).reshape(-1, 4, 4)
+            worlds = local.copy()
+            for k, parent in enumerate(parents):
+                worlds[k] = worlds[parent] @ local[k] if parent >= 0 else local[k]
+        if not (np.abs(worlds) <= LARGEST).all():
+            raise ValueError("numbers are not finite, or too large")
+        skins = _skins(parts, data, rank)
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_input=False)[0]
+        reason = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
+        raise UserError(f"{path}: damaged, or not glTF 2.0 in one file: {reason}") from error
+    except (ValueError, struct.error) as error:
+        raise UserError(f"{path}: damaged, or not glTF 2.0 in one file: {first_line(error)}") from error
+    names = tuple(parts.nodes[number].name or f"node {number}" for number in order)
+    for name in ("buffers", "bufferViews", "accessors"):
+        document.setdefault(name, [])
+    return Glb(document, data, tuple(order), names, parents, local, worlds, skins)
 
 
-def _matrix(node: dict[str, Any]) -> np.ndarray:
-    """Returns the matrix (4, 4) from a node's coordinates to those of its parent."""
-    if "matrix" in node:
-        return np.array(node["matrix"], float).reshape(4, 4).T
-    made = np.eye(4)
-    made[:3, :3] = Rotation.from_quat(node.get("rotation", [0, 0, 0, 1])).as_matrix() * node.get("scale", [1, 1, 1])
-    made[:3, 3] = node.get("translation", [0, 0, 0])
-    return made
+def _chunks(content: bytes) -> tuple[Any, bytes]:
+    """Returns the parsed document and the binary part of a file."""
+    version, _, size, kind = struct.unpack_from("<III4s", content, 4)
+    if version != 2 or kind != b"JSON" or size > DOCUMENT_LIMIT:
+        raise ValueError(f"version {version}, a first part {kind!r} of {size} bytes")
+    if len(content) < 20 + size:
+        raise ValueError("the file ends too early")
+    document = parse_json(content[20 : 20 + size])
+    if len(content) < 28 + size:
+        return document, b""
+    length, kind = struct.unpack_from("<I4s", content, 20 + size)
+    if kind != b"BIN\0" or len(content) < 28 + size + length:
+        raise ValueError(f"a second part {kind!r} of {length} bytes, which the file does not contain")
+    return document, content[28 + size : 28 + size + length]
 
 
-def _read_skin(
-    document: dict[str, Any], data: bytes, number: int, rank: dict[int, int]
-) -> tuple[list[int], np.ndarray, np.ndarray]:
-    skin, accessors = document["skins"][number], document["accessors"]
-    joints = [rank[joint] for joint in skin["joints"]]
-    binds = np.zeros((0, 4, 4))
-    if "inverseBindMatrices" in skin:
-        accessor = accessors[skin["inverseBindMatrices"]]
-        view = document["bufferViews"][accessor["bufferView"]]
-        if accessor["componentType"] != FLOAT or view.get("byteStride", 64) != 64:
-            raise ValueError("inverse bind matrices are not floats")
-        start = view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
-        values = np.frombuffer(data, "<f4", 16 * len(joints), start)
-        binds = values.reshape(-1, 4, 4).mT.astype(float)
-    corners = [np.zeros((0, 3))]
-    for node in document["nodes"]:
-        for part in document["meshes"][node["mesh"]]["primitives"] if node.get("skin") == number else ():
-            accessor = accessors[part["attributes"]["POSITION"]]
-            whole = {5120: 127, 5121: 255, 5122: 32767, 5123: 65535}.get(accessor["componentType"], 1)
-            box = np.array([accessor["min"], accessor["max"]], float) / (whole if accessor.get("normalized") else 1)
-            corners.append(np.stack([box[[i, j, k], [0, 1, 2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)]))
-    return joints, binds, np.concatenate(corners)
+def _skins(parts: _Document, data: bytes, rank: dict[int, int]) -> tuple[Skin, ...]:
+    """Returns the skins; `rank` converts indices of nodes to their numbers.
+
+    Raises:
+        ValueError: If bounds or matrices are missing or unusable.
+    """
+    corners: list[list[np.ndarray]] = [[np.zeros((0, 3))] for _ in parts.skins]
+    for node in (node for node in parts.nodes if min(node.mesh, node.skin) >= 0):
+        for primitive in parts.meshes[node.mesh].primitives:
+            accessor = parts.accessors[primitive.attributes.get("POSITION", -1)]
+            if "POSITION" not in primitive.attributes or {len(accessor.min), len(accessor.max)} != {3}:
+                raise ValueError("a mesh without positions, or without their bounds")
+            box = np.array([accessor.min, accessor.max], float)
+            if not (np.abs(box) <= LARGEST).all():
+                raise ValueError("bounds of a mesh are too large")
+            box /= WHOLE.get(accessor.componentType, 1) if accessor.normalized else 1
+            ends = [box[[i, j, k], [0, 1, 2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)]
+            corners[node.skin].append(np.stack(ends))
+    skins = []
+    for skin, own in zip(parts.skins, corners, strict=True):
+        binds = np.zeros((0, 4, 4))
+        if skin.inverseBindMatrices >= 0:
+            accessor = parts.accessors[skin.inverseBindMatrices]
+            view = parts.bufferViews[accessor.bufferView] if accessor.bufferView >= 0 else None
+            fits = (accessor.componentType, accessor.type) == (FLOAT, "MAT4") and accessor.count >= len(skin.joints)
+            if view is None or view.buffer or view.byteStride not in (0, 64) or not fits:
+                raise ValueError("inverse bind matrices are not floats, or not one per joint")
+            start = view.byteOffset + accessor.byteOffset
+            values = np.frombuffer(data, "<f4", 16 * len(skin.joints), start)
+            binds = values.reshape(-1, 4, 4).mT.astype(float)
+            usable = (np.abs(binds) <= LARGEST).all() and (np.abs(np.linalg.det(binds)) > 1e-30).all()
+            if not usable:
+                raise ValueError("inverse bind matrices are not finite, or have no inverse")
+        skins.append(Skin([rank[joint] for joint in skin.joints], binds, np.concatenate(own)))
+    return tuple(skins)
+
+
+# Writing --------------------------------------------------------------------------------------------------------------
 
 
 class Binary:
@@ -257,85 +378,32 @@ class Binary:
         self.data += b"\0" * (-len(self.data) % 4)
         return len(self.accessors) - 1
 
+    def animation(self, name: str, fps: float, curves: Sequence[tuple[str, int, np.ndarray]]) -> dict[str, Any]:
+        """Appends an animation of properties of nodes and returns it: property, node, values (F, K) in frames."""
+        times = self.add(np.arange(len(curves[0][2]), dtype=np.float32) / np.float32(fps), bounds=True)
+        return {
+            "name": name,
+            "samplers": [{"input": times, "output": self.add(values)} for _, _, values in curves],
+            "channels": [
+                {"sampler": sampler, "target": {"node": node, "path": kind}}
+                for sampler, (kind, node, _) in enumerate(curves)
+            ],
+        }
 
-def _skin(body: Figure) -> tuple[np.ndarray, ...]:
-    """Returns the body in its stored pose, lifted onto the floor: see `_limbs`. Helper bones join their joints."""
-    figure, floor = body.mesh, np.array([0, body.points[:, 1].min(), 0])
-    weights = figure.weights[:, : len(SMPL22)].copy()
-    np.add.at(weights.T, list(ANCHORS[len(SMPL22) :]), figure.weights[:, len(SMPL22) :].T)
-    joint = np.argsort(-weights, axis=1, kind="stable")[:, :4]
-    weight = np.rint(255 * np.take_along_axis(weights, joint, 1)).astype(int)
-    weight[:, 0] += 255 - weight.sum(1)
-    bind = np.tile(np.eye(4), (len(SMPL22), 1, 1))
-    bind[:, :3, :3] = body.neutral @ figure.turns[: len(SMPL22)].mT
-    bind[:, :3, 3] = -(bind[:, :3, :3] @ (body.joints - floor)[..., None])[..., 0]
-    return (
-        (body.points - floor).astype("<f4"),
-        figure.normals.astype("<f4"),
-        _linear(figure.colors),
-        np.where(weight > 0, joint, 0).astype("u1"),
-        weight.astype("u1"),
-        figure.triangles.astype("<u2").ravel(),
-        bind.astype("<f4"),
-    )
-
-
-def _linear(colors: np.ndarray) -> np.ndarray:
-    """Returns linear colors (N, 4) uint8 with alpha of colors (N, 3) from 0 to 255 as on screens."""
-    linear = np.rint(255 * (np.asarray(colors) / 255) ** 2.2)
-    return np.concatenate([linear, np.full((len(linear), 1), 255)], 1).astype("u1")
+    def save(self, path: Path, document: dict[str, Any]) -> None:
+        """Writes a .glb file with this binary part; adds the accessors, the views and the buffer to the document."""
+        own, *others = document.get("buffers") or [{}]
+        document |= {"accessors": self.accessors, "bufferViews": self.views}
+        document["buffers"] = [{**own, "byteLength": len(self.data)}, *others]
+        head = json.dumps(document, separators=(",", ":")).encode()
+        head += b" " * (-len(head) % 4)
+        chunks = struct.pack("<I4s", len(head), b"JSON") + head + struct.pack("<I4s", len(self.data), b"BIN\0")
+        chunks += self.data
+        with atomic_write(path) as temporary:
+            temporary.write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks)
 
 
-def _limbs(rest: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Returns the limbs of the rest pose: a mesh with N corners.
-
-    Positions and normals (N, 3), linear colors (N, 4), joints and weights (N, 4), triangles, inverse bind matrices
-    (22, 4, 4).
-    """
-    thickness, side_of, parents = radii(SMPL22), sides(SMPL22), SMPL22.parents
-    limbs = []
-    for joint, parent in enumerate(parents):
-        if parent >= 0:
-            side = side_of[joint] if side_of[joint] == side_of[parent] else 0
-            thick = min(thickness[parent], 1.35 * thickness[joint])
-            limbs.append((parent, side, *_limb(rest[parent], rest[joint], thick, thickness[joint])))
-            if SMPL22.joints[joint] == "head":
-                up = rest[joint] - rest[parent]
-                up /= np.linalg.norm(up)
-                limbs.append((joint, 0, *_limb(rest[joint] + 0.05 * up, rest[joint] + 0.11 * up, 0.08, 0.09)))
-    counts = [len(position) for _, _, position, _, _ in limbs]
-    starts = np.cumsum([0, *counts[:-1]])
-    color = np.repeat(np.array([SIDE_COLORS[side] for _, side, *_ in limbs]), counts, axis=0)
-    moved, weight = np.zeros((2, sum(counts), 4), "u1")
-    moved[:, 0], weight[:, 0] = np.repeat([joint for joint, *_ in limbs], counts), 255
-    bind = np.tile(np.eye(4, dtype="<f4"), (len(rest), 1, 1))
-    bind[:, :3, 3] = -rest
-    return (
-        np.concatenate([position for _, _, position, _, _ in limbs]).astype("<f4"),
-        np.concatenate([normal for _, _, _, normal, _ in limbs]).astype("<f4"),
-        _linear(color),
-        moved,
-        weight,
-        np.concatenate([start + triangles for (*_, triangles), start in zip(limbs, starts, strict=True)])
-        .astype("<u2")
-        .ravel(),
-        bind,
-    )
-
-
-def _limb(a: np.ndarray, b: np.ndarray, radius_a: float, radius_b: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Returns a limb with round ends: positions (N, 3), normals (N, 3), outward-facing triangles (T, 3)."""
-    along = (b - a) / np.linalg.norm(b - a)
-    side = np.cross(along, np.eye(3)[np.abs(along).argmin()])
-    side /= np.linalg.norm(side)
-    angles = 2 * np.pi * np.arange(SIDES) / SIDES
-    around = np.cos(angles)[:, None] * side + np.sin(angles)[:, None] * np.cross(along, side)
-    latitudes = np.radians([-89, -45, 0, 0, 45, 89])
-    normals = np.cos(latitudes)[:, None, None] * around + np.sin(latitudes)[:, None, None] * along
-    centers, radii = np.array([a, a, a, b, b, b]), np.array([radius_a] * 3 + [radius_b] * 3)
-    positions = centers[:, None] + radii[:, None, None] * normals
-    ring, corner = np.meshgrid(np.arange(len(latitudes) - 1), np.arange(SIDES), indexing="ij")
-    this, next_ = ring * SIDES + corner, ring * SIDES + (corner + 1) % SIDES
-    above, above_next = this + SIDES, next_ + SIDES
-    triangles = np.stack([this, next_, above_next, this, above_next, above], -1).reshape(-1, 3)
-    return positions.reshape(-1, 3), normals.reshape(-1, 3), triangles
+def quaternions(matrices: np.ndarray) -> np.ndarray:
+    """Converts rotations (F, ..., 3, 3) to float32 quaternions x, y, z, w without sign changes between frames."""
+    turns = rotation.continuous(rotation.matrix_to_quaternion(torch.from_numpy(matrices)), dim=0)
+    return turns[..., [1, 2, 3, 0]].float().numpy()

@@ -19,7 +19,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from flame_mdm.formats import bvh, characters, glb
+from flame_mdm.errors import UserError, shortened
+from flame_mdm.formats import bvh, characters, skinned
 from flame_mdm.formats.characters import Character
 from flame_mdm.formats.poses import Poses, solve
 from flame_mdm.formats.retarget import CENTIMETER, Rig, continuous_euler, preset, retarget, smpl
@@ -27,6 +28,7 @@ from flame_mdm.representations import rotation
 from flame_mdm.representations.skeleton import SMPL22, Skeleton
 from flame_mdm.representations.smpl import ADULT
 from flame_mdm.safe_io import atomic_write, write_text
+from flame_mdm.visualize.body import Mesh, try_fit
 
 AMASS_AXES = torch.tensor([[-1.0, 0, 0], [0, 0, 1], [0, 1, 0]], dtype=torch.float64)
 """Converts AMASS's coordinates, z up, to y up as in HumanML3D: (-x, z, y). It is its own inverse."""
@@ -35,6 +37,8 @@ END_SITES = {
     **{"left_wrist": ADULT[22], "right_wrist": ADULT[23]},
 }
 """Tips of head, toes and hands beyond the last joints, in meters; without them programs do not draw these bones."""
+ENDINGS = (".bvh", ".glb", ".npz", ".json", ".npy", ".gif", ".mp4")
+"""Extensions of the files that are written."""
 FIGURES = ("body", "bones")
 """Meshes of .glb files; the first is the default."""
 
@@ -57,7 +61,7 @@ class Motion:
         parts: text, first and last frame (exclusive) of each part of a sequence; () = one part.
 
     Raises:
-        ValueError: wrong shapes, non-finite joints, or a frame rate that is not a positive number.
+        UserError: If a shape is wrong, a joint is not finite, or the frame rate is not a positive number.
     """
 
     joints: np.ndarray
@@ -77,24 +81,22 @@ class Motion:
         self.joints = np.asarray(self.joints, dtype=np.float32)
         shape = self.joints.shape
         if len(shape) != 3 or shape[2] != 3 or not shape[0]:
-            raise ValueError(f"{name}: joints have shape {shape}, expected (frames, joints, 3)")
+            raise UserError(f"{name}: joints have shape {shape}, expected (frames, joints, 3)")
         if shape[1] != len(skeleton.joints):
-            raise ValueError(f"{name}: {shape[1]} joints, but skeleton {skeleton.name} has {len(skeleton.joints)}")
+            raise UserError(f"{name}: {shape[1]} joints, but skeleton {skeleton.name} has {len(skeleton.joints)}")
         if not np.isfinite(self.joints).all():
             frame, joint, _ = np.argwhere(~np.isfinite(self.joints))[0]
-            raise ValueError(f"{name}: joint {joint} in frame {frame} is not finite; did the model diverge?")
+            raise UserError(f"{name}: joint {joint} in frame {frame} is not finite; did the model diverge?")
         self.fps = float(self.fps)
         if not 0 < self.fps < float("inf"):
-            raise ValueError(f"{name}: fps is {self.fps}, expected a number above 0")
+            raise UserError(f"{name}: fps is {self.fps}, expected a number above 0")
         if self.contacts is not None:
             self.contacts = np.asarray(self.contacts, dtype=bool)
-            found, expected = self.contacts.shape, (shape[0], len(skeleton.feet))
-            if found != expected:
-                raise ValueError(f"{name}: contacts have shape {found}, expected (frames, feet) = {expected}")
+            actual, expected = self.contacts.shape, (shape[0], len(skeleton.feet))
+            if actual != expected:
+                raise UserError(f"{name}: contacts have shape {actual}, expected (frames, feet) = {expected}")
 
     def __repr__(self) -> str:
-        from flame_mdm.errors import shortened
-
         name = shortened(self.text or self.id, 60)
         return f"{type(self).__name__}({name!r}, {len(self.joints)} frames, {self.fps:g} fps, {self.skeleton.name})"
 
@@ -102,7 +104,7 @@ class Motion:
         """Returns the rotations; if they are not known, computes them from joint positions.
 
         Raises:
-            ValueError: the skeleton is not SMPL's.
+            UserError: If the skeleton is not SMPL's.
         """
         if self.poses is not None:
             return self.poses
@@ -118,6 +120,7 @@ class Motion:
         rest_pose: bool = False,
         rig: str | None = None,
         character: str | Path | Character | None = None,
+        body: Mesh | None = None,
         **facts: Any,
     ) -> str:
         """Writes a motion file and returns a line that describes it.
@@ -132,32 +135,42 @@ class Motion:
             rig: the skeleton of a `.bvh` or `.glb` file, one of `flame_mdm.formats.retarget.presets`; default: SMPL's.
             character: a `.bvh` or `.glb` file, or what `flame_mdm.formats.characters.read` returned; the same kind of
                 file with this motion is written. The other options do not apply.
+            body: the body in `.glb`, `.gif` and `.mp4` files, from `flame_mdm.visualize.bodies.load_body`; default: the
+                mannequin.
             facts: additional entries of an `.npz` file, such as the seed.
 
         Raises:
-            ValueError: the extension is unknown, or `.bvh` or `.glb` is requested for another skeleton than SMPL's.
-            UserError: the file cannot be written, `.mp4` is requested and the package av is not installed, the rig is
-                unknown, or the character cannot be used.
+            UserError: If the extension, an option or the rig is unknown or does not apply, `.bvh` or `.glb` is
+                requested for another skeleton than SMPL's, the file cannot be written, `.mp4` is requested and the
+                package av is not installed, or the character cannot be used.
         """
         path = Path(path)
-        writers = {".bvh": _write_bvh, ".glb": _write_glb, ".npz": _write_npz, ".json": _write_json, ".npy": _write_npy}
-        writers |= {".gif": _write_video, ".mp4": _write_video}
-        writer = writers.get(path.suffix.lower())
-        if writer is None:
-            raise ValueError(f"{path}: unknown kind of motion file. Use one of {', '.join(writers)}")
+        ending = path.suffix.lower()
+        if ending not in ENDINGS:
+            raise UserError(f"{path}: unknown kind of motion file. Use one of {', '.join(ENDINGS)}")
         if figure not in FIGURES:
-            raise ValueError(f"figure={figure}: unknown. Use {' or '.join(FIGURES)}")
-        if (figure != FIGURES[0] and writer is not _write_glb) or (rest_pose and writer is not _write_bvh):
-            raise ValueError(f"{path}: figure is only for .glb files, and rest_pose only for .bvh files")
-        if rig is not None and writer not in (_write_bvh, _write_glb):
-            raise ValueError(f"{path}: rig is only for .bvh and .glb files, which contain a skeleton")
+            raise UserError(f"figure={figure}: unknown. Use {' or '.join(FIGURES)}")
+        if (figure != FIGURES[0] and ending != ".glb") or (rest_pose and ending != ".bvh"):
+            raise UserError(f"{path}: figure is only for .glb files, and rest_pose only for .bvh files")
+        if rig is not None and ending not in (".bvh", ".glb"):
+            raise UserError(f"{path}: rig is only for .bvh and .glb files, which contain a skeleton")
         if character is not None:
             if figure != FIGURES[0] or rest_pose or rig is not None:
-                raise ValueError(f"{path}: figure, rest_pose and rig do not apply to a character's own file")
-            what = _write_character(self, path, character)
-            return f"{path}: {len(self.joints)} frames at {self.fps:g} per second, {what}"
-        given = {_write_npz: (facts,), _write_glb: (figure, rig), _write_bvh: (rest_pose, rig)}
-        what = writer(self, path, *given.get(writer, ()))
+                raise UserError(f"{path}: figure, rest_pose and rig do not apply to a character's own file")
+            character = character if isinstance(character, Character) else characters.read(character)
+            what = characters.write(path, character, self, self.text or self.id or "motion")
+        elif ending == ".bvh":
+            what = _write_bvh(self, path, rest_pose, rig)
+        elif ending == ".glb":
+            what = _write_glb(self, path, figure, rig, body)
+        elif ending == ".npz":
+            what = _write_npz(self, path, facts)
+        elif ending == ".json":
+            what = _write_json(self, path)
+        elif ending == ".npy":
+            what = _write_npy(self, path)
+        else:
+            what = _write_video(self, path, body)
         return f"{path}: {len(self.joints)} frames at {self.fps:g} per second, {what}"
 
     def show(self) -> Any:
@@ -219,10 +232,10 @@ def _write_bvh(motion: Motion, path: Path, rest_pose: bool, rig: str | None) -> 
     offsets = np.round(skeleton.offsets() / skeleton.unit, 5)
     if rest_pose:
         turns = np.concatenate([skeleton.rest()[None], turns])
-        root = np.concatenate([skeleton.places[None, skeleton.hips], root])
+        root = np.concatenate([skeleton.positions[None, skeleton.hips], root])
     angles = np.round(np.degrees(continuous_euler(torch.from_numpy(turns), skeleton.orders).numpy()), 6)
-    places = np.tile(offsets, (len(angles), 1, 1))
-    places[:, skeleton.hips] = np.round(root / skeleton.unit, 5)
+    positions = np.tile(offsets, (len(angles), 1, 1))
+    positions[:, skeleton.hips] = np.round(root / skeleton.unit, 5)
     moving = [skeleton.moving or joint <= skeleton.hips for joint in range(len(offsets))]
     offsets[skeleton.hips] = 0  # programs disagree on whether the channels replace the offset or add to it
     ends = {skeleton.sources.index(SMPL22.joints.index(name)): site for name, site in END_SITES.items()}
@@ -241,7 +254,7 @@ def _write_bvh(motion: Motion, path: Path, rest_pose: bool, rig: str | None) -> 
                 [
                     part
                     for joint, moves in enumerate(moving)
-                    for part in ([places[:, joint]] * moves + [angles[:, joint]])
+                    for part in ([positions[:, joint]] * moves + [angles[:, joint]])
                 ],
                 axis=1,
             ),
@@ -253,18 +266,11 @@ def _write_bvh(motion: Motion, path: Path, rest_pose: bool, rig: str | None) -> 
     return f"{unit}, y up; {_error(motion, poses)}" + "; the first frame is the rest pose" * rest_pose
 
 
-def _write_glb(motion: Motion, path: Path, figure: str, rig: str | None) -> str:
-    from flame_mdm.visualize.body import try_figure
-
+def _write_glb(motion: Motion, path: Path, figure: str, rig: str | None, body: Mesh | None) -> str:
     poses = motion.posed()
-    body, reason = try_figure(motion) if figure == FIGURES[0] else (None, "")
-    glb.write(path, poses, _rig(poses, rig), motion.fps, motion.text, motion.id, body)
+    fitted, reason = try_fit(motion, body) if figure == FIGURES[0] else (None, "")
+    skinned.write(path, poses, _rig(poses, rig), motion.fps, motion.text, motion.id, fitted)
     return f"meters, y up; {_error(motion, poses)}" + (reason and f"; without a body: {reason}")
-
-
-def _write_character(motion: Motion, path: Path, character: str | Path | Character) -> str:
-    made = character if isinstance(character, Character) else characters.read(character)
-    return characters.write(path, made, motion, motion.text or motion.id or "motion")
 
 
 def _write_json(motion: Motion, path: Path) -> str:
@@ -283,16 +289,15 @@ def _write_npy(motion: Motion, path: Path) -> str:
     return f"joints {motion.joints.shape} in meters, y up; the file does not contain the frame rate"
 
 
-def _write_video(motion: Motion, path: Path) -> str:
+def _write_video(motion: Motion, path: Path, body: Mesh | None) -> str:
     from flame_mdm.visualize import write_gif, write_mp4
-    from flame_mdm.visualize.body import try_figure
 
-    _, reason = try_figure(motion)
+    _, reason = try_fit(motion, body)
     without = reason and f"; without a body: {reason}"
     if path.suffix.lower() == ".mp4":
-        write_mp4(path, [motion])
+        write_mp4(path, [motion], body=body)
         return f"H.264 video{without}"
-    write_gif(path, [motion])
+    write_gif(path, [motion], body=body)
     return f"animated GIF of at most 50 frames per second{without}"
 
 

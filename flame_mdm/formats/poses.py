@@ -8,6 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from flame_mdm.errors import UserError
 from flame_mdm.representations import rotation
 from flame_mdm.representations.skeleton import SMPL22, forward_kinematics
 from flame_mdm.representations.smpl import ADULT
@@ -20,8 +21,8 @@ FORWARD = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
 BENDS = {1: -FORWARD, 2: -FORWARD, 16: FORWARD, 17: FORWARD}
 """Hips and shoulders -> direction in which the knee or elbow bends the limb in the rest pose."""
 STRAIGHT = 0.15
-"""Sine of the bend at which a knee or elbow has the same weight for the twist of its limb as the parent's rotation.
-Weights are squared, so that a clear bend dominates."""
+"""Sine of the bend of a knee or elbow at which the bend and the parent's rotation have the same weight for the twist of
+the limb. Weights are squared, so that a clear bend dominates."""
 FOOT = 0.3
 """Weight of the foot relative to the shin in the twist of a thigh: it determines the twist of a straight leg."""
 SMOOTH = 0.1
@@ -74,10 +75,10 @@ def solve(joints: Tensor, fps: float) -> Poses:
         fps: frames per second.
 
     Raises:
-        ValueError: the joints are of another skeleton, or a bone has no length.
+        UserError: If the joints are of another skeleton, or a bone has no length.
     """
     if joints.ndim != 3 or not len(joints) or joints.shape[1:] != (len(SMPL22), 3):
-        raise ValueError(
+        raise UserError(
             f"joint rotations are computed only for the {len(SMPL22)} joints of SMPL, (frames, {len(SMPL22)}, 3); "
             f"these joints have shape {tuple(joints.shape)}: write them as .json or .npy"
         )
@@ -86,7 +87,7 @@ def solve(joints: Tensor, fps: float) -> Poses:
     lengths = torch.linalg.vector_norm(bones, dim=-1).mean(0)
     if (lengths[1:] < 1e-4).any():
         name = SMPL22.joints[int(lengths[1:].argmin()) + 1]
-        raise ValueError(f"the bone that ends in {name} has no length, so its direction is undefined")
+        raise UserError(f"the bone that ends in {name} has no length, so its direction is undefined")
     adult = torch.tensor(ADULT[: len(SMPL22)], dtype=torch.float64)
     offsets = lengths[:, None] * F.normalize(adult, dim=-1)
     for joint in (PELVIS, SPINE3):
@@ -97,9 +98,9 @@ def solve(joints: Tensor, fps: float) -> Poses:
     chest = rotation.matrix_to_quaternion(_fit(offsets[list(CHILDREN[SPINE3])], bones[:, list(CHILDREN[SPINE3])]))
 
     turned: list[Tensor] = []  # world rotation of each joint
-    places = [joints[:, 0]] + [joints[:, 0]] * (len(SMPL22) - 1)
+    positions = [joints[:, 0]] + [joints[:, 0]] * (len(SMPL22) - 1)
     for joint, children in enumerate(CHILDREN):
-        aims = joints[:, list(children)] - places[joint][:, None]
+        aims = joints[:, list(children)] - positions[joint][:, None]
         if len(children) > 1:
             turned.append(_fit(offsets[list(children)], aims))
         elif not children:
@@ -113,7 +114,7 @@ def solve(joints: Tensor, fps: float) -> Poses:
                 swung = rotation.multiply(_twist(joint, swung, offsets[children[0]], bones, fps), swung)
             turned.append(rotation.quaternion_to_matrix(swung))
         for child in children:
-            places[child] = places[joint] + turned[joint] @ offsets[child]
+            positions[child] = positions[joint] + turned[joint] @ offsets[child]
     world = torch.stack(turned, 1)
     above = world[:, [max(parent, 0) for parent in SMPL22.parents]]
     local = above.mT @ world

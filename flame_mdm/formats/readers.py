@@ -16,7 +16,7 @@ from flame_mdm.formats.body import check_size, leg_length
 from flame_mdm.formats.layouts import array_layout, read_bvh
 from flame_mdm.formats.motion import AMASS_AXES, Motion, motion_of_poses
 from flame_mdm.formats.poses import Poses
-from flame_mdm.formats.resampling import between, check_frames, frame_rate, resample
+from flame_mdm.formats.resampling import check_frames, frame_pairs, frame_rate, resample
 from flame_mdm.representations import rotation
 from flame_mdm.representations.motion272 import Motion272
 from flame_mdm.representations.skeleton import SKELETONS, SMPL22, Skeleton
@@ -191,7 +191,7 @@ def smpl_motion(data: dict[str, Any], fps: float | None = None) -> tuple[Tensor,
         ValueError: fewer than 24 joints, or too many frames.
     """
     poses = data["poses"].reshape(len(data["poses"]), -1)
-    frames = None if fps is None else between(len(poses), data["fps"], fps, poses.shape[1] // 3)
+    frames = None if fps is None else frame_pairs(len(poses), data["fps"], fps, poses.shape[1] // 3)
     translation, rotations = read_pose(torch.from_numpy(np.concatenate([data["trans"], poses], 1)))
     turns = rotation.matrix_to_quaternion(rotations)
     if fps is None or frames is None:

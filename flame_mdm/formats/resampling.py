@@ -12,6 +12,8 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
+from flame_mdm.errors import UserError
+
 RATES = (0.1, 1000.0)
 """Lowest and highest frame rate of a motion file, in frames per second."""
 MAX_FRAMES = 500_000
@@ -28,19 +30,19 @@ def frame_rate(value: Any, name: str = "fps") -> float:
         name: its name in the file.
 
     Raises:
-        ValueError: the value is not one number within `RATES`.
+        UserError: If the value is not one number within `RATES`.
     """
     number = np.asarray(value)
     if number.shape or number.dtype.kind not in "fiu" or not RATES[0] <= float(number) <= RATES[1]:
         shown = f"{float(number):g}" if not number.shape and number.dtype.kind in "fiu" else f"{value}"[:40]
-        raise ValueError(f"{name} is {shown}, not a number of frames per second from {RATES[0]:g} to {RATES[1]:g}")
+        raise UserError(f"{name} is {shown}, not a number of frames per second from {RATES[0]:g} to {RATES[1]:g}")
     return float(number)
 
 
 def check_frames(frames: int) -> None:
-    """Raises `ValueError` if a motion has more than `MAX_FRAMES` frames."""
+    """Raises `UserError` if a motion has more than `MAX_FRAMES` frames."""
     if frames > MAX_FRAMES:
-        raise ValueError(f"{frames:,} frames, but a motion may have at most {MAX_FRAMES:,}: cut it")
+        raise UserError(f"{frames:,} frames, but a motion may have at most {MAX_FRAMES:,}: cut it")
 
 
 def resampled_frames(frames: int, rate: float, fps: float, joints: int, slack: float = 0.0) -> int:
@@ -54,19 +56,20 @@ def resampled_frames(frames: int, rate: float, fps: float, joints: int, slack: f
         slack: fraction of a frame by which the last frame may be past the end.
 
     Raises:
-        ValueError: more than `MAX_FRAMES` frames before, or more than `MAX_RESAMPLED` joint positions after upsampling.
+        UserError: If there are more than `MAX_FRAMES` frames before, or more than `MAX_RESAMPLED` joint positions
+            after upsampling.
     """
     check_frames(frames)
     count = math.floor((frames - 1) * fps / rate + slack) + 1
     if count * joints > max(frames * joints, MAX_RESAMPLED):
-        raise ValueError(
+        raise UserError(
             f"{frames:,} frames at {rate:g} frames per second would become {count:,} at {fps:g}, with {joints} joints: "
             "too many; check the frame rate, or cut the motion"
         )
     return count
 
 
-def between(
+def frame_pairs(
     frames: int, rate: float, fps: float, joints: int, slack: float = 1e-6
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Returns the frames before and after each new frame, and its position between them, 0 to 1.
@@ -75,7 +78,7 @@ def between(
     `resampled_frames`.
 
     Raises:
-        ValueError: as in `resampled_frames`.
+        UserError: If `resampled_frames` raises it.
     """
     times = np.arange(resampled_frames(frames, rate, fps, joints, slack)) * rate / fps
     before = np.minimum(times.astype(int), frames - 1)
@@ -92,9 +95,9 @@ def resample(values: np.ndarray, rate: float, fps: float, cubic: bool = False) -
         cubic: interpolate with cubic splines, which preserve bone lengths to about 0.1 %; otherwise linearly.
 
     Raises:
-        ValueError: as in `resampled_frames`.
+        UserError: If `resampled_frames` raises it.
     """
-    before, after, share = between(len(values), rate, fps, math.prod(values.shape[1:-1]))
+    before, after, share = frame_pairs(len(values), rate, fps, math.prod(values.shape[1:-1]))
     if cubic and len(values) > 1:
         return CubicSpline(np.arange(len(values)), values)(before + share)
     share = share.reshape(-1, *[1] * (values.ndim - 1))
@@ -102,7 +105,7 @@ def resample(values: np.ndarray, rate: float, fps: float, cubic: bool = False) -
 
 
 def slerp(rotations: np.ndarray, before: np.ndarray, after: np.ndarray, share: np.ndarray) -> np.ndarray:
-    """Interpolates rotations (F, J, 3, 3) on the sphere and returns (F', J, 3, 3); arguments as `between` returns."""
+    """Interpolates rotations (F, J, 3, 3) on the sphere and returns (F', J, 3, 3); arguments as from `frame_pairs`."""
     turn = np.swapaxes(rotations[before], -1, -2) @ rotations[after]
     vectors = Rotation.from_matrix(turn.reshape(-1, 3, 3)).as_rotvec().reshape(turn.shape[:3])
     part = Rotation.from_rotvec((share[:, None, None] * vectors).reshape(-1, 3)).as_matrix().reshape(turn.shape)

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -18,6 +18,7 @@ from flame_mdm.formats.poses import Poses
 from flame_mdm.representations import rotation
 from flame_mdm.representations.skeleton import SMPL22
 from flame_mdm.safe_io import read_yaml
+from flame_mdm.visualize.body import world_rotations
 
 JOINT = {name: number for number, name in enumerate(SMPL22.joints)}
 DIRECTIONS = {
@@ -36,7 +37,7 @@ class Rig:
     Attributes:
         joints: names; parents precede their children.
         parents: index of each joint's parent, -1 for a root.
-        places: (J, 3), positions of the joints.
+        positions: (J, 3) of the joints.
         turns: (J, 3, 3), rotations of the joints in the world.
         sources: for each joint, the index of the joint of SMPL whose rotation it takes, or -1.
         neutral: (J, 3, 3), rotations of these joints in the world while SMPL's are those of its rest pose.
@@ -49,7 +50,7 @@ class Rig:
 
     joints: tuple[str, ...]
     parents: tuple[int, ...]
-    places: np.ndarray
+    positions: np.ndarray
     turns: np.ndarray
     sources: tuple[int, ...]
     neutral: np.ndarray
@@ -66,14 +67,15 @@ class Rig:
 
     def offsets(self) -> np.ndarray:
         """Returns the position (J, 3) of each joint in the frame of its parent, or in the world of the file."""
-        return np.stack([self.within(self.places[joint], joint) for joint in range(len(self.joints))])
+        return np.stack([self.within(self.positions[joint], joint) for joint in range(len(self.joints))])
 
-    def within(self, places: np.ndarray, joint: int) -> np.ndarray:
+    def within(self, positions: np.ndarray, joint: int) -> np.ndarray:
         """Converts positions (..., 3) in the world to the frame of a joint's parent in the rest pose."""
         parent = self.parents[joint]
         if parent < 0:
-            return places @ self.frame
-        return (places - self.places[parent]) @ self.turns[parent] / (self.scales[parent] if len(self.scales) else 1)
+            return positions @ self.frame
+        scale = self.scales[parent] if len(self.scales) else 1
+        return (positions - self.positions[parent]) @ self.turns[parent] / scale
 
     def rest(self) -> np.ndarray:
         """Returns the rotation (J, 3, 3) of each joint relative to its parent, or to the world of the file."""
@@ -100,11 +102,38 @@ class Rig:
                 turned[:, joint] = turned[:, parent] @ rest[joint]
         return turned
 
+    def assembled(self, world: np.ndarray, pelvis: np.ndarray) -> np.ndarray:
+        """Returns positions (F, J, 3) of joints with world rotations (F, J, 3, 3), with the pelvis at (F, 3)."""
+        positions, hips = np.tile(self.positions, (len(world), 1, 1)), self.hips
+        for joint, parent in enumerate(self.parents):
+            if joint == hips:
+                positions[:, joint] = pelvis
+            elif parent >= 0:
+                offset = self.turns[parent].T @ (self.positions[joint] - self.positions[parent])
+                positions[:, joint] = positions[:, parent] + world[:, parent] @ offset
+        return positions
+
 
 @cache
 def presets() -> dict[str, dict[str, Any]]:
     """Returns the skeletons in `rigs.yaml` by name."""
     return read_yaml(Path(__file__).with_name("rigs.yaml"))
+
+
+def joint_names(skeleton: Mapping[str, Any]) -> dict[str, str]:
+    """Returns SMPL's joints -> names of the joints of a skeleton in `rigs.yaml`, without prefix."""
+    names = {}
+    for part, side, mark in _parts(skeleton):
+        own = {joint: name for name, joint in skeleton[part].items() if isinstance(joint, str)}
+        names |= {side + joint: name.replace("*", mark) for joint, name in own.items()}
+    return names
+
+
+def _parts(skeleton: Mapping[str, Any]) -> Iterator[tuple[str, str, str]]:
+    """Yields the parts of a skeleton in `rigs.yaml`: key, prefix of SMPL's joints, mark of the side in names."""
+    yield "trunk", "", ""
+    for side, mark in zip(("left_", "right_"), skeleton["sides"], strict=True):
+        yield from (("leg", side, mark), ("arm", side, mark))
 
 
 def smpl(poses: Poses) -> Rig:
@@ -135,36 +164,47 @@ def preset(name: str, poses: Poses) -> Rig:
     for parent, joint in SMPL22.edges:
         rest[joint] = rest[parent] + posed[parent] @ offsets[joint]
     rest[:, 1] -= rest[:, 1].min()
-    # name, parent, counterpart, place, axes in the T-pose, rotation in the rest pose
-    joints: list[tuple[str, int, int, np.ndarray, np.ndarray, np.ndarray]] = []
+    joints: list[_RigJoint] = []
     if "root" in data:
-        joints.append((data["root"], -1, -1, np.zeros(3), np.eye(3), np.eye(3)))
-
-    def add(part: str, start: str | None, side: str = "", mark: str = "") -> None:
-        parent = next((k for k, each in enumerate(joints) if each[0] == start), len(joints) - 1)
-        for name, at in data[part].items():
-            if isinstance(at, str):
-                number = JOINT[side + at]
-                axes = _axes(data.get("axes", {}), part, at, offsets[_end(number)], side == "right_")
-                joints.append((name.replace("*", mark), parent, number, rest[number], axes, posed[number] @ axes))
+        joints.append(_RigJoint(data["root"], -1, -1, np.zeros(3), np.eye(3), np.eye(3)))
+    starts = {"trunk": data.get("root"), "leg": next(iter(data["trunk"])), "arm": data["chest"]}
+    for part, side, mark in _parts(data):
+        start, names = starts[part], list(data[part].items())
+        parent = next((k for k, joint in enumerate(joints) if joint.name == start), len(joints) - 1)
+        for number, (name, source) in enumerate(names):
+            name = name.replace("*", mark)
+            if isinstance(source, str):
+                joint = JOINT[side + source]
+                local = _axes(data.get("axes", {}), part, source, offsets[_end(joint)], side == "right_")
+                joints.append(_RigJoint(name, parent, joint, rest[joint], posed[joint] @ local, local))
             else:
-                following = list(data[part].values())[list(data[part]).index(name) :]
-                end = rest[JOINT[side + next(place for place in following if isinstance(place, str))]]
-                place = joints[parent][3] + at * (end - joints[parent][3])
-                joints.append((name.replace("*", mark), parent, -1, place, *joints[parent][4:]))
+                above, following = joints[parent], next(ours for _, ours in names[number:] if isinstance(ours, str))
+                position = above.position + source * (rest[JOINT[side + following]] - above.position)
+                joints.append(_RigJoint(name, parent, -1, position, above.turn, above.neutral))
             parent = len(joints) - 1
-
-    add("trunk", data.get("root"))
-    for side, mark in zip(("left_", "right_"), data["sides"], strict=True):
-        add("leg", next(iter(data["trunk"])), side, mark)
-        add("arm", data["chest"], side, mark)
-    names, parents, sources, places, neutral, turns = zip(*joints, strict=True)
+    names, parents, sources, positions, turns, neutral = zip(*joints, strict=True)
     return Rig(
-        *(tuple(data.get("prefix", "") + name for name in names), parents, np.stack(places), np.stack(turns)),
-        *(sources, np.stack(neutral), (data["order"],) * len(joints)),
+        joints=tuple(data.get("prefix", "") + name for name in names),
+        parents=parents,
+        positions=np.stack(positions),
+        turns=np.stack(turns),
+        sources=sources,
+        neutral=np.stack(neutral),
+        orders=(data["order"],) * len(joints),
         unit=data.get("unit", CENTIMETER),
         moving=data.get("moving", False),
     )
+
+
+class _RigJoint(NamedTuple):
+    """A joint of a rig: name, parent, joint of SMPL, position, world rotation and neutral rotation in the rest pose."""
+
+    name: str
+    parent: int
+    source: int
+    position: np.ndarray
+    turn: np.ndarray
+    neutral: np.ndarray
 
 
 def _end(joint: int) -> int:
@@ -175,20 +215,20 @@ def _end(joint: int) -> int:
 def _axes(axes: dict[str, Any], part: str, joint: str, bone: np.ndarray, right: bool) -> np.ndarray:
     """Returns the local axes (3, 3) in a T-pose of a joint whose bone has the direction `bone`."""
     flip = np.array([-1, 1, 1]) if right else np.ones(3)
-    made, columns = np.eye(3), []
+    matrix, columns = np.eye(3), []
     for axis, direction in axes.get(joint, axes.get(part, {})).items():  # two of them, of the left side
         toward = np.array(DIRECTIONS[direction], float) if direction in DIRECTIONS else bone * flip
         for column in columns:
-            toward = toward - made[:, column] * (made[:, column] @ toward)
+            toward = toward - matrix[:, column] * (matrix[:, column] @ toward)
         columns.append("xyz".index(axis[-1]))
-        made[:, columns[-1]] = toward / np.linalg.norm(toward) * (-1 if axis.startswith("-") else 1)
+        matrix[:, columns[-1]] = toward / np.linalg.norm(toward) * (-1 if axis.startswith("-") else 1)
     if columns:
         third = 3 - sum(columns)
-        made[:, third] = np.cross(made[:, (third + 1) % 3], made[:, (third + 2) % 3])
+        matrix[:, third] = np.cross(matrix[:, (third + 1) % 3], matrix[:, (third + 2) % 3])
         if right:
-            made = made * flip[:, None] * (-1 if axes.get("opposed") else 1)
-            made[:, third] *= 1 if axes.get("opposed") else -1
-    return made
+            matrix = matrix * flip[:, None] * (-1 if axes.get("opposed") else 1)
+            matrix[:, third] *= 1 if axes.get("opposed") else -1
+    return matrix
 
 
 def retarget(poses: Poses, rig: Rig) -> tuple[np.ndarray, np.ndarray]:
@@ -198,14 +238,6 @@ def retarget(poses: Poses, rig: Rig) -> tuple[np.ndarray, np.ndarray]:
         Rotations (F, J, 3, 3) relative to parents, or of roots in the world; positions (F, 3) of the hips in the world.
     """
     return rig.local(rig.turned(world_rotations(poses.rotations.numpy()))), poses.root.numpy()
-
-
-def world_rotations(rotations: np.ndarray) -> np.ndarray:
-    """Returns rotations (..., 22, 3, 3) in the world from those relative to parents."""
-    world = rotations.copy()
-    for parent, joint in SMPL22.edges:
-        world[..., joint, :, :] = world[..., parent, :, :] @ rotations[..., joint, :, :]
-    return world
 
 
 def continuous_euler(matrices: Tensor, orders: Sequence[str] = SMPL_ORDERS) -> Tensor:

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from flame_mdm.data.store import Entry, Store
     from flame_mdm.formats.motion import Motion
     from flame_mdm.representations import Representation
+    from flame_mdm.visualize.body import Mesh
 
 SECONDS = 15
 """Seconds shown of a longer clip, to keep the page small."""
@@ -75,7 +76,14 @@ def motion(store: Store, representation: Representation, clip: Entry) -> Motion:
     return Motion(joints, representation.fps, representation.skeleton, caption, clip.id)
 
 
-def write_page(path: Path, store: Store, representation: Representation, clips: Sequence[Entry], title: str) -> None:
+def write_page(
+    path: Path,
+    store: Store,
+    representation: Representation,
+    clips: Sequence[Entry],
+    title: str,
+    body: Mesh | None = None,
+) -> None:
     """Writes a page that shows some clips of a store."""
     from flame_mdm.visualize import write_player
 
@@ -86,6 +94,7 @@ def write_page(path: Path, store: Store, representation: Representation, clips: 
         about=describe(store),
         groups=[clip.split for clip in clips],
         beside=[clip.id[1:] if clip.id.startswith("M") else "" for clip in clips],
+        body=body,
     )
 
 

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from markupsafe import Markup
 
     from flame_mdm.formats.motion import Motion
+    from flame_mdm.visualize.body import Mesh
 
 MOTIONS = (".npz", ".bvh", ".json")
 """Suffixes of the motion files that are compared. Not .npy, which does not store its frame rate."""
@@ -70,7 +71,9 @@ def shared(shown: Sequence[Mapping[Prompt, Motion]]) -> list[Prompt]:
 # Side by side ---------------------------------------------------------------------------------------------------------
 
 
-def comparison(compared: Sequence[ComparedRun], shown: Sequence[Mapping[Prompt, Motion]]) -> str:
+def comparison(
+    compared: Sequence[ComparedRun], shown: Sequence[Mapping[Prompt, Motion]], mesh: Mesh | None = None
+) -> str:
     """Returns the page that compares runs side by side. The same runs give the same bytes."""
     runs = {c.label: c.run for c in compared if c.run is not None}
     body = render(
@@ -79,7 +82,7 @@ def comparison(compared: Sequence[ComparedRun], shown: Sequence[Mapping[Prompt, 
         labels=list(runs),
         facts=_facts(runs),
         differences=_differences(runs),
-        player=_player(compared, shown),
+        player=_player(compared, shown, mesh),
         evaluations=_evaluations(runs),
         unpaired=in_common(runs),
         columns=HEAD,
@@ -113,7 +116,7 @@ def _differences(runs: Mapping[str, Run]) -> list[list[str]]:
     return [row for row in rows if len(set(row[1:])) > 1]
 
 
-def _player(compared: Sequence[ComparedRun], shown: Sequence[Mapping[Prompt, Motion]]) -> str:
+def _player(compared: Sequence[ComparedRun], shown: Sequence[Mapping[Prompt, Motion]], body: Mesh | None) -> str:
     from flame_mdm.visualize import player_page
 
     scene = [
@@ -121,7 +124,7 @@ def _player(compared: Sequence[ComparedRun], shown: Sequence[Mapping[Prompt, Mot
         for prompt in shared(shown)
         for c, those in zip(compared, shown, strict=True)
     ]
-    return player_page(scene, "", columns=len(compared)) if scene else ""
+    return player_page(scene, "", columns=len(compared), body=body) if scene else ""
 
 
 class Difference(NamedTuple):

@@ -13,10 +13,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
-from flame_mdm.errors import markdown_text, one_line
+from flame_mdm.errors import markdown_text, one_line, shortened
 from flame_mdm.reporting.page import render
 from flame_mdm.reporting.plots import Histogram, Panel, Series, svg
-from flame_mdm.visualize.scene import shortened
 
 if TYPE_CHECKING:
     from markupsafe import Markup

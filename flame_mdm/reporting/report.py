@@ -6,6 +6,7 @@ import os
 import shlex
 from collections.abc import Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from flame_mdm.errors import UserError
 from flame_mdm.reporting.audit import card_of
@@ -14,6 +15,9 @@ from flame_mdm.reporting.plots import Curve, charts
 from flame_mdm.runs import FAULT, HISTORY, Fault, Provenance, Run, read_run
 from flame_mdm.safe_io import write_text
 from flame_mdm.schemas import Result, Value, read_json
+
+if TYPE_CHECKING:
+    from flame_mdm.visualize.body import Mesh
 
 COST = ("lr", "grad_norm", "samples_per_second", "seconds_per_step", "gpu_memory_gib")
 """Training curves about speed and optimization rather than losses."""
@@ -34,7 +38,7 @@ def paths(key: str, given: str) -> list[Path]:
     return [Path(name) for name in names]
 
 
-def write_report(folder: Path) -> Path:
+def write_report(folder: Path, mesh: Mesh | None = None) -> Path:
     """Writes `report.html` into a run directory, and returns its path. The same folder gives the same bytes.
 
     Raises:
@@ -57,7 +61,7 @@ def write_report(folder: Path) -> Path:
         facts=_facts(run),
         fault=fault,
         faulty=faulty,
-        player=_player(run),
+        player=_player(run, mesh),
         step=int(run.samples.name.removeprefix("step_")) if run.samples else 0,
         evaluations=[
             (evaluation_title(r), sampling(r), _card(folder, r), marks(r), r.not_computed, _values(r))
@@ -99,14 +103,14 @@ def _facts(run: Run) -> list[str]:
     return facts + ([run.provenance.device] if run.provenance else [])
 
 
-def _player(run: Run) -> str:
+def _player(run: Run, body: Mesh | None) -> str:
     if run.samples is None:
         return ""
     from flame_mdm.formats.readers import read
     from flame_mdm.visualize import player_page
 
     # Written again from the motions: `player.html` may be untrusted, and its scripts would run in the report.
-    return player_page([read(path) for path in sorted(run.samples.glob("motion_*.npz"))])
+    return player_page([read(path) for path in sorted(run.samples.glob("motion_*.npz"))], body=body)
 
 
 def _curves(run: Run, name: str, families: list[str]) -> tuple[dict[str, Curve], dict[str, Curve]]:

@@ -20,6 +20,7 @@ from flame_mdm.schemas import Int, Schema, read_json
 
 if TYPE_CHECKING:
     from flame_mdm.formats.motion import Motion
+    from flame_mdm.visualize.body import Mesh
 
 QUESTION = "Which animation better fits the following description?"
 """As in Tevet et al. 2023 (MDM), appendix D."""
@@ -59,7 +60,9 @@ class Ratings(Schema):
     pairs: list[Pair]
 
 
-def rating_page(compared: Sequence[ComparedRun], shown: Sequence[Mapping[Prompt, Motion]], seed: int) -> str:
+def rating_page(
+    compared: Sequence[ComparedRun], shown: Sequence[Mapping[Prompt, Motion]], seed: int, body: Mesh | None = None
+) -> str:
     """Returns a page that asks which of two motions fits a text better: the first run's or another run's.
 
     The first run is compared with each other run. Order and sides are random, from `seed`. The page saves the answers
@@ -84,7 +87,7 @@ def rating_page(compared: Sequence[ComparedRun], shown: Sequence[Mapping[Prompt,
             if draw.random() < 0.5:
                 left, right = reversed(sides)
             scene = [replace(left[1], id="the left one", text=""), replace(right[1], id="the right one", text="")]
-            player = player_page(scene, "", columns=2)
+            player = player_page(scene, "", columns=2, body=body)
             item = {"prompt": prompt[0], "a": first.label, "b": other.label, "left": left[0], "player": player}
             items.append(item)
     draw.shuffle(items)

@@ -25,6 +25,7 @@ from flame_mdm.sampling.sequences import motion_lengths, overlap, windows
 from flame_mdm.sampling.targets import Targets, read_targets
 from flame_mdm.task import MotionGeneration
 from flame_mdm.visualize import contact_sheet, write_gif, write_mp4, write_player
+from flame_mdm.visualize.body import Mesh
 
 BATCH = 32
 STAGES = 10
@@ -251,6 +252,7 @@ def write_motions(
     facts: dict[str, Any],
     stages: Sequence[Motion] | None = None,
     mp4: bool = False,
+    body: Mesh | None = None,
 ) -> None:
     """Writes `motion_000.npz` ..., `motions.gif`, `motions.png` and `player.html` into a folder, all or none.
 
@@ -262,19 +264,20 @@ def write_motions(
         facts: such as seed and checkpoint hash, added to each `.npz`.
         stages: of a sampling run, drawn in `trajectory.png`.
         mp4: also write `motions.mp4`.
+        body: the body to draw; None = the mannequin.
     """
     scene = [replace(motion, text=motion.text or "unconditioned") for motion in motions]
     with atomic_folder(folder) as made:
         for number, motion in enumerate(motions):
             motion.save(made / f"motion_{number:03d}.npz", **facts)
-        write_gif(made / "motions.gif", scene[:8])
+        write_gif(made / "motions.gif", scene[:8], body=body)
         if mp4:
-            write_mp4(made / "motions.mp4", scene[:8])
-        contact_sheet(made / "motions.png", scene[:8])
+            write_mp4(made / "motions.mp4", scene[:8], body=body)
+        contact_sheet(made / "motions.png", scene[:8], body=body)
         if stages:
-            contact_sheet(made / "trajectory.png", stages)
+            contact_sheet(made / "trajectory.png", stages, body=body)
         title = motions[0].text if len({motion.text for motion in motions}) == 1 else ""
-        write_player(made / "player.html", scene, title or "Motions")
+        write_player(made / "player.html", scene, title or "Motions", body=body)
         written = {path.name for path in made.iterdir()}
     for path in list(folder.iterdir()):
         if REQUEST_FILES.fullmatch(path.name) and path.name not in written:

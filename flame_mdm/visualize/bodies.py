@@ -19,8 +19,20 @@ from flame_mdm.progress import ProgressBar
 from flame_mdm.representations.skeleton import SMPL22
 from flame_mdm.representations.smpl import ADULT
 from flame_mdm.safe_io import atomic_write
-from flame_mdm.visualize.body import HAIR, JOINT, MANNEQUIN, SHIRT, SHOES, SKIN, TROUSERS, Mesh, between, use
-from flame_mdm.visualize.mannequin import frame, hairline, packed, smooth, with_helpers
+from flame_mdm.visualize.body import (
+    HAIR,
+    HELPERS,
+    JOINT,
+    SHIRT,
+    SHOES,
+    SKIN,
+    TROUSERS,
+    Mesh,
+    mannequin,
+    orthonormal,
+    packed,
+    shortest_turn,
+)
 
 SHAPE = {"gender": 0.5, "age": 2 / 3, "height": 0.45, "weight": 0.4}
 """Anny's numbers and their defaults, 0 to 1: male to female, baby to old (2/3: a young adult), small to tall, light to
@@ -52,24 +64,22 @@ CLOTHES = {"neck": SKIN, "head": SKIN, "wrist": SKIN, "ankle": SHOES, "foot": SH
 )
 
 
-def choose_body(body: str) -> None:
-    """Chooses the body of all pictures, pages and files that this process draws from now on.
-
-    Anny's figure is made once for each shape, with a progress bar, and kept in the user's cache.
+def load_body(name: str) -> Mesh:
+    """Returns the mesh of a body. Anny's is made once per shape, with a progress bar, and kept in the user's cache.
 
     Args:
-        body: mannequin; or anny, with numbers of `SHAPE`, such as "anny gender=1 age=0.9".
+        name: mannequin; or anny, with numbers of `SHAPE`, such as "anny gender=1 age=0.9".
 
     Raises:
-        UserError: the body or a number is unknown, or the package anny is needed and not installed.
+        UserError: If the body or a number is unknown, or the package anny is required and not installed.
     """
-    name, *options = body.split() or [""]
-    if name not in ("mannequin", "anny") or (options and name != "anny"):
-        raise UserError(f'body={body}: unknown. Use mannequin, anny, or anny with its shape: body="anny age=0.9"')
-    use(_anny(body, options) if name == "anny" else MANNEQUIN)
+    kind, *options = name.split() or [""]
+    if kind not in ("mannequin", "anny") or (options and kind != "anny"):
+        raise UserError(f'body={name}: unknown. Use mannequin, anny, or anny with its shape: body="anny age=0.9"')
+    return Mesh(_anny(name, options)) if kind == "anny" else mannequin()
 
 
-def _anny(body: str, options: list[str]) -> Path:
+def _anny(name: str, options: list[str]) -> Path:
     """Returns the file of Anny's figure; makes it if it does not exist."""
     shape = dict(SHAPE)
     for option in options:
@@ -79,7 +89,7 @@ def _anny(body: str, options: list[str]) -> Path:
         except ValueError:
             shape[key] = np.nan
         if not 0 <= shape[key] <= 1:
-            raise UserError(f"body={body}: {option} is not one of {', '.join(SHAPE)} with a number from 0 to 1")
+            raise UserError(f"body={name}: {option} is not one of {', '.join(SHAPE)} with a number from 0 to 1")
     folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "flame-mdm"
     path = folder / f"anny1-{'-'.join(f'{key}{value:.3g}' for key, value in shape.items())}.npz"
     if not path.exists():
@@ -91,10 +101,10 @@ def _anny(body: str, options: list[str]) -> Path:
 
 
 def bake(shape: dict[str, float]) -> dict[str, np.ndarray]:
-    """Returns the arrays of the file of a figure of Anny: `mannequin.packed`.
+    """Returns the arrays of the file of a figure of Anny: `packed`.
 
     Raises:
-        UserError: the package anny is not installed.
+        UserError: If the package anny is not installed.
     """
     try:
         package = import_module("anny")
@@ -106,11 +116,11 @@ def bake(shape: dict[str, float]) -> dict[str, np.ndarray]:
             bar.update(bar.n < SECONDS - 1)
         model = built.result()
         bar.update(SECONDS - bar.n)
-    made = model(phenotype_kwargs={**shape, "muscle": 0.5, "proportions": 0.5})
+    output = model(phenotype_kwargs={**shape, "muscle": 0.5, "proportions": 0.5})
     axes = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])  # Anny's z is up, and it faces -y
-    points, heads = (made[key][0].detach().numpy() @ axes.T for key in ("rest_vertices", "rest_bone_heads"))
+    points, heads = (output[key][0].detach().numpy() @ axes.T for key in ("rest_vertices", "rest_bone_heads"))
     bones = model.bone_labels
-    places = _joints(dict(zip(bones, heads, strict=True)))
+    joints = _joints(dict(zip(bones, heads, strict=True)))
     weights = np.zeros((len(points), len(SMPL22)))
     owner = np.array([_owner(bone) for bone in bones])[model.vertex_bone_indices.numpy()]
     for joint, weight in zip(owner.T, model.vertex_bone_weights.detach().numpy().T, strict=True):
@@ -119,9 +129,9 @@ def bake(shape: dict[str, float]) -> dict[str, np.ndarray]:
     sides = points[triangles[:, 1:]] - points[triangles[:, :1]]
     normals = np.zeros_like(points)
     np.add.at(normals, triangles.ravel(), np.repeat(np.cross(sides[:, 0], sides[:, 1]), 3, axis=0))
-    colors = _clothes(points - places[0], weights)
-    helped = with_helpers(points, weights, places)
-    return packed(points - places[0], normals, helped, colors, triangles, places - places[0], _turns(places))
+    colors = _clothes(points - joints[0], weights)
+    helped = with_helpers(points, weights, joints)
+    return packed(points - joints[0], normals, helped, colors, triangles, joints - joints[0], _turns(joints))
 
 
 def _owner(bone: str) -> int:
@@ -135,23 +145,23 @@ def _owner(bone: str) -> int:
 
 def _joints(heads: dict[str, np.ndarray]) -> np.ndarray:
     """Returns SMPL's joints (22, 3) in Anny's rest pose, from the beginnings of Anny's bones."""
-    places = np.zeros((len(SMPL22), 3))
+    joints = np.zeros((len(SMPL22), 3))
     for joint, bone in HEADS.items():
         for side in ("left", "right") if joint not in JOINT else ("",):
-            places[JOINT[f"{side}_{joint}" if side else joint]] = heads[f"{bone}.{side[0].upper()}" if side else bone]
-    places[JOINT["neck"]] = heads["neck01"] + [0, 0.02, 0]
-    hips = places[JOINT["left_hip"], 1]
+            joints[JOINT[f"{side}_{joint}" if side else joint]] = heads[f"{bone}.{side[0].upper()}" if side else bone]
+    joints[JOINT["neck"]] = heads["neck01"] + [0, 0.02, 0]
+    hips = joints[JOINT["left_hip"], 1]
     spine = np.array([heads[f"spine0{k}"] for k in (5, 4, 3, 2, 1)] + [heads["neck01"]])
     for joint, share in (("pelvis", 0.137), ("spine1", 0.339), ("spine2", 0.565), ("spine3", 0.653)):
-        height = hips + share * (places[JOINT["neck"], 1] - hips)
-        places[JOINT[joint]] = [0, height, np.interp(height, spine[:, 1], spine[:, 2])]
+        height = hips + share * (joints[JOINT["neck"], 1] - hips)
+        joints[JOINT[joint]] = [0, height, np.interp(height, spine[:, 1], spine[:, 2])]
     for side in ("left", "right"):
         letter = side[0].upper()
-        places[JOINT[f"{side}_collar"]] = (heads[f"clavicle.{letter}"] + heads[f"shoulder01.{letter}"]) / 2
-    return places
+        joints[JOINT[f"{side}_collar"]] = (heads[f"clavicle.{letter}"] + heads[f"shoulder01.{letter}"]) / 2
+    return joints
 
 
-def _turns(places: np.ndarray) -> np.ndarray:
+def _turns(joints: np.ndarray) -> np.ndarray:
     """Returns rotations (22, 3, 3) in the world from the rest pose of SMPL to joints (22, 3) in Anny's rest pose.
 
     Pelvis, chest and head keep their direction, and feet stay level; arms are twisted so that elbows bend as SMPL's.
@@ -160,15 +170,15 @@ def _turns(places: np.ndarray) -> np.ndarray:
     usual = np.array(ADULT)
     for parent, joint in SMPL22.edges:
         name = SMPL22.joints[parent]
-        along, level = places[joint] - places[parent], [1, 0, 1] if name.endswith("ankle") else 1
+        along, level = joints[joint] - joints[parent], [1, 0, 1] if name.endswith("ankle") else 1
         if name not in ("pelvis", "spine3"):
-            turns[parent] = between(usual[joint] * level, along * level)
+            turns[parent] = shortest_turn(usual[joint] * level, along * level)
     for side in ("left", "right"):
         shoulder, elbow, wrist = (JOINT[f"{side}_{name}"] for name in ("shoulder", "elbow", "wrist"))
-        upper, lower = places[elbow] - places[shoulder], places[wrist] - places[elbow]
+        upper, lower = joints[elbow] - joints[shoulder], joints[wrist] - joints[elbow]
         hinge, rest = np.cross(upper, lower), np.cross(usual[elbow], [0, 0, 1])
-        turns[shoulder] = frame(upper, hinge).T @ frame(usual[elbow], rest)
-        turns[elbow] = turns[wrist] = frame(lower, hinge).T @ frame(usual[wrist], rest)
+        turns[shoulder] = orthonormal(upper, hinge).T @ orthonormal(usual[elbow], rest)
+        turns[elbow] = turns[wrist] = orthonormal(lower, hinge).T @ orthonormal(usual[wrist], rest)
         turns[JOINT[f"{side}_foot"]] = turns[JOINT[f"{side}_ankle"]]
     return turns
 
@@ -177,9 +187,38 @@ def _clothes(points: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """Returns colors (V, 3), 0 to 255, by the joint that a vertex follows; hair as that of the mannequin."""
     table = np.array([CLOTHES.get(name.split("_")[-1], SHIRT) for name in SMPL22.joints], float)
     colors = weights @ table
-    mannequin, head = Mesh(MANNEQUIN), weights[:, JOINT["head"]] > 0.5
-    usual = mannequin.points[mannequin.weights[:, JOINT["head"]] > 0.5]
+    figure, head = mannequin(), weights[:, JOINT["head"]] > 0.5
+    usual = figure.points[figure.weights[:, JOINT["head"]] > 0.5]
     own = points[head]
     alike = usual.min(0) + (own - own.min(0)) / np.ptp(own, 0) * np.ptp(usual, 0)
     colors[head] += smooth(-0.006, 0.006, hairline(alike))[:, None] * (np.array(HAIR) - colors[head])
     return colors
+
+
+def hairline(points: np.ndarray) -> np.ndarray:
+    """Returns the distance of points of the head into the hair: above the forehead, and behind the ears."""
+    above = (points - [0, 0.757, 0.086]) @ np.array([0, 0.84, -0.54])
+    behind = np.minimum((points - [0, 0.70, 0.016]) @ np.array([0, 0.10, -0.99]), points[..., 1] - 0.652)
+    return np.maximum(above, behind)
+
+
+def smooth(low: float, high: float, value: np.ndarray) -> np.ndarray:
+    """Returns 0 below `low`, 1 above `high` and a smooth transition between."""
+    share = np.clip((value - low) / (high - low), 0, 1)
+    return share * share * (3 - 2 * share)
+
+
+def with_helpers(points: np.ndarray, weights: np.ndarray, joints: np.ndarray) -> np.ndarray:
+    """Returns weights (V, 28): the upper part of limbs moves to helper bones, which turn less about the limb.
+
+    The forearm is the other way round: its lower half moves to a bone that takes part in the twist of the wrist.
+    `joints` (22, 3) are those of the mesh.
+    """
+    columns = []
+    for joint, _ in HELPERS:
+        bone = joints[SMPL22.parents.index(joint)] - joints[joint]
+        part = smooth(0.2, 0.75, (points - joints[joint]) @ bone / (bone @ bone))
+        helper = weights[:, joint] * (part if SMPL22.joints[joint].endswith("elbow") else 1 - part)
+        weights[:, joint] -= helper
+        columns.append(helper)
+    return np.concatenate([weights, np.stack(columns, 1)], 1)

@@ -1,4 +1,4 @@
-"""A body: its mesh, bound to the bone lengths of a clip and skinned to a motion. `mannequin.py` models one."""
+"""A body: its mesh, fitted to the bone lengths of a clip and skinned to a motion."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class Mesh:
     """A closed mesh in its stored pose, an A-pose with the pelvis at 0.
 
     Attributes:
-        stored: the arrays of its file; `mannequin.packed` describes them.
+        stored: the arrays of its file; `packed` describes them.
         points: (V, 3) in meters.
         normals: (V, 3) unit vectors.
         weights: (V, 28), of the 22 joints of SMPL and `HELPERS`; at most four are not 0.
@@ -61,10 +61,10 @@ class Mesh:
         """Reads a file.
 
         Raises:
-            UserError: the file is missing or damaged.
+            UserError: If the file is missing or damaged.
         """
         try:
-            with np.load(path) as file:
+            with np.load(path, allow_pickle=False) as file:
                 self.stored = {name: file[name] for name in file.files}
             self.points, self.colors = self.stored["points"] / 20000, self.stored["colors"].astype(float)
             self.normals = self.stored["normals"] / np.linalg.norm(self.stored["normals"], axis=1, keepdims=True)
@@ -85,27 +85,46 @@ class Mesh:
         return self.weights @ np.array(sides(SMPL22), float)[list(ANCHORS)]
 
 
-_read = cache(Mesh)
-_chosen = MANNEQUIN
+def packed(
+    points: np.ndarray,
+    normals: np.ndarray,
+    weights: np.ndarray,
+    colors: np.ndarray,
+    triangles: np.ndarray,
+    joints: np.ndarray,
+    turns: np.ndarray,
+) -> dict[str, np.ndarray]:
+    """Returns the arrays of the file of a body, which `Mesh` reads.
 
-
-def use(path: Path) -> None:
-    """Sets the file of the body that this process draws from now on; `bodies.choose_body` finds it by name."""
-    global _chosen
-    _chosen = path
-
-
-def mesh() -> Mesh:
-    """Returns the mesh of the chosen body.
-
-    Raises:
-        UserError: its file is missing or damaged.
+    `points` (V, 3) in units of 1/20 mm and `normals` (V, 3) in 1/127, of the stored pose with the pelvis at 0;
+    `bones` (V, 4) and `weights` (V, 4), which add up to 255; `colors` (V, 3); `triangles` (T, 3); `joints` (22, 3) and
+    `turns` (22, 3, 3), the stored pose.
     """
-    return _read(_chosen)
+    bones = np.argsort(-weights, axis=1, kind="stable")[:, :4]
+    most = np.take_along_axis(weights, bones, 1)
+    most = np.floor(255 * most / most.sum(1, keepdims=True) + 0.5).astype(int)
+    most[:, 0] += 255 - most.sum(1)
+    normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
+    return {
+        "points": np.rint(points * 20000).astype("<i2"),
+        "normals": np.rint(normals * 127).astype("i1"),
+        "bones": np.where(most > 0, bones, 0).astype("u1"),
+        "weights": most.astype("u1"),
+        "colors": np.rint(colors).astype("u1"),
+        "triangles": triangles.astype("<u2"),
+        "joints": joints,
+        "turns": turns,
+    }
+
+
+@cache
+def mannequin() -> Mesh:
+    """Returns the mesh of the mannequin, the default body."""
+    return Mesh(MANNEQUIN)
 
 
 @dataclass(frozen=True, eq=False)
-class Figure:
+class FittedBody:
     """A body with the bone lengths of a clip, and its motion. F frames, B = 28 bones.
 
     Attributes:
@@ -116,7 +135,7 @@ class Figure:
         neutral: (22, 3, 3), rotation of each part of the mesh in the rest pose: of feet until their soles are flat, of
             the head until it is upright.
         turns: (F, B, 3, 3), rotation of each bone from the stored pose to each frame.
-        places: (F, B, 3), where each bone begins: at the motion's joints, lifted.
+        starts: (F, B, 3), where each bone begins: at the motion's joints, lifted.
         lift: height of a joint of the body above that of the motion: the thickness of the sole.
     """
 
@@ -126,13 +145,13 @@ class Figure:
     points: np.ndarray
     neutral: np.ndarray
     turns: np.ndarray
-    places: np.ndarray
+    starts: np.ndarray
     lift: float
 
     def skinned(self, frame: int) -> tuple[np.ndarray, np.ndarray]:
         """Returns vertices and normals (V, 3) of a frame, by linear blend skinning."""
         turns = self.turns[frame]
-        moves = self.places[frame] - (turns @ self.joints[list(ANCHORS), :, None])[..., 0]
+        moves = self.starts[frame] - (turns @ self.joints[list(ANCHORS), :, None])[..., 0]
         blended = self.mesh.weights @ np.concatenate([turns.reshape(-1, 9), moves], 1)
         turned = blended[:, :9].reshape(-1, 3, 3)
         points = (turned @ self.points[..., None])[..., 0] + blended[:, 9:]
@@ -149,20 +168,23 @@ class Figure:
         return local
 
 
-def figure(motion: Shown) -> Figure:
-    """Binds the chosen body to a clip and computes the rotations of its bones.
+def fit_body(motion: Shown, body: Mesh | None = None) -> FittedBody:
+    """Fits a body to a clip and computes the rotations of its bones.
 
     The body's joints are the motion's, but higher by the thickness of the sole: in motions, the lowest joint is on the
     floor. If rotations are solved for, positions determine neither the head's pitch, whose median while the chest is
     upright is taken as level, nor the toes, which stay flat on the floor while the heel rises.
 
+    Args:
+        motion: the clip.
+        body: the mesh; None = the mannequin.
+
     Raises:
-        ValueError: the skeleton is not SMPL's, or a limb is much longer or shorter than people's.
-        UserError: the figure's file is missing or damaged.
+        UserError: If the skeleton is not SMPL's, or a limb is much longer or shorter than people's.
     """
-    poses, body = motion.posed(), mesh()
+    poses, body = motion.posed(), body or mannequin()
     joints = motion.joints[:, : len(SMPL22)].astype(float)
-    world = _world(np.asarray(poses.rotations))
+    world = world_rotations(np.asarray(poses.rotations))
     offsets = np.array(poses.offsets)
     fit, wide = proportions(body, offsets)
     neutral = np.tile(np.eye(3), (len(SMPL22), 1, 1))
@@ -170,7 +192,7 @@ def figure(motion: Shown) -> Figure:
         ankle, toe = JOINT[f"{side}_ankle"], JOINT[f"{side}_foot"]
         if motion.poses is None:
             flat = _flat_foot(joints[:, ankle], joints[:, toe], offsets[toe])
-            neutral[ankle] = neutral[toe] = between(flat, offsets[toe])
+            neutral[ankle] = neutral[toe] = shortest_turn(flat, offsets[toe])
             offsets[toe] = flat
         _, high, long = body.rest[toe]
         tall = (wide * body.sole - offsets[toe, 1]) / (body.sole - high)
@@ -182,7 +204,7 @@ def figure(motion: Shown) -> Figure:
         upright = chest[:, 1, 1] > UPRIGHT if chest[:, 1, 1].max() > UPRIGHT else slice(None)
         sine, cosine = chest[:, [0, 2], 2].T / np.linalg.norm(chest[:, [0, 2], 2], axis=1)
         usual = np.median(np.stack([x * cosine - z * sine, y, x * sine + z * cosine], 1)[upright], 0)
-        neutral[head] = between(offsets[head], usual).T
+        neutral[head] = shortest_turn(offsets[head], usual).T
     world = world @ neutral
     if motion.poses is None:
         for toe in (JOINT["left_foot"], JOINT["right_foot"]):
@@ -193,7 +215,7 @@ def figure(motion: Shown) -> Figure:
         rest[joint] = rest[parent] + turns[parent] @ offsets[joint]
     stretched = turns[: len(rest)] @ fit @ turns[: len(rest)].mT
     lift = wide * body.sole
-    return Figure(
+    return FittedBody(
         body,
         stretched,
         rest,
@@ -205,13 +227,11 @@ def figure(motion: Shown) -> Figure:
     )
 
 
-def try_figure(motion: Shown) -> tuple[Figure | None, str]:
-    """Returns the figure of `figure`, or None and the reason why this motion is drawn as a skeleton."""
+def try_fit(motion: Shown, body: Mesh | None = None) -> tuple[FittedBody | None, str]:
+    """Returns what `fit_body` returns, or None and the reason why this motion is drawn as a skeleton."""
     try:
-        return figure(motion), ""
-    except UserError:
-        raise
-    except ValueError as error:
+        return fit_body(motion, body), ""
+    except UserError as error:
         return None, str(error)
 
 
@@ -242,13 +262,13 @@ def proportions(body: Mesh, offsets: np.ndarray) -> tuple[np.ndarray, float]:
         The linear map (22, 3, 3) of each joint's part in the rest pose, and the ratio of widths.
 
     Raises:
-        ValueError: a limb is much longer or shorter than people's.
+        UserError: If a limb is much longer or shorter than people's.
     """
     lengths, usual = np.linalg.norm(offsets, axis=1), np.linalg.norm(body.rest, axis=1)
     ratio = np.divide(lengths, usual, out=np.ones_like(lengths), where=usual > 0)
     for joint in LIMBS:
         if not LONGER[0] <= ratio[joint] <= LONGER[1]:
-            raise ValueError(
+            raise UserError(
                 f"the bone that ends in {SMPL22.joints[joint]} is {lengths[joint]:.3g} m long, the body's is "
                 f"{usual[joint]:.3g} m. Is the unit right? Such a motion is drawn without a body"
             )
@@ -276,15 +296,23 @@ def proportions(body: Mesh, offsets: np.ndarray) -> tuple[np.ndarray, float]:
     return fit, wide
 
 
-def _world(rotations: np.ndarray) -> np.ndarray:
-    """Returns rotations (F, 22, 3, 3) in the world from those relative to parents."""
+def world_rotations(rotations: np.ndarray) -> np.ndarray:
+    """Returns rotations (..., 22, 3, 3) in the world from those relative to parents."""
     world = rotations.copy()
     for parent, joint in SMPL22.edges:
-        world[:, joint] = world[:, parent] @ rotations[:, joint]
+        world[..., joint, :, :] = world[..., parent, :, :] @ rotations[..., joint, :, :]
     return world
 
 
-def between(start: np.ndarray, end: np.ndarray) -> np.ndarray:
+def orthonormal(direction: np.ndarray, u: np.ndarray) -> np.ndarray:
+    """Returns axes as rows (3, 3): the direction, then `u` made orthogonal to it, then the third one."""
+    along = direction / np.linalg.norm(direction)
+    across = u - (u @ along) * along
+    across /= np.linalg.norm(across)
+    return np.stack([along, across, np.cross(along, across)])
+
+
+def shortest_turn(start: np.ndarray, end: np.ndarray) -> np.ndarray:
     """Returns the smallest rotation (3, 3) that turns one direction into another."""
     a, b = start / np.linalg.norm(start), end / np.linalg.norm(end)
     axis = np.cross(a, b)

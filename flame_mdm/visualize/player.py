@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from flame_mdm.errors import shortened
 from flame_mdm.safe_io import write_text
-from flame_mdm.visualize.body import ANCHORS, Figure, mesh, try_figure
+from flame_mdm.visualize.body import ANCHORS, FittedBody, Mesh, mannequin, try_fit
 from flame_mdm.visualize.scene import Shown, check_any, head, radii, sides
 
 MILLIMETER = 0.001
@@ -23,7 +23,7 @@ def write_player(path: str | Path, motions: Sequence[Shown], title: str = "Motio
     """Writes the page of `player_page` to a file; the options are those of `player_page`.
 
     Raises:
-        ValueError: there are no motions.
+        UserError: If there are no motions.
     """
     path = Path(path)
     check_any(motions, path)
@@ -38,6 +38,7 @@ def player_page(
     groups: Sequence[str] = (),
     beside: Sequence[str] = (),
     marks: Sequence[Sequence[tuple[int, int, str, str]]] = (),
+    body: Mesh | None = None,
 ) -> str:
     """Returns a self-contained HTML page that plays motions side by side in 3D, with a shared clock and camera.
 
@@ -55,30 +56,33 @@ def player_page(
         beside: for each motion, the id of an earlier one to show it next to, such as the original of a mirrored copy;
             "" = none.
         marks: for each motion, spans of its time line to mark: first frame, end (exclusive), kind and description.
+        body: the body to draw; None = the mannequin.
     """
     blank = [""] * len(motions)
     rows = zip(motions, groups or blank, beside or blank, marks or [()] * len(motions), strict=True)
-    packed = [_packed(*each) for each in rows]
+    packed = [_packed(*row, body) for row in rows]
     # "<" never occurs in the data, so no caption can close the script element
-    fitting = any(each["body"] for each in packed)
+    fitting = any(motion["body"] for motion in packed)
     content = {
         "TITLE": html.escape(shortened(title)),
         "ABOUT": about and f"<details><summary>About these motions</summary><div>{about}</div></details>",
         "COLUMNS": str(columns),
-        "BODY": json.dumps(_mesh() if fitting else None, separators=(",", ":")),
+        "BODY": json.dumps(_mesh(body or mannequin()) if fitting else None, separators=(",", ":")),
         "DATA": json.dumps(packed, separators=(",", ":")).replace("<", "\\u003c"),
     }
     template = Path(__file__).with_suffix(".html").read_text(encoding="utf-8")
     return re.sub("__(TITLE|ABOUT|COLUMNS|BODY|DATA)__", lambda match: content[match[1]], template)
 
 
-def _packed(motion: Shown, group: str, beside: str, marks: Sequence[tuple[int, int, str, str]]) -> dict[str, Any]:
+def _packed(
+    motion: Shown, group: str, beside: str, marks: Sequence[tuple[int, int, str, str]], mesh: Mesh | None
+) -> dict[str, Any]:
     low, high = motion.joints.min((0, 1)).astype(float), motion.joints.max((0, 1)).astype(float)
     center = (low + high) / 2
     step = max(MILLIMETER, float((high - low).max()) / 65534)
-    body, reason = try_figure(motion)
+    body, reason = try_fit(motion, mesh)
     return {
-        "id": motion.id,
+        "id": shortened(motion.id),
         "caption": shortened(motion.text),
         "group": group,
         "beside": beside,
@@ -99,7 +103,7 @@ def _packed(motion: Shown, group: str, beside: str, marks: Sequence[tuple[int, i
     }
 
 
-def _packed_body(body: Figure) -> dict[str, Any]:
+def _packed_body(body: FittedBody) -> dict[str, Any]:
     """Returns proportions, and for each frame and bone a quaternion in 32 bits, exact to about 0.1 degrees.
 
     The two highest bits tell which number of x, y, z, w is largest; the others follow, 10 bits each. They lie between
@@ -119,8 +123,8 @@ def _packed_body(body: Figure) -> dict[str, Any]:
     }
 
 
-def _mesh() -> dict[str, Any]:
-    stored = mesh().stored
+def _mesh(mesh: Mesh) -> dict[str, Any]:
+    stored = mesh.stored
     names = ("points", "normals", "bones", "weights", "colors", "triangles")
     joints = np.round(stored["joints"], 5).ravel().tolist()
     return {name: _base64(stored[name]) for name in names} | {"joints": joints, "anchors": ANCHORS}

@@ -13,7 +13,7 @@ from PIL import Image, ImageDraw, ImageFilter, ImageFont
 
 from flame_mdm.errors import UserError, shortened
 from flame_mdm.safe_io import atomic_write
-from flame_mdm.visualize.body import MATERIALS, Figure, rasterize, shaded, try_figure
+from flame_mdm.visualize.body import MATERIALS, FittedBody, Mesh, rasterize, shaded, try_fit
 from flame_mdm.visualize.scene import Shown, check_any, frame_at, head, radii, sides
 
 Color = tuple[int, int, int]
@@ -32,13 +32,13 @@ SMOOTH = 2
 """Images are drawn this many times larger and then reduced."""
 
 
-def frames_array(motion: Shown, size: int = 256) -> np.ndarray:
+def frames_array(motion: Shown, size: int = 256, body: Mesh | None = None) -> np.ndarray:
     """Returns each frame of a motion as an image: (F, size, size, 3) uint8, for the video panels of loggers."""
-    body, _ = try_figure(motion)
-    return np.stack([np.asarray(_figure(motion, body, frame, size)) for frame in range(len(motion.joints))])
+    fitted, _ = try_fit(motion, body)
+    return np.stack([np.asarray(_figure(motion, fitted, frame, size)) for frame in range(len(motion.joints))])
 
 
-def write_gif(path: str | Path, motions: Sequence[Shown], size: int = 256) -> None:
+def write_gif(path: str | Path, motions: Sequence[Shown], size: int = 256, body: Mesh | None = None) -> None:
     """Writes a looping animation of motions side by side, with captions below.
 
     Args:
@@ -46,16 +46,17 @@ def write_gif(path: str | Path, motions: Sequence[Shown], size: int = 256) -> No
         motions: drawn at the highest of their frame rates; a motion that ends earlier stays at its last frame. The
             format allows at most 50 frames per second, so frames of faster motions are dropped.
         size: width and height of a panel in pixels.
+        body: the body to draw; None = the mannequin.
 
     Raises:
-        ValueError: there are no motions.
+        UserError: If there are no motions.
     """
     path = Path(path)
     check_any(motions, path)
     fps = max(motion.fps for motion in motions)
     fps /= math.ceil(fps / 50)
     palette = _palette()
-    images = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in _video(motions, fps, size)]
+    images = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in _video(motions, fps, size, body)]
     # GIF counts in hundredths of a second: round the times, not the durations, so that errors do not add up
     times = np.rint(100 * np.arange(len(images) + 1) / fps).astype(int)
     with atomic_write(path) as temporary:
@@ -69,12 +70,11 @@ def write_gif(path: str | Path, motions: Sequence[Shown], size: int = 256) -> No
         )
 
 
-def write_mp4(path: str | Path, motions: Sequence[Shown], size: int = 384) -> None:
+def write_mp4(path: str | Path, motions: Sequence[Shown], size: int = 384, body: Mesh | None = None) -> None:
     """Writes the animation of `write_gif` as H.264 video (yuv420p), with no limit on the frame rate.
 
     Raises:
-        UserError: the package av is not installed.
-        ValueError: there are no motions.
+        UserError: If the package av is not installed, or there are no motions.
     """
     path = Path(path)
     check_any(motions, path)
@@ -85,7 +85,7 @@ def write_mp4(path: str | Path, motions: Sequence[Shown], size: int = 384) -> No
         stream.thread_count = 1  # the same bytes on any number of cores
         context = stream.codec_context
         context.colorspace = context.color_primaries = context.color_trc = BT709
-        for image in _video(motions, fps, size):
+        for image in _video(motions, fps, size, body):
             if not context.is_open:
                 context.width, context.height = image.width // 2 * 2, image.height // 2 * 2  # H.264 needs even sizes
             pixels = np.asarray(image)[: context.height, : context.width]
@@ -101,7 +101,7 @@ def video_package(name: str) -> ModuleType:
         name: what needs it, for the error message.
 
     Raises:
-        UserError: it is not installed.
+        UserError: If it is not installed.
     """
     try:
         return import_module("av")
@@ -111,7 +111,9 @@ def video_package(name: str) -> ModuleType:
         ) from None
 
 
-def contact_sheet(path: str | Path, motions: Sequence[Shown], frames: int = 6, size: int = 192) -> None:
+def contact_sheet(
+    path: str | Path, motions: Sequence[Shown], frames: int = 6, size: int = 192, body: Mesh | None = None
+) -> None:
     """Writes one PNG with a row per motion: its poses at equally spaced times from first to last, and its caption.
 
     Args:
@@ -119,23 +121,24 @@ def contact_sheet(path: str | Path, motions: Sequence[Shown], frames: int = 6, s
         motions: one row each.
         frames: poses per row.
         size: width and height of a pose in pixels.
+        body: the body to draw; None = the mannequin.
 
     Raises:
-        ValueError: there are no motions, or fewer than one pose per row.
+        UserError: If there are no motions, or fewer than one pose per row.
     """
     path = Path(path)
     check_any(motions, path)
     if frames < 1:
-        raise ValueError(f"{path}: {frames} poses per row, expected at least 1")
+        raise UserError(f"{path}: {frames} poses per row, expected at least 1")
     rows = []
     for motion in motions:
-        body, _ = try_figure(motion)
+        fitted, _ = try_fit(motion, body)
         row = Image.new("RGB", (frames * size, size), PAPER)
         pen = ImageDraw.Draw(row)
         for k, frame in enumerate(np.rint(np.linspace(0, len(motion.joints) - 1, frames)).astype(int).tolist()):
-            row.paste(_figure(motion, body, frame, size), (k * size, 0))
+            row.paste(_figure(motion, fitted, frame, size), (k * size, 0))
             pen.text((k * size + 8, 6), f"{frame / motion.fps:.2f} s", FAINT, _font(size))
-        lines = _lines(motion, body, row.width, size)
+        lines = _lines(motion, fitted, row.width, size)
         rows.append(_below(row, _caption(lines, row.width, len(lines), size)))
     sheet = Image.new("RGB", (frames * size, sum(row.height for row in rows)), PAPER)
     top = 0
@@ -159,13 +162,13 @@ def _palette() -> Image.Image:
     return image
 
 
-def _video(motions: Sequence[Shown], fps: float, size: int) -> Iterator[Image.Image]:
+def _video(motions: Sequence[Shown], fps: float, size: int, mesh: Mesh | None) -> Iterator[Image.Image]:
     """Yields images of the panels side by side, one every 1 / fps seconds, with a progress bar."""
     seconds = max(len(motion.joints) / motion.fps for motion in motions)
     columns = len(motions) if len(motions) < 4 else min(4, math.ceil(math.sqrt(len(motions))))
     frames = [-1] * len(motions)
     panels = [Image.new("RGB", (0, 0))] * len(motions)
-    bodies = [try_figure(motion)[0] for motion in motions]
+    bodies = [try_fit(motion, mesh)[0] for motion in motions]
     lines = [_lines(motion, body, size, size) for motion, body in zip(motions, bodies, strict=True)]
     captions = [_caption(own, size, max(map(len, lines)), size) for own in lines]
     count = max(1, math.ceil(seconds * fps - 1e-6))
@@ -183,7 +186,7 @@ def _video(motions: Sequence[Shown], fps: float, size: int) -> Iterator[Image.Im
         yield image
 
 
-def _figure(motion: Shown, body: Figure | None, frame: int, size: int) -> Image.Image:
+def _figure(motion: Shown, body: FittedBody | None, frame: int, size: int) -> Image.Image:
     """Draws one pose on the ground, (size, size) pixels; the camera follows the root smoothed over one second.
 
     Args:
@@ -349,7 +352,7 @@ def _wrapped(text: str, width: int, size: int) -> list[str]:
     return [*lines[:2], f"{lines[2]} …"] if len(lines) > 3 else lines
 
 
-def _lines(motion: Shown, body: Figure | None, width: int, size: int) -> list[str]:
+def _lines(motion: Shown, body: FittedBody | None, width: int, size: int) -> list[str]:
     """Returns the lines of a motion's caption; the last one says so if it is drawn as a skeleton."""
     return [*_wrapped(motion.text or motion.id, width, size), *["(no body fits)"] * (body is None)]
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
-from flame_mdm.errors import shortened as shortened
+from flame_mdm.errors import UserError
 
 if TYPE_CHECKING:  # drawing needs numpy and Pillow, not torch
     from torch import Tensor
@@ -67,5 +67,6 @@ def frame_at(motion: Shown, seconds: float) -> int:
 
 
 def check_any(motions: Sequence[Shown], path: Path) -> None:
+    """Raises `UserError` if there are no motions to write to `path`."""
     if not motions:
-        raise ValueError(f"{path}: no motions to show")
+        raise UserError(f"{path}: no motions to show")

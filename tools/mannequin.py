@@ -1,23 +1,36 @@
-"""Maker of `mannequin.npz`, the figure that pictures and files show: `python -m flame_mdm.visualize.mannequin`
+"""Models the mannequin of pictures and files, and writes flame_mdm/visualize/mannequin.npz: python tools/mannequin.py
 
-The figure is modeled here; it contains no data of others. Ellipses along the bones of `ADULT`, with the
-widths and depths of an adult of 1.78 m, are joined by smooth unions into one surface. Its left half is triangulated
-and simplified; the right half is its mirror image. This needs two more packages:
-pip install scikit-image fast-simplification
+The figure contains no third-party data. Ellipses along the bones of `ADULT`, with the widths and depths of an adult of
+1.78 m, are joined by smooth unions into one surface. Its left half is triangulated and simplified; the right half is
+its mirror image. This needs the packages in tools/requirements.txt.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from importlib import import_module
 
+import fast_simplification
 import numpy as np
 from scipy.interpolate import PchipInterpolator
 from scipy.spatial.transform import Rotation
+from skimage import measure
 
 from flame_mdm.representations.skeleton import SMPL22
 from flame_mdm.representations.smpl import ADULT
-from flame_mdm.visualize.body import HAIR, HELPERS, JOINT, MANNEQUIN, SHIRT, SHOES, SKIN, TROUSERS, TWISTED
+from flame_mdm.visualize.bodies import hairline, smooth, with_helpers
+from flame_mdm.visualize.body import (
+    HAIR,
+    HELPERS,
+    JOINT,
+    MANNEQUIN,
+    SHIRT,
+    SHOES,
+    SKIN,
+    TROUSERS,
+    TWISTED,
+    orthonormal,
+    packed,
+)
 
 A_POSE = {"shoulder": (0, 0, -46), "elbow": (0, -14, 0), "hip": (0, 0, 4), "ankle": (0, 0, -4)}
 """Degrees about x, y, z from the rest pose of SMPL to the pose in which the mesh is stored, for the left side. Arms
@@ -71,32 +84,24 @@ def union(first: np.ndarray, second: np.ndarray, blend: float) -> np.ndarray:
 
 def pose() -> tuple[np.ndarray, np.ndarray]:
     """Returns the joints (22, 3) of the stored pose, pelvis at 0, and their world rotations (22, 3, 3)."""
-    places, turned = np.zeros((22, 3)), np.tile(np.eye(3), (22, 1, 1))
+    joints, turned = np.zeros((22, 3)), np.tile(np.eye(3), (22, 1, 1))
     for joint, parent in enumerate(SMPL22.parents):
         side, _, name = SMPL22.joints[joint].rpartition("_")
         angles = np.array(A_POSE.get(name, (0, 0, 0))) * (1 if side == "left" else (1, -1, -1))
         turn = Rotation.from_euler("xyz", angles, degrees=True).as_matrix()
         if parent >= 0:
-            places[joint] = places[parent] + turned[parent] @ np.array(ADULT[joint])
+            joints[joint] = joints[parent] + turned[parent] @ np.array(ADULT[joint])
             turned[joint] = turned[parent] @ turn
-    return places, turned
-
-
-def frame(direction: np.ndarray, u: np.ndarray) -> np.ndarray:
-    """Returns axes (3, 3): the direction, then `u` made orthogonal to it, then the third one."""
-    along = direction / np.linalg.norm(direction)
-    across = u - (u @ along) * along
-    across /= np.linalg.norm(across)
-    return np.stack([along, across, np.cross(along, across)])
+    return joints, turned
 
 
 def model() -> dict[str, Field]:
     """Returns the parts of the left half; the legs and the arm are those of the left side."""
-    places, turned = pose()
+    joints, turned = pose()
 
     def bone(start: str, end: str, u: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
         at = JOINT[start]
-        return places[at], frame(places[JOINT[end]] - places[at], turned[at] @ np.array(u, float))
+        return joints[at], orthonormal(joints[JOINT[end]] - joints[at], turned[at] @ np.array(u, float))
 
     up = np.array([[0, 1, 0], [1, 0, 0], [0, 0, 1.0]])
     zero = np.zeros(3)
@@ -114,7 +119,7 @@ def model() -> dict[str, Field]:
         "blade": ellipsoid((0.085, 0.385, -0.085), (0.065, 0.085, 0.030)),
         "trapezius": tube(
             np.array([0.0, 0.53, -0.050]),
-            frame(np.array([0.2, -0.062, -0.005]), np.array([0, 1.0, 0])),
+            orthonormal(np.array([0.2, -0.062, -0.005]), np.array([0, 1.0, 0])),
             "0 0 0 40 46; 80 -4 0 36 46; 180 -4 4 42 50",
         ),
     }
@@ -129,9 +134,9 @@ def model() -> dict[str, Field]:
         "-15 0 5 47 53; 50 0 -4 48 53; 130 3 -14 53 59; 200 2 -13 48 54; 300 0 -6 36 42; "
         "380 0 -4 31 37; 430 0 -4 33 40",
     )
-    ankle = places[JOINT["left_ankle"]]
-    ahead = places[JOINT["left_foot"]] - ankle
-    forward = frame(ahead * [1, 0, 1], np.array([1.0, 0, 0]))
+    ankle = joints[JOINT["left_ankle"]]
+    ahead = joints[JOINT["left_foot"]] - ankle
+    forward = orthonormal(ahead * [1, 0, 1], np.array([1.0, 0, 0]))
     forward[2] = [0, 1, 0]
     shoe = tube(
         ankle * [1, 0, 1] + [0, SOLE, 0],
@@ -155,15 +160,15 @@ def model() -> dict[str, Field]:
         "-10 0 0 34 37; 50 0 3 37 42; 110 0 2 34 40; 190 0 0 26 32; 250 0 0 21 28; 275 0 0 20 28",
     )
     wrist = JOINT["left_wrist"]
-    hand_axes = frame(turned[wrist] @ np.array([1, -0.06, -0.04]), turned[wrist] @ np.array([0, 1.0, 0]))
+    hand_axes = orthonormal(turned[wrist] @ np.array([1, -0.06, -0.04]), turned[wrist] @ np.array([0, 1.0, 0]))
     palm = tube(
-        places[wrist],
+        joints[wrist],
         hand_axes,
         "-10 0 0 19 28; 30 0 2 18.5 36; 80 1 0 17 42; 105 0 0 14.5 41",
         2.4,
     )
     fingers = [
-        tube(places[wrist], hand_axes, stations)
+        tube(joints[wrist], hand_axes, stations)
         for stations in (
             "80 0 31.5 9.6 9.6; 115 -1 36 9.6 9.6; 142 -7 38.7 9.1 9.1; 170 -20 40.5 7.7 7.7",
             "80 0 10.8 10.2 10.2; 115 -1 12.3 10.2 10.2; 149 -7 13.2 9.7 9.7; 183 -20 13.8 8.2 8.2",
@@ -171,23 +176,23 @@ def model() -> dict[str, Field]:
             "80 0 -31 8.6 8.6; 115 -1 -36 8.6 8.6; 133 -7 -39 8.2 8.2; 152 -20 -41 6.9 6.9",
         )
     ]
-    thumb_axes = frame(hand_axes.T @ np.array([0.80, -0.25, 0.62]), hand_axes[1])
+    thumb_axes = orthonormal(hand_axes.T @ np.array([0.80, -0.25, 0.62]), hand_axes[1])
     thumb = tube(
-        places[wrist] + hand_axes.T @ np.array([0.018, -0.004, 0.016]),
+        joints[wrist] + hand_axes.T @ np.array([0.018, -0.004, 0.016]),
         thumb_axes,
         "0 0 0 15 17; 35 0 0 14.5 15.5; 65 0 -4 11.5 12; 88 0 -10 9 9.5",
     )
 
     def hand(points: np.ndarray) -> np.ndarray:
-        found = palm(points)
+        distance = palm(points)
         for finger in fingers:
-            found = union(found, finger(points), 0.008)
-        return union(found, thumb(points), 0.014)
+            distance = union(distance, finger(points), 0.008)
+        return union(distance, thumb(points), 0.014)
 
     parts["hand"] = hand
     parts["neck"] = tube(
         np.array([0, 0.47, -0.045]),
-        frame(np.array([0, 0.17, 0.045]), np.array([1.0, 0, 0])),
+        orthonormal(np.array([0, 0.17, 0.045]), np.array([1.0, 0, 0])),
         "-20 0 0 75 50; 40 0 0 56 56; 90 0 0 51 55; 170 0 0 52 58",
     )
     skull = ellipsoid((0, 0.712, 0.003), (0.074, 0.089, 0.095))
@@ -198,7 +203,7 @@ def model() -> dict[str, Field]:
     )
     nose = tube(
         np.array([0, 0.708, 0.098]),
-        frame(np.array([0, -0.045, 0.022]), np.array([1.0, 0, 0])),
+        orthonormal(np.array([0, -0.045, 0.022]), np.array([1.0, 0, 0])),
         "0 0 0 7 8; 30 0 0 9 10; 47 0 1 13 11",
     )
     brow = ellipsoid((0.030, 0.716, 0.089), (0.032, 0.008, 0.013))
@@ -208,30 +213,23 @@ def model() -> dict[str, Field]:
     chin = ellipsoid((0, 0.604, 0.074), (0.022, 0.017, 0.018))
     ear = tube(
         np.array([0.0745, 0.690, -0.004]),
-        frame(np.array([0.08, -1, 0.25]), np.array([1.0, 0, 0.4])),
+        orthonormal(np.array([0.08, -1, 0.25]), np.array([1.0, 0, 0.4])),
         "-24 0 0 8 14; 0 0 0 9 16; 26 -3 0 7 9",
     )
     crown = ellipsoid((0, 0.719, -0.004), (0.081, 0.094, 0.101))
 
     def bald(points: np.ndarray) -> np.ndarray:
-        found = union(skull(points), face(points), 0.03)
-        found = union(union(found, brow(points), 0.014), cheek(points), 0.03)
-        found = -union(-found, eye(points), 0.014)
-        found = union(union(union(found, nose(points), 0.014), lips(points), 0.010), chin(points), 0.025)
-        return union(found, ear(points), 0.006)
+        distance = union(skull(points), face(points), 0.03)
+        distance = union(union(distance, brow(points), 0.014), cheek(points), 0.03)
+        distance = -union(-distance, eye(points), 0.014)
+        distance = union(union(union(distance, nose(points), 0.014), lips(points), 0.010), chin(points), 0.025)
+        return union(distance, ear(points), 0.006)
 
     def head(points: np.ndarray) -> np.ndarray:
         return union(bald(points), -union(-crown(points), hairline(points), 0.012), 0.004)
 
     parts["head"] = head
     return parts
-
-
-def hairline(points: np.ndarray) -> np.ndarray:
-    """Returns the distance of points of the head into the hair: above the forehead, and behind the ears."""
-    above = (points - [0, 0.757, 0.086]) @ np.array([0, 0.84, -0.54])
-    behind = np.minimum((points - [0, 0.70, 0.016]) @ np.array([0, 0.10, -0.99]), points[..., 1] - 0.652)
-    return np.maximum(above, behind)
 
 
 def surface(parts: dict[str, Field], points: np.ndarray) -> np.ndarray:
@@ -255,16 +253,16 @@ def gradient(distance: Field, points: np.ndarray) -> np.ndarray:
 
 def magnified(points: np.ndarray, inverse: bool = False) -> np.ndarray:
     """Enlarges head and hand, so that they keep more of the vertices, and shrinks their surroundings in turn."""
-    places, turned = pose()
-    hand = places[JOINT["left_wrist"]] + turned[JOINT["left_wrist"]] @ np.array([0.09, 0, 0])
+    joints, turned = pose()
+    hand = joints[JOINT["left_wrist"]] + turned[JOINT["left_wrist"]] @ np.array([0.09, 0, 0])
     radii = np.linspace(0, 3, 6001)
     for center, reach, growth in (((0, 0.67, 0.07), 0.13, 1.6), (hand, 0.12, 0.9))[:: -1 if inverse else 1]:
         slope = np.where(radii < reach, growth, np.where(radii < reach * (1 + 2 * growth), -0.5, 0))
         grown = radii + np.cumsum(slope) * radii[1]
         offset = points - np.array(center)
         distance = np.linalg.norm(offset, axis=1, keepdims=True)
-        known, wanted = (grown, radii) if inverse else (radii, grown)
-        points = np.array(center) + offset * np.interp(distance, known, wanted) / np.maximum(distance, 1e-9)
+        before, after = (grown, radii) if inverse else (radii, grown)
+        points = np.array(center) + offset * np.interp(distance, before, after) / np.maximum(distance, 1e-9)
     return points
 
 
@@ -273,15 +271,11 @@ def triangulate(distance: Field) -> tuple[np.ndarray, np.ndarray]:
     axes = [np.arange(low, high, CELL) for low, high in ((0, 0.76), (-1.01, 0.84), (-0.18, 0.22))]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), -1)
     values = np.concatenate([distance(part.reshape(-1, 3)).reshape(part.shape[:3]) for part in np.split(grid, 8)])
-    try:
-        measure, simplification = import_module("skimage.measure"), import_module("fast_simplification")
-    except ImportError as error:
-        raise SystemExit(f"{error.name} is missing. Run pip install scikit-image fast-simplification") from error
     points, triangles, _, _ = measure.marching_cubes(values, 0.0, spacing=(CELL,) * 3)
     points = points + [axis[0] for axis in axes]
     share = 1 - 2 * VERTICES / len(triangles)
     order = np.array([1, 2, 0])  # the result depends on the order of axes; this one keeps the border closed
-    points, triangles = simplification.simplify(
+    points, triangles = fast_simplification.simplify(
         np.ascontiguousarray(magnified(points)[:, order], np.float32), triangles.astype(np.int32), share, agg=3
     )
     points = magnified(points[:, np.argsort(order)].astype(float), inverse=True)
@@ -303,20 +297,14 @@ def triangulate(distance: Field) -> tuple[np.ndarray, np.ndarray]:
     return points, triangles if volume.sum() > 0 else triangles[:, ::-1]
 
 
-def smooth(low: float, high: float, value: np.ndarray) -> np.ndarray:
-    """Returns 0 below `low`, 1 above `high` and a smooth transition between."""
-    share = np.clip((value - low) / (high - low), 0, 1)
-    return share * share * (3 - 2 * share)
-
-
 def skin(points: np.ndarray, parts: dict[str, Field]) -> np.ndarray:
     """Returns the weights (V, 22) of the joints, for points of the left half."""
-    places, turned = pose()
+    joints, turned = pose()
 
     def beyond(name: str, normal: Sequence[float] | np.ndarray, width: float) -> np.ndarray:
         """Returns how far points lie beyond a joint: 0.5 on the plane through it, 0 and 1 `width` meters from it."""
         unit = np.array(normal, float) / np.linalg.norm(normal)
-        return smooth(-width, width, (points - places[JOINT[name]]) @ unit)
+        return smooth(-width, width, (points - joints[JOINT[name]]) @ unit)
 
     def along(name: str, local: Sequence[float]) -> np.ndarray:
         return turned[JOINT[name]] @ np.array(local, float)
@@ -357,8 +345,8 @@ def skin(points: np.ndarray, parts: dict[str, Field]) -> np.ndarray:
         below = whole[:, children].sum(1)
         too_much = np.maximum(1, below / np.maximum(whole[:, joint], 1e-9))
         for child in children:  # joints on both sides of the middle share what their parent has
-            for each in descendants(child):
-                weights[:, each] /= too_much
+            for joint_below in descendants(child):
+                weights[:, joint_below] /= too_much
         weights[:, joint] = whole[:, joint] - below / too_much
     return weights
 
@@ -368,30 +356,14 @@ def descendants(joint: int) -> list[int]:
     return [joint] + [j for child, p in enumerate(SMPL22.parents) if p == joint for j in descendants(child)]
 
 
-def with_helpers(points: np.ndarray, weights: np.ndarray, places: np.ndarray) -> np.ndarray:
-    """Returns weights (V, 28): the upper part of limbs moves to helper bones, which turn less about the limb.
-
-    The forearm is the other way round: its lower half moves to a bone that takes part in the twist of the wrist.
-    `places` (22, 3) are the joints.
-    """
-    columns = []
-    for joint, _ in HELPERS:
-        bone = places[SMPL22.parents.index(joint)] - places[joint]
-        part = smooth(0.2, 0.75, (points - places[joint]) @ bone / (bone @ bone))
-        helper = weights[:, joint] * (part if SMPL22.joints[joint].endswith("elbow") else 1 - part)
-        weights[:, joint] -= helper
-        columns.append(helper)
-    return np.concatenate([weights, np.stack(columns, 1)], 1)
-
-
 def paint(points: np.ndarray) -> np.ndarray:
     """Returns colors (V, 3), 0 to 255, of a half: hair, skin, shirt, trousers and shoes, blended at their borders."""
-    places, turned = pose()
+    joints, turned = pose()
 
     def mixed(below: np.ndarray, above: tuple[int, int, int], share: np.ndarray) -> np.ndarray:
         return below + share[:, None] * (np.array(above) - below)
 
-    elbow = (points - places[JOINT["left_elbow"]]) @ turned[JOINT["left_shoulder"]] @ np.array([1.0, 0, 0])
+    elbow = (points - joints[JOINT["left_elbow"]]) @ turned[JOINT["left_shoulder"]] @ np.array([1.0, 0, 0])
     hand = smooth(-0.115, -0.07, elbow) * (points[:, 0] > 0.2)
     color = mixed(np.tile(np.array(SHIRT, float), (len(points), 1)), SKIN, hand)
     neck = points[:, 1] - 0.535 + 0.28 * points[:, 2]
@@ -417,8 +389,8 @@ def make() -> dict[str, np.ndarray]:
     points, triangles = triangulate(distance)
     normals = gradient(distance, points)
     normals[points[:, 0] == 0, 0] = 0
-    places, turned = pose()
-    weights = with_helpers(points, skin(points, parts), places)
+    joints, turned = pose()
+    weights = with_helpers(points, skin(points, parts), joints)
     beside = points[:, 0] > 0
     copies = np.arange(len(points))
     copies[beside] = len(points) + np.arange(beside.sum())
@@ -436,41 +408,9 @@ def make() -> dict[str, np.ndarray]:
         np.concatenate([weights, weights[beside][:, mirrored]]),
         np.concatenate([paint(points), paint(points)[beside]]),
         triangles,
-        places,
+        joints,
         turned,
     )
-
-
-def packed(
-    points: np.ndarray,
-    normals: np.ndarray,
-    weights: np.ndarray,
-    colors: np.ndarray,
-    triangles: np.ndarray,
-    joints: np.ndarray,
-    turns: np.ndarray,
-) -> dict[str, np.ndarray]:
-    """Returns the arrays of the file of a body, which `body.Mesh` reads.
-
-    `points` (V, 3) in units of 1/20 mm and `normals` (V, 3) in 1/127, of the stored pose with the pelvis at 0;
-    `bones` (V, 4) and `weights` (V, 4), which add up to 255; `colors` (V, 3); `triangles` (T, 3); `joints` (22, 3) and
-    `turns` (22, 3, 3), the stored pose.
-    """
-    bones = np.argsort(-weights, axis=1, kind="stable")[:, :4]
-    most = np.take_along_axis(weights, bones, 1)
-    most = np.floor(255 * most / most.sum(1, keepdims=True) + 0.5).astype(int)
-    most[:, 0] += 255 - most.sum(1)
-    normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
-    return {
-        "points": np.rint(points * 20000).astype("<i2"),
-        "normals": np.rint(normals * 127).astype("i1"),
-        "bones": np.where(most > 0, bones, 0).astype("u1"),
-        "weights": most.astype("u1"),
-        "colors": np.rint(colors).astype("u1"),
-        "triangles": triangles.astype("<u2"),
-        "joints": joints,
-        "turns": turns,
-    }
 
 
 if __name__ == "__main__":

@@ -1,0 +1,254 @@
+"""Crafted .glb characters: one clear line or a valid file, within 10 seconds and 1 GiB."""
+
+import copy
+import json
+import random
+import resource
+import shutil
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from support.glb import Glb, odd_character, packed, write_names
+from support.motions import synthetic
+from support.refusals import address_space
+
+from flame_mdm.errors import UserError
+from flame_mdm.formats import characters, glb
+from flame_mdm.formats.motion import Motion
+
+Change = Callable[[dict[str, Any]], object]
+HUGE = 10**400
+SILENT = {"sampler": 0, "target": {}}
+
+
+@pytest.fixture(scope="module")
+def heroes(tmp_path_factory) -> list[Path]:
+    """Valid characters: of Mixamo with a body, of Unreal below other nodes with names in a file, and one of limbs."""
+    folder, kick = tmp_path_factory.mktemp("heroes"), synthetic("kick")
+    paths = [folder / f"{name}.glb" for name in ("mixamo", "odd", "limbs")]
+    kick.save(paths[0], rig="mixamo")
+    odd_character(paths[1], kick)
+    write_names(paths[1].with_suffix(".yaml"))
+    kick.save(paths[2], rig="lafan1", figure="bones")
+    return paths
+
+
+@contextmanager
+def bounded(seconds: float = 10, memory: int = 2**30) -> Iterator[None]:
+    """Limits the address space that this process may add, and the processor time it may take."""
+    limits, start = resource.getrlimit(resource.RLIMIT_AS), time.process_time()
+    resource.setrlimit(resource.RLIMIT_AS, (address_space() + memory, limits[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, limits)
+    assert time.process_time() - start < seconds
+
+
+def outcome(path: Path, out: Path) -> str:
+    """Moves a character for a few frames: "" and a valid file, or the error's one line and no file."""
+    message = ""
+    try:
+        with bounded():
+            Motion(synthetic("kick").joints[:5], 20).save(out, character=path)
+            glb.read(out)
+    except UserError as error:
+        message = str(error)
+    assert out.exists() == (not message)
+    if message:
+        assert str(path) in message
+        assert "\n" not in message
+    else:
+        assert all(np.isfinite(values).all() for values in Glb(out).curves().values())
+        out.unlink()
+    return message
+
+
+def node(**values: Any) -> Change:
+    return lambda document: document["nodes"][0].update(values)
+
+
+def item(part: str, **values: Any) -> Change:
+    return lambda document: document[part][0].update(values)
+
+
+def put(part: str, value: Any) -> Change:
+    return lambda document: document.update({part: value})
+
+
+def bind(**values: Any) -> Change:
+    """Changes the accessor of the inverse bind matrices."""
+    return lambda document: document["accessors"][document["skins"][0]["inverseBindMatrices"]].update(values)
+
+
+def unbuffered(document: dict[str, Any]) -> None:
+    """No binary part is needed: neither vertices nor bind matrices are stored."""
+    for accessor in document["accessors"]:
+        accessor.pop("bufferView")
+    document["skins"][0].pop("inverseBindMatrices")
+    document |= {"bufferViews": []}
+    del document["buffers"]
+
+
+def unended(document: dict[str, Any]) -> None:
+    document["nodes"][21]["children"] = [0]
+
+
+def deep(document: dict[str, Any]) -> None:
+    """A chain of as many nodes as are allowed."""
+    first = len(document["nodes"])
+    document["nodes"] += [{"children": [number + 1]} for number in range(first, glb.MAX_NODES - 1)] + [{}]
+
+
+def drawn(document: dict[str, Any]) -> None:
+    document["meshes"][0]["primitives"] *= 65_000
+    document["nodes"] += [{"mesh": 0, "skin": 0}] * 1000
+
+
+FAULTS: dict[str, tuple[Change, str]] = {
+    "negative child": (node(children=[-1]), "greater than or equal to 0"),
+    "child that does not exist": (node(children=[999]), "child: there is no number 999"),
+    "child of another type": (node(children=["0"]), "valid integer"),
+    "children of another type": (node(children={"0": 1}), "valid list"),
+    "two parents": (
+        lambda document: document["nodes"][0]["children"].append(document["nodes"][1]["children"][0]),
+        "two parents",
+    ),
+    "own ancestor": (unended, "damaged"),
+    "many nodes": (lambda document: document["nodes"].extend([{}] * 100_000), "at most 4096"),
+    "long chain": (deep, ""),
+    "many primitives": (drawn, "parts of meshes"),
+    "no buffers": (lambda document: document.pop("buffers"), "there is no number 0"),
+    "empty buffers": (put("buffers", []), "there is no number 0"),
+    "buffers of another type": (put("buffers", ["x"]), "buffers.0"),
+    "nothing stored": (unbuffered, ""),
+    "no animations": (put("animations", None), "animations: Input should be a valid list"),
+    "animation of nothing": (put("animations", [{"samplers": [], "channels": [SILENT]}]), "sampler"),
+    "bool as a number": (item("bufferViews", byteOffset=True), "valid integer"),
+    "fraction as an index": (item("skins", joints=[0.5]), "valid integer"),
+    "large integer": (item("accessors", count=HUGE), "accessors.0.count"),
+    "long buffer": (item("buffers", byteLength=10**9), "a buffer of 1000000000 bytes"),
+    "long view": (item("bufferViews", byteLength=10**9), "longer than its buffer"),
+    "long accessor": (item("accessors", count=10**9), "longer than its bufferView"),
+    "negative offset": (item("accessors", byteOffset=-4), "greater than or equal to 0"),
+    "wrong matrices": (bind(componentType=5125), "inverse bind matrices"),
+    "few matrices": (bind(count=3), "inverse bind matrices"),
+    "matrices elsewhere": (bind(bufferView=0), ".glb: "),
+    "nan": (lambda document: document["nodes"][0].update(translation=[float("nan"), 0, 0]), "NaN"),
+    "overflow": (node(translation=[1e308, 0, 0]), "less than or equal to"),
+    "overflow of products": (lambda d: [n.update(scale=[1e8] * 3) for n in d["nodes"]], "not finite, or too large"),
+    "vanishing": (lambda d: [n.update(scale=[1e-8] * 3) for n in d["nodes"]], ""),
+    "flat": (node(scale=[0, 0, 0]), ""),
+    "rotation of length 0": (node(rotation=[0, 0, 0, 0]), "rotation of length 0"),
+    "matrix of 15 numbers": (node(matrix=[1] * 15), "at least 16 items"),
+    "no bounds": (lambda document: [a.pop("min", None) for a in document["accessors"]], "without their bounds"),
+    "another version": (put("asset", {"version": "1.0"}), "asset.version"),
+    "no document": (lambda document: document.clear(), "asset: Field required"),
+}
+
+
+def test_faults_of_documents_are_named(heroes: list[Path], tmp_path: Path):
+    """Each fault in one of the characters; whether a flat or vanishing one is written depends on the character."""
+    surprises = [str(hero) for hero in heroes if outcome(hero, tmp_path / "out.glb")]
+    shutil.copy(heroes[1].with_suffix(".yaml"), tmp_path / "odd.yaml")
+    for number, (name, (change, message)) in enumerate(FAULTS.items()):
+        hero = heroes[number % 3]
+        file = Glb(hero)
+        change(file.document)
+        path = tmp_path / hero.name
+        file.save(path)
+        result = outcome(path, tmp_path / "out.glb")
+        if message not in result or (name in ("long chain", "nothing stored") and result):
+            surprises.append((name, result))
+    assert not surprises
+
+
+def test_faults_of_the_parts_of_a_file_are_named(heroes: list[Path], tmp_path: Path):
+    path, whole = tmp_path / "a.glb", heroes[0].read_bytes()
+    tiny = json.dumps({"asset": {"version": "2.0"}, "nodes": [{"children": [-1]}]}).encode()
+    for content, message in (
+        (b"", "not a .glb file"),
+        (whole[:30], "ends too early"),
+        (whole[:-9], "which the file does not contain"),
+        (whole[:4] + b"\1\0\0\0" + whole[8:], "version 1"),
+        (packed(tiny), "nodes.0.children.0"),
+        (packed(b"[" * 10**6), "nested too deeply"),
+        (packed(b"[1, 2]"), "valid dictionary"),
+        (packed(b"{}" * 3), "Extra data"),
+        (packed(b"\xff{}"), "decode"),
+        (packed(b" " * (glb.DOCUMENT_LIMIT + 4)), "a first part"),
+        (whole[:12] + b"\xff\xff\xff\xff" + whole[16:], "a first part"),
+    ):
+        path.write_bytes(content)
+        assert message in outcome(path, tmp_path / "out.glb"), content[:40]
+
+
+def test_many_nodes_are_read_in_time(heroes: list[Path], tmp_path: Path):
+    path = tmp_path / "mixamo.glb"
+    file = Glb(heroes[0])
+    file.document["nodes"] += [{"name": f"bone {k}"} for k in range(len(file.document["nodes"]), glb.MAX_NODES)]
+    file.document["skins"][0]["joints"] = list(range(glb.MAX_NODES))
+    del file.document["skins"][0]["inverseBindMatrices"]
+    file.save(path)
+    assert outcome(path, tmp_path / "out.glb") == ""
+    assert len(characters.read(path).rig.joints) == glb.MAX_NODES
+
+
+# Many mutations -------------------------------------------------------------------------------------------------------
+
+VALUES = [None, True, -1, 0, 1, 7, 99, 2**31, 2**70, HUGE, 0.5, -1e-300, 1e30, 1e308, "", "x", "0", [], [0], [-1], [[]]]
+VALUES += [{}, {"a": 1}, [1e9] * 3, [0] * 4, [0] * 16, [1] * 16, list(range(50)), [{}], [None]]
+
+
+def mutated(value: Any, draw: random.Random) -> Any:
+    """The value with one change at a random place."""
+    steps: list[tuple[Any, Any]] = []
+    while isinstance(value, dict | list) and value and (not steps or draw.random() < 0.85):
+        key = draw.choice(list(value)) if isinstance(value, dict) else draw.randrange(len(value))
+        steps.append((value, key))
+        value = value[key]
+    container, key = steps[-1]
+    kind = draw.randrange(5)
+    if kind == 0:
+        del container[key]
+    elif kind == 1 and isinstance(container, list):
+        container.insert(key, copy.deepcopy(draw.choice([value, draw.choice(VALUES)])))
+    elif kind == 2 and isinstance(value, int | float):
+        container[key] = draw.choice([-value, value * 10, value + 1, value - 1, value * 1e9, float(value)])
+    else:
+        container[key] = copy.deepcopy(draw.choice(VALUES))
+    return steps[0][0]
+
+
+@pytest.mark.robustness
+@pytest.mark.parametrize("seed", range(8))
+def test_mutated_characters_are_refused_or_written(seed: int, heroes: list[Path], tmp_path: Path):
+    """25 mutations per seed, 200 in all: changes in the document, in its bytes and in the binary part."""
+    draw, surprises, refused = random.Random(seed), [], 0
+    for number in range(25):
+        hero = heroes[number % 3]
+        path = tmp_path / hero.name
+        if hero.with_suffix(".yaml").exists():
+            shutil.copy(hero.with_suffix(".yaml"), tmp_path)
+        file = Glb(hero)
+        if number % 5 < 3:
+            for _ in range(draw.choice((1, 1, 1, 3))):
+                file.document = mutated(file.document, draw)
+            content = packed(json.dumps(file.document).encode(), file.binary)
+        else:
+            data = bytearray(hero.read_bytes())
+            for _ in range(draw.choice((1, 4, 64))):
+                data[draw.randrange(len(data) if number % 5 == 3 else 12_000)] = draw.randrange(256)
+            content = bytes(data)
+        path.write_bytes(content)
+        try:
+            refused += bool(outcome(path, tmp_path / "out.glb"))
+        except Exception as error:
+            surprises.append((number, hero.name, repr(error)[:300]))
+    assert not surprises
+    assert refused > 3

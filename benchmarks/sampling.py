@@ -24,6 +24,7 @@ from flame_mdm.processes.diffusion import GaussianDiffusion
 from flame_mdm.processes.flow_matching import FlowMatching
 from flame_mdm.processes.guidance import classifier_free_guidance
 from flame_mdm.processes.samplers import CountedDenoise
+from flame_mdm.sampler_options import SamplerOptions
 from flame_mdm.seeds import seeded_noise
 
 RUNS = [
@@ -60,6 +61,11 @@ def seconds(run: Callable[[], Tensor], repeats: int) -> float:
     return statistics.median(times[1:])
 
 
+def options(sampler: str, steps: int) -> SamplerOptions:
+    """Returns the options of a run."""
+    return SamplerOptions(sampler=sampler, num_inference_steps=steps)
+
+
 def measure_loops(args: argparse.Namespace) -> list[Row]:
     """Returns the host cost of each sampler per network call, at batch 1, and that of drawing noise."""
     fixed, mask, cond = inputs(1, args)
@@ -75,8 +81,8 @@ def measure_loops(args: argparse.Namespace) -> list[Row]:
                 cells.append(None)
                 continue
             counted = CountedDenoise(denoise)
-            run = partial(process.sample, counted, lambda draw: fixed, mask, cond, sampler=sampler, edit=edit)
-            taken = seconds(partial(run, num_inference_steps=50), 2 * args.repeats)
+            run = partial(process.sample, counted, lambda draw: fixed, mask, cond, options(sampler, 50), edit=edit)
+            taken = seconds(run, 2 * args.repeats)
             cells.append(1e3 * taken * (2 * args.repeats + 1) / counted.calls)
         names = ("alone", "guided", "edited", "guided and edited")
         rows.append({"sampler": sampler, **dict(zip(names, cells, strict=True))})
@@ -97,11 +103,11 @@ def measure_steps(denoise: Denoise, args: argparse.Namespace) -> list[Row]:
         fixed, mask, cond = inputs(batch, args)
         noise = seeded_noise([str(i) for i in range(batch)], *fixed.shape[1:], seed=0, replication=0, like=fixed)
         run = partial(GaussianDiffusion().sample, guided, noise, mask, cond)
-        short = taken = seconds(partial(run, num_inference_steps=10), 3)
+        short = taken = seconds(partial(run, options("ancestral", 10)), 3)
         for steps in (10, 50, 1000):
             estimate = short * steps / 10
             if steps > 10:
-                taken = estimate if estimate > args.longest else seconds(partial(run, num_inference_steps=steps), 1)
+                taken = estimate if estimate > args.longest else seconds(partial(run, options("ancestral", steps)), 1)
             first = first or taken
             how = ", estimated from 10" if estimate > args.longest else ""
             row: Row = {"batch": str(batch), "steps": f"{steps:,}{how}", "seconds": taken}
@@ -115,7 +121,7 @@ def measure_samplers(denoise: Denoise, args: argparse.Namespace) -> list[Row]:
     guided = classifier_free_guidance(denoise, args.guidance_scale, args.features)
     samples: list[Callable[[Denoise], Tensor]] = [
         lambda counted, process=process, sampler=sampler, count=count: process.sample(
-            counted, lambda draw: fixed, mask, cond, sampler=sampler, num_inference_steps=count
+            counted, lambda draw: fixed, mask, cond, options(sampler, count)
         )
         for process, sampler, count in RUNS
     ]

@@ -21,6 +21,7 @@ from flame_mdm.errors import UserError
 from flame_mdm.progress import ProgressBar
 from flame_mdm.representations import Representation
 from flame_mdm.safe_io import atomic_write, read_npz, regular_file
+from flame_mdm.sampler_options import SamplerOptions
 from flame_mdm.sampling.editing import kept_parts
 from flame_mdm.sampling.request import EditRequest
 from flame_mdm.seeds import key, normal
@@ -98,8 +99,7 @@ class Generator:
     Args:
         model: the model, on its device.
         folder: cache of the motions, `rep_0.npz` and so on, as `SampleFolder` reads them; None = no cache.
-        options: for `MotionGeneration.generate`: guidance_scale, sampler, num_inference_steps, seed; with `parts`,
-            also `edit`, the options of `Edit`.
+        options: fields of `SamplerOptions`, and `seed`; with `parts`, also `edit`, the options of `Edit`.
         clips: the split.
         condition: "text", "action" or "none".
         batch_size: motions per batch.
@@ -123,9 +123,10 @@ class Generator:
         total: int = 0,
         progress: bool = True,
     ):
-        self.model, self.folder, self.options, self.clips = model, folder, dict(options), clips
+        chosen = dict(options)
+        self.how, self.seed = chosen.pop("edit", {}), chosen.pop("seed", 0)
+        self.model, self.folder, self.options, self.clips = model, folder, SamplerOptions(**chosen), clips
         self.condition, self.batch_size, self.timed, self.parts = condition, batch_size, timed, parts
-        self.how = self.options.pop("edit", {})
         self.bar = ProgressBar(total=total, desc="generating", unit=" motions", disable=not progress)
 
     def __call__(self, name: str, rows: list[Row], replication: int, rank: int = 0, world: int = 1) -> Samples:
@@ -192,10 +193,11 @@ class Generator:
     def _sample(self, rows: Sequence[Row], replication: int) -> list[np.ndarray]:
         x = self.model.generate(
             self._batch(rows),
+            self.options,
             replication=replication,
+            seed=self.seed,
             unconditioned=self.condition == "none",
             edit=None if self.parts is None else self._edit(rows),
-            **self.options,
         )
         found = self.model.representation.denormalize(x.float()).cpu().numpy()
         return [motion[: len(row.frames)].copy() for row, motion in zip(rows, found, strict=True)]

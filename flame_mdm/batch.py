@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, TypedDict
+from typing import Literal, Protocol
 
 import torch
 from torch import Tensor
@@ -100,6 +100,18 @@ class Condition:
         return twice.drop(torch.arange(2 * batch, device=self.pooled.device) >= batch)
 
 
+class Guide(Protocol):
+    """Leads motions (B, F, D) to a goal, such as positions in the world."""
+
+    def steer(self, clean: Callable[[Tensor], Tensor], x_t: Tensor) -> Tensor:
+        """Returns a noisy motion whose clean estimate, that of the function `clean`, is nearer to the goal."""
+        ...
+
+    def reach(self, x0_hat: Tensor) -> Tensor:
+        """Returns a clean estimate that meets the goal."""
+        ...
+
+
 @dataclass
 class Edit:
     """Parts of a motion to keep; in-betweening, prediction, interpolation and body-part editing differ only in `keep`.
@@ -114,8 +126,7 @@ class Edit:
         blend: for "x_t", replace the kept part "after" each step (FLAME, eq. 6), which ends in the known motion itself,
             or "before" each call of the denoiser (FLAME's code), which ends in the model's version of it.
         resample: for "x_t", how many times each step is repeated, after adding noise again (RePaint, algorithm 1).
-        guide: for "x0", returns the clean estimate (B, F, D) of each step, before the kept part overwrites it, from the
-            function that estimates it and x_t.
+        guide: for "x0", leads the motion to a goal in each step, before the kept part overwrites the clean estimate.
         strength: fraction of the sampling steps to take, in (0, 1]. Sampling starts from `known`, as noisy as the first
             of these steps (SDEdit; of N steps, MDM's code skips `skip_timesteps` = (1 - strength) N). None: from noise.
     """
@@ -127,34 +138,16 @@ class Edit:
     blend: Literal["after", "before"] = "after"
     resample: int = 1
     strength: float | None = None
-    guide: Callable[[Callable[[Tensor], Tensor], Tensor], Tensor] | None = None
+    guide: Guide | None = None
 
-    def impose(self, clean: Callable[[Tensor], Tensor], x_t: Tensor) -> Tensor:
-        """Returns the clean estimate (B, F, D) of mode "x0"; `clean` estimates it from x_t without the edit."""
-        x0_hat = clean(x_t) if self.guide is None else self.guide(clean, x_t)
+    def impose(self, x0_hat: Tensor) -> Tensor:
+        """Returns the clean estimate (B, F, D) of mode "x0"."""
+        x0_hat = x0_hat if self.guide is None else self.guide.reach(x0_hat)
         return torch.where(self.keep, self.known, x0_hat)
 
     def steps(self, total: int) -> int:
         """Returns how many of `total` sampling steps are taken, at least one."""
         return total if self.strength is None else max(1, round(self.strength * total))
-
-
-class Sampling(TypedDict, total=False):
-    """How motions are sampled; an option that is absent or None has the value of the recipe or of the process.
-
-    Attributes:
-        guidance_scale: 1 = off.
-        sampler: a name that the process knows.
-        num_inference_steps: number of steps; of diffusion also the steps themselves, rising, 0 = the least noisy one.
-        eta: randomness of the sampler "ddim", 0 to 1.
-        spacing: how diffusion places a number of steps, "linspace" or "stride"; see `schedules.timesteps`.
-    """
-
-    guidance_scale: float | None
-    sampler: str | None
-    num_inference_steps: int | Sequence[int] | None
-    eta: float | None
-    spacing: str | None
 
 
 Denoise = Callable[[Tensor, Tensor, Tensor, Condition], Tensor]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal, Self, Unpack
+from typing import Any, Literal, Self
 
 import torch
 from lightning import LightningModule
@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.optim.lr_scheduler import LambdaLR
 from torchmetrics import MeanMetric
 
-from flame_mdm.batch import Condition, Denoise, Edit, MotionBatch, Sampling, pad_to
+from flame_mdm.batch import Condition, Denoise, Edit, MotionBatch, pad_to
 from flame_mdm.conditions import ConditionEncoder
 from flame_mdm.conditions.vocabulary import vocabulary
 from flame_mdm.config import Config, instantiate, parameters
@@ -159,7 +159,6 @@ class MotionGeneration(Task):
         self.denoiser, self.process = denoiser, process
         self.losses = MotionLosses(representation.to_joints, representation.skeleton.feet, **losses)
         self.cond_drop_prob = cond_drop_prob
-        self.guidance_scale, self.sampler, self.num_inference_steps = guidance_scale, sampler, num_inference_steps
         self.val_losses = torch.nn.ModuleDict()
         if compile:
             self.denoiser.compile()
@@ -224,8 +223,7 @@ class MotionGeneration(Task):
             seeded_noise(["trial"], 2, like.shape[-1], seed=0, replication=0, like=like),
             mask,
             Condition(like[:, 0], like, mask),
-            sampler=self.sampler,
-            num_inference_steps=self.num_inference_steps,
+            self.sampler_options,
         )
 
     def training_step(self, batch: MotionBatch, batch_idx: int) -> Tensor:
@@ -268,6 +266,7 @@ class MotionGeneration(Task):
     def generate(
         self,
         batch: MotionBatch,
+        options: SamplerOptions | None = None,
         *,
         seed: int = 0,
         replication: int = 0,
@@ -276,15 +275,14 @@ class MotionGeneration(Task):
         unconditioned: bool = False,
         shared_noise: bool = False,
         trajectory: list[Tensor] | None = None,
-        **sampling: Unpack[Sampling],
     ) -> Tensor:
         """Samples motions for the conditions, lengths and ids of `batch`; its `x` is ignored.
 
-        The noise of a motion is a function of (seed, replication, id), so the motion is the same in any batch.
-        `unconditioned` samples a conditional model with its null condition. With `shared_noise`, all motions get the
-        same noise, a function of (seed, replication) only. The normalized clean estimate (B, F, D) of each denoiser
-        call is appended to `trajectory`. With `windows`, motions may be longer than those in training, and the
-        conditions are those of the windows.
+        Options of the sampler that are None have the values of the recipe. The noise of a motion is a function of
+        (seed, replication, id), so the motion is the same in any batch. `unconditioned` samples a conditional model
+        with its null condition. With `shared_noise`, all motions get the same noise, a function of (seed, replication)
+        only. The normalized clean estimate (B, F, D) of each denoiser call is appended to `trajectory`. With `windows`,
+        motions may be longer than those in training, and the conditions are those of the windows.
 
         Returns:
             (B, F, D) normalized, 0 past the end of each motion.
@@ -292,10 +290,7 @@ class MotionGeneration(Task):
         was_training = self.training
         if was_training:  # setting the mode of all modules takes as long as a small network
             self.eval()
-        chosen: dict[str, Any] = {name: value for name, value in sampling.items() if value is not None}
-        scale = chosen.pop("guidance_scale", self.guidance_scale)
-        if trajectory is not None:
-            chosen["trajectory"] = trajectory
+        options = self.sampler_options if options is None else options.over(self.sampler_options)
         denoise: Denoise = self.denoiser
         described = batch if windows is None else windows.batch
         if unconditioned and self.condition.features:
@@ -304,11 +299,11 @@ class MotionGeneration(Task):
         else:
             cond = self.condition(described)
         if cond.null is not None and self.condition.features and not unconditioned:
-            denoise = classifier_free_guidance(self.denoiser, scale, self.representation.features)
+            denoise = classifier_free_guidance(self.denoiser, options.guidance_scale, self.representation.features)
         if windows is not None:
             denoise = blended(denoise, windows)
         mask, frames, features = batch.mask, batch.mask.shape[1], self.representation.features
-        if windows is None and not getattr(self.denoiser, "mask_padding", True):
+        if windows is None and not self.denoiser.mask_padding:
             # This denoiser attends to padding, so the padded length must be the same as in training.
             mask = pad_to(mask, max(frames, self.facts.get("max_frames", 0)))
             if edit is not None:
@@ -316,14 +311,7 @@ class MotionGeneration(Task):
                 edit = replace(edit, known=known, keep=keep)
         ids = ["shared"] * len(batch) if shared_noise else batch.ids
         noise = seeded_noise(ids, mask.shape[1], features, seed=seed, replication=replication, like=batch.x)
-        x = self.process.sample(
-            denoise,
-            noise,
-            mask,
-            cond,
-            edit=edit,
-            **({"sampler": self.sampler, "num_inference_steps": self.num_inference_steps} | chosen),
-        )
+        x = self.process.sample(denoise, noise, mask, cond, options, edit=edit, trajectory=trajectory)
         if was_training:
             self.train()
         return x[:, :frames]

@@ -302,7 +302,8 @@ def test_options_of_mdm(tmp_path):
     model = load(tmp_path / "ours.safetensors")
     assert model.facts["actions"][9] == "phone"
     assert model.facts["max_frames"] == 40
-    assert (model.guidance_scale, model.num_inference_steps, model.losses.weights["velocity"]) == (1.0, 50, 1.0)
+    assert model.sampler_options.guidance_scale == model.losses.weights["velocity"] == 1
+    assert model.sampler_options.num_inference_steps == 50
     process = model.config["process"]
     assert (process["num_train_timesteps"], process["schedule"], process["variance"]) == (50, "linear", "fixed_large")
     motions = generate(model, actions=["phone"], frames=24, num_inference_steps=3)
@@ -336,7 +337,7 @@ def test_options_of_mfm(tmp_path, solver, sampler, steps, odeint_grid):
     text += f"ode_kwargs: {json.dumps(solver)}\n"
     assert main(["import", "mfm", *released_file(tmp_path, rot6d_state(), text)]) == 0
     model = load(tmp_path)
-    assert (model.sampler, model.num_inference_steps) == (sampler, steps)
+    assert (model.sampler_options.sampler, model.sampler_options.num_inference_steps) == (sampler, steps)
     assert (model.config["process"]["odeint_grid"], model.config["process"]["quantize_time"]) == (odeint_grid, True)
     assert model.config["denoiser"]["num_heads"] == 2
     assert model.losses.weights["joints"] == 1

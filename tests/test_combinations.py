@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 from functools import cache
-from typing import Any, get_args
+from typing import Any
 
 import pytest
 import torch
@@ -12,10 +12,11 @@ from flame_mdm.batch import Condition, MotionBatch, length_mask
 from flame_mdm.config import EXPERIMENTS, compose, parameters
 from flame_mdm.denoisers import Denoiser
 from flame_mdm.processes import Process
-from flame_mdm.processes.diffusion import Sampler
-from flame_mdm.processes.flow_matching import STEPS as SOLVERS
+from flame_mdm.processes.diffusion import GaussianDiffusion
+from flame_mdm.processes.flow_matching import FlowMatching
 from flame_mdm.representations import Representation
 from flame_mdm.representations.skeleton import Skeleton
+from flame_mdm.sampler_options import SamplerOptions
 from flame_mdm.task import MotionGeneration
 
 TINY = {"latent_dim": 16, "ff_size": 16, "num_layers": 1, "num_heads": 2, "channels": [8, 8], "num_groups": 4}
@@ -115,7 +116,7 @@ def build(denoiser: str, process: str, condition: str = "learned", **process_opt
 
 
 def samplers(process: str) -> list[str]:
-    return [*SOLVERS, "dopri5"] if process == FLOW else list(get_args(Sampler))
+    return list((FlowMatching if process == FLOW else GaussianDiffusion).samplers)
 
 
 def batch(rows: slice = slice(None), frames: int | None = None) -> MotionBatch:
@@ -168,7 +169,7 @@ def test_trains_and_samples(denoiser, process, condition, monkeypatch):
     for sampler in samplers(process):
         if sampler == "dopri5" and condition != "learned":
             continue  # hundreds of calls
-        x = task.generate(motions, sampler=sampler)
+        x = task.generate(motions, SamplerOptions(sampler=sampler))
         assert x.shape == motions.x.shape
         assert x.isfinite().all()
         assert (x[~motions.mask] == 0).all()
@@ -198,7 +199,7 @@ def test_another_seed_replication_text_or_scale_is_another_motion(process):
     assert (task.generate(motions, seed=1) - x)[0].abs().max() > 0.1
     assert (task.generate(motions, replication=1) - x)[0].abs().max() > 0.1
     assert (task.generate(changed) - x)[0].abs().max() > 1e-6
-    assert (task.generate(motions, guidance_scale=1.0) - x)[0].abs().max() > 1e-6
+    assert (task.generate(motions, SamplerOptions(guidance_scale=1.0)) - x)[0].abs().max() > 1e-6
     assert (task.generate(motions, unconditioned=True) - x)[0].abs().max() > 1e-6
 
 
@@ -208,7 +209,7 @@ def test_an_oracle_returns_the_data(process, sampler):
     task = build("mdm_encoder", process, **options)
     motions = batch()
     task.denoiser = Oracle(motions.x, task.process, 1000.0 if process == FLOW else 1.0)
-    x = task.generate(motions, sampler=sampler, num_inference_steps=5)
+    x = task.generate(motions, SamplerOptions(sampler=sampler, num_inference_steps=5))
     left = 5e-4 if process == FLOW else 1e-6  # a flow keeps sigma_min = 1e-4 times the noise
     torch.testing.assert_close(x, motions.x, rtol=0, atol=left)
     joints = task.representation.to_joints(x)
@@ -222,7 +223,7 @@ def test_one_encoding_a_run_and_one_forward_a_call(process, sampler, guidance_sc
     encodings, forwards = [], []
     task.condition.register_forward_hook(lambda *_: encodings.append(1))
     task.denoiser.register_forward_hook(lambda _, inputs, __: forwards.append(len(inputs[0])))
-    task.generate(batch(), sampler=sampler, num_inference_steps=steps, guidance_scale=guidance_scale)
+    task.generate(batch(), SamplerOptions(sampler=sampler, num_inference_steps=steps, guidance_scale=guidance_scale))
     assert len(encodings) == 1
     assert set(forwards) == {copies * len(LENGTHS)}
     if sampler != "dopri5":
@@ -231,6 +232,6 @@ def test_one_encoding_a_run_and_one_forward_a_call(process, sampler, guidance_sc
 
 def test_a_sampler_of_another_process_is_refused():
     with pytest.raises(ValueError, match="unknown sampler 'euler': GaussianDiffusion has ancestral"):
-        build("mdm_encoder", "x0").generate(batch(), sampler="euler")
+        build("mdm_encoder", "x0").generate(batch(), SamplerOptions(sampler="euler"))
     with pytest.raises(ValueError, match="unknown sampler 'ddim': FlowMatching has euler"):
-        build("mdm_encoder", FLOW).generate(batch(), sampler="ddim")
+        build("mdm_encoder", FLOW).generate(batch(), SamplerOptions(sampler="ddim"))

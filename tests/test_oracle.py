@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import pytest
 import torch
-from support.analytic import NO_CONDITION
+from support.analytic import oracle, sample
 from support.fixtures import recipe
 from torch import Tensor
 
-from flame_mdm.batch import Denoise, Edit
+from flame_mdm.batch import Edit
 from flame_mdm.config import instantiate, recipes
-from flame_mdm.processes import Process
-from flame_mdm.processes.diffusion import GaussianDiffusion
 from flame_mdm.representations import Representation
-from flame_mdm.sampling.editing import METHODS
+from flame_mdm.sampling.request import METHODS
 from flame_mdm.seeds import normal
 
 pytestmark = pytest.mark.slow
@@ -52,20 +48,6 @@ def traveller(representation: Representation) -> Tensor:
     return representation.normalize(features.double())[None]
 
 
-def oracle(process: Process, x: Tensor, start: Tensor) -> Denoise:
-    """The denoiser that knows the motion, and of a flow the noise that it started from."""
-
-    def denoise(x_t: Tensor, t: Tensor, *_: Any) -> Tensor:
-        noise = start
-        if isinstance(process, GaussianDiffusion):
-            deviation = process.corrupt(torch.zeros_like(x), torch.ones_like(x), t)
-            noise = (x_t - process.corrupt(x, torch.zeros_like(x), t)) / deviation
-        output = process.target(x, noise, t)
-        return torch.cat([output, torch.zeros_like(output)], -1)[..., : process.out_features(x.shape[-1])]
-
-    return denoise
-
-
 def root_path(name: str, edit: Edit | None = None) -> tuple[Tensor, Tensor]:
     """The root (F, 3) of the traveller, and of the oracle's sample, as the recipe has it."""
     config = recipe(name)
@@ -78,15 +60,8 @@ def root_path(name: str, edit: Edit | None = None) -> tuple[Tensor, Tensor]:
     def noise(draw: int) -> Tensor:
         return normal(torch.tensor([draw]), *x.shape[1:]).double()
 
-    sampled = process.sample(
-        oracle(process, x, noise(0)),
-        noise,
-        torch.ones(x.shape[:2], dtype=torch.bool),
-        NO_CONDITION,
-        sampler=config["task"]["sampler"],
-        num_inference_steps=config["task"]["num_inference_steps"],
-        edit=edit,
-    )
+    how = {key: config["task"][key] for key in ("sampler", "num_inference_steps")}
+    sampled = sample(process, oracle(process, x, noise(0)), noise, edit=edit, **how)
     real, ours = (representation.to_joints(motion)[0, :, 0] for motion in (x, sampled))
     return real, ours
 

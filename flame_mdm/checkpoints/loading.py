@@ -15,8 +15,8 @@ from torch.utils._pytree import tree_leaves
 from flame_mdm.checkpoints.model_files import FILE, read_checkpoint
 from flame_mdm.config import Config, flatten, instantiate, trust
 from flame_mdm.errors import UserError, did_you_mean, first_line
-from flame_mdm.processes import MAX_STEPS
 from flame_mdm.safe_io import regular_file
+from flame_mdm.sampler_options import MAX_STEPS
 from flame_mdm.task import MotionGeneration, Task
 
 Which = Literal["last", "best"]

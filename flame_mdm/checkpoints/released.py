@@ -25,8 +25,8 @@ from flame_mdm.denoisers.flame import FLAME
 from flame_mdm.denoisers.gru import MDMGRU
 from flame_mdm.denoisers.mdm import MDMDecoder, MDMEncoder
 from flame_mdm.errors import UserError, first_line
-from flame_mdm.processes import MAX_STEPS
 from flame_mdm.safe_io import check_torch, read_npy, read_yaml, sha256
+from flame_mdm.sampler_options import MAX_STEPS
 from flame_mdm.schemas import Number, check_shape
 from flame_mdm.task import MotionGeneration
 

@@ -156,7 +156,7 @@ def page(studio: Studio, device: str | None) -> gr.Blocks:
     """Returns the page; arguments as for `web_app`."""
     stops: dict[str, Event] = {}
     names = list(studio.files)
-    samplers = list(studio.model(names[0]).process.sampler_names)
+    samplers = list(studio.model(names[0]).process.samplers)
 
     def show(query: str, web: gr.Request, progress: gr.Progress = gr.Progress()) -> Shown:  # noqa: B008
         stop = stops[str(web.session_hash)] = Event()
@@ -164,7 +164,7 @@ def page(studio: Studio, device: str | None) -> gr.Blocks:
             request = _read(query)
             model = studio.model(request.model)
             runs = 1 + len(request.edits) + STEERING_STEPS * bool(request.path)
-            steps = request.num_inference_steps or model.num_inference_steps
+            steps = request.num_inference_steps or model.sampler_options.num_inference_steps
             total = (len(steps) if isinstance(steps, list) else steps) * runs
 
             def report(calls: int) -> None:
@@ -209,7 +209,7 @@ def page(studio: Studio, device: str | None) -> gr.Blocks:
 
     def switch(name: str) -> list[Any]:
         samples = [[text] for text in _examples(studio, name)]
-        choices = list(studio.model(name).process.sampler_names)
+        choices = list(studio.model(name).process.samplers)
         return [gr.Dataset(samples=samples), gr.Dropdown(choices=choices, value=None), _vocabulary(studio, name)]
 
     with gr.Blocks(title="flame_mdm", analytics_enabled=False) as blocks:

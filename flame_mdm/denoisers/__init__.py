@@ -14,6 +14,10 @@ class Denoiser(nn.Module, ABC):
     `cond_features` (C; 0 = unconditioned), which `task.build` passes; the others come from the configuration.
     """
 
+    mask_padding: bool = True
+    """Whether the content and the number of frames past the end of a motion have no influence on its real frames. Set
+    it to False in a network that attends to padding: it is then sampled at the padded length of its training."""
+
     @abstractmethod
     def forward(self, x_t: Tensor, t: Tensor, mask: Tensor, cond: Condition) -> Tensor:
         """Predicts from a noisy motion. A pure function, except for dropout in training.
@@ -21,7 +25,7 @@ class Denoiser(nn.Module, ABC):
         Args:
             x_t: (B, F, D) noisy motion.
             t: (B,) float in [0, 1000), the time as a row of the sinusoidal table.
-            mask: (B, F) bool, True = real frame. The content of other frames does not change the result in real ones.
+            mask: (B, F) bool, True = real frame. See also `mask_padding`.
             cond: the condition, in which dropped samples are already replaced by nulls.
 
         Returns:

@@ -1,12 +1,14 @@
 """Generative processes: corruption of motion, prediction target of the denoiser, training loss and sampling."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 from torch import Tensor, nn
 
 from flame_mdm.batch import Condition, Denoise, Edit, Noise
-from flame_mdm.sampler_options import MAX_STEPS as MAX_STEPS
+from flame_mdm.errors import UserError
+from flame_mdm.processes.samplers import Sampler
+from flame_mdm.sampler_options import SamplerOptions
 
 Auxiliary = Callable[[Tensor, Tensor, Tensor], dict[str, Tensor]]
 """(x0_hat (B, F, D), x (B, F, D), mask (B, F)) -> weighted per-sample losses (B,) of the clean estimate, by name."""
@@ -21,8 +23,8 @@ class Process(nn.Module, ABC):
     edit_modes: Sequence[str] = ()
     """Modes of `Edit` that sampling supports; the first is the authors'."""
 
-    sampler_names: Sequence[str] = ()
-    """Values of `sampler` in `sample`."""
+    samplers: Mapping[str, Sampler] = {}
+    """Samplers by name."""
 
     @abstractmethod
     def out_features(self, features: int) -> int:
@@ -68,16 +70,71 @@ class Process(nn.Module, ABC):
         noise: Noise,
         mask: Tensor,
         cond: Condition,
+        options: SamplerOptions,
         *,
-        sampler: str,
-        num_inference_steps: int | Sequence[int],
         edit: Edit | None = None,
-        spacing: str = "linspace",
-        eta: float = 0.0,
         trajectory: list[Tensor] | None = None,
     ) -> Tensor:
         """Samples normalized motion (B, F, D) from noise; frames past the end of a motion are 0.
 
+        Args:
+            denoise: the denoiser, with or without guidance.
+            noise: draw 0 is the start.
+            mask: (B, F).
+            cond: the condition.
+            options: sampler and number of steps, and the options of the sampler; the guidance scale is ignored.
+            edit: parts of a motion to keep, in one of `edit_modes`.
+            trajectory: list to which the clean estimate (B, F, D) of each call is appended.
+
         Raises:
-            ValueError: the process does not support the sampler, the number of steps or the edit mode.
+            UserError: If the process does not support the sampler, the number of steps or the edit, or the sampler does
+                not have one of the options.
         """
+
+    def find_sampler(self, options: SamplerOptions) -> Sampler:
+        """Returns the requested sampler.
+
+        Raises:
+            UserError: If the process has no such sampler, or the sampler does not have one of the options.
+        """
+        if options.sampler not in self.samplers:
+            name = type(self).__name__
+            raise UserError(f"unknown sampler '{options.sampler}': {name} has {', '.join(self.samplers)}")
+        sampler = self.samplers[options.sampler]
+        names = ["guidance_scale", "sampler", "num_inference_steps", *sampler.options]
+        for name, value in options.chosen().items():
+            if name not in names:
+                raise UserError(
+                    f"{name}={value}: the sampler {options.sampler} has no such option; it has {', '.join(names)}. "
+                    f"Omit {name}, or choose another sampler"
+                )
+        return sampler
+
+    def check_edit(self, edit: Edit, mask: Tensor) -> None:
+        """Checks an edit before a long run.
+
+        Raises:
+            UserError: If the process does not support its mode, or its shape does not match the motions.
+        """
+        if edit.mode not in self.edit_modes:
+            modes = ", ".join(self.edit_modes)
+            raise UserError(f"edit mode '{edit.mode}' is not supported: {type(self).__name__} has {modes}")
+        if edit.blend not in ("after", "before") or edit.resample < 1:
+            raise UserError(
+                f"edit has blend={edit.blend}, resample={edit.resample}: blend is after or before, resample at least 1"
+            )
+        if edit.strength is not None and not 0 < edit.strength <= 1:
+            raise UserError(f"strength={edit.strength}: choose a number above 0, up to 1")
+        if edit.known.shape != edit.keep.shape or edit.known.shape[:2] != mask.shape:
+            shapes = f"known {tuple(edit.known.shape)}, keep {tuple(edit.keep.shape)}"
+            raise UserError(f"edit does not match the shape of the motions: {shapes}, mask {tuple(mask.shape)}")
+
+
+def check_choice(name: str, value: str, choices: Sequence[str]) -> None:
+    """Checks an option of a process that has a few values.
+
+    Raises:
+        UserError: If the value is not one of the choices.
+    """
+    if value not in choices:
+        raise UserError(f"unknown {name} '{value}': choose from {', '.join(choices)}")

@@ -1,25 +1,24 @@
 """Flow matching on straight paths (Lipman et al. 2023; Motion Flow Matching)."""
 
-from collections.abc import Sequence
 from typing import Literal, get_args
 
 import torch
 from torch import Tensor
 
 from flame_mdm.batch import Condition, Denoise, Edit, Noise
+from flame_mdm.errors import UserError
 from flame_mdm.losses import masked_mse
-from flame_mdm.processes import Auxiliary, Process, samplers
-from flame_mdm.processes.diffusion import check_edit
+from flame_mdm.processes import Auxiliary, Process, check_choice, samplers
+from flame_mdm.sampler_options import SamplerOptions
 
 TimeDistribution = Literal["uniform", "logit_normal"]
-STEPS = {"euler": samplers.euler, "midpoint": samplers.midpoint, "heun": samplers.heun, "rk4": samplers.rk4}
 
 
 class FlowMatching(Process):
     """Straight path from noise at t = 0 to motion at t = 1; the denoiser predicts its velocity and is passed 1000 t."""
 
     edit_modes = ("trajectory", "x0")
-    sampler_names = (*STEPS, "dopri5")
+    samplers = samplers.FLOW_SAMPLERS
 
     def __init__(
         self,
@@ -42,16 +41,13 @@ class FlowMatching(Process):
                 N, a time is one row of the table lower than with N equal steps (never for 10, 20 or 30).
 
         Raises:
-            ValueError: the prediction or time distribution is unknown, or sigma_min is not in [0, 1).
+            UserError: If the prediction or time distribution is unknown, or sigma_min is not in [0, 1).
         """
         super().__init__()
-        if prediction not in ("velocity", "x0"):
-            raise ValueError(f"unknown prediction '{prediction}': choose from velocity, x0")
-        if time_distribution not in get_args(TimeDistribution):
-            known = ", ".join(get_args(TimeDistribution))
-            raise ValueError(f"unknown time_distribution '{time_distribution}': choose from {known}")
+        check_choice("prediction", prediction, ("velocity", "x0"))
+        check_choice("time_distribution", time_distribution, get_args(TimeDistribution))
         if not 0 <= sigma_min < 1:
-            raise ValueError(f"sigma_min is {sigma_min}: choose a number in [0, 1)")
+            raise UserError(f"sigma_min is {sigma_min}: choose a number in [0, 1)")
         self.sigma_min = sigma_min
         self.prediction = prediction
         self.time_distribution = time_distribution
@@ -118,83 +114,58 @@ class FlowMatching(Process):
         noise: Noise,
         mask: Tensor,
         cond: Condition,
+        options: SamplerOptions,
         *,
-        sampler: str = "euler",
-        num_inference_steps: int | Sequence[int],
         edit: Edit | None = None,
-        spacing: str = "linspace",
-        eta: float = 0.0,
         trajectory: list[Tensor] | None = None,
     ) -> Tensor:
-        """See `Process.sample`; draws only noise number 0.
+        """See `Process.sample`. Takes N >= 1 equal steps and draws only noise number 0; "dopri5" chooses its own steps.
 
-        Args:
-            denoise: the denoiser, with or without guidance; called 1 (euler), 2 (midpoint, heun) or 4 times (rk4) per
-                step.
-            noise: the start.
-            mask: (B, F).
-            cond: the condition.
-            sampler: "euler", "midpoint", "heun", "rk4" or "dopri5".
-            num_inference_steps: N >= 1 equal steps; "dopri5" chooses its own.
-            edit: mode "trajectory" (MFM, algorithm 1) overwrites the kept part before each step at a time <= `until`
-                with the straight path from its noise to the known motion; after that, the model moves it freely. Mode
-                "x0" overwrites the clean estimate of every call, which reproduces the kept part exactly. Not supported
-                by "dopri5".
-            spacing, eta: of diffusion; other values than these are refused.
-            trajectory: list to which the clean estimate (B, F, D) of each call is appended.
-
-        Raises:
-            ValueError: the sampler, number of steps or edit is not supported.
+        An edit of mode "trajectory" overwrites the kept part early on the path (MFM, algorithm 1); after that, the
+        model moves it freely. Mode "x0" overwrites the clean estimate of every call, which reproduces the kept part
+        exactly. "dopri5" cannot edit.
         """
-        if sampler not in self.sampler_names:
-            raise ValueError(f"unknown sampler '{sampler}': FlowMatching has {', '.join(self.sampler_names)}")
-        if spacing != "linspace" or eta:
-            raise ValueError(f"spacing={spacing}, eta={eta}: a flow takes equal steps without noise; leave them out")
-        if not isinstance(num_inference_steps, int):
-            raise ValueError(f"num_inference_steps={num_inference_steps}: a flow takes a number of equal steps")
-        if num_inference_steps < 1:
-            raise ValueError(f"num_inference_steps is {num_inference_steps}: flow matching needs at least 1")
+        sampler, count = self.find_sampler(options), options.num_inference_steps
+        if not isinstance(count, int):
+            raise UserError(f"num_inference_steps={count}: a flow takes a number of equal steps")
         if edit is not None:
-            check_edit(edit, mask, self.edit_modes, "FlowMatching")
-            if sampler == "dopri5":
-                raise ValueError(f"dopri5 chooses its own steps and cannot edit: choose from {', '.join(STEPS)}")
-        start = noise(0)
+            self.check_edit(edit, mask)
+            if not sampler.single_step:
+                able = ", ".join(name for name, other in self.samplers.items() if other.single_step)
+                raise UserError(f"{options.sampler} chooses its own steps and cannot edit: choose from {able}")
+        imposed = edit if edit is not None and edit.mode == "x0" else None
 
         def velocity(x: Tensor, t: float | Tensor) -> Tensor:
             # Filling a tensor on the device with a number needs no copy and no synchronization.
             precision = torch.promote_types(x.dtype, torch.float32)
             time = t.expand(len(x)) if isinstance(t, Tensor) else x.new_full((len(x),), t, dtype=precision)
-            output = x
 
             def clean(x: Tensor) -> Tensor:
-                nonlocal output
-                output = denoise(x, self.table_time(time), mask, cond).to(x.dtype)
-                return self.to_x0(output, x, time)
+                return self.to_x0(denoise(x, self.table_time(time), mask, cond).to(x.dtype), x, time)
 
-            imposed = edit if edit is not None and edit.mode == "x0" else None
-            x0_hat = clean(x) if imposed is None else imposed.impose(clean, x)
+            seen = x if imposed is None or imposed.guide is None else imposed.guide.steer(clean, x)
+            output = denoise(seen, self.table_time(time), mask, cond).to(x.dtype)
             if self.prediction == "velocity" and trajectory is None and imposed is None:
                 return output
-            straight = (x0_hat - (1 - self.sigma_min) * x) / (1 - (1 - self.sigma_min) * time[:, None, None])
-            if self.prediction == "x0":
-                output = straight
-            elif imposed is not None:
-                output = straight if imposed.guide else torch.where(imposed.keep, straight, output)
+            x0_hat = self.to_x0(output, seen, time)
+            if imposed is not None:
+                x0_hat = imposed.impose(x0_hat)
             if trajectory is not None:
                 trajectory.append(x0_hat * mask[..., None])
-            return output
+            straight = (x0_hat - (1 - self.sigma_min) * x) / (1 - (1 - self.sigma_min) * time[:, None, None])
+            if self.prediction == "x0" or (imposed is not None and imposed.guide is not None):
+                return straight
+            return output if imposed is None else torch.where(imposed.keep, straight, output)
 
-        if sampler == "dopri5":
-            return samplers.dopri5(velocity, start) * mask[..., None]
-        step, times, count = STEPS[sampler], self.times(num_inference_steps), num_inference_steps
-        first = 0 if edit is None else count - edit.steps(count)
+        start, times = noise(0), self.times(count)
+        if edit is None:
+            return sampler.loop(velocity, start, times) * mask[..., None]
+        first = count - edit.steps(count)
         x = start
-        if edit is not None and edit.strength is not None:
+        if edit.strength is not None:
             x = self.corrupt(edit.known, start, start.new_full((len(start),), times[first]))
-        for i in range(first, count):
-            if edit is not None and edit.mode == "trajectory" and i / count <= edit.until:
-                x = torch.where(edit.keep, (start * (count - i) + edit.known * i) / count, x)
-            x = step(velocity, x, times[i], times[i + 1] - times[i])
-        if edit is not None and edit.mode == "x0":
-            x = torch.where(edit.keep, edit.known, x)
+        if edit.mode == "trajectory":
+            x = samplers.rewrite(sampler, velocity, x, times, first, start, edit)
+        else:
+            x = torch.where(edit.keep, edit.known, sampler.loop(velocity, x, times[first:]))
         return x * mask[..., None]

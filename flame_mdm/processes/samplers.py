@@ -1,19 +1,21 @@
-"""Samplers from noise to motion, one function each.
+"""Sampling loops from noise to motion, one plain function each, and the options that each of them has.
 
-Diffusion samplers descend the steps of a `Schedule`; they call the denoiser as `estimate(x_t, i)`, which returns the
-clean motion and the log-variance at step i. ODE solvers call a velocity field. Coefficients and times are Python
-numbers, so that no loop waits for the device.
+Diffusion samplers descend numbers i of steps of a `Schedule`; they get the clean motion and the log-variance at step i
+from `estimate`. ODE solvers follow a velocity field. Coefficients and times are Python numbers, so that no loop waits
+for the device.
 """
 
-import itertools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
 
 import torch
 from torch import Tensor
 
-from flame_mdm.batch import Condition, Denoise, Edit, Noise
+from flame_mdm.batch import Condition, Denoise, Edit
 from flame_mdm.processes.schedules import Schedule
+from flame_mdm.sampler_options import SamplerOptions
 
 with torch.device("cpu"):  # it holds tensors, and a network may be built on "meta" while this module is imported
     from torchdiffeq import odeint
@@ -23,6 +25,22 @@ Estimate = Callable[[Tensor, int], tuple[Tensor, Tensor | float]]
 
 Velocity = Callable[[Tensor, float | Tensor], Tensor]
 """(x (B, F, D), time t) -> dx/dt (B, F, D)."""
+
+
+@dataclass(frozen=True)
+class Sampler:
+    """A sampling loop and what it can do.
+
+    Attributes:
+        loop: of a diffusion: (estimate, x_t, schedule, steps i, draws of noise, options) -> x after the last step. Of a
+            flow: (velocity, x, times) -> x at the last time.
+        options: fields of `SamplerOptions` that it has besides guidance_scale, sampler and num_inference_steps.
+        single_step: whether each step depends on the previous x alone, so that an edit can come between two steps.
+    """
+
+    loop: Callable[..., Tensor]
+    options: tuple[str, ...] = ()
+    single_step: bool = True
 
 
 class CountedDenoise:
@@ -35,6 +53,68 @@ class CountedDenoise:
     def __call__(self, x_t: Tensor, t: Tensor, mask: Tensor, cond: Condition) -> Tensor:
         self.calls += 1
         return self.denoise(x_t, t, mask, cond)
+
+
+# Diffusion ------------------------------------------------------------------------------------------------------------
+
+
+def ancestral(
+    estimate: Estimate,
+    x: Tensor,
+    schedule: Schedule,
+    steps: Sequence[int],
+    draws: Iterator[Tensor],
+    options: SamplerOptions,
+) -> Tensor:
+    """Draws every x_{t-1} from the learned reverse process (Ho et al. 2020, algorithm 2); the last one is its mean."""
+    for i in steps:
+        x0_hat, log_variance = estimate(x, i)
+        x = ancestral_step(x, x0_hat, log_variance, schedule, i, next(draws) if i else None)
+    return x
+
+
+def ddim(
+    estimate: Estimate,
+    x: Tensor,
+    schedule: Schedule,
+    steps: Sequence[int],
+    draws: Iterator[Tensor],
+    options: SamplerOptions,
+) -> Tensor:
+    """Non-Markovian sampling (Song et al. 2021): deterministic at eta = 0, as random as `ancestral` at eta = 1."""
+    eta = options.eta or 0.0
+    for i in steps:
+        x0_hat, _ = estimate(x, i)
+        x = ddim_step(x, x0_hat, schedule, i, next(draws) if eta and i else None, eta)
+    return x
+
+
+def dpm_solver_pp_2m(
+    estimate: Estimate,
+    x: Tensor,
+    schedule: Schedule,
+    steps: Sequence[int],
+    draws: Iterator[Tensor],
+    options: SamplerOptions,
+) -> Tensor:
+    """DPM-Solver++ (2M), a deterministic multistep solver (Lu et al. 2022b, algorithm 2).
+
+    The first step is of first order, since there is no history; the last one returns the clean estimate.
+    """
+    signal, deviation = schedule.tables["signal"].tolist(), schedule.tables["noise"].tolist()
+    log_snr = [math.log(a / s) for a, s in zip(signal, deviation, strict=True)]
+    last: Tensor | None = None
+    for i in steps:
+        x0_hat, _ = estimate(x, i)
+        if i == 0:
+            return x0_hat
+        size = log_snr[i - 1] - log_snr[i]
+        data = x0_hat
+        if last is not None:
+            data = x0_hat + size / (2 * (log_snr[i] - log_snr[i + 1])) * (x0_hat - last)
+        last = x0_hat
+        x = deviation[i - 1] / deviation[i] * x - signal[i - 1] * math.expm1(-size) * data
+    return x
 
 
 def ancestral_step(
@@ -58,118 +138,125 @@ def ddim_step(x_t: Tensor, x0_hat: Tensor, schedule: Schedule, i: int, noise: Te
     return x if noise is None else x + variance**0.5 * noise
 
 
-def ancestral(estimate: Estimate, schedule: Schedule, noise: Noise, edit: Edit | None = None) -> Tensor:
-    """Draws every x_{t-1} from the learned reverse process (Ho et al. 2020, algorithm 2); the last one is its mean."""
+def blended(estimate: Estimate, edit: Edit, schedule: Schedule, start: Tensor, draws: Iterator[Tensor]) -> Estimate:
+    """Returns an `estimate` that sees the known motion, as noisy as x_t, in the kept part of x_t.
 
-    def step(x_t: Tensor, i: int, draw: Callable[[], Tensor]) -> Tensor:
-        x0_hat, log_variance = estimate(x_t, i)
-        return ancestral_step(x_t, x0_hat, log_variance, schedule, i, draw() if i else None)
-
-    return _descend(step, schedule, noise, edit)
-
-
-def ddim(estimate: Estimate, schedule: Schedule, noise: Noise, edit: Edit | None = None, *, eta: float = 0.0) -> Tensor:
-    """Non-Markovian sampling (Song et al. 2021): deterministic at eta = 0, as random as `ancestral` at eta = 1."""
-
-    def step(x_t: Tensor, i: int, draw: Callable[[], Tensor]) -> Tensor:
-        x0_hat, _ = estimate(x_t, i)
-        return ddim_step(x_t, x0_hat, schedule, i, draw() if eta and i else None, eta)
-
-    return _descend(step, schedule, noise, edit)
-
-
-def dpm_solver_pp_2m(estimate: Estimate, schedule: Schedule, noise: Noise, edit: Edit | None = None) -> Tensor:
-    """DPM-Solver++ (2M), a deterministic multistep solver (Lu et al. 2022b, algorithm 2).
-
-    The first step is of first order, since there is no history; the last one returns the clean estimate.
+    This wrapper is exact, since what a sampler makes of the kept part is replaced before the next call. With the blend
+    "after", the kept part of the first x_t has the noise of the start, as if it were blended after a step before that.
     """
-    signal, deviation = schedule.tables["signal"].tolist(), schedule.tables["noise"].tolist()
-    log_snr = [math.log(a / s) for a, s in zip(signal, deviation, strict=True)]
-    last: Tensor | None = None
+    first = edit.steps(len(schedule)) - 1 if edit.blend == "after" else None
 
-    def step(x_t: Tensor, i: int, draw: Callable[[], Tensor]) -> Tensor:
-        nonlocal last
-        x0_hat, _ = estimate(x_t, i)
-        if i == 0:
-            return x0_hat
-        size = log_snr[i - 1] - log_snr[i]
-        data = x0_hat
-        if last is not None:
-            data = x0_hat + size / (2 * (log_snr[i] - log_snr[i + 1])) * (x0_hat - last)
-        last = x0_hat
-        return deviation[i - 1] / deviation[i] * x_t - signal[i - 1] * math.expm1(-size) * data
+    def estimate_blended(x_t: Tensor, i: int) -> tuple[Tensor, Tensor | float]:
+        noise = start if i == first else next(draws)
+        return estimate(torch.where(edit.keep, schedule.corrupt(edit.known, noise, i), x_t), i)
 
-    return _descend(step, schedule, noise, edit)
+    return estimate_blended
 
 
-def _descend(
-    step: Callable[[Tensor, int, Callable[[], Tensor]], Tensor], schedule: Schedule, noise: Noise, edit: Edit | None
+def repaint(
+    sampler: Sampler,
+    estimate: Estimate,
+    x: Tensor,
+    schedule: Schedule,
+    steps: Sequence[int],
+    draws: Iterator[Tensor],
+    options: SamplerOptions,
+    edit: Edit,
 ) -> Tensor:
-    """Descends all steps from noise(0) and applies an edit of mode "x_t".
-
-    Draws are numbered in order of use: blending before a step, the step, blending after it, resampling.
-    """
-    draws = itertools.count()
-
-    def draw() -> Tensor:
-        return noise(next(draws))
-
-    x = draw()
-    top = (len(schedule) if edit is None else edit.steps(len(schedule))) - 1
-    if edit is not None and edit.strength is not None:
-        x = schedule.corrupt(edit.known, x, top)
-    elif edit is not None and edit.mode == "x_t" and edit.blend == "after":
-        x = torch.where(edit.keep, schedule.corrupt(edit.known, x, top), x)
-    if edit is None or edit.mode != "x_t":
-        for i in range(top, -1, -1):
-            x = step(x, i, draw)
-        return x
-    for i in range(top, -1, -1):
-        for repeats_left in range(edit.resample - 1 if i else 0, -1, -1):
+    """RePaint (Lugmayr et al. 2022, algorithm 1): takes each step several times, adding its noise again in between."""
+    if edit.blend == "after":
+        x = torch.where(edit.keep, schedule.corrupt(edit.known, x, steps[0]), x) if edit.strength is None else x
+    for i in steps:
+        for repeats_left in reversed(range(edit.resample if i else 1)):
             if edit.blend == "before":
-                x = torch.where(edit.keep, schedule.corrupt(edit.known, draw(), i), x)
-            x = step(x, i, draw)
+                x = torch.where(edit.keep, schedule.corrupt(edit.known, next(draws), i), x)
+            x = sampler.loop(estimate, x, schedule, [i], draws, options)
             if edit.blend == "after":
-                kept = schedule.corrupt(edit.known, draw(), i - 1) if i else edit.known
+                kept = schedule.corrupt(edit.known, next(draws), i - 1) if i else edit.known
                 x = torch.where(edit.keep, kept, x)
             if repeats_left:
                 beta = schedule.at("betas", i, x)
-                x = (1 - beta) ** 0.5 * x + beta**0.5 * draw()
+                x = (1 - beta) ** 0.5 * x + beta**0.5 * next(draws)
     return x
 
 
-def euler(velocity: Velocity, x: Tensor, t: float, dt: float) -> Tensor:
-    """One step of order 1, one call."""
-    return x + dt * velocity(x, t)
+DIFFUSION_SAMPLERS = {
+    "ancestral": Sampler(ancestral, ("spacing",)),
+    "ddim": Sampler(ddim, ("spacing", "eta")),
+    "dpm_solver_pp_2m": Sampler(dpm_solver_pp_2m, ("spacing",), single_step=False),
+}
+
+# Flows ----------------------------------------------------------------------------------------------------------------
 
 
-def midpoint(velocity: Velocity, x: Tensor, t: float, dt: float) -> Tensor:
-    """One step of order 2, two calls."""
-    return x + dt * velocity(x + dt / 2 * velocity(x, t), t + dt / 2)
+def euler(velocity: Velocity, x: Tensor, times: Sequence[float]) -> Tensor:
+    """Order 1, one call per step."""
+    for t, end in pairwise(times):
+        x = x + (end - t) * velocity(x, t)
+    return x
 
 
-def heun(velocity: Velocity, x: Tensor, t: float, dt: float) -> Tensor:
-    """One step of order 2, two calls: the trapezoid with an Euler predictor."""
-    first = velocity(x, t)
-    return x + dt / 2 * (first + velocity(x + dt * first, t + dt))
+def midpoint(velocity: Velocity, x: Tensor, times: Sequence[float]) -> Tensor:
+    """Order 2, two calls per step."""
+    for t, end in pairwise(times):
+        dt = end - t
+        x = x + dt * velocity(x + dt / 2 * velocity(x, t), t + dt / 2)
+    return x
 
 
-def rk4(velocity: Velocity, x: Tensor, t: float, dt: float) -> Tensor:
-    """One step of order 4, four calls: Kutta's 3/8 rule, also called rk4 in torchdiffeq."""
-    k1 = velocity(x, t)
-    k2 = velocity(x + dt / 3 * k1, t + dt / 3)
-    k3 = velocity(x + dt * (k2 - k1 / 3), t + dt * 2 / 3)
-    k4 = velocity(x + dt * (k1 - k2 + k3), t + dt)
-    return x + dt / 8 * (k1 + 3 * (k2 + k3) + k4)
+def heun(velocity: Velocity, x: Tensor, times: Sequence[float]) -> Tensor:
+    """Order 2, two calls per step: the trapezoid with an Euler predictor."""
+    for t, end in pairwise(times):
+        dt = end - t
+        first = velocity(x, t)
+        x = x + dt / 2 * (first + velocity(x + dt * first, t + dt))
+    return x
 
 
-def dopri5(velocity: Velocity, x: Tensor) -> Tensor:
-    """Integrates from t = 0 to 1 with adaptive steps of order 5 (Dormand and Prince 1980), rtol = atol = 1e-5, as MFM.
+def rk4(velocity: Velocity, x: Tensor, times: Sequence[float]) -> Tensor:
+    """Order 4, four calls per step: Kutta's 3/8 rule, also called rk4 in torchdiffeq."""
+    for t, end in pairwise(times):
+        dt = end - t
+        k1 = velocity(x, t)
+        k2 = velocity(x + dt / 3 * k1, t + dt / 3)
+        k3 = velocity(x + dt * (k2 - k1 / 3), t + dt * 2 / 3)
+        k4 = velocity(x + dt * (k1 - k2 + k3), t + dt)
+        x = x + dt / 8 * (k1 + 3 * (k2 + k3) + k4)
+    return x
+
+
+def dopri5(velocity: Velocity, x: Tensor, times: Sequence[float]) -> Tensor:
+    """Adaptive steps of order 5 from the first to the last time (Dormand and Prince 1980), rtol = atol = 1e-5, as MFM.
 
     The error is measured over the entire batch, so a motion depends on the rest of its batch, up to the tolerance. The
-    last step may go beyond t = 1; the solver then interpolates back.
+    last step may go beyond the last time; the solver then interpolates back.
     """
-    ends = torch.tensor([0.0, 1.0], dtype=x.dtype, device=x.device)
+    ends = torch.tensor([times[0], times[-1]], dtype=x.dtype, device=x.device)
     path = odeint(lambda t, y: velocity(y, t), x, ends, rtol=1e-5, atol=1e-5, method="dopri5")
     assert isinstance(path, Tensor)
     return path[-1]
+
+
+def rewrite(
+    sampler: Sampler, velocity: Velocity, x: Tensor, times: Sequence[float], first: int, start: Tensor, edit: Edit
+) -> Tensor:
+    """MFM's editing (Hu et al. 2023, algorithm 1): replaces the kept part before each step at a time <= `until`.
+
+    It is replaced by the straight path from its noise in `start` to the known motion; after that, the model moves it.
+    Sampling begins with step number `first`.
+    """
+    count = len(times) - 1
+    for i in range(first, count):
+        if i / count <= edit.until:
+            x = torch.where(edit.keep, (start * (count - i) + edit.known * i) / count, x)
+        x = sampler.loop(velocity, x, times[i : i + 2])
+    return x
+
+
+FLOW_SAMPLERS = {
+    "euler": Sampler(euler),
+    "midpoint": Sampler(midpoint),
+    "heun": Sampler(heun),
+    "rk4": Sampler(rk4),
+    "dopri5": Sampler(dopri5, single_step=False),
+}

@@ -6,10 +6,10 @@ from typing import Literal, get_args
 import torch
 from torch import Tensor
 
-from flame_mdm.processes import MAX_STEPS
+from flame_mdm.errors import UserError
+from flame_mdm.sampler_options import MAX_STEPS, SPACINGS
 
 ScheduleName = Literal["cosine", "linear"]
-Spacing = Literal["linspace", "stride"]
 
 
 def cosine_betas(num_train_timesteps: int) -> Tensor:
@@ -96,12 +96,12 @@ def build_schedule(name: ScheduleName, num_train_timesteps: int) -> Schedule:
     """Returns the schedule of this name with T steps.
 
     Raises:
-        ValueError: the name is unknown, or the number of steps is not in [2, `MAX_STEPS`].
+        UserError: If the name is unknown, or the number of steps is not in [2, `MAX_STEPS`].
     """
     if name not in get_args(ScheduleName):
-        raise ValueError(f"unknown schedule '{name}': choose from {', '.join(get_args(ScheduleName))}")
+        raise UserError(f"unknown schedule '{name}': choose from {', '.join(get_args(ScheduleName))}")
     if not 2 <= num_train_timesteps <= MAX_STEPS:
-        raise ValueError(f"num_train_timesteps is {num_train_timesteps}: a diffusion has 2 to {MAX_STEPS:,} steps")
+        raise UserError(f"num_train_timesteps is {num_train_timesteps}: a diffusion has 2 to {MAX_STEPS:,} steps")
     return Schedule({"cosine": cosine_betas, "linear": linear_betas}[name](num_train_timesteps))
 
 
@@ -117,18 +117,18 @@ def timesteps(num_train_timesteps: int, num_inference_steps: int, spacing: str =
             2021).
 
     Raises:
-        ValueError: N is not in 1 ... T, the spacing is unknown, or no stride gives N steps.
+        UserError: If N is not in 1 ... T, the spacing is unknown, or no stride gives N steps.
     """
     total, count = num_train_timesteps, num_inference_steps
     if not 1 <= count <= total:
-        raise ValueError(f"num_inference_steps is {count}: choose from 1 to num_train_timesteps = {total}")
+        raise UserError(f"num_inference_steps is {count}: choose from 1 to num_train_timesteps = {total}")
     if spacing == "stride":
         for stride in range(1, total + 1):
             if len(range(0, total, stride)) == count:
                 return list(range(0, total, stride))
-        raise ValueError(f"no stride gives {count} of {total} steps: choose another number or spacing=linspace")
+        raise UserError(f"no stride gives {count} of {total} steps: choose another number or spacing=linspace")
     if spacing != "linspace":
-        raise ValueError(f"unknown spacing '{spacing}': choose from {', '.join(get_args(Spacing))}")
+        raise UserError(f"unknown spacing '{spacing}': choose from {', '.join(SPACINGS)}")
     stride = (total - 1) / (count - 1) if count > 1 else 1.0
     # A running sum, not i * stride: its rounding decides ties, and the released models were sampled at those steps.
     steps, position = [], 0.0

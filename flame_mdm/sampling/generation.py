@@ -182,13 +182,13 @@ def _sample(model: MotionGeneration, plan: _Plan, rows: slice, trajectory: list[
         edit = replace(edit, known=known.expand_as(batch.x), keep=keep.expand_as(batch.x))
     x = model.generate(
         batch,
+        request.options,
         seed=request.seed,
         shared_noise=request.shared_noise,
         trajectory=trajectory,
         windows=covering,
         edit=edit,
         unconditioned=request.kind == "none",
-        **request.options.chosen(),
     )
     return [_decoded(model, plan, rows.start + row, features) for row, features in enumerate(x)]
 

@@ -96,7 +96,7 @@ def windows(
     covering = [(row, *span) for row, parts in enumerate(lengths) for span in spans(parts, longest, shared, loop)]
     names = [conditions[row][part] for row, part, _, _ in covering]
     # A denoiser that attends to its padding sees as many frames as in training.
-    width = max(size for *_, size in covering) if getattr(model.denoiser, "mask_padding", True) else longest
+    width = max(size for *_, size in covering) if model.denoiser.mask_padding else longest
     positions = [(row, first, size) for row, _, first, size in covering]
     rows, frames, mask, weights = place(positions, [sum(parts) for parts in lengths], shared, width, device)
     batch = MotionBatch(

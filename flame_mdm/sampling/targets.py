@@ -38,6 +38,32 @@ KEYS = {
 
 
 @dataclass(frozen=True)
+class PositionGuide:
+    """Leads motions to positions in the world; a `flame_mdm.batch.Guide`.
+
+    Attributes:
+        representation: decodes motions as joints.
+        positions: the goal.
+        bones: (3, N) frame, parent and child of the bones that keep their lengths.
+        known, keep: (1, F, D) features that are imposed in any case, and where.
+    """
+
+    representation: Representation
+    positions: Positions
+    bones: Tensor
+    known: Tensor
+    keep: Tensor
+
+    def steer(self, clean: Callable[[Tensor], Tensor], x_t: Tensor) -> Tensor:
+        return steer(clean, x_t, self.representation.to_joints, self.positions)
+
+    def reach(self, x0_hat: Tensor) -> Tensor:
+        imposed, free = torch.where(self.keep, self.known, x0_hat), ~self.keep.expand_as(x0_hat)
+        sigma = SMOOTHNESS * self.representation.fps
+        return reach(imposed, self.representation.to_joints, self.positions, self.bones, free, sigma)
+
+
+@dataclass(frozen=True)
 class Targets:
     """What motions should reach.
 
@@ -67,16 +93,10 @@ class Targets:
         for frame, features in self.poses:
             known[0, frame] = representation.normalize(features.to(device))
             keep[0, frame] = representation.joint_features(range(1, len(representation.skeleton))).to(device)
-        wanted = Positions(*(x.to(device) for x in vars(self.positions).values()))
+        positions = Positions(*(x.to(device) for x in vars(self.positions).values()))
         bones = self._bones(representation).to(device)
-        sigma = SMOOTHNESS * representation.fps
-
-        def guide(clean: Callable[[Tensor], Tensor], x_t: Tensor) -> Tensor:
-            x0_hat = clean(steer(clean, x_t, representation.to_joints, wanted))
-            imposed = torch.where(keep, known, x0_hat)
-            return reach(imposed, representation.to_joints, wanted, bones, ~keep.expand_as(x0_hat), sigma)
-
-        return Edit(known, keep, guide=guide if len(wanted.values) else None)
+        guide = PositionGuide(representation, positions, bones, known, keep)
+        return Edit(known, keep, guide=guide if len(positions.values) else None)
 
     def _bones(self, representation: Representation) -> Tensor:
         """Returns frame, parent and child (3, N) of all bones in frames in which other joints than the root move."""

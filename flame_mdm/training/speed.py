@@ -43,7 +43,7 @@ def accelerate(task: Task, data: MotionDataModule, config: Config) -> str:
         supported = torch.cuda.is_bf16_supported(including_emulation=False)
         if isinstance(task, MotionGeneration) and trainer["max_steps"] >= COMPILED_FROM:
             say("compiling the network: the first steps take longer, and less so in later runs")
-            if getattr(task.denoiser, "mask_padding", True):  # otherwise, padding changes what it learns
+            if task.denoiser.mask_padding:  # otherwise, padding changes what it learns
                 data.pad_multiple = max(data.pad_multiple, PAD_MULTIPLE)
             torch._dynamo.config.recompile_limit = MOST_SHAPES
             task.denoiser.compile(dynamic=False)

@@ -1,12 +1,18 @@
 """Analytic denoisers of the diffusion and flow fixtures, comparisons with these, and rotations of Euler angles."""
 
+from collections.abc import Sequence
+from typing import Any
+
 import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from flame_mdm.batch import Condition, Denoise
+from flame_mdm.batch import Condition, Denoise, Edit, Noise
+from flame_mdm.processes import Process
+from flame_mdm.processes.flow_matching import FlowMatching
 from flame_mdm.processes.schedules import timesteps
+from flame_mdm.sampler_options import SamplerOptions
 from support.fixtures import Arrays, meta
 
 NO_CONDITION = Condition(torch.zeros(1, 1), torch.zeros(1, 0, 1), None)
@@ -15,6 +21,51 @@ NO_CONDITION = Condition(torch.zeros(1, 1), torch.zeros(1, 0, 1), None)
 def motions(array: np.ndarray, dtype: torch.dtype = torch.float32) -> Tensor:
     """(B, joints, features, frames) or (B, D, frames) -> (B, F, D)."""
     return torch.from_numpy(array).to(dtype).flatten(1, -2).transpose(1, 2).contiguous()
+
+
+def sample(
+    process: Process,
+    denoise: Denoise,
+    noise: Noise,
+    mask: Tensor | None = None,
+    cond: Condition = NO_CONDITION,
+    *,
+    edit: Edit | None = None,
+    trajectory: list[Tensor] | None = None,
+    **options: Any,
+) -> Tensor:
+    """`Process.sample` with the sampler's options as keywords; without a mask, all frames are real."""
+    if mask is None:
+        mask = torch.ones_like(noise(0)[..., 0], dtype=torch.bool)
+    return process.sample(denoise, noise, mask, cond, SamplerOptions(**options), edit=edit, trajectory=trajectory)
+
+
+def recorded(first: Tensor, rest: Sequence[Tensor] | Tensor = ()) -> Noise:
+    """Noise from recorded draws; asking for more of them is an error."""
+    return lambda draw: first if draw == 0 else rest[draw - 1]
+
+
+def drawn(shape: tuple[int, ...], dtype: torch.dtype = torch.float32) -> Noise:
+    """Noise that depends on the number of the draw alone."""
+    return lambda draw: torch.randn(shape, generator=torch.Generator().manual_seed(draw), dtype=dtype)
+
+
+def oracle(process: Process, x: Tensor, start: Tensor | None = None) -> Denoise:
+    """The denoiser that knows the data, from which the noise in x_t follows; a learned variance is the smallest.
+
+    Of a flow that rounds its times, it also knows the noise of the start.
+    """
+
+    def denoise(x_t: Tensor, t: Tensor, mask: Tensor, cond: Condition) -> Tensor:
+        time = t / 1000 if isinstance(process, FlowMatching) else t
+        zero, one = torch.zeros_like(x), torch.ones_like(x)
+        noise = (x_t - process.corrupt(x, zero, time)) / process.corrupt(zero, one, time)
+        if start is not None and isinstance(process, FlowMatching):
+            noise = start
+        output = process.target(x, noise, time)
+        return torch.cat([output, torch.zeros_like(output)], -1)[..., : process.out_features(x.shape[-1])]
+
+    return denoise
 
 
 def linear_denoiser(A: np.ndarray, b: np.ndarray, g: float) -> Denoise:

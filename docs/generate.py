@@ -23,6 +23,8 @@ def head(name: str) -> tuple[str, str]:
     lines = (EXPERIMENTS / f"{name}.yaml").read_text().splitlines()[1:]
     comment = " ".join(line.removeprefix("#").strip() for line in takewhile(lambda line: line.startswith("#"), lines))
     what, _, deviations = comment.partition("Deviations")
+    what = re.sub(r"(Kim|Tevet|Hu) et al\., (AAAI |ICLR )?\d{4}, arXiv:[\d.]+(, )?", "", what).replace(" ()", "")
+    what = re.sub(r" Not a (row of (the|a) paper|benchmark row)\.", "", what)
     return what.strip(), ("Deviations" + deviations if deviations else "")
 
 
@@ -31,7 +33,9 @@ def recipes_page() -> str:
     page = f"""# Recipes
 
 {HEAD}
-Each row of the papers' tables that FLAME, MDM or MFM fill has a recipe: `make train EXP=humanml3d/mdm`. "Those of mdm"
+Each row of the papers' tables that FLAME (Kim et al., AAAI 2023, arXiv:2209.00349), MDM (Tevet et al., ICLR 2023,
+arXiv:2209.14916) or Motion Flow Matching (Hu et al., 2023, arXiv:2312.08895) fill has a recipe: `make train
+EXP=humanml3d/mdm`. Recipes that name no table are not rows of a paper. "Those of mdm"
 are the deviations of the recipe `mdm` in the same folder. Some deviations hold for all recipes: a batch contains
 motions of about the same length, every sample of a batch has the same weight, and checkpoints are chosen on validation
 clips.

@@ -17,9 +17,7 @@ from flame_mdm.config import (
     EXPERIMENTS,
     Config,
     check,
-    current_names,
     instantiate,
-    original_names,
     plain,
     trust,
 )
@@ -42,7 +40,7 @@ MIN_RESAMPLES = 100
 
 @dataclass(frozen=True, kw_only=True)
 class EvaluationRequest:
-    """The keys of an evaluation, which experiments/evaluate.yaml explains.
+    """The keys of an evaluation, which `flame-mdm evaluate --help` explains.
 
     Raises:
         UserError: If keys contradict each other, or a value is out of range.
@@ -281,12 +279,11 @@ def load_protocol(name: str, representation: Representation) -> Protocol:
     if not isinstance(config, dict) or "_target_" not in config:
         raise UserError(f"{path}: not a protocol: it has no _target_, such as evaluators.protocol.Protocol")
     plain(config, path)
-    config = current_names(config)
     check(config)
     protocol = instantiate(config)
     if not isinstance(protocol, Protocol):
         raise UserError(f"{path}: not a protocol: {config['_target_']}. Name evaluators.protocol.Protocol")
-    protocol.sha256 = _digest(original_names(config))
+    protocol.sha256 = _digest(config)
     return protocol
 
 
@@ -415,7 +412,7 @@ def _describe(
         report["checkpoint"] = {
             "path": str(request.ckpt),
             "experiment": model.config.get("experiment"),
-            "config_sha256": _digest(original_names(model.config)),
+            "config_sha256": _digest(model.config),
             "averaged_weights": bool(model.config.get("ema")),
             "parameters": sum(p.numel() for p in model.parameters() if p.requires_grad),
             "prediction": {"epsilon": "noise"}.get(model.process.prediction, model.process.prediction),

@@ -6,7 +6,6 @@ import sys
 from collections.abc import Sequence
 from importlib import import_module
 
-from flame_mdm.config import guarded
 from flame_mdm.errors import UserError, did_you_mean, say
 
 COMMANDS = {
@@ -39,6 +38,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 0 if words else 2
     name, *rest = words
     if name not in COMMANDS:
+        from flame_mdm.config import guarded  # imports Hydra, for which --help does not wait
+
         return guarded(lambda: _unknown(name))
     module = import_module(f"flame_mdm.commands.{'import_released' if name == 'import' else name}")
     return module.main(rest)

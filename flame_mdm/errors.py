@@ -13,9 +13,6 @@ MAX_LINE = 2_000
 """Maximum number of characters shown of an error line. The framework's own messages are shorter."""
 DIRECTIONS = re.compile("[\u061c\u200e\u200f\u202a-\u202e\u2066-\u2069]")
 """Bidirectional control characters of Unicode."""
-stopped_by: BaseException | None = None
-"""The exception of the first signal that the running command received. Progress bars raise it again at their next
-step, because a library may have swallowed it."""
 
 
 class UserError(ValueError):

@@ -8,7 +8,7 @@ from typing import IO, Any
 
 from tqdm import tqdm
 
-from flame_mdm import errors
+from flame_mdm.signals import raise_received
 
 
 class ProgressBar(tqdm):
@@ -23,12 +23,12 @@ class ProgressBar(tqdm):
 
     def __iter__(self) -> Iterator[Any]:
         for item in super().__iter__():
-            _stop()
+            raise_received()
             yield item
 
     def update(self, n: float | None = 1) -> bool | None:
         """See tqdm; raises the exception of a signal that a library has swallowed."""
-        _stop()
+        raise_received()
         return super().update(n)
 
     @staticmethod
@@ -46,8 +46,3 @@ class ProgressBar(tqdm):
                 end = "\n"
 
         return write
-
-
-def _stop() -> None:
-    if errors.stopped_by is not None:
-        raise errors.stopped_by

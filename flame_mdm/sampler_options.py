@@ -16,8 +16,15 @@ SPACINGS = ("linspace", "stride")
 
 
 def option(default: Any, help: str) -> Any:
-    """Returns a dataclass field with a help text, which the command line and the demo show."""
-    return field(default=default, metadata={"help": help})
+    """Returns a dataclass field with a help text, which the command line shows; a function `default` computes it."""
+    kind = "default_factory" if callable(default) else "default"
+    return field(**{kind: default}, metadata={"help": help})
+
+
+def same_option(kind: type[Any], name: str, **default: Any) -> Any:
+    """Returns a dataclass field with the help text, and unless given the default, of the field of another dataclass."""
+    original = next(entry for entry in fields(kind) if entry.name == name)
+    return option(default.get("default", original.default), original.metadata["help"])
 
 
 @dataclass(frozen=True, kw_only=True)

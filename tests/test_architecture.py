@@ -15,19 +15,20 @@ from support.fixtures import ROOT
 FILES = sorted([*(ROOT / "flame_mdm").rglob("*.py"), *(ROOT / "evaluators").rglob("*.py")])
 
 AXES = {"denoisers", "processes", "conditions", "representations"}
-GROUND = {"errors", "sampler_options", "losses", "safe_io", "config", "batch", "seeds", "progress"}
+GROUND = {"errors", "signals", "sampler_options", "losses", "safe_io", "config", "batch", "seeds", "progress"}
 MODELS = GROUND | AXES | {"visualize", "formats", "data", "task"}
 ALL = MODELS | {"sampling", "checkpoints", "schemas", "runs", "reporting", "training"}
 MAY_IMPORT: dict[str, set[str]] = {
     "errors": set(),
     "sampler_options": {"errors"},
     "losses": set(),
-    "progress": {"errors"},
+    "signals": set(),
+    "progress": {"signals"},
     "representations": {"errors"},
     "safe_io": {"errors"},
     "batch": {"errors"},
     "seeds": {"errors", "batch"},
-    "config": {"errors", "safe_io"},
+    "config": {"errors", "safe_io", "signals"},
     "denoisers": GROUND,
     "processes": GROUND,
     "conditions": GROUND,
@@ -151,6 +152,7 @@ def test_strings_outside_commands_name_no_module_of_the_evaluators():
     ("name", "line"),
     [
         ("flame_mdm.errors", "import flame_mdm.safe_io"),
+        ("flame_mdm.signals", "from flame_mdm.errors import say"),
         ("flame_mdm.sampler_options", "from flame_mdm.processes import Process"),
         ("flame_mdm.losses", "from flame_mdm import batch"),
         ("flame_mdm.representations.smpl", "from flame_mdm.batch import MotionBatch"),

@@ -1,31 +1,43 @@
+"""Recipes, command lines and the check of signatures."""
+
 import subprocess
 import sys
 import textwrap
-from pathlib import Path
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from importlib import import_module
+from typing import ClassVar, Literal
 
 import pytest
 import torch
+from support.fixtures import recipe
 
 from flame_mdm import config
-from flame_mdm.__main__ import main
-from flame_mdm.config import check, command_line, compose, flatten, instantiate, parameters, recipes, trust
+from flame_mdm.__main__ import COMMANDS, main
+from flame_mdm.commands.evaluate import EvaluateSettings
+from flame_mdm.commands.inspect import InspectSettings
+from flame_mdm.config import check, compose, compose_data, flatten, instantiate, parameters, recipes, trust
+from flame_mdm.config.command_line import read_settings, run
+from flame_mdm.config.entry import make_variables
+from flame_mdm.config.signatures import check_kind, source_file
 from flame_mdm.errors import UserError
-from flame_mdm.safe_io import read_yaml
+from flame_mdm.sampler_options import option
+
+PARTS = ("task", "representation", "process", "condition", "denoiser", "data")
 
 
-@pytest.mark.parametrize("name", recipes())
-def test_every_recipe_composes_and_is_legal(name):
-    composed = compose(name)
-    assert composed["experiment"] == name
-    assert {"data", "representation", "task", "trainer"} <= composed.keys()
+# Recipes --------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", recipes())
-def test_recipes_are_short_and_say_what_they_are(name):
-    lines = (config.EXPERIMENTS / f"{name}.yaml").read_text().splitlines()
-    assert len(lines) <= 25
-    assert lines[0] == "# @package _global_"
-    assert lines[1].startswith("# ")
+def test_every_recipe_composes_is_short_and_says_what_it_is():
+    wrong = []
+    for name in recipes():
+        composed = recipe(name)
+        lines = (config.EXPERIMENTS / f"{name}.yaml").read_text().splitlines()
+        whole = composed["experiment"] == name and {"data", "representation", "task", "trainer"} <= composed.keys()
+        if not (whole and len(lines) <= 25 and lines[0] == "# @package _global_" and lines[1].startswith("# ")):
+            wrong.append(name)
+    assert wrong == []
 
 
 @pytest.mark.parametrize(
@@ -33,7 +45,6 @@ def test_recipes_are_short_and_say_what_they_are(name):
     [
         (["trainer.max_step=5"], "unknown config key 'trainer.max_step'. Did you mean trainer.max_steps"),
         (["max_steps=5"], "unknown config key 'max_steps'. Did you mean trainer.max_steps?"),
-        (["optimizer.weigth_decay=0.1"], "Did you mean optimizer.weight_decay?"),
         (["denoiser=mdm_encodr"], "no denoiser is called 'mdm_encodr'. Did you mean mdm_encoder"),
         (["denoiser.latent_dims=3"], "Did you mean denoiser.latent_dim?"),
         (["data.source.clip=3"], "Did you mean data.source.clips"),
@@ -41,6 +52,10 @@ def test_recipes_are_short_and_say_what_they_are(name):
         (["trainer.max_steps=[1"], "cannot read an override"),
         (["+denoiser.heads=3"], "unknown config key 'denoiser.heads'. Did you mean denoiser.num_heads?"),
         (["denoiser._target_=flame_mdm.denoisers.mdm.Encoder"], "no such class or function"),
+        (["denoiser.num_heads=true"], "denoiser.num_heads=True: must be a whole number"),
+        (["trainer.gradient_clip_val=nan"], "trainer.gradient_clip_val=nan: must be"),
+        (["optimizer.lr=inf"], "optimizer.lr=inf: must be a finite number"),
+        (["trainer.devices=[0,x]"], "trainer.devices"),
     ],
 )
 def test_a_wrong_override_is_one_line_with_the_nearest_names(overrides, message):
@@ -50,19 +65,23 @@ def test_a_wrong_override_is_one_line_with_the_nearest_names(overrides, message)
     assert "\n" not in str(error.value)
 
 
+def test_keys_that_lightning_checks_late_are_checked_first(capsys, tmp_path):
+    for word in ("trainer.val_check_interval=0", "trainer.log_every_n_steps=0", "trainer.accumulate_grad_batches=0"):
+        assert main(["train", "quickstart", f"run.dir={tmp_path / 'run'}", word]) == 1
+        assert capsys.readouterr().err == f"error: {word}: must be above 0\n"
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_an_unknown_experiment_names_the_nearest():
     with pytest.raises(UserError, match=r"unknown experiment 'quikstart'\. Did you mean quickstart"):
         compose("quikstart")
 
 
-def test_a_key_that_only_the_signature_knows_is_legal():
-    assert compose("quickstart", ["trainer.limit_val_batches=2"])["trainer"]["limit_val_batches"] == 2
-
-
-def test_swapping_a_part_leaves_nothing_of_the_old_one():
+def test_parts_are_swapped_whole_and_keys_of_signatures_are_legal():
     swapped = compose("quickstart", ["denoiser=mdm_encoder", "representation=humanml_legacy"])
     assert swapped["denoiser"]["latent_dim"] == 512
     assert swapped["representation"]["variant"] == "legacy"
+    assert compose("quickstart", ["trainer.limit_val_batches=2"])["trainer"]["limit_val_batches"] == 2
 
 
 def test_a_saved_configuration_composes_to_itself_and_its_parts_are_fixed(tmp_path):
@@ -75,8 +94,9 @@ def test_a_saved_configuration_composes_to_itself_and_its_parts_are_fixed(tmp_pa
 
 
 def test_a_recipe_outside_the_repository_uses_its_parts(tmp_path):
-    recipe = "# @package _global_\n# Mine.\ndefaults:\n  - /quickstart\n  - _self_\nseed: 5\n"
-    (tmp_path / "mine.yaml").write_text(recipe)
+    (tmp_path / "mine.yaml").write_text(
+        "# @package _global_\n# Mine.\ndefaults:\n  - /quickstart\n  - _self_\nseed: 5\n"
+    )
     composed = compose(str(tmp_path / "mine.yaml"))
     assert (composed["seed"], composed["experiment"]) == (5, "mine")
 
@@ -90,6 +110,20 @@ def test_a_damaged_yaml_is_one_line(tmp_path):
         compose(str(tmp_path / "absent.yaml"))
 
 
+def test_a_data_set_is_composed_with_its_representation(tmp_path):
+    nodes = compose_data("synthetic", ["representation=smpl", "data.source.clips=5"], data_root=f"{tmp_path}/${{a}}")
+    assert nodes["representation"]["_target_"].endswith("SMPL")
+    assert (nodes["data"]["source"]["clips"], nodes["data"]["root"]) == (5, f"{tmp_path}/${{a}}")
+    assert compose_data("humanml3d")["data"]["source"]["bone_lengths"]
+    with pytest.raises(UserError, match=r"Did you mean data\.source\.clips"):
+        compose_data("synthetic", ["data.source.clip=5"])
+    with pytest.raises(UserError, match="no data is called 'syntetic'"):
+        compose_data("syntetic")
+
+
+# Signatures and trust -------------------------------------------------------------------------------------------------
+
+
 def test_signatures_are_read_through_reexports_bases_and_dataclasses():
     assert {"lr", "weight_decay", "fused"} <= parameters("torch.optim.AdamW")
     assert {"max_steps", "devices"} <= parameters("lightning.Trainer")
@@ -97,18 +131,44 @@ def test_signatures_are_read_through_reexports_bases_and_dataclasses():
     assert {"keep", "known", "mode"} <= parameters("flame_mdm.batch.Edit")
     with pytest.raises(UserError, match="no such class"):
         parameters("torch.optim.Adamm")
-
-
-def test_check_finds_unknown_arguments_deep_inside():
     with pytest.raises(UserError, match=r"unknown config key 'a\.0\.lrr'\. Did you mean a\.0\.lr\?"):
         check({"a": [{"_target_": "torch.optim.AdamW", "lrr": 1}]})
 
 
+@pytest.mark.parametrize(
+    ("annotation", "legal", "illegal"),
+    [
+        ("int", [3], [True, 3.0, "3", None]),
+        ("float | None", [3, 0.5, None], [True, float("nan"), float("-inf"), "x"]),
+        ("Optional[Union[int, float]]", [3, 0.5, None], [False, float("nan"), "x", [1]]),
+        ("bool", [True], [1, 0, "true"]),
+        ("str", ["x"], [3, None, True]),
+        ("Literal['a', 'b'] | None", ["a", None], ["c", 1]),
+        ("typing.Optional[typing.Literal['last', 'best']]", ["last", None], ["x"]),
+        ("list[int | None]", [[1, None], []], [[True], ["x"], 3, None]),
+        ("Sequence[float] | Sequence[Sequence[float]]", [[1, 2], [[1, 2], [3, 4]]], [["x"], [[None]], 3]),
+        ("'int'", [3], ["x"]),
+        ("Denoiser", ["x", {}], [3, None, True]),
+        ("dict[str, Any]", [{}, 3], []),
+        ("", [None, 3], []),
+    ],
+)
+def test_values_are_checked_against_annotations(annotation, legal, illegal):
+    for value in legal:
+        check_kind("key", value, annotation)
+    for value in illegal:
+        with pytest.raises(UserError, match="must be "):
+            check_kind("key", value, annotation)
+
+
+ENCODER = {"_target_": "flame_mdm.denoisers.mdm.MDMEncoder"}
+
+
 def test_untrusted_targets_are_refused(monkeypatch):
-    with pytest.raises(UserError, match=r"os\.system at b\. Its code is only run if you trust it"):
-        trust({"_target_": "flame_mdm.denoisers.mdm.MDMEncoder", "b": {"_target_": "os.system"}})
+    with pytest.raises(UserError, match=r"os\.system at denoiser\.b\. Its code is only run if you trust it"):
+        trust({"denoiser": ENCODER | {"b": {"_target_": "os.system"}}})
     monkeypatch.setenv("FLAME_MDM_TRUST", "fractions")
-    trust({"_target_": "fractions.Fraction", "numerator": 3})
+    trust({"denoiser": {"_target_": "fractions.Fraction"}})
 
 
 @pytest.mark.parametrize(
@@ -124,6 +184,8 @@ def test_untrusted_targets_are_refused(monkeypatch):
         "flame_mdm.task.torch.load",
         "flame_mdm.denoisers.mdm",
         "flame_mdm.training.callbacks.Checkpoints",  # writes files
+        "flame_mdm.conditions.text.PretrainedText",  # a class of another part
+        "evaluators.extractors.MotionCLIPExtractor",
         "evaluators",
         "evaluators.",
         ".system",
@@ -138,18 +200,31 @@ def test_a_checkpoint_names_only_own_classes(target, monkeypatch):
     for hidden in (
         {"_target_": target},
         {"a": [1, {"b": ({"_target_": target},)}]},  # a tuple, which Hydra takes as a list
-        {"_target_": "flame_mdm.task.MotionGeneration", "_args_": [{"_partial_": True, "_target_": target}]},
+        ENCODER | {"_args_": [{"_partial_": True, "_target_": target}]},
     ):
+        for part in ("denoiser", "callbacks"):
+            with pytest.raises(UserError, match="Its code is only run if you"):
+                trust({part: hidden})
+
+
+def test_no_class_path_names_a_file_outside_of_packages(tmp_path, monkeypatch):
+    (tmp_path / "evil.py").write_text("class MDMEncoder: pass")
+    monkeypatch.setattr("ast.parse", lambda *_: pytest.fail("a file was parsed"))
+    for module in (f"flame_mdm.denoisers./{tmp_path}/evil", "flame_mdm.denoisers.../../evil", "flame_mdm/denoisers"):
+        assert source_file(module) is None
         with pytest.raises(UserError, match="Its code is only run if you"):
-            trust({"denoiser": hidden})
+            trust({"denoiser": {"_target_": f"{module}.MDMEncoder"}})
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", recipes())
-def test_what_checkpoints_of_our_recipes_name_is_trusted(name):
-    composed = compose(name)
-    parts = ("task", "representation", "process", "condition", "denoiser", "data")
-    trust({part: composed[part] for part in parts if part in composed})
+def test_arguments_in_a_checkpoint_are_checked_before_anything_is_built():
+    for wrong in ({"num_heads": True}, {"latent_dim": ENCODER}, {"latent_dims": 3}, {"dropout": float("nan")}):
+        with pytest.raises(UserError, match=r"denoiser\."):
+            trust({"denoiser": ENCODER | wrong})
+
+
+def test_what_checkpoints_of_our_recipes_name_is_trusted():
+    for name in recipes():
+        trust({part: recipe(name)[part] for part in PARTS if part in recipe(name)})
 
 
 def test_wrong_arguments_are_one_line():
@@ -158,56 +233,162 @@ def test_wrong_arguments_are_one_line():
     assert "\n" not in str(error.value)
 
 
-def test_flatten():
-    assert flatten({"a": {"b": 1, "c": [2]}, "d": {}}) == {"a.b": 1, "a.c": [2], "d": {}}
-
-
-def test_what_make_hands_down_is_read_without_a_shell(monkeypatch):
-    flags = r"""s -- q=#hash UNCONDITIONED=1 TEXT=100%\ a\ --\ b\ $$5 x.y=a\ "c"\ (d)\ ;$$HOME a.b=[1,\ 2] EXP=q"""
-    monkeypatch.setenv("MAKEFLAGS", flags)
-    words = ["q", "a.b=[1, 2]", 'x.y=a "c" (d) ;$HOME', "text=100% a -- b $5", "unconditioned=1", "q=#hash"]
-    assert command_line._make_variables() == words
-    monkeypatch.setenv("MAKEFLAGS", "")
-    assert command_line._make_variables() == []
-
-
-@pytest.mark.parametrize("text", ["it's ${a} (b), c=d; \\ [e]", "plain", '"quoted" ünïcode'])
-def test_free_text_survives_hydra(text, capsys):
-    seen = {}
-    code = config.run(seen.update, [f"text={text}"], usage="", name="sample", text=("text",))
-    assert (code, seen["text"]) == (0, text)
-
-
-def test_help_and_a_misspelt_key_do_not_wait_for_torch():
-    program = """
-        import sys
-        from flame_mdm.__main__ import main
-        assert main(["train", "--help"]) == 0
-        assert main(["train", "quickstart", "trainer.max_step=1"]) == 1
-        assert main(["sample", "text=a"]) == 1
-        assert main(["prepare"]) == 1
-        assert "torch" not in sys.modules and "lightning" not in sys.modules, "heavy imports"
-    """
-    result = subprocess.run(
-        [sys.executable, "-c", textwrap.dedent(program)], capture_output=True, text=True, check=False
-    )
-    assert result.returncode == 0, result.stderr
-    assert result.stderr.count("error: ") == 3
-
-
 def test_own_classes_outside_the_repository_need_no_registration(tmp_path, monkeypatch):
-    module = (
+    (tmp_path / "my_parts.py").write_text(
         "import torch\nclass Mine(torch.nn.Module):\n    def __init__(self, width: int):\n        super().__init__()\n"
     )
-    (tmp_path / "my_parts.py").write_text(module)
     monkeypatch.syspath_prepend(tmp_path)
     assert isinstance(instantiate({"_target_": "my_parts.Mine", "width": 3}), torch.nn.Module)
     with pytest.raises(UserError, match="Did you mean width"):
         check({"_target_": "my_parts.Mine", "widht": 3})
 
 
-def test_the_experiments_folder_is_found():
-    assert (Path(config.EXPERIMENTS) / "base.yaml").is_file()
+def test_flatten():
+    assert flatten({"a": {"b": 1, "c": [2]}, "d": {}}) == {"a.b": 1, "a.c": [2], "d": {}}
+
+
+# Command lines --------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True)
+class Example:
+    """usage: example FILE [NAME ...]"""
+
+    OBJECTS: ClassVar = ("file", "names")
+    file: str | None = option(None, "a file")
+    names: list[str] | None = option(None, "names")
+    text: str = option("", "any text")
+    steps: int | Sequence[int] = option(3, "steps")
+    which: Literal["last", "best"] = option("last", "last or best")
+    rate: float | None = option(None, "a rate")
+    loop: bool = option(False, "true or false")
+
+
+@pytest.mark.parametrize(
+    ("words", "values"),
+    [
+        (["a b", "n", "m o"], {"file": "a b", "names": ["n", "m o"]}),
+        (["file=x", "names=a 'b c'"], {"file": "x", "names": ["a", "b c"]}),
+        (["text=it's ${a} (b), c=d; \\ [e]"], {"text": "it's ${a} (b), c=d; \\ [e]"}),
+        (['text="quoted" ünïcode'], {"text": '"quoted" ünïcode'}),
+        (["steps=[0,2]", "rate=1e-3", "loop=true", "which=best", "file=null"], {"steps": [0, 2], "rate": 1e-3}),
+        (["rate=null", "steps=5"], {"rate": None, "steps": 5}),
+    ],
+)
+def test_words_become_typed_settings(words, values):
+    seen: list[Example] = []
+    assert run(seen.append, Example, words) == 0
+    assert {key: getattr(seen[0], key) for key in values} == values
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["flie=x"], "unknown config key 'flie'. Did you mean file?"),
+        (["x", "file=y"], "file is given twice"),
+        (["steps=1.5"], "steps=1.5: must be a whole number or a list"),
+        (["steps=[1,x]"], "steps=[1, 'x']: must be"),
+        (["loop=yes"], "loop=yes: must be true or false"),
+        (["rate=nan"], "rate=nan: must be a finite number or null"),
+        (["rate=1,2"], "Add --multirun"),
+        (["which=first"], "which=first: must be one of last, best"),
+        (["rate=[1"], "cannot read an override"),
+        (["names='a"], "No closing quotation"),
+        (["--fast"], "unknown option --fast"),
+        (["rate=1,2", "--multirun", "steps=x"], "steps=x: must be"),
+    ],
+)
+def test_wrong_words_are_one_line(words, message, capsys):
+    assert run(lambda _: pytest.fail("it ran"), Example, words) == 1
+    error = capsys.readouterr().err
+    assert error.startswith("error: ")
+    assert message in error
+    assert error.count("\n") == 1
+
+
+def test_a_sweep_runs_each_combination(capsys):
+    seen: list[Example] = []
+    assert run(seen.append, Example, ["rate=1,2", "steps=3,4", "text=a,b", "-m"]) == 0
+    assert [(job.rate, job.steps, job.text) for job in seen] == [
+        (1, 3, "a,b"),
+        (1, 4, "a,b"),
+        (2, 3, "a,b"),
+        (2, 4, "a,b"),
+    ]
+
+    def fail(job: Example) -> None:
+        raise UserError(f"failed at {job.rate}")
+
+    assert run(fail, Example, ["rate=1,2", "-m"]) == 1
+    assert capsys.readouterr().err == "error: failed at 1\nerror: failed at 2\n"
+
+
+def test_every_command_lists_its_keys_with_defaults_and_help(capsys):
+    for command in COMMANDS:
+        module = import_module(f"flame_mdm.commands.{'import_released' if command == 'import' else command}")
+        assert main([command, "--help"]) == 0
+        shown = capsys.readouterr().out
+        assert shown.startswith(f"usage: flame-mdm {command} ")
+        kind = module.main.args[1]
+        if command != "train":
+            listed = [line for line in shown.partition("defaults:\n")[2].splitlines() if line[2:3] != " "]
+            assert {line.split("=")[0].strip() for line in listed} == {entry.name for entry in fields(kind)} - {
+                "composed"
+            }
+
+
+def test_make_variables_are_read_without_a_shell(monkeypatch):
+    flags = r"""s -- q=#hash UNCONDITIONED=1 TEXT=100%\ a\ --\ b\ $$5 x.y=a\ "c"\ (d)\ ;$$HOME a.b=[1,\ 2] EXP=q"""
+    monkeypatch.setenv("MAKEFLAGS", flags)
+    words = ["q", "a.b=[1, 2]", 'x.y=a "c" (d) ;$HOME', "text=100% a -- b $5", "unconditioned=1", "q=#hash"]
+    assert make_variables() == words
+    monkeypatch.setenv("MAKEFLAGS", "")
+    assert make_variables() == []
+
+
+def test_settings_with_a_data_set_compose_it():
+    settings = read_settings(EvaluateSettings, ["ckpt=x", "data=synthetic", "data.source.clips=5", "guidance_scale=2"])
+    assert settings.nodes["data"]["source"]["clips"] == 5
+    assert read_settings(InspectSettings, ["motion=synthetic"]).data == "synthetic"
+    for words, message in ((["data=synthetic", "data.source.clip=5"], "Did you mean"), (["data.x=5"], "none is named")):
+        with pytest.raises(UserError, match=message):
+            read_settings(EvaluateSettings, words)
+
+
+REFUSED = [
+    ["train", "quickstart", "trainer.max_step=1"],
+    ["sample", "text=a"],
+    ["sample", "quickstart", "text=a", "guidance_scale=x"],
+    ["sample", "absent", "text=a"],
+    ["sample", "quickstart", "text=a", "device=meta"],
+    ["sample", "quickstart", "text=a", "after=absent.npz"],
+    ["sample", "quickstart", "text=a", "body=x"],
+    ["edit", "quickstart", "motion=walk.xyz", "text=a"],
+    ["convert", "absent.npz", "x.glb"],
+    ["convert", "Makefile", "x.npz"],
+    ["inspect", "absent.npz"],
+    ["evaluate", "absent", "extractor=none"],
+    ["export", "absent", "out=x"],
+    ["import", "mdm", "absent.pt", "out=x"],
+    ["browse", "syntetic"],
+    ["prepare"],
+]
+
+
+def test_help_and_wrong_words_do_not_wait_for_torch():
+    program = f"""
+        import sys
+        from flame_mdm.__main__ import main
+        assert main(["train", "--help"]) == 0
+        for words in {REFUSED}:
+            assert main(words) == 1, words
+            assert "torch" not in sys.modules and "lightning" not in sys.modules, words
+    """
+    result = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(program)], capture_output=True, text=True, check=False
+    )
+    assert result.returncode == 0, result.stderr
+    assert result.stderr.count("error: ") == len(REFUSED), result.stderr
 
 
 def test_an_unknown_command_is_one_line(capsys):
@@ -215,10 +396,3 @@ def test_an_unknown_command_is_one_line(capsys):
     assert capsys.readouterr().err == (
         "error: unknown command: trian. Did you mean train? `flame-mdm --help` lists the commands\n"
     )
-
-
-def test_no_key_of_a_command_is_the_name_of_a_folder_of_recipes():
-    """Hydra would take `folder=x` for a choice among the files of `experiments/folder`."""
-    folders = {path.name for path in config.EXPERIMENTS.iterdir() if path.is_dir()}
-    for path in config.EXPERIMENTS.glob("*.yaml"):
-        assert not folders & set(read_yaml(path)), path.name

@@ -16,7 +16,7 @@ import pytest
 from support.fixtures import ROOT
 
 from flame_mdm.__main__ import COMMANDS
-from flame_mdm.config import command_line
+from flame_mdm.config import sweeps
 from flame_mdm.data.synthetic import Synthetic
 from flame_mdm.formats.motion import Motion
 
@@ -105,14 +105,14 @@ def is_composed(program: str, command: str, words: tuple[str, ...]) -> bool:
     """Returns whether a command line is parsed, composed and checked without an error; its work is not done."""
     main = importlib.import_module(f"flame_mdm.commands.{'import_released' if command == 'import' else command}").main
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(command_line, "hydra_main", lambda **_: lambda _: lambda: None)  # runs the jobs of a sweep
+        patch.setattr(sweeps, "hydra_main", lambda **_: lambda _: lambda: None)  # runs the jobs of a sweep
         if program == "make":
             if not all("=" in word for word in words):
                 return False
             escaped = [re.sub(r"([\\ ])", r"\\\1", word) for word in words]
             patch.setenv("MAKEFLAGS", " -- " + " ".join(reversed(escaped)))
             words = ("--from-make",)
-        return main.func(lambda config: None, words, **main.keywords) == 0
+        return main.func(lambda settings: None, *main.args[1:], words) == 0
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))

@@ -12,7 +12,7 @@ import pytest
 from support.runs import TINY
 
 from flame_mdm.__main__ import main
-from flame_mdm.config.command_line import guarded
+from flame_mdm.config import guarded
 from flame_mdm.data.store import Store
 from flame_mdm.progress import ProgressBar
 

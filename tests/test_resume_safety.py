@@ -22,8 +22,7 @@ from flame_mdm.data.store import Store, write_store
 from flame_mdm.data.synthetic import Synthetic
 from flame_mdm.errors import UserError
 from flame_mdm.representations.humanml import HumanML
-from flame_mdm.training import callbacks
-from flame_mdm.training.callbacks import Checkpoints
+from flame_mdm.signals import StopRequest
 from flame_mdm.training.guards import AtomicCheckpoints, lost_worker, only_run
 
 pytestmark = pytest.mark.slow
@@ -326,14 +325,12 @@ def test_a_second_sigterm_ends_a_run_whose_loading_processes_hang(training):
     assert not running(workers)
 
 
-def test_which_second_signal_ends_a_run_at_once(tmp_path, monkeypatch):
-    callback = Checkpoints(str(tmp_path), 1)
-    monkeypatch.setattr(callbacks, "_kill_workers", lambda: None)
-    callback._note(signal.SIGUSR1, None)
-    callback._note(signal.SIGTERM, None)
-    callback._note(signal.SIGTERM, None)
-    callback.noted -= 2
-    with pytest.raises(SystemExit, match="143"):
-        callback._note(signal.SIGTERM, None)
-    with pytest.raises(SystemExit, match="130"):
-        callback._note(signal.SIGINT, None)
+def test_which_second_signal_ends_a_run_at_once(monkeypatch):
+    request = StopRequest()
+    monkeypatch.setattr("flame_mdm.signals.kill_children", lambda: None)
+    for signum in (signal.SIGUSR1, signal.SIGTERM, signal.SIGTERM):
+        request.note(signum, None)
+    request.time -= 2
+    for signum, code in ((signal.SIGTERM, "143"), (signal.SIGINT, "130")):
+        with pytest.raises(SystemExit, match=code):
+            request.note(signum, None)

@@ -7,7 +7,7 @@ from support.fixtures import ROOT
 import flame_mdm
 from evaluators.metrics.attributes import read_attributes
 from flame_mdm.__main__ import main
-from flame_mdm.checkpoints.loading import SHIPPED, find
+from flame_mdm.checkpoints.locating import SHIPPED, find
 from flame_mdm.data.synthetic import prompts
 from flame_mdm.safe_io import sha256
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, NotRequired
 
 from typing_extensions import TypedDict
 
-from flame_mdm.config import current_names, plain
+from flame_mdm.config import plain
 from flame_mdm.errors import UserError
 from flame_mdm.safe_io import atomic_write, parse_json, read_torch
 from flame_mdm.schemas import Number, check_shape
@@ -146,7 +146,7 @@ def checked(path: Path, content: Any) -> dict[str, Any]:
         check_weights(content["state_dict"], path)
     except ValueError as error:
         raise UserError(f"{path}: damaged: {error}") from error
-    return content | {"config": current_names(content["config"])}
+    return content
 
 
 def check_weights(weights: Mapping[Any, Any], path: Path) -> None:

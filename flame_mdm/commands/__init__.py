@@ -1,35 +1,166 @@
-"""Commands, one file each; `flame_mdm.__main__` lists them."""
+"""Commands, one file each; `flame_mdm.__main__` lists them. This module has the keys that several commands share."""
 
-from flame_mdm.config import EXPERIMENTS, Config
-from flame_mdm.errors import UserError
+from __future__ import annotations
 
-OPTIONS = {
-    "guidance_scale": "float",
-    "sampler": "str",
-    "num_inference_steps": "int | list[int]",
-    "eta": "float",
-    "spacing": "Literal['linspace', 'stride']",
-}
-"""Keys of `flame_mdm.batch.Sampling`, and the types of their values."""
+import os
+import re
+from dataclasses import dataclass
+from functools import cached_property
+from glob import escape
+from pathlib import Path
 
-SAMPLING = {"samples": "int", "seed": "int", **OPTIONS}
-"""Keys that all sampling commands share, and the types of their values."""
+from flame_mdm.checkpoints.locating import Which, find
+from flame_mdm.config import EXPERIMENTS, Config, compose_data, instantiate
+from flame_mdm.errors import UserError, did_you_mean
+from flame_mdm.formats import ENDINGS
+from flame_mdm.safe_io import read_yaml
+from flame_mdm.sampler_options import option
+
+STORE = "store.json"
 
 
-def data_node(config: Config) -> Config:
-    """Returns the data set of a command, with the path given as `source`.
+@dataclass(frozen=True, kw_only=True)
+class ModelSettings:
+    """Keys that name a model."""
+
+    ckpt: str | None = option(
+        None,
+        "a checkpoint, a run directory, a model file, the name of a shipped model (quickstart), or a model on the hub",
+    )
+    which: Which = option("last", "or best: the checkpoint of a run directory")
+
+    def model_file(self) -> Path:
+        """Returns the file of the model; see `flame_mdm.checkpoints.locating.find`."""
+        if self.ckpt is None:
+            raise UserError("no checkpoint given. Add ckpt=runs/.../checkpoints/last.ckpt")
+        return find(self.ckpt, self.which)
+
+
+@dataclass(frozen=True, kw_only=True)
+class FileSettings:
+    """Keys that describe a motion file."""
+
+    fps: float | None = option(
+        None, "frames per second; overrides the value in the file; required for .npy, which has none"
+    )
+    unit: float | None = option(None, "meters per length unit of the file; default 0.01 for most .bvh, 1 for .npy")
+    up: str | None = option(None, "axis of the file that points up: y, z or -y; default that of skeleton.yaml, or y")
+
+
+@dataclass(frozen=True, kw_only=True)
+class BodySettings:
+    """The body in pictures, pages and files."""
+
+    body: str = option("mannequin", 'or anny, also with a shape, such as "anny gender=1 age=0.9": docs/formats.md')
+
+
+@dataclass(frozen=True, kw_only=True)
+class DataSettings:
+    """Keys of commands that open a data set."""
+
+    data: str | None = option(
+        None, "data set: a file in experiments/data. Its keys are overridden by data.KEY=..., as in a recipe"
+    )
+    representation: str | None = option(
+        None, "representation of the motions: a file in experiments/representation. Default: that of the data set"
+    )
+    data_root: str = option(
+        lambda: os.environ.get("FLAME_MDM_DATA", "data"),
+        "folder of the prepared data sets; default: FLAME_MDM_DATA, or data",
+    )
+    seed: int = option(0, "seed of generated data")
+    composed: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.data is not None:
+            _ = self.nodes  # composed now, to report errors before any work
+        elif self.composed:
+            raise UserError(f"{self.composed[0]} belongs to a data set, and none is named. Add data=NAME")
+
+    @cached_property
+    def nodes(self) -> Config:
+        """The composed configuration of the data set and its representation: `data` and `representation`.
+
+        Raises:
+            UserError: If no data set is named, or a key is unknown.
+        """
+        if self.data is None:
+            names = ", ".join(sorted(path.stem for path in (EXPERIMENTS / "data").glob("*.yaml")))
+            raise UserError(f"no data set named. Add data=NAME, one of: {names}; folder is for your own motions")
+        name, words = self.choice(self.data)
+        return compose_data(name, words, data_root=self.data_root or "data", seed=self.seed)
+
+    def choice(self, name: str) -> tuple[str, list[str]]:
+        """Returns the file in experiments/data of a data set, and the overrides of its keys."""
+        return name, [*([f"representation={self.representation}"] if self.representation else []), *self.composed]
+
+    def data_node(self, source: str | None = None) -> Config:
+        """Returns the configuration of the data set, with the path given as `source`.
+
+        Raises:
+            UserError: If no data set is named, or it takes no source.
+        """
+        node = self.nodes["data"]
+        if source == "":
+            raise UserError("source= is empty. Give the folder of the data set, or drop it")
+        if source is not None:
+            if "path" not in node["source"]:
+                raise UserError(f"source={source}: {node['name']} is generated and has no source. Drop source=")
+            node["source"]["path"] = source
+        return node
+
+
+@dataclass(frozen=True, kw_only=True)
+class PreparedSettings(DataSettings):
+    """Keys of commands that open a prepared data set, which may also be named by its `data.name`."""
+
+    def choice(self, name: str) -> tuple[str, list[str]]:
+        """See `DataSettings`; the name of a prepared set of the user's own motions stands for its keys.
+
+        Raises:
+            UserError: If it was prepared in several representations and none is chosen.
+        """
+        root = Path(self.data_root)
+        file, words = super().choice(name)
+        if (EXPERIMENTS / "data" / f"{name}.yaml").exists() or not any(root.glob(f"{escape(name)}-*/{STORE}")):
+            return file, words
+        files = sorted((EXPERIMENTS / "representation").glob("*.yaml"))
+        prepared = [p.stem for p in files if (root / f"{name}-{instantiate(read_yaml(p)).name}" / STORE).exists()]
+        if self.representation is not None:
+            prepared = []
+        if len(prepared) > 1:
+            listed = " and as ".join(prepared)
+            raise UserError(f"data={name} was prepared as {listed}. Add representation={prepared[0]}")
+        return "folder", [f"data.name={name}", *(f"representation={part}" for part in prepared), *words]
+
+
+def check_motion(key: str, source: str | None) -> None:
+    """Checks that a motion file exists and has a known ending; `dataset:id` is left to its reader.
 
     Raises:
-        UserError: If no data set is named, or it takes no source.
+        FileNotFoundError: If the file does not exist.
+        UserError: If its ending is unknown.
     """
-    if "data" not in config:
-        names = sorted(path.stem for path in (EXPERIMENTS / "data").glob("*.yaml"))
-        raise UserError(f"no data set named. Add data=NAME, one of: {', '.join(names)}; folder is for your own motions")
-    node = config["data"]
-    if config["source"] == "":
-        raise UserError("source= is empty. Give the folder of the data set, or drop it")
-    if config["source"] is not None:
-        if "path" not in node["source"]:
-            raise UserError(f"source={config['source']}: {node['name']} is generated and has no source. Drop source=")
-        node["source"]["path"] = str(config["source"])
-    return node
+    if source is None or (":" in source and Path(source).suffix.lower() not in ENDINGS):
+        return
+    if Path(source).suffix.lower() not in ENDINGS:
+        kinds = ", ".join(ENDINGS)
+        raise UserError(f"{key}={source}: neither a motion file ({kinds}) nor dataset:id")
+    if not Path(source).exists():
+        raise FileNotFoundError(f"{source}: no such file")
+
+
+def check_words(settings: BodySettings, device: str | None = None) -> None:
+    """Checks the names of body and device, before torch is imported.
+
+    Raises:
+        UserError: If a name is unknown.
+    """
+    if settings.body.split()[:1] not in (["mannequin"], ["anny"]):
+        raise UserError(
+            f'body={settings.body}: unknown. Use mannequin, anny, or anny with its shape: body="anny age=0.9"'
+        )
+    if device is not None and not re.fullmatch(r"cpu|mps|xpu|cuda(:\d+)?", device):
+        raise UserError(
+            f"device={device}: unknown.{did_you_mean(device, ['cpu', 'cuda'])} Give cpu, cuda or cuda:NUMBER"
+        )

@@ -2,61 +2,75 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import ClassVar
 
-from flame_mdm.config import Config, run
+from flame_mdm.commands import DataSettings
+from flame_mdm.config import run
 from flame_mdm.errors import UserError, say
 from flame_mdm.reporting.audit import card_name, read_card, write_card
-from flame_mdm.reporting.report import paths
 from flame_mdm.safe_io import write_json
-
-USAGE = """
-usage: flame-mdm audit data=NAME extractor=FILE|none [key=value ...]
-       flame-mdm audit cards="A.json B.json"
-
-Perturbs the real motions of a data set at graded strengths, measures them like generated ones, and writes a card: what
-each metric sees, from which strength, and what it cannot see. extractor=none audits the metrics of joint positions.
-If interrupted, the same command continues where it stopped. cards= compares two cards side by side.
-Keys, with their defaults: experiments/audit.yaml
-"""
+from flame_mdm.sampler_options import option
 
 
-def audit(config: Config) -> None:
+@dataclass(frozen=True, kw_only=True)
+class AuditSettings(DataSettings):
+    """usage: flame-mdm audit data=NAME extractor=FILE|none [key=value ...]
+           flame-mdm audit cards="A.json B.json"
+
+    Perturbs the real motions of a data set at graded strengths, measures them like generated ones, and writes a card:
+    what each metric sees, from which strength, and what it cannot see. extractor=none audits the metrics of joint
+    positions. If interrupted, the same command continues where it stopped. cards= compares two cards side by side.
+    """
+
+    OBJECTS: ClassVar = ("data", "extractor")
+    extractor: str | None = option(
+        None,
+        "a checkpoint of `make train EXP=motion_clip/...`, or as the protocol requires; none = metrics of joints",
+    )
+    protocol: str | None = option(
+        None, "whose metrics are audited; default: synthetic on the synthetic set, otherwise text_to_motion"
+    )
+    split: str = option("test", "train, val or test")
+    samples: int | None = option(None, "number of motions; default: all of the split")
+    resamples: int = option(100, "bootstrap resamples of motions, for the intervals")
+    cards: list[str] | None = option(
+        None, "one or two cards (.json), to be rendered again, two side by side; nothing is measured"
+    )
+    batch_size: int = option(64, "motions at once")
+    device: str | None = option(None, "default: cpu")
+    data_root: str = option("", "folder of the prepared data sets; default: FLAME_MDM_DATA, or data")
+    out: str = option("runs/audit", "folder of the cards")
+
+
+def audit(settings: AuditSettings) -> None:
     """Audits an evaluator, or renders existing cards.
 
     Raises:
         UserError: If a key is missing or wrong, a card is damaged, or data, protocol and extractor do not match.
     """
-    out = Path(config["out"])
-    if config["cards"] is not None:
-        files = paths("cards", str(config["cards"]))
-        if len(files) > 2:
-            raise UserError(f"cards={config['cards']}: {len(files)} cards. Give one or two")
-        say(*write_card([read_card(path) for path in files], out))
+    out = Path(settings.out)
+    if settings.cards is not None:
+        if len(settings.cards) > 2:
+            raise UserError(f"cards={' '.join(settings.cards)}: {len(settings.cards)} cards. Give one or two")
+        say(*write_card([read_card(Path(card)) for card in settings.cards], out))
         return
-    if "data" not in config or config["extractor"] is None:
+    if settings.data is None or settings.extractor is None:
         raise UserError(
             "an audit needs a data set and an extractor. Give data=NAME and extractor=FILE, or extractor=none"
         )
-    if config["resamples"] == 0 or (config["samples"] or 64) < 8:
-        raise UserError(f"resamples={config['resamples']}, samples={config['samples']}: give 100, and 8 or more")
+    if settings.resamples == 0 or (settings.samples or 64) < 8:
+        raise UserError(f"resamples={settings.resamples}, samples={settings.samples}: give 100, and 8 or more")
     from evaluators.audit import audit as measure
     from evaluators.evaluation import EvaluationRequest
 
-    protocol = config["protocol"] or ("synthetic" if config["data"]["name"] == "synthetic" else "text_to_motion")
-    request = EvaluationRequest.of(config | {"baseline": "real", "protocol": protocol})
+    protocol = settings.protocol or ("synthetic" if settings.nodes["data"]["name"] == "synthetic" else "text_to_motion")
+    request = EvaluationRequest.of(vars(settings) | settings.nodes | {"baseline": "real", "protocol": protocol})
     card = measure(request, out / "cache")
     write_json(out / f"{card_name(card)}.json", card.model_dump(), indent=None)
     say(*write_card([card], out))
 
 
-main = partial(
-    run,
-    audit,
-    usage=USAGE,
-    name="audit",
-    objects=("data", "extractor"),
-    text=("extractor", "protocol", "cards", "data_root", "out"),
-    kinds={"seed": "int", "samples": "int", "resamples": "int", "batch_size": "int"},
-)
+main = partial(run, audit, AuditSettings)

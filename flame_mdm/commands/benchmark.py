@@ -7,67 +7,79 @@ import subprocess
 import sys
 import time
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
-from flame_mdm.commands.tables import evaluate_missing
-from flame_mdm.config import EXPERIMENTS, Config, run, settings
+from flame_mdm.commands.tables import TablesSettings, evaluate_missing
+from flame_mdm.config import EXPERIMENTS, run
 from flame_mdm.errors import UserError, say
 from flame_mdm.reporting.page import page, render
 from flame_mdm.reporting.rendering import Table
 from flame_mdm.reporting.tables import build, load_spec, write
 from flame_mdm.runs import newest_samples
 from flame_mdm.safe_io import read_yaml, write_json, write_text
+from flame_mdm.sampler_options import option
 from flame_mdm.schemas import Number, read_json
 
 if TYPE_CHECKING:
     from markupsafe import Markup
 
-USAGE = """
-usage: flame-mdm benchmark NAME [out=FOLDER]
 
-Trains a motion-CLIP and a model of each kind, evaluates them, and writes a table and a report page, all in one command.
-If interrupted, the same command continues where it stopped.
-NAME is a file in experiments/benchmark: synthetic and synthetic_medium, which need no download, bandai, or bandai_full,
-for one GPU.
-"""
+@dataclass(frozen=True, kw_only=True)
+class BenchmarkSettings:
+    """usage: flame-mdm benchmark NAME [out=FOLDER]
+
+    Trains a motion-CLIP and a model of each kind, evaluates them, and writes a table and a report page, all in one
+    command. If interrupted, the same command continues where it stopped.
+    NAME is a file in experiments/benchmark: synthetic and synthetic_medium, which need no download, bandai, or
+    bandai_full, for one GPU.
+    """
+
+    OBJECTS: ClassVar = ("exp",)
+    exp: str | None = option(None, "a file in experiments/benchmark")
+    evaluate: bool = option(True, "false = train and evaluate nothing, render existing results")
+    out: str | None = option(None, "folder; default runs/benchmark/<exp>")
+    device: str | None = option(None, "device and batch_size: as for make evaluate")
+    batch_size: int = option(64, "motions at once")
+    data_root: str = option("", "folder of the prepared data sets; default: the checkpoint's, or FLAME_MDM_DATA")
 
 
-def benchmark(config: Config) -> None:
+def benchmark(settings: BenchmarkSettings) -> None:
     """Trains and evaluates the models listed in a file of experiments/benchmark, and writes a report page.
 
     Raises:
         UserError: If the file does not exist, a training run fails, or a model is worse than expected.
     """
     names = sorted(path.stem for path in (EXPERIMENTS / "benchmark").glob("*.yaml"))
-    if config["exp"] not in names:
+    if settings.exp not in names:
         raise UserError(f"no benchmark named. Add EXP=NAME, one of: {', '.join(names)}")
-    plan = read_yaml(EXPERIMENTS / "benchmark" / f"{config['exp']}.yaml")
-    out = Path(config["out"] or Path("runs") / "benchmark" / config["exp"])
+    plan = read_yaml(EXPERIMENTS / "benchmark" / f"{settings.exp}.yaml")
+    out = Path(settings.out or Path("runs") / "benchmark" / settings.exp)
     out.mkdir(parents=True, exist_ok=True)  # fails before hours of work, not after
     times = Times(out / "times.json")
-    if config["evaluate"]:
+    if settings.evaluate:
         for words in plan["train"]:
-            train(words, times, config["data_root"])
+            train(words, times, settings.data_root)
     spec = load_spec(plan["table"])
-    options = settings("tables") | {name: config[name] for name in ("device", "batch_size", "data_root")}
-    results = Path(options["results"])
+    options = TablesSettings(device=settings.device, batch_size=settings.batch_size, data_root=settings.data_root)
+    results = Path(options.results)
     begin = time.monotonic()
-    failed = evaluate_missing({plan["table"]: spec}, results, options) if config["evaluate"] else []
+    failed = evaluate_missing({plan["table"]: spec}, results, options) if settings.evaluate else []
     times.add("evaluation", time.monotonic() - begin)
     table = build(plan["table"], spec, results)
     body = write(table, out)
     checks = check(table, plan.get("expected", {}))
     report = out / "report.html"
-    write_text(report, page(table.title, _report(config["exp"], body, times, checks, plan["train"])))
+    write_text(report, page(table.title, _report(settings.exp, body, times, checks, plan["train"])))
     say(f"{sum(times.seconds.values()) / 60:.0f} minutes in total; report: {report}")
     wrong = [line for line, right in checks if not right]
     if failed or wrong:
         raise UserError("; ".join([*failed, *wrong]))
 
 
-main = partial(run, benchmark, usage=USAGE, name="benchmark", objects=("exp",), text=("exp", "out", "data_root"))
+main = partial(run, benchmark, BenchmarkSettings)
 
 
 class Times:
@@ -110,7 +122,7 @@ def check(table: Table, expected: Mapping[str, Mapping[str, Mapping[str, Sequenc
     Returns:
         For each expected range, a line that describes the check, and whether the value is within the range.
     """
-    found = {
+    values = {
         (part.name, line.label, column): cell.value if cell is not None and not line.state else None
         for part in table.parts
         for line in part.lines
@@ -121,7 +133,7 @@ def check(table: Table, expected: Mapping[str, Mapping[str, Mapping[str, Sequenc
     for part, rows in expected.items():
         for row, columns in rows.items():
             for column, (low, high) in columns.items():
-                value = found.get((part, row, column))
+                value = values.get((part, row, column))
                 measured = "not measured" if value is None else f"{value:.3g}"
                 line = f"{row}: {column} {measured}, expected {low:g} to {high:g}"
                 checks.append((line, value is not None and low <= value <= high))

@@ -2,86 +2,116 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
-from flame_mdm.config import Config, run
+from flame_mdm.commands import BodySettings, FileSettings, check_motion, check_words
+from flame_mdm.config import run
 from flame_mdm.errors import UserError, say
+from flame_mdm.formats import ENDINGS, WRITTEN
 from flame_mdm.progress import ProgressBar
+from flame_mdm.sampler_options import option
 
 if TYPE_CHECKING:
     from flame_mdm.formats.characters import Character
 
-USAGE = """
-usage: flame-mdm convert MOTION OUT [fps=20] [unit=0.01] [up=z] [figure=bones] [rest_pose=true]
-       flame-mdm convert MOTION OUT rig=mixamo
-       flame-mdm convert MOTION OUT character=hero.glb
-       flame-mdm convert FOLDER OUT format=glb ...
 
-Converts a motion file, or all motion files in a folder and the folders below it. The nearest skeleton.yaml in its
-folder or above applies (docs/own-data.md).
-Inputs: .npz written by `make sample`, .npz of AMASS, .bvh, .json, and .npy with joint positions.
-Outputs: .bvh and .glb for Blender and game engines, .npz in the layout of AMASS, and .json and .npy with joint
-positions; .mp4 and .gif to look at. Units, axes and joint names: docs/formats.md
-rig is the skeleton of .bvh and .glb: mixamo, unreal, unity, lafan1, soma, cmu, geno or 100style. character is your
-own .glb or .bvh file, which is written with the motion: docs/characters.md
-"""
+@dataclass(frozen=True, kw_only=True)
+class ConvertSettings(BodySettings, FileSettings):
+    """usage: flame-mdm convert MOTION OUT [fps=20] [unit=0.01] [up=z] [figure=bones] [rest_pose=true]
+           flame-mdm convert MOTION OUT rig=mixamo
+           flame-mdm convert MOTION OUT character=hero.glb
+           flame-mdm convert FOLDER OUT format=glb ...
+
+    Converts a motion file, or all motion files in a folder and the folders below it. The nearest skeleton.yaml in its
+    folder or above applies (docs/own-data.md).
+    Inputs: .npz written by `make sample`, .npz of AMASS, .bvh, .json, and .npy with joint positions.
+    Outputs: .bvh and .glb for Blender and game engines, .npz in the layout of AMASS, and .json and .npy with joint
+    positions; .mp4 and .gif to look at. Units, axes and joint names: docs/formats.md
+    """
+
+    OBJECTS: ClassVar = ("motion", "out")
+    motion: str | None = option(None, "a file, or a folder of files; .npy holds joint positions (frames, joints, 3)")
+    out: str | None = option(None, ".bvh, .glb, .npz (layout of AMASS), .json or .npy; .mp4 or .gif to look at")
+    format: str | None = option(None, "if MOTION is a folder: ending of the files that are written to the folder OUT")
+    figure: str = option("body", "mesh of .glb: body, or bones for rounded limbs")
+    rest_pose: bool = option(False, "true = .bvh begins with a frame of the rest pose, arms out")
+    rig: str | None = option(
+        None,
+        "skeleton of .bvh and .glb: mixamo, unreal, unity, lafan1, soma, cmu, geno or 100style; default: SMPL's",
+    )
+    character: str | None = option(
+        None, "your own .glb or .bvh file; the same kind of file is written, with the motion: docs/characters.md"
+    )
 
 
-def convert(config: Config) -> None:
+def convert(settings: ConvertSettings) -> None:
     """Converts one file or a folder.
 
     Raises:
         UserError: If the input or the output is not named, the folder has no motions, or as raised by `Motion.save`.
-        FileNotFoundError, ValueError: As raised by `formats.files.read` and `Motion.save`.
+        FileNotFoundError: If a file does not exist.
     """
-    if config["motion"] is None or config["out"] is None:
+    if settings.motion is None or settings.out is None:
         raise UserError("name an input and an output file: flame-mdm convert motion.npz walk.bvh")
-    from flame_mdm.formats import characters, joint_names
-    from flame_mdm.formats.readers import ENDINGS
+    check_words(settings)
+    path, out, hero = Path(settings.motion), Path(settings.out), settings.character
+    if hero is not None and not Path(hero).exists():
+        raise FileNotFoundError(f"{hero}: no such file")
+    if path.is_dir():
+        targets = _targets(settings, path, out)
+    elif settings.format is not None:
+        raise UserError("format=... is for folders; the ending of OUT is the format of one file")
+    else:
+        check_motion("motion", settings.motion)
+        targets = {out: path}
+    if wrong := [target for target in targets if target.suffix.lower() not in WRITTEN]:
+        raise UserError(f"{wrong[0]}: unknown kind of motion file. Use one of {', '.join(WRITTEN)}")
 
-    path, out, hero = Path(str(config["motion"])), Path(str(config["out"])), config["character"]
+    from flame_mdm.formats import characters, joint_names
+
     try:
         character = None if hero is None else characters.read(hero)
     except joint_names.UnknownJoints as error:
         say(*error.template)
         raise
-    if not path.is_dir():
-        if config["format"] is not None:
-            raise UserError("format=... is for folders; the ending of OUT is the format of one file")
-        _convert(config, path, out, character)
-        return
-    ending = config["format"] or (Path(hero).suffix[1:].lower() if hero else None)
+    for target, file in ProgressBar(targets.items(), desc="convert", unit="file", disable=not path.is_dir()):
+        _convert(settings, file, target, character)
+
+
+def _targets(settings: ConvertSettings, folder: Path, out: Path) -> dict[Path, Path]:
+    """Returns the files to write, and the motion file of each, for all motion files of a folder."""
+    ending = settings.format or (Path(settings.character).suffix[1:].lower() if settings.character else None)
     if ending is None:
-        raise UserError(f"{path} is a folder: name the format of the files too, such as format=glb")
-    found = sorted(file for file in path.rglob("*") if file.suffix.lower() in ENDINGS and file.is_file())
-    if not found:
-        raise UserError(f"{path}: no motion files ({', '.join(ENDINGS)})")
-    outputs = {out / file.relative_to(path).with_suffix(f".{ending}"): file for file in found}
-    if double := [file for file in found if file not in outputs.values()]:
+        raise UserError(f"{folder} is a folder: name the format of the files too, such as format=glb")
+    files = sorted(file for file in folder.rglob("*") if file.suffix.lower() in ENDINGS and file.is_file())
+    if not files:
+        raise UserError(f"{folder}: no motion files ({', '.join(ENDINGS)})")
+    targets = {out / file.relative_to(folder).with_suffix(f".{ending}"): file for file in files}
+    if double := [file for file in files if file not in targets.values()]:
         raise UserError(f"{double[0]}: another motion has the same name, so both would become one file. Rename one")
-    for target, file in ProgressBar(outputs.items(), desc="convert", unit="file"):
-        _convert(config, file, target, character)
+    return targets
 
 
-def _convert(config: Config, path: Path, out: Path, character: Character | None) -> None:
+def _convert(settings: ConvertSettings, path: Path, out: Path, character: Character | None) -> None:
     from flame_mdm.formats.body import LEG, head_height, leg_length
     from flame_mdm.formats.layouts import find_skeleton
     from flame_mdm.formats.readers import read
     from flame_mdm.representations.skeleton import SMPL22
     from flame_mdm.visualize.bodies import load_body
 
-    body = load_body(config["body"])
-    given = find_skeleton(path, config["up"])
+    body = load_body(settings.body)
+    facts = find_skeleton(path, settings.up)
     # a BVH file keeps proportions in any unit; the other files are in meters
     copied = path.suffix.lower() == out.suffix.lower() == ".bvh"
-    motion = read(path, config["fps"], config["unit"], given=given, any_size=copied)
+    motion = read(path, settings.fps, settings.unit, given=facts, any_size=copied)
     if out.exists() and out.samefile(path):
         raise UserError(f"{out}: the same file as the input, which stays as it is. Choose another name for the output")
     if out.suffix.lower() == ".npz":
         motion.poses = motion.posed()  # other programs expect AMASS's keys
-    say(motion.save(out, config["figure"], config["rest_pose"], config["rig"], character, body))
+    say(motion.save(out, settings.figure, settings.rest_pose, settings.rig, character, body))
     if motion.skeleton.joints[: len(SMPL22)] == SMPL22.joints:
         leg, head = leg_length(motion.joints), head_height(motion.joints)
         say(f"legs {leg:.2f} m, head joint at {head:.2f} m")
@@ -89,12 +119,4 @@ def _convert(config: Config, path: Path, out: Path, character: Character | None)
             say(f"adults have legs of {LEG[0]:g} to {LEG[1]:g} m: if the unit of {path} is wrong, set unit=...")
 
 
-main = partial(
-    run,
-    convert,
-    usage=USAGE,
-    name="convert",
-    objects=("motion", "out"),
-    text=("motion", "out", "up", "figure", "rig", "body", "character", "format"),
-    kinds={"fps": "float", "unit": "float"},
-)
+main = partial(run, convert, ConvertSettings)

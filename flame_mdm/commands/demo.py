@@ -2,45 +2,48 @@
 
 from __future__ import annotations
 
-import shlex
+from dataclasses import dataclass
 from functools import partial
+from importlib.util import find_spec
+from typing import ClassVar
 
-from flame_mdm.config import Config, run
+from flame_mdm.config import run
 from flame_mdm.errors import UserError
-
-USAGE = """
-usage: flame-mdm demo [CKPT ...] [host=127.0.0.1] [port=7860] [device=cuda]
-
-Serves a page where you type a sentence, watch the motion, edit it and download it. Without CKPT, it uses the model in
-the package. It needs the extra demo: pip install "flame-mdm[demo]"
-Keys, with their defaults: experiments/demo.yaml
-"""
+from flame_mdm.sampler_options import option
 
 
-def demo(config: Config) -> None:
+@dataclass(frozen=True, kw_only=True)
+class DemoSettings:
+    """usage: flame-mdm demo [CKPT ...] [host=127.0.0.1] [port=7860] [device=cuda]
+
+    Serves a page where you type a sentence, watch the motion, edit it and download it. Without CKPT, it uses the model
+    in the package. It needs the extra demo: pip install "flame-mdm[demo]". docs/demo.md explains the page.
+    """
+
+    OBJECTS: ClassVar = ("ckpt",)
+    ckpt: list[str] = option(
+        lambda: ["quickstart"],
+        'one or more models, as for sample: "runs/a/default quickstart"; the first is selected at first',
+    )
+    host: str = option("127.0.0.1", "address to listen on: this computer alone; 0.0.0.0 = all networks")
+    port: int = option(7860, "0 = any free port")
+    device: str | None = option(None, "default: cuda if available")
+
+
+def demo(settings: DemoSettings) -> None:
     """Serves the page until interrupted.
 
     Raises:
         UserError: If gradio is not installed, the port is invalid or in use, or a model cannot be found or loaded.
     """
-    if not 0 <= config["port"] <= 65535:
-        raise UserError(f"port={config['port']}: give a number from 0 to 65535; 0 is any free port")
-    try:
-        import gradio  # noqa: F401
-    except ImportError as error:
-        raise UserError('the demo needs the package gradio. Run pip install "flame-mdm[demo]"') from error
+    if not 0 <= settings.port <= 65535:
+        raise UserError(f"port={settings.port}: give a number from 0 to 65535; 0 is any free port")
+    if find_spec("gradio") is None:
+        raise UserError('the demo needs the package gradio. Run pip install "flame-mdm[demo]"')
 
     from flame_mdm.demo.app import serve
 
-    serve(shlex.split(str(config["ckpt"])), str(config["host"]), config["port"], config["device"])
+    serve(settings.ckpt, settings.host, settings.port, settings.device)
 
 
-main = partial(
-    run,
-    demo,
-    usage=USAGE,
-    name="demo",
-    objects=("ckpt*",),
-    text=("ckpt", "host"),
-    kinds={"port": "int", "device": "str"},
-)
+main = partial(run, demo, DemoSettings)

@@ -2,73 +2,88 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from pathlib import Path
+from typing import ClassVar
 
-from flame_mdm.commands import OPTIONS, SAMPLING
-from flame_mdm.commands.sample import check_condition, check_request, default_folder, summary
-from flame_mdm.config import Config, run
+from flame_mdm.commands import FileSettings, check_motion
+from flame_mdm.commands.sample import OutputSettings, check_condition, default_folder, summary
+from flame_mdm.config import run
 from flame_mdm.errors import UserError, say
-
-USAGE = """
-usage: flame-mdm edit ckpt=FILE motion=walk.npz region=in_between text="a person jumps" [key=value ...]
-       flame-mdm edit ckpt=FILE motion=take.bvh cut=[0,3] joints=upper_body unconditioned=true
-       flame-mdm edit ckpt=FILE motion=bandai:CLIP region_seconds=[1,2] joints=[left_arm,head] method=flame ...
-
-Keeps part of a motion and resamples the rest. Writes the original and the results (.npz), a GIF, and a player that
-opens in any browser. Keys, with their defaults: experiments/edit.yaml
-"""
+from flame_mdm.sampler_options import SamplerOptions, option
+from flame_mdm.sampling.request import EditRequest
 
 
-def write_edits(config: Config) -> None:
-    """Edits a motion as configured, and writes the original and the results.
+@dataclass(frozen=True, kw_only=True)
+class EditSettings(OutputSettings, EditRequest, FileSettings):
+    """usage: flame-mdm edit CKPT motion=walk.npz region=in_between text="a person jumps" [key=value ...]
+           flame-mdm edit CKPT motion=take.bvh cut=[0,3] joints=upper_body unconditioned=true
+           flame-mdm edit CKPT motion=bandai:CLIP region_seconds=[1,2] joints=[left_arm,head] method=flame ...
+
+    Keeps part of a motion and resamples the rest. Writes the original and the results (.npz), a GIF, and a player that
+    opens in any browser. docs/editing.md explains the keys.
+    """
+
+    OBJECTS: ClassVar = ("ckpt", "out")
+    motion: str | None = option(None, "FILE (.npz, .bvh, .json, .npy) or dataset:id")
+    cut: Sequence[float] | None = option(None, "[begin, end] in seconds: use only this part of the motion")
+    data_root: str = option(lambda: os.environ.get("FLAME_MDM_DATA", "data"), "folder of the prepared data sets")
+    out: str | None = option(
+        None,
+        "folder; default samples/<experiment>/<run>-step<steps>-<hash>/edit-<motion>-<text>-seed<seed>-<options>",
+    )
+
+    def __post_init__(self) -> None:
+        SamplerOptions.__post_init__(self)
+        EditRequest.__post_init__(self)
+
+
+IN_NAME = (
+    *("region", "region_seconds", "joints", "method", "until", "strength"),
+    *(entry.name for entry in fields(SamplerOptions)),
+    *("cut", "cleanup", "resample"),
+)
+"""Keys that change the motions: the name of the folder contains those that differ from their defaults."""
+
+
+def write_edits(settings: EditSettings) -> None:
+    """Edits a motion, and writes the original and the results.
 
     Raises:
         UserError: If not exactly one condition is requested, or `flame_mdm.sampling.editing.edit` refuses the request.
     """
-    texts = check_request(config)
-    if config["motion"] is None:
+    request = settings.request(editing=True)
+    if settings.motion is None:
         raise UserError("no motion to edit. Give motion=FILE (.npz, .bvh, .json, .npy) or motion=dataset:id")
+    check_motion("motion", settings.motion)
+    file = settings.model_file()
 
     import torch
 
-    from flame_mdm.checkpoints.loading import find, load
+    from flame_mdm.checkpoints.loading import load
     from flame_mdm.safe_io import sha256
-    from flame_mdm.sampling.editing import edit
+    from flame_mdm.sampling.editing import edit_request
     from flame_mdm.sampling.generation import write_motions
     from flame_mdm.sampling.reading import read_motion
     from flame_mdm.visualize.bodies import load_body
 
-    body = load_body(config["body"])
-    file = find(config["ckpt"], config["which"])
-    model = load(file, config["device"] or ("cuda" if torch.cuda.is_available() else "cpu"))
-    check_condition(config, model, texts)
-    original = read_motion(
-        model.representation,
-        str(config["motion"]),
-        **{key: config[key] for key in ("fps", "unit", "up", "cut", "data_root")},
-    )
-    keys = ("region", "region_seconds", "joints", "method", "until", "resample", "strength")
-    keys += ("samples", "seed", "cleanup", *OPTIONS)
-    stages = [] if config["trajectory"] else None
-    edits = edit(
-        model,
-        original,
-        texts,
-        actions=None if config["action"] is None else [str(config["action"])],
-        stages=stages,
-        **{key: config[key] for key in keys},
-    )
-    requested = {key: config[key] for key in keys if key not in ("resample", "samples", "seed", "cleanup")}
-    requested |= {"cut": config["cut"], "cleanup": config["cleanup"] or None}
-    requested["resample"] = config["resample"] if config["resample"] != 1 else None
+    body = load_body(settings.body)
+    model = load(file, settings.device or ("cuda" if torch.cuda.is_available() else "cpu"))
+    check_condition(settings, request, model)
+    facts = {key: getattr(settings, key) for key in ("fps", "unit", "up", "cut", "data_root")}
+    original = read_motion(model.representation, settings.motion, **facts)
+    stages = [] if settings.trajectory else None
+    edits = edit_request(model, original, request, stages=stages)
     digest, what = sha256(file), f"edit {Path(original.id).stem} {edits[0].text}"
-    folder = Path(config["out"] or default_folder(model, digest, what, config["seed"], requested))
+    name = default_folder(model, digest, what, settings.seed, settings.changed(IN_NAME))
+    folder = Path(settings.out or name)
     shown = replace(original, text=f"original: {original.text or original.id}")
-    facts = {"seed": config["seed"], "checkpoint": digest, "keep": edits[0].keep}
-    write_motions(folder, [shown, *edits], facts, stages, config["mp4"], body)
-    say(summary(folder, edits, config["mp4"]))
+    facts = {"seed": settings.seed, "checkpoint": digest, "keep": edits[0].keep}
+    write_motions(folder, [shown, *edits], facts, stages, settings.mp4, body)
+    say(summary(folder, edits, settings.mp4))
     say(
         f"{edits[0].keep.mean():.0%} of the features are kept. Largest change in the kept part: "
         f"{max(e.feature_error for e in edits):.3g} in normalized features, "
@@ -78,21 +93,4 @@ def write_edits(config: Config) -> None:
         say("a kept part that follows a generated one begins where that one ends, so its place in the world may differ")
 
 
-main = partial(
-    run,
-    write_edits,
-    usage=USAGE,
-    name="edit",
-    objects=("ckpt", "out"),
-    text=("text", "ckpt", "motion", "out", "up", "body"),
-    kinds={
-        **SAMPLING,
-        "method": "str",
-        "until": "float",
-        "resample": "int",
-        "strength": "float",
-        "cleanup": "bool",
-        "trajectory": "bool",
-        "mp4": "bool",
-    },
-)
+main = partial(run, write_edits, EditSettings)

@@ -2,45 +2,56 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import partial
+from typing import ClassVar
 
-from flame_mdm.commands import data_node
-from flame_mdm.config import Config, instantiate, run
+from flame_mdm.commands import STORE, DataSettings
+from flame_mdm.config import instantiate, run
 from flame_mdm.errors import say
-
-USAGE = """
-usage: flame-mdm prepare data=NAME [source=PATH] [representation=NAME] [check|verify|force=true]
-
-Converts a data set, as distributed by its owners, into a packed store under data/. `check=true` only lists the files
-that were found and those that are missing; `verify=true` checks an existing store; `force=true` rewrites it.
-"""
+from flame_mdm.sampler_options import option
 
 
-def prepare(config: Config) -> None:
+@dataclass(frozen=True, kw_only=True)
+class PrepareSettings(DataSettings):
+    """usage: flame-mdm prepare data=NAME [source=PATH] [representation=NAME] [check|verify|force=true]
+
+    Converts a data set, as distributed by its owners, into a packed store under data/. `check=true` only lists the
+    files that exist and those that are missing; `verify=true` checks an existing store; `force=true` rewrites it.
+    """
+
+    OBJECTS: ClassVar = ("data",)
+    source: str | None = option(None, "folder or archive, if the data set needs one")
+    check: bool = option(False, "list the files that exist and those that are missing, prepare nothing")
+    verify: bool = option(False, "check and report on an existing store, write nothing")
+    force: bool = option(False, "rewrite an existing store")
+
+
+def prepare(settings: PrepareSettings) -> None:
     """Writes or verifies the store of a data set.
 
     Raises:
-        UserError: If no data set is named, or the data set takes no source.
-        FileNotFoundError, ValueError: If the raw data is missing or damaged.
+        UserError: If no data set is named, or the data set takes no source; or if the raw data is damaged.
+        FileNotFoundError: If the raw data is missing.
     """
-    node = data_node(config)
+    node = settings.data_node(settings.source)
 
     from flame_mdm.data.store import write_store
     from flame_mdm.data.verify import deviations, lines, report
 
-    representation = instantiate(config["representation"])
+    representation = instantiate(settings.nodes["representation"])
     data = instantiate(node, representation=representation)
-    if config["check"]:
+    if settings.check:
         say(*data.source.check())
         return
-    if config["verify"]:
-        found = report(data)
-        say(*lines(found))
-        if differ := deviations(found):
+    if settings.verify:
+        checked = report(data)
+        say(*lines(checked))
+        if differ := deviations(checked):
             say("DIFFERS from the published figures:", *(f"  {line}" for line in differ))
         say(f"{data.folder}: complete, every hash matches; the report is in verify.json")
         return
-    if (data.folder / "store.json").exists() and not config["force"]:
+    if (data.folder / STORE).exists() and not settings.force:
         store = data.open()
         say(f"{data.folder}: already prepared (force=true rewrites it, verify=true checks it)", *data.changed())
     else:
@@ -54,4 +65,4 @@ def prepare(config: Config) -> None:
     say(f"{info['shape'][0]} frames with {info['shape'][1]} features, fingerprint {store.fingerprint}: {data.folder}")
 
 
-main = partial(run, prepare, usage=USAGE, name="prepare", objects=("data",), text=("source",))
+main = partial(run, prepare, PrepareSettings)

@@ -2,32 +2,42 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import ClassVar
 
-from flame_mdm.config import Config, run
+from flame_mdm.commands import ModelSettings
+from flame_mdm.config import run
 from flame_mdm.errors import UserError, say
-
-USAGE = """
-usage: flame-mdm push CKPT user/name [OUT] [private=true] [dry_run=true]
-
-Writes model.safetensors, config.yaml and a model card, and uploads them to the Hugging Face hub.
-Keys, with their defaults: experiments/push.yaml
-"""
+from flame_mdm.sampler_options import option
 
 
-def _push(config: Config) -> None:
-    if config["ckpt"] is None or config["repository"] is None:
+@dataclass(frozen=True, kw_only=True)
+class PushSettings(ModelSettings):
+    """usage: flame-mdm push CKPT user/name [OUT] [private=true] [dry_run=true]
+
+    Writes model.safetensors, config.yaml and a model card, and uploads them to the Hugging Face hub.
+    """
+
+    OBJECTS: ClassVar = ("ckpt", "repository", "out")
+    repository: str | None = option(None, "user/name on the Hugging Face hub")
+    out: str | None = option(None, "local folder for the files; default push/<name>")
+    private: bool = option(False, "true = the repository is private")
+    dry_run: bool = option(False, "true = write the folder, upload nothing")
+
+
+def push_model(settings: PushSettings) -> None:
+    """Writes the folder and uploads it."""
+    if settings.ckpt is None or settings.repository is None:
         raise UserError("name a checkpoint and a repository: flame-mdm push CKPT user/name")
+    file = settings.model_file()
     from flame_mdm.checkpoints.hub import push
-    from flame_mdm.checkpoints.loading import find
 
-    name, upload = str(config["repository"]), not config["dry_run"]
-    folder = config["out"] or Path("push") / name.rpartition("/")[2]
-    folder = push(find(config["ckpt"], config["which"]), name, folder, upload=upload, private=config["private"])
+    name, upload = settings.repository, not settings.dry_run
+    folder = settings.out or Path("push") / name.rpartition("/")[2]
+    folder = push(file, name, folder, upload=upload, private=settings.private)
     say(f"{f'uploaded to {name}' if upload else 'not uploaded'}: {folder}")
 
 
-main = partial(
-    run, _push, usage=USAGE, name="push", objects=("ckpt", "repository", "out"), text=("ckpt", "repository", "out")
-)
+main = partial(run, push_model, PushSettings)

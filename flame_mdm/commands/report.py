@@ -2,33 +2,44 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
+from typing import ClassVar
 
-from flame_mdm.config import Config, run
+from flame_mdm.commands import BodySettings, check_words
+from flame_mdm.config import run
 from flame_mdm.errors import UserError, say
-from flame_mdm.reporting.report import paths, write_report
-
-USAGE = """
-usage: flame-mdm report RUN
-
-Writes report.html into a run directory: curves, newest samples, evaluations and provenance on one page that needs no
-server and no network. Training also writes it at the end. runs="A B" writes several reports.
-"""
+from flame_mdm.reporting.report import write_report
+from flame_mdm.sampler_options import option
 
 
-def report(config: Config) -> None:
+@dataclass(frozen=True, kw_only=True)
+class ReportSettings(BodySettings):
+    """usage: flame-mdm report RUN ...
+
+    Writes report.html into a run directory: curves, newest samples, evaluations and provenance on one page that needs
+    no server and no network. Training also writes it at the end.
+    """
+
+    OBJECTS: ClassVar = ("runs",)
+    runs: list[str] | None = option(None, "run directories, separated by spaces")
+
+
+def report(settings: ReportSettings) -> None:
     """Writes the report of each run.
 
     Raises:
         UserError: If no run is named, or a folder holds no run.
     """
-    if config["runs"] is None:
+    if settings.runs is None:
         raise UserError("no run named. Name a run directory: flame-mdm report runs/synthetic/mdm/default")
+    check_words(settings)
     from flame_mdm.visualize.bodies import load_body
 
-    body = load_body(config["body"])
-    for folder in paths("runs", str(config["runs"])):
-        say(write_report(folder, body))
+    body = load_body(settings.body)
+    for folder in settings.runs:
+        say(write_report(Path(folder), body))
 
 
-main = partial(run, report, usage=USAGE, name="report", objects=("runs*",), text=("runs", "body"))
+main = partial(run, report, ReportSettings)

@@ -4,124 +4,203 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, fields
 from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
-from flame_mdm.commands import OPTIONS, SAMPLING
-from flame_mdm.config import Config, run
-from flame_mdm.errors import UserError, say
+from flame_mdm.checkpoints.locating import find
+from flame_mdm.commands import BodySettings, ModelSettings, check_motion, check_words
+from flame_mdm.config import run
+from flame_mdm.errors import UserError, say, shortened
 from flame_mdm.safe_io import MEBIBYTE, read_text
+from flame_mdm.sampler_options import SamplerOptions, option, same_option
+from flame_mdm.sampling.request import EditRequest, SamplingRequest
 
 if TYPE_CHECKING:
     from flame_mdm.formats.motion import Motion
     from flame_mdm.task import MotionGeneration
 
-LENGTHS = {"seconds": "float | list[float]", "frames": "int | list[int]"}
-"""Keys that take one value, or one per prompt, and the types of their values."""
-TOGGLES = ("shared_noise", "cleanup", "loop")
-"""Keys that are true or false and change the motions."""
-USAGE = """
-usage: flame-mdm sample ckpt=FILE text="a person walks in a circle clockwise" [seconds=3] [key=value ...]
-       flame-mdm sample ckpt=FILE text="walks forward @3 | turns left | sits down @2.5" [after=walk.npz] [loop=true]
-       flame-mdm sample ckpt=FILE text="walks forward" targets=path.json
-       flame-mdm sample ckpt=FILE prompts=FILE.txt [seconds=[2,3.5,...]] [mp4=true]
-       flame-mdm sample ckpt=FILE action=walk
-       flame-mdm sample ckpt=FILE unconditioned=true
 
-Writes motions (.npz), a GIF, and a player that opens in any browser. A file of prompts has one per line; each gets its
-own folder.
-Keys, with their defaults: experiments/sample.yaml
-"""
+@dataclass(frozen=True, kw_only=True)
+class OutputSettings(BodySettings, SamplerOptions, ModelSettings):
+    """Keys that `sample` and `edit` share."""
+
+    text: str | None = same_option(SamplingRequest, "texts")
+    action: str | None = same_option(SamplingRequest, "actions")
+    unconditioned: bool = option(False, "true = neither text nor action")
+    samples: int = same_option(SamplingRequest, "samples", default=3)
+    seed: int = same_option(SamplingRequest, "seed")
+    cleanup: bool = same_option(SamplingRequest, "cleanup")
+    trajectory: bool = option(
+        False, "true = also draws trajectory.png: the clean estimates along the sampling of the first motion"
+    )
+    mp4: bool = option(
+        False, 'true = also writes motions.mp4; needs pip install "flame-mdm[video]", which `make setup` includes'
+    )
+    device: str | None = option(None, "default: cuda if available")
+
+    def texts(self) -> list[str] | None:
+        """Returns the texts; None if there are none."""
+        return None if self.text is None else [self.text]
+
+    def request(self, editing: bool = False) -> SamplingRequest:
+        """Returns what is requested of the model.
+
+        Raises:
+            UserError: If more than one condition is requested, a file cannot be read, a value is invalid, or a package
+                is missing.
+        """
+        check_words(self, self.device)
+        if self.text is not None and not self.text.strip():
+            raise UserError("the text is empty. Describe what the person does, or use unconditioned=true")
+        choices = [name for name in ("text", "prompts", "action") if hasattr(self, name)]
+        conditions = [name for name in choices if getattr(self, name) is not None]
+        conditions += ["unconditioned"] * self.unconditioned
+        if len(conditions) > 1:
+            listed = "=..., ".join(choices)
+            raise UserError(f"give only one of {listed}=... and unconditioned=true, not {' and '.join(conditions)}")
+        if self.mp4 and find_spec("av") is None:
+            raise UserError('mp4=true: MP4 needs the package av. Run pip install "flame-mdm[video]", or write a GIF')
+        kinds = [SamplingRequest, SamplerOptions, *([EditRequest] if editing else [])]
+        names = {entry.name for kind in kinds for entry in fields(kind)}
+        values = {entry.name: getattr(self, entry.name) for entry in fields(self) if entry.name in names}
+        return SamplingRequest.of("sample", editing, texts=self.texts(), actions=self.action, **values)
+
+    def changed(self, names: Iterable[str]) -> dict[str, Any]:
+        """Returns the values of keys that differ from their defaults."""
+        defaults = {entry.name: entry.default for entry in fields(self)}
+        return {name: value for name in names if (value := getattr(self, name)) != defaults[name]}
 
 
-def sample(config: Config) -> None:
+@dataclass(frozen=True, kw_only=True)
+class SampleSettings(OutputSettings):
+    """usage: flame-mdm sample CKPT text="a person walks in a circle clockwise" [seconds=3] [key=value ...]
+           flame-mdm sample CKPT text="walks forward @3 | turns left | sits down @2.5" [after=walk.npz] [loop=true]
+           flame-mdm sample CKPT text="walks forward" targets=path.json
+           flame-mdm sample CKPT prompts=FILE.txt [seconds=[2,3.5,...]] [mp4=true]
+           flame-mdm sample CKPT action=walk
+           flame-mdm sample CKPT unconditioned=true
+
+    Writes motions (.npz), a GIF, and a player that opens in any browser. A file of prompts has one per line; each gets
+    its own folder.
+    """
+
+    OBJECTS: ClassVar = ("ckpt", "out")
+    prompts: str | None = option(
+        None, "instead of text: a text file with one prompt per line; each prompt gets its own folder"
+    )
+    seconds: float | Sequence[float] | None = same_option(SamplingRequest, "seconds")
+    frames: int | Sequence[int] | None = same_option(SamplingRequest, "frames")
+    after: str | None = same_option(SamplingRequest, "after")
+    loop: bool = same_option(SamplingRequest, "loop")
+    targets: str | None = same_option(SamplingRequest, "targets")
+    candidates: int = same_option(SamplingRequest, "candidates")
+    scorer: str | None = option(
+        None, "a motion-CLIP (run or checkpoint) that chooses among the candidates by how well they fit the text"
+    )
+    shared_noise: bool = same_option(SamplingRequest, "shared_noise")
+    out: str | None = option(
+        None,
+        "folder; default samples/<experiment>/<run>-step<steps>-<hash>/<text>-seed<seed>, plus options such as "
+        "-eta=0.5; with prompts, a folder per prompt is made in it",
+    )
+
+    def texts(self) -> list[str] | None:
+        """Returns the text or the lines of the file of prompts; None if there are none."""
+        if self.text is not None and self.text.endswith(".txt") and Path(self.text).exists():
+            raise UserError(f"text={self.text}: a file. To sample the prompts in it, give prompts={self.text}")
+        return super().texts() if self.prompts is None else read_prompts(self.prompts)
+
+
+LENGTHS = ("seconds", "frames")
+"""Keys that take one value, or one per prompt."""
+IN_NAME = (
+    *LENGTHS,
+    *(entry.name for entry in fields(SamplerOptions)),
+    *("shared_noise", "cleanup", "loop", "after", "targets", "scorer", "candidates"),
+)
+"""Keys that change the motions: the name of the folder contains those that differ from their defaults."""
+
+
+def sample(settings: SampleSettings) -> None:
     """Samples the requested motions and writes them.
 
     Raises:
-        UserError: If not exactly one condition is requested, the file of prompts cannot be read, or `generate` refuses
-            the request.
+        UserError: If not exactly one condition is requested, the file of prompts cannot be read, or the model cannot
+            do what is requested.
     """
-    texts = check_request(config)
-    if config["scorer"] is not None and (texts is None or config["candidates"] == 1):
-        raise UserError(f"scorer={config['scorer']} chooses among motions for a text: give text=... and candidates=8")
+    request = settings.request()
+    if settings.scorer is not None and (request.kind != "text" or settings.candidates == 1):
+        raise UserError(f"scorer={settings.scorer} chooses among motions for a text: give text=... and candidates=8")
+    check_motion("after", settings.after)
+    if settings.targets is not None and not Path(settings.targets).exists():
+        raise FileNotFoundError(f"{settings.targets}: no such file")
+    file = settings.model_file()
+    if settings.scorer is not None:
+        try:
+            find(settings.scorer)
+        except (UserError, FileNotFoundError) as error:
+            raise UserError(f"scorer: {error}") from error
 
-    import numpy as np
     import torch
 
-    from flame_mdm.checkpoints.loading import find, load
+    from flame_mdm.checkpoints.loading import load
     from flame_mdm.safe_io import sha256
-    from flame_mdm.sampling.generation import generate, write_motions
-    from flame_mdm.sampling.targets import errors, read_targets
+    from flame_mdm.sampling.generation import sample_request, write_motions
     from flame_mdm.visualize.bodies import load_body
 
-    body = load_body(config["body"])
-    device = config["device"] or ("cuda" if torch.cuda.is_available() else "cpu")
-    file = find(config["ckpt"], config["which"])
-    model = load(file, device)
-    check_condition(config, model, texts)
-    stages = [] if config["trajectory"] else None
-    keys = ("seconds", "frames", *OPTIONS)
+    body = load_body(settings.body)
+    model = load(file, settings.device or ("cuda" if torch.cuda.is_available() else "cpu"))
+    check_condition(settings, request, model)
     score = None
-    if config["scorer"] is not None:
+    if settings.scorer is not None:
         from evaluators.selection import text_fit
 
         try:
-            score = text_fit(str(config["scorer"]), model, device)
+            score = text_fit(settings.scorer, model, model.device)
         except (UserError, FileNotFoundError) as error:
             raise UserError(f"scorer: {error}") from error
-    motions = generate(
-        model,
-        texts,
-        actions=None if config["action"] is None else [str(config["action"])],
-        samples=config["samples"],
-        candidates=config["candidates"],
-        score=score,
-        seed=config["seed"],
-        after=config["after"],
-        loop=config["loop"],
-        targets=config["targets"],
-        shared_noise=config["shared_noise"],
-        stages=stages,
-        cleanup=config["cleanup"],
-        **{key: config[key] for key in keys},
-    )
-    requested = {key: config[key] for key in keys} | {key: config[key] or None for key in TOGGLES}
-    requested |= {key: config[key] for key in ("after", "targets", "scorer")}
-    requested["candidates"] = config["candidates"] if config["candidates"] != 1 else None
+    stages = [] if settings.trajectory else None
+    motions = sample_request(model, request, score=score, stages=stages)
     digest = sha256(file)
+    for folder, made in _folders(settings, model, digest, motions).items():
+        facts = {"seed": settings.seed, "checkpoint": digest}
+        write_motions(folder, made, facts, stages if made[0] is motions[0] else None, settings.mp4, body)
+        say(summary(folder, made, settings.mp4))
+        if settings.targets is not None:
+            say(_distance(settings.targets, model, made))
+
+
+main = partial(run, sample, SampleSettings)
+
+
+def _folders(
+    settings: SampleSettings, model: MotionGeneration, digest: str, motions: Sequence[Motion]
+) -> dict[Path, list[Motion]]:
+    """Returns the folders to write, with the motions of each; a prompt that is listed twice has one folder."""
+    changed = settings.changed(IN_NAME)
     folders: dict[Path, list[Motion]] = {}
-    for number in range(len(motions) // config["samples"]):
-        part = motions[number * config["samples"] :][: config["samples"]]
-        options = {key: v[number] if isinstance(v, list) and key in LENGTHS else v for key, v in requested.items()}
-        folder = default_folder(model, digest, part[0].text or "unconditioned", config["seed"], options)
-        if config["out"]:
-            folder = Path(config["out"], folder.name if config["prompts"] is not None else "")
-        folders.setdefault(folder, []).extend(part)  # a prompt that is listed twice
-    for folder, made in folders.items():
-        facts = {"seed": config["seed"], "checkpoint": digest}
-        write_motions(folder, made, facts, stages if made[0] is motions[0] else None, config["mp4"], body)
-        say(summary(folder, made, config["mp4"]))
-        if config["targets"] is not None:
-            off = [100 * errors(motion, read_targets(model.representation, config["targets"])) for motion in made]
-            say(f"distance from the targets: mean {np.mean(off):.1f} cm, max {np.max(off):.1f} cm")
+    for number in range(len(motions) // settings.samples):
+        part = motions[number * settings.samples :][: settings.samples]
+        lists = {key: changed[key][number] for key in LENGTHS if isinstance(changed.get(key), list)}
+        folder = default_folder(model, digest, part[0].text or "unconditioned", settings.seed, changed | lists)
+        if settings.out:
+            folder = Path(settings.out, folder.name if settings.prompts is not None else "")
+        folders.setdefault(folder, []).extend(part)
+    return folders
 
 
-main = partial(
-    run,
-    sample,
-    usage=USAGE,
-    name="sample",
-    objects=("ckpt", "out"),
-    text=("text", "prompts", "ckpt", "out", "after", "body", "targets", "scorer"),
-    kinds={
-        **SAMPLING,
-        **LENGTHS,
-        "candidates": "int",
-        **dict.fromkeys((*TOGGLES, "trajectory", "mp4"), "bool"),
-    },
-)
+def _distance(targets: str, model: MotionGeneration, motions: Sequence[Motion]) -> str:
+    """Returns a line that tells how far motions are from their targets."""
+    import numpy as np
+
+    from flame_mdm.sampling.targets import errors, read_targets
+
+    distances = [100 * errors(motion, read_targets(model.representation, targets)) for motion in motions]
+    return f"distance from the targets: mean {np.mean(distances):.1f} cm, max {np.max(distances):.1f} cm"
 
 
 def summary(folder: Path, motions: Sequence[Motion], mp4: bool = False) -> str:
@@ -158,18 +237,17 @@ def default_folder(model: MotionGeneration, digest: str, what: str, seed: int, o
     """Returns `samples/<experiment>/<run>-step<steps>-<hash>/<what>-seed<seed>`, followed by all options not None.
 
     Requests for different motions, and checkpoints with another `digest` (SHA-256), thus go to different folders, also
-    where the file system ignores case. A text that differs from its readable file name, even in case, is
-    followed by its hash. The names of experiment and run come from the
-    checkpoint, which may be untrusted; they are cleaned, so the folder is always within `samples`.
+    where the file system ignores case. A text that differs from its readable file name, even in case, is followed by
+    its hash. The names of experiment and run come from the checkpoint, which may be untrusted; they are cleaned, so the
+    folder is always within `samples`.
     """
     run = model.config.get("run")
     name = run.get("name") if isinstance(run, dict) else None
     parts = [_clean(str(name or "model")), f"step{model.steps}" if model.steps is not None else "", digest[:6]]
     experiment = re.findall(r"[\w-][\w.-]*", str(model.config["experiment"]))
     short = _clean(what.lower())[:60]
-    if (
-        short.replace("-", " ") != what or not what.isascii()
-    ):  # file systems also fold other letters, such as the long s
+    # File systems also fold other letters, such as the long s.
+    if short.replace("-", " ") != what or not what.isascii():
         short = f"{short}-{hashlib.sha256(what.encode()).hexdigest()[:6]}".strip("-")
     values = {key: re.sub(r"[^\w.,-]+", "", str(value)) for key, value in options.items() if value is not None}
     suffix = "".join(f"-{key}={value}" for key, value in values.items())[:150]
@@ -180,50 +258,22 @@ def _clean(name: str) -> str:
     return re.sub(r"[^\w]+", "-", name).strip("-")
 
 
-def check_condition(config: Config, model: MotionGeneration, texts: Sequence[str] | None) -> None:
+def check_condition(settings: OutputSettings, request: SamplingRequest, model: MotionGeneration) -> None:
     """Warns of words that the model has never seen.
 
     Raises:
         UserError: If no condition is requested; the message gives examples.
     """
-    if texts is not None:
+    if request.kind == "text":
         from flame_mdm.conditions.vocabulary import advice
-        from flame_mdm.errors import shortened
-        from flame_mdm.sampling.request import read_parts
 
-        for text in dict.fromkeys(part for each in texts for part, _ in read_parts(each)):
-            of = f"'{shortened(text, 60)}': " * (len(texts) > 1 or text not in texts)
+        for text in dict.fromkeys(part for parts in request.parts for part, _ in parts):
+            of = f"'{shortened(text, 60)}': " * (len(request.prompts) > 1 or text not in request.prompts)
             for line in advice(text, model.facts, model.condition.max_words):
                 say(f"warning: {of}{line}")
-    elif config["action"] is None and not config["unconditioned"]:
+    elif request.kind == "none" and not settings.unconditioned:
         choices = {"text": model.facts.get("captions", ()), "action": model.facts["actions"], "none": ()}
         examples = list(choices[model.conditioned_on])
         shown = "; ".join(examples[:: max(1, len(examples) // 5)][:5])
         key = {"none": "unconditioned=true", "text": "text=...", "action": "action=..."}[model.conditioned_on]
         raise UserError(f"say what to sample: {key}" + f", for example {shown}" * bool(shown))
-
-
-def check_request(config: Config) -> list[str] | None:
-    """Checks that a checkpoint and at most one condition are requested, and returns the texts if there are any.
-
-    Raises:
-        UserError: If not, if the file of prompts cannot be read, or if MP4 is requested but cannot be written.
-    """
-    conditions = [key for key in ("text", "prompts", "action") if config.get(key) is not None]
-    conditions += ["unconditioned"] * config["unconditioned"]
-    if config["ckpt"] is None:
-        raise UserError("no checkpoint given. Add ckpt=runs/.../checkpoints/last.ckpt")
-    if config["text"] is not None and not str(config["text"]).strip():
-        raise UserError("the text is empty. Describe what the person does, or use unconditioned=true")
-    if len(conditions) > 1:
-        choices = f"text=..., {'prompts=..., ' * ('prompts' in config)}action=... and unconditioned=true"
-        raise UserError(f"give only one of {choices}, not {' and '.join(conditions)}")
-    if "prompts" in config and str(config["text"]).endswith(".txt") and Path(str(config["text"])).exists():
-        raise UserError(f"text={config['text']}: a file. To sample the prompts in it, give prompts={config['text']}")
-    if config["mp4"]:
-        from flame_mdm.visualize.render import video_package
-
-        video_package("mp4=true")
-    if config.get("prompts") is not None:
-        return read_prompts(str(config["prompts"]))
-    return None if config["text"] is None else [str(config["text"])]

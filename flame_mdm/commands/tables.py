@@ -4,32 +4,47 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
-from flame_mdm.config import Config, instantiate, run, settings
+from flame_mdm.config import Config, compose_data, instantiate, run
 from flame_mdm.errors import UserError, first_line, say
 from flame_mdm.safe_io import read_yaml, sha256, write_json, write_text
+from flame_mdm.sampler_options import option
 
 if TYPE_CHECKING:
     from flame_mdm.reporting.tables import Request
 
 INVALID = 3
 """Exit code if a requested row is not valid."""
-USAGE = """
-usage: flame-mdm tables [table="NAME ..."] [evaluate=false] [out=FOLDER]
-
-Renders tables and figures as Markdown, LaTeX, CSV and HTML. A table is described by a file in experiments/tables, or by
-your own file, which names checkpoints, a protocol and columns. Checkpoints without a result are evaluated first;
-evaluate=false uses existing results only. Without table=, all tables are rendered. Output is deterministic: the same
-results give the same bytes.
-Exit codes: 0; 1 = wrong input, or an evaluation failed; 3 = a requested row is NOT VALID, the tables are written.
-Keys, with their defaults: experiments/tables.yaml
-"""
 
 
-def tables(config: Config) -> None:
+@dataclass(frozen=True, kw_only=True)
+class TablesSettings:
+    """usage: flame-mdm tables [NAME ...] [evaluate=false] [out=FOLDER]
+
+    Renders tables and figures as Markdown, LaTeX, CSV and HTML. A table is described by a file in experiments/tables,
+    or by your own file, which names checkpoints, a protocol and columns. Checkpoints without a result are evaluated
+    first; evaluate=false uses existing results only. Output is deterministic: the same results give the same bytes.
+    Exit codes: 0; 1 = wrong input, or an evaluation failed; 3 = a requested row is NOT VALID, the tables are written.
+    """
+
+    OBJECTS: ClassVar = ("table",)
+    table: list[str] | None = option(
+        None, "names in experiments/tables, or paths of specs, separated by spaces; default: all"
+    )
+    evaluate: bool = option(True, "evaluate what is missing; false = render existing results only")
+    out: str = option("runs/tables", "folder of the tables")
+    results: str = option("runs/results", "folder of the results")
+    device: str | None = option(None, "this and the next two: as for make evaluate")
+    batch_size: int = option(64, "motions at once")
+    force: bool = option(False, "generate even if real motions miss the values that the protocol expects")
+    data_root: str = option("", "folder of the prepared data sets; default: the checkpoint's, or FLAME_MDM_DATA")
+
+
+def tables(settings: TablesSettings) -> None:
     """Runs missing evaluations and renders the tables.
 
     Raises:
@@ -40,13 +55,11 @@ def tables(config: Config) -> None:
     from flame_mdm.reporting.page import page, render
     from flame_mdm.reporting.tables import NOT_VALID, build, load_spec, spec_names, write
 
-    names = str(config["table"]).split() if config["table"] is not None else spec_names()
-    if not names:
-        raise UserError("table= names no table. Give names of experiments/tables, or leave it out for all tables")
+    names = settings.table or spec_names()
     specs = {Path(name).stem: load_spec(name) for name in names}
-    results = Path(config["results"])
-    failed = evaluate_missing(specs, results, config) if config["evaluate"] else []
-    out = Path(config["out"])
+    results = Path(settings.results)
+    failed = evaluate_missing(specs, results, settings) if settings.evaluate else []
+    out = Path(settings.out)
     built = {name: build(name, spec, results) for name, spec in specs.items()}
     counts = {}
     invalid = False
@@ -68,7 +81,7 @@ def tables(config: Config) -> None:
         raise SystemExit(INVALID)
 
 
-def evaluate_missing(specs: Mapping[str, Config], results: Path, config: Config) -> list[str]:
+def evaluate_missing(specs: Mapping[str, Config], results: Path, settings: TablesSettings) -> list[str]:
     """Runs the evaluations of specs whose results are missing or outdated, and counts lengths of data sets.
 
     Returns:
@@ -80,7 +93,7 @@ def evaluate_missing(specs: Mapping[str, Config], results: Path, config: Config)
     listed: dict[Path, Request] = {}
     for part in (part for spec in specs.values() for part in spec["parts"].values()):
         for dataset in part.get("lengths", []):
-            count_lengths(dataset, results, config)
+            count_lengths(dataset, results, settings)
         for _, row in requests(part) if "columns" in part else ():
             listed |= {request.path(results): request for request in row if not request.absent}
     missing = {path: request for path, request in listed.items() if not path.exists() or outdated(path, request)}
@@ -89,13 +102,13 @@ def evaluate_missing(specs: Mapping[str, Config], results: Path, config: Config)
         say(f"evaluating {number + 1} of {len(missing)}: {request.label}")
         keys = dict(request.keys)
         try:
-            dotted = [f"{name}={keys.pop(name)}" for name in list(keys) if name == "data" or "." in name]
-            options = settings("evaluate", dotted)
+            dotted = [f"{name}={keys.pop(name)}" for name in list(keys) if "." in name]
+            nodes = compose_data(keys.pop("data"), dotted) if "data" in keys else {}
             names = ("device", "batch_size", "force", "data_root")
-            general = {name: config[name] for name in names if config[name] is not None}
+            general = {name: value for name in names if (value := getattr(settings, name)) is not None}
             if "batch_size" in read_yaml(protocol_file(keys["protocol"])):
                 general.pop("batch_size", None)  # protocols that measure time set the batch size
-            evaluate(EvaluationRequest.of(options | general | keys | {"out": str(path)}))
+            evaluate(EvaluationRequest.of(nodes | general | keys | {"out": str(path)}))
         except (UserError, OSError) as error:
             failed.append(f"{request.label}: {first_line(error)}")
             say(f"failed: {failed[-1]}")
@@ -118,13 +131,12 @@ def outdated(path: Path, request: Request) -> bool:
     return False
 
 
-def count_lengths(dataset: str, results: Path, config: Config) -> None:
+def count_lengths(dataset: str, results: Path, settings: TablesSettings) -> None:
     """Writes the motion lengths of a data set to `results`; prints a message if the data set is not prepared."""
     from flame_mdm.reporting.tables import Lengths
 
-    options = settings("browse", [f"data={dataset}"])
-    node = options["data"] | ({"root": config["data_root"]} if config["data_root"] else {})
-    data = instantiate(node, representation=instantiate(options["representation"]))
+    nodes = compose_data(dataset, data_root=settings.data_root or os.environ.get("FLAME_MDM_DATA", "data"))
+    data = instantiate(nodes["data"], representation=instantiate(nodes["representation"]))
     if not (data.folder / "store.json").exists():
         say(f"{dataset}: not prepared, so its lengths are omitted. To prepare it: make prepare DATA={dataset}")
         return
@@ -138,6 +150,4 @@ def count_lengths(dataset: str, results: Path, config: Config) -> None:
     write_json(results / "lengths" / f"{dataset}.json", counted.model_dump(), indent=None)
 
 
-main = partial(
-    run, tables, usage=USAGE, name="tables", objects=("table*",), text=("table", "out", "results", "data_root")
-)
+main = partial(run, tables, TablesSettings)

@@ -6,7 +6,8 @@ from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
 
-from flame_mdm.config import Config, flatten, movable, read_saved, run
+from flame_mdm.config import Config, flatten, movable, read_saved
+from flame_mdm.config.sweeps import run_recipe
 from flame_mdm.errors import UserError
 
 USAGE = """
@@ -39,9 +40,6 @@ FREE = (
 )
 """Keys that may differ when a run is resumed."""
 
-ADDED = {"lr_decay": 0.0}
-"""Keys that the configurations of earlier versions do not have, with the values that they imply."""
-
 
 def train(config: Config) -> None:
     """Trains the composed experiment, or resumes the run in its directory.
@@ -62,18 +60,18 @@ def train(config: Config) -> None:
         fit(folder, config)
 
 
-main = partial(run, train, usage=USAGE)
+main = partial(run_recipe, train, USAGE)
 
 
 def _same_run(folder: Path, config: Config) -> None:
     """Raises `UserError` if the folder holds a run with another configuration."""
     if not (folder / "config.yaml").exists():
         return
-    saved, wanted = ADDED | flatten(movable(read_saved(folder / "config.yaml"))), flatten(movable(config))
+    saved, requested = flatten(movable(read_saved(folder / "config.yaml"))), flatten(movable(config))
     differing = [
-        f"{key} ({saved.get(key, 'absent')} there, {wanted.get(key, 'absent')} here)"
-        for key in sorted(saved.keys() | wanted.keys())
-        if saved.get(key) != wanted.get(key) and not key.startswith(FREE)
+        f"{key} ({saved.get(key, 'absent')} there, {requested.get(key, 'absent')} here)"
+        for key in sorted(saved.keys() | requested.keys())
+        if saved.get(key) != requested.get(key) and not key.startswith(FREE)
     ]
     if differing:
         raise UserError(

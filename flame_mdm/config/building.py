@@ -2,31 +2,17 @@
 
 from __future__ import annotations
 
-import ast
 import copy
-import functools
 import importlib
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from omegaconf import OmegaConf
 
-from flame_mdm.config.signatures import Config, definition, walk
+from flame_mdm.config.signatures import Config
 from flame_mdm.errors import UserError, first_line
 from flame_mdm.safe_io import read_yaml, write_text
-
-TRUSTED = (
-    "flame_mdm.task",
-    "flame_mdm.denoisers",
-    "flame_mdm.processes",
-    "flame_mdm.conditions",
-    "flame_mdm.representations",
-    "flame_mdm.data",
-    "evaluators",
-)
-"""Modules whose classes a configuration from a checkpoint may name."""
 
 MOST_VALUES, MOST_LEVELS = 1_000_000, 50
 """Limits of a configuration in a file: number of values, and depth of nested mappings and lists."""
@@ -89,7 +75,7 @@ def read_saved(path: Path) -> Config:
     if not isinstance(config, dict) or not isinstance(config.get("run"), dict):
         raise UserError(f"{path}: not the configuration of a run: it has no key `run`")
     plain(config, path, but=RUN_DIR)
-    return current_names(config)
+    return config
 
 
 def movable(config: Config) -> Config:
@@ -102,65 +88,6 @@ def movable(config: Config) -> Config:
         return RUN_DIR + node.removeprefix(folder) if isinstance(node, str) and node.startswith(folder) else node
 
     return {name: value if name == "run" else moved(value) for name, value in config.items()}
-
-
-@functools.cache
-def _moved() -> dict[str, str]:
-    return read_yaml(Path(__file__).with_name("moved.yaml"))
-
-
-def current_names(config: Config) -> Config:
-    """Returns a configuration from a file with the names of earlier versions replaced by current names."""
-    return _renamed(config, _moved())
-
-
-def original_names(config: Config) -> Config:
-    """Returns a configuration with current names replaced by those of the first version, so that hashes stay equal."""
-    return _renamed(config, {new: old for old, new in _moved().items()})
-
-
-def _renamed(node: Any, names: Mapping[str, str]) -> Any:
-    if isinstance(node, Mapping):
-        renamed = {name: _renamed(value, names) for name, value in node.items()}
-        target = renamed.get("_target_")
-        if isinstance(target, str):
-            found = max((old for old in names if f"{target}.".startswith(f"{old}.")), key=len, default="")
-            renamed["_target_"] = names[found] + target.removeprefix(found) if found else target
-        return renamed
-    return [_renamed(value, names) for value in node] if isinstance(node, list | tuple) else node
-
-
-def trust(config: Config) -> None:
-    """Checks a configuration from a checkpoint: it may only name classes defined in `TRUSTED` modules, no functions.
-
-    The environment variable FLAME_MDM_TRUST adds packages, separated by commas, of which it may name anything. Nothing
-    that it names is imported here.
-
-    Raises:
-        UserError: If it names anything else.
-    """
-    added = [name for name in os.environ.get("FLAME_MDM_TRUST", "").split(",") if name]
-    for path, mapping in walk(config):
-        if "_target_" not in mapping:
-            continue
-        target = mapping["_target_"]
-        package = str(target).partition(".")[0]
-        if not (isinstance(target, str) and (package in added or _is_trusted_class(target))):
-            raise UserError(
-                f"the checkpoint's configuration names {target} at {'.'.join(path)}. Its code is only run if "
-                f"you trust it: set FLAME_MDM_TRUST={package}"
-            )
-
-
-def _is_trusted_class(target: str) -> bool:
-    """Returns whether a class is defined in the named module, or imported there from another trusted module."""
-    module, _, name = target.rpartition(".")
-    found = definition(module, name) if _is_trusted_module(module) else None
-    return found is not None and isinstance(found[1], ast.ClassDef) and _is_trusted_module(found[0])
-
-
-def _is_trusted_module(name: str) -> bool:
-    return any(name == trusted or name.startswith(f"{trusted}.") for trusted in TRUSTED)
 
 
 def instantiate(node: Config, **derived: Any) -> Any:
@@ -182,12 +109,12 @@ def instantiate(node: Config, **derived: Any) -> Any:
     name: str = node["_target_"]
     build = _instances if node.get("_recursive_", True) else copy.deepcopy
     skipped = ("_target_", "_recursive_", *derived)
-    given: dict[str, Any] = {key: build(value) for key, value in node.items() if key not in skipped}
+    arguments: dict[str, Any] = {key: build(value) for key, value in node.items() if key not in skipped}
     try:
         module, _, attribute = name.rpartition(".")
         if not module:
             raise UserError(f"_target_={name}: not the name of a module and a class, such as torch.nn.Linear")
-        return getattr(importlib.import_module(module), attribute)(**given, **derived)
+        return getattr(importlib.import_module(module), attribute)(**arguments, **derived)
     except (UserError, ValueError, FileNotFoundError):
         raise
     except Exception as error:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,7 +16,7 @@ from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from flame_mdm.config.building import RUN_DIR, current_names, plain
+from flame_mdm.config.building import RUN_DIR, plain
 from flame_mdm.config.signatures import Config, check, check_same_kinds, parameters, source_file, unknown_key
 from flame_mdm.errors import UserError, did_you_mean, first_line
 from flame_mdm.safe_io import read_yaml
@@ -61,22 +62,30 @@ def compose(name: str, overrides: Sequence[str] = ()) -> Config:
     return config
 
 
-def settings(name: str, overrides: Sequence[str] = ()) -> Config:
-    """Composes the configuration of a command, such as `experiments/evaluate.yaml` of `evaluate`, with overrides.
+def compose_data(name: str, overrides: Sequence[str] = (), *, data_root: str = "data", seed: int = 0) -> Config:
+    """Composes a data set and its representation: a mapping with the keys `data` and `representation`.
+
+    Args:
+        name: a file in `experiments/data` without its suffix.
+        overrides: overrides such as `representation=smpl` or `data.source.clips=100`.
+        data_root: folder of the prepared data sets.
+        seed: of the data that are generated.
 
     Raises:
         UserError: As for `compose`.
     """
-    config = resolve(plan_composition(Recipe(EXPERIMENTS, name), overrides))
+    first = [f"+seed={seed}", quoted(f"+data_root={data_root}")]
+    config = resolve(plan_composition(Recipe(EXPERIMENTS, None), [f"+data={name}", *overrides], first))
     check(config)
-    return config
+    return {key: config[key] for key in ("data", "representation")}
 
 
 class Recipe(NamedTuple):
     """Location and kind of a configuration."""
 
     folder: Path
-    stem: str
+    stem: str | None
+    """Name of the file in `folder` without its suffix; None = an empty configuration."""
     saved: bool = False
     """Whether it is a resolved configuration, whose parts cannot be replaced."""
     experiment: str | None = None
@@ -87,19 +96,22 @@ class Plan(NamedTuple):
     """Input of Hydra's composition."""
 
     folder: Path
-    stem: str
+    stem: str | None
     overrides: list[str]
     base: Config | None = None
     """The recipe without overrides of single keys. An override must have the type of the value in it."""
 
 
-def plan_composition(recipe: Recipe, overrides: Sequence[str]) -> Plan:
-    """Checks overrides and prepares them for Hydra. Keys that the recipe lacks but a `_target_` accepts get a `++`."""
+def plan_composition(recipe: Recipe, overrides: Sequence[str], first: Sequence[str] = ()) -> Plan:
+    """Checks overrides and prepares them for Hydra. Keys that the recipe lacks but a `_target_` accepts get a `++`.
+
+    Overrides in `first` are passed to Hydra unchecked.
+    """
     parsed = parse(overrides)
     if recipe.saved:
         _refuse_groups(parsed, recipe)
     _check_groups(parsed)
-    first = [f"hydra.searchpath=[file://{EXPERIMENTS}]"] if recipe.folder != EXPERIMENTS else []
+    first = [*first, *([f"hydra.searchpath=[file://{EXPERIMENTS}]"] if recipe.folder != EXPERIMENTS else [])]
     if recipe.experiment:
         first.append(f"experiment={recipe.experiment}")
     parts = [o for o in parsed if _is_group(o)]
@@ -116,13 +128,13 @@ def override_word(override: Override) -> str:
 def first_choice(override: Override) -> str:
     """Returns the override; for a sweep, the override with its first value."""
     return (
-        f"{override.get_key_element()}={_choices(override)[0]}"
+        f"{override.get_key_element()}={choices(override)[0]}"
         if override.is_sweep_override()
         else override_word(override)
     )
 
 
-def _choices(override: Override) -> list[str]:
+def choices(override: Override) -> list[str]:
     """Returns the values of an override: one, or those of a sweep."""
     value = override.value()
     if isinstance(value, Glob):
@@ -154,6 +166,14 @@ def find_recipe(name: str) -> Recipe:
     return Recipe(path.parent, path.name, experiment=name)  # Hydra looks up `launch` relative to the recipe
 
 
+def quoted(word: str) -> str:
+    """Returns a word `key=value` whose value Hydra takes literally."""
+    key, _, value = word.partition("=")
+    # Hydra takes a backslash literally, except right before a quote, where it has to be doubled.
+    escaped = re.sub(r"(\\*)('|$)", lambda m: m[1] * 2 + ("\\'" if m[2] else ""), value).replace("${", "\\${")
+    return f"{key}='{escaped}'"
+
+
 def parse(overrides: Sequence[str]) -> list[Override]:
     for word in overrides:
         if len(word) > LONGEST_WORD:
@@ -176,7 +196,7 @@ def _check_groups(overrides: Sequence[Override]) -> None:
             continue
         group = override.key_or_group
         options = _options(group)
-        for option in _choices(override):
+        for option in choices(override):
             if option not in options:
                 raise UserError(
                     f"no {group} is called '{option}'.{did_you_mean(option, options)} Available: {', '.join(options)}"
@@ -200,14 +220,13 @@ def resolve(plan: Plan) -> Config:
     GlobalHydra.instance().clear()
     try:
         with initialize_config_dir(version_base="1.3", config_dir=str(plan.folder)):
-            config = hydra_compose(plan.stem, plan.overrides)
-            resolved = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+            composed = hydra_compose(plan.stem, plan.overrides)
+            resolved = OmegaConf.to_container(composed, resolve=True, throw_on_missing=True)
     except (HydraException, OmegaConfBaseException) as error:
-        raise UserError(f"{plan.stem}: {first_line(error)}") from error
-    plain: Config = {str(key): value for key, value in resolved.items()}  # type: ignore[union-attr]
-    plain = current_names(plain)
-    check_same_kinds(plan.base or {}, plain)
-    return plain
+        raise UserError(f"{plan.stem or 'data'}: {first_line(error)}") from error
+    config: Config = {str(key): value for key, value in resolved.items()}  # type: ignore[union-attr]
+    check_same_kinds(plan.base or {}, config)
+    return config
 
 
 def _legal(config: Config, override: Override) -> str:

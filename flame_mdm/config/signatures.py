@@ -9,6 +9,7 @@ from __future__ import annotations
 import ast
 import difflib
 import functools
+import math
 import re
 import sys
 from collections.abc import Iterator, Mapping, Sequence
@@ -42,33 +43,71 @@ def check(config: Config) -> None:
 KINDS: dict[str, tuple[type | tuple[type, ...], str]] = {
     "bool": (bool, "true or false"),
     "int": (int, "a whole number"),
-    "float": ((int, float), "a number"),
+    "float": ((int, float), "a finite number"),
     "str": (str, "a text"),
-    "list[int]": (list, "a list of whole numbers"),
-    "list[float]": (list, "a list of numbers"),
     "None": (type(None), "null"),
 }
+"""The values that an annotation allows: their types, and a description."""
 
 
 def check_kind(key: str, value: Any, annotation: str) -> None:
-    """Raises `UserError` if the annotation of a parameter rules out a value. Unknown annotations allow any value."""
-    needed = []
-    for part in re.sub(r"^Optional\[(.*)\]$", r"\1 | None", annotation).split(" | "):
-        if part in KINDS:
-            kind, words = KINDS[part]
-            if isinstance(value, kind) and (part == "bool" or not isinstance(value, bool)):
-                return
-        elif part.startswith("Literal[") and part.endswith("]"):
-            choices = ast.literal_eval(f"({part[8:-1]},)")
-            words = f"one of {', '.join(map(str, choices))}"
-            if value in choices:
-                return
-        elif re.fullmatch(r"[A-Z]\w+", part) and part != "Any" and (value is None or isinstance(value, int | float)):
-            words = "a part"  # a class
-        else:
+    """Checks a value against the annotation of a parameter. Unknown annotations allow any value.
+
+    Raises:
+        UserError: If the annotation rules out the value.
+    """
+    required = []
+    for kind in _alternatives(ast.parse(annotation or "Any", mode="eval").body):
+        description = _mismatch(value, kind)
+        if not description:
             return
-        needed.append(words)
-    raise UserError(f"{key}={value}: must be {' or '.join(dict.fromkeys(needed))}")
+        required.append(description)
+    raise UserError(f"{key}={value}: must be {' or '.join(dict.fromkeys(required))}")
+
+
+def _alternatives(annotation: ast.expr) -> list[ast.expr]:
+    """Returns the members of a union; otherwise the annotation itself."""
+    if isinstance(annotation, ast.BinOp):
+        return [*_alternatives(annotation.left), *_alternatives(annotation.right)]
+    if isinstance(annotation, ast.Constant) and isinstance(annotation.value, str):  # a forward reference
+        return _alternatives(ast.parse(annotation.value, mode="eval").body)
+    if isinstance(annotation, ast.Subscript):
+        name, members = _name(annotation.value), annotation.slice
+        if name == "Optional":
+            return [*_alternatives(members), ast.Constant(None)]
+        if name == "Union" and isinstance(members, ast.Tuple):
+            return [kind for member in members.elts for kind in _alternatives(member)]
+    return [annotation]
+
+
+def _mismatch(value: Any, kind: ast.expr) -> str:
+    """Returns what an annotation without unions requires, if the value does not meet it; otherwise ""."""
+    name = _name(kind)
+    if name in KINDS:
+        types, description = KINDS[name]
+        legal = isinstance(value, types) and isinstance(value, bool) == (name == "bool")
+        return "" if legal and not (isinstance(value, float) and not math.isfinite(value)) else description
+    if isinstance(kind, ast.Subscript):
+        outer = _name(kind.value)
+        if outer == "Literal":
+            members = kind.slice.elts if isinstance(kind.slice, ast.Tuple) else [kind.slice]
+            choices = [ast.literal_eval(member) for member in members]
+            return "" if value in choices else f"one of {', '.join(map(str, choices))}"
+        if outer not in ("list", "Sequence") or (isinstance(value, Mapping) and "_target_" in value):
+            return ""
+        if not isinstance(value, list | tuple):
+            return "a list"
+        required = [[_mismatch(item, member) for member in _alternatives(kind.slice)] for item in value]
+        wrong = [descriptions for descriptions in required if all(descriptions)]
+        return f"a list, each item {' or '.join(dict.fromkeys(wrong[0]))}" if wrong else ""
+    if re.fullmatch(r"[A-Z]\w+", name) and name != "Any" and (value is None or isinstance(value, int | float)):
+        return "a part"  # a class
+    return ""
+
+
+def _name(node: ast.expr) -> str:
+    """Returns the last part of a dotted name."""
+    return ast.unparse(node).rpartition(".")[2] if isinstance(node, ast.Name | ast.Attribute | ast.Constant) else ""
 
 
 def check_same_kinds(base: Config, config: Config, path: str = "") -> None:
@@ -103,14 +142,14 @@ def unknown_key(config: Config, parts: Sequence[str], depth: int, node: Any) -> 
     key = ".".join(parts)
     if parts[0] == "data" and not depth:
         return f"{key} belongs to a data set, and none is named. Add data=NAME, such as data=folder"
-    known = {".".join([*path, str(name)]) for path, mapping in walk(config) for name in mapping}
+    legal = {".".join([*path, str(name)]) for path, mapping in walk(config) for name in mapping}
     if isinstance(node, Mapping) and "_target_" in node:
-        known |= {".".join([*parts[:depth], name]) for name in parameters(node["_target_"]) if name != "**"}
-    known -= {key}
-    siblings = {name for name in known if name.rpartition(".")[0] == ".".join(parts[:depth])}
+        legal |= {".".join([*parts[:depth], name]) for name in parameters(node["_target_"]) if name != "**"}
+    legal -= {key}
+    siblings = {name for name in legal if name.rpartition(".")[0] == ".".join(parts[:depth])}
     near = difflib.get_close_matches(parts[depth], [s.rpartition(".")[2] for s in siblings], 3, 0.6)
-    names = [".".join([*parts[:depth], n]) for n in near] or difflib.get_close_matches(key, known, 3, 0.6)
-    names = names or [name for name in sorted(known) if name.endswith(f".{parts[-1]}")][:3]
+    names = [".".join([*parts[:depth], n]) for n in near] or difflib.get_close_matches(key, legal, 3, 0.6)
+    names = names or [name for name in sorted(legal) if name.endswith(f".{parts[-1]}")][:3]
     return f"unknown config key '{key}'." + (f" Did you mean {', '.join(names)}?" if names else "")
 
 
@@ -133,13 +172,13 @@ def parameters(target: str, *, where: str = "_target_", exact: bool = True) -> f
 def signature(target: str, where: str) -> dict[str, str]:
     """Returns the arguments of a class or function: name -> annotation, "" without one."""
     module, _, name = target.rpartition(".")
-    found = definition(module, name)
-    if found is None and (owner := definition(module.rpartition(".")[0], module.rpartition(".")[2])):  # a method
-        methods = (node for node in ast.iter_child_nodes(owner[1]) if isinstance(node, ast.FunctionDef))
-        found = next(((owner[0], node) for node in methods if node.name == name), None)
-    if found is None:
+    node = definition(module, name)
+    if node is None and (owner := definition(module.rpartition(".")[0], module.rpartition(".")[2])):  # a method
+        methods = (child for child in ast.iter_child_nodes(owner[1]) if isinstance(child, ast.FunctionDef))
+        node = next(((owner[0], method) for method in methods if method.name == name), None)
+    if node is None:
         raise UserError(f"{where}={target}: no such class or function")
-    return _arguments(*found)
+    return _arguments(*node)
 
 
 def definition(module: str, name: str, seen: frozenset[str] = frozenset()) -> tuple[str, ast.AST] | None:
@@ -155,9 +194,9 @@ def definition(module: str, name: str, seen: frozenset[str] = frozenset()) -> tu
             for alias in node.names:
                 if alias.name == "*" or (alias.asname or alias.name) == name:
                     source = _absolute(module, node)
-                    found = definition(source, name if alias.name == "*" else alias.name, seen | {module})
-                    if found:
-                        return found
+                    original = definition(source, name if alias.name == "*" else alias.name, seen | {module})
+                    if original:
+                        return original
     return None
 
 
@@ -179,6 +218,9 @@ def _absolute(module: str, node: ast.ImportFrom) -> str:
 
 
 def source_file(module: str) -> Path | None:
+    """Returns the source file of a module; None if there is none, or the name is not one of a module."""
+    if not all(part.isidentifier() for part in module.split(".")):  # a slash would name any file
+        return None
     relative = Path(*module.split("."))
     for entry in [str(Path(__file__).parent.parent.parent), *sys.path]:
         for candidate in (Path(entry) / relative / "__init__.py", (Path(entry) / relative).with_suffix(".py")):
@@ -216,7 +258,7 @@ def _arguments(module: str, node: ast.AST) -> dict[str, str]:
 def _inherited(module: str, node: ast.ClassDef) -> dict[str, str]:
     names: dict[str, str] = {}
     for base in node.bases:
-        found = definition(module, ast.unparse(base).rpartition(".")[2])
-        if found and found[1] is not node:
-            names |= _arguments(*found)
+        parent = definition(module, ast.unparse(base).rpartition(".")[2])
+        if parent and parent[1] is not node:
+            names |= _arguments(*parent)
     return names

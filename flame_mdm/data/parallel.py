@@ -5,7 +5,6 @@ from __future__ import annotations
 import errno
 import fcntl
 import os
-import signal
 import socket
 import threading
 import time
@@ -23,6 +22,7 @@ from typing import IO, TypeVar
 
 from flame_mdm.errors import UserError, say
 from flame_mdm.safe_io import made_folder
+from flame_mdm.signals import ignore_interrupts
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
@@ -139,7 +139,7 @@ def _start_worker() -> None:
             parent.join()
             os._exit(1)
 
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    ignore_interrupts()
     threading.Thread(target=follow, daemon=True).start()
 
 

@@ -1,1 +1,6 @@
 """Motion files for exchange with other programs. `docs/formats.md` lists units, axes and joints of each format."""
+
+ENDINGS = (".npz", ".bvh", ".json", ".npy")
+"""Endings of motion files that are read."""
+WRITTEN = (".bvh", ".glb", ".npz", ".json", ".npy", ".gif", ".mp4")
+"""Endings of the files that `flame_mdm.formats.motion.Motion.save` writes."""

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from flame_mdm.errors import UserError
+from flame_mdm.formats import ENDINGS
 from flame_mdm.formats.body import check_size, leg_length
 from flame_mdm.formats.layouts import array_layout, read_bvh
 from flame_mdm.formats.motion import AMASS_AXES, Motion, motion_of_poses
@@ -23,7 +24,6 @@ from flame_mdm.representations.skeleton import SKELETONS, SMPL22, Skeleton
 from flame_mdm.representations.smpl import ADULT, read_pose
 from flame_mdm.safe_io import MEBIBYTE, read_json, read_npy, read_npz, regular_file
 
-ENDINGS = (".npz", ".bvh", ".json", ".npy")
 CAMERA_AXES = torch.diag(torch.tensor([1.0, -1, -1], dtype=torch.float64))
 """Rotates the camera coordinates of the action data sets, y down, to y up."""
 ROTATED = {"smpl147": 147, "rot6d-25": 150, "motion272": 272}

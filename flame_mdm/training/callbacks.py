@@ -10,10 +10,8 @@ import time
 from collections.abc import Mapping, Sequence
 from inspect import getdoc, signature
 from itertools import zip_longest
-from multiprocessing import active_children
 from pathlib import Path
 from resource import RUSAGE_SELF, getrusage
-from types import FrameType
 from typing import Any
 
 import torch
@@ -32,6 +30,7 @@ from flame_mdm.progress import ProgressBar
 from flame_mdm.reporting.page import number
 from flame_mdm.reporting.report import write_report
 from flame_mdm.sampling.generation import generate, write_motions
+from flame_mdm.signals import StopRequest
 from flame_mdm.task import MotionGeneration, Task
 from flame_mdm.training.loggers import log_video
 from flame_mdm.training.provenance import device_name
@@ -68,24 +67,13 @@ class Checkpoints(Checkpoint):
             raise ValueError(f"callbacks.checkpoints.every_n_steps={every_n_steps}: must be at least 1")
         self.folder = Path(folder)
         self.every_n_steps, self.keep_every_n_steps = every_n_steps, keep_every_n_steps
-        self.signum, self.noted = 0, 0.0
+        self.stop = StopRequest()
         self.exchanged = torch.tensor(0)
         self.step = -1
-        self.handlers: dict[int, Any] = {}
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         self.step = trainer.global_step
-        for signum in (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGUSR2):
-            self.handlers[signum] = signal.signal(signum, self._note)
-
-    def _note(self, signum: int, frame: FrameType | None) -> None:
-        repeated = self.signum == signum and time.monotonic() > self.noted + 1
-        if self.signum and (signum == signal.SIGINT or (signum == signal.SIGTERM and repeated)):
-            _kill_workers()
-            raise SystemExit(128 + signum)
-        self.signum, self.noted = signum, time.monotonic()
-        # print is not reentrant, and the signal may have interrupted another print.
-        os.write(1, b"\nstopping at the end of this step; press Ctrl-C or send SIGTERM again to stop immediately\n")
+        self.stop.install()
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
@@ -93,7 +81,7 @@ class Checkpoints(Checkpoint):
         if trainer.global_step == self.step:  # gradients are still being accumulated
             return
         self.step = trainer.global_step
-        signum = self.signum
+        signum = self.stop.signum
         if trainer.world_size > 1:
             # All processes act on the signal exchanged in the previous step. Reading the one of this step would wait
             # for the step to end on the device.
@@ -109,22 +97,10 @@ class Checkpoints(Checkpoint):
             raise Interrupted(signum, self.step)
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        self._restore()
+        self.stop.restore()
 
     def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
-        self._restore()
-
-    def _restore(self) -> None:
-        for signum, handler in self.handlers.items():
-            signal.signal(signum, handler)
-        self.handlers = {}
-
-
-def _kill_workers() -> None:
-    """Kills the data loading processes, including suspended ones, for which Python would wait forever."""
-    signal.signal(signal.SIGCHLD, signal.SIG_DFL)  # otherwise, torch's handler raises an error for each of them
-    for process in active_children():
-        process.kill()
+        self.stop.restore()
 
 
 class Measurements(Callback):

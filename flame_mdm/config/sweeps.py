@@ -1,0 +1,174 @@
+"""The command line of `train`, which Hydra composes; sweeps; and jobs that Hydra's launchers start."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+from hydra import main as hydra_main
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import OmegaConf
+
+from flame_mdm.config.building import plain
+from flame_mdm.config.composition import (
+    EXPERIMENTS,
+    LAUNCH,
+    find_recipe,
+    first_choice,
+    groups,
+    parse,
+    plan_composition,
+    quoted,
+    recipes,
+    resolve,
+)
+from flame_mdm.config.entry import STOP, guarded, make_variables
+from flame_mdm.config.signatures import Config, check
+from flame_mdm.errors import UserError, say
+
+FLAGS = ("--help", "--multirun", "-m", "--cfg", "--resolve", "--package")
+"""Options of Hydra that `train` accepts."""
+
+QUIET = ["hydra/job_logging=disabled", "hydra/hydra_logging=disabled", "hydra.output_subdir=null"]
+
+INTERRUPT = STOP[:1]
+"""Signals that end training before the first step; then training handles them itself."""
+
+
+def run_recipe(command: Callable[[Config], None], usage: str, argv: Sequence[str]) -> int:
+    """Runs a command line `RECIPE key=value ...` and returns the exit code.
+
+    Options of Hydra (`--multirun`, `--cfg job`) are passed on. `launch=...` passes each job of a sweep, or the only
+    job, to that launcher, and waits for them.
+    """
+    words = make_variables() if "--from-make" in argv else list(argv)
+    if not words or any(word in ("-h", "--help") for word in words):
+        say(*usage.strip().splitlines(), "", "experiments:")
+        for folder, names in groupby(recipes(), lambda recipe: recipe.rpartition("/")[0]):
+            listed = ", ".join(name.rpartition("/")[2] for name in names)
+            say(f"  {f'{folder}/' if folder else '':13}{listed}")
+        say("parts: " + ", ".join(f"{group}=..." for group in groups()))
+        return 0 if words else 2
+    codes = [0]
+    return guarded(lambda: _serve(command, words, codes), INTERRUPT) or max(codes)
+
+
+def _serve(command: Callable[[Config], None], words: Sequence[str], codes: list[int]) -> None:
+    name, *words = words
+    if name.startswith("-") or "=" in name:
+        raise UserError(f"the first word must name an experiment, such as quickstart, not '{name}'")
+    recipe = find_recipe(name)
+    flags = [w for i, w in enumerate(words) if w.startswith("-") or (i and words[i - 1] in ("--cfg", "--package"))]
+    if unknown := [w for w in flags if w.startswith("-") and w.partition("=")[0] not in FLAGS]:
+        raise UserError(f"unknown option {unknown[0]}. Available: {', '.join(FLAGS)}, and keys as key=value")
+    plan = plan_composition(recipe, [w for w in words if w not in flags])
+    parsed = parse(plan.overrides)
+    launcher = [str(o.value()) for o in parsed if o.key_or_group == LAUNCH]
+    sweep = bool(launcher) or any(flag in ("-m", "--multirun") for flag in flags)
+    config = resolve(plan._replace(overrides=[first_choice(o) for o in parsed] if sweep else plan.overrides))
+    check(config)
+    _check_whole(config, name)
+    if "local" in launcher and config["trainer"].get("devices", 1) != 1:
+        raise UserError("launch=local runs each job in one process. Remove launch, or trainer.devices")
+
+    def start(config: Config, task: Sequence[str]) -> int:
+        # Lightning starts further processes with these words.
+        sys.argv = [sys.argv[0], "train", name, *task, quoted(f"run.dir={config['run']['dir']}")]
+        codes.append(guarded(lambda: command(config), INTERRUPT))
+        return codes[-1]
+
+    if not flags and not sweep:
+        start(config, [word for word in plan.overrides if not word.startswith("hydra.")])
+        return
+
+    def job(config: Any) -> None:
+        hydra = HydraConfig.get()
+        if sweep:
+            config = OmegaConf.merge(config, {"run": {"dir": hydra.runtime.output_dir}})
+        resolved: Config = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)  # type: ignore[assignment]
+        check(resolved)
+        HydraConfig.instance().cfg = None  # otherwise Lightning adds words for Hydra's command line
+        task = [str(word) for word in hydra.overrides.task if not str(word).startswith(f"+{LAUNCH}=")]
+        code = start(resolved, task)
+        if code > 128 or (
+            launcher and code
+        ):  # a signal ends the whole sweep, and a failed launched job counts as failed
+            raise SystemExit(code)
+
+    fixed = [repr(o.key_or_group) for o in parsed if not o.is_sweep_override()]
+    output = [
+        "hydra.run.dir=${run.dir}",
+        "hydra.sweep.dir=${run.dir}",
+        "hydra.sweep.subdir=${hydra.job.override_dirname}",
+        f"hydra.job.config.override_dirname.exclude_keys=[{','.join(fixed)}]",
+    ]
+    if launcher:
+        say(f"waiting for the jobs; their output is in {config['run']['dir']}/.submitit")
+    if sweep and not {"-m", "--multirun"} & set(flags):
+        flags.append("--multirun")
+    _hydra(job, plan.folder, plan.stem, [*flags, *output, *plan.overrides])
+
+
+def launch(jobs: Sequence[Callable[[], int]], words: Sequence[str], folder: Path) -> None:
+    """Passes jobs to a launcher of Hydra and waits for them.
+
+    Args:
+        jobs: functions that do the work and return an exit code.
+        words: `launch=NAME`, and keys of the launcher.
+        folder: where the output of the jobs is written.
+    """
+    resolve(plan_composition(find_recipe("quickstart"), words))  # checks the words
+    say(f"waiting for the jobs; their output is in {folder}/.submitit")
+
+    def job(config: Any) -> None:
+        if code := jobs[config["job"]]():
+            raise SystemExit(code)
+
+    numbers = ",".join(map(str, range(len(jobs))))
+    launcher = [f"+{word}" if word.startswith(f"{LAUNCH}=") else word for word in words]
+    output = [f"hydra.sweep.dir={folder}", "hydra.sweep.subdir=${job}"]
+    _hydra(job, EXPERIMENTS, None, ["--multirun", *output, *launcher, f"+job={numbers}"])
+
+
+def _hydra(job: Callable[[Any], None], folder: Path, name: str | None, words: Sequence[str]) -> None:
+    sys.argv = [sys.argv[0], *words, *QUIET]
+    GlobalHydra.instance().clear()
+    hydra_main(version_base="1.3", config_path=str(folder), config_name=name)(job)()
+
+
+POSITIVE = ("val_check_interval", "log_every_n_steps", "accumulate_grad_batches")
+"""Keys of the trainer that Lightning checks only after data and model are loaded."""
+
+
+def _check_whole(config: Config, name: str) -> None:
+    """Checks that a recipe has everything that a run needs.
+
+    Raises:
+        UserError: If a part or a key is missing, or a value is out of range.
+    """
+    plain(config, name)  # otherwise the checkpoints of the run would be refused
+    for key in ("run", "trainer", "data", "representation", "task", "optimizer", "callbacks"):
+        node = config.get(key)
+        if not isinstance(node, Mapping) or (key not in ("run", "callbacks") and "_target_" not in node):
+            raise UserError(f"{name}: no {key}. Begin the recipe with the defaults of another recipe, or with /base")
+    if not config["run"].get("dir"):
+        raise UserError(f"{name}: run.dir is empty. Set it to the directory of the run")
+    if "max_steps" not in config["trainer"]:
+        raise UserError(f"{name}: trainer.max_steps is missing. Set it; -1 trains without end")
+    for key in ("denoiser", "process", "condition"):
+        if key in config and not (isinstance(config[key], Mapping) and "_target_" in config[key]):
+            raise UserError(f"{name}: {key} has no _target_. Replace it with one of experiments/{key}: {key}=...")
+    for key, value in config.get("denoiser", {}).items():
+        if isinstance(value, int) and value < 0:
+            raise UserError(f"denoiser.{key}={value}: must not be negative")
+    for key in POSITIVE:
+        value = config["trainer"].get(key)
+        if isinstance(value, int | float) and value <= 0:
+            raise UserError(f"trainer.{key}={value}: must be above 0")
+    for key in ("experiment", "seed", "ema", "logger"):
+        if key not in config:
+            raise UserError(f"{name}: no {key}. Begin the recipe with the defaults of another recipe, or with /base")

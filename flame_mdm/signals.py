@@ -1,0 +1,101 @@
+"""Signals: they end a command cleanly, or stop training at the end of a step."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from multiprocessing import active_children
+from types import FrameType
+from typing import Any, NoReturn
+
+_received: BaseException | None = None
+"""The exception of the first signal that the running command received."""
+
+
+@contextmanager
+def stoppable(signums: Sequence[int]) -> Iterator[None]:
+    """Turns signals into exceptions, so that partial files are cleaned up; the exit code is 128 + the signal."""
+    global _received
+
+    def exception(number: int) -> BaseException:
+        return KeyboardInterrupt() if number == signal.SIGINT else SystemExit(128 + number)
+
+    def stop(number: int, frame: FrameType | None) -> NoReturn:
+        global _received
+        sys.unraisablehook = lambda _: None  # of objects that were being created or deleted
+        _received = _received or exception(number)
+        raise exception(number)
+
+    hook = sys.unraisablehook
+    before = {n: signal.signal(n, stop) for n in signums if signal.getsignal(n) is not signal.SIG_IGN}
+    try:
+        yield
+    except Exception:
+        # The exception of a signal may come between any two steps of a library, whose cleanup can then fail.
+        if _received is not None:
+            raise _received from None
+        raise
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+        _received, sys.unraisablehook = None, hook
+
+
+def raise_received() -> None:
+    """Raises the exception of a signal again that the command received, because a library may have swallowed it."""
+    if _received is not None:
+        raise _received
+
+
+class StopRequest:
+    """Notes a signal that asks training to stop at the end of a step.
+
+    A second SIGINT stops immediately. So does a second SIGTERM, if it comes more than one second after the first, since
+    `timeout` sends two at once.
+
+    Attributes:
+        signum: the last signal received; 0 = none.
+    """
+
+    SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGUSR2)
+
+    def __init__(self) -> None:
+        self.signum, self.time = 0, 0.0
+        self.handlers: dict[int, Any] = {}
+
+    def install(self) -> None:
+        """Replaces the handlers of `SIGNALS`."""
+        for signum in self.SIGNALS:
+            self.handlers[signum] = signal.signal(signum, self.note)
+
+    def restore(self) -> None:
+        """Installs the previous handlers again."""
+        for signum, handler in self.handlers.items():
+            signal.signal(signum, handler)
+        self.handlers = {}
+
+    def note(self, signum: int, frame: FrameType | None) -> None:
+        """Handles a signal."""
+        repeated = self.signum == signum and time.monotonic() > self.time + 1
+        if self.signum and (signum == signal.SIGINT or (signum == signal.SIGTERM and repeated)):
+            kill_children()
+            raise SystemExit(128 + signum)
+        self.signum, self.time = signum, time.monotonic()
+        # print is not reentrant, and the signal may have interrupted another print.
+        os.write(1, b"\nstopping at the end of this step; press Ctrl-C or send SIGTERM again to stop immediately\n")
+
+
+def kill_children() -> None:
+    """Kills all child processes, including suspended ones, for which Python would wait forever."""
+    signal.signal(signal.SIGCHLD, signal.SIG_DFL)  # otherwise, torch's handler raises an error for each of them
+    for process in active_children():
+        process.kill()
+
+
+def ignore_interrupts() -> None:
+    """Leaves Ctrl-C to the parent process, in a worker process."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)

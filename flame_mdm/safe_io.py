@@ -1,28 +1,31 @@
-"""Atomic writes, hashes, and safe reading of untrusted files.
+"""Atomic writes, hashes, locks, and reading files of others.
 
 Every file that may come from other people is read here or checked here first: it must be a regular file of limited
-size, and the sizes that it declares must match its actual bytes.
+size, and the sizes that it declares must match its actual bytes. All functions that read a path raise
+`FileNotFoundError` if it does not exist, and `UserError` if it is no regular file or its content is refused.
 """
 
 from __future__ import annotations
 
 import errno
+import fcntl
 import hashlib
 import json
 import math
 import os
 import secrets
 import shutil
+import socket
 import stat
 import tokenize
 import zipfile
 import zlib
-from collections.abc import Collection, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Collection, Iterator
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
-from flame_mdm.errors import UserError, first_line
+from flame_mdm.errors import UserError, first_line, say
 
 if TYPE_CHECKING:  # `--help` must not import NumPy
     import numpy as np
@@ -55,7 +58,7 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
     The temporary name is unique, so that several processes can write the same file; the last one wins.
 
     Raises:
-        UserError: the file cannot be written, for instance because the disk is full.
+        UserError: If the file cannot be written, for instance because the disk is full.
     """
     path = Path(path)
     temporary = path.with_name(f".{path.stem[:80]}.{os.getpid()}-{secrets.token_hex(4)}{path.suffix}")
@@ -74,7 +77,7 @@ def atomic_folder(path: str | Path) -> Iterator[Path]:
     If the folder `path` exists, the new files replace files of the same name, and other files are kept.
 
     Raises:
-        UserError: `path` is a file, or something in it cannot be written.
+        UserError: If `path` is a file, or something in it cannot be written.
     """
     path = Path(path)
     if path.exists() and not path.is_dir():
@@ -100,10 +103,9 @@ def atomic_folder(path: str | Path) -> Iterator[Path]:
 
 @contextmanager
 def writing(path: Path, temporary: Path) -> Iterator[None]:
-    """Converts an `OSError` about `temporary`, a file or folder that becomes `path`, to a `UserError` about `path`.
+    """Converts every `OSError` raised while `path` is written as `temporary` to a `UserError` that names `path`.
 
-    So are errors about a folder above it, which could not be made. Errors that name other files, and errors without
-    `errno`, are not converted.
+    Errors that name neither of the two nor a folder above `path`, and errors without `errno`, pass unchanged.
     """
     try:
         yield
@@ -148,6 +150,68 @@ def write_json(path: str | Path, content: Any, indent: int | None = 2) -> None:
     write_text(path, json.dumps(content, indent=indent, allow_nan=False) + "\n")
 
 
+@contextmanager
+def naming(name: object, *errors: type[Exception], what: str = "") -> Iterator[None]:
+    """Adds the name of a file to every `UserError` about its content that does not contain it.
+
+    Errors of other kinds that this content may cause become a `UserError` that says `what` is wrong.
+    """
+    try:
+        yield
+    except UserError as error:
+        if str(name) in str(error):
+            raise
+        raise UserError(f"{name}: {first_line(error)}") from error
+    except errors as error:
+        raise UserError(f"{name}: {what}{first_line(error)}") from error
+
+
+# Locks ----------------------------------------------------------------------------------------------------------------
+
+
+@contextmanager
+def locked(path: Path, busy: Callable[[str], object], advice: str) -> Iterator[str]:
+    """Holds a lock file, with process and host in it, that no other process holds, here or on other hosts.
+
+    The operating system releases the lock when a process ends in any way, so a free lock in a file that still names a
+    process was left behind by one that died. POSIX record locks also hold between hosts on NFS and Lustre, unlike the
+    locks of `filelock`. Windows has neither.
+
+    Args:
+        path: the lock file; removed at the end.
+        busy: called with the owner if another process holds the lock; raises, or returns to wait.
+        advice: what to do on file systems without locks.
+
+    Yields:
+        The process that died and left the file behind; "" if there is none.
+    """
+    while True:
+        with made_folder(path.parent), path.open("a+") as file:
+            file.seek(0)
+            owner = file.read().strip()
+            try:
+                fcntl.lockf(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError as error:
+                if error.errno in (errno.EACCES, errno.EAGAIN):
+                    busy(owner)
+                    fcntl.lockf(file, fcntl.LOCK_EX)
+                else:
+                    say(f"{path}: this file system has no locks ({error.strerror}); {advice}")
+            try:
+                if not os.path.samestat(os.fstat(file.fileno()), path.stat()):
+                    continue  # another process holds a new file
+            except FileNotFoundError:  # the previous process has removed it
+                continue
+            with suppress(OSError):  # a full disk
+                file.truncate(0)
+                os.write(file.fileno(), f"process {os.getpid()} on {socket.gethostname()}\n".encode())
+            try:
+                yield owner
+            finally:
+                path.unlink(missing_ok=True)
+            return
+
+
 # Reading --------------------------------------------------------------------------------------------------------------
 
 
@@ -158,12 +222,7 @@ def sha256(path: str | Path) -> str:
 
 
 def regular_file(path: str | Path, limit: int | None = None) -> int:
-    """Returns the size in bytes of a regular file or of the target of a link.
-
-    Raises:
-        FileNotFoundError: the file does not exist.
-        UserError: the path is a folder, a pipe or a device, or the file has more than `limit` bytes.
-    """
+    """Returns the size in bytes, at most `limit`, of a regular file or of the target of a link."""
     try:
         status = Path(path).stat()
     except (FileNotFoundError, NotADirectoryError):
@@ -179,12 +238,7 @@ def regular_file(path: str | Path, limit: int | None = None) -> int:
 
 
 def read_text(path: str | Path, limit: int = TEXT_LIMIT) -> str:
-    """Returns the text of a UTF-8 file of at most `limit` bytes.
-
-    Raises:
-        FileNotFoundError: the file does not exist.
-        UserError: the path is not a regular file, or the file is too large, unreadable or not UTF-8.
-    """
+    """Returns the text of a UTF-8 file of at most `limit` bytes."""
     path = Path(path)
     regular_file(path, limit)
     try:
@@ -196,16 +250,10 @@ def read_text(path: str | Path, limit: int = TEXT_LIMIT) -> str:
 
 
 def read_json(path: str | Path, limit: int = TEXT_LIMIT) -> Any:
-    """Returns the content of a JSON file.
-
-    Raises:
-        FileNotFoundError: the file does not exist.
-        UserError: the file is not JSON, is nested too deeply, or contains NaN, infinity or a lone surrogate.
-    """
+    """Returns the content of a JSON file without NaN, infinity and lone surrogates."""
+    text = read_text(path, limit)
     try:
-        return parse_json(read_text(path, limit))
-    except UserError:
-        raise
+        return parse_json(text)
     except ValueError as error:
         raise UserError(f"{path}: not a JSON file: {error}") from error
 
@@ -226,11 +274,9 @@ def parse_json(text: str | bytes) -> Any:
 
 
 def read_yaml(path: str | Path) -> Any:
-    """Returns the plain content of a YAML file; interpolations such as `${a}` are kept as texts.
+    """Returns the plain content of a YAML file, limited in size after its aliases are expanded.
 
-    Raises:
-        FileNotFoundError: the file does not exist.
-        UserError: the file is not YAML, is nested too deeply, or is too large before or after expanding aliases.
+    Interpolations such as `${a}` are kept as texts.
     """
     import yaml
     from omegaconf import OmegaConf
@@ -248,10 +294,10 @@ def read_yaml(path: str | Path) -> Any:
         raise UserError(f"{path}: not a readable YAML file: {first_line(error)}") from error
 
 
-def _nodes(node: Any, known: dict[int, float]) -> float:
+def _nodes(node: Any, counted: dict[int, float]) -> float:
     """Returns the number of nodes of a YAML file with its aliases expanded; infinite if one contains itself."""
-    if id(node) not in known:
-        known[id(node)] = math.inf
+    if id(node) not in counted:
+        counted[id(node)] = math.inf
         content = node.value if node is not None else ""
         if getattr(node, "tag", "").endswith(":int") and len(content) > YAML_DIGITS:
             # As keys, large integers could be chosen so that all have the same hash.
@@ -259,8 +305,11 @@ def _nodes(node: Any, known: dict[int, float]) -> float:
         if isinstance(content, str):
             content.encode()  # a lone surrogate cannot be written again
         parts = [part for pair in content for part in (pair if isinstance(pair, tuple) else [pair])]
-        known[id(node)] = 1 + sum(_nodes(part, known) for part in parts if hasattr(part, "value"))
-    return known[id(node)]
+        counted[id(node)] = 1 + sum(_nodes(part, counted) for part in parts if hasattr(part, "value"))
+    return counted[id(node)]
+
+
+# Arrays, archives and checkpoints -------------------------------------------------------------------------------------
 
 
 def read_npz(
@@ -279,29 +328,19 @@ def read_npz(
         header: read only the first row of arrays of two and more dimensions; all their rows are that one.
 
     Raises:
-        FileNotFoundError: the file does not exist.
-        UserError: the path is not a regular file.
-        ValueError: the file is damaged or encrypted, contains objects, declares wrong sizes, or expands to more than
-            `ARRAYS_LIMIT` bytes and more than `INFLATION` times its size.
+        UserError: If the file is damaged or encrypted, contains objects, declares wrong sizes, or expands to more than
+            `ARRAYS_LIMIT` bytes and more than `INFLATION` times its size. The message names the path, if any.
     """
-    if isinstance(source, Path):
-        regular_file(source)
-        with source.open("rb") as file:
-            return read_npz(file, skip=skip, only=only, header=header)
-    try:
-        size = source.seek(0, os.SEEK_END)
-        with zipfile.ZipFile(source) as archive:
-            members = {member.filename.removesuffix(".npy"): member for member in archive.infolist()}
-            wanted = {n: m for n, m in members.items() if n not in skip and (only is None or n in only)}
-            check_expansion(sum(member.file_size for member in wanted.values()), size)
-            arrays = {}
-            for name, member in wanted.items():
-                check_member(member)
-                with archive.open(member) as file:
-                    arrays[name] = _array(file, member.file_size, name, header=header)
-            return arrays
-    except (*ZIP_ERRORS, OSError, ValueError) as error:
-        raise ValueError(f"damaged, or not a file of plain arrays: {first_line(error)}") from error
+    with _opened(source) as (file, size), zipfile.ZipFile(file) as archive:
+        members = {member.filename.removesuffix(".npy"): member for member in archive.infolist()}
+        members = {n: m for n, m in members.items() if n not in skip and (only is None or n in only)}
+        check_expansion(sum(member.file_size for member in members.values()), size)
+        arrays = {}
+        for name, member in members.items():
+            check_member(member)
+            with archive.open(member) as content:
+                arrays[name] = _array(content, member.file_size, name, header)
+        return arrays
 
 
 def read_npy(source: Path | IO[bytes], *, mmap: bool = False, header: bool = False) -> np.ndarray:
@@ -312,122 +351,94 @@ def read_npy(source: Path | IO[bytes], *, mmap: bool = False, header: bool = Fal
         mmap: memory-map the file, read-only, instead of loading it; requires a path.
         header: as in `read_npz`.
     """
-    if isinstance(source, Path):
-        regular_file(source)
-        with source.open("rb") as file:
-            return read_npy(file, header=header) if not mmap else _npy(file, mmap, header)
-    return _npy(source, mmap, header)
+    import numpy as np
+
+    with _opened(source) as (file, size):
+        array = _array(file, size, "the array", header or mmap)
+        return np.load(source, "r", allow_pickle=False) if mmap and array.size else array
 
 
-def _npy(file: IO[bytes], mmap: bool, header: bool) -> np.ndarray:
-    size = file.seek(0, os.SEEK_END)
-    file.seek(0)
+@contextmanager
+def _opened(source: Path | IO[bytes]) -> Iterator[tuple[IO[bytes], int]]:
+    """Yields a file of arrays and its size; errors that are raised for damaged content become `UserError`."""
+    with ExitStack() as stack:
+        name = ""
+        if isinstance(source, Path):
+            regular_file(source)
+            name, source = f"{source}: ", stack.enter_context(source.open("rb"))
+        size = source.seek(0, os.SEEK_END)
+        source.seek(0)
+        try:
+            yield source, size
+        except (*ZIP_ERRORS, OSError, ValueError) as error:
+            raise UserError(f"{name}damaged, or not a file of plain arrays: {first_line(error)}") from error
+
+
+def _array(file: IO[bytes], size: int, name: str, header: bool) -> np.ndarray:
+    """Returns the array of an .npy file of `size` bytes, which its header must declare before memory is allocated."""
+    import numpy as np
+    from numpy.lib import format as npy
+
     try:
-        return _array(file, size, "the array", mmap, header)
-    except ValueError as error:
-        raise ValueError(f"damaged, or not a file of plain arrays: {first_line(error)}") from error
+        read_header = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}[npy.read_magic(file)]
+        shape, is_fortran, dtype = read_header(file)
+    except KeyError as error:
+        raise ValueError(f"{name}: its format is {error}, not 1.0 or 2.0") from error
+    except (ValueError, EOFError, TypeError, RecursionError, MemoryError, SyntaxError, tokenize.TokenError) as error:
+        raise ValueError(f"{name}: not an array: {first_line(error)}") from error
+    if dtype.hasobject:
+        raise ValueError(f"{name}: an array of Python objects, which could run code")
+    count = math.prod(shape)
+    if min(shape, default=0) < 0 or file.tell() + count * dtype.itemsize != size or (not dtype.itemsize and count > 1):
+        raise ValueError(f"{name}: its header declares {shape} of {dtype}, which does not match the content")
+    if header and count and len(shape) > 1 and not is_fortran:
+        row = np.frombuffer(file.read(count // shape[0] * dtype.itemsize), dtype)
+        return np.broadcast_to(row.reshape(1, *shape[1:]), shape)
+    file.seek(0)
+    return npy.read_array(file, allow_pickle=False)
 
 
 def check_member(member: zipfile.ZipInfo) -> None:
-    """Raises `ValueError` if a member of a zip archive is encrypted, or compressed with another method than deflate.
+    """Raises `UserError` if a member of a zip archive is encrypted, or compressed with another method than deflate.
 
     Only for deflate does `zipfile` limit the bytes unpacked at a time by the declared size.
     """
     if member.flag_bits & 1:
-        raise ValueError(f"{member.filename}: encrypted")
+        raise UserError(f"{member.filename}: encrypted")
     if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-        raise ValueError(f"{member.filename}: compressed with method {member.compress_type}, not deflate")
+        raise UserError(f"{member.filename}: compressed with method {member.compress_type}, not deflate")
 
 
 def read_torch(path: Path) -> Any:
-    """Returns the plain values and tensors in a file written by `torch.save`; code in the file is never executed.
-
-    Raises:
-        FileNotFoundError: the file does not exist.
-        UserError: the path is not a regular file.
-        ValueError: the file is damaged, contains other objects, or is compressed.
-    """
+    """Returns the plain values and tensors in a file written by `torch.save`; code in the file is never executed."""
     import torch
 
     check_torch(path)
     try:
         return torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # torch raises many kinds of errors for damaged files and other pickles
-        raise ValueError(f"damaged, or not a file of plain values and tensors: {first_line(error)}") from error
+        raise UserError(f"{path}: damaged, or not a file of plain values and tensors: {first_line(error)}") from error
 
 
 def check_torch(path: Path) -> None:
-    """Checks sizes and checksums of an archive, which `torch.load` does not check.
-
-    Raises:
-        FileNotFoundError, UserError, ValueError: see `read_torch`.
-    """
+    """Checks sizes and checksums of an archive of `torch.save`, which `torch.load` does not check."""
     size = regular_file(path)
     with path.open("rb") as file:
         if file.read(4) != b"PK\3\4":  # formats of old versions, which are not archives
             return
-    try:
-        with zipfile.ZipFile(path) as archive:
-            members = archive.infolist()
-            if any(member.compress_type for member in members) or sum(m.file_size for m in members) > size:
-                raise ValueError("damaged: its parts are compressed or overlap, and torch.save compresses none")
-            if (spoiled := archive.testzip()) is not None:
-                raise ValueError(f"damaged: the checksum of {spoiled} is wrong")
-    except (*ZIP_ERRORS, OSError) as error:
-        raise ValueError(f"damaged, or not a file of torch.save: {first_line(error)}") from error
+    damage = naming(path, *ZIP_ERRORS, OSError, what="damaged, or not a file of torch.save: ")
+    with damage, zipfile.ZipFile(path) as archive:
+        members = archive.infolist()
+        if any(member.compress_type for member in members) or sum(m.file_size for m in members) > size:
+            raise UserError("damaged: its parts are compressed or overlap, and torch.save compresses none")
+        if (spoiled := archive.testzip()) is not None:
+            raise UserError(f"damaged: the checksum of {spoiled} is wrong")
 
 
 def check_expansion(expanded: int, packed: int) -> None:
-    """Raises `ValueError` if compressed content expands disproportionately."""
+    """Raises `UserError` if compressed content expands disproportionately."""
     if expanded > max(ARRAYS_LIMIT, INFLATION * packed):
-        raise ValueError(f"its {_size(packed)} expand to {_size(expanded)}; motion data does not")
-
-
-def _array(file: IO[bytes], size: int, name: str, mmap: bool = False, header: bool = False) -> np.ndarray:
-    """Returns the array of an .npy file whose header declares exactly the size of the content.
-
-    Args:
-        file: open file, positioned at its beginning.
-        size: size of the file in bytes.
-        name: name of the array in error messages.
-        mmap, header: as in `read_npy`.
-    """
-    import numpy as np
-
-    try:
-        version = np.lib.format.read_magic(file)
-        readers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
-        if version not in readers:
-            raise ValueError(f"its format is {version[0]}.{version[1]}, not 1.0 or 2.0")
-        shape, fortran, dtype = readers[version](file)
-    except (ValueError, EOFError, TypeError, RecursionError, MemoryError, SyntaxError, tokenize.TokenError) as error:
-        raise ValueError(f"{name}: not an array: {first_line(error)}") from error
-    if dtype.hasobject:
-        raise ValueError(f"{name}: an array of Python objects, which could run code")
-    count, begin = math.prod(shape), file.tell()
-    if min(shape, default=0) < 0 or begin + count * dtype.itemsize != size or (not dtype.itemsize and count > 1):
-        raise ValueError(f"{name}: its header declares {shape} of {dtype}, which does not match the content")
-    order = "F" if fortran else "C"
-    if mmap and count:
-        return np.memmap(file, dtype, "r", begin, shape, order)
-    header = header and bool(count) and len(shape) > 1 and not fortran
-    rows = (1, *shape[1:]) if header else shape
-    content = bytearray(math.prod(rows) * dtype.itemsize)
-    array = np.ndarray(rows, dtype, content, order=order)
-    if _read_into(file, content) < len(content):
-        raise ValueError(f"{name}: it ends too early")
-    return np.broadcast_to(array, shape) if header else array
-
-
-def _read_into(file: Any, content: bytearray) -> int:
-    """Fills `content` from a file and returns the number of bytes read."""
-    view, done = memoryview(content), 0
-    while done < len(view):
-        count = file.readinto(view[done : done + MEBIBYTE])
-        if not count:
-            break
-        done += count
-    return done
+        raise UserError(f"its {_size(packed)} expand to {_size(expanded)}; motion data does not")
 
 
 def _size(count: float) -> str:

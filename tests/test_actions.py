@@ -57,8 +57,7 @@ CONTENT = {
     "poses": [np.arange(6.0).reshape(2, 3), np.asfortranarray(np.arange(6).reshape(2, 3))],
     "ragged": ragged,
     "y": [np.int64(3), 2, True],
-    "number": (np.float32(0.5), 1.5, None, 2 + 1j),
-    "names": {"a", "ä"},
+    "number": (np.float32(0.5), 1.5, None),
     "raw": b"\x00\xff",
     "big": np.arange(3, dtype=">i2"),
     "texts": np.array(["a", "bc"]),
@@ -74,7 +73,6 @@ def test_arrays_and_plain_values_are_read(protocol: int, core: str, tmp_path: Pa
     (tmp_path / "x.pkl").write_bytes(data)
     found = restricted_pickle.read(tmp_path / "x.pkl")
     assert found["number"] == CONTENT["number"]
-    assert found["names"] == CONTENT["names"]
     assert found["raw"] == CONTENT["raw"]
     assert found["y"] == CONTENT["y"]
     assert found["big"].tolist() == [0, 1, 2]
@@ -338,7 +336,7 @@ def test_smpls_offsets_come_from_its_file_without_running_code(tmp_path: Path, m
         with pytest.raises(ValueError, match=r"it names (scipy|copy_?reg)"):
             restricted_pickle.read(path)
     path = written(tmp_path / "bad.pkl", smpl_model(v_template=Attack(os.mkdir, str(tmp_path / "run"))))
-    with pytest.raises(ValueError, match=r"not a SMPL model of 24 joints: .*it names posix\.mkdir"):
+    with pytest.raises(ValueError, match=r"bad\.pkl: not read as a pickle: it names posix\.mkdir"):
         load_offsets(path)
     assert not (tmp_path / "run").exists()
     for name, value in {"J_regressor": np.ones((52, 50)), "v_template": 3, "kintree_table": np.zeros((2, 24))}.items():
@@ -468,7 +466,7 @@ def test_front_view_is_actors_camera():
         ("names.txt", "a0_p001.avi\n", r"names\.txt, line 1: 'a0_p001\.avi' is not the name of a video"),
         ("names.txt", "a40_d0_p001_c1_color.avi\n", r"names\.txt, line 1: .* one of the 40 actions"),
         ("num_frames_min.txt", "3\n", r"num_frames_min\.txt 1 and vibe_cache_refined\.pkl 60 clips"),
-        ("names.txt", None, r"info/names\.txt: no such file; it is part of the data set"),
+        ("names.txt", None, r"info/names\.txt: not found; it is published with the poses"),
     ],
 )
 def test_damaged_lists_are_named(file: str, text: str | None, message: str, tmp_path: Path):
@@ -490,6 +488,6 @@ def test_other_shapes_are_named(tmp_path: Path):
 
 def test_action_sets_are_not_resampled(tmp_path: Path):
     write_humanact12(tmp_path / "raw")
-    with pytest.raises(ValueError, match=r"humanact12: .* representation\.fps=20"):
+    with pytest.raises(ValueError, match=r"humanact12 has 20 frames .* representation\.fps=20"):
         next(HumanAct12(str(tmp_path / "raw")).clips(30.0))
     assert Rot6D().fps == humanact12.FPS

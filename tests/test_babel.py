@@ -107,7 +107,7 @@ def row_of(window: Window) -> list[int]:
 @pytest.mark.parametrize("stem", ["rules"])
 def test_clips_are_those_of_flame(stem: str, tmp_path: Path):
     source = coded(tmp_path, golden(stem))
-    found = sorted(row_of(window) for window in source.windows())
+    found = sorted(row_of(window) for window in source.windows)
     assert found == sorted(golden(stem)["babel_clips"].tolist())
     clips = list(source.clips(FPS))
     assert source.count() == len(clips) == len(found)
@@ -150,12 +150,12 @@ def small(tmp_path: Path) -> tuple[Path, Path]:
 def test_labels_become_texts_and_bad_ones_are_counted(small: tuple[Path, Path]):
     babel, amass = small
     source = open_babel(babel, amass)
-    texts = [(w.label.text, w.start) for w in source.windows() if w.motion.endswith("/01_01_poses")]
+    texts = [(w.label.text, w.start) for w in source.windows if w.motion.endswith("/01_01_poses")]
     walks = [("walk", 0), ("walk", 10), ("walk", 20), ("walk", 30)]
     moves = [("move", start) for _, start in walks]
     assert sorted(texts) == sorted([*walks, *moves, ("step", 20), ("wave", 40)])
-    assert "another annotator" not in {window.label.text for window in source.windows()}
-    assert source.excluded() == {
+    assert "another annotator" not in {window.label.text for window in source.windows}
+    assert source.excluded == {
         "transitions": 21,
         "labels that end before they start": 42,
         "labels without a time": 21,
@@ -207,13 +207,13 @@ def test_the_official_training_set_stays_whole_and_val_is_divided_by_motion(tmp_
     }
     source = open_babel(write_babel(tmp_path / "babel", sequences), tmp_path / "amass")
     splits: dict[str, set[str]] = {"train": set(), "val": set(), "test": set()}
-    for window in source.windows():
+    for window in source.windows:
         assert window.split == "train" if window.id.startswith("train") else window.split in ("val", "test")
         splits[window.split].add(window.motion)
     assert {split: len(motions) for split, motions in splits.items()} == {"train": 24, "val": 28, "test": 8}
     assert len(set().union(*splits.values())) == 60, "a motion in two splits"
-    assert source.excluded() == {"labels of the val part on motions of the train part": 1}
-    flames = Counter(w.split for w in open_babel(tmp_path / "babel", tmp_path / "amass", True).windows())
+    assert source.excluded == {"labels of the val part on motions of the train part": 1}
+    flames = Counter(w.split for w in open_babel(tmp_path / "babel", tmp_path / "amass", True).windows)
     assert flames["val"] + flames["test"] == 4 * 37
 
 
@@ -251,7 +251,7 @@ def test_absent_and_damaged_motions_are_named(small: tuple[Path, Path]):
     [
         ("{", r"val\.json: not a JSON file"),
         ("[1]", r"val\.json: not in the layout of BABEL"),
-        ('{"1": {"feat_p": "a/b"}}', r"val\.json: not in the layout of BABEL v1\.0: KeyError\('frame_ann'\)"),
+        ('{"1": {"feat_p": "a/b"}}', r"val\.json: not in the layout of BABEL v1\.0: 'frame_ann'"),
     ],
 )
 def test_damaged_labels_are_named(content: str, message: str, small: tuple[Path, Path]):

@@ -497,7 +497,7 @@ def test_a_cut_archive_is_named(tiny, tmp_path):
     with tarfile.open(path, "w:xz") as archive:
         archive.add(tiny, "set")
     os.truncate(path, path.stat().st_size // 2)
-    with pytest.raises(ValueError, match=r"cut.tar.xz: damaged archive: "):
+    with pytest.raises(ValueError, match=r"cut.tar.xz: damaged archive"):
         Bandai(str(path)).count()
 
 

@@ -314,7 +314,7 @@ def test_motions_are_excluded_by_name(arrays: Path):
     (arrays / "one.npy").write_bytes(b"")
     source = Folder(str(arrays), exclude=["one"])
     assert [clip.id for clip in source.clips(20.0)] == ["deep_two", "three"]
-    assert source.excluded() == {"motions by data.source.exclude": 1}
+    assert source.excluded == {"motions by data.source.exclude": 1}
     with pytest.raises(ValueError, match="no motion won"):
         Folder(str(arrays), exclude=["won"]).count()
     with pytest.raises(ValueError, match=r"one\.npy: damaged"):

@@ -238,13 +238,13 @@ def set_nan(folder):
         (lambda f: motion(f).write_bytes(b""), r"000001\.npy: damaged"),
         (lambda f: np.save(motion(f), np.zeros((3, 4, 5))), r"000001\.npy: shape \(3, 4, 5\)"),
         (lambda f: np.save(motion(f), np.zeros((50, 4))), r"clip 000001: shape \(50, 4\)"),
-        (lambda f: (f / "Mean.npy").unlink(), r"Mean\.npy: no such file; clone"),
+        (lambda f: (f / "Mean.npy").unlink(), r"Mean\.npy: not found; clone"),
         (lambda f: np.save(f / "Std.npy", np.zeros(263)), "is not a mean or positive std"),
         (lambda f: (f / "test.txt").write_text("000000\n"), r"test\.txt: 000000 is also in train\.txt"),
         (lambda f: (f / "val.txt").write_text("M000000\n"), r"is also in train\.txt"),
-        (lambda f: (f / "val.txt").unlink(), r"val\.txt: no such list of names"),
+        (lambda f: (f / "val.txt").unlink(), r"val\.txt: not found; clone"),
         (lambda f: (f / "texts/000001.txt").write_text("ok#a/DET#0#0\nno tags\n"), r"000001\.txt, line 2: not caption"),
-        (shutil.rmtree, r"HumanML3D: no such folder; clone"),
+        (shutil.rmtree, r"HumanML3D: not found; clone"),
     ],
 )
 def test_a_damaged_folder_is_named(folder, tmp_path, damage, message):
@@ -270,7 +270,7 @@ def test_damaged_motions_can_be_excluded(folder, tmp_path):
     store = write_store(tmp_path / "store", source, legacy())
     assert not {"000001", "M000000", "000005"} & {clip.id for clip in store.clips}
     assert store.info["excluded"]["names by data.source.exclude"] == 3
-    with pytest.raises(ValueError, match=r"data\.source\.exclude: no split contains 7"):
+    with pytest.raises(ValueError, match=r"data\.source\.exclude: .* has no 7"):
         HumanML3D(str(folder), exclude=["7"]).count()
 
 
@@ -531,7 +531,7 @@ def body_of_55_joints(root):
     [
         (smplx, r"kick_high_left02_poses\.npz: this is AMASS's SMPL-X release; download the SMPL\+H G release"),
         (rename_as_smplx, r"KIT: this is the SMPL-X release \(files end in _stageii\); download SMPL\+H G"),
-        (truncate_archive, r"KIT\.tar\.bz2: damaged archive: .*; download it again"),
+        (truncate_archive, r"KIT\.tar\.bz2: damaged archive, download it again: "),
         (
             archive_without_recording,
             r"BMLrub\.tar\.bz2: 1 recordings are missing in the archive, such as BioMotionLab",
@@ -554,11 +554,11 @@ def body_of_55_joints(root):
             lambda r: shutil.rmtree(r / "amass" / "BMLrub"),
             r"cannot be created: BioMotionLab_NTroje: missing \(1 recordings\); .* BioMotionLab_NTroje or BMLrub",
         ),
-        (lambda r: shutil.rmtree(r / "amass"), r"amass: no such folder; register at https://amass"),
+        (lambda r: shutil.rmtree(r / "amass"), r"amass: not found; register at https://amass"),
         (lambda r: shutil.rmtree(r / "bodies"), r"bodies: contains neither male/model\.npz nor SMPLH_MALE\.npz"),
-        (lambda r: truncate(r / "bodies/smplh/male/model.npz"), r"male/model\.npz: damaged or not an SMPL\+H model"),
+        (lambda r: truncate(r / "bodies/smplh/male/model.npz"), r"male/model\.npz: damaged"),
         (body_of_55_joints, r"male/model\.npz: a model with 55 joints, not SMPL\+H with 52"),
-        (lambda r: (r / "HumanML3D/index.csv").unlink(), r"index\.csv: no such file"),
+        (lambda r: (r / "HumanML3D/index.csv").unlink(), r"index\.csv: not found"),
         (lambda r: (r / "HumanML3D/index.csv").write_text("a,b\n1,2\n"), r"index\.csv, line 2: not a clip"),
         (lambda r: shutil.rmtree(r / "HumanML3D/pose_data"), r"1 clips of HumanAct12 are missing, such as P11G01R02"),
         (lambda r: truncate(r / "HumanML3D/pose_data/humanact12.zip"), r"humanact12\.zip: damaged archive"),

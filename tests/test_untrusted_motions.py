@@ -85,8 +85,8 @@ def zip_bomb(name: str, start: bytes = b"") -> bytes:
     return stream.getvalue()
 
 
-def bvh_at(seconds: str, frames: int = 3) -> bytes:
-    return bvh(frames).replace("Frame Time: 0.05", f"Frame Time: {seconds}").encode()
+def bvh_at(seconds: str) -> bytes:
+    return bvh().replace("Frame Time: 0.05", f"Frame Time: {seconds}").encode()
 
 
 JOINTS = body(4).astype(float)
@@ -272,7 +272,7 @@ def archive_cases() -> Iterator[tuple[bytes, str]]:
     yield member("@LongLink", 10**10, tarfile.GNUTYPE_LONGNAME) + bytes(1024), "a header of"
     yield member("x", 10**10, tarfile.XHDTYPE) + bytes(1024), "a header of"
     for kind, values, says in (
-        (tarfile.XGLTYPE, 200, "200 header values apply"),
+        (tarfile.XGLTYPE, 200, "data.source.exclude="),
         (tarfile.XHDTYPE, 10_000, "a header of"),
     ):
         records = b"".join(b"%d k%d=v\n" % (len(f"k{n}=v\n") + 3, n) for n in range(10_000, 10_000 + values))
@@ -369,18 +369,18 @@ PICKLES = {
     "number": (b"\x80\x04\x8b" + struct.pack("<i", 2**31 - 1) + b"x.", "too early"),
     "frame": (b"\x80\x04\x95" + struct.pack("<Q", 10**12) + b"N.", "too early"),
     "memo": (b"\x80\x04Nr\xff\xff\xff\x7f.", "must contain"),
-    "tuples": (b"\x80\x04})" + b"\x85" * 10**6 + b"Ns.", "nested too deeply"),
+    "tuples": (b"\x80\x04})" + b"\x85" * 10**6 + b"Ns.", "is not text"),
     "lists": (b"\x80\x04" + b"](" * 10**5 + b"e" * 10**5 + b".", "nested too deeply"),
-    "doubled": (doubled(60), "more than its size"),
+    "doubled": (doubled(60), "expand to"),
     "cycle": (b"\x80\x04]\x94h\x00a.", "nested too deeply"),
-    "integers": (pickle.dumps({n * (2**61 - 1): 0 for n in range(2**10)}, 4), "more than 64 bits"),
-    "complex": (pickle.dumps({complex(-1_000_003 * n, n): 0 for n in range(1, 2**10)}, 4), "neither a number nor text"),
-    "complexes": (pickle.dumps({complex(-1_000_003 * n, n) for n in range(1, 2**10)}, 4), "neither a number nor text"),
-    "frozen": (pickle.dumps(frozenset([(1, 2), (3, 4)]), 4), "neither a number nor text"),
-    "old set": (pickle.dumps({(1, 2), (3, 4)}, 2), "neither a number nor text"),
-    "one key": (pickle.dumps({1j: 0}, 4), "neither a number nor text"),
-    "old dictionary": (b"((I1\nI2\ntI3\nd.", "neither a number nor text"),
-    "digits": (b"L" + b"9" * 30 + b"L\n.", "more than 64 bits"),
+    "integers": (pickle.dumps({n * (2**61 - 1): 0 for n in range(2**10)}, 4), "is not text"),
+    "complex": (pickle.dumps({complex(-1_000_003 * n, n): 0 for n in range(1, 2**10)}, 4), "it names builtins.complex"),
+    "complexes": (pickle.dumps({complex(-1_000_003 * n, n) for n in range(1, 2**10)}, 4), "a set"),
+    "frozen": (pickle.dumps(frozenset([(1, 2), (3, 4)]), 4), "a set"),
+    "old set": (pickle.dumps({(1, 2), (3, 4)}, 2), "it names __builtin__.set"),
+    "one key": (pickle.dumps({1j: 0}, 4), "it names builtins.complex"),
+    "old dictionary": (b"((I1\nI2\ntI3\nd.", "is not text"),
+    "digits": (b"L" + b"9" * 30 + b"L\n.", "must contain"),
     "attributes": (b"\x80\x04c_codecs\nencode\n}\x8c\x01aNsb.", "sets attributes"),
 }
 
@@ -398,7 +398,7 @@ def test_repeated_arrays_of_a_pickle_count_each_time(tmp_path: Path):
     (tmp_path / "few.pkl").write_bytes(pickle.dumps([array] * 5))
     assert len(restricted_pickle.read(tmp_path / "few.pkl")) == 5
     (tmp_path / "many.pkl").write_bytes(pickle.dumps([array] * 1000))
-    with pytest.raises(ValueError, match="more than its size"):
+    with pytest.raises(ValueError, match="expand to"):
         restricted_pickle.read(tmp_path / "many.pkl")
 
 

@@ -1,16 +1,21 @@
 """Data sets: reading published releases, packing them into stores, and serving training batches."""
 
 import hashlib
-import inspect
-import json
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping
+from collections import Counter
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal, Self
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal, TypeVar, get_args
 
 import numpy as np
 
+from flame_mdm.errors import UserError
+
 Split = Literal["train", "val", "test"]
+SPLITS: tuple[Split, ...] = get_args(Split)
+Value = TypeVar("Value")
 
 
 @dataclass
@@ -46,18 +51,15 @@ class Clip:
     reference: np.ndarray | None = None
 
 
-PLACES = frozenset({"path", "amass", "body_models", "humanact12", "index", "splits", "workers"})
-"""Arguments of sources that say where files are and how to read them. All others define the data."""
-
-
 class MotionSource(ABC):
     """A data set in the form in which it is published."""
 
     name: str
     named_by_recipe: bool = False
     """Whether the name of the data set is `data.name` of the recipe, because the files are the user's own."""
-    options: Mapping[str, Any]
-    """Arguments that define the data (all but `PLACES`), as JSON values. They are saved in the store."""
+    options: Mapping[str, Any] = {}
+    """Arguments of the constructor that define the data, as JSON values; not those that say where files are and how to
+    read them. They are saved in the store, and commands compare them with the recipe's."""
     actions: tuple[str, ...] = ()
     """Names of the action labels, in the order of their numbers; empty for sets without labels."""
     captions_may_be_shared: bool = False
@@ -68,24 +70,10 @@ class MotionSource(ABC):
     workers: int = 0
     """Number of processes that read and encode; 0 = one per core, 1 = this process only."""
 
-    def __new__(cls, *args: Any, **kwargs: Any) -> Self:
-        """Keeps the arguments of the constructor as `options`."""
-        source = super().__new__(cls)
-        signature = inspect.signature(cls.__init__)
-        bound = signature.bind_partial(source, *args, **kwargs)
-        bound.apply_defaults()
-        variadic = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
-        options = {
-            name: bound.arguments[name]
-            for name, parameter in signature.parameters.items()
-            if name in bound.arguments and name not in {"self", *PLACES} and parameter.kind not in variadic
-        }
-        source.options = json.loads(json.dumps(options, default=str))
-        return source
-
-    def excluded(self) -> dict[str, int]:
-        """Returns the number of clips or labels left out, by reason; complete once `clips` is exhausted."""
-        return {}
+    @cached_property
+    def excluded(self) -> Counter[str]:
+        """Number of clips or labels left out, by reason; complete once `clips` is exhausted. Saved in the store."""
+        return Counter()
 
     def counts(self) -> Mapping[str, float]:
         """Returns the figures of the raw data under the names of `published.yaml`; saved once `clips` is exhausted."""
@@ -100,7 +88,8 @@ class MotionSource(ABC):
         """Returns the number of clips that `clips` yields, without reading motions; used by the progress bar.
 
         Raises:
-            FileNotFoundError: the raw data is not at the path in the recipe; the message says how to get it.
+            FileNotFoundError: If the raw data is not at the path in the recipe; the message says how to get it.
+            UserError: If a file is damaged, or an option does not fit the data.
         """
 
     def check(self) -> list[str]:
@@ -113,14 +102,62 @@ class MotionSource(ABC):
 
     @abstractmethod
     def clips(self, fps: float) -> Iterator[Clip]:
-        """Yields all clips at `fps` frames per second, always in the same order.
+        """Yields all clips at `fps` frames per second, always in the same order; raises the errors of `count`."""
 
-        Raises:
-            ValueError: a file is damaged; the message names it.
-        """
+    def check_fps(self, fps: float, published: float) -> None:
+        """Raises `UserError` if a set that is not resampled is requested at another frame rate."""
+        if fps != published:
+            raise UserError(
+                f"{self.name} has {published:g} frames per second, but representation.fps is {fps:g}. Set "
+                f"representation.fps={published:g}"
+            )
+
+
+# What the readers of data sets share ----------------------------------------------------------------------------------
+
+
+def required(path: Path, get_it: str) -> Path:
+    """Returns a path; raises `FileNotFoundError`, which says how to get the data set, if nothing is there."""
+    if not path.exists():
+        raise FileNotFoundError(f"{path}: not found; {get_it}")
+    return path
+
+
+def some(names: Iterable[str]) -> str:
+    """Returns the first five names, sorted, and the number of the others."""
+    first = sorted(names)
+    return ", ".join(first[:5]) + (f" and {len(first) - 5} more" if len(first) > 5 else "")
+
+
+def without(named: Mapping[str, Value], exclude: Collection[str], path: Path) -> dict[str, Value]:
+    """Returns the values of names that `data.source.exclude` does not contain.
+
+    Raises:
+        UserError: If it contains an unknown name.
+    """
+    if unknown := set(exclude) - named.keys():
+        raise UserError(f"data.source.exclude: {path} has no {some(unknown)}")
+    return {name: value for name, value in named.items() if name not in exclude}
+
+
+def name_hash(name: str) -> int:
+    """Returns 160 bits that are a function of a name on any machine."""
+    return int(hashlib.sha1(name.encode()).hexdigest(), 16)
 
 
 def hashed_split(name: str, val: int, test: int) -> Split:
     """Holds out `val` and `test` percent of all names by a hash of the name, so that adding names moves no others."""
-    share = int(hashlib.sha1(name.encode()).hexdigest()[:8], 16) % 100
+    share = (name_hash(name) >> 128) % 100
     return "train" if share < 100 - val - test else "val" if share < 100 - test else "test"
+
+
+def split_blocks(name: str, clips: int, size: int, *, val: float, test: float) -> dict[int, Split]:
+    """Returns the split of each block of `size` consecutive clips, drawn by a hash of `name` and its number.
+
+    Neighboring clips may come from one recording and look alike. `val` and `test` are shares of the blocks, at least
+    one block each.
+    """
+    blocks = sorted(range(-(-clips // size)), key=lambda block: name_hash(f"{name}_{block}"))
+    held_out = [max(1, round(share * len(blocks))) for share in (test, val)]
+    splits: list[Split] = ["test"] * held_out[0] + ["val"] * held_out[1]
+    return dict(zip(blocks, splits + ["train"] * len(blocks), strict=False))

@@ -17,13 +17,13 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 import torch
 
-from flame_mdm.data import archives
+from flame_mdm.data import archives, required
 from flame_mdm.data.parallel import cores, in_order
 from flame_mdm.errors import UserError
 from flame_mdm.formats.resampling import check_frames, frame_rate
 from flame_mdm.representations import rotation
 from flame_mdm.representations.skeleton import SMPL22, forward_kinematics
-from flame_mdm.safe_io import read_npz
+from flame_mdm.safe_io import naming, read_npz
 
 SUBSETS = {
     "ACCAD": ("ACCD",),
@@ -52,12 +52,13 @@ SUBSETS = {
 }
 """Folder of each subset in the archives that HumanML3D was made from -> its other names (web page, later releases)."""
 
-Wanted = TypeVar("Wanted")
+Argument = TypeVar("Argument")
 Result = TypeVar("Result")
 ARCHIVE_ENDINGS = (".tar.bz2", ".tar.xz", ".tar.gz", ".tar")
 CHUNK = 32
-_Place = Path | dict[str, Path]
+_Files = Path | dict[str, Path]
 """An archive, or a mapping from key to file."""
+GET_IT = "register at https://amass.is.tue.mpg.de, download the SMPL+H G archives and put them there"
 
 
 def _plain(name: str) -> str:
@@ -81,13 +82,10 @@ class Recording(NamedTuple):
 
         For 20 fps, every second frame is kept at 59.94 Hz and every twelfth at 250 Hz, so the resulting rate is only
         approximately `fps`.
-
-        Raises:
-            ValueError: the recording has a frame rate below `fps`.
         """
         step = int(self.fps / fps)
         if step < 1:
-            raise ValueError(f"recorded at {self.fps:g} frames per second, fewer than the requested {fps:g}")
+            raise UserError(f"recorded at {self.fps:g} frames per second, fewer than the requested {fps:g}")
         return self._replace(poses=self.poses[::step], translation=self.translation[::step])
 
 
@@ -113,38 +111,26 @@ def subset_of(key: str) -> str:
 
 
 def read(file: Path | bytes, name: str) -> Recording:
-    """Reads a recording; `name` is used in error messages.
-
-    Raises:
-        ValueError: the file is not an SMPL+H file of AMASS, is damaged, or contains non-finite numbers.
-    """
-    try:
+    """Reads a recording, whose numbers must be finite; `name` is used in error messages."""
+    with naming(name, ValueError):
         data = read_npz(io.BytesIO(file) if isinstance(file, bytes) else file, skip=("dmpls", "marker_data"))
-    except UserError:
-        raise
-    except ValueError as error:
-        raise ValueError(f"{name}: {error}; download it again") from error
-    width = data["poses"].shape[-1] if "poses" in data and data["poses"].ndim else 0
-    if width == 165 or "surface_model_type" in data:
-        raise ValueError(f"{name}: this is AMASS's SMPL-X release; download the SMPL+H G release")
-    missing = [key for key in ("poses", "trans", "betas", "gender", "mocap_framerate") if key not in data]
-    if missing:
-        raise ValueError(f"{name}: not a motion of AMASS's SMPL+H G release: {', '.join(missing)} missing")
-    poses, translation = data["poses"], data["trans"]
-    if poses.ndim != 2 or width != 156 or translation.shape != (len(poses), 3):
-        raise ValueError(f"{name}: poses {poses.shape} and trans {translation.shape}, not (F, 156) and (F, 3)")
-    betas, gender = data["betas"], data["gender"]
-    if {poses.dtype.kind, translation.dtype.kind, betas.dtype.kind} - set("fiu") or betas.ndim != 1 or gender.size != 1:
-        raise ValueError(f"{name}: poses, trans and betas must be arrays of real numbers, and gender a single word")
-    if not (np.isfinite(poses).all() and np.isfinite(translation).all() and np.isfinite(betas).all()):
-        raise ValueError(f"{name}: contains non-finite numbers")
-    try:
+        width = data["poses"].shape[-1] if "poses" in data and data["poses"].ndim else 0
+        if width == 165 or "surface_model_type" in data:
+            raise UserError("this is AMASS's SMPL-X release; download the SMPL+H G release")
+        if missing := [key for key in ("poses", "trans", "betas", "gender", "mocap_framerate") if key not in data]:
+            raise UserError(f"not a motion of AMASS's SMPL+H G release: {', '.join(missing)} missing")
+        poses, translation, betas, gender = (data[key] for key in ("poses", "trans", "betas", "gender"))
+        if poses.ndim != 2 or width != 156 or translation.shape != (len(poses), 3):
+            raise UserError(f"poses {poses.shape} and trans {translation.shape}, not (F, 156) and (F, 3)")
+        numbers = (poses, translation, betas)
+        if {array.dtype.kind for array in numbers} - set("fiu") or betas.ndim != 1 or gender.size != 1:
+            raise UserError("poses, trans and betas must be arrays of real numbers, and gender a single word")
+        if not all(np.isfinite(array).all() for array in numbers):
+            raise UserError("contains non-finite numbers")
         check_frames(len(poses))
         fps = frame_rate(data["mocap_framerate"], "mocap_framerate")
         word = gender.item()
         return Recording(poses, translation, betas, word.decode() if isinstance(word, bytes) else str(word), fps)
-    except ValueError as error:
-        raise ValueError(f"{name}: {error}") from error
 
 
 class Amass:
@@ -156,71 +142,61 @@ class Amass:
     @cached_property
     def files(self) -> dict[str, Path]:
         """Key of each unpacked recording -> its file."""
-        if not self.root.is_dir():
-            raise FileNotFoundError(
-                f"{self.root}: no such folder; register at https://amass.is.tue.mpg.de, download the SMPL+H G "
-                "archives and put them there"
-            )
-        found = {}
-        for folder, _, names in os.walk(self.root):
+        files = {}
+        for folder, _, names in os.walk(required(self.root, GET_IT)):
             inside = Path(folder).relative_to(self.root).as_posix()
             for name in names:
                 if name.endswith(".npz") and (key := key_of(f"{inside}/{name}")):
-                    found[key] = Path(folder, name)
-        return found
+                    files[key] = Path(folder, name)
+        return files
 
     @cached_property
     def archives(self) -> dict[str, Path]:
         """Subset -> its archive, recognized by file name."""
-        found = {}
+        archives = {}
         for ending in ARCHIVE_ENDINGS:
             for path in sorted(self.root.rglob(f"*{ending}")):
                 subset = _BY_NAME.get(_plain(path.name.removesuffix(ending)))
                 if subset:
-                    found[subset] = path
-        return found
+                    archives[subset] = path
+        return archives
 
     def missing(self, keys: Collection[str]) -> list[str]:
         """Returns one line per subset with missing recordings; archives are not opened, so not checked."""
         lines = []
         stems = {subset_of(key): key.endswith("_stageii") for key in self.files}
-        for subset, wanted in sorted(_by_subset(keys).items()):
-            absent = [key for key in wanted if key not in self.files]
+        for subset, members in sorted(_by_subset(keys).items()):
+            absent = [key for key in members if key not in self.files]
             if not absent or subset in self.archives:
                 continue
             names = " or ".join((subset, *SUBSETS[subset]))
-            if len(absent) < len(wanted):
-                lines.append(f"{subset}: {len(absent)} of {len(wanted)} recordings are missing, such as {min(absent)}")
+            if len(absent) < len(members):
+                lines.append(f"{subset}: {len(absent)} of {len(members)} recordings are missing, such as {min(absent)}")
             elif stems.get(subset):
                 lines.append(f"{subset}: this is the SMPL-X release (files end in _stageii); download SMPL+H G")
             else:
-                lines.append(f"{subset}: missing ({len(wanted)} recordings); the archive is called {names}")
+                lines.append(f"{subset}: missing ({len(members)} recordings); the archive is called {names}")
         return lines
 
     def each(
-        self, wanted: Mapping[str, Wanted], function: Callable[[Wanted, Recording], Result], workers: int = 0
+        self, arguments: Mapping[str, Argument], function: Callable[[Argument, Recording], Result], workers: int = 0
     ) -> Iterator[tuple[str, Result]]:
-        """Calls `function(wanted[key], recording)` for each key in worker processes; yields (key, result), sorted.
+        """Calls `function(arguments[key], recording)` for each key in worker processes; yields (key, result), sorted.
 
         Args:
-            wanted: key of `key_of` -> first argument of the function; picklable.
-            function: picklable; the file name is prepended to its errors.
+            arguments: key of `key_of` -> first argument of the function; picklable.
+            function: picklable; the file name is prepended to its `UserError`s.
             workers: number of processes; 0 = one per core, 1 = this process only.
-
-        Raises:
-            FileNotFoundError: recordings are missing.
-            ValueError: a file or archive is damaged, or `function` raised a `ValueError`.
         """
-        absent = self.missing(wanted)
-        if absent:
+        if absent := self.missing(arguments):
             raise FileNotFoundError(f"{self.root}: {'; '.join(absent)}")
-        tasks: list[tuple[_Place, dict[str, Wanted]]] = []
-        for subset, keys in sorted(_by_subset(wanted).items()):
+        tasks: list[tuple[_Files, dict[str, Argument]]] = []
+        for subset, keys in sorted(_by_subset(arguments).items()):
             if all(key in self.files for key in keys):
                 chunks = [sorted(keys)[begin : begin + CHUNK] for begin in range(0, len(keys), CHUNK)]
-                tasks += [({k: self.files[k] for k in chunk}, {k: wanted[k] for k in chunk}) for chunk in chunks]
+                tasks += [({k: self.files[k] for k in chunk}, {k: arguments[k] for k in chunk}) for chunk in chunks]
             else:
-                tasks.append((self.archives[subset], {key: wanted[key] for key in sorted(keys)}))
+                tasks.append((self.archives[subset], {key: arguments[key] for key in sorted(keys)}))
         # An archive takes minutes: this process must not begin with one alone.
         for results in in_order(partial(_run, function), tasks, min(workers or cores(), len(tasks))):
             yield from results
@@ -234,37 +210,32 @@ def _by_subset(keys: Collection[str]) -> dict[str, list[str]]:
 
 
 def _run(
-    function: Callable[[Wanted, Recording], Result], task: tuple[_Place, dict[str, Wanted]]
+    function: Callable[[Argument, Recording], Result], task: tuple[_Files, dict[str, Argument]]
 ) -> list[tuple[str, Result]]:
-    place, wanted = task
+    files, arguments = task
     results = {}
-    for key, name, file in _contents(place, wanted):
-        recording = read(file, name)
-        try:
-            results[key] = function(wanted[key], recording)
-        except ValueError as error:
-            raise ValueError(f"{name}: {error}") from error
-    return [(key, results[key]) for key in wanted]
+    for key, name, file in _contents(files, arguments):
+        with naming(name):
+            results[key] = function(arguments[key], read(file, name))
+    return [(key, results[key]) for key in arguments]
 
 
-def _contents(place: _Place, keys: Collection[str]) -> Iterator[tuple[str, str, Path | bytes]]:
+def _contents(files: _Files, keys: Collection[str]) -> Iterator[tuple[str, str, Path | bytes]]:
     """Yields key, name and content of the recordings in an archive or a set of files."""
-    if isinstance(place, dict):
-        yield from ((key, str(path), path) for key, path in place.items())
+    if isinstance(files, dict):
+        yield from ((key, str(path), path) for key, path in files.items())
         return
-    left = set(keys)
-    releases = set()
-    for name, content in archives.members(place):
-        key = key_of(name)
-        releases.add(name.endswith("_stageii.npz"))
-        if key in left and name.endswith(".npz"):
+    left, is_smplx = set(keys), False
+    for name, content in archives.members(files, lambda name: name.endswith(".npz") and key_of(name) in left):
+        is_smplx |= name.endswith("_stageii.npz")
+        if content and (key := key_of(name)):
             left.remove(key)
-            yield key, f"{place}/{name}", content()
+            yield key, f"{files}/{name}", content
         if not left:
             return
-    if True in releases:
-        raise ValueError(f"{place}: this is AMASS's SMPL-X release (_stageii.npz); download the SMPL+H G release")
-    raise ValueError(f"{place}: {len(left)} recordings are missing in the archive, such as {min(left)}")
+    if is_smplx:
+        raise UserError(f"{files}: this is AMASS's SMPL-X release (_stageii.npz); download the SMPL+H G release")
+    raise UserError(f"{files}: {len(left)} recordings are missing in the archive, such as {min(left)}")
 
 
 class Body(NamedTuple):
@@ -294,10 +265,6 @@ def load_bodies(folder: Path) -> dict[str, Body]:
     Args:
         folder: contains `male/model.npz` and `female/model.npz` (from the model's archive), or `SMPLH_MALE.npz` and
             `SMPLH_FEMALE.npz`, directly or in a subfolder `smplh`.
-
-    Raises:
-        FileNotFoundError: a model file is missing.
-        ValueError: a file is damaged or not an SMPL+H model.
     """
     return {gender: _load_body(Path(folder), gender) for gender in ("male", "female")}
 
@@ -314,22 +281,16 @@ def _load_body(folder: Path, gender: str) -> Body:
             f"{folder}: contains neither {' nor '.join(names)}; download the extended SMPL+H model from "
             "https://mano.is.tue.mpg.de"
         )
-    try:
+    with naming(path, ValueError, KeyError, IndexError, what="not an SMPL+H model: "):
         arrays = read_npz(path, only=(*_MODEL, "kintree_table"))
         regressor, template, directions = (arrays[key] for key in _MODEL)
-        parents = arrays["kintree_table"][0, 1:22]
+        parents, vertices = arrays["kintree_table"][0, 1:22], regressor.shape[1:]
         if {array.dtype.kind for array in arrays.values()} - set("fiu"):
             raise ValueError("its arrays do not all contain real numbers")
-    except UserError:
-        raise
-    except (ValueError, KeyError, IndexError) as error:
-        raise ValueError(f"{path}: damaged or not an SMPL+H model: {error}") from error
-    vertices = regressor.shape[1:]
-    if (template.shape, directions.shape[:2], directions.ndim) != ((*vertices, 3), (*vertices, 3), 3):
-        shapes = f"{regressor.shape}, {template.shape} and {directions.shape}"
-        raise ValueError(f"{path}: damaged or not an SMPL+H model: its arrays have shapes {shapes}")
-    if regressor.shape[0] != 52 or tuple(parents) != SMPL22.parents[1:]:
-        raise ValueError(f"{path}: a model with {regressor.shape[0]} joints, not SMPL+H with 52")
+        if (template.shape, directions.shape[:2], directions.ndim) != ((*vertices, 3), (*vertices, 3), 3):
+            raise ValueError(f"its arrays have shapes {regressor.shape}, {template.shape} and {directions.shape}")
+        if regressor.shape[0] != 52 or tuple(parents) != SMPL22.parents[1:]:
+            raise UserError(f"a model with {regressor.shape[0]} joints, not SMPL+H with 52")
     regressor = regressor[:22].astype(np.float64)
     shape = np.einsum("jv,vck->jck", regressor, directions[..., :10].astype(np.float64))
     return Body(torch.from_numpy(regressor @ template.astype(np.float64)), torch.from_numpy(shape))

@@ -7,20 +7,26 @@ Language-based Motion Synthesis & Editing", AAAI 2023, appendix "BABEL". `docs/b
 from __future__ import annotations
 
 import math
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
-from flame_mdm.data import Clip, MotionSource, Split, hashed_split
+from flame_mdm.data import Clip, MotionSource, Split, hashed_split, required
 from flame_mdm.data.amass import Amass, Recording, key_of
+from flame_mdm.errors import UserError
 from flame_mdm.progress import ProgressBar
-from flame_mdm.safe_io import read_json
+from flame_mdm.safe_io import naming, read_json
 
 FPS = 20.0
+GET_IT = (
+    "BABEL v1.0 is published at https://babel.is.tue.mpg.de: unpack it, then run `make prepare` with "
+    "SOURCE=/path/to/babel_v1.0_release"
+)
 
 PARTS: dict[str, tuple[str, ...]] = {"train": ("train", "extra_train"), "val": ("val", "extra_val")}
 """Files of each part. The "extra" files contain labels of several annotators; only the first annotator's are used."""
@@ -89,24 +95,19 @@ class Babel(MotionSource):
         """
         self.path, self.amass, self.published_split = Path(path), Amass(Path(amass)), published_split
         self.length, self.stride, self.workers = length, stride, workers
-        self._excluded: Counter[str] = Counter()
-        self._windows: list[Window] | None = None
-
-    def excluded(self) -> dict[str, int]:
-        return dict(self._excluded)
+        self.options = {"published_split": published_split, "length": length, "stride": stride}
 
     def counts(self) -> dict[str, int]:
         files = (self.path / f"{name}.json" for part in PARTS for name in PARTS[part])
         return {"labels": sum(1 for file in files for _ in self._annotations(file))}
 
     def count(self) -> int:
-        return len(self.windows())
+        return len(self.windows)
 
     def clips(self, fps: float) -> Iterator[Clip]:
-        if fps != FPS:
-            raise ValueError(f"babel: clips are cut at {FPS:g} frames per second, set representation.fps={FPS:g}")
+        self.check_fps(fps, FPS)
         windows: defaultdict[str, list[Window]] = defaultdict(list)
-        for window in self.windows():
+        for window in self.windows:
             windows[window.motion].append(window)
         for key, motion in self.amass.each(dict.fromkeys(windows), _motion, self.workers):
             for window in windows[key]:
@@ -120,33 +121,27 @@ class Babel(MotionSource):
                     window=(window.start, self.length),
                 )
 
+    @cached_property
     def windows(self) -> list[Window]:
-        """Returns all clips in FLAME's order; reads the labels and the lengths of the motions.
-
-        Raises:
-            FileNotFoundError, ValueError: a file is missing or damaged.
-        """
-        if self._windows is None:
-            self._excluded = Counter()
-            labels = {part: self.labels(part) for part in PARTS}
-            keys = dict.fromkeys(label.motion for part in PARTS for label in labels[part])
-            measured = self.amass.each(keys, _measure, self.workers)
-            lengths = dict(ProgressBar(measured, "measuring the motions of AMASS", len(keys), unit=" motions"))
-            self._windows = []
-            trained = {label.motion for label in labels["train"]}
-            for part in PARTS:
-                number = 0
-                for label in labels[part]:
-                    starts = self._starts(label, lengths[label.motion])
-                    if starts and part == "val" and label.motion in trained and not self.published_split:
-                        self._exclude("labels of the val part on motions of the train part")
-                        number += len(starts)
-                        continue
-                    for start in starts:
-                        split = self._split(part, number, label.motion)
-                        self._windows.append(Window(f"{part}_{number:06d}", label.motion, split, start, label))
-                        number += 1
-        return self._windows
+        """All clips in FLAME's order; reads the labels and the lengths of the motions."""
+        labels = {part: self.labels(part) for part in PARTS}
+        keys = dict.fromkeys(label.motion for part in PARTS for label in labels[part])
+        measured = self.amass.each(keys, _measure, self.workers)
+        lengths = dict(ProgressBar(measured, "measuring the motions of AMASS", len(keys), unit=" motions"))
+        windows = []
+        trained = {label.motion for label in labels["train"]}
+        for part in PARTS:
+            number = 0
+            for label in labels[part]:
+                starts = self._starts(label, lengths[label.motion])
+                if starts and part == "val" and label.motion in trained and not self.published_split:
+                    self._exclude("labels of the val part on motions of the train part")
+                else:
+                    for n, start in enumerate(starts, number):
+                        split = self._split(part, n, label.motion)
+                        windows.append(Window(f"{part}_{n:06d}", label.motion, split, start, label))
+                number += len(starts)
+        return windows
 
     def labels(self, part: str) -> list[Label]:
         """Returns the labels of a part in FLAME's order: for each file the annotators' words, then the categories.
@@ -170,23 +165,15 @@ class Babel(MotionSource):
 
     def _annotations(self, path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
         """Yields the key of the motion and the label, for every frame label of a file."""
-        try:
-            data = read_json(path)
-        except FileNotFoundError:
-            raise FileNotFoundError(
-                f"{path}: no such file; BABEL v1.0 is published at https://babel.is.tue.mpg.de: unpack it, then run "
-                "`make prepare` with SOURCE=/path/to/babel_v1.0_release"
-            ) from None
+        data = read_json(required(path, GET_IT))
         key = "frame_anns" if path.stem.startswith("extra_") else "frame_ann"
-        try:
+        with naming(path, AttributeError, KeyError, TypeError, IndexError, what="not in the layout of BABEL v1.0: "):
             for sequence in data.values():
                 annotation = sequence[key][0] if key == "frame_anns" and sequence[key] else sequence[key]
                 for label in annotation["labels"] if annotation else ():
                     fields = {k: label[k] for k in ("proc_label", "act_cat", "start_t", "end_t")}
                     _check(fields)
                     yield self._key(str(sequence["feat_p"])), fields
-        except (AttributeError, KeyError, TypeError, IndexError) as error:
-            raise ValueError(f"{path}: not in the layout of BABEL v1.0: {error!r}") from error
 
     def _starts(self, label: Label, frames: int) -> range:
         """Returns the first frame of each clip of a label in a motion of `frames` frames; counts why there are none."""
@@ -208,7 +195,7 @@ class Babel(MotionSource):
         return range(first, first + 1)
 
     def _exclude(self, reason: str) -> range:
-        self._excluded[reason] += 1
+        self.excluded[reason] += 1
         return range(0)
 
     def _split(self, part: str, number: int, motion: str) -> Split:
@@ -221,7 +208,7 @@ class Babel(MotionSource):
     def _key(self, motion: str) -> str:
         key = key_of(motion)
         if key is None:
-            raise ValueError(f"{self.path}: the labels refer to {motion}, which is in no subset of AMASS")
+            raise UserError(f"{self.path}: the labels refer to {motion}, which is in no subset of AMASS")
         return key
 
 

@@ -6,27 +6,27 @@ Stylization", arXiv 2306.08861, 2023; CC BY-NC 4.0. `docs/bandai.md` describes t
 
 from __future__ import annotations
 
-import hashlib
 import re
 from collections.abc import Container, Generator, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import cache, cached_property, partial
 from pathlib import Path, PurePosixPath
 from typing import Literal, get_args
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from flame_mdm.data import Clip, MotionSource, Split, archives
+from flame_mdm.data import Clip, MotionSource, Split, archives, name_hash, required, split_blocks, without
 from flame_mdm.data.parallel import in_order
+from flame_mdm.errors import UserError
 from flame_mdm.formats import bvh
 from flame_mdm.formats.layouts import LAYOUTS
 from flame_mdm.representations.skeleton import SMPL22
 from flame_mdm.safe_io import TEXT_LIMIT, read_yaml, regular_file
 
-_PLACES = LAYOUTS["Bandai-Namco"].map
-JOINTS = {name: place if isinstance(place := _PLACES[name], str) else next(iter(place)) for name in SMPL22.joints}
+_MAP = LAYOUTS["Bandai-Namco"].map
+JOINTS = {name: own if isinstance(own := _MAP[name], str) else next(iter(own)) for name in SMPL22.joints}
 """The joint of the files for each joint of SMPL, in the order of SMPL; spine1 lies between Hips and Spine."""
 SPINE1, SPINE2 = list(JOINTS).index("spine1"), list(JOINTS).index("spine2")
 
@@ -94,6 +94,10 @@ HELD_OUT = frozenset(
 SplitRule = Literal["takes", "compositional"]
 
 
+GET_IT = (
+    "the data sets are published at https://github.com/BandaiNamcoResearchInc/Bandai-Namco-Research-Motiondataset (CC "
+    "BY-NC 4.0): clone it, then run `make prepare` with SOURCE=/path/to/the/clone"
+)
 FILE = re.compile(r"dataset-([12])_([^_]+)_([^_]+)_(\d+)\.bvh")
 
 
@@ -138,35 +142,26 @@ class Bandai(MotionSource):
             exclude: takes to leave out, by the name of the BVH file without extension.
             split: "takes" holds out takes of combinations of content and style that training sees; "compositional"
                 holds out the combinations `HELD_OUT`, whose contents and styles training sees only in others.
-
-        Raises:
-            ValueError: `motion` or `split` has another value.
         """
-        if split not in get_args(SplitRule):
-            raise ValueError(f"data.source.split={split}: give takes or compositional")
+        for name, value, values in (("split", split, get_args(SplitRule)), ("motion", motion, ("joints", "smpl"))):
+            if value not in values:
+                raise UserError(f"data.source.{name}={value}: give {' or '.join(values)}")
+        self.path, self.workers, self.exclude = Path(path), workers, tuple(exclude)
         self.split: SplitRule = split
-        if motion not in ("joints", "smpl"):
-            raise ValueError(f"data.source.motion={motion}: give joints or smpl")
-        self.path, self.mirror, self.workers, self.exclude = Path(path), mirror, workers, tuple(exclude)
-        self.motion: Literal["joints", "smpl"] = motion
-        self._found: list[Take] | None = None
+        self.mirror, self.motion = mirror, motion
+        self.options = {"motion": motion, "mirror": mirror, "exclude": list(exclude), "split": split}
+        if exclude:
+            self.excluded["takes by data.source.exclude"] = len(exclude)
 
     def count(self) -> int:
-        return sum(1 + (self.mirror and take.split == "train") for take in self.takes())
+        return sum(1 + (self.mirror and take.split == "train") for take in self.takes)
 
     def counts(self) -> dict[str, int]:
-        takes = [take.dataset for take in self.takes()]
-        return {
-            "takes": len(takes),
-            "takes of data set 1": takes.count(1),
-            "takes of data set 2": takes.count(2),
-        }
-
-    def excluded(self) -> dict[str, int]:
-        return {"takes by data.source.exclude": len(self.exclude)} if self.exclude else {}
+        takes = [take.dataset for take in self.takes]
+        return {"takes": len(takes), **{f"takes of data set {number}": takes.count(number) for number in (1, 2)}}
 
     def clips(self, fps: float) -> Iterator[Clip]:
-        takes = self.takes()
+        takes = self.takes
         ready: dict[str, np.ndarray] = {}  # members of an archive come in any order
         with closing(self._motions({take.id for take in takes}, fps)) as motions:
             for take in takes:
@@ -178,27 +173,18 @@ class Bandai(MotionSource):
                 if self.mirror and take.split == "train":
                     yield self._clip(take, motion, mirrored=True)
 
+    @cached_property
     def takes(self) -> list[Take]:
-        """Returns the takes that are present and not excluded, sorted by name.
-
-        Raises:
-            FileNotFoundError: the folder or archive does not exist or contains no BVH file of the data sets.
-            ValueError: the archive is damaged, a file is present twice, or `exclude` has an unknown name.
-        """
-        if self._found is None:
-            names: dict[str, str] = {}
-            for name, _ in _files(self.path, wanted=()):
-                id_ = PurePosixPath(name).stem
-                if id_ in names:
-                    raise ValueError(f"{self.path}: {id_} exists twice, as {names[id_]} and {name}; delete one")
-                names[id_] = name
-            if not names:
-                raise _not_found(f"{self.path}: no file dataset-1_*.bvh or dataset-2_*.bvh in it")
-            unknown = set(self.exclude) - set(names)
-            if unknown:
-                raise ValueError(f"data.source.exclude: {self.path} has no {', '.join(sorted(unknown))}")
-            self._found = [_take(id_, self.split) for id_ in sorted(set(names) - set(self.exclude))]
-        return self._found
+        """The takes that are present and not excluded, sorted by name."""
+        names: dict[str, str] = {}
+        for name, _ in _files(self.path, ids=()):
+            id_ = PurePosixPath(name).stem
+            if id_ in names:
+                raise UserError(f"{self.path}: {id_} exists twice, as {names[id_]} and {name}; delete one")
+            names[id_] = name
+        if not names:
+            raise FileNotFoundError(f"{self.path}: no file dataset-1_*.bvh or dataset-2_*.bvh in it; {GET_IT}")
+        return [_take(id_, self.split) for id_ in sorted(without(names, self.exclude, self.path))]
 
     def _motions(self, ids: set[str], fps: float) -> Generator[tuple[str, np.ndarray]]:
         """Yields id and motion of these takes in the order of the folder or archive."""
@@ -229,33 +215,23 @@ def convert(file: tuple[str, bytes], fps: float, kind: Literal["joints", "smpl"]
 
     The motion is joints (F, 22, 3) in meters, y up, or the SMPL motion (F, 75) described in `smpl_motion`. Local
     rotations and the position of the hips are interpolated, so bones keep their length.
-
-    Raises:
-        ValueError: the file is damaged or has another skeleton; the message names it.
     """
     name, data = file
     id_ = PurePosixPath(name).stem
     try:
         motion = bvh.parse(data, name)
-        missing = sorted(set(JOINTS.values()) - set(motion.joints))
-        if missing:
-            raise ValueError(f"{name}: not the skeleton of this data set: joint {', '.join(missing)} missing")
-        rotations, translations = _resampled(motion, fps, name)
+        if missing := set(JOINTS.values()) - set(motion.joints):
+            raise UserError(f"not the skeleton of this data set: joint {', '.join(sorted(missing))} missing")
+        rotations, translations = motion.resample(fps)
     except ValueError as error:
-        raise ValueError(f"{error}; to continue without it: data.source.exclude=[{id_}]") from error
+        message = str(error) if name in str(error) else f"{name}: {error}"
+        raise UserError(f"{message}; to continue without it: data.source.exclude=[{id_}]") from error
     if kind == "smpl":
         return id_, smpl_motion(motion, rotations, translations)
     positions, _ = bvh.forward_kinematics(motion.parents, rotations, translations)
     joints = positions[:, [motion.joints.index(joint) for joint in JOINTS.values()]] / 100
     joints[:, SPINE1] += 0.4 * (joints[:, SPINE2] - joints[:, SPINE1])
     return id_, joints.astype(np.float32)
-
-
-def _resampled(motion: bvh.Bvh, fps: float, name: str) -> tuple[np.ndarray, np.ndarray]:
-    try:
-        return motion.resample(fps)
-    except ValueError as error:
-        raise ValueError(f"{name}: {error}") from error
 
 
 def smpl_motion(skeleton: bvh.Bvh, rotations: np.ndarray, translations: np.ndarray) -> np.ndarray:
@@ -337,26 +313,18 @@ def split_of(dataset: int, content: str, style: str, number: int, rule: SplitRul
             return "test"
         return "val" if split_of(dataset, content, style, number) == "val" else "train"
     if dataset == 1:
-        draw = _hash(f"dataset-1_{content}_{style}") % 20
+        draw = (name_hash(f"dataset-1_{content}_{style}") >> 128) % 20
         return "test" if draw < 2 else "val" if draw == 2 else "train"
     if style == "normal" and content.startswith("walk-turn-"):
         return "train"
-    test, val = _held_out_blocks(content, style)
-    block = (number - 1) // 5
-    return "test" if block in test else "val" if block in val else "train"
+    return _blocks(content, style)[(number - 1) // 5]
 
 
 @cache
-def _held_out_blocks(content: str, style: str) -> tuple[list[int], list[int]]:
-    """Returns test (10 %, at least one) and validation blocks (5 %, at least one) of a combination of data set 2."""
+def _blocks(content: str, style: str) -> dict[int, Split]:
+    """Returns block -> split of a combination of data set 2: 10 % for testing, 5 % for validation."""
     takes = TAKES_2[content][STYLES_2.index(style)]
-    blocks = sorted(range(-(-takes // 5)), key=lambda block: _hash(f"dataset-2_{content}_{style}_{block}"))
-    test, val = max(1, round(0.1 * len(blocks))), max(1, round(0.05 * len(blocks)))
-    return blocks[:test], blocks[test : test + val]
-
-
-def _hash(text: str) -> int:
-    return int(hashlib.sha1(text.encode()).hexdigest()[:8], 16)
+    return split_blocks(f"dataset-2_{content}_{style}", takes, 5, val=0.05, test=0.1)
 
 
 def _take(id_: str, rule: SplitRule) -> Take:
@@ -364,13 +332,13 @@ def _take(id_: str, rule: SplitRule) -> Take:
     dataset = int(name[-1])
     contents, styles = (CONTENTS_1, STYLES_1) if dataset == 1 else (TAKES_2, STYLES_2)
     if content not in contents or style not in styles:
-        raise ValueError(f"{id_}.bvh: data set {dataset} has no content {content} with style {style}")
+        raise UserError(f"{id_}.bvh: data set {dataset} has no content {content} with style {style}")
     split = split_of(dataset, content, style, int(number), rule)
     return Take(id_, dataset, swap_sides(content) if id_ in WRONG_SIDE else content, style, split)
 
 
-def _files(path: Path, wanted: Container[str]) -> Iterator[tuple[str, bytes]]:
-    """Yields path and content of the BVH files in a folder or archive; the content is empty if the id is not `wanted`.
+def _files(path: Path, ids: Container[str]) -> Iterator[tuple[str, bytes]]:
+    """Yields path and content of the BVH files in a folder or archive; the content is empty for other ids.
 
     Archives are not unpacked to disk: that would take 550 MB, which would have to be removed after every error.
     """
@@ -378,20 +346,18 @@ def _files(path: Path, wanted: Container[str]) -> Iterator[tuple[str, bytes]]:
     def belongs(name: str) -> bool:
         return FILE.fullmatch(PurePosixPath(name).name) is not None
 
-    def is_wanted(name: str) -> bool:
-        return PurePosixPath(name).stem in wanted
+    def is_read(name: str) -> bool:
+        return belongs(name) and PurePosixPath(name).stem in ids
 
     if path.is_dir():
         for file in sorted(path.rglob("dataset-*.bvh")):
             if belongs(file.name):
                 regular_file(file, TEXT_LIMIT)
-                yield file.as_posix(), file.read_bytes() if is_wanted(file.name) else b""
-    elif not path.exists():
-        raise _not_found(f"{path}: no such folder or archive")
+                yield file.as_posix(), file.read_bytes() if is_read(file.name) else b""
     else:
-        for name, content in archives.members(path):
+        for name, content in archives.members(required(path, GET_IT), is_read):
             if belongs(name):
-                yield f"{path}/{name}", content() if is_wanted(name) else b""
+                yield f"{path}/{name}", content
 
 
 def prompts() -> list[str]:
@@ -404,11 +370,3 @@ def prompts() -> list[str]:
         "a person raises the left hand and waves",
         "a person kicks",
     ]
-
-
-def _not_found(what: str) -> FileNotFoundError:
-    return FileNotFoundError(
-        f"{what}; the data sets are published at "
-        "https://github.com/BandaiNamcoResearchInc/Bandai-Namco-Research-Motiondataset (CC BY-NC 4.0): clone it, then "
-        "run `make prepare` with SOURCE=/path/to/the/clone"
-    )

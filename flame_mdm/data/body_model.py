@@ -9,9 +9,8 @@ import numpy as np
 from scipy.sparse import csc_matrix
 
 from flame_mdm.data import restricted_pickle
-from flame_mdm.errors import UserError, first_line
 from flame_mdm.representations.skeleton import SMPL24
-from flame_mdm.safe_io import read_npz
+from flame_mdm.safe_io import naming, read_npz
 
 Offsets = tuple[tuple[float, float, float], ...]
 
@@ -23,12 +22,8 @@ def load_offsets(path: Path) -> Offsets:
 
     Args:
         path: SMPL's .pkl as downloaded, or an .npz with the same arrays.
-
-    Raises:
-        FileNotFoundError: no such file.
-        ValueError: it is damaged, or no SMPL model of 24 joints.
     """
-    try:
+    with naming(path, KeyError, TypeError, IndexError, ValueError, what="not a SMPL model of 24 joints: "):
         if path.suffix == ".npz":
             model: Any = read_npz(path, only=("J_regressor", "v_template", "kintree_table"))
         else:
@@ -46,9 +41,5 @@ def load_offsets(path: Path) -> Offsets:
         joints = regressor @ template
         if not np.isfinite(joints).all():
             raise ValueError("non-finite numbers")
-    except UserError:
-        raise
-    except (KeyError, TypeError, IndexError, ValueError) as error:
-        raise ValueError(f"{path}: not a SMPL model of 24 joints: {first_line(error)}") from error
     offsets = joints - np.concatenate([np.zeros((1, 3)), joints[list(SMPL24.parents[1:])]])
     return tuple(tuple(offset) for offset in offsets.tolist())

@@ -109,15 +109,15 @@ class Folder(MotionSource):
             raise ValueError(f"data.source.motion={motion}, mirror={mirror}: give joints, or smpl with mirror=false")
         self.path, self.motion, self.mirror, self.exclude = Path(path), motion, mirror, tuple(exclude)
         self.workers = workers
+        self.options = {"motion": motion, "mirror": mirror, "exclude": list(exclude)}
+        if exclude:
+            self.excluded["motions by data.source.exclude"] = len(exclude)
         self._skeletons: dict[Path, dict[str, Any]] = {}
         self._found: list[Found] = []
 
     def count(self) -> int:
         splits = Counter(self.splits.values())
         return sum(splits.values()) + (splits["train"] if self.mirror else 0)
-
-    def excluded(self) -> dict[str, int]:
-        return {"motions by data.source.exclude": len(self.exclude)} if self.exclude else {}
 
     def clips(self, fps: float) -> Iterator[Clip]:
         self.actions = tuple(sorted({note.action for note in self.notes.values() if note.action is not None}))

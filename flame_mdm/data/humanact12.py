@@ -6,20 +6,23 @@ Guo et al., "Action2Motion: Conditioned Generation of 3D Human Motions", ACM MM 
 
 from __future__ import annotations
 
-import hashlib
-from collections import defaultdict
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from flame_mdm.data import Clip, MotionSource, Split, restricted_pickle
+from flame_mdm.data import Clip, MotionSource, Split, restricted_pickle, split_blocks
 from flame_mdm.errors import UserError
-from flame_mdm.safe_io import read_npy
+from flame_mdm.safe_io import naming, read_npy
 
 FPS = 20.0
 """Frames per second at which the authors' code plays the action data sets; frames are not resampled."""
+
+NO_NUMBERS = (TypeError, ValueError, OverflowError)
+"""Errors that NumPy raises for what does not consist of numbers."""
 
 BLOCK = 10
 """Number of consecutive clips in the file that go to one split together: they may be cut from one recording."""
@@ -46,39 +49,33 @@ class HumanAct12(MotionSource):
             published_split: use all clips for training and for testing.
         """
         self.path, self.published_split = Path(path), published_split
-        self._found: list[tuple[np.ndarray, int]] | None = None
+        self.options = {"published_split": published_split}
 
     def count(self) -> int:
-        return len(self._clips())
+        return len(self._motions)
 
     def clips(self, fps: float) -> Iterator[Clip]:
-        check_fps(self.name, fps)
-        found = self._clips()
-        splits = self._splits([action for _, action in found])
-        for number, ((motion, action), (source, split)) in enumerate(zip(found, splits, strict=True)):
+        self.check_fps(fps, FPS)
+        splits = self._splits([action for _, action in self._motions])
+        for number, ((motion, action), (source, split)) in enumerate(zip(self._motions, splits, strict=True)):
             yield Clip(f"humanact12_{number:04d}", motion, [], split, source, action)
 
-    def _clips(self) -> list[tuple[np.ndarray, int]]:
-        if self._found is None:
-            self._found = read(find(self.path, "humanact12poses.pkl"), len(self.actions))
-        return self._found
+    @cached_property
+    def _motions(self) -> list[tuple[np.ndarray, int]]:
+        return read(find(self.path, "humanact12poses.pkl"), len(self.actions))
 
-    def _splits(self, actions: list[int]) -> list[tuple[str, Split]]:
+    def _splits(self, actions: Sequence[int]) -> list[tuple[str, Split]]:
         """Returns source and split of each clip."""
         if self.published_split:
             return [(f"humanact12_{number:04d}", "train") for number in range(len(actions))]
-        seen: defaultdict[int, int] = defaultdict(int)
-        places = []
+        clips, seen = Counter(actions), Counter[int]()
+        blocks = {a: split_blocks(f"humanact12_{a}", clips[a], BLOCK, val=0.1, test=0.2) for a in clips}
+        splits = []
         for action in actions:
-            places.append((action, seen[action] // BLOCK))
+            block = seen[action] // BLOCK
+            splits.append((f"{self.actions[action]} {block}", blocks[action][block]))
             seen[action] += 1
-        splits: dict[tuple[int, int], Split] = {}
-        for action, clips in seen.items():
-            blocks = sorted(range(-(-clips // BLOCK)), key=lambda block: _hash(f"humanact12_{action}_{block}"))
-            test, val = max(1, round(0.2 * len(blocks))), max(1, round(0.1 * len(blocks)))
-            for rank, block in enumerate(blocks):
-                splits[action, block] = "test" if rank < test else "val" if rank < test + val else "train"
-        return [(f"{self.actions[action]} {block}", splits[action, block]) for action, block in places]
+        return splits
 
 
 def read(path: Path, actions: int = len(HumanAct12.actions)) -> list[tuple[np.ndarray, int]]:
@@ -87,24 +84,18 @@ def read(path: Path, actions: int = len(HumanAct12.actions)) -> list[tuple[np.nd
     Returns:
         Pairs of a motion (F, 75) float32 and a label in [0, `actions`). A motion is the position of the root joint
         (meters, camera axes), then 24 axis-angle vectors, that of the root in camera axes.
-
-    Raises:
-        FileNotFoundError, ValueError: the file is missing, damaged or another file.
     """
-    data = restricted_pickle.read(path)
-    poses, joints, labels = columns(path, data, "poses", "joints3D", "y")
     clips = []
-    for number, (pose, joint, label) in enumerate(zip(poses, joints, labels, strict=True)):
-        try:
-            pose, joint, label = np.asarray(pose, np.float32), np.asarray(joint, np.float32), int(label)
-        except (TypeError, ValueError, OverflowError) as error:
-            raise ValueError(f"{path}: clip {number} does not consist of numbers: {error}") from error
+    for number, columns in enumerate(zip(*read_lists(path, "poses", "joints3D", "y"), strict=True)):
+        with naming(f"{path}: clip {number}", *NO_NUMBERS, what="does not consist of numbers: "):
+            pose, joint = (np.asarray(column, np.float32) for column in columns[:2])
+            label = int(columns[2])
         if pose.ndim != 2 or pose.shape[1] != 72 or joint.shape != (len(pose), 24, 3) or not len(pose):
-            raise ValueError(
+            raise UserError(
                 f"{path}: clip {number} has poses {pose.shape} and joints {joint.shape}, not (F, 72) and (F, 24, 3)"
             )
         if not 0 <= label < actions:
-            raise ValueError(f"{path}: clip {number} has the label {label}, not one of 0 to {actions - 1}")
+            raise UserError(f"{path}: clip {number} has the label {label}, not one of 0 to {actions - 1}")
         clips.append((np.concatenate([joint[:, 0], pose], 1), label))
     return clips
 
@@ -118,18 +109,10 @@ def read_unconstrained(path: Path) -> np.ndarray:
     Returns:
         (N, F, 15, 3) float32, joints in the order of the file: SMPL's joints 15, 12, 16, 18, 20, 17, 19, 21, 0, 1, 4,
         7, 2, 5, 8.
-
-    Raises:
-        FileNotFoundError, ValueError: the file is missing, damaged or another file.
     """
-    try:
-        data = read_npy(path)
-    except UserError:
-        raise
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
+    data = read_npy(path)
     if data.dtype.kind not in "fiu" or data.ndim != 4 or data.shape[1] < 15 or data.shape[2] != 3:
-        raise ValueError(f"{path}: shape {data.shape}, not (motions, 15 or more joints, 3, frames)")
+        raise UserError(f"{path}: shape {data.shape}, not (motions, 15 or more joints, 3, frames)")
     return np.ascontiguousarray(data[:, :15].transpose(0, 3, 1, 2), np.float32)
 
 
@@ -137,39 +120,28 @@ def find(path: Path, name: str) -> Path:
     """Returns `path` if it is a file, else the file of this name in that folder or one of its subfolders.
 
     Raises:
-        FileNotFoundError: there is no such file; the message says where it is published.
+        FileNotFoundError: If there is no such file; the message says where it is published.
     """
-    if path.is_file():
-        return path
-    for found in (path / name, *sorted(path.glob(f"*/{name}"))):
-        if found.is_file():
-            return found
+    for file in (path, path / name, *sorted(path.glob(f"*/{name}"))):
+        if file.is_file():
+            return file
     raise FileNotFoundError(
         f"{path}: no {name}; the data set is published with ACTOR (https://github.com/Mathux/ACTOR, prepare/"
         "download_datasets.sh): unpack it, then run `make prepare` with SOURCE=/path/to/the/folder"
     )
 
 
-def columns(path: Path, data: Any, *names: str) -> list[Any]:
+def read_lists(path: Path, *names: str) -> list[Any]:
     """Returns the lists of these names in a pickled dictionary, checked to have equal length."""
+    data = restricted_pickle.read(path)
     if not isinstance(data, dict) or not set(names) <= set(data):
         kind = f"keys {', '.join(map(str, data))}" if isinstance(data, dict) else type(data).__name__
-        raise ValueError(f"{path}: must contain {', '.join(names)}; it contains {kind}")
+        raise UserError(f"{path}: must contain {', '.join(names)}; it contains {kind}")
     for name in names:
         values = data[name]
         if not isinstance(values, list | tuple | np.ndarray) or (isinstance(values, np.ndarray) and not values.ndim):
-            raise ValueError(f"{path}: {name} is not a list, but {type(values).__name__}")
+            raise UserError(f"{path}: {name} is not a list, but {type(values).__name__}")
     lengths = {name: len(data[name]) for name in names}
     if len(set(lengths.values())) > 1:
-        raise ValueError(f"{path}: lists differ in length: {lengths}")
+        raise UserError(f"{path}: lists differ in length: {lengths}")
     return [data[name] for name in names]
-
-
-def check_fps(name: str, fps: float) -> None:
-    """Raises `ValueError` for another frame rate: the action data sets are not resampled."""
-    if fps != FPS:
-        raise ValueError(f"{name}: clips are played at {FPS:g} frames per second, set representation.fps={FPS:g}")
-
-
-def _hash(text: str) -> str:
-    return hashlib.sha1(text.encode()).hexdigest()

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import csv
 import io
-from collections import Counter, defaultdict
-from collections.abc import Iterator, Sequence
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Sequence
 from functools import cached_property, partial
 from pathlib import Path, PurePosixPath
 from typing import NamedTuple
@@ -17,14 +17,14 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from flame_mdm.data import Clip, MotionSource, archives, restricted_pickle
+from flame_mdm.data import Clip, MotionSource, archives, required, restricted_pickle
 from flame_mdm.data.amass import Amass, Body, Recording, key_of, load_bodies, subset_of
 from flame_mdm.data.t2m import T2MFolder
 from flame_mdm.errors import UserError
 from flame_mdm.progress import ProgressBar
 from flame_mdm.representations import Frames
 from flame_mdm.representations.humanml import HumanML
-from flame_mdm.safe_io import atomic_write, read_npy, read_text
+from flame_mdm.safe_io import atomic_write, naming, read_npy, read_text
 
 FPS = 20
 
@@ -59,30 +59,28 @@ class Row(NamedTuple):
 
 
 def read_index(path: Path) -> list[Row]:
-    """Reads the clips of HumanML3D's `index.csv`.
-
-    Raises:
-        FileNotFoundError: the file does not exist.
-        ValueError: the file has another layout; the message names the line.
-    """
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file; it is index.csv of https://github.com/EricGuo5513/HumanML3D")
+    """Reads the clips of HumanML3D's `index.csv`."""
+    required(path, "it is index.csv of https://github.com/EricGuo5513/HumanML3D")
     rows = []
     lines = csv.DictReader(io.StringIO(read_text(path), newline=""))
-    number = 1
-    try:
+    with naming(path, csv.Error):
         for number, line in enumerate(lines, 2):
-            try:
+            errors = (KeyError, TypeError, ValueError)
+            with naming(f"{path}, line {number}", *errors, what="not a clip of HumanML3D's index: "):
                 source, name = line["source_path"], PurePosixPath(line["new_name"]).stem
                 key = PurePosixPath(source).stem if "humanact12" in source.lower() else key_of(source)
                 if key is None:
-                    raise ValueError(f"{source} is in no subset of AMASS")
+                    raise UserError(f"{source} is in no subset of AMASS")
                 rows.append(Row(name, key, int(line["start_frame"]), int(line["end_frame"])))
-            except (KeyError, TypeError, ValueError) as error:
-                raise ValueError(f"{path}, line {number}: not a clip of HumanML3D's index: {error}") from error
-    except csv.Error as error:
-        raise ValueError(f"{path}, line {number + 1}: {error}") from error
     return rows
+
+
+def by_recording(rows: Iterable[Row]) -> tuple[dict[str, list[Row]], dict[str, list[Row]]]:
+    """Returns recording -> its clips, first the recordings of AMASS, then those of HumanAct12."""
+    recordings: tuple[dict[str, list[Row]], dict[str, list[Row]]] = defaultdict(list), defaultdict(list)
+    for row in rows:
+        recordings[row.humanact12][row.key].append(row)
+    return recordings
 
 
 class HumanML3D(T2MFolder):
@@ -126,6 +124,7 @@ class HumanML3D(T2MFolder):
         self.humanact12 = Path(humanact12) if humanact12 else _beside(self.path, *joints)
         self.index = Path(index) if index else _beside(self.path, "index.csv")
         self.bone_lengths, self.workers = bone_lengths, workers
+        self.options |= {"bone_lengths": bone_lengths and list(bone_lengths)}
 
     def count(self) -> int:
         if self.amass:
@@ -176,30 +175,30 @@ class HumanML3D(T2MFolder):
             if missing:
                 raise FileNotFoundError(f"{self.name} cannot be created: {'; '.join(missing)}")
             folder = self.path / "new_joint_vecs"
-            made = not folder.exists()
+            is_new = not folder.exists()
             folder.mkdir(exist_ok=True)
-            write = partial(_write_features, folder, HumanML("smpl22", "legacy", bone_lengths=self.bone_lengths))
-            recordings: dict[str, list[Row]] = defaultdict(list)
-            for row in todo:
-                recordings[row.key].append(row)
-            joints = _humanact12_files(self.humanact12)
             try:
-                with ProgressBar(desc=f"creating {self.name}", total=len(todo), unit=" motions") as progress:
-                    from_amass = {key: rows for key, rows in recordings.items() if not rows[0].humanact12}
-                    for _, done in amass.each(from_amass, partial(_from_amass, write, self._bodies()), self.workers):
-                        progress.update(done)
-                    for key in sorted(recordings.keys() - from_amass.keys()):
-                        for row in recordings[key]:
-                            write(row, _read_joints(joints[key]))
-                            progress.update()
+                self._make_motions(amass, todo, folder)
             except BaseException:
                 for unfinished in folder.glob(".*.npy"):  # of workers that were stopped
                     unfinished.unlink(missing_ok=True)
-                if made and not any(folder.iterdir()):
+                if is_new and not any(folder.iterdir()):
                     folder.rmdir()
                 raise
         if not (self.path / "Mean.npy").is_file():
             self._write_statistics()
+
+    def _make_motions(self, amass: Amass, todo: Sequence[Row], folder: Path) -> None:
+        write = partial(_write_features, folder, HumanML("smpl22", "legacy", bone_lengths=self.bone_lengths))
+        from_amass, from_humanact12 = by_recording(todo)
+        joints = _humanact12_files(self.humanact12)
+        with ProgressBar(desc=f"creating {self.name}", total=len(todo), unit=" motions") as progress:
+            for _, count in amass.each(from_amass, partial(_from_amass, write, self._bodies()), self.workers):
+                progress.update(count)
+            for key, rows in sorted(from_humanact12.items()):
+                for row in rows:
+                    write(row, _read_joints(joints[key]))
+                    progress.update()
 
     def _write_statistics(self) -> None:
         """Writes mean and std over all motions of any length and split, including mirrored ones."""
@@ -209,7 +208,7 @@ class HumanML3D(T2MFolder):
         for name in names:
             length, features = self._load(name, mmap=True).shape
             if features != representation.features:
-                raise ValueError(f"{self.path}: {name} has {features} features; delete it and prepare again")
+                raise UserError(f"{self.path}: {name} has {features} features; delete it and prepare again")
             frames += length
         motions = Frames(lambda: (self._load(name).astype(np.float32) for name in names), frames)
         mean, std = representation.statistics(motions)
@@ -232,10 +231,8 @@ def _from_amass(write: partial[None], bodies: dict[str, Body], rows: Sequence[Ro
 def _write_features(folder: Path, representation: HumanML, row: Row, joints: np.ndarray) -> None:
     """Writes the features of a clip and of its mirror image, each under a temporary name first."""
     motion = torch.from_numpy(joints).double()
-    try:
+    with naming(f"clip {row.name} (data.source.exclude=[{row.name}] leaves it out)", ValueError):
         features = representation.encode_many([motion, representation.skeleton.mirror(motion)])
-    except ValueError as error:
-        raise ValueError(f"clip {row.name}: {error}, with data.source.exclude=[{row.name}]") from error
     for name, array in zip((row.name, f"M{row.name}"), features, strict=True):
         _save(folder / f"{name}.npy", array.numpy())
 
@@ -262,17 +259,19 @@ def _humanact12_files(path: Path) -> dict[str, Path | tuple[Path, str]]:
 
 
 def _read_joints(source: Path | tuple[Path, str]) -> np.ndarray:
-    file = source if isinstance(source, Path) else "/".join(map(str, source))
-    try:
-        joints = read_npy(source if isinstance(source, Path) else io.BytesIO(archives.read_member(*source)))
-    except UserError:
-        raise
-    except ValueError as error:
-        raise ValueError(f"{file}: {error}") from error
-    if joints.dtype.kind not in "fiu":
-        raise ValueError(f"{file}: an array of {joints.dtype}, not of real numbers")
-    if joints.ndim != 3 or joints.shape[1] < 22 or joints.shape[2] != 3:
-        raise ValueError(f"{file}: shape {joints.shape}, not (frames, 22 joints or more, 3)")
+    """Reads joints (F, 22, 3) of HumanAct12 from a file or from a member of a zip."""
+    if isinstance(source, Path):
+        file, content = source, source
+    else:
+        path, name = source
+        file = path / name
+        content = io.BytesIO(next(data for member, data in archives.members(path, name.__eq__) if member == name))
+    with naming(file):
+        joints = read_npy(content)
+        if joints.dtype.kind not in "fiu":
+            raise UserError(f"an array of {joints.dtype}, not of real numbers")
+        if joints.ndim != 3 or joints.shape[1] < 22 or joints.shape[2] != 3:
+            raise UserError(f"shape {joints.shape}, not (frames, 22 joints or more, 3)")
     return joints[:, :22]
 
 
@@ -312,7 +311,7 @@ class HumanML3DSMPL(MotionSource):
         self.folder, self.amass = HumanML3D(path, exclude, index=index), Amass(Path(amass))
         self.humanact12 = Path(humanact12) if humanact12 else None
         self.published_split, self.workers = published_split, workers
-        self._excluded: Counter[str] = Counter()
+        self.options = {"published_split": published_split, "exclude": list(exclude)}
 
     @cached_property
     def rows(self) -> list[Row]:
@@ -326,40 +325,34 @@ class HumanML3DSMPL(MotionSource):
         return rows if self.humanact12 else [row for row in rows if not row.humanact12]
 
     def count(self) -> int:
-        missing = self.amass.missing({row.key for row in self.rows if not row.humanact12})
-        if missing:
+        if missing := self._missing():
             raise FileNotFoundError(f"{self.amass.root}: {'; '.join(missing)}")
         return sum(len(self.folder.texts[row.name]) for row in self.rows)
 
     def check(self) -> list[str]:
         """Returns lines about the number of motions and the missing files."""
-        missing = self.amass.missing({row.key for row in self.rows if not row.humanact12})
-        return [f"{len(self.rows)} motions in the index", *(f"missing: {line}" for line in missing)]
+        return [f"{len(self.rows)} motions in the index", *(f"missing: {line}" for line in self._missing())]
 
-    def excluded(self) -> dict[str, int]:
-        """Returns the number of motions left out, by reason."""
-        return dict(self._excluded)
+    def _missing(self) -> list[str]:
+        return self.amass.missing({row.key for row in self.rows if not row.humanact12})
 
     def clips(self, fps: float) -> Iterator[Clip]:
-        if fps != FPS:
-            raise ValueError(f"{self.name} has {FPS} frames per second, but representation.fps is {fps:g}")
+        self.check_fps(fps, FPS)
         listed = {name for name in self.folder.names if not name.startswith("M")}  # without mirrored copies
         indexed = [row for row in self.folder.rows if row.name in listed]
-        left_out = {
+        counts = {
             "motions by data.source.exclude": sum(not name.startswith("M") for name in self.folder.exclude),
             "motions that index.csv lacks": len(listed) - len(indexed),
             "motions of HumanAct12, as data.source.humanact12 is not given": len(indexed) - len(self.rows),
         }
-        self._excluded = Counter({reason: count for reason, count in left_out.items() if count})
-        recordings: dict[str, list[Row]] = defaultdict(list)
-        for row in self.rows:
-            recordings[row.key].append(row)
-        from_amass = {key: rows for key, rows in recordings.items() if not rows[0].humanact12}
+        self.excluded.clear()
+        self.excluded.update({reason: count for reason, count in counts.items() if count})
+        from_amass, from_humanact12 = by_recording(self.rows)
         for key, motions in self.amass.each(from_amass, _parameters, self.workers):
-            for row, motion in zip(recordings.pop(key), motions, strict=True):
+            for row, motion in zip(from_amass[key], motions, strict=True):
                 yield from self._clips(row, motion)
         if self.humanact12:
-            yield from self._from_humanact12(self.humanact12, recordings)
+            yield from self._from_humanact12(self.humanact12, from_humanact12)
 
     def _from_humanact12(self, path: Path, recordings: dict[str, list[Row]]) -> Iterator[Clip]:
         """Yields SMPL poses of HumanAct12; the root position is used as SMPL's translation, as in FLAME's code."""
@@ -367,19 +360,18 @@ class HumanML3DSMPL(MotionSource):
         for key in sorted(recordings):
             entry = data.get(f"{key}.npy", data.get(key)) if isinstance(data, dict) else None
             if entry is None:
-                self._excluded[f"motions of HumanAct12 that {path.name} lacks"] += len(recordings[key])
+                self.excluded[f"motions of HumanAct12 that {path.name} lacks"] += len(recordings[key])
                 continue
-            try:
+            errors = (KeyError, TypeError, ValueError, IndexError)
+            with naming(path, *errors, what=f"{key} lacks poses (F, 72) or joints3D (F, 24, 3): "):
                 poses = np.asarray(entry["poses"], np.float32)
                 motion = np.concatenate([np.asarray(entry["joints3D"], np.float32)[:, 0], poses.reshape(-1, 72)], 1)
-            except (KeyError, TypeError, ValueError, IndexError) as error:
-                raise ValueError(f"{path}: {key} lacks poses (F, 72) or joints3D (F, 24, 3): {error}") from error
             for row in recordings[key]:
                 yield from self._clips(row, motion)
 
     def _clips(self, row: Row, motion: np.ndarray) -> Iterator[Clip]:
         if not len(motion):
-            self._excluded["motions without a frame"] += 1
+            self.excluded["motions without a frame"] += 1
             return
         split = self.folder.names[row.name]
         for number, description in enumerate(self.folder.texts[row.name]):

@@ -5,7 +5,6 @@ Plappert, Mandery, Asfour, "The KIT Motion-Language Dataset", Big Data 2016. `do
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterator, Sequence
 from functools import cached_property
 from itertools import islice
@@ -14,10 +13,11 @@ from typing import Any
 
 import numpy as np
 
-from flame_mdm.data import Clip, MotionSource, Split
+from flame_mdm.data import SPLITS, Clip, MotionSource, Split
 from flame_mdm.data.parallel import in_order
-from flame_mdm.data.t2m import SPLITS, T2MFolder
-from flame_mdm.safe_io import TEXT_LIMIT, read_json, read_text, regular_file
+from flame_mdm.data.t2m import T2MFolder, read_names, read_splits
+from flame_mdm.errors import UserError
+from flame_mdm.safe_io import TEXT_LIMIT, naming, read_json, regular_file
 
 UNITS_PER_METER = 640
 MMM_FPS = 100
@@ -43,6 +43,7 @@ class KITTemos(MotionSource):
 
     name = "kit-temos"
     shortest, longest = 10, 500
+    get_it = "get datasets/kit-splits of https://github.com/Mathux/TEMOS"
 
     def __init__(self, path: str, splits: str, exclude: Sequence[str] = (), workers: int = 0):
         """Stores the arguments; reads no files.
@@ -53,52 +54,33 @@ class KITTemos(MotionSource):
             exclude: numbers to leave out.
             workers: number of processes; 0 = one per core, 1 = this process only.
         """
-        self.workers = workers
-        self.path, self.splits, self.exclude = Path(path), Path(splits), frozenset(str(name) for name in exclude)
-        self._excluded: Counter[str] = Counter()
+        self.path, self.splits, self.workers = Path(path), Path(splits), workers
+        self.exclude = frozenset(str(name) for name in exclude)
+        self.options = {"exclude": list(exclude)}
 
     @cached_property
     def names(self) -> dict[str, Split]:
-        """Name of each motion in a split -> its split.
-
-        Raises:
-            FileNotFoundError: the list of a split is missing.
-            ValueError: a motion is in two splits, or `exclude` has an unknown name.
-        """
-        found: dict[str, Split] = {}
-        for split in SPLITS:
-            for name in self._list(split):
-                if found.setdefault(name, split) != split:
-                    raise ValueError(f"{self.splits}/{split}: {name} is also in {found[name]}")
-        unknown = self.exclude - found.keys()
-        if unknown:
-            raise ValueError(f"data.source.exclude: no split contains {', '.join(sorted(unknown))}")
-        return {name: split for name, split in found.items() if name not in self.exclude}
+        """Name of each motion in a split -> its split."""
+        return read_splits(self.splits, "", self.exclude, self.get_it)
 
     @cached_property
     def texts(self) -> dict[str, list[str]]:
-        """Captions of each motion in the splits, except motions without captions.
-
-        Raises:
-            FileNotFoundError: files are missing.
-            ValueError: a file is damaged, or the two files of a motion disagree.
-        """
-        wanted = [f"{name}_{kind}" for name in self.names for kind in ("fke.csv", "annotations.json", "meta.json")]
-        there = {path.name for path in self.path.glob("*_*")}
-        absent = [name for name in wanted if name not in there]
-        if absent:
+        """Captions of each motion in the splits, except motions without captions."""
+        needed = [f"{name}_{kind}" for name in self.names for kind in ("fke.csv", "annotations.json", "meta.json")]
+        files = {path.name for path in self.path.glob("*_*")}
+        if absent := [name for name in needed if name not in files]:
             raise FileNotFoundError(
-                f"{self.path}: {len(absent)} of {len(wanted)} files are missing, such as {absent[0]}; download KIT-ML "
+                f"{self.path}: {len(absent)} of {len(needed)} files are missing, such as {absent[0]}; download KIT-ML "
                 "from https://motion-annotation.humanoids.kit.edu/dataset and the joints as described in docs/kit.md"
             )
-        found = {}
+        texts = {}
         for name in self.names:
             captions, meta = (_json(self.path / f"{name}_{kind}.json") for kind in ("annotations", "meta"))
             if len(captions) != meta.get("nb_annotations"):
-                raise ValueError(f"{self.path}/{name}_meta.json: nb_annotations does not match {name}_annotations.json")
+                raise UserError(f"{self.path}/{name}_meta.json: nb_annotations does not match {name}_annotations.json")
             if captions:
-                found[name] = captions
-        return found
+                texts[name] = captions
+        return texts
 
     @cached_property
     def frames(self) -> dict[str, int]:
@@ -109,20 +91,17 @@ class KITTemos(MotionSource):
         return sum(self._fits(name) for name in self.frames)
 
     def clips(self, fps: float) -> Iterator[Clip]:
-        """Yields all motions, in the order of the splits.
-
-        Raises:
-            ValueError: `fps` is not 12.5, or a file is damaged.
-        """
-        if fps * 8 != MMM_FPS:
-            raise ValueError(f"{self.name} has 12.5 frames per second, but representation.fps is {fps:g}")
-        ghosh = set(self._list("ghosh-test")) if (self.splits / "ghosh-test").is_file() else set()
-        self._excluded = Counter({"motions by data.source.exclude": len(self.exclude)} if self.exclude else {})
-        self._excluded.update(f"motions of {split} without a caption" for split in self._without_caption())
+        """Yields all motions, in the order of the splits."""
+        self.check_fps(fps, MMM_FPS / 8)
+        ghosh = set(read_names(self.splits / "ghosh-test", "")) if (self.splits / "ghosh-test").is_file() else set()
+        self.excluded.clear()
+        if self.exclude:
+            self.excluded["motions by data.source.exclude"] = len(self.exclude)
+        self.excluded.update(f"motions of {s} without a caption" for n, s in self.names.items() if n not in self.texts)
         for name, frames in self.frames.items():
             if not self._fits(name):
                 limit = f"shorter than {self.shortest}" if frames < self.shortest else f"longer than {self.longest}"
-                self._excluded[f"motions of {self.names[name]} {limit} frames"] += 1
+                self.excluded[f"motions of {self.names[name]} {limit} frames"] += 1
         names = [name for name in self.frames if self._fits(name)]
         tasks = ((self.path / f"{name}_fke.csv", 1 if self.names[name] == "test" else 8) for name in names)
         for name, recording in zip(names, in_order(_recording, tasks, self.workers), strict=True):
@@ -137,30 +116,16 @@ class KITTemos(MotionSource):
                 reference=recording if split == "test" else None,
             )
 
-    def excluded(self) -> dict[str, int]:
-        """Returns the number of motions left out, by reason."""
-        return dict(self._excluded)
-
     def counts(self) -> dict[str, int]:
         """Returns the figures of the folder under the names of `published.yaml`."""
         files = [path for path in self.path.glob("*_annotations.json") if _json(path)]
         texts = sum(len(_json(path)) for path in files)
-        splits = {split.replace("-", "_"): len(self._list(split)) for split in (*SPLITS, "ghosh-test")}
+        lists = (self.splits / split for split in (*SPLITS, "ghosh-test"))
+        splits = {path.name.replace("-", "_"): len(read_names(path, self.get_it)) for path in lists}
         return {"motions": len(list(self.path.glob("*_fke.csv"))), "texts": texts, **splits}
 
     def _fits(self, name: str) -> bool:
         return self.names[name] == "test" or self.shortest <= self.frames[name] <= self.longest
-
-    def _without_caption(self) -> list[str]:
-        return [split for name, split in self.names.items() if name not in self.texts]
-
-    def _list(self, split: str) -> list[str]:
-        file = self.splits / split
-        if not file.is_file():
-            raise FileNotFoundError(
-                f"{file}: no such list of motions; get datasets/kit-splits of https://github.com/Mathux/TEMOS"
-            )
-        return read_text(file).split()
 
 
 def _recording(task: tuple[Path, int]) -> np.ndarray:
@@ -171,20 +136,14 @@ def read_joints(path: Path, step: int = 8) -> np.ndarray:
     """Reads every `step`-th frame of `NUMBER_fke.csv`: joints (F, 21, 3) float32 in meters, y up.
 
     A row contains its number and 63 coordinates in KIT's unit, about 1/640 of a meter.
-
-    Raises:
-        ValueError: the file is damaged.
     """
     regular_file(path, TEXT_LIMIT)
-    with path.open(encoding="utf-8") as file:
-        try:
-            rows = np.loadtxt(islice(file, 1, None, step), delimiter=",", ndmin=2)
-        except ValueError as error:
-            raise ValueError(f"{path}: damaged: {error}; exclude the motion by its number") from error
-    if rows.shape[1] != 64 or not len(rows):
-        raise ValueError(f"{path}: {rows.shape[1]} columns, not a row number and 63 coordinates")
-    if not np.isfinite(rows).all():
-        raise ValueError(f"{path}: contains non-finite numbers; exclude the motion by its number")
+    with path.open(encoding="utf-8") as file, naming(path, ValueError, what="damaged, exclude it by its number: "):
+        rows = np.loadtxt(islice(file, 1, None, step), delimiter=",", ndmin=2)
+        if rows.shape[1] != 64 or not len(rows):
+            raise UserError(f"{rows.shape[1]} columns, not a row number and 63 coordinates")
+        if not np.isfinite(rows).all():
+            raise UserError("non-finite numbers")
     return (rows[:, 1:].reshape(-1, 21, 3) / UNITS_PER_METER).astype(np.float32)
 
 
@@ -199,5 +158,5 @@ def _json(path: Path) -> Any:
     content = read_json(path)
     kind = list if path.name.endswith("_annotations.json") else dict
     if not isinstance(content, kind) or (kind is list and not all(isinstance(text, str) for text in content)):
-        raise ValueError(f"{path}: damaged: not {'a list of texts' if kind is list else 'an object'}")
+        raise UserError(f"{path}: damaged: not {'a list of texts' if kind is list else 'an object'}")
     return content

@@ -1,33 +1,26 @@
-"""Parallel processing of many files in worker processes, with results in order; locks between processes."""
+"""Parallel processing of many files in worker processes, with results in order."""
 
 from __future__ import annotations
 
-import errno
-import fcntl
 import os
-import socket
 import threading
 import time
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import islice
 from multiprocessing import active_children, get_context, parent_process
 from multiprocessing.process import BaseProcess
-from pathlib import Path
-from typing import IO, TypeVar
+from typing import TypeVar
 
-from flame_mdm.errors import UserError, say
-from flame_mdm.safe_io import made_folder
+from flame_mdm.errors import UserError
 from flame_mdm.signals import ignore_interrupts
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
-
-
 PATIENCE = 2.0
 """Seconds of work after which processes are started if their number is not given: starting one takes that long."""
 
@@ -49,7 +42,7 @@ def in_order(function: Callable[[Task], Result], tasks: Iterable[Task], workers:
             seconds.
 
     Raises:
-        UserError: a worker died, for instance because the system ran out of memory.
+        UserError: If a worker died, for instance because the system ran out of memory.
     """
     workers = 1 if not workers and cores() == 1 else workers
     start, remaining = time.monotonic(), iter(tasks)
@@ -141,51 +134,3 @@ def _start_worker() -> None:
 
     ignore_interrupts()
     threading.Thread(target=follow, daemon=True).start()
-
-
-@contextmanager
-def locked(path: Path, busy: Callable[[str], object], advice: str) -> Iterator[str]:
-    """Holds a lock file, with process and host in it, that no other process holds, here or on other hosts.
-
-    The operating system releases the lock when a process ends in any way, so a free lock in a file that still names a
-    process was left behind by one that died. POSIX record locks also hold between hosts on NFS and Lustre; `filelock`
-    uses flock, which Lustre limits to one host by default, and empties the file that names the owner. Windows has
-    neither.
-
-    Args:
-        path: the lock file; removed at the end.
-        busy: called with the owner if another process holds the lock; raises, or returns to wait.
-        advice: what to do on file systems without locks.
-
-    Yields:
-        The process that died and left the file behind; "" if there is none.
-    """
-    while True:
-        with made_folder(path.parent), path.open("a+") as file:
-            file.seek(0)
-            owner = file.read().strip()
-            try:
-                fcntl.lockf(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError as error:
-                if error.errno in (errno.EACCES, errno.EAGAIN):
-                    busy(owner)
-                    fcntl.lockf(file, fcntl.LOCK_EX)
-                else:
-                    say(f"{path}: this file system has no locks ({error.strerror}); {advice}")
-            if not _is_at(file, path):  # the previous process has removed it, and another may hold a new one
-                continue
-            with suppress(OSError):  # a full disk
-                file.truncate(0)
-                os.write(file.fileno(), f"process {os.getpid()} on {socket.gethostname()}\n".encode())
-            try:
-                yield owner
-            finally:
-                path.unlink(missing_ok=True)
-            return
-
-
-def _is_at(file: IO[str], path: Path) -> bool:
-    try:
-        return os.path.samestat(os.fstat(file.fileno()), path.stat())
-    except FileNotFoundError:
-        return False

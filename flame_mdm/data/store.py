@@ -26,24 +26,23 @@ from contextlib import ExitStack, closing
 from dataclasses import asdict, dataclass, field
 from itertools import chain, islice
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 import torch
 
-from flame_mdm.data import Clip, MotionSource, Split
-from flame_mdm.data.parallel import in_order, locked
+from flame_mdm.data import SPLITS, Clip, MotionSource, Split
+from flame_mdm.data.parallel import in_order
 from flame_mdm.errors import UserError, first_line, say
 from flame_mdm.progress import ProgressBar
 from flame_mdm.representations import Frames, Representation
-from flame_mdm.safe_io import parse_json, read_json, read_npy, read_npz, regular_file, sha256, writing
+from flame_mdm.safe_io import locked, parse_json, read_json, read_npy, read_npz, regular_file, sha256, writing
 
 FORMAT = 1
 CHUNK = 4096
 """Frames that are encoded together."""
 BLOCK = 8192
 """Frames that are read together for the statistics."""
-SPLITS = get_args(Split)
 _Motion = tuple[str, str, np.ndarray]
 """Clip that names a motion in errors, name of the representation or "", and the motion itself."""
 
@@ -347,7 +346,7 @@ def _describe(
         "source": dict(source.options),
         "actions": list(source.actions),
         "published_split": source.published_split,
-        "excluded": source.excluded(),
+        "excluded": dict(source.excluded),
         "counts": source.counts(),
         "representation": representation.name,
         "fps": representation.fps,

@@ -547,6 +547,7 @@ class Synthetic(MotionSource):
             )
         self.size, self.seed, self.min_seconds, self.max_seconds = clips, seed, min_seconds, max_seconds
         self.workers = workers
+        self.options = {"clips": clips, "seed": seed, "min_seconds": min_seconds, "max_seconds": max_seconds}
 
     def count(self) -> int:
         return self.size

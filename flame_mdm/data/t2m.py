@@ -11,16 +11,16 @@ from __future__ import annotations
 import math
 import re
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from functools import cached_property
 from pathlib import Path, PurePosixPath
 from typing import NamedTuple
 
 import numpy as np
 
-from flame_mdm.data import Clip, MotionSource, Split, archives
+from flame_mdm.data import SPLITS, Clip, MotionSource, Split, archives, required, some, without
 from flame_mdm.errors import UserError
-from flame_mdm.safe_io import read_npy, read_text
+from flame_mdm.safe_io import naming, read_npy, read_text
 
 TAG_FPS = 20
 """Frames per second of the tags `from` and `to`, also in KIT-ML, whose motions have 12.5."""
@@ -29,7 +29,6 @@ MAX_LENGTH = 200
 """Motions and cuts of this many frames or more are left out."""
 
 MAX_TOKENS = 20
-SPLITS: tuple[Split, ...] = ("train", "val", "test")
 
 
 class Description(NamedTuple):
@@ -51,12 +50,8 @@ class Cut(NamedTuple):
 
 
 def parse(text: str, where: str) -> list[Description]:
-    """Parses the descriptions in a text file; a NaN tag means 0, as published.
-
-    Raises:
-        ValueError: a line does not have four parts; the message contains `where` and the line number.
-    """
-    found = []
+    """Parses the descriptions in a text file, which `where` names in errors; a NaN tag means 0, as published."""
+    descriptions = []
     for number, line in enumerate(text.splitlines(), 1):
         if not line.strip():
             continue
@@ -64,9 +59,9 @@ def parse(text: str, where: str) -> list[Description]:
             caption, tokens, *tags = line.strip().rsplit("#", 3)
             begin, end = (0.0 if math.isnan(float(tag)) else float(tag) for tag in tags)
         except ValueError:
-            raise ValueError(f"{where}, line {number}: not caption#words#from#to: {line.strip()[:60]!r}") from None
-        found.append(Description(caption, tokens.split(" "), begin, end))
-    return found
+            raise UserError(f"{where}, line {number}: not caption#words#from#to: {line.strip()[:60]!r}") from None
+        descriptions.append(Description(caption, tokens.split(" "), begin, end))
+    return descriptions
 
 
 def cuts(name: str, frames: int, descriptions: Sequence[Description], shortest: int) -> list[Cut]:
@@ -77,7 +72,7 @@ def cuts(name: str, frames: int, descriptions: Sequence[Description], shortest: 
     """
     if not shortest <= frames < MAX_LENGTH:
         return []
-    found: list[Cut] = []
+    items: list[Cut] = []
     seen: Counter[str] = Counter()
     for description in descriptions:
         if description.begin == description.end == 0:
@@ -87,9 +82,9 @@ def cuts(name: str, frames: int, descriptions: Sequence[Description], shortest: 
         if shortest <= length < MAX_LENGTH:
             id_ = f"{name}@{description.begin:g}-{description.end:g}"
             seen[id_] += 1
-            found.append(Cut(id_ if seen[id_] == 1 else f"{id_}#{seen[id_]}", start, length, [description]))
+            items.append(Cut(id_ if seen[id_] == 1 else f"{id_}#{seen[id_]}", start, length, [description]))
     whole = [d for d in descriptions if d.begin == d.end == 0]
-    return [*found, Cut(name, 0, frames, whole)] if whole else found
+    return [*items, Cut(name, 0, frames, whole)] if whole else items
 
 
 def words_of(caption: str) -> list[str]:
@@ -101,6 +96,27 @@ def frame_tokens(tokens: Sequence[str]) -> tuple[list[str], int]:
     """Returns the first 20 tokens between sos and eos, padded to 22 with unk, and the number without padding."""
     framed = ["sos/OTHER", *tokens[:MAX_TOKENS], "eos/OTHER"]
     return framed + ["unk/OTHER"] * (MAX_TOKENS + 2 - len(framed)), len(framed)
+
+
+def read_names(path: Path, get_it: str) -> list[str]:
+    """Returns the names in a list; `get_it` says where it is published."""
+    return read_text(required(path, get_it)).split()
+
+
+def read_splits(folder: Path, ending: str, exclude: Collection[str], get_it: str) -> dict[str, Split]:
+    """Returns name -> split, in the order of the lists train, val and test in a folder, without excluded names.
+
+    Raises:
+        FileNotFoundError: If the folder or a list is missing.
+        UserError: If a name is in two splits, or `exclude` has an unknown name.
+    """
+    splits: dict[str, Split] = {}
+    for split in SPLITS:
+        file = required(folder, get_it) / f"{split}{ending}"
+        for name in read_names(file, get_it):
+            if splits.setdefault(name, split) != split:
+                raise UserError(f"{file}: {name} is also in {splits[name]}{ending}")
+    return without(splits, exclude, folder)
 
 
 class T2MFolder(MotionSource):
@@ -123,30 +139,12 @@ class T2MFolder(MotionSource):
             exclude: names to leave out; a mirrored copy has its own name.
         """
         self.path, self.exclude = Path(path), frozenset(str(name) for name in exclude)
-        self._excluded: Counter[str] = Counter()
+        self.options = {"exclude": list(exclude)}
 
     @cached_property
     def names(self) -> dict[str, Split]:
-        """Name in a list of the splits -> its split, in the order of the lists.
-
-        Raises:
-            FileNotFoundError: the folder or a list is missing.
-            ValueError: a name is in two splits, or `exclude` has an unknown name.
-        """
-        if not self.path.is_dir():
-            raise FileNotFoundError(f"{self.path}: no such folder; {self.get_it}")
-        found: dict[str, Split] = {}
-        for split in SPLITS:
-            file = self.path / f"{split}.txt"
-            if not file.is_file():
-                raise FileNotFoundError(f"{file}: no such list of names; {self.get_it}")
-            for name in read_text(file).split():
-                if found.setdefault(name, split) != split:
-                    raise ValueError(f"{file}: {name} is also in {found[name]}.txt")
-        unknown = self.exclude - found.keys()
-        if unknown:
-            raise ValueError(f"data.source.exclude: no split contains {_some(unknown)}")
-        return {name: split for name, split in found.items() if name not in self.exclude}
+        """Name in a list of the splits -> its split, in the order of the lists."""
+        return read_splits(self.path, ".txt", self.exclude, self.get_it)
 
     @cached_property
     def texts(self) -> dict[str, list[Description]]:
@@ -155,18 +153,12 @@ class T2MFolder(MotionSource):
 
     @cached_property
     def frames(self) -> dict[str, int]:
-        """Number of frames of each motion in the splits.
-
-        Raises:
-            FileNotFoundError: motions or texts of names in the splits are missing.
-            ValueError: a file is damaged.
-        """
+        """Number of frames of each motion in the splits."""
         names = self.names
-        for what, kind in ((self._motions(), "new_joint_vecs/*.npy"), (self.texts, "texts/*.txt")):
-            absent = [name for name in names if name not in what]
-            if absent:
+        for files, kind in ((self._motions(), "new_joint_vecs/*.npy"), (self.texts, "texts/*.txt")):
+            if absent := names.keys() - files:
                 raise FileNotFoundError(
-                    f"{self.path}: {kind} lacks {len(absent)} of the names in the splits: {_some(absent)}; process "
+                    f"{self.path}: {kind} lacks {len(absent)} of the names in the splits: {some(absent)}; process "
                     f"them again, or leave them out with {_exclusion(absent)}"
                 )
         return {name: len(self._load(name, mmap=True)) for name in names}
@@ -177,27 +169,22 @@ class T2MFolder(MotionSource):
         return total
 
     def clips(self, fps: float) -> Iterator[Clip]:
-        """Yields all items, at the frame rate of the folder.
-
-        Raises:
-            ValueError: another frame rate is requested, a file is damaged, or motions are not finite; these are all
-                listed at the end, so that they can be excluded together.
-        """
-        if fps != self.fps:
-            raise ValueError(f"{self.name} has {self.fps:g} frames per second, but representation.fps is {fps:g}")
-        self._excluded = Counter({"names by data.source.exclude": len(self.exclude)} if self.exclude else {})
-        orphans = self.texts.keys() - self._motions() - self.exclude
-        if orphans:
-            self._excluded[f"texts without a motion ({_some(orphans)})"] = len(orphans)
+        """Yields all items, at the frame rate of the folder; motions that are not finite are all named at the end."""
+        self.check_fps(fps, self.fps)
+        self.excluded.clear()
+        if self.exclude:
+            self.excluded["names by data.source.exclude"] = len(self.exclude)
+        if orphans := self.texts.keys() - self._motions() - self.exclude:
+            self.excluded[f"texts without a motion ({some(orphans)})"] = len(orphans)
         damaged = []
         for name, length in self.frames.items():
-            found = cuts(name, length, self.texts[name], self.shortest)
-            self._account(name, length, found)
-            motion = self._load(name) if found else np.zeros(0)
+            items = cuts(name, length, self.texts[name], self.shortest)
+            self._account(name, length, items)
+            motion = self._load(name) if items else np.zeros(0)
             if not np.isfinite(motion).all():
                 damaged.append(name)
                 continue
-            for cut in found:
+            for cut in items:
                 yield Clip(
                     id=cut.id,
                     motion=motion,
@@ -209,33 +196,24 @@ class T2MFolder(MotionSource):
                     window=(cut.start, cut.length),
                 )
         if damaged:
-            raise ValueError(
-                f"{self.path}: {len(damaged)} motions contain non-finite numbers: {_some(damaged)}; process them "
+            raise UserError(
+                f"{self.path}: {len(damaged)} motions contain non-finite numbers: {some(damaged)}; process them "
                 f"again, or leave them out with {_exclusion(damaged)}"
             )
 
-    def excluded(self) -> dict[str, int]:
-        """Returns the number of names without clips, by split and reason, and of descriptions of parts without clip."""
-        return dict(self._excluded)
-
     def statistics(self) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the published mean and std, which are over all motions of all splits.
-
-        Raises:
-            FileNotFoundError: the files are missing.
-            ValueError: the files are damaged, or a std is not positive.
-        """
+        """Returns the published mean and std, which are over all motions of all splits."""
         mean, std = (self._array(self.path / f"{name}.npy") for name in ("Mean", "Std"))
         if {mean.dtype.kind, std.dtype.kind} - set("fiu"):
-            raise ValueError(f"{self.path}: Mean.npy and Std.npy are not arrays of real numbers")
+            raise UserError(f"{self.path}: Mean.npy and Std.npy are not arrays of real numbers")
         if mean.shape != std.shape or mean.ndim != 1 or not np.isfinite(mean).all() or not (std > 0).all():
-            raise ValueError(f"{self.path}: Mean.npy {mean.shape} or Std.npy {std.shape} is not a mean or positive std")
+            raise UserError(f"{self.path}: Mean.npy {mean.shape} or Std.npy {std.shape} is not a mean or positive std")
         return mean.astype(np.float32), std.astype(np.float32)
 
     def counts(self) -> dict[str, float]:
         """Returns the figures of the folder under the names of `published.yaml`, of which mirrored copies give none."""
         originals = {name.removeprefix("M") for name in self._motions()}
-        captions = [d.caption for name, found in self.texts.items() if not name.startswith("M") for d in found]
+        captions = [d.caption for name, texts in self.texts.items() if not name.startswith("M") for d in texts]
         words = [words_of(caption) for caption in captions]
         splits = Counter(self.names.values())
         return {
@@ -255,22 +233,15 @@ class T2MFolder(MotionSource):
         motion = self._array(self.path / "new_joint_vecs" / f"{name}.npy", mmap)
         if motion.ndim != 2 or motion.dtype.kind not in "fiu":
             what = f"shape {motion.shape} of {motion.dtype}"
-            raise ValueError(f"{self.path}/new_joint_vecs/{name}.npy: {what}, not numbers (frames, features)")
+            raise UserError(f"{self.path}/new_joint_vecs/{name}.npy: {what}, not numbers (frames, features)")
         return motion
 
     def _array(self, path: Path, mmap: bool = False) -> np.ndarray:
-        try:
-            return read_npy(path, mmap=mmap)
-        except UserError:
-            raise
-        except FileNotFoundError:
-            raise FileNotFoundError(f"{path}: no such file; {self.get_it}") from None
-        except ValueError as error:
-            raise ValueError(f"{path}: {error}; process it again, or exclude it by name") from error
+        return read_npy(required(path, self.get_it), mmap=mmap)
 
-    def _account(self, name: str, frames: int, found: Sequence[Cut]) -> None:
+    def _account(self, name: str, frames: int, items: Sequence[Cut]) -> None:
         """Counts what is left out of a motion, by reason."""
-        lost = len(self.texts[name]) - sum(len(cut.descriptions) for cut in found)
+        lost = len(self.texts[name]) - sum(len(cut.descriptions) for cut in items)
         reason = ""
         if frames < self.shortest:
             reason = f"shorter than {self.shortest} frames"
@@ -278,12 +249,12 @@ class T2MFolder(MotionSource):
             reason = f"of {MAX_LENGTH} frames or more"
         elif not self.texts[name]:
             reason = "without a caption"
-        elif not found:
+        elif not items:
             reason = "with captions of unfit parts only"
         elif lost:
-            self._excluded["captions of parts that are too short or too long"] += lost
+            self.excluded["captions of parts that are too short or too long"] += lost
         if reason:
-            self._excluded[f"names of {self.names[name]} {reason}"] += 1
+            self.excluded[f"names of {self.names[name]} {reason}"] += 1
 
 
 def _texts(path: Path) -> Iterator[tuple[str, str, str]]:
@@ -295,24 +266,17 @@ def _texts(path: Path) -> Iterator[tuple[str, str, str]]:
     archive = path / "texts.zip"
     if not archive.is_file():
         raise FileNotFoundError(f"{path}: contains neither a folder texts nor texts.zip")
-    contents = {
-        member: content()
-        for member, content in archives.members(archive)
-        if member.endswith(".txt") and "__MACOSX" not in PurePosixPath(member).parts
-    }
-    for member, content in sorted(contents.items()):
-        try:
+
+    def is_text(member: str) -> bool:
+        return member.endswith(".txt") and "__MACOSX" not in PurePosixPath(member).parts
+
+    for member, content in sorted(item for item in archives.members(archive, is_text) if is_text(item[0])):
+        where = f"{archive}/{member}"
+        with naming(where, UnicodeDecodeError, what="not a UTF-8 text file: "):
             text = content.decode("utf-8").replace("\r\n", "\n").replace("\r", "\n")
-        except UnicodeDecodeError as error:
-            raise ValueError(f"{archive}/{member}: not a UTF-8 text file: {error}") from error
-        yield PurePosixPath(member).stem, f"{archive}/{member}", text
+        yield PurePosixPath(member).stem, where, text
 
 
-def _some(names: Iterable[str]) -> str:
-    first = sorted(names)
-    return ", ".join(first[:5]) + (f" and {len(first) - 5} more" if len(first) > 5 else "")
-
-
-def _exclusion(names: Sequence[str]) -> str:
+def _exclusion(names: Collection[str]) -> str:
     """Returns the override that leaves these names out; only its key if there are more than 100."""
-    return f"'data.source.exclude=[{','.join(names)}]'" if len(names) <= 100 else "data.source.exclude"
+    return f"'data.source.exclude=[{','.join(sorted(names))}]'" if len(names) <= 100 else "data.source.exclude"

@@ -6,20 +6,20 @@ et al., "Action-Conditioned 3D Human Motion Synthesis with Transformer VAE", ICC
 
 from __future__ import annotations
 
-import hashlib
 import math
 import re
-from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from flame_mdm.data import Clip, MotionSource, Split, restricted_pickle
-from flame_mdm.data.humanact12 import check_fps, columns, find
-from flame_mdm.safe_io import read_text
+from flame_mdm.data import Clip, MotionSource, Split, name_hash, required
+from flame_mdm.data.humanact12 import FPS, NO_NUMBERS, find, read_lists
+from flame_mdm.errors import UserError
+from flame_mdm.safe_io import naming, read_text
 
 TRAIN_SUBJECTS = (
     *(1, 2, 6, 12, 13, 16, 21, 24, 28, 29, 30, 31, 33, 35, 39, 41, 42, 45, 47, 50, 52, 54, 55, 57, 59, 61, 63),
@@ -68,77 +68,74 @@ class UESTC(MotionSource):
             min_frames: minimum length of a training clip; published: three quarters of 60.
         """
         self.path, self.published_split, self.min_frames = Path(path), published_split, min_frames
-        self._videos: list[Video] | None = None
-        self._actions: tuple[str, ...] = ()
-        self._excluded: Counter[str] = Counter()
+        self.options = {"published_split": published_split, "min_frames": min_frames}
 
-    @property
-    def actions(self) -> tuple[str, ...]:
+    @cached_property
+    def actions(self) -> tuple[str, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Names of the actions, read from the data set: models need their number before training."""
-        self.videos()
-        return self._actions
+        return tuple(self._lines("action_classes.txt"))
 
     def count(self) -> int:
         """Returns the number of videos, including the few left out when their poses are read."""
-        return len(self.videos())
-
-    def excluded(self) -> dict[str, int]:
-        return dict(self._excluded)
+        return len(self.used)
 
     def counts(self) -> dict[str, int]:
-        return {"videos": self._size, "subjects": len({video.subject for video in self.videos()})}
+        return {"videos": len(self.videos), "subjects": len({video.subject for video in self.used})}
 
+    @cached_property
+    def poses(self) -> Path:
+        """The file of poses, next to the folder `info`."""
+        return find(self.path, "vibe_cache_refined.pkl")
+
+    @cached_property
     def videos(self) -> list[Video]:
-        """Returns the videos that are used: of side 2, only views 0 to 7. Also reads the names of the actions.
+        """All videos, in the order of the file of poses."""
+        videos = []
+        for index, name in enumerate(self._lines("names.txt")):
+            match = NAME.fullmatch(name)
+            if match is None or int(match[1]) >= len(self.actions):
+                raise UserError(
+                    f"{self.poses.parent}/info/names.txt, line {index + 1}: {name!r} is not the name of a video with "
+                    f"one of the {len(self.actions)} actions, such as a0_d0_p001_c1_color.avi"
+                )
+            action, view, subject, side = (int(match[k]) for k in range(1, 5))
+            videos.append(Video(index, name.removesuffix(match[5] or ""), action, view, subject, side))
+        return videos
 
-        Raises:
-            FileNotFoundError, ValueError: a file of `info` is missing or damaged.
-        """
-        if self._videos is None:
-            self._folder = find(self.path, "vibe_cache_refined.pkl").parent
-            self._actions = tuple(_lines(self._folder / "info" / "action_classes.txt"))
-            videos = []
-            for index, name in enumerate(_lines(self._folder / "info" / "names.txt")):
-                match = NAME.fullmatch(name)
-                if match is None or int(match[1]) >= len(self._actions):
-                    raise ValueError(
-                        f"{self._folder}/info/names.txt, line {index + 1}: {name!r} is not the name of a video such as "
-                        f"a0_d0_p001_c1_color.avi with one of the {len(self._actions)} actions"
-                    )
-                action, view, subject, side = (int(match[k]) for k in range(1, 5))
-                videos.append(Video(index, name.removesuffix(match[5] or ""), action, view, subject, side))
-            self._size = len(videos)
-            self._videos = [video for video in videos if video.side == 1 or video.view < 8]
-        return self._videos
+    @property
+    def used(self) -> list[Video]:
+        """The videos that are used: of side 2, only views 0 to 7."""
+        return [video for video in self.videos if video.side == 1 or video.view < 8]
+
+    def _lines(self, name: str) -> list[str]:
+        path = self.poses.parent / "info" / name
+        return read_text(required(path, "it is published with the poses; unpack the archive again")).splitlines()
 
     def clips(self, fps: float) -> Iterator[Clip]:
-        check_fps(self.name, fps)
-        videos = self.videos()
-        path = self._folder / "vibe_cache_refined.pkl"
-        poses, joints, cameras = columns(path, restricted_pickle.read(path), "pose", "joints3d", "orig_cam")
-        frames = _lines(self._folder / "info" / "num_frames_min.txt")
-        if not self._size == len(frames) == len(poses):
-            raise ValueError(
-                f"{self._folder}: names.txt has {self._size} lines, num_frames_min.txt {len(frames)} and "
-                f"vibe_cache_refined.pkl {len(poses)} clips; the numbers must be equal"
+        self.check_fps(fps, FPS)
+        path, videos = self.poses, self.used
+        columns = read_lists(path, "pose", "joints3d", "orig_cam")
+        frames, numbers = self._lines("num_frames_min.txt"), (len(self.videos), len(columns[0]))
+        if {*numbers} != {len(frames)}:
+            raise UserError(
+                f"{path.parent}: names.txt has {numbers[0]} lines, num_frames_min.txt {len(frames)} and {path.name} "
+                f"{numbers[1]} clips; the numbers must be equal"
             )
-        self._excluded = Counter()
-        if self._size > len(videos):
-            self._excluded["videos of view 8, side 2"] = self._size - len(videos)
+        self.excluded.clear()
+        if len(videos) < len(self.videos):
+            self.excluded["videos of view 8, side 2"] = len(self.videos) - len(videos)
         for video in videos:
-            try:
-                pose, joint, camera = (np.asarray(part[video.index], np.float64) for part in (poses, joints, cameras))
+            with naming(f"{path}: {video.id}", *NO_NUMBERS, what="does not consist of numbers: "):
+                pose, joint, camera = (np.asarray(column[video.index], np.float64) for column in columns)
                 limit = int(frames[video.index])
-            except (TypeError, ValueError, OverflowError) as error:
-                raise ValueError(f"{path}: {video.id} does not consist of numbers: {error}") from error
             if pose.shape[1:] != (72,) or joint.shape != (len(pose), 49, 3) or camera.shape != (len(pose), 4):
-                raise ValueError(
+                raise UserError(
                     f"{path}: {video.id} has pose {pose.shape}, joints3d {joint.shape}, orig_cam {camera.shape}, not "
                     "(F, 72), (F, 49, 3), (F, 4)"
                 )
             split, length = self.split(video.subject), min(len(pose), limit)
             if length < (1 if split == "test" else self.min_frames):
-                self._excluded[f"{'test' if split == 'test' else 'training'} clips that are too short"] += 1
+                self.excluded[f"{'test' if split == 'test' else 'training'} clips that are too short"] += 1
                 continue
             yield Clip(
                 video.id,
@@ -154,7 +151,7 @@ class UESTC(MotionSource):
         """Returns the split of a subject's clips."""
         if subject not in TRAIN_SUBJECTS:
             return "test"
-        ranked = sorted(TRAIN_SUBJECTS, key=lambda s: hashlib.sha1(f"uestc_p{s:03d}".encode()).hexdigest())
+        ranked = sorted(TRAIN_SUBJECTS, key=lambda s: name_hash(f"uestc_p{s:03d}"))
         return "val" if not self.published_split and subject in ranked[:VAL_SUBJECTS] else "train"
 
 
@@ -174,19 +171,10 @@ def front_view(pose: np.ndarray, root: np.ndarray, camera: np.ndarray, video: Vi
         (F, 75) float32: translation relative to the first frame and pose, in camera axes.
     """
     depth = FOCAL_LENGTH / (np.abs(camera[:, 0]) * IMAGE_SIZE / 2)
-    place = np.concatenate([camera[:, 2:], depth[:, None]], 1)
-    place -= place[0]
+    shift = np.concatenate([camera[:, 2:], depth[:, None]], 1)
+    shift -= shift[0]
     if video.side != 1:
         turn = Rotation.from_rotvec([0.0, -video.view * math.pi / 4, 0.0])
         pose = np.concatenate([(turn * Rotation.from_rotvec(pose[:, :3])).as_rotvec(), pose[:, 3:]], 1)
-        root, place = turn.apply(root), turn.apply(place)
-    return np.concatenate([root + place, pose], 1).astype(np.float32)
-
-
-def _lines(path: Path) -> list[str]:
-    try:
-        return read_text(path).splitlines()
-    except FileNotFoundError:
-        raise FileNotFoundError(
-            f"{path}: no such file; it is part of the data set published by ACTOR; unpack the archive again"
-        ) from None
+        root, shift = turn.apply(root), turn.apply(shift)
+    return np.concatenate([root + shift, pose], 1).astype(np.float32)

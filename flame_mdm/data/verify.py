@@ -7,12 +7,12 @@ import re
 from collections import Counter, defaultdict
 from hashlib import sha1
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 import torch
 
-from flame_mdm.data import Split
+from flame_mdm.data import SPLITS
 from flame_mdm.data.datamodule import MotionDataModule
 from flame_mdm.data.store import Entry, Store
 from flame_mdm.progress import ProgressBar
@@ -20,7 +20,6 @@ from flame_mdm.representations import Representation
 from flame_mdm.safe_io import read_yaml, write_text
 
 PUBLISHED = Path(__file__).with_name("published.yaml")
-SPLITS: tuple[Split, ...] = get_args(Split)
 STILL_DISTANCE = 0.01
 """Meters; a clip in which no joint moves farther from its first position counts as still."""
 

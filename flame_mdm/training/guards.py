@@ -19,9 +19,8 @@ from torch.utils._pytree import tree_leaves
 
 from flame_mdm.batch import MotionBatch
 from flame_mdm.checkpoints.model_files import read_checkpoint
-from flame_mdm.data.parallel import locked
 from flame_mdm.errors import UserError, say
-from flame_mdm.safe_io import write_failure
+from flame_mdm.safe_io import locked, write_failure
 
 LAST, PREVIOUS = "last.ckpt", "previous.ckpt"
 

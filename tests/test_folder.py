@@ -23,7 +23,7 @@ from flame_mdm.data.store import Store, write_store
 from flame_mdm.data.synthetic import Synthetic
 from flame_mdm.errors import UserError
 from flame_mdm.formats import bvh
-from flame_mdm.formats.layouts import LAYOUTS, SOMA77, read_skeleton
+from flame_mdm.formats.layouts import LAYOUTS, read_skeleton
 from flame_mdm.formats.readers import read
 from flame_mdm.representations.humanml import HumanML
 from flame_mdm.representations.skeleton import KIT21, SMPL22
@@ -429,7 +429,7 @@ def test_arrays_of_kimodo_are_known(tmp_path: Path):
     joints = np.zeros((len(WALK), 77, 3))
     for joint, place in layout.map.items():
         (name,) = [place] if isinstance(place, str) else place
-        joints[:, SOMA77.index(name)] = WALK[:, SMPL22.joints.index(joint)]
+        joints[:, LAYOUTS["SOMA"].joints.index(name)] = WALK[:, SMPL22.joints.index(joint)]
     np.savez(tmp_path / "a.npz", posed_joints=joints, root_positions=joints[:, 0])
     np.testing.assert_allclose(only(tmp_path), WALK, atol=1e-5)
     np.testing.assert_allclose(read(tmp_path / "a.npz").joints, WALK, atol=1e-5)

@@ -106,7 +106,7 @@ def _convert(settings: ConvertSettings, path: Path, out: Path, character: Charac
     facts = find_skeleton(path, settings.up)
     # a BVH file keeps proportions in any unit; the other files are in meters
     copied = path.suffix.lower() == out.suffix.lower() == ".bvh"
-    motion = read(path, settings.fps, settings.unit, given=facts, any_size=copied)
+    motion = read(path, settings.fps, settings.unit, fields=facts, any_size=copied)
     if out.exists() and out.samefile(path):
         raise UserError(f"{out}: the same file as the input, which stays as it is. Choose another name for the output")
     if out.suffix.lower() == ".npz":

@@ -112,7 +112,7 @@ def _read(settings: InspectSettings, files: Sequence[Path]) -> tuple[str, int, I
     path = Path(str(settings.motion))
 
     def motion(file: Path) -> Motion:
-        content = read(file, settings.fps, settings.unit, given=find_skeleton(file, settings.up))
+        content = read(file, settings.fps, settings.unit, fields=find_skeleton(file, settings.up))
         return content if file == path else replace(content, id=file.relative_to(path).with_suffix("").as_posix())
 
     return path.resolve().stem, len(files), map(motion, files)

@@ -18,15 +18,15 @@ SMOOTHNESS = 0.034
 OUTLIER = 0.03
 """Distance in meters from the smooth path at which a position has half its weight."""
 LOW = 0.07
-"""Height in meters above the floor from which on a toe is in the air."""
+"""Height in meters above the floor at which a toe counts as in the air."""
 SLOW = 0.5
-"""Speed in meters per second over the ground from which on a low toe is in the air, if the body stands."""
+"""Horizontal speed in meters per second at which a low toe counts as off the ground, while the body stands still."""
 SHARE, SHARE_PINNED = 0.5, 0.4
-"""Share of the body's speed added to `SLOW`, before and after the body follows its feet. A foot on the floor may slide
-along with a generated body; one in the air overtakes it."""
+"""Fraction of the body's speed added to `SLOW`, before and after the body follows its feet. In generated motion, a foot
+on the floor may slide along with the body; a swinging foot is faster than the body."""
 DRIFT = 0.2
-"""Speed in meters per second up to which the body may slide over its feet; the legs make up for the difference. From
-one and a half times this speed on, the body follows its feet entirely."""
+"""Speed in meters per second up to which the body may slide over its feet; the legs compensate for the difference.
+Above 1.5 times this speed, the body follows its feet entirely."""
 REACH = 0.999
 """Maximum distance from hip to ankle relative to the length of the straight leg, unless it was longer before."""
 
@@ -52,9 +52,9 @@ def cleanup(joints: np.ndarray, fps: float, skeleton: Skeleton, contacts: np.nda
         joints: (F, J, 3) in meters, y up.
         fps: frames per second.
         skeleton: of the J joints; its first two chains are the legs.
-        contacts: (F, N), how surely each of `skeleton.feet` stands on the floor from a frame to the next, 0 to 1, as
-            models predict it for some representations: more reliable than height and speed of toes that slide, from
-            which contacts are read otherwise.
+        contacts: (F, N), probability that each of `skeleton.feet` stands on the floor from this frame to the next, as
+            models predict it for some representations. Otherwise contacts are estimated from height and speed of the
+            toes, which is less reliable if they slide.
 
     Returns:
         (F, J, 3) float32. Motions of fewer than 4 frames are returned unchanged.
@@ -115,7 +115,7 @@ def _constant_bones(motion: np.ndarray, skeleton: Skeleton) -> np.ndarray:
 
 
 def _contacts(toes: np.ndarray, root: np.ndarray, fps: float, share: float) -> np.ndarray:
-    """Returns (F - 1, 2) in [0, 1]: how surely each toe (F, 2, 3) stands on the floor from a frame to the next."""
+    """Returns (F - 1, 2) in [0, 1]: the confidence that each toe (F, 2, 3) stands on the floor until the next frame."""
     speed = np.linalg.norm(np.diff(toes[..., [0, 2]], axis=0), axis=-1) * fps
     travel = np.linalg.norm(np.diff(root[:, [0, 2]], axis=0), axis=-1) * fps
     travel = gaussian_filter1d(travel, 0.15 * fps, mode="nearest")
@@ -164,5 +164,5 @@ def _bend(motion: np.ndarray, leg: Sequence[int], shift: np.ndarray) -> None:
     along = (thigh**2 - shin**2 + reach**2) / (2 * reach)
     motion[:, leg[1]] = hip + along * line + np.sqrt(np.maximum(thigh**2 - along**2, 0)) * forward
     moved = hip + reach * line - ankle
-    for joint, place in zip(leg[2:], (ankle, *foot), strict=True):
-        motion[:, joint] = place + moved
+    for joint, position in zip(leg[2:], (ankle, *foot), strict=True):
+        motion[:, joint] = position + moved

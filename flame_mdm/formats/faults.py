@@ -12,7 +12,7 @@ from scipy.ndimage import binary_opening
 from flame_mdm.formats.motion import Motion
 
 LOW = 0.05
-"""Height in meters above the floor below which a toe touches it."""
+"""Height in meters above the floor, y = 0, below which a toe joint touches it. Also for the foot skating ratio."""
 STANDSTILL = 0.2
 """Speed of the root in m/s below which the body does not jump: it is slower for only 0.04 s at the top of a jump."""
 LIMITS = {
@@ -51,7 +51,7 @@ def find_faults(motion: Motion) -> list[Fault]:
     joints, skeleton, fps = motion.joints.astype(float), motion.skeleton, motion.fps
     names = skeleton.joints
     step = np.linalg.norm(np.diff(joints, axis=0), axis=-1) * fps
-    found = [
+    faults = [
         *_runs("skating", names, *_skating(joints, skeleton.feet[1::2], fps), frames=math.ceil(0.4 * fps)),
         *_runs("pop", names, *_pops(joints, fps)),
         *_runs("bone length", names, *_stretched(joints, skeleton.edges)),
@@ -61,29 +61,29 @@ def find_faults(motion: Motion) -> list[Fault]:
     height = joints[..., 1].min(1)[:, None]
     aloft, slow = height > LOW, np.append(step[:, :1], step[-1:, :1], axis=0) < STANDSTILL
     floats = [binary_opening(flag, np.ones((math.ceil(s * fps), 1))) for s, flag in ((0.8, aloft), (0.3, aloft & slow))]
-    found += _runs("floating", ("body",), np.logical_or(*floats), height)
+    faults += _runs("floating", ("body",), np.logical_or(*floats), height)
     still = step.max(1, initial=0.0)[:, None]
     frames = max(2, round(fps))
-    found += _runs("frozen", ("body",), still < LIMITS["frozen"][0], still, frames=frames)
-    return sorted(found, key=lambda fault: (fault.start, fault.kind, fault.joint))
+    faults += _runs("frozen", ("body",), still < LIMITS["frozen"][0], still, frames=frames)
+    return sorted(faults, key=lambda fault: (fault.start, fault.kind, fault.joint))
 
 
 def _runs(kind: str, names: Sequence[str], flags: np.ndarray, values: np.ndarray, frames: int = 1) -> list[Fault]:
     """Returns the runs of at least `frames` True in flags (F, J), with the largest of values (F, J)."""
-    found = []
+    runs = []
     for joint in np.flatnonzero(flags.any(0)).tolist():
         flag = binary_opening(flags[:, joint], np.ones(frames)) if frames > 1 else flags[:, joint]
         edges = np.flatnonzero(np.diff(np.r_[0, flag.astype(int), 0]))
         for start, end in edges.reshape(-1, 2).tolist():
-            found.append(Fault(kind, names[joint], start, end, float(values[start:end, joint].max())))
-    return found
+            runs.append(Fault(kind, names[joint], start, end, float(values[start:end, joint].max())))
+    return runs
 
 
 def _skating(joints: np.ndarray, toes: Sequence[int], fps: float) -> tuple[np.ndarray, np.ndarray]:
     speed = np.zeros(joints.shape[:2])
     low = joints[:, toes, 1] < LOW
-    way = np.linalg.norm(np.diff(joints[:, toes][..., [0, 2]], axis=0), axis=-1) * fps
-    speed[:-1, toes] = way * (low[1:] & low[:-1])
+    travel = np.linalg.norm(np.diff(joints[:, toes][..., [0, 2]], axis=0), axis=-1) * fps
+    speed[:-1, toes] = travel * (low[1:] & low[:-1])
     return speed > LIMITS["skating"][0], speed
 
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -38,7 +39,7 @@ def read(
     fps: float | None = None,
     unit: float | None = None,
     resample_to: float | None = None,
-    given: Mapping[str, Any] = {},
+    fields: Mapping[str, Any] = {},
     any_size: bool = False,
 ) -> Motion:
     """Reads a motion: `.npz` of this project, of AMASS or with joints and fps, `.bvh`, `.json`, or joints `.npy`.
@@ -50,53 +51,66 @@ def read(
             .npy (default 1).
         resample_to: target frame rate; joints are interpolated with cubic splines, the rotations of .bvh and AMASS on
             the sphere. Default: frames are not resampled.
-        given: fields of `Layout` that override those of a known skeleton, as from `find_skeleton`; `fps` and `unit`
+        fields: fields of `Layout` that override those of a known skeleton, as from `find_skeleton`; `fps` and `unit`
             override them in turn. Not for .json and .npz files written by this project, nor for AMASS.
         any_size: accept bodies of any size in .bvh files and arrays; otherwise their legs must be those of people.
 
     Raises:
-        FileNotFoundError: the file does not exist.
-        UserError: the path is not a regular file.
-        ValueError: the file is damaged, of another kind or a wrong unit, or has no frame rate.
+        FileNotFoundError: If the file does not exist.
+        UserError: If the file is damaged, of another kind or in a wrong unit, or has no frame rate.
     """
     path = Path(path)
     suffix = path.suffix.lower()
     if suffix not in ENDINGS:
-        raise ValueError(f"{path}: unknown kind of motion file. Use one of {', '.join(ENDINGS)}")
+        raise UserError(f"{path}: unknown kind of motion file. Use one of {', '.join(ENDINGS)}")
     regular_file(path)
     if unit is not None and suffix in (".npz", ".json"):
-        raise ValueError(f"{path}: lengths in {suffix} files are in meters; unit is only for .bvh and .npy")
-    given = {**given} if unit is None else {**given, "unit": unit}
+        raise UserError(f"{path}: lengths in {suffix} files are in meters; unit is only for .bvh and .npy")
+    fields = fields if unit is None else {**fields, "unit": unit}
+    with _named(path):
+        rate = None if fps is None else frame_rate(fps)
+        if suffix != ".bvh":
+            return _of_arrays(path, rate, resample_to, fields, any_size)
+        joints, rate, layout = read_bvh(path, resample_to, fields, rate)
+        if not any_size:
+            check_size(leg_length(joints), layout.unit, layout.children)
+        return Motion(joints, rate, id=path.stem)
+
+
+def _of_arrays(
+    path: Path, rate: float | None, resample_to: float | None, fields: Mapping[str, Any], any_size: bool
+) -> Motion:
+    """Returns the motion in an .npz, .json or .npy file; the arguments are those of `read`."""
+    data = read_arrays(path)
+    if "text" in data:  # written by this project
+        fields = {}
+    rate = data.get("fps", fields.get("fps")) if rate is None else rate
+    if rate is None:
+        raise UserError("no frame rate in the file: set it, for example with fps=20")
+    data["fps"] = frame_rate(rate)
+    text = str(data.get("text", ""))
+    if "joints" not in data:
+        translation, turns = smpl_motion(data, resample_to)
+        poses = _smpl_poses(translation, rotation.quaternion_to_matrix(turns), AMASS_AXES)
+        return motion_of_poses(poses, resample_to or data["fps"], text, path.stem)
+    if {"joints", "map", "up", "mirrored"} & set(fields) or data["joints"].shape[1:2] in ((52,), (77,)):
+        layout, names = array_layout(path, data["joints"], fields)
+        data = {"fps": data["fps"], "joints": layout.apply(data["joints"].astype(float), names)}
+        fields = {"unit": layout.unit, "children": layout.children}
+    elif "unit" in fields:
+        data["joints"] = data["joints"] * fields["unit"]
+    if fields and not any_size and data["joints"].shape[1:] == (len(SMPL22), 3):
+        check_size(leg_length(data["joints"]), fields.get("unit", 1.0), fields.get("children", False))
+    return _of_joints(path, data, text, resample_to)
+
+
+@contextmanager
+def _named(path: Path) -> Iterator[None]:
+    """Adds the path to errors that do not name it; some readers of parts of a file raise `ValueError`."""
     try:
-        if suffix == ".bvh":
-            rate = None if fps is None else frame_rate(fps)
-            joints, rate, layout = read_bvh(path, resample_to, given, rate)
-            if not any_size:
-                check_size(leg_length(joints), layout.unit, layout.children)
-            return Motion(joints, rate, id=path.stem)
-        data = read_arrays(path)
-        given = {} if "text" in data else given
-        fps = given.get("fps") if fps is None and "fps" not in data else fps
-        if fps is not None:
-            data["fps"] = frame_rate(fps)
-        elif "fps" not in data:
-            raise ValueError("no frame rate in the file: set it, for example with fps=20")
-        text = str(data.get("text", ""))
-        if "joints" not in data:
-            translation, turns = smpl_motion(data, resample_to)
-            poses = _smpl_poses(translation, rotation.quaternion_to_matrix(turns), AMASS_AXES)
-            return motion_of_poses(poses, resample_to or data["fps"], text, path.stem)
-        if {"joints", "map", "up", "mirrored"} & set(given) or data["joints"].shape[1:2] in ((52,), (77,)):
-            layout, names = array_layout(path, data["joints"], given)
-            data = {"fps": data["fps"], "joints": layout.apply(data["joints"].astype(float), names)}
-            given = {"unit": layout.unit, "children": layout.children}
-        elif "unit" in given:
-            data["joints"] = data["joints"] * given["unit"]
-        if given and not any_size and data["joints"].shape[1:] == (len(SMPL22), 3):
-            check_size(leg_length(data["joints"]), given.get("unit", 1.0), given.get("children", False))
-        return _of_joints(path, data, text, resample_to)
+        yield
     except ValueError as error:
-        raise ValueError(str(error) if str(path) in str(error) else f"{path}: {error}") from error
+        raise UserError(str(error) if str(path) in str(error) else f"{path}: {error}") from error
 
 
 def from_array(joints: Any, fps: float | None) -> Motion:
@@ -108,16 +122,16 @@ def from_array(joints: Any, fps: float | None) -> Motion:
         fps: frames per second.
 
     Raises:
-        ValueError: another shape, not numbers, or no frame rate.
+        UserError: If the shape is another one, the values are not numbers, or there is no frame rate.
     """
     values = joints.detach().cpu().numpy() if isinstance(joints, Tensor) else np.asarray(joints)
     if not _is_real(values):
         name = type(joints).__name__
-        raise ValueError(f"{name}: not a motion. Give a path, a Motion, or an array of joints (frames, joints, 3)")
+        raise UserError(f"{name}: not a motion. Give a path, a Motion, or an array of joints (frames, joints, 3)")
     _check_numbers("joints", values, False)
     skeleton = _skeleton(values)
     if fps is None:
-        raise ValueError("an array has no frame rate: set it, for example with fps=20")
+        raise UserError("an array has no frame rate: set it, for example with fps=20")
     return Motion(values, frame_rate(fps), skeleton)
 
 
@@ -128,12 +142,11 @@ def read_arrays(path: Path, header: bool = False) -> dict[str, Any]:
     repeat their first frame; the others are neither read nor checked.
 
     Raises:
-        FileNotFoundError: the file does not exist.
-        UserError: the path is not a regular file.
-        ValueError: the file is damaged or contains no motion; the message names the file.
+        FileNotFoundError: If the file does not exist.
+        UserError: If the file is damaged or contains no motion; the message names the file.
     """
     suffix = path.suffix.lower()
-    try:
+    with _named(path):
         if suffix == ".npz":
             data: dict[str, Any] = read_npz(path, skip=("dmpls",), header=header)
         elif suffix == ".npy":
@@ -143,22 +156,18 @@ def read_arrays(path: Path, header: bool = False) -> dict[str, Any]:
         if "posed_joints" in data:  # of NVIDIA's Kimodo, whose files do not contain their rate
             data = {"fps": KIMODO_FPS, **data, "joints": data["posed_joints"]}
         if not {"joints", "poses"} & set(data):
-            found = ", ".join(data) or "nothing"
-            raise ValueError(f"contains {found}; a motion has joints and fps, or poses, trans and mocap_framerate")
+            names = ", ".join(data) or "nothing"
+            raise UserError(f"contains {names}; a motion has joints and fps, or poses, trans and mocap_framerate")
         for name in {"joints", "poses", "trans"} & set(data):
             _check_numbers(name, data[name], header)
         if "features" in data and (not _is_real(data["features"]) or data["features"].ndim != 2):
-            raise ValueError("features are not an array (frames, features) of real numbers")
+            raise UserError("features are not an array (frames, features) of real numbers")
         if "poses" in data and data.get("trans", np.zeros(0)).shape != (len(data["poses"]), 3):
-            raise ValueError("AMASS files have poses (F, 3 K), trans (F, 3) and mocap_framerate")
+            raise UserError("AMASS files have poses (F, 3 K), trans (F, 3) and mocap_framerate")
         keys = ("fps", "mocap_framerate", "mocap_frame_rate")
         rate = next((key for key in (keys if "joints" in data else keys[::-1]) if key in data), None)
         if rate is not None:
             data["fps"] = frame_rate(data[rate], rate)
-    except UserError:
-        raise
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
     return data
 
 
@@ -168,12 +177,12 @@ def _is_real(values: np.ndarray) -> bool:
 
 def _check_numbers(name: str, values: np.ndarray, header: bool) -> None:
     if not _is_real(values):
-        raise ValueError(f"{name} are not an array of real numbers")
+        raise UserError(f"{name} are not an array of real numbers")
     if not values.ndim or not len(values):
-        raise ValueError(f"{name} of shape {values.shape} have no frames")
+        raise UserError(f"{name} of shape {values.shape} have no frames")
     check_frames(len(values))
     if (beyond := ~(np.abs(values[:1] if header else values) < 1e6)).any():
-        raise ValueError(f"numbers of {name} in frame {np.argwhere(beyond)[0][0]} are not finite, or exceed a million")
+        raise UserError(f"numbers of {name} in frame {np.argwhere(beyond)[0][0]} are not finite, or exceed a million")
 
 
 def _read_json(path: Path) -> dict[str, Any]:
@@ -181,14 +190,14 @@ def _read_json(path: Path) -> dict[str, Any]:
     try:
         return {"joints": np.array(data["joints"], float), "fps": data["fps"], "text": str(data.get("caption", ""))}
     except (ValueError, TypeError, KeyError, OverflowError) as error:
-        raise ValueError(f"not a motion in JSON, which is an object with joints and fps: {error}") from error
+        raise UserError(f"not a motion in JSON, which is an object with joints and fps: {error}") from error
 
 
 def smpl_motion(data: dict[str, Any], fps: float | None = None) -> tuple[Tensor, Tensor]:
     """Returns translation (F, 3) and quaternions (F, 24, 4), float64, of AMASS arrays, resampled to `fps` if given.
 
     Raises:
-        ValueError: fewer than 24 joints, or too many frames.
+        UserError: If there are fewer than 24 joints, or too many frames.
     """
     poses = data["poses"].reshape(len(data["poses"]), -1)
     frames = None if fps is None else frame_pairs(len(poses), data["fps"], fps, poses.shape[1] // 3)
@@ -213,7 +222,7 @@ def _poses(data: dict[str, Any]) -> Poses | None:
     """Returns the rotations stored with joints, from AMASS arrays or SMPL features; HumanML3D features contain none."""
     if "poses" in data:
         if len(data["poses"]) != len(data["joints"]):
-            raise ValueError(f"{len(data['poses'])} frames of poses, but {len(data['joints'])} of joints")
+            raise UserError(f"{len(data['poses'])} frames of poses, but {len(data['joints'])} of joints")
         translation, turns = smpl_motion(data)
         return _smpl_poses(translation, rotation.quaternion_to_matrix(turns), AMASS_AXES)
     representation = str(data.get("representation", ""))
@@ -221,7 +230,7 @@ def _poses(data: dict[str, Any]) -> Poses | None:
         return None
     expected = (len(data["joints"]), ROTATED[representation])
     if data["features"].shape != expected:
-        raise ValueError(f"features of shape {data['features'].shape}, but {representation} has {expected}")
+        raise UserError(f"features of shape {data['features'].shape}, but {representation} has {expected}")
     x = torch.from_numpy(data["features"]).double()
     if representation == "motion272":
         pelvis, turns = Motion272().poses(x)
@@ -249,7 +258,7 @@ def _of_joints(path: Path, data: dict[str, Any], text: str, resample_to: float |
 def _skeleton(joints: np.ndarray) -> Skeleton:
     """Returns the skeleton of joints (F, J, 3), identified by the number of joints."""
     if joints.ndim == 2 and joints.shape[1] in (263, 251):
-        raise ValueError(
+        raise UserError(
             f"{joints.shape[1]} features of HumanML3D, not joints; their rotations are not SMPL's and cannot be "
             "exported: decode joint positions (flame_mdm.representations.humanml) and convert those"
         )
@@ -257,4 +266,4 @@ def _skeleton(joints: np.ndarray) -> Skeleton:
         if joints.ndim == 3 and joints.shape[1:] == (len(skeleton), 3):
             return skeleton
     sizes = " or ".join(f"{len(skeleton)} ({skeleton.name})" for skeleton in SKELETONS.values())
-    raise ValueError(f"joints of shape {joints.shape}, not (frames, joints, 3) with {sizes} joints")
+    raise UserError(f"joints of shape {joints.shape}, not (frames, joints, 3) with {sizes} joints")

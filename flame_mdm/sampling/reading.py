@@ -51,8 +51,8 @@ def read_motion(
     """
     name = str(source)
     if Path(source).suffix.lower() in ENDINGS:
-        given = find_skeleton(Path(source), up)
-        motion = replace(read(source, fps, unit, representation.fps, given), id=name)
+        fields = find_skeleton(Path(source), up)
+        motion = replace(read(source, fps, unit, representation.fps, fields), id=name)
         motion = with_features(representation, motion)
     elif ":" in name:
         motion = _read_clip(representation, name, Path(data_root))

@@ -1,5 +1,7 @@
 """A public demo on a Hugging Face Space; README.md says how to create one."""
 
+import os
+
 from flame_mdm.demo.app import serve
 
-serve(["quickstart"], host="0.0.0.0", port=7860)
+serve(["quickstart"], host="0.0.0.0", port=7860, hosts=os.environ.get("SPACE_HOST", "").split())

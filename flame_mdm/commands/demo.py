@@ -14,7 +14,7 @@ from flame_mdm.sampler_options import option
 
 @dataclass(frozen=True, kw_only=True)
 class DemoSettings:
-    """usage: flame-mdm demo [CKPT ...] [host=127.0.0.1] [port=7860] [device=cuda]
+    """usage: flame-mdm demo [CKPT ...] [host=127.0.0.1] [port=7860] [hosts=NAME] [device=cuda]
 
     Serves a page where you type a sentence, watch the motion, edit it and download it. Without CKPT, it uses the model
     in the package. It needs the extra demo: pip install "flame-mdm[demo]". docs/demo.md explains the page.
@@ -27,6 +27,9 @@ class DemoSettings:
     )
     host: str = option("127.0.0.1", "address to listen on: this computer alone; 0.0.0.0 = all networks")
     port: int = option(7860, "0 = any free port")
+    hosts: list[str] = option(
+        list, "names under which the page is reached, such as motion.example.org; localhost and addresses always work"
+    )
     device: str | None = option(None, "default: cuda if available")
 
 
@@ -43,7 +46,7 @@ def demo(settings: DemoSettings) -> None:
 
     from flame_mdm.demo.app import serve
 
-    serve(settings.ckpt, settings.host, settings.port, settings.device)
+    serve(settings.ckpt, settings.host, settings.port, settings.device, settings.hosts)
 
 
 main = partial(run, demo, DemoSettings)

@@ -1,10 +1,12 @@
+const FAR = 20  // meters that a way point may be from the start
+const parse = (text) => text.split('|').map((part) => part.match(/^([^]*?)(?:@([^@]*))?$/).slice(1).map((s) => (s || '').trim()))
+const duration = (text, seconds) => parse(text).reduce((sum, part) => sum + (parseFloat(part[1]) || seconds), 0)
+
 // Rows of a sequence and a path on the floor. Both show and change fields of the form, which alone hold the values.
 const editor = (() => {
-  const FAR = 20  // meters that a way point may be from the start
   const field = (id) => document.querySelector(`#${id} textarea, #${id} input`)
   const write = (id, value) =>
     Object.assign(field(id), { value }).dispatchEvent(new Event('input', { bubbles: true }))
-  const parse = (text) => text.split('|').map((part) => part.match(/^([^]*?)(?:@([^@]*))?$/).slice(1).map((s) => (s || '').trim()))
   const join = (rows) => rows.map(([words, seconds]) => words + (seconds && ` @${seconds}`)).join(' | ')
   const read = () => [...document.querySelectorAll('#parts .part')].map((row) =>
     [...row.querySelectorAll('input')].map((input) => input.value.replace(/[|@]/g, ' ').trim()))
@@ -49,6 +51,10 @@ const editor = (() => {
     if (event.target.closest('#parts')) write('text', join(read()))
   })
   document.addEventListener('click', (event) => {
+    if (event.target.closest('#examples button')) {
+      write('text', event.target.textContent)
+      setTimeout(() => document.querySelector('#go').click(), 50)  // after the field's value has been taken over
+    }
     const row = event.target.closest('#parts .remove')?.parentElement, floor = event.target.closest('#floor svg')
     if (row) {
       write('text', join(read().filter((_, index) => row.parentElement.children[index] !== row)))
@@ -71,6 +77,48 @@ const editor = (() => {
     if (values.length) shown = [values[0] || '', values[1] || 3, values[2] || '']
     if (!document.querySelector('#floor')) return
     drawParts(shown[0])
-    drawPath(points(shown[2]), parse(shown[0]).reduce((sum, part) => sum + (parseFloat(part[1]) || shown[1]), 0))
+    drawPath(points(shown[2]), duration(shown[0], shown[1]))
   }
+})()
+
+// Query strings of requests. The server checks them; `flame_mdm/demo/request.py` describes the keys.
+const links = (() => {
+  const STRENGTH = 0.5, SAMPLES = 3  // of variations
+  const NUMBERS = ['seconds', 'seed', 'samples']
+
+  function compose(keys, values) {
+    const pairs = keys.map((key, k) => [key, values[k]]).filter(([, value]) => value != null && value !== '')
+    return String(new URLSearchParams(pairs))
+  }
+
+  function read(keys, values) {  // the request of the page's address, and the values of its form
+    const link = new URLSearchParams(location.search)
+    if (![...link.keys()].some((key) => !key.startsWith('__'))) return [compose(keys, values), ...values]
+    const shown = keys.map((key, k) => {
+      const value = link.get(key)
+      if (value === null) return key === 'text' ? '' : values[k]
+      if (NUMBERS.includes(key)) return Number.isFinite(+value) ? +value : values[k]
+      return key === 'cleanup' ? !/^(false|f|no|n|off|0)$/i.test(value) : value
+    })
+    return [location.search.slice(1), ...shown]
+  }
+
+  function withEdit(query, edit) {
+    const set = Object.entries(edit).filter(([, value]) => value != null && value !== '' && String(value) !== '')
+    return `${query}&${new URLSearchParams({ edit: JSON.stringify(Object.fromEntries(set)) })}`
+  }
+
+  function change(query, motion, text, begin, end, joints, seed) {
+    const link = new URLSearchParams(query)
+    const total = duration(link.get('text') || '', +link.get('seconds') || 3)
+    const region = begin || end ? [begin || 0, end || total] : null
+    return withEdit(query, { motion, text, region_seconds: region, joints, seed })
+  }
+
+  function vary(query, motion, seed) {
+    const link = new URLSearchParams(query), last = link.getAll('edit').at(-1)
+    const text = (last ? JSON.parse(last).text : link.get('text')) || ''
+    return withEdit(query, { motion, text, strength: STRENGTH, samples: SAMPLES, seed })
+  }
+  return { compose, read, change, vary }
 })()

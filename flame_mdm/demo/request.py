@@ -1,4 +1,7 @@
-"""Requests of the demo: one form, one link, one command line and one Python program for the same motion."""
+"""Requests of the demo: the link of a motion, and the command lines and the Python program that make the same one.
+
+They are a `SamplingRequest`, which checks the values, and its edits, within the limits of a public page.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +25,10 @@ MAX_SEED = 2**31 - 1
 MAX_WAY_POINTS, FAR = 16, 20.0  # a path: way points, and meters along x and z
 ARRIVAL = 0.2  # seconds before the end of the motion at which the last way point is reached
 
-Text = Annotated[str, StringConstraints(strip_whitespace=True, max_length=MAX_TEXT, pattern=r"^[^\x00-\x1f\x7f]*$")]
+PLAIN = r"^[^\x00-\x1f\x7f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069]*$"
+"""Text without control characters, those of writing direction included."""
+
+Text = Annotated[str, StringConstraints(strip_whitespace=True, max_length=MAX_TEXT, pattern=PLAIN)]
 Samples = Annotated[int, Field(ge=1, le=MAX_SAMPLES)]
 Seed = Annotated[int, Field(ge=0, le=MAX_SEED)]
 Part = Literal["left_arm", "right_arm", "left_leg", "right_leg", "arms", "legs", "upper_body", "lower_body"]
@@ -47,7 +53,7 @@ Path = Annotated[
 """Way points; in a link and on the page "x,z x,z ..."."""
 
 
-class Change(BaseModel):
+class DemoEdit(BaseModel):
     """An edit of one of the motions so far: `joints` in `region_seconds` are resampled, the rest is kept.
 
     Attributes:
@@ -61,14 +67,14 @@ class Change(BaseModel):
     model_config = RULES
     motion: Annotated[int, Field(ge=0, lt=MAX_SAMPLES)] = 0
     text: Text = ""
-    region_seconds: tuple[Annotated[float, Field(ge=0)], Annotated[float, Field(gt=0)]] | None = None
+    region_seconds: tuple[float, float] | None = None
     joints: tuple[Part, ...] = ()
-    strength: Annotated[float, Field(gt=0, le=1)] | None = None
+    strength: float | None = None
     samples: Samples = 1
     seed: Seed = 0
 
 
-class Request(BaseModel):
+class DemoRequest(BaseModel):
     """Everything that determines the motions that the demo shows; keys are those of `flame-mdm sample`.
 
     Attributes:
@@ -82,17 +88,17 @@ class Request(BaseModel):
     seconds: Annotated[float, Field(gt=0, le=MAX_SECONDS)] = 3.0
     samples: Samples = 1
     seed: Seed = 0
-    guidance_scale: Annotated[float, Field(ge=-100, le=100)] | None = None
+    guidance_scale: float | None = None
     num_inference_steps: Annotated[int, Field(ge=1, le=MAX_STEPS)] | None = None
-    sampler: Annotated[str, StringConstraints(pattern=r"^\w{1,40}$")] | None = None
+    sampler: Annotated[str, StringConstraints(max_length=40, pattern=PLAIN)] | None = None
     cleanup: bool = True
     path: Path = ()
-    edits: Annotated[tuple[Change, ...], Field(max_length=MAX_EDITS)] = ()
+    edits: Annotated[tuple[DemoEdit, ...], Field(max_length=MAX_EDITS)] = ()
 
     def query(self) -> str:
         """Returns the query string of a link to this request; `parse_query` reads it."""
-        given = self.model_dump(exclude={"edits"}, mode="json") | {"cleanup": str(self.cleanup).lower()}
-        pairs = {key: value for key, value in given.items() if value not in (None, "")}
+        values = self.model_dump(exclude={"edits"}, mode="json") | {"cleanup": str(self.cleanup).lower()}
+        pairs = {key: value for key, value in values.items() if value not in (None, "")}
         edits = [change.model_dump_json(exclude_defaults=True) for change in self.edits]
         return urlencode([*pairs.items(), *(("edit", text) for text in edits)])
 
@@ -105,41 +111,39 @@ class Request(BaseModel):
         return {"root": [{"time": time, "position": list(at)} for time, at in zip(times, self.path, strict=True)]}
 
     def steps(self, kind: str) -> list[tuple[int | None, dict[str, Any]]]:
-        """Returns what makes the motions, in order: the number of the motion to edit, None for the first step, and the
-        arguments of `flame_mdm.generate` or `flame_mdm.edit`.
-
-        Motions are edited as the model made them and cleaned up at the end.
+        """Returns the steps to the motions: the number of the motion to edit, None for the first step, and keywords of
+        `flame_mdm.generate` or `flame_mdm.edit`. Motions are edited as the model made them and cleaned up at the end.
 
         Args:
-            kind: what the model was trained on: text, action or none.
+            kind: What the model was trained on: text, action or none.
         """
-        keys = ("guidance_scale", "num_inference_steps", "sampler")
-        shared = {key: value for key in keys if (value := getattr(self, key)) is not None}
-        found: list[tuple[int | None, dict[str, Any]]] = []
+        names = ("guidance_scale", "num_inference_steps", "sampler")
+        shared = {name: value for name in names if (value := getattr(self, name)) is not None}
+        steps: list[tuple[int | None, dict[str, Any]]] = []
         for part in (self, *self.edits):
-            given: dict[str, Any] = {} if kind == "none" or not part.text else {f"{kind}s": part.text}
-            if isinstance(part, Request):
-                given["seconds"] = part.seconds
-                given |= {"targets": part.targets(kind)} if part.path else {}
+            keywords: dict[str, Any] = {} if kind == "none" or not part.text else {f"{kind}s": part.text}
+            if isinstance(part, DemoRequest):
+                keywords["seconds"] = part.seconds
+                keywords |= {"targets": part.targets(kind)} if part.path else {}
             else:
                 region = None if part.region_seconds is None else list(part.region_seconds)
-                chosen = {"region_seconds": region, "joints": list(part.joints) or None, "strength": part.strength}
-                given |= {key: value for key, value in chosen.items() if value is not None}
-            given |= {"samples": part.samples, "seed": part.seed, **shared}
-            found.append((None if isinstance(part, Request) else part.motion, given))
+                editing = {"region_seconds": region, "joints": list(part.joints) or None, "strength": part.strength}
+                keywords |= {name: value for name, value in editing.items() if value is not None}
+            keywords |= {"samples": part.samples, "seed": part.seed, **shared}
+            steps.append((None if isinstance(part, DemoRequest) else part.motion, keywords))
         if self.cleanup and not self.path:  # cleanup moves the root off the way points, by 0.3 m in one example
-            found[-1][1]["cleanup"] = True
-        return found
+            steps[-1][1]["cleanup"] = True
+        return steps
 
     def command(self, kind: str, device: str | None) -> str:
         """Returns the command lines that write the same motions; `device` if it is not the default."""
         lines, folder = [], "motions"
-        for number, (source, given) in enumerate(self.steps(kind)):
+        for number, (source, keywords) in enumerate(self.steps(kind)):
             words = ["flame-mdm", "sample" if source is None else "edit", self.model]
             if source is not None:  # the folder of an edit begins with the original
                 words.append(f"motion={folder}/motion_{source + (number > 1):03d}.npz")
                 folder = f"edit_{number}"
-            keys = {{"texts": "text", "actions": "action"}.get(key, key): value for key, value in given.items()}
+            keys = {{"texts": "text", "actions": "action"}.get(key, key): value for key, value in keywords.items()}
             keys |= {} if keys.keys() & {"text", "action"} else {"unconditioned": True}
             keys |= {"device": device} if device else {}
             if "targets" in keys:
@@ -152,9 +156,9 @@ class Request(BaseModel):
     def python(self, kind: str, device: str) -> str:
         """Returns the lines of Python that make the same motions."""
         lines = ["import flame_mdm", "", f"model = flame_mdm.load({self.model!r}{f', {device!r}' * (device != 'cpu')})"]
-        for source, given in self.steps(kind):
+        for source, keywords in self.steps(kind):
             call = "generate(model" if source is None else f"edit(model, motions[{source}]"
-            options = "".join(f", {key}={value!r}" for key, value in given.items())
+            options = "".join(f", {key}={value!r}" for key, value in keywords.items())
             lines.append(f"motions = flame_mdm.{call}{options})")
         return "\n".join([*lines, 'motions[0].save("motion.bvh")  # or .glb, .npz, .mp4'])
 
@@ -165,13 +169,13 @@ def _word(value: Any) -> str:
     return str(value).lower() if isinstance(value, bool) else str(value)
 
 
-def parse_query(pairs: Iterable[tuple[str, str]]) -> Request:
+def parse_query(pairs: Iterable[tuple[str, str]]) -> DemoRequest:
     """Returns the request of a link's query string; keys that begin with "__" belong to the host and are skipped.
 
     Raises:
-        UserError: a key is unknown or given twice, or a value is invalid.
+        UserError: If a key is unknown or given twice, or a value is invalid.
     """
-    found: dict[str, Any] = {}
+    values: dict[str, Any] = {}
     edits: list[Any] = []
     for key, value in pairs:
         if key == "edit":
@@ -179,21 +183,21 @@ def parse_query(pairs: Iterable[tuple[str, str]]) -> Request:
                 edits.append(json.loads(value))
             except (ValueError, RecursionError):
                 raise UserError(f"edit={_shown(value)}: not an edit of this page. Copy the whole link") from None
-        elif key in found:
+        elif key in values:
             raise UserError(f"{_shown(key)} is given twice. Remove one")
         elif not key.startswith("__"):
-            found[key] = value
-    return checked(Request, found | ({"edits": edits} if edits else {}))
+            values[key] = value
+    return checked(DemoRequest, values | ({"edits": edits} if edits else {}))
 
 
 Checked = TypeVar("Checked", bound=BaseModel)
 
 
 def checked(kind: type[Checked], values: dict[str, Any]) -> Checked:
-    """Returns a request or a change with these values; empty ones are left to the defaults.
+    """Returns a request or an edit with these values; empty ones are left to the defaults.
 
     Raises:
-        UserError: a value is invalid; the message quotes it.
+        UserError: If a value is invalid; the message quotes it.
     """
     try:
         return kind(**{key: value for key, value in values.items() if value not in (None, "")})

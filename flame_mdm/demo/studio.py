@@ -12,8 +12,8 @@ from typing import Any
 
 from flame_mdm.checkpoints.loading import find, load
 from flame_mdm.conditions.vocabulary import advice
-from flame_mdm.demo.request import MAX_SECONDS, Request
-from flame_mdm.errors import UserError, did_you_mean
+from flame_mdm.demo.request import MAX_SECONDS, DemoRequest
+from flame_mdm.errors import UserError, did_you_mean, one_line
 from flame_mdm.formats.cleanup import cleaned
 from flame_mdm.formats.motion import Motion
 from flame_mdm.sampling.editing import edit
@@ -37,11 +37,11 @@ class Studio:
     """Makes the motions of requests with a fixed set of models.
 
     Args:
-        sources: names of models, as for `flame_mdm.load`; requests can choose no other.
-        device: of all models.
+        sources: Names of models, as for `flame_mdm.load`; requests can choose no other.
+        device: Device of all models.
 
     Raises:
-        UserError, FileNotFoundError: a model cannot be found or loaded; the first is loaded now.
+        UserError: If a model cannot be found, or the first, which is loaded at once, cannot be loaded.
     """
 
     def __init__(self, sources: Sequence[str], device: str):
@@ -49,7 +49,7 @@ class Studio:
         self.files = {name: find(name) for name in sources}
         self._models: dict[str, MotionGeneration] = {}
         self._made: OrderedDict[tuple[Any, ...], list[Motion]] = OrderedDict()
-        self._working = Lock()
+        self._working, self._memory = Lock(), Lock()
         self.model(sources[0])
 
     def model(self, name: str) -> MotionGeneration:
@@ -62,27 +62,21 @@ class Studio:
         return self._models[name]
 
     def motions(
-        self, request: Request, report: Callable[[int], None] = lambda calls: None, stop: Event | None = None
+        self, request: DemoRequest, report: Callable[[int], None] = lambda calls: None, stop: Event | None = None
     ) -> list[Motion]:
         """Returns the motions of a request, from memory if they were made before.
 
         Args:
-            request: what to make.
-            report: called before each call of the network, with the number of calls so far.
-            stop: once set, the next call raises `Stopped`.
+            request: What to make.
+            report: Called before each call of the network, with the number of calls so far.
+            stop: Once set, the next call raises `Stopped`.
 
         Raises:
-            UserError, ValueError: the model refuses the request, it took too long or was canceled.
+            UserError: If the model refuses the request, or it took too long or was canceled.
         """
         with self._working:
             model = self.model(request.model)
-            if model.conditioned_on != "none" and not request.text:
-                raise UserError("the text is empty. Describe what the person does")
-            parts = read_parts(request.text) if request.text else []
-            if sum(seconds or request.seconds for _, seconds in parts) > MAX_SECONDS:
-                raise UserError(f"the parts are too long: give at most {MAX_SECONDS} seconds in total")
-            steps = request.steps(model.conditioned_on)
-            cleanup = bool(steps[-1][1].pop("cleanup", False))
+            steps, cleanup = _plan(model, request)
             calls, deadline = 0, time.monotonic() + TIME_LIMIT
 
             def before(*_: object) -> None:
@@ -97,25 +91,26 @@ class Studio:
             hook = model.denoiser.register_forward_pre_hook(before)
             try:
                 motions: list[Motion] = []
-                for number, (source, given) in enumerate(steps):
+                for number, (source, arguments) in enumerate(steps):
                     key = (request.model, repr(steps[: number + 1]))
-                    if key not in self._made:
-                        if source is None:
-                            self._made[key] = generate(model, **given)
-                        elif source >= len(motions):
-                            raise UserError(f"motion={source}: there are {len(motions)} motions, numbered from 0")
-                        else:
-                            self._made[key] = list(edit(model, motions[source], **given))
-                    self._made.move_to_end(key)
-                    motions = self._made[key]
+                    if key in self._made:
+                        made = self._made[key]
+                    elif source is None:
+                        made = generate(model, **arguments)
+                    elif source >= len(motions):
+                        raise UserError(f"motion={source}: there are {len(motions)} motions, numbered from 0")
+                    else:
+                        made = list(edit(model, motions[source], **arguments))
+                    with self._memory:
+                        self._made[key] = motions = made
+                        self._made.move_to_end(key)
+                        while len(self._made) > KEPT:
+                            self._made.popitem(last=False)
             finally:
                 hook.remove()
-            while len(self._made) > KEPT:
-                self._made.popitem(last=False)
-        contacts = model.representation.contacts
-        return [cleaned(motion, contacts(motion.features)) for motion in motions] if cleanup else motions
+        return _cleaned(model, motions) if cleanup else motions
 
-    def advice(self, request: Request) -> list[str]:
+    def advice(self, request: DemoRequest) -> list[str]:
         """Returns warnings of words that the model has never seen."""
         model = self.model(request.model)
         if model.conditioned_on != "text":
@@ -124,18 +119,43 @@ class Studio:
         parts = dict.fromkeys(words for text in texts for words, _ in read_parts(text))
         return [line for words in parts for line in advice(words, model.facts, model.condition.max_words)]
 
-    def file(self, request: Request, number: int, extension: str, rig: str | None = None) -> bytes:
+    def file(self, request: DemoRequest, number: int, extension: str, rig: str | None = None) -> bytes:
         """Returns the bytes of a motion file; `number` counts the motions of the request from 0.
 
+        The motion comes from memory, so that a file costs no work of the model and waits for nobody's request.
+
         Raises:
-            UserError, ValueError: there is no such motion, format or rig, or as in `motions`.
+            UserError: If there is no such format, motion or rig, or the motion is not in memory.
         """
         if extension not in FORMATS:
-            raise UserError(f"{extension[:20]}: not a format of this page. Use {', '.join(FORMATS)}")
-        motions = self.motions(request)
+            raise UserError(f"{one_line(extension[:20])}: not a format of this page. Use {', '.join(FORMATS)}")
+        motions = None
+        if model := self._models.get(request.model):
+            steps, cleanup = _plan(model, request)
+            with self._memory:
+                motions = self._made.get((request.model, repr(steps)))
+        if model is None or motions is None:
+            raise UserError("this motion is not in memory. Open its link, and download it from there")
         if not 0 <= number < len(motions):
             raise UserError(f"motion={number}: there are {len(motions)} motions, numbered from 0")
+        motion = (_cleaned(model, motions) if cleanup else motions)[number]
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder, f"motion{extension}")
-            motions[number].save(path, rig=rig)
+            motion.save(path, rig=rig)
             return path.read_bytes()
+
+
+def _plan(model: MotionGeneration, request: DemoRequest) -> tuple[list[tuple[int | None, dict[str, Any]]], bool]:
+    """Returns the steps of a request, and whether the motions are cleaned up at the end."""
+    if model.conditioned_on != "none" and not request.text:
+        raise UserError("the text is empty. Describe what the person does")
+    parts = read_parts(request.text) if request.text else []
+    if sum(seconds or request.seconds for _, seconds in parts) > MAX_SECONDS:
+        raise UserError(f"the parts are too long: give at most {MAX_SECONDS} seconds in total")
+    steps = request.steps(model.conditioned_on)
+    return steps, bool(steps[-1][1].pop("cleanup", False))
+
+
+def _cleaned(model: MotionGeneration, motions: Sequence[Motion]) -> list[Motion]:
+    contacts = model.representation.contacts
+    return [cleaned(motion, contacts(motion.features)) for motion in motions]

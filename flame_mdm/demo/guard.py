@@ -1,0 +1,194 @@
+"""Guard of the demo's server: it passes on what the page itself requests, and refuses everything else."""
+
+from __future__ import annotations
+
+import asyncio
+import ipaddress
+import re
+from collections.abc import Callable, Collection, Mapping
+from http import HTTPStatus
+from typing import Annotated
+from urllib.parse import urlsplit
+
+from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationError
+from starlette.datastructures import Headers
+from starlette.responses import PlainTextResponse
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+MAX_BODY = 64 * 1024
+"""Maximum number of bytes of a request's body, counted as they arrive."""
+BODY_TIME = 10.0
+"""Maximum number of seconds in which a body arrives."""
+READ = re.compile(
+    r"/|/theme\.css|/favicon\.ico|/manifest\.json|/(assets|static)(/[\w-]+(\.[\w-]+)*)+|/motion\.\w{3}"
+    r"|/gradio_api/(queue/data|heartbeat/\w{1,40})"
+)
+"""Paths that the page reads with GET."""
+HEADERS = {
+    "Content-Security-Policy": "default-src 'self'; script-src 'self' 'unsafe-inline' 'unsafe-eval'; "
+    "style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; font-src 'self' data:; connect-src 'self'; "
+    "frame-src 'self'; worker-src 'self' blob:; frame-ancestors 'self' https://huggingface.co",
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+}
+"""Of every response. Nothing is loaded from other servers, and only Hugging Face may show the page in a frame."""
+
+Id = Annotated[str, StringConstraints(pattern=r"^\w{1,40}$")]
+RULES = ConfigDict(extra="forbid", strict=True)
+
+
+class Call(BaseModel):
+    """A call of one of the page's functions; its arguments are texts, never objects that could name a file."""
+
+    model_config = RULES
+    data: Annotated[list[Annotated[str, Field(max_length=20_000)]], Field(max_length=1)]
+    fn_index: int
+    session_hash: Id
+    trigger_id: int | None = None
+    event_data: None = None
+
+
+class Cancellation(BaseModel):
+    """A cancellation of a waiting or running call."""
+
+    model_config = RULES
+    event_id: Id
+    session_hash: Id
+    fn_index: int
+
+
+class Reset(BaseModel):
+    """The page's note that it no longer waits for a call."""
+
+    model_config = RULES
+    event_id: Id
+
+
+class Refused(Exception):
+    """A request that is not one of this page; with the status and the line of the answer."""
+
+    def __init__(self, status: HTTPStatus, line: str):
+        super().__init__(line)
+        self.status = status
+
+
+class Guard:
+    """ASGI middleware that checks host, origin, path, size and content of a request before the application sees it.
+
+    Args:
+        app: The application.
+        hosts: Names of this server, besides localhost and addresses in numbers: another name is one that somebody else
+            pointed at this computer (DNS rebinding).
+        calls: Functions of the page that may be called: number -> path, and whether arguments are accepted.
+    """
+
+    def __init__(
+        self, app: ASGIApp, hosts: Collection[str], calls: Mapping[int, tuple[str, Callable[[list[str]], bool]]]
+    ):
+        self.app = app
+        self.hosts = {host.lower() for host in hosts if not _is_address(host)} - {"localhost"}
+        self.calls = calls
+        self.closing = asyncio.Event()
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answers a request; see ASGI for the arguments."""
+        if scope["type"] == "lifespan":
+            return await self.app(scope, receive, send)
+        if scope["type"] != "http":
+            return await send({"type": "websocket.close", "code": 1008})
+
+        async def send_headers(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                kept = [(k, v) for k, v in message.get("headers", ()) if not k.lower().startswith(b"access-control")]
+                message["headers"] = [*kept, *((k.lower().encode(), v.encode()) for k, v in HEADERS.items())]
+            await send(message)
+
+        try:
+            headers = Headers(scope=scope)
+            self._check_sender(headers, scope["path"])
+            if scope["method"] == "POST" and headers.get("content-type") != "application/json":
+                raise Refused(HTTPStatus.UNSUPPORTED_MEDIA_TYPE, "this is not a request of this page")
+            body = await _body(receive)
+            self._check_content(scope["method"], scope["path"], body)
+        except Refused as refusal:
+            answer = PlainTextResponse(str(refusal), refusal.status, {"Connection": "close"})
+            return await answer(scope, receive, send_headers)
+        messages: list[Message] = [{"type": "http.request", "body": body, "more_body": False}]
+
+        async def replay() -> Message:
+            return messages.pop() if messages else await self._until_closing(receive)
+
+        return await self.app(scope, replay, send_headers)
+
+    async def _until_closing(self, receive: Receive) -> Message:
+        """Returns the next message; a disconnection once the server stops, so that streams to open pages end."""
+        tasks = [asyncio.ensure_future(receive()), asyncio.ensure_future(self.closing.wait())]
+        try:
+            done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+            return tasks[0].result() if tasks[0] in done else {"type": "http.disconnect"}
+        finally:
+            for task in tasks:
+                task.cancel()
+
+    def _check_sender(self, headers: Headers, path: str) -> None:
+        """Raises `Refused` if the request is for another server, or comes from a page of another site."""
+        host = headers.get("host", "")
+        name = _host_name(f"//{host}")
+        if name not in self.hosts | {"localhost"} and not _is_address(name):
+            line = "this demo is not served under that name. Start it with hosts=NAME"
+            raise Refused(HTTPStatus.MISDIRECTED_REQUEST, line)
+        origin = headers.get("origin", f"http://{host}")
+        # a proxy may have replaced the host, but not the origin
+        same = urlsplit(origin).netloc.lower() == host.lower() or _host_name(origin) in self.hosts
+        if not same or (path != "/" and headers.get("sec-fetch-site", "none") not in ("same-origin", "none")):
+            raise Refused(HTTPStatus.FORBIDDEN, "this request comes from a page of another site")
+
+    def _check_content(self, method: str, path: str, body: bytes) -> None:
+        """Raises `Refused` if the page itself would not send this."""
+        try:
+            if method in ("GET", "HEAD") and READ.fullmatch(path) and not body:
+                return
+            if method == "POST" and path == "/gradio_api/cancel":
+                Cancellation.model_validate_json(body)
+            elif method == "POST" and path == "/gradio_api/reset":
+                Reset.model_validate_json(body)
+            elif method == "POST" and path in ("/gradio_api/queue/join", "/gradio_api/run/predict"):
+                call = Call.model_validate_json(body)
+                address, accepts = self.calls.get(call.fn_index, ("", bool))
+                if address != path or not accepts(call.data):
+                    raise Refused(HTTPStatus.BAD_REQUEST, "this is not a request of this page")
+            else:
+                raise Refused(HTTPStatus.NOT_FOUND, "this page has nothing at that address")
+        except ValidationError as error:
+            raise Refused(HTTPStatus.BAD_REQUEST, "this is not a request of this page") from error
+
+
+async def _body(receive: Receive) -> bytes:
+    body = bytearray()
+    try:
+        async with asyncio.timeout(BODY_TIME):
+            while True:
+                message = await receive()
+                if message["type"] == "http.disconnect":
+                    raise Refused(HTTPStatus.BAD_REQUEST, "the request is incomplete")
+                body += message.get("body", b"")
+                if len(body) > MAX_BODY:
+                    raise Refused(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, "this request is too large")
+                if not message.get("more_body"):
+                    return bytes(body)
+    except TimeoutError as error:
+        raise Refused(HTTPStatus.REQUEST_TIMEOUT, "the request took too long to arrive") from error
+
+
+def _host_name(address: str) -> str:
+    try:
+        return (urlsplit(address).hostname or "").lower()
+    except ValueError:
+        return ""
+
+
+def _is_address(name: str) -> bool:
+    try:
+        return bool(ipaddress.ip_address(name))
+    except ValueError:
+        return False

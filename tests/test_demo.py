@@ -334,8 +334,9 @@ def test_bodies_are_counted_as_they_arrive(server):
         connection.sendall(head.encode())
         sent = 0
         with contextlib.suppress(OSError):  # the server closes the connection
-            for sent in range(1, 301):
+            while sent < 300:
                 connection.sendall(b"%x\r\n%s\r\n" % (2**20, b"x" * 2**20))
+                sent += 1
     assert sent < 30, f"the server read {sent} MiB"
     for route, size, status in (("queue/join", 70_000, 413), ("upload", 10, 404)):
         assert get(f"{server}/gradio_api/{route}", b"x" * size)[0] == status
@@ -352,7 +353,7 @@ def test_random_requests_are_answered_or_refused(server, number):
         data = draw.choice([json.dumps(body).encode(), draw.randbytes(200), b"[" * 5000])
         path = draw.choice(["run/predict", "queue/join", "cancel", "reset", "call/generate", "queue/data", "info"])
         status, answer = get(f"{server}/gradio_api/{path}?{quote(draw.randbytes(9))}", draw.choice([data, data, None]))
-        assert status in (200, 400, 404), (path, data, status)
+        assert status in (200, 400, 404, 422), (path, data, status)
         assert b"Traceback" not in answer
         assert b"site-packages" not in answer
     assert "<iframe" in generated(server, query_of("seed=4"))[0]
@@ -378,7 +379,8 @@ with TestClient(app, "http://localhost") as client, studio._working:
         answer = client.post("/gradio_api/run/predict", json=body)
         assert answer.status_code == 200, answer.text
 own = [route.path for route in gradio.routes if hasattr(route, "path")]
-api = [route.path for group in gradio.routes if hasattr(group, "original_router") for route in group.original_router.routes]
+groups = [group.original_router for group in gradio.routes if hasattr(group, "original_router")]
+api = [route.path for group in groups for route in group.routes]
 routes = sorted({*own, *(path if path.startswith("/gradio_api") else f"/gradio_api{path}" for path in api)})
 sessions = [len(gradio.state_holder.session_data), SESSIONS]
 print(json.dumps({"routes": routes, "sessions": sessions, "files": [file.status_code for file in files]}))
@@ -555,6 +557,41 @@ def test_a_person_writes_a_sequence_in_rows_and_draws_a_path(server, tmp_path):
         click(tab, "Generate")
         tab.wait("location.search && !location.search.includes('path=')")
         assert tab.errors == []
+
+
+@pytest.mark.tools
+@pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed")
+def test_a_page_of_another_site_gets_nothing(server, tmp_path):
+    generated(server, EDITED.query())
+    motion = f"{server}/motion.npz?{EDITED.query()}"
+    call = body_of(6, {"path": "/etc/passwd", "meta": {"_type": "gradio.FileData"}}).decode()
+    evil = f"<a id=file href='{motion}'>x</a>"
+    evil += f"<form method=post enctype=text/plain action='{server}/gradio_api/run/predict'>"
+    evil += f"<input name='{call[:-1]},\"a\":\"' value='\"}}'></form><iframe src='{server}'></iframe>"
+    (tmp_path / "index.html").write_text(evil)
+    words = [sys.executable, "-m", "http.server", "0", "--bind", "127.0.0.1", "-d", str(tmp_path)]
+    with subprocess.Popen([words[0], "-u", *words[1:]], stdout=subprocess.PIPE, text=True) as other:
+        assert other.stdout is not None
+        site = f"http://localhost:{re.findall('port ([0-9]+)', other.stdout.readline())[0]}"
+        try:
+            with browser(tmp_path / "profile") as tab:
+                for action in ("#file').click()", "form').submit()"):
+                    tab.open(site)
+                    tab.wait("!!document.querySelector('#file')")
+                    time.sleep(1)  # the frame
+                    for mode in ("cors", "no-cors"):
+                        fetched = f"fetch('{motion}', {{mode: '{mode}'}}).then(answer => answer.text(), () => '')"
+                        assert tab.run(fetched) == ""
+                    assert tab.run(
+                        "frames[0].length === 0 && document.querySelector('iframe').contentDocument === null"
+                    )
+                    tab.run(f"document.querySelector('{action}")
+                    tab.wait("document.body?.innerText.includes('comes from a page of another site')")
+                assert not any(
+                    "queue/join" in url for url in tab.requested
+                )  # a frame of the page would start to sample
+        finally:
+            other.terminate()
 
 
 def click(tab: Any, label: str) -> None:

@@ -72,7 +72,7 @@ class Condition:
         """Returns conditions in which samples with `drop` (B,) bool True are replaced by the null condition.
 
         Raises:
-            ValueError: there is no null condition.
+            ValueError: If there is no null condition.
         """
         if self.null is None:
             raise ValueError("this condition has no null to drop to")

@@ -5,6 +5,9 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor, nn
 
+CONTACT_SPEED = 0.01
+"""Maximum displacement per frame, in meters, of a foot in contact in the data."""
+
 
 def masked_mean(x: Tensor, mask: Tensor) -> Tensor:
     """Returns the mean (B,) of x (B, F, ...) over the real frames of each sample; 0 if a sample has none.
@@ -43,9 +46,7 @@ class MotionLosses(nn.Module):
         *,
         joints: float = 0.0,
         velocity: float = 0.0,
-        joint_velocity: float = 0.0,
         foot_contact: float = 0.0,
-        contact_speed: float = 0.01,
         root_relative: bool = False,
         velocity_features: int | None = None,
     ):
@@ -56,10 +57,8 @@ class MotionLosses(nn.Module):
             feet: indices of the joints that touch the ground.
             joints: weight of the squared error of the joint positions (eq. 3).
             velocity: weight of the squared error of the features' velocity (eq. 5).
-            joint_velocity: weight of the squared error of the joints' velocity; in MDM's code, but not in its loss.
             foot_contact: weight of the squared velocity of feet in contact in the data (eq. 4). The mean includes feet
                 that are not in contact, whose entries are 0, like the sum over all frames in the paper.
-            contact_speed: maximum displacement per frame, in meters, of a foot in contact in the data.
             root_relative: subtract the first joint from all joints, as in MDM's code, so that joint-based losses do not
                 depend on the root translation.
             velocity_features: number of features, from the first, that `velocity` uses, as in MDM's code (144 of
@@ -68,13 +67,7 @@ class MotionLosses(nn.Module):
         super().__init__()
         self.to_joints = to_joints
         self.feet = list(feet)
-        self.weights = {
-            "joints": joints,
-            "velocity": velocity,
-            "joint_velocity": joint_velocity,
-            "foot_contact": foot_contact,
-        }
-        self.contact_speed = contact_speed
+        self.weights = {"joints": joints, "velocity": velocity, "foot_contact": foot_contact}
         self.root_relative = root_relative
         self.velocity_features = velocity_features
 
@@ -86,15 +79,13 @@ class MotionLosses(nn.Module):
         if self.weights["velocity"]:
             size = self.velocity_features
             losses["velocity"] = masked_mse(differences(x0_hat[..., :size]), differences(x[..., :size]), moving)
-        if self.weights["joints"] or self.weights["joint_velocity"] or self.weights["foot_contact"]:
+        if self.weights["joints"] or self.weights["foot_contact"]:
             predicted, real = self._joints(x0_hat), self._joints(x)
             if self.weights["joints"]:
                 losses["joints"] = masked_mse(predicted, real, mask)
-            if self.weights["joint_velocity"]:
-                losses["joint_velocity"] = masked_mse(differences(predicted), differences(real), moving)
             if self.weights["foot_contact"]:
-                stands = differences(real[:, :, self.feet]).norm(dim=-1, keepdim=True) <= self.contact_speed
-                slide = torch.where(stands, differences(predicted[:, :, self.feet]), 0.0)
+                in_contact = differences(real[:, :, self.feet]).norm(dim=-1, keepdim=True) <= CONTACT_SPEED
+                slide = torch.where(in_contact, differences(predicted[:, :, self.feet]), 0.0)
                 losses["foot_contact"] = masked_mean(slide.square(), moving)
         return {name: self.weights[name] * loss for name, loss in losses.items()}
 

@@ -148,6 +148,8 @@ class MotionGeneration(Task):
         compile: bool = False,
     ):
         super().__init__(condition, representation, optimizer=optimizer, seed=seed)
+        if not isinstance(denoiser, Denoiser):
+            raise UserError(f"{type(denoiser).__name__} is no denoiser: derive it from flame_mdm.denoisers.Denoiser")
         if not 0 <= cond_drop_prob <= 1:
             raise UserError(f"task.cond_drop_prob={cond_drop_prob}: give a probability from 0 to 1")
         try:
@@ -298,8 +300,9 @@ class MotionGeneration(Task):
             cond = self.condition(replace(described, text=[""] * len(described), action=nothing)).drop(nothing == 0)
         else:
             cond = self.condition(described)
-        if cond.null is not None and self.condition.features and not unconditioned:
-            denoise = classifier_free_guidance(self.denoiser, options.guidance_scale, self.representation.features)
+        scale = options.guidance_scale
+        if scale is not None and cond.null is not None and self.condition.features and not unconditioned:
+            denoise = classifier_free_guidance(self.denoiser, scale, self.representation.features)
         if windows is not None:
             denoise = blended(denoise, windows)
         mask, frames, features = batch.mask, batch.mask.shape[1], self.representation.features

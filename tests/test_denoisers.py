@@ -14,9 +14,11 @@ from flame_mdm.denoisers.flame import FLAME
 from flame_mdm.denoisers.layers import sinusoid
 from flame_mdm.denoisers.mdm import MDMDecoder, MDMEncoder
 from flame_mdm.denoisers.unet import MaskedGroupNorm, MDMUNet
+from flame_mdm.errors import UserError
 
 CONFIGS = sorted((ROOT / "experiments" / "denoiser").glob("*.yaml"))
-TINY = {"latent_dim": 16, "ff_size": 24, "num_layers": 2, "num_heads": 2, "channels": [8, 8, 16], "num_groups": 4}
+TRANSFORMER = {"latent_dim": 16, "ff_size": 24, "num_layers": 2, "num_heads": 2, "dropout": 0.0}
+TINY = {**TRANSFORMER, "channels": [8, 8, 16], "num_groups": 4}
 D, C, LENGTHS = 7, 12, [11, 8, 1]
 
 
@@ -26,10 +28,10 @@ def config_of(path: Path) -> dict:
     return {str(key): value for key, value in config.items()}
 
 
-def tiny(path: Path, out_features: int = D, cond_features: int = C, **options) -> Denoiser:
+def tiny(path: str | Path, out_features: int = D, cond_features: int = C, **options) -> Denoiser:
     """The denoiser of a YAML in the smallest sizes, in float64 so that only real differences show."""
     torch.manual_seed(0)
-    config = config_of(path)
+    config = config_of(ROOT / "experiments/denoiser" / path)
     config |= {key: value for key, value in TINY.items() if key in config}
     return instantiate(config, D, out_features, cond_features, **options).double().eval()
 
@@ -59,7 +61,7 @@ each_denoiser = pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.s
 
 
 @each_denoiser
-def test_shape_and_determinism(path: Path) -> None:
+def test_shape_determinism_and_sizes(path: Path) -> None:
     denoiser, inputs = tiny(path, out_features=2 * D, dropout=0.5), batch()
     torch.manual_seed(1)
     y = denoiser(*inputs)
@@ -67,6 +69,10 @@ def test_shape_and_determinism(path: Path) -> None:
     assert y.isfinite().all()
     torch.manual_seed(2)
     assert torch.equal(denoiser(*inputs), y)
+    config = config_of(path)  # holds all sizes and no derived ones
+    get_class(config["_target_"])
+    assert not config.keys() & {"in_features", "out_features", "cond_features"}
+    assert path.read_text().startswith("# ")
 
 
 @each_denoiser
@@ -90,12 +96,10 @@ def test_padding_does_not_leak(path: Path) -> None:
 def test_dropped_condition_is_the_null(path: Path) -> None:
     denoiser = tiny(path)
     x_t, t, mask, cond = batch()
-    null = cond.null
+    null, size = cond.null, len(x_t)
     assert null is not None
-    size = len(x_t)
-    everywhere = Condition(
-        null.pooled.expand(size, -1), null.tokens.expand(size, -1, -1), torch.ones(size, 5, dtype=torch.bool)
-    )
+    all_real = torch.ones(size, 5, dtype=torch.bool)
+    everywhere = Condition(null.pooled.expand(size, -1), null.tokens.expand(size, -1, -1), all_real)
     y, y_null = denoiser(x_t, t, mask, cond), denoiser(x_t, t, mask, everywhere)
     assert_same(denoiser(x_t, t, mask, cond.drop(torch.ones(size, dtype=torch.bool))), y_null)
     mixed = denoiser(x_t, t, mask, cond.drop(torch.tensor([False, True, False])))
@@ -105,18 +109,12 @@ def test_dropped_condition_is_the_null(path: Path) -> None:
 
 
 @each_denoiser
-def test_all_weights_get_gradients(path: Path) -> None:
+def test_all_weights_get_gradients_and_time_is_continuous(path: Path) -> None:
     denoiser = tiny(path)
     x_t, t, mask, cond = batch()
     denoiser(x_t, t, mask, cond)[mask].square().sum().backward()
     without = [name for name, p in denoiser.named_parameters() if p.grad is None or not p.grad.abs().sum() > 0]
     assert without == []
-
-
-@each_denoiser
-def test_time_is_continuous_and_matters(path: Path) -> None:
-    denoiser = tiny(path)
-    x_t, _, mask, cond = batch()
 
     def at(t: float) -> torch.Tensor:
         return denoiser(x_t, torch.full((len(x_t),), t), mask, cond)[mask]
@@ -129,21 +127,12 @@ def test_time_is_continuous_and_matters(path: Path) -> None:
 def test_unconditioned(path: Path) -> None:
     denoiser = tiny(path, cond_features=0)
     x_t, t, mask, _ = batch()
-    size = len(x_t)
-    nothing = Condition(torch.zeros(size, 0), torch.zeros(size, 0, 0), None)
+    nothing = Condition(torch.zeros(len(x_t), 0), torch.zeros(len(x_t), 0, 0), None)
     if config_of(path).get("max_tokens"):
-        with pytest.raises(ValueError, match="tokens"):
+        with pytest.raises(UserError, match="tokens"):
             denoiser(x_t, t, mask, nothing)
-        return
-    assert denoiser(x_t, t, mask, nothing).isfinite().all()
-
-
-@each_denoiser
-def test_yaml_holds_all_sizes_and_no_derived_ones(path: Path) -> None:
-    config = config_of(path)
-    get_class(config["_target_"])
-    assert not config.keys() & {"in_features", "out_features", "cond_features"}
-    assert path.read_text().startswith("# ")
+    else:
+        assert denoiser(x_t, t, mask, nothing).isfinite().all()
 
 
 PAPER = [
@@ -158,15 +147,12 @@ PAPER = [
 
 @pytest.mark.parametrize(("name", "parameters"), PAPER)
 def test_paper_size(name: str, parameters: int) -> None:
-    config = config_of(ROOT / "experiments" / "denoiser" / f"{name}.yaml")
     features = (147, 294, 768) if name == "flame" else (263, 263, 512)
     with torch.device("meta"):
-        denoiser = instantiate(config, *features)
+        denoiser = instantiate(config_of(ROOT / "experiments" / "denoiser" / f"{name}.yaml"), *features)
     assert sum(p.numel() for p in denoiser.parameters()) == parameters
-
-
-def test_unet_is_within_5_percent_of_the_papers_count() -> None:
-    assert abs(dict(PAPER)["mdm_unet"] / 23.47e6 - 1) < 0.05
+    if name == "mdm_unet":
+        assert abs(parameters / 23.47e6 - 1) < 0.05  # the paper's count
 
 
 @each_denoiser
@@ -197,9 +183,6 @@ def test_group_norm_without_padding_is_torchs() -> None:
     torch.testing.assert_close(norm(x, torch.ones(2, 1, 5)), expected)
 
 
-TRANSFORMER = {"latent_dim": 16, "ff_size": 24, "num_layers": 2, "num_heads": 2, "dropout": 0.0}
-
-
 @pytest.mark.parametrize("network", [MDMEncoder, MDMDecoder])
 def test_attention_to_padding_is_the_legacy_flag(network: type[Denoiser]) -> None:
     """Without the mask, padding is seen by every frame, as in the released models."""
@@ -215,23 +198,23 @@ def test_gru_recurs_over_frames_or_by_flag_over_the_batch() -> None:
     x_t, t, mask, cond = batch()
     changed = x_t.clone()
     changed[0, 0] += 1
-    frames = tiny(ROOT / "experiments/denoiser/mdm_gru.yaml")
-    reached = (frames(changed, t, mask, cond) - frames(x_t, t, mask, cond)).abs().amax(-1) > 1e-12
-    assert reached[0].all()
-    assert not reached[1:].any()
-    legacy = tiny(ROOT / "experiments/denoiser/mdm_gru.yaml", recur_over_batch=True)
-    reached = (legacy(changed, t, mask, cond) - legacy(x_t, t, mask, cond)).abs().amax(-1) > 1e-12
-    assert reached[:, 0].all()
-    assert not reached[:, 1:].any()
+
+    def reached(gru: Denoiser) -> torch.Tensor:
+        return (gru(changed, t, mask, cond) - gru(x_t, t, mask, cond)).abs().amax(-1) > 1e-12
+
+    frames, legacy = reached(tiny("mdm_gru.yaml")), reached(tiny("mdm_gru.yaml", recur_over_batch=True))
+    assert frames[0].all()
+    assert not frames[1:].any()
+    assert legacy[:, 0].all()
+    assert not legacy[:, 1:].any()
 
 
 @pytest.mark.parametrize("length_token", [True, False])
 @pytest.mark.parametrize("cross_attention", [True, False])
 def test_flame_ablations(length_token: bool, cross_attention: bool) -> None:
     """Table 4: what is left out leaves no weights, and text tokens act through cross-attention alone."""
-    flame = FLAME(
-        D, D, C, **TRANSFORMER, max_frames=20, length_token=length_token, cross_attention=cross_attention
-    ).double()
+    options = {"length_token": length_token, "cross_attention": cross_attention}
+    flame = FLAME(D, D, C, **TRANSFORMER, max_frames=20, **options).double()
     x_t, t, mask, cond = batch()
     y = flame(x_t, t, mask, cond)
     y[mask].square().sum().backward()
@@ -243,17 +226,14 @@ def test_flame_ablations(length_token: bool, cross_attention: bool) -> None:
     assert torch.equal(flame(x_t, t, mask, other), y) != cross_attention
 
 
-def test_flame_returns_zeros_past_the_end() -> None:
+def test_flame_returns_zeros_past_the_end_and_knows_lengths_up_to_max_frames() -> None:
     x_t, t, mask, cond = batch()
-    y = tiny(ROOT / "experiments/denoiser/flame.yaml")(x_t, t, mask, cond)
+    y = tiny("flame.yaml")(x_t, t, mask, cond)
     assert (y[~mask] == 0).all()
     assert (y[mask] != 0).all()
-
-
-def test_flame_knows_lengths_up_to_max_frames() -> None:
     flame = FLAME(D, D, C, **TRANSFORMER, max_frames=11).double()
     assert flame(*batch(frames=14)).isfinite().all()
-    with pytest.raises(ValueError, match=r"12 frames .* denoiser\.max_frames \(11\)"):
+    with pytest.raises(UserError, match=r"12 frames .* denoiser\.max_frames \(11\)"):
         flame(*batch([12, 3], frames=14))
 
 
@@ -268,7 +248,7 @@ def test_flame_rounds_lengths_down_to_those_of_its_training() -> None:
     x_t, t, mask, cond = batch([12, 8, 4], frames=12)
     assert torch.equal(flame(x_t, t, mask, cond), exact(x_t, t, mask, cond))
     for unit in (0, -4, 1.5, "4", True):
-        with pytest.raises(ValueError, match="length_unit"):
+        with pytest.raises(UserError, match="length_unit"):
             FLAME(D, D, C, **TRANSFORMER, max_frames=20, length_unit=unit)  # type: ignore[arg-type]
 
 
@@ -279,7 +259,7 @@ def test_token_positions_do_not_move_the_frames() -> None:
     two = torch.tensor([True, True, False, False, False]).expand(3, 5)
     fewer = Condition(cond.pooled, cond.tokens[:, :2], two[:, :2])
     assert_same(encoder(x_t, t, mask, Condition(cond.pooled, cond.tokens, two)), encoder(x_t, t, mask, fewer))
-    with pytest.raises(ValueError, match=r"6 condition tokens: denoiser\.max_tokens \(5\)"):
+    with pytest.raises(UserError, match=r"6 condition tokens: denoiser\.max_tokens \(5\)"):
         encoder(*batch(tokens=6))
 
 
@@ -291,18 +271,19 @@ def test_action_embedding_is_added_as_it_is() -> None:
     unconditioned.load_state_dict(encoder.state_dict())
     zero = Condition(torch.zeros_like(cond.pooled), cond.tokens, cond.token_mask)
     assert_same(encoder(x_t, t, mask, zero), unconditioned(x_t, t, mask, zero))
-    with pytest.raises(ValueError, match=r"\(12\) must equal latent_dim \(16\)"):
-        MDMEncoder(D, D, C, **TRANSFORMER, project_condition=False)
 
 
 def test_bad_options_are_named() -> None:
-    with pytest.raises(ValueError, match=r"latent_dim \(16\) is not a multiple of num_heads \(3\)"):
-        MDMEncoder(D, D, C, **{**TRANSFORMER, "num_heads": 3})
-    with pytest.raises(ValueError, match="input_token is none, condition or time, not 'both'"):
-        MDMDecoder(D, D, C, **TRANSFORMER, input_token="both")  # pyright: ignore[reportArgumentType]
-    with pytest.raises(ValueError, match=r"num_groups \(3\)"):
-        MDMUNet(D, D, C, latent_dim=16, channels=[8], num_groups=3, dropout=0.0)
     x_t, t, mask, cond = batch()
     pooled_only = Condition(cond.pooled, cond.tokens[:, :0], None)
-    with pytest.raises(ValueError, match="the condition encoder has none"):
-        MDMDecoder(D, D, C, **TRANSFORMER, token_memory=True).double()(x_t, t, mask, pooled_only)
+    decoder = MDMDecoder(D, D, C, **TRANSFORMER, token_memory=True).double()
+    unet = {"latent_dim": 16, "channels": [8], "dropout": 0.0}
+    for build, message in (
+        (lambda: MDMEncoder(D, D, C, **TRANSFORMER | {"num_heads": 3}), r"latent_dim \(16\) .* num_heads \(3\)"),
+        (lambda: MDMEncoder(D, D, C, **TRANSFORMER, project_condition=False), r"\(12\) must equal latent_dim \(16\)"),
+        (lambda: MDMDecoder(D, D, C, **TRANSFORMER, input_token="both"), "condition or time, not 'both'"),  # pyright: ignore[reportArgumentType]
+        (lambda: MDMUNet(D, D, C, **unet, num_groups=3), r"num_groups \(3\)"),
+        (lambda: decoder(x_t, t, mask, pooled_only), "the condition encoder has none"),
+    ):
+        with pytest.raises(UserError, match=message):
+            build()

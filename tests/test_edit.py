@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from support.motions import synthetic
 from support.runs import TINY
 
 import flame_mdm
@@ -28,7 +29,7 @@ from flame_mdm.sampling.reading import read_motion
 from flame_mdm.seeds import seeded_noise
 from flame_mdm.task import MotionGeneration
 
-FLOW = ["process=flow_matching", "task.sampler=euler"]
+CLIP = "synthetic:synthetic_0_000003"
 
 
 def build(overrides: list[str], max_frames: int = 60) -> MotionGeneration:
@@ -48,7 +49,8 @@ def diffusion() -> MotionGeneration:
 
 @pytest.fixture(scope="module")
 def flow() -> MotionGeneration:
-    return build([*(o for o in TINY if "num_train_timesteps" not in o), *FLOW])
+    shared = [override for override in TINY if "num_train_timesteps" not in override]
+    return build([*shared, "process=flow_matching", "task.sampler=euler"])
 
 
 @pytest.fixture(scope="module")
@@ -60,10 +62,9 @@ def store(tmp_path_factory) -> Path:
     return root
 
 
-def walk(fps: float, seconds: float = 2.0, turned: float = 0.0) -> np.ndarray:
-    """Joints (F, 22, 3) of a smooth motion, turned about the vertical by some radians."""
-    clip = next(c for c in Synthetic(clips=20).clips(200) if c.attributes["action"] == "walk")
-    joints = clip.motion[: round(200 * seconds) + 1 : round(200 / fps)]
+def walk(fps: float, turned: float = 0.0) -> np.ndarray:
+    """Joints (F, 22, 3) of two seconds of a smooth motion, turned about the vertical by some radians."""
+    joints = synthetic("walk", fps=200, size=20).joints[: 401 : round(200 / fps)]
     s, c = np.sin(turned), np.cos(turned)
     return joints @ np.array([[c, 0, -s], [0, 1, 0], [s, 0, c]]) + [turned, 0, 2 * turned]
 
@@ -71,32 +72,28 @@ def walk(fps: float, seconds: float = 2.0, turned: float = 0.0) -> np.ndarray:
 @pytest.fixture(scope="module")
 def motion(diffusion) -> Motion:
     features = diffusion.representation.encode(torch.from_numpy(walk(20)))
-    joints = diffusion.representation.decode(features)
-    motion = Motion(joints.numpy(), 20.0, SMPL22, "a person walks", "walk")
-    motion.features, motion.representation = features.numpy(), diffusion.representation.name
-    return motion
+    joints = diffusion.representation.decode(features).numpy()
+    name = diffusion.representation.name
+    return Motion(joints, 20.0, SMPL22, "a person walks", "walk", features=features.numpy(), representation=name)
 
 
 # What is kept ---------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("length", [8, 37, 60])
-@pytest.mark.parametrize(
-    ("region", "kept"),
-    [
-        ("in_between", lambda i, n: i < int(0.25 * n) or i >= int(0.75 * n)),
-        ("prediction", lambda i, n: i < int(0.25 * n)),
-        ("prefix", lambda i, n: i < int(0.25 * n)),
-        ("suffix", lambda i, n: i >= int(0.75 * n)),
-        ("interpolate", lambda i, n: i % 5 == 0),
-        ([2, 5], lambda i, n: not 2 <= i < 5),
-        ([[0, 1], [4, 8]], lambda i, n: not (i < 1 or 4 <= i < 8)),
-    ],
-)
-def test_regions(diffusion, motion, region, kept, length):
+@pytest.mark.parametrize("length", [8, 37])
+def test_regions(diffusion, motion, length):
     part = replace(motion, joints=motion.joints[:1].repeat(length, 0), features=motion.features[:1].repeat(length, 0))
-    keep = edit(diffusion, part, region=region, num_inference_steps=2)[0].keep
-    assert keep.tolist() == [[kept(i, length)] * 263 for i in range(length)]
+    for region, kept in (
+        ("in_between", lambda i: i < int(0.25 * length) or i >= int(0.75 * length)),
+        ("prediction", lambda i: i < int(0.25 * length)),
+        ("prefix", lambda i: i < int(0.25 * length)),
+        ("suffix", lambda i: i >= int(0.75 * length)),
+        ("interpolate", lambda i: i % 5 == 0),
+        ([2, 5], lambda i: not 2 <= i < 5),
+        ([[0, 1], [4, 8]], lambda i: not (i < 1 or 4 <= i < 8)),
+    ):
+        keep = edit(diffusion, part, region=region, num_inference_steps=2)[0].keep
+        assert keep.tolist() == [[kept(i)] * 263 for i in range(length)], region
 
 
 def test_seconds_are_frames(diffusion, motion):
@@ -106,19 +103,16 @@ def test_seconds_are_frames(diffusion, motion):
     assert np.array_equal(a.features, b.features)
 
 
-def test_upper_body_keeps_what_mdm_keeps(diffusion, motion):
+def test_frames_and_joints_meet_and_the_upper_body_is_what_mdm_resamples(diffusion, motion):
+    both = edit(diffusion, motion, region="in_between", joints=["left_arm", "head"])[0].keep
+    frames = edit(diffusion, motion, region="in_between")[0].keep
+    joints = edit(diffusion, motion, joints=["left_arm", "head"])[0].keep
+    assert np.array_equal(both, frames | joints)
     keep = edit(diffusion, motion, joints="upper_body")[0].keep
     assert (keep == keep[0]).all()
     lower = np.isin(np.arange(22), (0, 1, 2, 4, 5, 7, 8, 10, 11))
     positions, rotations = (np.repeat(lower[1:], size) for size in (3, 6))
     assert keep[0].tolist() == [True] * 4 + [*positions, *rotations, *np.repeat(lower, 3)] + [True] * 4
-
-
-def test_frames_and_joints_meet(diffusion, motion):
-    both = edit(diffusion, motion, region="in_between", joints=["left_arm", "head"])[0].keep
-    frames = edit(diffusion, motion, region="in_between")[0].keep
-    joints = edit(diffusion, motion, joints=["left_arm", "head"])[0].keep
-    assert np.array_equal(both, frames | joints)
 
 
 @pytest.mark.parametrize("skeleton", [SMPL22, SMPL24, KIT21], ids=lambda s: s.name)
@@ -129,9 +123,8 @@ def test_parts_of_the_body(skeleton):
     assert {skeleton.mirrored[joint] for joint in parts["left_leg"]} == set(parts["right_leg"])
     assert set(skeleton.feet) <= set(parts["legs"]) == set(parts["lower_body"]) - {0}
     assert {skeleton.joints[j] for j in parts["right_arm"]} >= {"right_shoulder", "right_elbow", "right_wrist"}
-    assert find_joints(skeleton, ["right_leg", "left_elbow"]) == sorted(
-        [*parts["right_leg"], skeleton.joints.index("left_elbow")]
-    )
+    expected = sorted([*parts["right_leg"], skeleton.joints.index("left_elbow")])
+    assert find_joints(skeleton, ["right_leg", "left_elbow"]) == expected
 
 
 @pytest.mark.parametrize("representation", [SMPL(), Rot6D()], ids=lambda r: r.name)
@@ -139,17 +132,15 @@ def test_features_of_joints_move_these_joints(representation):
     """A joint's rotation turns what hangs on it, and nothing else; the root's features move all."""
     torch.manual_seed(0)
     features = torch.randn(2, representation.features)
-    skeleton = representation.skeleton
     for joint in range(24):
         below = {joint}
-        for child, parent in enumerate(skeleton.parents):
+        for child, parent in enumerate(representation.skeleton.parents):
             below |= {child} if parent in below else set()
-        below -= {joint}
         mask = representation.joint_features([joint])
         assert mask.shape == (representation.features,)
         moved = representation.decode(torch.where(mask, torch.randn_like(features), features))
         distance = (moved - representation.decode(features)).norm(dim=-1).amax(0)
-        expected = set(range(24)) if joint == 0 else below
+        expected = set(range(24)) if joint == 0 else below - {joint}
         assert {i for i, way in enumerate(distance.tolist()) if way > 1e-3} == expected
     assert sum(representation.joint_features([j]).int() for j in range(24)).tolist() == [1] * representation.features  # type: ignore[union-attr]
 
@@ -158,7 +149,7 @@ def test_features_of_joints_move_these_joints(representation):
 
 
 @pytest.mark.parametrize("method", ["mdm", "flame"])
-@pytest.mark.parametrize("options", [{"region": "in_between"}, {"joints": "upper_body"}, {"region": "suffix"}], ids=str)
+@pytest.mark.parametrize("options", [{"region": "in_between"}, {"joints": "upper_body"}], ids=str)
 def test_exact_methods_keep_exactly(diffusion, motion, method, options):
     results = edit(diffusion, motion, "a person jumps", method=method, samples=2, **options)
     for result in results:
@@ -215,18 +206,7 @@ def test_a_variation_starts_from_the_noised_motion(kind, strength, motion, reque
     noise = seeded_noise(["#0"], *known.shape[1:], seed=0, replication=0, like=known)(0)
     time = t / 1000 if kind == "flow" else t
     torch.testing.assert_close(x_t, model.process.corrupt(known, noise, time), rtol=0, atol=1e-4)
-
-
-def test_a_variation_may_keep_parts(diffusion, motion):
-    assert edit(diffusion, motion, strength=0.5, joints="upper_body")[0].feature_error == 0
-
-
-@pytest.mark.parametrize("strength", [0.0, 1.5, float("nan")])
-def test_a_variation_needs_a_share_of_the_steps(diffusion, motion, strength):
-    with pytest.raises(UserError, match=r"strength=.*above 0, up to 1"):
-        edit(diffusion, motion, strength=strength)
-    with pytest.raises(UserError, match=r"no part of the motion is kept.*strength=0\.5"):
-        edit(diffusion, motion)
+    assert edit(model, motion, strength=strength, joints="upper_body", method="mdm")[0].feature_error == 0
 
 
 def test_resampling_takes_each_step_more_often(diffusion, motion):
@@ -264,6 +244,11 @@ def test_models_that_attend_to_the_padding_know_it_as_empty(motion):
 # Where motions come from ----------------------------------------------------------------------------------------------
 
 
+def npz(folder: Path, **arrays) -> Path:
+    np.savez(folder / "motion.npz", **arrays)
+    return folder / "motion.npz"
+
+
 def test_samples_are_read_as_they_are(diffusion, tmp_path):
     motions = generate(diffusion, "a person waves", frames=24)
     write_motions(tmp_path, motions, {"seed": 0})
@@ -273,10 +258,9 @@ def test_samples_are_read_as_they_are(diffusion, tmp_path):
     assert read.text == "a person waves"
 
 
-@pytest.mark.parametrize(("fps", "turned"), [(20, 0.0), (20, 2.0), (50, 0.0), (100, -1.3), (10, 3.0)])
+@pytest.mark.parametrize(("fps", "turned"), [(20, 2.0), (50, 0.0), (100, -1.3), (10, 3.0)])
 def test_joints_of_any_rate_and_facing(diffusion, motion, tmp_path, fps, turned):
-    np.savez(tmp_path / "mine.npz", joints=walk(fps, turned=turned), fps=fps)
-    read = read_motion(diffusion.representation, str(tmp_path / "mine.npz"))
+    read = read_motion(diffusion.representation, npz(tmp_path, joints=walk(fps, turned), fps=fps))
     assert read.features.shape == motion.features.shape
     # At 10 fps the footsteps themselves are lost between the frames.
     assert np.abs(read.joints - motion.joints).max() < (0.15 if fps == 10 else 0.01)
@@ -293,42 +277,38 @@ def test_resampling_keeps_the_time():
 
 
 def test_a_bvh_file_of_a_known_skeleton(diffusion, tmp_path):
-    joints = 100 * walk(50)
+    joints, file = 100 * walk(50), tmp_path / "take.bvh"
     names = tuple(dict.fromkeys(("joint_Root", *bandai.JOINTS.values())))
-    places = np.zeros((len(joints), len(names), 3))
+    positions = np.zeros((len(joints), len(names), 3))
     for joint, name in enumerate(bandai.JOINTS.values()):
-        places[:, names.index(name)] = joints[:, joint]
-    places[:, names.index("Hips")] = joints[:, 0]
-    file = tmp_path / "take.bvh"
-    channels = (("Xposition", "Yposition", "Zposition"),) * len(names)
-    parents = (-1, *[0] * (len(names) - 1))
-    frames = places.reshape(len(joints), -1)
-    skeleton = (names, parents, np.zeros((len(names), 3)), channels, (), np.zeros((0, 3)))
-    bvh.write(bvh.Bvh(*skeleton, frames, 50.0), file)
-    read = read_motion(diffusion.representation, file)
-    expected = read_motion(diffusion.representation, _npz(tmp_path, joints=walk(20), fps=20))
-    assert read.features.shape == expected.features.shape
-    others = [joint for joint in range(22) if joint != bandai.SPINE1]
-    assert np.abs(read.joints - expected.joints)[:, others].max() < 0.02
+        positions[:, names.index(name)] = joints[:, joint]
+    positions[:, names.index("Hips")] = joints[:, 0]
+    channels, parents = (("Xposition", "Yposition", "Zposition"),) * len(names), (-1, *[0] * (len(names) - 1))
+    skeleton = (parents, np.zeros((len(names), 3)), channels, (), np.zeros((0, 3)))
 
-    bvh.write(bvh.Bvh(("Bip01", *names[1:]), *skeleton[1:], frames, 50.0), file)
-    assert read_motion(diffusion.representation, file).features.shape == expected.features.shape
-    bvh.write(bvh.Bvh((*names[:-1], "Tail"), *skeleton[1:], frames, 50.0), file)
+    def read(*joint_names: str) -> Motion:
+        bvh.write(bvh.Bvh(joint_names, *skeleton, positions.reshape(len(joints), -1), 50.0), file)
+        return read_motion(diffusion.representation, file)
+
+    expected = read_motion(diffusion.representation, npz(tmp_path, joints=walk(20), fps=20))
+    others = [joint for joint in range(22) if joint != bandai.SPINE1]
+    assert np.abs(read(*names).joints - expected.joints)[:, others].max() < 0.02
+    assert read("Bip01", *names[1:]).features.shape == expected.features.shape
     with pytest.raises(ValueError, match=r"take\.bvh: unknown skeleton\. Bandai-Namco .* missing: Hand_R\. .*Tail"):
-        read_motion(diffusion.representation, file)
+        read(*names[:-1], "Tail")
 
 
 def test_a_clip_of_a_prepared_set_and_a_part_of_it(diffusion, store):
-    stored = read_motion(diffusion.representation, "synthetic:synthetic_0_000003", data_root=store)
+    stored = read_motion(diffusion.representation, CLIP, data_root=store)
     assert stored.text
-    part = read_motion(diffusion.representation, "synthetic:synthetic_0_000003", data_root=store, cut=(0.5, 1.5))
+    part = read_motion(diffusion.representation, CLIP, data_root=store, cut=(0.5, 1.5))
     assert np.array_equal(part.features, stored.features[10:30])
 
 
-def test_cuts_of_world_coordinates_start_anew(tmp_path):
+def test_cuts_of_world_coordinates_begin_at_the_origin(tmp_path):
     representation = Rot6D()
     features = np.cumsum(np.ones((40, 150), np.float32), 0)
-    file = _npz(tmp_path, joints=np.zeros((40, 24, 3)), features=features, fps=20, representation=representation.name)
+    file = npz(tmp_path, joints=np.zeros((40, 24, 3)), features=features, fps=20, representation=representation.name)
     part = read_motion(representation, file, cut=[1, 2])
     assert part.features[0, 144:147].tolist() == [0, 0, 0]
 
@@ -336,19 +316,13 @@ def test_cuts_of_world_coordinates_start_anew(tmp_path):
 # Bad requests ---------------------------------------------------------------------------------------------------------
 
 
-def _npz(folder: Path, **arrays) -> Path:
-    np.savez(folder / "motion.npz", **arrays)
-    return folder / "motion.npz"
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({}, "no part of the motion is kept: choose region"),
+        ({}, r"no part of the motion is kept: choose region.*strength=0\.5"),
         ({"region": [0, 40]}, "no part of the motion is kept"),
         ({"joints": []}, "the entire motion is kept"),
         ({"region": [5, 5]}, r"region=\[5, 5\] is not a range of this motion, which has 40 frames \(2 seconds\)"),
-        ({"region": [30, 50]}, "is not a range of this motion"),
         ({"region_seconds": [1.5, 2.5]}, r"region_seconds=\[1.5, 2.5\] is not a range"),
         ({"region": [1, 2, 3]}, r"write \[begin, end\], or several"),
         ({"region": [[1, 2], 3]}, r"write \[begin, end\], or several"),
@@ -358,12 +332,14 @@ def _npz(folder: Path, **arrays) -> Path:
         ({"joints": "uper_body"}, "no joint or part 'uper_body'. Did you mean upper_body"),
         ({"joints": ["left_hnad"]}, "Did you mean left_hip"),
         ({"region": "suffix", "method": "mfm"}, "method=mfm is not supported by GaussianDiffusion; .* mdm, flame"),
-        (
-            {"region": "suffix", "method": "repaint"},
-            "method=repaint is unknown. Choose from mdm, flame, flame_code, mfm",
-        ),
+        ({"region": "suffix", "method": "repaint"}, "method=repaint is unknown. Choose from mdm, flame, flame_code"),
         ({"region": "suffix", "until": 0.3}, "until=0.3 is an option of method=mfm, not of mdm"),
         ({"region": "suffix", "resample": 3}, "resample=3 is an option of method=flame"),
+        ({"region": "suffix", "seconds": 3}, "an edit is as long as its motion: omit seconds"),
+        ({"region": "suffix", "texts": "walks | jumps"}, "an edit keeps a single motion"),
+        ({"regoin": "suffix"}, "edit has no option regoin. Did you mean region"),
+        ({"strength": 0.0}, "strength=0: give a number above 0, up to 1"),
+        ({"strength": float("nan")}, "strength=nan: give a number"),
     ],
 )
 def test_bad_edits_are_one_line(diffusion, motion, options, message):
@@ -372,18 +348,15 @@ def test_bad_edits_are_one_line(diffusion, motion, options, message):
     assert "\n" not in str(caught.value)
 
 
-def test_methods_of_diffusion_are_refused_by_flows(flow, motion):
+def test_what_a_model_cannot_edit(flow, motion):
     with pytest.raises(UserError, match="method=flame is not supported by FlowMatching; this model supports: mdm, mfm"):
         edit(flow, motion, region="suffix", method="flame")
+    long = r"walk: 40 frames, but the model was trained on at most 36 \(1.8 seconds\): select a part with cut="
+    with pytest.raises(UserError, match=long):
+        edit(build(TINY, max_frames=36), motion, region="suffix")
 
 
-def test_a_motion_longer_than_those_of_the_training(motion):
-    model = build(TINY, max_frames=36)
-    with pytest.raises(
-        UserError,
-        match=r"walk: 40 frames, but the model was trained on at most 36 \(1.8 seconds\): select a part with cut=",
-    ):
-        edit(model, motion, region="suffix")
+JOINTS = np.zeros((9, 22, 3))
 
 
 @pytest.mark.parametrize(
@@ -391,28 +364,19 @@ def test_a_motion_longer_than_those_of_the_training(motion):
     [
         ({"joints": np.zeros((9, 21, 3)), "fps": 20}, r"shape \(9, 21, 3\), but humanml-clean-smpl22 takes"),
         ({"joints": np.zeros((9, 22)), "fps": 20}, r"joints of shape \(9, 22\), not \(frames, joints, 3\)"),
-        ({"joints": np.full((9, 22, 3), np.nan), "fps": 30}, "are not finite"),
-        ({"joints": np.zeros((9, 22, 3))}, "no frame rate in the file"),
-        ({"joints": np.zeros((9, 22, 3)), "fps": 0}, "fps is 0, not a number"),
+        ({"joints": JOINTS * np.nan, "fps": 30}, "are not finite"),
+        ({"joints": JOINTS}, "no frame rate in the file"),
+        ({"joints": JOINTS, "fps": 0}, "fps is 0, not a number"),
         ({"fps": 20}, "contains fps; a motion has joints and fps"),
         (
-            {"features": np.zeros((9, 251)), "fps": 12.5, "representation": "x"},
-            "contains features, fps, representation; a motion",
-        ),
-        (
-            {
-                "joints": np.zeros((9, 22, 3)),
-                "features": np.zeros((9, 2)),
-                "fps": 20,
-                "representation": "humanml-clean-smpl22",
-            },
-            r"features of shape \(9, 2\), not \(frames, 263\)",
+            {"joints": JOINTS, "features": JOINTS[..., 0], "fps": 20, "representation": "humanml-clean-smpl22"},
+            r"features of shape \(9, 22\), not \(frames, 263\)",
         ),
         ({"joints": np.array([{}], object), "fps": 20}, "damaged, or not a file of plain arrays"),
     ],
 )
 def test_bad_motions_are_one_line(diffusion, tmp_path, arrays, message):
-    file = _npz(tmp_path, **arrays)
+    file = npz(tmp_path, **arrays)
     with pytest.raises(ValueError, match=message) as caught:
         read_motion(diffusion.representation, file)
     assert str(file) in str(caught.value)
@@ -424,21 +388,17 @@ def test_motions_that_are_not_there(diffusion, store, tmp_path):
     for name in ("absent.npz", "absent.bvh"):
         with pytest.raises(FileNotFoundError, match=f"{name}: no such file"):
             read_motion(representation, tmp_path / name)
-    np.save(tmp_path / "array.npy", np.zeros(3))
-    for content in (b"PK\x03\x04", b"", (tmp_path / "array.npy").read_bytes()):
-        (tmp_path / "bad.npz").write_bytes(content)
-        with pytest.raises(ValueError, match="damaged"):
-            read_motion(representation, tmp_path / "bad.npz")
-    with pytest.raises(UserError, match=r"Give a \.npz, \.bvh, \.json, \.npy file, or dataset:id"):
-        read_motion(representation, "walk")
-    with pytest.raises(UserError, match=r"has no clip 'synthetic_0_00003'\. Did you mean synthetic_0_000003"):
-        read_motion(representation, "synthetic:synthetic_0_00003", data_root=store)
+    for source, options, message in (
+        ("walk", {}, r"Give a \.npz, \.bvh, \.json, \.npy file, or dataset:id"),
+        ("synthetic:synthetic_0_00003", {"data_root": store}, r"has no clip .*\. Did you mean synthetic_0_000003"),
+        (CLIP, {"data_root": store, "cut": [1, 99]}, f"is not a range of {CLIP}, which lasts"),
+    ):
+        with pytest.raises(UserError, match=message):
+            read_motion(representation, source, **options)
     with pytest.raises(FileNotFoundError, match="no prepared data set"):
         read_motion(representation, "kit:1", data_root=store)
-    with pytest.raises(UserError, match="is not a range of synthetic:synthetic_0_000003, which lasts"):
-        read_motion(representation, "synthetic:synthetic_0_000003", data_root=store, cut=[1, 99])
     with pytest.raises(ValueError, match=r"motion.npz: motion: shape \(9, 22, 3\), expected \(frames, 3 \+ 3 x joints"):
-        read_motion(SMPL(), _npz(tmp_path, joints=np.zeros((9, 22, 3)), fps=20))
+        read_motion(SMPL(), npz(tmp_path, joints=JOINTS, fps=20))
 
 
 # The command ----------------------------------------------------------------------------------------------------------
@@ -454,13 +414,7 @@ def checkpoint(diffusion, tmp_path) -> Path:
 @pytest.mark.slow
 def test_the_command_writes_the_original_beside_the_edits(checkpoint, store, tmp_path, capsys):
     out = tmp_path / "out"
-    words = [
-        f"ckpt={checkpoint}",
-        "motion=synthetic:synthetic_0_000003",
-        f"data_root={store}",
-        f"out={out}",
-        "samples=2",
-    ]
+    words = [f"ckpt={checkpoint}", f"motion={CLIP}", f"data_root={store}", f"out={out}", "samples=2"]
     words += ["text=it's a (jump), $5", "region=in_between", "joints=[left_arm,head]", "seed=4"]
     assert main(["edit", *words, "strength=0.8", "trajectory=true"]) == 0
     assert (out / "trajectory.png").is_file()
@@ -489,14 +443,11 @@ def test_the_command_writes_the_original_beside_the_edits(checkpoint, store, tmp
         (["text=jump", "unconditioned=true"], "not text and unconditioned"),
         (["unconditioned=true", "motion=null"], "no motion to edit"),
         (["unconditioned=true", "cut=3"], r"cut=3: write [begin, end]"),
-        (["unconditioned=true", "region=[1,2", "seed=1"], "cannot read an override"),
         (["unconditioned=true", "region=in_between", "methd=mdm"], "Did you mean method"),
-        (["unconditioned=true", "ckpt=nowhere/at.ckpt"], "nowhere/at.ckpt: no such checkpoint"),
     ],
 )
 def test_bad_words_are_one_line(checkpoint, store, capsys, words, message):
-    first = [f"ckpt={checkpoint}", "motion=synthetic:synthetic_0_000003", f"data_root={store}"]
-    assert main(["edit", *first, *words]) == 1
+    assert main(["edit", f"ckpt={checkpoint}", f"motion={CLIP}", f"data_root={store}", *words]) == 1
     output = capsys.readouterr().err
     assert message in output
     assert output.startswith("error: ")
@@ -504,5 +455,4 @@ def test_bad_words_are_one_line(checkpoint, store, capsys, words, message):
 
 
 def test_the_python_api_is_there_though_the_command_is_a_module_of_that_name(diffusion, motion):
-    result = flame_mdm.edit(diffusion, motion, region="suffix")
-    assert result[0].feature_error == 0
+    assert flame_mdm.edit(diffusion, motion, region="suffix")[0].feature_error == 0

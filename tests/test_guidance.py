@@ -10,6 +10,7 @@ from flame_mdm.processes.samplers import CountedDenoise
 MASK = length_mask(torch.tensor([4, 2]))
 NULL = Condition(torch.tensor([[10.0]]), torch.zeros(1, 0, 1), None)
 COND = Condition(torch.tensor([[1.0], [2.0]]), torch.zeros(2, 0, 1), None, NULL)
+ZEROS = torch.zeros(2, 4, 2), torch.zeros(2)
 
 
 def sees_condition(x_t, t, mask, cond):
@@ -32,16 +33,11 @@ def test_guidance_is_two_passes_in_one(scale):
     assert denoise.calls == 1
 
 
-def test_the_variance_is_not_guided_away_by_a_wrong_split():
-    """The prediction alone: all channels are guided."""
-    x_t, t = torch.randn(2, 4, 2), torch.zeros(2)
-
-    def mean_only(*args):
-        return sees_condition(*args)[..., :2]
-
-    guided = classifier_free_guidance(mean_only, 3.0, features=2)(x_t, t, MASK, COND)
-    assert guided.shape == x_t.shape
-    torch.testing.assert_close(guided, (x_t + 10 + 3 * (COND.pooled[:, None] - 10)) * MASK[..., None])
+def test_without_a_learned_variance_all_channels_are_guided():
+    x_t = torch.randn(2, 4, 2)
+    guided = classifier_free_guidance(lambda *args: sees_condition(*args)[..., :2], 3.0, features=2)
+    expected = (x_t + 10 + 3 * (COND.pooled[:, None] - 10)) * MASK[..., None]
+    torch.testing.assert_close(guided(x_t, torch.zeros(2), MASK, COND), expected)
 
 
 def test_scale_one_is_the_denoiser_itself():
@@ -49,39 +45,26 @@ def test_scale_one_is_the_denoiser_itself():
     assert classifier_free_guidance(sees_condition, 1, 2) is sees_condition
 
 
-def test_the_doubled_condition_is_made_once_a_run_and_follows_a_change():
+def test_doubled_conditions_and_masks_are_made_once_per_run_and_follow_a_change():
     seen = []
 
     def denoise(x_t, t, mask, cond):
-        seen.append(cond)
+        seen.append((mask, cond))
         return x_t
 
     guided = classifier_free_guidance(denoise, 2.0, 2)
-    x_t, t = torch.zeros(2, 4, 2), torch.zeros(2)
     other = Condition(COND.pooled + 1, COND.tokens, None, NULL)
-    for cond in (COND, COND, other, COND):
-        guided(x_t, t, MASK, cond)
-    assert seen[0] is seen[1]
-    assert seen[2].pooled.flatten().tolist() == [2, 3, 10, 10]
-    assert seen[3].pooled.flatten().tolist() == [1, 2, 10, 10]
-
-
-def test_the_doubled_mask_is_made_once_a_run_and_follows_a_change():
-    seen = []
-
-    def denoise(x_t, t, mask, cond):
-        seen.append(mask)
-        return x_t
-
-    guided = classifier_free_guidance(denoise, 2.0, 2)
-    for mask in (MASK, MASK, ~MASK, MASK):
-        guided(torch.zeros(2, 4, 2), torch.zeros(2), mask, COND)
-    assert seen[0] is seen[1]
-    assert torch.equal(seen[2], torch.cat([~MASK, ~MASK]))
-    assert torch.equal(seen[3], torch.cat([MASK, MASK]))
+    for mask, cond in ((MASK, COND), (MASK, COND), (MASK, other), (~MASK, COND), (MASK, COND)):
+        guided(*ZEROS, mask, cond)
+    masks, conditions = zip(*seen, strict=True)
+    assert masks[0] is masks[1]
+    assert conditions[0] is conditions[1]
+    pooled = [1, 2, 10, 10]
+    assert [cond.pooled.flatten().tolist() for cond in conditions] == [pooled, pooled, [2, 3, 10, 10], pooled, pooled]
+    assert [torch.equal(mask, torch.cat([MASK, MASK])) for mask in masks] == [True, True, True, False, True]
 
 
 def test_there_is_no_guidance_without_a_null():
     lone = Condition(COND.pooled, COND.tokens, None)
     with pytest.raises(ValueError, match="no null"):
-        classifier_free_guidance(sees_condition, 2.0, 2)(torch.zeros(2, 4, 2), torch.zeros(2), MASK, lone)
+        classifier_free_guidance(sees_condition, 2.0, 2)(*ZEROS, MASK, lone)

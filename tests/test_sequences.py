@@ -1,4 +1,4 @@
-"""Sequences of actions: texts with parts, windows that cover them, continued motions and loops."""
+"""Sequences of actions: texts with parts, windows that cover them, continued motions, loops and candidates."""
 
 import itertools
 from collections.abc import Sequence
@@ -15,10 +15,12 @@ from flame_mdm.batch import Condition, MotionBatch
 from flame_mdm.errors import UserError
 from flame_mdm.formats.faults import find_faults
 from flame_mdm.formats.readers import read
-from flame_mdm.processes.windows import Windows, blended, place, spans
+from flame_mdm.processes.windows import Windows, blended, spans, window_tensors
 from flame_mdm.sampling.generation import best
 from flame_mdm.sampling.request import read_parts
 from flame_mdm.sampling.sequences import overlap
+
+CPU = torch.device("cpu")
 
 
 @pytest.fixture(scope="module")
@@ -27,27 +29,24 @@ def model() -> flame_mdm.MotionGeneration:
 
 
 def test_parts_of_a_text_and_their_seconds():
-    assert read_parts("walks forward @3 | turns left| sits down @ 2.5s") == [
-        ("walks forward", 3.0),
-        ("turns left", None),
-        ("sits down", 2.5),
-    ]
+    parts = [("walks forward", 3.0), ("turns left", None), ("sits down", 2.5)]
+    assert read_parts("walks forward @3 | turns left| sits down @ 2.5s") == parts
     assert read_parts("a person walks") == [("a person walks", None)]
 
 
 @pytest.mark.parametrize("lengths", [[40], [30, 50, 24], [100], [200, 24, 61]])
 @pytest.mark.parametrize("loop", [False, True])
 def test_windows_cover_every_frame_and_share_the_overlap(lengths, loop):
-    found = spans(lengths, longest=60, overlap=16, loop=loop)
+    windows = spans(lengths, longest=60, overlap=16, loop=loop)
     total = sum(lengths)
-    assert max(size for *_, size in found) <= 60
-    assert {part for part, _, _ in found} == set(range(len(lengths)))
+    assert max(size for *_, size in windows) <= 60
+    assert {part for part, _, _ in windows} == set(range(len(lengths)))
     if not loop:
-        assert found[0][1] == 0
-        assert found[-1][1] + found[-1][2] == total
-    for (_, first, size), (_, after, _) in itertools.pairwise(found):
+        assert windows[0][1] == 0
+        assert windows[-1][1] + windows[-1][2] == total
+    for (_, first, size), (_, after, _) in itertools.pairwise(windows):
         assert first + size - after >= 16
-    rows, frames, mask, weights = place([(0, *span[1:]) for span in found], [total], 16, 60, torch.device("cpu"))
+    rows, frames, mask, weights = window_tensors([(0, *window[1:]) for window in windows], [total], 16, 60, CPU)
     sums = torch.zeros(1, total).index_put((rows[:, None].expand_as(frames), frames), weights, accumulate=True)
     torch.testing.assert_close(sums, torch.ones(1, total))
     assert not weights[~mask].any()
@@ -57,30 +56,27 @@ def test_one_window_changes_nothing_and_two_are_averaged():
     x, t, mask = torch.randn(2, 20, 3), torch.tensor([5.0, 7.0]), torch.ones(2, 20, dtype=torch.bool)
     cond = Condition(torch.zeros(3, 1), torch.zeros(3, 0, 1), None)
 
-    def covered(spans: list[tuple[int, int, int]], width: int) -> Windows:
-        rows, frames, real, weights = place(spans, [20, 20], 4, width, x.device)
+    def covered(spans: list[tuple[int, int, int]]) -> Windows:
+        rows, frames, real, weights = window_tensors(spans, [20, 20], 4, 20, CPU)
         return Windows(MotionBatch(torch.zeros(*real.shape, 0), real, ["a"] * len(rows)), rows, frames, weights)
 
     def denoise(x_t, t, mask, cond):
         return x_t * t[:, None, None]
 
-    whole = blended(denoise, covered([(0, 0, 20), (1, 0, 20)], 20))
+    whole = blended(denoise, covered([(0, 0, 20), (1, 0, 20)]))
     assert torch.equal(whole(x, t, mask, cond), denoise(x, t, mask, cond))
     number = torch.tensor([1.0, 2.0, 3.0])
-    three = [(0, 0, 12), (0, 8, 12), (1, 0, 20)]
-    several = blended(lambda x_t, *_: number[:, None, None].expand_as(x_t), covered(three, 20))
-    found = several(x, t, mask, cond)[..., 0]
+    three = covered([(0, 0, 12), (0, 8, 12), (1, 0, 20)])
+    several = blended(lambda x_t, *_: number[:, None, None].expand_as(x_t), three)(x, t, mask, cond)[..., 0]
     expected = torch.tensor([1.0] * 8 + [1 + np.sin(np.pi / 16 * n) ** 2 for n in (1, 3, 5, 7)] + [2.0] * 8).float()
-    torch.testing.assert_close(found[0], expected)
-    torch.testing.assert_close(found[1], torch.full((20,), 3.0))
+    torch.testing.assert_close(several[0], expected)
+    torch.testing.assert_close(several[1], torch.full((20,), 3.0))
 
 
 def test_a_sequence_is_one_motion_of_which_a_part_is_changed_by_its_text(model):
     options = {"seconds": 1.5, "num_inference_steps": 5, "shared_noise": True}
-    bow, jump = (
-        flame_mdm.generate(model, f"a person walks forward @2 | a person {what}", **options)[0]
-        for what in ("bows", "jumps")
-    )
+    texts = [f"a person walks forward @2 | a person {what}" for what in ("bows", "jumps")]
+    bow, jump = flame_mdm.generate(model, texts, **options)
     assert len(bow.joints) == len(jump.joints) == 70
     assert bow.text == "a person walks forward @2 | a person bows"
     moved = np.abs(bow.features - jump.features).mean(1)
@@ -88,12 +84,12 @@ def test_a_sequence_is_one_motion_of_which_a_part_is_changed_by_its_text(model):
 
 
 def test_a_part_longer_than_training_and_one_as_long_as_training(model):
-    text = "a person walks forward"
+    text, options = "a person walks forward", {"num_inference_steps": 5, "shared_noise": True}
     long = flame_mdm.generate(model, f"{text} @20", num_inference_steps=5)[0]
     assert len(long.joints) == 400
     assert np.isfinite(long.joints).all()
-    same = flame_mdm.generate(model, f"{text} @2", num_inference_steps=5, shared_noise=True)[0]
-    plain = flame_mdm.generate(model, text, seconds=2, num_inference_steps=5, shared_noise=True)[0]
+    same = flame_mdm.generate(model, f"{text} @2", **options)[0]
+    plain = flame_mdm.generate(model, text, seconds=2, **options)[0]
     np.testing.assert_allclose(same.joints, plain.joints, atol=1e-5)
     with pytest.raises(UserError, match="'walks @20'"):
         flame_mdm.generate(model, text, seconds=20)
@@ -102,9 +98,8 @@ def test_a_part_longer_than_training_and_one_as_long_as_training(model):
 def test_a_continued_motion_begins_with_it(model, tmp_path):
     begin = flame_mdm.generate(model, "a person walks forward", seconds=2, num_inference_steps=5)[0]
     begin.save(tmp_path / "walk.npz")
-    motion = flame_mdm.generate(
-        model, "a person bows", after=tmp_path / "walk.npz", seconds=1.5, num_inference_steps=5
-    )[0]
+    options = {"after": tmp_path / "walk.npz", "seconds": 1.5, "num_inference_steps": 5}
+    motion = flame_mdm.generate(model, "a person bows", **options)[0]
     assert len(motion.joints) == 40 + 30
     np.testing.assert_allclose(motion.joints[:40], begin.joints, atol=1e-5)
     step = np.linalg.norm(np.diff(motion.joints, axis=0), axis=-1).max(1)
@@ -128,30 +123,27 @@ def test_a_loop_has_no_seam(model):
     assert seam(loop=True) < 1 < seam(loop=False)
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("walks | | sits", "part 2 is empty"),
-        ("walks @fast", "seconds of a part are a number"),
-        ("walks @-1", "seconds of a part are a number"),
-        ("walks @0.2 | sits", "'walks': a part of 0.2 seconds is too short"),
-        ("walks @9999", "too long"),
-    ],
-)
-def test_bad_parts_give_one_clear_line(model, text, message):
-    with pytest.raises(UserError, match=message):
-        flame_mdm.generate(model, text)
-
-
-@pytest.mark.parametrize("other", [{"loop": True}, {"targets": "path.json"}], ids=["loop", "targets"])
-def test_a_loop_or_targets_cannot_continue_a_motion(model, other):
-    with pytest.raises(UserError, match=rf"^after=walk\.npz: a motion .* cannot have {next(iter(other))}\."):
-        flame_mdm.generate(model, "walks", after="walk.npz", **other)
-
-
-def test_only_a_motion_can_be_continued(model):
-    with pytest.raises(UserError, match=r"^notes\.txt: not a motion\. Give a \.npz"):
-        flame_mdm.generate(model, "walks", after="notes.txt")
+def test_bad_requests_give_one_clear_line(model):
+    for text, options, message in (
+        ("walks | | sits", {}, "part 2 is empty"),
+        ("walks @fast", {}, "seconds of a part are a number"),
+        ("walks @-1", {}, "seconds of a part are a number"),
+        ("walks @0.2 | sits", {}, "'walks': a part of 0.2 seconds is too short"),
+        ("walks @9999", {}, "too long"),
+        ("walks", {"after": "walk.npz", "loop": True}, r"^after=walk\.npz: a motion .* cannot have loop\."),
+        ("walks", {"after": "walk.npz", "targets": "path.json"}, r"^after=walk\.npz: .* cannot have targets\."),
+        ("walks", {"after": "notes.txt"}, r"^notes\.txt: not a motion\. Give a \.npz"),
+        ("walks", {"candidates": 0}, "candidates=0"),
+        ("walks", {"candidates": 2, "stages": []}, "one motion"),
+        ("walks", {"seed": 0.5}, "seed=0.5: give a whole number"),
+        ("walks", {"actions": "walk"}, "texts or actions, not both"),
+        ("walks", {"second": 3}, "generate has no option second. Did you mean seconds"),
+        (None, {"actions": "walk"}, "action=walk: this model was trained on captions"),
+        (" ", {}, "empty text"),
+    ):
+        with pytest.raises(UserError, match=message) as raised:
+            flame_mdm.generate(model, text, **options)
+        assert "\n" not in str(raised.value), message
 
 
 def test_the_command_writes_a_sequence(tmp_path, monkeypatch, capsys):
@@ -163,8 +155,6 @@ def test_the_command_writes_a_sequence(tmp_path, monkeypatch, capsys):
     (path,) = Path("samples").rglob("motion_000.npz")
     assert "after" in path.parent.name
     assert len(read(path).joints) == 80
-    assert main(["sample", "quickstart", "text=walks | ", "samples=1"]) == 1
-    assert "part 2 is empty" in capsys.readouterr().err
 
 
 class _Scores:
@@ -185,7 +175,7 @@ def test_the_best_of_several_candidates_is_kept(model):
     chosen = flame_mdm.generate(model, text, samples=2, candidates=3, score=score, **options)
     assert len(chosen) == len(score.seen) == 2
     for motion, group in zip(chosen, (several[:3], several[3:]), strict=True):
-        faultless = [each for each in group if not find_faults(each)] or group
+        faultless = [motion for motion in group if not find_faults(motion)] or group
         np.testing.assert_allclose(motion.joints, faultless[int(np.argmax(score(faultless)))].joints, atol=1e-4)
 
 
@@ -193,19 +183,11 @@ def test_without_a_score_the_fewest_faulty_frames_decide():
     moved = np.linspace(0, 1, 20)[:, None, None] * np.array([1, 0, 1])
     joints = np.tile(np.linspace(0, 1, 22)[None, :, None], (20, 1, 3)) + moved
     worse, better = joints.copy(), joints.copy()
-    worse[5, 3, 0] += 5
-    worse[9, 3, 0] += 5
+    worse[[5, 9], 3, 0] += 5
     better[5, 3, 0] += 5
-    motions = [flame_mdm.Motion(each, 20) for each in (worse, better)]
+    motions = [flame_mdm.Motion(joints, 20) for joints in (worse, better)]
     assert best(motions) is motions[1]
-    assert best(motions, lambda given: [2.0, 1.0]) is motions[0]
-
-
-def test_bad_candidates_give_one_clear_line(model):
-    with pytest.raises(UserError, match="candidates=0"):
-        flame_mdm.generate(model, "walks", candidates=0)
-    with pytest.raises(UserError, match="one motion"):
-        flame_mdm.generate(model, "walks", candidates=2, stages=[])
+    assert best(motions, lambda motions: [2.0, 1.0]) is motions[0]
 
 
 def test_the_parts_of_a_motion(model):

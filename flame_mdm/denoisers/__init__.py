@@ -11,7 +11,10 @@ class Denoiser(nn.Module, ABC):
     """A network (x_t, t, mask, cond) -> prediction.
 
     The first arguments of subclasses are `in_features` (D), `out_features` (D, or 2D with a learned variance) and
-    `cond_features` (C; 0 = unconditioned), which `task.build` passes; the others come from the configuration.
+    `cond_features` (C; 0 = unconditioned), which `task.build` passes; the others come from the configuration. Several
+    networks have `latent_dim`, the width of their layers; `ff_size`, the hidden width of feed-forward layers;
+    `num_layers`; `num_heads` of attention; `dropout`, a probability after the positions and inside the layers; and
+    `project_condition`, False to add the condition to the time without projection, as MDM does with action embeddings.
     """
 
     mask_padding: bool = True

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from flame_mdm.batch import Condition
 from flame_mdm.denoisers import Denoiser
 from flame_mdm.denoisers.layers import Transformer, with_prefix
+from flame_mdm.errors import UserError
 
 
 class FLAME(Denoiser):
@@ -36,17 +37,9 @@ class FLAME(Denoiser):
         condition_frames: bool = False,
         length_unit: int = 1,
     ):
-        """Builds the network.
+        """Builds the network; `Denoiser` describes the arguments that several networks have.
 
         Args:
-            in_features: D of the noisy motion.
-            out_features: channels to predict; with learned variance 2D.
-            cond_features: C, width of the condition; 0 = unconditioned.
-            latent_dim: width of the transformer.
-            ff_size: hidden width of its feed-forward layers.
-            num_layers: number of its layers.
-            num_heads: attention heads.
-            dropout: probability inside the layers.
             max_frames: maximum length of a motion that ML can embed.
             length_token: False omits ML (table 4, first row).
             cross_attention: False gives a transformer encoder over ML, TS, CLS and frames (table 4, first two rows).
@@ -56,11 +49,11 @@ class FLAME(Denoiser):
                 windows in training: ML knows no other lengths.
 
         Raises:
-            ValueError: `length_unit` is not a positive whole number.
+            UserError: If `length_unit` is not a positive whole number.
         """
         super().__init__()
         if type(length_unit) is not int or length_unit < 1:
-            raise ValueError(f"length_unit is {length_unit}: choose a number of frames, 1 or more")
+            raise UserError(f"length_unit is {length_unit}: choose a number of frames, 1 or more")
         self.max_frames, self.condition_frames, self.length_unit = max_frames, condition_frames, length_unit
         # A table of max_frames rows is enough for the lengths 1 to max_frames: row 0, which the authors' code never
         # reads, is used for the longest motion.
@@ -77,14 +70,14 @@ class FLAME(Denoiser):
         """See `Denoiser.forward`.
 
         Raises:
-            ValueError: a motion is longer than `max_frames`.
+            UserError: If a motion is longer than `max_frames`.
         """
         x = self.input(x_t)
         prefix = [cosine_first_sinusoid(t, x.shape[-1]).to(x_t.dtype)]
         if self.length_embedding is not None:
             lengths = mask.sum(1)
             if x_t.shape[1] > self.max_frames and lengths.max() > self.max_frames:
-                raise ValueError(
+                raise UserError(
                     f"a motion of {int(lengths.max())} frames is too long for the length token: "
                     f"increase denoiser.max_frames ({self.max_frames})"
                 )

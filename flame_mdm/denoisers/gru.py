@@ -28,16 +28,9 @@ class MDMGRU(Denoiser):
         project_condition: bool = True,
         recur_over_batch: bool = False,
     ):
-        """Builds the network.
+        """Builds the network; `Denoiser` describes the arguments that several networks have.
 
         Args:
-            in_features: D of the noisy motion.
-            out_features: channels to predict.
-            cond_features: C, width of the condition; 0 = unconditioned.
-            latent_dim: width of the recurrent state.
-            num_layers: number of recurrent layers.
-            dropout: probability, after the positions.
-            project_condition: False adds the condition to the time without projection.
             recur_over_batch: recurs from sample to sample instead of from frame to frame, as MDM's released code does
                 because of swapped axes. Only for reproduction: results then depend on the order of the batch.
         """

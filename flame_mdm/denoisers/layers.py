@@ -9,6 +9,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from flame_mdm.errors import UserError
+
 
 def sinusoid(position: Tensor, features: int) -> Tensor:
     """Returns sines in even and cosines in odd channels (Vaswani et al. 2017, section 3.5).
@@ -42,7 +44,7 @@ class Attention(nn.Module):
     def __init__(self, features: int, num_heads: int, dropout: float):
         super().__init__()
         if num_heads < 1 or features % num_heads:
-            raise ValueError(f"latent_dim ({features}) is not a multiple of num_heads ({num_heads})")
+            raise UserError(f"latent_dim ({features}) is not a multiple of num_heads ({num_heads})")
         self.num_heads, self.dropout = num_heads, dropout
         self.attend: Callable[..., Tensor] = functional.scaled_dot_product_attention
         self.qkv = nn.Linear(features, 3 * features)
@@ -143,7 +145,7 @@ class TimeAndCondition(nn.Module):
     def __init__(self, features: int, cond_features: int, project_condition: bool):
         super().__init__()
         if cond_features and not project_condition and cond_features != features:
-            raise ValueError(
+            raise UserError(
                 f"with project_condition=false the condition is added directly to the time embedding: its width "
                 f"({cond_features}) must equal latent_dim ({features})"
             )

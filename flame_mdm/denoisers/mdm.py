@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from flame_mdm.batch import Condition
 from flame_mdm.denoisers import Denoiser
 from flame_mdm.denoisers.layers import TimeAndCondition, Transformer, sinusoid, with_prefix
+from flame_mdm.errors import UserError
 
 
 class MDMEncoder(Denoiser):
@@ -31,18 +32,9 @@ class MDMEncoder(Denoiser):
         mask_padding: bool = True,
         condition_frames: bool = False,
     ):
-        """Builds the network.
+        """Builds the network; `Denoiser` describes the arguments that several networks have.
 
         Args:
-            in_features: D of the noisy motion.
-            out_features: channels to predict.
-            cond_features: C, width of the condition; 0 = unconditioned.
-            latent_dim: width of the transformer.
-            ff_size: hidden width of its feed-forward layers.
-            num_layers: number of its layers.
-            num_heads: attention heads.
-            dropout: probability, after the positions and inside the layers.
-            project_condition: False adds the condition to the time without projection (MDM's action embeddings).
             max_tokens: 0 = the pooled condition is added to the time. Otherwise the maximum number of condition tokens
                 between the time and the frames (MFM with T5: 30); frames keep their positions if there are fewer.
             mask_padding: False lets frames attend to the padding, as the released models of MDM and MFM do: they are
@@ -62,13 +54,13 @@ class MDMEncoder(Denoiser):
         """See `Denoiser.forward`.
 
         Raises:
-            ValueError: condition tokens are needed but missing, or there are more than `max_tokens`.
+            UserError: If condition tokens are needed but missing, or there are more than `max_tokens`.
         """
         token_mask = mask[:, :0]
         if self.max_tokens:
             tokens, token_mask = condition_tokens(cond)
             if tokens.shape[1] > self.max_tokens:
-                raise ValueError(
+                raise UserError(
                     f"{tokens.shape[1]} condition tokens: denoiser.max_tokens ({self.max_tokens}) must be at least that"
                 )
             prefix = torch.cat([self.condition.time(t)[:, None], self.condition.projection(tokens)], 1)
@@ -104,18 +96,9 @@ class MDMDecoder(Denoiser):
         token_memory: bool = False,
         mask_padding: bool = True,
     ):
-        """Builds the network.
+        """Builds the network; `Denoiser` describes the arguments that several networks have.
 
         Args:
-            in_features: D of the noisy motion.
-            out_features: channels to predict.
-            cond_features: C, width of the condition; 0 = unconditioned.
-            latent_dim: width of the transformer.
-            ff_size: hidden width of its feed-forward layers.
-            num_layers: number of its layers.
-            num_heads: attention heads.
-            dropout: probability, after the positions and inside the layers.
-            project_condition: False adds the condition to the time without projection (MDM's action embeddings).
             input_token: token before the frames: "condition" is the paper's "+ input token", where time + condition
                 are both input token and memory, as in the released model; "time" is MDM's code since February 2025,
                 where the token is only the time.
@@ -125,7 +108,7 @@ class MDMDecoder(Denoiser):
         """
         super().__init__()
         if input_token not in ("none", "condition", "time"):
-            raise ValueError(f"input_token is none, condition or time, not {input_token!r}")
+            raise UserError(f"input_token is none, condition or time, not {input_token!r}")
         self.input_token, self.mask_padding = input_token, mask_padding
         self.token_memory = token_memory and cond_features > 0
         self.condition = TimeAndCondition(latent_dim, cond_features, project_condition)
@@ -138,7 +121,7 @@ class MDMDecoder(Denoiser):
         """See `Denoiser.forward`.
 
         Raises:
-            ValueError: condition tokens are needed but missing.
+            UserError: If condition tokens are needed but missing.
         """
         x = self.input(x_t)
         if self.input_token == "condition":
@@ -160,8 +143,8 @@ def condition_tokens(cond: Condition) -> tuple[Tensor, Tensor]:
     """Returns the tokens (B, S, C) and their mask (B, S).
 
     Raises:
-        ValueError: the condition encoder returns no tokens.
+        UserError: If the condition encoder returns no tokens.
     """
     if cond.token_mask is None or not cond.tokens.shape[1]:
-        raise ValueError("this denoiser needs condition tokens, but the condition encoder has none: choose another one")
+        raise UserError("this denoiser needs condition tokens, but the condition encoder has none: choose another one")
     return cond.tokens, cond.token_mask

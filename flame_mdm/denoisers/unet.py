@@ -15,6 +15,7 @@ from torch.nn import functional
 from flame_mdm.batch import Condition
 from flame_mdm.denoisers import Denoiser
 from flame_mdm.denoisers.layers import TimeAndCondition
+from flame_mdm.errors import UserError
 
 
 class MDMUNet(Denoiser):
@@ -36,17 +37,11 @@ class MDMUNet(Denoiser):
         dropout: float,
         project_condition: bool = True,
     ):
-        """Builds the network.
+        """Builds the network; `Denoiser` describes the arguments that several networks have.
 
         Args:
-            in_features: D of the noisy motion.
-            out_features: channels to predict.
-            cond_features: C, width of the condition; 0 = unconditioned.
-            latent_dim: width of the time and condition embedding.
             channels: width of each level; each level has half the frame rate of the previous one.
             num_groups: groups of the group norms; divides all widths.
-            dropout: probability inside the residual blocks.
-            project_condition: False adds the condition to the time without projection.
         """
         super().__init__()
 
@@ -115,7 +110,7 @@ class MaskedGroupNorm(nn.Module):
     def __init__(self, channels: int, num_groups: int):
         super().__init__()
         if channels % num_groups:
-            raise ValueError(f"num_groups ({num_groups}) does not divide the number of channels ({channels})")
+            raise UserError(f"num_groups ({num_groups}) does not divide the number of channels ({channels})")
         self.num_groups = num_groups
         self.weight = nn.Parameter(torch.ones(channels))
         self.bias = nn.Parameter(torch.zeros(channels))

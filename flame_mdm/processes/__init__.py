@@ -97,18 +97,17 @@ class Process(nn.Module, ABC):
         Raises:
             UserError: If the process has no such sampler, or the sampler does not have one of the options.
         """
-        if options.sampler not in self.samplers:
-            name = type(self).__name__
-            raise UserError(f"unknown sampler '{options.sampler}': {name} has {', '.join(self.samplers)}")
-        sampler = self.samplers[options.sampler]
-        names = ["guidance_scale", "sampler", "num_inference_steps", *sampler.options]
-        for name, value in options.chosen().items():
-            if name not in names:
+        name = options.sampler
+        if name is None or name not in self.samplers:
+            raise UserError(f"unknown sampler '{name}': {type(self).__name__} has {', '.join(self.samplers)}")
+        names = ["guidance_scale", "sampler", "num_inference_steps", *self.samplers[name].options]
+        for option, value in options.chosen().items():
+            if option not in names:
                 raise UserError(
-                    f"{name}={value}: the sampler {options.sampler} has no such option; it has {', '.join(names)}. "
-                    f"Omit {name}, or choose another sampler"
+                    f"{option}={value}: the sampler {name} has no such option; it has {', '.join(names)}. "
+                    f"Omit {option}, or choose another sampler"
                 )
-        return sampler
+        return self.samplers[name]
 
     def check_edit(self, edit: Edit, mask: Tensor) -> None:
         """Checks an edit before a long run.

@@ -129,15 +129,12 @@ class GaussianDiffusion(Process):
             return noise
         return self.schedule.at("signal", t, x) * noise - self.schedule.at("noise", t, x) * x
 
-    def to_x0(self, output: Tensor, x_t: Tensor, t: Tensor) -> Tensor:
-        """See `Process.to_x0`; `output` may contain the channels of a learned variance."""
-        return self._to_x0(output, x_t, t)
-
-    def _to_x0(self, output: Tensor, x_t: Tensor, i: Tensor | int) -> Tensor:
+    def to_x0(self, output: Tensor, x_t: Tensor, t: Tensor | int) -> Tensor:
+        """See `Process.to_x0`; `output` may contain the channels of a learned variance, and t be one step for all."""
         output = output[..., : x_t.shape[-1]]
         if self.prediction == "x0":
             return output
-        signal, noise = self.schedule.at("signal", i, x_t), self.schedule.at("noise", i, x_t)
+        signal, noise = self.schedule.at("signal", t, x_t), self.schedule.at("noise", t, x_t)
         if self.prediction == "epsilon":
             return (x_t - noise * output) / signal
         return signal * x_t - noise * output
@@ -233,7 +230,7 @@ class GaussianDiffusion(Process):
         def clean(x_t: Tensor, i: int) -> tuple[Tensor, Tensor]:
             t = torch.full((len(x_t),), float(steps[i]), device=x_t.device)
             output = denoise(x_t, t, mask, cond).to(x_t.dtype)
-            x0_hat = self._to_x0(output, x_t, steps[i])
+            x0_hat = self.to_x0(output, x_t, steps[i])
             return x0_hat.clamp(-1, 1) if self.clip_x0 else x0_hat, output
 
         def estimate(x_t: Tensor, i: int) -> tuple[Tensor, Tensor | float]:
@@ -246,21 +243,19 @@ class GaussianDiffusion(Process):
                 trajectory.append(x0_hat * mask[..., None])
             return x0_hat, self.log_variance(output, x_t, i, schedule)
 
-        draws = map(noise, itertools.count())
-        start = next(draws)
-        if edit is None:
-            x = sampler.loop(estimate, start, schedule, range(len(steps))[::-1], draws, options)
-            return x * mask[..., None]
-        descent = range(edit.steps(len(steps)))[::-1]
-        x = start if edit.strength is None else schedule.corrupt(edit.known, start, descent[0])
-        if edit.mode == "x_t" and edit.resample > 1:
-            x = samplers.repaint(sampler, estimate, x, schedule, descent, draws, options, edit)
-        elif edit.mode == "x_t":
-            seen = samplers.blended(estimate, edit, schedule, start, draws)
-            x = sampler.loop(seen, x, schedule, descent, draws, options)
-            x = torch.where(edit.keep, edit.known, x) if edit.blend == "after" else x
+        draws, total = map(noise, itertools.count()), len(steps)
+        x = start = next(draws)
+        descent = range(total if edit is None else edit.steps(total))[::-1]
+        run = samplers.Descent(estimate, schedule, descent, draws, options)
+        if edit is not None and edit.strength is not None:
+            x = schedule.corrupt(edit.known, start, descent[0])
+        if edit is None or edit.mode == "x0":
+            x = sampler.loop(x, run)
+        elif edit.resample > 1:
+            x = samplers.repaint(sampler, x, run, edit)
         else:
-            x = sampler.loop(estimate, x, schedule, descent, draws, options)
+            x = sampler.loop(x, samplers.blended(run, edit, start))
+            x = torch.where(edit.keep, edit.known, x) if edit.blend == "after" else x
         return x * mask[..., None]
 
     def _steps(self, options: SamplerOptions) -> list[int]:

@@ -12,8 +12,8 @@ from flame_mdm.batch import Condition, Denoise
 STEERING_STEPS = 2
 """Gradient steps before each step of the sampler."""
 STEERING_LIMIT = 0.02
-"""Maximum length of such a step, as RMS over the normalized features. Where the denoiser hardly reacts to x_t, longer
-steps leave what it was trained on: arms grew by a third."""
+"""Maximum length of such a step, as RMS over the normalized features. With longer steps, x_t is no longer like noisy
+motions of the training where the denoiser depends on it only weakly: in one trial, arms grew by a third."""
 CLOSE, MOST_STEPS = 0.005, 8
 """Largest error in meters that ends the search for a motion that reaches positions, and its maximum number of steps."""
 RELAXATION = 1e-3
@@ -32,7 +32,7 @@ def classifier_free_guidance(denoise: Denoise, scale: float | Tensor, features: 
         features: D. Channels from D on (a learned variance) are not guided: those of the conditional half are returned.
 
     Raises:
-        ValueError: in the first call, if the condition has no null.
+        ValueError: In the first call, if the condition has no null.
     """
     if not isinstance(scale, Tensor) and scale == 1:
         return denoise
@@ -68,7 +68,7 @@ class Positions:
 
 
 def steer(
-    clean: Callable[[Tensor], Tensor], x_t: Tensor, to_joints: Callable[[Tensor], Tensor], wanted: Positions
+    clean: Callable[[Tensor], Tensor], x_t: Tensor, to_joints: Callable[[Tensor], Tensor], positions: Positions
 ) -> Tensor:
     """Returns noisy motions whose clean estimates are nearer to positions in the world.
 
@@ -79,12 +79,12 @@ def steer(
         clean: returns the clean estimates (B, F, D) of noisy motions (B, F, D).
         x_t: (B, F, D).
         to_joints: decodes (B, F, D) as joints (B, F, J, 3) in meters.
-        wanted: the positions.
+        positions: the goal.
     """
     for _ in range(STEERING_STEPS):
         with torch.enable_grad():
             x = x_t.detach().requires_grad_()
-            loss = (wanted.of(to_joints(clean(x))) - wanted.values).square().sum(-1)
+            loss = (positions.of(to_joints(clean(x))) - positions.values).square().sum(-1)
             (slope,) = torch.autograd.grad(loss.sum(), x)
         norm = slope.square().sum((1, 2)).clamp(min=1e-9).sqrt()
         length = (loss.detach() / norm).clamp(max=STEERING_LIMIT * slope[0].numel() ** 0.5)
@@ -95,7 +95,7 @@ def steer(
 def reach(
     x: Tensor,
     to_joints: Callable[[Tensor], Tensor],
-    wanted: Positions,
+    positions: Positions,
     bones: Tensor,
     free: Tensor,
     smoothness: float,
@@ -110,7 +110,7 @@ def reach(
     Args:
         x: (B, F, D) normalized features.
         to_joints: decodes (F, D) as joints (F, J, 3) in meters.
-        wanted: the positions.
+        positions: the goal.
         bones: (3, N) int64: frame, parent and child of bones that the change could stretch; all bones of a frame.
         free: (B, F, D) bool, features that may change.
         smoothness: standard deviation in frames of the Gaussian process.
@@ -121,7 +121,7 @@ def reach(
 
     def values(features: Tensor) -> Tensor:
         joints = to_joints(features)
-        return torch.cat([wanted.of(joints), (joints[frames, children] - joints[frames, parents]).norm(dim=-1)])
+        return torch.cat([positions.of(joints), (joints[frames, children] - joints[frames, parents]).norm(dim=-1)])
 
     around = frames.unique()
     near = torch.exp(-0.5 * ((torch.arange(x.shape[1], device=x.device)[:, None] - around) / smoothness) ** 2)
@@ -130,7 +130,7 @@ def reach(
         joints = to_joints(motion)
         usual = (joints[:, children] - joints[:, parents]).norm(dim=-1).median(0).values
         for _ in range(MOST_STEPS):
-            error = torch.cat([wanted.values, usual]) - values(motion)
+            error = torch.cat([positions.values, usual]) - values(motion)
             if error.abs().max() < CLOSE:
                 break
             slope = torch.func.jacrev(values)(motion) * may  # (M + N, F, D)
@@ -155,15 +155,15 @@ def _with_bones(
 ) -> Tensor:
     """Returns the nearest motion (F, D) whose bones (2, N) have `lengths` (F, N) in each frame."""
 
-    def found(frame: Tensor) -> Tensor:
+    def bone_lengths(frame: Tensor) -> Tensor:
         joints = to_joints(frame[None])[0]
         return (joints[edges[1]] - joints[edges[0]]).norm(dim=-1)
 
     for _ in range(MOST_STEPS):
-        error = lengths - torch.func.vmap(found)(motion)
+        error = lengths - torch.func.vmap(bone_lengths)(motion)
         if error.abs().max() < CLOSE:
             break
-        slope = torch.func.vmap(torch.func.jacrev(found))(motion) * free[:, None]  # (F, N, D)
+        slope = torch.func.vmap(torch.func.jacrev(bone_lengths))(motion) * free[:, None]  # (F, N, D)
         gram = (slope @ slope.mT).double()
         gram = gram + torch.diag_embed(RELAXATION * gram.diagonal(dim1=1, dim2=2) + 1e-9)
         motion = motion + (torch.linalg.solve(gram, error.double()).to(motion)[..., None] * slope).sum(1)

@@ -9,6 +9,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -32,8 +33,8 @@ class Sampler:
     """A sampling loop and what it can do.
 
     Attributes:
-        loop: of a diffusion: (estimate, x_t, schedule, steps i, draws of noise, options) -> x after the last step. Of a
-            flow: (velocity, x, times) -> x at the last time.
+        loop: of a diffusion: (x_t, `Descent`) -> x after its last step. Of a flow: (velocity, x, times) -> x at the
+            last time.
         options: fields of `SamplerOptions` that it has besides guidance_scale, sampler and num_inference_steps.
         single_step: whether each step depends on the previous x alone, so that an edit can come between two steps.
     """
@@ -55,57 +56,54 @@ class CountedDenoise:
         return self.denoise(x_t, t, mask, cond)
 
 
+class Descent(NamedTuple):
+    """What a diffusion sampler needs besides x_t.
+
+    Attributes:
+        estimate: calls the denoiser.
+        schedule: of the sampling steps.
+        steps: numbers i of the steps to take, falling.
+        draws: noise, in order of use.
+        options: of the sampler.
+    """
+
+    estimate: Estimate
+    schedule: Schedule
+    steps: Sequence[int]
+    draws: Iterator[Tensor]
+    options: SamplerOptions
+
+
 # Diffusion ------------------------------------------------------------------------------------------------------------
 
 
-def ancestral(
-    estimate: Estimate,
-    x: Tensor,
-    schedule: Schedule,
-    steps: Sequence[int],
-    draws: Iterator[Tensor],
-    options: SamplerOptions,
-) -> Tensor:
+def ancestral(x: Tensor, run: Descent) -> Tensor:
     """Draws every x_{t-1} from the learned reverse process (Ho et al. 2020, algorithm 2); the last one is its mean."""
-    for i in steps:
-        x0_hat, log_variance = estimate(x, i)
-        x = ancestral_step(x, x0_hat, log_variance, schedule, i, next(draws) if i else None)
+    for i in run.steps:
+        x0_hat, log_variance = run.estimate(x, i)
+        x = ancestral_step(x, x0_hat, log_variance, run.schedule, i, next(run.draws) if i else None)
     return x
 
 
-def ddim(
-    estimate: Estimate,
-    x: Tensor,
-    schedule: Schedule,
-    steps: Sequence[int],
-    draws: Iterator[Tensor],
-    options: SamplerOptions,
-) -> Tensor:
+def ddim(x: Tensor, run: Descent) -> Tensor:
     """Non-Markovian sampling (Song et al. 2021): deterministic at eta = 0, as random as `ancestral` at eta = 1."""
-    eta = options.eta or 0.0
-    for i in steps:
-        x0_hat, _ = estimate(x, i)
-        x = ddim_step(x, x0_hat, schedule, i, next(draws) if eta and i else None, eta)
+    eta = run.options.eta or 0.0
+    for i in run.steps:
+        x0_hat, _ = run.estimate(x, i)
+        x = ddim_step(x, x0_hat, run.schedule, i, next(run.draws) if eta and i else None, eta)
     return x
 
 
-def dpm_solver_pp_2m(
-    estimate: Estimate,
-    x: Tensor,
-    schedule: Schedule,
-    steps: Sequence[int],
-    draws: Iterator[Tensor],
-    options: SamplerOptions,
-) -> Tensor:
+def dpm_solver_pp_2m(x: Tensor, run: Descent) -> Tensor:
     """DPM-Solver++ (2M), a deterministic multistep solver (Lu et al. 2022b, algorithm 2).
 
     The first step is of first order, since there is no history; the last one returns the clean estimate.
     """
-    signal, deviation = schedule.tables["signal"].tolist(), schedule.tables["noise"].tolist()
+    signal, deviation = (run.schedule.tables[name].tolist() for name in ("signal", "noise"))
     log_snr = [math.log(a / s) for a, s in zip(signal, deviation, strict=True)]
     last: Tensor | None = None
-    for i in steps:
-        x0_hat, _ = estimate(x, i)
+    for i in run.steps:
+        x0_hat, _ = run.estimate(x, i)
         if i == 0:
             return x0_hat
         size = log_snr[i - 1] - log_snr[i]
@@ -138,39 +136,31 @@ def ddim_step(x_t: Tensor, x0_hat: Tensor, schedule: Schedule, i: int, noise: Te
     return x if noise is None else x + variance**0.5 * noise
 
 
-def blended(estimate: Estimate, edit: Edit, schedule: Schedule, start: Tensor, draws: Iterator[Tensor]) -> Estimate:
-    """Returns an `estimate` that sees the known motion, as noisy as x_t, in the kept part of x_t.
+def blended(run: Descent, edit: Edit, start: Tensor) -> Descent:
+    """Returns a run whose `estimate` sees the known motion, as noisy as x_t, in the kept part of x_t.
 
     This wrapper is exact, since what a sampler makes of the kept part is replaced before the next call. With the blend
     "after", the kept part of the first x_t has the noise of the start, as if it were blended after a step before that.
     """
-    first = edit.steps(len(schedule)) - 1 if edit.blend == "after" else None
+    first = run.steps[0] if edit.blend == "after" else None
 
-    def estimate_blended(x_t: Tensor, i: int) -> tuple[Tensor, Tensor | float]:
-        noise = start if i == first else next(draws)
-        return estimate(torch.where(edit.keep, schedule.corrupt(edit.known, noise, i), x_t), i)
+    def estimate(x_t: Tensor, i: int) -> tuple[Tensor, Tensor | float]:
+        noise = start if i == first else next(run.draws)
+        return run.estimate(torch.where(edit.keep, run.schedule.corrupt(edit.known, noise, i), x_t), i)
 
-    return estimate_blended
+    return run._replace(estimate=estimate)
 
 
-def repaint(
-    sampler: Sampler,
-    estimate: Estimate,
-    x: Tensor,
-    schedule: Schedule,
-    steps: Sequence[int],
-    draws: Iterator[Tensor],
-    options: SamplerOptions,
-    edit: Edit,
-) -> Tensor:
+def repaint(sampler: Sampler, x: Tensor, run: Descent, edit: Edit) -> Tensor:
     """RePaint (Lugmayr et al. 2022, algorithm 1): takes each step several times, adding its noise again in between."""
-    if edit.blend == "after":
-        x = torch.where(edit.keep, schedule.corrupt(edit.known, x, steps[0]), x) if edit.strength is None else x
-    for i in steps:
+    schedule, draws = run.schedule, run.draws
+    if edit.blend == "after" and edit.strength is None:
+        x = torch.where(edit.keep, schedule.corrupt(edit.known, x, run.steps[0]), x)
+    for i in run.steps:
         for repeats_left in reversed(range(edit.resample if i else 1)):
             if edit.blend == "before":
                 x = torch.where(edit.keep, schedule.corrupt(edit.known, next(draws), i), x)
-            x = sampler.loop(estimate, x, schedule, [i], draws, options)
+            x = sampler.loop(x, run._replace(steps=[i]))
             if edit.blend == "after":
                 kept = schedule.corrupt(edit.known, next(draws), i - 1) if i else edit.known
                 x = torch.where(edit.keep, kept, x)

@@ -64,18 +64,18 @@ def spans(lengths: Sequence[int], longest: int, overlap: int, loop: bool = False
     Returns:
         Part, first frame and number of frames of each window. A loop has windows that begin before frame 0.
     """
-    total, begin, found = sum(lengths), 0, []
+    total, begin, windows = sum(lengths), 0, []
     for part, length in enumerate(lengths):
         first = begin - overlap // 2 * (loop or begin > 0)
         begin += length
         size = begin + overlap // 2 * (loop or begin < total) - first
         count = max(1, -(-(size - overlap) // (longest - overlap)))
-        each = -(-(size + (count - 1) * overlap) // count)
-        found += [(part, first + round(i * (size - each) / max(1, count - 1)), each) for i in range(count)]
-    return found
+        width = -(-(size + (count - 1) * overlap) // count)
+        windows += [(part, first + round(i * (size - width) / max(1, count - 1)), width) for i in range(count)]
+    return windows
 
 
-def place(
+def window_tensors(
     windows: Sequence[tuple[int, int, int]], totals: Sequence[int], overlap: int, width: int, device: torch.device
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Returns rows, frames, mask (W, L) and weights of `Windows`.

@@ -45,9 +45,9 @@ def read_motion(
         data_root: folder of the prepared data sets.
 
     Raises:
-        FileNotFoundError: the file or data set does not exist.
-        ValueError: the file is damaged, or this representation cannot encode the motion.
-        UserError: the clip is unknown, or `cut` is outside of the motion.
+        FileNotFoundError: If the file or data set does not exist.
+        UserError: If the file is damaged, the clip is unknown, `cut` is outside of the motion, or this representation
+            cannot encode the motion.
     """
     name = str(source)
     if Path(source).suffix.lower() in ENDINGS:
@@ -75,15 +75,15 @@ def with_features(representation: Representation, motion: Motion) -> Motion:
     """Returns the motion if it has features of this representation, otherwise computes them from its joints.
 
     Raises:
-        ValueError: the features have another shape, the body has the wrong size, the motion is too long, or its joints
-            cannot be encoded.
+        UserError: If the features have another shape, the body has the wrong size, the motion is too long, or its
+            joints cannot be encoded.
     """
     name = f"{motion.id}: " if motion.id else ""
     fits = motion.representation == representation.name and math.isclose(motion.fps, representation.fps)
     if fits:
         shape, size = motion.features.shape, representation.features
         if shape[1:] != (size,) or not np.isfinite(motion.features).all():
-            raise ValueError(f"{name}features of shape {shape}, not (frames, {size}), or not finite")
+            raise UserError(f"{name}features of shape {shape}, not (frames, {size}), or not finite")
         return motion
     joints, skeleton = motion.joints.astype(float), representation.skeleton
     if skeleton.joints == motion.skeleton.joints[: len(skeleton)]:
@@ -94,21 +94,21 @@ def with_features(representation: Representation, motion: Motion) -> Motion:
         if motion.skeleton.joints[: len(SMPL22)] == SMPL22.joints:
             check_size(leg_length(joints), 1.0, children=True)
     except ValueError as error:
-        raise ValueError(f"{name}{error}") from error
+        raise UserError(f"{name}{error}") from error
     return _decoded(representation, features, motion.text, motion.id)
 
 
 def _decoded(representation: Representation, features: np.ndarray, text: str, name: str) -> Motion:
     joints = representation.decode(torch.from_numpy(features)).numpy()
-    skeleton, known = representation.skeleton, representation.name
-    return Motion(joints, representation.fps, skeleton, text, name, features=features, representation=known)
+    fps, skeleton = representation.fps, representation.skeleton
+    return Motion(joints, fps, skeleton, text, name, features=features, representation=representation.name)
 
 
 def _read_clip(representation: Representation, source: str, data_root: Path) -> Motion:
     dataset, _, clip_id = source.partition(":")
     store = Store(data_root / f"{dataset}-{representation.name}")
     if store.info["fps"] != representation.fps:
-        raise ValueError(
+        raise UserError(
             f"{store.folder}: prepared at {store.info['fps']:g} fps, but the model has {representation.fps:g}"
         )
     clips = {clip.id: clip for clip in store.clips}

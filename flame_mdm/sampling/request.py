@@ -196,7 +196,7 @@ class SamplingRequest:
             object.__setattr__(self, name, tuple(value) if isinstance(value, list | tuple) else value)
         for name in ("samples", "candidates"):
             value = getattr(self, name)
-            if not isinstance(value, Integral) or not 1 <= value <= MAX_SAMPLES:
+            if not isinstance(value, Integral) or not 1 <= int(value) <= MAX_SAMPLES:
                 raise UserError(f"{name}={value}: give 1 to {MAX_SAMPLES:,}")
         if not isinstance(self.seed, Integral):
             raise UserError(f"seed={self.seed!r}: give a whole number")
@@ -237,7 +237,7 @@ class SamplingRequest:
         name, value = ("frames", self.frames) if self.seconds is None else ("seconds", self.seconds)
         if value is None:
             return
-        lengths = list(value) if isinstance(value, tuple) else [value] * len(self.prompts)
+        lengths: list[Any] = list(value) if isinstance(value, tuple) else [value] * len(self.prompts)
         shown = f"{name}={lengths if isinstance(value, tuple) else value}"
         if len(lengths) != len(self.prompts):
             prompts = "1 prompt" if len(self.prompts) == 1 else f"{len(self.prompts)} prompts"
@@ -279,7 +279,7 @@ class SamplingRequest:
     def lengths(self, fps: float) -> list[float | None]:
         """Returns the length of each prompt in frames, not rounded; None where the request gives none."""
         value, scale = (self.frames, 1.0) if self.seconds is None else (self.seconds, fps)
-        values = value if isinstance(value, tuple) else [value] * len(self.prompts)
+        values: Sequence[Any] = value if isinstance(value, tuple) else [value] * len(self.prompts)
         return [None if length is None else length * scale for length in values]
 
 

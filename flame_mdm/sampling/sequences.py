@@ -8,7 +8,7 @@ import torch
 
 from flame_mdm.batch import MotionBatch
 from flame_mdm.errors import UserError
-from flame_mdm.processes.windows import Windows, place, spans
+from flame_mdm.processes.windows import Windows, spans, window_tensors
 from flame_mdm.sampling.request import Part, SamplingRequest
 from flame_mdm.task import MotionGeneration
 
@@ -98,7 +98,7 @@ def windows(
     # A denoiser that attends to its padding sees as many frames as in training.
     width = max(size for *_, size in covering) if model.denoiser.mask_padding else longest
     positions = [(row, first, size) for row, _, first, size in covering]
-    rows, frames, mask, weights = place(positions, [sum(parts) for parts in lengths], shared, width, device)
+    rows, frames, mask, weights = window_tensors(positions, [sum(parts) for parts in lengths], shared, width, device)
     batch = MotionBatch(
         x=torch.zeros(*mask.shape, 0, device=device),
         mask=mask,

@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -23,11 +23,11 @@ from flame_mdm.sampling.reading import read_motion
 
 SMOOTHNESS = 0.2
 """Seconds over which a correction fades; see docs/targets.md."""
-FASTEST = 8.0
-"""Meters per second that no way point may require."""
+MAX_SPEED = 8.0
+"""Meters per second that way points may require."""
 REACH = 2.5
-"""Meters above the floor up to which a joint can be, and from the place that the body moves to or from."""
-MOST = 600
+"""Maximum height of a joint above the floor, and its maximum distance from where the body stands, in meters."""
+MAX_COORDINATES = 600
 """Maximum number of coordinates; they are solved for together in every step."""
 KEYS = {
     "root": ({"time", "position"}, set[str]()),
@@ -35,6 +35,15 @@ KEYS = {
     "poses": ({"time", "file"}, {"frame", "position", "heading"}),
 }
 """Kinds of targets, with the keys that each entry must have and those that it may have."""
+
+
+class Goal(NamedTuple):
+    """A position (3,) in meters that a joint should have in a frame, NaN = free; `source` names it in messages."""
+
+    source: str
+    frame: int
+    joint: int
+    position: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -99,25 +108,25 @@ class Targets:
         return Edit(known, keep, guide=guide if len(positions.values) else None)
 
     def _bones(self, representation: Representation) -> Tensor:
-        """Returns frame, parent and child (3, N) of all bones in frames in which other joints than the root move."""
+        """Returns frame, parent and child (3, N) of all bones, in each frame with a target for a joint but the root."""
         frames = sorted(set(self.positions.frames[self.positions.joints > 0].tolist()))
-        found = [(frame, *edge) for frame in frames for edge in representation.skeleton.edges]
-        return torch.tensor(found, dtype=torch.long).reshape(-1, 3).T
+        bones = [(frame, *edge) for frame in frames for edge in representation.skeleton.edges]
+        return torch.tensor(bones, dtype=torch.long).reshape(-1, 3).T
 
 
 def errors(motion: Motion, targets: Targets) -> np.ndarray:
-    """Returns the distance in meters of a motion from each position; coordinates that are free count as reached."""
-    wanted = targets.positions
-    off = wanted.of(torch.from_numpy(motion.joints)) - wanted.values
-    places, index = torch.stack([wanted.frames, wanted.joints], 1).unique(dim=0, return_inverse=True)
-    return torch.zeros(len(places)).index_add(0, index, off**2).sqrt().numpy()
+    """Returns the distance in meters of a motion from each target position, along the coordinates that are not free."""
+    goal = targets.positions
+    off = goal.of(torch.from_numpy(motion.joints)) - goal.values
+    targeted, index = torch.stack([goal.frames, goal.joints], 1).unique(dim=0, return_inverse=True)
+    return torch.zeros(len(targeted)).index_add(0, index, off**2).sqrt().numpy()
 
 
 def read_targets(representation: Representation, source: str | Path | Mapping[str, Any]) -> Targets:
     """Reads targets from a JSON file, or from its content; docs/targets.md describes it.
 
     Raises:
-        UserError: the file is not such a file, a joint is unknown, or a target cannot be reached.
+        UserError: If the file is not such a file, a joint is unknown, or a target cannot be reached.
     """
     name, folder = ("targets", Path()) if isinstance(source, Mapping) else (f"targets={source}", Path(source).parent)
     content = source if isinstance(source, Mapping) else _read(source, name)
@@ -125,45 +134,50 @@ def read_targets(representation: Representation, source: str | Path | Mapping[st
         raise UserError(f"{name}: give an object with {', '.join(KEYS)}, each a list. See docs/targets.md")
     if unknown := [str(key) for key in content if key not in KEYS]:
         raise UserError(f"{name}: unknown key '{unknown[0]}'.{did_you_mean(unknown[0], KEYS)} Use {', '.join(KEYS)}")
-    places: list[tuple[str, int, int, np.ndarray]] = []  # description, frame, joint, and a position with NaN = free
+    goals: list[Goal] = []
     poses = []
     for kind, entries in content.items():
         if not isinstance(entries, list | tuple):
             raise UserError(f"{name}: {kind} is {entries}, not a list. See docs/targets.md")
         for number, entry in enumerate(entries):
             where = f"{name}: {kind}[{number}]"
-            needed, possible = KEYS[kind]
-            if not isinstance(entry, Mapping) or not needed <= entry.keys() <= needed | possible:
-                optional = f", and possibly {', '.join(sorted(possible))}" if possible else ""
-                raise UserError(f"{where} is {entry}. Give an object with {', '.join(sorted(needed))}{optional}")
-            (time,) = _numbers(entry, "time", where)
-            if not time >= 0:
-                raise UserError(f"{where}.time={entry['time']}: give seconds from the start of the motion")
-            frame = round(time * representation.fps)
+            frame = _frame(kind, entry, where, representation.fps)
             if kind == "root":
                 x, z = _numbers(entry, "position", where, 2)
-                places.append((where, frame, 0, np.array([x, math.nan, z])))
+                goals.append(Goal(where, frame, 0, np.array([x, math.nan, z])))
             elif kind == "joints":
                 joint = _joint(representation, entry["joint"], where)
-                places.append((where, frame, joint, np.array(_numbers(entry, "position", where, 3))))
+                goals.append(Goal(where, frame, joint, np.array(_numbers(entry, "position", where, 3))))
             elif entry.get("position") is None:
                 pose, features = _pose(representation, entry, folder, where)
                 poses.append((frame, features))
-                places.append((where, frame, 0, np.array([math.nan, pose[0, 1], math.nan])))
+                goals.append(Goal(where, frame, 0, np.array([math.nan, pose[0, 1], math.nan])))
             else:
                 x, z = _numbers(entry, "position", where, 2)
                 pose = _pose(representation, entry, folder, where)[0] + np.array([x, 0.0, z])
-                places += [(where, frame, joint, place) for joint, place in enumerate(pose)]
-    _check_reach(places, representation.fps)
+                goals += [Goal(where, frame, joint, position) for joint, position in enumerate(pose)]
+    _check_reach(goals, representation.fps)
     rows = [
-        (frame, joint, axis, float(place[axis]))
-        for _, frame, joint, place in places
-        for axis in np.flatnonzero(~np.isnan(place)).tolist()
+        (goal.frame, goal.joint, axis, float(goal.position[axis]))
+        for goal in goals
+        for axis in np.flatnonzero(~np.isnan(goal.position)).tolist()
     ]
-    if len(rows) > MOST:
-        raise UserError(f"{name}: {len(rows)} coordinates are too many. Give at most {MOST}")
+    if len(rows) > MAX_COORDINATES:
+        raise UserError(f"{name}: {len(rows)} coordinates are too many. Give at most {MAX_COORDINATES}")
     frames, joints, axes = torch.tensor([row[:3] for row in rows], dtype=torch.long).reshape(-1, 3).T
     return Targets(Positions(frames, joints, axes, torch.tensor([row[3] for row in rows])), tuple(poses))
+
+
+def _frame(kind: str, entry: Any, where: str, fps: float) -> int:
+    """Checks the keys of an entry, and returns the frame of its time."""
+    needed, possible = KEYS[kind]
+    if not isinstance(entry, Mapping) or not needed <= entry.keys() <= needed | possible:
+        optional = f", and possibly {', '.join(sorted(possible))}" if possible else ""
+        raise UserError(f"{where} is {entry}. Give an object with {', '.join(sorted(needed))}{optional}")
+    (time,) = _numbers(entry, "time", where)
+    if not time >= 0:
+        raise UserError(f"{where}.time={entry['time']}: give seconds from the start of the motion")
+    return round(time * fps)
 
 
 def _read(source: str | Path, name: str) -> Any:
@@ -186,10 +200,10 @@ def _numbers(entry: Mapping[str, Any], key: str, where: str, count: int = 1) -> 
 
 
 def _joint(representation: Representation, name: Any, where: str) -> int:
-    known = representation.skeleton.joints
-    if name not in known:
-        raise UserError(f"{where}: no joint '{name}'.{did_you_mean(str(name), known)} Joints: {', '.join(known)}")
-    return known.index(name)
+    joints = representation.skeleton.joints
+    if name not in joints:
+        raise UserError(f"{where}: no joint '{name}'.{did_you_mean(str(name), joints)} Joints: {', '.join(joints)}")
+    return joints.index(name)
 
 
 def _pose(
@@ -212,18 +226,21 @@ def _pose(
     return pose, torch.from_numpy(motion.features[number])
 
 
-def _check_reach(places: list[tuple[str, int, int, np.ndarray]], fps: float) -> None:
-    """Checks that heights are possible, and that a person can move from place to place in time."""
-    before, reached, begun = "the start", np.zeros(2), 0
-    for where, frame, _, place in sorted(places, key=lambda each: each[1]):
-        if not (np.isnan(place[1]) or -0.1 <= place[1] <= REACH):
-            raise UserError(f"{where}: height {place[1]:g} m is impossible. Give 0 to {REACH:g} meters above the floor")
-        if np.isnan(place[[0, 2]]).any():
-            continue
-        way, seconds = float(np.linalg.norm(place[[0, 2]] - reached)), (frame - begun) / fps
-        if way > FASTEST * seconds + REACH:
+def _check_reach(goals: list[Goal], fps: float) -> None:
+    """Checks that heights are possible, and that a person can move from position to position in time."""
+    before, start, begin = "the start", np.zeros(2), 0
+    for goal in sorted(goals, key=lambda goal: goal.frame):
+        height, floor = goal.position[1], goal.position[[0, 2]]
+        if not (np.isnan(height) or -0.1 <= height <= REACH):
             raise UserError(
-                f"{where}: {way:.1f} m from {before} in {seconds:g} seconds is impossible. Give more time, or a nearer "
-                f"place: people run at most {FASTEST:g} m/s"
+                f"{goal.source}: height {height:g} m is impossible. Give 0 to {REACH:g} meters above the floor"
             )
-        before, reached, begun = where, place[[0, 2]], frame
+        if np.isnan(floor).any():
+            continue
+        distance, seconds = float(np.linalg.norm(floor - start)), (goal.frame - begin) / fps
+        if distance > MAX_SPEED * seconds + REACH:
+            raise UserError(
+                f"{goal.source}: {distance:.1f} m from {before} in {seconds:g} seconds is impossible. Give more time, "
+                f"or a nearer position: people run at most {MAX_SPEED:g} m/s"
+            )
+        before, start, begin = goal.source, floor, goal.frame

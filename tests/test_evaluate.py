@@ -481,7 +481,7 @@ def test_released_classifiers_give_features_and_scores_of_their_data_alone(tmp_p
     for kind, (content, actions) in made.items():
         torch.save(content, tmp_path / kind)
         extractor = ClassifierExtractor(kind, str(tmp_path / kind))
-        extractor.check(representation, extractor.dataset)
+        extractor.check(representation, extractor.made_for[1])
         with torch.no_grad():
             found = extractor.motions(x, joints, mask)
         assert found["logits"].shape == (3, actions)

@@ -6,19 +6,21 @@ import hashlib
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
-from evaluators.extractors.action_gru import ActionGRU, load_action_gru
+from evaluators.extractors.action_gru import ActionGRU
 from evaluators.extractors.classifier import ClassifierTask
 from evaluators.extractors.mardm import MARDMClip, clip_tokens, load_mardm_clip
 from evaluators.extractors.motion_clip import MotionCLIPTask
-from evaluators.extractors.stgcn import Unconstrained, load_uestc, load_unconstrained
-from evaluators.extractors.t2m import WordVectors, load_t2m
+from evaluators.extractors.stgcn import UESTC, Unconstrained
+from evaluators.extractors.t2m import T2MEvaluator, WordVectors, load_t2m
 from evaluators.extractors.t2m_training import T2MTask
 from flame_mdm.checkpoints.loading import find, load_task
 from flame_mdm.checkpoints.model_files import weights_sha256
+from flame_mdm.checkpoints.released_weights import load_strictly, read_weights
 from flame_mdm.conditions.vocabulary import words
 from flame_mdm.data.humanact12 import read_unconstrained
 from flame_mdm.errors import UserError
@@ -74,6 +76,9 @@ class Extractor(ABC):
         return None
 
 
+# Networks trained here ------------------------------------------------------------------------------------------------
+
+
 class OwnExtractor(Extractor):
     """A network trained with `make train`, loaded from its checkpoint.
 
@@ -95,7 +100,7 @@ class OwnExtractor(Extractor):
     def check(self, representation: Representation, dataset: str) -> None:
         """Checks that representation and data set are those of its training."""
         own, advice = self.task.representation, f"Train one with make train EXP={self.recipes}/..."
-        if not self._reads(representation):
+        if not self.reads(representation):
             raise UserError(
                 f"extractor {self.path}: trained on {own.name} at {own.fps:g} frames per second, but the motions are "
                 f"{representation.name} at {representation.fps:g}. {advice}"
@@ -106,9 +111,14 @@ class OwnExtractor(Extractor):
                 f"from {dataset}. {advice}"
             )
 
-    def _reads(self, representation: Representation) -> bool:
+    def reads(self, representation: Representation) -> bool:
+        """Returns whether the network reads motions in a representation."""
         own = self.task.representation
         return (own.name, own.fps, own.features) == (representation.name, representation.fps, representation.features)
+
+    def motions(self, features: Tensor, joints: Tensor, mask: Tensor) -> dict[str, Tensor]:
+        """Computes features of motions."""
+        return {"features": self.task(features, mask)}
 
 
 class MotionCLIPExtractor(OwnExtractor):
@@ -119,21 +129,110 @@ class MotionCLIPExtractor(OwnExtractor):
 
     def __init__(self, path: str, device: str | torch.device = "cpu"):
         super().__init__(path, device)
-        self.known: dict[str, Tensor] = {}
-
-    def motions(self, features: Tensor, joints: Tensor, mask: Tensor) -> dict[str, Tensor]:
-        """Computes features of motions."""
-        return {"features": self.task(features, mask)}
+        self.encoded: dict[str, Tensor] = {}
 
     def texts(self, captions: Sequence[str], tokens: Sequence[Sequence[str] | None]) -> Tensor:
         """Computes features of captions; each caption is encoded once."""
-        new = sorted(set(captions) - self.known.keys())
+        new = sorted(set(captions) - self.encoded.keys())
         if new:
-            self.known |= dict(zip(new, self.task.text(new), strict=True))
-        return torch.stack([self.known[caption] for caption in captions])
+            self.encoded |= dict(zip(new, self.task.text(new), strict=True))
+        return torch.stack([self.encoded[caption] for caption in captions])
 
 
-class T2MExtractor(Extractor):
+class OwnT2MExtractor(OwnExtractor):
+    """An evaluator of Guo et al. 2022 trained with `make train EXP=t2m/...`."""
+
+    trained, recipes = T2MTask, "t2m"
+    task: T2MTask
+
+    def reads(self, representation: Representation) -> bool:
+        """Returns whether the network reads motions in a representation; it may see only features that both have."""
+        own, used = self.task.representation, self.task.network.used
+        part = (representation.part_of, representation.fps) == (own.name, own.fps) and used <= representation.features
+        return part or super().reads(representation)
+
+    def texts(self, captions: Sequence[str], tokens: Sequence[Sequence[str] | None]) -> Tensor:
+        """Computes features of captions.
+
+        Raises:
+            UserError: If a caption has no tokens, and the evaluator needs them.
+        """
+        if self.task.learns_words:
+            return self.task.text([words(caption) for caption in captions])
+        return self.task.text(_tagged(self.path, tokens))
+
+
+class OwnClassifierExtractor(OwnExtractor):
+    """An action classifier trained with `make train EXP=classifier/...`."""
+
+    trained, recipes = ClassifierTask, "classifier"
+    task: ClassifierTask
+
+    def motions(self, features: Tensor, joints: Tensor, mask: Tensor) -> dict[str, Tensor]:
+        """Computes features and class scores of motions."""
+        return {"features": self.task(joints, mask), "logits": self.task.logits(joints, mask)}
+
+
+def _tagged(path: Path, tokens: Sequence[Sequence[str] | None]) -> list[Sequence[str]]:
+    """Returns the tokens of captions.
+
+    Raises:
+        UserError: If a caption has no tokens.
+    """
+    tagged = [words for words in tokens if words is not None]
+    if len(tagged) < len(tokens):
+        raise UserError(f"extractor {path}: needs tagged words, but the data set has captions without them")
+    return tagged
+
+
+# Networks released by the authors -------------------------------------------------------------------------------------
+
+
+class ReleasedExtractor(Extractor):
+    """A network with the weights that its authors released.
+
+    Args:
+        path: the folder of `FILES`, or the file if there is only one.
+
+    Raises:
+        FileNotFoundError: If a file is missing.
+    """
+
+    FILES: tuple[str, ...] = ()
+    network: nn.Module
+    made_for: tuple[str, str]
+    """Names of the representation and the data set that it was trained on."""
+    used = 0
+    """Number of features that it reads, from the first."""
+
+    def __init__(self, path: str):
+        self.path = Path(path)
+        files = [self.path / name for name in self.FILES] or [self.path]
+        missing = [file.name for file in files if not file.is_file()]
+        if missing:
+            raise FileNotFoundError(
+                f"{path}: not a folder of released files: it lacks {', '.join(missing)}"
+                if self.FILES
+                else f"{path}: no such file. Give the path of the weights released by the authors"
+            )
+        hashes = [sha256(file) for file in files]
+        self.sha256 = hashes[0] if len(hashes) == 1 else hashlib.sha256("".join(hashes).encode()).hexdigest()
+
+    def check(self, representation: Representation, dataset: str) -> None:
+        """Checks that the motions are from the data set of its training, with the features that it reads."""
+        names = {representation.name} | ({representation.part_of} if self.used <= representation.features else set())
+        if self.made_for[0] not in names or dataset != self.made_for[1]:
+            raise UserError(
+                f"extractor {self.path}: made for {' of '.join(self.made_for)}, but the motions are "
+                f"{representation.name} of {dataset}"
+            )
+
+    def motions(self, features: Tensor, joints: Tensor, mask: Tensor) -> dict[str, Tensor]:
+        """Computes features of motions."""
+        return {"features": self.network(features, mask)}
+
+
+class T2MExtractor(ReleasedExtractor):
     """The evaluator of Guo et al. 2022, or MARDM's first evaluator, as released, from a folder with five files.
 
     The files are finest.tar (from text_mot_match/model), mean.npy and std.npy (t2m_mean.npy and t2m_std.npy in MDM,
@@ -145,36 +244,20 @@ class T2MExtractor(Extractor):
         full_length: legacy option, see `WordVectors`: captions are treated as filling all 22 slots.
 
     Raises:
-        FileNotFoundError, ValueError: If a file is missing, or has other content.
+        FileNotFoundError, UserError: If a file is missing, or has other content.
     """
 
     FILES = ("finest.tar", "mean.npy", "std.npy", "our_vab_data.npy", "our_vab_idx.pkl")
+    network: T2MEvaluator
 
     def __init__(self, path: str, device: str | torch.device = "cpu", *, full_length: bool = False):
-        folder = Path(path)
-        missing = [name for name in self.FILES if not (folder / name).is_file()]
-        if missing:
-            raise FileNotFoundError(f"{folder}: not a folder of the T2M evaluator: it lacks {', '.join(missing)}")
-        hashes = "".join(sha256(folder / name) for name in self.FILES)
-        self.path, self.sha256 = folder, hashlib.sha256(hashes.encode()).hexdigest()
-        self.network = load_t2m(*(folder / name for name in self.FILES[:3])).to(device)
-        self.words, self.full_length = WordVectors(folder), full_length
-
-    def check(self, representation: Representation, dataset: str) -> None:
-        """Checks that the motions have the published features of the data set with that number of features."""
+        super().__init__(path)
+        self.network = load_t2m(self.path).to(device)
+        self.words, self.full_length = WordVectors.read(self.path), full_length
         human, kit = ("humanml-legacy-smpl22", "humanml3d"), ("humanml-legacy-kit21", "kit")
         made_for = {263: human, 67: human, 251: kit, 64: kit}
-        wanted = made_for.get(len(self.network.mean), ("unknown features", "an unknown data set"))
-        parts = {representation.part_of} if self.network.used <= representation.features else set()
-        if wanted[0] not in {representation.name, *parts} or dataset != wanted[1]:
-            raise UserError(
-                f"extractor {self.path}: made for {wanted[0]} of {wanted[1]}, but the motions are "
-                f"{representation.name} of {dataset}"
-            )
-
-    def motions(self, features: Tensor, joints: Tensor, mask: Tensor) -> dict[str, Tensor]:
-        """Computes features of motions."""
-        return {"features": self.network(features, mask)}
+        self.made_for = made_for.get(len(self.network.mean), ("unknown features", "an unknown data set"))
+        self.used = self.network.used
 
     def texts(self, captions: Sequence[str], tokens: Sequence[Sequence[str] | None]) -> Tensor:
         """Computes features of captions.
@@ -185,7 +268,7 @@ class T2MExtractor(Extractor):
         return self.network.text(self.words(_tagged(self.path, tokens), full_length=self.full_length))
 
 
-class MARDMClipExtractor(Extractor):
+class MARDMClipExtractor(ReleasedExtractor):
     """The second evaluator of MARDM as released, for its CLIP-score: `MotionCLIPScore` of its features.
 
     Args:
@@ -193,81 +276,42 @@ class MARDMClipExtractor(Extractor):
         device: to compute on.
 
     Raises:
-        FileNotFoundError, ValueError: If a file is missing, or has other content.
+        FileNotFoundError, UserError: If a file is missing, or has other content.
     """
 
     FILES = ("finest.tar", "mean.npy", "std.npy")
+    made_for = ("humanml-legacy-smpl22", "humanml3d")
     network: MARDMClip
 
     def __init__(self, path: str, device: str | torch.device = "cpu"):
-        folder = Path(path)
-        self.path, self.network = folder, load_mardm_clip(*(folder / name for name in self.FILES)).to(device)
-        self.sha256 = hashlib.sha256("".join(sha256(folder / name) for name in self.FILES).encode()).hexdigest()
-
-    def check(self, representation: Representation, dataset: str) -> None:
-        """Checks that the motions have the published features of HumanML3D, or the essential ones."""
-        if "humanml-legacy-smpl22" not in (representation.name, representation.part_of) or dataset != "humanml3d":
-            raise UserError(
-                f"extractor {self.path}: made for humanml-legacy-smpl22 of humanml3d, but the motions are "
-                f"{representation.name} of {dataset}"
-            )
-
-    def motions(self, features: Tensor, joints: Tensor, mask: Tensor) -> dict[str, Tensor]:
-        """Computes features of motions."""
-        return {"features": self.network(features, mask)}
+        super().__init__(path)
+        self.network = load_mardm_clip(self.path).to(device)
 
     def texts(self, captions: Sequence[str], tokens: Sequence[Sequence[str] | None]) -> Tensor:
         """Computes features of captions."""
         return self.network.text(clip_tokens(captions).to(self.network.mean.device))
 
 
-class OwnT2MExtractor(OwnExtractor):
-    """An evaluator of Guo et al. 2022 trained with `make train EXP=t2m/...`."""
+class ReleasedClassifier(NamedTuple):
+    """A released action classifier: its network, the key of the weights in its file, its data set and its input."""
 
-    trained, recipes = T2MTask, "t2m"
-    task: T2MTask
-
-    def _reads(self, representation: Representation) -> bool:
-        own, used = self.task.representation, self.task.network.used  # it may see only features that both have
-        part = (representation.part_of, representation.fps) == (own.name, own.fps) and used <= representation.features
-        return part or super()._reads(representation)
-
-    def motions(self, features: Tensor, joints: Tensor, mask: Tensor) -> dict[str, Tensor]:
-        """Computes features of motions."""
-        return {"features": self.task(features, mask)}
-
-    def texts(self, captions: Sequence[str], tokens: Sequence[Sequence[str] | None]) -> Tensor:
-        """Computes features of captions.
-
-        Raises:
-            UserError: If a caption has no tokens, and the evaluator needs them.
-        """
-        given = [words(caption) for caption in captions] if self.task.learns_words else tokens
-        return self.task.text(_tagged(self.path, given))
-
-
-def _tagged(path: Path, tokens: Sequence[Sequence[str] | None]) -> list[Sequence[str]]:
-    """Returns the tokens of captions.
-
-    Raises:
-        UserError: If a caption has no tokens.
-    """
-    known = [words for words in tokens if words is not None]
-    if len(known) < len(tokens):
-        raise UserError(f"extractor {path}: needs tagged words, but the data set has captions without them")
-    return known
+    network: type[ActionGRU | UESTC | Unconstrained]
+    key: str | None
+    dataset: str
+    input: str
 
 
 CLASSIFIERS = {
-    "humanact12": (load_action_gru, "humanact12", "joints"),
-    "humanact12_unconstrained": (load_unconstrained, "humanact12", "joints"),
-    "uestc": (load_uestc, "uestc", "features"),
+    "humanact12": ReleasedClassifier(ActionGRU, "model", "humanact12", "joints"),
+    "humanact12_unconstrained": ReleasedClassifier(Unconstrained, None, "humanact12", "joints"),
+    "uestc": ReleasedClassifier(UESTC, None, "uestc", "features"),
 }
-"""Name -> loader of the released weights, data set that they belong to, and input that they read."""
+"""The authors' files are action_recognition_model_humanact12.tar (humanact12_gru.tar in MDM),
+humanact12_gru_modi_struct.pth.tar (not a GRU despite its name) and uestc_rot6d_stgcn.tar."""
 
 
-class ClassifierExtractor(Extractor):
-    """A released action classifier, one of `CLASSIFIERS`.
+class ClassifierExtractor(ReleasedExtractor):
+    """A released action classifier, one of `CLASSIFIERS`, which reads rotations or joints of 24 SMPL joints.
 
     Args:
         kind: which one.
@@ -278,46 +322,36 @@ class ClassifierExtractor(Extractor):
             motion, so it is the same in any batch.
 
     Raises:
-        FileNotFoundError, UserError, ValueError: If the file does not exist or holds other weights, or `random_start`
-            is given for a network that is not recurrent.
+        FileNotFoundError, UserError: If the file does not exist or holds other weights, or `random_start` is given for
+            a network that is not recurrent.
     """
 
     def __init__(self, kind: str, path: str, device: str | torch.device = "cpu", *, random_start: bool = False):
-        read, self.dataset, self.reads = CLASSIFIERS[kind]
+        super().__init__(path)
+        network, weights_key, dataset, self.input = CLASSIFIERS[kind]
+        weights = self.path / self.FILES[0] if self.FILES else self.path
         try:
-            self.network = read(path).to(device)
-        except UserError:
-            raise
-        except ValueError as error:
+            self.network = load_strictly(network(), read_weights(weights, weights_key), weights).to(device)
+        except UserError as error:
             raise UserError(
                 f"{error}. For classifiers of make train EXP=classifier/..., use protocol=action_to_motion_own"
             ) from error
-        self.path, self.sha256, self.random_start = path, sha256(path), random_start
-        if random_start and not isinstance(self.network, ActionGRU):
-            raise ValueError(f"random_start: the classifier {kind} is not recurrent")
-
-    def check(self, representation: Representation, dataset: str) -> None:
-        """Checks that the motions are rotations of 24 SMPL joints, from the data set of its training."""
-        if representation.name != "rot6d-25" or dataset != self.dataset:
-            raise UserError(
-                f"extractor {self.path}: made for {self.dataset} as rot6d-25, but the motions are "
-                f"{representation.name} of {dataset}"
-            )
+        self.made_for, self.random_start = ("rot6d-25", dataset), random_start
+        if random_start and network is not ActionGRU:
+            raise UserError(f"random_start: the classifier {kind} is not recurrent")
 
     def motions(self, features: Tensor, joints: Tensor, mask: Tensor) -> dict[str, Tensor]:
         """Computes features and class scores of motions."""
-        x = joints if self.reads == "joints" else features
-        if not self.random_start:
-            return {"features": self.network(x, mask), "logits": self.network.logits(x, mask)}
-        assert isinstance(self.network, ActionGRU)
-        names = [
-            hashlib.sha256(motion[real].cpu().numpy().tobytes()).hexdigest()
-            for motion, real in zip(x, mask, strict=True)
-        ]
-        start = {use: torch.cat([self._start(use, name) for name in names], 1) for use in ("features", "logits")}
+        x = joints if self.input == "joints" else features
+        start: dict[str, tuple[Tensor, ...]] = {"features": (), "logits": ()}
+        if self.random_start:
+            pairs = zip(x, mask, strict=True)
+            names = [hashlib.sha256(motion[real].cpu().numpy().tobytes()).hexdigest() for motion, real in pairs]
+            start = {use: (torch.cat([self._start(use, name) for name in names], 1),) for use in start}
+        assert isinstance(self.network, ActionGRU | UESTC | Unconstrained)
         return {
-            "features": self.network(x, mask, start["features"]),
-            "logits": self.network.logits(x, mask, start["logits"]),
+            "features": self.network(x, mask, *start["features"]),
+            "logits": self.network.logits(x, mask, *start["logits"]),
         }
 
     def _start(self, use: str, name: str) -> Tensor:
@@ -333,37 +367,19 @@ class UnconstrainedExtractor(ClassifierExtractor):
         device: to compute on.
 
     Raises:
-        FileNotFoundError, UserError, ValueError: a file is missing, or is another one.
+        FileNotFoundError, UserError: If a file is missing, or is another one.
     """
 
     FILES = ("humanact12_gru_modi_struct.pth.tar", "humanact12_unconstrained_modi_struct.npy")
 
     def __init__(self, path: str, device: str | torch.device = "cpu"):
-        weights, motions = (Path(path) / name for name in self.FILES)
-        missing = [file.name for file in (weights, motions) if not file.is_file()]
-        if missing:
-            raise FileNotFoundError(
-                f"{path}: not a folder of the unconstrained reference, it lacks {', '.join(missing)}"
-            )
-        super().__init__("humanact12_unconstrained", str(weights), device)
-        self.real = torch.from_numpy(read_unconstrained(motions)).to(device)
-        self.sha256 = hashlib.sha256((self.sha256 + sha256(motions)).encode()).hexdigest()
+        super().__init__("humanact12_unconstrained", path, device)
+        self.real = torch.from_numpy(read_unconstrained(self.path / self.FILES[1])).to(device)
 
     def reference(self) -> Tensor:
         """(N, 256) features of the reference motions."""
         assert isinstance(self.network, Unconstrained)
         batches = self.real.split(64)
         masks = [torch.ones(batch.shape[:2], dtype=torch.bool, device=batch.device) for batch in batches]
-        found = [self.network.published(batch, mask) for batch, mask in zip(batches, masks, strict=True)]
-        return torch.cat(found).float().cpu()
-
-
-class OwnClassifierExtractor(OwnExtractor):
-    """An action classifier trained with `make train EXP=classifier/...`."""
-
-    trained, recipes = ClassifierTask, "classifier"
-    task: ClassifierTask
-
-    def motions(self, features: Tensor, joints: Tensor, mask: Tensor) -> dict[str, Tensor]:
-        """Computes features and class scores of motions."""
-        return {"features": self.task(joints, mask), "logits": self.task.logits(joints, mask)}
+        features = [self.network.published(batch, mask) for batch, mask in zip(batches, masks, strict=True)]
+        return torch.cat(features).float().cpu()

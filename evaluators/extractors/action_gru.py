@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import torch
 from torch import Tensor, nn
-
-from evaluators.extractors.released import load_strictly, read_weights
 
 NUM_ACTIONS = 12
 
@@ -65,15 +61,3 @@ class ActionGRU(nn.Module):
         """Draws an initial state (layers, B, hidden) from a standard normal distribution, as the authors do."""
         shape = (self.recurrent.num_layers, batch, self.recurrent.hidden_size)
         return torch.randn(shape, generator=generator).to(self.linear1.weight)
-
-
-def load_action_gru(path: str | Path) -> ActionGRU:
-    """Loads the classifier with the authors' weights.
-
-    The file is action_recognition_model_humanact12.tar, or humanact12_gru.tar in MDM.
-
-    Raises:
-        FileNotFoundError: If the file does not exist.
-        ValueError: If it holds other weights.
-    """
-    return load_strictly(ActionGRU(), read_weights(path, "model"), path)

@@ -8,11 +8,12 @@ from typing import Self
 import torch
 import torch.distributed
 import torch.nn.functional as F
-from torch import Tensor
+from torch import Tensor, nn
 from torchmetrics import MeanMetric
 
 from evaluators.extractors.action_gru import ActionGRU
 from evaluators.extractors.stgcn import JointSTGCN
+from evaluators.extractors.validation import log_validation
 from evaluators.metrics.accuracy import ActionAccuracy
 from flame_mdm.batch import MotionBatch
 from flame_mdm.conditions import Unconditional
@@ -48,7 +49,7 @@ class ClassifierTask(Task):
     ):
         super().__init__(Unconditional(), representation, optimizer=optimizer, seed=seed)
         self.network = network
-        self.val_loss, self.accuracy = MeanMetric(), ActionAccuracy()
+        self.val_metrics = nn.ModuleDict({"loss": MeanMetric(), "accuracy": ActionAccuracy()})
 
     @classmethod
     def build(cls, config: Config, representation: Representation, *, actions: Sequence[str] = ()) -> Self:
@@ -126,14 +127,9 @@ class ClassifierTask(Task):
         If there are fewer clips than processes, each process has all of them, which does not change the values.
         """
         logits, labels = self._classified(batch)
-        self.val_loss.update(F.cross_entropy(logits, labels, reduction="none"))
-        self.accuracy.update(logits, labels)
+        self.val_metrics["loss"].update(F.cross_entropy(logits, labels, reduction="none"))  # type: ignore[operator]
+        self.val_metrics["accuracy"].update(logits, labels)  # type: ignore[operator]
 
     def on_validation_epoch_end(self) -> None:
         """Logs the mean cross-entropy and the accuracy over all clips, over all processes."""
-        self.log("val/loss", self.val_loss.compute(), prog_bar=True)
-        accuracy = self.accuracy.compute()
-        assert accuracy is not None
-        self.log("val/accuracy", accuracy)
-        self.val_loss.reset()
-        self.accuracy.reset()
+        log_validation(self, self.val_metrics)

@@ -12,8 +12,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from evaluators.extractors.released import load_strictly, read_weights
 from evaluators.extractors.t2m import read_statistics
+from flame_mdm.checkpoints.released_weights import load_strictly, read_weights
 from flame_mdm.conditions.text import Pretrained
 from flame_mdm.denoisers.layers import sinusoid
 
@@ -97,16 +97,19 @@ class MARDMClip(nn.Module):
 def clip_tokens(captions: Sequence[str]) -> Tensor:
     """Returns CLIP's tokens (B, 77) of captions, 0 after the end; longer captions are cut."""
     tokenizer = Pretrained(*CLIP, None, None).tokenizer
-    found = tokenizer(list(captions), padding="max_length", truncation=True, max_length=77, return_tensors="pt")
-    return found["input_ids"] * found["attention_mask"]
+    encoded = tokenizer(list(captions), padding="max_length", truncation=True, max_length=77, return_tensors="pt")
+    return encoded["input_ids"] * encoded["attention_mask"]
 
 
-def load_mardm_clip(path: Path, mean: Path, std: Path) -> MARDMClip:
-    """Loads the evaluator with the authors' weights: text_mot_match_clip/model/finest.tar, eval_mean and eval_std.
+def load_mardm_clip(folder: Path) -> MARDMClip:
+    """Loads the evaluator with the authors' weights.
+
+    Args:
+        folder: of finest.tar (from text_mot_match_clip/model), mean.npy and std.npy (eval_mean and eval_std).
 
     Raises:
         FileNotFoundError: If a file does not exist.
-        ValueError: If a file is damaged, or belongs to another network.
+        UserError: If a file is damaged, or belongs to another network.
     """
-    network = MARDMClip(read_statistics(mean), read_statistics(std))
-    return load_strictly(network, read_weights(path, "contrast_model"), path)
+    path = folder / "finest.tar"
+    return load_strictly(MARDMClip(*read_statistics(folder)), read_weights(path, "contrast_model"), path)

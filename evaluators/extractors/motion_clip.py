@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, Self
+from typing import Self
 
 import torch
 import torch.distributed
@@ -12,14 +12,15 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.distributed.nn.functional import all_gather
 
-from evaluators.extractors.released import load_strictly
+from evaluators.extractors.validation import log_validation, update_pairs
 from evaluators.metrics.alignment import MotionsForText, TextAndMotion, TextsForMotion
 from flame_mdm.batch import MotionBatch
-from flame_mdm.checkpoints.released import _ENCODER_LAYER, _count_layers, _layer_names, _renamed, _shape, released_state
+from flame_mdm.checkpoints.released_weights import ENCODER_LAYER, layer_names, load_strictly, renamed, shape_of
 from flame_mdm.conditions import ConditionEncoder
 from flame_mdm.config import Config, instantiate
 from flame_mdm.denoisers.flame import cosine_first_sinusoid
 from flame_mdm.denoisers.layers import Transformer, with_prefix
+from flame_mdm.errors import UserError
 from flame_mdm.representations import Representation
 from flame_mdm.seeds import key
 from flame_mdm.task import Task
@@ -83,11 +84,11 @@ class MotionCLIP(nn.Module):
         """Returns features (B, E) of normalized motions (B, F, D) with mask (B, F).
 
         Raises:
-            ValueError: If a motion is longer than `max_frames`.
+            UserError: If a motion is longer than `max_frames`.
         """
         lengths = mask.sum(1)
         if x.shape[1] > self.max_frames and lengths.max() > self.max_frames:
-            raise ValueError(
+            raise UserError(
                 f"a motion has {int(lengths.max())} frames, but this motion-CLIP takes at most {self.max_frames}"
             )
         x = F.pad(x[..., self.blind_features :], (self.blind_features, 0))
@@ -154,17 +155,16 @@ class PooledLoss(TextAndMotion):
     """InfoNCE in pools of 32, formed by key and thus independent of batch size and number of processes.
 
     The pairs of an incomplete last pool are compared with the last 32 pairs; fewer than 32 pairs form one smaller pool.
-    Features of motions are given scaled by the inverse temperature.
     """
 
     higher_is_better = False
 
-    def compute(self) -> float | None:
+    def update(self, generated: Tensor, text: Tensor, keys: Tensor, scale: Tensor) -> None:
+        """Adds features of motions and texts, (B, E) of length 1, with keys (B,), and the inverse temperature ()."""
+        super().update(scale * generated, text, keys)
+
+    def value(self, motion: Tensor, text: Tensor) -> float:
         """Returns the mean loss per pair, in nats."""
-        rows = self.rows("keys", "generated", "text")
-        if rows is None:
-            return None
-        motion, text = rows
         losses = []
         for begin in range(0, len(motion), POOL):
             pool = slice(max(0, min(begin, len(motion) - POOL)), begin + POOL)
@@ -199,8 +199,9 @@ class MotionCLIPTask(Task):
         super().__init__(condition, representation, optimizer=optimizer, seed=seed)
         self.network = network
         self.features = network.embedding_dim
-        self.val_loss = PooledLoss()
-        self.retrieval = nn.ModuleDict({"texts_for_motion": TextsForMotion(), "motions_for_text": MotionsForText()})
+        self.val_metrics = nn.ModuleDict(
+            {"loss": PooledLoss(), "texts_for_motion": TextsForMotion(), "motions_for_text": MotionsForText()}
+        )
 
     @classmethod
     def build(cls, config: Config, representation: Representation, *, actions: Sequence[str] = ()) -> Self:
@@ -213,12 +214,12 @@ class MotionCLIPTask(Task):
         return task
 
     @classmethod
-    def import_released(cls, checkpoint: Mapping[str, Any], config: Config) -> Self:
+    def import_released(cls, state: Mapping[str, Tensor], config: Config) -> Self:
         """Imports FLAME's released motion-CLIP into the task of a recipe with the same sizes.
 
         Args:
-            checkpoint: content of the authors' file. Its pooler, with the random weights that the network was trained
-                on, is loaded into the text encoder.
+            state: weights by the authors' names, see `released_state`. The pooler, with the random weights that the
+                network was trained on, is loaded into the text encoder.
             config: `experiments/motion_clip/humanml3d_smpl.yaml`, composed.
 
         Raises:
@@ -226,13 +227,11 @@ class MotionCLIPTask(Task):
         """
         representation: Representation = instantiate(config["representation"])
         task = cls.build(config, representation)
-        state = released_state(checkpoint, ema=False)
         theirs = "text_model.pooler.dense."
         pooler = {f"pooler_{name.removeprefix(theirs)}": state[name] for name in state if name.startswith(theirs)}
         load_strictly(task.condition, pooler, "released motion-CLIP")
-        network = import_mclip(state, num_heads=config["task"]["network"]["num_heads"])
-        load_strictly(task.network, network.state_dict(), "released motion-CLIP")
-        task.facts |= {"fingerprint": None, "max_frames": network.max_frames}
+        load_strictly(task.network, our_names(state), "released motion-CLIP")
+        task.facts |= {"fingerprint": None, "max_frames": task.network.max_frames}
         return task.eval()
 
     # Feature extraction -----------------------------------------------------------------------------------------------
@@ -265,36 +264,15 @@ class MotionCLIPTask(Task):
         )
         return loss
 
-    def on_validation_epoch_start(self) -> None:
-        """Chooses the metrics: R-precision needs 32 different captions, and is skipped on smaller sets."""
-        clips = self.trainer.datamodule.val  # type: ignore[attr-defined]
-        enough = len({clips.caption(index, number) for index, number in enumerate(clips.evaluated)}) >= POOL
-        self.measured: dict[str, Any] = dict(self.retrieval.items()) if enough else {}
-
     def validation_step(self, batch: MotionBatch, batch_idx: int) -> None:
-        """Collects the features of the validation pairs, each on one process."""
-        if self.global_rank and len(self.trainer.datamodule.val) < self.trainer.world_size:  # type: ignore[attr-defined]
-            return  # with so few clips, every process has all of them
-        assert batch.text is not None
+        """Adds the pairs of a batch to the metrics."""
         motion = F.normalize(self.network(batch.x, batch.mask), dim=-1)
         text = F.normalize(self.network.text(self.condition(batch).pooled), dim=-1)
-        keys, text_keys = (
-            torch.tensor([key(kind, name) for name in names], device=self.device)
-            for kind, names in (("motion", batch.ids), ("caption", batch.text))
-        )
-        self.val_loss.update(motion * self.network.logit_scale.exp(), text, keys)
-        for metric in self.measured.values():
-            metric.update(motion, text, text_keys, keys)
+        update_pairs(self, self.val_metrics, batch, motion, text, scale=self.network.logit_scale.exp())
 
     def on_validation_epoch_end(self) -> None:
         """Logs the loss in pools of 32, and both kinds of R-precision by cosine."""
-        loss = self.val_loss.compute()
-        if loss is not None:
-            self.log("val/loss", loss, prog_bar=True)
-        self.val_loss.reset()
-        for name, metric in self.measured.items():
-            self.log_dict({f"val/{name}_{top}": value for top, value in metric.compute().items()})
-            metric.reset()
+        log_validation(self, self.val_metrics)
 
 
 _MCLIP = {
@@ -307,34 +285,14 @@ _MCLIP = {
 }
 
 
-def import_mclip(state: Mapping[str, Tensor], *, num_heads: int = 8) -> MotionCLIP:
-    """Imports FLAME's released network, without its RoBERTa (`text_model.*`).
-
-    Args:
-        state: weights by the authors' names, as returned by `flame_mdm.checkpoints.released.released_state`.
-        num_heads: number of attention heads, 8 in the released model; it cannot be read from the weights.
+def our_names(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Returns the weights of FLAME's released network by our names, without its RoBERTa (`text_model.*`).
 
     Raises:
-        ValueError: If a weight is missing, unknown or has another shape.
+        ValueError: If a name is unknown, or there is no CLS token.
     """
     learned = {name: value for name, value in state.items() if not name.startswith("text_model.")}
-    stack = "motion_encoder.motion_encoder"
-    layers = _count_layers(learned, stack)
-    ours = _renamed(learned, {**_layer_names(stack, _ENCODER_LAYER, layers), **_MCLIP})
-    _shape(ours, "cls", ndim=3)
-    ours["cls"] = ours["cls"].flatten()
-    latent_dim, in_features = _shape(ours, "input.weight")
-    embedding_dim, text_features = _shape(ours, "text_projection.weight")
-    network = MotionCLIP(
-        in_features,
-        text_features,
-        latent_dim=latent_dim,
-        ff_size=_shape(ours, "transformer.layers.0.feed_forward.0.weight")[0],
-        num_layers=layers,
-        num_heads=num_heads,
-        dropout=0.1,
-        max_frames=_shape(ours, "length_embedding.weight")[0],
-        embedding_dim=embedding_dim,
-        blind_features=3,
-    )
-    return load_strictly(network, ours, "released motion-CLIP")
+    layers, _ = layer_names(learned, "motion_encoder.motion_encoder", ENCODER_LAYER)
+    ours = renamed(learned, {**layers, **_MCLIP})
+    shape_of(ours, "cls", ndim=3)
+    return ours | {"cls": ours["cls"].flatten()}

@@ -77,8 +77,8 @@ class CalibratedMotionCLIPTask(MotionCLIPTask):
         super().on_fit_start()
         clips = self.trainer.datamodule.train.clips  # type: ignore[attr-defined]
         self.meanings = {clip.id: key("captions", *sorted(clip.captions)) for clip in clips}
-        found = zip(clips, near_misses(clips), strict=True)
-        self.near_misses = {clip.id: list(texts.values()) for clip, texts in found}
+        pairs = zip(clips, near_misses(clips), strict=True)
+        self.near_misses = {clip.id: list(texts.values()) for clip, texts in pairs}
 
     def training_step(self, batch: MotionBatch, batch_idx: int) -> Tensor:
         """Returns the loss of one batch, with the pairs of the other processes as negatives."""
@@ -93,13 +93,10 @@ class CalibratedMotionCLIPTask(MotionCLIPTask):
             [self.meanings[name], key("caption", text)] for name, text in zip(batch.ids, batch.text, strict=True)
         ]
 
-        rows = torch.randperm(len(batch))[: (len(batch) + 1) // 2]
-        strength = torch.rand(len(rows)) ** 2
-        copies = noisy_copies(
-            self.representation, batch.x[rows.to(self.device)], batch.lengths[rows.to(self.device)], strength
-        )
-        rows, strength = rows.to(self.device), strength.to(self.device)
-        motion = self.network(torch.cat([batch.x, copies]), torch.cat([batch.mask, batch.mask[rows]]))
+        chosen = torch.randperm(len(batch))[: (len(batch) + 1) // 2].to(self.device)
+        strength = torch.rand(len(chosen)) ** 2
+        copies = noisy_copies(self.representation, batch.x[chosen], batch.lengths[chosen], strength)
+        motion = self.network(torch.cat([batch.x, copies]), torch.cat([batch.mask, batch.mask[chosen]]))
         motion, copy = motion.tensor_split([len(batch)])
         contrast = info_nce(
             motion,
@@ -108,14 +105,9 @@ class CalibratedMotionCLIPTask(MotionCLIPTask):
             meaning=torch.tensor(meaning, device=self.device),
             wrong_text=wrong_text.unflatten(0, (-1, NEAR_MISSES)),
         )
-        error = calibration_error(motion[rows], copy, strength)
-        loss = contrast + WEIGHT * error
-        values = {
-            "loss": loss,
-            "contrast": contrast,
-            "calibration_error": error,
-            "temperature": (-self.network.logit_scale).exp(),
-        }
+        error = calibration_error(motion[chosen], copy, strength.to(self.device))
+        loss, temperature = contrast + WEIGHT * error, (-self.network.logit_scale).exp()
+        values = {"loss": loss, "contrast": contrast, "calibration_error": error, "temperature": temperature}
         self.log_dict({f"train/{name}": value for name, value in values.items()}, batch_size=len(batch))
         return loss
 

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 
 import torch
 from torch import Tensor, nn
 
-from evaluators.extractors.released import load_strictly, read_weights
 from flame_mdm.representations.skeleton import SMPL24
 
 UNCONSTRAINED_JOINTS = (15, 12, 16, 18, 20, 17, 19, 21, 0, 1, 4, 7, 2, 5, 8)
@@ -158,23 +156,3 @@ class JointSTGCN(STGCN):
     def forward(self, x: Tensor, mask: Tensor) -> Tensor:
         """Returns features (B, E) of joints (B, F, J, 3) in meters, y up, with mask (B, F)."""
         return super().forward(x - x[:, :1, :1], mask)
-
-
-def load_uestc(path: str | Path) -> UESTC:
-    """Loads the classifier with the authors' weights (uestc_rot6d_stgcn.tar).
-
-    Raises:
-        FileNotFoundError: If the file does not exist.
-        ValueError: If it holds other weights.
-    """
-    return load_strictly(UESTC(), read_weights(path), path)
-
-
-def load_unconstrained(path: str | Path) -> Unconstrained:
-    """Loads the classifier with the authors' weights (humanact12_gru_modi_struct.pth.tar, not a GRU despite its name).
-
-    Raises:
-        FileNotFoundError: If the file does not exist.
-        ValueError: If it holds other weights.
-    """
-    return load_strictly(Unconstrained(), read_weights(path), path)

@@ -8,15 +8,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn.utils.rnn import pack_padded_sequence
 
-from evaluators.extractors.released import load_strictly, read_weights
 from flame_mdm.batch import pad_to
+from flame_mdm.checkpoints.released_weights import load_strictly, read_weights
 from flame_mdm.conditions.vocabulary import hashed
 from flame_mdm.data import restricted_pickle
 from flame_mdm.data.t2m import MAX_TOKENS, frame_tokens
@@ -58,30 +58,38 @@ class Words(NamedTuple):
 
 
 class WordVectors:
-    """GloVe vectors of the words in the captions of HumanML3D and KIT-ML: our_vab_data.npy and our_vab_idx.pkl.
+    """Vectors of words, such as the GloVe vectors of the captions of HumanML3D and KIT-ML.
 
-    Raises:
-        FileNotFoundError: If a file is not in `folder`.
-        ValueError: If a file does not have the expected content.
+    Args:
+        rows: row of each word.
+        vectors: (N, 300).
     """
 
-    def __init__(self, folder: str | Path):
-        folder = Path(folder)
-        for name in ("our_vab_data.npy", "our_vab_idx.pkl"):
-            if not (folder / name).is_file():
+    def __init__(self, rows: dict[str, int], vectors: Tensor):
+        self.rows, self.vectors = rows, vectors
+
+    @classmethod
+    def read(cls, folder: Path) -> Self:
+        """Reads the released vectors, our_vab_data.npy and our_vab_idx.pkl.
+
+        Raises:
+            FileNotFoundError: If a file is not in `folder`.
+            UserError: If a file does not have the expected content.
+        """
+        data, index = folder / "our_vab_data.npy", folder / "our_vab_idx.pkl"
+        for file in (data, index):
+            if not file.is_file():
                 raise FileNotFoundError(
-                    f"{folder / name}: no such file. Give the folder of the GloVe vectors released by the authors"
+                    f"{file}: no such file. Give the folder of the GloVe vectors released by the authors"
                 )
-        rows = restricted_pickle.read(folder / "our_vab_idx.pkl")
-        vectors = _read(folder / "our_vab_data.npy").astype(np.float32)
+        rows, vectors = restricted_pickle.read(index), _read_numbers(data).astype(np.float32)
         if not isinstance(rows, dict) or vectors.ndim != 2 or not {"sos", "eos", "unk"} <= rows.keys():
-            raise ValueError(f"{folder}: not the released GloVe vectors, which have sos, eos, unk and one row per word")
+            raise UserError(f"{folder}: not the released GloVe vectors, which have sos, eos, unk and one row per word")
         if not all(isinstance(row, int | np.integer) and row >= 0 for row in rows.values()):
-            raise ValueError(f"{folder / 'our_vab_idx.pkl'}: not a mapping of words to row numbers")
+            raise UserError(f"{index}: not a mapping of words to row numbers")
         if max(rows.values()) >= len(vectors):
-            raise ValueError(f"{folder / 'our_vab_data.npy'}: has {len(vectors)} rows, but the index refers to more")
-        self.rows: dict[str, int] = rows
-        self.vectors = torch.from_numpy(vectors)
+            raise UserError(f"{data}: has {len(vectors)} rows, but the index refers to more")
+        return cls(rows, torch.from_numpy(vectors))
 
     def __call__(self, captions: Sequence[Sequence[str]], *, full_length: bool = False) -> Words:
         """Returns the text encoder's input for captions.
@@ -153,7 +161,6 @@ class T2MEvaluator(nn.Module):
         motion_hidden: int = 1024,
         embedding: int = 512,
         max_frames: int = 196,
-        keep_padding: bool = False,
         used_features: int | None = None,
     ):
         """Builds the networks; widths are those of the released weights.
@@ -167,13 +174,11 @@ class T2MEvaluator(nn.Module):
             motion_hidden: width of the motion GRU.
             embedding: E, width of the joint space.
             max_frames: length to which every motion is padded.
-            keep_padding: legacy option of MDM's code, which always samples 196 frames: the network sees the frames past
-                the end of a motion.
             used_features: number of features that the network sees, from the first; MARDM's sees 67 (KIT: 64). None =
                 all but the contacts.
         """
         super().__init__()
-        self.features, self.max_frames, self.keep_padding = embedding, max_frames, keep_padding
+        self.features, self.max_frames = embedding, max_frames
         self.register_buffer("mean", mean.float())
         self.register_buffer("std", std.float())
         self.used = used_features or len(mean) - CONTACTS
@@ -185,18 +190,16 @@ class T2MEvaluator(nn.Module):
         """Returns embeddings (B, E) of motions (B, F, D) in the data's units, with mask (B, F).
 
         Raises:
-            ValueError: If a motion is shorter than 4 frames or longer than `max_frames`.
+            UserError: If a motion is shorter than 4 frames or longer than `max_frames`.
         """
         lengths = mask.sum(1)
         if lengths.min() < UNIT or lengths.max() > self.max_frames:
-            raise ValueError(
+            raise UserError(
                 f"the T2M evaluator takes motions of {UNIT} to {self.max_frames} frames, "
                 f"but these have {int(lengths.min())} to {int(lengths.max())}"
             )
         used = slice(self.used)
-        x = (x[..., used] - self.mean[used]) / self.std[used]
-        if not self.keep_padding:
-            x = x * mask[..., None]
+        x = (x[..., used] - self.mean[used]) / self.std[used] * mask[..., None]
         x = pad_to(x[:, : self.max_frames], self.max_frames)
         with torch.no_grad():  # it is frozen when texts and motions are matched
             movements = self.movement_encoder(x)
@@ -261,44 +264,39 @@ class _TextEncoder(_Recurrent):
         return super().forward(vectors + self.pos_emb(parts), lengths)
 
 
-def _read(path: Path) -> np.ndarray:
+def _read_numbers(path: Path) -> np.ndarray:
     """Returns the array of an .npy file of real numbers; errors name the file."""
     try:
         array = read_npy(path)
-        if array.dtype.kind not in "fiu":
-            raise ValueError(f"an array of {array.dtype}, not of numbers")
-        return array
     except UserError:
         raise
     except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
+        raise UserError(f"{path}: {error}") from error
+    if array.dtype.kind not in "fiu":
+        raise UserError(f"{path}: an array of {array.dtype}, not of numbers")
+    return array
 
 
-def read_statistics(path: Path) -> Tensor:
-    """Reads a mean or std (D,) that was released with an evaluator."""
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file. The evaluator needs the statistics released with it")
-    return torch.from_numpy(_read(path))
+def read_statistics(folder: Path) -> list[Tensor]:
+    """Reads mean.npy and std.npy (D,) that were released with an evaluator."""
+    return [torch.from_numpy(_read_numbers(folder / name)) for name in ("mean.npy", "std.npy")]
 
 
-def load_t2m(path: str | Path, mean: str | Path, std: str | Path, **options: Any) -> T2MEvaluator:
+def load_t2m(folder: Path) -> T2MEvaluator:
     """Loads the evaluator with the authors' weights.
 
     Args:
-        path: text_mot_match/model/finest.tar of t2m or kit.
-        mean: the evaluator's mean.npy; in MDM, t2m_mean.npy or kit_mean.npy; in MARDM, eval_mean.npy, whose 67 or 64
-            features tell its evaluator apart.
-        std: its std.npy.
-        options: of `T2MEvaluator`.
+        folder: of finest.tar (text_mot_match/model/finest.tar of t2m or kit), and its mean.npy and std.npy; in MDM,
+            these are t2m_mean.npy or kit_mean.npy; in MARDM, eval_mean.npy, whose 67 or 64 features tell its evaluator
+            apart.
 
     Raises:
         FileNotFoundError: If a file does not exist.
-        ValueError: If a file is damaged, or belongs to another data set.
+        UserError: If a file is damaged, or belongs to another data set.
     """
-    statistics = [read_statistics(Path(file)) for file in (mean, std)]
-    if len(statistics[0]) in (67, 64):  # MARDM's
-        options["used_features"] = len(statistics[0])
-    network = T2MEvaluator(*statistics, **options)
+    mean, std = read_statistics(folder)
+    network = T2MEvaluator(mean, std, used_features=len(mean) if len(mean) in (67, 64) else None)
+    path = folder / "finest.tar"
     for name in ("movement_encoder", "text_encoder", "motion_encoder"):
         load_strictly(network.get_submodule(name), read_weights(path, name), path)
     return network.eval()

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Self
+from typing import Self
 
 import torch
 from torch import Tensor, nn
 from torchmetrics import MeanMetric
 
 from evaluators.extractors.t2m import UNIT, LearnedWords, T2MEvaluator, WordVectors
+from evaluators.extractors.validation import log_validation, update_pairs
 from evaluators.metrics.alignment import MotionsForText, MultimodalDistance, TextAndMotion
 from flame_mdm.batch import MotionBatch
 from flame_mdm.conditions import Unconditional
@@ -21,9 +22,6 @@ from flame_mdm.errors import UserError
 from flame_mdm.representations import Representation
 from flame_mdm.seeds import key
 from flame_mdm.task import Task
-
-POOL = 32
-"""Pairs per pool in which validation ranks, as in R-precision."""
 
 
 class _MovementDecoder(nn.Module):
@@ -43,13 +41,6 @@ class _MovementDecoder(nn.Module):
     def forward(self, latents: Tensor) -> Tensor:
         """(B, N, latent) -> (B, 4 N, out_features)."""
         return self.out_net(self.main(self.in_net(latents).transpose(1, 2)).transpose(1, 2))
-
-
-class _SavedWords(WordVectors):
-    """Word vectors from a checkpoint."""
-
-    def __init__(self, rows: dict[str, int], vectors: Tensor):
-        self.rows, self.vectors = rows, vectors
 
 
 def matching_loss(motion: Tensor, text: Tensor, margin: float, fits: Tensor | None = None) -> Tensor:
@@ -82,17 +73,13 @@ class MatchingLoss(TextAndMotion):
 
     higher_is_better = False
 
-    def __init__(self, margin: float, **kwargs: Any):
-        super().__init__(**kwargs)
+    def __init__(self, margin: float):
+        super().__init__()
         self.margin = margin
 
-    def compute(self) -> float | None:
+    def value(self, motion: Tensor, text: Tensor) -> float | None:
         """Returns the loss; None with fewer than two pairs."""
-        rows = self.rows("keys", "generated", "text")
-        if rows is None or len(rows[0]) < 2:
-            return None
-        motion, text = rows
-        return matching_loss(motion, text, self.margin).item()
+        return matching_loss(motion, text, self.margin).item() if len(motion) > 1 else None
 
 
 class T2MTask(Task):
@@ -141,8 +128,8 @@ class T2MTask(Task):
         self.sparsity, self.smoothness, self.margin = sparsity, smoothness, margin
         self.words: WordVectors | LearnedWords | None = LearnedWords() if words == "learned" else None
         self.tokens: dict[str, dict[str, list[str]]] = {}  # of the captions of each clip
-        self.val_loss, self.val_reconstruction = MatchingLoss(margin), MeanMetric()
-        self.retrieval, self.distance = MotionsForText(POOL), MultimodalDistance()
+        pairs = {"loss": MatchingLoss(margin), "mm_dist": MultimodalDistance(), "motions_for_text": MotionsForText()}
+        self.val_metrics = nn.ModuleDict(pairs | {"reconstruction": MeanMetric()})
 
     @classmethod
     def build(cls, config: Config, representation: Representation, *, actions: Sequence[str] = ()) -> Self:
@@ -158,8 +145,8 @@ class T2MTask(Task):
         """Sets up the task, reads the word vectors, and collects the tagged words of all captions.
 
         Raises:
-            FileNotFoundError, ValueError: If the word vectors do not exist, or are damaged.
-            UserError: If captions have no tagged words, or the batch size is less than 2.
+            FileNotFoundError: If the word vectors do not exist.
+            UserError: If they are damaged, captions have no tagged words, or the batch size is less than 2.
         """
         super().setup(stage)
         data: MotionDataModule = self.trainer.datamodule  # type: ignore[attr-defined]
@@ -170,7 +157,7 @@ class T2MTask(Task):
                 raise FileNotFoundError(
                     f"task.words={self.word_folder}: no such folder. Give that of our_vab_data.npy and our_vab_idx.pkl"
                 )
-            self.words = WordVectors(self.word_folder)
+            self.words = WordVectors.read(Path(self.word_folder))
             self.facts["words"] = {str(word): int(row) for word, row in self.words.rows.items()}
         self.network.mean.copy_(self.representation.mean)
         self.network.std.copy_(self.representation.std)
@@ -182,10 +169,9 @@ class T2MTask(Task):
         bare = [name for name, tokens in self.tokens.items() if not tokens]
         if bare:
             raise UserError(
-                f"{data.folder}: {len(bare)} clips have no captions with tagged words, such as {bare[0]}. This "
-                "evaluator needs a data set with tagged words, such as HumanML3D or KIT-ML, or task.words=learned"
-                if not self.learns_words
-                else f"{data.folder}: {len(bare)} clips have no captions, such as {bare[0]}"
+                f"{data.folder}: {len(bare)} clips have no captions"
+                f"{'' if self.learns_words else ' with tagged words'}, such as {bare[0]}. Choose a data "
+                "set with captions; tagged words, as in HumanML3D and KIT-ML, are not needed with task.words=learned"
             )
 
     @property
@@ -207,7 +193,7 @@ class T2MTask(Task):
             return
         if isinstance(self.words, WordVectors) and not torch.equal(self.words.vectors, state.cpu()):
             raise UserError(f"task.words={self.word_folder}: these are not the word vectors that this run began with")
-        self.words = _SavedWords(self.facts["words"], state.cpu())
+        self.words = WordVectors(self.facts["words"], state.cpu())
 
     # Feature extraction -----------------------------------------------------------------------------------------------
 
@@ -274,29 +260,10 @@ class T2MTask(Task):
         return self(self.representation.denormalize(batch.x), batch.mask), self.text(tokens)
 
     def validation_step(self, batch: MotionBatch, batch_idx: int) -> None:
-        """Collects the embeddings of the validation pairs, each on one process."""
-        if self.global_rank and len(self.trainer.datamodule.val) < self.trainer.world_size:  # type: ignore[attr-defined]
-            return  # with so few clips, every process has all of them
-        keys = torch.tensor([key("motion", name) for name in batch.ids], device=self.device)
-        texts = torch.tensor([key("caption", text) for text in batch.text or ()], device=self.device)
-        motion, text = self._embed(batch)
-        self.val_loss.update(motion, text, keys)
-        self.retrieval.update(motion, text, texts, keys)
-        self.distance.update(motion, text, keys)
-        self.val_reconstruction.update(self._reconstruct(batch)["reconstruction"])
+        """Adds the pairs of a batch to the metrics."""
+        update_pairs(self, self.val_metrics, batch, *self._embed(batch))
+        self.val_metrics["reconstruction"].update(self._reconstruct(batch)["reconstruction"])  # type: ignore[operator]
 
     def on_validation_epoch_end(self) -> None:
-        """Logs the matching loss in both stages of training, so that the best checkpoint is from the second.
-
-        R-precision needs 32 motions, and is skipped on smaller sets.
-        """
-        values: dict[str, float | None] = {"loss": self.val_loss.compute(), "mm_dist": self.distance.compute()}
-        if len(self.trainer.datamodule.val) >= POOL:  # type: ignore[attr-defined]
-            values |= {f"motions_for_text_{top}": value for top, value in self.retrieval.compute().items()}
-        for name, value in values.items():
-            if value is not None:
-                self.log(f"val/{name}", value, prog_bar=name == "loss")
-        if values["mm_dist"] is not None:
-            self.log("val/reconstruction", self.val_reconstruction.compute())
-        for metric in (self.val_loss, self.retrieval, self.distance, self.val_reconstruction):
-            metric.reset()
+        """Logs the matching loss in both stages of training, so that the best checkpoint is from the second."""
+        log_validation(self, self.val_metrics)

@@ -218,8 +218,8 @@ class TMRRetrieval(CaptionMetric):
     def _dissimilar(self, meaning: Tensor) -> Tensor:
         """Returns the indices of the dissimilar motions, among all sorted by key; none without an encoder or ids."""
         if self.ids is not None:
-            keys = torch.cat(list(self.keys)).sort().values
-            return torch.isin(keys, torch.tensor(self.ids)).nonzero()[:, 0]
+            rows = self.rows("keys", "keys") or [torch.zeros(0, dtype=torch.long)]
+            return torch.isin(rows[0], torch.tensor(self.ids)).nonzero()[:, 0]
         if not meaning.shape[1]:
             return torch.zeros(0, dtype=torch.long)
         chosen = [0]

@@ -1,0 +1,167 @@
+"""Weights of files that the authors of a paper released: reading them, renaming them, and loading all of them."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+import torch
+from torch import Tensor, nn
+
+from flame_mdm.errors import UserError
+from flame_mdm.safe_io import check_torch
+
+Network = TypeVar("Network", bound=nn.Module)
+
+_LAYER = {
+    "self_attn.in_proj_": "self_attention.qkv.",
+    "self_attn.out_proj.": "self_attention.out.",
+    "multihead_attn.in_proj_": "cross_attention.qkv.",
+    "multihead_attn.out_proj.": "cross_attention.out.",
+    "linear1.": "feed_forward.0.",
+    "linear2.": "feed_forward.3.",
+    "norm1.": "self_norm.",
+}
+ENCODER_LAYER = {**_LAYER, "norm2.": "feed_forward_norm."}
+"""Prefixes of torch's names in a layer of `nn.TransformerEncoder` -> those in a layer of our `Transformer`."""
+DECODER_LAYER = {**_LAYER, "norm2.": "cross_norm.", "norm3.": "feed_forward_norm."}
+"""The same for `nn.TransformerDecoder`."""
+
+
+def read_released(path: Path, *, run_code: bool = False, advice: str = "Save only its state dict") -> Mapping[str, Any]:
+    """Reads the content of a released file.
+
+    Args:
+        path: the file.
+        run_code: whether to load pickles that hold more than weights, which runs any code in them.
+        advice: what to do about a file with other objects than plain weights.
+
+    Raises:
+        FileNotFoundError: If the file does not exist.
+        UserError: If it is damaged, or holds other objects than plain weights.
+    """
+    try:
+        check_torch(path)
+        content = torch.load(path, map_location="cpu", weights_only=not run_code)
+    except (FileNotFoundError, UserError):
+        raise
+    except ImportError as error:
+        raise UserError(f"{path}: {error}. The objects in this file need this package: install it") from error
+    except Exception as error:  # torch raises many kinds for damaged files
+        unsafe = re.search(r"Unsupported global: GLOBAL (\S+)", str(error))
+        if unsafe is None:
+            raise UserError(f"{path}: damaged, or not a PyTorch file. Download it again") from error
+        raise UserError(
+            f"{path}: holds Python objects ({unsafe[1]}) besides the weights, as old Lightning files do. Reading them "
+            f"can run any code. {advice}"
+        ) from error
+    if not isinstance(content, Mapping):
+        raise UserError(f"{path}: holds a {type(content).__name__}, not the weights of a released model")
+    return content
+
+
+def read_weights(path: Path, key: str | None = None) -> dict[str, Tensor]:
+    """Reads a state dict from a released file, without running code in it.
+
+    Args:
+        path: the file.
+        key: key of the state dict in the file; None = the file is the state dict.
+
+    Raises:
+        FileNotFoundError: If the file does not exist.
+        UserError: If it is damaged, holds more than plain values and tensors, or lacks `key`.
+    """
+    content = read_released(path)
+    state = content if key is None else content.get(key)
+    if not isinstance(state, Mapping) or not all(isinstance(value, Tensor) for value in state.values()):
+        raise UserError(f"{path}: contains no weights{f' under {key!r}' if key else ''}, but {_listed(content)}")
+    return dict(state)
+
+
+def released_state(checkpoint: Mapping[str, Any], *, ema: bool = True) -> dict[str, Tensor]:
+    """Finds the network's state dict in the content of a released file of MDM, MFM or FLAME.
+
+    Args:
+        checkpoint: a flat state dict (MDM, MFM), {"model", "model_avg"} (MDM trained with `--use_ema`) or FLAME's
+            Lightning checkpoint with "state_dict".
+        ema: whether to use averaged weights if the file has them, as in the authors' evaluation.
+
+    Raises:
+        ValueError: If the file has none of these layouts.
+    """
+    prefixes = ("ema_model.model.", "net.") if ema else ("net.",)
+    if "model_avg" in checkpoint:
+        state, prefixes = checkpoint.get("model_avg" if ema else "model"), ()
+    else:
+        state = checkpoint.get("state_dict", checkpoint)
+    if not isinstance(state, Mapping) or not all(isinstance(key, str) for key in state):
+        state = {}
+    inner = [{k.removeprefix(p): v for k, v in state.items() if k.startswith(p)} for p in prefixes]
+    state = next(filter(None, inner), state)
+    if not state or not all(isinstance(value, Tensor) for value in state.values()):
+        raise ValueError(
+            "not a released checkpoint: expected a state dict, 'model' and 'model_avg', or 'state_dict', but it has "
+            + (_listed(checkpoint) or "nothing")
+        )
+    return dict(state)
+
+
+def layer_names(state: Mapping[str, Tensor], stack: str, layer: Mapping[str, str]) -> tuple[dict[str, str], int]:
+    """Returns the prefixes of all layers of a torch transformer -> those of ours, and the number of layers."""
+    count = sum(key.startswith(f"{stack}.layers.") and key.endswith(".norm1.weight") for key in state)
+    prefixes = ((f"{stack}.layers.{i}.", f"transformer.layers.{i}.") for i in range(count))
+    return {theirs + a: ours + b for theirs, ours in prefixes for a, b in layer.items()}, count
+
+
+def renamed(state: Mapping[str, Tensor], prefixes: Mapping[str, str]) -> dict[str, Tensor]:
+    """Replaces the prefix of every name.
+
+    Raises:
+        ValueError: If a name has none of the prefixes.
+    """
+    result, unknown = {}, []
+    for key, value in state.items():
+        theirs = next((prefix for prefix in prefixes if key.startswith(prefix)), None)
+        if theirs is None:
+            unknown.append(key)
+        else:
+            result[prefixes[theirs] + key.removeprefix(theirs)] = value
+    if unknown:
+        raise ValueError(f"released weights: unknown keys {_listed(unknown)}: not a network of this kind")
+    return result
+
+
+def shape_of(state: Mapping[str, Tensor], key: str, ndim: int = 2) -> torch.Size:
+    """Returns the shape of a weight.
+
+    Raises:
+        ValueError: If it is missing, or has another number of dimensions.
+    """
+    if key not in state:
+        raise ValueError(f"released weights: {key} is missing: not a network of this kind, or a damaged file")
+    if state[key].ndim != ndim:
+        raise ValueError(f"released weights: {key} has shape {tuple(state[key].shape)}, not {ndim} dimensions")
+    return state[key].shape
+
+
+def load_strictly(
+    network: Network, state: Mapping[str, Tensor], source: str | Path, *, assign: bool = False
+) -> Network:
+    """Loads all weights into a network, and returns it in evaluation mode; `assign` as for `load_state_dict`.
+
+    Raises:
+        UserError: If a weight is missing, unknown or has another shape; the message begins with `source`.
+    """
+    try:
+        network.load_state_dict(state, strict=True, assign=assign)
+    except RuntimeError as error:
+        lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+        raise UserError(f"{source}: not the weights of {type(network).__name__}: {lines[1]}") from error
+    return network.eval()
+
+
+def _listed(keys: Iterable[Any]) -> str:
+    names = sorted(map(str, keys))
+    return ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
-from support.fixtures import GOLDEN, Arrays, golden, meta
+from support.fixtures import GOLDEN, Arrays, golden, meta, weights
 
 from flame_mdm.__main__ import main
 from flame_mdm.batch import Condition, MotionBatch
@@ -37,10 +37,6 @@ MDM = [
 DTYPES = [torch.float32, torch.float64]
 NORMALIZED = ("humanml", "kit")
 WIDTHS = {263: "humanml", 251: "kit", 150: "humanact12"}
-
-
-def weights(arrays: Arrays) -> dict[str, torch.Tensor]:
-    return {key.removeprefix("state/"): torch.from_numpy(v) for key, v in arrays.items() if key.startswith("state/")}
 
 
 def statistics_folder(folder: Path, features: int) -> Path:

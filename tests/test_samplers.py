@@ -25,7 +25,7 @@ from support.analytic import (
     sample,
     spaced,
 )
-from support.fixtures import Arrays, golden, groups, meta
+from support.fixtures import Arrays, golden, groups, meta, weights
 from torch import Tensor
 from torchdiffeq import odeint
 
@@ -255,10 +255,6 @@ def test_flow_run(case):
 
 
 # Loops of the authors' networks ---------------------------------------------------------------------------------------
-
-
-def weights(arrays: Arrays) -> dict[str, Tensor]:
-    return {key.removeprefix("state/"): torch.from_numpy(v) for key, v in arrays.items() if key.startswith("state/")}
 
 
 def built(released: Released) -> Denoise:

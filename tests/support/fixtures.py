@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 from flame_mdm.config import compose, recipes
 from flame_mdm.safe_io import write_json
@@ -75,3 +76,14 @@ def meta(arrays: Arrays) -> dict:
 def groups(arrays: Arrays, suffix: str) -> list[str]:
     """The cases of a fixture: every prefix P with a key `P/suffix`."""
     return sorted(key.removesuffix(f"/{suffix}") for key in arrays if key.endswith(f"/{suffix}"))
+
+
+def weights(arrays: Arrays, prefix: str = "state/") -> dict[str, torch.Tensor]:
+    """The state dict of a fixture."""
+    return {name.removeprefix(prefix): torch.from_numpy(x) for name, x in arrays.items() if name.startswith(prefix)}
+
+
+def assert_within(ours: torch.Tensor, arrays: Arrays, name: str, like: str | None = None) -> None:
+    """Within ten times of what the authors' float32 differs from their float64."""
+    tolerance = 10 * meta(arrays)["max_abs_diff_f32_vs_f64"][like or name][0]
+    torch.testing.assert_close(ours, torch.from_numpy(arrays[name]), atol=tolerance, rtol=0)

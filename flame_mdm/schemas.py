@@ -76,7 +76,7 @@ class Data(Schema):
     representation: str = ""
 
 
-class Extractor(Schema):
+class ExtractorRecord(Schema):
     """The feature extractor."""
 
     sha256: str
@@ -129,7 +129,7 @@ class Result(Schema):
     split: str
     data: Data
     seed: Int
-    extractor: Extractor | None
+    extractor: ExtractorRecord | None
     checkpoint: Checkpoint | None
     device: str
     values: dict[str, Value | None] | None
@@ -172,7 +172,7 @@ class AuditedPerturbation(ClosedSchema):
     grades: Annotated[list[AuditedGrade], Field(min_length=1)]
 
 
-class AuditedExtractor(Extractor):
+class AuditedExtractor(ExtractorRecord):
     """The extractor of an audit, by its recipe or file."""
 
     name: str

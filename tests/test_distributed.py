@@ -116,9 +116,8 @@ def test_motion_clip_keeps_fewer_pairs_than_processes_once_each(clips, kept):
         task = MotionCLIPTask.build(config, instantiate(config["representation"]))
         data = SimpleNamespace(val=range(clips))
         task.trainer = SimpleNamespace(global_rank=rank, world_size=2, datamodule=data)  # type: ignore[assignment]
-        task.measured = {}
         task.eval().validation_step(batch, 0)
-        assert len(torch.cat([torch.empty(0), *cast(list, task.val_loss.keys)])) == kept[rank]
+        assert len(torch.cat([torch.empty(0), *cast(list, task.val_metrics["loss"].keys)])) == kept[rank]
 
 
 def test_processes_are_started_with_the_words_of_one_job(tiny, tmp_path, monkeypatch):

@@ -50,8 +50,8 @@ def test_windows_of_training_motions_have_distance_zero():
     motions = [walk(seed, frames) for seed, frames in enumerate((30, 50, 41))]
     features = torch.randn(3, 5, generator=torch.Generator().manual_seed(0))
     copies = [moved(motions[1][7:43], 0.8, (3, 4)), motions[2], motions[0][:24]]
-    found = training(motions, features).nearest(copies, features[[1, 2, 0]])
-    torch.testing.assert_close(found, torch.zeros(3, 2).to(found), atol=1e-9, rtol=0)
+    distances = training(motions, features).nearest(copies, features[[1, 2, 0]])
+    torch.testing.assert_close(distances, torch.zeros(3, 2).to(distances), atol=1e-9, rtol=0)
 
 
 def test_nearest_is_that_of_all_windows():
@@ -59,9 +59,9 @@ def test_nearest_is_that_of_all_windows():
     # A window across the end of a motion is none; the third motion is too short for the second query.
     across = torch.cat([motions[0][-12:], motions[1][:13]])
     queries = [walk(9, 20), walk(8, 28), across]
-    found = training(motions).nearest(queries, None)
-    assert found.shape == (3, 1)
-    for query, distance in zip(queries, found[:, 0], strict=True):
+    distances = training(motions).nearest(queries, None)
+    assert distances.shape == (3, 1)
+    for query, distance in zip(queries, distances[:, 0], strict=True):
         compared = poses(query, FACING)[::STEP].numpy()
         windows = [
             poses(motion, FACING)[first : first + len(query) : STEP].numpy()
@@ -81,10 +81,7 @@ def test_copies_are_counted():
     assert metric.compute() == {"joints": pytest.approx(0.3), "features": None, "copies": 0.4}
     itself = NearestTraining()
     itself.update(torch.arange(100), real.expand(-1, 2), real.expand(-1, 2))
-    values = itself.compute()
-    assert values["copies"] == 0.01
-    assert values["features"] == pytest.approx(0.15)
-    assert NearestTraining().compute() == {"joints": None, "features": None, "copies": None}
+    assert itself.compute() == {"joints": pytest.approx(0.15), "features": pytest.approx(0.15), "copies": 0.01}
 
 
 def raised(side: str, turn: float) -> np.ndarray:
@@ -107,14 +104,14 @@ def test_sides_are_read_from_the_motion():
         assert read_side(right, content, 20) == "right"
     metric = SideAccuracy(fps=20)
     joints = torch.from_numpy(np.stack([left, left, right, right]))
-    wanted = [
+    requested = [
         ("bye", "left"),
         ("walk-turn-right", "right"),
         ("raise-up-right-hand", "right"),
         ("wave-both-hands", "both"),
     ]
-    metric.update(joints, torch.ones(4, 40, dtype=torch.bool), wanted)
+    metric.update(joints, torch.ones(4, 40, dtype=torch.bool), requested)
     assert metric.compute() == {"hand": 1.0, "path": 0.0, "hand_or_path": pytest.approx(2 / 3)}
-    metric.reset()
+    metric = SideAccuracy(fps=20)
     metric.update(joints[:1], torch.ones(1, 40, dtype=torch.bool), [("walk", "")])
     assert metric.compute() == {"hand": None, "path": None, "hand_or_path": None}

@@ -8,17 +8,18 @@ from itertools import islice
 import pytest
 import torch
 from support.distributed import GlooPool
-from support.fixtures import GOLDEN, Arrays, golden, meta
+from support.fixtures import GOLDEN, assert_within, golden, meta, weights
 from torch.nn import functional
 
 from evaluators.extractors import MotionCLIPExtractor
-from evaluators.extractors.motion_clip import MotionCLIP, MotionCLIPTask, PooledLoss, import_mclip, info_nce
+from evaluators.extractors.motion_clip import MotionCLIP, MotionCLIPTask, PooledLoss, info_nce, our_names
 from evaluators.extractors.motion_clip_calibrated import CalibratedMotionCLIPTask, calibration_error, noisy_copies
 from flame_mdm.__main__ import main
 from flame_mdm.batch import length_mask
 from flame_mdm.checkpoints.hub import export
 from flame_mdm.checkpoints.loading import load, load_task
 from flame_mdm.checkpoints.model_files import read_checkpoint
+from flame_mdm.checkpoints.released_weights import load_strictly
 from flame_mdm.conditions.text import PretrainedText
 from flame_mdm.config import compose, instantiate
 from flame_mdm.data.synthetic import Synthetic
@@ -35,38 +36,43 @@ def network(in_features: int = 7, **options) -> MotionCLIP:
     return MotionCLIP(in_features, 10, dropout=0.0, **SMALL, **options).eval()
 
 
-def weights(arrays: Arrays) -> dict[str, torch.Tensor]:
-    return {name.removeprefix("state/"): torch.from_numpy(v) for name, v in arrays.items() if name.startswith("state/")}
-
-
-OUTPUTS = ["motion_feat", "motion_feat_shifted_translation", "text_feat", "motion_feat_l2_norm", "text_feat_l2_norm"]
-OUTPUTS += ["logits_per_motion", "logits_per_text", "loss"]
-
-
 @pytest.mark.golden
-@pytest.mark.parametrize("name", [pytest.param(name, id=f"flame_mclip-{name}") for name in OUTPUTS])
-def test_released_weights_give_the_authors_outputs(name):
-    arrays = golden("flame_mclip")
-    options = meta(arrays)
-    clip = import_mclip(weights(arrays), num_heads=options["config"]["heads"])
+@pytest.mark.parametrize("stem", ["flame_mclip"])
+def test_released_weights_give_the_authors_outputs(stem):
+    arrays = golden(stem)
+    state = our_names(weights(arrays) | {"text_model.encoder.weight": torch.zeros(1)})
+    (embedding, texts), (width, features) = state["text_projection.weight"].shape, state["input.weight"].shape
+    clip = MotionCLIP(
+        features,
+        texts,
+        latent_dim=width,
+        ff_size=len(state["transformer.layers.0.feed_forward.0.weight"]),
+        num_layers=len({name.split(".")[2] for name in state if name.startswith("transformer.layers.")}),
+        num_heads=meta(arrays)["config"]["heads"],
+        dropout=0.1,
+        max_frames=len(state["length_embedding.weight"]),
+        embedding_dim=embedding,
+        blind_features=3,
+    )
+    load_strictly(clip, state, stem)
     x = torch.from_numpy(arrays["in/motion"]).transpose(1, 2)
     mask = length_mask(torch.from_numpy(arrays["in/motion_length"]), x.shape[1])
     with torch.no_grad():
         motion, text = clip(x, mask), clip.text(torch.from_numpy(arrays["lm/pooler_output"]))
-        shifted = clip(x + torch.arange(x.shape[2]).lt(3) * 5.0, mask)
-        logits = clip.logit_scale.exp() * functional.normalize(motion, dim=1) @ functional.normalize(text, dim=1).T
+        unit_motion, unit_text = functional.normalize(motion, dim=1), functional.normalize(text, dim=1)
+        logits = clip.logit_scale.exp() * unit_motion @ unit_text.T
         ours = {
             "motion_feat": motion,
-            "motion_feat_shifted_translation": shifted,
+            "motion_feat_shifted_translation": clip(x + torch.arange(x.shape[2]).lt(3) * 5.0, mask),
             "text_feat": text,
-            "motion_feat_l2_norm": functional.normalize(motion, dim=1),
-            "text_feat_l2_norm": functional.normalize(text, dim=1),
+            "motion_feat_l2_norm": unit_motion,
+            "text_feat_l2_norm": unit_text,
             "logits_per_motion": logits,
             "logits_per_text": logits.T,
             "loss": info_nce(motion, text, clip.logit_scale),
-        }[name]
-    tolerance = 10 * options["max_abs_diff_f32_vs_f64"][f"out/{name}"][0]
-    torch.testing.assert_close(ours, torch.from_numpy(arrays[f"out/{name}"]), atol=tolerance, rtol=0)
+        }
+    for name, value in ours.items():
+        assert_within(value, arrays, f"out/{name}")
 
 
 @pytest.mark.golden
@@ -76,49 +82,36 @@ def test_the_temperature_starts_where_the_authors_start_it(stem):
     assert network().logit_scale.item() == pytest.approx(math.log(1 / 0.07))
 
 
-@pytest.mark.golden
-@pytest.mark.parametrize("stem", ["flame_mclip"])
-def test_the_import_takes_every_weight_exactly_once(stem):
-    state = weights(golden(stem))
-    import_mclip({**state, "text_model.encoder.weight": torch.zeros(1)})
-    for name in ("motion_encoder.CLS_TOKEN", "lm_projection.bias", "motion_encoder.motion_encoder.layers.0.norm2.bias"):
-        with pytest.raises(ValueError, match="released"):
-            import_mclip({k: v for k, v in state.items() if k != name})
-    with pytest.raises(ValueError, match="unknown keys extra"):
-        import_mclip({**state, "extra": torch.zeros(1)})
-
-
-@pytest.mark.golden
-@pytest.mark.parametrize("stem", ["state_dict_manifest-flame_mclip_net"])
-def test_the_recipe_has_the_sizes_of_the_released_network(stem):
-    manifest = json.loads((GOLDEN / "state_dict_manifest.json").read_text())["flame_mclip_net"]
-    shapes = {name: shape for name, shape in manifest["keys"].items() if not name.startswith("text_model.")}
-    released = import_mclip({name: torch.zeros(shape) for name, shape in shapes.items()})
-    recipe = compose("motion_clip/humanml3d_smpl")["task"]["network"]
-    ours = instantiate(recipe, in_features=147, text_features=768)
-    assert {n: v.shape for n, v in ours.state_dict().items()} == {n: v.shape for n, v in released.state_dict().items()}
-    assert ours.blind_features == released.blind_features
-    assert ours.transformer.layers[0].self_attention.num_heads == 8
-    assert recipe["dropout"] == 0.1
-
-
-@pytest.fixture
 def released() -> dict[str, torch.Tensor]:
     """Random weights by the names and sizes of the released file."""
     manifest = json.loads((GOLDEN / "state_dict_manifest.json").read_text())["flame_mclip_net"]
     torch.manual_seed(0)
     shapes = {name: shape for name, shape in manifest["keys"].items() if not name.startswith("text_model.")}
     shapes |= {"text_model.pooler.dense.weight": [768, 768], "text_model.pooler.dense.bias": [768]}
-    state = {f"net.{name}": 0.05 * torch.randn(shape) for name, shape in shapes.items()}
-    return state | {"net.text_model.embeddings.word_embeddings.weight": torch.randn(5, 768)}
+    state = {name: 0.05 * torch.randn(shape) for name, shape in shapes.items()}
+    return state | {"text_model.embeddings.word_embeddings.weight": torch.randn(5, 768)}
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize("stem", ["state_dict_manifest-flame_mclip_net"])
+def test_the_recipe_takes_every_weight_of_the_released_network(stem):
+    recipe = compose("motion_clip/humanml3d_smpl")["task"]["network"]
+    ours, state = instantiate(recipe, in_features=147, text_features=768), released()
+    load_strictly(ours, our_names(state), "released")
+    assert (ours.blind_features, ours.transformer.layers[0].self_attention.num_heads, recipe["dropout"]) == (3, 8, 0.1)
+    for name in ("motion_encoder.CLS_TOKEN", "lm_projection.bias", "motion_encoder.motion_encoder.layers.0.norm2.bias"):
+        with pytest.raises(ValueError, match="released"):
+            load_strictly(ours, our_names({k: v for k, v in state.items() if k != name}), "released")
+    with pytest.raises(ValueError, match="unknown keys extra"):
+        our_names({**state, "extra": torch.zeros(1)})
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("stem", ["state_dict_manifest-flame_mclip_net"])
-def test_the_released_file_becomes_an_extractor(stem, released, tmp_path, monkeypatch, capsys):
+def test_the_released_file_becomes_an_extractor(stem, tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("FLAME_MDM_DATA", str(tmp_path / "own"))
-    file, out = tmp_path / "mclip.ckpt", tmp_path / "mclip.safetensors"
-    torch.save({"state_dict": released, "epoch": 3}, file)
+    file, out, state = tmp_path / "mclip.ckpt", tmp_path / "mclip.safetensors", released()
+    torch.save({"state_dict": {f"net.{name}": value for name, value in state.items()}, "epoch": 3}, file)
     with pytest.raises(UserError, match=r"mclip\.ckpt: not a checkpoint .* `flame-mdm import`"):
         MotionCLIPExtractor(str(file))
     assert main(["import", "mclip", str(file), f"out={out}"]) == 0, capsys.readouterr().err
@@ -129,32 +122,26 @@ def test_the_released_file_becomes_an_extractor(stem, released, tmp_path, monkey
     with pytest.raises(UserError, match="trained on smpl"):
         extractor.check(instantiate(compose("kit/mdm")["representation"]), "kit")
 
-    condition = extractor.task.condition
+    condition, clip = extractor.task.condition, extractor.task.network
     assert isinstance(condition, PretrainedText)
-    assert torch.equal(condition.pooler_weight, released["net.text_model.pooler.dense.weight"])
-    assert torch.equal(condition.pooler_bias, released["net.text_model.pooler.dense.bias"])
-    x, mask = torch.randn(2, 9, 147), length_mask(torch.tensor([9, 4]))
-    network = import_mclip({name.removeprefix("net."): value for name, value in released.items()})
-    with torch.no_grad():
-        features = extractor.motions(x, torch.zeros(0), mask)["features"]
-        torch.testing.assert_close(features, network.eval()(x, mask))
+    assert torch.equal(condition.pooler_weight, state["text_model.pooler.dense.weight"])
+    assert torch.equal(condition.pooler_bias, state["text_model.pooler.dense.bias"])
+    assert all(torch.equal(value, clip.state_dict()[name]) for name, value in our_names(state).items())
 
-    for name, told in (
+    for name, message in (
         ("text_model.pooler.dense.bias", "not the weights of PretrainedText: .*pooler_bias"),
         ("lm_projection.bias", "text_projection.bias"),
     ):
-        torch.save({"state_dict": {k: v for k, v in released.items() if k != f"net.{name}"}}, file)
+        torch.save({"state_dict": {f"net.{k}": v for k, v in state.items() if k != name}}, file)
         assert main(["import", "mclip", str(file), f"out={out}"]) == 1
-        assert re.search(rf"mclip\.ckpt: .*{told}", capsys.readouterr().err)
+        assert re.search(rf"mclip\.ckpt: .*{message}", capsys.readouterr().err)
     assert main(["import", "mclip", str(file), str(file), f"out={out}"]) == 1
     assert "mclip takes no file of options" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("features", [263, 251, 147, 64])
-def test_padding_and_company_do_not_change_features(features):
-    clip = network(features)
-    x = torch.randn(3, 20, features)
-    lengths = torch.tensor([20, 13, 1])
+@pytest.mark.parametrize("roughness", [False, True])
+def test_padding_and_company_do_not_change_features(roughness):
+    clip, x, lengths = network(roughness=roughness), torch.randn(3, 20, 7), torch.tensor([20, 13, 1])
     together = clip(x, length_mask(lengths))
     for row, length in enumerate(lengths.tolist()):
         alone = clip(x[row : row + 1, :length], torch.ones(1, length, dtype=torch.bool))
@@ -224,7 +211,7 @@ def test_the_loss_with_hard_negatives_is_that_of_a_loop():
     for i in range(6):
         others = [j for j in range(6) if not (MEANING[i] == MEANING[j]).any()]
         own = math.exp(scale * float(motion[i] @ text[i]))
-        texts = [float(motion[i] @ text[j]) for j in others] + [float(motion[i] @ each) for each in wrong[i]]
+        texts = [float(motion[i] @ text[j]) for j in others] + [float(motion[i] @ near) for near in wrong[i]]
         motions = [float(text[i] @ motion[j]) for j in others]
         for negatives in (texts, motions):
             total -= math.log(own / (own + sum(math.exp(scale * cosine) for cosine in negatives))) / 12
@@ -249,17 +236,17 @@ def test_the_loss_is_low_for_pairs_and_high_for_exchanged_ones():
 
 def test_the_validation_loss_does_not_depend_on_batches_or_order():
     torch.manual_seed(0)
-    motion, text, keys = 5 * torch.randn(70, 8), torch.randn(70, 8), torch.arange(70)
+    motion, text, keys, scale = torch.randn(70, 8), torch.randn(70, 8), torch.arange(70), torch.tensor(5.0)
     values = set()
     for order, size in ((torch.arange(70), 70), (torch.randperm(70), 7), (torch.randperm(70), 32)):
         metric = PooledLoss()
         for part in order.split(size):
-            metric.update(motion[part], text[part], keys[part])
+            metric.update(motion[part], text[part], keys[part], scale)
         values.add(metric.compute())
     assert len(values) == 1
     terms = []
     for pool, new in ((slice(0, 32), 32), (slice(32, 64), 32), (slice(38, 70), 6)):
-        logits, own = (motion[pool] @ text[pool].T).double(), torch.arange(32)
+        logits, own = (5 * motion[pool] @ text[pool].T).double(), torch.arange(32)
         ways = [functional.cross_entropy(table, own, reduction="none")[-new:] for table in (logits, logits.T)]
         terms.append((ways[0] + ways[1]) / 2)
     assert values.pop() == pytest.approx(torch.cat(terms).mean().item(), rel=1e-6)
@@ -269,13 +256,8 @@ def test_the_validation_loss_does_not_depend_on_batches_or_order():
 # Calibration ----------------------------------------------------------------------------------------------------------
 
 
-def test_roughness_is_seen_and_does_not_depend_on_padding():
+def test_roughness_alone_sees_noise_and_no_steady_change():
     clip = network(roughness=True)
-    x, lengths = torch.randn(3, 20, 7), torch.tensor([20, 13, 1])
-    together = clip(x, length_mask(lengths))
-    for row, length in enumerate(lengths.tolist()):
-        alone = clip(x[row : row + 1, :length], torch.ones(1, length, dtype=torch.bool))
-        torch.testing.assert_close(alone[0], together[row], atol=1e-5, rtol=1e-5)
     with torch.no_grad():  # nothing but the roughness reaches the transformer
         clip.input.weight[:, :7] = 0
     steady = torch.linspace(0, 3, 20)[:, None] * torch.randn(2, 1, 7)
@@ -358,35 +340,25 @@ def test_training_by_recipe_learns_to_retrieve(trained):
 
 
 @pytest.mark.slow
-def test_a_checkpoint_is_a_feature_extractor(trained):
-    extractor = load_task(trained, MotionCLIPTask)
-    torch.manual_seed(0)
-    x = torch.randn(2, 30, extractor.representation.features)
-    mask = length_mask(torch.tensor([30, 24]))
-    features = extractor(extractor.representation.denormalize(x), mask)
-    assert features.shape == (2, extractor.features)
-    torch.testing.assert_close(features, extractor.network(x, mask), atol=1e-4, rtol=1e-4)
-    texts = extractor.text(["a person walks forward", "a person waves with the left hand", "a person walks forward"])
-    assert texts.shape == (3, extractor.features)
+def test_a_checkpoint_is_a_feature_extractor(trained, tmp_path):
+    task = load_task(trained, MotionCLIPTask)
+    x, mask = torch.randn(2, 30, task.representation.features), length_mask(torch.tensor([30, 24]))
+    features = task(task.representation.denormalize(x), mask)
+    assert features.shape == (2, task.features)
+    torch.testing.assert_close(features, task.network(x, mask), atol=1e-4, rtol=1e-4)
+    texts = task.text(["a person walks forward", "a person waves with the left hand", "a person walks forward"])
     assert torch.equal(texts[0], texts[2])
     assert not torch.allclose(texts[0], texts[1], atol=1e-3)
     facts = read_checkpoint(trained)["facts"]
     assert facts["dataset"] == "synthetic"
     assert facts["fingerprint"]
-
-
-@pytest.mark.slow
-def test_an_exported_extractor_is_the_same_extractor(trained, tmp_path):
-    exported = MotionCLIPExtractor(str(export(trained, tmp_path)))
-    assert exported.sha256 == MotionCLIPExtractor(str(trained)).sha256
-    halves = MotionCLIPExtractor(str(export(trained, tmp_path / "half.safetensors", half=True)))
-    assert halves.sha256 != exported.sha256
-
-
-@pytest.mark.slow
-def test_a_feature_extractor_is_not_sampled_from(trained):
     with pytest.raises(UserError, match=r"last\.ckpt: holds a motion-CLIP, not a motion generator"):
         load(trained)
+
+    own, exported = MotionCLIPExtractor(str(trained)), MotionCLIPExtractor(str(export(trained, tmp_path)))
+    assert exported.sha256 == own.sha256
+    halves = MotionCLIPExtractor(str(export(trained, tmp_path / "half.safetensors", half=True)))
+    assert halves.sha256 != exported.sha256
 
 
 @pytest.mark.slow
@@ -405,8 +377,8 @@ def test_a_calibrated_run_resumes_exactly(tmp_path, data_root, capsys):
     task = load_task(folder / "checkpoints" / "last.ckpt", MotionCLIPTask)
     assert isinstance(task, CalibratedMotionCLIPTask)
     features = task(torch.randn(2, 9, 263), length_mask(torch.tensor([9, 6])))
-    for each in (features, task.text(["a person jumps", "someone bows"])):
-        torch.testing.assert_close(each.norm(dim=1), torch.tensor([10.0, 10.0]))
+    for vectors in (features, task.text(["a person jumps", "someone bows"])):
+        torch.testing.assert_close(vectors.norm(dim=1), torch.tensor([10.0, 10.0]))
     assert len(features.unique(dim=0)) == 2
 
 
@@ -430,7 +402,4 @@ def test_few_captions_train_without_retrieval(tmp_path, capsys):
     header = (tmp_path / "run" / "csv" / "metrics.csv").read_text().splitlines()[0]
     assert "val/loss" in header
     assert "top1" not in header
-
-
-def test_keys_of_motions_and_captions_are_unlike():
     assert key("motion", "a") != key("caption", "a")

@@ -6,13 +6,15 @@ import math
 import numpy as np
 import pytest
 import torch
-from support.fixtures import golden, groups, meta
+from support.fixtures import ROOT, golden, groups, meta
 from torch import Tensor
+from torchmetrics import Metric
 
 from evaluators.metrics.alignment import MotionsForText
 from evaluators.metrics.distribution import frechet_distance
 from evaluators.metrics.published_physics import (
     JERK_OF_REAL_MOTIONS,
+    KimodoConstraints,
     KimodoQuality,
     MBenchQuality,
     PhysicalFootContact,
@@ -38,6 +40,7 @@ from evaluators.metrics.retrieval import (
 )
 from flame_mdm.representations import rotation
 from flame_mdm.representations.humanml import HumanML
+from flame_mdm.safe_io import read_yaml
 from flame_mdm.seeds import key
 
 FEET = (7, 10, 8, 11)
@@ -61,6 +64,17 @@ def y_up(joints: np.ndarray) -> Tensor:
 # The authors' code ----------------------------------------------------------------------------------------------------
 
 
+MBENCH_NAMES = dict(zip(MBenchQuality.NAMES, ("jitter", "dynamic", "penetration", "sliding", "floating"), strict=True))
+
+
+def mean_over(metric: Metric, fixture: dict[str, np.ndarray], names: list[str]) -> dict[str, float]:
+    """The value of a metric for motions of a fixture."""
+    for name in names:
+        joints = y_up(fixture[f"in/{name}/joints"])[None]
+        metric.update(joints, torch.ones(joints.shape[:2], dtype=torch.bool), torch.tensor([key(name)]))
+    return metric.compute()
+
+
 @pytest.mark.golden
 @pytest.mark.parametrize("case", cases(MBENCH, "", "mbench_quality"))
 def test_mbench_equals_the_authors(case: str):
@@ -71,9 +85,7 @@ def test_mbench_equals_the_authors(case: str):
         parts = mbench_floating(motion, motion[:, toes], contact)
         np.testing.assert_array_equal(parts, MBENCH[f"aux/{case}/floating_parts"])
     ours = mbench_quality(motion, toes)
-    for name, theirs in zip(
-        MBenchQuality.NAMES, ("jitter", "dynamic", "penetration", "sliding", "floating"), strict=True
-    ):
+    for name, theirs in MBENCH_NAMES.items():
         expected = float(MBENCH.get(f"f64/{case}/{theirs}", math.nan))  # without a value where the code fails
         assert float(ours[name]) == pytest.approx(expected, rel=1e-8, abs=1e-8, nan_ok=True), name
 
@@ -81,16 +93,9 @@ def test_mbench_equals_the_authors(case: str):
 @pytest.mark.golden
 @pytest.mark.parametrize("stem", ["mbench_quality"])
 def test_mbench_averages_motions_as_the_authors_do(stem: str):
-    metric = MBenchQuality(20.0)
-    for case in meta(MBENCH)["config"]["summary_over"]:
-        joints = y_up(MBENCH[f"in/{case}/joints"])[None]
-        metric.update(joints, torch.ones(joints.shape[:2], dtype=torch.bool), torch.tensor([key(case)]))
-    values = metric.compute()
-    for name, theirs in zip(
-        MBenchQuality.NAMES, ("jitter", "dynamic", "penetration", "sliding", "floating"), strict=True
-    ):
-        assert values[name] == pytest.approx(float(MBENCH[f"out/summary/{theirs}"][0]), abs=1e-6)
-    assert values["measured"] == 1
+    values = mean_over(MBenchQuality(20.0), MBENCH, meta(MBENCH)["config"]["summary_over"])
+    expected = {name: float(MBENCH[f"out/summary/{theirs}"][0]) for name, theirs in MBENCH_NAMES.items()}
+    assert values == pytest.approx(expected | {"measured": 1}, abs=1e-6)
 
 
 @pytest.mark.golden
@@ -104,12 +109,10 @@ def test_physical_foot_contact_equals_the_authors(case: str):
 @pytest.mark.golden
 @pytest.mark.parametrize("stem", ["pfc"])
 def test_physical_foot_contact_leaves_out_motions_without_a_value(stem: str):
-    metric, averaged = PhysicalFootContact(30.0), meta(PFC)["config"]["folder_mean_over"]
-    for case in (*averaged, "static", "steady_glide"):
-        joints = y_up(PFC[f"in/{case}/joints"])[None]
-        metric.update(joints, torch.ones(joints.shape[:2], dtype=torch.bool), torch.tensor([key(case)]))
+    averaged = meta(PFC)["config"]["folder_mean_over"]
+    values = mean_over(PhysicalFootContact(30.0), PFC, [*averaged, "static", "steady_glide"])
     expected = {"pfc": float(PFC["f64/folder_mean"]), "measured": len(averaged) / (len(averaged) + 2)}
-    assert metric.compute() == pytest.approx(expected, rel=1e-9)
+    assert values == pytest.approx(expected, rel=1e-9)
 
 
 @pytest.mark.golden
@@ -143,19 +146,14 @@ def test_kimodos_skating_equals_the_authors(stem: str):
 @pytest.mark.parametrize("case", cases(KIMODO, "c", "kimodo_metrics"))
 def test_kimodos_constraints_equal_the_authors(case: str):
     errors = kimodo_errors(case)
-    names = {"root2d_err", "root2d_acc", "fullbody_keyframe", "end_effector"}
-    for name in names:
+    for name in KimodoConstraints.NAMES:
         expected = float(KIMODO.get(f"f64/{case}/constraint_{name}", math.nan))
         assert float(errors[name]) == pytest.approx(expected, abs=1e-7, nan_ok=True)
 
 
 def kimodo_errors(case: str) -> dict[str, Tensor]:
     joints = torch.from_numpy(KIMODO[f"in/{case}/joints"]).double()
-    offsets: dict[str, list[Tensor]] = {
-        "root2d": [torch.zeros(0, 2)],
-        "full": [torch.zeros(0, 3)],
-        "ee": [torch.zeros(0, 3)],
-    }
+    offsets = {"root2d": [torch.zeros(0, 2)], "full": [torch.zeros(0, 3)], "ee": [torch.zeros(0, 3)]}
     for group in groups(KIMODO, "target"):
         if group.startswith(f"in/{case}/"):
             frames, target = (torch.from_numpy(KIMODO[f"{group}/{name}"]) for name in ("frames", "target"))
@@ -200,39 +198,24 @@ def test_kimodos_retrieval_and_distances_equal_the_authors(stem: str):
 def test_angles_between_rotations_equal_the_reproductions(stem: str):
     pred, target = (torch.from_numpy(KIMODO[f"in/geodesic/{name}"]).double() for name in ("pred", "target"))
     angles = torch.rad2deg(rotation.matrix_to_axis_angle(pred @ target.mT).norm(dim=-1))
-    np.testing.assert_allclose(
-        angles, KIMODO["f64/geodesic/degrees"], atol=2e-2
-    )  # its arc cosine rounds near 0 and 180
+    # its arc cosine rounds near 0 and 180
+    np.testing.assert_allclose(angles, KIMODO["f64/geodesic/degrees"], atol=2e-2)
 
 
 @pytest.mark.golden
-@pytest.mark.parametrize("stem", ["transition"])
-def test_jerk_of_transitions_equals_the_authors(stem: str):
-    positions, lengths = FLOWMDM["in/joints/positions"], FLOWMDM["in/joints/lengths"]
-    curve = torch.zeros(positions.shape[1] - 3, dtype=torch.float64)
-    for motion, length, expected in zip(positions, lengths, FLOWMDM["f64/joints/jerk"], strict=True):
-        jerk = transition_jerk(torch.from_numpy(motion))
-        jerk[length - 3 :] = 0  # theirs: windows are padded
-        np.testing.assert_allclose(jerk, expected, atol=1e-9)
-        curve += jerk / len(positions)
-    peak, area = peak_and_area(curve, JERK_OF_REAL_MOTIONS[20])
-    assert (peak, area) == pytest.approx(
-        tuple(float(FLOWMDM[f"f64/joints/{n}"]) for n in ("peak_jerk", "auj")), rel=1e-9
-    )
-
-
-@pytest.mark.golden
-@pytest.mark.parametrize("stem", ["transition"])
-def test_jerk_of_features_equals_the_authors(stem: str):
-    feats = torch.from_numpy(FLOWMDM["in/features/feats"]).double()
-    joints = HumanML(variant="legacy").decode(feats)
-    np.testing.assert_allclose(joints, FLOWMDM["out/features/positions"], atol=2e-6)
-    curves = torch.stack([transition_jerk(motion) for motion in joints])
-    for row, length in enumerate(FLOWMDM["in/features/lengths"]):
-        curves[row, length - 3 :] = 0
-    peak, area = peak_and_area(curves.mean(0), JERK_OF_REAL_MOTIONS[20])
-    assert peak == pytest.approx(float(FLOWMDM["f64/features/peak_jerk"]), rel=1e-7)
-    assert area == pytest.approx(float(FLOWMDM["f64/features/auj"]), rel=1e-7)
+@pytest.mark.parametrize(("stem", "kind"), [("transition", "joints"), ("transition", "features")])
+def test_jerk_of_transitions_equals_the_authors(stem: str, kind: str):
+    motions = torch.from_numpy(FLOWMDM[f"in/{kind}/{'positions' if kind == 'joints' else 'feats'}"])
+    if kind == "features":
+        motions = HumanML(variant="legacy").decode(motions.double())
+        np.testing.assert_allclose(motions, FLOWMDM["out/features/positions"], atol=2e-6)
+    curves = torch.stack([transition_jerk(motion) for motion in motions])
+    for row, length in enumerate(FLOWMDM[f"in/{kind}/lengths"]):
+        curves[row, length - 3 :] = 0  # theirs: windows are padded
+    if kind == "joints":
+        np.testing.assert_allclose(curves, FLOWMDM["f64/joints/jerk"], atol=1e-9)
+    values = peak_and_area(curves.mean(0), JERK_OF_REAL_MOTIONS[20])
+    assert values == pytest.approx([float(FLOWMDM[f"f64/{kind}/{n}"]) for n in ("peak_jerk", "auj")], rel=1e-7)
 
 
 def assert_recall(ours: dict, group: str, within: float = 1e-10):
@@ -308,8 +291,8 @@ def test_equal_captions_count_as_correct_and_the_classic_value_stays():
     keys = torch.arange(count)
     metric, classic = MultiPositiveRPrecision(), MotionsForText()
     metric.update(motion, text, captions, keys)
-    classic.update(motion, text, torch.arange(count) % (count // 2), keys)
-    values, single = ({name: value or 0 for name, value in m.compute().items()} for m in (metric, classic))
+    classic.update(motion, text, keys % (count // 2), keys)
+    values, single = metric.compute(), classic.compute()
     assert values["top1"] == values["proper"] == 1
     assert values["single_top1"] == single["top1"] < 1
     assert 1 < values["positives"] < 2
@@ -322,10 +305,6 @@ def test_captions_are_compared_without_case_and_punctuation():
 
 @pytest.mark.slow
 def test_similar_captions_are_the_same_by_sentence_bert():
-    from support.fixtures import ROOT
-
-    from flame_mdm.safe_io import read_yaml
-
     metrics = read_yaml(ROOT / "experiments" / "evaluation" / "text_to_motion_2026.yaml")["metrics"]
     encoder = metrics["tmr"]["encoder"]
     assert metrics["multi_positive_minilm"]["encoder"] == encoder
@@ -352,10 +331,8 @@ def test_windows_of_transitions():
     kept = torch.zeros(2, 40, 22, dtype=torch.bool)
     kept[0, 20:] = True
     kept[1, 3:] = True  # its window would begin before the motion
-    metric = TransitionJerk(20.0, window=10)
-    metric.update(joints, torch.ones(2, 40, dtype=torch.bool), kept, torch.arange(2))
     real = JERK_OF_REAL_MOTIONS[20]
-    assert metric.compute() == pytest.approx({"peak": 2, "area": 4 - 3 * real + 4 * real, "windows": 1})
-    elsewhere = TransitionJerk(60.0, window=10)
-    elsewhere.update(joints, torch.ones(2, 40, dtype=torch.bool), kept, torch.arange(2))
-    assert elsewhere.compute() == {"peak": 2, "area": None, "windows": 1}
+    for fps, area in ((20.0, 4 - 3 * real + 4 * real), (60.0, None)):
+        metric = TransitionJerk(fps, window=10)
+        metric.update(joints, torch.ones(2, 40, dtype=torch.bool), kept, torch.arange(2))
+        assert metric.compute() == pytest.approx({"peak": 2, "area": area, "windows": 1})

@@ -64,28 +64,25 @@ def fit(folder: Path, words: list[str], *more: str) -> Path:
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory, words) -> Path:
-    """Checkpoint of a small evaluator after 200 steps."""
+    """Checkpoint of a small evaluator after 160 steps."""
     folder = tmp_path_factory.mktemp("run")
-    return fit(folder, words, "trainer.max_steps=200", f"trainer.val_check_interval={MOVEMENT}")
-
-
-def history(checkpoint: Path) -> list[dict[str, float]]:
-    return [json.loads(row) for row in (checkpoint.parent.parent / "metrics.jsonl").read_text().splitlines()]
+    return fit(folder, words, "trainer.max_steps=160", f"trainer.val_check_interval={MOVEMENT}")
 
 
 def logged(checkpoint: Path, name: str) -> dict[int, float]:
-    return {int(row["step"]): row[name] for row in history(checkpoint) if name in row}
+    lines = (checkpoint.parent.parent / "metrics.jsonl").read_text().splitlines()
+    return {int(row["step"]): row[name] for row in map(json.loads, lines) if name in row}
 
 
 @pytest.mark.slow
 def test_training_by_recipe_matches_texts_and_motions(trained):
     loss, top3 = logged(trained, "val/loss"), logged(trained, "val/motions_for_text_top3")
-    assert list(loss) == list(logged(trained, "val/mm_dist")) == [39, 79, 119, 159, 199]
-    assert loss[199] < loss[39] / 4
-    assert top3[199] > 0.5  # by chance 3 in 32
+    assert list(loss) == list(logged(trained, "val/mm_dist")) == [39, 79, 119, 159]
+    assert loss[159] < loss[39] / 4
+    assert top3[159] > 0.5  # by chance 3 in 32
     reconstruction = logged(trained, "val/reconstruction")
     assert reconstruction[39] < 0.95 * logged(trained, "train/loss")[9]
-    assert reconstruction[39] == reconstruction[199], "the second part leaves it alone"
+    assert reconstruction[39] == reconstruction[159], "the second part leaves it alone"
     network = OwnT2MExtractor(str(trained)).task.network
     assert torch.equal(network.mean, torch.full((251,), 2.0))
     assert torch.equal(network.std, torch.full((251,), 3.0))
@@ -104,12 +101,12 @@ def same(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor], *parts: str) ->
 def test_a_resumed_run_is_the_uninterrupted_one_and_changes_parts_at_its_step(words, tmp_path):
     options = [*words, "task.movement_steps=3", "trainer.val_check_interval=2"]
     whole = weights(fit(tmp_path / "whole", options, "trainer.max_steps=6"))
-    at = {most: weights(fit(tmp_path / "run", options, f"trainer.max_steps={most}")) for most in (2, 3, 4, 6)}
+    at = {most: weights(fit(tmp_path / "run", options, f"trainer.max_steps={most}")) for most in (2, 3, 6)}
     assert whole.keys() == at[6].keys()
     assert same(whole, at[6], "") == {True}
     movement, matching = ("decoder", "network.movement"), ("network.text", "network.motion")
-    assert same(at[2], at[3], *movement) == same(at[3], at[4], *matching) == {False}
-    assert same(at[2], at[3], *matching) == same(at[3], at[4], *movement) == same(at[4], at[6], *movement) == {True}
+    assert same(at[2], at[3], *movement) == same(at[3], at[6], *matching) == {False}
+    assert same(at[2], at[3], *matching) == same(at[3], at[6], *movement) == {True}
 
 
 @pytest.mark.slow
@@ -144,19 +141,19 @@ def test_the_checkpoint_needs_no_word_vectors_beside_it(trained):
 
 
 @pytest.mark.slow
-def test_what_is_missing_is_told_in_a_line(words, tmp_path, monkeypatch, capsys):
-    def refused(*more: str) -> str:
-        assert main(["train", "t2m/kit", *words, f"run.dir={tmp_path / 'run'}", *more]) == 1
-        return capsys.readouterr().err
-
-    assert "task.words=nowhere: no such folder" in refused("task.words=nowhere")
-    assert f"{tmp_path / 'our_vab_data.npy'}: no such file" in refused(f"task.words={tmp_path}")
-    assert "data.batch_size=1: matching needs at least two motions" in refused("data.batch_size=1")
-
+def test_what_is_missing_is_one_line(words, tmp_path, monkeypatch, capsys):
     whole = T2MFolder.clips
-    monkeypatch.setattr(T2MFolder, "clips", lambda self, fps: (replace(c, attributes={}) for c in whole(self, fps)))
-    told = refused(f"data_root={tmp_path}")
-    assert "72 clips have no captions with tagged words, such as 00train" in told
+    for change, message in (
+        ("task.words=nowhere", "task.words=nowhere: no such folder"),
+        (f"task.words={tmp_path}", f"{tmp_path / 'our_vab_data.npy'}: no such file"),
+        ("data.batch_size=1", "data.batch_size=1: matching needs at least two motions"),
+        (f"data_root={tmp_path}", "72 clips have no captions with tagged words, such as 00train"),
+    ):
+        if change.startswith("data_root"):
+            bare = lambda self, fps: (replace(clip, attributes={}) for clip in whole(self, fps))  # noqa: E731
+            monkeypatch.setattr(T2MFolder, "clips", bare)
+        assert main(["train", "t2m/kit", *words, f"run.dir={tmp_path / 'run'}", change]) == 1
+        assert message in capsys.readouterr().err
 
 
 def test_the_loss_is_the_published_one():
@@ -181,8 +178,8 @@ def test_a_motion_that_a_text_describes_is_no_wrong_one():
 
 @pytest.mark.slow
 def test_words_are_learned_from_captions_without_tags(words, tmp_path):
-    learned = fit(tmp_path, words, "task.words=learned", "trainer.max_steps=200", "trainer.val_check_interval=200")
-    assert logged(learned, "val/motions_for_text_top3")[199] > 0.5  # by chance 3 in 32
+    learned = fit(tmp_path, words, "task.words=learned", "trainer.max_steps=120", "trainer.val_check_interval=120")
+    assert logged(learned, "val/motions_for_text_top3")[119] > 0.5  # by chance 3 in 32
     extractor = OwnT2MExtractor(str(learned))
     features = extractor.texts(["Walks slowly.", "runs left"], [None, None])
     assert torch.allclose(extractor.texts(["walks slowly"], [["another/VERB"]]), features[:1], atol=1e-5)

@@ -428,9 +428,9 @@ def protocol_file(folder: Path, old: str, new: str) -> str:
 def test_misspelt_options_of_metrics_are_refused_before_anything_is_generated(runs, capsys, tmp_path, monkeypatch):
     monkeypatch.setattr(Generator, "_generate", lambda *_: pytest.fail("sampled"))
     for old, new, message in (
-        ("normalize: true", "normalise: true", "unknown option: normalise. Did you mean normalize"),
-        ("FrechetMotionDistance", "FrechetMotionDistance, epz: 1", "metric fid: unknown option: epz"),
-        ("samples: 20, pairs: 10", "samples: 20, pair: 10", "Did you mean pairs"),
+        ("normalize: true", "normalise: true", "Did you mean metrics.motions_for_text.normalize?"),
+        ("FrechetMotionDistance", "FrechetMotionDistance, epz: 1", "unknown config key 'metrics.fid.epz'"),
+        ("samples: 20, pairs: 10", "samples: 20, pair: 10", "multimodality.pairs?"),
         ("  prompts: 20", "  promts: 20", "promts"),
     ):
         assert message in refused(runs, capsys, tmp_path, protocol_file(tmp_path, old, new))

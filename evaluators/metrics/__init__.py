@@ -38,7 +38,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from flame_mdm.config import Config, instantiate, parameters
-from flame_mdm.errors import UserError, did_you_mean
+from flame_mdm.errors import UserError
 
 if TYPE_CHECKING:
     from torchmetrics import Metric
@@ -52,16 +52,13 @@ def make_metrics(configs: Mapping[str, Config], **options: Any) -> dict[str, Met
         options: further arguments, for those metrics that take them.
 
     Raises:
-        UserError: If a mapping has no `_target_`, or an option that its metric does not take.
+        UserError: If a mapping has no `_target_`.
     """
     metrics = {}
     for name, config in configs.items():
         if not isinstance(config, Mapping) or "_target_" not in config:
             raise UserError(f"metric {name}: no _target_. Name the class of the metric")
-        legal = parameters(config["_target_"], exact=False)
-        unknown = [option for option in config if not option.startswith("_") and option not in legal]
-        if unknown:
-            raise UserError(f"metric {name}: unknown option: {unknown[0]}.{did_you_mean(unknown[0], legal)}")
+        legal = parameters(config["_target_"])
         metrics[name] = instantiate(config, **{option: options[option] for option in options if option in legal})
     return metrics
 

@@ -23,8 +23,6 @@ def head(name: str) -> tuple[str, str]:
     lines = (EXPERIMENTS / f"{name}.yaml").read_text().splitlines()[1:]
     comment = " ".join(line.removeprefix("#").strip() for line in takewhile(lambda line: line.startswith("#"), lines))
     what, _, deviations = comment.partition("Deviations")
-    what = re.sub(r"(Kim|Tevet|Hu) et al\., (AAAI |ICLR )?\d{4}, arXiv:[\d.]+(, )?", "", what).replace(" ()", "")
-    what = re.sub(r" Not a (row of (the|a) paper|benchmark row)\.", "", what)
     return what.strip(), ("Deviations" + deviations if deviations else "")
 
 
@@ -46,6 +44,8 @@ clips.
             folder = name.rpartition("/")[0]
             page += f"\n## {folder or 'First steps'}\n\n| recipe | paper, table, row | deviations |\n|---|---|---|\n"
         what, deviations = head(name)
+        what = re.sub(r"(Kim|Tevet|Hu) et al\., (AAAI |ICLR )?\d{4}, arXiv:[\d.]+(, )?", "", what).replace(" ()", "")
+        what = re.sub(r" Not a (row of (the|a) paper|benchmark row)\.", "", what)
         deviations = re.sub(r"^Deviations(:| from)\s*", lambda m: "" if m[1] == ":" else "from ", deviations)
         page += f"| `{name}` | {what} | {deviations} |\n"
     return page

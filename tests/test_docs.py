@@ -67,7 +67,7 @@ def exists(name: str) -> bool:
 
 def unknown_paths(text: str) -> list[str]:
     """Returns paths inside the repository's folders that do not exist; targets of links are left to `broken_links`."""
-    text = re.sub(r"\]\([^)]*\)", "]", text)
+    text = re.sub(r"\]\([^)]*\)|benchmarks/\w+\.py`?\s+at\s+commit", "]", text)
     paths = set(re.findall(r"(?<![\w/.-])(?:flame_mdm|evaluators|experiments|benchmarks|tests)/[\w./-]*\w", text))
     return sorted(path for path in paths if not (ROOT / path).exists() and not any(word in path for word in OWN))
 

@@ -66,7 +66,7 @@ class Task(LightningModule):
         """Opens the captions encoded by `prepare_data`, and adds the facts about the data to `facts`."""
         self.condition.load_cache(*self._captions())
         data: MotionDataModule = self.trainer.datamodule  # type: ignore[attr-defined]
-        if device := data.place(self.condition.cache_size()):
+        if device := data.choose_device(self.condition.cache_size()):
             self.condition.move_cache(device)
         # Buffers are equal in all processes. If DDP broadcast them in each forward pass, processes with more validation
         # batches than others would wait forever.

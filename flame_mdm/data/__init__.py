@@ -83,6 +83,10 @@ class MotionSource(ABC):
         """Returns lines to print about the motions, complete once `clips` is exhausted."""
         return []
 
+    def changed(self, store: Path) -> list[str]:
+        """Returns a line if files were added or changed after they were prepared as the file `store`."""
+        return []
+
     @abstractmethod
     def count(self) -> int:
         """Returns the number of clips that `clips` yields, without reading motions; used by the progress bar.

@@ -178,7 +178,7 @@ class Amass:
                 lines.append(f"{subset}: missing ({len(members)} recordings); the archive is called {names}")
         return lines
 
-    def each(
+    def map(
         self, arguments: Mapping[str, Argument], function: Callable[[Argument, Recording], Result], workers: int = 0
     ) -> Iterator[tuple[str, Result]]:
         """Calls `function(arguments[key], recording)` for each key in worker processes; yields (key, result), sorted.

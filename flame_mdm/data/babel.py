@@ -109,7 +109,7 @@ class Babel(MotionSource):
         windows: defaultdict[str, list[Window]] = defaultdict(list)
         for window in self.windows:
             windows[window.motion].append(window)
-        for key, motion in self.amass.each(dict.fromkeys(windows), _motion, self.workers):
+        for key, motion in self.amass.map(dict.fromkeys(windows), _motion, self.workers):
             for window in windows[key]:
                 yield Clip(
                     window.id,
@@ -126,7 +126,7 @@ class Babel(MotionSource):
         """All clips in FLAME's order; reads the labels and the lengths of the motions."""
         labels = {part: self.labels(part) for part in PARTS}
         keys = dict.fromkeys(label.motion for part in PARTS for label in labels[part])
-        measured = self.amass.each(keys, _measure, self.workers)
+        measured = self.amass.map(keys, _measure, self.workers)
         lengths = dict(ProgressBar(measured, "measuring the motions of AMASS", len(keys), unit=" motions"))
         windows = []
         trained = {label.motion for label in labels["train"]}

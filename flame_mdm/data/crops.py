@@ -9,6 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from flame_mdm.errors import UserError
+
 Below = Callable[[Any], Any]
 """Draws uniform integers from 0 up to, and not including, its argument: an integer, or one for each of B clips."""
 
@@ -52,7 +54,7 @@ class Units(Crop):
 
     def __post_init__(self) -> None:
         if not 1 <= self.unit <= self.min_frames <= self.max_frames or self.max_frames % self.unit:
-            raise ValueError(
+            raise UserError(
                 f"crop: needs 1 <= unit <= min_frames <= max_frames and whole units, not unit {self.unit}, "
                 f"min_frames {self.min_frames}, max_frames {self.max_frames}"
             )

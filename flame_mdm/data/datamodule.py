@@ -87,10 +87,10 @@ class EvaluationBatches(Sampler[list[Draw]]):
 
 def _check_crop(crop: Crop) -> None:
     if not isinstance(crop, Crop):
-        raise ValueError(f"data.crop={crop!s:.80}: not a crop rule; give one such as those in flame_mdm.data.crops")
+        raise UserError(f"data.crop={crop!s:.80}: not a crop rule; give one such as those in flame_mdm.data.crops")
     for name, frames in (("shortest", crop.shortest()), ("longest", crop.longest())):
         if type(frames) is not int or not 1 <= frames <= MAX_FRAMES:
-            raise ValueError(f"data.crop: its {name} sample has {frames!s:.20} frames; give 1 to {MAX_FRAMES:,}")
+            raise UserError(f"data.crop: its {name} sample has {frames!s:.20} frames; give 1 to {MAX_FRAMES:,}")
 
 
 class MotionDataModule(LightningDataModule):
@@ -126,15 +126,15 @@ class MotionDataModule(LightningDataModule):
         pad_multiple: int = 1,
     ):
         super().__init__()
-        if batch_size < 1:
-            raise ValueError(f"data.batch_size={batch_size}: a batch has at least one clip")
-        if num_workers < 0 or not name:
-            raise ValueError(f"data.num_workers={num_workers}, data.name='{name}': give 0 or more, and a name")
-        known = isinstance(resident, bool) or resident == "auto"
-        if not known or not 1 <= pad_multiple <= MAX_FRAMES:
-            raise ValueError(
-                f"data.resident={resident}, data.pad_multiple={pad_multiple}: give true, false or auto, and 1 or more"
-            )
+        for key, value, is_valid, remedy in (
+            ("batch_size", batch_size, batch_size >= 1, "a batch has at least one clip"),
+            ("num_workers", num_workers, num_workers >= 0, "give 0 or more"),
+            ("name", name, bool(name), "give the data set a name"),
+            ("resident", resident, isinstance(resident, bool) or resident == "auto", "give true, false or auto"),
+            ("pad_multiple", pad_multiple, 1 <= pad_multiple <= MAX_FRAMES, f"give 1 to {MAX_FRAMES:,}"),
+        ):
+            if not is_valid:
+                raise UserError(f"data.{key}={value}: {remedy}")
         _check_crop(crop)
         if source.named_by_recipe:
             source.name = name
@@ -163,25 +163,21 @@ class MotionDataModule(LightningDataModule):
         """Returns the prepared store and copies its statistics to the representation.
 
         Raises:
-            FileNotFoundError: the data set is not prepared.
-            ValueError: the store is damaged, or was prepared with other options or another representation.
+            FileNotFoundError: If the data set is not prepared.
+            UserError: If the store is damaged, or was prepared with other options or another representation.
         """
         store = Store(self.folder)
-        wanted = {
+        recipe = {
             "dataset": self.source.name,
             "representation": self.representation.name,
             "fps": self.representation.fps,
             "published_split": self.source.published_split,
+            **self.source.options,
         }
-        # Stores of earlier versions do not have their options; those of own data have the name "folder".
-        found = {name: store.info[name] for name in wanted} | store.info.get("source", {})
-        if self.source.named_by_recipe and found["dataset"] == type(self.source).name:
-            found["dataset"] = wanted["dataset"]
-        wanted |= self.source.options
-        differing = [name for name in wanted if name in found and found[name] != wanted[name]]
-        if differing:
-            there, here = (", ".join(f"{name}={of[name]}" for name in differing) for of in (found, wanted))
-            raise ValueError(
+        prepared = store.info | store.info.get("source", {})
+        if differing := [name for name in recipe if prepared.get(name) != recipe[name]]:
+            there, here = (", ".join(f"{name}={of.get(name)}" for name in differing) for of in (prepared, recipe))
+            raise UserError(
                 f"{self.folder}: prepared with {there}, but the recipe has {here}. Prepare it again with force=true, "
                 "choose another data_root or data.name, or change the recipe"
             )
@@ -194,35 +190,26 @@ class MotionDataModule(LightningDataModule):
         shortest = self.crop.shortest()
         used = Counter(clip.split for clip in store.clips if clip.length >= shortest)
         short = {split: total - used[split] for split, total in store.info["clips"].items()}
-        each = (
+        counts = (
             f"{used[split]}" + f" of {used[split] + n} ({n} shorter than {shortest} frames)" * bool(n) + f" {split}"
             for split, n in short.items()
         )
-        empty = [split for split in short if not used[split]]
         advice = [
             f"all {split} clips are too short: lower data.crop.min_frames"
             if short[split]
             else f"no {split} clips. For your own data, add a `split` column to captions.csv"
-            for split in empty
+            for split in short
+            if not used[split]
         ]
         if not store.info["actions"] and not any(clip.captions for clip in store.clips):
             advice.append(
                 "no captions: add captions.csv and prepare again with force=true, or train with condition=none"
             )
-        return ["clips: " + ", ".join(each), *(() if store.info["published_split"] else advice)]
+        return ["clips: " + ", ".join(counts), *(() if store.info["published_split"] else advice)]
 
     def changed(self) -> list[str]:
         """Returns a line if files of the user's own data set were added or changed after it was prepared."""
-        if not self.source.named_by_recipe or not (folder := Path(getattr(self.source, "path", ""))).is_dir():
-            return []
-        when = (self.folder / "store.json").stat().st_mtime
-        newer = sorted(
-            str(path.relative_to(folder))
-            for path in folder.rglob("*")
-            if path.is_file() and path.stat().st_mtime > when
-        )
-        more = f" and {len(newer) - 1} more" * (len(newer) > 1)
-        return [f"{folder}: {newer[0]}{more} changed since: prepare with force=true to read them"] if newer else []
+        return self.source.changed(self.folder / "store.json")
 
     def padding(self) -> float:
         """Returns the share of padding in the frames of the first pass over the training clips."""
@@ -244,11 +231,11 @@ class MotionDataModule(LightningDataModule):
         self.store = self.open()
         self.train, self.val, self.test = (self.clips(split) for split in ("train", "val", "test"))
         if not len(self.train):
-            raise ValueError(f"{self.folder}: no training clip has {self.crop.shortest()} frames or more")
+            raise UserError(f"{self.folder}: no training clip has {self.crop.shortest()} frames or more")
         self.features = None
-        self.place()
+        self.choose_device()
 
-    def place(self, more: int = 0) -> torch.device | None:
+    def choose_device(self, more: int = 0) -> torch.device | None:
         """Decides whether the data set is kept on the training device.
 
         Args:
@@ -298,17 +285,10 @@ class MotionDataModule(LightningDataModule):
         With fewer clips than processes, every process gets all clips: a process without a batch would skip validation
         while the others wait for it.
         """
-        few = self.trainer is not None and len(self.val) < self.trainer.world_size
-        return self._evaluation(self.val, alone=few)
-
-    def test_dataloader(self) -> Loader:
-        """Returns each test clip once across all processes."""
-        return self._evaluation(self.test)
-
-    def _evaluation(self, clips: Clips, alone: bool = False) -> Loader:
-        trainer = None if alone else self.trainer
-        rank, world = (trainer.global_rank, trainer.world_size) if trainer else (0, 1)
-        return self._loader(clips, EvaluationBatches(clips.lengths, self.batch_size, rank=rank, world=world))
+        trainer = self.trainer
+        shared = trainer is not None and len(self.val) >= trainer.world_size
+        rank, world = (trainer.global_rank, trainer.world_size) if trainer and shared else (0, 1)
+        return self._loader(self.val, EvaluationBatches(self.val.lengths, self.batch_size, rank=rank, world=world))
 
     def _loader(self, clips: Clips, sampler: Sampler[list[Draw]]) -> Loader:
         if self.device is not None:

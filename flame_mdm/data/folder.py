@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import hashlib
 import io
 import math
 import os
@@ -18,7 +17,7 @@ from typing import Any, Literal, NamedTuple, get_args
 import numpy as np
 import torch
 
-from flame_mdm.data import Clip, MotionSource, Split, hashed_split
+from flame_mdm.data import Clip, MotionSource, Split, hashed_split, name_hash, without
 from flame_mdm.data.parallel import in_order
 from flame_mdm.errors import UserError, printable
 from flame_mdm.formats import bvh
@@ -56,8 +55,8 @@ Task = tuple[Path, str, dict[str, Any]]
 """A motion, its skeleton.yaml or "", and the content of that file."""
 
 
-class Found(NamedTuple):
-    """What a motion file contains: skeleton with unit and frame rate, frames and seconds as recorded, sizes in meters.
+class Facts(NamedTuple):
+    """Facts about a motion file: skeleton with unit and frame rate, frames and seconds as recorded, sizes in meters.
 
     `upright` is the mean of the vertical component of the trunk's direction. Rotations of SMPL have no size.
     """
@@ -101,19 +100,16 @@ class Folder(MotionSource):
             mirror: yield a mirrored copy after each clip of the training split; joints only.
             exclude: motions to leave out, by their path in the folder without extension.
             workers: number of processes that read; 0 = one per core, 1 = this process only.
-
-        Raises:
-            ValueError: `motion` has another value, or `mirror` is combined with SMPL rotations.
         """
         if motion not in ("joints", "smpl") or (mirror and motion == "smpl"):
-            raise ValueError(f"data.source.motion={motion}, mirror={mirror}: give joints, or smpl with mirror=false")
+            raise UserError(f"data.source.motion={motion}, mirror={mirror}: give joints, or smpl with mirror=false")
         self.path, self.motion, self.mirror, self.exclude = Path(path), motion, mirror, tuple(exclude)
         self.workers = workers
         self.options = {"motion": motion, "mirror": mirror, "exclude": list(exclude)}
         if exclude:
             self.excluded["motions by data.source.exclude"] = len(exclude)
         self._skeletons: dict[Path, dict[str, Any]] = {}
-        self._found: list[Found] = []
+        self._facts: list[Facts] = []
 
     def count(self) -> int:
         splits = Counter(self.splits.values())
@@ -121,10 +117,10 @@ class Folder(MotionSource):
 
     def clips(self, fps: float) -> Iterator[Clip]:
         self.actions = tuple(sorted({note.action for note in self.notes.values() if note.action is not None}))
-        self._found = []
+        self._facts = []
         read = in_order(partial(_read, self.motion, fps), map(self._task, self.files.values()), self.workers)
-        for name, (motion, found) in zip(self.files, read, strict=True):
-            self._found.append(found)
+        for name, (motion, facts) in zip(self.files, read, strict=True):
+            self._facts.append(facts)
             note, split = self.notes[name], self.splits[name]
             clip = Clip(
                 name.replace("/", "_"),
@@ -140,7 +136,7 @@ class Folder(MotionSource):
         self._check_upright()
 
     def findings(self) -> list[str]:
-        """Returns the skeletons found so far, with the lengths of their motions and the range of their sizes."""
+        """Returns the skeletons of the motions read so far, with lengths and ranges of sizes."""
         lines = []
         for skeleton, motions in self._by_skeleton().items():
             many = f"{len(motions)} motion" + "s" * (len(motions) > 1)
@@ -152,27 +148,27 @@ class Folder(MotionSource):
             lines.append(line)
         return lines
 
-    def _by_skeleton(self) -> dict[str, list[Found]]:
-        motions: dict[str, list[Found]] = {}
-        for found in self._found:
-            motions.setdefault(found.skeleton, []).append(found)
+    def _by_skeleton(self) -> dict[str, list[Facts]]:
+        motions: dict[str, list[Facts]] = {}
+        for facts in self._facts:
+            motions.setdefault(facts.skeleton, []).append(facts)
         return motions
 
     def check(self) -> list[str]:
         """Reads all captions and the header and first frame of each motion; returns lines on skeletons and failures."""
-        self._found = []
+        self._facts = []
         failed: dict[str, list[str]] = {}
         tasks: dict[str, Task] = {}
         for name, path in self.files.items():
             try:
                 tasks[name] = self._task(path)
-            except (ValueError, UserError) as error:
+            except ValueError as error:
                 failed.setdefault(f": {error}", []).append(name)
-        for name, found in zip(tasks, in_order(partial(_look, self.motion), tasks.values(), self.workers), strict=True):
-            if isinstance(found, str):
-                failed.setdefault(found.replace(str(self.files[name]), ""), []).append(name)
+        for name, facts in zip(tasks, in_order(partial(_look, self.motion), tasks.values(), self.workers), strict=True):
+            if isinstance(facts, str):
+                failed.setdefault(facts.replace(str(self.files[name]), ""), []).append(name)
             else:
-                self._found.append(found)
+                self._facts.append(facts)
         lines = self.findings()
         for error, names in failed.items():
             more = f" and {len(names) - 1} more" * (len(names) > 1)
@@ -181,7 +177,7 @@ class Folder(MotionSource):
             self._check_upright()
             counts = Counter(self.splits.values())
             splits = ", ".join(f"{counts[split]} {split}" for split in get_args(Split))
-        except (ValueError, UserError) as error:
+        except ValueError as error:
             return [*lines, f"error: {error}"]
         if failed:
             count = sum(map(len, failed.values()))
@@ -192,21 +188,15 @@ class Folder(MotionSource):
         for skeleton, motions in self._by_skeleton().items():
             upright = [motion.upright for motion in motions if motion.upright is not None]
             if upright and np.median(upright) < 0.3:
-                raise ValueError(
+                raise UserError(
                     f"{self.path}: the body is lying down in most motions ({skeleton}); set the axis `up` in "
                     "skeleton.yaml"
                 )
 
     @cached_property
     def files(self) -> dict[str, Path]:
-        """Path in the folder without extension -> file, sorted.
-
-        Raises:
-            FileNotFoundError: the folder does not exist or contains no motion.
-            UserError: a motion is not a regular file, or its name cannot be stored.
-            ValueError: two motions have the same name, or `exclude` has an unknown name.
-        """
-        found: dict[str, Path] = {}
+        """Path in the folder without extension -> file, sorted."""
+        files: dict[str, Path] = {}
         for path in sorted(self.path.rglob("*")) if self.path.is_dir() else ():
             if path.suffix.lower() in MOTIONS and path != self.path / TABLES[1]:
                 name = path.relative_to(self.path).with_suffix("").as_posix()
@@ -215,24 +205,23 @@ class Folder(MotionSource):
                         f"{printable(str(path))}: its name contains control characters or is not UTF-8. Rename it"
                     )
                 regular_file(path)
-                if name in found:
-                    raise ValueError(f"{path}: has the same name as {found[name].name}; each motion needs its own name")
-                found[name] = path
-        if not found:
+                if name in files:
+                    raise UserError(f"{path}: has the same name as {files[name].name}; each motion needs its own name")
+                files[name] = path
+        if not files:
             what = "no motion in it" if self.path.is_dir() else "a file" if self.path.exists() else "no such folder"
             raise FileNotFoundError(f"{self.path}: {what}; give a folder of {', '.join(MOTIONS)} files")
-        unknown = sorted(set(self.exclude) - set(found))
-        if unknown:
-            raise ValueError(f"data.source.exclude: {self.path} has no motion {', '.join(unknown)}")
-        return {name: path for name, path in sorted(found.items()) if name not in self.exclude}
+        return without(dict(sorted(files.items())), self.exclude, self.path)
+
+    def changed(self, store: Path) -> list[str]:
+        when, files = store.stat().st_mtime, self.path.rglob("*") if self.path.is_dir() else ()
+        newer = sorted(str(f.relative_to(self.path)) for f in files if f.is_file() and f.stat().st_mtime > when)
+        more = f" and {len(newer) - 1} more" * (len(newer) > 1)
+        return [f"{self.path}: {newer[0]}{more} changed since: prepare with force=true to read them"] if newer else []
 
     @cached_property
     def notes(self) -> dict[str, Note]:
-        """Captions and labels of each motion, from tables and text files.
-
-        Raises:
-            ValueError: a table cannot be read or names an unknown motion, or some motions lack a caption or an action.
-        """
+        """Captions and labels of each motion, from tables and text files; all motions have a caption, or none."""
         notes = {name: Note() for name in self.files}
         for table in TABLES:
             if _is_there(self.path / table):
@@ -246,7 +235,7 @@ class Folder(MotionSource):
         for kind, values in (("caption", "texts"), ("action", "action")):
             bare = [name for name, note in notes.items() if not getattr(note, values)]
             if 0 < len(bare) < len(notes):
-                raise ValueError(
+                raise UserError(
                     f"{self.path}: {len(bare)} of {len(notes)} motions have no {kind}, such as {bare[0]}; add one to "
                     "each, or leave these out with data.source.exclude"
                 )
@@ -254,12 +243,12 @@ class Folder(MotionSource):
 
     def _task(self, path: Path) -> Task:
         """Returns a motion with the name and content of the nearest `skeleton.yaml` above it; "" and {} without one."""
-        found = skeleton_file(path)
-        if found is None:
+        file = skeleton_file(path)
+        if file is None:
             return path, "", {}
-        if found not in self._skeletons:
-            self._skeletons[found] = read_skeleton(found)
-        return path, os.path.relpath(found), self._skeletons[found]
+        if file not in self._skeletons:
+            self._skeletons[file] = read_skeleton(file)
+        return path, os.path.relpath(file), self._skeletons[file]
 
     @cached_property
     def splits(self) -> dict[str, Split]:
@@ -269,16 +258,16 @@ class Folder(MotionSource):
         highest hash from the split with the most sources. All motions of a source stay in one split.
         """
         sources = {name: note.source or name for name, note in self.notes.items()}
-        given: dict[str, Split] = {sources[name]: note.split for name, note in self.notes.items() if note.split}
-        free = sorted(set(sources.values()) - set(given))
+        stated: dict[str, Split] = {sources[name]: note.split for name, note in self.notes.items() if note.split}
+        free = sorted(set(sources.values()) - set(stated))
         drawn: dict[str, Split] = {source: hashed_split(source, val=5, test=10) for source in free}
         for split in get_args(Split) if len(sources) >= SPLITTABLE else ("train",):
-            if split not in {*given.values(), *drawn.values()}:
+            if split not in {*stated.values(), *drawn.values()}:
                 sizes = Counter(drawn.values())
                 most = max(sizes.values(), default=0)
                 if movable := [source for source in drawn if sizes[drawn[source]] == most > (split != "train")]:
-                    drawn[max(movable, key=lambda source: hashlib.sha1(source.encode()).digest())] = split
-        splits: dict[str, Split] = {**given, **drawn}
+                    drawn[max(movable, key=name_hash)] = split
+        splits: dict[str, Split] = {**stated, **drawn}
         return {name: note.split or splits[sources[name]] for name, note in self.notes.items()}
 
     def _mirrored(self, clip: Clip, note: Note) -> Clip:
@@ -289,27 +278,24 @@ class Folder(MotionSource):
         return Clip(f"M{clip.id}", motion, [_swapped(text) for text in clip.captions], clip.split, clip.source, action)
 
 
-def _look(kind: str, task: Task) -> Found | str:
+def _look(kind: str, task: Task) -> Facts | str:
     """Returns what the header and the first frame of a motion say, or the error."""
     try:
         try:
             return _read(kind, LOOK_FPS, task, header=True)[1]
         except UnclearPose:
             return _read(kind, LOOK_FPS, task)[1]
-    except (ValueError, UserError) as error:
+    except ValueError as error:
         return str(error)
 
 
-def _read(kind: str, fps: float, task: Task, header: bool = False) -> tuple[np.ndarray, Found]:
+def _read(kind: str, fps: float, task: Task, header: bool = False) -> tuple[np.ndarray, Facts]:
     """Reads and checks a motion: joints or, if `kind` is "smpl", a raw motion of the SMPL representation.
 
-    With `header`, reads only the header and the first frame, and returns that frame.
-
-    Raises:
-        UnclearPose: with `header`, the feet look wrong in the first frame.
-        UserError, ValueError: the file is damaged or wrong; the message names it.
+    With `header`, reads only the header and the first frame, and returns that frame; raises `UnclearPose` if the feet
+    look wrong in it.
     """
-    path, where, given = task
+    path, where, layout_options = task
     try:
         if path.suffix.lower() == ".bvh":
             file = bvh.read_header(path) if header else bvh.read(path)
@@ -317,12 +303,12 @@ def _read(kind: str, fps: float, task: Task, header: bool = False) -> tuple[np.n
             if header:
                 resampled_frames(frames, rate, fps, len(file.joints))
                 file = replace(file, frames=file.frames[:1])
-            joints, _, layout = map_bvh(path, file, None if header else fps, given)
+            joints, _, layout = map_bvh(path, file, None if header else fps, layout_options)
         else:
             data = read_arrays(path, header)
-            rate = data.setdefault("fps", given.get("fps"))
+            rate = data.setdefault("fps", layout_options.get("fps"))
             if rate is None:
-                raise ValueError("no frame rate in the file. Write it into skeleton.yaml, for example `fps: 30`")
+                raise UserError("no frame rate in the file. Write it into skeleton.yaml, for example `fps: 30`")
             shape = data["poses" if "poses" in data else "joints"].shape
             frames = shape[0]
             if header:
@@ -331,16 +317,16 @@ def _read(kind: str, fps: float, task: Task, header: bool = False) -> tuple[np.n
             if "poses" in data:
                 width = math.prod(shape[1:])
                 model = {72: "SMPL", 156: "SMPL+H", 165: "SMPL-X"}.get(width, f"{width // 3} joints")
-                found = Found(f"AMASS, {model}, {rate:g} fps" + f" ({where})" * bool(where), frames, frames / rate)
-                return _from_smpl(kind, data, None if header else fps), found
-            layout, names = array_layout(path, data["joints"], given)
+                facts = Facts(f"AMASS, {model}, {rate:g} fps" + f" ({where})" * bool(where), frames, frames / rate)
+                return _from_smpl(kind, data, None if header else fps), facts
+            layout, names = array_layout(path, data["joints"], layout_options)
             moved = data["joints"].astype(float)
             joints = layout.apply(moved if header else resample(moved, rate, fps), names)
         if kind == "smpl":
-            raise ValueError("contains no SMPL rotations; use AMASS .npz files, or set motion=joints")
+            raise UserError("contains no SMPL rotations; use AMASS .npz files, or set motion=joints")
         if not np.isfinite(joints).all():
             frame = int(np.argmin(np.isfinite(joints).all((1, 2))))
-            raise ValueError(f"numbers in frame {frame} are not finite")
+            raise UserError(f"numbers in frame {frame} are not finite")
         leg = leg_length(joints)
         check_size(leg, layout.unit, layout.children)
         try:
@@ -352,9 +338,9 @@ def _read(kind: str, fps: float, task: Task, header: bool = False) -> tuple[np.n
         trunk = joints[:, SMPL22.joints.index("neck")] - joints[:, 0]
         upright = float((trunk[:, 1] / np.linalg.norm(trunk, axis=1)).mean())
         name = f"{layout_name(layout)}, unit {layout.unit:.4g}, {rate:g} fps" + f" ({where})" * bool(where)
-        return joints, Found(name, frames, frames / rate, leg, head_height(joints), upright)
+        return joints, Facts(name, frames, frames / rate, leg, head_height(joints), upright)
     except ValueError as error:
-        raise ValueError(str(error) if str(path) in str(error) else f"{path}: {error}") from error
+        raise UserError(str(error) if str(path) in str(error) else f"{path}: {error}") from error
 
 
 def _from_smpl(kind: str, data: dict[str, Any], fps: float | None) -> np.ndarray:
@@ -381,29 +367,29 @@ def _csv_rows(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
     try:
         names = list(reader.fieldnames or ())
         if len(set(names)) < len(names):
-            raise ValueError(f"{path}: duplicate column: {', '.join(names)[:200]}")
+            raise UserError(f"{path}: duplicate column: {', '.join(names)[:200]}")
         if set(names) - set(COLUMNS) or "id" not in names:
-            raise ValueError(
+            raise UserError(
                 f"{path}: its columns are {str(names)[:200]}; use {', '.join(COLUMNS)} (only id is required)"
             )
         for row in reader:
             if None in row or None in row.values():
-                raise ValueError(
+                raise UserError(
                     f"{path}, line {reader.line_num}: not one cell per column; put texts that contain a comma in quotes"
                 )
             yield f"{path}, line {reader.line_num}", {key: cell.strip() for key, cell in row.items()}
     except csv.Error as error:
-        raise ValueError(f"{path}, line {reader.line_num}: {error}") from error
+        raise UserError(f"{path}, line {reader.line_num}: {error}") from error
 
 
 def _json_rows(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
     data = read_json(path)
     if not isinstance(data, dict) or not all(isinstance(value, dict) for value in data.values()):
-        raise ValueError(f'{path}: write {{"id": {{"text": ["...", "..."], "action": "..."}}, ...}}')
+        raise UserError(f'{path}: write {{"id": {{"text": ["...", "..."], "action": "..."}}, ...}}')
     for name, value in data.items():
         unknown = set(value) - set(COLUMNS[1:])
         if unknown:
-            raise ValueError(f"{path}: {name}: unknown key {', '.join(sorted(unknown))}; use {', '.join(COLUMNS[1:])}")
+            raise UserError(f"{path}: {name}: unknown key {', '.join(sorted(unknown))}; use {', '.join(COLUMNS[1:])}")
         yield f"{path}: {name}", {"id": name, **value}
 
 
@@ -412,20 +398,20 @@ def _take(notes: dict[str, Note], exclude: Sequence[str], where: str, row: Mappi
     if row["id"] in exclude:
         return
     if row["id"] not in notes:
-        raise ValueError(f"{where}: no motion {row['id']!r}; ids are paths in the folder without extension")
+        raise UserError(f"{where}: no motion {row['id']!r}; ids are paths in the folder without extension")
     note = notes[row["id"]]
     texts = row.get("text") or []
     if not isinstance(texts, str | list) or not all(isinstance(text, str) for text in texts):
-        raise ValueError(f"{where}: text is {repr(texts)[:100]}, not a text or a list of texts")
+        raise UserError(f"{where}: text is {repr(texts)[:100]}, not a text or a list of texts")
     note.texts += [texts] if isinstance(texts, str) else texts
     for key in ("action", "split", "source"):
         value = row.get(key)
         if value:
             if getattr(note, key) not in (None, value):
-                raise ValueError(f"{where}: {row['id']} has two values of {key}: {getattr(note, key)} and {value}")
+                raise UserError(f"{where}: {row['id']} has two values of {key}: {getattr(note, key)} and {value}")
             setattr(note, key, str(value))
     if note.split not in (None, *get_args(Split)):
-        raise ValueError(f"{where}: unknown split {note.split!r}; use {', '.join(get_args(Split))}")
+        raise UserError(f"{where}: unknown split {note.split!r}; use {', '.join(get_args(Split))}")
 
 
 def _swapped(text: str) -> str:

@@ -193,7 +193,7 @@ class HumanML3D(T2MFolder):
         from_amass, from_humanact12 = by_recording(todo)
         joints = _humanact12_files(self.humanact12)
         with ProgressBar(desc=f"creating {self.name}", total=len(todo), unit=" motions") as progress:
-            for _, count in amass.each(from_amass, partial(_from_amass, write, self._bodies()), self.workers):
+            for _, count in amass.map(from_amass, partial(_from_amass, write, self._bodies()), self.workers):
                 progress.update(count)
             for key, rows in sorted(from_humanact12.items()):
                 for row in rows:
@@ -348,7 +348,7 @@ class HumanML3DSMPL(MotionSource):
         self.excluded.clear()
         self.excluded.update({reason: count for reason, count in counts.items() if count})
         from_amass, from_humanact12 = by_recording(self.rows)
-        for key, motions in self.amass.each(from_amass, _parameters, self.workers):
+        for key, motions in self.amass.map(from_amass, _parameters, self.workers):
             for row, motion in zip(from_amass[key], motions, strict=True):
                 yield from self._clips(row, motion)
         if self.humanact12:

@@ -90,16 +90,16 @@ class ResidentLoader:
         start, last, lengths, action = sent(torch.from_numpy(values), self.features.device)[..., None]
         frames = self.frames[: padded_length(int(length.max()), self.multiple, len(self.frames))]
         mask = frames < lengths
-        places = torch.minimum(start + frames, last).masked_fill(~mask, len(self.features) - 1)
-        x = F.embedding(places, self.features)
+        rows_of_frames = torch.minimum(start + frames, last).masked_fill(~mask, len(self.features) - 1)
+        x = F.embedding(rows_of_frames, self.features)
         if adapts_cuts(self.clips.representation):
             x = ((self.clips.representation.rebase(x) - self.mean) / self.std).masked_fill(~mask[..., None], 0)
         entries = [self.clips.clips[index] for index in indices]
-        told = bool(self.clips.captions[rows].all())
+        has_text = bool(self.clips.captions[rows].all())
         return MotionBatch(
             x=x,
             mask=mask,
             ids=[clip.id for clip in entries],
-            text=[clip.captions[n] for clip, n in zip(entries, caption.tolist(), strict=True)] if told else None,
+            text=[clip.captions[n] for clip, n in zip(entries, caption.tolist(), strict=True)] if has_text else None,
             action=None if (values[3] < 0).any() else action[:, 0],
         )

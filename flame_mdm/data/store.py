@@ -65,20 +65,18 @@ class Store:
     """A prepared data set, opened for reading.
 
     Raises:
-        FileNotFoundError: `folder` contains no store.
-        ValueError: the files are damaged or do not belong together.
+        FileNotFoundError: If `folder` contains no store.
+        UserError: If the files are damaged or do not belong together.
     """
 
     def __init__(self, folder: Path):
         self.folder = Path(folder)
         self.info: dict[str, Any] = _read_info(self.folder)
-        for name in ("clips.jsonl", "statistics.npz"):
-            if _sha256(self.folder / name) != self.info["sha256"].get(name):
-                raise _damaged(self.folder / name, "its hash differs from the one in store.json")
+        self._check("clips.jsonl", "statistics.npz")
         shape: list[int] = self.info["shape"]
         try:
             self.features: np.ndarray = read_npy(self.folder / "features.npy", mmap=True)
-        except (UserError, OSError, ValueError) as error:
+        except (UserError, OSError) as error:
             raise _damaged(self.folder / "features.npy", str(error)) from error
         if list(self.features.shape) != shape or len(shape) != 2 or self.features.dtype != np.float32:
             raise _damaged(self.folder / "features.npy", f"shape {self.features.shape}, not {shape}, or not float32")
@@ -86,7 +84,7 @@ class Store:
         try:
             statistics = read_npz(self.folder / "statistics.npz")
             self.mean, self.std = (statistics[name] for name in ("mean", "std"))
-        except (ValueError, KeyError) as error:
+        except (UserError, KeyError) as error:
             raise _damaged(self.folder / "statistics.npz", str(error)) from error
         if not self.mean.shape == self.std.shape == (shape[1],) or {self.mean.dtype.kind, self.std.dtype.kind} != {"f"}:
             raise _damaged(self.folder / "statistics.npz", f"not a mean and std of {shape[1]} features")
@@ -104,29 +102,21 @@ class Store:
         return self.features[clip.start : clip.start + clip.length]
 
     def references(self, ids: Sequence[str]) -> list[np.ndarray] | None:
-        """Returns the joints of clips at the frame rate of their recording; None if a clip has none.
-
-        Raises:
-            ValueError: references.npz has changed since it was written.
-        """
+        """Returns the joints of clips at the frame rate of their recording; None if a clip has none."""
         if "references.npz" not in self.info["sha256"]:
             return None
         self._check("references.npz")
-        found = read_npz(self.folder / "references.npz", only=set(ids))
-        return [found[name] for name in ids] if found.keys() == set(ids) else None
+        joints = read_npz(self.folder / "references.npz", only=set(ids))
+        return [joints[name] for name in ids] if joints.keys() == set(ids) else None
 
     def verify(self) -> None:
-        """Checks the hashes of the features and references; opening the store checks the other files only.
+        """Checks the hashes of the features and references; opening the store checks the other files only."""
+        self._check("features.npy", *{"references.npz"} & self.info["sha256"].keys())
 
-        Raises:
-            ValueError: one of them has changed since it was written.
-        """
-        for name in {"features.npy"} | ({"references.npz"} & self.info["sha256"].keys()):
-            self._check(name)
-
-    def _check(self, name: str) -> None:
-        if _sha256(self.folder / name) != self.info["sha256"].get(name):
-            raise _damaged(self.folder / name, "its hash differs from the one in store.json")
+    def _check(self, *names: str) -> None:
+        for name in names:
+            if _sha256(self.folder / name) != self.info["sha256"].get(name):
+                raise _damaged(self.folder / name, "its hash differs from the one in store.json")
 
 
 def write_store(folder: Path, source: MotionSource, representation: Representation) -> Store:
@@ -135,7 +125,7 @@ def write_store(folder: Path, source: MotionSource, representation: Representati
     If another process is writing the store, waits for it and opens the result.
 
     Raises:
-        FileNotFoundError, ValueError: the data set cannot be read, or features are not finite. No files are left
+        FileNotFoundError, UserError: If the data set cannot be read, or features are not finite. No files are left
             behind.
     """
     total, before = source.count(), (folder / "store.json").exists()
@@ -198,7 +188,7 @@ class _Writer(ExitStack):
         """Writes a clip of the data set `name`, and the features of its motion unless the previous clip has the same.
 
         Raises:
-            ValueError: the clip exceeds its motion, or its id or split contradicts that of another clip.
+            UserError: If the clip exceeds its motion, or its id or split contradicts that of another clip.
         """
         if clip.motion is not self._motion:
             self._motion, self._begin = clip.motion, self.frames
@@ -206,11 +196,11 @@ class _Writer(ExitStack):
             self._append(self._packed, features.tobytes())
         first, length = clip.window or (0, len(features))
         if first < 0 or length < 1 or first + length > len(features):
-            raise ValueError(f"clip {clip.id}: window {clip.window} exceeds {len(features)} frames")
+            raise UserError(f"clip {clip.id}: window {clip.window} exceeds {len(features)} frames")
         if (other := self._split_of.setdefault(clip.source, clip.split)) != clip.split:
-            raise ValueError(f"{name}: clips of {clip.source} are in both {other} and {clip.split}")
+            raise UserError(f"{name}: clips of {clip.source} are in both {other} and {clip.split}")
         if clip.id in self._ids:
-            raise ValueError(f"{name}: two clips have the same id, {clip.id}")
+            raise UserError(f"{name}: two clips have the same id, {clip.id}")
         self._ids.add(clip.id)
         self.splits[clip.split] += 1
         start, attributes = self._begin + first, dict(clip.attributes)
@@ -226,10 +216,10 @@ class _Writer(ExitStack):
                     np.lib.format.write_array(file, np.asarray(clip.reference, np.float32))
 
     def finish(self, name: str) -> None:
-        """Completes the files; raises `ValueError` if no clip of the data set `name` is in the training split."""
+        """Completes the files; raises `UserError` if no clip of the data set `name` is in the training split."""
         if not self.splits["train"]:
             advice = "For your own data, add a `split` column to captions.csv"
-            raise ValueError(f"{name}: no clip is in the training split. {advice}")
+            raise UserError(f"{name}: no clip is in the training split. {advice}")
         self._packed.seek(0)
         self._append(self._packed, _header(self.frames, self.features))
         self.close()
@@ -248,9 +238,9 @@ class _Writer(ExitStack):
             with (self.partial / "features.npy").open("rb") as file:
                 file.seek(len(_header(0, self.features)))
                 for begin in range(0, self.frames, BLOCK):
-                    wanted = training[begin : begin + BLOCK]
-                    block = np.fromfile(file, np.float32, len(wanted) * self.features)
-                    yield block.reshape(len(wanted), self.features)[wanted]
+                    used = training[begin : begin + BLOCK]
+                    block = np.fromfile(file, np.float32, len(used) * self.features)
+                    yield block.reshape(len(used), self.features)[used]
 
         mean, std = representation.statistics(Frames(frames, int(training.sum())))
         return mean.numpy(), std.numpy()
@@ -302,23 +292,23 @@ def _encode(encoder: Representation, motions: Sequence[_Motion]) -> list[np.ndar
     """Returns the features of motions; published features are only checked."""
     for name, encoded, _ in motions:
         if encoded and encoded not in (encoder.name, encoder.part_of):
-            raise ValueError(f"clip {name}: published as {encoded}, which cannot be converted to {encoder.name}")
+            raise UserError(f"clip {name}: published as {encoded}, which cannot be converted to {encoder.name}")
     raw = [torch.from_numpy(np.ascontiguousarray(motion)) for _, encoded, motion in motions if not encoded]
     try:
         fresh = iter(encoder.encode_many(raw) if raw else [])
     except ValueError as error:
         if len(motions) == 1:
-            raise ValueError(f"clip {motions[0][0]}: {error}") from error
+            raise UserError(f"clip {motions[0][0]}: {error}") from error
         return [features for motion in motions for features in _encode(encoder, [motion])]  # names the clip
     arrays = []
     for name, encoded, motion in motions:
         features = np.asarray(motion if encoded else next(fresh).numpy(), np.float32)
         features = features[:, : encoder.features] if encoded == encoder.part_of else features
         if features.ndim != 2 or features.shape[1] != encoder.features:
-            raise ValueError(f"clip {name}: shape {features.shape}, not (frames, {encoder.features})")
+            raise UserError(f"clip {name}: shape {features.shape}, not (frames, {encoder.features})")
         if not np.isfinite(features).all():
             frame = int(np.argwhere(~np.isfinite(features).all(1))[0, 0])
-            raise ValueError(f"clip {name}: the features of frame {frame} are not finite. Exclude it by name")
+            raise UserError(f"clip {name}: the features of frame {frame} are not finite. Exclude it by name")
         arrays.append(features)
     return arrays
 
@@ -385,15 +375,15 @@ def _read_info(folder: Path) -> dict[str, Any]:
     except UserError as error:
         raise _damaged(folder / "store.json", str(error)) from error
     if not isinstance(info, dict) or info.get("format") != FORMAT:
-        raise ValueError(f"{folder}: not a store of format {FORMAT}. Prepare the data set again")
+        raise UserError(f"{folder}: not a store of format {FORMAT}. Prepare the data set again")
     wrong = [name for name, kind in INFO.items() if not isinstance(info.get(name), kind)]
     if not wrong:
-        counts, numbers = info["clips"], {"fps": info["fps"], "hours": info["hours"]}
-        usable = {name: 0 <= number < 1e9 for name, number in numbers.items()}
-        usable["clips"] = counts.keys() == set(SPLITS) and all(type(n) is int for n in counts.values())
-        usable["actions"] = all(isinstance(name, str) for name in info["actions"])
-        usable["source"] = isinstance(info.get("source", {}), dict)
-        wrong = [name for name, good in usable.items() if not good]
+        counts = info["clips"]
+        is_usable = {name: 0 <= info[name] < 1e9 for name in ("fps", "hours")}
+        is_usable["clips"] = counts.keys() == set(SPLITS) and all(type(n) is int for n in counts.values())
+        is_usable["actions"] = all(isinstance(name, str) for name in info["actions"])
+        is_usable["source"] = isinstance(info.get("source", {}), dict)
+        wrong = [name for name, usable in is_usable.items() if not usable]
     if wrong:
         raise _damaged(folder / "store.json", f"no valid {wrong[0]}")
     return info
@@ -419,7 +409,7 @@ def _entries(path: Path, frames: int, actions: int) -> list[Entry]:
 
 def _wrong_field(clip: Entry, actions: int) -> str | None:
     """Returns the first field of a clip with a value of the wrong type, or None."""
-    good = {
+    is_right = {
         "id": isinstance(clip.id, str) and clip.id != "",
         "start": type(clip.start) is int,
         "length": type(clip.length) is int,
@@ -429,11 +419,11 @@ def _wrong_field(clip: Entry, actions: int) -> str | None:
         "action": clip.action is None or (type(clip.action) is int and 0 <= clip.action < actions),
         "attributes": isinstance(clip.attributes, dict),
     }
-    return next((name for name, right in good.items() if not right), None)
+    return next((name for name, right in is_right.items() if not right), None)
 
 
-def _damaged(path: Path, what: str) -> ValueError:
-    return ValueError(f"{path}: damaged: {what}. Delete {path.parent} and prepare the data set again")
+def _damaged(path: Path, what: str) -> UserError:
+    return UserError(f"{path}: damaged: {what}. Delete {path.parent} and prepare the data set again")
 
 
 def _sha256(path: Path) -> str:

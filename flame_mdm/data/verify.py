@@ -12,9 +12,10 @@ from typing import Any
 import numpy as np
 import torch
 
-from flame_mdm.data import SPLITS
+from flame_mdm.data import SPLITS, some
 from flame_mdm.data.datamodule import MotionDataModule
 from flame_mdm.data.store import Entry, Store
+from flame_mdm.errors import UserError
 from flame_mdm.progress import ProgressBar
 from flame_mdm.representations import Representation
 from flame_mdm.safe_io import read_yaml, write_text
@@ -35,8 +36,8 @@ def report(data: MotionDataModule) -> dict[str, Any]:
         split), frames, still (ids), duplicates (groups of ids), duplicates_across_splits, statistics, excluded.
 
     Raises:
-        FileNotFoundError: the data set is not prepared.
-        ValueError: the store is damaged: wrong hashes, non-finite numbers, or a source in two splits.
+        FileNotFoundError: If the data set is not prepared.
+        UserError: If the store is damaged: wrong hashes, non-finite numbers, or a source in two splits.
     """
     store = data.open()
     store.verify()
@@ -47,7 +48,7 @@ def report(data: MotionDataModule) -> dict[str, Any]:
     captions = [caption for clip in store.clips for caption in clip.captions]
     duplicates = _duplicates(store)
     split_of = {clip.id: clip.split for clip in store.clips}
-    found = {
+    content = {
         **{key: store.info[key] for key in ("dataset", "representation", "fps", "fingerprint", "published_split")},
         "files": store.info["sha256"],
         "figures": _figures(store),
@@ -75,58 +76,58 @@ def report(data: MotionDataModule) -> dict[str, Any]:
         "statistics": _deviation(store, data.representation),
         "excluded": store.info["excluded"],
     }
-    write_text(store.folder / "verify.json", json.dumps(found, indent=2, ensure_ascii=False) + "\n")
-    return found
+    write_text(store.folder / "verify.json", json.dumps(content, indent=2, ensure_ascii=False) + "\n")
+    return content
 
 
-def lines(found: dict[str, Any]) -> list[str]:
+def lines(content: dict[str, Any]) -> list[str]:
     """Returns the lines of a report as an aligned table."""
     rows: list[tuple[str, ...]] = []
 
     def section(title: str, *head: str) -> None:
         rows.extend([(), (title, *head)])
 
-    rows.append(("data set", f"{found['dataset']} as {found['representation']} at {found['fps']:g} fps"))
-    rows.append(("fingerprint", found["fingerprint"]))
+    rows.append(("data set", f"{content['dataset']} as {content['representation']} at {content['fps']:g} fps"))
+    rows.append(("fingerprint", content["fingerprint"]))
     rows.append(
-        ("split", "as published" if found["published_split"] else "without leaks: each source is in one split only")
+        ("split", "as published" if content["published_split"] else "without leaks: each source is in one split only")
     )
-    rows.extend((f"sha256 {name}", digest) for name, digest in found["files"].items())
+    rows.extend((f"sha256 {name}", digest) for name, digest in content["files"].items())
     section("figures", "found", "published", "")
-    for name, figure in found["figures"].items():
+    for name, figure in content["figures"].items():
         numbers = ("-" if figure[key] is None else str(figure[key]) for key in ("found", "published"))
         rows.append(
             (f"  {name}", *numbers, figure["state"].upper() if figure["state"] == "differs" else figure["state"])
         )
     section("captions")
-    rows.extend((f"  {name}", str(number)) for name, number in found["captions"].items())
-    if found["actions"]:
+    rows.extend((f"  {name}", str(number)) for name, number in content["captions"].items())
+    if content["actions"]:
         section("clips by action", *SPLITS)
-        rows.extend((f"  {name}", *map(str, splits.values())) for name, splits in found["actions"].items())
+        rows.extend((f"  {name}", *map(str, splits.values())) for name, splits in content["actions"].items())
     section("frames")
     rows.extend(
         (f"  {name}", f"{number:g}" if isinstance(number, float) else str(number))
-        for name, number in found["frames"].items()
+        for name, number in content["frames"].items()
     )
     section("anomalies")
     rows.append(("  non-finite numbers", "0"))
-    rows.append(("  clips without movement", str(len(found["still"])), _some(found["still"])))
-    groups = [" = ".join(group) for group in found["duplicates"]]
-    rows.append(("  duplicate motions", str(len(groups)), _some(groups)))
-    rows.append(("  duplicates across splits", str(found["duplicates_across_splits"])))
+    rows.append(("  clips without movement", str(len(content["still"])), some(content["still"])))
+    groups = [" = ".join(group) for group in content["duplicates"]]
+    rows.append(("  duplicate motions", str(len(groups)), some(groups)))
+    rows.append(("  duplicates across splits", str(content["duplicates_across_splits"])))
     section("deviation of mean and std from the training frames")
-    rows.extend((f"  {name}", f"{number:.2g}") for name, number in found["statistics"].items())
+    rows.extend((f"  {name}", f"{number:.2g}") for name, number in content["statistics"].items())
     section("left out")
-    rows.extend((f"  {reason}", str(number)) for reason, number in found["excluded"].items())
-    if not found["excluded"]:
+    rows.extend((f"  {reason}", str(number)) for reason, number in content["excluded"].items())
+    if not content["excluded"]:
         rows.append(("  nothing", ""))
     return _aligned(rows)
 
 
-def deviations(found: dict[str, Any]) -> list[str]:
+def deviations(content: dict[str, Any]) -> list[str]:
     """Returns which figures of a report differ from the published ones, and by how much."""
     lines = []
-    for name, figure in found["figures"].items():
+    for name, figure in content["figures"].items():
         if figure["state"] == "differs":
             number, published = figure["found"], figure["published"]
             off = number - published
@@ -152,8 +153,8 @@ def _figures(store: Store) -> dict[str, dict[str, Any]]:
     published = read_yaml(PUBLISHED).get(store.info["dataset"], {})
     figures = {}
     for name in [*published, *(name for name in counted if name not in published)]:
-        given, number = published.get(name), counted.get(name)
-        expected, tolerance = given if isinstance(given, list) else (given, 0)
+        figure, number = published.get(name), counted.get(name)
+        expected, tolerance = figure if isinstance(figure, list) else (figure, 0)
         if expected is None:
             state = "not published"
         elif not isinstance(number, int | float):
@@ -165,7 +166,7 @@ def _figures(store: Store) -> dict[str, dict[str, Any]]:
 
 
 def _check_frames(store: Store) -> None:
-    """Raises `ValueError` if a clip has non-finite numbers or extends beyond the packed frames."""
+    """Raises `UserError` if a clip has non-finite numbers or extends beyond the packed frames."""
     finite = np.concatenate(
         [np.isfinite(store.features[begin : begin + 65536]).all(1) for begin in range(0, len(store.features), 65536)]
     )
@@ -174,19 +175,19 @@ def _check_frames(store: Store) -> None:
         if len(frames) < clip.length or not frames.all():
             what = "is not finite" if len(frames) == clip.length else "is missing"
             frame = int(np.argmin(frames)) if len(frames) == clip.length else len(frames)
-            raise ValueError(f"{store.folder}: damaged: frame {frame} of clip {clip.id} {what}; prepare it again")
+            raise UserError(f"{store.folder}: damaged: frame {frame} of clip {clip.id} {what}; prepare it again")
 
 
 def _check_sources(store: Store) -> None:
     splits: defaultdict[str, set[str]] = defaultdict(set)
     for clip in store.clips:
         splits[clip.source].add(clip.split)
-    leaks = {source: sorted(found) for source, found in splits.items() if len(found) > 1}
+    leaks = {source: sorted(names) for source, names in splits.items() if len(names) > 1}
     if leaks:
-        source, found = next(iter(leaks.items()))
-        raise ValueError(
+        source, names = next(iter(leaks.items()))
+        raise UserError(
             f"{store.folder}: damaged: {len(leaks)} sources are in two splits, such as {source} in "
-            f"{' and '.join(found)}; prepare it again"
+            f"{' and '.join(names)}; prepare it again"
         )
 
 
@@ -200,12 +201,12 @@ def _motions(store: Store) -> list[list[Entry]]:
 
 def _still(store: Store, representation: Representation) -> list[str]:
     """Returns the ids of clips without movement."""
-    found = []
+    still = []
     for group in ProgressBar(_motions(store), "looking for movement", unit=" motions"):
         joints = representation.decode(torch.from_numpy(np.array(store.motion(group[0]))))
         if float((joints - joints[:1]).norm(dim=-1).max()) < STILL_DISTANCE:
-            found += [clip.id for clip in group]
-    return found
+            still += [clip.id for clip in group]
+    return still
 
 
 def _duplicates(store: Store) -> list[list[str]]:
@@ -228,10 +229,6 @@ def _deviation(store: Store, representation: Representation) -> dict[str, float]
         "largest difference of a mean, in std": float((np.abs(store.mean - mean) / std).max()),
         "largest relative difference of a std": float(np.abs(store.std / std - 1).max()),
     }
-
-
-def _some(names: list[str]) -> str:
-    return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
 
 
 def _aligned(rows: list[tuple[str, ...]]) -> list[str]:

@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 import torch
+from support.analytic import oracle
 from torch import Tensor
 
 from flame_mdm.batch import Condition, MotionBatch, length_mask
@@ -62,18 +63,14 @@ class TwoJoints(Representation):
 
 
 class Oracle(Denoiser):
-    """Knows the motions and answers what the process wants to hear."""
+    """Knows the motions and answers what the process wants to hear, also for the doubled batch of guidance."""
 
-    def __init__(self, x: Tensor, process: Process, time_scale: float):
+    def __init__(self, x: Tensor, process: Process):
         super().__init__()
-        self.x, self.process, self.time_scale = x, process, time_scale
+        self.x, self.process = x, process
 
     def forward(self, x_t: Tensor, t: Tensor, mask: Tensor, cond: Condition) -> Tensor:
-        x, t = self.x.repeat(len(x_t) // len(self.x), 1, 1), t / self.time_scale
-        zero = torch.zeros_like(x)
-        noise = (x_t - self.process.corrupt(x, zero, t)) / self.process.corrupt(zero, zero + 1, t)
-        output = self.process.target(x, noise, t)
-        return torch.cat([output, zero], -1)[..., : self.process.out_features(x.shape[-1])]
+        return oracle(self.process, self.x.repeat(len(x_t) // len(self.x), 1, 1))(x_t, t, mask, cond)
 
 
 @cache
@@ -209,7 +206,7 @@ def test_an_oracle_returns_the_data(process, sampler):
     options: dict[str, Any] = {"quantize_time": False} if process == FLOW else {}
     task = build("mdm_encoder", process, **options)
     motions = batch()
-    task.denoiser = Oracle(motions.x, task.process, 1000.0 if process == FLOW else 1.0)
+    task.denoiser = Oracle(motions.x, task.process)
     x = task.generate(motions, SamplerOptions(sampler=sampler, num_inference_steps=5))
     left = 5e-4 if process == FLOW else 1e-6  # a flow keeps sigma_min = 1e-4 times the noise
     torch.testing.assert_close(x, motions.x, rtol=0, atol=left)

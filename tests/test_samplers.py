@@ -1,6 +1,5 @@
 """Every sampler of both processes: against the authors' loops, diffusers and torchdiffeq, and against an oracle."""
 
-import json
 import math
 import re
 from itertools import product
@@ -100,71 +99,6 @@ def replay_mdm_loop(arrays: Arrays, case: str, dtype: torch.dtype = torch.float3
 @pytest.mark.parametrize("case", cases("gaussian", OPTIONS["mdm_loops"]))
 def test_mdm_loop(case, dtype):
     replay_mdm_loop(GAUSSIAN, case, dtype)
-
-
-def numpy_loop(
-    arrays: Arrays, total: int, steps: list[int], draws: np.ndarray, start: np.ndarray, eta: float
-) -> np.ndarray:
-    """The way from `start`, as noisy as the last of `steps`, in numpy; DDPM where eta is 1 (Song et al. 2021, eq. 12).
-
-    `arrays` holds the linear denoiser that returns the clean motion, of `total` steps; a draw is used after each step.
-    """
-    ends = np.cos((np.arange(total + 1) / total + 0.008) / 1.008 * np.pi / 2) ** 2
-    signal = np.cumprod(np.maximum(ends[1:] / ends[:-1], 0.001))[steps]
-    before = np.append(1.0, signal[:-1])
-    x = start
-    for i, noise in zip(reversed(range(len(steps))), draws, strict=False):
-        mixed = np.einsum("jk,bkfl->bjfl", arrays["loop/lin4/A"], x) + arrays["loop/lin4/b"][:, :, None]
-        x0 = mixed + arrays["lin4/g"] * steps[i] / 1000
-        epsilon = (x - signal[i] ** 0.5 * x0) / (1 - signal[i]) ** 0.5
-        variance = eta**2 * (1 - before[i]) / (1 - signal[i]) * (1 - signal[i] / before[i])
-        x = before[i] ** 0.5 * x0 + (1 - before[i] - variance) ** 0.5 * epsilon + variance**0.5 * noise
-    return x
-
-
-def stand_in(case: str, section: str | list[int], **options: Any) -> Arrays:
-    """A fixture in the layout of gaussian.npz with one loop of T = 30, or of 1000 for a section by name."""
-    rng, shape, total = np.random.default_rng(7), (3, 4, 2, 5), 1000 if isinstance(section, str) else section[0]
-    loops = {case: [total, section, "ddim" if "eta" in options else "ddpm", options]}
-    arrays: Arrays = {
-        "loop/lin4/A": rng.normal(size=(4, 4)) / 4,
-        "loop/lin4/b": rng.normal(size=(4, 2)) / 4,
-        "lin4/g": np.array(0.3),
-        "loop/x_T": rng.normal(size=shape),
-        "loop/inpainted_motion": rng.normal(size=shape),
-        f"loop/{case}/noise": rng.normal(size=(30, *shape)),
-        "meta": np.array(json.dumps({"options": {"mdm_loops": loops}, "max_abs_diff_f32_vs_f64": {}})),
-    }
-    steps, draws, x = steps_of(section, total), arrays[f"loop/{case}/noise"], arrays["loop/x_T"]
-    if skip := skipped(case, options):
-        steps = steps[:-skip]
-        level = np.cos((np.arange(total + 1) / total + 0.008) / 1.008 * np.pi / 2) ** 2
-        level = level[steps[-1] + 1] / level[0]
-        x = level**0.5 * arrays["loop/inpainted_motion"] + (1 - level) ** 0.5 * x
-    if "const_noise" in case:
-        draws = np.repeat(draws[:, :1], shape[0], 1)
-    arrays[f"loop/{case}/out"] = numpy_loop(arrays, total, steps, draws, x, options.get("eta", 1.0))
-    return arrays
-
-
-@pytest.mark.parametrize(
-    ("case", "section", "options"),
-    [
-        ("ddpm_T30_skip12_init", [30], {"skip_timesteps": 12, "init_image": True}),
-        ("ddpm_T30_skip12_const_noise", [30], {}),
-        ("ddim_T1000_fast27", "fast27", {"eta": 0.0}),
-        ("ddim_T1000_10", "10", {"eta": 0.5}),
-    ],
-)
-def test_loops_are_replayed_as_their_options_say(case, section, options):
-    replay_mdm_loop(stand_in(case, section, **options), case)
-
-
-def test_section_names():
-    assert spaced(1000, "1") == [0]
-    steps = spaced(1000, "fast27")
-    assert (len(steps), steps[-1]) == (27, 997)
-    assert steps[:-1] == spaced(1000, "10,10,3,2,2")[:-1]
 
 
 def flame_edit(known: Tensor, joints: list[int], keep_translation: bool) -> Edit:
@@ -280,31 +214,6 @@ def released_flow(arrays: Arrays = MFM) -> tuple[Denoise, Condition]:
 @pytest.mark.parametrize("case", cases("mfm", [name for name, run in FLOW_RUNS.items() if run["on"] != "field"]))
 def test_flow_run_of_the_network(case):
     replay_flow_run(MFM, case, *released_flow(), quantize_time=True)
-
-
-def test_flow_runs_of_action_models_are_replayed():
-    """A fixture of MFM with actions and 25 x 6 rotations, made of MDM's network for actions by steps in numpy."""
-    actions = golden("mdm_action_rot6d")
-    count, scale, x = 4, 2.5, actions["in/x_t"]
-    run = {"on": "cfg", "step_size": 1 / count, "method": "euler_raw"}
-    config = {"heads": meta(actions)["config"]["num_heads"], "runs": {"raw_cfg": run}}
-    arrays = actions | {
-        "sample/x_init": x,
-        "in/scale": np.full(len(x), scale, np.float32),
-        "meta": np.array(json.dumps({"config": config, "sigma_min": 1e-4, "max_abs_diff_f32_vs_f64": {}})),
-    }
-    network, cond = released_flow(arrays)
-    for i in range(count):
-        inputs, time = motions(x), torch.full((len(x),), float(1000 * i // count))
-        conditional, null = (
-            network(inputs, time, ones(inputs), Condition(pooled, cond.tokens, None))
-            .transpose(1, 2)
-            .reshape(x.shape)
-            .numpy()
-            for pooled in (cond.pooled, torch.zeros_like(cond.pooled))
-        )
-        x = x + (null + scale * (conditional - null)) / count
-    replay_flow_run(arrays | {"run/raw_cfg": x}, "raw_cfg", network, cond, quantize_time=True)
 
 
 @pytest.mark.golden

@@ -12,7 +12,7 @@ from flame_mdm.data.datamodule import MotionDataModule
 from flame_mdm.errors import UserError, say
 from flame_mdm.runs import made_by
 from flame_mdm.task import MotionGeneration
-from flame_mdm.training.callbacks import explained
+from flame_mdm.training.callbacks import explain_metrics
 from flame_mdm.training.loggers import log_table
 
 
@@ -114,4 +114,4 @@ class Evaluate(Callback):
         )
         real = {name: value["mean"] for name, value in found["ground_truth"].items()}
         say(f"evaluation after {step} steps, {self.protocol.name}, validation clips:")
-        say(*explained(values, real, {k: get_class(v["_target_"]) for k, v in self.protocol.metrics.items()}))
+        say(*explain_metrics(values, real, {k: get_class(v["_target_"]) for k, v in self.protocol.metrics.items()}))

@@ -152,6 +152,8 @@ class MotionGeneration(Task):
             raise UserError(f"{type(denoiser).__name__} is no denoiser: derive it from flame_mdm.denoisers.Denoiser")
         if not 0 <= cond_drop_prob <= 1:
             raise UserError(f"task.cond_drop_prob={cond_drop_prob}: give a probability from 0 to 1")
+        if num_inference_steps is None:  # a recipe may come from a file
+            raise UserError("task.num_inference_steps=null: give the number of sampling steps")
         try:
             self.sampler_options = SamplerOptions(
                 guidance_scale=guidance_scale, sampler=sampler, num_inference_steps=num_inference_steps

@@ -171,7 +171,7 @@ def test_strings_outside_commands_name_no_module_of_the_evaluators():
         ("flame_mdm.schemas", "from flame_mdm.runs import read_run"),
         ("flame_mdm.runs", "from flame_mdm.reporting.tables import build"),
         ("flame_mdm.reporting.tables", "from flame_mdm.task import load"),
-        ("flame_mdm.sampling.editing", "from flame_mdm.training.guards import newest"),
+        ("flame_mdm.sampling.editing", "from flame_mdm.training.checkpointing import newest"),
         ("flame_mdm.checkpoints.model_files", "from flame_mdm.reporting.rendering import markdown_text"),
         ("flame_mdm.training.callbacks", "from evaluators.evaluation import evaluate"),
         ("flame_mdm.demo.app", "from flame_mdm.reporting.page import write"),

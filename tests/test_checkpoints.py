@@ -17,6 +17,7 @@ from flame_mdm.__main__ import main
 from flame_mdm.batch import Condition, MotionBatch
 from flame_mdm.checkpoints import hub, model_files
 from flame_mdm.checkpoints.loading import load
+from flame_mdm.checkpoints.model_files import FORMAT_KEY
 from flame_mdm.checkpoints.released import import_flame, import_mdm
 from flame_mdm.checkpoints.released_weights import released_state
 from flame_mdm.config import compose, instantiate
@@ -429,7 +430,7 @@ def trained(tmp_path: Path, tiny: list[str]) -> Path:
     task = MotionGeneration.build(config, instantiate(config["representation"]))
     facts = {"actions": [], "dataset": "synthetic", "fingerprint": "f00d", "max_frames": 60}
     state = task.state_dict() | {"representation.mean": torch.randn(263)}
-    content = {"config": config, "facts": facts, "state_dict": state, "global_step": 7}
+    content = {"config": config, "facts": facts, "state_dict": state, "global_step": 7, FORMAT_KEY: 2}
     torch.save(content, tmp_path / "last.ckpt")
     return tmp_path / "last.ckpt"
 
@@ -480,10 +481,15 @@ def test_damaged_and_foreign_files_are_one_line(trained, tmp_path):
     for content, message in (
         (whole[:-10], "damaged, or not a .safetensors file"),
         (b"", "damaged, or not a .safetensors file"),
-        (bytes(flipped), "its weights have changed since it was written"),
-        (whole.replace(b'\\"format\\": 1', b'\\"format\\": 2'), "has format 2, but this version reads 1"),
+        (bytes(flipped), "it has changed since it was written"),
+        (whole.replace(b'\\"max_frames\\": 60', b'\\"max_frames\\": 61'), "it has changed since it was written"),
+        (whole.replace(b'\\"steps\\": 7', b'\\"steps\\": 9'), "it has changed since it was written"),
+        (whole.replace(b'\\"seed\\": 0', b'\\"seed\\": 1'), "it has changed since it was written"),
+        (whole.replace(b'\\"format\\": 2', b'\\"format\\": 3'), "has format 3, but this version reads 2"),
+        (whole.replace(b'\\"format\\": 2', b'\\"format\\": 1'), "written by version 0.1 of flame_mdm"),
         (whole.replace(b'\\"origin\\"', b'\\"oregon\\"'), "its recipe cannot be read"),
     ):
+        assert content != whole
         file.write_bytes(content)
         with pytest.raises(UserError, match=message) as caught:
             load(file)

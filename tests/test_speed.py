@@ -1,17 +1,17 @@
 """`speed=fast`, the moving average, and the cost of a step that does not show in results."""
 
 import math
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 from lightning import LightningModule
-from lightning.pytorch.callbacks import EMAWeightAveraging
+from lightning.pytorch.callbacks import EMAWeightAveraging, WeightAveraging
 from support.runs import TINY
 from torch import nn
 from torch.nn import functional
-from torch.optim.swa_utils import AveragedModel
 
 from flame_mdm.__main__ import main
 from flame_mdm.checkpoints.model_files import read_checkpoint
@@ -87,35 +87,54 @@ class Tiny(LightningModule):
         self.register_buffer("seen", torch.zeros(1))
 
 
-@pytest.mark.parametrize("options", [{}, {"update_every_n_steps": 2, "update_starting_at_step": 3}])
-def test_the_moving_average_is_that_of_lightning(options):
-    model = Tiny()
-    ours, theirs = MovingAverage(0.9, **options), EMAWeightAveraging(use_buffers=False, decay=0.9, **options)
+class Steps:
+    """What callbacks see of a trainer."""
 
-    class Trainer:
-        global_step = 0
+    global_step = 0
 
-    trainer = Trainer()
-    for callback in (ours, theirs):
-        callback.setup(trainer, model, "fit")  # type: ignore[arg-type]
-    ours.on_train_start(trainer, model)  # type: ignore[arg-type]
-    for step in range(1, 12):
-        trainer.global_step = step
+
+def train_with(callbacks: list[WeightAveraging], model: Tiny, steps: int) -> Iterator[int]:
+    """Changes the weights at random in each step and calls the callbacks, twice as for two accumulated batches."""
+    trainer: Any = Steps()
+    for callback in callbacks:
+        callback.setup(trainer, model, "fit")
+        callback.on_train_start(trainer, model)
+    for trainer.global_step in range(1, steps + 1):
         for p in model.parameters():
             p.data.add_(torch.randn_like(p))
         model.get_buffer("seen").add_(1)
-        for callback in (ours, theirs):
-            for _ in range(2):  # a step of two accumulated batches
-                callback.on_train_batch_end(trainer, model, None, None, 0)  # type: ignore[arg-type]
-    checkpoints = [{"state_dict": model.state_dict()} for _ in range(2)]
-    for callback, checkpoint in zip((ours, theirs), checkpoints, strict=True):
-        callback.on_save_checkpoint(trainer, model, checkpoint)  # type: ignore[arg-type]
-        assert isinstance(callback._average_model, AveragedModel)
-    mine, lightnings = checkpoints
+        for callback in callbacks * 2:
+            callback.on_train_batch_end(trainer, model, None, None, 0)
+        yield trainer.global_step
+
+
+def saved(callback: WeightAveraging, model: Tiny) -> dict[str, Any]:
+    checkpoint: dict[str, Any] = {"state_dict": model.state_dict()}
+    callback.on_save_checkpoint(Steps(), model, checkpoint)  # type: ignore[arg-type]
+    return checkpoint
+
+
+def test_the_moving_average_is_that_of_lightning():
+    model = Tiny()
+    ours, theirs = MovingAverage(0.9), EMAWeightAveraging(use_buffers=False, decay=0.9)
+    list(train_with([ours, theirs], model, 11))
+    mine, lightnings = saved(ours, model), saved(theirs, model)
     assert torch.equal(mine["averaging_state"]["n_averaged"], lightnings["averaging_state"]["n_averaged"])
     for name, value in lightnings["state_dict"].items():
         torch.testing.assert_close(mine["state_dict"][name], value)
     assert float(mine["state_dict"]["seen"]) == 11
+
+
+def test_the_moving_average_of_flame_is_that_of_its_code():
+    """FLAME's code copies the weights every 10 steps up to step 100, and averages them at 110, 120, ..."""
+    model, expected = Tiny(), torch.zeros(0)
+    average = MovingAverage(**compose("humanml3d/flame_code")["ema"])
+    for step in train_with([average], model, 130):
+        weight = model.layer.weight.detach()
+        if step % 10 == 0:
+            expected = weight.clone() if step <= 100 else 0.99 * expected + 0.01 * weight
+        if step >= 10:
+            torch.testing.assert_close(saved(average, model)["state_dict"]["layer.weight"], expected)
 
 
 def train(folder: Path, name: str, *words: str) -> dict[str, Any]:

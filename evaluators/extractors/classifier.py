@@ -49,7 +49,8 @@ class ClassifierTask(Task):
     ):
         super().__init__(Unconditional(), representation, optimizer=optimizer, seed=seed)
         self.network = network
-        self.val_metrics = nn.ModuleDict({"loss": MeanMetric(), "accuracy": ActionAccuracy()})
+        with torch.device("cpu"):  # a loaded model is built on the meta device, of which metrics cannot be moved
+            self.val_metrics = nn.ModuleDict({"loss": MeanMetric(), "accuracy": ActionAccuracy()})
 
     @classmethod
     def build(cls, config: Config, representation: Representation, *, actions: Sequence[str] = ()) -> Self:

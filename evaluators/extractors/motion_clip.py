@@ -199,9 +199,10 @@ class MotionCLIPTask(Task):
         super().__init__(condition, representation, optimizer=optimizer, seed=seed)
         self.network = network
         self.features = network.embedding_dim
-        self.val_metrics = nn.ModuleDict(
-            {"loss": PooledLoss(), "texts_for_motion": TextsForMotion(), "motions_for_text": MotionsForText()}
-        )
+        with torch.device("cpu"):  # a loaded model is built on the meta device, of which metrics cannot be moved
+            self.val_metrics = nn.ModuleDict(
+                {"loss": PooledLoss(), "texts_for_motion": TextsForMotion(), "motions_for_text": MotionsForText()}
+            )
 
     @classmethod
     def build(cls, config: Config, representation: Representation, *, actions: Sequence[str] = ()) -> Self:

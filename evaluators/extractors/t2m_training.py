@@ -128,8 +128,13 @@ class T2MTask(Task):
         self.sparsity, self.smoothness, self.margin = sparsity, smoothness, margin
         self.words: WordVectors | LearnedWords | None = LearnedWords() if words == "learned" else None
         self.tokens: dict[str, dict[str, list[str]]] = {}  # of the captions of each clip
-        pairs = {"loss": MatchingLoss(margin), "mm_dist": MultimodalDistance(), "motions_for_text": MotionsForText()}
-        self.val_metrics = nn.ModuleDict(pairs | {"reconstruction": MeanMetric()})
+        with torch.device("cpu"):  # a loaded model is built on the meta device, of which metrics cannot be moved
+            pairs = {
+                "loss": MatchingLoss(margin),
+                "mm_dist": MultimodalDistance(),
+                "motions_for_text": MotionsForText(),
+            }
+            self.val_metrics = nn.ModuleDict(pairs | {"reconstruction": MeanMetric()})
 
     @classmethod
     def build(cls, config: Config, representation: Representation, *, actions: Sequence[str] = ()) -> Self:

@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, TypeVar
 
 import torch
 from hydra.utils import get_class
-from torch import Tensor
-from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils._pytree import tree_leaves
+from torch.overrides import TorchFunctionMode
 
 from flame_mdm.checkpoints.locating import Which, find
 from flame_mdm.checkpoints.model_files import read_checkpoint
-from flame_mdm.config import Config, flatten, instantiate, trust
+from flame_mdm.config import Config, instantiate, trust
+from flame_mdm.config.signatures import walk
 from flame_mdm.errors import UserError
-from flame_mdm.sampler_options import MAX_STEPS
 from flame_mdm.task import MotionGeneration, Task
 
 NO_GPU = "PyTorch finds no GPU" if torch.version.cuda or torch.version.hip else "this PyTorch was built without CUDA"
@@ -49,74 +48,74 @@ def load_task(path: Path, kind: type[Trained], device: str | torch.device = "cpu
     check_device(device)
     checkpoint = read_checkpoint(path)
     try:
-        return _build(path, checkpoint, kind).eval().to(device)
-    except (UserError, FileNotFoundError):
-        raise
+        return _build(checkpoint, kind).eval().to(device)
     except Exception as error:  # a nonsensical recipe may fail anywhere
-        raise UserError(f"{path}: cannot build the model: {type(error).__name__}: {error}") from error
+        if isinstance(error, FileNotFoundError):  # of a text encoder
+            raise
+        kind_of_error = "" if isinstance(error, UserError) else f"cannot build the model: {type(error).__name__}: "
+        raise UserError(f"{path}: {kind_of_error}{error}") from error
 
 
 def check_device(device: str | torch.device) -> None:
     """Raises `UserError` if this machine has no such device."""
     try:
+        if torch.device(device).type == "meta":
+            raise RuntimeError("no device that computes")
         torch.empty(0, device=device)
     except (RuntimeError, AssertionError) as error:  # torch reports an absent device as either
         gpus = [f"cuda:{number}" for number in range(torch.cuda.device_count())]
-        there = ", ".join(["cpu", *gpus]) + f" ({NO_GPU})" * (not gpus)
-        raise UserError(f"device={device}: this machine has only {there}. Drop device=, or change it") from error
+        names = ", ".join(["cpu", *gpus]) + f" ({NO_GPU})" * (not gpus)
+        raise UserError(f"device={device}: this machine has only {names}. Drop device=, or change it") from error
 
 
-def _build(path: str | Path, checkpoint: dict[str, Any], kind: type[Trained]) -> Trained:
-    config, facts = checkpoint["config"], checkpoint["facts"]
-    parts = {name: config[name] for name in PARTS if name in config}
+def _build(checkpoint: dict[str, Any], kind: type[Trained]) -> Trained:
+    """Builds the task of a checkpoint with its weights, without compiling it.
+
+    Networks of this project are built on the meta device, so that a recipe takes no more memory than the weights in the
+    file. Other classes may only be named if the user trusts them, and are built as in training.
+    """
+    config, state = checkpoint["config"], checkpoint["state_dict"]
+    parts: Config = {name: config[name] for name in PARTS if name in config}
     trust(parts)
     for name in ("task", "representation", *parts):
         if "_target_" not in (config[name] if isinstance(config.get(name), dict) else {}):
-            raise UserError(f"{path}: damaged: its recipe has no {name}")
-    built = get_class(config["task"]["_target_"])
-    if not issubclass(built, kind):
-        found = built.noun if issubclass(built, Task) else built.__name__
-        raise UserError(f"{path}: holds {found}, not {kind.noun}. Give another checkpoint")
-    with _Sizes(path, checkpoint["state_dict"], parts):
+            raise UserError(f"damaged: its recipe has no {name}")
+    task_class = get_class(config["task"]["_target_"])
+    if not issubclass(task_class, kind):
+        noun = task_class.noun if issubclass(task_class, Task) else task_class.__name__
+        raise UserError(f"holds {noun}, not {kind.noun}. Give another checkpoint")
+    targets = [str(node["_target_"]) for _, node in walk(parts) if "_target_" in node]
+    for target in targets:
+        get_class(target)  # imports modules here, since tensors that they create must not be on the meta device
+    own = all(target.startswith(("flame_mdm.", "evaluators.")) for target in targets)
+    uncompiled = config | {"task": {name: value for name, value in config["task"].items() if name != "compile"}}
+    with ExitStack() as stack:
+        if own:
+            stack.enter_context(torch.device("meta"))
+            stack.enter_context(_CallLimit(20_000 + 50 * len(state)))
         representation = instantiate(config["representation"])
-        task = built.build(config, representation, actions=facts["actions"])
-    task.facts = facts
-    task.steps = checkpoint.get("global_step", (checkpoint.get("origin") or {}).get("steps"))
+        task = task_class.build(uncompiled, representation, actions=checkpoint["facts"]["actions"])
+    task.config, task.facts = config, checkpoint["facts"]
+    kinds = {name: value.dtype for name, value in task.state_dict().items()}
+    state = {name: value.to(kinds.get(name, value.dtype)) for name, value in state.items()}
     try:
-        task.load_state_dict(checkpoint["state_dict"], strict=True)
+        task.load_state_dict(state, strict=True, assign=own)
     except RuntimeError as error:
         lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-        raise UserError(f"{path}: the weights do not match the recipe saved with them: {lines[1]}") from error
+        raise UserError(f"the weights do not match the recipe saved with them: {lines[1]}") from error
+    task.steps = checkpoint.get("global_step", (checkpoint.get("origin") or {}).get("steps"))
     return task
 
 
-class _Sizes(TorchDispatchMode):
-    """While a model is built, refuses tensors that are too large for the weights in its file, before allocating them.
+class _CallLimit(TorchFunctionMode):
+    """Refuses more than `limit` calls of torch functions, so that a recipe of a million layers ends soon."""
 
-    Args:
-        path: the file, for messages.
-        weights: the state dict in it.
-        parts: the recipe of the model, whose integers are checked immediately.
-
-    Raises:
-        UserError: If an integer of the recipe exceeds all reasonable sizes.
-    """
-
-    def __init__(self, path: str | Path, weights: dict[str, Tensor], parts: Config):
+    def __init__(self, limit: int):
         super().__init__()
-        largest = max((size for value in weights.values() if value.numel() for size in value.shape), default=0)
-        for name, value in flatten(parts).items():
-            for number in value if isinstance(value, list | tuple) else [value]:
-                if isinstance(number, int) and abs(number) > max(MAX_STEPS, largest):
-                    raise UserError(f"{path}: {name}={number} in its recipe exceeds the size of any model")
-        self.path, self.numbers = path, 4 * sum(value.numel() for value in weights.values()) + 10_000_000
-        self.tensors = 4 * len(weights) + 2_000
+        self.left = limit
 
-    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        kwargs = kwargs or {}
-        if not any(isinstance(value, Tensor) for value in tree_leaves((args, kwargs))):
-            self.numbers -= sum(v.numel() for v in tree_leaves(func(*args, **kwargs | {"device": "meta"})))
-            self.tensors -= 1
-            if self.numbers < 0 or self.tensors < 0:
-                raise UserError(f"{self.path}: its recipe describes a larger model than the weights saved with it")
-        return func(*args, **kwargs)
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        self.left -= 1
+        if self.left < 0:
+            raise UserError("its recipe describes a larger model than the weights saved with it")
+        return func(*args, **(kwargs or {}))

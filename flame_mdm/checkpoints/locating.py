@@ -31,34 +31,18 @@ def find(source: str | Path, which: Which = "last") -> Path:
     if which not in get_args(Which):
         raise UserError(f"which={which}: write last or best")
     path = Path(source)
-    if path.exists() and not path.is_dir():
+    if path.is_dir():
+        return _find_in_folder(path, which)
+    if path.exists():
         regular_file(path)
         return path
-    weights = [file for file in sorted(path.glob("*.safetensors")) if not file.name.startswith(".")]  # not half-written
-    is_run = (path / "config.yaml").is_file() and not weights
-    if is_run or (path / "checkpoints").is_dir():
-        file = path / "checkpoints" / f"{which}.ckpt"
-        if not file.exists():
-            there = ", ".join(sorted(checkpoint.name for checkpoint in file.parent.glob("*.ckpt"))) or "none yet"
-            raise FileNotFoundError(f"{file}: no such checkpoint. The run has {there}")
-        return file
-    if path.is_dir():
-        if len(weights) != 1:
-            there = ", ".join(file.name for file in weights) or "no .safetensors file"
-            runs = ", ".join(str(folder.parent) for folder in sorted(path.glob("*/checkpoints"))[:3])
-            raise UserError(
-                f"{path}: this folder holds {there}. Name {f'a run: {runs}' if runs else 'the file of the model'}"
-            )
-        regular_file(weights[0])
-        return weights[0]
     if str(source) in SHIPPED:
         return SHIPPED[str(source)]
     match = re.fullmatch(r"([\w.-]+/[\w.-]+)(?:@([\w./-]+))?", str(source))
     if match is None or path.suffix in (".ckpt", ".safetensors", ".pt") or path.parent.is_dir():
-        there = [p.name for p in path.parent.iterdir()] if path.parent.is_dir() else []
-        near = did_you_mean(path.name, [*there, *SHIPPED])
-        advice = near or " Give a run, or a .ckpt or .safetensors file"
-        raise FileNotFoundError(f"{path}: no such checkpoint.{advice}")
+        neighbors = [p.name for p in path.parent.iterdir()] if path.parent.is_dir() else []
+        near = did_you_mean(path.name, [*neighbors, *SHIPPED])
+        raise FileNotFoundError(f"{path}: no such checkpoint.{near or ' Give a run, or a .ckpt or .safetensors file'}")
     from huggingface_hub import hf_hub_download, logging
 
     logging.set_verbosity_error()  # otherwise it reports every attempt to reach the hub
@@ -69,3 +53,23 @@ def find(source: str | Path, which: Which = "last") -> Path:
             f"{source}: no such file or folder, and {FILE} of a model with this name cannot be downloaded from the "
             f"hub: {first_line(error)}"
         ) from error
+
+
+def _find_in_folder(folder: Path, which: Which) -> Path:
+    """Returns a checkpoint of a run directory, or the only model file in another folder."""
+    weights = [file for file in sorted(folder.glob("*.safetensors")) if not file.name.startswith(".")]  # half-written
+    is_run = (folder / "config.yaml").is_file() and not weights
+    if is_run or (folder / "checkpoints").is_dir():
+        file = folder / "checkpoints" / f"{which}.ckpt"
+        if not file.exists():
+            names = ", ".join(sorted(path.name for path in file.parent.glob("*.ckpt"))) or "none yet"
+            raise FileNotFoundError(f"{file}: no such checkpoint. The run has {names}")
+        return file
+    if len(weights) != 1:
+        names = ", ".join(file.name for file in weights) or "no .safetensors file"
+        runs = ", ".join(str(path.parent) for path in sorted(folder.glob("*/checkpoints"))[:3])
+        raise UserError(
+            f"{folder}: this folder holds {names}. Name {f'a run: {runs}' if runs else 'the file of the model'}"
+        )
+    regular_file(weights[0])
+    return weights[0]

@@ -1,7 +1,8 @@
 """File formats of models: checkpoints (.ckpt) of training, and model files (.safetensors).
 
 A model file holds the (averaged) weights, including the statistics of the features. Its metadata has a key `flame_mdm`
-with the recipe, metadata of the data set, and the origin of the weights, as JSON. It contains no code.
+with the recipe, metadata of the data set, and the origin of the weights, as JSON, and a key `sha256` with the hash of
+that text and the weights. It contains no code.
 """
 
 from __future__ import annotations
@@ -22,7 +23,10 @@ from flame_mdm.schemas import Number, check_shape
 if TYPE_CHECKING:
     from torch import Tensor
 
-FORMAT = 1
+FORMAT = 2
+"""Format of checkpoints and model files: 2 since version 0.2.0."""
+FORMAT_KEY = "flame_mdm_format"
+"""Key of the format in a checkpoint."""
 KEY = "flame_mdm"
 FILE = "model.safetensors"
 MOST_FRAMES = 100_000
@@ -33,32 +37,47 @@ def read_model_file(path: Path) -> dict[str, Any]:
     """Reads a model file as `config`, `facts`, `origin` and `state_dict`.
 
     Raises:
-        UserError: If it is damaged, not a model file, or has a newer format.
+        UserError: If it is damaged, not a model file, or has another format.
     """
     from safetensors import SafetensorError, safe_open
 
     try:
         with safe_open(path, framework="pt") as file:
-            text = (file.metadata() or {}).get(KEY)
+            metadata = file.metadata() or {}
             state = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (it is no mapping)
     except (SafetensorError, OSError, ValueError) as error:
         raise UserError(f"{path}: damaged, or not a .safetensors file") from error
+    text = metadata.get(KEY)
     if text is None:
         raise UserError(
             f"{path}: weights without a recipe. Import released weights of MDM, MFM and FLAME with `flame-mdm import`"
         )
     try:
         content = parse_json(text)
-        found, digest = content["format"], content["sha256"]
+        check_format(path, content["format"])
         model = {name: content[name] for name in ("config", "facts", "origin")}
+    except UserError:
+        raise
     except (ValueError, TypeError, KeyError) as error:
         raise UserError(f"{path}: damaged: its recipe cannot be read") from error
-    if found != FORMAT:
-        raise UserError(f"{path}: has format {found}, but this version reads {FORMAT}. Update flame_mdm")
-    model = checked(path, model | {"state_dict": state})
-    if _sha256(state) != digest:
-        raise UserError(f"{path}: damaged: its weights have changed since it was written. Download or export it again")
-    return model
+    if metadata.get("sha256") != content_sha256(text, state):
+        raise UserError(f"{path}: damaged: it has changed since it was written. Download or export it again")
+    return checked(path, model | {"state_dict": state})
+
+
+def check_format(path: Path, number: Any) -> None:
+    """Checks the format of a checkpoint or model file; that of version 0.1 is 1 in model files and None in checkpoints.
+
+    Raises:
+        UserError: If it is another format than `FORMAT`.
+    """
+    if number in (1, None):
+        raise UserError(
+            f"{path}: written by version 0.1 of flame_mdm, whose files this version does not read. Train or import the "
+            "model again, or use it with version 0.1"
+        )
+    if number != FORMAT:
+        raise UserError(f"{path}: has format {str(number)[:40]}, but this version reads {FORMAT}. Update flame_mdm")
 
 
 class _Folder(TypedDict, total=False):
@@ -114,10 +133,7 @@ class _Checkpoint(TypedDict):
 
 
 def checked(path: Path, content: Any) -> dict[str, Any]:
-    """Checks the content of a checkpoint or model file: a recipe of plain values, metadata of the data, and weights.
-
-    Returns:
-        The content, with current names in its recipe.
+    """Returns the content of a checkpoint or model file: a recipe of plain values, metadata of the data, and weights.
 
     Raises:
         UserError: If it is something else, or its weights are declared to be larger than the file.
@@ -142,10 +158,7 @@ def checked(path: Path, content: Any) -> dict[str, Any]:
         raise UserError(f"{path}: damaged: facts.max_frames is {facts['max_frames']}, not 1 to {MOST_FRAMES:,} frames")
     if not isinstance(content["state_dict"], dict):
         raise UserError(f"{path}: damaged: its weights are not a mapping of tensors")
-    try:
-        check_weights(content["state_dict"], path)
-    except ValueError as error:
-        raise UserError(f"{path}: damaged: {error}") from error
+    check_weights(content["state_dict"], path)
     return content
 
 
@@ -153,7 +166,7 @@ def check_weights(weights: Mapping[Any, Any], path: Path) -> None:
     """Checks weights from the file at `path`.
 
     Raises:
-        ValueError: If a name is not text, a value is not a dense tensor of real numbers, or all values together are
+        UserError: If a name is not text, a value is not a dense tensor of real numbers, or all values together are
             declared to be larger than the file.
     """
     import torch
@@ -162,12 +175,13 @@ def check_weights(weights: Mapping[Any, Any], path: Path) -> None:
     kinds += (torch.int64, torch.int32, torch.int16, torch.int8, torch.uint8, torch.bool)
     for name, value in weights.items():
         if not (isinstance(name, str) and isinstance(value, torch.Tensor)):
-            raise ValueError(f"its weights are not tensors by name: {str(name)[:80]} is a {type(value).__name__}")
+            shown = f"{str(name)[:80]} is a {type(value).__name__}"
+            raise UserError(f"{path}: damaged: its weights are not tensors by name: {shown}")
         if value.layout != torch.strided or value.device.type != "cpu" or value.dtype not in kinds or value.is_neg():
-            shown = f"{value.dtype}, {value.layout}, on {value.device.type}"
-            raise ValueError(f"its weights are not dense tensors of real numbers: {name[:80]} is {shown}")
+            shown = f"{name[:80]} is {value.dtype}, {value.layout}, on {value.device.type}"
+            raise UserError(f"{path}: damaged: its weights are not dense tensors of real numbers: {shown}")
     if sum(value.numel() * value.element_size() for value in weights.values()) > 2 * path.stat().st_size:  # 2: shared
-        raise ValueError("its weights are declared to be larger than the file")
+        raise UserError(f"{path}: damaged: its weights are declared to be larger than the file")
 
 
 def write_model_file(
@@ -185,9 +199,15 @@ def write_model_file(
     from safetensors.torch import save
 
     tensors = {name: value.detach().cpu().clone().contiguous() for name, value in state.items()}
-    content = {"format": FORMAT, "sha256": _sha256(tensors), "config": config, "facts": facts, "origin": origin}
+    text = json.dumps({"format": FORMAT, "config": config, "facts": facts, "origin": origin})
+    metadata = {"format": "pt", KEY: text, "sha256": content_sha256(text, tensors)}
     with atomic_write(path) as temporary:
-        temporary.write_bytes(save(tensors, {"format": "pt", KEY: json.dumps(content)}))
+        temporary.write_bytes(save(tensors, metadata))
+
+
+def content_sha256(text: str, state: Mapping[str, Tensor]) -> str:
+    """Returns the sha256 of the recipe (JSON) and the weights of a model file."""
+    return hashlib.sha256(f"{text}\n{_sha256(state)}".encode()).hexdigest()
 
 
 def _sha256(state: Mapping[str, Tensor]) -> str:
@@ -218,7 +238,9 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
         raise
     except ValueError as error:
         raise UserError(f"{path}: damaged, or not a checkpoint of this framework") from error
-    return checked(path, checkpoint)
+    checkpoint = checked(path, checkpoint)
+    check_format(path, checkpoint.get(FORMAT_KEY))
+    return checkpoint
 
 
 def weights_sha256(path: Path) -> str:

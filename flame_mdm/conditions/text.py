@@ -88,10 +88,12 @@ class PretrainedText(ConditionEncoder):
         self._pretrained = Pretrained(model, revision, package, sha256)
         self._cache: CaptionCache | None = None
         if not freeze:
-            self.network = self._pretrained.load_network().train()
+            with torch.device("cpu"):  # also in a model that is built on the meta device
+                self.network = self._pretrained.load_network().train()
         if pooling == "pooler":
-            weight = torch.empty(features, features)  # an excessive size fails here, before drawing numbers
-            weight.copy_(torch.from_numpy(np.random.default_rng(0).normal(0, 0.02, (features, features))))
+            weight = torch.empty(features, features)
+            if not weight.is_meta:  # otherwise, the weights come from a checkpoint
+                weight.copy_(torch.from_numpy(np.random.default_rng(0).normal(0, 0.02, (features, features))))
             for name, value in (("weight", weight), ("bias", torch.zeros(features))):
                 if freeze:
                     self.register_buffer(f"pooler_{name}", value)

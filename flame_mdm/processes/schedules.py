@@ -20,7 +20,7 @@ def cosine_betas(num_train_timesteps: int) -> Tensor:
 
     steps = range(num_train_timesteps)
     ratios = [alpha_bar((i + 1) / num_train_timesteps) / alpha_bar(i / num_train_timesteps) for i in steps]
-    return torch.tensor([min(1 - ratio, 0.999) for ratio in ratios], dtype=torch.float64)
+    return torch.tensor([min(1 - ratio, 0.999) for ratio in ratios], dtype=torch.float64, device="cpu")
 
 
 def linear_betas(num_train_timesteps: int) -> Tensor:
@@ -30,7 +30,9 @@ def linear_betas(num_train_timesteps: int) -> Tensor:
     reached below T = 21.
     """
     scale = 1000 / num_train_timesteps
-    return torch.linspace(scale * 1e-4, scale * 0.02, num_train_timesteps, dtype=torch.float64).clamp(max=0.999)
+    return torch.linspace(scale * 1e-4, scale * 0.02, num_train_timesteps, dtype=torch.float64, device="cpu").clamp(
+        max=0.999
+    )
 
 
 class Schedule:

@@ -13,14 +13,14 @@ from torch.optim.swa_utils import get_ema_multi_avg_fn
 class MovingAverage(WeightAveraging):
     """Exponential moving average of the weights, which replaces them in validation and in the saved model.
 
-    Computes the same as Lightning's `EMAWeightAveraging`, but with one call for all parameters, which are listed once:
-    that class walks through all modules in every step, and on CUDA waits for the device. Buffers are copied, not
-    averaged.
+    With the default options it computes the same as Lightning's `EMAWeightAveraging`, but with one call for all
+    parameters, which are listed once: that class walks through all modules in every step, and on CUDA waits for the
+    device. Buffers are copied, not averaged.
 
     Args:
         decay: average = decay * average + (1 - decay) * weights.
-        update_every_n_steps: number of steps between updates.
-        update_starting_at_step: number of steps before the first update, which copies the weights.
+        update_every_n_steps: number of steps between updates, which are at its multiples.
+        update_starting_at_step: up to this step, updates copy the weights instead of averaging them; so does the first.
     """
 
     def __init__(self, decay: float, update_every_n_steps: int = 1, update_starting_at_step: int = 0):
@@ -30,19 +30,6 @@ class MovingAverage(WeightAveraging):
         self.averages: list[Tensor] = []
         self.weights: list[Tensor] = []
         self.begun = False
-
-    @property
-    def state_key(self) -> str:
-        """The name of this callback's state in checkpoints: Lightning's, as in earlier versions."""
-        return "EMAWeightAveraging"
-
-    def should_update(self, step_idx: int | None = None, epoch_idx: int | None = None) -> bool:
-        """Whether step number `step_idx`, from 0, updates the average."""
-        return (
-            step_idx is not None
-            and step_idx >= self.update_starting_at_step
-            and step_idx % self.update_every_n_steps == 0
-        )
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         assert self._average_model is not None
@@ -54,10 +41,10 @@ class MovingAverage(WeightAveraging):
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
         step = trainer.global_step
-        if step <= self._latest_update_step or not self.should_update(step - 1):
+        if step <= self._latest_update_step or step % self.update_every_n_steps:
             return
         assert self._average_model is not None
-        if self.begun:
+        if self.begun and step > self.update_starting_at_step:
             self.average(self.averages, self.weights, None)
         else:
             for average, weight in zip(self.averages, self.weights, strict=True):

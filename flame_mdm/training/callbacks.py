@@ -24,7 +24,7 @@ from torchmetrics import Metric
 from flame_mdm.batch import MotionBatch
 from flame_mdm.conditions.action import ActionLabels
 from flame_mdm.data.datamodule import Clips, MotionDataModule
-from flame_mdm.errors import say
+from flame_mdm.errors import UserError, say
 from flame_mdm.formats.motion import Motion
 from flame_mdm.progress import ProgressBar
 from flame_mdm.reporting.page import number
@@ -64,7 +64,7 @@ class Checkpoints(Checkpoint):
     def __init__(self, folder: str, every_n_steps: int, keep_every_n_steps: int | None = None):
         super().__init__()
         if every_n_steps < 1:
-            raise ValueError(f"callbacks.checkpoints.every_n_steps={every_n_steps}: must be at least 1")
+            raise UserError(f"callbacks.checkpoints.every_n_steps={every_n_steps}: must be at least 1")
         self.folder = Path(folder)
         self.every_n_steps, self.keep_every_n_steps = every_n_steps, keep_every_n_steps
         self.stop = StopRequest()
@@ -85,9 +85,9 @@ class Checkpoints(Checkpoint):
         if trainer.world_size > 1:
             # All processes act on the signal exchanged in the previous step. Reading the one of this step would wait
             # for the step to end on the device.
-            signum, known = int(self.exchanged), torch.tensor(signum, device=pl_module.device)
-            torch.distributed.all_reduce(known, torch.distributed.ReduceOp.MAX)
-            self.exchanged = known
+            signum, received = int(self.exchanged), torch.tensor(signum, device=pl_module.device)
+            torch.distributed.all_reduce(received, torch.distributed.ReduceOp.MAX)
+            self.exchanged = received
         last = bool(signum) or trainer.should_stop or self.step >= trainer.max_steps > 0
         if last or self.step % self.every_n_steps == 0:
             trainer.save_checkpoint(self.folder / "last.ckpt")
@@ -189,8 +189,8 @@ class Report(Callback):
         if not trainer.is_global_zero:
             return
         where = {"train/loss": "on the last batch", "val/loss": "on the validation clips"}
-        found = {text: trainer.callback_metrics.get(name) for name, text in where.items()}
-        losses = ", ".join(f"{value:.4g} {text}" for text, value in found.items() if value is not None)
+        values = {text: trainer.callback_metrics.get(name) for name, text in where.items()}
+        losses = ", ".join(f"{value:.4g} {text}" for text, value in values.items() if value is not None)
         if losses:
             say(f"loss after {trainer.global_step} steps: {losses} (lower is better; comparable within a recipe only)")
         say(f"report: {write_report(self.folder)}")
@@ -214,24 +214,24 @@ def _command(name: str, folder: Path, *words: str) -> str:
     return " ".join(("make", name, *(f"{key.upper()}={value}" for key, _, value in pairs)))
 
 
-def explained(
+def explain_metrics(
     values: Mapping[str, float | None], real: Mapping[str, float | None], metrics: Mapping[str, type[Metric]]
 ) -> list[str]:
-    """Returns lines that say what metrics mean, by their docstrings, with their values next to those of real motions.
+    """Returns lines that explain metrics by their docstrings, with their values next to those of real motions.
 
     Args:
         values: by metric, or by metric/part; None = no value.
-        real: the same of real motions, as far as it is known.
+        real: the same for real motions; values may be missing.
         metrics: classes by name.
     """
     lines = []
     for name, metric in metrics.items():
-        known = {key: value for key, value in values.items() if key.partition("/")[0] == name and value is not None}
-        beside = {key: f" (real motions: {number(real[key])})" if real.get(key) is not None else "" for key in known}
-        if known:
+        own = {key: value for key, value in values.items() if key.partition("/")[0] == name and value is not None}
+        references = {key: f" (real motions: {number(real[key])})" for key in own if real.get(key) is not None}
+        if own:
             better = {True: " Higher is better.", False: " Lower is better.", None: ""}[metric.higher_is_better]
             lines.append(f"{name}: {(getdoc(metric) or '').partition(chr(10))[0]}{better}")
-            lines += [f"  {key}: {number(value)}{beside[key]}" for key, value in known.items()]
+            lines += [f"  {key}: {number(value)}{references.get(key, '')}" for key, value in own.items()]
     return lines
 
 
@@ -288,7 +288,7 @@ class SampleMotions(Callback):
         metrics: dict[str, Metric] | None = None,
     ):
         if not seconds > 0:
-            raise ValueError(f"callbacks.samples.seconds={seconds}: must be greater than 0")
+            raise UserError(f"callbacks.samples.seconds={seconds}: must be greater than 0")
         self.folder, self.every_n_steps, self.seconds = Path(folder), every_n_steps, seconds
         self.prompts = [(p, {}) if isinstance(p, str) else (p[0], dict(p[1])) for p in prompts or []]
         self.unconditioned, self.metrics = unconditioned, metrics or {}
@@ -326,7 +326,7 @@ class SampleMotions(Callback):
         _, folder, values = self.written
         if trainer.is_global_zero:
             real = self._measure_real(trainer.datamodule.train, pl_module) if values else {}  # type: ignore[attr-defined]
-            say(*explained(values, real, {name: type(metric) for name, metric in self.metrics.items()}))
+            say(*explain_metrics(values, real, {name: type(metric) for name, metric in self.metrics.items()}))
             say(f"player: {folder / 'player.html'} (open in any browser), animation: {folder / 'motions.gif'}")
 
     def write(self, trainer: Trainer, pl_module: LightningModule) -> None:
@@ -343,7 +343,8 @@ class SampleMotions(Callback):
         if not trainer.is_global_zero:
             return
         write_motions(folder, motions, {"seed": 0, "step": step, "checkpoint": ""})
-        values = self.measure([torch.from_numpy(m.joints) for m in motions], [wanted for _, wanted in self.prompts])
+        requested = [attributes for _, attributes in self.prompts]
+        values = self.measure([torch.from_numpy(m.joints) for m in motions], requested)
         for logger in trainer.loggers:
             # Lightning logs steps from 0: the values of this validation are logged at step - 1
             log_video(logger, "samples", folder / "motions.gif", step - 1)
@@ -368,14 +369,15 @@ class SampleMotions(Callback):
     def _measure_real(self, clips: Clips, task: LightningModule) -> dict[str, float | None]:
         """Computes all metrics of up to `REAL` training clips, which have the attributes that all prompts request."""
         assert isinstance(task, MotionGeneration)
-        asked = [set(requested) for _, requested in self.prompts]
-        common, every = (set.intersection(*asked), set.union(*asked)) if asked else (set(), set())
+        names = [set(requested) for _, requested in self.prompts]
+        common, all_names = (set.intersection(*names), set.union(*names)) if names else (set(), set())
         usable = [k for k, clip in enumerate(clips.clips) if common <= clip.attributes.keys()]
         chosen = usable[:: -(-len(usable) // REAL) or 1]
-        known = task.representation
-        decoded = (known.to_joints(clips[k, -1][1][None].to(known.mean.device))[0].cpu() for k in chosen)
-        wanted = [{name: v for name, v in clips.clips[k].attributes.items() if name in every} for k in chosen]
-        return self.measure(list(decoded), wanted) if chosen else {}
+        representation = task.representation
+        features = (clips[k, -1][1][None].to(representation.mean.device) for k in chosen)
+        joints = [representation.to_joints(x)[0].cpu() for x in features]
+        attributes = [{name: v for name, v in clips.clips[k].attributes.items() if name in all_names} for k in chosen]
+        return self.measure(joints, attributes) if chosen else {}
 
     def measure(self, motions: Sequence[Tensor], requested: Sequence[dict[str, Any]]) -> dict[str, float | None]:
         """Computes all metrics of motions (F, J, 3), in meters; a metric without a value is None."""
@@ -383,10 +385,10 @@ class SampleMotions(Callback):
         for name, metric in self.metrics.items():
             metric.reset()
             metric.distributed_available_fn = bool  # returns False: no synchronization, this process has all motions
-            for motion, wanted in zip(motions, requested, strict=True):
+            for motion, attributes in zip(motions, requested, strict=True):
                 mask = torch.ones(1, len(motion), dtype=torch.bool)
-                known = {"joints": motion[None], "mask": mask, "requested": [wanted]}
-                metric.update(**{k: v for k, v in known.items() if k in signature(metric.update).parameters})
+                inputs = {"joints": motion[None], "mask": mask, "requested": [attributes]}
+                metric.update(**{k: v for k, v in inputs.items() if k in signature(metric.update).parameters})
             result = metric.compute()
             parts = result if isinstance(result, dict) else {"": result}
             values |= {f"{name}/{k}".rstrip("/"): None if v is None else float(v) for k, v in parts.items()}

@@ -15,6 +15,7 @@ from hydra.utils import get_class
 from lightning import Callback, Trainer, seed_everything
 from lightning.fabric.plugins.environments.slurm import SLURMEnvironment
 from lightning.fabric.plugins.environments.torchelastic import TorchElasticEnvironment
+from lightning.pytorch.utilities import rank_zero_only
 
 from flame_mdm.checkpoints.loading import NO_GPU
 from flame_mdm.config import Config, instantiate
@@ -23,9 +24,10 @@ from flame_mdm.errors import UserError, say
 from flame_mdm.task import Task
 from flame_mdm.training.averaging import MovingAverage
 from flame_mdm.training.callbacks import Interrupted, Measurements, Progress, Report
-from flame_mdm.training.guards import AtomicCheckpoints, lost_worker, newest, out_of_memory
+from flame_mdm.training.checkpointing import AtomicCheckpoints, Resumed, check_training_state, newest
+from flame_mdm.training.guards import lost_worker, out_of_memory
 from flame_mdm.training.loggers import History
-from flame_mdm.training.provenance import Provenance
+from flame_mdm.training.provenance import WriteProvenance
 from flame_mdm.training.speed import accelerate
 
 
@@ -38,7 +40,8 @@ def fit(folder: Path, config: Config) -> None:
     _quiet()
     check_devices(config["trainer"])
     torch.set_float32_matmul_precision("high")
-    checkpoint, step = newest(folder / "checkpoints")
+    resumed = newest(folder / "checkpoints")
+    step = resumed.step if resumed else 0
     most = config["trainer"]["max_steps"]
     if 0 <= most <= step:
         say(f"{folder}: already trained for {step} steps. Increase trainer.max_steps, or start a new run: run.name=...")
@@ -46,12 +49,12 @@ def fit(folder: Path, config: Config) -> None:
     seed_everything(config["seed"], verbose=False)
     representation = instantiate(config["representation"])
     data: MotionDataModule = instantiate(config["data"], representation=representation, seed=config["seed"])
-    if checkpoint is not None:
-        _same_data(checkpoint, data)
+    if resumed:
+        _check_same_data(resumed, data)
     task: Task = get_class(config["task"]["_target_"]).build(config, representation, actions=data.actions)
     fast = config["run"].get("speed") == "fast"
     precision = accelerate(task, data, config) if fast else config["trainer"]["precision"]
-    callbacks: list[Callback] = [Provenance(config)]
+    callbacks: list[Callback] = [WriteProvenance(config)]
     if config["ema"]:
         callbacks.append(MovingAverage(**config["ema"]))  # before the callbacks that use averaged weights in validation
     callbacks += [instantiate(c) for c in config["callbacks"].values() if c]
@@ -59,7 +62,7 @@ def fit(folder: Path, config: Config) -> None:
         callbacks.append(Progress())
     callbacks += [Measurements(), Report(folder)]
     loggers = [instantiate(config["logger"])] if config["logger"] else []
-    plugins: list[Any] = [AtomicCheckpoints()]
+    plugins: list[Any] = [AtomicCheckpoints(folder / "checkpoints", resumed)]
     if SLURMEnvironment.detect() and not TorchElasticEnvironment.detect():
         # Lightning would save during a step, to a file that it then prefers to `last.ckpt`.
         plugins.append(SLURMEnvironment(auto_requeue=False))
@@ -71,8 +74,10 @@ def fit(folder: Path, config: Config) -> None:
         default_root_dir=str(folder),
         enable_model_summary=False,
     )
+    if resumed:
+        check_training_state(resumed, task, trainer)
     try:
-        trainer.fit(task, data, ckpt_path=checkpoint, weights_only=True)
+        trainer.fit(task, data, ckpt_path=resumed.path if resumed else None, weights_only=True)
     except Interrupted as stop:
         if not trainer.is_global_zero:  # the first process reports it; launchers treat any other exit code as a crash
             return
@@ -128,23 +133,19 @@ def _requeue() -> None:
         say(f"error: {' '.join(command)}: {failure}. Submit the job again", error=True)
 
 
-def _same_data(checkpoint: Path, data: MotionDataModule) -> None:
+def _check_same_data(resumed: Resumed, data: MotionDataModule) -> None:
     """Checks, on the first process, that a resumed run has the data that it was trained on.
 
     Raises:
         UserError: If the data has another fingerprint.
     """
-    import torch
-    from lightning.pytorch.utilities import rank_zero_only
-
     if rank_zero_only.rank:
         return
     data.prepare_data()
-    facts = torch.load(checkpoint, map_location="cpu", weights_only=True, mmap=True)["facts"]  # reads no weights
-    trained, found = facts.get("fingerprint"), data.open().fingerprint
-    if trained not in (None, found):
+    before, now = resumed.content["facts"].get("fingerprint"), data.open().fingerprint
+    if before not in (None, now):
         raise UserError(
-            f"{checkpoint}: trained on data with fingerprint {trained}, but {data.folder} has {found}. Start another "
+            f"{resumed.path}: trained on data with fingerprint {before}, but {data.folder} has {now}. Start another "
             "run with run.name=..., or prepare the original data again"
         )
 

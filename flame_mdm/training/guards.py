@@ -1,9 +1,8 @@
-"""Safeguards for long runs: run lock, atomic checkpoints, divergence detection."""
+"""Safeguards for long runs: run lock, divergence detection, explanations of lost processes and exhausted memory."""
 
 from __future__ import annotations
 
 import json
-import os
 import re
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
@@ -13,16 +12,11 @@ from typing import Any
 
 import torch
 from lightning import Callback, LightningModule, Trainer
-from lightning.pytorch.plugins.io import TorchCheckpointIO
 from torch import Tensor
-from torch.utils._pytree import tree_leaves
 
 from flame_mdm.batch import MotionBatch
-from flame_mdm.checkpoints.model_files import read_checkpoint
 from flame_mdm.errors import UserError, say
-from flame_mdm.safe_io import locked, write_failure
-
-LAST, PREVIOUS = "last.ckpt", "previous.ckpt"
+from flame_mdm.safe_io import locked
 
 
 @contextmanager
@@ -50,84 +44,6 @@ def only_run(folder: Path) -> Iterator[None]:
         finally:
             if new and not (folder / "config.yaml").exists():  # training did not start, there are only logger files
                 shutil.rmtree(folder, ignore_errors=True)
-
-
-class AtomicCheckpoints(TorchCheckpointIO):
-    """Writes checkpoints atomically: to a temporary file, synced and then renamed.
-
-    The former `last.ckpt` is kept as `previous.ckpt`.
-    """
-
-    def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None) -> None:
-        """Writes a checkpoint.
-
-        Raises:
-            UserError: If it cannot be written, for example on a full disk. Earlier checkpoints remain unchanged.
-        """
-        path = Path(path)
-        partial = path.with_suffix(".partial")
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            with partial.open("wb") as file:
-                torch.save(checkpoint, file)
-                file.flush()
-                os.fsync(file.fileno())
-            if path.name == LAST and path.exists():
-                path.replace(path.with_name(PREVIOUS))
-            partial.replace(path)
-        except (OSError, RuntimeError) as error:  # torch reports a failed write as either
-            partial.unlink(missing_ok=True)
-            reason = write_failure(error if isinstance(error, OSError) else error.__context__ or error, path)
-            raise UserError(
-                f"{path}: the checkpoint of step {checkpoint['global_step']} cannot be written ({reason}). Earlier "
-                "checkpoints are intact: free some space, and run the same command to resume"
-            ) from error
-
-
-def newest(folder: Path) -> tuple[Path | None, int]:
-    """Returns the checkpoint to resume from, and its step: the last one, or the previous one if the last is damaged.
-
-    Args:
-        folder: folder in which `AtomicCheckpoints` writes; it need not exist.
-
-    Returns:
-        Path and step; (None, 0) if there is no checkpoint.
-
-    Raises:
-        UserError: If all existing checkpoints are damaged.
-    """
-    there = [folder / name for name in (LAST, PREVIOUS) if (folder / name).exists()]
-    for number, path in enumerate(there):
-        try:
-            step = _resumable(path, read_checkpoint(path))
-        except UserError as error:
-            if number + 1 == len(there):
-                raise UserError(f"{error}. There is no other checkpoint. Delete {folder} to start over") from error
-            say(f"{error}; resuming from the previous checkpoint")
-        else:
-            if path.name != LAST:
-                say(f"{path}: resuming from step {step}")
-            return path, step
-    return None, 0
-
-
-def _resumable(path: Path, checkpoint: dict[str, Any]) -> int:
-    """Returns the step of a checkpoint, after checking that it has everything needed to resume training."""
-    step, optimizers = checkpoint.get("global_step"), checkpoint.get("optimizer_states")
-    if type(step) is not int or step < 0:
-        raise UserError(f"{path}: damaged: its global_step is {str(step)[:40]}, not a number of steps")
-    whole = isinstance(optimizers, list) and all(
-        isinstance(state, dict)
-        and isinstance(state.get("state"), dict)
-        and isinstance(state.get("param_groups"), list)
-        and all(isinstance(group, dict) and isinstance(group.get("params"), list) for group in state["param_groups"])
-        for state in optimizers
-    )
-    shapes = {(), (1,)} | {value.shape for value in checkpoint["state_dict"].values()}
-    whole &= all(value.shape in shapes for value in tree_leaves(optimizers) if isinstance(value, Tensor))
-    if not whole or not all(isinstance(checkpoint.get(name), dict) for name in ("loops", "callbacks")):
-        raise UserError(f"{path}: damaged: the state of the optimizer, the loops or the callbacks is missing")
-    return step
 
 
 class BadLoss(Callback):

@@ -15,14 +15,16 @@ from lightning import Callback, LightningModule, Trainer
 from flame_mdm.config import Config, movable, save
 from flame_mdm.data.datamodule import MotionDataModule
 from flame_mdm.errors import say
+from flame_mdm.runs import PROVENANCE, Provenance
 from flame_mdm.safe_io import write_json
+from flame_mdm.schemas import read_json
 from flame_mdm.task import Task
 from flame_mdm.training.loggers import log_config
 
 PACKAGES = ("flame-mdm", "torch", "lightning", "torchmetrics", "transformers", "numpy", "scipy")
 
 
-class Provenance(Callback):
+class WriteProvenance(Callback):
     """Writes `config.yaml` and `provenance.json` at the start of training, and prints a short summary.
 
     The loggers also get their contents.
@@ -37,19 +39,28 @@ class Provenance(Callback):
         assert isinstance(pl_module, Task)
         folder = Path(self.config["run"]["dir"])
         save(movable(self.config), folder / "config.yaml", head="A saved run. EXP=path/to/this/file repeats it.")
-        known: dict[str, Any] = pl_module.facts  # type: ignore[assignment]
         facts = {
             **environment(),
             "device": device_name(trainer),
             "parameters": sum(p.numel() for p in pl_module.parameters() if p.requires_grad),
-            "data": {name: value for name, value in known.items() if name not in ("vocabulary", "captions")},
+            "data": {name: fact for name, fact in pl_module.facts.items() if name not in ("vocabulary", "captions")},
         }
-        write_json(folder / "provenance.json", facts)
+        if trainer.global_step and (folder / PROVENANCE).exists():
+            self._compare_code(read_json(folder / PROVENANCE, Provenance, "delete it to resume"), facts)
+        write_json(folder / PROVENANCE, facts)
         for logger in trainer.loggers:
             log_config(logger, self.config, facts)
         self._introduce(trainer, pl_module, facts)
 
-    def _introduce(self, trainer: Trainer, task: Any, facts: dict[str, Any]) -> None:
+    @staticmethod
+    def _compare_code(before: Provenance, now: dict[str, Any]) -> None:
+        """Warns if a resumed run continues with other code or packages, since its results may then differ."""
+        kinds = {"commit": "code", "changed": "uncommitted changes", "packages": "packages"}
+        different = [kind for name, kind in kinds.items() if getattr(before, name) != now[name]]
+        if different:
+            say(f"resuming with different {' and '.join(different)}: results may differ from an uninterrupted run")
+
+    def _introduce(self, trainer: Trainer, task: Task, facts: dict[str, Any]) -> None:
         count = facts["parameters"]
         size = self.config["data"]["batch_size"] * trainer.world_size * trainer.accumulate_grad_batches
         module: MotionDataModule = trainer.datamodule  # type: ignore[attr-defined]
@@ -63,8 +74,8 @@ class Provenance(Callback):
         say(f"device: {facts['device']}, {trainer.precision}, speed={speed}")
         if size > self.config["data"]["batch_size"]:
             times = f"{trainer.world_size} processes x {trainer.accumulate_grad_batches} accumulated"
-            each, lr = self.config["data"]["batch_size"], self.config["optimizer"].get("lr")
-            say(f"batch: {size} clips = {each} x {times}; optimizer.lr={lr} is not scaled with the batch size")
+            clips, lr = self.config["data"]["batch_size"], self.config["optimizer"].get("lr")
+            say(f"batch: {size} clips = {clips} x {times}; optimizer.lr={lr} is not scaled with the batch size")
         passes = trainer.max_steps * size / len(module.train)
         say(f"steps: {trainer.global_step} to {trainer.max_steps}, {size} clips per step, {passes:.0f} epochs")
 

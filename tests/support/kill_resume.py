@@ -32,7 +32,7 @@ from flame_mdm.checkpoints.model_files import read_checkpoint
 from flame_mdm.commands import evaluate, prepare, train
 from flame_mdm.data.store import Store
 from flame_mdm.task import MotionGeneration
-from flame_mdm.training import callbacks, guards
+from flame_mdm.training import callbacks, checkpointing
 
 STEPS = 400
 RECIPE = [
@@ -75,7 +75,7 @@ class Kill:
             file.flush()
             os.kill(os.getpid(), self.signum)
 
-        guards.torch.save = half
+        checkpointing.torch.save = half
 
 
 def work(main: Callable[[list[str]], int], words: list[str], kill: Kill | None, log: Path) -> None:
@@ -148,7 +148,8 @@ def training(trials: Trials, kills: int) -> None:
         kill = trials.kill(number, 0.05, 2 * STEPS // (kills + 6), writing=number % 4 == 2)
         code, _ = trials.run(train.main, words("killed"), kill)
         with contextlib.redirect_stdout(io.StringIO()) as said:
-            step = guards.newest(folder / "killed" / "checkpoints")[1]
+            resumed = checkpointing.newest(folder / "killed" / "checkpoints")
+        step = resumed.step if resumed else 0
         trials.row(number, kill, code, f"step {step} {said.getvalue().strip()}")
     trials.run(train.main, words("killed"))
     ends = [read_checkpoint(folder / name / "checkpoints" / "last.ckpt") for name in ("whole", "killed")]

@@ -1,0 +1,254 @@
+"""Atomic checkpoints, and resuming from them after validation.
+
+A run directory may come from somebody else, and Lightning restores the state of loops, callbacks and optimizers without
+checking it. So `newest` and `check_training_state` check what a checkpoint says before Lightning reads it, and
+`AtomicCheckpoints` only removes files directly in the folder of the checkpoints.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from lightning import Trainer
+from lightning.pytorch.callbacks import ModelCheckpoint
+from lightning.pytorch.plugins.io import TorchCheckpointIO
+from packaging.version import InvalidVersion, Version
+from torch import Tensor
+
+from flame_mdm.checkpoints.model_files import FORMAT, FORMAT_KEY, check_weights, read_checkpoint
+from flame_mdm.config import instantiate
+from flame_mdm.errors import UserError, say
+from flame_mdm.safe_io import write_failure
+from flame_mdm.task import Task
+
+LAST, PREVIOUS = "last.ckpt", "previous.ckpt"
+OLDEST_LIGHTNING = Version("2.6")
+"""Lightning migrates checkpoints of older versions, by code that trusts them."""
+SCALAR = torch.tensor(0.0)
+LARGEST = 2**53
+"""Numbers of steps and learning rates are smaller."""
+
+
+class Resumed(NamedTuple):
+    """The checkpoint from which a run resumes."""
+
+    path: Path
+    step: int
+    content: dict[str, Any]
+
+
+class AtomicCheckpoints(TorchCheckpointIO):
+    """Writes checkpoints atomically: to a temporary file, synced and then renamed.
+
+    The former `last.ckpt` is kept as `previous.ckpt`.
+
+    Args:
+        folder: folder of the checkpoints; files elsewhere are never removed.
+        resumed: the checkpoint from which the run resumes, which is not read again.
+    """
+
+    def __init__(self, folder: Path, resumed: Resumed | None = None):
+        super().__init__()
+        self.folder, self.resumed = folder, resumed
+
+    def load_checkpoint(self, path: Any, *args: Any, **options: Any) -> dict[str, Any]:
+        """Returns the content of the checkpoint that the run resumes from, as `check_training_state` checked it."""
+        resumed, self.resumed = self.resumed, None  # it needs as much memory as the model and its optimizer
+        if resumed is None or resumed.path != Path(path):
+            raise UserError(f"{path}: only {resumed.path if resumed else 'a checked checkpoint'} can be resumed")
+        return resumed.content
+
+    def remove_checkpoint(self, path: Any) -> None:
+        """Removes a checkpoint, which is a file directly in the folder."""
+        if directly_in(self.folder, path) and Path(path).is_file():
+            Path(path).unlink()
+
+    def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None) -> None:
+        """Writes a checkpoint.
+
+        Raises:
+            UserError: If it cannot be written, for example on a full disk. Earlier checkpoints remain unchanged.
+        """
+        path = Path(path)
+        partial = path.with_suffix(".partial")
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with partial.open("wb") as file:
+                torch.save(checkpoint | {FORMAT_KEY: FORMAT}, file)
+                file.flush()
+                os.fsync(file.fileno())
+            if path.name == LAST and path.exists():
+                path.replace(path.with_name(PREVIOUS))
+            partial.replace(path)
+        except (OSError, RuntimeError) as error:  # torch reports a failed write as either
+            partial.unlink(missing_ok=True)
+            reason = write_failure(error if isinstance(error, OSError) else error.__context__ or error, path)
+            raise UserError(
+                f"{path}: the checkpoint of step {checkpoint['global_step']} cannot be written ({reason}). Earlier "
+                "checkpoints are intact: free some space, and run the same command to resume"
+            ) from error
+
+
+def newest(folder: Path) -> Resumed | None:
+    """Returns the checkpoint to resume from: the last one, or the previous one if the last is damaged.
+
+    Args:
+        folder: folder in which `AtomicCheckpoints` writes; it need not exist.
+
+    Raises:
+        UserError: If all existing checkpoints are damaged.
+    """
+    paths = [folder / name for name in (LAST, PREVIOUS) if (folder / name).exists()]
+    for path in paths:
+        try:
+            content = read_checkpoint(path)
+            step = content.get("global_step")
+            if type(step) is not int or step < 0:
+                raise UserError(f"{path}: damaged: its global_step is {str(step)[:40]}, not a number of steps")
+        except UserError as error:
+            if path == paths[-1]:
+                raise UserError(f"{error}. There is no other checkpoint. Delete {folder} to start over") from error
+            say(f"{error}; resuming from the previous checkpoint")
+        else:
+            if path.name != LAST:
+                say(f"{path}: resuming from step {step}")
+            return Resumed(path, step, content)
+    return None
+
+
+def check_training_state(resumed: Resumed, task: Task, trainer: Trainer) -> None:
+    """Checks that a checkpoint holds the state of training `task` with `trainer`, before `Trainer.fit` is called.
+
+    The state of a `ModelCheckpoint` is dropped if it names a path that is not directly in the folder of the
+    checkpoints: the run directory was moved, or the path is an attack on other files.
+
+    Raises:
+        UserError: If a part is missing or has other types or shapes.
+    """
+    content, path = resumed.content, resumed.path
+    if fault := next(_faults(content, path, task, trainer), None):
+        raise UserError(
+            f"{path}: damaged: {fault} is missing or does not fit the recipe. Delete this file to resume from another "
+            "checkpoint"
+        )
+    for callback in trainer.callbacks:  # type: ignore[attr-defined]
+        state = content["callbacks"].get(callback.state_key)
+        if isinstance(callback, ModelCheckpoint) and state:
+            scores, kth = state["best_k_models"], state["kth_best_model_path"]
+            paths = [state["best_model_path"], state["last_model_path"], kth, *scores]
+            inside = all(directly_in(path.parent, name) for name in paths if name)
+            if not inside or (scores and kth not in scores):
+                del content["callbacks"][callback.state_key]
+
+
+def directly_in(folder: Path, path: str | Path) -> bool:
+    """Returns whether a path names an entry of a folder itself, after links and `..` are resolved."""
+    if "\0" in str(path) or Path(path).name in ("", ".."):
+        return False
+    return Path(path).parent.resolve() == folder.resolve()
+
+
+def _faults(content: dict[str, Any], path: Path, task: Task, trainer: Trainer) -> Iterator[str]:
+    """Yields the parts of a checkpoint that Lightning cannot restore; later checks rely on earlier ones."""
+    version = content.get("pytorch-lightning_version")
+    try:
+        supported = isinstance(version, str) and Version(version) >= OLDEST_LIGHTNING
+    except InvalidVersion:
+        supported = False
+    if not supported:
+        yield "pytorch-lightning_version"
+    weights = {name: value.to("meta") for name, value in task.state_dict().items()}
+    averaged = bool(task.config.get("ema"))
+    for name in ("state_dict", "current_model_state") if averaged else ("state_dict",):
+        saved = content.get(name)
+        try:
+            check_weights(saved if isinstance(saved, dict) else {None: None}, path)
+        except UserError:
+            yield name
+        extra = {key: value for key, value in saved.items() if key.endswith("_extra_state")}  # of any shape
+        yield from _differences(weights | extra, saved, name)
+    if averaged:
+        yield from _differences({"n_averaged": torch.tensor(0)}, content.get("averaging_state"), "averaging_state")
+    loops = content.get("loops")
+    progress = loops.get("fit_loop") if isinstance(loops, dict) else None
+    yield from _differences(trainer.fit_loop.state_dict(), progress, "loops.fit_loop")
+    precision = trainer.precision_plugin
+    if scaler := precision.state_dict():
+        name = type(precision).__qualname__
+        yield from _differences(scaler, content.get(name), name)
+    yield from _faults_of_callbacks(content.get("callbacks"), trainer)
+    yield from _faults_of_optimizer(content.get("optimizer_states"), content.get("lr_schedulers"), task, trainer)
+
+
+def _faults_of_callbacks(states: Any, trainer: Trainer) -> Iterator[str]:
+    if not isinstance(states, dict) or not all(isinstance(state, dict) for state in states.values()):
+        yield "callbacks"
+        return
+    for callback in trainer.callbacks:  # type: ignore[attr-defined]
+        key, state = callback.state_key, states.get(callback.state_key)
+        if not state or type(callback).__module__.partition(".")[0] not in ("lightning", "flame_mdm"):
+            continue
+        expected = callback.state_dict()
+        if isinstance(callback, ModelCheckpoint):
+            models = state.get("best_k_models")
+            if not isinstance(models, dict) or not all(isinstance(name, str) for name in models):
+                yield f"callbacks.{key}.best_k_models"
+                return
+            expected |= {"dirpath": "", "best_k_models": dict.fromkeys(models, SCALAR)}
+            for name in ("best_model_score", "current_score", "kth_value"):
+                expected[name] = None if state.get(name) is None else SCALAR
+        yield from _differences(expected, state, f"callbacks.{key}")
+
+
+def _faults_of_optimizer(states: Any, schedulers: Any, task: Task, trainer: Trainer) -> Iterator[str]:
+    """Compares with the state of the recipe's optimizer after a step with one parameter."""
+    task.trainer = trainer
+    made: Any = task.configure_optimizers()
+    optimizer = made["optimizer"] if isinstance(made, dict) else made
+    scheduler = [made["lr_scheduler"]["scheduler"].state_dict()] if isinstance(made, dict) else []
+    yield from _differences(scheduler, schedulers, "lr_schedulers")
+    groups = optimizer.state_dict()["param_groups"]
+    saved = states[0] if isinstance(states, list) and len(states) == 1 else None
+    entries = saved.get("state") if isinstance(saved, dict) else None
+    if not isinstance(saved, dict) or not isinstance(entries, dict):
+        yield "optimizer_states"
+        return
+    yield from _differences(groups, saved.get("param_groups"), "optimizer_states.param_groups")
+    learning_rates = {"lr": 0.0, "initial_lr": 0.0}
+    if [g | learning_rates for g in saved["param_groups"]] != [g | learning_rates for g in groups]:
+        yield "optimizer_states.param_groups"
+    weight = torch.zeros(2, requires_grad=True)
+    trial = instantiate(task.optimizer, params=[weight])
+    weight.sum().backward()
+    trial.step()
+    template = trial.state_dict()["state"].get(0, {})
+    parameters = [parameter for parameter in task.parameters() if parameter.requires_grad]
+    for number, entry in entries.items():
+        if type(number) is not int or not 0 <= number < len(parameters):
+            yield "optimizer_states.state"
+            return
+        like = parameters[number].detach().to("meta")
+        expected = {name: like if getattr(value, "ndim", 0) else value for name, value in template.items()}
+        yield from _differences(expected, entry, f"optimizer_states.state.{number}")
+
+
+def _differences(expected: Any, actual: Any, where: str) -> Iterator[str]:
+    """Yields the keys whose values have other types or shapes than those in `expected`, which is trusted."""
+    if isinstance(expected, dict) and isinstance(actual, dict) and actual.keys() == expected.keys():
+        for name, value in expected.items():
+            yield from _differences(value, actual[name], f"{where}.{name}")
+    elif isinstance(expected, list | tuple) and isinstance(actual, list | tuple) and len(actual) == len(expected):
+        for number, value in enumerate(expected):
+            yield from _differences(value, actual[number], f"{where}.{number}")
+    elif isinstance(expected, Tensor) and isinstance(actual, Tensor):
+        if (actual.shape, actual.is_floating_point()) != (expected.shape, expected.is_floating_point()):
+            yield where
+    elif isinstance(expected, int | float) and type(actual) in (int, float) and not isinstance(expected, bool):
+        if not abs(actual) < LARGEST or (isinstance(expected, int) and (type(actual) is float or actual < 0)):
+            yield where
+    elif type(actual) is not type(expected) or isinstance(expected, dict | list | tuple):
+        yield where

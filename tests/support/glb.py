@@ -40,7 +40,7 @@ class Glb:
         begin = view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
         assert begin % 4 == 0
         width = WIDTHS[accessor["type"]]
-        array = np.frombuffer(self.binary, KINDS[accessor["componentType"]], accessor["count"] * width, begin)
+        array = np.frombuffer(self.binary, KINDS[accessor["componentType"]], accessor["count"] * width, begin).copy()
         array = array.reshape(-1, width)
         assert accessor.get("min", array.min(0).tolist()) == array.min(0).tolist()
         assert accessor.get("max", array.max(0).tolist()) == array.max(0).tolist()

@@ -6,6 +6,7 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from support.fixtures import ROOT
@@ -14,6 +15,7 @@ from support.runs import RUN, TWO, alarm, finish, free_port, reference, spawn
 from flame_mdm.__main__ import main
 from flame_mdm.checkpoints.model_files import read_checkpoint
 from flame_mdm.config import compose
+from flame_mdm.data.synthetic import Synthetic
 from flame_mdm.errors import UserError
 
 SLURM = {
@@ -92,49 +94,58 @@ def test_a_slurm_job_that_runs_out_of_time_is_requeued_and_ends_as_if_it_had_not
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("recipe", ["quickstart", "synthetic/mdm"])
-def test_jobs_of_a_sweep_run_beside_one_another_in_folders_of_their_own(recipe, tiny, tmp_path):
+def test_jobs_of_a_sweep_run_beside_one_another_in_folders_of_their_own(tiny, tmp_path):
     """On this machine; the first one is refused, as its folder holds another run."""
     words = [*tiny, "callbacks.samples=null", "callbacks.best=null", "trainer.max_steps=1"]
     (tmp_path / "run" / "seed=1").mkdir(parents=True)
     (tmp_path / "run" / "seed=1" / "config.yaml").write_text("seed: 5\n")
-    code, out, err = finish(spawn(["flame_mdm", "train", recipe, *words, "seed=1,2", "launch=local"]))
+    code, out, err = finish(spawn(["flame_mdm", "train", "synthetic/mdm", *words, "seed=1,2", "launch=local"]))
     assert code == 1, out + err
     assert str(tmp_path / "run" / ".submitit") in out
     logs = "\n".join(path.read_text() for path in (tmp_path / "run" / ".submitit").rglob("*log.err"))
     assert "seed=1/config.yaml: not the configuration" in logs
     assert not (tmp_path / "run" / "seed=1" / "checkpoints").exists()
-    checkpoint = read_checkpoint(tmp_path / "run" / "seed=2" / "checkpoints" / "last.ckpt")
-    assert checkpoint["config"]["seed"] == 2
-    assert "launch" not in checkpoint["config"]
+    config = read_checkpoint(tmp_path / "run" / "seed=2" / "checkpoints" / "last.ckpt")["config"]
+    assert config["seed"] == 2
+    assert "launch" not in config
+
+
+@pytest.mark.slow
+def test_other_commands_are_launched_too(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    np.savez("walk.npz", joints=next(Synthetic(clips=20).clips(30.0)).motion, fps=30.0)
+    words = ["convert", "walk.npz", "out.bvh", "rest_pose=true,false", "launch=local", "hydra.launcher.timeout_min=5"]
+    code, out, err = finish(spawn(["flame_mdm", *words]))
+    assert code == 0, out + err
+    assert "waiting for the jobs; their output is in runs/sweeps/.submitit" in out
+    assert (tmp_path / "out.bvh").exists()
 
 
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["launch=slurmm"], "no launch is called 'slurmm'. Did you mean slurm?"),
-        (["launch=local", "trainer.devices=2"], "launch=local runs each job in one process"),
-        (["launch=slurm", "trainer.max_step=1"], "Did you mean trainer.max_steps"),
-        (["launch=slurm", "optimizer.lr=1,2", "logger=csv,nothing"], "no logger is called 'nothing'"),
-        (["launch=slurm", "hydra.launcher.partitionn=gpu"], "partitionn"),
+        (["train", "quickstart", "launch=slurmm"], "no launch is called 'slurmm'. Did you mean slurm?"),
+        (["train", "quickstart", "launch=local", "trainer.devices=2"], "launch=local runs each job in one process"),
+        (["train", "quickstart", "launch=slurm", "trainer.max_step=1"], "Did you mean trainer.max_steps"),
+        (["train", "quickstart", "launch=slurm", "seed=1,2", "logger=csv,nothing"], "no logger is called 'nothing'"),
+        (["train", "quickstart", "launch=slurm", "hydra.launcher.partitionn=gpu"], "partitionn"),
+        (["convert", "a", "b", "launch=slurm", "hydra.launcher.partitionn=gpu"], "partitionn"),
+        (["convert", "a", "b", "launch=slurm", "fps=1,x"], "fps=x: must be a finite number"),
     ],
 )
-def test_what_is_wrong_is_told_before_anything_is_submitted(words, message, tiny, tmp_path, capsys):
-    assert main(["train", "quickstart", *tiny, *words]) == 1
-    told = capsys.readouterr().err
-    assert told.startswith("error: ")
-    assert message in told
-    assert told.count("\n") == 1
-    assert not (tmp_path / "run").exists()
+def test_what_is_wrong_is_told_before_anything_is_submitted(words, message, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(words) == 1
+    error = capsys.readouterr().err
+    assert error.startswith("error: ")
+    assert message in error
+    assert error.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("launcher", ["local", "slurm"])
-@pytest.mark.parametrize("recipe", ["humanml3d/mdm", "motion_clip/synthetic"])
-def test_launchers_are_found_for_recipes_in_folders(recipe, launcher):
-    assert compose(recipe, [f"launch={launcher}"]) == compose(recipe)
-
-
-def test_a_missing_launcher_names_the_extra(monkeypatch):
+def test_launchers_are_found_for_recipes_in_folders_or_named_by_their_extra(monkeypatch):
+    for recipe, launcher in (("humanml3d/mdm", "local"), ("motion_clip/synthetic", "slurm")):
+        assert compose(recipe, [f"launch={launcher}"]) == compose(recipe)
     monkeypatch.setattr("flame_mdm.config.composition.source_file", lambda module: None)
     with pytest.raises(UserError, match=r"launch=slurm needs .*: pip install flame-mdm\[slurm\]"):
         compose("quickstart", ["launch=slurm"])

@@ -23,10 +23,7 @@ STORE = "store.json"
 class ModelSettings:
     """Keys that name a model."""
 
-    ckpt: str | None = option(
-        None,
-        "a checkpoint, a run directory, a model file, the name of a shipped model (quickstart), or a model on the hub",
-    )
+    ckpt: str | None = option(None, "a checkpoint, run directory, model file, shipped model (quickstart), or hub id")
     which: Which = option("last", "or best: the checkpoint of a run directory")
 
     def model_file(self) -> Path:
@@ -40,9 +37,7 @@ class ModelSettings:
 class FileSettings:
     """Keys that describe a motion file."""
 
-    fps: float | None = option(
-        None, "frames per second; overrides the value in the file; required for .npy, which has none"
-    )
+    fps: float | None = option(None, "frames per second; overrides the value in the file; required for .npy")
     unit: float | None = option(None, "meters per length unit of the file; default 0.01 for most .bvh, 1 for .npy")
     up: str | None = option(None, "axis of the file that points up: y, z or -y; default that of skeleton.yaml, or y")
 
@@ -58,12 +53,8 @@ class BodySettings:
 class DataSettings:
     """Keys of commands that open a data set."""
 
-    data: str | None = option(
-        None, "data set: a file in experiments/data. Its keys are overridden by data.KEY=..., as in a recipe"
-    )
-    representation: str | None = option(
-        None, "representation of the motions: a file in experiments/representation. Default: that of the data set"
-    )
+    data: str | None = option(None, "data set: a file in experiments/data; data.KEY=... overrides its keys")
+    representation: str | None = option(None, "a file in experiments/representation; default: the data set's")
     data_root: str = option(
         lambda: os.environ.get("FLAME_MDM_DATA", "data"),
         "folder of the prepared data sets; default: FLAME_MDM_DATA, or data",

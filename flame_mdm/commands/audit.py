@@ -26,19 +26,12 @@ class AuditSettings(DataSettings):
     """
 
     OBJECTS: ClassVar = ("data", "extractor")
-    extractor: str | None = option(
-        None,
-        "a checkpoint of `make train EXP=motion_clip/...`, or as the protocol requires; none = metrics of joints",
-    )
-    protocol: str | None = option(
-        None, "whose metrics are audited; default: synthetic on the synthetic set, otherwise text_to_motion"
-    )
+    extractor: str | None = option(None, "a motion-CLIP, or as the protocol requires; none = metrics of joints")
+    protocol: str | None = option(None, "whose metrics are audited; default: synthetic or text_to_motion")
     split: str = option("test", "train, val or test")
     samples: int | None = option(None, "number of motions; default: all of the split")
     resamples: int = option(100, "bootstrap resamples of motions, for the intervals")
-    cards: list[str] | None = option(
-        None, "one or two cards (.json), to be rendered again, two side by side; nothing is measured"
-    )
+    cards: list[str] | None = option(None, "one or two cards (.json) to render again, side by side")
     batch_size: int = option(64, "motions at once")
     device: str | None = option(None, "default: cpu")
     data_root: str = option("", "folder of the prepared data sets; default: FLAME_MDM_DATA, or data")

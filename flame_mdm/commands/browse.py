@@ -30,9 +30,7 @@ class BrowseSettings(BodySettings, PreparedSettings):
     source: str | None = option(None, "folder or archive, if the data set is not prepared yet and needs one")
     split: str | None = option(None, "train, val or test; default: all")
     search: str | None = option(None, "words that must occur in the id or the captions of a clip")
-    clips: int = option(
-        200, "maximum number on the page, evenly spaced; mirrored copies are shown with their originals"
-    )
+    clips: int = option(200, "maximum number on the page, evenly spaced; mirrored copies come with their originals")
     motions: str | None = option(None, "folder: also write the shown clips as motion files")
 
 

@@ -38,17 +38,13 @@ class CompareSettings(BodySettings):
     """
 
     OBJECTS: ClassVar = ("runs",)
-    runs: list[str] | None = option(
-        None, "run directories, or folders of motion files (for example real motions), separated by spaces"
-    )
+    runs: list[str] | None = option(None, "run directories, or folders of motion files, separated by spaces")
     texts: str | None = option(
         None,
         '"a person walks; a person jumps", or a .txt file with one text per line, sampled by each last.ckpt; default: '
         "the captions of the first folder of motions; without such a folder, the newest samples of each run",
     )
-    seconds: float | None = option(
-        None, "length of the sampled motions; default 3, or the lengths of the motions in that folder"
-    )
+    seconds: float | None = option(None, "length of the sampled motions; default 3, or those in that folder")
     seed: int = option(0, "seed of sampling, and of the order in which motions are rated")
     rate: bool = option(False, "write a rating page: motions of the first run against those of each other run")
     ratings: list[str] | None = option(None, "files saved by the rating page, to be counted")

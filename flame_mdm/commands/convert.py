@@ -38,13 +38,8 @@ class ConvertSettings(BodySettings, FileSettings):
     format: str | None = option(None, "if MOTION is a folder: ending of the files that are written to the folder OUT")
     figure: str = option("body", "mesh of .glb: body, or bones for rounded limbs")
     rest_pose: bool = option(False, "true = .bvh begins with a frame of the rest pose, arms out")
-    rig: str | None = option(
-        None,
-        "skeleton of .bvh and .glb: mixamo, unreal, unity, lafan1, soma, cmu, geno or 100style; default: SMPL's",
-    )
-    character: str | None = option(
-        None, "your own .glb or .bvh file; the same kind of file is written, with the motion: docs/characters.md"
-    )
+    rig: str | None = option(None, "skeleton: mixamo, unreal, unity, lafan1, soma, cmu, geno or 100style")
+    character: str | None = option(None, "your own .glb or .bvh file, written with the motion: docs/characters.md")
 
 
 def convert(settings: ConvertSettings) -> None:

@@ -21,10 +21,7 @@ class DemoSettings:
     """
 
     OBJECTS: ClassVar = ("ckpt",)
-    ckpt: list[str] = option(
-        lambda: ["quickstart"],
-        'one or more models, as for sample: "runs/a/default quickstart"; the first is selected at first',
-    )
+    ckpt: list[str] = option(lambda: ["quickstart"], "one or more models, separated by spaces, as for sample")
     host: str = option("127.0.0.1", "address to listen on: this computer alone; 0.0.0.0 = all networks")
     port: int = option(7860, "0 = any free port")
     hosts: list[str] = option(

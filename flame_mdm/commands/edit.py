@@ -31,10 +31,7 @@ class EditSettings(OutputSettings, EditRequest, FileSettings):
     motion: str | None = option(None, "FILE (.npz, .bvh, .json, .npy) or dataset:id")
     cut: Sequence[float] | None = option(None, "[begin, end] in seconds: use only this part of the motion")
     data_root: str = option(lambda: os.environ.get("FLAME_MDM_DATA", "data"), "folder of the prepared data sets")
-    out: str | None = option(
-        None,
-        "folder; default samples/<experiment>/<run>-step<steps>-<hash>/edit-<motion>-<text>-seed<seed>-<options>",
-    )
+    out: str | None = option(None, "folder; default samples/<experiment>/<run>-step<steps>-<hash>/edit-<motion>-...")
 
     def __post_init__(self) -> None:
         SamplerOptions.__post_init__(self)

@@ -26,33 +26,19 @@ class EvaluateSettings(SamplerOptions, DataSettings, ModelSettings):
     """
 
     OBJECTS: ClassVar = ("ckpt", "out")
-    protocol: str | None = option(
-        None, "a name in experiments/evaluation, or the path of a file; default: chosen for the checkpoint"
-    )
-    extractor: str | None = option(
-        None, "a checkpoint of `make train EXP=motion_clip/...`, or as the protocol requires; none = no extractor"
-    )
-    smpl: str | None = option(
-        lambda: os.environ.get("FLAME_MDM_SMPL"), "SMPL's model file (.pkl or .npz), for the joints of SMPL rotations"
-    )
-    from_samples: str | None = option(
-        None, "a folder of motions from other systems, instead of a checkpoint; requires data=..."
-    )
-    baseline: str | None = option(
-        None, "real, shuffled, noisy or static motions, instead of a checkpoint; requires data=..."
-    )
+    protocol: str | None = option(None, "a name in experiments/evaluation, or a file; default: the model decides")
+    extractor: str | None = option(None, "a motion-CLIP, or as the protocol requires; none = no extractor")
+    smpl: str | None = option(lambda: os.environ.get("FLAME_MDM_SMPL"), "SMPL's model file (.pkl or .npz), for joints")
+    from_samples: str | None = option(None, "a folder of motions of other systems, instead of ckpt; needs data=")
+    baseline: str | None = option(None, "real, shuffled, noisy or static motions, instead of ckpt; needs data=")
     split: str = option("test", "train, val or test")
     seed: int = option(0, "seed of the noise and of the drawn motions")
     replications: int | None = option(None, "replications and samples: override the protocol; the result says so")
     samples: int | None = option(None, "number of motions")
-    resamples: int = option(
-        0, "sets of motions drawn for 95 % intervals over motions, such as 200; generates nothing new"
-    )
+    resamples: int = option(0, "sets of motions drawn for 95 % intervals over motions, such as 200")
     multimodality: bool = option(True, "false = skip metrics that need several samples per prompt; the result says so")
     quick: bool = option(False, "two replications of 64 motions, to check that everything works; the result says so")
-    force: bool = option(
-        False, "generate even if real motions miss the values that the protocol expects; the result says so"
-    )
+    force: bool = option(False, "generate even if real motions miss the expected values; the result says so")
     method: str | None = same_option(EditRequest, "method")
     until: float | None = same_option(EditRequest, "until")
     strength: float | None = same_option(EditRequest, "strength")

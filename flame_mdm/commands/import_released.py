@@ -32,9 +32,7 @@ class ImportSettings:
     stats: str | None = option(None, "folder with Mean.npy and Std.npy of HumanML3D or KIT-ML")
     averaged: bool = option(True, "false = the raw weights, if the file also has averaged ones")
     num_heads: int | None = option(None, "number of attention heads, if it differs from the released models")
-    time_token: bool = option(
-        False, "decoder whose input token is the time alone, as in MDM's code since February 2025"
-    )
+    time_token: bool = option(False, "decoder whose input token is the time alone, as in MDM's code since 2025")
     run_code: bool = option(False, "load pickles that hold more than weights: THIS RUNS ANY CODE IN THE FILE")
 
 

@@ -36,9 +36,7 @@ class InspectSettings(BodySettings, FileSettings, PreparedSettings):
     """
 
     OBJECTS: ClassVar = ("motion", "out")
-    motion: str | None = option(
-        None, "a motion file as for `convert`, a folder of them, or the name of a prepared data set"
-    )
+    motion: str | None = option(None, "a motion file, a folder of them, or the name of a prepared data set")
     out: str | None = option(None, "HTML file; default runs/inspect/<name>.html")
     clips: int = option(24, "maximum number of motions in the player, the worst ones")
     split: str | None = option(None, "train, val or test of a data set; default: all")

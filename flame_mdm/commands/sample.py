@@ -34,12 +34,8 @@ class OutputSettings(BodySettings, SamplerOptions, ModelSettings):
     samples: int = same_option(SamplingRequest, "samples", default=3)
     seed: int = same_option(SamplingRequest, "seed")
     cleanup: bool = same_option(SamplingRequest, "cleanup")
-    trajectory: bool = option(
-        False, "true = also draws trajectory.png: the clean estimates along the sampling of the first motion"
-    )
-    mp4: bool = option(
-        False, 'true = also writes motions.mp4; needs pip install "flame-mdm[video]", which `make setup` includes'
-    )
+    trajectory: bool = option(False, "draw the clean estimates along the sampling of the first motion: trajectory.png")
+    mp4: bool = option(False, 'also write motions.mp4; needs pip install "flame-mdm[video]"')
     device: str | None = option(None, "default: cuda if available")
 
     def texts(self) -> list[str] | None:
@@ -89,24 +85,16 @@ class SampleSettings(OutputSettings):
     """
 
     OBJECTS: ClassVar = ("ckpt", "out")
-    prompts: str | None = option(
-        None, "instead of text: a text file with one prompt per line; each prompt gets its own folder"
-    )
+    prompts: str | None = option(None, "instead of text: a file with one prompt per line; each gets its own folder")
     seconds: float | Sequence[float] | None = same_option(SamplingRequest, "seconds")
     frames: int | Sequence[int] | None = same_option(SamplingRequest, "frames")
     after: str | None = same_option(SamplingRequest, "after")
     loop: bool = same_option(SamplingRequest, "loop")
     targets: str | None = same_option(SamplingRequest, "targets")
     candidates: int = same_option(SamplingRequest, "candidates")
-    scorer: str | None = option(
-        None, "a motion-CLIP (run or checkpoint) that chooses among the candidates by how well they fit the text"
-    )
+    scorer: str | None = option(None, "a motion-CLIP that chooses the candidate that fits the text best")
     shared_noise: bool = same_option(SamplingRequest, "shared_noise")
-    out: str | None = option(
-        None,
-        "folder; default samples/<experiment>/<run>-step<steps>-<hash>/<text>-seed<seed>, plus options such as "
-        "-eta=0.5; with prompts, a folder per prompt is made in it",
-    )
+    out: str | None = option(None, "folder; default samples/<experiment>/<run>-step<steps>-<hash>/<text>-seed<seed>")
 
     def texts(self) -> list[str] | None:
         """Returns the text or the lines of the file of prompts; None if there are none."""

@@ -32,9 +32,7 @@ class TablesSettings:
     """
 
     OBJECTS: ClassVar = ("table",)
-    table: list[str] | None = option(
-        None, "names in experiments/tables, or paths of specs, separated by spaces; default: all"
-    )
+    table: list[str] | None = option(None, "names in experiments/tables, or paths of specs; default: all")
     evaluate: bool = option(True, "evaluate what is missing; false = render existing results only")
     out: str = option("runs/tables", "folder of the tables")
     results: str = option("runs/results", "folder of the results")

@@ -12,6 +12,7 @@ import pytest
 import torch
 from support.fixtures import recipe
 
+import flame_mdm
 from flame_mdm import config
 from flame_mdm.__main__ import COMMANDS, main
 from flame_mdm.commands.evaluate import EvaluateSettings
@@ -396,3 +397,8 @@ def test_an_unknown_command_is_one_line(capsys):
     assert capsys.readouterr().err == (
         "error: unknown command: trian. Did you mean train? `flame-mdm --help` lists the commands\n"
     )
+
+
+def test_the_package_lists_its_public_names_alone():
+    assert dir(flame_mdm) == ["Motion", "MotionGeneration", "edit", "generate", "load"]
+    assert all(getattr(flame_mdm, name) for name in dir(flame_mdm))

@@ -95,9 +95,9 @@ def test_interpolations_in_models_are_refused(attacked, trained, changed, bad, t
                 attacked("evaluate", f"ckpt={path}", "extractor=none", "quick=true", says="holds an interpolation")
                 attacked("evaluate", f"ckpt={trained}", f"extractor={path}", "quick=true", says="interpolation")
                 attacked("push", str(path), "a/b", "dry_run=true", says="holds an interpolation")
-                attacked(
-                    "edit", f"ckpt={path}", "motion=x.npz", "region=in_between", TEXT, says="holds an interpolation"
-                )
+                np.savez("x.npz", joints=np.zeros((5, 22, 3)), fps=20.0)
+                attacked("edit", f"ckpt={path}", "motion=x.npz", TEXT, says="holds an interpolation")
+                Path("x.npz").unlink()
     path = model_file(bad / "x.safetensors", trained, config__denoiser__latent_dim=exploit(marker))
     attacked("sample", f"ckpt={path}", TEXT, says="holds an interpolation")
     attacked("sample", f"ckpt={bad}", TEXT, says="holds an interpolation")
@@ -447,7 +447,7 @@ def test_odd_statistics_of_released_models(attacked, bad):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("megabytes", [300, 600, 800])
+@pytest.mark.parametrize("megabytes", [300, 700])
 def test_little_memory_is_one_line(trained, tmp_path, megabytes):
     """While it imports and samples. With little more, it is OpenBLAS or Pillow that runs out, and not in our words."""
     program = (

@@ -56,11 +56,11 @@ class Refused:
         try:
             code: object = main([command, *words])
         except BaseException as error:
-            place = error.__traceback__
-            while place and place.tb_next:
-                place = place.tb_next
+            last = error.__traceback__
+            while last and last.tb_next:
+                last = last.tb_next
             code = f"{type(error).__name__}: {error}" + (
-                f" ({place.tb_frame.f_code.co_filename}:{place.tb_lineno})" if place else ""
+                f" ({last.tb_frame.f_code.co_filename}:{last.tb_lineno})" if last else ""
             )
         finally:
             signal.setitimer(signal.ITIMER_PROF, 0)
@@ -69,7 +69,7 @@ class Refused:
             for signum, handler in handlers.items():
                 signal.signal(signum, handler)
         out, err = self.capture.readouterr()
-        told = [
+        faults = [
             f"no end after {self.seconds} s" if late else "",  # which code that catches every exception hides
             f"it ended with {code}" if code not in (1, 2) else "",
             f"it left {sorted(map(str, self._tree() ^ before))}" if self._tree() != before else "",
@@ -77,8 +77,8 @@ class Refused:
             f"it said {err!r}" if not one_line(err, command) or says not in err else "",
             "it ran out of memory" if "out of memory" in err else "",
         ]
-        if any(told):
-            self.faults.append(f"{command} {str(words)[-200:]}: {'; '.join(filter(None, told))}")
+        if any(faults):
+            self.faults.append(f"{command} {str(words)[-200:]}: {'; '.join(filter(None, faults))}")
 
     def _tree(self) -> set[Path]:
         return {path for folder in self.watched for path in folder.rglob("*")}

@@ -19,9 +19,10 @@ import torch
 from sections import Section, section, show
 from torch import Tensor
 
-from evaluators.evaluation import load_protocol
+from evaluators.evaluation import Evaluation
 from evaluators.extractors import Extractor
-from evaluators.sources import Baseline, Generator, Row, Samples
+from evaluators.protocol import Row, load_protocol
+from evaluators.sources import Baseline, Generator, Samples
 from flame_mdm.data.crops import Units
 from flame_mdm.data.datamodule import Clips
 from flame_mdm.data.store import Entry
@@ -55,7 +56,7 @@ class Windows(Generator):
     def __init__(self, clips: Clips):
         self.real = Baseline("real", clips, "text", 0)
 
-    def __call__(self, name: str, rows: list[Row], replication: int, rank: int = 0, world: int = 1) -> Samples:
+    def __call__(self, name: str, rows: list[Row], replication: int) -> Samples:
         return Samples(rows, self.real._real(rows, replication))
 
 
@@ -96,9 +97,9 @@ def measure(*words: str) -> Section:
 
     def seconds(multimodality: bool, **size: Any) -> float:
         protocol = load_protocol(args.protocol, clips.representation)
-        protocol.change(**{"samples": None, "quick": False} | size, clips=args.clips, multimodality=multimodality)
+        protocol, _ = protocol.resized(args.clips, multimodality=multimodality, **size)
         start = time.perf_counter()
-        protocol.evaluate(Windows(clips), clips, extractor, clips.representation, batch_size=64)
+        Evaluation(protocol, clips, extractor, clips.representation).run(Windows(clips))
         return time.perf_counter() - start
 
     seconds(True, replications=1, samples=64)  # warms up
@@ -109,7 +110,7 @@ def measure(*words: str) -> Section:
     profile.disable()
     several = seconds(True, replications=1) - once
     protocol = load_protocol(args.protocol, clips.representation)
-    again = protocol.multimodality["replications"] if protocol.multimodality else 0
+    again = protocol.multimodality.replications if protocol.multimodality else 0
     total = once * protocol.replications + several * again
     if args.profile:
         pstats.Stats(profile).sort_stats("tottime").print_stats(40)

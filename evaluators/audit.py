@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -16,7 +15,6 @@ from scipy.stats import hypergeom, rankdata
 from torch import Tensor
 from torchmetrics import Metric
 
-from evaluators.evaluation import EvaluationRequest, open_data, open_protocol
 from evaluators.evaluator import Evaluator, Extracted, Motions
 from evaluators.extractors import OwnExtractor
 from evaluators.metrics import alignment, make_metrics, physics, update_metrics
@@ -26,7 +24,10 @@ from evaluators.metrics.diversity import Diversity
 from evaluators.metrics.published_physics import MeanOverMotions
 from evaluators.near_misses import near_misses
 from evaluators.perturbations import PERTURBATIONS, Joints, Perturbation, continue_with, encode
-from evaluators.sources import Row, real_motions
+from evaluators.plan import open_data
+from evaluators.protocol import Row, digest, open_protocol
+from evaluators.request import EvaluationRequest
+from evaluators.sources import real_motions
 from flame_mdm.config import EXPERIMENTS, instantiate
 from flame_mdm.data.datamodule import MotionDataModule
 from flame_mdm.errors import UserError
@@ -79,8 +80,7 @@ def audit(request: EvaluationRequest, cache: Path) -> AuditCard:
             "representation of joint positions, such as representation=humanml_clean"
         )
     clips = data.clips(request.split)
-    sizes: dict[str, Any] = {"replications": 1, "samples": None, "quick": False}
-    protocol, _ = open_protocol(str(request.protocol), clips, representation, None, **sizes)
+    protocol, _ = open_protocol(str(request.protocol), clips, representation, None, replications=1)
     extractor = protocol.open_extractor(request.extractor, representation, info["dataset"])
     rows = protocol.rows(clips, request.seed, 0)[: request.samples]
     again = {row.clip.id: row for row in protocol.rows(clips, request.seed, 0, purpose="real")}
@@ -95,44 +95,55 @@ def audit(request: EvaluationRequest, cache: Path) -> AuditCard:
         "seed": request.seed,
         "motions": len(rows),
     }
-    digest = hashlib.sha256(json.dumps([FORMAT, facts, protocol.sha256], sort_keys=True).encode()).hexdigest()[:16]
     evaluator = Evaluator(extractor, protocol.metrics, representation, batch_size=request.batch_size or 64)
     scene = _Scene(data, rows, real_motions(clips, rows), representation, request.seed)
     sets = {REAL: lambda: real_motions(clips, [again[row.clip.id] for row in rows])} | scene.motions()
-    captioned = protocol.condition == "text"
-    texts = [_text(row, row.text) for row in rows] if captioned else []
-    listed = scene.perturbations(captioned)
-    with ProgressBar(total=len(sets) + sum(len(each.grades) for each in listed), desc="audit", unit=" sets") as bar:
+    texts = [_text(row, row.text) for row in rows] if protocol.condition == "text" else []
+    perturbations = scene.perturbations(bool(texts))
+    folder = cache / digest([FORMAT, facts, protocol.sha256])[:16]
+    steps = len(sets) + sum(len(perturbation.grades) for perturbation in perturbations)
+    with ProgressBar(total=steps, desc="audit", unit=" sets") as bar:
         inputs: dict[str, Inputs] = {}
         for name, make in sets.items():
-            ids = [row.id for row in rows]
-            inputs[name] = _inputs(evaluator, cache / digest / f"{name.replace(' ', '-')}.npz", ids, make)
+            inputs[name] = _inputs(evaluator, folder / f"{name.replace(' ', '-')}.npz", [row.id for row in rows], make)
             bar.update()
         measure = _Measure(evaluator, inputs, texts, scene.draws("bootstrap"), request.resamples)
-        base = measure(inputs[BASE], texts)
-        changed, given = inputs[BASE], texts
-        scores, perturbations = [measure.scores(changed, given)], []
-        for each in listed:
-            grades = []
-            for grade in each.grades:
-                changed, given = scene.condition(each, grade, inputs, texts)
-                grades.append({"grade": float(grade), "values": _differences(measure(changed, given), base)})
-                bar.update()
-            if each.group == "meaning":
-                scores.append(measure.scores(changed, given))
-            about = {name: getattr(each, name) for name in ("name", "group", "about", "unit")}
-            perturbations.append({**about, "grades": grades})
-    better = {name: _higher_is_better(measure.metrics, *name.partition("/")[::2]) for name in base}
-    content = {
-        "format": FORMAT,
-        **facts,
-        "resamples": request.resamples,
-        "packages": environment()["packages"],
-        "metrics": better,
+        measured = _measured(measure, scene, perturbations, inputs, texts, bar)
+    packages = environment()["packages"]
+    return check_shape(
+        {"format": FORMAT, **facts, "resamples": request.resamples, "packages": packages, **measured}, AuditCard
+    )
+
+
+def _measured(
+    measure: _Measure,
+    scene: _Scene,
+    perturbations: Sequence[Perturbation],
+    inputs: Mapping[str, Inputs],
+    texts: Sequence[Text],
+    bar: ProgressBar[Any],
+) -> dict[str, Any]:
+    """Returns the measured part of a card."""
+    base = measure(inputs[BASE], texts)
+    scores, listed = [measure.scores(inputs[BASE], texts)], []
+    for perturbation in perturbations:
+        grades = []
+        changed, wrong = inputs[BASE], texts
+        for grade in perturbation.grades:
+            changed, wrong = scene.condition(perturbation, grade, inputs, texts)
+            grades.append({"grade": float(grade), "values": _differences(measure(changed, wrong), base)})
+            bar.update()
+        if perturbation.group == "meaning":
+            scores.append(measure.scores(changed, wrong))
+        about = {name: getattr(perturbation, name) for name in ("name", "group", "about", "unit")}
+        listed.append({**about, "grades": grades})
+    return {
+        "metrics": {name: _higher_is_better(measure.metrics, *name.partition("/")[::2]) for name in base},
+        "real": {name: _interval(values) for name, values in base.items()},
+        "perturbations": listed,
+        "not_computed": measure.reasons,
+        "truth": _agreement(scores, listed),
     }
-    content |= {"real": {name: _interval(values) for name, values in base.items()}, "perturbations": perturbations}
-    content |= {"not_computed": measure.reasons, "truth": _agreement(scores, perturbations)}
-    return check_shape(content, AuditCard)
 
 
 # Perturbed motions and texts ------------------------------------------------------------------------------------------
@@ -161,10 +172,11 @@ class _Scene:
         def changed(change: Callable[[int, Joints], Joints]) -> Callable[[], list[np.ndarray]]:
             return lambda: encode(self.representation, [change(i, x) for i, x in enumerate(self.joints)])
 
-        def graded(each: Perturbation, grade: float) -> Callable[[int, Joints], Joints]:
-            assert each.change is not None
-            change = each.change  # the draws are the same at all grades
-            return lambda i, x: change(x, grade, self.draws(each.name, self.rows[i].id), fps)
+        def graded(perturbation: Perturbation, grade: float) -> Callable[[int, Joints], Joints]:
+            change = perturbation.change
+            assert change is not None
+            # The draws are the same at all grades.
+            return lambda i, x: change(x, grade, self.draws(perturbation.name, self.rows[i].id), fps)
 
         sets = {
             BASE: changed(lambda _, x: x),
@@ -183,15 +195,15 @@ class _Scene:
         return sets
 
     def _memorized(self) -> list[np.ndarray]:
-        """Returns for each motion a training motion with its captions, or else its action, or else itself."""
-        training, found = self.data.clips("train"), []
+        """Returns for each motion a training motion with the same captions or the same action, or the motion itself."""
+        training, copies = self.data.clips("train"), []
         for row in self.rows:
             same = [clip for clip in training.clips if clip.captions == row.clip.captions]
             same = same or [clip for clip in training.clips if clip.action == row.clip.action] or [row.clip]
             draws = self.draws("memorized", row.id)
             clip = same[int(draws.integers(len(same)))]
-            found.append(Row(row.id, clip, training.crop(clip.length, draws), None, row.id))
-        return real_motions(training, found)
+            copies.append(Row(row.id, clip, training.crop(clip.length, draws), None, row.id))
+        return real_motions(training, copies)
 
     def _representations(self) -> list[HumanML]:
         """Returns the other representations of these joints."""
@@ -203,12 +215,12 @@ class _Scene:
     def _wrong(self) -> dict[str, list[Text | None]]:
         """Returns a wrong text for each motion, by the name of the perturbation; None if there is none."""
         texts = {caption: _text(row, caption) for row in self.rows for caption in row.clip.captions}
-        found = near_misses([row.clip for row in self.rows])
-        names = sorted({name for each in found for name in each})
+        contradicting = near_misses([row.clip for row in self.rows])
+        names = sorted({name for misses in contradicting for name in misses})
         wrong: dict[str, list[Text | None]] = {}
         for kind in ("wrong captions", "near misses", *(f"near misses: {name}" for name in names if len(names) > 1)):
             wrong[kind] = []
-            for row, misses in zip(self.rows, found, strict=True):
+            for row, misses in zip(self.rows, contradicting, strict=True):
                 draws, options = self.draws(kind, row.id), misses.get(kind.partition(": ")[2], [])
                 if kind == "near misses" and misses:
                     options = misses[sorted(misses)[draws.integers(len(misses))]]
@@ -219,45 +231,48 @@ class _Scene:
 
     def perturbations(self, captioned: bool) -> list[Perturbation]:
         """Returns the perturbations of this data."""
-        found = []
-        for each in PERTURBATIONS:
-            if each.unit == "% of captions":
-                kinds = [kind for kind in self.wrong if kind.partition(":")[0] == each.name] if captioned else []
+        listed = []
+        for perturbation in PERTURBATIONS:
+            if perturbation.unit == "% of captions":
+                kinds = (
+                    [kind for kind in self.wrong if kind.partition(":")[0] == perturbation.name] if captioned else []
+                )
                 for kind in kinds:
                     most = 100 * sum(text is not None for text in self.wrong[kind]) / len(self.rows)
-                    grades = [*(grade for grade in each.grades if grade < most), round(most, 1)]
-                    found.append(replace(each, name=kind, grades=grades))
-            elif each.unit == "motions":
-                found.append(replace(each, grades=[grade for grade in each.grades if grade < len(self.rows)]))
-            elif each.unit != "% of actions" or len({row.clip.action for row in self.rows}) > 1:
-                found.append(each)
+                    grades = [*(grade for grade in perturbation.grades if grade < most), round(most, 1)]
+                    listed.append(replace(perturbation, name=kind, grades=grades))
+            elif perturbation.unit == "motions":
+                grades = [grade for grade in perturbation.grades if grade < len(self.rows)]
+                listed.append(replace(perturbation, grades=grades))
+            elif perturbation.unit != "% of actions" or len({row.clip.action for row in self.rows}) > 1:
+                listed.append(perturbation)
         about = "encoded and decoded by another representation"
-        found += [Perturbation(f"through {each.name}", "plumbing", about) for each in self._representations()]
-        return [each for each in found if each.grades]
+        listed += [Perturbation(f"through {other.name}", "plumbing", about) for other in self._representations()]
+        return [perturbation for perturbation in listed if perturbation.grades]
 
     def condition(
-        self, each: Perturbation, grade: float, inputs: Mapping[str, Inputs], texts: Sequence[Text]
+        self, perturbation: Perturbation, grade: float, inputs: Mapping[str, Inputs], texts: Sequence[Text]
     ) -> tuple[Inputs, list[Text]]:
         """Returns the motions and texts of a perturbation at a grade; pair i belongs to real motion i."""
         base, texts, count = inputs[BASE], list(texts), len(self.rows)
-        order, share = self.draws("order", each.name).permutation(count), round(count * grade / 100)
-        if each.unit == "% of captions":
-            for i in [i for i in order if self.wrong[each.name][i]][:share]:
-                texts[i] = self.wrong[each.name][i] or texts[i]
-        elif each.unit == "% of motions":
+        order, share = self.draws("order", perturbation.name).permutation(count), round(count * grade / 100)
+        if perturbation.unit == "% of captions":
+            for i in [i for i in order if self.wrong[perturbation.name][i]][:share]:
+                texts[i] = self.wrong[perturbation.name][i] or texts[i]
+        elif perturbation.unit == "% of motions":
             chosen = np.isin(np.arange(count), order[:share])
             shaped = {name: chosen.reshape(-1, *[1] * (x.ndim - 1)) for name, x in base.items()}
-            base = {name: np.where(shaped[name], inputs[each.name][name], x) for name, x in base.items()}
-        elif each.unit == "% of actions":
+            base = {name: np.where(shaped[name], inputs[perturbation.name][name], x) for name, x in base.items()}
+        elif perturbation.unit == "% of actions":
             actions = sorted({row.clip.action or 0 for row in self.rows}, key=lambda a: key("missing", self.seed, a))
             gone = actions[: max(1, round(len(actions) * grade / 100))]
             kept = [i for i in order if (self.rows[i].clip.action or 0) not in gone]
             picked = np.array([i if i in kept else kept[i % len(kept)] for i in range(count)])
             return {name: x[picked] for name, x in base.items()}, [texts[i] for i in picked] if texts else []
-        elif each.unit == "motions":
+        elif perturbation.unit == "motions":
             return {name: x[: int(grade)] for name, x in base.items()}, texts[: int(grade)]
         else:
-            base = inputs[f"{each.name} {grade:g}" if each.change else each.name]
+            base = inputs[f"{perturbation.name} {grade:g}" if perturbation.change else perturbation.name]
         return base, texts
 
 
@@ -274,15 +289,16 @@ def _inputs(evaluator: Evaluator, path: Path, ids: list[str], make: Callable[[],
     """Returns the metric inputs of motions, from the cache or else from one feature pass."""
     if path.exists():
         return read_npz(path)
-    found = evaluator.extract(Motions(ids, make()))
-    inputs: Inputs = {"features": found.rows["generated"].double().numpy()} if "generated" in found.rows else {}
+    extracted = evaluator.extract(Motions(ids, make()))
+    features = extracted.rows.get("generated")
+    inputs: Inputs = {} if features is None else {"features": features.double().numpy()}
     for name, metric in make_metrics(evaluator.metrics).items():
         if type(metric) in TOTALS:
-            inputs[name] = np.array([_totals(metric, joints) for joints in found.joints])
+            inputs[name] = np.array([_totals(metric, joints) for joints in extracted.joints])
         elif isinstance(metric, MeanOverMotions):
-            inputs |= _values(name, metric, found)
+            inputs |= _values(name, metric, extracted)
         elif isinstance(metric, AttributeAccuracy):
-            inputs["seen"] = np.array([json.dumps(read_attributes(x.numpy(), metric.fps)) for x in found.joints])
+            inputs["seen"] = np.array([json.dumps(read_attributes(x.numpy(), metric.fps)) for x in extracted.joints])
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_write(path) as temporary:
         np.savez(temporary, allow_pickle=False, **inputs)
@@ -293,8 +309,7 @@ def _totals(metric: Metric, joints: Tensor) -> list[float]:
     """Returns the two states of a metric, for one motion."""
     metric.reset()
     mask = torch.ones(1, len(joints), dtype=torch.bool)
-    given = {"joints": joints[None], "mask": mask, "keys": torch.zeros(1, dtype=torch.long)}
-    update_metrics({"": metric}, **given)
+    update_metrics({"": metric}, joints=joints[None], mask=mask, keys=torch.zeros(1, dtype=torch.long))
     states = [getattr(metric, state) for state in TOTALS[type(metric)]]
     return [float(sum(x.sum() for x in state) if isinstance(state, list) else state) for state in states]
 
@@ -305,17 +320,17 @@ def _higher_is_better(metrics: Mapping[str, Metric], name: str, part: str) -> bo
     return other.get(part, metric.higher_is_better)
 
 
-def _values(name: str, metric: MeanOverMotions, found: Extracted) -> Inputs:
+def _values(name: str, metric: MeanOverMotions, extracted: Extracted) -> Inputs:
     """Returns the value, or 0, and whether it is defined, for each motion; nothing if no motion may have one."""
     if metric.required_fps not in (None, metric.fps):
         return {}
-    for i, joints in enumerate(found.joints):
-        rows = {row: found.rows[row][i : i + 1] for row in ("keys", "contacts") if row in found.rows}
+    for i, joints in enumerate(extracted.joints):
+        rows = {row: extracted.rows[row][i : i + 1] for row in ("keys", "contacts") if row in extracted.rows}
         rows |= {"contacts": rows["contacts"][0][None]} if "contacts" in rows else {}
         update_metrics({name: metric}, joints=joints[None], mask=torch.ones(1, len(joints), dtype=torch.bool), **rows)
     values, defined = (torch.cat(getattr(metric, state)).double().numpy() for state in ("values", "defined"))
     parts = zip(metric.NAMES, values.T, defined.T, strict=True)
-    return {f"{name}/{part}": np.stack([value, known], 1) for part, value, known in parts if known.any()}
+    return {f"{name}/{part}": np.stack([value, weight], 1) for part, value, weight in parts if weight.any()}
 
 
 class _Measure:
@@ -341,15 +356,14 @@ class _Measure:
 
     def __call__(self, inputs: Inputs, texts: Sequence[Text]) -> dict[str, np.ndarray]:
         """Returns the values (1 + R,) of each metric."""
-        pairs = self._pairs(inputs, texts)
-        found = {name: self._ratio(pair) for name, pair in pairs.items()}
+        values = {name: self._ratio(pair) for name, pair in self._pairs(inputs, texts).items()}
         for name, metric in self.metrics.items():
             if "features" in inputs and isinstance(metric, FrechetMotionDistance | Diversity):
                 base = inputs is self.inputs[BASE]  # as it is for changed captions
-                found[name] = self.of_base[name] if base and name in self.of_base else self._of_set(metric, inputs)
-                self.of_base |= {name: found[name]} if base else {}
+                values[name] = self.of_base[name] if base and name in self.of_base else self._of_set(metric, inputs)
+                self.of_base |= {name: values[name]} if base else {}
         order = list(self.metrics)
-        return dict(sorted(found.items(), key=lambda item: order.index(item[0].partition("/")[0])))
+        return dict(sorted(values.items(), key=lambda item: order.index(item[0].partition("/")[0])))
 
     def scores(self, inputs: Inputs, texts: Sequence[Text]) -> dict[str, np.ndarray]:
         """Returns the values (N,) of single pairs, by metric."""
@@ -362,7 +376,7 @@ class _Measure:
 
     def _of_set(self, metric: Metric, inputs: Inputs) -> np.ndarray:
         """Returns the values (1 + R,) of a metric of a set."""
-        x, real = (torch.from_numpy(each["features"]) for each in (inputs, self.inputs[REAL]))
+        x, real = (torch.from_numpy(group["features"]) for group in (inputs, self.inputs[REAL]))
         weights = self.weights[:, : len(x)]
         if isinstance(metric, Diversity):
             return ((weights @ _distances(x, x).numpy()) * weights).sum(1) / weights.sum(1) ** 2
@@ -372,24 +386,25 @@ class _Measure:
 
     def _pairs(self, inputs: Inputs, texts: Sequence[Text]) -> dict[str, np.ndarray]:
         """Returns value and weight (N, 2) of each motion or pair, by metric."""
-        found = {name: pair for name, pair in inputs.items() if name.partition("/")[0] in self.metrics}
+        pairs = {name: pair for name, pair in inputs.items() if name.partition("/")[0] in self.metrics}
         if texts and "seen" in inputs and all("action" in text.requested for text in texts):
             read = [(json.loads(str(seen)), text.requested) for seen, text in zip(inputs["seen"], texts, strict=True)]
-            right = [right_attributes(*each) for each in read]
+            right = [right_attributes(*pair) for pair in read]
             name = next(name for name, metric in self.metrics.items() if isinstance(metric, AttributeAccuracy))
             for part in AttributeAccuracy.names:
-                if any(part in each for each in right):
-                    found[f"{name}/{part}"] = np.array([[each.get(part, False), part in each] for each in right], float)
+                if any(part in shown for shown in right):
+                    weighted = [[shown.get(part, False), part in shown] for shown in right]
+                    pairs[f"{name}/{part}"] = np.array(weighted, float)
         if not texts or "features" not in inputs:
-            return found
+            return pairs
         motion, text = torch.from_numpy(inputs["features"]), self._encoded(texts)
         unit = F.normalize(motion, dim=-1), F.normalize(text, dim=-1)
         values: dict[str, np.ndarray | Tensor] = {}
         for name, metric in self.metrics.items():
             if isinstance(metric, alignment.TextsForMotion):
-                first = {each.caption: i for i, each in reversed(list(enumerate(texts)))}
-                place = {caption: number for number, caption in enumerate(first)}
-                own = torch.tensor([place[each.caption] for each in texts])
+                first = {text.caption: i for i, text in reversed(list(enumerate(texts)))}
+                column = {caption: number for number, caption in enumerate(first)}
+                own = torch.tensor([column[text.caption] for text in texts])
                 values |= self._top(name, metric, _distances(motion, text[list(first.values())]), own)
             elif isinstance(metric, alignment.MotionsForText):
                 pair = unit if metric.normalize else (motion, text)
@@ -406,16 +421,16 @@ class _Measure:
                     values[name] = alignment.pointwise_mutual_information(*pair, metric.eps)
                 else:
                     self.reasons[name] = f"{len(real)} motions are too few for its covariances"
-        return found | {name: np.stack([value, np.ones(len(value))], 1) for name, value in values.items()}
+        return pairs | {name: np.stack([value, np.ones(len(value))], 1) for name, value in values.items()}
 
     def _encoded(self, texts: Sequence[Text]) -> Tensor:
         """Returns features (N, E) of texts, float64; each caption is encoded once."""
         assert self.extractor is not None
         new = {text.caption: text for text in texts if text.caption not in self.encoded}
         if new:
-            found = self.extractor.texts(list(new), [text.tokens for text in new.values()])
-            assert found is not None
-            self.encoded |= dict(zip(new, found.detach().cpu().double(), strict=True))
+            features = self.extractor.texts(list(new), [text.tokens for text in new.values()])
+            assert features is not None
+            self.encoded |= dict(zip(new, features.detach().cpu().double(), strict=True))
         return torch.stack([self.encoded[text.caption] for text in texts])
 
     def _top(
@@ -443,8 +458,8 @@ def _interval(values: np.ndarray) -> list[float | None]:
 
 def _differences(values: Mapping[str, np.ndarray], base: Mapping[str, np.ndarray]) -> dict[str, list[float | None]]:
     """Returns value and interval, difference from real motions and its interval, by metric."""
-    found = {name: (values.get(name, np.full_like(real, np.nan)), real) for name, real in base.items()}
-    return {name: [*_interval(x), *_interval(x - real)] for name, (x, real) in found.items()}
+    pairs = {name: (values.get(name, np.full_like(real, np.nan)), real) for name, real in base.items()}
+    return {name: [*_interval(x), *_interval(x - real)] for name, (x, real) in pairs.items()}
 
 
 def _agreement(
@@ -458,15 +473,15 @@ def _agreement(
     """
     if TRUTH not in scores[0]:
         return {}
-    right = np.concatenate([each[TRUTH] for each in scores]) > 0
-    grades = [grade["values"] for each in perturbations for grade in each["grades"]]
-    found = {}
+    right = np.concatenate([of_set[TRUTH] for of_set in scores]) > 0
+    grades = [grade["values"] for perturbation in perturbations for grade in perturbation["grades"]]
+    agreement = {}
     for name in scores[0]:
         if name.endswith("/top1") or name in ("mm_dist", "mclip_score", "mid"):
-            score = np.concatenate([each[name] for each in scores]) * (-1 if name == "mm_dist" else 1)
+            score = np.concatenate([of_set[name] for of_set in scores]) * (-1 if name == "mm_dist" else 1)
             ranks, count = rankdata(score)[right], int(right.sum())
             auc = (ranks.sum() - count * (count + 1) / 2) / (count * (len(right) - count))
             both = np.array([(grade[name][0], grade[TRUTH][0]) for grade in grades if grade[name][0] is not None])
             correlation = np.corrcoef(rankdata(both, axis=0).T)[0, 1]
-            found[name] = {"auc": float(auc), "correlation": float(correlation)}
-    return found
+            agreement[name] = {"auc": float(auc), "correlation": float(correlation)}
+    return agreement

@@ -7,7 +7,10 @@ from pathlib import Path
 from hydra.utils import get_class
 from lightning import Callback, LightningModule, Trainer
 
-from evaluators.evaluation import open_protocol
+from evaluators.evaluation import Evaluation
+from evaluators.plan import sampling_options
+from evaluators.protocol import open_protocol
+from evaluators.sources import Generator
 from flame_mdm.data.datamodule import MotionDataModule
 from flame_mdm.errors import UserError, say
 from flame_mdm.runs import made_by
@@ -55,50 +58,45 @@ class Evaluate(Callback):
         self.name, self.path, self.every_n_steps = protocol, extractor, every_n_steps
         self.samples, self.replications, self.batch_size = samples, replications, batch_size
         self.next = 0
-        self.values: dict[str, float] = {}
-        self.latest: tuple[int, dict[str, float]] = (0, {})
+        self.values: dict[str, float | None] = {}
+        self.latest: tuple[int, dict[str, float | None]] = (0, {})
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         assert isinstance(pl_module, MotionGeneration)
         data: MotionDataModule = trainer.datamodule  # type: ignore[attr-defined]
-        self.clips = data.clips("val")
-        size = {"replications": self.replications, "samples": self.samples, "quick": False, "multimodality": False}
-        self.protocol, _ = open_protocol(self.name, self.clips, pl_module.representation, pl_module, **size)
-        dataset = data.store.info["dataset"]
-        self.extractor = self.protocol.open_extractor(self.path, pl_module.representation, dataset)
+        clips, representation = data.clips("val"), pl_module.representation
+        size = {"replications": self.replications, "samples": self.samples, "multimodality": False}
+        protocol, _ = open_protocol(self.name, clips, representation, pl_module, **size)
+        extractor = protocol.open_extractor(self.path, representation, data.store.info["dataset"])
+        self.evaluation = Evaluation(protocol, clips, extractor, representation, batch_size=self.batch_size)
         self.next = trainer.global_step
 
     def on_validation_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        if trainer.global_step < self.next or not hasattr(self, "protocol"):
+        if trainer.global_step < self.next or not hasattr(self, "evaluation"):
             return
         assert isinstance(pl_module, MotionGeneration)
         self.next = (trainer.global_step // self.every_n_steps + 1) * self.every_n_steps
-        source = self.protocol.generator(
-            pl_module, None, {"seed": 0}, clips=self.clips, batch_size=self.batch_size, progress=False
-        )
-        result = self.protocol.evaluate(
-            source,
-            self.clips,
-            self.extractor,
-            pl_module.representation,
+        protocol = self.evaluation.protocol
+        source = Generator(
+            pl_module,
+            protocol,
+            self.evaluation.clips,
+            *sampling_options(protocol, pl_module),
+            seed=0,
             batch_size=self.batch_size,
-            rank=trainer.global_rank,
-            world=trainer.world_size,
-            ground_truth=False,
+            progress=False,
         )
-        name = f"val/{self.protocol.name}"
-        known = {f"{name}/{k}": value for k, value in result["values"].items() if value["mean"] is not None}
-        self.values = {k: value["mean"] for k, value in known.items()}
-        self.latest = (trainer.global_step, {k.removeprefix(f"{name}/"): v for k, v in self.values.items()})
+        values = self.evaluation.run(source, ground_truth=False).values or {}
+        numbers = {name: value for name, value in values.items() if value is not None and value.mean is not None}
+        self.latest = (trainer.global_step, {name: value.mean for name, value in numbers.items()})
+        self.values = {f"val/{protocol.name}/{name}": value.mean for name, value in numbers.items()}
         if self.replications > 1:
-            self.values |= {f"{k}/ci": value["ci"] for k, value in known.items()}
+            self.values |= {f"val/{protocol.name}/{name}/ci": value.ci for name, value in numbers.items()}
         if trainer.is_global_zero:
             columns = ("mean", "ci", "replications", "n")
-            rows = [[metric, *(value[column] for column in columns)] for metric, value in result["values"].items()]
+            rows = [[metric, *(getattr(value, column) for column in columns)] for metric, value in values.items()]
             for logger in trainer.loggers:
-                log_table(
-                    logger, f"evaluation/{self.protocol.name}", ["metric", *columns], rows, trainer.global_step - 1
-                )
+                log_table(logger, f"evaluation/{protocol.name}", ["metric", *columns], rows, trainer.global_step - 1)
 
     def on_validation_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         pl_module.log_dict(self.values)  # computed at the start, since averaged weights are swapped out by now
@@ -106,12 +104,10 @@ class Evaluate(Callback):
 
     def on_fit_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         step, values = self.latest
-        if not values or not trainer.is_global_zero:
+        if not values:
             return
-        assert isinstance(pl_module, MotionGeneration)
-        found = self.protocol.evaluate(
-            None, self.clips, self.extractor, pl_module.representation, batch_size=self.batch_size
-        )
-        real = {name: value["mean"] for name, value in found["ground_truth"].items()}
-        say(f"evaluation after {step} steps, {self.protocol.name}, validation clips:")
-        say(*explain_metrics(values, real, {k: get_class(v["_target_"]) for k, v in self.protocol.metrics.items()}))
+        protocol, measured = self.evaluation.protocol, self.evaluation.run(None)  # by all processes together
+        if trainer.is_global_zero:
+            real = {name: value.mean for name, value in (measured.ground_truth or {}).items() if value is not None}
+            say(f"evaluation after {step} steps, {protocol.name}, validation clips:")
+            say(*explain_metrics(values, real, {k: get_class(v["_target_"]) for k, v in protocol.metrics.items()}))

@@ -1,32 +1,77 @@
-"""Work shared by the processes of an evaluation."""
+"""Work shared by the processes of an evaluation. Without a process group, there is one process."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import os
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from datetime import timedelta
 from typing import Any, TypeVar
 
 import torch
+import torch.distributed as dist
+
+from flame_mdm.checkpoints.loading import check_device
 
 T = TypeVar("T")
 Item = TypeVar("Item")
 
 
-def shared(value: T, world: int) -> T:
-    """Returns the value of the first of `world` processes, on all of them."""
+def world_size() -> int:
+    """Returns the number of processes."""
+    return dist.get_world_size() if dist.is_available() and dist.is_initialized() else 1
+
+
+def is_first() -> bool:
+    """Returns whether this process computes metrics, writes files and shows progress."""
+    return world_size() == 1 or dist.get_rank() == 0
+
+
+def shared(value: T) -> T:
+    """Returns the value of the first process, on all of them."""
     box = [value]
-    if world > 1:
-        torch.distributed.broadcast_object_list(box)
+    if world_size() > 1:
+        dist.broadcast_object_list(box)
     return box[0]
 
 
-def dealt(function: Callable[[Item], T], items: Sequence[Item], rank: int, world: int) -> list[T]:
-    """Returns the results for all items, on all of `world` processes; each computes every `world`-th."""
-    own = [function(item) for item in items[rank::world]]
-    if world == 1:
-        return own
-    parts: list[Any] = [None] * world
-    torch.distributed.all_gather_object(parts, own)
+def dealt(function: Callable[[Item], T], items: Sequence[Item]) -> list[T]:
+    """Returns the results for all items, on all processes; of N processes, each computes every N-th result."""
+    count = world_size()
+    if count == 1:
+        return [function(item) for item in items]
+    parts: list[Any] = [None] * count
+    dist.all_gather_object(parts, [function(item) for item in items[dist.get_rank() :: count]])
     results: list[Any] = [None] * len(items)
     for number, part in enumerate(parts):
-        results[number::world] = part
+        results[number::count] = part
     return results
+
+
+@contextmanager
+def processes(device: str | None) -> Iterator[str]:
+    """Joins the processes started by torchrun, if any, and yields the device of this process.
+
+    Args:
+        device: the device; None = a GPU if there is one.
+
+    Raises:
+        UserError: If this machine has no such device.
+    """
+    if device is None:
+        local = int(os.environ.get("LOCAL_RANK", 0))
+        device = f"cuda:{local % torch.cuda.device_count()}" if torch.cuda.is_available() else "cpu"
+    check_device(device)
+    if int(os.environ.get("WORLD_SIZE", 1)) == 1:
+        yield device
+        return
+    # Imported before the group exists: otherwise, the default arguments of its functions would keep the group and its
+    # gloo threads alive, and a live thread can abort the process while Python shuts down.
+    from torch.distributed.nn import functional  # noqa: F401
+
+    # Motions are gathered once per replication, on the CPU; a process that finishes early may wait for hours.
+    dist.init_process_group("gloo", timeout=timedelta(days=7))
+    try:
+        yield device
+    finally:
+        dist.destroy_process_group()

@@ -1,490 +1,334 @@
-"""Evaluations: from a request to a result file."""
+"""Evaluations: real motions are measured first, then motions are generated and measured, and the result is written."""
 
 from __future__ import annotations
 
-import hashlib
-import json
-import math
-import os
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, fields
-from datetime import timedelta
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
-from flame_mdm.config import (
-    EXPERIMENTS,
-    Config,
-    check,
-    instantiate,
-    plain,
-    trust,
-)
-from flame_mdm.errors import UserError, say
-from flame_mdm.reporting.audit import card_of
-from flame_mdm.safe_io import read_yaml, sha256, write_json
+import numpy as np
+from scipy.ndimage import gaussian_filter1d
+from torch import Tensor
 
-if TYPE_CHECKING:  # commands check their keys before torch is imported
-    from evaluators.extractors import Extractor
-    from evaluators.protocol import Protocol
-    from flame_mdm.checkpoints.loading import Which
-    from flame_mdm.data import Split
-    from flame_mdm.data.datamodule import Clips, MotionDataModule
-    from flame_mdm.representations import Representation
-    from flame_mdm.task import MotionGeneration
+from evaluators.collectives import is_first, processes, shared
+from evaluators.evaluator import Evaluator, Extracted, Motions
+from evaluators.extractors import Extractor
+from evaluators.metrics.distribution import FrechetMotionDistance
+from evaluators.plan import make_plan
+from evaluators.protocol import Protocol, Row
+from evaluators.request import EvaluationRequest
+from evaluators.results import averages, make_result, mean_cost, show
+from evaluators.sources import Generator, Samples, Source, real_motions
+from flame_mdm.data.datamodule import Clips
+from flame_mdm.errors import UserError
+from flame_mdm.representations import Representation
+from flame_mdm.safe_io import write_json
+from flame_mdm.schemas import Cost, Measured, Value
+from flame_mdm.seeds import key
 
-FORMAT = 1
-MIN_RESAMPLES = 100
-
-
-@dataclass(frozen=True, kw_only=True)
-class EvaluationRequest:
-    """The keys of an evaluation, which `flame-mdm evaluate --help` explains.
-
-    Raises:
-        UserError: If keys contradict each other, or a value is out of range.
-    """
-
-    ckpt: str | None = None
-    which: Which = "last"
-    from_samples: str | None = None
-    baseline: str | None = None
-    data: Config | None = None
-    representation: Config | None = None
-    protocol: str | None = None
-    extractor: str | None = None
-    smpl: str | None = None
-    split: Split = "test"
-    seed: int = 0
-    replications: int | None = None
-    samples: int | None = None
-    resamples: int = 0
-    multimodality: bool = True
-    quick: bool = False
-    force: bool = False
-    guidance_scale: float | None = None
-    sampler: str | None = None
-    num_inference_steps: int | Sequence[int] | None = None
-    eta: float | None = None
-    spacing: str | None = None
-    method: str | None = None
-    until: float | None = None
-    strength: float | None = None
-    batch_size: int | None = None
-    device: str | None = None
-    data_root: str | None = None
-    out: str | None = None
-
-    @classmethod
-    def of(cls, config: Config) -> EvaluationRequest:
-        """Returns the request of a composed configuration."""
-        return cls(**{field.name: config[field.name] for field in fields(cls) if field.name in config})
-
-    def __post_init__(self) -> None:
-        what = [name for name in ("ckpt", "from_samples", "baseline") if getattr(self, name) is not None]
-        if len(what) != 1:
-            raise UserError(
-                "give exactly one of ckpt=runs/.../checkpoints/last.ckpt, from_samples=<folder of .npz files> and "
-                "baseline=shuffled"
-            )
-        if what != ["ckpt"] and not self.data:
-            raise UserError(f"{what[0]} needs a data set. Add data=NAME, such as data=humanml3d")
-        if what != ["ckpt"] and self.protocol is None:
-            raise UserError(f"{what[0]} needs a protocol. Add protocol=NAME, such as protocol=text_to_motion")
-        if what == ["from_samples"] and (self.quick or self.samples or self.replications):
-            raise UserError("from_samples evaluates all motions of the files. Remove quick, samples and replications")
-        if self.split not in ("train", "val", "test"):
-            raise UserError(f"unknown split: {self.split}. Choose train, val or test")
-        if self.resamples and self.resamples < MIN_RESAMPLES:
-            raise UserError(f"resamples={self.resamples}: give 0, or {MIN_RESAMPLES} or more for a 95 % interval")
-        if self.batch_size is not None and self.batch_size < 1:
-            raise UserError(f"batch_size={self.batch_size}: must be at least 1")
-        if self.guidance_scale is not None and not math.isfinite(self.guidance_scale):
-            raise UserError(f"guidance_scale={self.guidance_scale} is not a finite number")
+Scores = list[tuple[dict[str, float | None], int]]
+"""Values by metric, and number of motions, of each replication."""
 
 
 def evaluate(request: EvaluationRequest) -> None:
     """Evaluates a checkpoint, motion files or a baseline, and writes the result file.
 
     Raises:
-        UserError, FileNotFoundError, ValueError: If a file is missing, or model, data, protocol and extractor
-            do not match.
+        UserError: If model, data, protocol and extractor do not match, or real motions do not have the expected values.
+        FileNotFoundError: If a file is missing.
     """
     if request.out is not None:  # checked here, before hours of work
         if Path(request.out).is_dir():
             raise UserError(f"out={request.out} is a folder. Name the JSON file to write")
         Path(request.out).parent.mkdir(parents=True, exist_ok=True)
-    with _processes(request.device) as (rank, world, device):
-        _evaluate(request, rank, world, device)
-
-
-@contextmanager
-def _processes(device: str | None) -> Iterator[tuple[int, int, str]]:
-    """Joins the processes started by torchrun, if any. Yields rank, number of processes, and device of this process."""
-    import torch
-
-    from flame_mdm.checkpoints.loading import check_device
-
-    rank, world, local = (int(os.environ.get(n, d)) for n, d in (("RANK", 0), ("WORLD_SIZE", 1), ("LOCAL_RANK", 0)))
-    if device is None:
-        device = f"cuda:{local % torch.cuda.device_count()}" if torch.cuda.is_available() else "cpu"
-    check_device(device)
-    if world == 1:
-        yield rank, world, device
-        return
-    # Imported before the group exists: otherwise, the default arguments of its functions would keep the group and its
-    # gloo threads alive, and a live thread can abort the process while Python shuts down.
-    import torch.distributed.nn.functional
-
-    # Motions are gathered once per replication, on the CPU; a process that finishes early may wait for hours.
-    torch.distributed.init_process_group("gloo", timeout=timedelta(days=7))
-    try:
-        yield rank, world, device
-    finally:
-        torch.distributed.destroy_process_group()
-
-
-def _evaluate(request: EvaluationRequest, rank: int, world: int, device: str) -> None:
-    from flame_mdm.checkpoints.loading import find, load
-
-    file = find(request.ckpt, request.which) if request.ckpt is not None else None
-    model = load(file, device) if file is not None else None
-    data = open_data(request, model)
-    representation = model.representation if model else data.representation.to(device)
-    skeleton = _skeleton(request, representation)
-    clips = data.clips(request.split)
-    names = ("replications", "samples", "quick", "multimodality", "batch_size")
-    changes = {name: getattr(request, name) for name in names}
-    name = request.protocol or default_protocol(model)
-    protocol, changed = open_protocol(name, clips, representation, model, **changes)
-    size = protocol.batch_size or request.batch_size or 64
-    extractor = protocol.open_extractor(request.extractor, representation, data.store.info["dataset"])
-    report = _describe(request, protocol, model, data, extractor)
-    report["skeleton"] = skeleton
-    if model is not None and file is not None:
-        names = ("guidance_scale", "sampler", "num_inference_steps", "eta", "spacing", "method", "until", "strength")
-        sampling = protocol.sampling(model, **{name: getattr(request, name) for name in names})
-        report["checkpoint"] |= {"selected_by": _selection(model, file), "sha256": sha256(file), **sampling}
-        options = {"seed": request.seed, **sampling}
-        folder = _motions_folder(
-            file,
-            _kind(protocol),
-            report["checkpoint"]["sha256"],
-            {**options, "split": request.split, "data": data.store.fingerprint, "samples": protocol.samples}
-            | ({"batch_size": size} if protocol.batch_size else {}),
+    with processes(request.device) as device:
+        plan = make_plan(request, device)
+        result = make_result(request, plan)
+        evaluation = Evaluation(
+            plan.protocol,
+            plan.clips,
+            plan.extractor,
+            plan.representation,
+            seed=request.seed,
+            batch_size=plan.batch_size,
+            training=plan.data.clips("train"),
         )
-        source = protocol.generator(
-            model, folder, options, clips=clips, batch_size=size, world=world, progress=not rank
+        measured = evaluation.run(plan.source, force=request.force, resamples=request.resamples)
+        if is_first():
+            reasons = measured.invalid_because + result.invalid_because
+            result = result.model_copy(update=dict(measured) | {"invalid_because": reasons})
+            write_json(plan.path, result.model_dump())
+            show(result, plan.path)
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """A protocol on a split of a data set.
+
+    If there are several processes, all create and run it together.
+
+    Attributes:
+        protocol: what is measured.
+        clips: the split.
+        extractor: an opened extractor; None = metrics that need features have no value.
+        representation: of the motions, on the device to compute on.
+        seed: of all random draws.
+        batch_size: of the extractor.
+        training: the training split, for metrics that look for copies of its motions.
+    """
+
+    protocol: Protocol
+    clips: Clips
+    extractor: Extractor | None
+    representation: Representation
+    seed: int = 0
+    batch_size: int = 64
+    training: Clips | None = None
+
+    def run(
+        self, source: Source | None, *, ground_truth: bool = True, force: bool = False, resamples: int = 0
+    ) -> Measured:
+        """Evaluates real motions of all replications, and then the motions of the source.
+
+        Of several processes, each generates and extracts a share of the batches. The first one computes the metrics;
+        all return the result.
+
+        Args:
+            source: source of the motions; None = real motions only.
+            ground_truth: whether real motions are measured.
+            force: generate even if real motions do not have the values that the protocol expects.
+            resamples: number of sets drawn from the motions of the first replication, for intervals by bootstrap.
+
+        Raises:
+            UserError: If real motions do not have the expected values; nothing has been generated.
+        """
+        evaluator = Evaluator(
+            self.extractor,
+            self.protocol.metrics,
+            self.representation,
+            batch_size=self.batch_size,
+            skip_features=self.extractor is None and self.protocol.extractor is not None,  # with extractor=none
         )
-        path = folder / "result"
-    elif request.baseline is not None:
-        source = protocol.baseline(request.baseline, clips, request.seed)
-        path = Path("runs/baselines") / data.store.info["dataset"] / _kind(protocol) / request.baseline
-        path = path if request.split == "test" else path.with_name(f"{path.name}-{request.split}")
-    else:
-        source = protocol.sample_folder(Path(str(request.from_samples)), representation)
-        path = Path(str(request.from_samples)) / _kind(protocol)
-        report["samples_sha256"] = source.sha256
-    report |= {"changed": changed} | protocol.evaluate(
-        source,
-        clips,
-        extractor,
-        representation,
-        seed=request.seed,
-        batch_size=size,
-        rank=rank,
-        world=world,
-        force=request.force,
-        resamples=request.resamples,
-        training=data.clips("train"),
-    )
-    if rank:
-        return
-    for reason in _overlaps(request, model, extractor, data):
-        report["valid"] = False
-        report["invalid_because"].append(reason)
-    name = f"{path.name}-{extractor.sha256[:8]}" if extractor else path.name
-    name += "-quick" if request.quick else f"-{protocol.replications}x" if "replications" in changed else ""
-    out = Path(request.out or path.with_name(f"{name}.json"))
-    write_json(out, report)
-    _show(report, out)
+        several = self.protocol.multimodality and replace(evaluator, metrics=self.protocol.multimodality.metrics)
+        if evaluator.reads("nearest") and self.training is not None:
+            evaluator.training = evaluator.training_motions(*self._training(self.training))
+        seeds = [self._draws(replication) for replication in range(self.protocol.replications)]
+        measured = Measured(
+            ground_truth=None, values=None, not_computed={}, invalid_because=[], cost=Cost(), seeds=seeds
+        )
+        real_sets = self._measure_real(measured, source, evaluator, several, ground_truth)
+        measured.invalid_because = shared(self._unexpected(measured.ground_truth or {}))
+        if measured.invalid_because and source is not None:
+            measured.forced = force
+            if not is_first() and not force:
+                raise SystemExit(1)  # the first process prints the reason
+            if not force:
+                raise UserError(
+                    f"nothing was generated, because {'; '.join(measured.invalid_because)}. Check the data and the "
+                    "extractor, or give force=true: the result is then marked as not valid"
+                )
+        if source is not None:
+            self._measure(measured, source, evaluator, real_sets, resamples)
+        if source is not None and several:
+            self._measure_multimodality(measured, source, several)
+        if evaluator.skip_features:
+            measured.not_computed["extractor"] = "extractor=none: metrics that need features were not computed"
+        return shared(measured)
 
+    # Real motions -----------------------------------------------------------------------------------------------------
 
-def open_protocol(
-    name: str, clips: Clips, representation: Representation, model: MotionGeneration | None, **changes: Any
-) -> tuple[Protocol, dict[str, Any]]:
-    """Returns a protocol for a split and a model, and the options changed by `Protocol.change`.
+    def _measure_real(
+        self,
+        measured: Measured,
+        source: Source | None,
+        evaluator: Evaluator,
+        several: Evaluator | None,
+        ground_truth: bool,
+    ) -> list[tuple[Extracted, Extracted]]:
+        """Measures real motions, and returns for each replication those that motions of the source are compared with.
 
-    Raises:
-        UserError: If the protocol does not exist, or does not match the clips or the model.
-    """
-    protocol = load_protocol(name, representation)
-    changed = protocol.change(**changes, clips=len(protocol.selected(clips)))
-    protocol.check_data(clips)
-    if model is not None:
-        check_condition(protocol, model)
-    return protocol, changed
+        Raises:
+            UserError: If the motions lack an input that a metric needs.
+        """
+        scores: Scores = []
+        real_sets = []
+        for replication in range(self.protocol.replications):
+            paired, real = self._real(evaluator, replication)
+            if ground_truth:
+                scores.append(self._score(measured, evaluator, paired, paired, real, replication))
+            if source is not None:
+                for checked in filter(None, (evaluator, several)):  # before motions are generated
+                    checked.check(paired)
+                # All replications are kept in memory; joints, the largest part, only if metrics compare them.
+                real_sets.append((paired if evaluator.reads("real_joints") else paired.without_joints(), real))
+        if ground_truth:
+            measured.ground_truth = averages(scores)
+        return real_sets
 
+    def _training(self, clips: Clips) -> tuple[Motions, Motions]:
+        """Returns the training motions: all frames of each, and a window of each for its features."""
+        windows = self.protocol.rows(clips, self.seed, 0, purpose="training")
+        whole = [replace(row, frames=np.arange(row.clip.length)) for row in windows]
+        return self._motions(whole, real_motions(clips, whole)), self._motions(windows, real_motions(clips, windows))
 
-def _motions_folder(checkpoint: Path, kind: str, digest: str, options: Mapping[str, Any]) -> Path:
-    """Returns the folder of the motions that a checkpoint generates with some options."""
-    return run_folder(checkpoint) / "evaluation" / kind / f"{digest[:16]}-{_digest(options)[:8]}"
+    def _real(self, evaluator: Evaluator, replication: int) -> tuple[Extracted, Extracted]:
+        """Returns the real motions of a replication, and real motions for comparisons of sets."""
+        again = self.protocol.rows(self.clips, self.seed, replication, purpose="real")
+        real = evaluator.reference()
+        if real is None:
+            real = replace(evaluator, training=None).extract(self._motions(again, real_motions(self.clips, again)))
+        return self._paired(evaluator, self.protocol.rows(self.clips, self.seed, replication)), real.without_joints()
 
+    def _paired(self, evaluator: Evaluator, rows: Sequence[Row]) -> Extracted:
+        """Returns metric inputs computed from the real motions of rows."""
+        motions = self._motions(rows, real_motions(self.clips, rows))
+        motions.references = self.clips.store.references([row.clip.id for row in rows])
+        return evaluator.extract(motions)
 
-def _kind(protocol: Protocol) -> str:
-    return f"{protocol.name}-{protocol.version}"
+    def _unexpected(self, values: Mapping[str, Value | None]) -> list[str]:
+        """Returns a line for each value of real motions that differs from the expected one.
 
+        Nothing is expected in a quick evaluation, or on splits other than the test split.
+        """
+        # Without test clips (HumanAct12), the training clips are the test split, so they are checked.
+        info = self.clips.store.info
+        if self.protocol.quick or (self.clips.clips[0].split != "test" and info["clips"]["test"]):
+            return []
+        names = [info["dataset"], *([self.extractor.sha256] if self.extractor else [])]
+        lines = []
+        for metric, (expected, tolerance) in (
+            x for name in names for x in self.protocol.expected.get(name, {}).items()
+        ):
+            value = values.get(metric)
+            mean = value.mean if value else None
+            if mean is not None and not abs(mean - expected) <= tolerance:
+                lines.append(f"real motions have {metric} {mean:.4g}, expected {expected:g} +- {tolerance:g}")
+        return lines
 
-def protocol_file(name: str) -> Path:
-    """Returns the file of a protocol, by its name in experiments/evaluation or its path.
+    # Motions of the source --------------------------------------------------------------------------------------------
 
-    Raises:
-        UserError: If the protocol does not exist.
-    """
-    path = Path(name) if name.endswith((".yaml", ".yml")) else EXPERIMENTS / "evaluation" / f"{name}.yaml"
-    if not path.exists():
-        names = ", ".join(sorted(p.stem for p in path.parent.glob("*.yaml")))
-        raise UserError(f"no protocol is called '{name}'. Available: {names or 'none'}")
-    return path
+    def _measure(
+        self,
+        measured: Measured,
+        source: Source,
+        evaluator: Evaluator,
+        real_sets: Sequence[tuple[Extracted, Extracted]],
+        resamples: int,
+    ) -> None:
+        """Measures the source's motions of each replication, compared with the real ones; fills in `measured`."""
+        scores: Scores = []
+        costs = []
+        resampled: dict[str, list[float | None]] = {}
+        for replication, (paired, real) in enumerate(real_sets):
+            rows = self.protocol.rows(self.clips, self.seed, replication)
+            samples = source(f"rep_{replication}", rows, replication)
+            costs.append(samples.cost)
+            if len(samples.rows) != len(rows):  # motions from another system may not cover all clips
+                ids = {row.id for row in samples.rows}
+                paired = _select(paired, [i for i, row in enumerate(rows) if row.id in ids])
+            generated = evaluator.extract(self._generated(samples))
+            scores.append(self._score(measured, evaluator, generated, paired, real, replication))
+            if not replication:
+                measured.warnings = self._warnings(generated, real)
+                resampled = evaluator.resample(generated, paired, real, self._draws(0), resamples)
+                if "nearest" in generated.rows:
+                    sets = {"generated": generated, "real": paired}
+                    measured.nearest = {name: _sorted_distances(x.rows["nearest"]) for name, x in sets.items()}
+        measured.values, measured.cost = averages(scores, resampled), mean_cost(costs)
 
+    def _measure_multimodality(self, measured: Measured, source: Source, evaluator: Evaluator) -> None:
+        """Computes the metrics that need several motions per prompt."""
+        several = self.protocol.multimodality
+        assert several is not None
+        generates = isinstance(source, Generator) and not self.protocol.quick
+        scores: Scores = []
+        nothing = evaluator.extract(self._motions([], []))
+        for replication in range(several.replications):
+            motions = paired = nothing
+            if generates:
+                rows = self.protocol.prompts(self.clips, self.seed, replication)
+                motions = evaluator.extract(self._generated(source(f"multimodality_{replication}", rows, replication)))
+                real = self._paired(evaluator, rows[:: several.samples])
+                paired = _select(real, [i // several.samples for i in range(len(rows))])
+            scores.append(self._score(measured, evaluator, motions, paired, nothing, replication))
+        if not generates:
+            why = "not computed in a quick evaluation" if self.protocol.quick else "there is one sample per clip"
+            measured.not_computed["multimodality"] = f"{why}: it needs several samples per prompt"
+        measured.values = (measured.values or {}) | averages(scores)
 
-def load_protocol(name: str, representation: Representation) -> Protocol:
-    """Loads a protocol for motions of a representation.
+    def _generated(self, samples: Samples) -> Motions:
+        """Returns the motions to measure; smooths each over time, without padding, as FLAME's code does."""
+        sigma, features = self.protocol.smoothing, samples.features
+        if sigma is not None:
+            features = [gaussian_filter1d(motion, sigma, axis=0) for motion in features]
+        return self._motions(samples.rows, features, samples.captions)
 
-    Its file may use ${representation.fps}, ${representation.feet}, ${representation.toes} and
-    ${representation.parents}.
+    def _warnings(self, generated: Extracted, real: Extracted) -> list[str]:
+        """Returns warnings about biased Fréchet distances."""
+        lines = []
+        for name, config in self.protocol.metrics.items():
+            if not config["_target_"].endswith(FrechetMotionDistance.__name__) or "generated" not in generated.rows:
+                continue
+            width = generated.rows["generated"].shape[1]
+            few = min(len(generated), len(real))
+            if few < 2 * width:
+                lines.append(f"{name}: biased upwards: {few} motions are fewer than twice the {width} features")
+            if len(generated) != len(real):
+                lines.append(
+                    f"{name}: {len(generated)} generated and {len(real)} real motions. Compare it only with values for "
+                    "the same two numbers"
+                )
+        return lines
 
-    Args:
-        name: a name in experiments/evaluation, or the path of a .yaml file.
-        representation: of the motions.
+    # Both -------------------------------------------------------------------------------------------------------------
 
-    Raises:
-        UserError: If the protocol does not exist or cannot be read.
-    """
-    from evaluators.protocol import Protocol
+    def _draws(self, replication: int) -> int:
+        """Returns the seed of the random draws of metrics."""
+        return key("draws", self.seed, replication)
 
-    path = protocol_file(name)
-    skeleton = representation.skeleton
-    feet, parents = list(skeleton.feet), list(skeleton.parents)
-    facts = {"fps": representation.fps, "feet": feet, "toes": feet[1::2], "parents": parents}
-    known = {f"${{representation.{fact}}}": value for fact, value in facts.items()}
+    def _score(
+        self,
+        measured: Measured,
+        evaluator: Evaluator,
+        motions: Extracted,
+        paired: Extracted,
+        real: Extracted,
+        replication: int,
+    ) -> tuple[dict[str, float | None], int]:
+        """Returns values and number of motions; adds reasons for missing values to `measured`."""
+        values, reasons = evaluator.score(motions, paired, real, self._draws(replication))
+        measured.not_computed |= reasons
+        return values, len(motions)
 
-    def filled(node: Any) -> Any:
-        if isinstance(node, dict):
-            return {key: filled(value) for key, value in node.items()}
-        return [filled(value) for value in node] if isinstance(node, list) else known.get(str(node), node)
-
-    config = filled(read_yaml(path))
-    if not isinstance(config, dict) or "_target_" not in config:
-        raise UserError(f"{path}: not a protocol: it has no _target_, such as evaluators.protocol.Protocol")
-    plain(config, path)
-    check(config)
-    protocol = instantiate(config)
-    if not isinstance(protocol, Protocol):
-        raise UserError(f"{path}: not a protocol: {config['_target_']}. Name evaluators.protocol.Protocol")
-    protocol.sha256 = _digest(config)
-    return protocol
-
-
-def default_protocol(model: MotionGeneration | None) -> str:
-    """Returns the name of the default protocol for a model."""
-    assert model is not None
-    condition = model.conditioned_on
-    if condition == "none":
-        return "unconditioned"
-    if condition == "action":
-        released = {"humanact12": "action_to_motion", "uestc": "action_to_motion_uestc"}
-        return released.get(model.facts.get("dataset", ""), "action_to_motion_own")
-    return "synthetic" if model.facts.get("dataset") == "synthetic" else "text_to_motion"
-
-
-def check_condition(protocol: Protocol, model: MotionGeneration) -> None:
-    """Checks that the model was trained with the condition of the protocol.
-
-    Raises:
-        UserError: If it was trained with another condition.
-    """
-    if protocol.condition not in ("none", model.conditioned_on):
-        raise UserError(
-            f"protocol {protocol.name} generates motions from {protocol.condition}, but the checkpoint was trained "
-            f"with condition {model.conditioned_on}. Choose another protocol, such as {default_protocol(model)}"
+    def _motions(self, rows: Sequence[Row], features: list[np.ndarray], captions: list[str] | None = None) -> Motions:
+        """Returns motions with the conditions of their rows; `captions` replace the captions of the rows."""
+        condition = self.protocol.condition
+        texts = captions or [row.text for row in rows] if condition == "text" else None
+        labels = [row.clip.action for row in rows]
+        return Motions(
+            ids=[row.id for row in rows],
+            features=features,
+            captions=texts,
+            tokens=[_tokens(row, caption) for row, caption in zip(rows, texts, strict=True)] if texts else None,
+            labels=[int(label) for label in labels if label is not None] if condition == "action" else None,
+            groups=[row.prompt for row in rows],
+            requested=[row.clip.attributes for row in rows] if condition != "none" else None,
+            edit=self.protocol.edit,
         )
 
 
-def run_folder(checkpoint: Path) -> Path:
-    """Returns the run directory of a checkpoint, or the folder of a file that belongs to no run."""
-    return checkpoint.parent.parent if checkpoint.parent.name == "checkpoints" else checkpoint.parent
+def _tokens(row: Row, caption: str) -> list[str] | None:
+    """Returns the "word/PART" tokens of a caption of the clip, if the data has them."""
+    tagged = row.clip.attributes.get("tokens")
+    return tagged[row.clip.captions.index(caption)] if tagged and caption in row.clip.captions else None
 
 
-def open_data(request: EvaluationRequest, model: MotionGeneration | None) -> MotionDataModule:
-    """Returns the prepared data, with its own representation. The model keeps the statistics of its training data."""
-    from flame_mdm.data.datamodule import MotionDataModule
-
-    module, encoding, root = request.data, request.representation, "data"
-    if model is not None and not module:
-        if "data" not in model.config:
-            raise UserError(f"{request.ckpt}: its recipe names no data set. Add data=NAME")
-        module, encoding = model.config["data"], model.config["representation"]
-        trust({"data": module})
-        root = module.get("root")
-    assert module is not None
-    assert encoding is not None
-    root = request.data_root or os.environ.get("FLAME_MDM_DATA") or root
-    representation: Representation = instantiate(encoding)
-    if model is not None and representation.name != model.representation.name:
-        raise UserError(
-            f"the checkpoint generates {model.representation.name}, but the data set {module['name']} has "
-            f"{representation.name}"
-        )
-    data = instantiate(module | {"root": root}, representation=representation, seed=0)
-    if not isinstance(data, MotionDataModule):
-        raise UserError(f"{request.ckpt}: its recipe names {type(data).__name__} as the data set. Add data=NAME")
-    data.setup("test")
-    return data
+def _sorted_distances(nearest: Tensor) -> list[float]:
+    """Returns distances of joints in meters, rounded to 0.1 mm, for a figure."""
+    return [round(distance, 4) for distance in nearest[:, 0].sort().values.tolist()]
 
 
-def _overlaps(
-    request: EvaluationRequest, model: MotionGeneration | None, extractor: Extractor | None, data: MotionDataModule
-) -> list[str]:
-    """Returns reasons why values are not valid: evaluated clips may be training clips of the model or extractor.
-
-    `make train` trains on the training split, so that an extractor of the same data has seen the others only if they
-    are the training split, too: the footnotes of tables mark published splits like that.
-    """
-    here, reasons = data.store.fingerprint, []
-    for what, trained in (
-        ("training data", model.facts.get("fingerprint") if model is not None else None),
-        ("training data of the extractor", extractor.fingerprint if extractor is not None else None),
-    ):
-        if trained and trained != here:
-            reasons.append(f"{what} {trained} and evaluated data {here} differ: splits may overlap")
-    if extractor is not None and extractor.fingerprint == here and request.split == "train":
-        reasons.append("the extractor was trained on the evaluated split, train")
-    return reasons
-
-
-def _describe(
-    request: EvaluationRequest,
-    protocol: Protocol,
-    model: MotionGeneration | None,
-    data: MotionDataModule,
-    extractor: Extractor | None,
-) -> dict[str, Any]:
-    """Returns the provenance of a result."""
-    import torch
-
-    from flame_mdm.training.provenance import environment
-
-    info = data.store.info
-    where = (model.representation if model else data.representation).mean.device
-    card = card_of(info["dataset"], extractor.sha256 if extractor else None)
-    report: dict[str, Any] = {
-        "format": FORMAT,
-        "quick": request.quick,
-        "protocol": {
-            "name": protocol.name,
-            "version": protocol.version,
-            "sha256": protocol.sha256,
-            "length_source": "ground truth",
-        },
-        "split": request.split,
-        "published_split": info["published_split"],
-        "data": {
-            "dataset": info["dataset"],
-            "representation": info["representation"],
-            "fingerprint": info["fingerprint"],
-            "frames": [data.crop.shortest(), data.crop.longest()],
-            "excluded": _excluded(data, request.split),
-        },
-        "seed": request.seed,
-        "extractor": extractor
-        and {"path": str(request.extractor), "sha256": extractor.sha256, "data": extractor.fingerprint},
-        "samples_sha256": None,
-        "audit": card.as_posix() if card else None,
-        "baseline": request.baseline,
-        "checkpoint": None,
-        "device": torch.cuda.get_device_name(where) if where.type == "cuda" else "cpu",
-        "precision": f"float32, matmul {torch.get_float32_matmul_precision()}",
-        "environment": environment(),
-    }
-    if model is not None:
-        report["checkpoint"] = {
-            "path": str(request.ckpt),
-            "experiment": model.config.get("experiment"),
-            "config_sha256": _digest(model.config),
-            "averaged_weights": bool(model.config.get("ema")),
-            "parameters": sum(p.numel() for p in model.parameters() if p.requires_grad),
-            "prediction": {"epsilon": "noise"}.get(model.process.prediction, model.process.prediction),
-            "training_steps": model.steps,
-            **{f"training_{name}": value for name, value in model.facts.get("training", {}).items()},
-        }
-    return report
-
-
-def _skeleton(request: EvaluationRequest, representation: Representation) -> dict[str, Any] | None:
-    """Sets the bone offsets of a representation of SMPL rotations from SMPL's model file, if it is given.
-
-    Returns:
-        "stand_in": whether a stand-in skeleton is used, because the file is not given; "smpl_sha256": hash of the file.
-        None if motions are represented by joint positions, which need no skeleton.
-
-    Raises:
-        FileNotFoundError, ValueError: no such file, or no SMPL model.
-    """
-    from flame_mdm.data.body_model import load_offsets
-    from flame_mdm.representations.rot6d import Rot6D
-    from flame_mdm.representations.smpl import SMPL
-
-    if not isinstance(representation, SMPL | Rot6D):
-        return None
-    if request.smpl is None:
-        return {"stand_in": True, "smpl_sha256": None}
-    representation.offsets = load_offsets(Path(request.smpl))
-    return {"stand_in": False, "smpl_sha256": sha256(request.smpl)}
-
-
-def _excluded(data: MotionDataModule, split: Split) -> dict[str, int]:
-    """Returns the number of clips excluded from the data set and from the split, by reason."""
-    short = data.clips(split).too_short
-    reason = f"{split} clips shorter than {data.crop.shortest()} frames"
-    return data.store.info["excluded"] | ({reason: short} if short else {})
-
-
-def _selection(model: MotionGeneration, file: Path) -> str:
-    """Returns how a checkpoint was selected among those of its run, judging by its file name."""
-    best = (model.config.get("callbacks") or {}).get("best") or {}
-    return f"best {best['monitor']}" if file.stem == "best" and "monitor" in best else f"none: {file.stem}"
-
-
-def _digest(values: Any) -> str:
-    return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
-
-
-def _show(report: Mapping[str, Any], out: Path) -> None:
-    """Prints the values next to those of real motions."""
-    protocol = report["protocol"]
-    mark = " QUICK RUN, NOT FOR PUBLICATION" if report["quick"] else ""
-    say(f"{protocol['name']} version {protocol['version']}, {report['data']['dataset']} {report['split']}{mark}")
-    say(f"{'':32}{'real motions':>24}{report['baseline'] or 'generated':>24}")
-    for name, value in report["values"].items():
-        real = report["ground_truth"].get(name)
-        if any(found is not None and found["mean"] is not None for found in (real, value)):
-            say(f"{name:32}{_cell(real):>24}{_cell(value):>24}")
-    for reason, count in report["data"]["excluded"].items():
-        say(f"excluded from the data set: {count} {reason}")
-    for name, reason in report["not_computed"].items():
-        say(f"not computed: {name}: {reason}")
-    if report["skeleton"] and report["skeleton"]["stand_in"]:
-        say("warning: joints were computed with a stand-in skeleton. Give SMPL's model file for its own: smpl=FILE")
-    for reason in report["warnings"]:
-        say(f"warning: {reason}")
-    for reason in report["invalid_because"]:
-        say(f"NOT VALID: {reason}")
-    if report["audit"] is None:
-        say(f"not audited: what this evaluator sees is not known. make audit DATA={report['data']['dataset']} tells")
-    say(f"written: {out}")
-
-
-def _cell(value: Mapping[str, Any] | None) -> str:
-    return "-" if value is None or value["mean"] is None else f"{value['mean']:.4g} +- {value['ci']:.2g}"
+def _select(extracted: Extracted, indices: list[int]) -> Extracted:
+    rows = {n: v[indices] if isinstance(v, Tensor) else [v[i] for i in indices] for n, v in extracted.rows.items()}
+    kept = None if extracted.kept is None else [extracted.kept[i] for i in indices]
+    return Extracted(rows, [extracted.joints[i] for i in indices] if extracted.joints else [], kept)

@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 from torchmetrics import Metric
 
-from evaluators.collectives import dealt
+from evaluators.collectives import dealt, is_first
 from evaluators.extractors import Extractor
 from evaluators.metrics import make_metrics, missing_input, required_inputs, update_metrics
 from evaluators.metrics.attributes import ATTRIBUTES
@@ -94,8 +94,8 @@ class Evaluator:
     """Computes metrics of motions.
 
     For the same features, all values are bit-identical for any batch size and order. Several processes share the
-    feature pass: each extracts whole batches, so that features do not depend on the number of processes. Metrics are
-    computed by the first process, on the CPU.
+    feature pass: each extracts whole batches, so that features do not depend on the number of processes. The first
+    process computes the metrics, on the CPU.
 
     Attributes:
         extractor: computes the features for metrics; None = no features.
@@ -103,7 +103,6 @@ class Evaluator:
         representation: of the motions.
         batch_size: of the extractor.
         skip_features: whether metrics of features have no value, instead of raising for lack of input.
-        rank, world: rank of this process, and number of processes.
         training: motions that generated ones may be copies of; None = this is not measured.
     """
 
@@ -112,13 +111,11 @@ class Evaluator:
     representation: Representation
     batch_size: int = 64
     skip_features: bool = False
-    rank: int = 0
-    world: int = 1
     training: TrainingMotions | None = None
 
     @torch.no_grad()
     def extract(self, motions: Motions) -> Extracted:
-        """Runs the feature pass over motions, which are the same in all processes, and so is the result.
+        """Runs the feature pass over motions; all processes call it with the same motions and get the same result.
 
         Raises:
             UserError: If a motion contains NaN or infinity.
@@ -127,10 +124,10 @@ class Evaluator:
         # Batches of similar lengths need little padding.
         order = np.argsort([len(x) for x in motions.features], kind="stable").tolist()
         batches = [order[begin : begin + self.batch_size] for begin in range(0, len(order), self.batch_size)]
-        parts = dealt(partial(self._batch, motions), batches, self.rank, self.world)
+        parts = dealt(partial(self._batch, motions), batches)
         texts = [text for indices in batches if (text := self._texts(motions, indices)) is not None]
         back = np.argsort(order, kind="stable")
-        joints = [motion for found, _ in parts for motion in found]
+        joints = [motion for batch, _ in parts for motion in batch]
         joints = [joints[i] for i in back]
         if batches:
             rows |= {name: torch.cat([features[name] for _, features in parts])[back] for name in parts[0][1]}
@@ -144,9 +141,9 @@ class Evaluator:
         if motions.groups is not None:
             rows["groups"] = self._keys(motions.groups)
         if motions.requested is not None and all("action" in attributes for attributes in motions.requested):
-            rows["requested"] = [{k: v for k, v in each.items() if k in ATTRIBUTES} for each in motions.requested]
+            rows["requested"] = [{k: v for k, v in x.items() if k in ATTRIBUTES} for x in motions.requested]
         if motions.requested is not None and all("content" in attributes for attributes in motions.requested):
-            rows["sides"] = [(each["content"], each.get("side", "")) for each in motions.requested]
+            rows["sides"] = [(x["content"], x.get("side", "")) for x in motions.requested]
         if motions.references is not None:
             rows["references"] = [torch.from_numpy(joints) for joints in motions.references]
         contacts = self.representation.slices.get("contacts")
@@ -164,13 +161,13 @@ class Evaluator:
         extracted = self.extract(windows)
         facing = self.representation.skeleton.facing
         joints = replace(self, extractor=None).extract(whole).joints
-        found = [poses(motion, facing) for motion in joints]
-        lengths = torch.tensor([len(motion) for motion in found])
-        return TrainingMotions(torch.cat(found), lengths, extracted.rows.get("generated"), facing)
+        frames = [poses(motion, facing) for motion in joints]
+        lengths = torch.tensor([len(motion) for motion in frames])
+        return TrainingMotions(torch.cat(frames), lengths, extracted.rows.get("generated"), facing)
 
     @torch.no_grad()
     def reference(self) -> Extracted | None:
-        """The features of the real motions that belong to the extractor; None = sets are compared with the data's."""
+        """Returns features of the extractor's own real motions; None = sets are compared with motions of the data."""
         features = self.extractor.reference() if self.extractor is not None else None
         if features is None:
             return None
@@ -193,11 +190,11 @@ class Evaluator:
         joints = [motion[:length].clone() for motion, length in zip(padded.cpu(), lengths, strict=True)]
         if self.extractor is None:
             return joints, {}
-        found = self.extractor.motions(x, padded.where(mask[..., None, None], 0.0), mask)
-        return joints, {"generated" if name == "features" else name: x.float().cpu() for name, x in found.items()}
+        features = self.extractor.motions(x, padded.where(mask[..., None, None], 0.0), mask)
+        return joints, {"generated" if name == "features" else name: x.float().cpu() for name, x in features.items()}
 
     def _texts(self, motions: Motions, indices: Sequence[int]) -> Tensor | None:
-        """Returns features of some captions, as every process computes them: an extractor may encode each only once."""
+        """Returns features of some captions. Every process computes all of them, since extractors cache captions."""
         if self.extractor is None or motions.captions is None:
             return None
         tokens = motions.tokens or [None] * len(motions)
@@ -217,14 +214,14 @@ class Evaluator:
             seed: of the random draws of metrics.
 
         Returns:
-            The values by name, `metric` or `metric/part`, None if not computable; and the reasons by metric, if there
-            are too few samples. Both are empty in all processes but the first.
+            The values by name, `metric` or `metric/part`, None if not computable; and by metric, why a value is
+            missing. Both are empty in all processes but the first.
 
         Raises:
             UserError: If the motions lack an input that a metric needs.
             ValueError: If motions do not match in a metric that compares them one by one.
         """
-        if self.rank:
+        if not is_first():
             return {}, {}
         metrics, usable = self._metrics(generated, seed)
         for begin in range(0, len(generated), CHUNK):
@@ -244,10 +241,10 @@ class Evaluator:
         Returns:
             (resamples,) values by name, None if not computable; empty in all processes but the first.
         """
-        if self.rank or not len(generated) or not resamples:
+        if not is_first() or not len(generated) or not resamples:
             return {}
         metrics, usable = self._metrics(generated, seed)
-        # What each motion adds to the states of the metrics: a row of a list, or a part of a sum.
+        # Each motion adds a row to a state that is a list, or a summand to a state that is a sum.
         states = [(name, state) for name, metric in usable.items() for state in metric._reductions]
         sums: dict[tuple[str, str], list[Tensor]] = {
             (name, state): [] for name, state in states if isinstance(getattr(usable[name], state), Tensor)
@@ -257,7 +254,7 @@ class Evaluator:
             _update(usable, generated, paired, slice(i, i + 1))
             for name, state in sums:
                 sums[name, state].append(getattr(usable[name], state) - before[name, state])
-        added = {where: torch.stack(parts) for where, parts in sums.items()}
+        added = {state: torch.stack(parts) for state, parts in sums.items()}
         lists = [(name, state) for name, state in states if (name, state) not in sums and getattr(usable[name], state)]
         added |= {(name, state): torch.cat(getattr(usable[name], state)) for name, state in lists}
         generator = np.random.default_rng(key("bootstrap", seed))
@@ -311,14 +308,14 @@ class Evaluator:
         Raises:
             UserError: If the motions lack an input that a metric needs.
         """
-        given = {*motions.rows, "joints", "mask", "real_joints", "real_mask"}
-        given |= {"real"} if "generated" in motions.rows else set()
-        given |= {"kept"} if motions.kept is not None else set()
-        given |= {"real_nearest"} if "nearest" in motions.rows else set()
+        available = {*motions.rows, "joints", "mask", "real_joints", "real_mask"}
+        available |= {"real"} if "generated" in motions.rows else set()
+        available |= {"kept"} if motions.kept is not None else set()
+        available |= {"real_nearest"} if "nearest" in motions.rows else set()
         usable = {}
         for name, metric in (make_metrics(self.metrics) if metrics is None else metrics).items():
             needed = ["generated", "keys"] if isinstance(metric, TwoSets) else required_inputs(metric)
-            missing = [row for row in needed if row not in given]
+            missing = [row for row in needed if row not in available]
             if not missing:
                 usable[name] = metric
             elif not (self.skip_features and FEATURES.intersection(missing)):

@@ -28,8 +28,8 @@ def near_misses(clips: Sequence[Entry]) -> list[dict[str, list[str]]]:
     captions: dict[_Stated, set[str]] = {}
     for own, clip in zip(stated, clips, strict=True):
         captions.setdefault(own, set()).update(clip.captions)
-    found = {own: _contradicting(own, captions) for own in captions}
-    return [found[own] for own in stated]
+    contradicting = {own: _contradicting(own, captions) for own in captions}
+    return [contradicting[own] for own in stated]
 
 
 def _stated(clip: Entry) -> _Stated:
@@ -37,19 +37,19 @@ def _stated(clip: Entry) -> _Stated:
 
     With side "left", "wave-left-hand" is "wave-{side}-hand", the same action as "wave-both-hands" with side "both".
     """
-    known = {name: value for name, value in clip.attributes.items() if isinstance(value, str | int | float)}
-    action = next((str(known.pop(name)) for name in ACTION if name in known), "")
-    names = {str(value): f"{{{name}}}" for name, value in known.items()}
+    stated = {name: value for name, value in clip.attributes.items() if isinstance(value, str | int | float)}
+    action = next((str(stated.pop(name)) for name in ACTION if name in stated), "")
+    names = {str(value): f"{{{name}}}" for name, value in stated.items()}
     if action:
-        known["action"] = "-".join(names.get(word, word.removesuffix("s")) for word in action.split("-"))
-    return frozenset(known.items())
+        stated["action"] = "-".join(names.get(word, word.removesuffix("s")) for word in action.split("-"))
+    return frozenset(stated.items())
 
 
 def _contradicting(own: _Stated, captions: dict[_Stated, set[str]]) -> dict[str, list[str]]:
     mine = dict(own)
     wrong: dict[str, set[str]] = {}
-    for each, texts in captions.items():
-        other = dict(each)
+    for attributes, texts in captions.items():
+        other = dict(attributes)
         if "action" not in mine or mine["action"] != other.get("action"):
             continue
         differing = [name for name in mine.keys() & other.keys() if mine[name] != other[name]]

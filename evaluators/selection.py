@@ -36,11 +36,11 @@ def text_fit(
         for motion in motions:
             parts = motion.parts or ((motion.text, 0, len(motion.features)),)
             texts = extractor.texts([text for text, _, _ in parts], [None] * len(parts))
-            found = []
+            features = []
             for _, begin, end in parts:
                 x, joints = (torch.from_numpy(y[None, begin:end]).to(device) for y in (motion.features, motion.joints))
-                found.append(extractor.motions(x, joints, torch.ones_like(x[..., 0], dtype=torch.bool))["features"])
-            scores.append(float(F.cosine_similarity(torch.cat(found), texts).mean()))
+                features.append(extractor.motions(x, joints, torch.ones_like(x[..., 0], dtype=torch.bool))["features"])
+            scores.append(float(F.cosine_similarity(torch.cat(features), texts).mean()))
         return scores
 
     return score

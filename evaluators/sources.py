@@ -8,15 +8,16 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
+from typing import Protocol as Interface
 
 import numpy as np
 import torch
 
-from evaluators.collectives import dealt, shared
+from evaluators.collectives import dealt, is_first, shared, world_size
+from evaluators.protocol import Protocol, Row
 from flame_mdm.batch import Edit, MotionBatch, length_mask, pad_to
 from flame_mdm.data.datamodule import Clips
-from flame_mdm.data.store import Entry
 from flame_mdm.errors import UserError
 from flame_mdm.progress import ProgressBar
 from flame_mdm.representations import Representation
@@ -29,31 +30,6 @@ from flame_mdm.task import MotionGeneration
 
 NOISE = 0.5
 """Standard deviation of the noise in noisy baselines, in normalized features."""
-
-
-@dataclass(frozen=True)
-class Row:
-    """One motion to generate.
-
-    Attributes:
-        id: unique name of the motion.
-        clip: the real clip that it is compared with.
-        frames: indices of the frames drawn from the clip.
-        caption: index of the caption drawn from the clip; None = the clip has none.
-        prompt: name shared by all motions with the same caption and length.
-    """
-
-    id: str
-    clip: Entry
-    frames: np.ndarray
-    caption: int | None
-    prompt: str
-
-    @property
-    def text(self) -> str:
-        """The drawn caption."""
-        assert self.caption is not None
-        return self.clip.captions[self.caption]
 
 
 @dataclass
@@ -73,13 +49,13 @@ class Samples:
     captions: list[str] | None = None
 
 
-class Source(Protocol):
-    """A source of motions for given rows."""
+class Source(Interface):
+    """A source of motions for the rows of a protocol."""
 
-    def __call__(self, name: str, rows: list[Row], replication: int, rank: int, world: int) -> Samples:
+    def __call__(self, name: str, rows: list[Row], replication: int) -> Samples:
         """Returns the motions of the rows; `name` identifies replication and purpose.
 
-        All of `world` processes call it together and get the same motions.
+        All processes call it together and get the same motions.
         """
         ...
 
@@ -98,67 +74,65 @@ class Generator:
 
     Args:
         model: the model, on its device.
-        folder: cache of the motions, `rep_0.npz` and so on, as `SampleFolder` reads them; None = no cache.
-        options: fields of `SamplerOptions`, and `seed`; with `parts`, also `edit`, the options of `Edit`.
+        protocol: condition and edit of the motions, and whether they are timed.
         clips: the split.
-        condition: "text", "action" or "none".
+        options: of the sampler.
+        edit: options of `Edit`, if motions are edited.
+        seed: of the noise.
         batch_size: motions per batch.
-        timed: whether to sample a first batch once more, untimed, since it is slower than the others.
-        parts: `region` and `joints` of `flame_mdm.sampling.editing.kept_parts`: the motions are edits of real motions.
-        total: number of motions in the whole evaluation, for the progress bar.
+        folder: cache of the motions, `rep_0.npz` and so on, as `SampleFolder` reads them; None = no cache.
         progress: whether to show a progress bar.
     """
 
     def __init__(
         self,
         model: MotionGeneration,
-        folder: Path | None,
-        options: Mapping[str, Any],
-        *,
+        protocol: Protocol,
         clips: Clips,
-        condition: str,
+        options: SamplerOptions,
+        edit: Mapping[str, Any],
+        *,
+        seed: int,
         batch_size: int,
-        timed: bool = False,
-        parts: Mapping[str, Any] | None = None,
-        total: int = 0,
+        folder: Path | None = None,
         progress: bool = True,
     ):
-        chosen = dict(options)
-        self.how, self.seed = chosen.pop("edit", {}), chosen.pop("seed", 0)
-        self.model, self.folder, self.options, self.clips = model, folder, SamplerOptions(**chosen), clips
-        self.condition, self.batch_size, self.timed, self.parts = condition, batch_size, timed, parts
-        self.bar = ProgressBar(total=total, desc="generating", unit=" motions", disable=not progress)
+        self.model, self.protocol, self.clips = model, protocol, clips
+        self.options, self.edit, self.seed = options, edit, seed
+        self.batch_size, self.folder = batch_size, folder
+        total = protocol.count(clips) // world_size()
+        self.bar = ProgressBar(total=total, desc="generating", unit=" motions", disable=not (progress and is_first()))
 
-    def __call__(self, name: str, rows: list[Row], replication: int, rank: int = 0, world: int = 1) -> Samples:
+    def __call__(self, name: str, rows: list[Row], replication: int) -> Samples:
         """Returns the motions of the rows, from the cache or else from the model; see `Source`.
 
         Raises:
             UserError: If the folder holds other motions or a damaged file, or the model returns NaN or infinity.
         """
         path = self.folder / f"{name}.npz" if self.folder else None
-        if shared(path is not None and path.exists(), world):
+        if shared(path is not None and path.exists()):
             assert path is not None
-            content = shared(self._read(path, rows) if not rank else None, world)
-            assert content is not None
-            return Samples(rows, *content)
+            cached = shared(self._read(path, rows) if is_first() else None)
+            assert cached is not None
+            return Samples(rows, *cached)
         order = np.argsort([-len(row.frames) for row in rows], kind="stable").tolist()
         batches = [order[first : first + self.batch_size] for first in range(0, len(order), self.batch_size)]
-        if self.timed:
-            self._sample([rows[i] for i in batches[0]], replication)
+        if self.protocol.batch_size is not None:
+            self._sample([rows[i] for i in batches[0]], replication)  # not timed: slower than the others
         try:
-            parts = dealt(lambda some: self._generate([rows[i] for i in some], replication), batches, rank, world)
+            parts = dealt(lambda indices: self._generate([rows[i] for i in indices], replication), batches)
         except BaseException:
             self.bar.close()  # ends the line of the progress bar
             raise
-        motions = [motion for found, _, _ in parts for motion in found]
+        motions = [motion for batch, _, _ in parts for motion in batch]
         features = [motions[i] for i in np.argsort(order)]
         cost = {
             "nfe": sum(calls for _, calls, _ in parts) / len(parts),
             "seconds_per_sample": sum(seconds for _, _, seconds in parts) / len(rows),
             "batch_size": float(len(batches[0])),
         }
-        if path is not None and not rank:
-            _write(path, rows, features, cost, self.condition)
+        if path is not None and is_first():
+            _write(path, rows, features, cost, self.protocol.condition)
         return Samples(rows, features, cost)
 
     def _read(self, path: Path, rows: list[Row]) -> tuple[list[np.ndarray], dict[str, float]]:
@@ -166,7 +140,7 @@ class Generator:
         if content["ids"].tolist() != [row.id for row in rows]:
             raise UserError(f"{path}: holds motions of other clips. Delete it")
         self.bar.update(len(rows))
-        cost = {key: float(content[key]) for key in ("nfe", "seconds_per_sample", "batch_size")}
+        cost = {name: float(content[name]) for name in ("nfe", "seconds_per_sample", "batch_size")}
         return _split(content), cost
 
     def _generate(self, rows: Sequence[Row], replication: int) -> tuple[list[np.ndarray], int, float]:
@@ -195,35 +169,35 @@ class Generator:
             self._batch(rows),
             self.options,
             replication=replication,
+            unconditioned=self.protocol.condition == "none",
+            edit=None if self.protocol.edit is None else self._edit(rows, self.protocol.edit),
             seed=self.seed,
-            unconditioned=self.condition == "none",
-            edit=None if self.parts is None else self._edit(rows),
         )
-        found = self.model.representation.denormalize(x.float()).cpu().numpy()
-        return [motion[: len(row.frames)].copy() for row, motion in zip(rows, found, strict=True)]
+        features = self.model.representation.denormalize(x.float()).cpu().numpy()
+        return [motion[: len(row.frames)].copy() for row, motion in zip(rows, features, strict=True)]
 
     def _batch(self, rows: Sequence[Row]) -> MotionBatch:
-        model = self.model
+        model, condition = self.model, self.protocol.condition
         mask = length_mask(torch.tensor([len(row.frames) for row in rows], device=model.device))
-        labels = [row.clip.action for row in rows] if self.condition == "action" else None
+        labels = [row.clip.action for row in rows] if condition == "action" else None
         return MotionBatch(
             x=torch.zeros(*mask.shape, model.representation.features, device=model.device),
             mask=mask,
             ids=[row.id for row in rows],
-            text=[row.text for row in rows] if self.condition == "text" else None,
+            text=[row.text for row in rows] if condition == "text" else None,
             action=None if labels is None else torch.tensor(labels, device=model.device),
         )
 
-    def _edit(self, rows: Sequence[Row]) -> Edit:
+    def _edit(self, rows: Sequence[Row], parts: Mapping[str, Any]) -> Edit:
         """Returns the real motions of the rows and their kept parts; padding is kept, as zeros."""
         representation, longest = self.model.representation, max(len(row.frames) for row in rows)
-        known, keep = [], []
+        real, keep = [], []
         for motion in real_motions(self.clips, rows):
             x = torch.from_numpy(motion).to(self.model.device)
-            known.append(pad_to(representation.normalize(x)[None], longest))
-            kept, _ = kept_parts(representation, len(motion), EditRequest(**self.parts or {}))
+            real.append(pad_to(representation.normalize(x)[None], longest))
+            kept, _ = kept_parts(representation, len(motion), EditRequest(**parts))
             keep.append(~pad_to(~kept[None].to(x.device), longest))
-        return Edit(torch.cat(known), torch.cat(keep), **self.how)
+        return Edit(torch.cat(real), torch.cat(keep), **self.edit)
 
 
 class SampleFolder:
@@ -254,7 +228,7 @@ class SampleFolder:
             digest.update(path.read_bytes())
         return digest.hexdigest()
 
-    def __call__(self, name: str, rows: list[Row], replication: int, rank: int = 0, world: int = 1) -> Samples:
+    def __call__(self, name: str, rows: list[Row], replication: int) -> Samples:
         """Returns the motions of one file that belong to the rows, with their captions; see `Source`.
 
         Raises:
@@ -282,11 +256,11 @@ class SampleFolder:
                 f"{path}: {features[0].shape[1]} features per frame, but {self.representation.name} has "
                 f"{self.representation.features}"
             )
-        place = {name: index for index, name in enumerate(ids)}
-        requested = [row for row in rows if row.id in place]
+        index = {name: number for number, name in enumerate(ids)}
+        requested = [row for row in rows if row.id in index]
         captions = content.get("captions")
-        texts = None if captions is None else [str(captions[place[row.id]]) for row in requested]
-        return Samples(requested, [features[place[row.id]] for row in requested], captions=texts)
+        texts = None if captions is None else [str(captions[index[row.id]]) for row in requested]
+        return Samples(requested, [features[index[row.id]] for row in requested], captions=texts)
 
 
 class Baseline:
@@ -318,7 +292,7 @@ class Baseline:
             raise UserError("baseline=shuffled: motions without text or labels cannot be shuffled")
         self.kind, self.clips, self.condition, self.seed = kind, clips, condition, seed
 
-    def __call__(self, name: str, rows: list[Row], replication: int, rank: int = 0, world: int = 1) -> Samples:
+    def __call__(self, name: str, rows: list[Row], replication: int) -> Samples:
         """Returns the motions of the rows; see `Source`."""
         make = {"real": self._real, "shuffled": self._shuffled, "noisy": self._noisy, "static": self._static}
         return Samples(rows, make[self.kind](rows, replication))
@@ -341,14 +315,14 @@ class Baseline:
         """
         names = [row.text if self.condition == "text" else str(row.clip.action) for row in rows]
         turn = {name: key("shuffle", self.seed, replication, name) for name in names}
-        place = [(turn[name], key(row.id)) for name, row in zip(names, rows, strict=True)]
-        order = sorted(range(len(rows)), key=place.__getitem__)
+        ranks = [(turn[name], key(row.id)) for name, row in zip(names, rows, strict=True)]
+        order = sorted(range(len(rows)), key=ranks.__getitem__)
         largest = max(Counter(names).values())
         if 2 * largest > len(rows):
             raise UserError(f"baseline=shuffled: {largest} of {len(rows)} motions have the same caption or label")
         motions = real_motions(self.clips, rows)
-        given = {order[i]: motions[order[i - largest]] for i in range(len(rows))}
-        return [given[i] for i in range(len(rows))]
+        shuffled = {order[i]: motions[order[i - largest]] for i in range(len(rows))}
+        return [shuffled[i] for i in range(len(rows))]
 
     def _noisy(self, rows: Sequence[Row], replication: int) -> list[np.ndarray]:
         motions = []

@@ -47,27 +47,28 @@ class ClosedSchema(Schema):
 class Value(Schema):
     """A metric over replications: mean, half-width of its 95 % interval, number of motions; None if not computable.
 
-    `each` is the value of each replication, and `resampled` that of each set of a bootstrap over the motions of the
-    first one. Results of earlier versions have neither.
+    `per_replication` holds the value of each replication, and `resampled` that of each set of a bootstrap over the
+    motions of the first one.
     """
 
     mean: Number | None
     ci: Number | None
     replications: Int | None
     n: Int | None
-    each: list[Number | None] = []
+    per_replication: list[Number | None] = []
     resampled: list[Number | None] = []
 
 
-class Protocol(Schema):
-    """The evaluation protocol."""
+class ProtocolVersion(Schema):
+    """The protocol of an evaluation or audit: its name and version, and the hash of its content."""
 
     name: str
     version: Int
+    sha256: str = ""
 
 
 class Data(Schema):
-    """The data set of an evaluation or training."""
+    """The data set of an evaluation or audit; `frames` are the limits of its clips, `excluded` counts by reason."""
 
     dataset: str
     fingerprint: str
@@ -77,13 +78,15 @@ class Data(Schema):
 
 
 class ExtractorRecord(Schema):
-    """The feature extractor."""
+    """The feature extractor: its file and hash, and the fingerprint of the data it was trained on, if known."""
 
     sha256: str
+    path: str = ""
+    data: str | None = None
 
 
 class Checkpoint(Schema):
-    """The checkpoint that generated the motions, and its sampling options."""
+    """The checkpoint that generated the motions, its training, and the sampling options."""
 
     path: str
     sha256: str
@@ -92,7 +95,9 @@ class Checkpoint(Schema):
     eta: Number | None = None
     spacing: str | None = None
     guidance_scale: Number
+    edit: dict[str, Plain] = {}
     experiment: str | None = None
+    config_sha256: str = ""
     selected_by: str = ""
     averaged_weights: bool | None = None
     parameters: Int | None = None
@@ -103,54 +108,83 @@ class Checkpoint(Schema):
     training_speed: str | None = None
     training_precision: str | None = None
     training_memory_gib: Number | None = None
-    edit: dict[str, Plain] = {}
 
 
-class Skeleton(Schema):
-    """Whose joints SMPL's rotations were given: those of SMPL's model file, or of a stand-in."""
+class UsedSkeleton(Schema):
+    """The bones of joints computed from SMPL's rotations: those of SMPL's model file, or of a stand-in."""
 
     stand_in: bool
     smpl_sha256: str | None = None
 
 
 class Cost(Schema):
-    """Cost per motion."""
+    """Cost per motion; None if no model was used."""
 
     nfe: Number | None = None
     seconds_per_sample: Number | None = None
     batch_size: Number | None = None
 
 
-class Result(Schema):
-    """A result of `flame-mdm evaluate`, with the keys that tables and pages read."""
+class Measured(Schema):
+    """What an evaluation measures.
+
+    Attributes:
+        ground_truth, values: of real motions, and of the motions of the source, by metric; None = not measured.
+        not_computed: reasons, by metric.
+        invalid_because: reasons why the values are not valid; [] = they are.
+        forced: whether motions were generated although real motions do not have the expected values.
+        warnings: about values.
+        cost: per motion.
+        nearest: sorted distances in meters from the nearest training motion, of the "generated" and "real" motions of
+            the first replication, if a metric reads them.
+        seeds: of the draws of metrics, by replication.
+    """
+
+    ground_truth: dict[str, Value | None] | None
+    values: dict[str, Value | None] | None
+    not_computed: dict[str, str]
+    invalid_because: list[str]
+    forced: bool = False
+    warnings: list[str] = []
+    cost: Cost | None = None
+    nearest: dict[str, list[Number]] = {}
+    seeds: list[Int] = []
+
+
+class Result(Measured):
+    """A result of `flame-mdm evaluate`: what was evaluated, how and where, and the values.
+
+    Attributes:
+        quick: whether this is a quick evaluation, not for publication.
+        changed: options that differ from the protocol.
+        published_split: whether the published split tests on clips seen in training, or has no validation clips.
+        samples_sha256: hash of the files, if motions come from files.
+        baseline: kind, if motions come from a sanity-check baseline.
+        audit: name or path of the audit card of the extractor; None = not audited.
+        skeleton: None if the data has joint positions.
+    """
 
     quick: bool
-    protocol: Protocol
+    protocol: ProtocolVersion
+    changed: dict[str, Plain] = {}
     split: str
+    published_split: bool = False
     data: Data
     seed: Int
     extractor: ExtractorRecord | None
     checkpoint: Checkpoint | None
-    device: str
-    values: dict[str, Value | None] | None
-    ground_truth: dict[str, Value | None] | None
-    not_computed: dict[str, str]
-    invalid_because: list[str]
-    published_split: bool = False
     samples_sha256: str | None = None
     baseline: str | None = None
-    changed: dict[str, Plain] = {}
-    forced: bool = False
-    warnings: list[str] = []
-    cost: Cost | None = None
-    skeleton: Skeleton | None = None
     audit: str | None = None
-    nearest: dict[str, list[Number]] = {}
+    skeleton: UsedSkeleton | None = None
+    device: str
+    precision: str = ""
+    environment: dict[str, Any] = {}
 
     @property
     def stand_in_skeleton(self) -> bool:
-        """Whether joints are those of a stand-in skeleton; results of earlier versions do not say so."""
-        return self.skeleton.stand_in if self.skeleton else self.data.representation in ("smpl147", "rot6d-25")
+        """Whether joints are those of a stand-in skeleton."""
+        return self.skeleton is not None and self.skeleton.stand_in
 
 
 class AuditedGrade(ClosedSchema):
@@ -172,9 +206,10 @@ class AuditedPerturbation(ClosedSchema):
     grades: Annotated[list[AuditedGrade], Field(min_length=1)]
 
 
-class AuditedExtractor(ExtractorRecord):
+class AuditedExtractor(Schema):
     """The extractor of an audit, by its recipe or file."""
 
+    sha256: str
     name: str
 
 
@@ -189,7 +224,7 @@ class AuditCard(ClosedSchema):
 
     format: Int
     extractor: AuditedExtractor | None
-    protocol: Protocol
+    protocol: ProtocolVersion
     data: Data
     split: str
     motions: Int

@@ -13,11 +13,11 @@ from support.fixtures import ROOT
 
 import evaluators.audit as audits
 from evaluators.audit import BASE, REAL, Text, _inputs, _Measure
-from evaluators.evaluation import load_protocol
 from evaluators.evaluator import Evaluator, Motions
 from evaluators.extractors import Extractor
 from evaluators.metrics.alignment import MotionsForText, TextsForMotion
 from evaluators.perturbations import PERTURBATIONS
+from evaluators.protocol import load_protocol
 from flame_mdm.__main__ import main
 from flame_mdm.data.synthetic import Synthetic
 from flame_mdm.reporting.audit import PHYSICS, Seen, card_name, card_of, findings, read_card, seen, write_card

@@ -91,7 +91,7 @@ def test_a_page_puts_runs_side_by_side(three, tmp_path):
 
 
 def of(mean: float, each: list[float], resampled: list[float], n: int = 64) -> dict[str, Any]:
-    return {"mean": mean, "ci": 0.1, "replications": len(each), "n": n, "each": each, "resampled": resampled}
+    return {"mean": mean, "ci": 0.1, "replications": len(each), "n": n, "per_replication": each, "resampled": resampled}
 
 
 def test_paired_differences_are_those_of_student_and_of_the_draws():

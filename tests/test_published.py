@@ -12,8 +12,8 @@ import pytest
 import yaml
 from support.fixtures import recipe
 
-from evaluators.evaluation import load_protocol
 from evaluators.evaluator import Evaluator, Motions
+from evaluators.protocol import load_protocol, protocol_config
 from flame_mdm.config import EXPERIMENTS, Config, instantiate, recipes
 from flame_mdm.errors import UserError
 from flame_mdm.processes.diffusion import GaussianDiffusion
@@ -53,8 +53,8 @@ def measures(protocol: str, name: str) -> tuple[Any, set[str]]:
 def _measures(protocol: str, representation: str) -> tuple[Any, set[str]]:
     motions = instantiate(json.loads(representation))
     loaded = load_protocol(protocol, motions)
-    several = (loaded.multimodality or {}).get("metrics", {})
-    evaluator = Evaluator(None, loaded.metrics | several, motions)
+    several = loaded.multimodality
+    evaluator = Evaluator(None, loaded.metrics | (several.metrics if several else {}), motions)
     nothing = evaluator.extract(Motions([], []))
     return loaded, set(evaluator.score(nothing, nothing, nothing, 0)[0])
 
@@ -205,9 +205,7 @@ def test_seconds_are_those_of_one_motion_as_the_papers_have_them(name):
 
 @pytest.mark.parametrize("name", ["prediction", "in_between", "interpolation", "upper_body"])
 def test_edits_are_measured_alike_by_both_extractors(name):
-    clip, t2m = (
-        yaml.safe_load((EXPERIMENTS / "evaluation" / f"editing_{name}{end}.yaml").read_text()) for end in ("", "_t2m")
-    )
+    clip, t2m = (protocol_config(f"editing_{name}{end}") for end in ("", "_t2m"))
     assert t2m.pop("extractor")["_target_"].endswith(".T2MExtractor")
     assert clip.pop("extractor")["_target_"].endswith(".MotionCLIPExtractor")
     expected = yaml.safe_load((EXPERIMENTS / "evaluation" / "text_to_motion_t2m.yaml").read_text())["expected"]
@@ -228,15 +226,11 @@ def test_small_models_say_what_they_predict():
 @pytest.mark.parametrize("name", sorted(path.stem for path in (EXPERIMENTS / "evaluation").glob("*.yaml")))
 def test_protocols_cite_tables_of_their_task(name):
     text = (EXPERIMENTS / "evaluation" / f"{name}.yaml").read_text()
-    head = re.sub(r"\n# ", " ", text.partition("_target_")[0])
+    head = re.sub(r"\n# ", " ", text.partition("\nversion:")[0])
     for paper, numbers in re.findall(r"(FLAME|MDM|MFM)(?:,|'s) tables? (\d(?:(?:,| and| to) \d)*)", head):
         for number in re.findall(r"\d", numbers):
             parts = SPECS[f"{paper.lower()}_{number}"]["parts"].values()
-            tasks = {
-                yaml.safe_load((EXPERIMENTS / "evaluation" / f"{p['protocol']}.yaml").read_text())["condition"]
-                for p in parts
-                if "protocol" in p
-            }
+            tasks = {protocol_config(part["protocol"])["condition"] for part in parts if "protocol" in part}
             assert tasks == {yaml.safe_load(text)["condition"]}, f"{paper}, table {number}"
 
 

@@ -361,7 +361,6 @@ def test_the_batch_size_of_the_command_is_not_that_of_timed_rows(folder, monkeyp
             "rot6d-25",
             "joints of a stand-in skeleton, whose bones are not SMPL's",
         ),
-        (None, "rot6d-25", "joints of a stand-in skeleton"),  # as results of earlier versions
         (
             {"stand_in": False, "smpl_sha256": "5" * 64},
             "rot6d-25",

@@ -19,7 +19,7 @@ from support.fixtures import ROOT
 from support.refusals import one_line
 from support.runs import TINY
 
-from evaluators.evaluation import load_protocol
+from evaluators.protocol import load_protocol
 from flame_mdm.checkpoints.hub import card, export
 from flame_mdm.checkpoints.loading import load
 from flame_mdm.checkpoints.model_files import KEY, content_sha256, read_checkpoint, read_model_file

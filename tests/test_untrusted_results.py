@@ -20,7 +20,8 @@ from test_report import a_run, result
 from test_tables import SPEC, put
 
 import flame_mdm
-from evaluators.sources import Row, _write, read_samples
+from evaluators.protocol import Row
+from evaluators.sources import _write, read_samples
 from flame_mdm.__main__ import main
 from flame_mdm.checkpoints import hub, model_files
 from flame_mdm.commands import benchmark

@@ -57,7 +57,7 @@ def audit(settings: AuditSettings) -> None:
     if settings.resamples == 0 or (settings.samples or 64) < 8:
         raise UserError(f"resamples={settings.resamples}, samples={settings.samples}: give 100, and 8 or more")
     from evaluators.audit import audit as measure
-    from evaluators.evaluation import EvaluationRequest
+    from evaluators.request import EvaluationRequest
 
     protocol = settings.protocol or ("synthetic" if settings.nodes["data"]["name"] == "synthetic" else "text_to_motion")
     request = EvaluationRequest.of(vars(settings) | settings.nodes | {"baseline": "real", "protocol": protocol})

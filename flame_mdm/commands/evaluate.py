@@ -54,12 +54,14 @@ class EvaluateSettings(SamplerOptions, DataSettings, ModelSettings):
 
 def evaluate_request(settings: EvaluateSettings) -> None:
     """Evaluates what the settings name, and writes the result."""
-    from evaluators.evaluation import EvaluationRequest, evaluate
+    from evaluators.request import EvaluationRequest
 
     nodes = settings.nodes if settings.data is not None else {"data": None, "representation": None}
     request = EvaluationRequest.of(vars(settings) | nodes)
     if settings.ckpt is not None:
         settings.model_file()  # reports a missing file before torch is imported
+    from evaluators.evaluation import evaluate
+
     evaluate(request)
 
 

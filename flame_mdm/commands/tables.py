@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 from flame_mdm.config import Config, compose_data, instantiate, run
 from flame_mdm.errors import UserError, first_line, say
-from flame_mdm.safe_io import read_yaml, sha256, write_json, write_text
+from flame_mdm.safe_io import sha256, write_json, write_text
 from flame_mdm.sampler_options import option
 
 if TYPE_CHECKING:
@@ -85,7 +85,9 @@ def evaluate_missing(specs: Mapping[str, Config], results: Path, settings: Table
     Returns:
         One line per failed evaluation.
     """
-    from evaluators.evaluation import EvaluationRequest, evaluate, protocol_file
+    from evaluators.evaluation import evaluate
+    from evaluators.protocol import protocol_config
+    from evaluators.request import EvaluationRequest
     from flame_mdm.reporting.tables import requests
 
     listed: dict[Path, Request] = {}
@@ -104,7 +106,7 @@ def evaluate_missing(specs: Mapping[str, Config], results: Path, settings: Table
             nodes = compose_data(keys.pop("data"), dotted) if "data" in keys else {}
             names = ("device", "batch_size", "force", "data_root")
             general = {name: value for name in names if (value := getattr(settings, name)) is not None}
-            if "batch_size" in read_yaml(protocol_file(keys["protocol"])):
+            if "batch_size" in protocol_config(keys["protocol"]):
                 general.pop("batch_size", None)  # protocols that measure time set the batch size
             evaluate(EvaluationRequest.of(nodes | general | keys | {"out": str(path)}))
         except (UserError, OSError) as error:

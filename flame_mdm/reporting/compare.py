@@ -186,7 +186,7 @@ def differences(first: Result, second: Result) -> list[Difference] | str:
 def _difference(name: str, first: Value | None, second: Value | None) -> Difference | None:
     if first is None or second is None or first.n != second.n:
         return None
-    if (each := _paired(first.each, second.each)) is None:
+    if (each := _paired(first.per_replication, second.per_replication)) is None:
         return None
     mean, low, high = paired_difference(*each)
     over_motions = None

@@ -1,0 +1,214 @@
+"""From the request of an evaluation to its parts: model, data, protocol, extractor, source and file names."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from evaluators.extractors import Extractor
+from evaluators.protocol import Protocol, default_protocol, digest, open_protocol
+from evaluators.request import EvaluationRequest
+from evaluators.sources import Baseline, Generator, SampleFolder, Source
+from flame_mdm.checkpoints.loading import find, load
+from flame_mdm.config import instantiate, trust
+from flame_mdm.data.body_model import load_offsets
+from flame_mdm.data.datamodule import Clips, MotionDataModule
+from flame_mdm.errors import UserError
+from flame_mdm.representations import Representation
+from flame_mdm.representations.rot6d import Rot6D
+from flame_mdm.representations.smpl import SMPL
+from flame_mdm.safe_io import sha256
+from flame_mdm.sampler_options import SamplerOptions
+from flame_mdm.sampling.editing import method_options
+from flame_mdm.sampling.request import EditRequest
+from flame_mdm.schemas import UsedSkeleton
+from flame_mdm.task import MotionGeneration
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plan:
+    """All parts of an evaluation, opened and checked before anything is measured.
+
+    Attributes:
+        model, file: the model that generates the motions, and its checkpoint; None without a model.
+        sampling: sampling options of the model.
+        data, clips: the data set, and the evaluated split.
+        representation: of the motions, on the device to compute on.
+        skeleton: the bones of joints computed from SMPL's rotations; None if the data has joint positions.
+        protocol: in the requested size.
+        changed: options that differ from the protocol.
+        extractor: None = metrics that need features are skipped.
+        source: of the motions.
+        batch_size: motions per batch.
+        path: of the result file.
+    """
+
+    model: MotionGeneration | None
+    file: Path | None
+    sampling: dict[str, Any]
+    data: MotionDataModule
+    clips: Clips
+    representation: Representation
+    skeleton: UsedSkeleton | None
+    protocol: Protocol
+    changed: dict[str, Any]
+    extractor: Extractor | None
+    source: Source
+    batch_size: int
+    path: Path
+
+
+def make_plan(request: EvaluationRequest, device: str) -> Plan:
+    """Opens the parts of an evaluation.
+
+    Raises:
+        UserError: If model, data, protocol and extractor do not match.
+        FileNotFoundError: If a file is missing.
+    """
+    file = find(request.ckpt, request.which) if request.ckpt is not None else None
+    model = load(file, device) if file is not None else None
+    data = open_data(request, model)
+    representation = model.representation if model else data.representation.to(device)
+    skeleton = set_bones(request.smpl, representation)
+    clips = data.clips(request.split)
+    size = {
+        name: getattr(request, name) for name in ("replications", "samples", "quick", "multimodality", "batch_size")
+    }
+    name = request.protocol or (default_protocol(model) if model else "")
+    protocol, changed = open_protocol(name, clips, representation, model, **size)
+    extractor = protocol.open_extractor(request.extractor, representation, data.store.info["dataset"])
+    batch_size = protocol.batch_size or request.batch_size or 64
+    sampling: dict[str, Any] = {}
+    source: Source
+    if model is not None and file is not None:
+        options, edit = sampling_options(protocol, model, request.options, request.editing)
+        sampling = options.chosen() | {"edit": edit}
+        folder = _motions_folder(request, file, protocol, sampling, data, batch_size)
+        source = Generator(
+            model, protocol, clips, options, edit, seed=request.seed, batch_size=batch_size, folder=folder
+        )
+        path = folder / "result"
+    elif request.baseline is not None:
+        source = Baseline(request.baseline, clips, protocol.condition, request.seed)
+        split = f"-{request.split}" if request.split != "test" else ""
+        path = Path("runs/baselines") / data.store.info["dataset"] / protocol.title / f"{request.baseline}{split}"
+    else:
+        source = SampleFolder(Path(str(request.from_samples)), representation)
+        protocol = protocol.model_copy(update={"replications": len(source.files), "samples": None})
+        path = Path(str(request.from_samples)) / protocol.title
+    suffix = f"-{extractor.sha256[:8]}" if extractor else ""
+    suffix += "-quick" if request.quick else f"-{protocol.replications}x" if "replications" in changed else ""
+    return Plan(
+        model=model,
+        file=file,
+        sampling=sampling,
+        data=data,
+        clips=clips,
+        representation=representation,
+        skeleton=skeleton,
+        protocol=protocol,
+        changed=changed,
+        extractor=extractor,
+        source=source,
+        batch_size=batch_size,
+        path=Path(request.out or path.with_name(f"{path.name}{suffix}.json")),
+    )
+
+
+def open_data(request: EvaluationRequest, model: MotionGeneration | None) -> MotionDataModule:
+    """Returns the prepared data, with its own representation. The model keeps the statistics of its training data.
+
+    Raises:
+        UserError: If no data set is named, or it is not prepared, or the model generates another representation.
+    """
+    module, encoding, root = request.data, request.representation, "data"
+    if model is not None and not module:
+        if "data" not in model.config:
+            raise UserError(f"{request.ckpt}: its recipe names no data set. Add data=NAME")
+        module, encoding = model.config["data"], model.config["representation"]
+        trust({"data": module})
+        root = module.get("root")
+    assert module is not None
+    assert encoding is not None
+    root = request.data_root or os.environ.get("FLAME_MDM_DATA") or root
+    representation: Representation = instantiate(encoding)
+    if model is not None and representation.name != model.representation.name:
+        raise UserError(
+            f"the checkpoint generates {model.representation.name}, but the data set {module['name']} has "
+            f"{representation.name}"
+        )
+    data = instantiate(module | {"root": root}, representation=representation, seed=0)
+    if not isinstance(data, MotionDataModule):
+        raise UserError(f"{request.ckpt}: its recipe names {type(data).__name__} as the data set. Add data=NAME")
+    data.setup("test")
+    return data
+
+
+def set_bones(smpl: str | None, representation: Representation) -> UsedSkeleton | None:
+    """Sets the bone offsets of a representation of SMPL rotations from SMPL's model file.
+
+    Args:
+        smpl: the file; None = the offsets of a stand-in skeleton remain.
+        representation: of the motions; nothing is set if it consists of joint positions.
+
+    Raises:
+        UserError: If the file is no SMPL model.
+        FileNotFoundError: If it does not exist.
+    """
+    if not isinstance(representation, SMPL | Rot6D):
+        return None
+    if smpl is None:
+        return UsedSkeleton(stand_in=True)
+    representation.offsets = load_offsets(Path(smpl))
+    return UsedSkeleton(stand_in=False, smpl_sha256=sha256(smpl))
+
+
+def sampling_options(
+    protocol: Protocol,
+    model: MotionGeneration,
+    options: SamplerOptions | None = None,
+    editing: EditRequest | None = None,
+) -> tuple[SamplerOptions, dict[str, Any]]:
+    """Returns the options of the sampler and those of `Edit`: the requested ones, otherwise those of the recipe.
+
+    Raises:
+        UserError: If an editing option is given but nothing is edited, or the model's process does not allow it.
+    """
+    options, editing = options or SamplerOptions(), editing or EditRequest()
+    edit: dict[str, Any] = {}
+    if protocol.edit is not None:
+        edit, options = method_options(model.process, editing, options)
+    elif editing != EditRequest():
+        raise UserError(f"protocol {protocol.name} does not edit motions. Remove method, until and strength")
+    return options.over(model.sampler_options), edit
+
+
+def _motions_folder(
+    request: EvaluationRequest,
+    file: Path,
+    protocol: Protocol,
+    sampling: Mapping[str, Any],
+    data: MotionDataModule,
+    batch_size: int,
+) -> Path:
+    """Returns the folder of the motions that a checkpoint generates with some options.
+
+    It is in the run directory of the checkpoint, or next to a file that belongs to no run. Models in this package or on
+    the hub are not in the user's folders: their motions go to runs/NAME in the working directory.
+    """
+    if not Path(str(request.ckpt)).exists():
+        run = Path("runs") / str(request.ckpt)
+    else:
+        run = file.parent.parent if file.parent.name == "checkpoints" else file.parent
+    used = {
+        **sampling,
+        "seed": request.seed,
+        "split": request.split,
+        "data": data.store.fingerprint,
+        "samples": protocol.samples,
+    }
+    used |= {"batch_size": batch_size} if protocol.batch_size else {}
+    return run / "evaluation" / protocol.title / f"{sha256(file)[:16]}-{digest(used)[:8]}"

@@ -1,0 +1,170 @@
+"""Results of evaluations: averages over replications, provenance, and what is printed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from evaluators.metrics.confidence import mean_ci
+from evaluators.plan import Plan
+from evaluators.protocol import digest
+from evaluators.request import EvaluationRequest
+from evaluators.sources import SampleFolder
+from flame_mdm.data import Split
+from flame_mdm.data.datamodule import MotionDataModule
+from flame_mdm.errors import say
+from flame_mdm.reporting.audit import card_of
+from flame_mdm.safe_io import sha256
+from flame_mdm.schemas import (
+    Checkpoint,
+    Cost,
+    Data,
+    ExtractorRecord,
+    ProtocolVersion,
+    Result,
+    Value,
+)
+from flame_mdm.training.provenance import environment
+
+
+def averages(
+    scores: Sequence[tuple[Mapping[str, float | None], int]],
+    resampled: Mapping[str, list[float | None]] | None = None,
+) -> dict[str, Value | None]:
+    """Returns means over replications; None if one replication has no value.
+
+    Args:
+        scores: values by metric, and number of motions, of each replication.
+        resampled: values of the sets of a bootstrap, by metric.
+    """
+    table: dict[str, Value | None] = {}
+    for name in scores[0][0] if scores else ():
+        values = [replication[name] for replication, _ in scores]
+        numbers = [value for value in values if value is not None]
+        mean, ci = mean_ci(numbers) if len(numbers) == len(values) else (None, None)
+        drawn = (resampled or {}).get(name, [])
+        table[name] = Value(
+            mean=mean, ci=ci, replications=len(values), n=scores[0][1], per_replication=values, resampled=drawn
+        )
+    return table
+
+
+def mean_cost(costs: Sequence[Mapping[str, float]]) -> Cost:
+    """Returns the mean cost over replications; None if one of them used no model."""
+    if not costs or not all(costs):
+        return Cost()
+    return Cost(**{name: float(np.mean([cost[name] for cost in costs])) for name in Cost.model_fields})
+
+
+def make_result(request: EvaluationRequest, plan: Plan) -> Result:
+    """Returns a result with the provenance of its values, which are still to be measured."""
+    info, extractor, protocol = plan.data.store.info, plan.extractor, plan.protocol
+    device = plan.representation.mean.device
+    card = card_of(info["dataset"], extractor.sha256 if extractor else None)
+    return Result(
+        quick=request.quick,
+        protocol=ProtocolVersion(name=protocol.name, version=protocol.version, sha256=protocol.sha256),
+        changed=plan.changed,
+        split=request.split,
+        published_split=info["published_split"],
+        data=Data(
+            dataset=info["dataset"],
+            representation=info["representation"],
+            fingerprint=info["fingerprint"],
+            frames=[plan.data.crop.shortest(), plan.data.crop.longest()],
+            excluded=_excluded(plan.data, request.split),
+        ),
+        seed=request.seed,
+        extractor=extractor
+        and ExtractorRecord(sha256=extractor.sha256, path=str(request.extractor), data=extractor.fingerprint),
+        checkpoint=_checkpoint(plan),
+        samples_sha256=plan.source.sha256 if isinstance(plan.source, SampleFolder) else None,
+        baseline=request.baseline,
+        audit=card.name if card else None,
+        skeleton=plan.skeleton,
+        device=torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu",
+        precision=f"float32, matmul {torch.get_float32_matmul_precision()}",
+        environment=environment(),
+        ground_truth=None,
+        values=None,
+        not_computed={},
+        invalid_because=_overlaps(request, plan),
+    )
+
+
+def _checkpoint(plan: Plan) -> Checkpoint | None:
+    """Describes the checkpoint, and how it was selected among those of its run, judging by its file name."""
+    model, file = plan.model, plan.file
+    if model is None or file is None:
+        return None
+    best = (model.config.get("callbacks") or {}).get("best") or {}
+    return Checkpoint(
+        path=str(file),
+        sha256=sha256(file),
+        experiment=model.config.get("experiment"),
+        config_sha256=digest(model.config),
+        selected_by=f"best {best['monitor']}" if file.stem == "best" and "monitor" in best else f"none: {file.stem}",
+        averaged_weights=bool(model.config.get("ema")),
+        parameters=sum(p.numel() for p in model.parameters() if p.requires_grad),
+        prediction={"epsilon": "noise"}.get(model.process.prediction, model.process.prediction),
+        training_steps=model.steps,
+        **{f"training_{name}": value for name, value in model.facts.get("training", {}).items()},
+        **plan.sampling,
+    )
+
+
+def _excluded(data: MotionDataModule, split: Split) -> dict[str, int]:
+    """Returns the number of clips excluded from the data set and from the split, by reason."""
+    short = data.clips(split).too_short
+    reason = f"{split} clips shorter than {data.crop.shortest()} frames"
+    return data.store.info["excluded"] | ({reason: short} if short else {})
+
+
+def _overlaps(request: EvaluationRequest, plan: Plan) -> list[str]:
+    """Returns reasons why values are not valid: evaluated clips may be training clips of the model or extractor.
+
+    `make train` trains on the training split, so that an extractor of the same data has seen the others only if they
+    are the training split, too: the footnotes of tables mark published splits like that.
+    """
+    evaluated, extractor, reasons = plan.data.store.fingerprint, plan.extractor, []
+    for what, trained in (
+        ("training data", plan.model.facts.get("fingerprint") if plan.model else None),
+        ("training data of the extractor", extractor.fingerprint if extractor else None),
+    ):
+        if trained and trained != evaluated:
+            reasons.append(f"{what} {trained} and evaluated data {evaluated} differ: splits may overlap")
+    if extractor is not None and extractor.fingerprint == evaluated and request.split == "train":
+        reasons.append("the extractor was trained on the evaluated split, train")
+    return reasons
+
+
+def show(result: Result, path: Path) -> None:
+    """Prints the values next to those of real motions."""
+    protocol, data = result.protocol, result.data
+    mark = " QUICK RUN, NOT FOR PUBLICATION" if result.quick else ""
+    say(f"{protocol.name} version {protocol.version}, {data.dataset} {result.split}{mark}")
+    say(f"{'':32}{'real motions':>24}{result.baseline or 'generated':>24}")
+    for name, value in (result.values or {}).items():
+        real = (result.ground_truth or {}).get(name)
+        if any(shown is not None and shown.mean is not None for shown in (real, value)):
+            say(f"{name:32}{_cell(real):>24}{_cell(value):>24}")
+    for reason, count in data.excluded.items():
+        say(f"excluded from the data set: {count} {reason}")
+    for name, reason in result.not_computed.items():
+        say(f"not computed: {name}: {reason}")
+    if result.stand_in_skeleton:
+        say("warning: joints were computed with a stand-in skeleton. Give SMPL's model file for its own: smpl=FILE")
+    for reason in result.warnings:
+        say(f"warning: {reason}")
+    for reason in result.invalid_because:
+        say(f"NOT VALID: {reason}")
+    if result.audit is None:
+        say(f"not audited: no one has checked what this evaluator sees. To do so: make audit DATA={data.dataset}")
+    say(f"written: {path}")
+
+
+def _cell(value: Value | None) -> str:
+    return "-" if value is None or value.mean is None else f"{value.mean:.4g} +- {value.ci:.2g}"

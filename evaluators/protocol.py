@@ -341,9 +341,9 @@ def load_protocol(name: str, representation: Representation) -> Protocol:
         protocol = check_shape(config | {"sha256": digest(config | {"name": ""})}, Protocol)
     except ValueError as error:
         raise UserError(f"{where}: {error}") from error
-    several = protocol.multimodality
-    make_metrics(protocol.metrics | (several.metrics if several else {}))  # raises if an option is unknown
     check(config)
+    several = protocol.multimodality
+    make_metrics(protocol.metrics | (several.metrics if several else {}))  # raises if one cannot be created
     return protocol
 
 

@@ -83,7 +83,7 @@ def make_result(request: EvaluationRequest, plan: Plan) -> Result:
         checkpoint=_checkpoint(plan),
         samples_sha256=plan.source.sha256 if isinstance(plan.source, SampleFolder) else None,
         baseline=request.baseline,
-        audit=card.name if card else None,
+        audit=card.as_posix() if card else None,
         skeleton=plan.skeleton,
         device=torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu",
         precision=f"float32, matmul {torch.get_float32_matmul_precision()}",

@@ -160,7 +160,7 @@ class Result(Measured):
         published_split: whether the published split tests on clips seen in training, or has no validation clips.
         samples_sha256: hash of the files, if motions come from files.
         baseline: kind, if motions come from a sanity-check baseline.
-        audit: name or path of the audit card of the extractor; None = not audited.
+        audit: path of the audit card of the extractor; None = not audited.
         skeleton: None if the data has joint positions.
     """
 

@@ -205,9 +205,12 @@ def test_results_and_tables_link_to_the_card_of_their_extractor(card, tmp_path, 
     path, _ = write_card([card], Path("runs/audit"))
     assert card_of("x", "ab" * 32) == path
     assert card_of("x", None) is card_of("x", "cd" * 32) is None
-    part = Part(
-        "p", {}, [], [("a", f"extractor; audit {path}; <i>"), ("b", "not audited"), ("", f"https://e.com/{path}")]
-    )
+    monkeypatch.setenv("FLAME_MDM_AUDITS", "elsewhere")
+    assert card_of("x", "ab" * 32) is None
+    committed = card_of("synthetic", None)
+    assert committed == Path("docs/benchmarks/audit/synthetic-none.html"), "an installed package knows its name"
+    notes = [f"extractor; audit {path}; <i>", f"audit {committed}", "not audited", f"https://e.com/{path}"]
+    part = Part("p", {}, [], [(mark, note) for mark, note in zip("abcd", notes, strict=True)])
     table = Table("t", "t", [part], folder=Path("runs/tables"))
     assert '<a href="../audit/x-abababababab.html">' in fragment(table)
     assert fragment(table).count("<a ") == markdown(table).count("](") == 1
@@ -229,6 +232,11 @@ def test_each_broken_model_is_ranked_last_by_a_headline_metric():
     assert worst("R precision (top 1)") == worst("mCLIP score") == shuffled
     assert worst("FID") == worst("Jitter") == noisy
     assert worst("Diversity") == worst("Static") == static
+
+
+def test_the_package_lists_the_committed_cards():
+    listed = json.loads((ROOT / "flame_mdm" / "reporting" / "audited.json").read_text())
+    assert listed == [path.stem for path in CARDS]
 
 
 CARDS = sorted((ROOT / "docs" / "benchmarks" / "audit").glob("*.json"))

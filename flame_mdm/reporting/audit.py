@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,8 +13,8 @@ from flame_mdm.reporting.page import interval, number, page, render
 from flame_mdm.safe_io import write_text
 from flame_mdm.schemas import AuditCard, AuditedPerturbation, read_json
 
-FOLDERS = (Path("docs/benchmarks/audit"), Path("runs/audit"))
-"""Where the card of an extractor is looked for."""
+COMMITTED = "docs/benchmarks/audit"
+"""Folder of the cards in the repository; audited.json in this package lists their names."""
 PHYSICS = ("foot_skating", "penetration", "floating", "jitter", "static_share")
 """Metrics of joints, which are not expected to see the meaning of a motion."""
 ROUNDING = 1e-6
@@ -73,16 +74,24 @@ def _name(dataset: str, sha256: str | None) -> str:
 
 
 def card_of(dataset: str, sha256: str | None) -> Path | None:
-    """Returns the card of an extractor on a data set, or of metrics of joints; None if it was not audited."""
+    """Returns the card of an extractor on a data set, or of metrics of joints; None if it was not audited.
+
+    It is in the folder that FLAME_MDM_AUDITS names, by default runs/audit, or else one of the cards in the repository.
+    An installed package knows only the names of those.
+    """
     name = _name(dataset, sha256)
-    return next((path for folder in FOLDERS if (path := folder / f"{name}.html").exists()), None)
+    path = Path(os.environ.get("FLAME_MDM_AUDITS", "runs/audit")) / f"{name}.html"
+    if path.exists():
+        return path
+    committed: list[str] = read_json(Path(__file__).with_name("audited.json"), list[str])
+    return Path(COMMITTED) / f"{name}.html" if name in committed else None
 
 
 def read_card(path: Path) -> AuditCard:
     """Returns a card.
 
     Raises:
-        UserError: The file is damaged.
+        UserError: If the file is damaged.
     """
     return read_json(path, AuditCard, "run `flame-mdm audit` again")
 

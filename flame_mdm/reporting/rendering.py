@@ -30,7 +30,7 @@ KINDS = {
 }
 NO_RESULTS = ("NOT VALID", "QUICK")
 """States of rows whose values must not be mistaken for results."""
-CARD = re.compile(r"(?<![\w/.])((?:docs/benchmarks|runs)/audit/[\w.-]+\.html)")
+CARD = re.compile(r"(?<=\baudit )([\w./-]+\.html)")
 """Paths of audit cards in footnotes."""
 SHARED = ("checkpoint sha256", "recipe", "sampler")
 """Facts that rows must have in common to be listed together as sources."""
@@ -132,10 +132,10 @@ class Table:
 
 
 def _linked(table: Table, text: str) -> list[tuple[str, str]]:
-    """Splits a footnote into texts and their links; "" = no link."""
-    parts = CARD.split(text)
+    """Splits a footnote into texts and their links; "" = no link, also to a card that is not on this machine."""
     return [
-        (part, Path(os.path.relpath(part, table.folder)).as_posix() if i % 2 else "") for i, part in enumerate(parts)
+        (part, Path(os.path.relpath(part, table.folder)).as_posix() if i % 2 and Path(part).exists() else "")
+        for i, part in enumerate(CARD.split(text))
     ]
 
 

@@ -86,10 +86,13 @@ def last(curve: Curve) -> float | None:
     return curve[max(curve)] if curve else None
 
 
-def _card(folder: Path, result: Result) -> str:
-    """Returns the link from a run directory to the audit of the evaluator of a result; "" if there is none."""
+def _card(folder: Path, result: Result) -> tuple[str, str]:
+    """Returns the audit of the evaluator of a result, and the link from a run directory; "" if there is none."""
     card = card_of(result.data.dataset, result.extractor.sha256 if result.extractor else None)
-    return Path(os.path.relpath(card, folder)).as_posix() if card else ""
+    if card is None:
+        return "evaluator not audited", ""
+    link = Path(os.path.relpath(card, folder)).as_posix() if card.exists() else ""
+    return "audit of the evaluator" + (f": {card.as_posix()}" if not link else ""), link
 
 
 def _facts(run: Run) -> list[str]:

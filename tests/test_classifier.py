@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from support.distributed import GlooPool
 from support.runs import TINY
 
 from evaluators.extractors import OwnClassifierExtractor
@@ -16,11 +15,10 @@ from evaluators.extractors.action_gru import ActionGRU
 from evaluators.extractors.classifier import ClassifierTask
 from evaluators.extractors.stgcn import JointSTGCN
 from flame_mdm.__main__ import main
-from flame_mdm.batch import MotionBatch, length_mask
+from flame_mdm.batch import length_mask
 from flame_mdm.config import compose, instantiate
 from flame_mdm.data.synthetic import Synthetic
 from flame_mdm.errors import UserError
-from flame_mdm.representations.humanml import HumanML
 from flame_mdm.representations.rot6d import Rot6D
 
 DATA = ("data=synthetic", "data.source.clips=600")
@@ -150,37 +148,3 @@ def test_st_gcn_trains_by_the_same_recipe(data, tmp_path):
     assert validated(tmp_path / "checkpoints" / "last.ckpt")[-1] > 0.2
     network = OwnClassifierExtractor(str(tmp_path / "checkpoints" / "last.ckpt")).task.network
     assert isinstance(network, JointSTGCN)
-
-
-# Several processes ----------------------------------------------------------------------------------------------------
-
-
-def validate(rank: int, world: int) -> tuple[float, ...]:
-    """Loss and accuracy of a classifier over all clips, of which this process sees every `world`-th.
-
-    Each process has normalized batches of its own in training: its running statistics are others.
-    """
-    torch.manual_seed(0)
-    representation = HumanML("smpl22", "clean", 20)
-    network = JointSTGCN(representation.skeleton.parents, 3, widths=(4,), strides=(1,))
-    task = ClassifierTask(network, representation, optimizer={}).eval()
-    x, labels = torch.randn(10, 8, representation.features), torch.arange(10) % 3
-    for name, buffer in network.named_buffers():
-        if "running" in name:
-            buffer += rank + 0.5
-    task.on_validation_epoch_start()
-    mine = slice(rank, None, world)
-    mask = torch.ones(10, 8, dtype=torch.bool)
-    with torch.no_grad():
-        task.validation_step(MotionBatch(x[mine], mask[mine], ["a"] * len(x[mine]), action=labels[mine]), 0)
-    return tuple(float(metric.compute()) for metric in task.val_metrics.values())
-
-
-@pytest.mark.slow
-def test_two_processes_validate_as_one():
-    loss, accuracy = validate(0, 1)
-    with GlooPool(2) as pool:
-        results = pool.run(validate, (0, 2), (1, 2))
-    assert results[0] == results[1]
-    assert results[0][0] == pytest.approx(loss, rel=1e-5)
-    assert results[0][1] == accuracy

@@ -12,6 +12,7 @@ from support.fixtures import (
     Arrays,
     assert_within,
     golden,
+    golden_case,
     groups,
     meta,
     needs_third_party,
@@ -203,8 +204,7 @@ def test_a_released_t2m_file_is_loaded_whole_or_not_at_all(tmp_path):
         load_t2m(tmp_path)
 
 
-@pytest.mark.golden
-@pytest.mark.parametrize("stem", ["essential67"])
+@golden_case("essential67")
 def test_mardms_clip_gives_the_authors_vectors(stem):
     arrays = golden(stem)
     state, config = weights(arrays, "state/contrast_model/"), meta(arrays)["config"]

@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from support.fixtures import ROOT, golden, groups, meta
+from support.fixtures import ROOT, golden, golden_case, groups, meta
 from torch import Tensor
 from torchmetrics import Metric
 
@@ -48,7 +48,7 @@ MBENCH, PFC, KIMODO, FLOWMDM, TMR = (
     golden(name) for name in ("mbench_quality", "pfc", "kimodo_metrics", "transition", "tmr_retrieval")
 )
 TOP = (1, 2, 3, 5, 10)
-one = pytest.mark.parametrize("stem", ["kimodo_metrics"])
+one = golden_case("kimodo_metrics")
 
 
 def cases(fixture: dict[str, np.ndarray], under: str, stem: str) -> list:
@@ -90,8 +90,7 @@ def test_mbench_equals_the_authors(case: str):
         assert float(ours[name]) == pytest.approx(expected, rel=1e-8, abs=1e-8, nan_ok=True), name
 
 
-@pytest.mark.golden
-@pytest.mark.parametrize("stem", ["mbench_quality"])
+@golden_case("mbench_quality")
 def test_mbench_averages_motions_as_the_authors_do(stem: str):
     values = mean_over(MBenchQuality(20.0), MBENCH, meta(MBENCH)["config"]["summary_over"])
     expected = {name: float(MBENCH[f"out/summary/{theirs}"][0]) for name, theirs in MBENCH_NAMES.items()}
@@ -106,8 +105,7 @@ def test_physical_foot_contact_equals_the_authors(case: str):
     assert ours == pytest.approx(expected, rel=1e-9, nan_ok=True)
 
 
-@pytest.mark.golden
-@pytest.mark.parametrize("stem", ["pfc"])
+@golden_case("pfc")
 def test_physical_foot_contact_leaves_out_motions_without_a_value(stem: str):
     averaged = meta(PFC)["config"]["folder_mean_over"]
     values = mean_over(PhysicalFootContact(30.0), PFC, [*averaged, "static", "steady_glide"])
@@ -115,7 +113,6 @@ def test_physical_foot_contact_leaves_out_motions_without_a_value(stem: str):
     assert values == pytest.approx(expected, rel=1e-9)
 
 
-@pytest.mark.golden
 @one
 def test_kimodos_skating_equals_the_authors(stem: str):
     joints, contacts, lengths = (
@@ -167,7 +164,6 @@ def kimodo_errors(case: str) -> dict[str, Tensor]:
     return constraint_errors(*(torch.cat(offsets[kind]) for kind in ("root2d", "full", "ee")))
 
 
-@pytest.mark.golden
 @one
 def test_kimodos_percentile_is_over_motions(stem: str):
     config = meta(KIMODO)["config"]["constraint_cases"]
@@ -175,7 +171,6 @@ def test_kimodos_percentile_is_over_motions(stem: str):
     assert means.quantile(0.95).item() == pytest.approx(float(KIMODO["out/constraint_root2d_err_p95"]), abs=1e-7)
 
 
-@pytest.mark.golden
 @one
 def test_kimodos_retrieval_and_distances_equal_the_authors(stem: str):
     text, motion, real = (torch.from_numpy(KIMODO[f"in/tmr/{n}"]).double() for n in ("text", "motion", "gt_motion"))
@@ -193,7 +188,6 @@ def test_kimodos_retrieval_and_distances_equal_the_authors(stem: str):
         assert float(frechet_distance(a, b)) == pytest.approx(float(KIMODO[f"f64/tmr/FID/{name}"]), abs=1e-6)
 
 
-@pytest.mark.golden
 @one
 def test_angles_between_rotations_equal_the_reproductions(stem: str):
     pred, target = (torch.from_numpy(KIMODO[f"in/geodesic/{name}"]).double() for name in ("pred", "target"))
@@ -246,15 +240,13 @@ def test_ranks_equal_tmrs(group: str):
     assert_recall(whole_set_retrieval(similarity, TOP, correct), group)
 
 
-@pytest.mark.golden
-@pytest.mark.parametrize("stem", ["tmr_retrieval"])
+@golden_case("tmr_retrieval")
 def test_small_batches_equal_tmrs(stem: str):
     similarity, batches = torch.from_numpy(TMR["in/sims"]).double(), torch.from_numpy(TMR["out/guo/batches"])
     assert_recall(batched_retrieval(similarity, batches, TOP), "out/guo")
 
 
-@pytest.mark.golden
-@pytest.mark.parametrize("stem", ["tmr_retrieval"])
+@golden_case("tmr_retrieval")
 def test_protocols_equal_tmrs_driver(stem: str, monkeypatch):
     ids, chosen = TMR["in/keyids"].tolist(), TMR["in/nsim_idx"]
     vectors = dict(zip(ids, torch.from_numpy(TMR["in/sent_emb"]), strict=True))

@@ -152,11 +152,7 @@ class OwnT2MExtractor(OwnExtractor):
         return part or super().reads(representation)
 
     def texts(self, captions: Sequence[str], tokens: Sequence[Sequence[str] | None]) -> Tensor:
-        """Computes features of captions.
-
-        Raises:
-            UserError: If a caption has no tokens, and the evaluator needs them.
-        """
+        """Computes features of captions, which need tokens if the evaluator did not learn its words."""
         if self.task.learns_words:
             return self.task.text([words(caption) for caption in captions])
         return self.task.text(_tagged(self.path, tokens))
@@ -189,13 +185,10 @@ def _tagged(path: Path, tokens: Sequence[Sequence[str] | None]) -> list[Sequence
 
 
 class ReleasedExtractor(Extractor):
-    """A network with the weights that its authors released.
-
-    Args:
-        path: the folder of `FILES`, or the file if there is only one.
+    """A network with the weights that its authors released, from a folder of `FILES`, or from one file.
 
     Raises:
-        FileNotFoundError: If a file is missing.
+        FileNotFoundError, UserError: If a file is missing, or has other content.
     """
 
     FILES: tuple[str, ...] = ()
@@ -237,14 +230,7 @@ class T2MExtractor(ReleasedExtractor):
 
     The files are finest.tar (from text_mot_match/model), mean.npy and std.npy (t2m_mean.npy and t2m_std.npy in MDM,
     kit_... for KIT, eval_mean.npy and eval_std.npy in MARDM), our_vab_data.npy and our_vab_idx.pkl (GloVe).
-
-    Args:
-        path: the folder.
-        device: to compute on.
-        full_length: legacy option, see `WordVectors`: captions are treated as filling all 22 slots.
-
-    Raises:
-        FileNotFoundError, UserError: If a file is missing, or has other content.
+    `full_length` is a legacy option, see `WordVectors`: captions are treated as filling all 22 slots.
     """
 
     FILES = ("finest.tar", "mean.npy", "std.npy", "our_vab_data.npy", "our_vab_idx.pkl")
@@ -260,23 +246,14 @@ class T2MExtractor(ReleasedExtractor):
         self.used = self.network.used
 
     def texts(self, captions: Sequence[str], tokens: Sequence[Sequence[str] | None]) -> Tensor:
-        """Computes features of captions.
-
-        Raises:
-            UserError: If a caption has no tokens.
-        """
+        """Computes features of captions, which need tokens."""
         return self.network.text(self.words(_tagged(self.path, tokens), full_length=self.full_length))
 
 
 class MARDMClipExtractor(ReleasedExtractor):
     """The second evaluator of MARDM as released, for its CLIP-score: `MotionCLIPScore` of its features.
 
-    Args:
-        path: a folder of finest.tar (from text_mot_match_clip/model), mean.npy and std.npy (eval_mean, eval_std).
-        device: to compute on.
-
-    Raises:
-        FileNotFoundError, UserError: If a file is missing, or has other content.
+    The files are finest.tar (from text_mot_match_clip/model), mean.npy and std.npy (eval_mean and eval_std).
     """
 
     FILES = ("finest.tar", "mean.npy", "std.npy")
@@ -313,17 +290,9 @@ humanact12_gru_modi_struct.pth.tar (not a GRU despite its name) and uestc_rot6d_
 class ClassifierExtractor(ReleasedExtractor):
     """A released action classifier, one of `CLASSIFIERS`, which reads rotations or joints of 24 SMPL joints.
 
-    Args:
-        kind: which one.
-        path: the file.
-        device: to compute on.
-        random_start: legacy option of Guo et al. 2020 and all later work: the initial state of the humanact12 GRU is
-            drawn from a normal distribution, separately for features and scores. Here, the draw is a function of the
-            motion, so it is the same in any batch.
-
-    Raises:
-        FileNotFoundError, UserError: If the file does not exist or holds other weights, or `random_start` is given for
-            a network that is not recurrent.
+    `random_start` is a legacy option of Guo et al. 2020 and all later work: the initial state of the humanact12 GRU is
+    drawn from a normal distribution, separately for features and scores. Here, the draw is a function of the motion, so
+    it is the same in any batch.
     """
 
     def __init__(self, kind: str, path: str, device: str | torch.device = "cpu", *, random_start: bool = False):
@@ -360,15 +329,7 @@ class ClassifierExtractor(ReleasedExtractor):
 
 
 class UnconstrainedExtractor(ClassifierExtractor):
-    """The classifier of unconstrained HumanAct12 with its reference motions, from a folder of the two files in `FILES`.
-
-    Args:
-        path: the folder.
-        device: to compute on.
-
-    Raises:
-        FileNotFoundError, UserError: If a file is missing, or is another one.
-    """
+    """The classifier of unconstrained HumanAct12 with its reference motions, from a folder of two files."""
 
     FILES = ("humanact12_gru_modi_struct.pth.tar", "humanact12_unconstrained_modi_struct.npy")
 

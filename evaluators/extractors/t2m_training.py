@@ -43,6 +43,22 @@ class _MovementDecoder(nn.Module):
         return self.out_net(self.main(self.in_net(latents).transpose(1, 2)).transpose(1, 2))
 
 
+def reconstruction_terms(network: T2MEvaluator, decoder: nn.Module, batch: MotionBatch) -> dict[str, Tensor]:
+    """Returns loss terms (B,) of the movement autoencoder, over the real frames and vectors of each motion."""
+    frames = batch.x.shape[1] // UNIT * UNIT
+    x, mask = batch.x[:, :frames, : network.used], batch.mask[:, :frames]
+    latents, units = network.movement_encoder(x), mask[:, UNIT - 1 :: UNIT]
+
+    def mean(values: Tensor, real: Tensor) -> Tensor:
+        return (values.mean(-1) * real).sum(1) / real.sum(1).clamp(min=1)
+
+    return {
+        "reconstruction": mean((decoder(latents) - x).abs(), mask),
+        "sparsity": mean(latents.abs(), units),
+        "smoothness": mean(latents.diff(dim=1).abs(), units[:, 1:]),
+    }
+
+
 def matching_loss(motion: Tensor, text: Tensor, margin: float, fits: Tensor | None = None) -> Tensor:
     """Contrastive loss of Guo et al. 2022 (Hadsell et al. 2006, eq. 4, without its factor 1/2).
 
@@ -218,7 +234,8 @@ class T2MTask(Task):
         torch.manual_seed(key("step", self.seed, batch_idx, self.global_rank))
         self.network.movement_encoder.train(self._learns_movement)
         if self._learns_movement:
-            terms = {name: value.mean() for name, value in self._reconstruct(batch).items()}
+            values = reconstruction_terms(self.network, self.decoder, batch)
+            terms = {name: value.mean() for name, value in values.items()}
             loss = terms["reconstruction"] + self.sparsity * terms["sparsity"] + self.smoothness * terms["smoothness"]
         else:
             fits = [[text in self.tokens[name] for name in batch.ids] for text in batch.text or ()]
@@ -242,22 +259,6 @@ class T2MTask(Task):
         matching += self.words.parameters() if isinstance(self.words, LearnedWords) else []
         return matching if self._learns_movement else movement
 
-    def _reconstruct(self, batch: MotionBatch) -> dict[str, Tensor]:
-        """Returns loss terms (B,) of the movement autoencoder, over the real frames and vectors of each motion."""
-        frames = batch.x.shape[1] // UNIT * UNIT
-        x, mask = batch.x[:, :frames, : self.network.used], batch.mask[:, :frames]
-        latents = self.network.movement_encoder(x)
-        units = mask[:, UNIT - 1 :: UNIT]
-
-        def mean(values: Tensor, real: Tensor) -> Tensor:
-            return (values.mean(-1) * real).sum(1) / real.sum(1).clamp(min=1)
-
-        return {
-            "reconstruction": mean((self.decoder(latents) - x).abs(), mask),
-            "sparsity": mean(latents.abs(), units),
-            "smoothness": mean(latents.diff(dim=1).abs(), units[:, 1:]),
-        }
-
     def _embed(self, batch: MotionBatch) -> tuple[Tensor, Tensor]:
         """Returns embeddings (B, E) of motions and of their captions."""
         assert batch.text is not None
@@ -267,7 +268,8 @@ class T2MTask(Task):
     def validation_step(self, batch: MotionBatch, batch_idx: int) -> None:
         """Adds the pairs of a batch to the metrics."""
         update_pairs(self, self.val_metrics, batch, *self._embed(batch))
-        self.val_metrics["reconstruction"].update(self._reconstruct(batch)["reconstruction"])  # type: ignore[operator]
+        errors = reconstruction_terms(self.network, self.decoder, batch)["reconstruction"]
+        self.val_metrics["reconstruction"].update(errors)  # type: ignore[operator]
 
     def on_validation_epoch_end(self) -> None:
         """Logs the matching loss in both stages of training, so that the best checkpoint is from the second."""

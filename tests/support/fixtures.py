@@ -8,6 +8,7 @@ that need them skip where that folder is absent.
 import hashlib
 import json
 import os
+from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -87,3 +88,8 @@ def assert_within(ours: torch.Tensor, arrays: Arrays, name: str, like: str | Non
     """Within ten times of what the authors' float32 differs from their float64."""
     tolerance = 10 * meta(arrays)["max_abs_diff_f32_vs_f64"][like or name][0]
     torch.testing.assert_close(ours, torch.from_numpy(arrays[name]), atol=tolerance, rtol=0)
+
+
+def golden_case(stem: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Marks a test on a single case, and gives it an id with the fixture's name."""
+    return lambda test: pytest.mark.golden(pytest.mark.parametrize("stem", [stem])(test))

@@ -101,3 +101,10 @@ def unpacked(packed: dict[str, Any]) -> np.ndarray:
     """Joints (F, J, 3) of a motion in a page."""
     quanta = np.frombuffer(base64.b64decode(packed["joints"]), "<i2").reshape(packed["frames"], -1, 3)
     return packed["center"] + quanta * packed["step"]
+
+
+def wander(joints: int, frames: int, seed: int) -> torch.Tensor:
+    """(F, J, 3): smooth motion of random joints, in meters."""
+    generator = torch.Generator().manual_seed(seed)
+    pose = torch.rand(joints, 3, generator=generator)
+    return pose + torch.randn(frames, joints, 3, generator=generator).cumsum(0) * 0.02

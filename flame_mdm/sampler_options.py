@@ -17,8 +17,9 @@ SPACINGS = ("linspace", "stride")
 
 def option(default: Any, help: str) -> Any:
     """Returns a dataclass field with a help text, which the command line shows; a function `default` computes it."""
-    kind = "default_factory" if callable(default) else "default"
-    return field(**{kind: default}, metadata={"help": help})
+    if callable(default):
+        return field(default_factory=default, metadata={"help": help})
+    return field(default=default, metadata={"help": help})
 
 
 def same_option(kind: type[Any], name: str, **default: Any) -> Any:
@@ -61,7 +62,7 @@ class SamplerOptions:
         if self.sampler is not None and not isinstance(self.sampler, str):
             raise UserError(f"sampler={self.sampler!r}: give the name of a sampler")
         if self.spacing is not None and self.spacing not in SPACINGS:
-            raise UserError(f"unknown spacing '{self.spacing}': choose from {', '.join(SPACINGS)}")
+            raise UserError(f"spacing={self.spacing} is unknown: choose from {', '.join(SPACINGS)}")
         steps = self.num_inference_steps
         if isinstance(steps, list | tuple):
             object.__setattr__(self, "num_inference_steps", tuple(steps))

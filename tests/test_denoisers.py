@@ -1,6 +1,7 @@
 """What every denoiser of `experiments/denoiser` promises."""
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -278,8 +279,9 @@ def test_bad_options_are_named() -> None:
     pooled_only = Condition(cond.pooled, cond.tokens[:, :0], None)
     decoder = MDMDecoder(D, D, C, **TRANSFORMER, token_memory=True).double()
     unet = {"latent_dim": 16, "channels": [8], "dropout": 0.0}
+    three_heads: dict[str, Any] = TRANSFORMER | {"num_heads": 3}
     for build, message in (
-        (lambda: MDMEncoder(D, D, C, **TRANSFORMER | {"num_heads": 3}), r"latent_dim \(16\) .* num_heads \(3\)"),
+        (lambda: MDMEncoder(D, D, C, **three_heads), r"latent_dim \(16\) .* num_heads \(3\)"),
         (lambda: MDMEncoder(D, D, C, **TRANSFORMER, project_condition=False), r"\(12\) must equal latent_dim \(16\)"),
         (lambda: MDMDecoder(D, D, C, **TRANSFORMER, input_token="both"), "condition or time, not 'both'"),  # pyright: ignore[reportArgumentType]
         (lambda: MDMUNet(D, D, C, **unet, num_groups=3), r"num_groups \(3\)"),

@@ -97,9 +97,8 @@ def test_regions(diffusion, motion, length):
 
 
 def test_frames_and_joints_meet_and_the_upper_body_is_what_mdm_resamples(diffusion, motion):
-    seconds, frames = (
-        edit(diffusion, motion, **at)[0] for at in ({"region_seconds": [0.5, 1.25]}, {"region": [10, 25]})
-    )
+    seconds = edit(diffusion, motion, region_seconds=[0.5, 1.25])[0]
+    frames = edit(diffusion, motion, region=[10, 25])[0]
     assert np.array_equal(seconds.keep, frames.keep)
     assert np.array_equal(seconds.features, frames.features)
     both = edit(diffusion, motion, region="in_between", joints=["left_arm", "head"])[0].keep

@@ -74,7 +74,7 @@ def test_a_bad_request_is_one_line_and_writes_nothing(here, trained, capsys):
         (b"walks", ["prompts=null", "text=p.txt"], "text=p.txt: a file. To sample the prompts in it, give prompts="),
         (b"walks\njumps", ["seconds=[1,2,3]"], "seconds=[1, 2, 3]: 3 lengths for 2 prompts. Give one length, or one"),
         (b"walks\njumps", ["seconds=[1,30]"], "30 seconds (600 frames) cannot be sampled"),
-        (b"walks", ["seconds=x"], "seconds=x: must be a number or a list of numbers"),
+        (b"walks", ["seconds=x"], "seconds=x: must be a finite number or a list"),
         (b"walks\n" + b"a" * 3000, [], "3,000 characters are too many"),
     ):
         Path("p.txt").unlink(missing_ok=True)

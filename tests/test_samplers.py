@@ -409,7 +409,7 @@ def test_samplers_agree_with_diffusers(case, prediction, monkeypatch):
     monkeypatch.setattr("diffusers.schedulers.scheduling_ddpm.randn_tensor", lambda *_, **__: noise(next(used)))
     steps: Any = [0, 30, 90, 250, 400, 401, 777, 950]
     if case.startswith("fixed"):
-        scheduler = DDPMScheduler(**options, variance_type=variance, clip_sample=False)
+        scheduler: Any = DDPMScheduler(**options, variance_type=variance, clip_sample=False)
         how: dict[str, Any] = {"sampler": "ancestral"}
     elif case == "dpm":
         steps.remove(401)
@@ -421,7 +421,7 @@ def test_samplers_agree_with_diffusers(case, prediction, monkeypatch):
         more: dict[str, Any] = {"clip_sample": False, "set_alpha_to_one": True, "timestep_spacing": "leading"}
         scheduler, steps = DDIMScheduler(**options, **more), 20
         how = {"sampler": "ddim", "spacing": "stride", "eta": float(case.split(" ")[1])}
-    scheduler.set_timesteps(**({"num_inference_steps": 20} if steps == 20 else {"timesteps": steps[::-1]}))
+    scheduler.set_timesteps(steps) if steps == 20 else scheduler.set_timesteps(timesteps=steps[::-1])
     ours = sample(process, MIXING, noise, num_inference_steps=steps, **how)
     theirs = diffusers_loop(scheduler, noise, **({"eta": how["eta"]} if "eta" in how else {}))
     torch.testing.assert_close(ours, theirs, rtol=1e-4, atol=1e-4)  # theirs computes alpha products in float32
@@ -567,7 +567,7 @@ def test_rewriting_ends_at_its_threshold(sampler):
         (FlowMatching, {"sampler": "euler", "num_inference_steps": [0, 2]}, "a number of equal steps"),
         (FlowMatching, {"sampler": "dopri5", "edit": {"mode": "x0"}}, "cannot edit: choose from euler, midpoint"),
         (FlowMatching, {"sampler": "euler", "guidance_scale": math.nan}, "guidance_scale=nan is not a finite number"),
-        (FlowMatching, {"spacing": "even"}, "unknown spacing 'even': choose from linspace, stride"),
+        (FlowMatching, {"spacing": "even"}, "spacing=even is unknown: choose from linspace, stride"),
         (FlowMatching, {"num_inference_steps": [0, 1.5]}, "give a number of steps, or a list"),
         (FlowMatching, {"sampler": 3}, "sampler=3: give the name"),
     ],

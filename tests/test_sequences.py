@@ -3,6 +3,7 @@
 import itertools
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -84,7 +85,8 @@ def test_a_sequence_is_one_motion_of_which_a_part_is_changed_by_its_text(model):
 
 
 def test_a_part_longer_than_training_and_one_as_long_as_training(model):
-    text, options = "a person walks forward", {"num_inference_steps": 5, "shared_noise": True}
+    text = "a person walks forward"
+    options: dict[str, Any] = {"num_inference_steps": 5, "shared_noise": True}
     long = flame_mdm.generate(model, f"{text} @20", num_inference_steps=5)[0]
     assert len(long.joints) == 400
     assert np.isfinite(long.joints).all()
@@ -124,7 +126,7 @@ def test_a_loop_has_no_seam(model):
 
 
 def test_bad_requests_give_one_clear_line(model):
-    for text, options, message in (
+    cases: list[tuple[Any, dict[str, Any], str]] = [
         ("walks | | sits", {}, "part 2 is empty"),
         ("walks @fast", {}, "seconds of a part are a number"),
         ("walks @-1", {}, "seconds of a part are a number"),
@@ -140,7 +142,8 @@ def test_bad_requests_give_one_clear_line(model):
         ("walks", {"second": 3}, "generate has no option second. Did you mean seconds"),
         (None, {"actions": "walk"}, "action=walk: this model was trained on captions"),
         (" ", {}, "empty text"),
-    ):
+    ]
+    for text, options, message in cases:
         with pytest.raises(UserError, match=message) as raised:
             flame_mdm.generate(model, text, **options)
         assert "\n" not in str(raised.value), message

@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -120,7 +121,7 @@ def test_the_command_prints_the_distance(tmp_path, monkeypatch, capsys):
 def test_targets_that_the_text_does_not_suggest_do_not_stretch_bones(model):
     """Steering may not leave what the denoiser was trained on, and bones keep their lengths around a target."""
     target = {"joints": [{"time": 1.5, "joint": "right_wrist", "position": [-0.5, 1.5, 0.2]}]}
-    options = {"seconds": 3, "seed": 1}
+    options: dict[str, Any] = {"seconds": 3, "seed": 1}
     before, after = (
         flame_mdm.generate(model, "a person stands still", targets=t, **options)[0] for t in (None, target)
     )

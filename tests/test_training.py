@@ -369,7 +369,7 @@ def test_stages_are_the_clean_estimates_up_to_the_motion(trained):
         (["text=a", "sampler=euler"], "unknown sampler 'euler'"),
         (["text=a", "num_inference_steps=11"], "11"),
         (["text=a", "num_inference_steps=[3,1]"], "got [3, 1]"),
-        (["text=a", "num_inference_steps=[0,1.5]"], "got [0, 1.5]"),
+        (["text=a", "num_inference_steps=[0,1.5]"], "num_inference_steps=[0, 1.5]: "),
         (["text=a", "eta=0.5"], "eta=0.5"),
         (["text=a", "spacing=even"], "spacing=even"),
         (["text=a", "sead=3"], "unknown config key 'sead'. Did you mean seed"),

@@ -243,7 +243,7 @@ class SamplingRequest:
             prompts = "1 prompt" if len(self.prompts) == 1 else f"{len(self.prompts)} prompts"
             raise UserError(f"{shown}: {len(lengths)} lengths for {prompts}. Give one length, or one per prompt")
         for length in lengths:
-            if not isinstance(length, Real) or not abs(length) < 1e9 or (name == "frames" and length % 1):
+            if not issubclass(type(length), Real) or not abs(length) < 1e9 or (name == "frames" and length % 1):
                 raise UserError(f"{shown} is not a valid length")
 
     def check_edit(self) -> None:
@@ -279,7 +279,7 @@ class SamplingRequest:
     def lengths(self, fps: float) -> list[float | None]:
         """Returns the length of each prompt in frames, not rounded; None where the request gives none."""
         value, scale = (self.frames, 1.0) if self.seconds is None else (self.seconds, fps)
-        values: Sequence[Any] = value if isinstance(value, tuple) else [value] * len(self.prompts)
+        values: list[Any] = list(value) if isinstance(value, tuple) else [value] * len(self.prompts)
         return [None if length is None else length * scale for length in values]
 
 

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -15,32 +14,27 @@ from scipy.stats import hypergeom, rankdata
 from torch import Tensor
 from torchmetrics import Metric
 
+from evaluators.audit_sets import BASE, REAL, Inputs, Scene, Text, text_of
 from evaluators.evaluator import Evaluator, Extracted, Motions
 from evaluators.extractors import OwnExtractor
 from evaluators.metrics import alignment, make_metrics, physics, update_metrics
-from evaluators.metrics.attributes import ATTRIBUTES, AttributeAccuracy, read_attributes, right_attributes
+from evaluators.metrics.attributes import AttributeAccuracy, read_attributes, right_attributes
 from evaluators.metrics.distribution import FrechetMotionDistance, frechet_distance
 from evaluators.metrics.diversity import Diversity
 from evaluators.metrics.published_physics import MeanOverMotions
-from evaluators.near_misses import near_misses
-from evaluators.perturbations import PERTURBATIONS, Joints, Perturbation, continue_with, encode
+from evaluators.perturbations import Perturbation
 from evaluators.plan import open_data
-from evaluators.protocol import Row, digest, open_protocol
+from evaluators.protocol import digest, open_protocol
 from evaluators.request import EvaluationRequest
 from evaluators.sources import real_motions
-from flame_mdm.config import EXPERIMENTS, instantiate
-from flame_mdm.data.datamodule import MotionDataModule
 from flame_mdm.errors import UserError
 from flame_mdm.progress import ProgressBar
 from flame_mdm.representations.humanml import HumanML
-from flame_mdm.safe_io import atomic_write, read_npz, read_yaml
+from flame_mdm.safe_io import atomic_write, read_npz
 from flame_mdm.schemas import AuditCard, check_shape
-from flame_mdm.seeds import key
 from flame_mdm.training.provenance import environment
 
 FORMAT = 1
-BASE, REAL = "decoded and encoded", "reference"
-"""Sets of motions that all others are compared with: those of grade 0, and the real ones of set metrics."""
 TOTALS: dict[type[Metric], tuple[str, str]] = {
     **dict.fromkeys((physics.FootSkating, physics.StaticShare), ("hits", "total")),
     **dict.fromkeys((physics.Penetration, physics.Floating, physics.Jitter), ("total", "frames")),
@@ -48,17 +42,6 @@ TOTALS: dict[type[Metric], tuple[str, str]] = {
 """States of metrics of joints: their value is the sum of the first over motions, divided by that of the second."""
 TRUTH = "attributes/all"
 """Share of motions that show every requested attribute."""
-
-Inputs = dict[str, np.ndarray]
-"""Metric inputs of N motions: "features" (N, E), "seen" (N,) attributes as JSON, and totals (N, 2) by metric."""
-
-
-class Text(NamedTuple):
-    """A caption, its tagged words, and the attributes that it requests."""
-
-    caption: str
-    tokens: Sequence[str] | None
-    requested: Mapping[str, Any]
 
 
 def audit(request: EvaluationRequest, cache: Path) -> AuditCard:
@@ -96,9 +79,9 @@ def audit(request: EvaluationRequest, cache: Path) -> AuditCard:
         "motions": len(rows),
     }
     evaluator = Evaluator(extractor, protocol.metrics, representation, batch_size=request.batch_size or 64)
-    scene = _Scene(data, rows, real_motions(clips, rows), representation, request.seed)
+    scene = Scene(data, rows, real_motions(clips, rows), representation, request.seed)
     sets = {REAL: lambda: real_motions(clips, [again[row.clip.id] for row in rows])} | scene.motions()
-    texts = [_text(row, row.text) for row in rows] if protocol.condition == "text" else []
+    texts = [text_of(row, row.text) for row in rows] if protocol.condition == "text" else []
     perturbations = scene.perturbations(bool(texts))
     folder = cache / digest([FORMAT, facts, protocol.sha256])[:16]
     steps = len(sets) + sum(len(perturbation.grades) for perturbation in perturbations)
@@ -117,7 +100,7 @@ def audit(request: EvaluationRequest, cache: Path) -> AuditCard:
 
 def _measured(
     measure: _Measure,
-    scene: _Scene,
+    scene: Scene,
     perturbations: Sequence[Perturbation],
     inputs: Mapping[str, Inputs],
     texts: Sequence[Text],
@@ -144,142 +127,6 @@ def _measured(
         "not_computed": measure.reasons,
         "truth": _agreement(scores, listed),
     }
-
-
-# Perturbed motions and texts ------------------------------------------------------------------------------------------
-
-
-class _Scene:
-    """Real motions of a split, and how to perturb them."""
-
-    def __init__(
-        self, data: MotionDataModule, rows: list[Row], features: list[np.ndarray], representation: HumanML, seed: int
-    ):
-        self.data, self.rows, self.features, self.representation, self.seed = data, rows, features, representation, seed
-        self.joints = [representation.decode(torch.from_numpy(x)).double().numpy() for x in features]
-        self.wrong = self._wrong()
-
-    def draws(self, *parts: str | int) -> np.random.Generator:
-        """Returns the generator for a purpose."""
-        return np.random.default_rng(key("audit", self.seed, *parts))
-
-    def motions(self) -> dict[str, Callable[[], list[np.ndarray]]]:
-        """Returns how to make each set of N motions, as features, by the name of the perturbation and the grade."""
-        fps, mirror = self.representation.fps, self.representation.skeleton.mirror
-        order = self.draws("other half").permutation(len(self.rows))
-        other = dict(zip(order.tolist(), np.roll(order, 1).tolist(), strict=True))
-
-        def changed(change: Callable[[int, Joints], Joints]) -> Callable[[], list[np.ndarray]]:
-            return lambda: encode(self.representation, [change(i, x) for i, x in enumerate(self.joints)])
-
-        def graded(perturbation: Perturbation, grade: float) -> Callable[[int, Joints], Joints]:
-            change = perturbation.change
-            assert change is not None
-            # The draws are the same at all grades.
-            return lambda i, x: change(x, grade, self.draws(perturbation.name, self.rows[i].id), fps)
-
-        sets = {
-            BASE: changed(lambda _, x: x),
-            "as stored": lambda: self.features,
-            "half precision": lambda: [x.astype(np.float16).astype(np.float32) for x in sets[BASE]()],
-            "mirrored": changed(lambda _, x: mirror(torch.from_numpy(x)).numpy()),
-            "reversed": changed(lambda _, x: x[::-1].copy()),
-            "other half": changed(lambda i, x: continue_with(x, self.joints[other[i]], fps)),
-            "memorized": self._memorized,
-        }
-        sets |= {f"{p.name} {g:g}": changed(graded(p, g)) for p in PERTURBATIONS if p.change for g in p.grades}
-        for through in self._representations():
-            sets[f"through {through.name}"] = changed(
-                lambda _, x, r=through: r.decode(torch.from_numpy(encode(r, [x])[0])).numpy()
-            )
-        return sets
-
-    def _memorized(self) -> list[np.ndarray]:
-        """Returns for each motion a training motion with the same captions or the same action, or the motion itself."""
-        training, copies = self.data.clips("train"), []
-        for row in self.rows:
-            same = [clip for clip in training.clips if clip.captions == row.clip.captions]
-            same = same or [clip for clip in training.clips if clip.action == row.clip.action] or [row.clip]
-            draws = self.draws("memorized", row.id)
-            clip = same[int(draws.integers(len(same)))]
-            copies.append(Row(row.id, clip, training.crop(clip.length, draws), None, row.id))
-        return real_motions(training, copies)
-
-    def _representations(self) -> list[HumanML]:
-        """Returns the other representations of these joints."""
-        files = sorted((EXPERIMENTS / "representation").glob("humanml*.yaml"))
-        others: list[HumanML] = [instantiate(read_yaml(path)) for path in files]
-        own = self.representation
-        return [r for r in others if r.skeleton == own.skeleton and r.fps == own.fps and r.name != own.name]
-
-    def _wrong(self) -> dict[str, list[Text | None]]:
-        """Returns a wrong text for each motion, by the name of the perturbation; None if there is none."""
-        texts = {caption: _text(row, caption) for row in self.rows for caption in row.clip.captions}
-        contradicting = near_misses([row.clip for row in self.rows])
-        names = sorted({name for misses in contradicting for name in misses})
-        wrong: dict[str, list[Text | None]] = {}
-        for kind in ("wrong captions", "near misses", *(f"near misses: {name}" for name in names if len(names) > 1)):
-            wrong[kind] = []
-            for row, misses in zip(self.rows, contradicting, strict=True):
-                draws, options = self.draws(kind, row.id), misses.get(kind.partition(": ")[2], [])
-                if kind == "near misses" and misses:
-                    options = misses[sorted(misses)[draws.integers(len(misses))]]
-                elif kind == "wrong captions":
-                    options = [caption for caption in texts if caption not in row.clip.captions]
-                wrong[kind].append(texts[options[draws.integers(len(options))]] if options else None)
-        return {kind: chosen for kind, chosen in wrong.items() if any(chosen)}
-
-    def perturbations(self, captioned: bool) -> list[Perturbation]:
-        """Returns the perturbations of this data."""
-        listed = []
-        for perturbation in PERTURBATIONS:
-            if perturbation.unit == "% of captions":
-                kinds = (
-                    [kind for kind in self.wrong if kind.partition(":")[0] == perturbation.name] if captioned else []
-                )
-                for kind in kinds:
-                    most = 100 * sum(text is not None for text in self.wrong[kind]) / len(self.rows)
-                    grades = [*(grade for grade in perturbation.grades if grade < most), round(most, 1)]
-                    listed.append(replace(perturbation, name=kind, grades=grades))
-            elif perturbation.unit == "motions":
-                grades = [grade for grade in perturbation.grades if grade < len(self.rows)]
-                listed.append(replace(perturbation, grades=grades))
-            elif perturbation.unit != "% of actions" or len({row.clip.action for row in self.rows}) > 1:
-                listed.append(perturbation)
-        about = "encoded and decoded by another representation"
-        listed += [Perturbation(f"through {other.name}", "plumbing", about) for other in self._representations()]
-        return [perturbation for perturbation in listed if perturbation.grades]
-
-    def condition(
-        self, perturbation: Perturbation, grade: float, inputs: Mapping[str, Inputs], texts: Sequence[Text]
-    ) -> tuple[Inputs, list[Text]]:
-        """Returns the motions and texts of a perturbation at a grade; pair i belongs to real motion i."""
-        base, texts, count = inputs[BASE], list(texts), len(self.rows)
-        order, share = self.draws("order", perturbation.name).permutation(count), round(count * grade / 100)
-        if perturbation.unit == "% of captions":
-            for i in [i for i in order if self.wrong[perturbation.name][i]][:share]:
-                texts[i] = self.wrong[perturbation.name][i] or texts[i]
-        elif perturbation.unit == "% of motions":
-            chosen = np.isin(np.arange(count), order[:share])
-            shaped = {name: chosen.reshape(-1, *[1] * (x.ndim - 1)) for name, x in base.items()}
-            base = {name: np.where(shaped[name], inputs[perturbation.name][name], x) for name, x in base.items()}
-        elif perturbation.unit == "% of actions":
-            actions = sorted({row.clip.action or 0 for row in self.rows}, key=lambda a: key("missing", self.seed, a))
-            gone = actions[: max(1, round(len(actions) * grade / 100))]
-            kept = [i for i in order if (self.rows[i].clip.action or 0) not in gone]
-            picked = np.array([i if i in kept else kept[i % len(kept)] for i in range(count)])
-            return {name: x[picked] for name, x in base.items()}, [texts[i] for i in picked] if texts else []
-        elif perturbation.unit == "motions":
-            return {name: x[: int(grade)] for name, x in base.items()}, texts[: int(grade)]
-        else:
-            base = inputs[f"{perturbation.name} {grade:g}" if perturbation.change else perturbation.name]
-        return base, texts
-
-
-def _text(row: Row, caption: str) -> Text:
-    tagged = row.clip.attributes.get("tokens")
-    requested = {name: value for name, value in row.clip.attributes.items() if name in ATTRIBUTES}
-    return Text(caption, tagged[row.clip.captions.index(caption)] if tagged else None, requested)
 
 
 # Measurement ----------------------------------------------------------------------------------------------------------

@@ -122,7 +122,7 @@ class Perturbation:
         unit: of the grades. Shares ("% of motions", "% of captions", "% of actions") say how many are replaced.
         grades: from weak to strong; () = not graded.
         change: returns joints; arguments are joints, grade, generator and frames per second. None = it concerns
-            features, captions or the set, which `evaluators.audit` replaces.
+            features, captions or the set, which `evaluators.audit_sets` replaces.
     """
 
     name: str

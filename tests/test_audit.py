@@ -11,8 +11,9 @@ import pytest
 import torch
 from support.fixtures import ROOT
 
-import evaluators.audit as audits
-from evaluators.audit import BASE, REAL, Text, _inputs, _Measure
+import evaluators.audit_sets as audit_sets
+from evaluators.audit import _inputs, _Measure
+from evaluators.audit_sets import BASE, REAL, Text
 from evaluators.evaluator import Evaluator, Motions
 from evaluators.extractors import Extractor
 from evaluators.metrics.alignment import MotionsForText, TextsForMotion
@@ -164,7 +165,7 @@ def test_pages_escape_and_show_one_card_or_two(card, tmp_path):
 def test_an_audit_resumes_and_gives_the_same_card(tmp_path, monkeypatch, capsys):
     names = ("jitter", "mirrored", "near misses", "missing actions", "memorized", "fewer", "half precision")
     few = [each for each in PERTURBATIONS if each.name in names]
-    monkeypatch.setattr(audits, "PERTURBATIONS", few)
+    monkeypatch.setattr(audit_sets, "PERTURBATIONS", few)
     passes: list[int] = []
     extract = Evaluator.extract
     monkeypatch.setattr(Evaluator, "extract", lambda self, x: passes.append(len(x)) or extract(self, x))

@@ -5,6 +5,7 @@ docs/index.md.
 """
 
 import re
+from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +42,14 @@ def start_page(app: Any, name: str, source: list[str]) -> None:
     source[0] = re.sub(r"\]\((\.\./)+README\.md", lambda match: f"]({'../' * name.count('/')}index.md", source[0])
 
 
+def add_help(app: Any, what: str, name: str, documented: Any, options: Any, lines: list[str]) -> None:
+    """Adds the help texts of a dataclass, which the command line also shows, to its description."""
+    if is_dataclass(documented):
+        helps = {entry.name: entry.metadata["help"] for entry in fields(documented) if "help" in entry.metadata}
+        lines += [f":param {field}: {text}" for field, text in helps.items()] + [""]
+
+
 def setup(app: Any) -> None:
-    """Registers the start page."""
+    """Registers the start page and the help texts."""
     app.connect("source-read", start_page)
+    app.connect("autodoc-process-docstring", add_help)

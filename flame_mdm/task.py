@@ -312,8 +312,8 @@ class MotionGeneration(Task):
             # This denoiser attends to padding, so the padded length must be the same as in training.
             mask = pad_to(mask, max(frames, self.facts.get("max_frames", 0)))
             if edit is not None:
-                known, keep = pad_to(edit.known, mask.shape[1]), ~pad_to(~edit.keep, mask.shape[1])
-                edit = replace(edit, known=known, keep=keep)
+                size = mask.shape[1]
+                edit = replace(edit, known=pad_to(edit.known, size), keep=~pad_to(~edit.keep, size))
         ids = ["shared"] * len(batch) if shared_noise else batch.ids
         noise = seeded_noise(ids, mask.shape[1], features, seed=seed, replication=replication, like=batch.x)
         x = self.process.sample(denoise, noise, mask, cond, options, edit=edit, trajectory=trajectory)

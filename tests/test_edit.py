@@ -382,17 +382,10 @@ def test_motions_that_cannot_be_read_are_one_line(diffusion, store, tmp_path):
 # The command ----------------------------------------------------------------------------------------------------------
 
 
-@pytest.fixture
-def checkpoint(diffusion, tmp_path) -> Path:
-    content = {"config": diffusion.config, "facts": diffusion.facts, "state_dict": diffusion.state_dict()}
-    torch.save(content, tmp_path / "last.ckpt")
-    return tmp_path / "last.ckpt"
-
-
 @pytest.mark.slow
-def test_the_command_writes_the_original_beside_the_edits(checkpoint, store, tmp_path, capsys):
+def test_the_command_writes_the_original_beside_the_edits(trained, store, tmp_path, capsys):
     out = tmp_path / "out"
-    words = [f"ckpt={checkpoint}", f"motion={CLIP}", f"data_root={store}", f"out={out}", "samples=2"]
+    words = [f"ckpt={trained}", f"motion={CLIP}", f"data_root={store}", f"out={out}", "samples=2"]
     words += ["text=it's a (jump), $5", "region=in_between", "joints=[left_arm,head]", "seed=4"]
     assert main(["edit", *words, "strength=0.8", "trajectory=true"]) == 0
     assert (out / "trajectory.png").is_file()
@@ -411,16 +404,16 @@ def test_the_command_writes_the_original_beside_the_edits(checkpoint, store, tmp
         np.testing.assert_allclose(edited["features"][keep], original["features"][keep], atol=1e-5)
         assert not np.allclose(edited["features"][~keep], original["features"][~keep], atol=1e-2)
     # what was written can be edited again
-    assert main(["edit", f"ckpt={checkpoint}", f"motion={out}/motion_001.npz", f"out={out}/again", *words[5:]]) == 0
+    assert main(["edit", f"ckpt={trained}", f"motion={out}/motion_001.npz", f"out={out}/again", *words[5:]]) == 0
 
 
-def test_bad_words_are_one_line(checkpoint, store, capsys):
+def test_bad_words_are_one_line(trained, store, capsys):
     for words, message in (
         ([], "say what to sample: text=..."),
         (["text=jump", "unconditioned=true"], "not text and unconditioned"),
         (["unconditioned=true", "motion=null"], "no motion to edit"),
     ):
-        assert main(["edit", f"ckpt={checkpoint}", f"motion={CLIP}", f"data_root={store}", *words]) == 1
+        assert main(["edit", f"ckpt={trained}", f"motion={CLIP}", f"data_root={store}", *words]) == 1
         output = capsys.readouterr().err
         assert message in output
         assert output.startswith("error: ")

@@ -113,15 +113,15 @@ def edit_request(
     if keep.all():
         raise UserError("the entire motion is kept: choose a region or joints to resample")
     how, options = method_options(model.process, editing, request.options)
-    known = representation.normalize(torch.from_numpy(original.features).to(model.device))
+    normalized = representation.normalize(torch.from_numpy(original.features).to(model.device))
     results = sample_request(
         model,
         replace(request, frames=length, options=options, editing=None, cleanup=False),
         stages=stages,
-        edit=Edit(known[None], keep[None].to(model.device), **how),
+        edit=Edit(normalized[None], keep[None].to(model.device), **how),
     )
     # Normalization rounds, so kept values are compared with the input of the sampler.
-    exact, std = representation.denormalize(known).cpu().numpy(), representation.std.cpu().numpy()
+    exact, std = representation.denormalize(normalized).cpu().numpy(), representation.std.cpu().numpy()
     edits = []
     for result in results:
         error = float((np.abs(result.features - exact) / std)[keep.numpy()].max(initial=0))

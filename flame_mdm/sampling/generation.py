@@ -138,8 +138,8 @@ def _plan(model: MotionGeneration, request: SamplingRequest, edit: Edit | None) 
     if before is not None:  # its last frames are generated again, but kept
         shared = overlap(model)
         lengths = [[shared + first, *others] for first, *others in lengths]
-        known = model.representation.normalize(before[-shared:].to(model.device))[None]
-        edit = Edit(known, torch.ones_like(known, dtype=torch.bool))
+        ending = model.representation.normalize(before[-shared:].to(model.device))[None]
+        edit = Edit(ending, torch.ones_like(ending, dtype=torch.bool))
     copies = request.samples * request.candidates
     return _Plan(
         request=request,
@@ -178,8 +178,8 @@ def _sample(model: MotionGeneration, plan: _Plan, rows: slice, trajectory: list[
     if plan.targets is not None:
         edit = plan.targets.edit(model.representation, batch.lengths.tolist(), model.device)
     if edit is not None:
-        known, keep = pad_to(edit.known, mask.shape[1]), pad_to(edit.keep, mask.shape[1])
-        edit = replace(edit, known=known.expand_as(batch.x), keep=keep.expand_as(batch.x))
+        padded, keep = pad_to(edit.known, mask.shape[1]), pad_to(edit.keep, mask.shape[1])
+        edit = replace(edit, known=padded.expand_as(x), keep=keep.expand_as(x))
     x = model.generate(
         batch,
         request.options,

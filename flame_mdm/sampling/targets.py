@@ -54,20 +54,20 @@ class PositionGuide:
         representation: decodes motions as joints.
         positions: the goal.
         bones: (3, N) frame, parent and child of the bones that keep their lengths.
-        known, keep: (1, F, D) features that are imposed in any case, and where.
+        poses, keep: (1, F, D) features that are imposed in any case, and where.
     """
 
     representation: Representation
     positions: Positions
     bones: Tensor
-    known: Tensor
+    poses: Tensor
     keep: Tensor
 
     def steer(self, clean: Callable[[Tensor], Tensor], x_t: Tensor) -> Tensor:
         return steer(clean, x_t, self.representation.to_joints, self.positions)
 
     def reach(self, x0_hat: Tensor) -> Tensor:
-        imposed, free = torch.where(self.keep, self.known, x0_hat), ~self.keep.expand_as(x0_hat)
+        imposed, free = torch.where(self.keep, self.poses, x0_hat), ~self.keep.expand_as(x0_hat)
         sigma = SMOOTHNESS * self.representation.fps
         return reach(imposed, self.representation.to_joints, self.positions, self.bones, free, sigma)
 
@@ -97,15 +97,15 @@ class Targets:
                 f"targets: {last / fps:g} seconds is after the end of the motion, whose last frame is at "
                 f"{(min(lengths) - 1) / fps:g} seconds. Give an earlier time, or more seconds"
             )
-        known = torch.zeros(1, max(lengths), representation.features, device=device)
-        keep = torch.zeros_like(known, dtype=torch.bool)
+        imposed = torch.zeros(1, max(lengths), representation.features, device=device)
+        keep = torch.zeros_like(imposed, dtype=torch.bool)
         for frame, features in self.poses:
-            known[0, frame] = representation.normalize(features.to(device))
+            imposed[0, frame] = representation.normalize(features.to(device))
             keep[0, frame] = representation.joint_features(range(1, len(representation.skeleton))).to(device)
         positions = Positions(*(x.to(device) for x in vars(self.positions).values()))
         bones = self._bones(representation).to(device)
-        guide = PositionGuide(representation, positions, bones, known, keep)
-        return Edit(known, keep, guide=guide if len(positions.values) else None)
+        guide = PositionGuide(representation, positions, bones, imposed, keep)
+        return Edit(imposed, keep, guide=guide if len(positions.values) else None)
 
     def _bones(self, representation: Representation) -> Tensor:
         """Returns frame, parent and child (3, N) of all bones, in each frame with a target for a joint but the root."""

@@ -155,7 +155,9 @@ class Evaluation:
         for replication in range(self.protocol.replications):
             paired, real = self._real(evaluator, replication)
             if ground_truth:
-                scores.append(self._score(measured, evaluator, paired, paired, real, replication))
+                values, reasons = evaluator.score(paired, paired, real, self._draws(replication))
+                scores.append((values, len(paired)))
+                measured.not_computed |= reasons
             if source is not None:
                 for checked in filter(None, (evaluator, several)):  # before motions are generated
                     checked.check(paired)
@@ -227,7 +229,9 @@ class Evaluation:
                 ids = {row.id for row in samples.rows}
                 paired = _select(paired, [i for i, row in enumerate(rows) if row.id in ids])
             generated = evaluator.extract(self._generated(samples))
-            scores.append(self._score(measured, evaluator, generated, paired, real, replication))
+            values, reasons = evaluator.score(generated, paired, real, self._draws(replication))
+            scores.append((values, len(generated)))
+            measured.not_computed |= reasons
             if not replication:
                 measured.warnings = self._warnings(generated, real)
                 resampled = evaluator.resample(generated, paired, real, self._draws(0), resamples)
@@ -250,7 +254,9 @@ class Evaluation:
                 motions = evaluator.extract(self._generated(source(f"multimodality_{replication}", rows, replication)))
                 real = self._paired(evaluator, rows[:: several.samples])
                 paired = _select(real, [i // several.samples for i in range(len(rows))])
-            scores.append(self._score(measured, evaluator, motions, paired, nothing, replication))
+            values, reasons = evaluator.score(motions, paired, nothing, self._draws(replication))
+            scores.append((values, len(motions)))
+            measured.not_computed |= reasons
         if not generates:
             why = "not computed in a quick evaluation" if self.protocol.quick else "there is one sample per clip"
             measured.not_computed["multimodality"] = f"{why}: it needs several samples per prompt"
@@ -285,20 +291,6 @@ class Evaluation:
     def _draws(self, replication: int) -> int:
         """Returns the seed of the random draws of metrics."""
         return key("draws", self.seed, replication)
-
-    def _score(
-        self,
-        measured: Measured,
-        evaluator: Evaluator,
-        motions: Extracted,
-        paired: Extracted,
-        real: Extracted,
-        replication: int,
-    ) -> tuple[dict[str, float | None], int]:
-        """Returns values and number of motions; adds reasons for missing values to `measured`."""
-        values, reasons = evaluator.score(motions, paired, real, self._draws(replication))
-        measured.not_computed |= reasons
-        return values, len(motions)
 
     def _motions(self, rows: Sequence[Row], features: list[np.ndarray], captions: list[str] | None = None) -> Motions:
         """Returns motions with the conditions of their rows; `captions` replace the captions of the rows."""

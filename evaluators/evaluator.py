@@ -219,7 +219,6 @@ class Evaluator:
 
         Raises:
             UserError: If the motions lack an input that a metric needs.
-            ValueError: If motions do not match in a metric that compares them one by one.
         """
         if not is_first():
             return {}, {}
@@ -287,7 +286,7 @@ class Evaluator:
             for name, metric in metrics.items():
                 try:
                     result = metric.compute()
-                except ValueError as error:
+                except UserError as error:
                     reasons[name] = str(error)
                     metric.reset()
                     result = metric.compute()

@@ -350,12 +350,7 @@ def read_samples(path: Path) -> dict[str, np.ndarray]:
     Raises:
         UserError: If the file is damaged, or an array is missing.
     """
-    try:
-        content = read_npz(path)
-    except UserError:
-        raise
-    except ValueError as error:
-        raise UserError(f"{path}: {error}. Delete it or write it again") from error
+    content = read_npz(path)
     frames = {name: content[name] for name in ("features", "joints") if name in content}
     if not {"ids", "lengths"} <= content.keys() or not frames:
         raise UserError(

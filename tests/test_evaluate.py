@@ -683,9 +683,9 @@ def test_latency_is_that_of_one_motion_at_a_time_after_a_first_one(runs, tmp_pat
     sizes = []
     generate = MotionGeneration.generate
 
-    def counted(self, batch, **options):
+    def counted(self, batch, *args, **options):
         sizes.append(len(batch))
-        return generate(self, batch, **options)
+        return generate(self, batch, *args, **options)
 
     monkeypatch.setattr(MotionGeneration, "generate", counted)
     result = runs.result(tmp_path / "one.json", "protocol=latency")

@@ -14,7 +14,7 @@ from support.runs import TINY
 
 import evaluators.evaluation
 from flame_mdm.__main__ import main
-from flame_mdm.checkpoints.model_files import weights_sha256
+from flame_mdm.checkpoints.model_files import FORMAT, FORMAT_KEY, weights_sha256
 from flame_mdm.commands.tables import outdated
 from flame_mdm.errors import UserError
 from flame_mdm.reporting import tables
@@ -621,7 +621,12 @@ parts:
 def clip_file(folder: Path, weight: float, steps: int) -> str:
     """Writes an extractor and returns the sha256 of its weights."""
     facts = {"actions": [], "max_frames": 60}
-    content = {"config": {"experiment": "motion_clip/synthetic"}, "facts": facts, "global_step": steps}
+    content = {
+        "config": {"experiment": "motion_clip/synthetic"},
+        "facts": facts,
+        "global_step": steps,
+        FORMAT_KEY: FORMAT,
+    }
     torch.save(content | {"state_dict": {"w": torch.tensor([weight])}}, folder / "clip.ckpt")
     return weights_sha256(folder / "clip.ckpt")
 

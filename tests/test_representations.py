@@ -1,17 +1,22 @@
 import itertools
 import math
-from pathlib import Path
+import re
 
 import numpy as np
 import pytest
 import torch
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
-from support.fixtures import ROOT, SHARED, Arrays, golden, groups, load, needs_third_party, third_party
+from support.fixtures import ROOT, SHARED, Arrays, golden, groups, load, meta, needs_third_party, third_party
 from torch import Tensor
+from torch.nn import functional
 
+from flame_mdm.errors import UserError
 from flame_mdm.representations import Representation, rotation
+from flame_mdm.representations.essential import Essential
 from flame_mdm.representations.humanml import HumanML
+from flame_mdm.representations.motion272 import Motion272, face_forward
+from flame_mdm.representations.rifke import Rifke, upsample
 from flame_mdm.representations.rot6d import Rot6D
 from flame_mdm.representations.skeleton import KIT21, SKELETONS, SMPL22, SMPL24, forward_kinematics, global_rotations
 from flame_mdm.representations.smpl import ADULT, SMPL
@@ -37,14 +42,14 @@ def arrays(stem: str) -> Arrays:
     return FIXTURES[stem](stem.removeprefix("third_party-"))
 
 
-def cases(key: str) -> list:
-    """(fixture, clip) of every clip that holds `key`."""
-    return [
-        pytest.param(stem, clip, id=f"{stem}-{clip}", marks=[needs_third_party] if "third" in stem else [])
-        for stem in FIXTURES
-        for clip in groups(arrays(stem), key) or ["absent"]
-        if clip != "absent" or ("third" in stem and not SHARED.is_dir())
-    ]
+stems = pytest.mark.parametrize(
+    "stem", [pytest.param(stem, marks=[needs_third_party] if "third" in stem else []) for stem in FIXTURES]
+)
+
+
+def clips(stem: str, key: str) -> list[str]:
+    """The clips of a fixture that have `key`."""
+    return groups(arrays(stem), key)
 
 
 def legacy(stem: str) -> tuple[HumanML, Tensor]:
@@ -122,12 +127,11 @@ def test_skeleton_constants(stem: str):
 
 
 @pytest.mark.golden
-@pytest.mark.parametrize(
-    "clip", [clip for clip in groups(golden("hml263"), "joints_in") if "mirror" in clip], ids=lambda v: f"hml263-{v}"
-)
-def test_mirrored_joints(clip: str):
-    joints = fixture("hml263", clip.removesuffix("_mirror"), "joints_in")
-    assert torch.equal(SMPL22.mirror(joints), fixture("hml263", clip, "joints_in"))
+@pytest.mark.parametrize("stem", ["hml263"])
+def test_mirrored_joints(stem: str):
+    for clip in [clip for clip in clips(stem, "joints_in") if clip.endswith("_mirror")]:
+        joints = fixture(stem, clip.removesuffix("_mirror"), "joints_in")
+        assert torch.equal(SMPL22.mirror(joints), fixture(stem, clip, "joints_in"))
 
 
 @pytest.mark.parametrize("skeleton", SKELETONS.values(), ids=lambda s: s.name)
@@ -165,64 +169,49 @@ def test_forward_kinematics_is_the_sum_over_the_chain():
 
 
 @pytest.mark.golden
-@pytest.mark.parametrize(("stem", "clip"), cases("joints_in"))
-def test_published_features(stem: str, clip: str):
+@stems
+def test_published_features(stem: str):
     representation, _ = legacy(stem)
-    features = representation.encode(fixture(stem, clip, "joints_in"))
-    expected = fixture(stem, clip, "feats")
-    assert features.dtype == torch.float32
-    assert features.shape == expected.shape == (len(expected), representation.features)
     tolerances = KIT_TOLERANCE if stem.startswith("kit") else HUMANML_TOLERANCE
-    for name, columns in representation.slices.items():
-        close(features[:, columns], expected[:, columns], tolerances[name])
+    for clip in clips(stem, "joints_in"):
+        features, expected = representation.encode(fixture(stem, clip, "joints_in")), fixture(stem, clip, "feats")
+        assert features.dtype == torch.float32
+        assert features.shape == expected.shape == (len(expected), representation.features)
+        for name, columns in representation.slices.items():
+            close(features[:, columns], expected[:, columns], tolerances[name])
 
 
 @pytest.mark.golden
-@pytest.mark.parametrize(("stem", "clip"), cases("global_positions"))
-def test_published_canonical_joints(stem: str, clip: str):
-    canonical = legacy(stem)[0].canonicalize(fixture(stem, clip, "joints_in"))
-    close(canonical, fixture(stem, clip, "global_positions"), position_tolerance(stem))
+@stems
+def test_published_steps_of_encoding(stem: str):
+    representation, atol = legacy(stem)[0], position_tolerance(stem)
+    for clip in clips(stem, "global_positions"):
+        canonical = representation.canonicalize(fixture(stem, clip, "joints_in"))
+        close(canonical, fixture(stem, clip, "global_positions"), atol)
+    for clip in clips(stem, "uniform"):
+        joints = fixture(stem, clip, "joints_in").double()
+        one_clip = torch.zeros(len(joints), dtype=torch.int64)
+        retargeted = representation._retarget(joints, torch.tensor([0]), one_clip)
+        close(retargeted, fixture(stem, clip, "uniform"), atol)
+    for clip in clips(stem, "ik_root"):
+        expected = fixture(stem, clip, "ik_root")
+        actual = yaw_quaternion(-representation._heading(fixture(stem, clip, "global_positions").double()))
+        close(actual * (actual * expected).sum(-1, keepdim=True).sign(), expected, 1e-5)
 
 
 @pytest.mark.golden
-@pytest.mark.parametrize(("stem", "clip"), cases("uniform"))
-def test_published_retargeting(stem: str, clip: str):
-    joints = fixture(stem, clip, "joints_in").double()
-    one_clip = torch.zeros(len(joints), dtype=torch.int64)
-    retargeted = legacy(stem)[0]._retarget(joints, torch.tensor([0]), one_clip)
-    close(retargeted, fixture(stem, clip, "uniform"), position_tolerance(stem))
-
-
-@pytest.mark.golden
-@pytest.mark.parametrize(("stem", "clip"), cases("ik_root"))
-def test_published_root_rotation(stem: str, clip: str):
-    heading = legacy(stem)[0]._heading(fixture(stem, clip, "global_positions").double())
-    expected = fixture(stem, clip, "ik_root")
-    actual = yaw_quaternion(-heading)
-    close(actual * (actual * expected).sum(-1, keepdim=True).sign(), expected, 1e-5)
-
-
-@pytest.mark.golden
-@pytest.mark.parametrize(("stem", "clip"), cases("rec_ric"))
-def test_published_joints(stem: str, clip: str):
-    features = fixture(stem, clip, "feats")
-    close(legacy(stem)[0].decode(features), fixture(stem, clip, "rec_ric"), position_tolerance(stem))
-
-
-@pytest.mark.golden
-@pytest.mark.parametrize(("stem", "clip"), cases("root_quat"))
-def test_published_root(stem: str, clip: str):
-    heading, position = legacy(stem)[0]._root(fixture(stem, clip, "feats"))
-    close(yaw_quaternion(-heading), fixture(stem, clip, "root_quat"), 1e-5)
-    close(position, fixture(stem, clip, "root_pos"), position_tolerance(stem))
-
-
-@pytest.mark.golden
-@pytest.mark.parametrize(("stem", "clip"), cases("rec_rot"))
-def test_published_joints_from_rotations(stem: str, clip: str):
-    representation, lengths = legacy(stem)
-    joints = decode_rotations(representation, fixture(stem, clip, "feats"), lengths)
-    close(joints, fixture(stem, clip, "rec_rot"), position_tolerance(stem))
+@stems
+def test_published_steps_of_decoding(stem: str):
+    (representation, lengths), atol = legacy(stem), position_tolerance(stem)
+    for clip in clips(stem, "rec_ric"):
+        close(representation.decode(fixture(stem, clip, "feats")), fixture(stem, clip, "rec_ric"), atol)
+    for clip in clips(stem, "root_quat"):
+        heading, position = representation._root(fixture(stem, clip, "feats"))
+        close(yaw_quaternion(-heading), fixture(stem, clip, "root_quat"), 1e-5)
+        close(position, fixture(stem, clip, "root_pos"), atol)
+    for clip in clips(stem, "rec_rot"):
+        joints = decode_rotations(representation, fixture(stem, clip, "feats"), lengths)
+        close(joints, fixture(stem, clip, "rec_rot"), atol)
 
 
 @pytest.mark.golden
@@ -434,14 +423,14 @@ def test_features_of_joints():
         (torch.zeros(2, 22, 3), "2 frames"),
         (torch.zeros(5, 21, 3), r"\(5, 21, 3\).*\(frames, 22, 3\)"),
         (torch.zeros(5, 66), r"\(5, 66\)"),
-        (torch.full((5, 22, 3), math.nan), "frame 0 are not finite"),
-        (torch.zeros(5, 22, 3).index_fill(0, torch.tensor([3]), math.inf), "frame 3 are not finite"),
+        (torch.full((5, 22, 3), math.nan), "numbers in frame 0 are not finite"),
+        (torch.zeros(5, 22, 3).index_fill(0, torch.tensor([3]), math.inf), "numbers in frame 3 are not finite"),
     ],
 )
 def test_bad_motions(motion: Tensor, message: str):
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(UserError, match=message):
         HumanML().encode(motion)
-    with pytest.raises(ValueError, match=f"motion 1: .*{message}"):
+    with pytest.raises(UserError, match=f"motion 1: .*{message}"):
         HumanML().encode_many([wander(), motion])
 
 
@@ -454,7 +443,7 @@ def test_bad_motions(motion: Tensor, message: str):
     ],
 )
 def test_bad_options(options: dict, message: str):
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(UserError, match=message):
         HumanML(**options)
 
 
@@ -479,42 +468,21 @@ def test_flame_features_of_published_samples(clip: str):
     close(features, torch.from_numpy(third_party("smpl147")[f"{clip}/feats147"]), 4e-4)  # as stored by their authors
 
 
-def action_clips(prefix: str) -> list:
-    keys = [key.removeprefix(f"a2m/{prefix}") for key in golden("smpl147") if key.startswith(f"a2m/{prefix}")]
-    return [pytest.param(number, id=f"smpl147-{prefix}{number}") for number in keys]
-
-
-def action_motion(number: str) -> Tensor:
-    joints, pose = (torch.from_numpy(golden("smpl147")[f"a2m/{key}_{number}"]) for key in ("joints3d", "pose72"))
-    return torch.cat([joints[:, 0], pose], 1)
-
-
-def action_features(key: str) -> Tensor:
-    """(25, 6, F) of the fixture -> (F, 150)."""
-    return torch.from_numpy(golden("smpl147")[f"a2m/{key}"]).permute(2, 0, 1).flatten(1)
-
-
 @pytest.mark.golden
-@pytest.mark.parametrize("number", action_clips("inp_"))
-def test_action_features_of_consecutive_frames(number: str):
-    motion, expected = action_motion(number), action_features(f"inp_{number}")
-    start = max(int(golden("smpl147")[f"a2m/shift_draw_{number}"][2]), 0)
-    frames = (start + torch.arange(len(expected))).clamp(max=len(motion) - 1)
-    close(Rot6D().encode(motion[frames]), expected, 2e-6)
-
-
-@pytest.mark.golden
-@pytest.mark.parametrize("number", action_clips("rc_inp_"))
-def test_action_features_of_skipped_frames(number: str):
-    motion, expected = action_motion(number), action_features(f"rc_inp_{number}")
-    step, start = (int(draw[2]) for draw in golden("smpl147")[f"a2m/rc_draws_{number}"])
-    close(Rot6D().encode(motion[start::step][: len(expected)]), expected, 2e-6)
-
-
-@pytest.mark.golden
-@pytest.mark.parametrize("number", action_clips("full_inp_"))
-def test_action_features_of_whole_clips(number: str):
-    close(Rot6D().encode(action_motion(number)), action_features(f"full_inp_{number}"), 2e-6)
+@pytest.mark.parametrize("stem", ["smpl147"])
+def test_action_features_of_consecutive_skipped_and_all_frames(stem: str):
+    file = {key: torch.from_numpy(value) for key, value in golden(stem).items() if key.startswith("a2m/")}
+    cases = [re.fullmatch(r"a2m/(|rc_|full_)inp_(\w+)", key) for key in file]
+    for kind, number in [case.groups() for case in cases if case]:
+        motion = torch.cat([file[f"a2m/joints3d_{number}"][:, 0], file[f"a2m/pose72_{number}"]], 1)
+        expected = file[f"a2m/{kind}inp_{number}"].permute(2, 0, 1).flatten(1)  # (25, 6, F) -> (F, 150)
+        if kind == "":
+            start = max(int(file[f"a2m/shift_draw_{number}"][2]), 0)
+            motion = motion[(start + torch.arange(len(expected))).clamp(max=len(motion) - 1)]
+        elif kind == "rc_":
+            step, start = (int(draw[2]) for draw in file[f"a2m/rc_draws_{number}"])
+            motion = motion[start::step][: len(expected)]
+        close(Rot6D().encode(motion), expected, 2e-6)
 
 
 @pytest.mark.parametrize("representation", [SMPL(), Rot6D()], ids=lambda r: r.name)
@@ -540,28 +508,249 @@ def test_smpl_bodies_stand_upright(representation: SMPL | Rot6D):
     assert features.grad.isfinite().all()
 
 
-@pytest.mark.parametrize("representation", [SMPL(), Rot6D()], ids=lambda r: r.name)
 @pytest.mark.parametrize(
-    ("motion", "message"),
+    ("representations", "motion", "message"),
     [
-        (torch.zeros(4, 69), r"\(4, 69\)"),
-        (torch.zeros(0, 75), r"\(0, 75\)"),
-        (torch.zeros(4, 75).index_fill(0, torch.tensor([2]), math.nan), "frame 2"),
+        ([SMPL(), Rot6D()], torch.zeros(4, 69), r"\(4, 69\)"),
+        ([SMPL(), Rot6D()], torch.zeros(0, 75), r"\(0, 75\)"),
+        ([SMPL(), Rot6D()], torch.zeros(4, 75).index_fill(0, torch.tensor([2]), math.nan), "frame 2"),
+        ([Motion272()], torch.zeros(1, 75), "1 frame, but encoding needs at least 2"),
+        ([Rifke()], torch.zeros(5, 22, 3), r"shape \(5, 22, 3\), but rifke takes \(frames, 21, 3\)"),
+        ([Rifke()], torch.zeros(0, 21, 3), r"shape \(0, 21, 3\)"),
+        ([Rifke()], torch.full((5, 21, 3), torch.nan), "numbers in frame 0 are not finite"),
     ],
 )
-def test_bad_poses(representation: SMPL | Rot6D, motion: Tensor, message: str):
-    with pytest.raises(ValueError, match=message):
-        representation.encode(motion)
+def test_bad_raw_motions(representations: list[Representation], motion: Tensor, message: str):
+    for representation in representations:
+        with pytest.raises(UserError, match=message):
+            representation.encode(motion)
 
 
 # All representations
 
 
-@pytest.mark.parametrize("path", sorted(ROOT.glob("experiments/representation/*.yaml")), ids=lambda path: path.stem)
-def test_every_recipe_builds(path: Path):
-    representation = instantiate(OmegaConf.load(path))
-    assert isinstance(representation, Representation)
-    assert representation.mean.shape == representation.std.shape == (representation.features,)
-    joints = representation.to_joints(torch.randn(2, 5, representation.features))
-    assert joints.shape == (2, 5, len(representation.skeleton), 3)
-    assert joints.isfinite().all()
+def test_every_recipe_builds_decodes_and_passes_gradients():
+    for path in sorted(ROOT.glob("experiments/representation/*.yaml")):
+        representation = instantiate(OmegaConf.load(path))
+        assert isinstance(representation, Representation), path
+        size, joints = representation.features, len(representation.skeleton)
+        assert representation.mean.shape == representation.std.shape == (size,)
+        x = torch.randn(2, 5, size, requires_grad=True)
+        decoded = representation.to_joints(x)
+        assert decoded.shape == (2, 5, joints, 3)
+        assert decoded.isfinite().all()
+        longer = representation.to_joints(torch.cat([x, torch.randn(2, 3, size)], 1))
+        close(longer[:, :5], decoded, 1e-5)  # padding does not reach the frames before it
+        close(representation.to_joints(x[1]), decoded[1], 1e-5)
+        (gradient,) = torch.autograd.grad(decoded.square().sum(), x)
+        assert gradient.isfinite().all()
+        assert gradient.any()
+        owners = torch.stack([representation.joint_features([joint]) for joint in range(joints)])
+        assert owners.shape == (joints, size)
+        assert (owners.sum(0) >= 1).all()
+
+
+# TEMOS's features ---------------------------------------------------------------------------------------------------
+
+TEMOS = "temos64"
+temos = pytest.mark.parametrize("stem", [TEMOS])
+
+
+def in_kit_units(key: str) -> Tensor:
+    return torch.from_numpy(golden(TEMOS)[key])
+
+
+def temos_clips() -> dict[str, Tensor]:
+    """Joints in meters by clip."""
+    return {name: in_kit_units(f"{name}/joints_in").double() / 640 for name in groups(golden(TEMOS), "joints_in")}
+
+
+@pytest.mark.golden
+@temos
+def test_features_floor_heading_and_joints_are_temos(stem: str):
+    rifke, atol = Rifke(), 2e-3  # in KIT's unit, about 1.6 mm
+    for name, joints in temos_clips().items():
+        close(rifke.encode(joints), in_kit_units(f"{name}/feats"), atol)
+        close(rifke.floor(joints * 640)[None], in_kit_units(f"{name}/floor"), atol)
+        heading = rifke.heading(joints * 640)
+        close(torch.stack([heading.sin(), heading.cos()], 1), in_kit_units(f"{name}/forward_used"), 1e-5)
+        # the soft floor depends on the unit
+        meters = Rifke(units_per_metre=1.0).encode(joints * 0.64)
+        close(meters, in_kit_units(f"{name}/feats_metres_input"), 1e-5)
+        close(rifke.decode(in_kit_units(f"{name}/feats").double()) * 640, in_kit_units(f"{name}/joints_back"), atol)
+    close(rifke.decode(in_kit_units("gen/feats").double()) * 640, in_kit_units("gen/joints_back"), atol)
+    close(upsample(in_kit_units("upsample/in").double()), in_kit_units("upsample/out_12.5_to_100"), 1e-9)
+
+
+@pytest.mark.golden
+@temos
+def test_padding_enters_the_floor_of_a_batch_in_temos(stem: str):
+    features, clips = in_kit_units("batch/feats_padded"), temos_clips().values()
+    for row, length in enumerate(in_kit_units("batch/lengths").tolist()):
+        padded = [functional.pad(c, (0, 0, 0, 0, 0, features.shape[1] - length)) for c in clips if len(c) == length]
+        errors = [(Rifke().encode(p)[:length] - features[row, :length]).abs().max() for p in padded]
+        assert min(errors) < 2e-3
+    close(Rifke().decode(features.double()) * 640, in_kit_units("batch/joints_back_padded"), 2e-3)
+
+
+@pytest.mark.golden
+@temos
+def test_normalization_is_temos(stem: str):
+    rifke, x = Rifke(), in_kit_units("norm/feats_clip0")
+    rifke.mean.copy_(in_kit_units("norm/mean"))
+    rifke.std.copy_(in_kit_units("norm/std"))
+    ours = rifke.normalize(rifke.encode(next(iter(temos_clips().values()))))
+    close(ours * rifke.std, x * rifke.std, 2e-3)
+    close(rifke.to_joints(x) * 640, in_kit_units("norm/joints_back_clip0"), 5e-3)
+
+
+def rigid_walk(frames: int, facing: float, turn: float) -> Tensor:
+    """A rigid body whose knees, elbows, hips and shoulders all face one way, walking ahead and turning."""
+    body = torch.from_numpy(np.random.default_rng(1).normal([0, 1, 0], 0.3, (21, 3)))
+    for left, right in ((11, 16), (5, 8), (12, 17), (6, 9)):
+        body[left], body[right] = torch.tensor([-0.2, 1, 0.1]), torch.tensor([0.2, 1, 0.1])
+    body[0] = torch.tensor([0, 0.9, 0])
+    steps = torch.arange(frames)[:, None].double()
+    turned = rotation.rotate_y(body.expand(frames, 21, 3), facing + turn * steps)
+    ahead = torch.tensor([math.sin(facing), 0.0, math.cos(facing)], dtype=torch.float64)
+    return turned + 0.05 * steps[..., None] * ahead
+
+
+@pytest.mark.parametrize(("facing", "turn"), [(0.0, 0.0), (1.0, 0.02), (-3.0, 0.3), (3.1, -0.4)])
+def test_rifke_comes_back_canonical(facing: float, turn: float):
+    rifke, joints, canonical = Rifke(), rigid_walk(50, facing, turn), rigid_walk(50, 0.0, turn)
+    features = rifke.encode(joints)
+    canonical[..., 1] -= rifke.floor(joints * 640) / 640
+    close(rifke.decode(features.double()), canonical, 1e-5)
+    turns = torch.remainder(features[1:, 61] - turn + 1, 2 * math.pi) - 1
+    close(turns, torch.zeros(49), 1e-5)
+
+
+def test_full_turns_stay_in_rifke_as_published():
+    assert float(Rifke().encode(rigid_walk(50, 3.0, 0.1))[:, 61].min()) < -6
+
+
+def test_rifke_features_that_do_not_vary_are_divided_by_one():
+    features = torch.randn(100, 64, generator=torch.Generator().manual_seed(0))
+    features[:, 3] = 2.0
+    mean, std = Rifke().statistics(features)
+    assert float(std[3]) == 1
+    close(std[:3], features[:, :3].std(0), 1e-6)
+    close(mean, features.mean(0), 1e-6)
+    assert Rifke().joint_features([0, 2]).nonzero()[:, 0].tolist() == [0, 4, 5, 6, 61, 62, 63]
+
+
+# MotionStreamer's and MARDM's features ------------------------------------------------------------------------------
+
+FIXTURE272 = golden("motion272")
+stem272 = pytest.mark.parametrize("stem", ["motion272"])
+
+
+def array(name: str) -> Tensor:
+    return torch.from_numpy(FIXTURE272[name]).double()
+
+
+def pose(name: str) -> tuple[Tensor, Tensor]:
+    """Translation and rotation matrices of an array of 22 axis-angles, 6 zeros and a translation."""
+    values = array(name)
+    return values[:, 72:75], rotation.axis_angle_to_matrix(values[:, :66].unflatten(1, (22, 3)))
+
+
+def cases272(suffix: str) -> list[str]:
+    return [name.partition("/")[2] for name in groups(FIXTURE272, suffix) if not name.startswith("f64/")]
+
+
+@pytest.mark.golden
+@stem272
+def test_motion272_is_the_authors(stem: str):
+    representation = Motion272()
+    for case in cases272("face_z"):
+        translation, rotations = face_forward(*pose(f"in/{case}/smpl_85"))
+        theirs, turned = pose(f"out/{case}/face_z")
+        close(translation, theirs, 5e-6)
+        close(rotations, turned, 1e-5)
+        features = representation.features_of(array(f"in/{case}/joints"), turned)
+        close(features, array(f"out/{case}/feats"), 2e-6)
+    for case in cases272("rec_positions"):
+        features = array(f"{'in' if f'in/{case}/feats' in FIXTURE272 else 'out'}/{case}/feats")
+        close(representation.decode(features), array(f"out/{case}/rec_positions"), 5e-6)
+        pelvis, rotations = representation.poses(features)
+        theirs, turned = pose(f"f64/{case}/rec_smpl_85")
+        close(pelvis, theirs, 1e-5)
+        close(rotations, turned, 1e-5)
+    frames = torch.cat([array(f"out/{case}/feats") for case in meta(FIXTURE272)["config"]["stats_over"]])
+    for ours, name in zip(representation.statistics(frames.float()), ("mean", "std"), strict=True):
+        close(ours, array(f"out/stats/{name}"), 1e-6)
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize("stem", ["essential67"])
+def test_essential_features_are_the_authors(stem: str):
+    file = {key: torch.from_numpy(value) for key, value in golden(stem).items() if value.dtype.kind in "fi"}
+    features, representation = file["in/feats"], Essential(variant="legacy")
+    representation.mean, representation.std = file["in/mean"], file["in/std"]
+    real = torch.arange(features.shape[1]) < file["in/lengths"][:, None]
+    x = representation.normalize(features[..., : representation.features]) * real[..., None]
+    close(x, file["out/normed"], 5e-6)
+    close(representation.denormalize(x), file["out/inv"], 5e-6)
+    close(representation.decode(features[..., :67]), file["out/joints_from_67"], 5e-6)
+    kit = Essential("kit21", "legacy")
+    assert torch.equal(file["in/kit_feats"][..., : kit.features], file["out/kit_slice"])
+
+
+def raw(frames: int = 50, seed: int = 0) -> Tensor:
+    """A raw motion, z up: a body of 24 joints that walks in a circle and bends its joints."""
+    generator = torch.Generator().manual_seed(seed)
+    time = torch.linspace(0, 1, frames, dtype=torch.float64)
+    turns = 0.4 * torch.randn(24, 3, generator=generator).double() * torch.sin(6 * time)[:, None, None]
+    up = rotation.axis_angle_to_matrix(torch.tensor([torch.pi / 2, 0, 0], dtype=torch.float64))
+    about = rotation.axis_angle_to_matrix(5 * time[:, None] * torch.tensor([0, 0, 1.0], dtype=torch.float64))
+    turns[:, 0] = rotation.matrix_to_axis_angle(about @ up @ rotation.axis_angle_to_matrix(turns[:, 0]))
+    way = torch.stack([3 * torch.sin(5 * time), 3 * torch.cos(5 * time), 1 + 0.1 * torch.sin(20 * time)], 1)
+    return torch.cat([way, turns.flatten(1)], 1)
+
+
+def distances(joints: Tensor) -> Tensor:
+    """Distances of all points of a motion (F, J, 3)."""
+    return torch.cdist(joints.flatten(0, 1), joints.flatten(0, 1))
+
+
+def test_motion272_comes_back_up_to_place_and_heading():
+    representation, motion = Motion272(), raw()
+    features = representation.encode(motion).double()
+    offsets = torch.tensor(ADULT, dtype=torch.float64)[:22]
+    rotations = rotation.axis_angle_to_matrix(motion[:, 3:69].unflatten(1, (22, 3)))
+    world = forward_kinematics(SMPL22, rotations, offsets, motion[:, :3])[..., [1, 2, 0]]  # z up -> y up
+    joints = representation.decode(features)
+    assert joints[..., 1].min().item() == pytest.approx(0, abs=1e-6)
+    assert joints[0, 0, [0, 2]].abs().max() < 1e-6
+    close(distances(joints), distances(world), 1e-4)
+    pelvis, turns = representation.poses(features)
+    close(forward_kinematics(SMPL22, turns, offsets, pelvis), joints, 1e-5)
+    assert turns[0, 0, 0, 2].abs() < 1e-6
+    assert turns[0, 0, 2, 2] > 0, "the root faces +z in the first frame"
+    turn = rotation.axis_angle_to_matrix(torch.tensor([0, 0, 2.0], dtype=torch.float64))
+    moved = motion.clone()
+    moved[:, :3] = motion[:, :3] @ turn.T + torch.tensor([4.0, -2.0, 0.3])
+    moved[:, 3:6] = rotation.matrix_to_axis_angle(turn @ rotation.axis_angle_to_matrix(motion[:, 3:6]))
+    close(representation.encode(moved), features, 2e-6)
+
+
+def test_cuts_of_motion272_start_like_whole_motions():
+    representation = Motion272()
+    features = representation.encode(raw())
+    cut = representation.rebase(features[20:])
+    close(cut[1:], features[21:], 0)
+    assert not cut[0, :2].any()
+    joints, whole = representation.decode(cut.double()), representation.decode(features.double())[20:]
+    assert joints[0, 0, [0, 2]].abs().max() == 0
+    close(distances(joints), distances(whole), 1e-4)
+
+
+def test_essential_features_are_the_first_of_humanml():
+    joints, representation, whole = wander(frames=30), Essential(), HumanML()
+    features = representation.encode(joints)
+    assert torch.equal(features, whole.encode(joints)[:, :67])
+    assert torch.equal(representation.decode(features), whole.decode(whole.encode(joints)))
+    assert [len(x) for x in representation.statistics(features)] == [67, 67]
+    assert representation.part_of == whole.name != representation.name

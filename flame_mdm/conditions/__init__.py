@@ -36,7 +36,7 @@ class ConditionEncoder(nn.Module, ABC):
         """Opens the cache that `precompute` filled. Called in every process.
 
         Raises:
-            FileNotFoundError: there is no cache for these captions.
+            FileNotFoundError: If there is no cache for these captions.
             ValueError: the cache is damaged.
         """
 

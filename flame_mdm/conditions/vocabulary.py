@@ -51,12 +51,12 @@ def advice(text: str, facts: Mapping[str, Any], max_words: int | None = None) ->
 
     Args:
         text: the prompt.
-        facts: of the checkpoint; older checkpoints have no vocabulary, and nothing is said about them.
+        facts: of the checkpoint; imported models have no vocabulary, and their words are not checked.
         max_words: maximum number of words that the text encoder reads; None = no such limit.
     """
     lines, prompt = [], words(text)
-    known = set(facts.get("vocabulary", prompt))
-    if unseen := [word for word in dict.fromkeys(prompt) if word not in known]:
+    seen = set(facts.get("vocabulary", prompt))
+    if unseen := [word for word in dict.fromkeys(prompt) if word not in seen]:
         line = f"never seen in training: {', '.join(unseen)}. The model guesses from the other words"
         near = ", ".join(f"'{caption}'" for caption in nearest(text, facts.get("captions", ())))
         lines.append(line + f". The nearest training captions: {near}" * bool(near))

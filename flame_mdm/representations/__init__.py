@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from flame_mdm.errors import UserError
 from flame_mdm.representations.skeleton import Skeleton
 
 Features = TypeVar("Features", np.ndarray, Tensor)
@@ -58,7 +59,7 @@ class Representation(nn.Module, ABC):
         """`name` is saved in stores and checkpoints; features with different names are never mixed."""
         super().__init__()
         if not isinstance(fps, int | float) or not 1 <= fps <= 1000:
-            raise ValueError(f"representation.fps={fps}: frames per second must be a number from 1 to 1000")
+            raise UserError(f"representation.fps={fps}: frames per second must be a number from 1 to 1000")
         self.name, self.features, self.fps, self.skeleton = name, features, fps, skeleton
         self.register_buffer("mean", torch.zeros(features))
         self.register_buffer("std", torch.ones(features))
@@ -75,13 +76,19 @@ class Representation(nn.Module, ABC):
     def decode(self, features: Tensor) -> Tensor:
         """Decodes features (..., F, D) in the data's units to joints (..., F, J, 3), meters, y up. Differentiable."""
 
-    @abstractmethod
     def statistics(self, features: Tensor | Frames) -> tuple[Tensor, Tensor]:
-        """Returns mean and std (D,) for normalization, from all training frames (N, D)."""
+        """Returns mean and std (D,) for normalization, from all training frames (N, D); by default 0 and 1."""
+        return torch.zeros(self.features), torch.ones(self.features)
 
     @abstractmethod
     def joint_features(self, joints: Iterable[int]) -> Tensor:
         """Returns (D,) bool, True for features of these joints; features of the root trajectory belong to joint 0."""
+
+    def joint_mask(self, joints: Iterable[int]) -> Tensor:
+        """Returns (J,) bool, True for these joints."""
+        mask = torch.zeros(len(self.skeleton), dtype=torch.bool)
+        mask[list(joints)] = True
+        return mask
 
     def contacts(self, features: Features) -> Features | None:
         """Returns the columns (..., F, N) of features for contacts of `skeleton.feet` with the floor, about 0 to 1.
@@ -108,6 +115,13 @@ class Representation(nn.Module, ABC):
         return self.decode(self.denormalize(x))
 
 
+def check_finite(motion: Tensor, name: str = "motion") -> None:
+    """Raises `UserError` if a raw motion (F, ...) has a number that is not finite."""
+    if not motion.isfinite().all():
+        frame = int((~motion.isfinite()).flatten(1).any(1).nonzero()[0, 0])
+        raise UserError(f"{name}: numbers in frame {frame} are not finite; leave the motion out")
+
+
 SMALLEST_STD = 1e-4
 """A group of features with a smaller std is constant up to rounding (positions in KIT's units round to 3e-5)."""
 
@@ -117,12 +131,16 @@ def grouped_statistics(features: Tensor | Frames, groups: Iterable[slice]) -> tu
 
     A constant group (`SMALLEST_STD`) gets std 1, so that rounding errors are not amplified.
     """
-    size, zero = 1 << 16, torch.zeros(())  # the frames of a data set would not fit in memory
-    mean = sum((chunk.double().sum(0) for chunk in features.split(size)), zero) / len(features)
-    squares = (chunk.double().sub_(mean).square_().sum(0) for chunk in features.split(size))
-    variance = sum(squares, zero) / len(features)
-    std = variance.sqrt()
+    mean, squares = moments(features)
+    std = (squares / len(features)).sqrt()
     for columns in groups:
         average = std[columns].mean()
         std[columns] = average if average > SMALLEST_STD else 1.0
     return mean.float(), std.float()
+
+
+def moments(features: Tensor | Frames) -> tuple[Tensor, Tensor]:
+    """Returns the mean (D,) of frames (N, D) and the sum (D,) of squared deviations from it, float64."""
+    size, zero = 1 << 16, torch.zeros(())  # the frames of a data set would not fit in memory
+    mean = sum((chunk.double().sum(0) for chunk in features.split(size)), zero) / len(features)
+    return mean, sum((chunk.double().sub_(mean).square_().sum(0) for chunk in features.split(size)), zero)

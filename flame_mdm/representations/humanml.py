@@ -9,7 +9,8 @@ import torch.nn.functional as F
 from scipy.ndimage import gaussian_filter1d
 from torch import Tensor
 
-from flame_mdm.representations import Frames, Representation, grouped_statistics, rotation
+from flame_mdm.errors import UserError
+from flame_mdm.representations import Frames, Representation, check_finite, grouped_statistics, rotation
 from flame_mdm.representations.skeleton import SKELETONS
 
 LEGACY_SMOOTHING_FRAMES = 20
@@ -69,15 +70,15 @@ class HumanML(Representation):
                 in contact: 0.002 for HumanML3D, 0.05 for KIT.
 
         Raises:
-            ValueError: the skeleton or variant is unknown, or the number of bone lengths is wrong.
+            UserError: If the skeleton or variant is unknown, or the number of bone lengths is wrong.
         """
         if skeleton not in SKELETONS:
-            raise ValueError(f"skeleton: {skeleton!r} is unknown; use one of {', '.join(SKELETONS)}")
+            raise UserError(f"skeleton: {skeleton!r} is unknown; use one of {', '.join(SKELETONS)}")
         if variant not in ("clean", "legacy"):
-            raise ValueError(f"variant: {variant!r} is unknown; use clean or legacy")
+            raise UserError(f"variant: {variant!r} is unknown; use clean or legacy")
         joints = len(SKELETONS[skeleton])
         if bone_lengths is not None and len(bone_lengths) != joints:
-            raise ValueError(f"bone_lengths: {len(bone_lengths)} numbers for the {joints} joints of {skeleton}")
+            raise UserError(f"bone_lengths: {len(bone_lengths)} numbers for the {joints} joints of {skeleton}")
         widths = {
             "turn": 1,
             "root_velocity": 2,
@@ -98,7 +99,7 @@ class HumanML(Representation):
         """Encodes joints (T, J, 3) in meters, y up, as features (T - 1, D) float32.
 
         Raises:
-            ValueError: fewer than 3 frames, another number of joints, or non-finite coordinates.
+            UserError: If fewer than 3 frames, another number of joints, or non-finite coordinates.
         """
         return self.encode_many([motion])[0]
 
@@ -129,7 +130,7 @@ class HumanML(Representation):
         """Returns canonical joints (T, J, 3) float64 of joints (T, J, 3) in meters, equal to `decode(encode(motion))`.
 
         Raises:
-            ValueError: as in `encode`.
+            UserError: If as in `encode`.
         """
         return self._canonical([motion])[0] / self.units_per_metre
 
@@ -153,8 +154,7 @@ class HumanML(Representation):
 
         For the lower body, including the root, this equals MDM's `HML_LOWER_BODY_MASK`.
         """
-        part = torch.zeros(len(self.skeleton), dtype=torch.bool)
-        part[list(joints)] = True
+        part = self.joint_mask(joints)
         feet = part[list(self.skeleton.feet)]
         return torch.cat(
             [part[:1].expand(4), *(part[1:].repeat_interleave(n) for n in (3, 6)), part.repeat_interleave(3), feet]
@@ -165,14 +165,12 @@ class HumanML(Representation):
         for number, motion in enumerate(motions):
             name = f"motion {number}" if len(motions) > 1 else "motion"
             if motion.ndim != 3 or motion.shape[1:] != (len(self.skeleton), 3):
-                raise ValueError(
+                raise UserError(
                     f"{name}: shape {tuple(motion.shape)}, but {self.name} takes (frames, {len(self.skeleton)}, 3)"
                 )
             if len(motion) < 3:
-                raise ValueError(f"{name}: {len(motion)} frames, but encoding needs at least 3; leave the motion out")
-            if not motion.isfinite().all():
-                frame = int((~motion.isfinite()).flatten(1).any(1).nonzero()[0, 0])
-                raise ValueError(f"{name}: coordinates in frame {frame} are not finite; leave the motion out")
+                raise UserError(f"{name}: {len(motion)} frames, but encoding needs at least 3; leave the motion out")
+            check_finite(motion, name)
         lengths = [len(motion) for motion in motions]
         clip = torch.arange(len(motions)).repeat_interleave(torch.tensor(lengths))
         first = torch.tensor([0, *lengths[:-1]]).cumsum(0)

@@ -6,6 +6,7 @@ from copy import deepcopy
 import torch
 from torch import Tensor
 
+from flame_mdm.errors import UserError
 from flame_mdm.representations import Features, Frames, Representation, grouped_statistics, rotation
 from flame_mdm.representations.skeleton import SMPL22, forward_kinematics
 from flame_mdm.representations.smpl import ADULT, read_pose
@@ -39,11 +40,11 @@ class Motion272(Representation):
         """Encodes a raw motion (F, 3 + 3 K) as features (F, 272) float32.
 
         Raises:
-            ValueError: fewer than 2 frames, or as in `read_pose`.
+            UserError: If fewer than 2 frames, or as in `read_pose`.
         """
         translation, rotations = read_pose(motion)
         if len(motion) < 2:
-            raise ValueError("motion: 1 frame, but encoding needs at least 2; leave the motion out")
+            raise UserError("motion: 1 frame, but encoding needs at least 2; leave the motion out")
         axes = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]], dtype=torch.float64)  # z up -> y up
         rotations = torch.cat([(axes @ rotations[:, :1]), rotations[:, 1:22]], 1)
         translation, rotations = face_forward(translation @ axes.T, rotations)
@@ -110,8 +111,7 @@ class Motion272(Representation):
 
     def joint_features(self, joints: Iterable[int]) -> Tensor:
         """Returns (D,) bool, True for the features of these joints; velocity and turn of the root belong to joint 0."""
-        part = torch.zeros(22, dtype=torch.bool)
-        part[list(joints)] = True
+        part = self.joint_mask(joints)
         return torch.cat([part[:1].expand(8), *(part.repeat_interleave(n) for n in (3, 3, 6))])
 
 

@@ -6,7 +6,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from flame_mdm.representations import Frames, Representation, rotation
+from flame_mdm.errors import UserError
+from flame_mdm.representations import Frames, Representation, check_finite, moments, rotation
 from flame_mdm.representations.skeleton import KIT21
 
 KNEES_AND_ELBOWS = [KIT21.joints.index(f"{side}_{part}") for part in ("knee", "elbow") for side in ("left", "right")]
@@ -36,13 +37,11 @@ class Rifke(Representation):
         """Encodes joints (T, 21, 3) in meters, y up, as features (T, 64) float32.
 
         Raises:
-            ValueError: no frames, another number of joints, or non-finite coordinates.
+            UserError: If no frames, another number of joints, or non-finite coordinates.
         """
         if motion.ndim != 3 or motion.shape[1:] != (21, 3) or not len(motion):
-            raise ValueError(f"motion: shape {tuple(motion.shape)}, but {self.name} takes (frames, 21, 3)")
-        if not motion.isfinite().all():
-            frame = int((~motion.isfinite()).flatten(1).any(1).nonzero()[0, 0])
-            raise ValueError(f"motion: coordinates in frame {frame} are not finite; leave the motion out")
+            raise UserError(f"motion: shape {tuple(motion.shape)}, but {self.name} takes (frames, 21, 3)")
+        check_finite(motion)
         joints = motion.double() * self.units_per_metre
         joints[..., 1] -= self.floor(joints)
         root, others = joints[:, 0], joints[:, 1:]
@@ -81,16 +80,13 @@ class Rifke(Representation):
 
     def joint_features(self, joints: Iterable[int]) -> Tensor:
         """Returns (D,) bool, True for the features of these joints."""
-        part = torch.zeros(21, dtype=torch.bool)
-        part[list(joints)] = True
+        part = self.joint_mask(joints)
         return torch.cat([part[:1], part[1:].repeat_interleave(3), part[:1].expand(3)])
 
     def statistics(self, features: Tensor | Frames) -> tuple[Tensor, Tensor]:
         """Returns mean and unbiased std of each feature; std 1 if it is constant."""
-        size, zero = 1 << 16, torch.zeros(())  # the frames of a data set would not fit in memory
-        mean = sum((chunk.double().sum(0) for chunk in features.split(size)), zero) / len(features)
-        squares = (chunk.double().sub_(mean).square_().sum(0) for chunk in features.split(size))
-        std = (sum(squares, zero) / (len(features) - 1)).sqrt()
+        mean, squares = moments(features)
+        std = (squares / (len(features) - 1)).sqrt()
         return mean.float(), torch.where(std > 0, std, 1.0).float()
 
 

@@ -7,7 +7,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from flame_mdm.representations import Features, Frames, Representation, rotation
+from flame_mdm.representations import Features, Representation, rotation
 from flame_mdm.representations.skeleton import SMPL24, forward_kinematics
 from flame_mdm.representations.smpl import ADULT, read_pose
 
@@ -48,10 +48,5 @@ class Rot6D(Representation):
 
     def joint_features(self, joints: Iterable[int]) -> Tensor:
         """Returns (D,) bool, True for features of these joints; the last row, the translation, belongs to joint 0."""
-        part = torch.zeros(24, dtype=torch.bool)
-        part[list(joints)] = True
+        part = self.joint_mask(joints)
         return torch.cat([part, part[:1]]).repeat_interleave(6)
-
-    def statistics(self, features: Tensor | Frames) -> tuple[Tensor, Tensor]:
-        """Returns mean 0 and std 1: ACTOR and MDM train on features that are not normalized."""
-        return torch.zeros(self.features), torch.ones(self.features)

@@ -10,6 +10,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from flame_mdm.errors import UserError
+
 SixD = Literal["rows", "columns"]
 """Which vectors of the matrix are kept: the first two rows (pytorch3d, FLAME, ACTOR, TEMOS, MDM's action data) or the
 first two columns (HumanML3D). rows(R) = columns(R^T): decoding one as the other gives the inverse rotation."""
@@ -186,5 +188,5 @@ def rotate_y(vector: Tensor, angle: Tensor) -> Tensor:
 
 def _axes(order: str) -> list[int]:
     if sorted(order) != ["X", "Y", "Z"]:
-        raise ValueError(f"Euler order {order!r} is not supported; use the letters X, Y and Z once each, as in 'ZXY'")
+        raise UserError(f"Euler order {order!r} is not supported; use the letters X, Y and Z once each, as in 'ZXY'")
     return ["XYZ".index(axis) for axis in order]

@@ -187,15 +187,15 @@ def find_joints(skeleton: Skeleton, names: str | Sequence[str]) -> list[int]:
     """Returns the indices of joints given by names of joints or body parts.
 
     Raises:
-        UserError: a name is unknown; the message suggests similar ones.
+        UserError: If a name is unknown; the message suggests similar ones.
     """
-    known = part_names(skeleton) | {name: [i] for i, name in enumerate(skeleton.joints)}
-    found: set[int] = set()
-    for name in names if isinstance(names, list | tuple) else [names]:
-        if not isinstance(name, str) or name not in known:
+    parts = part_names(skeleton)
+    indices = parts | {name: [index] for index, name in enumerate(skeleton.joints)}
+    names = list(names) if isinstance(names, list | tuple) else [names]
+    for name in names:
+        if not isinstance(name, str) or name not in indices:
             raise UserError(
-                f"skeleton {skeleton.name} has no joint or part '{name}'.{did_you_mean(str(name), list(known))} "
-                f"Parts: {', '.join(part_names(skeleton))}; joints: {', '.join(skeleton.joints)}"
+                f"skeleton {skeleton.name} has no joint or part '{name}'.{did_you_mean(str(name), list(indices))} "
+                f"Parts: {', '.join(parts)}; joints: {', '.join(skeleton.joints)}"
             )
-        found.update(known[name])
-    return sorted(found)
+    return sorted({index for name in names for index in indices[name]})

@@ -5,7 +5,8 @@ from collections.abc import Iterable, Sequence
 import torch
 from torch import Tensor
 
-from flame_mdm.representations import Frames, Representation, rotation
+from flame_mdm.errors import UserError
+from flame_mdm.representations import Representation, check_finite, rotation
 from flame_mdm.representations.skeleton import SMPL24, forward_kinematics
 
 ADULT = (
@@ -34,16 +35,14 @@ def read_pose(motion: Tensor) -> tuple[Tensor, Tensor]:
         Translation (F, 3) and matrices (F, 24, 3, 3), float64.
 
     Raises:
-        ValueError: no frames, fewer than 24 joints, or non-finite numbers.
+        UserError: If no frames, fewer than 24 joints, or non-finite numbers.
     """
     if motion.ndim != 2 or not len(motion) or motion.shape[1] < 75 or motion.shape[1] % 3:
-        raise ValueError(
+        raise UserError(
             f"motion: shape {tuple(motion.shape)}, expected (frames, 3 + 3 x joints), translation first, "
             "then axis-angle vectors of 24 joints or more"
         )
-    if not motion.isfinite().all():
-        frame = int((~motion.isfinite()).any(1).nonzero()[0, 0])
-        raise ValueError(f"motion: numbers in frame {frame} are not finite; leave the motion out")
+    check_finite(motion)
     motion = motion.double()
     return motion[:, :3], rotation.axis_angle_to_matrix(motion[:, 3:75].unflatten(1, (24, 3)))
 
@@ -75,10 +74,5 @@ class SMPL(Representation):
 
     def joint_features(self, joints: Iterable[int]) -> Tensor:
         """Returns (D,) bool, True for the features of these joints; the translation belongs to joint 0."""
-        part = torch.zeros(24, dtype=torch.bool)
-        part[list(joints)] = True
+        part = self.joint_mask(joints)
         return torch.cat([part[:1].expand(3), part.repeat_interleave(6)])
-
-    def statistics(self, features: Tensor | Frames) -> tuple[Tensor, Tensor]:
-        """Returns mean 0 and std 1: FLAME trains on features that are not normalized."""
-        return torch.zeros(self.features), torch.ones(self.features)

@@ -175,7 +175,8 @@ def sampling_options(
     """Returns the options of the sampler and those of `Edit`: the requested ones, otherwise those of the recipe.
 
     Raises:
-        UserError: If an editing option is given but nothing is edited, or the model's process does not allow it.
+        UserError: If an editing option is given but nothing is edited, or the model's process does not allow the edit,
+            the sampler or one of its options.
     """
     options, editing = options or SamplerOptions(), editing or EditRequest()
     edit: dict[str, Any] = {}
@@ -183,7 +184,9 @@ def sampling_options(
         edit, options = method_options(model.process, editing, options)
     elif editing != EditRequest():
         raise UserError(f"protocol {protocol.name} does not edit motions. Remove method, until and strength")
-    return options.over(model.sampler_options), edit
+    options = options.over(model.sampler_options)
+    model.process.find_sampler(options)
+    return options, edit
 
 
 def _motions_folder(

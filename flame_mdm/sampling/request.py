@@ -287,9 +287,10 @@ def check_model(request: SamplingRequest, model: MotionGeneration) -> None:
     """Checks that a model can do what is requested; the planning of a sampling run also checks the lengths.
 
     Raises:
-        UserError: If the model was not trained for the condition, does not know the action, or cannot generate
-            sequences.
+        UserError: If the model was not trained for the condition, does not know the action, cannot generate sequences,
+            or does not have the sampler or its options.
     """
+    model.process.find_sampler(request.options.over(model.sampler_options))
     if request.kind not in ("none", model.conditioned_on):
         trained, instead = TRAINED_ON[model.conditioned_on]
         raise UserError(f"{request.kind}={shortened(request.prompts[0], 60)}: this model {trained}. Give {instead}")

@@ -104,7 +104,7 @@ def _measured(
     perturbations: Sequence[Perturbation],
     inputs: Mapping[str, Inputs],
     texts: Sequence[Text],
-    bar: ProgressBar[Any],
+    bar: ProgressBar,
 ) -> dict[str, Any]:
     """Returns the measured part of a card."""
     base = measure(inputs[BASE], texts)

@@ -58,8 +58,8 @@ class Evaluate(Callback):
         self.name, self.path, self.every_n_steps = protocol, extractor, every_n_steps
         self.samples, self.replications, self.batch_size = samples, replications, batch_size
         self.next = 0
-        self.values: dict[str, float | None] = {}
-        self.latest: tuple[int, dict[str, float | None]] = (0, {})
+        self.values: dict[str, float] = {}
+        self.latest: tuple[int, dict[str, float]] = (0, {})
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         assert isinstance(pl_module, MotionGeneration)
@@ -87,11 +87,11 @@ class Evaluate(Callback):
             progress=False,
         )
         values = self.evaluation.run(source, ground_truth=False).values or {}
-        numbers = {name: value for name, value in values.items() if value is not None and value.mean is not None}
-        self.latest = (trainer.global_step, {name: value.mean for name, value in numbers.items()})
-        self.values = {f"val/{protocol.name}/{name}": value.mean for name, value in numbers.items()}
-        if self.replications > 1:
-            self.values |= {f"val/{protocol.name}/{name}/ci": value.ci for name, value in numbers.items()}
+        numbers = {name: v.mean for name, v in values.items() if v is not None and v.mean is not None}
+        widths = {f"{name}/ci": v.ci for name, v in values.items() if v is not None and v.ci is not None}
+        self.latest = (trainer.global_step, numbers)
+        logged = numbers | (widths if self.replications > 1 else {})
+        self.values = {f"val/{protocol.name}/{name}": value for name, value in logged.items()}
         if trainer.is_global_zero:
             columns = ("mean", "ci", "replications", "n")
             rows = [[metric, *(getattr(value, column) for column in columns)] for metric, value in values.items()]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass, field, fields
-from typing import Literal
+from typing import Any, Literal
 
 from flame_mdm.config import Config
 from flame_mdm.errors import UserError
@@ -49,12 +49,12 @@ class EvaluationRequest:
     @classmethod
     def of(cls, config: Config) -> EvaluationRequest:
         """Returns the request of a composed configuration."""
-        options, editing = (
-            kind(**{key.name: config[key.name] for key in fields(kind) if key.name in config})
-            for kind in (SamplerOptions, EditRequest)
-        )
-        keys = {key.name: config[key.name] for key in fields(cls) if key.name in config}
-        return cls(**keys, options=options, editing=editing)
+
+        def values(kind: Any) -> dict[str, Any]:
+            return {key.name: config[key.name] for key in fields(kind) if key.name in config}
+
+        sampling = {"options": SamplerOptions(**values(SamplerOptions)), "editing": EditRequest(**values(EditRequest))}
+        return cls(**values(cls) | sampling)
 
     def __post_init__(self) -> None:
         what = [name for name in ("ckpt", "from_samples", "baseline") if getattr(self, name) is not None]

@@ -11,6 +11,7 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -25,10 +26,10 @@ from evaluators.extractors.action_gru import ActionGRU
 from evaluators.extractors.stgcn import UESTC, Unconstrained
 from evaluators.extractors.t2m import T2MEvaluator
 from evaluators.plan import make_plan, sampling_options
-from evaluators.protocol import FOLDER, default_protocol, load_protocol, protocol_config, protocol_names
+from evaluators.protocol import FOLDER, Row, default_protocol, load_protocol, protocol_config, protocol_names
 from evaluators.request import EvaluationRequest
 from evaluators.results import _overlaps, make_result
-from evaluators.sources import Baseline, Generator, read_samples, real_motions
+from evaluators.sources import Baseline, Generator, Samples, read_samples, real_motions
 from flame_mdm.__main__ import main
 from flame_mdm.batch import length_mask
 from flame_mdm.checkpoints.loading import load
@@ -40,7 +41,7 @@ from flame_mdm.representations.humanml import HumanML
 from flame_mdm.representations.rot6d import Rot6D
 from flame_mdm.representations.skeleton import find_joints
 from flame_mdm.sampling.request import EditRequest
-from flame_mdm.schemas import Measured, Result, read_result
+from flame_mdm.schemas import Measured, read_result
 from flame_mdm.seeds import key
 from flame_mdm.task import MotionGeneration
 
@@ -75,7 +76,7 @@ class Runs:
         extractor = [] if any(word.startswith("extractor=") for word in words) else [f"extractor={self.clip}"]
         return main(["evaluate", f"ckpt={model}", *extractor, f"out={out}", "device=cpu", *words])
 
-    def result(self, out: Path, *words: str) -> Result:
+    def result(self, out: Path, *words: str) -> Any:
         assert self.evaluate(out, *words) == 0
         return read_result(out)
 
@@ -108,13 +109,13 @@ def runs(tmp_path_factory) -> Runs:
 
 
 @pytest.fixture(scope="module")
-def full(runs, tmp_path_factory) -> tuple[Result, Path]:
+def full(runs, tmp_path_factory) -> tuple[Any, Path]:
     """The result of an undisturbed evaluation, and its file."""
     out = tmp_path_factory.mktemp("full") / "result.json"
     return runs.result(out, "replications=2"), out
 
 
-def means(measured: Measured | Result) -> dict[str, float | None]:
+def means(measured: Measured) -> dict[str, Any]:
     values = {"real": measured.ground_truth or {}, "generated": measured.values or {}}
     return {f"{kind} {name}": v and v.mean for kind, named in values.items() for name, v in named.items()}
 
@@ -136,7 +137,8 @@ def test_a_result_says_what_it_is_and_where_it_comes_from(runs, full):
     result, out = full
     written = json.loads(out.read_text())
     assert written == result.model_dump(), "nothing is written that is not read"
-    protocol, data = load_protocol("synthetic", load(runs.model).representation), runs.data()
+    protocol: Any = load_protocol("synthetic", load(runs.model).representation)
+    data = runs.data()
     assert {name.split("/")[0] for name in result.values} == {*protocol.metrics, *protocol.multimodality.metrics}
     assert {name.split("/")[0] for name in result.ground_truth} == set(protocol.metrics)
     for name, value in result.values.items():
@@ -214,11 +216,12 @@ def test_results_of_models_in_the_package_go_to_the_working_directory(runs, tmp_
 
 
 def test_clips_that_may_have_been_seen_in_training_are_marked():
-    def reasons(model: str | None, extractor: str | None, split: str = "test") -> list[str]:
+    def reasons(model: Any, extractor: Any, split: Any = "test") -> list[str]:
         data = SimpleNamespace(store=SimpleNamespace(fingerprint="here"))
         model = model and SimpleNamespace(facts={"fingerprint": model})
         extractor = extractor and SimpleNamespace(fingerprint=extractor)
-        return _overlaps(SimpleNamespace(split=split), SimpleNamespace(data=data, model=model, extractor=extractor))
+        plan: Any = SimpleNamespace(data=data, model=model, extractor=extractor)
+        return _overlaps(EvaluationRequest(ckpt="a", split=split), plan)
 
     assert reasons("here", "here") == reasons(None, None) == []
     assert reasons("other", None) == ["training data other and evaluated data here differ: splits may overlap"]
@@ -275,7 +278,7 @@ def test_other_metrics_need_no_new_motions(runs, full, tmp_path, monkeypatch):
     model = full[1].parent / "model" / "checkpoints" / "last.ckpt"
     out = tmp_path / "result.json"
     assert runs.evaluate(out, "replications=2", "extractor=none", "resamples=100", model=model) == 0
-    result = read_result(out)
+    result: Any = read_result(out)
     assert {len(value.resampled) for value in result.values.values()} == {0, 100}  # not of multimodality
     assert "extractor" in result.not_computed
     of_joints = ("attributes", "foot_skating", "penetration", "floating", "jitter", "static_share")
@@ -339,15 +342,16 @@ def test_a_bootstrap_measures_each_motion_as_often_as_it_is_drawn(runs):
     assert drawn["fid"][0] != drawn["fid"][1]
 
 
-def shares(runs: Runs, samples: int, folder: Path | None) -> Measured:
+def shares(runs: Runs, samples: int, folder: Path | None) -> Any:
     """The result as one of several processes gets it."""
     evaluation = runs.evaluation(features=True, samples=samples, multimodality=True)
+    assert evaluation.protocol.multimodality is not None
     several = evaluation.protocol.multimodality.model_copy(update={"prompts": 1})
     evaluation = changed(evaluation, multimodality=several)
     return evaluation.run(runs.generator(evaluation, folder))
 
 
-def of_baseline(runs: Runs) -> tuple[Measured, int]:
+def of_baseline(runs: Runs) -> tuple[Any, int]:
     """The result of a baseline as one of several processes gets it, and the number of feature passes."""
     passes, extract = [], Evaluator.extract
 
@@ -429,7 +433,7 @@ def test_torchrun_writes_one_result(runs, tmp_path):
     )
     assert done.returncode == 0, done.stderr
     assert done.stdout.count("written:") == 1
-    assert read_result(out).values["jitter"].n == 5
+    assert json.loads(out.read_text())["values"]["jitter"]["n"] == 5
     assert [path.name for path in motions(out).iterdir()] == ["rep_0.npz"]
 
 
@@ -447,7 +451,7 @@ def test_motions_of_others_are_measured_alike(runs, full, tmp_path):
         np.savez(folder / path.name, ids=content["ids"][order], lengths=content["lengths"][order], features=features)
     words = [f"from_samples={folder}", *DATA, f"data_root={runs.root}", "protocol=synthetic", f"out={out}"]
     assert main(["evaluate", *words, f"extractor={runs.clip}"]) == 0
-    result = read_result(out)
+    result: Any = read_result(out)
     assert result.checkpoint is None
     assert len(result.samples_sha256) == 64
     for name, value in result.values.items():
@@ -506,7 +510,8 @@ def test_variants_replace_options_of_their_file(tmp_path):
 
 def test_the_default_protocol_follows_condition_and_data():
     def default(condition: str, dataset: str) -> str:
-        return default_protocol(SimpleNamespace(conditioned_on=condition, facts={"dataset": dataset}))
+        model: Any = SimpleNamespace(conditioned_on=condition, facts={"dataset": dataset})
+        return default_protocol(model)
 
     assert default("none", "humanact12") == "unconditioned"
     assert [default("action", x) for x in ("humanact12", "uestc", "bandai")] == [
@@ -545,11 +550,16 @@ def test_unexpected_values_of_real_motions_stop_before_anything_is_generated(run
     right = changed(evaluation, expected={"synthetic": {"attributes/all": [1.0, 0.05]}}).run(source, force=True)
     assert (right.forced, right.invalid_because) == (False, [])
     with pytest.raises(UserError, match=r"real motions have attributes/all .*, expected 0\.5 \+- 0\.05.*force=true"):
-        evaluation.run(lambda *_: pytest.fail("sampled before the ground truth was checked"))
+        evaluation.run(unused)
     train = replace(evaluation, clips=runs.data().clips("train"))
     assert train.run(None).invalid_because == [], "nothing is expected of other splits"
     train.clips.store.info["clips"]["test"] = 0  # HumanAct12 is tested on its training clips
     assert train.run(None).invalid_because
+
+
+def unused(name: str, rows: list[Row], replication: int) -> Samples:
+    """A source that is not to be asked."""
+    raise AssertionError("sampled before all was checked")
 
 
 def refused(runs: Runs, capsys, tmp_path: Path, *words: str) -> str:
@@ -621,7 +631,7 @@ def test_missing_inputs_of_metrics_are_refused_before_anything_is_generated(runs
     ):
         evaluation = runs.evaluation(own(tmp_path, old, new), features, multimodality=True)
         with pytest.raises(UserError, match=message):
-            evaluation.run(lambda *_: pytest.fail("sampled"))
+            evaluation.run(unused)
 
 
 def test_metrics_of_2026(runs):
@@ -663,7 +673,7 @@ def test_smoothing_takes_each_motion_for_itself(runs):
     assert other.ground_truth == one.ground_truth
     step = np.repeat([[0.0], [1.0]], 20, axis=0)
     rows = smooth.protocol.rows(smooth.clips, 0, 0)[:1]
-    (smoothed,) = smooth._generated(SimpleNamespace(rows=rows, features=[step], captions=None)).features
+    (smoothed,) = smooth._generated(Samples(rows, [step])).features
     expected = 0.5 * (1 + 2 * math.exp(-0.5) + 2 * math.exp(-2)) / (1 + 2 * math.exp(-0.5) + 2 * math.exp(-2))
     assert smoothed[0, 0] == pytest.approx(0, abs=1e-9)
     assert smoothed[19:21].mean() == pytest.approx(expected)
@@ -674,7 +684,7 @@ def test_the_best_of_several_is_no_worse_than_all(runs, tmp_path):
     text = (FOLDER / "reconstruction.yaml").read_text()
     (tmp_path / "mine.yaml").write_text(text.replace("prompts: 500", "prompts: 3").replace("samples: 10", "samples: 4"))
     evaluation = runs.evaluation(str(tmp_path / "mine_best_of_10.yaml"), samples=6, multimodality=True)
-    values = evaluation.run(runs.generator(evaluation)).values
+    values: Any = evaluation.run(runs.generator(evaluation)).values
     assert values["flame_of_10/best_ape_root"].mean < values["flame_of_10/worst_ape_root"].mean
     assert values["flame_of_10/best_ape_root"].n == 12
 
@@ -746,7 +756,7 @@ def test_training_motions_are_their_own_nearest(runs, tmp_path):
         "metrics: {nearest: {_target_: evaluators.metrics.memorization.NearestTraining}}\n"
     )
     data = runs.data()
-    measured = {}
+    measured: dict[str, Any] = {}
     for split in ("train", "test"):
         evaluation = runs.evaluation(str(protocol), features=True)
         evaluation = replace(evaluation, clips=data.clips(split), training=data.clips("train"))
@@ -764,7 +774,7 @@ def test_baselines_show_what_each_metric_sees(runs, tmp_path):
         out = tmp_path / f"{kind}.json"
         words = [*DATA, f"data_root={runs.root}", "protocol=synthetic", "replications=1", "device=cpu"]
         assert main(["evaluate", f"baseline={kind}", *words, f"extractor={runs.clip}", f"out={out}"]) == 0
-        result = read_result(out)
+        result: Any = read_result(out)
         assert (result.baseline, result.checkpoint) == (kind, None)
         values |= {name.replace("generated", kind): mean for name, mean in means(result).items()}
     real = values["real fid"]  # of the baseline "real": another window of each clip
@@ -831,7 +841,8 @@ def test_training_logs_the_values_of_the_validation_split(runs, tmp_path):
     assert "val/synthetic/diversity" not in rows[0], "too few motions"
     best = tmp_path / "run" / "checkpoints" / "best.ckpt"
     request = EvaluationRequest(ckpt=str(best), extractor="none", quick=True, samples=4, data_root=str(runs.root))
-    assert make_result(request, make_plan(request, "cpu")).checkpoint.selected_by == "best val/synthetic/fid"
+    result: Any = make_result(request, make_plan(request, "cpu"))
+    assert result.checkpoint.selected_by == "best val/synthetic/fid"
 
 
 def test_a_missing_extractor_of_the_selection_stops_before_training(runs, tmp_path, capsys, monkeypatch):
@@ -878,7 +889,8 @@ def test_released_classifiers_give_features_and_scores_of_their_data_alone(tmp_p
         torch.testing.assert_close(drawn[name], again[name].flip(0))
         torch.testing.assert_close(drawn[name][1:2], alone[name])
         assert not torch.allclose(drawn[name], zero[name], atol=1e-3)
-    assert not torch.allclose(legacy.network.linear2(drawn["features"]), drawn["logits"], atol=1e-3), "two draws"
+    network: Any = legacy.network
+    assert not torch.allclose(network.linear2(drawn["features"]), drawn["logits"], atol=1e-3), "two draws"
 
 
 def test_the_t2m_evaluator_is_read_from_a_folder(tmp_path):

@@ -3,11 +3,8 @@
 import copy
 import json
 import random
-import resource
 import shutil
-import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +12,7 @@ import numpy as np
 import pytest
 from support.glb import Glb, odd_character, packed, write_names
 from support.motions import synthetic
-from support.refusals import address_space
+from support.refusals import bounded
 
 from flame_mdm.errors import UserError
 from flame_mdm.formats import characters, glb
@@ -36,18 +33,6 @@ def heroes(tmp_path_factory) -> list[Path]:
     write_names(paths[1].with_suffix(".yaml"))
     kick.save(paths[2], rig="lafan1", figure="bones")
     return paths
-
-
-@contextmanager
-def bounded(seconds: float = 10, memory: int = 2**30) -> Iterator[None]:
-    """Limits the address space that this process may add, and the processor time it may take."""
-    limits, start = resource.getrlimit(resource.RLIMIT_AS), time.process_time()
-    resource.setrlimit(resource.RLIMIT_AS, (address_space() + memory, limits[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_AS, limits)
-    assert time.process_time() - start < seconds
 
 
 def outcome(path: Path, out: Path) -> str:

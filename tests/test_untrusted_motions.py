@@ -8,6 +8,7 @@ import json
 import lzma
 import os
 import pickle
+import shutil
 import signal
 import struct
 import tarfile
@@ -15,13 +16,14 @@ import time
 import tracemalloc
 import zipfile
 from collections.abc import Callable, Iterator
+from itertools import count
 from multiprocessing import active_children
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from support.refusals import Refused, carry_out
+from support.refusals import Refused, bounded, carry_out
 from support.runs import no_children
 from test_fuzz import body, bvh
 
@@ -29,11 +31,15 @@ from evaluators.sources import read_samples
 from flame_mdm.__main__ import main
 from flame_mdm.data import archives, restricted_pickle
 from flame_mdm.data.amass import read as read_amass
+from flame_mdm.data.bandai import Bandai
+from flame_mdm.data.folder import Folder
+from flame_mdm.data.humanact12 import HumanAct12
 from flame_mdm.data.parallel import in_order
 from flame_mdm.data.store import Store
 from flame_mdm.errors import UserError
+from flame_mdm.formats import bvh as bvh_files
 from flame_mdm.formats import resampling
-from flame_mdm.formats.bvh import read
+from flame_mdm.formats.readers import read
 from flame_mdm.safe_io import MEBIBYTE
 
 pytestmark = pytest.mark.slow
@@ -91,105 +97,144 @@ def bvh_at(seconds: str) -> bytes:
 
 JOINTS = body(4).astype(float)
 BOMB = zip_bomb("joints.npy", header((300 * 2**20 // 528, 22, 3)))
-MOTIONS: dict[str, tuple[str, bytes, str]] = {
-    "bvh frame time": ("a.bvh", bvh_at("999999"), "frame time"),
-    "bvh frame rate": ("a.bvh", bvh_at("0.0000011"), "frame time"),
-    "bvh frames": ("a.bvh", bvh().replace("Frames: 3", "Frames: 1000000000").encode(), "1000000000"),
-    "bvh digits": ("a.bvh", bvh_at("1" * 40_000 + "x"), "Frame Time"),
-    "npz fps": ("a.npz", npz(joints=JOINTS, fps=1e-7), "fps is 1e-07, not a number"),
-    "npz rate": ("a.npz", npz(joints=JOINTS, fps=1e300), "fps is 1e+300, not a number"),
-    "amass rate": (
+MOTIONS: list[tuple[str, bytes, str]] = [
+    ("a.bvh", bvh_at("999999"), "frame time"),
+    ("a.bvh", bvh_at("0.0000011"), "frame time"),
+    ("a.bvh", bvh().replace("Frames: 3", "Frames: 1000000000").encode(), "1000000000"),
+    ("a.bvh", bvh_at("1" * 40_000 + "x"), "Frame Time"),
+    ("a.npz", npz(joints=JOINTS, fps=1e-7), "fps is 1e-07, not a number"),
+    ("a.npz", npz(joints=JOINTS, fps=1e300), "fps is 1e+300, not a number"),
+    (
         "a.npz",
         npz(poses=np.zeros((4, 156)), trans=np.zeros((4, 3)), mocap_framerate=1e-7),
         "not a number",
     ),
-    "amass longdouble": (
+    (
         "a.npz",
         npz(poses=np.zeros((4, 156), np.longdouble), trans=np.zeros((4, 3)), mocap_framerate=20),
         "poses are not an array of real numbers",
     ),
-    "npz features": (
+    (
         "a.npz",
         npz(joints=JOINTS, fps=20, representation="smpl147", features=np.zeros((4, 147), [("a", "f4")])),
         "features are not an array",
     ),
-    "npz header": ("a.npz", zipped({"joints.npy": header((10**12, 22, 3)), "fps.npy": b"x"}), "declares"),
-    "npz bomb": ("a.npz", BOMB, "expand to"),
-    "npz encrypted": ("a.npz", changed(npz(joints=JOINTS, fps=20), flags=1), "encrypted"),
-    "npz method": ("a.npz", changed(npz(joints=JOINTS, fps=20), method=99), "method 99"),
-    "npz lzma": ("a.npz", zipped({"joints.npy": header((4, 22, 3))}, zipfile.ZIP_LZMA), "method 14"),
-    "npz bz2": ("a.npz", zipped({"joints.npy": header((4, 22, 3))}, zipfile.ZIP_BZIP2), "method 12"),
-    "npz objects": ("a.npz", npz(joints=np.array([{}]), fps=20), "Python objects"),
-}
+    ("a.npz", zipped({"joints.npy": header((10**12, 22, 3)), "fps.npy": b"x"}), "declares"),
+    ("a.npz", BOMB, "expand to"),
+    ("a.npz", changed(npz(joints=JOINTS, fps=20), flags=1), "encrypted"),
+    ("a.npz", changed(npz(joints=JOINTS, fps=20), method=99), "method 99"),
+    ("a.npz", zipped({"joints.npy": header((4, 22, 3))}, zipfile.ZIP_LZMA), "method 14"),
+    ("a.npz", zipped({"joints.npy": header((4, 22, 3))}, zipfile.ZIP_BZIP2), "method 12"),
+    ("a.npz", npz(joints=np.array([{}]), fps=20), "Python objects"),
+    ("a.npy", header((10**12, 22, 3)), "declares"),
+    ("a.npy", header((2**62, 2**62)), "declares"),
+    ("a.npy", b"\x93NUMPY\x01\x00" + struct.pack("<H", 60000) + b"(" * 60000, "not an array"),
+    ("a.npy", b"\x93NUMPY\x01\x00" + struct.pack("<H", 60) + b"(" * 60, "not an array"),
+    ("a.json", b'{"joints": ' + b"[" * 10**6, "nested too deeply"),
+    ("a.json", json.dumps({"fps": 1e-7, "joints": JOINTS.tolist()}).encode(), "fps is 1e-07"),
+    ("a.json", b"\xff\xfe{}", "a.json: not a UTF-8 text file"),
+]
 
 
-def prepared(attacked: Refused, bad: Path, change: Callable[[Path], Any], says: str) -> None:
-    """Prepares a folder of two motions after a change."""
-    place = bad / f"data{attacked.count}"
-    place.mkdir()
-    for name in "ac":
-        np.savez(place / f"{name}.npz", joints=body(60), fps=20.0)
-    change(place)
-    root = bad.parent / f"prepared{attacked.count}"
+class Surprises:
+    """Calls on bad input that are not refused as expected: with a message of one line, in little time and memory."""
+
+    def __init__(self) -> None:
+        self.faults: list[str] = []
+
+    def __call__(self, says: str, call: Callable, *arguments: Any, **options: Any) -> None:
+        """Adds a fault unless the call raises an error of the user's, whose message contains `says`."""
+        message = "no error"
+        try:
+            with bounded(5):
+                call(*arguments, **options)
+        except (UserError, OSError) as error:
+            message = str(error)
+        except Exception as error:  # a bug
+            message = repr(error)[:300]
+            says = "an error of the user's"
+        if says not in message or len(message.splitlines()) != 1:
+            self.faults.append(f"{says}: {message[:300]}")
+
+    def none(self) -> None:
+        assert not self.faults
+
+
+def of_folder(folder: Path) -> None:
+    """Reads a folder of motions, as `prepare` does."""
+    list(Folder(str(folder)).clips(20.0))
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Callable[[Callable[[Path], Any]], Path]:
+    """Makes folders of two motions after a change."""
+    numbers = count()
+
+    def make(change: Callable[[Path], Any]) -> Path:
+        path = tmp_path / f"data{next(numbers)}"
+        path.mkdir()
+        for name in "ac":
+            np.savez(path / f"{name}.npz", joints=body(60), fps=20.0)
+        change(path)
+        return path
+
+    return make
+
+
+def test_motion_files(tmp_path: Path, folder: Callable):
+    surprises = Surprises()
+    for name, content, says in MOTIONS:
+        path = tmp_path / name
+        path.write_bytes(content)
+        surprises(says, read, path, fps=20 if name == "a.npy" else None)
+        if name.endswith(("npz", "bvh")):
+            surprises(says, of_folder, folder(lambda place, p=path: shutil.copy(p, place / f"b{p.suffix}")))
+    surprises.none()
+
+
+def test_commands_refuse_in_one_line_and_leave_nothing(attacked: Refused, bad: Path, trained: Path):
+    root = bad.parent / "prepared"
     attacked.watched.append(root)
-    attacked("prepare", "data=folder", f"source={place}", f"data_root={root}", says=says)
+    (bad / "a.npz").write_bytes(BOMB)
+    attacked("convert", str(bad / "a.npz"), "out=out.json", says="expand to")
+    attacked("edit", f"ckpt={trained}", f"motion={bad / 'a.npz'}", "region=in_between", "text=a", says="expand to")
+    attacked("prepare", "data=folder", f"source={bad}", f"data_root={root}", says="expand to")
+    (bad / "set").write_bytes(sparse(TAKE, 40 * 10**9))
+    words = (f"source={bad / 'set'}", f"data_root={root}", "data.source.workers=1")
+    attacked("prepare", "data=bandai", *words, says="sparse")
+    (bad / "humanact12poses.pkl").write_bytes(PICKLES["doubled"][0])
+    attacked("prepare", "data=humanact12", f"source={bad / 'humanact12poses.pkl'}", f"data_root={root}", says="expand")
 
 
-@pytest.mark.parametrize("case", MOTIONS)
-def test_motion_files(attacked: Refused, bad: Path, trained: Path, case: str):
-    name, content, says = MOTIONS[case]
-    path = bad / name
-    path.write_bytes(content)
-    attacked("convert", str(path), "out=out.json", says=says)
-    prepared(attacked, bad, lambda place: (place / f"b{path.suffix}").write_bytes(content), says)
-    if not case.startswith("amass"):
-        attacked("edit", f"ckpt={trained}", f"motion={path}", "region=in_between", "text=a", says=says)
-
-
-def test_arrays_and_json(attacked: Refused, bad: Path):
-    for name, content, says in (
-        ("a.npy", header((10**12, 22, 3)), "declares"),
-        ("a.npy", header((2**62, 2**62)), "declares"),
-        ("a.npy", b"\x93NUMPY\x01\x00" + struct.pack("<H", 60000) + b"(" * 60000, "not an array"),
-        ("a.npy", b"\x93NUMPY\x01\x00" + struct.pack("<H", 60) + b"(" * 60, "not an array"),
-        ("a.json", b'{"joints": ' + b"[" * 10**6, "nested too deeply"),
-        ("a.json", json.dumps({"fps": 1e-7, "joints": JOINTS.tolist()}).encode(), "fps is 1e-07"),
-        ("a.json", b"\xff\xfe{}", "a.json: not a UTF-8 text file"),
-    ):
-        (bad / name).write_bytes(content)
-        attacked("convert", str(bad / name), "out=out.bvh", *(["fps=20"] if "npy" in name else []), says=says)
-
-
-def test_links_and_pipes(attacked: Refused, bad: Path, trained: Path):
-    os.mkfifo(bad / "pipe")
+def test_links_and_pipes(tmp_path: Path):
+    surprises = Surprises()
+    os.mkfifo(tmp_path / "pipe")
     for ending in ("npz", "bvh", "npy", "json"):
-        for number, target in enumerate((bad / "pipe", "/dev/zero", "loop", bad)):
-            path = bad / f"{number}.{ending}"
+        for number, target in enumerate((tmp_path / "pipe", "/dev/zero", "loop", tmp_path)):
+            path = tmp_path / f"{number}.{ending}"
             path.symlink_to(path if target == "loop" else target)
-            attacked("convert", str(path), "out=out.glb", "fps=20", says=str(path))
-            if ending in ("npz", "bvh"):
-                attacked("edit", f"ckpt={trained}", f"motion={path}", "region=in_between", "text=a", says=str(path))
+            surprises(str(path), read, path, fps=20)
+    surprises.none()
 
 
-def test_entries_of_data_folders(attacked: Refused, bad: Path):
-    def loop(place: Path) -> None:
-        (place / "loop").symlink_to(place)
-        (place / "b.npz").symlink_to(place / "b.npz")
+def test_entries_of_data_folders(folder: Callable):
+    surprises = Surprises()
+
+    def loop(path: Path) -> None:
+        (path / "loop").symlink_to(path)
+        (path / "b.npz").symlink_to(path / "b.npz")
 
     for name in ("b.npz", "b.bvh", "b.npy", "a.txt", "captions.csv", "captions.json", "skeleton.yaml"):
-        prepared(attacked, bad, lambda place, name=name: os.mkfifo(place / name), f"{name}: a pipe")
-        prepared(attacked, bad, lambda place, name=name: (place / name).symlink_to("/dev/zero"), f"{name}: a pipe")
+        surprises(f"{name}: a pipe", of_folder, folder(lambda path, name=name: os.mkfifo(path / name)))
+        surprises(f"{name}: a pipe", of_folder, folder(lambda path, name=name: (path / name).symlink_to("/dev/zero")))
     for name in ("b.npz", "b.npy", "b.bvh"):
-        prepared(attacked, bad, lambda place, name=name: (place / name).write_bytes(b""), f"{name}")
-        prepared(attacked, bad, lambda place, name=name: (place / name).mkdir(), f"{name}: a folder")
-    prepared(attacked, bad, loop, "b.npz: cannot be read")
+        surprises(name, of_folder, folder(lambda path, name=name: (path / name).write_bytes(b"")))
+        surprises(f"{name}: a folder", of_folder, folder(lambda path, name=name: (path / name).mkdir()))
+    surprises("b.npz: cannot be read", of_folder, folder(loop))
     for name, shown in ((b"\x1b[31m", r"\x1b[31m"), (b"\xff", r"\udcff"), (b"x\ny", r"x\ny")):
-        prepared(
-            attacked,
-            bad,
-            lambda place, name=name: Path(os.fsdecode(os.fsencode(place) + b"/" + name + b".npz")).write_bytes(b""),
-            shown,
-        )
+        path = folder(lambda path, name=name: Path(os.fsdecode(os.fsencode(path) + b"/" + name + b".npz")).touch())
+        surprises(shown, of_folder, path)
+    surprises.none()
 
 
 ALIASES = "a0: &a0 [x, x, x, x, x, x, x, x, x, x]\n" + "".join(
@@ -215,10 +260,11 @@ TABLES: list[tuple[str, bytes, str]] = [
 ]
 
 
-@pytest.mark.parametrize("number", range(len(TABLES)))
-def test_tables_of_data_folders(attacked: Refused, bad: Path, number: int):
-    name, content, says = TABLES[number]
-    prepared(attacked, bad, lambda place: (place / name).write_bytes(content), says)
+def test_tables_of_data_folders(folder: Callable):
+    surprises = Surprises()
+    for name, content, says in TABLES:
+        surprises(says, of_folder, folder(lambda path, n=name, c=content: (path / n).write_bytes(c)))
+    surprises.none()
 
 
 def test_long_motions_are_not_resampled_without_end():
@@ -293,16 +339,16 @@ def archive_cases() -> Iterator[tuple[bytes, str]]:
     yield bytes(10240), "no file dataset-1"
 
 
-def test_archives(attacked: Refused, bad: Path, monkeypatch):
+def test_archives(tmp_path: Path, monkeypatch):
     monkeypatch.setattr("flame_mdm.safe_io.ARRAYS_LIMIT", 4 * MEBIBYTE)  # packing more takes long
-    path, root = bad / "set", bad.parent / "prepared"
+    surprises, path = Surprises(), tmp_path / "set"
     for content, says in archive_cases():
         path.write_bytes(content)
-        words = ("data=bandai", f"source={path}", f"data_root={root}", "data.source.workers=1")
-        attacked("prepare", *words, says=says)
+        surprises(says, lambda: list(Bandai(str(path), workers=1).clips(20)))
     path.unlink()
     os.mkfifo(path)
-    attacked("prepare", "data=bandai", f"source={path}", f"data_root={root}", says="a pipe")
+    surprises("a pipe", lambda: list(Bandai(str(path), workers=1).clips(20)))
+    surprises.none()
 
 
 def test_a_tar_archive_of_many_members_takes_little_memory(tmp_path: Path):
@@ -341,7 +387,7 @@ def test_one_bad_task_ends_all_workers(case: str, tmp_path: Path):
     (tmp_path / "bomb").write_bytes(bvh_at("999999"))
     os.mkfifo(tmp_path / "pipe")
     tasks: dict[str, tuple] = {"killed": (signal.raise_signal, 9), "memory": (bytes, 2**60)}
-    task = tasks.get(case, (read, tmp_path / case))
+    task = tasks.get(case, (bvh_files.read, tmp_path / case))
     before, start = active_children(), time.monotonic()
     first = (abs, 1) if case == "killed" else (signal.raise_signal, signal.SIGSTOP)  # an end that does not come
     with pytest.raises((UserError, ValueError, MemoryError)) as error:
@@ -385,12 +431,16 @@ PICKLES = {
 }
 
 
-@pytest.mark.parametrize("case", PICKLES)
-def test_pickles(attacked: Refused, bad: Path, case: str):
-    content, says = PICKLES[case]
-    path = bad / "humanact12poses.pkl"
-    path.write_bytes(content)
-    attacked("prepare", "data=humanact12", f"source={path}", f"data_root={bad.parent / 'prepared'}", says=says)
+def actions(path: Path) -> None:
+    list(HumanAct12(str(path)).clips(20))
+
+
+def test_pickles(tmp_path: Path):
+    surprises, path = Surprises(), tmp_path / "humanact12poses.pkl"
+    for content, says in PICKLES.values():
+        path.write_bytes(content)
+        surprises(says, actions, path)
+    surprises.none()
 
 
 def test_repeated_arrays_of_a_pickle_count_each_time(tmp_path: Path):
@@ -402,8 +452,8 @@ def test_repeated_arrays_of_a_pickle_count_each_time(tmp_path: Path):
         restricted_pickle.read(tmp_path / "many.pkl")
 
 
-def test_lists_of_wrong_things_in_a_pickle_are_named(attacked: Refused, bad: Path):
-    path = bad / "humanact12poses.pkl"
+def test_lists_of_wrong_things_in_a_pickle_are_named(tmp_path: Path):
+    surprises, path = Surprises(), tmp_path / "humanact12poses.pkl"
     for content in (
         {"poses": 3, "joints3D": 3, "y": 3},
         {"poses": ["x"], "joints3D": ["x"], "y": [1]},
@@ -411,7 +461,8 @@ def test_lists_of_wrong_things_in_a_pickle_are_named(attacked: Refused, bad: Pat
         {"poses": [{}], "joints3D": [None], "y": [None]},
     ):
         path.write_bytes(pickle.dumps(content))
-        attacked("prepare", "data=humanact12", f"source={path}", f"data_root={bad.parent / 'prepared'}", says=str(path))
+        surprises(str(path), actions, path)
+    surprises.none()
 
 
 # Stores ---------------------------------------------------------------------------------------------------------------
@@ -442,34 +493,39 @@ INFOS = [("hours", 10**400), ("fps", 10**400), ("clips", COUNTS | {"<b>x": 1}), 
 INFOS += [("clips", {"train": 1}), ("actions", [1])]
 
 
-def test_every_field_of_a_store_is_checked(attacked: Refused, bad: Path):
-    place = bad / "synthetic-humanml-clean-smpl22"
-    words = ("browse", "data=synthetic", f"data_root={bad}", "clips=1", "out=out.html")
-    small_store(place, {"action": 0}, {})
-    Store(place).verify()
+def opened(folder: Path) -> None:
+    store = Store(folder)
+    store.motion(store.clips[0])
+
+
+def test_every_field_of_a_store_is_checked(tmp_path: Path):
+    surprises = Surprises()
+    small_store(tmp_path, {"action": 0}, {})
+    Store(tmp_path).verify()
     for name, value in CLIPS:
-        small_store(place, {name: value}, {})
-        attacked(*words, says=f"clips.jsonl: damaged: line 1: no valid {name}")
+        small_store(tmp_path, {name: value}, {})
+        surprises(f"clips.jsonl: damaged: line 1: no valid {name}", opened, tmp_path)
     for name, value in INFOS:
-        small_store(place, {}, {name: value})
-        attacked(*words, says=f"store.json: damaged: no valid {name}")
-    small_store(place, {}, {"fingerprint": "0123456789abcdef"})
-    attacked(*words, says="store.json: damaged: its fingerprint")
+        small_store(tmp_path, {}, {name: value})
+        surprises(f"store.json: damaged: no valid {name}", opened, tmp_path)
+    small_store(tmp_path, {}, {"fingerprint": "0123456789abcdef"})
+    surprises("store.json: damaged: its fingerprint", opened, tmp_path)
+    surprises.none()
 
 
-def test_features_and_clips_of_a_store_of_other_kinds(attacked: Refused, bad: Path):
-    place = bad / "synthetic-humanml-clean-smpl22"
-    words = ("browse", "data=synthetic", f"data_root={bad}", "clips=1", "out=out.html")
+def test_features_and_clips_of_a_store_of_other_kinds(tmp_path: Path):
+    surprises, place = Surprises(), tmp_path
     for content in (zipped({"a.npy": b"x"}), header((2**70, 263), "<f4"), header((-1, 263), "<f4")):
         small_store(place, {}, {})
         (place / "features.npy").write_bytes(content)
-        attacked(*words, says="features.npy: damaged")
+        surprises("features.npy: damaged", opened, place)
     small_store(place, {}, {})
     (place / "clips.jsonl").write_bytes(b"\xff\xfe\n")
     content = json.loads((place / "store.json").read_text())
     content["sha256"]["clips.jsonl"] = hashlib.sha256(b"\xff\xfe\n").hexdigest()
     (place / "store.json").write_text(json.dumps(content))
-    attacked(*words, says="clips.jsonl: damaged: not a UTF-8 text file")
+    surprises("clips.jsonl: damaged: not a UTF-8 text file", opened, place)
+    surprises.none()
 
 
 def test_crops_are_checked(attacked: Refused, bad: Path):

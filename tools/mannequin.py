@@ -43,6 +43,7 @@ SOLE = -0.981
 LIPS, EYES = (192, 138, 120), (92, 74, 64)
 """Colors of the face."""
 Field = Callable[[np.ndarray], np.ndarray]
+ORIGIN, UP = np.zeros(3), np.array([[0, 1, 0], [1, 0, 0], [0, 0, 1.0]])
 
 
 def tube(origin: np.ndarray, axes: np.ndarray, stations: str, power: float = 2.0) -> Field:
@@ -95,20 +96,24 @@ def pose() -> tuple[np.ndarray, np.ndarray]:
     return joints, turned
 
 
+def bone(start: str, end: str, u: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the origin and the axes of a tube along a bone; `u` is the direction of its first half width."""
+    joints, turned = pose()
+    at = JOINT[start]
+    return joints[at], orthonormal(joints[JOINT[end]] - joints[at], turned[at] @ np.array(u, float))
+
+
 def model() -> dict[str, Field]:
     """Returns the parts of the left half; the legs and the arm are those of the left side."""
-    joints, turned = pose()
+    return {**trunk(), **leg(), **arm(), "head": head()}
 
-    def bone(start: str, end: str, u: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
-        at = JOINT[start]
-        return joints[at], orthonormal(joints[JOINT[end]] - joints[at], turned[at] @ np.array(u, float))
 
-    up = np.array([[0, 1, 0], [1, 0, 0], [0, 0, 1.0]])
-    zero = np.zeros(3)
-    parts = {
+def trunk() -> dict[str, Field]:
+    """Returns torso, buttock, breast, shoulder blade, trapezius and neck."""
+    return {
         "torso": tube(
-            zero,
-            up,
+            ORIGIN,
+            UP,
             "-135 0 -5 110 80; -85 0 -8 160 108; -20 0 -8 163 112; 60 0 0 148 102; 130 0 4 137 95; "
             "200 0 4 141 100; 280 0 4 157 112; 350 0 2 168 117; 410 0 -12 166 106; 455 0 -28 150 80; "
             "490 0 -38 105 55; 515 0 -42 60 45",
@@ -122,8 +127,18 @@ def model() -> dict[str, Field]:
             orthonormal(np.array([0.2, -0.062, -0.005]), np.array([0, 1.0, 0])),
             "0 0 0 40 46; 80 -4 0 36 46; 180 -4 4 42 50",
         ),
+        "neck": tube(
+            np.array([0, 0.47, -0.045]),
+            orthonormal(np.array([0, 0.17, 0.045]), np.array([1.0, 0, 0])),
+            "-20 0 0 75 50; 40 0 0 56 56; 90 0 0 51 55; 170 0 0 52 58",
+        ),
     }
-    # axes of legs: down, to the left, forward
+
+
+def leg() -> dict[str, Field]:
+    """Returns thigh, calf and foot. Axes: down, to the left, forward."""
+    joints, _ = pose()
+    parts = {}
     thigh = bone("left_hip", "left_knee", (1, 0, 0))
     parts["thigh"] = tube(
         *thigh,
@@ -150,7 +165,13 @@ def model() -> dict[str, Field]:
         return -union(-shoe(points), -(SOLE - points[..., 1]), 0.012)
 
     parts["foot"] = foot
-    # axes of arms: to the left along the bone, up, forward
+    return parts
+
+
+def arm() -> dict[str, Field]:
+    """Returns upper arm, forearm and hand. Axes: to the left along the bone, up, forward."""
+    joints, turned = pose()
+    parts = {}
     parts["arm"] = tube(
         *bone("left_shoulder", "left_elbow", (0, 1, 0)),
         "-30 -14 2 40 46; 20 -10 2 50 56; 70 -4 3 50 54; 140 -2 4 43 48; 210 -1 0 36 41; 270 0 0 34 37",
@@ -190,15 +211,15 @@ def model() -> dict[str, Field]:
         return union(distance, thumb(points), 0.014)
 
     parts["hand"] = hand
-    parts["neck"] = tube(
-        np.array([0, 0.47, -0.045]),
-        orthonormal(np.array([0, 0.17, 0.045]), np.array([1.0, 0, 0])),
-        "-20 0 0 75 50; 40 0 0 56 56; 90 0 0 51 55; 170 0 0 52 58",
-    )
+    return parts
+
+
+def head() -> Field:
+    """Returns the head with face, ear and hair."""
     skull = ellipsoid((0, 0.712, 0.003), (0.074, 0.089, 0.095))
     face = tube(
-        zero,
-        up,
+        ORIGIN,
+        UP,
         "592 0 58 33 28; 605 0 50 46 43; 635 0 40 57 57; 670 0 32 63 67; 710 0 20 69 80; 745 0 12 66 80",
     )
     nose = tube(
@@ -225,11 +246,10 @@ def model() -> dict[str, Field]:
         distance = union(union(union(distance, nose(points), 0.014), lips(points), 0.010), chin(points), 0.025)
         return union(distance, ear(points), 0.006)
 
-    def head(points: np.ndarray) -> np.ndarray:
+    def haired(points: np.ndarray) -> np.ndarray:
         return union(bald(points), -union(-crown(points), hairline(points), 0.012), 0.004)
 
-    parts["head"] = head
-    return parts
+    return haired
 
 
 def surface(parts: dict[str, Field], points: np.ndarray) -> np.ndarray:

@@ -79,8 +79,8 @@ def _recognized(names: Mapping[int, str]) -> dict[str, list[int]]:
     for number, name in names.items():
         plain.setdefault(_plain(name), []).append(number)
     skeletons = [*map(joint_names, presets().values()), LAYOUTS["SMPL"].map, LAYOUTS["Bandai-Namco"].map]
-    known = [{_plain(name): joint for joint, name in map.items() if isinstance(name, str)} for map in skeletons]
-    nearest = max(known, key=lambda skeleton: len(skeleton.keys() & plain.keys()))
+    plain_names = [{_plain(name): joint for joint, name in map.items() if isinstance(name, str)} for map in skeletons]
+    nearest = max(plain_names, key=lambda skeleton: len(skeleton.keys() & plain.keys()))
     return {joint: plain[name] for name, joint in nearest.items() if name in plain}
 
 

@@ -106,11 +106,13 @@ def _of_arrays(
 
 @contextmanager
 def _named(path: Path) -> Iterator[None]:
-    """Adds the path to errors that do not name it; some readers of parts of a file raise `ValueError`."""
+    """Adds the path to errors that do not name it."""
     try:
         yield
-    except ValueError as error:
-        raise UserError(str(error) if str(path) in str(error) else f"{path}: {error}") from error
+    except UserError as error:
+        if str(path) in str(error):
+            raise
+        raise UserError(f"{path}: {error}") from error
 
 
 def from_array(joints: Any, fps: float | None) -> Motion:

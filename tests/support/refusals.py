@@ -4,7 +4,9 @@ import os
 import re
 import resource
 import signal
-from collections.abc import Sequence
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -82,6 +84,18 @@ class Refused:
 
     def _tree(self) -> set[Path]:
         return {path for folder in self.watched for path in folder.rglob("*")}
+
+
+@contextmanager
+def bounded(seconds: float = 10, memory: int = 2**30) -> Iterator[None]:
+    """Limits the address space that this process may add, and the processor time it may take."""
+    limits, start = resource.getrlimit(resource.RLIMIT_AS), time.process_time()
+    resource.setrlimit(resource.RLIMIT_AS, (address_space() + memory, limits[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, limits)
+    assert time.process_time() - start < seconds
 
 
 def address_space() -> int:

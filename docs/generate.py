@@ -8,9 +8,10 @@ from itertools import takewhile
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from flame_mdm.commands.tables import sizes
 from flame_mdm.config import EXPERIMENTS, recipes
-from flame_mdm.reporting.settings import LABELS, values
-from flame_mdm.reporting.tables import PUBLISHED, load_spec
+from flame_mdm.reporting.settings import LABELS, setting_text, values
+from flame_mdm.reporting.tables.specs import PUBLISHED, load_spec
 from flame_mdm.safe_io import read_yaml
 
 HEAD = "<!-- Written by docs/generate.py; do not edit. -->\n"
@@ -111,7 +112,7 @@ such value. Text encoders go by the id of their checkpoint; where a paper names 
 sentence-BERT), the checkpoint is our choice.
 """
     for table in TABLES:
-        columns = {name: values(name) for name in table.columns}
+        columns = {name: values(name, sizes) for name in table.columns}
         rows = [key for key in LABELS if any(key in papers for papers in table.columns.values())]
         page += f"\n## {table.title}\n\n| | {' | '.join(f'`{name}`' for name in columns)} |\n"
         page += f"|---|{'---|' * len(columns)}\n"
@@ -131,15 +132,7 @@ def _cell(ours: Any, papers: Any) -> str:
 
 
 def _text(value: Any) -> str:
-    if value is None:
-        return "–"
-    if isinstance(value, bool):
-        return "yes" if value else "no"
-    if isinstance(value, list | tuple):
-        return ", ".join(_text(item) for item in value)
-    if isinstance(value, int):
-        return f"{value:,}".replace(",", " ")
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
+    return "–" if value is None else setting_text(value)
 
 
 PAGES = {"recipes.md": recipes_page, "hyperparameters.md": hyperparameters_page}

@@ -22,7 +22,7 @@ from evaluators.protocol import load_protocol
 from flame_mdm.__main__ import main
 from flame_mdm.data.synthetic import Synthetic
 from flame_mdm.reporting.audit import PHYSICS, Seen, card_name, card_of, findings, read_card, seen, write_card
-from flame_mdm.reporting.rendering import Part, Table, fragment, markdown
+from flame_mdm.reporting.tables.format import Part, Table, fragment, markdown
 from flame_mdm.representations.humanml import HumanML
 from flame_mdm.schemas import AuditCard, AuditedPerturbation, check_shape
 from flame_mdm.seeds import key

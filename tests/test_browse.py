@@ -81,8 +81,8 @@ class Hostile(MotionSource):
     def count(self) -> int:
         return 5
 
-    def excluded(self) -> dict[str, int]:
-        return {HOSTILE: 3}
+    def __init__(self) -> None:
+        self.excluded[HOSTILE] = 3
 
     def clips(self, fps: float) -> Iterator[Clip]:
         walk = next(Synthetic(clips=1).clips(fps)).motion

@@ -574,12 +574,12 @@ def broken_results() -> Iterator[str]:
 
 
 def test_damaged_results(refused, bad):
-    from flame_mdm.reporting.tables import load_spec, requests
+    from flame_mdm.reporting.tables.specs import evaluations, load_spec
 
     refused.every = 6
     spec, run = bad / "mine.yaml", a_run(bad / "run")
     spec.write_text(json.dumps({**SPEC, "parts": {"A": SPEC["parts"]["A"]}}))
-    ((_, (request, _)), _) = requests(load_spec(str(spec))["parts"]["A"])
+    ((_, (request, _)), _) = evaluations(load_spec(str(spec))["parts"]["A"])
     in_table, in_run = request.path(bad / "results"), run / "evaluation" / "p-1" / "x" / "result.json"
     words = [f"table={spec}", "evaluate=false", f"results={bad / 'results'}"]
     for path in (in_table, in_run):

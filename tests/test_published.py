@@ -14,22 +14,32 @@ from support.fixtures import recipe
 
 from evaluators.evaluator import Evaluator, Motions
 from evaluators.protocol import load_protocol, protocol_config
+from flame_mdm.commands.tables import sizes
 from flame_mdm.config import EXPERIMENTS, Config, instantiate, recipes
 from flame_mdm.errors import UserError
 from flame_mdm.processes.diffusion import GaussianDiffusion
 from flame_mdm.processes.flow_matching import FlowMatching
-from flame_mdm.reporting import tables
-from flame_mdm.reporting.settings import values
+from flame_mdm.reporting.settings import values as recipe_values
+from flame_mdm.reporting.tables import build as builder
+from flame_mdm.reporting.tables.format import ABOUT
+from flame_mdm.reporting.tables.specs import PUBLISHED as PUBLISHED_FILE
+from flame_mdm.reporting.tables.specs import load_spec, spec_names
 
-PUBLISHED: dict[str, dict[str, Any]] = yaml.safe_load(tables.PUBLISHED.read_text())
+PUBLISHED: dict[str, dict[str, Any]] = yaml.safe_load(PUBLISHED_FILE.read_text())
 del PUBLISHED["hyperparameters"]  # which tests/test_recipes.py checks
-PAPERS = [name for name in tables.spec_names() if name.startswith(("flame_", "mdm_", "mfm_"))]
-SPECS = {name: tables.load_spec(name) for name in tables.spec_names()}
+PAPERS = [name for name in spec_names() if name.startswith(("flame_", "mdm_", "mfm_"))]
+SPECS = {name: load_spec(name) for name in spec_names()}
 PARTS = {f"{name}: {label}": part for name, spec in SPECS.items() for label, part in spec["parts"].items()}
 MEASURED = {name: part for name, part in PARTS.items() if "columns" in part}
 SETTINGS = {name: part for name, part in PARTS.items() if "recipes" in part}
 REPORTED = {f"{name}: {label}": part for name, parts in PUBLISHED.items() for label, part in parts.items()}
 NUMBER = re.compile(r"(\d{1,3}(,\d{3})*|\d+)(\.\d+)?(M|%)?( ±\d*\.\d+)?")
+
+
+@cache
+def settings(name: str) -> dict[str, Any]:
+    """Hyperparameters of a recipe."""
+    return recipe_values(name, sizes)
 
 
 def models(part: Config) -> list[Config]:
@@ -74,7 +84,7 @@ def test_there_is_a_table_for_each_of_the_papers():
 
 @pytest.mark.parametrize("name", PAPERS)
 def test_a_table_is_made_of_its_spec_and_the_published_numbers(name, tmp_path):
-    table = tables.build(name, SPECS[name], tmp_path)
+    table = builder.build(name, SPECS[name], tmp_path, sizes)
     assert [part.name for part in table.parts] == list(SPECS[name]["parts"])
 
 
@@ -106,7 +116,7 @@ def test_published_settings_are_those_of_the_recipes(name):
     assert [row["label"] for row in rows] == list(part["keys"])
     for row in rows:
         for column, printed in row["values"].items():
-            ours = values(part["recipes"][column])[part["keys"][row["label"]]]
+            ours = settings(part["recipes"][column])[part["keys"][row["label"]]]
             for one, text in zip(ours if isinstance(ours, list | tuple) else [ours], printed.split(", "), strict=True):
                 if isinstance(one, str):
                     assert one == text
@@ -119,7 +129,7 @@ def test_published_settings_are_those_of_the_recipes(name):
 def test_settings_exist_in_the_recipes(name):
     for label, key in SETTINGS[name]["keys"].items():
         for column in SETTINGS[name]["recipes"].values():
-            assert key in values(column), f"{label}: {column} has no {key}"
+            assert key in settings(column), f"{label}: {column} has no {key}"
 
 
 @pytest.mark.parametrize("name", MEASURED)
@@ -128,7 +138,7 @@ def test_columns_are_what_the_protocol_measures(name):
     wanted = {column["value"] for column in part["columns"].values()}
     for row in models(part):
         _, found = measures(part["protocol"], trained(row))
-        assert wanted <= found | tables.ABOUT.keys(), f"{part['protocol']} measures {sorted(found)}"
+        assert wanted <= found | ABOUT.keys(), f"{part['protocol']} measures {sorted(found)}"
 
 
 @pytest.mark.parametrize("name", MEASURED)
@@ -248,7 +258,7 @@ def test_a_published_column_without_a_counterpart_is_refused(tmp_path):
     columns = {label: column for label, column in spec["parts"]["KIT-ML"]["columns"].items() if label != "FID"}
     narrow = spec | {"parts": {"KIT-ML": spec["parts"]["KIT-ML"] | {"columns": columns}}}
     with pytest.raises(UserError, match="no column is called FID"):
-        tables.build("mdm_2", narrow, tmp_path)
+        builder.build("mdm_2", narrow, tmp_path, sizes)
 
 
 # What the papers say of themselves, twice or in other places ----------------------------------------------------------
@@ -329,7 +339,7 @@ def test_mfm_counts_parameters_and_calls_alike_in_its_tables():
     kit, humanml3d = PUBLISHED["mfm_1"]["KIT-ML"]["rows"], PUBLISHED["mfm_2"]["HumanML3D"]["rows"]
     assert [row for row in humanml3d if row["label"] != "MotionGPT"] == kit[:-1]
     assert kit[-1] == {"label": "Our MFM", "values": {"NFE": "50", "Parameters, M": "17.9M"}}
-    assert round(values("humanml3d/mfm")["parameters"], 1) == 17.9
+    assert round(settings("humanml3d/mfm")["parameters"], 1) == 17.9
 
 
 def test_fewer_steps_take_less_time_and_give_a_larger_distance():
@@ -354,7 +364,7 @@ def test_r_precision_grows_with_k():
 
 
 def test_each_setting_stands_beside_the_reported_one(tmp_path):
-    (part,) = tables.build("flame_6", SPECS["flame_6"], tmp_path).parts
+    (part,) = builder.build("flame_6", SPECS["flame_6"], tmp_path, sizes).parts
     assert list(part.columns) == ["HumanML3D", "HumanML3D, reported", "BABEL", "BABEL, reported"]
     lines = {line.label: [cell and cell.text for cell in line.cells] for line in part.lines}
     assert lines["Maximum text length"] == ["20", "20 words", "20", "20 words"]
@@ -362,7 +372,7 @@ def test_each_setting_stands_beside_the_reported_one(tmp_path):
 
 
 def test_recipes_stand_in_rows_where_there_are_more_of_them(tmp_path):
-    (part,) = tables.build("mdm_8", SPECS["mdm_8"], tmp_path).parts
+    (part,) = builder.build("mdm_8", SPECS["mdm_8"], tmp_path, sizes).parts
     assert list(part.columns) == ["Parameters, M", "Parameters, M, reported"]
     lines = {line.label: [cell and cell.text for cell in line.cells] for line in part.lines}
     assert lines["U-net"] == ["23.57", "23.47"]
@@ -370,8 +380,8 @@ def test_recipes_stand_in_rows_where_there_are_more_of_them(tmp_path):
 
 
 def test_settings_that_no_paper_reports_stand_alone(tmp_path, monkeypatch):
-    monkeypatch.setattr(tables, "PUBLISHED", tmp_path / "absent.yaml")
-    (part,) = tables.build("flame_6", SPECS["flame_6"], tmp_path).parts
+    monkeypatch.setattr(builder, "PUBLISHED", tmp_path / "absent.yaml")
+    (part,) = builder.build("flame_6", SPECS["flame_6"], tmp_path, sizes).parts
     assert list(part.columns) == ["HumanML3D", "BABEL"]
 
 

@@ -17,10 +17,23 @@ from flame_mdm.__main__ import main
 from flame_mdm.checkpoints.model_files import FORMAT, FORMAT_KEY, weights_sha256
 from flame_mdm.commands.tables import outdated
 from flame_mdm.errors import UserError
-from flame_mdm.reporting import tables
-from flame_mdm.reporting.rendering import Cell, Figure, Line, Part, Table, cumulative, draw, latex, markdown, places
 from flame_mdm.reporting.study import wilson
-from flame_mdm.reporting.tables import Request, build, load_spec, requests, spec_names, write
+from flame_mdm.reporting.tables import build as builder
+from flame_mdm.reporting.tables.build import build
+from flame_mdm.reporting.tables.format import (
+    Cell,
+    Line,
+    Part,
+    Plot,
+    Table,
+    cumulative,
+    draw,
+    latex,
+    markdown,
+    ranks,
+    write,
+)
+from flame_mdm.reporting.tables.specs import Evaluation, evaluations, load_spec, spec_names
 
 SPEC = """
 title: "A table, 50 % & more_of_it"
@@ -98,17 +111,17 @@ def folder(tmp_path: Path) -> Path:
         "FLAME <b>": result(0.6, 0.650, 9.5),
     }
     spec = load_spec(str(tmp_path / "spec.yaml"))
-    for row, asked in requests(spec["parts"]["Text-to-motion"]):
+    for row, asked in evaluations(spec["parts"]["Text-to-motion"]):
         if row["label"] in given:
             put(asked[0], tmp_path, given[row["label"]])
-    for row, asked in requests(spec["parts"]["Steps"]):
+    for row, asked in evaluations(spec["parts"]["Steps"]):
         fid = 1 / row["num_inference_steps"] + row["guidance_scale"] / 10
         checkpoint = given["MDM"]["checkpoint"] | {n: row[n] for n in ("num_inference_steps", "guidance_scale")}
         put(asked[0], tmp_path, result(fid, 0.6, 9.0) | {"checkpoint": checkpoint})
     return tmp_path
 
 
-def put(request: Request, folder: Path, content: dict) -> Path:
+def put(request: Evaluation, folder: Path, content: dict) -> Path:
     path = request.path(folder / "results")
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(content))
@@ -142,7 +155,7 @@ def test_the_same_results_give_the_same_bytes(folder, capsys):
 
 def test_deleting_a_result_changes_its_row_alone(folder):
     before = render(folder, folder / "a")
-    (row,) = [asked[0] for row, asked in requests(_part(folder)) if row["label"] == "MFM"]
+    (row,) = [asked[0] for row, asked in evaluations(_part(folder)) if row["label"] == "MFM"]
     row.path(folder / "results").unlink()
     after = render(folder, folder / "b")
     changed = [
@@ -176,7 +189,7 @@ def test_cells_ranks_and_real_motions(folder):
         "9.503 ±0.012",
         None,
     ]
-    places_of = {name: [c.place if c else None for c in line.cells] for name, line in lines.items()}
+    places_of = {name: [c.rank if c else None for c in line.cells] for name, line in lines.items()}
     assert places_of["measured: MDM"] == [2, 0, 2, 1]  # 9.559 is 0.056 from real motions, 9.5 only 0.003
     assert places_of["measured: MFM"] == [1, 1, 0, 1]
     assert places_of["measured: FLAME <b>"] == [0, 2, 1, 1]
@@ -187,7 +200,7 @@ def test_cells_ranks_and_real_motions(folder):
 
 
 def test_rows_of_another_evaluator_are_marked_and_not_compared(folder):
-    path = next(asked[0].path(folder / "results") for row, asked in requests(_part(folder)) if row["label"] == "MFM")
+    path = next(asked[0].path(folder / "results") for row, asked in evaluations(_part(folder)) if row["label"] == "MFM")
     content = json.loads(path.read_text())
     for change in (
         {"extractor": {"sha256": "d" * 64}},
@@ -203,14 +216,14 @@ def test_rows_of_another_evaluator_are_marked_and_not_compared(folder):
         lines = {line.label: line for line in table.parts[0].lines if line.kind == "measured"}
         assert lines["MDM"].marks == lines["FLAME <b>"].marks == "a", change
         assert lines["MFM"].marks == "b", change
-        assert all(cell is None or cell.place == 0 for cell in lines["MFM"].cells), change
-        assert [cell.place for cell in lines["MDM"].cells if cell] == [1, 2, 2, 1], change
+        assert all(cell is None or cell.rank == 0 for cell in lines["MFM"].cells), change
+        assert [cell.rank for cell in lines["MDM"].cells if cell] == [1, 2, 2, 1], change
         reals = [line for line in table.parts[0].lines if line.kind == "real"]
         assert [line.marks for line in reals] == ["a", "b"], change
 
 
 def test_clips_left_out_of_the_data_set_are_in_the_footnotes(folder):
-    (request,) = [asked[0] for row, asked in requests(_part(folder)) if row["label"] == "MDM"]
+    (request,) = [asked[0] for row, asked in evaluations(_part(folder)) if row["label"] == "MDM"]
     excluded = {"motions of HumanAct12, as data.source.humanact12 is not given": 1191}
     data = {"dataset": "synthetic", "fingerprint": "f" * 16, "excluded": excluded}
     put(request, folder, result(0.5, 0.4, 9.0, data=data))
@@ -236,7 +249,7 @@ def test_a_missing_extractor_is_noted_beside_a_missing_checkpoint(folder):
 
 
 def test_footnotes_list_what_differs_and_group_rows(folder):
-    for number, (_, asked) in enumerate(requests(load_spec(str(folder / "spec.yaml"))["parts"]["Steps"])):
+    for number, (_, asked) in enumerate(evaluations(load_spec(str(folder / "spec.yaml"))["parts"]["Steps"])):
         path = asked[0].path(folder / "results")
         reasons = {"invalid_because": ["real motions have fid 3, expected 0.002 +- 0.02"], "valid": False}
         path.write_text(json.dumps(json.loads(path.read_text()) | reasons | {"seed": number // 2}))
@@ -262,7 +275,7 @@ def test_a_row_that_is_not_valid_is_reported_by_the_exit_code(folder, capsys):
     words = [f"table={folder / 'spec.yaml'}", "evaluate=false", f"results={folder / 'results'}", f"out={folder / 'a'}"]
     assert main(["tables", *words]) == 0
     assert "NOT VALID" not in capsys.readouterr().err
-    (row,) = [asked[0] for row, asked in requests(_part(folder)) if row["label"] == "MFM"]
+    (row,) = [asked[0] for row, asked in evaluations(_part(folder)) if row["label"] == "MFM"]
     path = row.path(folder / "results")
     reason = "training data of the extractor 1 and evaluated data 2 differ: splits may overlap"
     path.write_text(json.dumps(json.loads(path.read_text()) | {"invalid_because": [reason], "valid": False}))
@@ -277,7 +290,7 @@ def test_a_row_that_is_not_valid_is_reported_by_the_exit_code(folder, capsys):
 
 
 def test_a_table_tells_how_its_checkpoints_were_chosen(folder):
-    for row, asked in requests(_part(folder)):
+    for row, asked in evaluations(_part(folder)):
         path = asked[0].path(folder / "results")
         if row["label"] == "MFM":
             content = json.loads(path.read_text())
@@ -289,7 +302,7 @@ def test_a_table_tells_how_its_checkpoints_were_chosen(folder):
 
 
 def test_a_distance_of_0_between_real_motions_is_explained(folder):
-    for _, asked in requests(_part(folder)):
+    for _, asked in evaluations(_part(folder)):
         path = asked[0].path(folder / "results")
         if path.exists():
             content = json.loads(path.read_text())
@@ -320,7 +333,7 @@ figures:
 def test_times_are_compared_in_batches_of_the_same_size_alone(folder):
     (folder / "timed.yaml").write_text(TIMED.format(folder=folder))
     spec = load_spec(str(folder / "timed.yaml"))
-    for row, asked in requests(spec["parts"]["all"]):
+    for row, asked in evaluations(spec["parts"]["all"]):
         size = row.get("batch_size", 1)
         content = result(0, 0, 0, cost={"nfe": 10.0, "seconds_per_sample": 1 / size, "batch_size": float(size)})
         trained = {"prediction": "velocity", "training_hours": 12.25, "training_memory_gib": 7.5}
@@ -337,7 +350,7 @@ def test_times_are_compared_in_batches_of_the_same_size_alone(folder):
     ], "results of earlier versions have no parameterization"
     assert [line.marks for line in lines] == ["a", "b", "a"]
     assert "as a, but timed in batches of 64 on cpu" in [note for _, note in part.notes]
-    assert [cell.place for line in lines if (cell := line.cells[1])] == [1, 0, 1]
+    assert [cell.rank for line in lines if (cell := line.cells[1])] == [1, 0, 1]
     assert "predicts – / – / velocity" in markdown(Table("timed", "", [part]))
 
 
@@ -370,7 +383,7 @@ def test_the_batch_size_of_the_command_is_not_that_of_timed_rows(folder, monkeyp
     ],
 )
 def test_the_skeleton_of_the_joints_is_in_the_footnotes(folder, skeleton, representation, note):
-    (request,) = [asked[0] for row, asked in requests(_part(folder)) if row["label"] == "MDM"]
+    (request,) = [asked[0] for row, asked in evaluations(_part(folder)) if row["label"] == "MDM"]
     data = {"dataset": "synthetic", "fingerprint": "f" * 16, "representation": representation}
     put(request, folder, result(0.5, 0.4, 9.0, data=data, skeleton=skeleton))
     found = [text for _, text in made(folder).parts[0].notes if "joints of" in text]
@@ -379,14 +392,14 @@ def test_the_skeleton_of_the_joints_is_in_the_footnotes(folder, skeleton, repres
 
 
 def test_an_invalid_row_says_so_and_is_not_ranked(folder):
-    path = next(asked[0].path(folder / "results") for row, asked in requests(_part(folder)) if row["label"] == "MFM")
+    path = next(asked[0].path(folder / "results") for row, asked in evaluations(_part(folder)) if row["label"] == "MFM")
     reason = "real motions have fid 3, expected 0.002 +- 0.02"
     forced = {"valid": False, "invalid_because": [reason], "forced": True}
     path.write_text(json.dumps(json.loads(path.read_text()) | forced))
     table = made(folder)
     line = next(line for line in table.parts[0].lines if line.label == "MFM")
     assert line.state == "NOT VALID"
-    assert all(cell is None or cell.place == 0 for cell in line.cells)
+    assert all(cell is None or cell.rank == 0 for cell in line.cells)
     assert f"MFM: NOT VALID: {reason}" in markdown(table)
     assert "as a, but forced: real motions do not have the values that the protocol expects" in markdown(table)
 
@@ -435,15 +448,15 @@ spec:
       - {label: "MDM, corrected", source: elsewhere, values: {FID: "0.489"}}
 """
     )
-    monkeypatch.setattr(tables, "PUBLISHED", published)
+    monkeypatch.setattr(builder, "PUBLISHED", published)
     lines = rows(folder)
     real, best = lines["reported real: Real"].cells[0], lines["measured: MFM"].cells[0]
     assert real is not None
     assert best is not None
-    assert (real.text, best.place) == ("0.002 ±.000", 1)
+    assert (real.text, best.rank) == ("0.002 ±.000", 1)
     reported = [lines[f"reported: {name}"] for name in ("T2M", "MDM", "MDM, corrected")]
     assert [line.marks for line in reported] == ["†", "†", "††"]
-    assert [line.cells[0].place for line in reported if line.cells[0]] == [2, 1, 0]
+    assert [line.cells[0].rank for line in reported if line.cells[0]] == [2, 1, 0]
     assert reported[0].options == {"nfe": 1000.0}
     text = markdown(made(folder))
     assert "†: as reported: Someone, table 1; measured with an evaluator of theirs" in text
@@ -508,7 +521,7 @@ def test_an_unknown_table_names_those_there_are(capsys):
 
 
 def test_a_damaged_result_is_told(folder, capsys):
-    path = next(asked[0].path(folder / "results") for row, asked in requests(_part(folder)) if row["label"] == "MFM")
+    path = next(asked[0].path(folder / "results") for row, asked in evaluations(_part(folder)) if row["label"] == "MFM")
     path.write_text(path.read_text()[:100])
     words = [f"table={folder / 'spec.yaml'}", f"results={folder / 'results'}", f"out={folder / 'out'}"]
     assert main(["tables", *words, "evaluate=false"]) == 1
@@ -520,12 +533,12 @@ def test_distances_from_the_training_motions_are_drawn():
     real = Line("Real motions", "real", [], nearest=[0.01 * i for i in range(1, 1001)])
     copied = Line("copies", "measured", [], nearest=[0.0, 0.0, 0.5, 1.0])
     part = Part("Text", {}, [real, copied, Line("unmeasured", "measured", [])])
-    drawn = draw(part, Figure("nearest", []), {})
+    drawn = draw(part, Plot("nearest", []))
     assert drawn is not None
     assert "distance from the nearest training motion, m" in drawn
     assert "copies" in drawn
     assert "unmeasured" not in drawn
-    assert draw(Part("Text", {}, [Line("unmeasured", "measured", [])]), Figure("nearest", []), {}) is None
+    assert draw(Part("Text", {}, [Line("unmeasured", "measured", [])]), Plot("nearest", [])) is None
     shares = cumulative(real.nearest)
     assert len(shares) == 100
     assert shares[-1] == (10.0, 1.0)
@@ -536,7 +549,7 @@ def test_distances_from_the_training_motions_are_drawn():
 def test_results_with_distances_are_drawn(folder):
     spec = (folder / "spec.yaml").read_text().partition("figures:")[0]
     (folder / "spec.yaml").write_text(spec + "figures: [{part: Text-to-motion, x: nearest}]\n")
-    (_, asked), *_ = requests(load_spec(str(folder / "spec.yaml"))["parts"]["Text-to-motion"])
+    (_, asked), *_ = evaluations(load_spec(str(folder / "spec.yaml"))["parts"]["Text-to-motion"])
     nearest = {"generated": [0.01, 0.02], "real": [0.03, 0.07]}
     put(asked[0], folder, result(0.544, 0.611, 9.559) | {"nearest": nearest})
     table = made(folder)
@@ -545,19 +558,19 @@ def test_results_with_distances_are_drawn(folder):
     assert "share of motions" in (folder / "out" / "spec-text-to-motion-figure.svg").read_text()
 
 
-def test_places():
-    assert places([3.0, 1.0, None, 2.0], "lower", None) == [0, 1, 0, 2]
-    assert places([3.0, 1.0, 2.0], "higher", None) == [1, 0, 2]
-    assert places([3.0, 1.0, 2.0], "real", 1.9) == [0, 2, 1]
-    assert places([3.0, 1.0], "real", None) == [0, 0]
-    assert places([3.0, 3.0, 1.0], "higher", None) == [1, 1, 2]
-    assert places([3.0], "higher", None) == [0]
-    assert places([3.0, 4.0], "none", None) == [0, 0]
+def test_ranks():
+    assert ranks([3.0, 1.0, None, 2.0], "lower", None) == [0, 1, 0, 2]
+    assert ranks([3.0, 1.0, 2.0], "higher", None) == [1, 0, 2]
+    assert ranks([3.0, 1.0, 2.0], "real", 1.9) == [0, 2, 1]
+    assert ranks([3.0, 1.0], "real", None) == [0, 0]
+    assert ranks([3.0, 3.0, 1.0], "higher", None) == [1, 1, 2]
+    assert ranks([3.0], "higher", None) == [0]
+    assert ranks([3.0, 4.0], "none", None) == [0, 0]
 
 
 def test_numbers_have_the_decimals_of_their_column_and_are_never_all_zeros():
     lines = [Line("", "measured", [Cell("", value, 0.0021)]) for value in (103.6, 0.016, 0.0)]
-    tables._print_cells(lines, 1)
+    builder._print_cells(lines, 1)
     assert [cell.text for line in lines if (cell := line.cells[0])] == ["103.6 ±0.0", "0.016 ±0.002", "0.0 ±0.0"]
 
 
@@ -632,7 +645,7 @@ def clip_file(folder: Path, weight: float, steps: int) -> str:
 
 
 def test_a_result_is_outdated_when_checkpoint_or_extractor_are_others_now(folder):
-    (request,) = [asked[0] for row, asked in requests(_part(folder)) if row["label"] == "MDM"]
+    (request,) = [asked[0] for row, asked in evaluations(_part(folder)) if row["label"] == "MDM"]
     content = json.loads(request.path(folder / "results").read_text())
     content["checkpoint"]["sha256"] = hashlib.sha256((folder / "mdm.ckpt").read_bytes()).hexdigest()
     content["extractor"]["sha256"] = clip_file(folder, 1.0, 600)
@@ -648,7 +661,7 @@ def test_a_result_is_outdated_when_checkpoint_or_extractor_are_others_now(folder
 
 
 def test_a_result_of_a_stand_in_skeleton_is_outdated_once_smpl_is_there(folder, monkeypatch):
-    (request,) = [asked[0] for row, asked in requests(_part(folder)) if row["label"] == "MDM"]
+    (request,) = [asked[0] for row, asked in evaluations(_part(folder)) if row["label"] == "MDM"]
     content = json.loads(request.path(folder / "results").read_text())
     content["checkpoint"]["sha256"] = hashlib.sha256((folder / "mdm.ckpt").read_bytes()).hexdigest()
     content["extractor"]["sha256"] = clip_file(folder, 1.0, 600)

@@ -30,9 +30,20 @@ from flame_mdm.formats.motion import Motion
 from flame_mdm.formats.readers import read
 from flame_mdm.reporting.page import POLICY, page
 from flame_mdm.reporting.plots import Panel, Series, svg
-from flame_mdm.reporting.rendering import Cell, Line, Part, Table, comma_separated, draw, latex, markdown
-from flame_mdm.reporting.rendering import Figure as Plot
-from flame_mdm.reporting.tables import build, load_spec, requests, write
+from flame_mdm.reporting.tables.build import build
+from flame_mdm.reporting.tables.format import (
+    Cell,
+    Line,
+    Part,
+    Plot,
+    Table,
+    comma_separated,
+    draw,
+    latex,
+    markdown,
+    write,
+)
+from flame_mdm.reporting.tables.specs import evaluations, load_spec
 from flame_mdm.representations.skeleton import SMPL22
 from flame_mdm.safe_io import atomic_folder, atomic_write, write_json
 from flame_mdm.sampling.generation import write_motions
@@ -139,7 +150,7 @@ def test_unreadable_results_and_ratings(attacked, bad, kind):
     attacked("compare", f"ratings={bad / 'ratings.json'}", says=f"{bad / 'ratings.json'}: {says}")
     spec = bad / "spec.yaml"
     spec.write_text(SPEC.format(folder=bad))
-    _, asked = next(requests(load_spec(str(spec))["parts"]["Steps"]))
+    _, asked = next(evaluations(load_spec(str(spec))["parts"]["Steps"]))
     path = asked[0].path(bad / "results")
     path.parent.mkdir(parents=True)
     make(path)
@@ -366,13 +377,13 @@ def test_tables_hold_text_not_markup_and_no_formulas():
 def test_figures_draw_labels_as_text():
     part = hostile_table().parts[0]
     part.lines[0].label = r"$\frac{$"
-    assert draw(part, part.figures[0], {})
+    assert draw(part, part.figures[0])
 
 
 def test_a_result_with_a_line_break_starts_no_heading(tmp_path):
     (tmp_path / "spec.yaml").write_text(SPEC.format(folder=tmp_path))
     spec = load_spec(str(tmp_path / "spec.yaml"))
-    for _, asked in requests(spec["parts"]["Steps"]):
+    for _, asked in evaluations(spec["parts"]["Steps"]):
         put(asked[0], tmp_path, result(quick=True, warnings=["w\n# Heading"], device="=1+1"))
     write(build("spec", spec, tmp_path / "results"), tmp_path)
     assert "w \\# Heading" in (tmp_path / "spec.md").read_text()

@@ -16,8 +16,9 @@ from flame_mdm.commands.tables import TablesSettings, evaluate_missing
 from flame_mdm.config import EXPERIMENTS, run
 from flame_mdm.errors import UserError, say
 from flame_mdm.reporting.page import page, render
-from flame_mdm.reporting.rendering import Table
-from flame_mdm.reporting.tables import build, load_spec, write
+from flame_mdm.reporting.tables.build import build
+from flame_mdm.reporting.tables.format import Table, write
+from flame_mdm.reporting.tables.specs import load_spec
 from flame_mdm.runs import newest_samples
 from flame_mdm.safe_io import read_yaml, write_json, write_text
 from flame_mdm.sampler_options import option

@@ -5,17 +5,17 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
-from flame_mdm.config import Config, compose_data, instantiate, run
+from flame_mdm.config import Config, compose, compose_data, instantiate, run
 from flame_mdm.errors import UserError, first_line, say
 from flame_mdm.safe_io import sha256, write_json, write_text
 from flame_mdm.sampler_options import option
 
 if TYPE_CHECKING:
-    from flame_mdm.reporting.tables import Request
+    from flame_mdm.reporting.tables.specs import Evaluation
 
 INVALID = 3
 """Exit code if a requested row is not valid."""
@@ -51,14 +51,16 @@ def tables(settings: TablesSettings) -> None:
         SystemExit: With code `INVALID` if a row is not valid; the tables are written, and each reason is printed.
     """
     from flame_mdm.reporting.page import page, render
-    from flame_mdm.reporting.tables import NOT_VALID, build, load_spec, spec_names, write
+    from flame_mdm.reporting.tables.build import NOT_VALID, build
+    from flame_mdm.reporting.tables.format import write
+    from flame_mdm.reporting.tables.specs import load_spec, spec_names
 
     names = settings.table or spec_names()
     specs = {Path(name).stem: load_spec(name) for name in names}
     results = Path(settings.results)
     failed = evaluate_missing(specs, results, settings) if settings.evaluate else []
     out = Path(settings.out)
-    built = {name: build(name, spec, results) for name, spec in specs.items()}
+    built = {name: build(name, spec, results, sizes) for name, spec in specs.items()}
     counts = {}
     invalid = False
     for name, table in built.items():
@@ -88,19 +90,19 @@ def evaluate_missing(specs: Mapping[str, Config], results: Path, settings: Table
     from evaluators.evaluation import evaluate
     from evaluators.protocol import protocol_config
     from evaluators.request import EvaluationRequest
-    from flame_mdm.reporting.tables import requests
+    from flame_mdm.reporting.tables.specs import evaluations
 
-    listed: dict[Path, Request] = {}
+    listed: dict[Path, Evaluation] = {}
     for part in (part for spec in specs.values() for part in spec["parts"].values()):
         for dataset in part.get("lengths", []):
             count_lengths(dataset, results, settings)
-        for _, row in requests(part) if "columns" in part else ():
-            listed |= {request.path(results): request for request in row if not request.absent}
-    missing = {path: request for path, request in listed.items() if not path.exists() or outdated(path, request)}
+        for _, row in evaluations(part) if "columns" in part else ():
+            listed |= {evaluation.path(results): evaluation for evaluation in row if not evaluation.absent}
+    missing = {path: listed[path] for path in listed if not path.exists() or outdated(path, listed[path])}
     failed = []
-    for number, (path, request) in enumerate(missing.items()):
-        say(f"evaluating {number + 1} of {len(missing)}: {request.label}")
-        keys = dict(request.keys)
+    for number, (path, evaluation) in enumerate(missing.items()):
+        say(f"evaluating {number + 1} of {len(missing)}: {evaluation.label}")
+        keys = dict(evaluation.keys)
         try:
             dotted = [f"{name}={keys.pop(name)}" for name in list(keys) if "." in name]
             nodes = compose_data(keys.pop("data"), dotted) if "data" in keys else {}
@@ -110,12 +112,12 @@ def evaluate_missing(specs: Mapping[str, Config], results: Path, settings: Table
                 general.pop("batch_size", None)  # protocols that measure time set the batch size
             evaluate(EvaluationRequest.of(nodes | general | keys | {"out": str(path)}))
         except (UserError, OSError) as error:
-            failed.append(f"{request.label}: {first_line(error)}")
+            failed.append(f"{evaluation.label}: {first_line(error)}")
             say(f"failed: {failed[-1]}")
     return failed
 
 
-def outdated(path: Path, request: Request) -> bool:
+def outdated(path: Path, evaluation: Evaluation) -> bool:
     """Returns whether the checkpoint or extractor of a result has changed, or SMPL's model file is now available."""
     from flame_mdm.checkpoints.model_files import weights_sha256
     from flame_mdm.schemas import read_result
@@ -124,7 +126,7 @@ def outdated(path: Path, request: Request) -> bool:
     if result.stand_in_skeleton and os.environ.get("FLAME_MDM_SMPL"):
         return True
     for used, key in ((result.checkpoint, "ckpt"), (result.extractor, "extractor")):
-        file = Path(str(request.keys.get(key)))
+        file = Path(str(evaluation.keys.get(key)))
         weights = key == "extractor" and file.suffix in (".ckpt", ".safetensors")
         if file.is_file() and (used is None or used.sha256 != (weights_sha256 if weights else sha256)(file)):
             return True
@@ -133,7 +135,7 @@ def outdated(path: Path, request: Request) -> bool:
 
 def count_lengths(dataset: str, results: Path, settings: TablesSettings) -> None:
     """Writes the motion lengths of a data set to `results`; prints a message if the data set is not prepared."""
-    from flame_mdm.reporting.tables import Lengths
+    from flame_mdm.reporting.tables.build import Lengths
 
     nodes = compose_data(dataset, data_root=settings.data_root or os.environ.get("FLAME_MDM_DATA", "data"))
     data = instantiate(nodes["data"], representation=instantiate(nodes["representation"]))
@@ -148,6 +150,26 @@ def count_lengths(dataset: str, results: Path, settings: TablesSettings) -> None
         excluded=store.info["excluded"],
     )
     write_json(results / "lengths" / f"{dataset}.json", counted.model_dump(), indent=None)
+
+
+@cache
+def sizes(recipe: str) -> dict[str, float]:
+    """Returns the number of features of a recipe, and of parameters of its denoiser, without the language model."""
+    import torch
+
+    config = compose(recipe)
+    features = instantiate(config["representation"]).features
+    if "denoiser" not in config:
+        return {"features": features}
+    process = instantiate(config["process"])
+    with torch.device("meta"):
+        denoiser = instantiate(
+            config["denoiser"],
+            in_features=features,
+            out_features=process.out_features(features),
+            cond_features=config["condition"].get("features", 0),
+        )
+    return {"features": features, "parameters": sum(p.numel() for p in denoiser.parameters()) / 1e6}
 
 
 main = partial(run, tables, TablesSettings)

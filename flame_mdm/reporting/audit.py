@@ -31,10 +31,10 @@ class Seen:
     """How a metric responds to a perturbation.
 
     Attributes:
-        grade: the smallest grade from which on the paired difference from real motions differs from 0; None = never.
-        outside: the same, of values that also leave the 95 % interval of real motions.
-        rewarded: whether the strongest grade is rated better than real motions.
-        monotone: whether each stronger grade differs at least as much, within its interval.
+        grade: smallest grade at which, and above which, the paired difference from real motions is not 0; None = none.
+        outside: the same for values outside the 95 % interval of real motions.
+        rewarded: whether the metric rates the strongest grade better than real motions.
+        monotone: whether every stronger grade differs at least as much, within its interval.
     """
 
     grade: float | None
@@ -46,11 +46,11 @@ class Seen:
 def seen(card: AuditCard, perturbation: AuditedPerturbation, metric: str) -> Seen | None:
     """Returns how a metric responds to a perturbation; None if it was not computed at all grades."""
     real, width = card.real[metric]
-    found = [(grade.grade, *grade.values[metric]) for grade in perturbation.grades]
+    graded = [(grade.grade, *grade.values[metric]) for grade in perturbation.grades]
     if real is None or width is None:
         return None
-    changes = [(grade, d, half) for grade, _, _, d, half in found if d is not None and half is not None]
-    if len(changes) < len(found):
+    changes = [(grade, d, half) for grade, _, _, d, half in graded if d is not None and half is not None]
+    if len(changes) < len(graded):
         return None
 
     def since(least: float) -> float | None:
@@ -141,17 +141,17 @@ def _facts(card: AuditCard) -> list[list[str]]:
 
 
 def _truth(card: AuditCard) -> list[list[str]]:
-    return [[name, number(each["auc"]), number(each["correlation"])] for name, each in card.truth.items()]
+    return [[name, number(scores["auc"]), number(scores["correlation"])] for name, scores in card.truth.items()]
 
 
 def findings(card: AuditCard) -> list[str]:
     """Returns what metrics do not see, or rate better than real motions, in plain sentences."""
     table = {(p.name, m): seen(card, p, m) for p in card.perturbations for m in card.metrics}
-    noticed = {pair for pair, found in table.items() if found and found.grade is not None}
+    noticed = {pair for pair, response in table.items() if response and response.grade is not None}
     group = {p.name: p.group for p in card.perturbations}
     wrong = [name for name in group if group[name] in ("joints", "meaning") and ":" not in name]
-    wanted = [name for name in group if name in wrong or name == "memorized"]
-    blind = [name for name in wanted if not any((name, metric) in noticed for metric in card.metrics)]
+    expected = [name for name in group if name in wrong or name == "memorized"]
+    blind = [name for name in expected if not any((name, metric) in noticed for metric in card.metrics)]
     lines = [f"No metric sees: {', '.join(blind)}."] if blind else []
     single = {m: [n for n in wrong if [x for x in card.metrics if (n, x) in noticed] == [m]] for m in card.metrics}
     lines += [f"Only {metric} sees: {', '.join(names)}." for metric, names in single.items() if names]
@@ -161,13 +161,13 @@ def findings(card: AuditCard) -> list[str]:
         if unseen and metric.partition("/")[2] in ("", "all", "top3"):
             lines.append(f"{metric} does not see: {', '.join(unseen)}.")
     for metric in card.metrics:
-        liked = [n for n in wrong if (found := table[n, metric]) and found.rewarded]
+        liked = [n for n in wrong if (response := table[n, metric]) and response.rewarded]
         if liked:
             lines.append(f"{metric} rates better than real motions: {', '.join(liked)}.")
-    for each in card.perturbations:
-        if each.name in ("fewer", "as stored") and "fid" in card.real:
-            grade, (real, _) = each.grades[-1], card.real["fid"]
-            what = f"of {grade.grade:g} real motions" if each.name == "fewer" else "of features as stored"
+    for perturbation in card.perturbations:
+        if perturbation.name in ("fewer", "as stored") and "fid" in card.real:
+            grade, (real, _) = perturbation.grades[-1], card.real["fid"]
+            what = f"of {grade.grade:g} real motions" if perturbation.name == "fewer" else "of features as stored"
             lines.append(
                 f"fid {what} is {number(grade.values['fid'][0])}; of all of them, decoded and encoded, {number(real)}."
             )
@@ -176,28 +176,26 @@ def findings(card: AuditCard) -> list[str]:
 
 def _cell(card: AuditCard, perturbation: AuditedPerturbation | None, metric: str) -> tuple[str, str]:
     """Returns the text of a cell of the summary, and its class."""
-    found = seen(card, perturbation, metric) if perturbation and metric in card.metrics else None
-    if found is None or found.grade is None:
-        return ("not computed", "faint") if found is None else ("–", "faint")
+    response = seen(card, perturbation, metric) if perturbation and metric in card.metrics else None
+    if response is None or response.grade is None:
+        return ("not computed", "faint") if response is None else ("–", "faint")
     graded = perturbation is not None and len(perturbation.grades) > 1
-    first, then = (("–" if g is None else f"{g:g}" if graded else "yes") for g in (found.grade, found.outside))
-    text = (first if first == then else f"{first} → {then}") + " ~" * (not found.monotone)
-    return text, "bad" if found.rewarded else "seen" if first == then else "weak"
+    first, then = (("–" if g is None else f"{g:g}" if graded else "yes") for g in (response.grade, response.outside))
+    text = (first if first == then else f"{first} → {then}") + " ~" * (not response.monotone)
+    return text, "bad" if response.rewarded else "seen" if first == then else "weak"
 
 
 def _rows(cards: Sequence[AuditCard], metrics: Sequence[str]) -> list[dict[str, object]]:
     """Returns the perturbations of all cards, each with its cells and curves by metric."""
     rows = []
-    listed = [{each.name: each for each in card.perturbations} for card in cards]
-    for name in dict.fromkeys(name for each in listed for name in each):
-        of = [each.get(name) for each in listed]
-        about = next(each for each in of if each)
-        pairs = list(zip(cards, of, strict=True))
-        curves = [(m, [c for card, each in pairs if each and (c := _curve(card, each, m))]) for m in metrics]
+    by_name = [{perturbation.name: perturbation for perturbation in card.perturbations} for card in cards]
+    for name in dict.fromkeys(name for names in by_name for name in names):
+        pairs = [(card, perturbations.get(name)) for card, perturbations in zip(cards, by_name, strict=True)]
+        curves = [(m, [curve for card, p in pairs if p and (curve := _curve(card, p, m))]) for m in metrics]
         rows.append(
             {
-                "about": about,
-                "cells": [[_cell(card, each, metric) for card, each in pairs] for metric in metrics],
+                "about": next(perturbation for _, perturbation in pairs if perturbation),
+                "cells": [[_cell(card, perturbation, metric) for card, perturbation in pairs] for metric in metrics],
                 "curves": [(metric, drawn) for metric, drawn in curves if drawn],
             }
         )
@@ -208,15 +206,15 @@ def _curve(card: AuditCard, perturbation: AuditedPerturbation, metric: str) -> d
     """Returns a response curve over real motions and all grades; None if the metric never changes."""
     if metric not in card.metrics:
         return None
-    found = [card.real[metric], *(grade.values[metric][:2] for grade in perturbation.grades)]
-    points = [(i, value, half) for i, (value, half) in enumerate(found) if value is not None and half is not None]
+    pairs = [card.real[metric], *(grade.values[metric][:2] for grade in perturbation.grades)]
+    points = [(i, value, half) for i, (value, half) in enumerate(pairs) if value is not None and half is not None]
     real = card.real[metric][0]
     if real is None or all(abs(value - real) <= ROUNDING * abs(real) for _, value, _ in points):
         return None
     low, high = min(v - h for _, v, h in points), max(v + h for _, v, h in points)
 
     def at(step: int, value: float) -> str:
-        x = 3 + (WIDE - 6) * step / (len(found) - 1)
+        x = 3 + (WIDE - 6) * step / (len(pairs) - 1)
         return f"{x:.0f},{3 + (HIGH - 6) * (high - value) / (high - low):.1f}"
 
     rim = [at(i, v + h) for i, v, h in points] + [at(i, v - h) for i, v, h in reversed(points)]

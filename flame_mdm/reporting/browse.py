@@ -125,12 +125,12 @@ def write_clips(
         raise UserError(
             f"motions={folder}: the folder holds other motions, such as {others[0].name}. Delete it, or choose another"
         )
-    given: set[str] = set()
+    used: set[str] = set()
     with atomic_folder(folder) as made:
         for path, clip in zip(paths, clips, strict=True):
             names = clip.captions or ([] if clip.action is None else [store.info["actions"][clip.action]])
-            caption = next((name for name in names if name not in given), names[0] if names else "")
-            given.add(caption)
+            caption = next((name for name in names if name not in used), names[0] if names else "")
+            used.add(caption)
             features = representation.rebase(store.motion(clip)[:longest])
             joints = representation.decode(torch.from_numpy(features.copy())).numpy()
             motion = Motion(joints, representation.fps, representation.skeleton, caption, clip.id)

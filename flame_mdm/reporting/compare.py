@@ -48,19 +48,19 @@ def find(folders: Sequence[Path]) -> list[ComparedRun]:
     """
     if len(set(folders)) < 2:
         raise UserError(f'a comparison needs two or more runs: runs="A B", not {" ".join(map(str, folders))}')
-    found = []
+    compared = []
     for folder in folders:
         if (folder / CONFIG).exists():
             content = read_run(folder)
-            found.append(ComparedRun(content.label, folder, content))
+            compared.append(ComparedRun(content.label, folder, content))
         elif any(path.suffix.lower() in MOTIONS for path in folder.glob("*")):
-            found.append(ComparedRun(folder.name, folder, None))
+            compared.append(ComparedRun(folder.name, folder, None))
         else:
             raise UserError(
                 f"{folder}: neither a run (no config.yaml) nor a folder of motions (no {', '.join(MOTIONS)} files)"
             )
-    labels = [compared.label for compared in found]
-    return [replace(c, label=str(c.folder)) if labels.count(c.label) > 1 else c for c in found]
+    labels = [entry.label for entry in compared]
+    return [replace(c, label=str(c.folder)) if labels.count(c.label) > 1 else c for c in compared]
 
 
 def shared(shown: Sequence[Mapping[Prompt, Motion]]) -> list[Prompt]:
@@ -94,23 +94,23 @@ def comparison(
 
 def _facts(runs: Mapping[str, Run]) -> list[list[str]]:
     rows = []
-    for label, found in runs.items():
-        facts = found.provenance
-        row = [label, f"{found.steps:,}", number(last(found.curves.get("train/epochs", {})))]
+    for label, run in runs.items():
+        facts = run.provenance
+        row = [label, f"{run.steps:,}", number(last(run.curves.get("train/epochs", {})))]
         row += [f"{facts.parameters / 1e6:.2f} M" if facts and facts.parameters else "–"]
-        row += [number(_median(found, f"train/{name}")) for name in ("seconds_per_step", "samples_per_second")]
+        row += [number(_median(run, f"train/{name}")) for name in ("seconds_per_step", "samples_per_second")]
         row += [facts.device, facts.data.fingerprint] if facts else ["–", "–"]
-        rows.append([*row, str(found.folder)])
+        rows.append([*row, str(run.folder)])
     return rows
 
 
-def _median(found: Run, name: str) -> float | None:
-    curve = found.curves.get(name)
+def _median(run: Run, name: str) -> float | None:
+    curve = run.curves.get(name)
     return statistics.median(curve.values()) if curve else None
 
 
 def _differences(runs: Mapping[str, Run]) -> list[list[str]]:
-    configs = [flatten(found.config) for found in runs.values()]
+    configs = [flatten(run.config) for run in runs.values()]
     keys = sorted({key for config in configs for key in config if key != "experiment" and not key.startswith("run.")})
     rows = [[key, *(str(config[key]) if key in config else "–" for config in configs)] for key in keys]
     return [row for row in rows if len(set(row[1:])) > 1]
@@ -138,12 +138,12 @@ class Difference(NamedTuple):
     @property
     def shown(self) -> str:
         """Whether the difference is shown: all intervals must exclude 0."""
-        found = [interval for interval in (self.over_replications, self.over_motions) if interval is not None]
-        if not found:
+        intervals = [interval for interval in (self.over_replications, self.over_motions) if interval is not None]
+        if not intervals:
             return "not tested: one replication"
-        if all(low > 0 for low, _ in found):
+        if all(low > 0 for low, _ in intervals):
             return "higher"
-        return "lower" if all(high < 0 for _, high in found) else "no difference shown"
+        return "lower" if all(high < 0 for _, high in intervals) else "no difference shown"
 
     @property
     def cells(self) -> list[str]:
@@ -176,8 +176,8 @@ def differences(first: Result, second: Result) -> list[Difference] | str:
         return "not compared: other seed, limits of length or skeleton, so that the motions are not paired"
     values = [result.values or {} for result in (first, second)]
     names = sorted(values[0].keys() & values[1].keys())
-    found = [_difference(name, values[0][name], values[1][name]) for name in names]
-    return [difference for difference in found if difference is not None] or (
+    computed = [_difference(name, values[0][name], values[1][name]) for name in names]
+    return [difference for difference in computed if difference is not None] or (
         "not compared: no metric has values per replication of the same number of motions. Results of earlier versions "
         "have none: evaluate both again; motions are not generated again"
     )
@@ -186,14 +186,14 @@ def differences(first: Result, second: Result) -> list[Difference] | str:
 def _difference(name: str, first: Value | None, second: Value | None) -> Difference | None:
     if first is None or second is None or first.n != second.n:
         return None
-    if (each := _paired(first.per_replication, second.per_replication)) is None:
+    if (replicated := _paired(first.per_replication, second.per_replication)) is None:
         return None
-    mean, low, high = paired_difference(*each)
+    mean, low, high = paired_difference(*replicated)
     over_motions = None
     if (drawn := _paired(first.resampled, second.resampled)) is not None:
         bounds = percentiles(drawn[1] - drawn[0], mean)
         over_motions = (float(bounds[0]), float(bounds[1]))
-    return Difference(name, mean, (low, high) if len(each[0]) > 1 else None, over_motions)
+    return Difference(name, mean, (low, high) if len(replicated[0]) > 1 else None, over_motions)
 
 
 def _paired(first: Sequence[float | None], second: Sequence[float | None]) -> np.ndarray | None:
@@ -206,8 +206,8 @@ def _paired(first: Sequence[float | None], second: Sequence[float | None]) -> np
 def grouped(runs: Mapping[str, Run]) -> dict[str, list[tuple[str, Result]]]:
     """Returns the results of the same protocol, data and extractor with the labels of their runs, by title."""
     groups: dict[str, list[tuple[str, Result]]] = {}
-    for label, found in runs.items():
-        for result in found.results.values():
+    for label, run in runs.items():
+        for result in run.results.values():
             title = f"{evaluation_title(result)}, data {result.data.fingerprint}"
             groups.setdefault(title, []).append((label, result))
     return dict(sorted(groups.items()))
@@ -219,11 +219,9 @@ def in_common(runs: Mapping[str, Run]) -> list[str]:
     if len(runs) < 2 or any(len({label for label, _ in columns}) > 1 for columns in groups.values()):
         return []
     lines = ["No evaluation in common: differences need the same protocol, data and extractor."]
-    for label, found in runs.items():
+    for label, run in runs.items():
         titles = [title for title, columns in groups.items() if columns[0][0] == label]
-        lines.append(
-            f"{label}: {'; '.join(titles) or f'no evaluation. To evaluate: make evaluate CKPT={found.folder}'}"
-        )
+        lines.append(f"{label}: {'; '.join(titles) or f'no evaluation. To evaluate: make evaluate CKPT={run.folder}'}")
     return lines
 
 
@@ -231,10 +229,10 @@ def tested(columns: Sequence[tuple[str, Result]]) -> list[tuple[str, list[list[s
     """Returns titles and rows of the differences of each result from the first; see `HEAD`."""
     (first, base), *others = columns
     tables = []
-    for place, (label, result) in enumerate(others, 2):
-        found = differences(base, result)
-        title = f"[{place}] {label} − [1] {first}"
-        tables.append((f"{title}: {found}", []) if isinstance(found, str) else (title, [each.cells for each in found]))
+    for index, (label, result) in enumerate(others, 2):
+        rows = differences(base, result)
+        title = f"[{index}] {label} − [1] {first}"
+        tables.append((f"{title}: {rows}", []) if isinstance(rows, str) else (title, [row.cells for row in rows]))
     return tables
 
 
@@ -255,12 +253,12 @@ def _evaluations(runs: Mapping[str, Run]) -> list[tuple[str, list[str], list[lis
 
 
 def _charts(runs: Mapping[str, Run]) -> dict[str, list[Markup]]:
-    names = {name for found in runs.values() for name in found.curves}
+    names = {name for run in runs.values() for name in run.curves}
     groups: dict[str, list[Markup]] = {}
     for heading, titles in charted({name: {0: 0.0} for name in names}).items():
         shown: dict[str, tuple[dict[str, Curve], dict[str, Curve]]] = {}
         for name in (f"{family}/{rest}" for rest, families in titles.items() for family in families):
-            lines: dict[str, Curve] = {k: found.curves.get(name, {}) for k, found in runs.items()}  # one color per run
+            lines: dict[str, Curve] = {k: run.curves.get(name, {}) for k, run in runs.items()}  # one color per run
             if len({value for line in lines.values() for value in line.values()}) > 1:
                 shown[name] = lines, {label: runs[label].curves.get(f"{name}/ci", {}) for label in lines}
         groups[heading] = charts(shown)

@@ -153,7 +153,7 @@ def _drawn(panel: Panel) -> dict[str, Any] | None:
     histogram = panel.content if isinstance(panel.content, Histogram) else None
     series = [] if isinstance(panel.content, Histogram) else panel.content
     points = {s.name: [(x, y) for x, y in s.points if x > 0 or not panel.log_x] for s in series}
-    everything = [point for found in points.values() for point in found]
+    everything = [point for curve in points.values() for point in curve]
     if histogram is not None:
         most = max(map(sum, zip(*histogram.counts.values(), strict=True)))
         everything = [(histogram.edges[0], 0), (histogram.edges[-1], max(1, most))]
@@ -172,17 +172,17 @@ def _drawn(panel: Panel) -> dict[str, Any] | None:
         across, down = WIDE - LEFT - RIGHT, HIGH - TOP - BOTTOM
         return f"{LEFT + across * x_axis.share(x):.1f}", f"{TOP + down * (1 - y_axis.share(y)):.1f}"
 
-    def path(found: Iterable[tuple[float, float]]) -> str:
-        return " ".join(",".join(at(x, y)) for x, y in found)
+    def path(line: Iterable[tuple[float, float]]) -> str:
+        return " ".join(",".join(at(x, y)) for x, y in line)
 
     lines = []
     for k, s in enumerate(series):
-        found = points[s.name]
-        wide = [(x, y) for x, y in found if x in s.spread]
+        curve = points[s.name]
+        wide = [(x, y) for x, y in curve if x in s.spread]
         rim = [(x, y + s.spread[x]) for x, y in wide] + [(x, y - s.spread[x]) for x, y in reversed(wide)]
         errors = [(*at(x, y - s.spread[x]), at(x, y + s.spread[x])[1]) for x, y in wide]
-        shown = _thinned(found)
-        dots = [at(x, y) for x, y in shown] if len(found) <= 40 or s.kind == "dots" else []
+        shown = _thinned(curve)
+        dots = [at(x, y) for x, y in shown] if len(curve) <= 40 or s.kind == "dots" else []
         lines.append((k % COLORS, s.kind, path(shown), path(rim), errors, dots))
     names = list(histogram.counts) if histogram else [s.name for s in series]
     legend = [(k % COLORS, HIGH + ROW * (k + bool(panel.x)), name) for k, name in enumerate(names)]

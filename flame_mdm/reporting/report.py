@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import os
-import shlex
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from flame_mdm.errors import UserError
 from flame_mdm.reporting.audit import card_of
 from flame_mdm.reporting.page import interval, number, page, render
 from flame_mdm.reporting.plots import Curve, charts
@@ -21,21 +19,6 @@ if TYPE_CHECKING:
 
 COST = ("lr", "grad_norm", "samples_per_second", "seconds_per_step", "gpu_memory_gib")
 """Training curves about speed and optimization rather than losses."""
-
-
-def paths(key: str, given: str) -> list[Path]:
-    """Splits the value of a key into paths. They are separated by spaces; a path that contains spaces is quoted.
-
-    Raises:
-        UserError: If there is no path, or a quote is not closed.
-    """
-    try:
-        names = shlex.split(given)
-    except ValueError as error:
-        raise UserError(f"{key}={given}: {error}. Put names that contain spaces in quotes") from error
-    if not all(names) or not names:
-        raise UserError(f"{key}={given}: no path given. Name at least one; separate several by spaces")
-    return [Path(name) for name in names]
 
 
 def write_report(folder: Path, mesh: Mesh | None = None) -> Path:
@@ -52,8 +35,8 @@ def write_report(folder: Path, mesh: Mesh | None = None) -> Path:
         fault = read_json(folder / FAULT, Fault, "delete it to write the page without it")
     faulty = [[f"process {b.rank}, batch {b.batch}", b.loss, ", ".join(b.ids)] for b in fault.batches] if fault else []
     groups = {
-        heading: charts({name: _curves(run, name, families) for name, families in found.items()})
-        for heading, found in charted(run.curves).items()
+        heading: charts({name: _curves(run, name, families) for name, families in titles.items()})
+        for heading, titles in charted(run.curves).items()
     }
     body = render(
         "report.html",
@@ -146,7 +129,7 @@ def constants(curves: Mapping[str, Curve]) -> dict[str, float]:
     values = {
         name: set(curve.values()) for name, curve in curves.items() if len(curve) > 1 and not name.endswith("/ci")
     }
-    return {name: next(iter(found)) for name, found in values.items() if len(found) == 1}
+    return {name: next(iter(level)) for name, level in values.items() if len(level) == 1}
 
 
 def _values(result: Result) -> list[list[str]]:
@@ -181,10 +164,10 @@ def sampling(result: Result) -> str:
 
 def marks(result: Result) -> list[str]:
     """Returns reasons not to publish a result, and its differences from the protocol."""
-    found = ["Quick run — not for publication"] if result.quick else []
-    found += [f"not valid: {reason}" for reason in result.invalid_because]
+    reasons = ["Quick run — not for publication"] if result.quick else []
+    reasons += [f"not valid: {reason}" for reason in result.invalid_because]
     changed = ", ".join(f"{name} {value}" for name, value in result.changed.items())
-    return found + ([f"differs from the protocol: {changed}"] if changed and not result.quick else [])
+    return reasons + ([f"differs from the protocol: {changed}"] if changed and not result.quick else [])
 
 
 def printed(value: Value | None) -> str:

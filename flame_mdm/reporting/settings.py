@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import inspect
-from functools import cache
+from collections.abc import Callable
 from typing import Any
 
-import torch
 from hydra.utils import get_class
 
-from flame_mdm.config import Config, compose, instantiate, parameters
+from flame_mdm.config import Config, compose, parameters
+
+Sizes = Callable[[str], dict[str, Any]]
+"""Returns the sizes that only a built network has, `features` and `parameters`, by the name of a recipe."""
 
 LABELS = {
     "optimizer._target_": "optimizer",
@@ -56,15 +58,11 @@ LABELS = {
 """Labels of the hyperparameters in tables, by dotted key; `features` and `parameters` are counted."""
 
 
-@cache
-def values(name: str) -> dict[str, Any]:
+def values(name: str, sizes: Sizes | None = None) -> dict[str, Any]:
     """Returns the hyperparameters of a recipe, by the keys of `LABELS`. Unset ones have the default of their class."""
     config = compose(name)
-    found = {key: value(config, key) for key in LABELS if "." in key}
-    found["features"] = instantiate(config["representation"]).features
-    if "denoiser" in config:
-        found["parameters"] = count_parameters(config, found["features"]) / 1e6
-    return {key: value for key, value in found.items() if value is not None}
+    settings = {key: value(config, key) for key in LABELS if "." in key} | (sizes(name) if sizes else {})
+    return {key: setting for key, setting in settings.items() if setting is not None}
 
 
 def value(config: Config, key: str) -> Any:
@@ -80,14 +78,12 @@ def value(config: Config, key: str) -> Any:
     return None
 
 
-def count_parameters(config: Config, features: int) -> int:
-    """Counts the parameters of the denoiser, without the language model."""
-    process = instantiate(config["process"])
-    with torch.device("meta"):
-        denoiser = instantiate(
-            config["denoiser"],
-            in_features=features,
-            out_features=process.out_features(features),
-            cond_features=config["condition"].get("features", 0),
-        )
-    return sum(p.numel() for p in denoiser.parameters())
+def setting_text(value: Any) -> str:
+    """Returns the value of a hyperparameter as text."""
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, list | tuple):
+        return ", ".join(map(setting_text, value))
+    if isinstance(value, int):
+        return f"{value:,}"
+    return f"{value:.4g}" if isinstance(value, float) else str(value)

@@ -114,10 +114,10 @@ def tally(files: Sequence[Path]) -> list[dict[str, Any]]:
         if (study, rater) in raters:
             raise UserError(f"{path}: {rater} also answered this page in {raters[study, rater]}. Give only one of them")
         raters[study, rater] = path
-        for place, rating in enumerate(answers.ratings, 1):
+        for number, rating in enumerate(answers.ratings, 1):
             a, b, choice = rating.a, rating.b, rating.choice
             if a == b:
-                raise UserError(f"{path}: rating {place} compares {a} with itself; a and b must differ")
+                raise UserError(f"{path}: rating {number} compares {a} with itself; a and b must differ")
             if (b, a) in counts:
                 a, b, choice = b, a, "a" if choice == "b" else "b"
             pair = counts.setdefault((a, b), {"a": 0, "b": 0, "raters": set()})

@@ -6,7 +6,7 @@ import csv
 import io
 import os
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from itertools import groupby
 from pathlib import Path
@@ -14,12 +14,32 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
 from flame_mdm.errors import markdown_text, one_line, shortened
-from flame_mdm.reporting.page import render
-from flame_mdm.reporting.plots import Histogram, Panel, Series, svg
+from flame_mdm.reporting.page import page, render
+from flame_mdm.reporting.plots import Histogram, Panel, Series, standalone, svg
+from flame_mdm.safe_io import write_text
 
 if TYPE_CHECKING:
     from markupsafe import Markup
 
+ABOUT = {
+    "num_inference_steps": "sampling steps",
+    "guidance_scale": "guidance scale",
+    "sampler": "sampler",
+    "eta": "eta",
+    "spacing": "spacing",
+    "until": "fraction of sampling that is rewritten",
+    "strength": "strength of the variation",
+    "nfe": "network calls per motion",
+    "seconds_per_sample": "seconds per motion",
+    "batch_size": "batch size",
+    "parameters": "parameters, M",
+    "prediction": "prediction",
+    "training_steps": "training steps",
+    "training_hours": "training hours",
+    "training_device": "device of training",
+    "training_memory_gib": "peak memory of training, GiB",
+}
+"""Labels of the values that a column may show besides metrics, and of the x-axes of figures."""
 ARROWS = {"higher": "↑", "lower": "↓", "real": "→", "none": ""}
 LATEX_ARROWS = {"higher": r"$\uparrow$", "lower": r"$\downarrow$", "real": r"$\rightarrow$", "none": ""}
 KINDS = {
@@ -48,17 +68,17 @@ class Cell:
         text: as printed.
         value: the number.
         ci: half width of its 95 % interval.
-        place: 1 = best, 2 = second best, 0 = neither.
+        rank: 1 = best, 2 = second best, 0 = neither.
     """
 
     text: str
     value: float | None = None
     ci: float | None = None
-    place: int = 0
+    rank: int = 0
 
 
 NEAREST = "nearest"
-"""`Figure.x` of the cumulative distribution of the distances from the nearest training motion."""
+"""`Plot.x` of the cumulative distribution of the distances from the nearest training motion."""
 
 
 @dataclass
@@ -87,7 +107,7 @@ class Line:
 
 
 @dataclass
-class Figure:
+class Plot:
     """A figure that plots columns of a part over an option of its rows, or the distances of `NEAREST`; see `draw`."""
 
     x: str
@@ -113,7 +133,7 @@ class Part:
     columns: dict[str, str]
     lines: list[Line]
     notes: list[tuple[str, str]] = field(default_factory=list)
-    figures: list[Figure] = field(default_factory=list)
+    figures: list[Plot] = field(default_factory=list)
     histograms: dict[str, tuple[list[float], list[int]]] = field(default_factory=dict)
 
 
@@ -159,14 +179,14 @@ def _number(part: Part, index: int) -> str:
     return f"{index + 1}" if len(part.figures) + len(part.histograms) > 1 else ""
 
 
-def figure_names(table: Table) -> list[tuple[Part, Figure | str, str]]:
+def figure_names(table: Table) -> list[tuple[Part, Plot | str, str]]:
     """Returns the figures of a table with their parts and file names, without suffix."""
-    found: list[tuple[Part, Figure | str, str]] = []
+    names: list[tuple[Part, Plot | str, str]] = []
     for part in table.parts:
         slug = f"-{_slug(part.name)}" if len(table.parts) > 1 else ""
         for index, figure in enumerate([*part.figures, *part.histograms]):
-            found.append((part, figure, f"{table.name}{slug}-figure{_number(part, index)}"))
-    return found
+            names.append((part, figure, f"{table.name}{slug}-figure{_number(part, index)}"))
+    return names
 
 
 def _slug(text: str) -> str:
@@ -192,9 +212,9 @@ def markdown(table: Table) -> str:
                 marks = f" <sup>{line.marks}</sup>" if line.marks else ""
                 page += f"| {markdown_text(_label(line))}{marks} | " + " | ".join(cells) + " |\n"
         for mark, text in part.notes:
-            parts = ((markdown_text(each), quote(link)) for each, link in _linked(table, text))
-            words = "".join(f"[{each}]({link})" if link else each for each, link in parts)
-            page += f"\n{mark}: {words}  " if mark else f"\n{words}  "
+            parts = ((markdown_text(words), quote(link)) for words, link in _linked(table, text))
+            text = "".join(f"[{words}]({link})" if link else words for words, link in parts)
+            page += f"\n{mark}: {text}  " if mark else f"\n{text}  "
         page += "\n"
         for owner, _, name in figure_names(table):
             if owner is part and name in table.drawn:
@@ -218,7 +238,7 @@ def _sources(table: Table) -> list[str]:
         for _, group in groupby(lines, lambda line: [line.facts.get(name) for name in SHARED]):
             some = list(group)
             values = {name: [line.facts[name] for line in some] for name in some[0].facts}
-            facts = ", ".join(f"{name} {_joined(found)}" for name, found in values.items() if any(found))
+            facts = ", ".join(f"{name} {_joined(texts)}" for name, texts in values.items() if any(texts))
             prefix = f"{part.name}: " if len(table.parts) > 1 else ""
             rows.append(f"{prefix}{' / '.join(dict.fromkeys(line.label for line in some))}: {facts}")
     return rows
@@ -232,7 +252,7 @@ def _styled(cell: Cell | None, escape: Callable[[str], str], best: str, second: 
     if cell is None:
         return escape("–")
     text = escape(cell.text)
-    return best.format(text) if cell.place == 1 else second.format(text) if cell.place == 2 else text
+    return best.format(text) if cell.rank == 1 else second.format(text) if cell.rank == 2 else text
 
 
 # LaTeX ----------------------------------------------------------------------------------------------------------------
@@ -284,11 +304,7 @@ def comma_separated(table: Table) -> str:
             values: list[Any] = []
             for name in columns:
                 cell = by_column.get(name)
-                values += (
-                    ["", "", "", ""]
-                    if cell is None
-                    else [_plain(cell.value), cell.text, _plain(cell.ci), cell.place or ""]
-                )
+                values += [_plain(cell.value), cell.text, _plain(cell.ci), cell.rank or ""] if cell else [""] * 4
             row = [part.name, line.label, line.kind, line.state, line.marks, *values]
             writer.writerow([_inert(str(x)) for x in (*row, *(line.facts.get(name, "") for name in facts))])
     return out.getvalue()
@@ -316,7 +332,7 @@ def fragment(table: Table) -> Markup:
     return render("table.html", table=table, sources=_sources(table), ranked=_is_ranked(table), **values)
 
 
-def draw(part: Part, figure: Figure | str, labels: Mapping[str, str]) -> str | None:
+def draw(part: Part, figure: Plot | str) -> str | None:
     """Draws a figure of a part as SVG; None if it has no points.
 
     Curves are named after rows; measured ones are solid, reported ones dashed. If closer to real motions is better in
@@ -325,28 +341,25 @@ def draw(part: Part, figure: Figure | str, labels: Mapping[str, str]) -> str | N
     Args:
         part: the table with the values.
         figure: what to draw, or the name of one of the part's histograms.
-        labels: option -> label of the x-axis.
     """
     if isinstance(figure, str):
         edges, counts = part.histograms[figure]
         return svg(figure, [Panel(Histogram(edges, {"motions": counts}, "frames"), "frames", shortened(figure, 40))])
     if figure.x == NEAREST:
         lines = [line for line in part.lines if line.nearest and not line.state]
-        series = [
-            Series(
-                shortened(one_line(line.label), 60),
-                cumulative(line.nearest),
-                kind="dashed" if line.kind == "real" else "line",
-            )
-            for line in lines
-        ]
+        kinds = {"real": "dashed"}
+        series = [Series(_short(x.label), cumulative(x.nearest), kind=kinds.get(x.kind, "line")) for x in lines]
         return svg(part.name, [Panel(series, "distance from the nearest training motion, m", "share of motions")])
     panels = []
     for column in figure.y:
         series, levels = _series(part, figure, column)
         head = f"{shortened(one_line(column), 40)} {ARROWS[part.columns[column]]}".strip()
-        panels.append(Panel(series, labels.get(figure.x, figure.x), head, figure.log, levels=levels))
+        panels.append(Panel(series, ABOUT[figure.x], head, figure.log, levels=levels))
     return svg(part.name, panels)
+
+
+def _short(label: str) -> str:
+    return shortened(one_line(label), 60)
 
 
 def cumulative(values: Sequence[float]) -> list[tuple[float, float]]:
@@ -356,23 +369,23 @@ def cumulative(values: Sequence[float]) -> list[tuple[float, float]]:
     return [(values[rank], (rank + 1) / count) for rank in ranks]
 
 
-def _series(part: Part, figure: Figure, column: str) -> tuple[list[Series], list[float]]:
+def _series(part: Part, figure: Plot, column: str) -> tuple[list[Series], list[float]]:
     """Returns the points of a column by row, and its values for real motions."""
-    place = list(part.columns).index(column)
-    found: dict[tuple[str, str], list[tuple[float, float, float]]] = {}
+    index = list(part.columns).index(column)
+    curves: dict[tuple[str, str], list[tuple[float, float, float]]] = {}
     levels = []
     for line in part.lines:
-        cell, x = line.cells[place], line.options.get(figure.x)
+        cell, x = line.cells[index], line.options.get(figure.x)
         if cell is None or cell.value is None or line.state:
             continue
         if line.kind.endswith("real"):
             levels += [cell.value] if part.columns[column] == "real" else []
         elif x is not None:
-            found.setdefault((line.kind, line.label), []).append((x, cell.value, cell.ci or 0.0))
+            curves.setdefault((line.kind, line.label), []).append((x, cell.value, cell.ci or 0.0))
     series = []
-    for (kind, label), points in found.items():
+    for (kind, label), points in curves.items():
         reported = kind == "reported"
-        name = shortened(one_line(label), 60) + ", reported" * reported
+        name = _short(label) + ", reported" * reported
         xy = [(x, y) for x, y, _ in sorted(points)]
         spread = {x: ci for x, _, ci in points if ci}
         series.append(Series(name, xy, spread, "dots" if figure.points else "dashed" if reported else "line"))
@@ -382,7 +395,7 @@ def _series(part: Part, figure: Figure, column: str) -> tuple[list[Series], list
 WRITERS: dict[str, Callable[[Table], str]] = {"md": markdown, "tex": latex, "csv": comma_separated}
 
 
-def places(values: Sequence[float | None], better: str, real: float | None) -> list[int]:
+def ranks(values: Sequence[float | None], better: str, real: float | None) -> list[int]:
     """Ranks values: 1 for the best, 2 for the second best, 0 for all others. A single value is not ranked.
 
     Args:
@@ -399,3 +412,17 @@ def places(values: Sequence[float | None], better: str, real: float | None) -> l
 
     order = sorted({badness(v) for v in there})
     return [0 if v is None else order.index(badness(v)) + 1 if badness(v) in order[:2] else 0 for v in values]
+
+
+def write(table: Table, out: Path) -> str:
+    """Writes a table in all formats and its figures; returns its HTML, without the head of the page."""
+    table.folder = out
+    for part, figure, name in figure_names(table):
+        if drawn := draw(part, figure):
+            table.drawn[name] = drawn
+            write_text(out / f"{name}.svg", standalone(drawn))
+    for suffix, writer in WRITERS.items():
+        write_text(out / f"{table.name}.{suffix}", writer(table))
+    body = fragment(table)
+    write_text(out / f"{table.name}.html", page(table.title, body))
+    return body

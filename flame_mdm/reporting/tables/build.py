@@ -1,0 +1,459 @@
+"""Builds tables from existing results, published numbers, recipes, lengths and ratings."""
+
+from __future__ import annotations
+
+import difflib
+import functools
+import math
+import re
+import string
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import FailFast, Field
+
+from flame_mdm.config import Config
+from flame_mdm.errors import UserError
+from flame_mdm.reporting.audit import card_of
+from flame_mdm.reporting.settings import LABELS, Sizes, setting_text, values
+from flame_mdm.reporting.study import Ratings, wilson
+from flame_mdm.reporting.tables.format import Cell, Line, Part, Plot, Table, ranks
+from flame_mdm.reporting.tables.specs import ABOUT, PUBLISHED, SWEPT, Evaluation, as_list, evaluations, load_mapping
+from flame_mdm.runs import made_by
+from flame_mdm.schemas import Checkpoint, Int, Number, Result, Schema, Value, read_json, read_result
+
+NOT_VALID = "NOT VALID"
+"""State of a row that is shown, but not ranked."""
+
+
+def build(name: str, spec: Config, results: Path, sizes: Sizes | None = None) -> Table:
+    """Builds the table of a spec from existing results and published numbers.
+
+    Args:
+        name: Name of the table.
+        spec: From `load_spec`.
+        results: Folder of the results.
+        sizes: Counts features and parameters of a recipe, for tables of hyperparameters that show them.
+
+    Raises:
+        UserError: If a published number or a result does not match the spec.
+    """
+    published = _published(PUBLISHED, PUBLISHED.stat().st_mtime_ns).get(name, {}) if PUBLISHED.exists() else {}
+    unknown = published.keys() - spec["parts"].keys()
+    if unknown:
+        raise UserError(f"{PUBLISHED}: {name} has parts that are not in its spec: {', '.join(sorted(unknown))}")
+    parts = []
+    for part_name, part in spec["parts"].items():
+        reported = published.get(part_name)
+        if "recipes" in part:
+            built = _hyperparameters(part_name, part, reported, sizes)
+        elif "lengths" in part:
+            built = _lengths(part_name, part, results)
+        elif "ratings" in part:
+            built = _ratings(part_name, part, reported)
+        else:
+            built = _measured(part_name, part, reported, results)
+            built.figures = [
+                Plot(f["x"], as_list(f.get("y", [])), f.get("log", False), f.get("points", False))
+                for f in spec.get("figures", [])
+                if f["part"] == part_name
+            ]
+        parts.append(built)
+    return Table(name, spec["title"], parts, list(spec.get("notes", [])))
+
+
+@functools.cache
+def _published(path: Path, changed: int) -> Config:
+    """Returns the published numbers. They are read once for all tables, until the file changes."""
+    return load_mapping(path)
+
+
+@dataclass
+class _Marks:
+    """Footnote letters by what the footnote says; see `_conditions`."""
+
+    letters: dict[tuple[tuple[str, str], ...], str] = field(default_factory=dict)
+
+    def of(self, facts: Mapping[str, str]) -> str:
+        mark = string.ascii_lowercase[len(self.letters) % 26] * (1 + len(self.letters) // 26)
+        return self.letters.setdefault(tuple(facts.items()), mark)
+
+    @property
+    def notes(self) -> list[tuple[str, str]]:
+        """The footnotes. One with up to three differences from the first lists only these."""
+        notes = []
+        for facts, mark in self.letters.items():
+            pairs = zip(facts, next(iter(self.letters)), strict=True)
+            different = [text or f"no {name}" for (name, text), first in pairs if (name, text) != first]
+            whole = "; ".join(text for _, text in facts if text)
+            notes.append((mark, f"as a, but {'; '.join(different)}" if 0 < len(different) <= 3 else whole))
+        return notes
+
+
+def _measured(name: str, part: Config, reported: Config | None, results: Path) -> Part:
+    """Builds a table of measured rows, followed by those of a paper."""
+    columns = {label: column.get("better", "none") for label, column in part["columns"].items()}
+    values = [column["value"] for column in part["columns"].values()]
+    marks = _Marks()
+    lines: list[Line] = []
+    truths: dict[str, Line] = {}
+    missing: list[tuple[str, str]] = []
+    for row, needed in evaluations(part):
+        read = [_result(evaluation, results) for evaluation in needed]
+        line = _line(row, read, values, [evaluation.path(results).name for evaluation in needed])
+        if not any(read):
+            line.state = next(iter(needed[0].absent), "not evaluated")
+        for evaluation, result in zip(needed, read, strict=True):
+            if result is None:
+                commands = [made_by(path) for path in evaluation.absent.values()] or ["make tables evaluates it"]
+                missing += [(line.label, command) for command in commands]
+        timed = {e.path(results) for e, value in zip(needed, values, strict=True) if value == "seconds_per_sample"}
+        pairs = [(e, result) for e, result in zip(needed, read, strict=True) if result is not None]
+        line.marks = ",".join(dict.fromkeys(marks.of(_conditions(r, e.path(results) in timed)) for e, r in pairs))
+        lines.append(line)
+        if line.marks and line.marks not in truths:
+            truth = Line("Real motions", "real", [_truth(r, v) for r, v in zip(read, values, strict=True)], line.marks)
+            truth.nearest = next((result.nearest["real"] for _, result in pairs if "real" in result.nearest), [])
+            truths[line.marks] = truth
+    lines = [line for line in truths.values() if any(line.cells)] + lines
+    notes = [*marks.notes, *_by_text(missing), *_warnings(lines, [v == "fid" for v in values], list(columns))]
+    if reported is not None:
+        more, sources = _reported(reported, columns, values, name)
+        lines, notes = lines + more, notes + sources
+    _print_cells(lines, len(columns))
+    _rank(lines, columns)
+    return Part(name, columns, lines, notes)
+
+
+def _warnings(lines: Sequence[Line], distances: Sequence[bool], columns: Sequence[str]) -> list[tuple[str, str]]:
+    """Returns the footnotes on rows that are not valid, on how checkpoints were chosen, and on distances of 0.
+
+    Args:
+        lines: The measured rows and those of real motions.
+        distances: Which columns are Fréchet distances.
+        columns: Labels of the columns.
+    """
+    reasons = [(line.label, line.facts.get("not valid because")) for line in lines]
+    notes = _by_text([(label, f"NOT VALID: {reason}") for label, reason in reasons if reason])
+    selected = [(line.label, line.facts.get("chosen by", "").partition(" ")) for line in lines]
+    texts = {"best": "best checkpoint by {}", "none:": "{} checkpoint, not chosen by validation"}
+    notes += _by_text([(label, texts[kind].format(name)) for label, (kind, _, name) in selected if kind in texts])
+    reals = [zip(columns, distances, line.cells, strict=True) for line in lines if line.kind == "real"]
+    zero = {label for cells in reals for label, distance, cell in cells if distance and cell and cell.value == 0}
+    why = "clips are taken whole, so that both draws of real motions, which are compared, are the same"
+    return notes + [("", f"{label} of real motions is 0 by construction: {why}") for label in sorted(zero)]
+
+
+def _result(evaluation: Evaluation, results: Path) -> Result | None:
+    path = evaluation.path(results)
+    return read_result(path) if path.exists() else None
+
+
+def _by_text(lines: Sequence[tuple[str, str]]) -> list[tuple[str, str]]:
+    """Returns one note per text, with the labels of all rows that it is about."""
+    labels: dict[str, dict[str, None]] = {}
+    for label, text in lines:
+        labels.setdefault(text, {})[label] = None
+    return [("", f"{'; '.join(rows)}: {text}") for text, rows in labels.items()]
+
+
+def _conditions(result: Result, timed: bool) -> dict[str, str]:
+    """Describes how a result was measured, with its timing if that is shown. Only rows with equal ones are compared."""
+    protocol, data, extractor, cost = result.protocol, result.data, result.extractor, result.cost
+    card = card_of(data.dataset, extractor.sha256 if extractor else None)
+    first = next((v for v in (result.values or {}).values() if v and v.n), None)  # later ones may have fewer motions
+    changed = ", ".join(f"{k} = {v}" for k, v in result.changed.items())
+    return {
+        "protocol": f"protocol {protocol.name} version {protocol.version}",
+        "data": f"{result.split} split of {data.dataset} (fingerprint {data.fingerprint})",
+        "limits": "{} to {} frames".format(*data.frames) if data.frames else "",
+        "metrics": f"N = {first.n}, {first.replications} replications" if first else "",
+        "time": f"timed in batches of {cost.batch_size or 0:g} on {result.device}" if timed and cost else "",
+        "seed": f"seed {result.seed}",
+        "extractor": f"extractor sha256 {extractor.sha256[:12]}" if extractor else "no extractor",
+        "audit": f"audit {card.as_posix()}" if card else "not audited",
+        "exclusions": _left_out(data.excluded),
+        "skeleton": _joints_of(result),
+        "changes": f"differs from the protocol: {changed}" if changed else "",
+        "published split": "published split: test clips are also used for training, or there are no validation clips"
+        * result.published_split,
+        "force": "forced: real motions do not have the values that the protocol expects" * result.forced,
+        "warnings": "; ".join(result.warnings),
+        "quick run": "QUICK RUN, NOT FOR PUBLICATION" * result.quick,
+    }
+
+
+def _joints_of(result: Result) -> str:
+    """Describes the skeleton of joints that were computed from SMPL's rotations."""
+    if result.stand_in_skeleton:
+        return "joints of a stand-in skeleton, whose bones are not SMPL's"
+    smpl = result.skeleton and result.skeleton.smpl_sha256
+    return f"joints of SMPL's model file, sha256 {smpl[:12]}" if smpl else ""
+
+
+def _left_out(excluded: Mapping[str, int]) -> str:
+    """Describes the clips that were left out of a data set, by reason."""
+    listed = ", ".join(f"{count:,} {reason}" for reason, count in excluded.items())
+    return f"excluded from the data set: {listed}" if listed else ""
+
+
+def _line(
+    row: Mapping[str, Any], results: Sequence[Result | None], values: Sequence[str], files: Sequence[str]
+) -> Line:
+    cells = [_cell(result, value, row) for result, value in zip(results, values, strict=True)]
+    line = Line(row["label"], "measured", cells)
+    line.options = {name: float(row[name]) for name in SWEPT if isinstance(row.get(name), int | float)}
+    first = next((result for result in results if result is not None), None)
+    if first is None:
+        return line
+    for name, result in (*zip(values, results, strict=True), *((name, first) for name in ABOUT)):
+        value = _about(result, name) if result is not None and name in ABOUT else None
+        if isinstance(value, int | float):
+            line.options.setdefault(name, float(value))
+    line.nearest = first.nearest.get("generated", [])
+    reasons = list(dict.fromkeys(reason for r in results if r is not None for reason in r.invalid_because))
+    line.state = NOT_VALID if reasons else "QUICK" if first.quick else ""
+    checkpoint = first.checkpoint
+    counts = {
+        name: f"{entry.replications} x {entry.n}"
+        for result, name in zip(results, values, strict=True)
+        if result and (entry := (result.values or {}).get(name)) and entry.n
+    }
+    most = Counter(counts.values()).most_common(1)[0][0] if counts else ""
+    others = "".join(f"; {name} {count}" for name, count in counts.items() if count != most)
+    weights = {True: "averaged", False: "raw", None: ""}
+    line.facts = {
+        "checkpoint sha256": (checkpoint.sha256 if checkpoint else first.samples_sha256 or "")[:16],
+        "recipe": (checkpoint and checkpoint.experiment) or "",
+        "baseline": first.baseline or "",
+        "chosen by": _text(checkpoint and checkpoint.selected_by),
+        "weights": weights[checkpoint.averaged_weights if checkpoint else None],
+        "guidance": _text(checkpoint and checkpoint.guidance_scale),
+        "predicts": _text(checkpoint and checkpoint.prediction),
+        "sampler": _sampler(checkpoint) if checkpoint else "",
+        "steps": _text(checkpoint and checkpoint.num_inference_steps),
+        "replications x motions": most + others,
+        "seed": _text(first.seed),
+        "device": first.device,
+        "speed of training": _text(checkpoint and checkpoint.training_speed),
+        "precision of training": _text(checkpoint and checkpoint.training_precision),
+        "training steps": _text(checkpoint and checkpoint.training_steps),
+        "training hours": _text(checkpoint and checkpoint.training_hours),
+        "device of training": _text(checkpoint and checkpoint.training_device),
+        "peak memory of training, GiB": _text(checkpoint and checkpoint.training_memory_gib),
+        "result": " ".join(dict.fromkeys(file for r, file in zip(results, files, strict=True) if r is not None)),
+        "not valid because": "; ".join(reasons),
+    }
+    return line
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, list):  # chosen steps
+        return ", ".join(map(str, value))
+    return "" if value is None else f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def _sampler(checkpoint: Checkpoint) -> str:
+    options = {"eta": checkpoint.eta, "spacing": checkpoint.spacing}
+    return ", ".join([checkpoint.sampler, *(f"{name} {value}" for name, value in options.items() if value is not None)])
+
+
+def _about(result: Result, name: str) -> Any:
+    """Returns a fact about the model or its cost, by its name in `ABOUT`."""
+    checkpoint, cost = result.checkpoint, result.cost
+    facts: dict[str, Any] = dict(checkpoint or ()) | (checkpoint.edit if checkpoint else {}) | dict(cost or ())
+    value = facts.get(name)
+    return value / 1e6 if name == "parameters" and value is not None else value
+
+
+def _cell(result: Result | None, value: str, row: Mapping[str, Any]) -> Cell | None:
+    if value in ABOUT:
+        fact = row.get(value) if result is None else _about(result, value)
+        if fact is None:
+            return None
+        return Cell(f"{float(fact):,g}", float(fact)) if isinstance(fact, int | float) else Cell(_text(fact))
+    return None if result is None else _entry((result.values or {}).get(value))
+
+
+def _truth(result: Result | None, value: str) -> Cell | None:
+    return None if result is None or value in ABOUT else _entry((result.ground_truth or {}).get(value))
+
+
+def _entry(entry: Value | None) -> Cell | None:
+    if entry is None or entry.mean is None:
+        return None
+    return Cell("", entry.mean, entry.ci if (entry.replications or 0) > 1 else None)
+
+
+def _print_cells(lines: Sequence[Line], columns: int) -> None:
+    """Formats the numbers of each column with the same decimals, about three digits for the largest.
+
+    Short settings, with at most one decimal and no interval, keep their text. Numbers that would round to zero show
+    two significant digits.
+    """
+    for index in range(columns):
+        cells = [c for line in lines if not line.kind.startswith("reported") and (c := line.cells[index]) is not None]
+        numbers = [abs(cell.value) for cell in cells if cell.value is not None]
+        decimals = _decimals(max(numbers, default=0.0))
+        short = all(cell.value == round(cell.value, 1) for cell in cells if cell.value is not None and cell.ci is None)
+        for cell in cells:
+            if cell.value is not None and not (cell.ci is None and cell.text and short):
+                small = 0 < abs(cell.value) < 10**-decimals
+                digits = 1 - math.floor(math.log10(abs(cell.value))) if small else decimals
+                cell.text = f"{cell.value:.{digits}f}" + (f" ±{cell.ci:.{digits}f}" if cell.ci is not None else "")
+
+
+def _decimals(largest: float) -> int:
+    if largest == 0 or 0.1 <= largest < 10:
+        return 3
+    return min(max(2 - math.floor(math.log10(largest)), 1), 6)
+
+
+def _rank(lines: Sequence[Line], columns: Mapping[str, str]) -> None:
+    """Marks best and second best among rows of the same kind with the same marks."""
+    for kind in ("measured", "reported"):
+        for marks in {line.marks for line in lines}:
+            rows = [x for x in lines if x.kind == kind and x.marks == marks and not x.state]
+            rows = [x for x in rows if not x.facts.get("baseline")]
+            truths = [x for x in lines if x.kind == {"measured": "real", "reported": "reported real"}[kind]]
+            truths = [x for x in truths if kind == "reported" or x.marks == marks]
+            for index, better in enumerate(columns.values()):
+                numbers = [cell.value if (cell := row.cells[index]) else None for row in rows]
+                reals = [c.value for x in truths if (c := x.cells[index]) is not None]
+                ranked = ranks(numbers, better, reals[0] if len(reals) == 1 else None)
+                for row, rank in zip(rows, ranked, strict=True):
+                    if (cell := row.cells[index]) is not None:
+                        cell.rank = rank
+
+
+# Published numbers ----------------------------------------------------------------------------------------------------
+
+
+def _reported(
+    reported: Config, columns: Mapping[str, str], values: Sequence[str], part: str
+) -> tuple[list[Line], list[tuple[str, str]]]:
+    """Returns the rows of a paper, and their footnotes."""
+    notes: dict[str, str] = {}
+    lines = []
+    for row in reported["rows"]:
+        unknown = row["values"].keys() - columns.keys()
+        if unknown:
+            raise UserError(f"{PUBLISHED}: {part}, {row['label']}: no column is called {', '.join(sorted(unknown))}")
+        text = f"as reported: {row.get('source') or reported['source']}; measured with {reported['evaluator']}"
+        mark = notes.setdefault(text, "†" * (len(notes) + 1))
+        cells = [Cell(str(v), _leading(str(v))) if (v := row["values"].get(c)) is not None else None for c in columns]
+        line = Line(row["label"], "reported real" if row.get("real") else "reported", cells, mark)
+        for value, cell in zip(values, cells, strict=True):
+            if value in ABOUT and cell is not None and cell.value is not None:
+                line.options[value] = cell.value
+        lines.append(line)
+    extra = [("", note) for note in reported.get("notes", [])]
+    return lines, [(mark, text) for text, mark in notes.items()] + extra
+
+
+def _leading(text: str) -> float | None:
+    """Returns the number at the beginning of a printed value; 1,000 is one thousand."""
+    number = re.match(r"[-+]?[\d,]*\.?\d+(?:[eE][-+]?\d+)?", text.strip())
+    return float(number[0].replace(",", "")) if number else None
+
+
+# Other kinds of parts -------------------------------------------------------------------------------------------------
+
+
+def _hyperparameters(name: str, part: Config, reported: Config | None, sizes: Sizes | None) -> Part:
+    """Builds a table of hyperparameters, read from recipes, each next to its reported value.
+
+    The rows are keys or recipes, whichever are more.
+    """
+    for key in part["keys"].values():
+        if key not in LABELS:
+            near = difflib.get_close_matches(key, LABELS, 3)
+            hint = f"Did you mean {', '.join(near)}?" if near else f"there are: {', '.join(LABELS)}"
+            raise UserError(f"part {name}: no setting is called '{key}'; {hint}")
+    recipes = {label: values(recipe, sizes) for label, recipe in part["recipes"].items()}
+    printed = {row["label"]: row["values"] for row in reported["rows"]} if reported else {}
+    ours: dict[tuple[str, str], Cell | None] = {}
+    theirs: dict[tuple[str, str], Cell | None] = {}
+    for label, key in part["keys"].items():
+        for recipe, settings in recipes.items():
+            position = (label, recipe) if len(part["keys"]) >= len(recipes) else (recipe, label)
+            ours[position] = Cell(setting_text(settings[key])) if key in settings else None
+            text = printed.get(label, {}).get(recipe)
+            theirs[position] = None if text is None else Cell(text)
+    rows, columns = (list(dict.fromkeys(names)) for names in zip(*ours, strict=True))
+    lines = [Line(row, "measured", []) for row in rows]
+    heads: list[str] = []
+    for column in columns:
+        for head, cells in ((column, ours), (f"{column}, reported", theirs)):
+            if any(cells[row, column] for row in rows):
+                heads.append(head)
+                for line in lines:
+                    line.cells.append(cells[line.label, column])
+    notes = [("", f"{label}: recipe {recipe}") for label, recipe in part["recipes"].items()]
+    if reported:
+        notes += [("", f"reported: {reported['source']}"), *(("", note) for note in reported.get("notes", []))]
+    return Part(name, dict.fromkeys(heads, "none"), lines, notes)
+
+
+class Lengths(Schema):
+    """Motion lengths of a data set, in frames."""
+
+    fingerprint: str
+    fps: Annotated[Number, Field(gt=0)]
+    lengths: Annotated[list[Annotated[Int, Field(ge=1)]], Field(min_length=1), FailFast()]
+    excluded: dict[str, Int] = Field({})
+
+
+def _lengths(name: str, part: Config, results: Path) -> Part:
+    """Builds a table of the motion lengths of data sets."""
+    columns = dict.fromkeys(["motions", "hours", "shortest", "median", "mean", "longest"], "none")
+    lines, histograms = [], {}
+    notes = [("", "lengths are in frames, at the frame rate of each data set")]
+    for dataset in part["lengths"]:
+        path = results / "lengths" / f"{dataset}.json"
+        if not path.exists():
+            lines.append(Line(dataset, "measured", [None] * len(columns), state="not prepared"))
+            continue
+        counted: Lengths = read_json(path, Lengths, "delete it; `flame-mdm tables` then counts again")
+        lengths, fps = sorted(counted.lengths), counted.fps
+        numbers = [
+            (f"{len(lengths):,}", len(lengths)),
+            (f"{sum(lengths) / fps / 3600:.2f}", sum(lengths) / fps / 3600),
+            *((f"{x:g}", x) for x in (lengths[0], lengths[len(lengths) // 2])),
+            (f"{sum(lengths) / len(lengths):.1f}", sum(lengths) / len(lengths)),
+            (f"{lengths[-1]}", lengths[-1]),
+        ]
+        facts = {"fingerprint": counted.fingerprint, "frames per second": _text(float(fps))}
+        lines.append(Line(dataset, "measured", [Cell(t, float(v)) for t, v in numbers], facts=facts))
+        notes += [("", f"{dataset}; {_left_out(counted.excluded)}")] if counted.excluded else []
+        step = max(1, math.ceil(lengths[-1] / 40))
+        counts = [0] * (lengths[-1] // step + 1)
+        for length in lengths:
+            counts[length // step] += 1
+        histograms[dataset] = ([float(i * step) for i in range(len(counts) + 1)], counts)
+    return Part(name, columns, lines, notes, histograms=histograms)
+
+
+def _ratings(name: str, part: Config, reported: Config | None) -> Part:
+    """Builds the table of a user study: how often one model was preferred to another."""
+    columns = {"Preferred": "none", "votes": "none", "raters": "none"}
+    lines = []
+    path = Path(part["ratings"])
+    if path.exists():
+        ratings: Ratings = read_json(path, Ratings, "run `flame-mdm compare ratings=...` to count again")
+        for pair in ratings.pairs:
+            votes = pair.wins_a + pair.wins_b
+            share, low, high = wilson(pair.wins_a, votes)
+            shares = Cell(f"{share:.1%} [{low:.1%}, {high:.1%}]", share)
+            cells: list[Cell | None] = [shares, Cell(str(votes), votes), Cell(str(pair.raters))]
+            lines.append(Line(f"{pair.a} over {pair.b}", "measured", cells))
+    notes = [("", "share of votes, with its 95 % interval (Wilson)")]
+    if not lines:
+        notes = [("", f'{path} is missing. make compare RUNS="a b" RATE=true writes a page for rating motions')]
+    if reported:
+        more, sources = _reported(reported, columns, ["", "", ""], name)
+        lines, notes = lines + more, notes + sources
+    return Part(name, columns, lines, notes)

@@ -1,0 +1,241 @@
+"""Specs of tables, the files in experiments/tables, and the evaluations that they need."""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import json
+import math
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, model_validator
+
+from flame_mdm.config import EXPERIMENTS, Config, plain
+from flame_mdm.errors import UserError, did_you_mean
+from flame_mdm.reporting.tables.format import ABOUT, NEAREST
+from flame_mdm.safe_io import read_yaml
+from flame_mdm.schemas import ClosedSchema, Int, Number, check_shape
+
+SPECS = EXPERIMENTS / "tables"
+PUBLISHED = SPECS / "published.yaml"
+SWEPT = ("sampler", "num_inference_steps", "eta", "spacing", "guidance_scale", "until", "strength", "batch_size")
+"""Options of a row that may be lists; each value makes one row."""
+MOST_ROWS, MOST_COLUMNS, MOST_FIGURES = 1_000, 100, 100
+"""Limits of a table: rows after expanding lists of options, columns, and plots. Tables of papers have about 20 rows."""
+
+
+class Options(ClosedSchema):
+    """Keys of `flame-mdm evaluate` that a part, a row or a column may set."""
+
+    protocol: str = ""
+    extractor: str = ""
+    data: str = ""
+    split: str = ""
+    seed: Int = 0
+    replications: Int = 0
+    samples: Int = 0
+    multimodality: bool = False
+
+
+class ColumnSpec(Options):
+    """A column: a metric or a key of `ABOUT`, and which of its values are better."""
+
+    value: str
+    better: Literal["higher", "lower", "real", "none"] = "none"
+
+
+class RowSpec(Options):
+    """A row: a model or baseline, and its sampling options. Keys that contain a dot override keys of the data."""
+
+    label: str
+    note: str = ""
+    ckpt: str = ""
+    baseline: str = ""
+    from_samples: str = ""
+    method: str = ""
+    sampler: str | list[str] = ""
+    num_inference_steps: Int | list[Int | list[Int]] = 0
+    eta: Number | list[Number] = 0
+    spacing: str | list[str] = ""
+    guidance_scale: Number | list[Number] = 0
+    until: Number | list[Number] = 0
+    strength: Number | list[Number] = 0
+    batch_size: Int | list[Int] = 0
+
+    @model_validator(mode="before")
+    @classmethod
+    def _overrides(cls, row: Any) -> Any:
+        for key in row if isinstance(row, dict) else ():
+            if "." in str(key) and not re.fullmatch(r"data(\.(?!_)\w+)+", str(key)):
+                raise ValueError(f"{key}: only keys of the data can be overridden, such as data.crop.max_frames")
+        return row
+
+    @model_validator(mode="after")
+    def _one_source(self) -> RowSpec:
+        if len({"ckpt", "baseline", "from_samples"} & self.model_fields_set) != 1:
+            raise ValueError("a row needs one of ckpt, baseline and from_samples")
+        return self
+
+
+class PartSpec(Options):
+    """A part of a table: either columns and rows, recipes and keys, lengths, or ratings."""
+
+    columns: dict[str, ColumnSpec] = Field({}, min_length=1)
+    rows: list[RowSpec] = Field([])
+    recipes: dict[str, str] = Field({}, min_length=1)
+    keys: dict[str, str] = Field({}, min_length=1)
+    lengths: list[str] = Field([])
+    ratings: str = ""
+
+    @model_validator(mode="after")
+    def _one_kind(self) -> PartSpec:
+        kinds = [{"columns", "rows"}, {"recipes", "keys"}, {"lengths"}, {"ratings"}]
+        if sum(kind <= self.model_fields_set for kind in kinds) != 1:
+            raise ValueError("needs columns and rows, or recipes and keys, or lengths, or ratings")
+        options = [[len(as_list(getattr(row, n))) for n in SWEPT if n in row.model_fields_set] for row in self.rows]
+        _at_most("rows", sum(map(math.prod, options)), MOST_ROWS)
+        _at_most("keys", len(self.keys), MOST_ROWS)
+        for name in ("columns", "recipes", "lengths"):
+            _at_most(name, len(getattr(self, name)), MOST_COLUMNS)
+        if self.rows and not self.protocol:
+            raise ValueError("needs a protocol")
+        return self
+
+
+class FigureSpec(ClosedSchema):
+    """A figure that plots columns of a part over an option of its rows; x: nearest plots the distances of its motions
+    from the nearest training motion.
+    """
+
+    part: str
+    x: str
+    y: str | list[str] = Field([])
+    log: bool = False
+    points: bool = False
+
+
+class Spec(ClosedSchema):
+    """A table: the content of a file in experiments/tables."""
+
+    title: str
+    notes: list[str] = Field([])
+    parts: Annotated[dict[str, PartSpec], Field(min_length=1)]
+    figures: list[FigureSpec] = Field([])
+
+    @model_validator(mode="after")
+    def _figures(self) -> Spec:
+        _at_most("figures", sum(len(as_list(figure.y)) for figure in self.figures), MOST_FIGURES)
+        for figure in self.figures:
+            part = self.parts.get(figure.part)
+            if part is None or figure.x not in (*ABOUT, NEAREST):
+                raise ValueError(f"a figure needs a part of the table and x, one of {', '.join([*ABOUT, NEAREST])}")
+            if not as_list(figure.y) and figure.x != NEAREST:
+                raise ValueError(f"figure: x={figure.x} needs y, a column or several of {figure.part}")
+            for column in as_list(figure.y):
+                if column not in part.columns:
+                    raise ValueError(f"figure: y={column} is not a column of {figure.part}")
+        return self
+
+
+def spec_names() -> list[str]:
+    """Returns the names of all tables, in the order of their numbers."""
+    names = [path.stem for path in SPECS.glob("*.yaml") if path != PUBLISHED]
+    return sorted(names, key=lambda name: re.sub(r"\d+", lambda number: number[0].zfill(3), name))
+
+
+def load_spec(name: str) -> Config:
+    """Loads the spec of a table.
+
+    Args:
+        name: a name in experiments/tables, or the path of a .yaml file.
+
+    Raises:
+        UserError: If the file does not exist, or is not a valid spec.
+    """
+    path = Path(name) if name.endswith((".yaml", ".yml")) else SPECS / f"{name}.yaml"
+    if not path.is_file() or path == PUBLISHED:
+        names = spec_names()
+        raise UserError(f"no table is called '{name}'.{did_you_mean(name, names)} There are: {', '.join(names)}")
+    spec = load_mapping(path)
+    try:
+        check_shape(spec, Spec)
+    except ValueError as error:
+        raise UserError(f"{path}: {error}") from error
+    return spec
+
+
+def _at_most(what: str, count: int, most: int) -> None:
+    if count > most:
+        raise ValueError(f"{what}: {count:,} exceed the limit of {most:,} per table. Split it into several tables")
+
+
+def load_mapping(path: Path) -> Config:
+    """Returns the content of a YAML file whose values are plain."""
+    content = read_yaml(path)
+    if not isinstance(content, dict):
+        raise UserError(f"{path}: not a mapping")
+    plain(content, path)
+    return {str(key): value for key, value in content.items()}
+
+
+def as_list(value: Any) -> list[Any]:
+    """Returns a list as it is, and another value as a list of one."""
+    return value if isinstance(value, list) else [value]
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """An evaluation that a table shows: the label of its row, and the keys of `flame-mdm evaluate` that it sets."""
+
+    label: str
+    keys: Mapping[str, Any]
+
+    def path(self, results: Path) -> Path:
+        """Returns the path of the result, a function of the keys alone.
+
+        Tables therefore share results, and are rendered without checkpoints.
+        """
+        digest = hashlib.sha256(json.dumps(dict(self.keys), sort_keys=True).encode()).hexdigest()
+        what = self.keys.get("baseline") or self.keys.get("ckpt") or self.keys["from_samples"]
+        name = re.sub(r"^runs-|-checkpoints-|-ckpt$|-default", "-", re.sub(r"[^A-Za-z0-9]+", "-", str(what))).strip("-")
+        name = re.sub(r"-+", "-", name)[-60:]
+        return results / Path(str(self.keys["protocol"])).stem / f"{name}-{digest[:10]}.json"
+
+    @property
+    def absent(self) -> dict[str, str]:
+        """Files that do not exist, by what is missing: "no checkpoint"."""
+        files = {"no checkpoint": "ckpt", "no samples": "from_samples", "no extractor": "extractor"}
+        paths = {what: str(self.keys.get(key) or "none") for what, key in files.items()}
+        return {what: path for what, path in paths.items() if path != "none" and not Path(path).exists()}
+
+
+def evaluations(part: Mapping[str, Any]) -> Iterator[tuple[dict[str, Any], list[Evaluation]]]:
+    """Yields the rows of a part, with lists of options expanded, each with one evaluation per column."""
+    for row in part.get("rows", []):
+        for values in itertools.product(*(as_list(row[name]) for name in SWEPT if name in row)):
+            single = row | dict(zip((name for name in SWEPT if name in row), values, strict=True))
+            single["label"] = _spread_label(part, row, single)
+            yield single, [_evaluation(part, single, column) for column in part["columns"].values()]
+
+
+def _spread_label(part: Mapping[str, Any], row: Mapping[str, Any], single: Mapping[str, Any]) -> str:
+    """Returns the label of an expanded row, with the options that vary and that no column shows."""
+    shown = {column["value"] for column in part["columns"].values()}
+    swept = [name for name in SWEPT if name not in shown and len(as_list(row.get(name))) > 1]
+    options = [f"{ABOUT[name]} {single[name]}" for name in swept]
+    return f"{row['label']} ({', '.join(options)})" if options else row["label"]
+
+
+def _evaluation(part: Mapping[str, Any], row: Mapping[str, Any], column: Mapping[str, Any]) -> Evaluation:
+    keys = {name: row[name] for name in row if name not in ("label", "note")}
+    for name in ("protocol", "split", "extractor", "seed", "data", "replications", "samples", "multimodality"):
+        for level in (part, row, column):
+            if name in level:
+                keys[name] = level[name]
+    if "ckpt" in keys:
+        keys.pop("data", None)  # a checkpoint names its data set
+    return Evaluation(row["label"], keys)

@@ -156,9 +156,7 @@ def test_motions_without_a_floor_stand_on_one(tmp_path):
 
 
 def run(tmp_path: Path, data_root: Path, *words: str) -> int:
-    return main(
-        ["browse", *SYNTHETIC, f"data_root={data_root}", f"run.dir={tmp_path}", f"out={tmp_path / 'page.html'}", *words]
-    )
+    return main(["browse", *SYNTHETIC, f"data_root={data_root}", f"out={tmp_path / 'page.html'}", *words])
 
 
 def test_command_prepares_and_shows(tmp_path, data_root, capsys):

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
-from flame_mdm.errors import UserError, did_you_mean
+from flame_mdm.errors import UserError
 
 MAX_STEPS = 100_000
 """Maximum number of steps of a diffusion or sampler."""
@@ -79,14 +79,3 @@ class SamplerOptions:
     def over(self, defaults: SamplerOptions) -> SamplerOptions:
         """Returns these options, with `defaults` for those that are None."""
         return replace(defaults, **self.chosen())
-
-
-def check_names(keywords: Sequence[str], names: Sequence[str], function: str) -> None:
-    """Checks the names of keyword arguments.
-
-    Raises:
-        UserError: If a keyword is not one of `names`; the message suggests similar ones.
-    """
-    for keyword in keywords:
-        if keyword not in names:
-            raise UserError(f"{function} has no option {keyword}.{did_you_mean(keyword, names)}")

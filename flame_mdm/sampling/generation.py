@@ -83,6 +83,8 @@ def sample_request(
     """
     if stages is not None and request.candidates > 1:
         raise UserError("the estimates along the sampling are those of one motion: omit candidates, or trajectory")
+    if request.editing is not None:
+        raise UserError("this request edits a motion. Call flame_mdm.edit")
     if edit is not None:
         request.check_edit()
     check_model(request, model)

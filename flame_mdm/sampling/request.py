@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from flame_mdm.errors import UserError, did_you_mean, shortened
-from flame_mdm.sampler_options import SamplerOptions, check_names, option
+from flame_mdm.sampler_options import SamplerOptions, option
 
 if TYPE_CHECKING:
     from flame_mdm.formats.motion import Motion
@@ -181,7 +181,9 @@ class SamplingRequest:
         names = [entry.name for entry in fields(cls) if entry.name not in ("options", "editing")]
         sampler = [entry.name for entry in fields(SamplerOptions)]
         edits = [entry.name for entry in fields(EditRequest)] if editing else []
-        check_names(list(keywords), [*names, *sampler, *edits], function)
+        for keyword in keywords:
+            if keyword not in (possible := [*names, *sampler, *edits]):
+                raise UserError(f"{function} has no option {keyword}.{did_you_mean(keyword, possible)}")
         values = {name: keywords[name] for name in names if name in keywords}
         options = SamplerOptions(**{name: keywords[name] for name in sampler if name in keywords})
         edit = EditRequest(**{name: keywords[name] for name in edits if name in keywords}) if editing else None

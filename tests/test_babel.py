@@ -261,8 +261,3 @@ def test_damaged_labels_are_named(content: str, message: str, small: tuple[Path,
     (small[0] / "val.json").unlink()
     with pytest.raises(FileNotFoundError, match=r"BABEL v1\.0 is published at"):
         open_babel(*small).count()
-
-
-def test_another_frame_rate_is_refused(small: tuple[Path, Path]):
-    with pytest.raises(ValueError, match=r"representation\.fps=20"):
-        next(open_babel(*small).clips(30.0))

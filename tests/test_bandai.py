@@ -18,7 +18,6 @@ from scipy.spatial.transform import Rotation
 from support.fixtures import SHARED, needs_third_party, third_party
 from support.runs import no_children
 
-from flame_mdm.__main__ import main
 from flame_mdm.data import Clip, bandai
 from flame_mdm.data.bandai import (
     CONTENTS_1,
@@ -32,7 +31,6 @@ from flame_mdm.data.bandai import (
     side_of,
     split_of,
 )
-from flame_mdm.data.store import Store
 from flame_mdm.formats import bvh
 from flame_mdm.representations.skeleton import SKELETONS, SMPL22, SMPL24
 from flame_mdm.representations.smpl import ADULT, SMPL
@@ -154,8 +152,6 @@ def test_clips_of_a_folder(tiny):
 def test_joints_are_those_of_smpl():
     skeleton = SKELETONS["smpl22"]
     assert tuple(JOINTS) == skeleton.joints
-    motion = np.random.default_rng(0).normal(size=(3, 22, 3)).astype(np.float32)
-    np.testing.assert_array_equal(bandai.mirror(motion), skeleton.mirror(torch.from_numpy(motion)).numpy())
 
 
 def test_bones_keep_their_length_and_joints_their_place(tiny):
@@ -184,7 +180,7 @@ def test_mirrored_copies(tiny):
     for clip in mirrored:
         original = by_id[clip.id[1:]]
         assert (clip.split, clip.source) == ("train", original.id)
-        np.testing.assert_array_equal(bandai.mirror(clip.motion), original.motion)
+        np.testing.assert_array_equal(SMPL22.mirror(torch.from_numpy(clip.motion)).numpy(), original.motion)
         side = str(original.attributes.get("side", ""))
         assert clip.attributes.get("side", "") == swapped.get(side, side)
         words = [
@@ -293,16 +289,6 @@ def test_mirrored_smpl_rotations(tiny):
         original = decoded(by_id[clip.id[1:]].motion)
         expected = SMPL24.mirror(torch.from_numpy(original)).numpy()
         np.testing.assert_allclose(decoded(clip.motion), expected, atol=1e-6)
-
-
-@pytest.mark.slow
-def test_preparing_smpl_rotations(tiny, tmp_path, capsys):
-    words = ["data=bandai", "representation=smpl", f"source={tiny}", f"data_root={tmp_path}", "data.source.workers=1"]
-    assert main(["prepare", *words, "data.source.motion=smpl"]) == 0
-    store = Store(tmp_path / "bandai-smpl147")
-    assert store.info["shape"][1] == 147
-    with pytest.raises(ValueError, match=r"data.source.motion=smplx: give joints or smpl"):
-        Bandai(str(tiny), motion="smplx")  # pyright: ignore[reportArgumentType]
 
 
 def published() -> list[tuple[int, str, str, int]]:
@@ -416,11 +402,6 @@ def test_archives_give_the_same_clips_and_leave_no_files(tiny, kind, tmp_path, m
 
 
 @pytest.mark.slow
-def test_processes_do_not_change_the_result(tiny):
-    same(clips(tiny, workers=2), clips(tiny, workers=1))
-
-
-@pytest.mark.slow
 def test_stopping_early_ends_the_processes(tiny):
     gc.collect()  # readers that other tests left open end their processes
     before = active_children()
@@ -463,19 +444,6 @@ def test_a_damaged_take_is_named_unless_excluded(tiny, tmp_path, workers):
     assert Bandai(str(root), exclude=[id_]).count() == len(rest)
 
 
-def test_another_skeleton_is_refused(tmp_path):
-    text = "HIERARCHY\nROOT Hips\n{\nOFFSET 0 0 0\nCHANNELS 1 Xposition\n}\nMOTION\nFrames: 1\nFrame Time: 0.1\n0\n"
-    (tmp_path / "dataset-1_run_sad_001.bvh").write_text(text)
-    with pytest.raises(ValueError, match=r"dataset-1_run_sad_001.bvh: not the skeleton .* Chest"):
-        clips(tmp_path)
-
-
-def test_where_to_get_what_is_missing(tmp_path):
-    for path in (tmp_path / "nowhere", tmp_path):
-        with pytest.raises(FileNotFoundError, match=rf"{path}.*BandaiNamcoResearchInc.*CC BY-NC 4.0.*SOURCE="):
-            Bandai(str(path)).count()
-
-
 def test_wrong_input_is_explained(tiny, tmp_path):
     with pytest.raises(ValueError, match=r"data.source.exclude: .* has no dataset-1_walk_hapy_001"):
         Bandai(str(tiny), exclude=["dataset-1_walk_hapy_001"]).count()
@@ -490,15 +458,6 @@ def test_wrong_input_is_explained(tiny, tmp_path):
         shutil.copy(next(tiny.rglob("dataset-1_walk_happy_001.bvh")), tmp_path / name)
     with pytest.raises(ValueError, match=r"dataset-1_walk_happy_001 exists twice, as .*one/.* and .*two/"):
         Bandai(str(tmp_path)).count()
-
-
-def test_a_cut_archive_is_named(tiny, tmp_path):
-    path = tmp_path / "cut.tar.xz"
-    with tarfile.open(path, "w:xz") as archive:
-        archive.add(tiny, "set")
-    os.truncate(path, path.stat().st_size // 2)
-    with pytest.raises(ValueError, match=r"cut.tar.xz: damaged archive"):
-        Bandai(str(path)).count()
 
 
 CASES = [key.split("/")[0] for key in third_party("hml263_bandai") if key.endswith("/joints_in")]

@@ -11,7 +11,7 @@ from support.t2m_folder import line, published, write_folder
 from evaluators.metrics.reconstruction import PARTS, temos_parts
 from flame_mdm.__main__ import main
 from flame_mdm.config import compose, instantiate
-from flame_mdm.data.kit import KIT, KITTemos, read_joints
+from flame_mdm.data.kit import KITTemos, read_joints
 from flame_mdm.data.store import Store, write_store
 from flame_mdm.errors import UserError
 from flame_mdm.representations.humanml import HumanML
@@ -50,14 +50,6 @@ def test_a_processed_folder_becomes_batches(tmp_path):
     counts |= {"train share, %": 75, "val share, %": 25, "test share, %": 0}
     assert data.source.counts() == counts | {"vocabulary": 10, "words per caption": 2.4}
     assert data.source.counts().keys() >= published("kit").keys()
-
-
-def test_frames_of_another_rate_or_set_are_refused(tmp_path):
-    folder = write_folder(tmp_path / "KIT-ML", TEXTS, {"train": ["00001"], "val": [], "test": []}, 251)
-    with pytest.raises(ValueError, match=r"kit has 12\.5 frames per second, but representation\.fps is 20"):
-        next(iter(KIT(str(folder)).clips(20.0)))
-    with pytest.raises(ValueError, match="clip 00001: published as humanml-legacy-kit21"):
-        write_store(tmp_path / "store", KIT(str(folder)), HumanML("smpl22", "legacy", fps=12.5))
 
 
 # TEMOS's joints -------------------------------------------------------------------------------------------------------
@@ -221,11 +213,3 @@ def test_a_damaged_folder_is_named(mmm, tmp_path, damage, message):
     with pytest.raises((ValueError, UserError, FileNotFoundError), match=message) as error:
         write_store(tmp_path / "store", source(mmm), Rifke())
     assert "\n" not in str(error.value)
-
-
-def test_motions_can_be_excluded(mmm, tmp_path):
-    (mmm / "00003_fke.csv").unlink()
-    store = write_store(tmp_path / "store", source(mmm, exclude=["00003"]), Rifke())
-    assert store.info["excluded"]["motions by data.source.exclude"] == 1
-    with pytest.raises(ValueError, match="has no 00099"):
-        source(mmm, exclude=["00099"]).count()

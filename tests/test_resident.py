@@ -9,13 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from lightning.fabric.utilities.apply_func import move_data_to_device
 from test_data import Broken, clip
 from test_training import STEPS, run
 
 from flame_mdm.batch import MotionBatch
 from flame_mdm.checkpoints.model_files import read_checkpoint
-from flame_mdm.config import Config, compose, instantiate
 from flame_mdm.data import datamodule, resident
 from flame_mdm.data.crops import Crop, Fixed, Units, Whole
 from flame_mdm.data.datamodule import MotionDataModule
@@ -145,14 +143,6 @@ def test_processes_share_the_memory_of_a_cpu(root, monkeypatch):
         assert (data.device is not None) == kept
 
 
-def test_devices_of_unknown_memory_are_not_chosen(root):
-    data = module(root, CROPS[0])
-    strategy = SimpleNamespace(root_device=torch.device("meta"))
-    data.trainer = SimpleNamespace(strategy=strategy, num_devices=1)  # type: ignore[assignment]
-    data.setup("fit")
-    assert data.device is None
-
-
 def test_data_that_does_not_fit_is_refused_in_one_line(root, monkeypatch):
     data = module(root, CROPS[0], resident=True)
     monkeypatch.setattr(datamodule, "free_memory", lambda device: 2**20)
@@ -179,12 +169,6 @@ def test_free_memory_is_that_of_the_machine_or_the_container(monkeypatch):
     assert free_memory(torch.device("cpu")) > 2**24
 
 
-@pytest.mark.parametrize("options", [{"resident": "yes"}, {"resident": 1}, {"pad_multiple": 0}])
-def test_wrong_options_are_refused(root, options):
-    with pytest.raises(ValueError, match=r"data\.(resident|pad_multiple)=.*: give "):
-        module(root, CROPS[0], **options)
-
-
 @pytest.mark.parametrize(
     "condition",
     [
@@ -203,18 +187,3 @@ def test_training_gives_the_same_weights(tiny, condition, tmp_path):
     ]
     assert weights[0].keys() == weights[1].keys()
     assert all(torch.equal(value, weights[1][name]) for name, value in weights[0].items())
-
-
-def test_batches_move_without_their_strings(root):
-    data = module(root, CROPS[0])
-    batch = next(iter(loader(data, "train")))
-    assert move_data_to_device(batch, torch.device("cpu")) is batch
-    moved = move_data_to_device(batch, torch.device("meta"))
-    assert (moved.x.device.type, moved.mask.device.type) == ("meta", "meta")
-    assert (moved.ids, moved.text) == (batch.ids, batch.text)
-
-
-def test_recipes_take_the_options(tiny):
-    config: Config = compose("quickstart", [*tiny, "data.resident=true", "data.pad_multiple=32"])
-    data = instantiate(config["data"], representation=instantiate(config["representation"]), seed=0)
-    assert (data.resident, data.pad_multiple) == (True, 32)

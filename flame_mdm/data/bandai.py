@@ -15,6 +15,7 @@ from pathlib import Path, PurePosixPath
 from typing import Literal, get_args
 
 import numpy as np
+import torch
 from scipy.spatial.transform import Rotation
 
 from flame_mdm.data import Clip, MotionSource, Split, archives, name_hash, required, split_blocks, without
@@ -195,7 +196,7 @@ class Bandai(MotionSource):
         content, side = take.content, side_of(take.content)
         if mirrored:
             content, side = swap_sides(content), swap_sides(side)
-            motion = mirror_smpl(motion) if self.motion == "smpl" else mirror(motion)
+            motion = mirror_smpl(motion) if self.motion == "smpl" else SMPL22.mirror(torch.from_numpy(motion)).numpy()
         attributes: dict[str, str | int | float] = {"content": content, "style": take.style, "dataset": take.dataset}
         if side:
             attributes["side"] = side
@@ -260,12 +261,6 @@ def smpl_motion(skeleton: bvh.Bvh, rotations: np.ndarray, translations: np.ndarr
     local[:, 0] = AXES @ turned[:, hips] @ REST["Hips"].T
     vectors = Rotation.from_matrix(local.reshape(-1, 3, 3)).as_rotvec().reshape(len(local), -1)
     return np.concatenate([positions[:, hips] @ AXES / 100, vectors], 1).astype(np.float32)
-
-
-def mirror(motion: np.ndarray) -> np.ndarray:
-    """Mirrors joints (F, 22, 3): x -> -x, left and right joints swapped."""
-    names = list(JOINTS)
-    return motion[:, [names.index(swap_sides(name)) for name in names]] * np.array([-1, 1, 1], motion.dtype)
 
 
 def mirror_smpl(motion: np.ndarray) -> np.ndarray:

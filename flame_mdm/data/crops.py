@@ -18,13 +18,16 @@ Below = Callable[[Any], Any]
 class Crop(ABC):
     """A rule that selects the frames of a training sample from a clip of any length."""
 
-    @abstractmethod
+    min_frames: int
+    max_frames: int
+
     def shortest(self) -> int:
         """Returns the minimum number of frames of a clip."""
+        return self.min_frames
 
-    @abstractmethod
     def longest(self) -> int:
         """Returns the maximum number of frames of a sample."""
+        return self.max_frames
 
     @abstractmethod
     def draw(self, frames: Any, below: Below | None) -> tuple[Any, Any]:
@@ -59,12 +62,6 @@ class Units(Crop):
                 f"min_frames {self.min_frames}, max_frames {self.max_frames}"
             )
 
-    def shortest(self) -> int:
-        return self.min_frames
-
-    def longest(self) -> int:
-        return self.max_frames
-
     def draw(self, frames: Any, below: Below | None) -> tuple[Any, Any]:
         length = np.minimum(frames, self.max_frames) // self.unit * self.unit
         if below is None:
@@ -80,12 +77,6 @@ class Whole(Crop):
     min_frames: int = 1
     max_frames: int = 471
 
-    def shortest(self) -> int:
-        return self.min_frames
-
-    def longest(self) -> int:
-        return self.max_frames
-
     def draw(self, frames: Any, below: Below | None) -> tuple[Any, Any]:
         length = np.minimum(frames, self.max_frames)
         return np.zeros_like(length), length
@@ -100,9 +91,6 @@ class Fixed(Crop):
 
     frames: int = 60
     min_frames: int = 1
-
-    def shortest(self) -> int:
-        return self.min_frames
 
     def longest(self) -> int:
         return self.frames

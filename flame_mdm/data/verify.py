@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections import Counter, defaultdict
+from collections.abc import Iterable
 from hashlib import sha1
 from pathlib import Path
 from typing import Any
@@ -84,43 +85,35 @@ def lines(content: dict[str, Any]) -> list[str]:
     """Returns the lines of a report as an aligned table."""
     rows: list[tuple[str, ...]] = []
 
-    def section(title: str, *head: str) -> None:
-        rows.extend([(), (title, *head)])
+    def section(title: str, table: Iterable[tuple[str, ...]], *head: str) -> None:
+        rows.extend([(), (title, *head), *((f"  {name}", *cells) for name, *cells in table)])
 
     rows.append(("data set", f"{content['dataset']} as {content['representation']} at {content['fps']:g} fps"))
     rows.append(("fingerprint", content["fingerprint"]))
-    rows.append(
-        ("split", "as published" if content["published_split"] else "without leaks: each source is in one split only")
-    )
+    split = "as published" if content["published_split"] else "without leaks: each source is in one split only"
+    rows.append(("split", split))
     rows.extend((f"sha256 {name}", digest) for name, digest in content["files"].items())
-    section("figures", "found", "published", "")
+    figures = []
     for name, figure in content["figures"].items():
         numbers = ("-" if figure[key] is None else str(figure[key]) for key in ("found", "published"))
-        rows.append(
-            (f"  {name}", *numbers, figure["state"].upper() if figure["state"] == "differs" else figure["state"])
-        )
-    section("captions")
-    rows.extend((f"  {name}", str(number)) for name, number in content["captions"].items())
+        figures.append((name, *numbers, "DIFFERS" if figure["state"] == "differs" else figure["state"]))
+    section("figures", figures, "found", "published", "")
+    section("captions", ((name, str(number)) for name, number in content["captions"].items()))
     if content["actions"]:
-        section("clips by action", *SPLITS)
-        rows.extend((f"  {name}", *map(str, splits.values())) for name, splits in content["actions"].items())
-    section("frames")
-    rows.extend(
-        (f"  {name}", f"{number:g}" if isinstance(number, float) else str(number))
-        for name, number in content["frames"].items()
-    )
-    section("anomalies")
-    rows.append(("  non-finite numbers", "0"))
-    rows.append(("  clips without movement", str(len(content["still"])), some(content["still"])))
+        actions = ((name, *map(str, splits.values())) for name, splits in content["actions"].items())
+        section("clips by action", actions, *SPLITS)
+    section("frames", ((name, f"{n:g}" if isinstance(n, float) else str(n)) for name, n in content["frames"].items()))
     groups = [" = ".join(group) for group in content["duplicates"]]
-    rows.append(("  duplicate motions", str(len(groups)), some(groups)))
-    rows.append(("  duplicates across splits", str(content["duplicates_across_splits"])))
-    section("deviation of mean and std from the training frames")
-    rows.extend((f"  {name}", f"{number:.2g}") for name, number in content["statistics"].items())
-    section("left out")
-    rows.extend((f"  {reason}", str(number)) for reason, number in content["excluded"].items())
-    if not content["excluded"]:
-        rows.append(("  nothing", ""))
+    anomalies = [
+        ("non-finite numbers", "0"),
+        ("clips without movement", str(len(content["still"])), some(content["still"])),
+        ("duplicate motions", str(len(groups)), some(groups)),
+        ("duplicates across splits", str(content["duplicates_across_splits"])),
+    ]
+    section("anomalies", anomalies)
+    statistics = ((name, f"{number:.2g}") for name, number in content["statistics"].items())
+    section("deviation of mean and std from the training frames", statistics)
+    section("left out", [(reason, str(n)) for reason, n in content["excluded"].items()] or [("nothing", "")])
     return _aligned(rows)
 
 

@@ -16,6 +16,7 @@ import pytest
 import torch
 from scipy.sparse import csc_matrix
 from support.fixtures import golden
+from support.stores import VIDEOS, poses, write_humanact12, write_uestc, written
 
 from evaluators.extractors import UnconstrainedExtractor
 from evaluators.extractors.action_gru import ActionGRU
@@ -44,11 +45,6 @@ class Attack:
 
     def __reduce__(self):
         return self.call
-
-
-def written(path: Path, content: object, protocol: int = 4) -> Path:
-    path.write_bytes(pickle.dumps(content, protocol))
-    return path
 
 
 ragged = np.empty(2, object)
@@ -115,26 +111,6 @@ def test_every_byte_may_be_wrong(tmp_path: Path):
 
 
 # HumanAct12
-
-
-def poses(frames: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """SMPL poses (F, 72) and joints (F, 24, 3) that wander."""
-    rng = np.random.default_rng(seed)
-    joints = rng.normal(size=(1, 24, 3)) + 0.02 * rng.normal(size=(frames, 1, 3)).cumsum(0)
-    return 0.3 * rng.normal(size=(frames, 72)).astype(np.float32), joints.astype(np.float32)
-
-
-def write_humanact12(folder: Path, clips: int = 360, **columns) -> Path:
-    """The pickle as ACTOR hands it out: lists of arrays of all lengths, labels in no order."""
-    found = [poses(20 + 7 * (k % 15), k) for k in range(clips)]
-    data = {
-        "poses": [pose for pose, _ in found],
-        "oldposes": [pose for pose, _ in found],
-        "joints3D": [joints for _, joints in found],
-        "y": [k % 12 for k in range(clips)],
-    }
-    folder.mkdir()
-    return written(folder / "humanact12poses.pkl", data | columns)
 
 
 def batch_of(source, tmp_path: Path):
@@ -362,35 +338,6 @@ def test_classifiers_see_smpls_joints_or_the_result_says_that_they_do_not(tmp_pa
 
 
 # UESTC
-
-VIDEOS = [
-    *(f"a{k % 40}_d0_p{subject:03d}_c1_color.avi" for k, subject in enumerate([*TRAIN_SUBJECTS, 3, 4, 118])),
-    "a3_d5_p003_c2_color.avi",
-    "a3_d8_p003_c2_color.avi",
-    "a3_d8_p004_c1_color.avi",
-    "a4_d2_p001_c2_color.avi",
-    "a5_d1_p001_c1_color.avi",
-    "a5_d1_p005_c1_color.avi",
-]
-
-
-def write_uestc(folder: Path, **changed) -> Path:
-    """What ACTOR hands out: one pickle of three lists of float32 arrays, and text files beside it."""
-    (folder / "info").mkdir(parents=True)
-    lengths = [60 + 3 * k for k in range(len(VIDEOS) - 2)] + [70, 50]
-    rng = np.random.default_rng(0)
-    data = {
-        "pose": [0.5 * rng.normal(size=(n, 72)).astype(np.float32) for n in lengths],
-        "shape": [np.zeros((n, 10), np.float32) for n in lengths],
-        "joints3d": [rng.normal(size=(n, 49, 3)).astype(np.float32) for n in lengths],
-        "orig_cam": [rng.uniform(0.2, 0.9, size=(n, 4)).astype(np.float32) for n in lengths],
-    }
-    written(folder / "vibe_cache_refined.pkl", data | changed)
-    shown = [*lengths[:-2], 44, 44]
-    (folder / "info" / "names.txt").write_text("\n".join(VIDEOS) + "\n")
-    (folder / "info" / "num_frames_min.txt").write_text("\n".join(map(str, shown)) + "\n")
-    (folder / "info" / "action_classes.txt").write_text("".join(f"exercise-{k}\n" for k in range(40)))
-    return folder
 
 
 def test_uestc_from_raw_files_to_batch(tmp_path: Path):

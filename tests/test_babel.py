@@ -1,6 +1,5 @@
 """FLAME's clips of BABEL, on folders in the layout of BABEL v1.0 and AMASS."""
 
-import json
 import shutil
 from collections import Counter
 from pathlib import Path
@@ -9,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from support.fixtures import Arrays, golden
+from support.stores import BABEL_FILES, label, sequence, small_babel, write_amass, write_babel
 
 from flame_mdm.data.amass import read
 from flame_mdm.data.babel import FPS, Babel, Window
@@ -18,57 +18,6 @@ from flame_mdm.data.store import write_store
 from flame_mdm.errors import UserError
 from flame_mdm.representations.smpl import SMPL
 
-FILES = ("train", "extra_train", "val", "extra_val")
-
-
-def write_amass(path: Path, frames: int, fps: float, seed: int = 0) -> None:
-    """An AMASS file: SMPL+H's 156 numbers, the gender as bytes, keys that nothing here reads."""
-    rng = np.random.default_rng(seed)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    np.savez(
-        path,
-        trans=rng.normal(size=(frames, 3)),
-        gender=np.array(b"female"),
-        mocap_framerate=np.array(fps),
-        betas=np.zeros(16),
-        dmpls=np.zeros((frames, 8)),
-        poses=rng.normal(size=(frames, 156)) * 0.3,
-    )
-
-
-def sequence(name: str, labels: list[dict] | None, extra: bool) -> dict:
-    """One entry of a file of BABEL; `name` is the path of the motion in AMASS."""
-    annotation = None if labels is None else {"babel_lid": "x", "anntr_id": "y", "mul_act": True, "labels": labels}
-    whole = {
-        "babel_lid": "z",
-        "labels": [{"raw_label": "walk", "proc_label": "walk", "seg_id": "s", "act_cat": ["walk"]}],
-    }
-    if extra:
-        other = {"babel_lid": "x", "labels": [label("another annotator", ["jump"], 0, 9)]}
-        annotations = None if annotation is None else [annotation, other]
-        kept = {"seq_anns": [whole], "frame_anns": annotations}
-    else:
-        kept = {"seq_ann": whole, "frame_ann": annotation}
-    return {"babel_sid": 0, "url": "https://", "feat_p": f"{name.split('/')[0]}/{name}", "dur": 1.0, **kept}
-
-
-def label(text: str, categories: list[str] | None, start: float | None, end: float | None) -> dict:
-    return {
-        "raw_label": text.upper(),
-        "proc_label": text,
-        "seg_id": "s",
-        "act_cat": categories,
-        "start_t": start,
-        "end_t": end,
-    }
-
-
-def write_babel(folder: Path, sequences: dict[str, dict[str, dict]]) -> Path:
-    folder.mkdir(parents=True, exist_ok=True)
-    for name in FILES:
-        (folder / f"{name}.json").write_text(json.dumps(sequences.get(name, {})))
-    return folder
-
 
 def coded(folder: Path, rules: Arrays) -> Babel:
     """The coded motions and labels of the fixture as files."""
@@ -76,13 +25,13 @@ def coded(folder: Path, rules: Arrays) -> Babel:
     def text(code: float) -> str:
         return "transition" if code == 999 else f"a{int(code)}"
 
-    sequences: dict[str, dict] = {name: {} for name in FILES}
+    sequences: dict[str, dict] = {name: {} for name in BABEL_FILES}
     for file, part, frames, fps in rules["babel_files"].tolist():
         write_amass(folder / "amass" / f"CMU/subject/{file:03d}_poses.npz", frames, fps)
         rows = [row for row in rules["babel_labels"].tolist() if row[0] == file]
         labels = [label(text(row[4]), [text(c) for c in row[5:] if c >= 0] or None, row[2], row[3]) for row in rows]
-        found = sequence(f"CMU/subject/{file:03d}_poses.npz", labels, FILES[part].startswith("extra"))
-        sequences[FILES[part]][str(file)] = found
+        found = sequence(f"CMU/subject/{file:03d}_poses.npz", labels, BABEL_FILES[part].startswith("extra"))
+        sequences[BABEL_FILES[part]][str(file)] = found
     return open_babel(write_babel(folder / "babel", sequences), folder / "amass", published_split=True)
 
 
@@ -103,6 +52,11 @@ def row_of(window: Window) -> list[int]:
     return [split, int(window.id.split("_")[1]), file, window.start, int(window.label.text[1:])]
 
 
+@pytest.fixture
+def small(tmp_path: Path) -> tuple[Path, Path]:
+    return small_babel(tmp_path)
+
+
 @pytest.mark.golden
 @pytest.mark.parametrize("stem", ["rules"])
 def test_clips_are_those_of_flame(stem: str, tmp_path: Path):
@@ -116,35 +70,6 @@ def test_clips_are_those_of_flame(stem: str, tmp_path: Path):
         assert clip.window is not None
         first, length = clip.window
         np.testing.assert_array_equal(clip.motion[first : first + length], motion[first:][:length])
-
-
-LABELS = [
-    label("walk", ["walk", "move"], 0.0, 8.0),
-    label("walk", ["walk"], 0.0, 8.0),  # said twice
-    label("transition", ["transition"], 0.0, 2.0),
-    label("", ["step"], 1.0, 3.0),
-    label("wave", None, 2.0, 4.0),
-    label("backwards", ["mislabeled"], 4.0, 3.0),
-    label("nowhen", None, None, None),
-    label("late", None, 12.0, 14.9),
-    label("too late", None, 12.0, 16.0),
-    label("nothing", None, 3.0, 3.06),
-    label("lost", [], 2.0, 4.0),
-]
-
-
-@pytest.fixture
-def small(tmp_path: Path) -> tuple[Path, Path]:
-    """BABEL with a few motions of 15 s in both parts, and one without frame labels."""
-    names = [f"CMU/{k:02d}/{k:02d}_01_poses.npz" for k in [*range(23), 27]]  # of the val part, 27 is for testing
-    for seed, name in enumerate(names):
-        write_amass(tmp_path / "amass" / name, 900, 60.0, seed)
-    sequences = {
-        "train": {str(k): sequence(name, LABELS if k else None, False) for k, name in enumerate(names[:12])},
-        "extra_train": {str(k): sequence(name, LABELS[:1], True) for k, name in enumerate(names[12:14])},
-        "val": {str(k): sequence(name, LABELS, False) for k, name in enumerate(names[14:])},
-    }
-    return write_babel(tmp_path / "babel", sequences), tmp_path / "amass"
 
 
 def test_labels_become_texts_and_bad_ones_are_counted(small: tuple[Path, Path]):

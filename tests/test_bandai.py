@@ -17,6 +17,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from support.fixtures import SHARED, needs_third_party, third_party
 from support.runs import no_children
+from support.stores import HIERARCHY, TAKES, synthetic_take
 
 from flame_mdm.data import Clip, bandai
 from flame_mdm.data.bandai import (
@@ -38,65 +39,6 @@ from flame_mdm.representations.smpl import ADULT, SMPL
 ARCHIVE = SHARED / "data" / "bandai-namco-motiondataset-raw.tar.xz"
 
 # Joint, parent and bone (cm, in the parent's axes) of the real files.
-HIERARCHY = """
-joint_Root - 0 0 0
-Hips joint_Root 0 93.9 -3
-Spine Hips 15.74 0 0
-Chest Spine 8.98 -0.41 0
-Neck Chest 16.38 0 0
-Head Neck 6.46 0 0
-Shoulder_L Chest 12.99 -0.24 4.98
-UpperArm_L Shoulder_L 5.35 0 0
-LowerArm_L UpperArm_L 24.33 0 0
-Hand_L LowerArm_L 22.29 0 0
-Shoulder_R Chest 12.99 -0.24 -4.98
-UpperArm_R Shoulder_R -5.35 0 0
-LowerArm_R UpperArm_R -24.33 0 0
-Hand_R LowerArm_R -22.29 0 0
-UpperLeg_L Hips -2.19 -6.47 0
-LowerLeg_L UpperLeg_L 39.08 0 0
-Foot_L LowerLeg_L 40.98 0 0
-Toes_L Foot_L 11.75 0 0
-UpperLeg_R Hips -2.19 6.47 0
-LowerLeg_R UpperLeg_R -39.08 0 0
-Foot_R LowerLeg_R -40.98 0 0
-Toes_R Foot_R -11.75 0 0
-"""
-TAKES = {
-    "dataset-1_walk_happy_001": 28,
-    "dataset-1_walk-left_old_001": 31,
-    "dataset-1_bye_giant_001": 25,
-    "dataset-2_walk-turn-left_normal_001": 34,
-    "dataset-2_walk-turn-right_masculine_006": 22,
-    "dataset-2_raise-up-right-hand_youthful_001": 19,
-    "dataset-2_run_active_017": 40,
-    "dataset-2_wave-both-hands_elderly_003": 23,
-}
-
-
-def synthetic_take(seed: int, frames: int) -> bvh.Bvh:
-    """Smooth random turns of all joints of the real skeleton; the hips wander."""
-    rng = np.random.default_rng(seed)
-    rows = [line.split() for line in HIERARCHY.split("\n") if line]
-    joints = tuple(row[0] for row in rows)
-    offsets = np.array([row[2:] for row in rows], float)
-    time = np.arange(frames)[:, None, None] / 30
-    phase, size = rng.uniform(0, 6, (2, 22, 3))
-    values = np.concatenate([np.tile(offsets, (frames, 1, 1)), 20 * size * np.sin(3 * time + phase)], 2)
-    values[:, 0] = 0
-    values[:, 1, :3] += 30 * np.sin(2 * time[:, 0] + phase[1])
-    channels = ("Xposition", "Yposition", "Zposition", "Zrotation", "Xrotation", "Yrotation")
-    ends = [joints.index(name) for name in ("Head", "Hand_L", "Hand_R", "Toes_L", "Toes_R")]
-    return bvh.Bvh(
-        joints,
-        tuple(-1 if row[1] == "-" else joints.index(row[1]) for row in rows),
-        offsets,
-        (channels,) * 22,
-        tuple(ends),
-        np.zeros((5, 3)),
-        values.reshape(frames, -1),
-        30.0,
-    )
 
 
 @pytest.fixture(scope="module")

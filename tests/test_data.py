@@ -4,9 +4,10 @@ from itertools import islice
 import numpy as np
 import pytest
 import torch
+from support.stores import OwnClips, clip
 
 from flame_mdm.batch import collate
-from flame_mdm.data import Clip, MotionSource, Split
+from flame_mdm.data import Split
 from flame_mdm.data.crops import Fixed, Units, Whole
 from flame_mdm.data.datamodule import Clips, EvaluationBatches, MotionDataModule, TrainingBatches
 from flame_mdm.data.store import Store, _fingerprint, write_store
@@ -86,26 +87,6 @@ def test_damaged_files_are_named(copy, name, damage):
     assert "\n" not in str(error.value)
 
 
-class Broken(MotionSource):
-    """Yields the clips it is given."""
-
-    name = "broken"
-
-    def __init__(self, *clips):
-        self.given = clips
-
-    def count(self):
-        return len(self.given)
-
-    def clips(self, fps):
-        yield from self.given
-
-
-def clip(name, split: Split = "train", source=None, motion=None, **options):
-    joints = next(iter(Synthetic(clips=1).clips(20.0))).motion if motion is None else motion
-    return Clip(name, joints, ["a person walks"], split, source or name, **options)
-
-
 @pytest.mark.parametrize(
     ("clips", "message"),
     [
@@ -123,13 +104,13 @@ def clip(name, split: Split = "train", source=None, motion=None, **options):
 )
 def test_bad_clips_stop_preparation_and_leave_nothing(clips, message, tmp_path):
     with pytest.raises(ValueError, match=message):
-        write_store(tmp_path / "store", Broken(*clips), HumanML())
+        write_store(tmp_path / "store", OwnClips(*clips), HumanML())
     assert list(tmp_path.iterdir()) == []
 
 
 def test_encoded_clips_and_given_statistics_are_stored_as_they_are(tmp_path):
     features = np.random.default_rng(0).normal(size=(30, 263)).astype(np.float32)
-    source = Broken(clip("a", motion=features, encoded="humanml-clean-smpl22"))
+    source = OwnClips(clip("a", motion=features, encoded="humanml-clean-smpl22"))
     source.statistics = lambda: (np.full(263, 2.0), np.full(263, 3.0))
     store = write_store(tmp_path / "store", source, HumanML())
     np.testing.assert_array_equal(store.motion(store.clips[0]), features)

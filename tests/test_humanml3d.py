@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from support.fixtures import golden, groups
-from support.t2m_folder import line, published, write_folder
+from support.stores import line, published, write_folder
 
 from flame_mdm.commands.prepare import main as prepare
 from flame_mdm.data import amass, humanml3d, t2m

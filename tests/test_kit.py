@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from support.fixtures import golden
-from support.t2m_folder import line, published, write_folder
+from support.stores import line, published, write_folder
 
 from evaluators.metrics.reconstruction import PARTS, temos_parts
 from flame_mdm.__main__ import main

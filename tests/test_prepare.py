@@ -15,10 +15,15 @@ from typing import Any
 import numpy as np
 import pytest
 from support.runs import TINY, no_children
-from support.t2m_folder import line, write_folder
-from test_actions import write_humanact12, write_uestc
-from test_babel import small  # noqa: F401  a fixture
-from test_bandai import TAKES, synthetic_take
+from support.stores import (
+    TAKES,
+    line,
+    small_babel,
+    synthetic_take,
+    write_folder,
+    write_humanact12,
+    write_uestc,
+)
 from test_humanml3d import downloads  # noqa: F401  a fixture
 from test_kit import mmm  # noqa: F401  a fixture
 
@@ -266,7 +271,7 @@ def words_of(data: str, request: pytest.FixtureRequest, tmp_path: Path) -> list[
         path = request.getfixturevalue("mmm")
         return [f"source={path}", f"data.source.splits={path.parent / 'kit-splits'}"]
     if data == "babel":
-        path, amass = request.getfixturevalue("small")
+        path, amass = small_babel(tmp_path)
         return [f"source={path}", f"data.source.amass={amass}", "data.source.workers=1"]
     if data == "humanact12":
         return [f"source={write_humanact12(tmp_path / 'set')}"]

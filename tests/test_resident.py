@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from test_data import Broken, clip
+from support.stores import OwnClips, clip
 from test_training import STEPS, run
 
 from flame_mdm.batch import MotionBatch
@@ -49,7 +49,7 @@ def rotations(root: Path, **options: Any) -> MotionDataModule:
     ]  # fmt: skip
     for number in (0, 1, 3):
         clips[number].captions.clear()
-    source = Broken(*clips)
+    source = OwnClips(*clips)
     source.actions = ("a", "b", "c")
     source.statistics = lambda: (np.full(150, 0.3), np.full(150, 1.7))
     data = MotionDataModule(source, Rot6D(), root=str(root), name="r", batch_size=3, crop=Units(8, 24, 4), **options)

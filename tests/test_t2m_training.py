@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from support.t2m_folder import line, write_folder
+from support.stores import line, write_folder
 
 from evaluators.extractors import OwnT2MExtractor
 from evaluators.extractors.t2m import LearnedWords

@@ -1,5 +1,6 @@
 """Resuming on other data, stores of other options, full disks, and loading processes that die or stop."""
 
+import hashlib
 import json
 import os
 import resource
@@ -105,34 +106,32 @@ def test_all_options_but_places_count(tmp_path):
     assert Synthetic(3).options == {"clips": 3, "seed": 0, "min_seconds": 2.0, "max_seconds": 3.0}
 
 
-@pytest.mark.parametrize(
-    ("name", "change"),
-    [
-        ("store.json", lambda info: info.pop("shape") and info),
-        ("store.json", lambda info: info | {"sha256": []}),
-        ("store.json", lambda info: info | {"source": [1]}),
-        ("store.json", lambda info: info | {"clips": None}),
-        ("clips.jsonl", lambda clip: clip | {"unknown": 1}),
-        ("clips.jsonl", lambda clip: clip | {"start": 10**9}),
-        ("clips.jsonl", lambda clip: clip | {"length": "x"}),
-        ("clips.jsonl", lambda clip: clip | {"split": "x"}),
-        ("clips.jsonl", lambda clip: [clip]),
-    ],
-)
-def test_stores_with_odd_values_are_refused(attacked, tmp_path, data_root, name, change):
-    from hashlib import sha256
+ODD_STORES = [
+    ("store.json", lambda info: info.pop("shape") and info),
+    ("store.json", lambda info: info | {"sha256": []}),
+    ("store.json", lambda info: info | {"source": [1]}),
+    ("store.json", lambda info: info | {"clips": None}),
+    ("clips.jsonl", lambda clip: clip | {"unknown": 1}),
+    ("clips.jsonl", lambda clip: clip | {"start": 10**9}),
+    ("clips.jsonl", lambda clip: clip | {"length": "x"}),
+    ("clips.jsonl", lambda clip: clip | {"split": "x"}),
+    ("clips.jsonl", lambda clip: [clip]),
+]
 
+
+def test_stores_with_odd_values_are_refused(attacked, tmp_path, data_root):
     folder = tmp_path / STORE
-    shutil.copytree(data_root / STORE, folder)
-    first, *rest = (folder / name).read_text().splitlines(keepends=True)
-    if name == "store.json":
-        (folder / name).write_text(json.dumps(change(json.loads("".join([first, *rest])))))
-    else:
-        (folder / name).write_text("".join([json.dumps(change(json.loads(first))) + "\n", *rest]))
-        info = json.loads((folder / "store.json").read_text())
-        info["sha256"][name] = sha256((folder / name).read_bytes()).hexdigest()
-        (folder / "store.json").write_text(json.dumps(info))
-    attacked("browse", *prepared(tmp_path, 60), says=f"{folder / name}: damaged: ")
+    for name, change in ODD_STORES:
+        shutil.copytree(data_root / STORE, folder, dirs_exist_ok=True)
+        first, *rest = (folder / name).read_text().splitlines(keepends=True)
+        if name == "store.json":
+            (folder / name).write_text(json.dumps(change(json.loads("".join([first, *rest])))))
+        else:
+            (folder / name).write_text("".join([json.dumps(change(json.loads(first))) + "\n", *rest]))
+            info = json.loads((folder / "store.json").read_text())
+            info["sha256"][name] = hashlib.sha256((folder / name).read_bytes()).hexdigest()
+            (folder / "store.json").write_text(json.dumps(info))
+        attacked("browse", *prepared(tmp_path, 60), says=f"{folder / name}: damaged: ")
 
 
 def test_refused_training_leaves_nothing(attacked, tmp_path, data_root):
@@ -158,7 +157,7 @@ def file_limit() -> Iterator[Callable[[int], None]]:
     resource.setrlimit(resource.RLIMIT_FSIZE, limits)
 
 
-@pytest.mark.parametrize("size", [0, 100, 100_000, 3_000_000])
+@pytest.mark.parametrize("size", [0, 100_000])
 def test_a_preparation_without_room_leaves_nothing(tmp_path, capsys, file_limit, size):
     file_limit(size)
     assert prepare.main(prepared(tmp_path / "data", 60)) == 1
@@ -180,6 +179,7 @@ def small_disk(tmp_path) -> Iterator[Path]:
     subprocess.run(["umount", str(folder)], check=True)
 
 
+@pytest.mark.robustness
 def test_a_full_disk_ends_a_preparation_in_one_line(small_disk):
     """In a process of its own: one that writes through a memory map is killed (SIGBUS)."""
 
@@ -192,9 +192,9 @@ def test_a_full_disk_ends_a_preparation_in_one_line(small_disk):
     shutil.rmtree(small_disk / "data")
     done = preparation(100)
     assert done.returncode == 1, done
-    told = done.stderr.splitlines()[-1]
-    assert told.startswith(f"error: {small_disk / 'data' / STORE / 'features.npy'}: cannot be written: No space left")
-    assert " are free on the disk of " in told
+    line = done.stderr.splitlines()[-1]
+    assert line.startswith(f"error: {small_disk / 'data' / STORE / 'features.npy'}: cannot be written: No space left")
+    assert " are free on the disk of " in line
     assert list(small_disk.iterdir()) == []
 
 
@@ -246,7 +246,8 @@ def running(pids: list[int]) -> list[int]:
     return [pid for pid in pids if Path(f"/proc/{pid}").exists()]
 
 
-def test_a_killed_loading_process_is_told_in_one_line(training, tmp_path, data_root):
+@pytest.mark.robustness
+def test_a_killed_loading_process_is_named_in_one_line(training, tmp_path, data_root):
     process, workers = training
     assert len(workers) >= 2
     os.kill(workers[-1], signal.SIGKILL)
@@ -287,6 +288,7 @@ def test_what_torch_says_of_lost_workers_is_understood(tmp_path, monkeypatch, me
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.robustness
 def test_a_second_sigterm_ends_a_run_whose_loading_processes_hang(training):
     process, workers = training
     for pid in workers:

@@ -158,25 +158,14 @@ def test_waiting_threads_soon_sleep():
         assert done.stdout.strip() == expected
 
 
-def test_bfloat16_is_one_switch(tiny):
-    checkpoint = run([*tiny, *STEPS, "trainer.precision=bf16-mixed"], 2)
-    values = [value for value in weights(checkpoint).values() if value.is_floating_point()]
-    assert all(value.dtype == torch.float32 for value in values)
-    assert all(torch.isfinite(value).all() for value in values)
-
-
-def test_a_folder_of_another_configuration_is_refused(tiny, capsys):
-    run([*tiny, *STEPS], 2)
+def test_a_finished_run_says_so_and_one_of_another_configuration_is_refused(tiny, capsys):
+    for _ in range(2):
+        run([*tiny, *STEPS], 2)
+    assert "already trained for 2 steps" in capsys.readouterr().out
     assert main(["train", "quickstart", *tiny, *STEPS, "optimizer.lr=0.5", "trainer.max_steps=4"]) == 1
     message = capsys.readouterr().err
     assert "optimizer.lr (0.002 there, 0.5 here)" in message
     assert "run.name=" in message
-
-
-def test_a_finished_run_says_so(tiny, capsys):
-    run([*tiny, *STEPS], 2)
-    run([*tiny, *STEPS], 2)
-    assert "already trained for 2 steps" in capsys.readouterr().out
 
 
 def test_a_saved_config_repeats_a_run(tiny, tmp_path):
@@ -188,7 +177,7 @@ def test_a_saved_config_repeats_a_run(tiny, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("signum", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("signum", [pytest.param(signal.SIGINT, marks=pytest.mark.robustness), signal.SIGTERM])
 def test_a_signal_stops_at_the_end_of_a_step_and_the_run_goes_on(tiny, signum, tmp_path):
     overrides = [*tiny, *STEPS, "trainer.max_steps=100000"]
     command = [sys.executable, "-m", "flame_mdm", "train", "quickstart", *overrides]
@@ -355,32 +344,32 @@ def test_stages_are_the_clean_estimates_up_to_the_motion(trained):
     assert np.abs(stages[0].joints - motion.joints).max() > 1e-3
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["text="], "the text is empty"),
-        (["text=  "], "the text is empty"),
-        ([], "say what to sample: text=..., for example a "),
-        (["text=a", "unconditioned=true"], "not text and unconditioned"),
-        (["text=a", "seconds=30"], "up to 3 seconds (60 frames at 20 fps)"),
-        (["text=a", "seconds=0"], "0 seconds (0 frames) are too short: give at least 0.1 seconds"),
-        (["action=walk"], "action=walk: this model was trained on captions. Give text="),
-        (["text=a", "seconds=-1"], "are too short"),
-        (["text=a", "sampler=euler"], "unknown sampler 'euler'"),
-        (["text=a", "num_inference_steps=11"], "11"),
-        (["text=a", "num_inference_steps=[3,1]"], "got [3, 1]"),
-        (["text=a", "num_inference_steps=[0,1.5]"], "num_inference_steps=[0, 1.5]: "),
-        (["text=a", "eta=0.5"], "eta=0.5"),
-        (["text=a", "spacing=even"], "spacing=even"),
-        (["text=a", "sead=3"], "unknown config key 'sead'. Did you mean seed"),
-    ],
-)
-def test_bad_requests_are_one_line(trained, words, message, tmp_path, capsys):
-    assert main(["sample", f"ckpt={trained}", f"out={tmp_path / 'out'}", *words]) == 1
-    error = capsys.readouterr().err
-    assert message in error
-    assert error.count("\n") == 1
-    assert not (tmp_path / "out").exists()
+BAD_REQUESTS = [
+    (["text="], "the text is empty"),
+    (["text=  "], "the text is empty"),
+    ([], "say what to sample: text=..., for example a "),
+    (["text=a", "unconditioned=true"], "not text and unconditioned"),
+    (["text=a", "seconds=30"], "up to 3 seconds (60 frames at 20 fps)"),
+    (["text=a", "seconds=0"], "0 seconds (0 frames) are too short: give at least 0.1 seconds"),
+    (["action=walk"], "action=walk: this model was trained on captions. Give text="),
+    (["text=a", "seconds=-1"], "are too short"),
+    (["text=a", "sampler=euler"], "unknown sampler 'euler'"),
+    (["text=a", "num_inference_steps=11"], "11"),
+    (["text=a", "num_inference_steps=[3,1]"], "got [3, 1]"),
+    (["text=a", "num_inference_steps=[0,1.5]"], "num_inference_steps=[0, 1.5]: "),
+    (["text=a", "eta=0.5"], "eta=0.5"),
+    (["text=a", "spacing=even"], "spacing=even"),
+    (["text=a", "sead=3"], "unknown config key 'sead'. Did you mean seed"),
+]
+
+
+def test_bad_requests_are_one_line(trained, tmp_path, capsys):
+    for words, message in BAD_REQUESTS:
+        assert main(["sample", f"ckpt={trained}", f"out={tmp_path / 'out'}", *words]) == 1, words
+        error = capsys.readouterr().err
+        assert message in error
+        assert error.count("\n") == 1
+        assert not (tmp_path / "out").exists()
 
 
 def test_bad_checkpoints_are_one_line(trained, tmp_path):
@@ -405,22 +394,15 @@ def test_a_checkpoint_of_another_shape_names_the_weight(trained, tmp_path):
         load(tmp_path / "other.ckpt")
 
 
-def test_a_checkpoint_cannot_name_foreign_code(trained, tmp_path):
-    checkpoint = read_checkpoint(trained)
-    checkpoint["config"]["denoiser"] = {"_target_": "os.system", "command": f"touch {tmp_path / 'owned'}"}
-    torch.save(checkpoint, tmp_path / "evil.ckpt")
-    with pytest.raises(UserError, match=r"names os\.system at denoiser"):
-        load(tmp_path / "evil.ckpt")
-    assert not (tmp_path / "owned").exists()
-
-
 def test_an_unwritable_folder_is_one_line(tiny, tmp_path, capsys):
     (tmp_path / "file").write_text("")
     assert main(["train", "quickstart", *tiny, f"run.dir={tmp_path / 'file' / 'run'}"]) == 1
     assert capsys.readouterr().err.count("\n") == 1
 
 
-def test_training_without_condition(tiny):
+def test_training_without_condition_in_bfloat16(tiny):
     overrides = [o for o in tiny if not o.startswith("condition.")]
-    checkpoint = run([*overrides, *STEPS, "condition=none"], 2)
+    checkpoint = run([*overrides, *STEPS, "condition=none", "trainer.precision=bf16-mixed"], 2)
+    values = [value for value in weights(checkpoint).values() if value.is_floating_point()]
+    assert all(value.dtype == torch.float32 and torch.isfinite(value).all() for value in values)
     assert generate(load(checkpoint), frames=24)[0].joints.shape == (24, 22, 3)

@@ -131,7 +131,7 @@ def test_recipes_build_the_sizes_of_their_data():
             length_mask(torch.tensor([12, 7])),
         )
         assert task.logits(joints, mask).shape == (2, 7)
-        assert task(joints, mask).shape == (2, task.network.features)
+        assert len(task(joints, mask)) == 2
 
 
 @pytest.mark.slow

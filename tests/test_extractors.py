@@ -256,14 +256,15 @@ def test_released_evaluators_of_mardm_are_read(tmp_path):
 @pytest.mark.parametrize("start", [pytest.param(s, id=f"humanact12_gru-{s or 'given'}") for s in ("", "_h0_zero")])
 def test_the_gru_gives_the_authors_features_and_logits(start):
     arrays = third_party("humanact12_gru")
-    network = ActionGRU(recenter=False).eval()
+    network = ActionGRU().eval()
     network.load_state_dict(weights(arrays))
-    joints = torch.from_numpy(arrays["in/xyz"]).permute(0, 3, 1, 2) * FLIP
+    joints = torch.from_numpy(arrays["in/xyz"]).permute(0, 3, 1, 2)
     mask = length_mask(torch.from_numpy(arrays["in/lengths"]), joints.shape[1])
     state = None if start else torch.from_numpy(arrays["in/hidden_unit"])
     with torch.no_grad():
-        assert_within(network(joints, mask, state), arrays, f"out/features{start}", like="out/features")
-        assert_within(network.logits(joints, mask, state), arrays, f"out/logits{start}", like="out/logits")
+        features = network.published(joints, mask, state)
+        assert_within(features, arrays, f"out/features{start}", like="out/features")
+        assert_within(network.linear2(features), arrays, f"out/logits{start}", like="out/logits")
 
 
 def test_the_gru_stops_at_the_end_and_starts_at_the_origin():
@@ -271,7 +272,7 @@ def test_the_gru_stops_at_the_end_and_starts_at_the_origin():
     network = ActionGRU().eval()
     joints, mask = torch.randn(3, 60, 24, 3), length_mask(torch.tensor([60, 31, 1]))
     features = network(joints, mask)
-    assert features.shape == (3, network.features)
+    assert features.shape == (3, ActionGRU.features)
     assert network.logits(joints, mask).shape == (3, NUM_ACTIONS)
     assert_padding_is_not_seen(network, joints, [60, 31, 1], atol=1e-6)
     moved = network(joints + torch.tensor([3.0, -1.0, 2.0]), mask)
@@ -363,7 +364,7 @@ def test_stgcn_classifies_and_sees_nothing_past_the_end(make, shape, actions):
     x, mask = torch.randn(3, 20, *shape), torch.ones(3, 20, dtype=torch.bool)
     with torch.no_grad():
         features, logits = network(x, mask), network.logits(x, mask)
-    assert (features.shape, logits.shape) == ((3, network.features), (3, actions))
+    assert (features.shape, logits.shape) == ((3, network.fcn.in_channels), (3, actions))
     torch.testing.assert_close(logits, features @ network.fcn.weight.flatten(1).T + network.fcn.bias)
     assert_padding_is_not_seen(network, x, [20, 13, 1])
 

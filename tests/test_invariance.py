@@ -320,7 +320,7 @@ def validate(rank: int, world: int) -> tuple[float, ...]:
     mask = torch.ones(10, 8, dtype=torch.bool)
     with torch.no_grad():
         task.validation_step(MotionBatch(x[mine], mask[mine], ["a"] * len(x[mine]), action=labels[mine]), 0)
-    return tuple(float(metric.compute()) for metric in task.val_metrics.values())
+    return tuple(float(metric.compute()) for metric in task.val_metrics.values())  # type: ignore[operator]
 
 
 @pytest.mark.slow

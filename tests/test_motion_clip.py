@@ -301,7 +301,7 @@ def test_a_checkpoint_is_a_feature_extractor(trained, tmp_path):
     task = load_task(trained, MotionCLIPTask)
     x, mask = torch.randn(2, 30, task.representation.features), length_mask(torch.tensor([30, 24]))
     features = task(task.representation.denormalize(x), mask)
-    assert features.shape == (2, task.features)
+    assert features.shape == (2, task.network.output.out_features)
     torch.testing.assert_close(features, task.network(x, mask), atol=1e-4, rtol=1e-4)
     texts = task.text(["a person walks forward", "a person waves with the left hand", "a person walks forward"])
     assert torch.equal(texts[0], texts[2])

@@ -18,18 +18,9 @@ class ActionGRU(nn.Module):
 
     features = 30
 
-    def __init__(
-        self,
-        num_joints: int = 24,
-        hidden: int = 128,
-        num_layers: int = 2,
-        *,
-        num_actions: int = NUM_ACTIONS,
-        recenter: bool = True,
-    ):
-        """Sizes are those of the released weights; `recenter` moves the pelvis of the first frame to the origin."""
+    def __init__(self, num_joints: int = 24, hidden: int = 128, num_layers: int = 2, *, num_actions: int = NUM_ACTIONS):
+        """Builds the network; sizes are those of the released weights."""
         super().__init__()
-        self.recenter = recenter
         self.recurrent = nn.GRU(3 * num_joints, hidden, num_layers, batch_first=True)
         self.linear1 = nn.Linear(hidden, self.features)
         self.linear2 = nn.Linear(self.features, num_actions)
@@ -39,7 +30,7 @@ class ActionGRU(nn.Module):
 
         Args:
             joints: (B, F, J, 3) in meters, y up; the 24 SMPL joints for the released weights. The network sees them
-                with y down, as published.
+                with y down and from the first position of the pelvis, as published.
             mask: (B, F) bool, True = real frame; every motion has at least one.
             state: (layers, B, hidden) initial state; None = zeros.
 
@@ -47,9 +38,11 @@ class ActionGRU(nn.Module):
             (B, 30) in (-1, 1).
         """
         joints = joints * joints.new_tensor([1.0, -1.0, -1.0])
-        if self.recenter:
-            joints = joints - joints[:, :1, :1]
-        outputs, _ = self.recurrent(joints.flatten(2), state)
+        return self.published(joints - joints[:, :1, :1], mask, state)
+
+    def published(self, x: Tensor, mask: Tensor, state: Tensor | None = None) -> Tensor:
+        """Returns features (B, 30) of what the network sees (B, F, J, 3); other arguments as for `forward`."""
+        outputs, _ = self.recurrent(x.flatten(2), state)
         last = mask.sum(1) - 1
         return torch.tanh(self.linear1(outputs[torch.arange(len(last), device=last.device), last]))
 

@@ -70,7 +70,7 @@ class MotionCLIP(nn.Module):
         """
         super().__init__()
         self.roughness = roughness
-        self.max_frames, self.blind_features, self.embedding_dim = max_frames, blind_features, embedding_dim
+        self.max_frames, self.blind_features = max_frames, blind_features
         self.cls = nn.Parameter(torch.randn(latent_dim))
         # Row 0, unused in the authors' code, is that of the longest motion: see the FLAME denoiser.
         self.length_embedding = nn.Embedding(max_frames, latent_dim)
@@ -198,7 +198,6 @@ class MotionCLIPTask(Task):
     ):
         super().__init__(condition, representation, optimizer=optimizer, seed=seed)
         self.network = network
-        self.features = network.embedding_dim
         with torch.device("cpu"):  # a loaded model is built on the meta device, of which metrics cannot be moved
             self.val_metrics = nn.ModuleDict(
                 {"loss": PooledLoss(), "texts_for_motion": TextsForMotion(), "motions_for_text": MotionsForText()}

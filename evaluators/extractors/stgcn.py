@@ -63,7 +63,6 @@ class STGCN(nn.Module):
             strides: temporal stride of each block.
         """
         super().__init__()
-        self.features = widths[-1]
         graph = adjacency(parents)
         self.register_buffer("A", graph)
         self.A: Tensor

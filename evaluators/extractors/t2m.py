@@ -121,14 +121,11 @@ class LearnedWords(nn.Module):
     """Word vectors learned with the evaluator, for data sets without tagged words; see `vocabulary.hashed`.
 
     Parts of speech are unknown: their vectors are 0.
-
-    Args:
-        buckets: rows of the word table.
     """
 
-    def __init__(self, buckets: int = 2048):
+    def __init__(self):
         super().__init__()
-        self.table = nn.Embedding(buckets, _TextEncoder.WORD)
+        self.table = nn.Embedding(2048, _TextEncoder.WORD)
         nn.init.normal_(self.table.weight, std=0.3)  # about the scale of GloVe vectors
 
     def forward(self, captions: Sequence[Sequence[str]]) -> Words:
@@ -178,7 +175,7 @@ class T2MEvaluator(nn.Module):
                 all but the contacts.
         """
         super().__init__()
-        self.features, self.max_frames = embedding, max_frames
+        self.max_frames = max_frames
         self.register_buffer("mean", mean.float())
         self.register_buffer("std", std.float())
         self.used = used_features or len(mean) - CONTACTS

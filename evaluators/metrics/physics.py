@@ -8,6 +8,11 @@ from torch import Tensor
 from evaluators.metrics.samples import SampleMetric, Share, real_frames
 from flame_mdm.formats.faults import LIMITS, LOW
 
+TOLERANCE = 0.005
+"""Distance from the floor, in meters, that counts as 0."""
+STANDING = 0.03
+"""Speed in meters per second below which a motion counts as static."""
+
 
 class FootSkating(Share):
     """Foot skating ratio: fraction of frame transitions in which a foot that touches the floor slides.
@@ -65,22 +70,14 @@ class MeanOverFrames(SampleMetric):
 
 
 class DistanceFromFloor(MeanOverFrames):
-    """Mean distance of the lowest joint from the floor, y = 0, in meters, on one side of it.
-
-    Args:
-        tolerance: distance in meters that counts as 0.
-    """
+    """Mean distance of the lowest joint from the floor, y = 0, in meters, on one side of it."""
 
     side: int
-
-    def __init__(self, tolerance: float = 0.005):
-        super().__init__()
-        self.tolerance = tolerance
 
     def frame_values(self, motion: Tensor) -> Tensor:
         """Returns the distance in each frame."""
         distance = self.side * motion[..., 1].amin(1)
-        return torch.where(distance > self.tolerance, distance, 0.0)
+        return torch.where(distance > TOLERANCE, distance, 0.0)
 
 
 class Penetration(DistanceFromFloor):
@@ -130,19 +127,18 @@ class StaticShare(Share):
 
     Args:
         fps: frames per second of the motions.
-        speed: meters per second below which a motion counts as static.
     """
 
     higher_is_better = False
 
-    def __init__(self, fps: float, speed: float = 0.03):
+    def __init__(self, fps: float):
         super().__init__()
-        self.fps, self.speed = fps, speed
+        self.fps = fps
 
     def update(self, joints: Tensor, mask: Tensor) -> None:
         """Adds motions: joints (B, F, J, 3) in meters, y up; mask (B, F). Motions with one frame are ignored."""
         for motion in real_frames("StaticShare", joints, mask):
             moved = motion.double().diff(dim=0).norm(dim=-1)
             if len(moved):
-                self.hits += (moved.mean() * self.fps < self.speed).long()
+                self.hits += (moved.mean() * self.fps < STANDING).long()
                 self.total += 1

@@ -21,6 +21,8 @@ from flame_mdm.seeds import key
 
 SAME = 0.9
 """Cosine above which TMR considers captions the same: its threshold 0.95 is of (cosine + 1) / 2."""
+BATCH = 32
+"""Size of TMR's batches."""
 
 
 @functools.cache
@@ -72,17 +74,16 @@ class CaptionMetric(SampleMetric):
     """A metric of motions and captions, some of which are the same.
 
     Args:
-        encoder: a mapping with the `_target_` of a text encoder, which decides with `cosine` what captions are the
-            same; None = only captions equal but for case, punctuation and spaces.
-        cosine: captions with a larger cosine are the same.
+        encoder: a mapping with the `_target_` of a text encoder: captions with a cosine above `SAME` are the same;
+            None = only captions equal but for case, punctuation and spaces.
     """
 
     higher_is_better = True
     states = ("generated", "text", "caption_keys", "meaning")
 
-    def __init__(self, encoder: Config | None = None, cosine: float = SAME):
+    def __init__(self, encoder: Config | None = None):
         super().__init__()
-        self.encoder, self.cosine = None if encoder is None else json.dumps(encoder, sort_keys=True), cosine
+        self.encoder = None if encoder is None else json.dumps(encoder, sort_keys=True)
 
     def update(self, generated: Tensor, text: Tensor, captions: Sequence[str], keys: Tensor) -> None:
         """Adds features of motions and of their texts, each (B, E), with the B captions and the keys (B,)."""
@@ -96,7 +97,7 @@ class CaptionMetric(SampleMetric):
 
     def same(self, caption_keys: Tensor, meaning: Tensor) -> Tensor:
         """Returns which captions are the same, (..., N, N) bool, from keys (..., N) and vectors (..., N, C)."""
-        return (caption_keys[..., None, :] == caption_keys[..., None]) | (meaning @ meaning.mT > self.cosine)
+        return (caption_keys[..., None, :] == caption_keys[..., None]) | (meaning @ meaning.mT > SAME)
 
 
 class MultiPositiveRPrecision(CaptionMetric):
@@ -109,7 +110,7 @@ class MultiPositiveRPrecision(CaptionMetric):
     raise all values, `chance_top1`, ... are those of a random order, and `positives` is the mean of R.
 
     Args:
-        encoder, cosine: as for all metrics of this module.
+        encoder: as for all metrics of this module.
         pool: motions in a pool.
         top: largest k.
         seed: of the pools.
@@ -119,13 +120,12 @@ class MultiPositiveRPrecision(CaptionMetric):
     def __init__(
         self,
         encoder: Config | None = None,
-        cosine: float = SAME,
         pool: int = 32,
         top: int = 3,
         seed: int = 0,
         normalize: bool = False,
     ):
-        super().__init__(encoder, cosine)
+        super().__init__(encoder)
         self.pool, self.top, self.seed, self.normalize = pool, top, seed, normalize
         tops = [f"{kind}top{k}" for kind in ("", "single_", "chance_") for k in range(1, top + 1)]
         self.names = (*tops, "proper", "positives")
@@ -139,7 +139,7 @@ class MultiPositiveRPrecision(CaptionMetric):
         similarity, correct = [], []
         for query, pool in zip(order.split(16), pools.split(16), strict=True):
             similarity.append(-torch.linalg.vector_norm(text[query, None] - motion[pool], dim=-1))
-            similar = (meaning[query, None] * meaning[pool]).sum(-1) > self.cosine
+            similar = (meaning[query, None] * meaning[pool]).sum(-1) > SAME
             correct.append((caption_keys[query, None] == caption_keys[pool]) | similar | (query[:, None] == pool))
         values = multi_positive(torch.cat(similarity), torch.cat(correct), self.top)
         single = best_ranks(torch.cat(similarity), F.one_hot(position, self.pool).bool())
@@ -173,10 +173,9 @@ class TMRRetrieval(CaptionMetric):
     of the subset is that whose caption is the least similar to those taken before it, after the first by key.
 
     Args:
-        encoder, cosine: as for all metrics of this module; without an encoder, `dissimilar` has no value.
+        encoder: as for all metrics of this module; without an encoder, `dissimilar` has no value.
         subset: number of dissimilar motions, at most half of all.
         ids: ids of the dissimilar motions, such as TMR's; None = chosen as above.
-        batch: size of the batches.
         seed: of the batches.
     """
 
@@ -186,14 +185,12 @@ class TMRRetrieval(CaptionMetric):
     def __init__(
         self,
         encoder: Config | None = None,
-        cosine: float = SAME,
         subset: int = 100,
         ids: Sequence[str] | None = None,
-        batch: int = 32,
         seed: int = 0,
     ):
-        super().__init__(encoder, cosine)
-        self.subset, self.batch, self.seed = subset, batch, seed
+        super().__init__(encoder)
+        self.subset, self.seed = subset, seed
         self.ids = None if ids is None else [key(name) for name in ids]
         values = [f"{way}_{name}" for way in ("t2m", "m2t") for name in (*(f"top{k}" for k in self.TOP), "median")]
         self.names = [f"{protocol}_{value}" for protocol in self.PROTOCOLS for value in values]
@@ -209,7 +206,7 @@ class TMRRetrieval(CaptionMetric):
         if len(chosen):
             values["dissimilar"] = whole_set_retrieval(similarity[chosen][:, chosen], self.TOP)
         order = np.random.default_rng(self.seed).permutation(len(motion))
-        batches = torch.from_numpy(order[: len(order) // self.batch * self.batch]).view(-1, self.batch)
+        batches = torch.from_numpy(order[: len(order) // BATCH * BATCH]).view(-1, BATCH)
         if len(batches):
             values["batches"] = batched_retrieval(similarity, batches, self.TOP)
         computed = {f"{protocol}_{name}": x for protocol, result in values.items() for name, x in result.items()}

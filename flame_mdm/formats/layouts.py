@@ -57,10 +57,6 @@ class Layout:
         """The joints of files that the mapping uses."""
         return {name for source in self.map.values() for name in _shares(source)}
 
-    def knows(self, names: Sequence[str]) -> bool:
-        """Returns whether these names include all joints that the mapping uses."""
-        return self.used <= set(names)
-
     def without_toes(self) -> Layout:
         """Returns the layout of the same skeleton with the end sites of the ankles instead of toes."""
         ends = {f"{side}_foot": f"{next(iter(_shares(self.map[f'{side}_ankle'])))}.end" for side in ("left", "right")}

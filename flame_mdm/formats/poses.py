@@ -49,10 +49,6 @@ class Poses:
         """Returns joint positions (F, 22, 3)."""
         return forward_kinematics(SMPL22, self.rotations, self.offsets, self.root)
 
-    def quaternions(self) -> Tensor:
-        """Returns quaternions (F, 22, 4), w, x, y, z, without sign changes between frames."""
-        return rotation.continuous(rotation.matrix_to_quaternion(self.rotations), dim=0)
-
     def rest(self) -> Tensor:
         """Returns joint positions (22, 3) of the rest pose, with the lowest joint on the floor."""
         identity = torch.eye(3, dtype=self.offsets.dtype).expand(1, len(SMPL22), 3, 3)

@@ -150,7 +150,7 @@ def preset(name: str, poses: Poses) -> Rig:
         poses: the body.
 
     Raises:
-        UserError: no skeleton has this name.
+        UserError: If no skeleton has this name.
     """
     if name not in presets():
         raise UserError(f"rig={name}: unknown.{did_you_mean(name, presets())} Use one of {', '.join(presets())}")

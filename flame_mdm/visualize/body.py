@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from flame_mdm.errors import UserError
 from flame_mdm.representations.skeleton import SMPL22
-from flame_mdm.visualize.scene import Shown, sides
+from flame_mdm.visualize.scene import Shown
 
 JOINT = {name: number for number, name in enumerate(SMPL22.joints)}
 TWISTED = {"hip": 0.4, "shoulder": 0.4, "elbow": 0.55}
@@ -79,10 +79,6 @@ class Mesh:
         above = self.joints - self.joints[[max(parent, 0) for parent in SMPL22.parents]]
         self.rest = (self.turns[[max(parent, 0) for parent in SMPL22.parents]].mT @ above[..., None])[..., 0]
         self.sole = float(self.joints[JOINT["left_foot"], 1] - self.points[:, 1].min())
-
-    def sides(self) -> np.ndarray:
-        """Returns for each vertex (V,) 1 = left, -1 = right, 0 = middle, and numbers between where they meet."""
-        return self.weights @ np.array(sides(SMPL22), float)[list(ANCHORS)]
 
 
 def packed(

@@ -17,7 +17,7 @@ from flame_mdm import config
 from flame_mdm.__main__ import COMMANDS, main
 from flame_mdm.commands.evaluate import EvaluateSettings
 from flame_mdm.commands.inspect import InspectSettings
-from flame_mdm.config import check, compose, compose_data, flatten, instantiate, parameters, recipes, trust
+from flame_mdm.config import check, compose, compose_data, flatten, guarded, instantiate, parameters, recipes, trust
 from flame_mdm.config.command_line import read_settings, run
 from flame_mdm.config.entry import make_variables
 from flame_mdm.config.signatures import check_kind, source_file
@@ -402,3 +402,34 @@ def test_an_unknown_command_is_one_line(capsys):
 def test_the_package_lists_its_public_names_alone():
     assert dir(flame_mdm) == ["Motion", "MotionGeneration", "edit", "generate", "load"]
     assert all(getattr(flame_mdm, name) for name in dir(flame_mdm))
+
+
+@pytest.mark.parametrize(
+    ("error", "line"),
+    [
+        (UserError("wrong: x. Do y"), "error: wrong: x. Do y"),
+        (FileNotFoundError("x.npz: no such file"), "error: x.npz: no such file"),
+        (PermissionError(13, "Permission denied", "x.npz"), "error: [Errno 13] Permission denied: 'x.npz'"),
+        (OSError(28, "No space left on device"), "error: [Errno 28] No space left on device"),
+        (MemoryError(), "error: out of memory (MemoryError). Free memory, or reduce the size"),
+        (RuntimeError("CUDA out of memory. Tried"), "error: out of memory (CUDA out of memory. Tried)."),
+        (ValueError("setting an array element with a sequence"), None),
+        (OSError(24, "Too many open files"), None),
+        (KeyError("x"), None),
+    ],
+)
+def test_only_errors_that_the_user_can_fix_are_one_line(error, line, capsys, monkeypatch):
+    def fail() -> None:
+        raise error
+
+    assert guarded(fail) == (70 if line is None else 1)
+    shown = capsys.readouterr().err
+    if line is None:
+        assert shown.startswith("Traceback")
+        assert "bug in flame_mdm. Please report it" in shown.splitlines()[-1]
+    else:
+        assert shown.startswith(line)
+        assert shown.count("\n") == 1
+        monkeypatch.setenv("FLAME_MDM_TRACEBACK", "1")
+        guarded(fail)
+        assert "Traceback" in capsys.readouterr().err

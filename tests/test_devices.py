@@ -46,5 +46,6 @@ def test_other_commands_name_the_devices_of_the_machine(trained, capsys, device)
     for words in (["sample", str(trained), "text=a person walks"], ["evaluate", str(trained), "extractor=none"]):
         assert main([*words, f"device={device}"]) == 1
         error = capsys.readouterr().err
-        assert f"error: device={device}: this machine has only cpu" in error
+        assert error.startswith(f"error: device={device}: ")
+        assert "cpu" in error
         assert error.count("\n") == 1

@@ -19,7 +19,8 @@ from flame_mdm.__main__ import main
 from flame_mdm.batch import collate
 from flame_mdm.checkpoints.model_files import read_checkpoint
 from flame_mdm.commands import train
-from flame_mdm.config import compose, instantiate, run
+from flame_mdm.config import compose, instantiate
+from flame_mdm.config.sweeps import run_recipe
 from flame_mdm.task import MotionGeneration
 
 pytestmark = pytest.mark.slow
@@ -126,7 +127,7 @@ def test_processes_are_started_with_the_words_of_one_job(tiny, tmp_path, monkeyp
     def note(config: dict) -> None:
         seen.append((sys.argv[1:], config["run"]["dir"], config))
 
-    monkeypatch.setattr(train, "main", partial(run, note, usage=train.USAGE))
+    monkeypatch.setattr(train, "main", partial(run_recipe, note, train.USAGE))
     monkeypatch.setattr(sys, "argv", ["flame-mdm", "train"])
     folder = f"run.dir={tmp_path / 'sweep'}"
     assert main(["train", "quickstart", *tiny[:-1], folder, "seed=1,2", "--multirun"]) == 0

@@ -141,16 +141,24 @@ def check_motion(key: str, source: str | None) -> None:
         raise FileNotFoundError(f"{source}: no such file")
 
 
-def check_words(settings: BodySettings, device: str | None = None) -> None:
-    """Checks the names of body and device, before torch is imported.
+def check_words(settings: BodySettings) -> None:
+    """Checks the name of the body, before torch is imported.
 
     Raises:
-        UserError: If a name is unknown.
+        UserError: If it is unknown.
     """
     if settings.body.split()[:1] not in (["mannequin"], ["anny"]):
         raise UserError(
             f'body={settings.body}: unknown. Use mannequin, anny, or anny with its shape: body="anny age=0.9"'
         )
+
+
+def check_device(device: str | None) -> None:
+    """Checks the name of a device, before torch is imported.
+
+    Raises:
+        UserError: If it is unknown.
+    """
     if device is not None and not re.fullmatch(r"cpu|mps|xpu|cuda(:\d+)?", device):
         raise UserError(
             f"device={device}: unknown.{did_you_mean(device, ['cpu', 'cuda'])} Give cpu, cuda or cuda:NUMBER"

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import ClassVar
 
-from flame_mdm.commands import DataSettings, ModelSettings
+from flame_mdm.commands import DataSettings, ModelSettings, check_device
 from flame_mdm.config import run
 from flame_mdm.sampler_options import SamplerOptions, option, same_option
 from flame_mdm.sampling.request import EditRequest
@@ -56,6 +56,7 @@ def evaluate_request(settings: EvaluateSettings) -> None:
     """Evaluates what the settings name, and writes the result."""
     from evaluators.request import EvaluationRequest
 
+    check_device(settings.device)
     nodes = settings.nodes if settings.data is not None else {"data": None, "representation": None}
     request = EvaluationRequest.of(vars(settings) | nodes)
     if settings.ckpt is not None:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from flame_mdm.checkpoints.locating import find
-from flame_mdm.commands import BodySettings, ModelSettings, check_motion, check_words
+from flame_mdm.commands import BodySettings, ModelSettings, check_device, check_motion, check_words
 from flame_mdm.config import run
 from flame_mdm.errors import UserError, say, shortened
 from flame_mdm.safe_io import MEBIBYTE, read_text
@@ -49,7 +49,8 @@ class OutputSettings(BodySettings, SamplerOptions, ModelSettings):
             UserError: If more than one condition is requested, a file cannot be read, a value is invalid, or a package
                 is missing.
         """
-        check_words(self, self.device)
+        check_words(self)
+        check_device(self.device)
         if self.text is not None and not self.text.strip():
             raise UserError("the text is empty. Describe what the person does, or use unconditioned=true")
         choices = [name for name in ("text", "prompts", "action") if hasattr(self, name)]

@@ -101,8 +101,8 @@ def instantiate(node: Config, **derived: Any) -> Any:
         derived: further arguments, derived from other parts of the recipe.
 
     Raises:
-        UserError: If the class or function does not exist, or arguments are of the wrong kind. A `UserError`,
-            `ValueError` or `FileNotFoundError` of the class or function is passed through.
+        UserError: If the class or function does not exist, or refuses its arguments. A `UserError` or
+            `FileNotFoundError` of the class or function is passed through.
     """
     if not isinstance(node, Mapping) or not isinstance(node.get("_target_"), str):
         raise UserError(f"no _target_, the name of a class, in {str(node)[:80]}")
@@ -115,7 +115,7 @@ def instantiate(node: Config, **derived: Any) -> Any:
         if not module:
             raise UserError(f"_target_={name}: not the name of a module and a class, such as torch.nn.Linear")
         return getattr(importlib.import_module(module), attribute)(**arguments, **derived)
-    except (UserError, ValueError, FileNotFoundError):
+    except (UserError, FileNotFoundError):
         raise
     except Exception as error:
         raise UserError(f"{name}: {first_line(error)}") from error

@@ -222,7 +222,7 @@ def resolve(plan: Plan) -> Config:
         with initialize_config_dir(version_base="1.3", config_dir=str(plan.folder)):
             composed = hydra_compose(plan.stem, plan.overrides)
             resolved = OmegaConf.to_container(composed, resolve=True, throw_on_missing=True)
-    except (HydraException, OmegaConfBaseException) as error:
+    except (HydraException, OmegaConfBaseException, ValueError, TypeError, RecursionError) as error:
         raise UserError(f"{plan.stem or 'data'}: {first_line(error)}") from error
     config: Config = {str(key): value for key, value in resolved.items()}  # type: ignore[union-attr]
     check_same_kinds(plan.base or {}, config)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import re
 import signal
@@ -13,6 +14,11 @@ from flame_mdm.signals import stoppable
 
 STOP = (signal.SIGINT, signal.SIGTERM)
 """Signals that end a command after it has cleaned up."""
+
+BUG = 70
+"""Exit code of a bug, as in sysexits.h."""
+REPORT = "this is a bug in flame_mdm. Please report it with the lines above and the command that you ran"
+FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
 
 NO_MEMORY = re.compile("allocate memory|out of memory|bad_alloc|start new thread|create a primitive|failed to map")
 """Messages of errors caused by a lack of memory: from torch, from threads, and from libraries that fail to load."""
@@ -35,26 +41,36 @@ def make_variables() -> list[str]:
 def guarded(action: Callable[[], None], signums: Sequence[int] = ()) -> int:
     """Runs `action` and returns the exit code; a signal of `signums` ends it after it has cleaned up.
 
-    For an error that the user can fix, it prints one line and returns 1; FLAME_MDM_TRACEBACK=1 adds the traceback.
+    For an error that the user can fix, it prints one line and returns 1; FLAME_MDM_TRACEBACK=1 adds the traceback. For
+    any other exception, a bug, it prints the traceback and how to report it, and returns `BUG`.
     """
     try:
         with stoppable(signums):
             action()
-    except (UserError, ValueError, OSError, MemoryError, RecursionError, RuntimeError, ImportError) as error:
-        memory = isinstance(error, MemoryError)
-        memory |= not isinstance(error, UserError) and NO_MEMORY.search(str(error)) is not None
-        if isinstance(error, RuntimeError | ImportError) and not (memory or isinstance(error, RecursionError)):
-            raise
-        if os.environ.get("FLAME_MDM_TRACEBACK") == "1":
-            traceback.print_exc()
-        message = (
-            f"out of memory ({first_line(error)}). Free memory, or reduce the size" if memory else first_line(error)
-        )
-        say(f"error: {message}", error=True)
-        return 1
     except SystemExit as stop:
         return int(stop.code or 0)
     except KeyboardInterrupt:
         say("interrupted", error=True)
         return 130
+    except Exception as error:
+        line = explanation(error)
+        if line is None or os.environ.get("FLAME_MDM_TRACEBACK") == "1":
+            traceback.print_exc()
+        say(f"error: {line}" if line is not None else REPORT, error=True)
+        return BUG if line is None else 1
     return 0
+
+
+def explanation(error: Exception) -> str | None:
+    """Returns the line for an error that the user can fix, or None for a bug.
+
+    The user can fix a `UserError`, a file that cannot be found, read or written, and a lack of memory.
+    """
+    if isinstance(error, UserError):
+        return first_line(error)
+    if isinstance(error, MemoryError) or NO_MEMORY.search(str(error)):
+        return f"out of memory ({first_line(error)}). Free memory, or reduce the size"
+    # Errors of files name the file, unless this framework raised them or a disk is full.
+    if isinstance(error, FileNotFoundError) or (isinstance(error, OSError) and (error.filename or error.errno in FULL)):
+        return first_line(error)
+    return None

@@ -232,7 +232,10 @@ def source_file(module: str) -> Path | None:
 @functools.cache
 def _tree(module: str) -> ast.Module | None:
     path = source_file(module)
-    return ast.parse(path.read_text(encoding="utf-8")) if path else None
+    try:
+        return ast.parse(path.read_text(encoding="utf-8")) if path else None
+    except (SyntaxError, ValueError) as error:
+        raise UserError(f"{path}: not readable Python: {error}") from error
 
 
 def _arguments(module: str, node: ast.AST) -> dict[str, str]:

@@ -99,7 +99,7 @@ class HumanML(Representation):
         """Encodes joints (T, J, 3) in meters, y up, as features (T - 1, D) float32.
 
         Raises:
-            UserError: If fewer than 3 frames, another number of joints, or non-finite coordinates.
+            UserError: If there are fewer than 3 frames, another number of joints, or non-finite coordinates.
         """
         return self.encode_many([motion])[0]
 
@@ -130,7 +130,7 @@ class HumanML(Representation):
         """Returns canonical joints (T, J, 3) float64 of joints (T, J, 3) in meters, equal to `decode(encode(motion))`.
 
         Raises:
-            UserError: If as in `encode`.
+            UserError: As in `encode`.
         """
         return self._canonical([motion])[0] / self.units_per_metre
 

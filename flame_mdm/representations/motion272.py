@@ -40,7 +40,7 @@ class Motion272(Representation):
         """Encodes a raw motion (F, 3 + 3 K) as features (F, 272) float32.
 
         Raises:
-            UserError: If fewer than 2 frames, or as in `read_pose`.
+            UserError: If there are fewer than 2 frames, or as in `read_pose`.
         """
         translation, rotations = read_pose(motion)
         if len(motion) < 2:

@@ -37,7 +37,7 @@ class Rifke(Representation):
         """Encodes joints (T, 21, 3) in meters, y up, as features (T, 64) float32.
 
         Raises:
-            UserError: If no frames, another number of joints, or non-finite coordinates.
+            UserError: If there are no frames, another number of joints, or non-finite coordinates.
         """
         if motion.ndim != 3 or motion.shape[1:] != (21, 3) or not len(motion):
             raise UserError(f"motion: shape {tuple(motion.shape)}, but {self.name} takes (frames, 21, 3)")

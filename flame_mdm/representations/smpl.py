@@ -35,7 +35,7 @@ def read_pose(motion: Tensor) -> tuple[Tensor, Tensor]:
         Translation (F, 3) and matrices (F, 24, 3, 3), float64.
 
     Raises:
-        UserError: If no frames, fewer than 24 joints, or non-finite numbers.
+        UserError: If there are no frames, fewer than 24 joints, or non-finite numbers.
     """
     if motion.ndim != 2 or not len(motion) or motion.shape[1] < 75 or motion.shape[1] % 3:
         raise UserError(

@@ -170,7 +170,7 @@ def load_spec(name: str) -> Config:
 
 def _at_most(what: str, count: int, most: int) -> None:
     if count > most:
-        raise ValueError(f"{what}: {count:,} exceed the limit of {most:,} per table. Split it into several tables")
+        raise UserError(f"{what}: {count:,} exceed the limit of {most:,} per table. Split it into several tables")
 
 
 def load_mapping(path: Path) -> Config:

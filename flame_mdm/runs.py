@@ -128,15 +128,15 @@ class Run:
 
 def newest_samples(folder: Path, file: str) -> Path | None:
     """Returns the newest folder of samples in a run directory that contains `file`."""
-    found = (path.parent for path in folder.glob(f"{SAMPLES}/{file}"))
-    return max((path for path in found if path.name.removeprefix("step_").isdecimal()), default=None)
+    folders = (path.parent for path in folder.glob(f"{SAMPLES}/{file}"))
+    return max((path for path in folders if path.name.removeprefix("step_").isdecimal()), default=None)
 
 
 def read_run(folder: Path) -> Run:
     """Returns the content of a run directory.
 
     Raises:
-        UserError: the folder is not a run directory, or a file is damaged.
+        UserError: If the folder is not a run directory, or a file is damaged.
     """
     path = folder / CONFIG
     if not path.exists():
@@ -157,7 +157,7 @@ def read_history(folder: Path) -> dict[str, dict[int, float]]:
     """Returns the curves of a run, name -> step -> value, sorted; {} if the run has no history.
 
     Raises:
-        UserError: the file is damaged.
+        UserError: If the file is damaged.
     """
     curves: dict[str, dict[int, float]] = {}
     for record in records(folder / HISTORY):
@@ -171,13 +171,13 @@ def records(path: Path) -> list[dict[str, Any]]:
     """Returns the lines of a history; ignores an incomplete last line, left by a killed process.
 
     Raises:
-        UserError: another line is damaged.
+        UserError: If another line is damaged.
     """
     if not path.exists():
         return []
     *lines, _ = safe_io.read_text(path, HISTORY_LIMIT).split("\n")
-    found = []
-    for place, line in enumerate(lines, 1):
+    complete = []
+    for number, line in enumerate(lines, 1):
         try:
             record = json.loads(line)
             if not isinstance(record, dict) or type(record.get("step")) is not int or not 0 <= record["step"] < 2**63:
@@ -187,6 +187,6 @@ def records(path: Path) -> list[dict[str, Any]]:
                 raise ValueError(f"{', '.join(wrong) or 'a value'} should be a number")
             "".join(record).encode()  # a lone surrogate cannot be written again
         except (ValueError, RecursionError) as error:
-            raise UserError(f"{path}: line {place} is damaged; delete that line ({error})") from error
-        found.append(record)
-    return found
+            raise UserError(f"{path}: line {number} is damaged; delete that line ({error})") from error
+        complete.append(record)
+    return complete

@@ -265,7 +265,7 @@ def check_shape(content: Any, kind: type[T] | Any) -> T:
         kind: a `Schema`, or any other type that pydantic supports.
 
     Raises:
-        ValueError: the content has another type; the message gives key, found value and expected type.
+        ValueError: If the content has another type; the message gives key, found value and expected type.
     """
     if large := _too_large(content):
         raise ValueError(f"{large[:40]} ... is too large for a JSON integer; the maximum is {MAX_INTEGER:,}")
@@ -312,8 +312,8 @@ def read_json(path: Path, kind: type[T] | Any, remedy: str = "") -> T:
         remedy: what to do if the file is damaged.
 
     Raises:
-        FileNotFoundError: the file does not exist.
-        UserError: the file has other content.
+        FileNotFoundError: If the file does not exist.
+        UserError: If the file has other content.
     """
     message = f"; {remedy}" if remedy else ""
     try:
@@ -330,6 +330,6 @@ def read_result(path: Path) -> Result:
     """Returns a result of `flame-mdm evaluate`.
 
     Raises:
-        UserError: the file is damaged.
+        UserError: If the file is damaged.
     """
     return read_json(path, Result, "delete it, then run `flame-mdm evaluate` or `flame-mdm tables` again")

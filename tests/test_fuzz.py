@@ -57,7 +57,7 @@ def fill(bad, trained, tmp_path) -> Callable[[str], str]:
         (bad / name).mkdir()
     texts = {"list.yaml": "- 1\n", "broken.yaml": "a: [\n", "bare.yaml": "name: x\n", "empty.txt": "\n \n"}
     texts |= {"foreign.yaml": "_target_: os.system\ncommand: ls\n", "file.zip": "x"}
-    texts |= {"part.yaml": "_target_: evaluators.protocol.Protocol\nname: x\n"}
+    texts |= {"part.yaml": "version: 1\ncondition: text\n"}
     for name, text in texts.items():
         (bad / name).write_text(text)
     for name in ("latin.yaml", "latin.txt"):

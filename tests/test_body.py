@@ -14,6 +14,7 @@ from flame_mdm.representations.smpl import ADULT
 from flame_mdm.visualize import frames_array, player_page, render
 from flame_mdm.visualize.bodies import load_body
 from flame_mdm.visualize.body import ANCHORS, JOINT, Mesh, fit_body, mannequin, rasterize, try_fit
+from flame_mdm.visualize.scene import sides
 
 REST = np.array(ADULT[:22])
 
@@ -27,8 +28,8 @@ def part_volume(points: np.ndarray, *joints: str) -> float:
     """Volume of the part that belongs to some joints; each of its openings is closed by a cone."""
     bones = [bone for bone, anchor in enumerate(ANCHORS) if SMPL22.joints[anchor] in joints]
     triangles = mannequin().triangles[(mannequin().weights[:, bones].sum(1) > 0.5)[mannequin().triangles].all(1)]
-    sides = {tuple(side) for side in triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2).tolist()}
-    after = {a: b for a, b in sides if (b, a) not in sides}
+    edges = {tuple(edge) for edge in triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2).tolist()}
+    after = {a: b for a, b in edges if (b, a) not in edges}
     total = volume(points, triangles)
     while after:
         ring = [next(iter(after))]
@@ -44,10 +45,10 @@ def part_volume(points: np.ndarray, *joints: str) -> float:
 def test_the_mesh_is_one_closed_symmetric_surface():
     points, triangles = mannequin().points, mannequin().triangles
     assert 1000 <= len(points) <= 3000
-    sides = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), 1)
-    found, count = np.unique(sides, axis=0, return_counts=True)
+    edges = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), 1)
+    distinct, count = np.unique(edges, axis=0, return_counts=True)
     assert (count == 2).all()
-    assert len(points) - len(found) + len(triangles) == 2  # Euler: like a sphere
+    assert len(points) - len(distinct) + len(triangles) == 2  # Euler: like a sphere
     assert 0.05 < volume(points, triangles) < 0.09  # cubic meters; a person of 1.78 m has 0.07
     assert 1.7 < np.ptp(points[:, 1]) < 1.85
     assert {tuple(p) for p in points.round(5).tolist()} == {tuple(p) for p in (points * [-1, 1, 1]).round(5).tolist()}

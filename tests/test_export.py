@@ -41,7 +41,8 @@ def walking(heading: ArrayLike, root: np.ndarray) -> Poses:
         **{"left_shoulder": (none, none, none - 69), "right_shoulder": (none, none, none + 69)},
         **{"left_elbow": (none, -23 - abs(swing), none), "right_elbow": (none, 23 + abs(swing), none)},
     }
-    motion = posed(len(root), heading=heading, root=root, **{name: np.stack(turn, -1) for name, turn in turns.items()})
+    stacked: dict[str, Any] = {name: np.stack(turn, -1) for name, turn in turns.items()}
+    motion = posed(len(root), heading=heading, root=root, **stacked)
     assert motion.poses is not None
     return motion.poses
 
@@ -128,7 +129,8 @@ def test_bent_limbs_show_their_twist():
             ("hip", "knee", (0, 34, 0), (69, 0, 0)),
             ("shoulder", "elbow", (46, 0, 0), (0, -69 * sign, 0)),
         ):
-            made = posed(20, **{f"{side}_{limb}": twist, f"{side}_{middle}": bend}).posed()
+            turns: dict[str, Any] = {f"{side}_{limb}": twist, f"{side}_{middle}": bend}
+            made = posed(20, **turns).posed()
             joint = SMPL22.joints.index(f"{side}_{limb}")
             solved = solve(made.joints(), FPS).rotations[:, joint]
             angle = rotation.matrix_to_axis_angle(solved @ made.rotations[:, joint].mT)

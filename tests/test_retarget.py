@@ -231,7 +231,7 @@ def test_a_template_of_names_is_printed(kick: Motion, tmp_path: Path, capsys: py
 
 def test_wrong_names_are_refused(kick: Motion, tmp_path: Path):
     odd_character(tmp_path / "hero.glb", kick)
-    other: dict[str, str | None]
+    other: dict[str, Any]
     for other, message in (
         ({"left_nee": "x"}, r"hero\.yaml: left_nee is no joint of SMPL\. Did you mean left_knee"),
         ({"left_knee": "Rig Bone-l_flak"}, r"left_knee: .*hero\.glb has no joint Rig Bone-l_flak\. Did you mean Rig"),

@@ -149,7 +149,7 @@ def test_faults_of_documents_are_named(heroes: list[Path], tmp_path: Path):
         file.save(path)
         result = outcome(path, tmp_path / "out.glb")
         if message not in result or (name in ("long chain", "nothing stored") and result):
-            surprises.append((name, result))
+            surprises.append(f"{name}: {result}")
     assert not surprises
 
 

@@ -162,6 +162,6 @@ def split_blocks(name: str, clips: int, size: int, *, val: float, test: float) -
     one block each.
     """
     blocks = sorted(range(-(-clips // size)), key=lambda block: name_hash(f"{name}_{block}"))
-    held_out = [max(1, round(share * len(blocks))) for share in (test, val)]
-    splits: list[Split] = ["test"] * held_out[0] + ["val"] * held_out[1]
-    return dict(zip(blocks, splits + ["train"] * len(blocks), strict=False))
+    tested, validated = (max(1, round(share * len(blocks))) for share in (test, val))
+    counts: dict[Split, int] = {"test": tested, "val": validated, "train": len(blocks)}
+    return dict(zip(blocks, (split for split, count in counts.items() for _ in range(count)), strict=False))

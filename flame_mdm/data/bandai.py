@@ -149,7 +149,8 @@ class Bandai(MotionSource):
                 raise UserError(f"data.source.{name}={value}: give {' or '.join(values)}")
         self.path, self.workers, self.exclude = Path(path), workers, tuple(exclude)
         self.split: SplitRule = split
-        self.mirror, self.motion = mirror, motion
+        self.motion: Literal["joints", "smpl"] = motion
+        self.mirror = mirror
         self.options = {"motion": motion, "mirror": mirror, "exclude": list(exclude), "split": split}
         if exclude:
             self.excluded["takes by data.source.exclude"] = len(exclude)

@@ -124,7 +124,7 @@ class HumanML3D(T2MFolder):
         self.humanact12 = Path(humanact12) if humanact12 else _beside(self.path, *joints)
         self.index = Path(index) if index else _beside(self.path, "index.csv")
         self.bone_lengths, self.workers = bone_lengths, workers
-        self.options |= {"bone_lengths": bone_lengths and list(bone_lengths)}
+        self.options = {**self.options, "bone_lengths": bone_lengths and list(bone_lengths)}
 
     def count(self) -> int:
         if self.amass:

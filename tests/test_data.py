@@ -56,6 +56,12 @@ def test_the_same_input_gives_the_same_fingerprint(store, tmp_path):
     assert store.fingerprint == again.fingerprint != other.fingerprint
 
 
+def test_a_clock_that_goes_backwards_changes_nothing(store, tmp_path, monkeypatch):
+    clock = iter(range(2 * 10**9, 0, -1000))
+    monkeypatch.setattr("time.time", lambda: float(next(clock)))
+    assert write_store(tmp_path / "again", Synthetic(clips=40, seed=1), HumanML()).fingerprint == store.fingerprint
+
+
 def test_noise_of_rounding_does_not_move_the_fingerprint(store):
     names = (store.folder, store.info["representation"], store.info["fps"])
     noisy = [values + scale * 1e-9 for values, scale in ((store.mean, -1), (store.std, 1))]

@@ -85,12 +85,12 @@ def both(tmp_path) -> Iterator[tuple[subprocess.Popen[str], subprocess.Popen[str
 def test_two_processes_prepare_the_same_data_once(both, tmp_path):
     first, second = both
     first.send_signal(signal.SIGCONT)
-    told = [process.communicate(timeout=120) for process in both]
-    assert [first.returncode, second.returncode] == [0, 0], told
+    outputs = [process.communicate(timeout=120) for process in both]
+    assert [first.returncode, second.returncode] == [0, 0], outputs
     assert [path.name for path in tmp_path.iterdir()] == [STORE]
-    assert "preparing" in told[0][1]
-    assert "preparing" not in told[1][1], "it opens what the other has written"
-    assert told[0][0].splitlines()[-1] == told[1][0].splitlines()[-1], "the fingerprint is the same"
+    assert "preparing" in outputs[0][1]
+    assert "preparing" not in outputs[1][1], "it opens what the other has written"
+    assert outputs[0][0].splitlines()[-1] == outputs[1][0].splitlines()[-1], "the fingerprint is the same"
     Store(tmp_path / STORE).verify()
 
 

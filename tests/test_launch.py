@@ -44,7 +44,7 @@ SLURM = {
         wait
         exit $code
     """,
-    "scontrol": 'echo "$*" >> "$CLUSTER/asked"; touch "$CLUSTER/requeue"',
+    "scontrol": 'echo "$*" >> "$CLUSTER/listed"; touch "$CLUSTER/requeue"',
     "sacct": 'echo "JobID|State|NodeList"; echo "7|RUNNING|localhost"',
 }
 
@@ -71,7 +71,7 @@ def test_a_slurm_job_that_runs_out_of_time_is_requeued_and_ends_as_if_it_had_not
     logs = "\n".join(path.read_text() for path in (tmp_path / "run" / ".submitit").rglob("*.out"))
     assert code == 0, out + err + logs
     assert "job 7 was requeued" in logs
-    assert (tmp_path / "asked").read_text() == "requeue 7\n"
+    assert (tmp_path / "listed").read_text() == "requeue 7\n"
     deadline = time.monotonic() + 20
     while len(codes := (tmp_path / "codes").read_text().split()) < 2 and time.monotonic() < deadline:
         time.sleep(0.1)  # the result of a job stands in its file before the job has ended
@@ -84,9 +84,9 @@ def test_a_slurm_job_that_runs_out_of_time_is_requeued_and_ends_as_if_it_had_not
     torch.testing.assert_close(checkpoint["state_dict"], reference(words, 5), rtol=1e-4, atol=1e-6)
 
     script = tmp_path / "script.sh"
-    asked = {line.removeprefix("#SBATCH --") for line in script.read_text().splitlines() if line.startswith("#SBATCH")}
-    wanted = {"nodes=1", "ntasks-per-node=2", "gpus-per-node=2", "time=90", "partition=gpu", "requeue"}
-    assert wanted | {"job-name=quickstart", "signal=USR2@120"} <= asked
+    listed = {line.removeprefix("#SBATCH --") for line in script.read_text().splitlines() if line.startswith("#SBATCH")}
+    options = {"nodes=1", "ntasks-per-node=2", "gpus-per-node=2", "time=90", "partition=gpu", "requeue"}
+    assert options | {"job-name=quickstart", "signal=USR2@120"} <= listed
     linter = Path(sys.executable).parent / "shellcheck"
     for command in (["bash", "-n", script], [linter, "--severity=warning", script]):
         linted = subprocess.run(command, capture_output=True, text=True, check=False)

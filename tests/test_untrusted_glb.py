@@ -137,6 +137,7 @@ FAULTS: dict[str, tuple[Change, str]] = {
 }
 
 
+@pytest.mark.slow
 def test_faults_of_documents_are_named(heroes: list[Path], tmp_path: Path):
     """Each fault in one of the characters; whether a flat or vanishing one is written depends on the character."""
     surprises = [str(hero) for hero in heroes if outcome(hero, tmp_path / "out.glb")]

@@ -159,6 +159,19 @@ def test_pages_escape_and_show_one_card_or_two(card, tmp_path):
     assert page.name == "x-abababababab-and-x-none.html"
     assert "| noise (mm) | 2 → 5 / 2 → 5 |" in text.read_text()
     assert page.read_text().count("<polyline") == 4
+    assert card.extractor is not None
+    markup = "<img src=x onerror=alert(1)>"
+    data = card.data.model_copy(update={"dataset": markup, "fingerprint": markup})
+    texts: dict[str, Any] = {"split": markup, "packages": {markup: markup}, "not_computed": {markup: markup}}
+    texts["metrics"] = {markup if name == "jitter" else name: better for name, better in card.metrics.items()}
+    texts["real"] = {markup if name == "jitter" else name: value for name, value in card.real.items()}
+    grades = json.loads(card.perturbations[0].model_dump_json().replace('"jitter"', json.dumps(markup)))
+    texts["perturbations"] = [type(card.perturbations[0])(**grades | {"unit": markup, "about": markup})]
+    texts["extractor"] = card.extractor.model_copy(update={"name": markup})
+    texts |= {"data": data, "truth": {markup: {"auc": 1.0, "correlation": 1.0}}}
+    for path in write_card([card.model_copy(update=texts)], tmp_path):
+        assert "<img" not in path.read_text()
+        assert path.read_text().count("&lt;img src=x onerror=alert(1)&gt;") > 10
 
 
 @pytest.mark.slow

@@ -135,7 +135,7 @@ def outdated(path: Path, evaluation: Evaluation) -> bool:
 
 def count_lengths(dataset: str, results: Path, settings: TablesSettings) -> None:
     """Writes the motion lengths of a data set to `results`; prints a message if the data set is not prepared."""
-    from flame_mdm.reporting.tables.build import Lengths
+    from flame_mdm.reporting.tables.specs import Lengths
 
     nodes = compose_data(dataset, data_root=settings.data_root or os.environ.get("FLAME_MDM_DATA", "data"))
     data = instantiate(nodes["data"], representation=instantiate(nodes["representation"]))

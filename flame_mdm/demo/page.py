@@ -48,7 +48,7 @@ def build_page(studio: Studio, device: str | None = None) -> gr.Blocks:
             model = studio.model(request.model)
             runs = 1 + len(request.edits) + STEERING_STEPS * bool(request.path)
             steps = request.num_inference_steps or model.sampler_options.num_inference_steps
-            total = (len(steps) if isinstance(steps, list | tuple) else steps) * runs
+            total = (steps if isinstance(steps, int) else len(steps or ())) * runs
 
             def report(calls: int) -> None:
                 progress((calls, max(total, calls + 1)), "Generating", unit="steps")

@@ -93,6 +93,7 @@ class Studio:
                 motions: list[Motion] = []
                 for number, (source, arguments) in enumerate(steps):
                     key = (request.model, repr(steps[: number + 1]))
+                    made: list[Motion]
                     if key in self._made:
                         made = self._made[key]
                     elif source is None:
@@ -100,7 +101,7 @@ class Studio:
                     elif source >= len(motions):
                         raise UserError(f"motion={source}: there are {len(motions)} motions, numbered from 0")
                     else:
-                        made = list(edit(model, motions[source], **arguments))
+                        made = [*edit(model, motions[source], **arguments)]
                     with self._memory:
                         self._made[key] = motions = made
                         self._made.move_to_end(key)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import os
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -235,8 +236,8 @@ def _markdown(cards: Sequence[AuditCard], title: str, metrics: Sequence[str]) ->
         for name, auc, correlation in _truth(card):
             text += f"- {markdown_text(name)} against exact attributes: AUC {auc}, rank correlation {correlation}\n"
         text += "\n| value | real motions |\n|---|---|\n"
-        text += "".join(f"| {m} | {markdown_text(interval(*pair))} |\n" for m, pair in card.real.items())
-    text += f"\n| seen from | {' | '.join(metrics)} |\n|---{'|---' * len(metrics)}|\n"
+        text += "".join(f"| {_metric_text(m)} | {markdown_text(interval(*pair))} |\n" for m, pair in card.real.items())
+    text += f"\n| seen from | {' | '.join(map(_metric_text, metrics))} |\n|---{'|---' * len(metrics)}|\n"
     for row in _rows(cards, metrics):
         about, cells = row["about"], row["cells"]
         assert isinstance(about, AuditedPerturbation)
@@ -248,3 +249,8 @@ def _markdown(cards: Sequence[AuditCard], title: str, metrics: Sequence[str]) ->
             + " |\n"
         )
     return text + f"\n{LEGEND}\n"
+
+
+def _metric_text(name: str) -> str:
+    """Returns the name of a metric as Markdown; the names that this project gives need no escapes."""
+    return name if re.fullmatch(r"[\w/.-]+", name) else markdown_text(name)

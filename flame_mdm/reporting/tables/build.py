@@ -11,19 +11,17 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any
-
-from pydantic import FailFast, Field
+from typing import Any
 
 from flame_mdm.config import Config
 from flame_mdm.errors import UserError
 from flame_mdm.reporting.audit import card_of
 from flame_mdm.reporting.settings import LABELS, Sizes, setting_text, values
 from flame_mdm.reporting.study import Ratings, wilson
-from flame_mdm.reporting.tables.format import Cell, Line, Part, Plot, Table, ranks
-from flame_mdm.reporting.tables.specs import ABOUT, PUBLISHED, SWEPT, Evaluation, as_list, evaluations, load_mapping
+from flame_mdm.reporting.tables.format import ABOUT, Cell, Line, Part, Plot, Table, ranks
+from flame_mdm.reporting.tables.specs import PUBLISHED, SWEPT, Evaluation, Lengths, as_list, evaluations, load_mapping
 from flame_mdm.runs import made_by
-from flame_mdm.schemas import Checkpoint, Int, Number, Result, Schema, Value, read_json, read_result
+from flame_mdm.schemas import Checkpoint, Result, Value, read_json, read_result
 
 NOT_VALID = "NOT VALID"
 """State of a row that is shown, but not ranked."""
@@ -396,15 +394,6 @@ def _hyperparameters(name: str, part: Config, reported: Config | None, sizes: Si
     if reported:
         notes += [("", f"reported: {reported['source']}"), *(("", note) for note in reported.get("notes", []))]
     return Part(name, dict.fromkeys(heads, "none"), lines, notes)
-
-
-class Lengths(Schema):
-    """Motion lengths of a data set, in frames."""
-
-    fingerprint: str
-    fps: Annotated[Number, Field(gt=0)]
-    lengths: Annotated[list[Annotated[Int, Field(ge=1)]], Field(min_length=1), FailFast()]
-    excluded: dict[str, Int] = Field({})
 
 
 def _lengths(name: str, part: Config, results: Path) -> Part:

@@ -12,13 +12,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import FailFast, Field, model_validator
 
 from flame_mdm.config import EXPERIMENTS, Config, plain
 from flame_mdm.errors import UserError, did_you_mean
 from flame_mdm.reporting.tables.format import ABOUT, NEAREST
 from flame_mdm.safe_io import read_yaml
-from flame_mdm.schemas import ClosedSchema, Int, Number, check_shape
+from flame_mdm.schemas import ClosedSchema, Int, Number, Schema, check_shape
 
 SPECS = EXPERIMENTS / "tables"
 PUBLISHED = SPECS / "published.yaml"
@@ -139,6 +139,15 @@ class Spec(ClosedSchema):
                 if column not in part.columns:
                     raise ValueError(f"figure: y={column} is not a column of {figure.part}")
         return self
+
+
+class Lengths(Schema):
+    """Motion lengths of a data set, in frames."""
+
+    fingerprint: str
+    fps: Annotated[Number, Field(gt=0)]
+    lengths: Annotated[list[Annotated[Int, Field(ge=1)]], Field(min_length=1), FailFast()]
+    excluded: dict[str, Int] = Field({})
 
 
 def spec_names() -> list[str]:

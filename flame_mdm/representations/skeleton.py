@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -191,11 +192,11 @@ def find_joints(skeleton: Skeleton, names: str | Sequence[str]) -> list[int]:
     """
     parts = part_names(skeleton)
     indices = parts | {name: [index] for index, name in enumerate(skeleton.joints)}
-    names = list(names) if isinstance(names, list | tuple) else [names]
-    for name in names:
+    chosen: list[Any] = list(names) if isinstance(names, list | tuple) else [names]
+    for name in chosen:
         if not isinstance(name, str) or name not in indices:
             raise UserError(
                 f"skeleton {skeleton.name} has no joint or part '{name}'.{did_you_mean(str(name), list(indices))} "
                 f"Parts: {', '.join(parts)}; joints: {', '.join(skeleton.joints)}"
             )
-    return sorted({index for name in names for index in indices[name]})
+    return sorted({index for name in chosen for index in indices[name]})

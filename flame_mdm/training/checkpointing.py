@@ -169,6 +169,8 @@ def _faults(content: dict[str, Any], path: Path, task: Task, trainer: Trainer) -
             check_weights(saved if isinstance(saved, dict) else {None: None}, path)
         except UserError:
             yield name
+            return
+        assert isinstance(saved, dict)
         extra = {key: value for key, value in saved.items() if key.endswith("_extra_state")}  # of any shape
         yield from _differences(weights | extra, saved, name)
     if averaged:
@@ -247,7 +249,8 @@ def _differences(expected: Any, actual: Any, where: str) -> Iterator[str]:
     elif isinstance(expected, Tensor) and isinstance(actual, Tensor):
         if (actual.shape, actual.is_floating_point()) != (expected.shape, expected.is_floating_point()):
             yield where
-    elif isinstance(expected, int | float) and type(actual) in (int, float) and not isinstance(expected, bool):
+    elif type(expected) in (int, float) and type(actual) in (int, float):
+        assert isinstance(actual, int | float)
         if not abs(actual) < LARGEST or (isinstance(expected, int) and (type(actual) is float or actual < 0)):
             yield where
     elif type(actual) is not type(expected) or isinstance(expected, dict | list | tuple):

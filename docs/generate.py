@@ -67,7 +67,7 @@ def published_tables() -> list[Table]:
     published = read_yaml(PUBLISHED)
     tables = []
     for page in published["hyperparameters"]["pages"]:
-        columns = {name: dict(known) for name, known in page["recipes"].items()}
+        columns = {name: dict(values) for name, values in page["recipes"].items()}
         for table in page.get("tables", []):
             for part_name, part in load_spec(table)["parts"].items():
                 for row in published[table][part_name]["rows"]:

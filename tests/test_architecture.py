@@ -268,3 +268,50 @@ def test_the_check_of_calls_can_fail(tmp_path, line):
     path = tmp_path / "file.py"
     path.write_text(f"def g(f):\n    return {line}\n")
     assert unsafe_calls(path) == [line]
+
+
+# Shape ----------------------------------------------------------------------------------------------------------------
+
+MOST_LINES = {"module": 450, "function": 80}
+MOST_METHODS = 15
+FILLERS = {"found", "each", "given", "known", "wanted", "place", "places", "told", "asked"}
+"""Names that do not say what a value holds."""
+KEPT = {"flame_mdm.batch": ["known: filler name"]}
+"""`Edit.known`, the name of the kept part in the papers on inpainting."""
+MOST_ROOMS = 30
+
+
+def shape(text: str) -> list[str]:
+    """Modules and functions that are too long, classes with too many methods, and filler names."""
+    tree = ast.parse(text)
+    faults = [f"module of {len(text.splitlines())} lines"] * (len(text.splitlines()) > MOST_LINES["module"])
+    for node in ast.walk(tree):
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+            lines = (node.end_lineno or 0) - node.lineno + 1
+            faults += [f"{node.name}: function of {lines} lines"] * (lines > MOST_LINES["function"])
+        elif isinstance(node, ast.ClassDef):
+            methods = sum(isinstance(item, ast.FunctionDef | ast.AsyncFunctionDef) for item in node.body)
+            faults += [f"{node.name}: class of {methods} methods"] * (methods > MOST_METHODS)
+        elif isinstance(node, ast.arg) and node.arg in FILLERS:
+            faults.append(f"{node.arg}: filler name")
+        elif isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store) and node.id in FILLERS:
+            faults.append(f"{node.id}: filler name")
+    return faults
+
+
+def test_modules_functions_and_classes_are_short_and_names_say_what_a_value_holds():
+    faults = {name: sorted(set(shape(text))) for name, text in sources().items()}
+    assert {name: lines for name, lines in faults.items() if lines} == KEPT
+
+
+def test_the_house_has_few_rooms():
+    rooms = {".".join(name.split(".")[:2]) for name in sources() if name.startswith("flame_mdm.")}
+    assert len(rooms) + 2 <= MOST_ROOMS  # and flame_mdm, evaluators
+
+
+def test_the_limits_of_shape_can_fail():
+    long = "\n".join(["def f(given):", *["    pass"] * 80])
+    wide = "\n".join(["class A:", *[f"    def f{n}(self): pass" for n in range(16)]])
+    assert shape(long) == ["f: function of 81 lines", "given: filler name"]
+    assert shape(wide) == ["A: class of 16 methods"]
+    assert shape("found = 1\n" * 451)[:2] == ["module of 451 lines", "found: filler name"]

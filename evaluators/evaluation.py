@@ -15,7 +15,7 @@ from evaluators.evaluator import Evaluator, Extracted, Motions
 from evaluators.extractors import Extractor
 from evaluators.metrics.distribution import FrechetMotionDistance
 from evaluators.plan import make_plan
-from evaluators.protocol import Protocol, Row
+from evaluators.protocol import DrawnClip, Protocol
 from evaluators.request import EvaluationRequest
 from evaluators.results import averages, make_result, mean_cost, show
 from evaluators.sources import Generator, Samples, Source, real_motions
@@ -181,7 +181,7 @@ class Evaluation:
             real = replace(evaluator, training=None).extract(self._motions(again, real_motions(self.clips, again)))
         return self._paired(evaluator, self.protocol.rows(self.clips, self.seed, replication)), real.without_joints()
 
-    def _paired(self, evaluator: Evaluator, rows: Sequence[Row]) -> Extracted:
+    def _paired(self, evaluator: Evaluator, rows: Sequence[DrawnClip]) -> Extracted:
         """Returns metric inputs computed from the real motions of rows."""
         motions = self._motions(rows, real_motions(self.clips, rows))
         motions.references = self.clips.store.references([row.clip.id for row in rows])
@@ -292,7 +292,9 @@ class Evaluation:
         """Returns the seed of the random draws of metrics."""
         return key("draws", self.seed, replication)
 
-    def _motions(self, rows: Sequence[Row], features: list[np.ndarray], captions: list[str] | None = None) -> Motions:
+    def _motions(
+        self, rows: Sequence[DrawnClip], features: list[np.ndarray], captions: list[str] | None = None
+    ) -> Motions:
         """Returns motions with the conditions of their rows; `captions` replace the captions of the rows."""
         condition = self.protocol.condition
         texts = captions or [row.text for row in rows] if condition == "text" else None
@@ -309,7 +311,7 @@ class Evaluation:
         )
 
 
-def _tokens(row: Row, caption: str) -> list[str] | None:
+def _tokens(row: DrawnClip, caption: str) -> list[str] | None:
     """Returns the "word/PART" tokens of a caption of the clip, if the data has them."""
     tagged = row.clip.attributes.get("tokens")
     return tagged[row.clip.captions.index(caption)] if tagged and caption in row.clip.captions else None

@@ -28,8 +28,8 @@ QUICK_REPLICATIONS, QUICK_SAMPLES = 2, 64
 
 
 @dataclass(frozen=True)
-class Row:
-    """One motion to generate.
+class DrawnClip:
+    """A clip, and the frames and caption drawn from it for one motion to generate.
 
     Attributes:
         id: unique name of the motion.
@@ -186,7 +186,7 @@ class Protocol(ClosedSchema):
         """Returns the clips of a split that the protocol evaluates on."""
         return [clip for clip in clips.clips if self.only.items() <= clip.attributes.items()]
 
-    def rows(self, clips: Clips, seed: int, replication: int, *, purpose: str = "generated") -> list[Row]:
+    def rows(self, clips: Clips, seed: int, replication: int, *, purpose: str = "generated") -> list[DrawnClip]:
         """Returns the motions of one replication; another `purpose` gives another draw of clips, captions and crops.
 
         Raises:
@@ -208,15 +208,15 @@ class Protocol(ClosedSchema):
             name = f"{clip.id}#{again}" if again else clip.id
             generator = np.random.default_rng(key("crop", purpose, seed, replication, name))
             caption = key("caption", purpose, seed, replication, name) % len(clip.captions) if clip.captions else None
-            rows.append(Row(name, clip, clips.crop(clip.length, generator), caption, name))
+            rows.append(DrawnClip(name, clip, clips.crop(clip.length, generator), caption, name))
         return rows
 
-    def prompts(self, clips: Clips, seed: int, replication: int) -> list[Row]:
+    def prompts(self, clips: Clips, seed: int, replication: int) -> list[DrawnClip]:
         """Returns the motions of one replication of multimodality: several for each of the first prompts."""
         assert self.multimodality is not None
         prompts = self.rows(clips, seed, replication)[: self.multimodality.prompts]
         return [
-            Row(f"{row.id}~{number}", row.clip, row.frames, row.caption, row.id)
+            DrawnClip(f"{row.id}~{number}", row.clip, row.frames, row.caption, row.id)
             for row in prompts
             for number in range(self.multimodality.samples)
         ]

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from evaluators.collectives import dealt, is_first, shared, world_size
-from evaluators.protocol import Protocol, Row
+from evaluators.protocol import DrawnClip, Protocol
 from flame_mdm.batch import Edit, MotionBatch, length_mask, pad_to
 from flame_mdm.data.datamodule import Clips
 from flame_mdm.errors import UserError
@@ -43,7 +43,7 @@ class Samples:
         captions: captions of the motions, if they differ from those of the rows.
     """
 
-    rows: list[Row]
+    rows: list[DrawnClip]
     features: list[np.ndarray]
     cost: dict[str, float] = field(default_factory=dict)
     captions: list[str] | None = None
@@ -52,7 +52,7 @@ class Samples:
 class Source(Interface):
     """A source of motions for the rows of a protocol."""
 
-    def __call__(self, name: str, rows: list[Row], replication: int) -> Samples:
+    def __call__(self, name: str, rows: list[DrawnClip], replication: int) -> Samples:
         """Returns the motions of the rows; `name` identifies replication and purpose.
 
         All processes call it together and get the same motions.
@@ -60,7 +60,7 @@ class Source(Interface):
         ...
 
 
-def real_motions(clips: Clips, rows: Sequence[Row]) -> list[np.ndarray]:
+def real_motions(clips: Clips, rows: Sequence[DrawnClip]) -> list[np.ndarray]:
     """Returns features (F, D) of the real motions of the rows, in the data's units."""
     store, rebase = clips.store, clips.representation.rebase
     return [np.ascontiguousarray(rebase(store.motion(row.clip)[row.frames]), np.float32) for row in rows]
@@ -103,7 +103,7 @@ class Generator:
         total = protocol.count(clips) // world_size()
         self.bar = ProgressBar(total=total, desc="generating", unit=" motions", disable=not (progress and is_first()))
 
-    def __call__(self, name: str, rows: list[Row], replication: int) -> Samples:
+    def __call__(self, name: str, rows: list[DrawnClip], replication: int) -> Samples:
         """Returns the motions of the rows, from the cache or else from the model; see `Source`.
 
         Raises:
@@ -135,7 +135,7 @@ class Generator:
             _write(path, rows, features, cost, self.protocol.condition)
         return Samples(rows, features, cost)
 
-    def _read(self, path: Path, rows: list[Row]) -> tuple[list[np.ndarray], dict[str, float]]:
+    def _read(self, path: Path, rows: list[DrawnClip]) -> tuple[list[np.ndarray], dict[str, float]]:
         content = read_samples(path)
         if content["ids"].tolist() != [row.id for row in rows]:
             raise UserError(f"{path}: holds motions of other clips. Delete it")
@@ -143,7 +143,7 @@ class Generator:
         cost = {name: float(content[name]) for name in ("nfe", "seconds_per_sample", "batch_size")}
         return _split(content), cost
 
-    def _generate(self, rows: Sequence[Row], replication: int) -> tuple[list[np.ndarray], int, float]:
+    def _generate(self, rows: Sequence[DrawnClip], replication: int) -> tuple[list[np.ndarray], int, float]:
         """Returns the motions of a batch, the number of denoiser calls, and seconds."""
         calls = 0
 
@@ -164,7 +164,7 @@ class Generator:
         self.bar.update(len(rows))
         return motions, calls, seconds
 
-    def _sample(self, rows: Sequence[Row], replication: int) -> list[np.ndarray]:
+    def _sample(self, rows: Sequence[DrawnClip], replication: int) -> list[np.ndarray]:
         x = self.model.generate(
             self._batch(rows),
             self.options,
@@ -176,7 +176,7 @@ class Generator:
         features = self.model.representation.denormalize(x.float()).cpu().numpy()
         return [motion[: len(row.frames)].copy() for row, motion in zip(rows, features, strict=True)]
 
-    def _batch(self, rows: Sequence[Row]) -> MotionBatch:
+    def _batch(self, rows: Sequence[DrawnClip]) -> MotionBatch:
         model, condition = self.model, self.protocol.condition
         mask = length_mask(torch.tensor([len(row.frames) for row in rows], device=model.device))
         labels = [row.clip.action for row in rows] if condition == "action" else None
@@ -188,7 +188,7 @@ class Generator:
             action=None if labels is None else torch.tensor(labels, device=model.device),
         )
 
-    def _edit(self, rows: Sequence[Row], parts: Mapping[str, Any]) -> Edit:
+    def _edit(self, rows: Sequence[DrawnClip], parts: Mapping[str, Any]) -> Edit:
         """Returns the real motions of the rows and their kept parts; padding is kept, as zeros."""
         representation, longest = self.model.representation, max(len(row.frames) for row in rows)
         real, keep = [], []
@@ -228,7 +228,7 @@ class SampleFolder:
             digest.update(path.read_bytes())
         return digest.hexdigest()
 
-    def __call__(self, name: str, rows: list[Row], replication: int) -> Samples:
+    def __call__(self, name: str, rows: list[DrawnClip], replication: int) -> Samples:
         """Returns the motions of one file that belong to the rows, with their captions; see `Source`.
 
         Raises:
@@ -292,22 +292,22 @@ class Baseline:
             raise UserError("baseline=shuffled: motions without text or labels cannot be shuffled")
         self.kind, self.clips, self.condition, self.seed = kind, clips, condition, seed
 
-    def __call__(self, name: str, rows: list[Row], replication: int) -> Samples:
+    def __call__(self, name: str, rows: list[DrawnClip], replication: int) -> Samples:
         """Returns the motions of the rows; see `Source`."""
         make = {"real": self._real, "shuffled": self._shuffled, "noisy": self._noisy, "static": self._static}
         return Samples(rows, make[self.kind](rows, replication))
 
-    def _real(self, rows: Sequence[Row], replication: int) -> list[np.ndarray]:
+    def _real(self, rows: Sequence[DrawnClip], replication: int) -> list[np.ndarray]:
         """Returns random windows of the rows' clips, with the rows' lengths."""
         moved = []
         for row in rows:
             generator = np.random.default_rng(key("baseline", self.seed, replication, row.id))
             spare = row.clip.length - 1 - int(row.frames[-1] - row.frames[0])
             begin = generator.integers(spare + 1) if spare > 0 else row.frames[0]
-            moved.append(Row(row.id, row.clip, row.frames - row.frames[0] + begin, row.caption, row.prompt))
+            moved.append(DrawnClip(row.id, row.clip, row.frames - row.frames[0] + begin, row.caption, row.prompt))
         return real_motions(self.clips, moved)
 
-    def _shuffled(self, rows: Sequence[Row], replication: int) -> list[np.ndarray]:
+    def _shuffled(self, rows: Sequence[DrawnClip], replication: int) -> list[np.ndarray]:
         """Gives each row the real motion of a row with another caption or label.
 
         Rows are sorted into groups with the same caption or label, in random order. Rotating the motions by the size of
@@ -324,7 +324,7 @@ class Baseline:
         shuffled = {order[i]: motions[order[i - largest]] for i in range(len(rows))}
         return [shuffled[i] for i in range(len(rows))]
 
-    def _noisy(self, rows: Sequence[Row], replication: int) -> list[np.ndarray]:
+    def _noisy(self, rows: Sequence[DrawnClip], replication: int) -> list[np.ndarray]:
         motions = []
         for row, motion in zip(rows, real_motions(self.clips, rows), strict=True):
             keys = torch.tensor([key("baseline", self.seed, replication, row.id)])
@@ -332,7 +332,7 @@ class Baseline:
             motions.append((motion + NOISE * noise * self.clips.std).astype(np.float32))
         return motions
 
-    def _static(self, rows: Sequence[Row], replication: int) -> list[np.ndarray]:
+    def _static(self, rows: Sequence[DrawnClip], replication: int) -> list[np.ndarray]:
         """Holds the first frame. If its features contain velocities, its joint positions are held and encoded."""
         representation, motions = self.clips.representation, real_motions(self.clips, rows)
         held = [torch.from_numpy(motion[:1]).expand(len(motion), -1) for motion in motions]
@@ -373,7 +373,7 @@ def _split(content: Mapping[str, np.ndarray], name: str = "features") -> list[np
 
 
 def _write(
-    path: Path, rows: Sequence[Row], features: Sequence[np.ndarray], cost: Mapping[str, float], condition: str
+    path: Path, rows: Sequence[DrawnClip], features: Sequence[np.ndarray], cost: Mapping[str, float], condition: str
 ) -> None:
     content: dict[str, Any] = {
         "ids": np.array([row.id for row in rows]),

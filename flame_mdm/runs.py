@@ -36,7 +36,7 @@ class TrainerSteps(Schema):
     max_steps: Int
 
 
-class Recipe(Schema):
+class RunConfig(Schema):
     """The configuration of a run, with the keys that pages read."""
 
     experiment: str | None
@@ -143,7 +143,7 @@ def read_run(folder: Path) -> Run:
         raise UserError(f"{folder}: contains no {CONFIG}; give a run directory, such as runs/synthetic/mdm/default")
     config = read_saved(path)
     try:
-        check_shape(config, Recipe)
+        check_shape(config, RunConfig)
     except ValueError as error:
         raise UserError(f"{path}: not the configuration of a run: {error}") from error
     origin = folder / PROVENANCE

@@ -75,12 +75,12 @@ def compose_data(name: str, overrides: Sequence[str] = (), *, data_root: str = "
         UserError: As for `compose`.
     """
     first = [f"+seed={seed}", quoted(f"+data_root={data_root}")]
-    config = resolve(plan_composition(Recipe(EXPERIMENTS, None), [f"+data={name}", *overrides], first))
+    config = resolve(plan_composition(ConfigSource(EXPERIMENTS, None), [f"+data={name}", *overrides], first))
     check(config)
     return {key: config[key] for key in ("data", "representation")}
 
 
-class Recipe(NamedTuple):
+class ConfigSource(NamedTuple):
     """Location and kind of a configuration."""
 
     folder: Path
@@ -102,7 +102,7 @@ class Plan(NamedTuple):
     """The recipe without overrides of single keys. An override must have the type of the value in it."""
 
 
-def plan_composition(recipe: Recipe, overrides: Sequence[str], first: Sequence[str] = ()) -> Plan:
+def plan_composition(recipe: ConfigSource, overrides: Sequence[str], first: Sequence[str] = ()) -> Plan:
     """Checks overrides and prepares them for Hydra. Keys that the recipe lacks but a `_target_` accepts get a `++`.
 
     Overrides in `first` are passed to Hydra unchecked.
@@ -146,7 +146,7 @@ def _options(group: str) -> list[str]:
     return sorted(p.stem for p in (EXPERIMENTS / group).glob("*.yaml"))
 
 
-def find_recipe(name: str) -> Recipe:
+def find_recipe(name: str) -> ConfigSource:
     if name.endswith((".yaml", ".yml")):
         path = Path(name).resolve()
         if not path.is_file():
@@ -157,13 +157,13 @@ def find_recipe(name: str) -> Recipe:
         saved = "defaults" not in content
         if saved:
             plain(content, name, but=RUN_DIR)
-        return Recipe(path.parent, path.stem, saved, None if saved else path.stem)
+        return ConfigSource(path.parent, path.stem, saved, None if saved else path.stem)
     if name not in recipes():
         raise UserError(
             f"unknown experiment '{name}'.{did_you_mean(name, recipes())} `flame-mdm train --help` lists them all"
         )
     path = EXPERIMENTS / name
-    return Recipe(path.parent, path.name, experiment=name)  # Hydra looks up `launch` relative to the recipe
+    return ConfigSource(path.parent, path.name, experiment=name)  # Hydra looks up `launch` relative to the recipe
 
 
 def quoted(word: str) -> str:
@@ -207,7 +207,7 @@ def _check_groups(overrides: Sequence[Override]) -> None:
             )
 
 
-def _refuse_groups(overrides: Sequence[Override], recipe: Recipe) -> None:
+def _refuse_groups(overrides: Sequence[Override], recipe: ConfigSource) -> None:
     for override in overrides:
         if _is_group(override) and override.key_or_group != LAUNCH:
             raise UserError(

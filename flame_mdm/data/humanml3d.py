@@ -37,7 +37,7 @@ GET_IT = (
 )
 
 
-class Row(NamedTuple):
+class IndexedClip(NamedTuple):
     """A clip in `index.csv`: frames `start` to `end` of a recording at 20 fps; `key` as returned by `key_of`."""
 
     name: str
@@ -58,7 +58,7 @@ class Row(NamedTuple):
         return range(count)[trimmed:][self.start : self.end]
 
 
-def read_index(path: Path) -> list[Row]:
+def read_index(path: Path) -> list[IndexedClip]:
     """Reads the clips of HumanML3D's `index.csv`."""
     required(path, "it is index.csv of https://github.com/EricGuo5513/HumanML3D")
     rows = []
@@ -71,13 +71,13 @@ def read_index(path: Path) -> list[Row]:
                 key = PurePosixPath(source).stem if "humanact12" in source.lower() else key_of(source)
                 if key is None:
                     raise UserError(f"{source} is in no subset of AMASS")
-                rows.append(Row(name, key, int(line["start_frame"]), int(line["end_frame"])))
+                rows.append(IndexedClip(name, key, int(line["start_frame"]), int(line["end_frame"])))
     return rows
 
 
-def by_recording(rows: Iterable[Row]) -> tuple[dict[str, list[Row]], dict[str, list[Row]]]:
+def by_recording(rows: Iterable[IndexedClip]) -> tuple[dict[str, list[IndexedClip]], dict[str, list[IndexedClip]]]:
     """Returns recording -> its clips, first the recordings of AMASS, then those of HumanAct12."""
-    recordings: tuple[dict[str, list[Row]], dict[str, list[Row]]] = defaultdict(list), defaultdict(list)
+    recordings: tuple[dict[str, list[IndexedClip]], dict[str, list[IndexedClip]]] = defaultdict(list), defaultdict(list)
     for row in rows:
         recordings[row.humanact12][row.key].append(row)
     return recordings
@@ -140,15 +140,15 @@ class HumanML3D(T2MFolder):
         return [done, *(f"missing: {line}" for line in self._missing(self.amass, todo))]
 
     @cached_property
-    def rows(self) -> list[Row]:
+    def rows(self) -> list[IndexedClip]:
         """The clips of the index that are not excluded."""
         return [row for row in read_index(self.index) if row.name not in self.exclude]
 
-    def _todo(self) -> list[Row]:
+    def _todo(self) -> list[IndexedClip]:
         made = self._motions()
         return [row for row in self.rows if not {row.name, f"M{row.name}"} <= made]
 
-    def _missing(self, amass: Amass, todo: Sequence[Row]) -> list[str]:
+    def _missing(self, amass: Amass, todo: Sequence[IndexedClip]) -> list[str]:
         missing = []
         for needed in (lambda: self.names, lambda: self.texts, lambda: amass.files, self._bodies):
             try:
@@ -188,7 +188,7 @@ class HumanML3D(T2MFolder):
         if not (self.path / "Mean.npy").is_file():
             self._write_statistics()
 
-    def _make_motions(self, amass: Amass, todo: Sequence[Row], folder: Path) -> None:
+    def _make_motions(self, amass: Amass, todo: Sequence[IndexedClip], folder: Path) -> None:
         write = partial(_write_features, folder, HumanML("smpl22", "legacy", bone_lengths=self.bone_lengths))
         from_amass, from_humanact12 = by_recording(todo)
         joints = _humanact12_files(self.humanact12)
@@ -216,7 +216,9 @@ class HumanML3D(T2MFolder):
         _save(self.path / "Mean.npy", mean.numpy())
 
 
-def _from_amass(write: partial[None], bodies: dict[str, Body], rows: Sequence[Row], recording: Recording) -> int:
+def _from_amass(
+    write: partial[None], bodies: dict[str, Body], rows: Sequence[IndexedClip], recording: Recording
+) -> int:
     """Writes the clips of a recording; any gender but "male" uses the female body, as published."""
     recording = recording.every(FPS)
     body = bodies["male" if recording.gender == "male" else "female"]
@@ -228,7 +230,7 @@ def _from_amass(write: partial[None], bodies: dict[str, Body], rows: Sequence[Ro
     return len(rows)
 
 
-def _write_features(folder: Path, representation: HumanML, row: Row, joints: np.ndarray) -> None:
+def _write_features(folder: Path, representation: HumanML, row: IndexedClip, joints: np.ndarray) -> None:
     """Writes the features of a clip and of its mirror image, each under a temporary name first."""
     motion = torch.from_numpy(joints).double()
     with naming(f"clip {row.name} (data.source.exclude=[{row.name}] leaves it out)", ValueError):
@@ -314,7 +316,7 @@ class HumanML3DSMPL(MotionSource):
         self.options = {"published_split": published_split, "exclude": list(exclude)}
 
     @cached_property
-    def rows(self) -> list[Row]:
+    def rows(self) -> list[IndexedClip]:
         """The clips to read, in the order of the index."""
         rows = [row for row in self.folder.rows if row.name in self.folder.names]
         absent = [row.name for row in rows if not self.folder.texts.get(row.name)]
@@ -354,7 +356,7 @@ class HumanML3DSMPL(MotionSource):
         if self.humanact12:
             yield from self._from_humanact12(self.humanact12, from_humanact12)
 
-    def _from_humanact12(self, path: Path, recordings: dict[str, list[Row]]) -> Iterator[Clip]:
+    def _from_humanact12(self, path: Path, recordings: dict[str, list[IndexedClip]]) -> Iterator[Clip]:
         """Yields SMPL poses of HumanAct12; the root position is used as SMPL's translation, as in FLAME's code."""
         data = restricted_pickle.read(path)
         for key in sorted(recordings):
@@ -369,7 +371,7 @@ class HumanML3DSMPL(MotionSource):
             for row in recordings[key]:
                 yield from self._clips(row, motion)
 
-    def _clips(self, row: Row, motion: np.ndarray) -> Iterator[Clip]:
+    def _clips(self, row: IndexedClip, motion: np.ndarray) -> Iterator[Clip]:
         if not len(motion):
             self.excluded["motions without a frame"] += 1
             return
@@ -384,7 +386,7 @@ class HumanML3DSMPL(MotionSource):
             )
 
 
-def _parameters(rows: Sequence[Row], recording: Recording) -> list[np.ndarray]:
+def _parameters(rows: Sequence[IndexedClip], recording: Recording) -> list[np.ndarray]:
     """Returns translation and poses (F, 3 + 156) float32 of each clip of a recording."""
     recording = recording.every(FPS)
     motion = np.concatenate([recording.translation, recording.poses], 1).astype(np.float32)

@@ -17,7 +17,7 @@ def text_fit(
 ) -> Callable[[Sequence[Motion]], list[float]]:
     """Returns a score for `flame_mdm.generate`: the cosine similarity of a motion and its text, mean over its parts.
 
-    A model that is chosen by a network looks better to it than it is: evaluate with another one.
+    Selection biases the score of the network that selects: evaluate with a different one.
 
     Args:
         path: run or checkpoint of a motion-CLIP.

@@ -286,7 +286,7 @@ def _too_large(content: Any) -> str:
 def _first_error(error: ValidationError, content: Any) -> str:
     first: Any = error.errors(include_url=False)[0]
     keys, kind, context = [], first["type"], first.get("ctx", {})
-    for key in first["loc"]:  # of which some name a type of a union, not a key
+    for key in first["loc"]:  # pydantic also lists the members of unions, which are no keys
         if (isinstance(content, dict) and key in content) or (isinstance(content, list) and isinstance(key, int)):
             content = content[key]
             keys.append(str(key))

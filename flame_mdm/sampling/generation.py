@@ -82,7 +82,7 @@ def sample_request(
     Args and Raises: see `generate`.
     """
     if stages is not None and request.candidates > 1:
-        raise UserError("the estimates along the sampling are those of one motion: omit candidates, or trajectory")
+        raise UserError("trajectory shows the estimates of a single motion: omit candidates or trajectory")
     if request.editing is not None:
         raise UserError("this request edits a motion. Call flame_mdm.edit")
     if edit is not None:

@@ -35,9 +35,13 @@ def sample(
     **options: Any,
 ) -> Tensor:
     """`Process.sample` with the sampler's options as keywords; without a mask, all frames are real."""
-    if mask is None:
-        mask = torch.ones_like(noise(0)[..., 0], dtype=torch.bool)
+    mask = real(noise(0)) if mask is None else mask
     return process.sample(denoise, noise, mask, cond, SamplerOptions(**options), edit=edit, trajectory=trajectory)
+
+
+def real(x: Tensor) -> Tensor:
+    """The mask of motions without padding."""
+    return torch.ones(x.shape[:2], dtype=torch.bool, device=x.device)
 
 
 def recorded(first: Tensor, rest: Sequence[Tensor] | Tensor = ()) -> Noise:

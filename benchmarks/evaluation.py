@@ -21,7 +21,7 @@ from torch import Tensor
 
 from evaluators.evaluation import Evaluation
 from evaluators.extractors import Extractor
-from evaluators.protocol import Row, load_protocol
+from evaluators.protocol import DrawnClip, load_protocol
 from evaluators.sources import Baseline, Generator, Samples
 from flame_mdm.data.crops import Units
 from flame_mdm.data.datamodule import Clips
@@ -56,7 +56,7 @@ class Windows(Generator):
     def __init__(self, clips: Clips):
         self.real = Baseline("real", clips, "text", 0)
 
-    def __call__(self, name: str, rows: list[Row], replication: int) -> Samples:
+    def __call__(self, name: str, rows: list[DrawnClip], replication: int) -> Samples:
         return Samples(rows, self.real._real(rows, replication))
 
 

@@ -37,8 +37,8 @@ def measure(*words: str) -> Section:
     """Measures with the number of runs in `words`."""
     runs = int(words[0]) if words else 2
     os.environ["OMP_NUM_THREADS"] = "1"
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(temporary)
         seconds(folder, "-m", "flame_mdm", "train", "quickstart", *TINY, "run.dir=first")  # also prepares the data
         evaluation = ["protocol=synthetic", "extractor=none", "quick=true", "replications=1", "samples=8"]
         work: dict[str, tuple[list[str], list[str]]] = {  # the second list differs from run to run
@@ -46,18 +46,18 @@ def measure(*words: str) -> Section:
             "sample": ([CKPT, "text=a person walks", "samples=1", "seconds=0.5"], ["out=samples{}"]),
             "evaluate": ([CKPT, *evaluation, "data_root=data"], ["seed={}", "out=result{}.json"]),
         }
-        rows = {"python -c 'import torch'": (["-c", "import torch"], list[str]())}
+        lines = {"python -c 'import torch'": (["-c", "import torch"], list[str]())}
         for command, (line, varying) in work.items():
             module = ["-m", "flame_mdm", command]
-            rows[f"{command} --help"] = ([*module, "--help"], [])
-            rows[f"{command}, misspelled key"] = ([*module, *line[: command == "train"], "seeed=1"], [])
-            rows[f"{command}, minimal work"] = ([*module, *line], varying)
+            lines[f"{command} --help"] = ([*module, "--help"], [])
+            lines[f"{command}, misspelled key"] = ([*module, *line[: command == "train"], "seeed=1"], [])
+            lines[f"{command}, minimal work"] = ([*module, *line], varying)
         rows: list[Row] = []
         times: list[float] = []
-        for row, (line, varying) in rows.items():
+        for name, (line, varying) in lines.items():
             runs_of = ([*line, *(word.format(number) for word in varying)] for number in range(runs))
             times.append(statistics.median(seconds(folder, *run) for run in runs_of))
-            rows.append({"command": f"`{row}`", "seconds": times[-1], "ratio": times[-1] / times[0]})
+            rows.append({"command": f"`{name}`", "seconds": times[-1], "ratio": times[-1] / times[0]})
     return section(
         "Start of the commands",
         "From the start of a process to its end, one thread. The work is minimal (one training step, one motion, one "

@@ -12,7 +12,7 @@ import torch
 from evaluators.metrics.attributes import ATTRIBUTES
 from evaluators.near_misses import near_misses
 from evaluators.perturbations import PERTURBATIONS, Joints, Perturbation, continue_with, encode
-from evaluators.protocol import Row
+from evaluators.protocol import DrawnClip
 from evaluators.sources import real_motions
 from flame_mdm.config import EXPERIMENTS, instantiate
 from flame_mdm.data.datamodule import MotionDataModule
@@ -39,7 +39,12 @@ class Scene:
     """Real motions of a split, and how to perturb them."""
 
     def __init__(
-        self, data: MotionDataModule, rows: list[Row], features: list[np.ndarray], representation: HumanML, seed: int
+        self,
+        data: MotionDataModule,
+        rows: list[DrawnClip],
+        features: list[np.ndarray],
+        representation: HumanML,
+        seed: int,
     ):
         self.data, self.rows, self.features, self.representation, self.seed = data, rows, features, representation, seed
         self.joints = [representation.decode(torch.from_numpy(x)).double().numpy() for x in features]
@@ -88,7 +93,7 @@ class Scene:
             same = same or [clip for clip in training.clips if clip.action == row.clip.action] or [row.clip]
             draws = self.draws("memorized", row.id)
             clip = same[int(draws.integers(len(same)))]
-            copies.append(Row(row.id, clip, training.crop(clip.length, draws), None, row.id))
+            copies.append(DrawnClip(row.id, clip, training.crop(clip.length, draws), None, row.id))
         return real_motions(training, copies)
 
     def _representations(self) -> list[HumanML]:
@@ -162,7 +167,7 @@ class Scene:
         return base, texts
 
 
-def text_of(row: Row, caption: str) -> Text:
+def text_of(row: DrawnClip, caption: str) -> Text:
     """Returns a caption of the clip of a row with its attributes."""
     tagged = row.clip.attributes.get("tokens")
     requested = {name: value for name, value in row.clip.attributes.items() if name in ATTRIBUTES}

@@ -26,7 +26,7 @@ from evaluators.extractors.action_gru import ActionGRU
 from evaluators.extractors.stgcn import UESTC, Unconstrained
 from evaluators.extractors.t2m import T2MEvaluator
 from evaluators.plan import make_plan, sampling_options
-from evaluators.protocol import FOLDER, Row, default_protocol, load_protocol, protocol_config, protocol_names
+from evaluators.protocol import FOLDER, DrawnClip, default_protocol, load_protocol, protocol_config, protocol_names
 from evaluators.request import EvaluationRequest
 from evaluators.results import _overlaps, make_result
 from evaluators.sources import Baseline, Generator, Samples, read_samples, real_motions
@@ -557,7 +557,7 @@ def test_unexpected_values_of_real_motions_stop_before_anything_is_generated(run
     assert train.run(None).invalid_because
 
 
-def unused(name: str, rows: list[Row], replication: int) -> Samples:
+def unused(name: str, rows: list[DrawnClip], replication: int) -> Samples:
     """A source that is not to be asked."""
     raise AssertionError("sampled before all was checked")
 

@@ -136,7 +136,7 @@ def test_bad_requests_give_one_clear_line(model):
         ("walks", {"after": "walk.npz", "targets": "path.json"}, r"^after=walk\.npz: .* cannot have targets\."),
         ("walks", {"after": "notes.txt"}, r"^notes\.txt: not a motion\. Give a \.npz"),
         ("walks", {"candidates": 0}, "candidates=0"),
-        ("walks", {"candidates": 2, "stages": []}, "one motion"),
+        ("walks", {"candidates": 2, "stages": []}, "single motion"),
         ("walks", {"seed": 0.5}, "seed=0.5: give a whole number"),
         ("walks", {"actions": "walk"}, "texts or actions, not both"),
         ("walks", {"second": 3}, "generate has no option second. Did you mean seconds"),

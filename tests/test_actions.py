@@ -9,14 +9,15 @@ import pickletools
 import sys
 import types
 from collections import Counter, OrderedDict
+from itertools import product
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from scipy.sparse import csc_matrix
-from support.fixtures import golden
-from support.stores import VIDEOS, poses, write_humanact12, write_uestc, written
+from support.fixtures import golden, golden_case
+from support.stores import VIDEOS, write_humanact12, write_uestc, written
 
 from evaluators.extractors import UnconstrainedExtractor
 from evaluators.extractors.action_gru import ActionGRU
@@ -29,6 +30,7 @@ from flame_mdm.data.datamodule import MotionDataModule
 from flame_mdm.data.humanact12 import HumanAct12, read_unconstrained
 from flame_mdm.data.store import write_store
 from flame_mdm.data.uestc import TRAIN_SUBJECTS, UESTC, front_view
+from flame_mdm.errors import UserError
 from flame_mdm.representations import rotation
 from flame_mdm.representations.rot6d import Rot6D
 from flame_mdm.representations.skeleton import SMPL24
@@ -60,164 +62,152 @@ CONTENT = {
 }
 
 
-@pytest.mark.parametrize("protocol", range(6))
-@pytest.mark.parametrize("core", ["core", "_core"])
-def test_arrays_and_plain_values_are_read(protocol: int, core: str, tmp_path: Path):
-    data = pickle.dumps(CONTENT, protocol)
-    if protocol < 4:  # where names are lines, and not counted
-        data = data.replace(b"numpy._core.", f"numpy.{core}.".encode())
-    (tmp_path / "x.pkl").write_bytes(data)
-    found = restricted_pickle.read(tmp_path / "x.pkl")
-    assert found["number"] == CONTENT["number"]
-    assert found["raw"] == CONTENT["raw"]
-    assert found["y"] == CONTENT["y"]
-    assert found["big"].tolist() == [0, 1, 2]
-    assert found["texts"].tolist() == ["a", "bc"]
-    for one, other in zip([*found["poses"], *found["ragged"]], [*CONTENT["poses"], *ragged], strict=True):
-        np.testing.assert_array_equal(one, other)
-        assert one.dtype == other.dtype
+def test_arrays_and_plain_values_are_read(tmp_path: Path):
+    for protocol, core in product(range(6), ("core", "_core")):
+        data = pickle.dumps(CONTENT, protocol)
+        if protocol < 4:  # where names are lines, and not counted
+            data = data.replace(b"numpy._core.", f"numpy.{core}.".encode())
+        (tmp_path / "x.pkl").write_bytes(data)
+        content = restricted_pickle.read(tmp_path / "x.pkl")
+        assert all(content[key] == CONTENT[key] for key in ("number", "raw", "y"))
+        assert (content["big"].tolist(), content["texts"].tolist()) == ([0, 1, 2], ["a", "bc"])
+        for one, other in zip([*content["poses"], *content["ragged"]], [*CONTENT["poses"], *ragged], strict=True):
+            np.testing.assert_array_equal(one, other)
+            assert one.dtype == other.dtype
 
 
-@pytest.mark.parametrize("protocol", [0, 2, 4, 5])
-@pytest.mark.parametrize(
-    ("attack", "named"),
-    [
-        (lambda path: Attack(os.mkdir, str(path)), "posix.mkdir"),
-        (lambda path: Attack(eval, f"__import__('os').mkdir({str(path)!r})"), r"builtin(s|__)\.eval"),
-        (lambda path: Attack(np.save, str(path), 1), r"numpy\.save"),
-        (lambda path: OrderedDict(a=1), r"collections\.OrderedDict"),
-        (lambda path: {"poses": [Path(path)]}, r"pathlib.*Path"),
-    ],
-    ids=["system", "eval", "numpy", "container", "inside"],
-)
-def test_anything_else_is_refused_before_it_runs(protocol: int, attack, named: str, tmp_path: Path):
-    path = written(tmp_path / "x.pkl", attack(tmp_path / "run"), protocol)
-    with pytest.raises(ValueError, match=rf"x\.pkl: not read as a pickle: it names .*{named}") as error:
-        restricted_pickle.read(path)
-    assert "\n" not in str(error.value)
-    assert os.listdir(tmp_path) == ["x.pkl"]  # noqa: PTH208
+ATTACKS = {
+    "posix.mkdir": lambda path: Attack(os.mkdir, str(path)),
+    r"builtin(s|__)\.eval": lambda path: Attack(eval, f"__import__('os').mkdir({str(path)!r})"),
+    r"numpy\.save": lambda path: Attack(np.save, str(path), 1),
+    r"collections\.OrderedDict": lambda path: OrderedDict(a=1),
+    "pathlib.*Path": lambda path: {"poses": [Path(path)]},
+}
 
 
-@pytest.mark.slow
+@pytest.mark.parametrize("named", ATTACKS)
+def test_anything_else_is_refused_before_it_runs(named: str, tmp_path: Path):
+    for protocol in (0, 2, 4, 5):
+        path = written(tmp_path / "x.pkl", ATTACKS[named](tmp_path / "run"), protocol)
+        with pytest.raises(ValueError, match=rf"x\.pkl: not read as a pickle: it names .*{named}") as error:
+            restricted_pickle.read(path)
+        assert "\n" not in str(error.value)
+        assert os.listdir(tmp_path) == ["x.pkl"]  # noqa: PTH208
+
+
 def test_every_byte_may_be_wrong(tmp_path: Path):
     """NumPy's own functions end the process on some of these, so this test does."""
     path = tmp_path / "x.pkl"
     for protocol in (2, 4):
         data = pickletools.optimize(pickle.dumps({"y": [1, np.arange(2.0), ragged]}, protocol))
-        for place in range(len(data)):
-            path.write_bytes(data[:place] + bytes([data[place] ^ 1]) + data[place + 1 :])
+        for at in range(len(data)):
+            path.write_bytes(data[:at] + bytes([data[at] ^ 1]) + data[at + 1 :])
             with contextlib.suppress(ValueError):  # and nothing else
                 restricted_pickle.read(path)
+
+
+def test_arrays_of_python_2_are_read(tmp_path: Path):
+    numbers = np.array([1.5, -2.5])
+    head = b"\x80\x02cnumpy.core.multiarray\n_reconstruct\ncnumpy\nndarray\nK\x00\x85U\x01b\x87R(K\x01K\x02\x85"
+    dtype = b"cnumpy\ndtype\nU\x02f8K\x00K\x01\x87R(K\x03U\x01<NNNJ\xff\xff\xff\xffJ\xff\xff\xff\xffK\x00tb"
+    (tmp_path / "x.pkl").write_bytes(head + dtype + b"\x89U\x10" + numbers.tobytes() + b"tb.")
+    np.testing.assert_array_equal(restricted_pickle.read(tmp_path / "x.pkl"), numbers)
 
 
 # HumanAct12
 
 
-def batch_of(source, tmp_path: Path):
-    data = MotionDataModule(
-        source, Rot6D(), root=str(tmp_path / "stores"), name="x", batch_size=8, crop=Fixed(frames=60), seed=3
-    )
+def data_of(source, root: Path, **options) -> MotionDataModule:
+    options = {"batch_size": 8, "crop": Fixed(frames=60), "seed": 3, **options}
+    data = MotionDataModule(source, Rot6D(), root=str(root / "stores"), name="x", **options)
     data.prepare_data()
     data.setup("fit")
+    return data
+
+
+def assert_batch(data: MotionDataModule):
+    """The first training batch has crops that start at the origin, and the labels of their clips."""
     batch = next(iter(data.train_dataloader()))
     assert batch.x.shape == (8, 60, 150)
     assert batch.mask.all()
     assert (batch.x[:, 0, 144:] == 0).all(), "a clip does not start at the origin"
-    assert batch.text is None
-    return data, batch
+    assert (batch.text, batch.action is None) == (None, False)
+    actions = {clip.id: clip.action for clip in data.store.clips}
+    assert batch.action.tolist() == [actions[name] for name in batch.ids]  # type: ignore[union-attr]
 
 
 def test_humanact12_from_raw_file_to_batch(tmp_path: Path):
     write_humanact12(tmp_path / "raw")
     source = HumanAct12(str(tmp_path / "raw"))
-    data, batch = batch_of(source, tmp_path)
+    data = data_of(source, tmp_path)
+    assert_batch(data)
     assert source.count() == len(data.store.clips) == 360
     assert data.store.info["actions"] == list(HumanAct12.actions)
     assert data.store.info["published_split"] is False
-    labels = [clip.action for clip in data.store.clips]
-    assert labels == [k % 12 for k in range(360)]
-    assert batch.action is not None
-    assert batch.action.tolist() == [labels[int(name[-4:])] for name in batch.ids]
+    assert [clip.action for clip in data.store.clips] == [k % 12 for k in range(360)]
     for split in ("train", "val", "test"):
         assert {clip.action for clip in data.store.clips if clip.split == split} == set(range(12))
     assert len(data.test) == 120  # of 30 clips an action, one block of ten
+    published = data_of(HumanAct12(str(tmp_path / "raw"), published_split=True), tmp_path / "published")
+    assert published.store.info["published_split"] is True
+    assert published.store.info["clips"] == {"train": 360, "val": 0, "test": 0}
+    assert [clip.id for clip in published.test.clips] == [clip.id for clip in published.train.clips]
+    assert len(published.val) == 0
 
 
 def test_neighbors_stay_in_one_split(tmp_path: Path):
     path = write_humanact12(tmp_path / "raw", 480, y=[0] * 430 + [5] * 50)
-    clips = list(HumanAct12(str(path)).clips(20.0))
-    for start in range(0, 430, 10):
-        assert len({clip.split for clip in clips[start : start + 10]}) == 1
-    counts = Counter(clip.split for clip in clips[:430])
-    assert counts == {"train": 300, "val": 40, "test": 90}
+    splits = [clip.split for clip in HumanAct12(str(path)).clips(20.0)]
+    assert all(len(set(splits[start : start + 10])) == 1 for start in range(0, 430, 10))
+    assert Counter(splits[:430]) == {"train": 300, "val": 40, "test": 90}
 
 
-def test_the_published_use_tests_on_training_clips(tmp_path: Path):
-    write_humanact12(tmp_path / "raw")
-    data, _ = batch_of(HumanAct12(str(tmp_path / "raw"), published_split=True), tmp_path)
-    assert data.store.info["published_split"] is True
-    assert data.store.info["clips"] == {"train": 360, "val": 0, "test": 0}
-    assert [clip.id for clip in data.test.clips] == [clip.id for clip in data.train.clips]
-    assert len(data.val) == 0
-
-
-def golden_clips() -> list:
-    keys = [key.removeprefix("a2m/inp_") for key in golden("smpl147") if key.startswith("a2m/inp_")]
-    return [pytest.param(number, id=f"smpl147-{number}") for number in keys]
-
-
-@pytest.mark.golden
-@pytest.mark.parametrize("number", golden_clips())
-def test_samples_are_those_of_actor(number: str, tmp_path: Path):
+@golden_case("smpl147")
+def test_samples_are_those_of_actor(stem: str, tmp_path: Path):
     """The whole way: pickle, store, crop, sample."""
-    arrays = golden("smpl147")
-    pose, joints = arrays[f"a2m/pose72_{number}"], arrays[f"a2m/joints3d_{number}"]
-    label = int(arrays[f"a2m/label_{number}"])
-    write_humanact12(tmp_path / "raw", poses=[pose], joints3D=[joints], y=[label])
-    source = HumanAct12(str(tmp_path / "raw"), published_split=True)
-    expected = arrays[f"a2m/inp_{number}"].transpose(2, 0, 1).reshape(-1, 150)
-    crop = Fixed(frames=len(expected))
-    data = MotionDataModule(source, Rot6D(), root=str(tmp_path), name="x", batch_size=1, crop=crop)
-    data.prepare_data()
-    data.setup("fit")
-    low, high, drawn = (int(value) for value in arrays[f"a2m/shift_draw_{number}"])
-    starts = {int(data.train.draw([0], batch)[0][0]) for batch in range(400)}
-    assert starts == set(range(max(low, 0), max(high, 0) + 1))
-    wanted = next(batch for batch in range(400) if data.train.draw([0], batch)[0][0] == max(drawn, 0))
-    _, sample, _, action = data.train[0, wanted]
-    assert action == label
-    np.testing.assert_allclose(sample.numpy(), expected, atol=2e-6)
+    arrays = golden(stem)
+    numbers = [key.removeprefix("a2m/inp_") for key in arrays if key.startswith("a2m/inp_")]
+    for number in numbers:
+        folder = tmp_path / number
+        folder.mkdir()
+        pose, joints = arrays[f"a2m/pose72_{number}"], arrays[f"a2m/joints3d_{number}"]
+        label = int(arrays[f"a2m/label_{number}"])
+        write_humanact12(folder / "raw", poses=[pose], joints3D=[joints], y=[label])
+        source = HumanAct12(str(folder / "raw"), published_split=True)
+        expected = arrays[f"a2m/inp_{number}"].transpose(2, 0, 1).reshape(-1, 150)
+        data = data_of(source, folder, batch_size=1, crop=Fixed(frames=len(expected)), seed=0)
+        low, high, drawn = (int(value) for value in arrays[f"a2m/shift_draw_{number}"])
+        starts = [int(data.train.draw([0], batch)[0][0]) for batch in range(400)]
+        assert set(starts) == set(range(max(low, 0), max(high, 0) + 1))
+        _, sample, _, action = data.train[0, starts.index(max(drawn, 0))]
+        assert action == label
+        np.testing.assert_allclose(sample.numpy(), expected, atol=2e-6, err_msg=number)
+    assert numbers
 
 
-@pytest.mark.parametrize(
-    ("columns", "message"),
-    [
-        ({"y": [0]}, r"humanact12poses\.pkl: lists differ in length"),
-        ({"y": [12] * 24}, r"clip 0 has the label 12, not one of 0 to 11"),
-        ({"joints3D": [np.zeros((9, 18, 3))] * 24}, r"clip 0 has poses \(20, 72\) and joints \(9, 18, 3\)"),
-        ({"poses": [np.full((f, 72), np.nan) for _ in range(2) for f in range(20, 104, 7)]}, "clip humanact12_00"),
-    ],
-)
-def test_another_humanact12_file_is_named(columns: dict, message: str, tmp_path: Path):
-    clips = 24
-    found = [poses(20 + 7 * (k % 12), k) for k in range(clips)]
-    full = {"poses": [p for p, _ in found], "joints3D": [j for _, j in found], "y": [k % 12 for k in range(clips)]}
-    path = written(tmp_path / "humanact12poses.pkl", full | columns)
-    with pytest.raises(ValueError, match=message):
-        write_store(tmp_path / "store", HumanAct12(str(path)), Rot6D())
+def test_another_humanact12_file_is_named(tmp_path: Path):
+    columns = {
+        r"humanact12poses\.pkl: lists differ in length": {"y": [0]},
+        "clip 0 has the label 12, not one of 0 to 11": {"y": [12] * 24},
+        r"clip 0 has poses \(20, 72\) and joints \(9, 18, 3\)": {"joints3D": [np.zeros((9, 18, 3))] * 24},
+        "clip humanact12_00": {"poses": [np.full((20 + 7 * (k % 15), 72), np.nan) for k in range(24)]},
+    }
+    for k, (message, changed) in enumerate(columns.items()):
+        path = write_humanact12(tmp_path / f"raw{k}", 24, **changed)
+        with pytest.raises(ValueError, match=message):
+            write_store(tmp_path / "store", HumanAct12(str(path)), Rot6D())
     with pytest.raises(ValueError, match="it contains list"):
-        HumanAct12(str(written(path, [1]))).count()
+        HumanAct12(str(written(tmp_path / "humanact12poses.pkl", [1]))).count()
     with pytest.raises(FileNotFoundError, match=r"no humanact12poses\.pkl; the data set is published with ACTOR"):
-        HumanAct12(str(tmp_path / "store")).count()
+        HumanAct12(str(tmp_path / "nowhere")).count()
 
 
 def test_the_unconstrained_reference_is_read(tmp_path: Path):
     data = np.random.default_rng(0).normal(size=(4, 18, 3, 60))
     np.save(tmp_path / "x.npy", data)
-    found = read_unconstrained(tmp_path / "x.npy")
-    assert found.shape == (4, 60, 15, 3)
-    assert found.dtype == np.float32
-    np.testing.assert_allclose(found[2, 7, 14], data[2, 14, :, 7], atol=1e-6)
+    motions = read_unconstrained(tmp_path / "x.npy")
+    assert (motions.shape, motions.dtype) == ((4, 60, 15, 3), np.float32)
+    np.testing.assert_allclose(motions[2, 7, 14], data[2, 14, :, 7], atol=1e-6)
     np.save(tmp_path / "x.npy", data[:, :14])
     with pytest.raises(ValueError, match=r"x\.npy: shape \(4, 14, 3, 60\)"):
         read_unconstrained(tmp_path / "x.npy")
@@ -226,39 +216,32 @@ def test_the_unconstrained_reference_is_read(tmp_path: Path):
         read_unconstrained(tmp_path / "x.npy")
 
 
-def features_of(extractor: UnconstrainedExtractor, motion: torch.Tensor) -> torch.Tensor:
-    mask = torch.ones(motion.shape[:2], dtype=torch.bool)
-    with torch.no_grad():
-        return extractor.motions(motion, motion, mask)["features"]
-
-
 @pytest.mark.slow
-def test_unconditioned_motions_are_compared_with_the_reference_motions(tmp_path: Path, capsys):
+def test_unconditioned_motions_are_compared_with_the_reference_motions(tmp_path: Path):
     """24 joints as models generate them, y up, and the same as the 15 of the file, y down and not from the pelvis."""
     torch.manual_seed(0)
     motion = torch.randn(70, 20, 24, 3)
     shown = (motion[:, :, list(UNCONSTRAINED_JOINTS)] * torch.tensor([1.0, -1.0, -1.0]) + 3).permute(0, 2, 3, 1)
-    folder = tmp_path / "assets"
-    folder.mkdir()
-    torch.save(Unconstrained().state_dict(), folder / "humanact12_gru_modi_struct.pth.tar")
+    reference = tmp_path / "humanact12_unconstrained_modi_struct.npy"
+    torch.save(Unconstrained().state_dict(), tmp_path / "humanact12_gru_modi_struct.pth.tar")
     with pytest.raises(FileNotFoundError, match=r"it lacks humanact12_unconstrained_modi_struct\.npy"):
-        UnconstrainedExtractor(str(folder))
-    np.save(
-        folder / "humanact12_unconstrained_modi_struct.npy", np.pad(shown.numpy(), ((0, 0), (0, 3), (0, 0), (0, 0)))
-    )
-    extractor = UnconstrainedExtractor(str(folder))
+        UnconstrainedExtractor(str(tmp_path))
+    np.save(reference, np.pad(shown.numpy(), ((0, 0), (0, 3), (0, 0), (0, 0))))
+    extractor = UnconstrainedExtractor(str(tmp_path))
     with torch.no_grad():
-        torch.testing.assert_close(extractor.reference(), features_of(extractor, motion), atol=1e-5, rtol=1e-4)
+        features = extractor.motions(motion, motion, torch.ones(motion.shape[:2], dtype=torch.bool))["features"]
+        torch.testing.assert_close(extractor.reference(), features, atol=1e-5, rtol=1e-4)
 
-    write_humanact12(tmp_path / "raw")
-    raw = ["data=humanact12_unconstrained", f"data_root={tmp_path}"]
-    assert main(["prepare", *raw, f"source={tmp_path / 'raw'}"]) == 0
-    words = ["evaluate", "baseline=real", *raw, f"extractor={folder}", "quick=true", f"out={tmp_path / 'result.json'}"]
+    raw = write_humanact12(tmp_path / "raw", 36)
+    data = ["data=humanact12_unconstrained", f"data_root={tmp_path}"]
+    assert main(["prepare", *data, f"source={raw}"]) == 0
+    words = ["evaluate", "baseline=real", *data, f"extractor={tmp_path}", "quick=true", "samples=12", "replications=1"]
     results = []
     for scale in (1.0, 3.0):
-        np.save(folder / "humanact12_unconstrained_modi_struct.npy", scale * shown.numpy())
-        assert main([*words, "protocol=unconditioned_humanact12"]) == 0
-        results.append(json.loads((tmp_path / "result.json").read_text()))
+        np.save(reference, scale * shown.numpy())
+        out = tmp_path / f"{scale}.json"
+        assert main([*words, "protocol=unconditioned_humanact12", f"out={out}"]) == 0
+        results.append(json.loads(out.read_text()))
     first, second = (result["values"]["fid"]["mean"] for result in results)
     assert first != pytest.approx(second, rel=0.1), "the reference motions are not looked at"
     assert results[0]["extractor"]["sha256"] != results[1]["extractor"]["sha256"]
@@ -276,10 +259,10 @@ def smpl_model(**changed) -> dict:
 def test_smpls_offsets_come_from_its_file_without_running_code(tmp_path: Path, monkeypatch):
     model = smpl_model()
     np.savez(tmp_path / "SMPL.npz", **model)
-    wanted = model["J_regressor"] @ model["v_template"]
+    positions = model["J_regressor"] @ model["v_template"]
     offsets = np.array(load_offsets(tmp_path / "SMPL.npz"))
-    np.testing.assert_allclose(offsets[1:], (wanted - wanted[list(SMPL24.parents)])[1:])
-    np.testing.assert_allclose(offsets[0], wanted[0])
+    np.testing.assert_allclose(offsets[1:], (positions - positions[list(SMPL24.parents)])[1:])
+    np.testing.assert_allclose(offsets[0], positions[0])
     chumpy = types.ModuleType("chumpy.ch")
     array = type("Ch", (), {"__module__": "chumpy.ch", "__init__": lambda self, x: self.__dict__.update(x=x)})
     vars(chumpy)["Ch"] = array
@@ -287,10 +270,8 @@ def test_smpls_offsets_come_from_its_file_without_running_code(tmp_path: Path, m
         patch.setitem(sys.modules, "chumpy.ch", chumpy)
         patch.setitem(sys.modules, "chumpy", types.ModuleType("chumpy"))
         parts = {"J_regressor": csc_matrix(model["J_regressor"]), "v_template": array(model["v_template"])}
-        for protocol in (0, 2, 4):
-            written(tmp_path / f"SMPL_{protocol}.pkl", model | parts, protocol)
-    for protocol in (0, 2, 4):
-        path = tmp_path / f"SMPL_{protocol}.pkl"
+        paths = [written(tmp_path / f"SMPL_{protocol}.pkl", model | parts, protocol) for protocol in (0, 2, 4)]
+    for path in paths:
         np.testing.assert_allclose(load_offsets(path), offsets)
         with pytest.raises(ValueError, match=r"it names (scipy|copy_?reg)"):
             restricted_pickle.read(path)
@@ -303,37 +284,27 @@ def test_smpls_offsets_come_from_its_file_without_running_code(tmp_path: Path, m
             load_offsets(written(path, smpl_model() | {name: value}))
 
 
-def test_arrays_of_python_2_are_read(tmp_path: Path):
-    numbers = np.array([1.5, -2.5])
-    head = b"\x80\x02cnumpy.core.multiarray\n_reconstruct\ncnumpy\nndarray\nK\x00\x85U\x01b\x87R(K\x01K\x02\x85"
-    dtype = b"cnumpy\ndtype\nU\x02f8K\x00K\x01\x87R(K\x03U\x01<NNNJ\xff\xff\xff\xffJ\xff\xff\xff\xffK\x00tb"
-    (tmp_path / "x.pkl").write_bytes(head + dtype + b"\x89U\x10" + numbers.tobytes() + b"tb.")
-    np.testing.assert_array_equal(restricted_pickle.read(tmp_path / "x.pkl"), numbers)
-
-
 @pytest.mark.slow
 def test_classifiers_see_smpls_joints_or_the_result_says_that_they_do_not(tmp_path: Path, capsys):
-    write_humanact12(tmp_path / "raw")
     raw = ["data=humanact12", f"data_root={tmp_path}"]
-    assert main(["prepare", *raw, f"source={tmp_path / 'raw'}"]) == 0
+    assert main(["prepare", *raw, f"source={write_humanact12(tmp_path / 'raw')}"]) == 0
     np.savez(tmp_path / "SMPL.npz", **smpl_model())
     torch.save({"model": ActionGRU().state_dict()}, tmp_path / "gru.tar")
-    words = ["evaluate", "baseline=real", *raw, f"extractor={tmp_path / 'gru.tar'}", "quick=true"]
+    words = ["evaluate", "baseline=real", *raw, "protocol=action_to_motion"]
+    words += [f"extractor={tmp_path / 'gru.tar'}", "quick=true", "samples=12", "replications=1"]
     results = []
     for smpl in ([], [f"smpl={tmp_path / 'SMPL.npz'}"]):
         out = tmp_path / f"{len(smpl)}.json"
-        assert main([*words, "protocol=action_to_motion", f"out={out}", *smpl]) == 0
+        assert main([*words, f"out={out}", *smpl]) == 0
         results.append(json.loads(out.read_text()))
         assert read_result(out).stand_in_skeleton == (not smpl)
         assert ("stand-in skeleton" in capsys.readouterr().out) == (not smpl)
     digest = hashlib.sha256((tmp_path / "SMPL.npz").read_bytes()).hexdigest()
-    assert [result["skeleton"] for result in results] == [
-        {"stand_in": True, "smpl_sha256": None},
-        {"stand_in": False, "smpl_sha256": digest},
-    ]
+    skeletons = [{"stand_in": True, "smpl_sha256": None}, {"stand_in": False, "smpl_sha256": digest}]
+    assert [result["skeleton"] for result in results] == skeletons
     one, other = (result["values"]["diversity"]["mean"] for result in results)
     assert one != pytest.approx(other, rel=1e-3), "the classifier sees the same joints"
-    assert main([*words, "protocol=action_to_motion", "smpl=absent.pkl"]) == 1
+    assert main([*words, "smpl=absent.pkl"]) == 1
     assert "absent.pkl: no such file" in capsys.readouterr().err
 
 
@@ -342,7 +313,8 @@ def test_classifiers_see_smpls_joints_or_the_result_says_that_they_do_not(tmp_pa
 
 def test_uestc_from_raw_files_to_batch(tmp_path: Path):
     source = UESTC(str(write_uestc(tmp_path / "uestc")))
-    data, batch = batch_of(source, tmp_path)
+    data = data_of(source, tmp_path)
+    assert_batch(data)
     info = data.store.info
     assert len(info["actions"]) == 40
     assert info["excluded"] == {"videos of view 8, side 2": 1, "training clips that are too short": 1}
@@ -357,49 +329,41 @@ def test_uestc_from_raw_files_to_batch(tmp_path: Path):
     assert subjects["train"] | subjects["val"] == set(TRAIN_SUBJECTS)
     assert not subjects["train"] & subjects["val"]
     assert subjects["test"] == {3, 4, 5, 118}
-    assert batch.action is not None
-
-
-def test_uestc_as_published_trains_on_51_subjects(tmp_path: Path):
-    source = UESTC(str(write_uestc(tmp_path / "uestc")), published_split=True)
-    assert len(source.actions) == 40, "a model has to know them before the data is prepared"
-    assert len(set(TRAIN_SUBJECTS)) == 51
-    assert Counter(source.split(subject) for subject in range(1, 119)) == {"train": 51, "test": 67}
+    published = UESTC(str(source.path), published_split=True)
+    assert len(published.actions) == 40, "a model has to know them before the data is prepared"
+    assert Counter(published.split(subject) for subject in range(1, 119)) == {"train": 51, "test": 67}
 
 
 def test_front_view_is_actors_camera():
     """Against the depth that reproduces the size of the picture, solved from the joints."""
     rng = np.random.default_rng(1)
     pose, joints, camera = rng.normal(size=(5, 72)), rng.normal(size=(5, 49, 3)), rng.uniform(0.2, 0.9, (5, 4))
-    place = []
+    places = []
     for points, (scale, _, x, y) in zip(joints, camera, strict=True):
         picture = (scale * (points[:, :2] + [x, y]) + 1) / 2 * 540
-        place.append([x, y, 500 * np.linalg.norm(np.ptp(points[:, :2], 0)) / np.linalg.norm(np.ptp(picture, 0))])
-    place = np.array(place) - place[0]
+        places.append([x, y, 500 * np.linalg.norm(np.ptp(points[:, :2], 0)) / np.linalg.norm(np.ptp(picture, 0))])
+    places = np.array(places) - places[0]
     for view, side in ((5, 2), (5, 1)):
         video = uestc.Video(0, "x", 0, view, 1, side)
         motion = front_view(pose, joints[:, uestc.ROOT], camera, video)
         turn = rotation.axis_angle_to_matrix(torch.tensor([0.0, -view * np.pi / 4 * (side != 1), 0.0]).double()).numpy()
-        np.testing.assert_allclose(motion[:, :3], (joints[:, uestc.ROOT] + place) @ turn.T, atol=1e-5)
+        np.testing.assert_allclose(motion[:, :3], (joints[:, uestc.ROOT] + places) @ turn.T, atol=1e-5)
         turned = rotation.axis_angle_to_matrix(torch.from_numpy(motion[:, 3:6]).double()).numpy()
         before = rotation.axis_angle_to_matrix(torch.from_numpy(pose[:, :3])).numpy()
         np.testing.assert_allclose(turned, turn @ before, atol=1e-5)
         np.testing.assert_allclose(motion[:, 6:], pose[:, 3:], atol=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("file", "text", "message"),
-    [
+def test_damaged_lists_are_named(tmp_path: Path):
+    folder = write_uestc(tmp_path / "uestc")
+    for file, text, message in (
         ("names.txt", "a0_p001.avi\n", r"names\.txt, line 1: 'a0_p001\.avi' is not the name of a video"),
         ("names.txt", "a40_d0_p001_c1_color.avi\n", r"names\.txt, line 1: .* one of the 40 actions"),
-        ("num_frames_min.txt", "3\n", r"num_frames_min\.txt 1 and vibe_cache_refined\.pkl 60 clips"),
-        ("names.txt", None, r"info/names\.txt: not found; it is published with the poses"),
-    ],
-)
-def test_damaged_lists_are_named(file: str, text: str | None, message: str, tmp_path: Path):
-    folder = write_uestc(tmp_path / "uestc")
-    (folder / "info" / file).unlink()
-    if text is not None:
+        ("names.txt", "\n".join(VIDEOS[:3]), r"num_frames_min\.txt \d+ and vibe_cache_refined\.pkl 60 clips"),
+    ):
         (folder / "info" / file).write_text(text)
-    with pytest.raises((ValueError, FileNotFoundError), match=message):
+        with pytest.raises(UserError, match=message):
+            list(UESTC(str(folder)).clips(20.0))
+    (folder / "info" / "names.txt").unlink()
+    with pytest.raises(FileNotFoundError, match=r"info/names\.txt: not found; it is published with the poses"):
         list(UESTC(str(folder)).clips(20.0))

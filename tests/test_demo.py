@@ -15,10 +15,10 @@ import threading
 import time
 import urllib.error
 import urllib.request
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 from urllib.parse import parse_qsl, quote, urlencode
 
 import numpy as np
@@ -48,18 +48,13 @@ def parsed(query: str) -> DemoRequest:
     return parse_query(parse_qsl(query))
 
 
-@pytest.mark.parametrize(
-    "request_", [DemoRequest(text="a person walks"), EDITED, PATH, DemoRequest(text="ü & = # % + ' \" <b>")]
-)
-def test_a_link_reproduces_its_request(request_):
-    assert parsed(request_.query()) == request_
-    assert parsed(request_.query() + "&__theme=dark") == request_
-
-
-def test_a_link_names_every_option_that_is_not_left_to_the_model():
-    keys = [key for key, _ in parse_qsl(EDITED.query())]
+def test_a_link_reproduces_its_request_and_names_every_option_that_is_not_left_to_the_model():
+    for request in (DemoRequest(text="a person walks"), EDITED, PATH, DemoRequest(text="ü & = # % + ' \" <b>")):
+        assert parsed(request.query()) == request
+        assert parsed(request.query() + "&__theme=dark") == request
     sampling = ["guidance_scale", "num_inference_steps", "sampler", "cleanup"]
-    assert keys == ["model", "text", "seconds", "samples", "seed", *sampling, "edit", "edit"]
+    keys = ["model", "text", "seconds", "samples", "seed", *sampling, "edit", "edit"]
+    assert [key for key, _ in parse_qsl(EDITED.query())] == keys
 
 
 def test_way_points_are_reached_at_a_constant_speed_just_before_the_end():
@@ -71,45 +66,33 @@ def test_way_points_are_reached_at_a_constant_speed_just_before_the_end():
 
 
 BAD = {
-    "seconds=-1": "seconds=-1: input should be greater than 0",
-    "seconds=nan": "seconds=nan",
+    "seconds=-1": "seconds=-1: input should be greater than 0", "seconds=nan": "seconds=nan",
+    "seconds=0.01": "too short",
     "seconds=1e9": "seconds=1e9: input should be less than or equal to 30",
     "seconds=20": "20 seconds (400 frames) cannot be sampled",
-    "seconds=0.01": "too short",
-    "seconds=soon": "seconds=soon: input should be a valid number",
-    "samples=5": "samples=5: input should be less than or equal to 4",
-    "samples=1.5": "samples=1.5",
-    "seed=99999999999999999999": "seed=99999999999999999999",
-    "num_inference_steps=1000000": "num_inference_steps=1000000",
-    "num_inference_steps=400": "400",
-    "guidance_scale=NaN": "guidance_scale=NaN",
+    "samples=5": "samples=5: input should be less than or equal to 4", "samples=1.5": "samples=1.5",
+    "seed=99999999999999999999": "seed=99999999999999999999", "seed=1&seed=2": "seed is given twice",
+    "num_inference_steps=1000000": "num_inference_steps=1000000", "num_inference_steps=400": "400",
+    "guidance_scale=NaN": "guidance_scale=NaN", "cleanup=maybe": "cleanup=maybe",
     "sampler=../../etc": "unknown sampler '../../etc'",
     "sampler=euler": "unknown sampler 'euler': GaussianDiffusion has ancestral",
-    "model=/etc/passwd": "unknown model '/etc/passwd'",
-    "model=quikstart": "Did you mean quickstart?",
-    "cleanup=maybe": "cleanup=maybe",
-    "text=": "the text is empty",
+    "model=/etc/passwd": "unknown model '/etc/passwd'", "model=quikstart": "Did you mean quickstart?",
+    "text=": "the text is empty", "text=walks+|": "part 2 is empty", "text=" + quote("a\x00b\x1b[31m"): "text=",
     "text=walks+@600+|+waves": "the parts are too long: give at most 30 seconds in total",
-    "text=walks+|": "part 2 is empty",
     f"text={'x' * 100_000}": "string should have at most 300 characters",
-    "text=" + quote("a\x00b\x1b[31m"): "text=",
+    "text=walks+%E2%80%AEkcab": "string should match",
     "path=0,nan": "path.0.1=nan: input should be a finite number",
     "path=0,1+20.5,0": "path.1.0=20.5: input should be less than or equal to 20",
     "path=0,1+2": "path=0,1 2: give way points as x,z in meters, such as 0,1 0.5,2",
     "path=0,x": "path.0.1=x: input should be a valid number",
     "path=0,19": "root[0]: 19.0 m from the start in 0.8 seconds is impossible",
-    "path=" + "+".join(["0,1"] * 17): "should have at most 16 items",
-    "file=/etc/passwd": "unknown option file",
-    "seed=1&seed=2": "seed is given twice",
-    "edit=<script>alert(1)</script>": "edit=<script>",
-    "edit=" + "[" * 5000: "edit=",
+    "path=" + "+".join(["0,1"] * 17): "should have at most 16 items", "file=/etc/passwd": "unknown option file",
+    "edit=<script>alert(1)</script>": "edit=<script>", "edit=" + "[" * 5000: "edit=",
     "edit=" + quote('{"region_seconds": [0.5, NaN]}'): "edits.0.region_seconds.1",
     "edit=" + quote('{"region_seconds": [0.7, 0.2]}'): "is not a range",
     "edit=" + quote('{"joints": ["tail"]}'): "edits.0.joints.0=tail",
-    "text=walks+%E2%80%AEkcab": "string should match",
     "edit=" + quote('{"motion": 3, "strength": 0.5}'): "there are 1 motions",
-    "edit=" + quote('{"path": "/etc/passwd"}'): "unknown option",
-    "edit={}": "no part of the motion is kept",
+    "edit=" + quote('{"path": "/etc/passwd"}'): "unknown option", "edit={}": "no part of the motion is kept",
     "&".join(["edit=" + quote('{"strength": 0.5}')] * (MAX_EDITS + 1)): "edits=",
 }  # fmt: skip
 
@@ -121,9 +104,8 @@ def query_of(bad: str) -> str:
 
 
 def test_a_cleared_field_is_left_to_the_default():
-    assert checked(DemoRequest, {"text": "a person walks", "sampler": "", "seed": None}) == DemoRequest(
-        text="a person walks"
-    )
+    walk = DemoRequest(text="a person walks")
+    assert checked(DemoRequest, {"text": "a person walks", "sampler": "", "seed": None}) == walk
     with pytest.raises(UserError, match=r"unknown option seeds\. Did you mean seed"):
         checked(DemoRequest, {"seeds": 1})
 
@@ -188,27 +170,69 @@ def test_a_request_stops_within_a_step_and_the_next_one_runs(studio):
             studio.motions(request.model_copy(update={"seed": 1}))
 
 
-def test_the_demo_refuses_a_wrong_port(capsys):
+def test_a_wrong_port_and_a_missing_package_are_one_line(monkeypatch, capsys):
     assert main(["demo", "port=99999"]) == 1
     assert "port=99999: give a number from 0 to 65535" in capsys.readouterr().err
-
-
-def test_the_demo_names_the_missing_package(monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "gradio", None)
     assert main(["demo"]) == 1
     assert capsys.readouterr().err == 'error: the demo needs the package gradio. Run pip install "flame-mdm[demo]"\n'
 
 
+INSIDE = """
+import json
+from starlette.testclient import TestClient
+from flame_mdm.demo.app import SESSIONS, web_app
+from flame_mdm.demo.studio import Studio
+from test_demo import EDITED, body_of
+
+studio = Studio(["quickstart"], "cpu")
+app = web_app(studio)
+gradio = next(route for route in app.app.routes if route.path == "").app
+halt = next(number for number, (path, _) in app.calls.items() if "predict" in path)
+studio.motions(EDITED)
+with TestClient(app, "http://localhost") as client, studio._working:
+    requests = EDITED, EDITED.model_copy(update={"seed": 6})
+    files = [client.get(f"/motion.npz?{request.query()}") for request in requests]
+    for number in range(SESSIONS + 20):
+        body = json.loads(body_of(halt, session=f"s{number}"))
+        answer = client.post("/gradio_api/run/predict", json=body)
+        assert answer.status_code == 200, answer.text
+own = [route.path for route in gradio.routes if hasattr(route, "path")]
+groups = [group.original_router for group in gradio.routes if hasattr(group, "original_router")]
+api = [route.path for group in groups for route in group.routes]
+routes = sorted({*own, *(path if path.startswith("/gradio_api") else f"/gradio_api{path}" for path in api)})
+sessions = [len(gradio.state_holder.session_data), SESSIONS]
+print(json.dumps({"routes": routes, "sessions": sessions, "files": [file.status_code for file in files]}), flush=True)
+"""
+NORMAL = "from flame_mdm.__main__ import main; sys.exit(main(['demo', 'port=0']))"
+HOSTED = """
+import runpy
+import flame_mdm.demo.app as app
+serve = app.serve
+app.serve = lambda *words, port, **keys: serve(*words, port=0, **keys)
+runpy.run_path('docs/space/app.py')
+"""
+
+
+class Server(NamedTuple):
+    address: str
+    process: int
+    inside: dict[str, Any]
+    """What a demo in the same process, which is not served, says about itself."""
+
+
 @contextlib.contextmanager
-def started(code: str = "from flame_mdm.__main__ import main; sys.exit(main(['demo', 'port=0']))", **environment: str):
-    """Starts a demo; provides its address and process id, and ends it by a signal while a page is open."""
+def started(code: str, **environment: str) -> Iterator[Server]:
+    """Starts a demo, and ends it by a signal while a page is open."""
     pytest.importorskip("gradio", reason="gradio is not installed")
     words = [sys.executable, "-c", f"import sys; {code}"]
-    with subprocess.Popen(words, stdout=subprocess.PIPE, text=True, cwd=ROOT, env=os.environ | environment) as running:
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), str(ROOT / "tests")])} | environment
+    with subprocess.Popen(words, stdout=subprocess.PIPE, text=True, cwd=ROOT, env=environment) as running:
         assert running.stdout is not None
+        inside = json.loads(running.stdout.readline()) if code.startswith("\nimport json") else {}
         address = running.stdout.readline().split()[0].replace("0.0.0.0", "127.0.0.1")
         try:
-            yield address, running.pid
+            yield Server(address, running.pid, inside)
             with urllib.request.urlopen(f"{address}/gradio_api/heartbeat/open"):
                 running.send_signal(signal.SIGTERM)
                 assert running.wait(20) in (143, -signal.SIGTERM)
@@ -217,14 +241,14 @@ def started(code: str = "from flame_mdm.__main__ import main; sys.exit(main(['de
 
 
 @pytest.fixture(scope="module")
-def process() -> Iterator[tuple[str, int]]:
-    with started() as demo:
-        yield demo
+def normal() -> Iterator[Server]:
+    with started(INSIDE + NORMAL) as server:
+        yield server
 
 
 @pytest.fixture
-def server(process) -> str:
-    return process[0]
+def server(normal) -> str:
+    return normal.address
 
 
 def get(address: str, data: bytes | None = None, **headers: str) -> tuple[int, bytes]:
@@ -247,18 +271,16 @@ def generated(server: str, query: str, session: str = "") -> list[Any]:
     """Outputs of the page for a query string."""
     session = session or f"s{random.getrandbits(40)}"
     page = get(server)[1].decode()
-    functions = json.loads(re.findall(r"window.gradio_config = (\{.*?\});</script>", page, re.DOTALL)[0])[
-        "dependencies"
-    ]
+    config = re.findall(r"window.gradio_config = (\{.*?\});</script>", page, re.DOTALL)[0]
+    functions = json.loads(config)["dependencies"]
     show = next(function["id"] for function in functions if len(function["outputs"]) == 7)
     status, body = get(f"{server}/gradio_api/queue/join", body_of(show, query, session=session))
     assert status == 200, body
     _, stream = get(f"{server}/gradio_api/queue/data?session_hash={session}")
-    last = [
-        json.loads(line) for line in re.findall(rb"^data: (.*)$", stream, re.MULTILINE) if b"process_completed" in line
-    ]
-    assert "data" in last[-1]["output"], (query[:200], last[-1])
-    return last[-1]["output"]["data"]
+    lines = re.findall(rb"^data: (.*process_completed.*)$", stream, re.MULTILINE)
+    last = json.loads(lines[-1])
+    assert "data" in last["output"], (query[:200], last)
+    return last["output"]["data"]
 
 
 def test_a_bad_request_gets_one_clear_line(server):
@@ -277,21 +299,15 @@ def test_a_bad_request_gets_one_clear_line(server):
     assert not wrong
 
 
-def secrets(folder: Path) -> list[str]:
-    (folder / "secret.txt").write_text("TOP SECRET")
-    return [str(folder / "secret.txt"), "/dev/zero"]
-
-
 @pytest.mark.slow
-def test_no_function_and_no_route_opens_a_file(inside, server, tmp_path):
+def test_no_function_and_no_route_opens_a_file(normal, tmp_path):
     """Every function of the page and every route of gradio gets payloads that name files."""
-    with started("import runpy, flame_mdm.demo.app as app; serve = app.serve; app.serve = "
-        "lambda *words, port, **keys: serve(*words, port=0, **keys); runpy.run_path('docs/space/app.py')",
-        SPACE_HOST="user-demo.hf.space") as (space, _):  # fmt: skip
-        assert get(space, Host="user-demo.hf.space", Origin="https://user-demo.hf.space")[0] == 200
-        for address in (server, space):
-            opened = files_opened(address, inside["routes"], secrets(tmp_path))
-            assert opened == []
+    (tmp_path / "secret.txt").write_text("TOP SECRET")
+    with started(HOSTED, SPACE_HOST="user-demo.hf.space") as hosted:
+        assert get(hosted.address, Host="user-demo.hf.space", Origin="https://user-demo.hf.space")[0] == 200
+        for address in (normal.address, hosted.address):
+            paths = [str(tmp_path / "secret.txt"), "/dev/zero"]
+            assert files_opened(address, normal.inside["routes"], paths) == []
             assert "<iframe" in generated(address, query_of("seed=3"))[0]
 
 
@@ -360,56 +376,16 @@ def test_random_requests_are_answered_or_refused(server, number):
     assert "<iframe" in generated(server, query_of("seed=4"))[0]
 
 
-INSIDE = """
-import json, sys
-from starlette.testclient import TestClient
-from flame_mdm.demo.app import SESSIONS, web_app
-from flame_mdm.demo.studio import Studio
-from test_demo import EDITED, body_of
-
-studio = Studio(["quickstart"], "cpu")
-app = web_app(studio)
-gradio = next(route for route in app.app.routes if route.path == "").app
-halt = next(number for number, (path, _) in app.calls.items() if "predict" in path)
-studio.motions(EDITED)
-with TestClient(app, "http://localhost") as client, studio._working:
-    requests = EDITED, EDITED.model_copy(update={"seed": 6})
-    files = [client.get(f"/motion.npz?{request.query()}") for request in requests]
-    for number in range(SESSIONS + 20):
-        body = json.loads(body_of(halt, session=f"s{number}"))
-        answer = client.post("/gradio_api/run/predict", json=body)
-        assert answer.status_code == 200, answer.text
-own = [route.path for route in gradio.routes if hasattr(route, "path")]
-groups = [group.original_router for group in gradio.routes if hasattr(group, "original_router")]
-api = [route.path for group in groups for route in group.routes]
-routes = sorted({*own, *(path if path.startswith("/gradio_api") else f"/gradio_api{path}" for path in api)})
-sessions = [len(gradio.state_holder.session_data), SESSIONS]
-print(json.dumps({"routes": routes, "sessions": sessions, "files": [file.status_code for file in files]}))
-"""
-
-
-@pytest.fixture(scope="module")
-def inside() -> dict[str, Any]:
-    """What a demo without a server says about itself; a process of its own, because gradio leaves event loops open."""
-    paths = os.pathsep.join([str(ROOT), str(ROOT / "tests")])
-    words = [sys.executable, "-c", INSIDE]
-    output = subprocess.run(words, stdout=subprocess.PIPE, check=True, env=os.environ | {"PYTHONPATH": paths}).stdout
-    return json.loads(output.splitlines()[-1])
-
-
-def test_files_come_from_memory_while_the_model_works(inside):
-    assert inside["files"] == [200, 400]
-
-
-def test_gradio_forgets_old_sessions(inside):
-    assert inside["sessions"][0] == inside["sessions"][1]
+def test_files_come_from_memory_while_the_model_works_and_old_sessions_are_forgotten(normal):
+    assert normal.inside["files"] == [200, 400]
+    assert normal.inside["sessions"][0] == normal.inside["sessions"][1]
 
 
 @pytest.mark.slow
-def test_a_hundred_requests_from_eight_clients_are_answered_in_constant_memory(server, process):
+def test_a_hundred_requests_from_eight_clients_are_answered_in_constant_memory(normal):
     def ask(number: int) -> int:
         request = DemoRequest(text="a person walks", seed=number, samples=2, **FAST)
-        player, notes, query, *_ = generated(server, request.query())
+        player, notes, query, *_ = generated(normal.address, request.query())
         assert "<iframe" in player
         assert notes == ""
         assert parsed(query) == request
@@ -417,9 +393,9 @@ def test_a_hundred_requests_from_eight_clients_are_answered_in_constant_memory(s
 
     with ThreadPoolExecutor(8) as clients:
         assert len(set(clients.map(ask, range(70)))) == 70  # fills the memory of results
-        before = resident(process[1])
+        before = resident(normal.process)
         assert len(set(clients.map(ask, range(100, 130)))) == 30
-    assert resident(process[1]) - before < 30e6
+    assert resident(normal.process) - before < 30e6
 
 
 def resident(process: int) -> int:
@@ -430,25 +406,25 @@ def resident(process: int) -> int:
 def test_downloads_are_the_shown_motion(server, studio):
     motion = studio.motions(EDITED)[1]
     generated(server, EDITED.query())
-    status, body = get(f"{server}/motion.npz?{EDITED.query()}&motion=1")
-    assert status == 200
-    with np.load(io.BytesIO(body)) as content:
-        np.testing.assert_allclose(content["joints"], motion.joints, atol=1e-5)  # other numbers of threads
+    shown = joints_of(f"{server}/motion.npz?{EDITED.query()}&motion=1")
+    np.testing.assert_allclose(shown, motion.joints, atol=1e-5)  # other numbers of threads
     assert get(f"{server}/motion.npz?{EDITED.query()}&motion=2")[0] == 400
     for rig in presets():
         assert get(f"{server}/motion.bvh?{EDITED.query()}&rig={rig}")[1].startswith(b"HIERARCHY")
     assert get(f"{server}/motion.bvh?{EDITED.query()}&rig=no")[0] == 400
-
-
-def test_several_actions_in_one_text(server):
     request = DemoRequest(text="a person walks @1 | a person waves", **FAST)
     assert generated(server, request.query())[1] == ""
-    with np.load(io.BytesIO(get(f"{server}/motion.npz?{request.query()}")[1])) as content:
-        assert len(content["joints"]) == 40
+    assert len(joints_of(f"{server}/motion.npz?{request.query()}")) == 40, "both actions"
 
 
-@pytest.mark.tools
-@pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed")
+def in_chromium(test: Callable[..., None]) -> Callable[..., None]:
+    return pytest.mark.tools(pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed")(test))
+
+
+LINKS = "[...document.querySelectorAll('#files a')]"
+
+
+@in_chromium
 def test_a_person_uses_the_page(server, tmp_path):
     with browser(tmp_path / "profile") as tab:
         tab.open(server)
@@ -462,7 +438,7 @@ def test_a_person_uses_the_page(server, tmp_path):
             frames.append(tab.screenshot(tmp_path / f"{number}.png"))
         assert frames[0] != frames[1]
 
-        files = tab.run("Object.fromEntries([...document.querySelectorAll('#files a')].map(a => [a.text, a.href]))")
+        files = tab.run(f"Object.fromEntries({LINKS}.map(a => [a.text, a.href]))")
         assert list(files)[:4] == ["BVH", "GLB", "NPZ", "MP4"]
         shown = joints_of(files["NPZ"])
         assert shown.shape == (60, 22, 3)
@@ -476,12 +452,8 @@ def test_a_person_uses_the_page(server, tmp_path):
         tab.type("#edit [placeholder=start]", "1.5")
         click(tab, "Change")
         edited = tab.wait("location.search.includes('edit=') && location.href")
-        after = joints_of(
-            tab.wait(
-                "[...document.querySelectorAll('#files a')].map(a => a.href).find(h => "
-                "h.includes('.npz') && h.includes('edit='))"
-            )
-        )
+        both = "h.includes('.npz') && h.includes('edit=')"
+        after = joints_of(tab.wait(f"{LINKS}.map(a => a.href).find(h => {both})"))
         assert np.abs(after[:24] - shown[:24]).max() < 0.1
         assert np.abs(after[36:] - shown[36:]).max() > 0.2
 
@@ -498,8 +470,7 @@ def test_a_person_uses_the_page(server, tmp_path):
         assert tab.run("document.documentElement.scrollWidth <= innerWidth")
 
 
-@pytest.mark.tools
-@pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed")
+@in_chromium
 def test_a_person_writes_a_sequence_in_rows_and_draws_a_path(server, tmp_path):
     text = "document.querySelector('#text textarea').value"
     with browser(tmp_path / "profile") as tab:
@@ -527,9 +498,8 @@ def test_a_person_writes_a_sequence_in_rows_and_draws_a_path(server, tmp_path):
         tab.wait("document.querySelector('#floor output')?.textContent.includes('Click to add')")
         for right, down in ((0.4, 0.49), (0.45, 0.4), (0.6, 0.45)):
             tab.run("document.querySelector('#floor svg').scrollIntoView({block: 'center'})")
-            x, y, width, height = tab.run(
-                "(r => [r.x, r.y, r.width, r.height])(document.querySelector('#floor svg').getBoundingClientRect())"
-            )
+            box = "document.querySelector('#floor svg').getBoundingClientRect()"
+            x, y, width, height = tab.run(f"(r => [r.x, r.y, r.width, r.height])({box})")
             for kind in ("mousePressed", "mouseReleased"):
                 at = {"x": x + right * width, "y": y + down * height}
                 tab.send("Input.dispatchMouseEvent", type=kind, **at, button="left", clickCount=1)
@@ -540,9 +510,7 @@ def test_a_person_writes_a_sequence_in_rows_and_draws_a_path(server, tmp_path):
         assert drawn == "0.6,0.8 0.3,1.2"  # the view: x from 3 (left) to -3, z from 3 (top) to -1.5
         click(tab, "Generate")
         tab.wait("location.search.includes('path=')")
-        address = tab.wait(
-            "[...document.querySelectorAll('#files a')].map(a => a.href).find(h => /npz.*path=/.test(h))"
-        )
+        address = tab.wait(f"{LINKS}.map(a => a.href).find(h => /npz.*path=/.test(h))")
         joints = joints_of(address)
         points = parsed(address.partition("?")[2].partition("&motion=")[0]).targets("text")["root"]
         assert [point["position"] for point in points] == [[0.6, 0.8], [0.3, 1.2]]
@@ -560,8 +528,7 @@ def test_a_person_writes_a_sequence_in_rows_and_draws_a_path(server, tmp_path):
         assert tab.errors == []
 
 
-@pytest.mark.tools
-@pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed")
+@in_chromium
 def test_a_page_of_another_site_gets_nothing(server, tmp_path):
     generated(server, EDITED.query())
     motion = f"{server}/motion.npz?{EDITED.query()}"
@@ -583,14 +550,12 @@ def test_a_page_of_another_site_gets_nothing(server, tmp_path):
                     for mode in ("cors", "no-cors"):
                         fetched = f"fetch('{motion}', {{mode: '{mode}'}}).then(answer => answer.text(), () => '')"
                         assert tab.run(fetched) == ""
-                    assert tab.run(
-                        "frames[0].length === 0 && document.querySelector('iframe').contentDocument === null"
-                    )
+                    hidden = "document.querySelector('iframe').contentDocument === null"
+                    assert tab.run(f"frames[0].length === 0 && {hidden}")
                     tab.run(f"document.querySelector('{action}")
                     tab.wait("document.body?.innerText.includes('comes from a page of another site')")
-                assert not any(
-                    "queue/join" in url for url in tab.requested
-                )  # a frame of the page would start to sample
+                # a frame of the page would start to sample
+                assert not any("queue/join" in url for url in tab.requested)
         finally:
             other.terminate()
 

@@ -20,9 +20,9 @@ import numpy as np
 import pytest
 import torch
 from support.fixtures import ROOT
+from support.pages import a_run
 from support.refusals import one_line
 from support.runs import TINY
-from test_report import a_run
 
 from flame_mdm.__main__ import main
 from flame_mdm.checkpoints.model_files import read_checkpoint

@@ -1,5 +1,7 @@
 """What a run tells while it trains, and the page that shows it."""
 
+import contextlib
+import io
 import json
 import math
 import re
@@ -12,6 +14,7 @@ from typing import Any, cast
 
 import pytest
 import torch
+from support.pages import a_run, put
 from support.runs import TINY
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
@@ -44,11 +47,19 @@ def run(folder: Path, data_root: Path, *words: str, recipe: str = "quickstart") 
 
 
 @pytest.fixture(scope="module")
-def evaluated(tmp_path_factory, data_root):
+def printed() -> io.StringIO:
+    """What the run `evaluated` printed."""
+    return io.StringIO()
+
+
+@pytest.fixture(scope="module")
+def evaluated(tmp_path_factory, data_root, printed) -> Path:
     """A run of 8 steps that evaluates while it trains."""
     folder = tmp_path_factory.mktemp("evaluated")
     (folder / "mine.yaml").write_text(EVALUATE)
-    return run(folder / "run", data_root, "trainer.max_steps=8", recipe=str(folder / "mine.yaml"))
+    with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(printed):
+        patch.delenv("MAKELEVEL", raising=False)
+        return run(folder / "run", data_root, "trainer.max_steps=8", recipe=str(folder / "mine.yaml"))
 
 
 def test_the_history_holds_what_a_step_does_and_costs(evaluated):
@@ -61,10 +72,6 @@ def test_the_history_holds_what_a_step_does_and_costs(evaluated):
     for step, pace in curves["train/samples_per_second"].items():
         assert pace * curves["train/seconds_per_step"][step] == pytest.approx(8, rel=1e-4)
     assert "train/gpu_memory_gib" not in curves
-
-
-def test_values_of_several_replications_have_their_interval(evaluated):
-    curves = read_history(evaluated)
     name = "val/synthetic/foot_skating"
     assert curves[name].keys() == curves[f"{name}/ci"].keys() == {3, 7}
     assert all(width > 0 for width in curves[f"{name}/ci"].values())
@@ -73,10 +80,9 @@ def test_values_of_several_replications_have_their_interval(evaluated):
 def test_tensorboard_shows_the_table_the_configuration_and_the_data(evaluated):
     events = EventAccumulator(str(evaluated / "tensorboard"))
     events.Reload()
-    text = {
-        name.removesuffix("/text_summary"): events.Tensors(name)[-1].tensor_proto.string_val[0].decode()
-        for name in events.Tags()["tensors"]
-    }
+    names = events.Tags()["tensors"]
+    values = [events.Tensors(name)[-1].tensor_proto.string_val[0].decode() for name in names]
+    text = {name.removesuffix("/text_summary"): value for name, value in zip(names, values, strict=True)}
     assert "| metric | mean | ci | replications | n |" in text["evaluation/synthetic"]
     assert "| foot_skating |" in text["evaluation/synthetic"]
     assert "num_train_timesteps: 10" in text["config"]
@@ -106,12 +112,9 @@ def test_memory_is_told_on_cuda(monkeypatch):
     monkeypatch.setattr(torch.cuda, "max_memory_allocated", lambda device: 3 * 2**29)
     logged = {}
     data = SimpleNamespace(batch_size=8, train=range(80))
-    trainer: Any = SimpleNamespace(
-        global_step=9, log_every_n_steps=5, world_size=1, accumulate_grad_batches=1, datamodule=data
-    )
-    model: Any = SimpleNamespace(
-        device=torch.device("cuda"), log=lambda name, value, prog_bar=False: logged.update({name: value})
-    )
+    trainer: Any = SimpleNamespace(log_every_n_steps=5, world_size=1, accumulate_grad_batches=1, datamodule=data)
+    trainer.global_step = 9
+    model: Any = SimpleNamespace(device=torch.device("cuda"), log=lambda name, value, **_: logged.update({name: value}))
     measurements = Measurements()
     measurements.on_train_start(trainer, model)
     trainer.global_step = 10
@@ -147,14 +150,14 @@ def rows(file: Path) -> Iterator[dict[str, Any]]:
     """The history in a .wandb file: LevelDB's log format, blocks of 32 KiB after 7 bytes, of protocol buffers."""
     from wandb.proto.wandb_internal_pb2 import Record  # type: ignore[attr-defined]
 
-    data, place, whole = file.read_bytes(), 7, b""
-    while place + 7 <= len(data):
-        if 32768 - place % 32768 < 7:
-            place += 32768 - place % 32768
+    data, at, whole = file.read_bytes(), 7, b""
+    while at + 7 <= len(data):
+        if 32768 - at % 32768 < 7:
+            at += 32768 - at % 32768
             continue
-        _, size, kind = struct.unpack_from("<IHB", data, place)
-        whole += data[place + 7 : place + 7 + size]
-        place += 7 + size
+        _, size, kind = struct.unpack_from("<IHB", data, at)
+        whole += data[at + 7 : at + 7 + size]
+        at += 7 + size
         if kind in (1, 4):  # whole, or the last part
             record = Record()
             record.ParseFromString(whole)
@@ -169,10 +172,10 @@ def test_wandb_has_one_run_through_resume(tmp_path, data_root, monkeypatch):
     monkeypatch.setenv("WANDB_MODE", "offline")
     words = ["logger=wandb", "logger.offline=true", "callbacks.samples.every_n_steps=4"]
     folder = run(tmp_path / "run", data_root, *words, "trainer.max_steps=4")
-    known = json.loads((folder / "wandb.json").read_text())
+    first_id = json.loads((folder / "wandb.json").read_text())["id"]
     run(folder, data_root, *words, "trainer.max_steps=8")
-    assert json.loads((folder / "wandb.json").read_text())["id"] == known["id"]
-    first, second = (list(rows(file)) for file in sorted(folder.glob(f"wandb/offline-run-*-{known['id']}/*.wandb")))
+    assert json.loads((folder / "wandb.json").read_text())["id"] == first_id
+    first, second = (list(rows(file)) for file in sorted(folder.glob(f"wandb/offline-run-*-{first_id}/*.wandb")))
     together = first + second
     assert [row["_step"] for row in together] == list(range(len(together))), "else the second part replaces the first"
     steps = [row["trainer/global_step"] for row in together]
@@ -186,41 +189,6 @@ def test_wandb_has_one_run_through_resume(tmp_path, data_root, monkeypatch):
 # The page -------------------------------------------------------------------------------------------------------------
 
 
-def a_run(folder: Path, name: str = "default", **changes: Any) -> Path:
-    """The folder of a run that never was."""
-    folder.mkdir(parents=True)
-    config = {"experiment": "mine", "run": {"name": name, "dir": str(folder)}, "trainer": {"max_steps": 20}, **changes}
-    (folder / "config.yaml").write_text(json.dumps(config))
-    lines = [{"step": k, "train/loss": 2.0**-k, "val/p/fid": 3.0 + k, "val/p/fid/ci": 0.5} for k in range(10)]
-    (folder / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
-    return folder
-
-
-def result(**changes: Any) -> dict[str, Any]:
-    """A result of an evaluation, as far as pages read it."""
-    value = {"ci": 0.25, "replications": 2, "n": 64}
-    return {
-        "quick": False,
-        "invalid_because": [],
-        "changed": {},
-        "protocol": {"name": "p", "version": 3},
-        "split": "test",
-        "data": {"dataset": "synthetic", "fingerprint": "abc"},
-        "seed": 0,
-        "extractor": None,
-        "checkpoint": {
-            **{"path": "last.ckpt", "sha256": "0123456789", "sampler": "ddim"},
-            **{"num_inference_steps": 5, "guidance_scale": 2.5},
-        },
-        "device": "cpu",
-        "values": {"fid": {"mean": 4.5, **value}, "kid": {"mean": None, **value, "ci": None}},
-        "ground_truth": {"fid": {"mean": 0.125, **value}},
-        "not_computed": {"kid": "too few <samples>"},
-        "cost": {"seconds_per_sample": 0.5},
-        **changes,
-    }
-
-
 def test_training_ends_with_a_report_that_needs_nothing_else(evaluated):
     text = (evaluated / "report.html").read_text()
     for words in ("Samples at step 8", "Losses", "Validation", "synthetic/foot_skating", "grad_norm", "fingerprint"):
@@ -232,26 +200,18 @@ def test_training_ends_with_a_report_that_needs_nothing_else(evaluated):
     assert (evaluated / "report.html").read_bytes() == before
 
 
-def test_a_report_shows_evaluations_with_their_marks(tmp_path):
+def test_a_report_shows_evaluations_and_why_training_stopped(tmp_path):
     folder = a_run(tmp_path / "run")
-    path = folder / "evaluation" / "p-3" / "x" / "result-0.json"
-    path.parent.mkdir(parents=True)
-    path.write_text(json.dumps(result(invalid_because=["real motions are off"], changed={"samples": 64})))
+    put(folder, invalid_because=["real motions are off"], changed={"samples": 64})
+    batches = [{"rank": 0, "batch": 7, "ids": ["<b>walk"], "loss": "nan"}]
+    (folder / "bad_batch.json").write_text(json.dumps({"step": 8, "usual_loss": "0.5", "batches": batches}))
     text = write_report(folder).read_text()
     for words in (
         *("4.5 ± 0.25", "0.125 ± 0.25", "not valid: real motions are off", "differs from the protocol: samples 64"),
         *("not computed: kid: too few &lt;samples&gt;", "ddim, 5 steps, guidance 2.5", "p version 3, synthetic test"),
+        *("Training stopped at step 8", "&lt;b&gt;walk"),
     ):
         assert words in text, words
-
-
-def test_a_report_shows_why_training_stopped(tmp_path):
-    folder = a_run(tmp_path / "run")
-    batches = [{"rank": 0, "batch": 7, "ids": ["<b>walk"], "loss": "nan"}]
-    (folder / "bad_batch.json").write_text(json.dumps({"step": 8, "usual_loss": "0.5", "batches": batches}))
-    text = write_report(folder).read_text()
-    assert "Training stopped at step 8" in text
-    assert "&lt;b&gt;walk" in text
     assert "<b>" not in text
 
 
@@ -261,65 +221,57 @@ def test_names_are_text_not_html(tmp_path):
     text = write_report(folder).read_text()
     assert "<script" not in text
     assert "<i>x" not in text
+    text = page("a & b", chart("<i>", {"<b>": {1: 2.0}}) + "<u>")
+    assert "<title>a &amp; b</title>" in text
+    assert "&lt;i&gt;" in text
+    assert "&lt;u&gt;" in text
+    assert not re.search("<[ibu]>", text)
 
 
-@pytest.mark.parametrize(
-    ("name", "content", "message"),
-    [
-        ("metrics.jsonl", "hello\n", r"metrics.jsonl: line 1 is damaged"),
-        ("metrics.jsonl", '{"step": 1}\n{"stop": 2}\n', r"metrics.jsonl: line 2 is damaged"),
-        ("metrics.jsonl", "[]\n", r"metrics.jsonl: line 1 is damaged"),
-        ("provenance.json", "{", r"provenance.json: not a JSON file"),
-        ("provenance.json", "[]", r"provenance.json: damaged: the file is \[\], not a mapping"),
-    ],
-)
-def test_damaged_files_are_named(tmp_path, name, content, message):
-    folder = a_run(tmp_path / "run")
-    (folder / name).write_text(content)
-    with pytest.raises(UserError, match=message):
-        write_report(folder)
-    assert not (folder / "report.html").exists()
-
-
-def test_a_folder_without_a_run_is_one_line(tmp_path, capsys):
-    assert main(["report", str(tmp_path)]) == 1
-    assert "contains no config.yaml" in capsys.readouterr().err
-    assert main(["report"]) == 1
-    assert "no run named" in capsys.readouterr().err
-
-
-def test_a_run_without_a_history_has_a_report(tmp_path):
+def test_missing_and_damaged_files_are_named(tmp_path, capsys):
+    for case, (name, content, message) in enumerate(
+        (
+            ("metrics.jsonl", "hello\n", "metrics.jsonl: line 1 is damaged"),
+            ("metrics.jsonl", '{"step": 1}\n{"stop": 2}\n', "metrics.jsonl: line 2 is damaged"),
+            ("metrics.jsonl", "[]\n", "metrics.jsonl: line 1 is damaged"),
+            ("provenance.json", "{", "provenance.json: not a JSON file"),
+            ("provenance.json", "[]", r"provenance.json: damaged: the file is \[\], not a mapping"),
+        )
+    ):
+        folder = a_run(tmp_path / f"run{case}")
+        (folder / name).write_text(content)
+        with pytest.raises(UserError, match=message):
+            write_report(folder)
+        assert not (folder / "report.html").exists()
     folder = a_run(tmp_path / "run")
     (folder / "metrics.jsonl").unlink()
     assert "there is no metrics.jsonl in the folder" in write_report(folder).read_text()
     assert read_run(folder).label == "mine"
+    for words, message in (([str(tmp_path)], "contains no config.yaml"), ([], "no run named")):
+        assert main(["report", *words]) == 1
+        assert message in capsys.readouterr().err
 
 
 # The end of training --------------------------------------------------------------------------------------------------
 
 
-def test_training_ends_with_what_its_numbers_mean(tmp_path, data_root, capsys, monkeypatch):
-    monkeypatch.delenv("MAKELEVEL", raising=False)
-    (tmp_path / "mine.yaml").write_text(EVALUATE)
-    folder = run(tmp_path / "run", data_root, "trainer.max_steps=4", recipe=str(tmp_path / "mine.yaml"))
-    out = capsys.readouterr().out
-    samples, evaluation = out.split("evaluation after 4 steps, synthetic, validation clips:\n")
-    curves = read_history(folder)
+def test_training_ends_with_what_its_numbers_mean(evaluated, printed, tmp_path):
+    out, curves = printed.getvalue(), read_history(evaluated)
+    samples, evaluation = out.split("evaluation after 8 steps, synthetic, validation clips:\n")
     for text, name in ((samples, "samples"), (evaluation, "val/synthetic")):
         ours, real = re.findall(r"^  foot_skating: (\S+) \(real motions: (\S+)\)$", text, re.MULTILINE)[0]
-        assert ours == number(curves[f"{name}/foot_skating"][3])
+        assert ours == number(curves[f"{name}/foot_skating"][7])
         assert 0 <= float(real) < 0.05
         assert "foot_skating: Foot skating ratio: fraction of frame transitions in which a foot that touches" in text
         assert re.search(r"^  attributes/action: \S+ \(real motions: 1\)$", text, re.MULTILINE)
     assert "fid: " not in evaluation, "it has no value without an extractor"
-    losses = re.findall(
-        r"^loss after 4 steps: (\S+) on the last batch, (\S+) on the validation clips", out, re.MULTILINE
-    )
-    assert losses[0][1] == f"{curves['val/loss'][3]:.4g}"
-    assert float(losses[0][0]) > 0
+    pattern = r"^loss after 8 steps: (\S+) on the last batch, (\S+) on the validation clips"
+    ((batch, clips),) = re.findall(pattern, out, re.MULTILINE)
+    assert clips == f"{curves['val/loss'][7]:.4g}"
+    assert float(batch) > 0
     command = re.findall(r"^next: flame-mdm (sample .*)$", out, re.MULTILINE)[0]
     assert main([*shlex.split(command), f"out={tmp_path / 'samples'}", "samples=1"]) == 0
-    assert f"flame-mdm evaluate {folder} extractor=none quick=true" in out
+    assert f"flame-mdm evaluate {evaluated} extractor=none quick=true" in out
 
 
 def test_the_next_command_is_for_make_where_make_was_used(tmp_path, data_root, capsys, monkeypatch):
@@ -332,11 +284,8 @@ def test_the_next_command_is_for_make_where_make_was_used(tmp_path, data_root, c
 
 
 def test_curves_of_training_and_validation_share_a_chart():
-    curves = {
-        name: {1: 1.0, 2: 2.0}
-        for name in ("train/loss", "val/loss", "val/p/fid", "val/p/fid/ci", "train/grad_norm", "train/epochs")
-    }
-    curves["train/lr"] = {1: 0.1, 2: 0.1}
+    names = ["train/loss", "val/loss", "val/p/fid", "val/p/fid/ci", "train/grad_norm", "train/epochs"]
+    curves = {name: {1: 1.0, 2: 2.0} for name in names} | {"train/lr": {1: 0.1, 2: 0.1}}
     assert charted(curves) == {
         "Losses": {"loss": ["train", "val"]},
         "Validation": {"p/fid": ["val"]},
@@ -375,13 +324,9 @@ def test_a_chart_draws_what_it_is_given():
     assert straight[0][1] > straight[2][1], "up is more"
     logarithmic = points(chart("x", {"a": {0: 1.0, 5: 10.0, 10: 100.0}}))
     assert logarithmic[1][1] == pytest.approx((logarithmic[0][1] + logarithmic[2][1]) / 2, abs=0.1)
-
-
-def test_a_chart_keeps_the_extremes_of_long_curves():
-    long = {step: math.sin(step / 500) for step in range(20_000)} | {7777: 9.0}
-    thin = points(chart("x", {"a": long}))
+    thin = points(chart("x", {"a": {step: math.sin(step / 500) for step in range(20_000)} | {7777: 9.0}}))
     assert len(thin) <= 600
-    assert min(y for _, y in thin) == points(chart("x", {"a": {0: 0.0, 7777: 9.0, 19_999: -1.0}}))[1][1]
+    assert min(y for _, y in thin) == points(chart("x", {"a": {0: 0.0, 7777: 9.0, 19_999: -1.0}}))[1][1], "extremes"
 
 
 def test_a_chart_bears_what_runs_log():
@@ -395,19 +340,6 @@ def test_a_chart_bears_what_runs_log():
 
 
 def test_numbers_are_short_and_true():
-    assert [number(value) for value in (None, 0.0, 1.23456, 0.000012, 123456.0)] == [
-        "–",
-        "0",
-        "1.235",
-        "1.20e-05",
-        "123,456",
-    ]
+    shown = {None: "–", 0.0: "0", 1.23456: "1.235", 0.000012: "1.20e-05", 123456.0: "123,456"}
+    assert {value: number(value) for value in shown} == shown
     assert [short(step) for step in (0, 950, 1500, 2_000_000)] == ["0", "950", "1.5k", "2M"]
-
-
-def test_pages_escape_what_they_are_given():
-    text = page("a & b", chart("<i>", {"<b>": {1: 2.0}}) + "<u>")
-    assert "<title>a &amp; b</title>" in text
-    assert "&lt;i&gt;" in text
-    assert "&lt;u&gt;" in text
-    assert not re.search("<[ibu]>", text)

@@ -417,11 +417,11 @@ def test_downloads_are_the_shown_motion(server, studio):
     assert len(joints_of(f"{server}/motion.npz?{request.query()}")) == 40, "both actions"
 
 
+LINKS = "[...document.querySelectorAll('#files a')]"
+
+
 def in_chromium(test: Callable[..., None]) -> Callable[..., None]:
     return pytest.mark.tools(pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed")(test))
-
-
-LINKS = "[...document.querySelectorAll('#files a')]"
 
 
 @in_chromium

@@ -2,9 +2,9 @@
 
 import hashlib
 import json
-import math
 import re
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -15,22 +15,10 @@ from flame_mdm.__main__ import main
 from flame_mdm.checkpoints.model_files import FORMAT, FORMAT_KEY, weights_sha256
 from flame_mdm.commands.tables import outdated
 from flame_mdm.errors import UserError
-from flame_mdm.reporting.study import wilson
 from flame_mdm.reporting.tables import build as builder
+from flame_mdm.reporting.tables import format as printing
 from flame_mdm.reporting.tables.build import build
-from flame_mdm.reporting.tables.format import (
-    Cell,
-    Line,
-    Part,
-    Plot,
-    Table,
-    cumulative,
-    draw,
-    latex,
-    markdown,
-    ranks,
-    write,
-)
+from flame_mdm.reporting.tables.format import Cell, Line, Part, Plot, Table, cumulative, draw, markdown, ranks, write
 from flame_mdm.reporting.tables.specs import Evaluation, evaluations, load_spec, spec_names
 
 SPEC = """
@@ -69,33 +57,15 @@ def result(fid: float, top3: float, diversity: float, **other) -> dict:
         return {"mean": mean, "ci": 0.0123, "replications": 5, "n": n}
 
     values = {"fid": entry(fid), "texts_for_motion/top3": entry(top3), "diversity": entry(diversity)}
-    report = {
-        "quick": False,
-        "protocol": {"name": "synthetic", "version": 1},
-        "split": "test",
-        "published_split": False,
-        "data": {"dataset": "synthetic", "fingerprint": "f" * 16},
-        "seed": 0,
-        "extractor": {"sha256": "e" * 64},
-        "samples_sha256": None,
-        "checkpoint": {
-            "path": "mdm.ckpt",
-            "sha256": "c" * 64,
-            "experiment": "synthetic/mdm",
-            "selected_by": "none: last",
-        }
-        | {"averaged_weights": True, "guidance_scale": 2.5, "sampler": "ddpm", "num_inference_steps": 50}
-        | {"parameters": 12_345_678},
-        "device": "cpu",
-        "changed": {},
-        "ground_truth": {"fid": entry(0.002), "texts_for_motion/top3": entry(0.797), "diversity": entry(9.503)},
-        "values": values,
-        "cost": {"nfe": 50.0, "seconds_per_sample": 0.11, "batch_size": 64.0},
-        "valid": True,
-        "invalid_because": [],
-        "not_computed": {},
-    }
-    return report | other
+    real = {"fid": entry(0.002), "texts_for_motion/top3": entry(0.797), "diversity": entry(9.503)}
+    checkpoint = {"path": "mdm.ckpt", "sha256": "c" * 64, "experiment": "synthetic/mdm", "selected_by": "none: last"}
+    checkpoint |= {"averaged_weights": True, "guidance_scale": 2.5, "sampler": "ddpm", "num_inference_steps": 50}
+    report = {"quick": False, "changed": {}, "device": "cpu", "split": "test", "published_split": False, "seed": 0}
+    report |= {"protocol": {"name": "synthetic", "version": 1}, "extractor": {"sha256": "e" * 64}}
+    report |= {"data": {"dataset": "synthetic", "fingerprint": "f" * 16}, "samples_sha256": None}
+    report |= {"checkpoint": checkpoint | {"parameters": 12_345_678}, "values": values, "ground_truth": real}
+    report |= {"cost": {"nfe": 50.0, "seconds_per_sample": 0.11, "batch_size": 64.0}, "not_computed": {}}
+    return report | {"valid": True, "invalid_because": []} | other
 
 
 @pytest.fixture
@@ -103,11 +73,8 @@ def folder(tmp_path: Path) -> Path:
     (tmp_path / "spec.yaml").write_text(SPEC.format(folder=tmp_path))
     for name in ("clip", "mdm", "mfm", "flame"):
         (tmp_path / f"{name}.ckpt").write_bytes(b"")
-    measured = {
-        "MDM": result(0.544, 0.611, 9.559),
-        "MFM": result(0.410, 0.7, 9.4),
-        "FLAME <b>": result(0.6, 0.650, 9.5),
-    }
+    measured = {"MDM": result(0.544, 0.611, 9.559), "MFM": result(0.410, 0.7, 9.4)}
+    measured["FLAME <b>"] = result(0.6, 0.650, 9.5)
     spec = load_spec(str(tmp_path / "spec.yaml"))
     for row, needed in evaluations(spec["parts"]["Text-to-motion"]):
         if row["label"] in measured:
@@ -126,6 +93,20 @@ def put(request: Evaluation, folder: Path, content: dict) -> Path:
     return path
 
 
+def request_of(folder: Path, label: str) -> Evaluation:
+    part = load_spec(str(folder / "spec.yaml"))["parts"]["Text-to-motion"]
+    return next(needed[0] for row, needed in evaluations(part) if row["label"] == label)
+
+
+def change(folder: Path, label: str, **changes: Any) -> None:
+    """Changes keys of a row's result; those of mappings are added to the mapping."""
+    path = request_of(folder, label).path(folder / "results")
+    content = json.loads(path.read_text())
+    for key, value in changes.items():
+        content[key] = content[key] | value if isinstance(value, dict) and key in content else value
+    path.write_text(json.dumps(content))
+
+
 def made(folder: Path) -> Table:
     return build("spec", load_spec(str(folder / "spec.yaml")), folder / "results")
 
@@ -138,31 +119,24 @@ def files(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in folder.iterdir()}
 
 
-def render(folder: Path, out: Path) -> dict[str, bytes]:
+def command(folder: Path, out: Path) -> int:
     words = [f"table={folder / 'spec.yaml'}", "evaluate=false", f"results={folder / 'results'}", f"out={out}"]
-    assert main(["tables", *words]) == 0
-    return files(out)
+    return main(["tables", *words])
 
 
 def test_the_same_results_give_the_same_bytes(folder, capsys):
-    first, second = render(folder, folder / "a"), render(folder, folder / "b")
-    assert first == second
-    assert {"spec.md", "spec.tex", "spec.csv", "spec.html", "spec-steps-figure1.svg"} <= first.keys()
-    assert "3 of 4 rows measured" not in capsys.readouterr().out  # the sweep's four rows count, too
-
-
-def _part(folder: Path) -> dict:
-    return load_spec(str(folder / "spec.yaml"))["parts"]["Text-to-motion"]
+    assert command(folder, folder / "a") == command(folder, folder / "b") == 0
+    assert files(folder / "a") == files(folder / "b")
+    names = {"spec.md", "spec.tex", "spec.csv", "spec.html", "spec-steps-figure1.svg", "spec-steps-figure2.svg"}
+    assert names == files(folder / "a").keys()
+    assert "![Steps](spec-steps-figure1.svg)" in (folder / "a" / "spec.md").read_text()
+    assert "spec: 7 of 8 rows measured" in capsys.readouterr().out  # the sweep's four rows count, too
 
 
 def test_cells_ranks_and_real_motions(folder):
     lines = rows(folder)
-    assert [c.text if c else None for c in lines["real: Real motions"].cells] == [
-        "0.002 ±0.012",
-        "0.797 ±0.012",
-        "9.503 ±0.012",
-        None,
-    ]
+    real = [c.text if c else None for c in lines["real: Real motions"].cells]
+    assert real == ["0.002 ±0.012", "0.797 ±0.012", "9.503 ±0.012", None]
     ranks_of = {name: [c.rank if c else None for c in line.cells] for name, line in lines.items()}
     assert ranks_of["measured: MDM"] == [2, 0, 2, 1]  # 9.559 is 0.056 from real motions, 9.5 only 0.003
     assert ranks_of["measured: MFM"] == [1, 1, 0, 1]
@@ -174,11 +148,9 @@ def test_cells_ranks_and_real_motions(folder):
 
 
 def test_rows_of_another_evaluator_are_marked_and_not_compared(folder):
-    path = next(
-        needed[0].path(folder / "results") for row, needed in evaluations(_part(folder)) if row["label"] == "MFM"
-    )
+    path = request_of(folder, "MFM").path(folder / "results")
     content = json.loads(path.read_text())
-    for change in (
+    for changes in (
         {"extractor": {"sha256": "d" * 64}},
         {"protocol": {"name": "synthetic", "version": 2}},
         {"changed": {"samples": 64}},
@@ -187,29 +159,41 @@ def test_rows_of_another_evaluator_are_marked_and_not_compared(folder):
         {"seed": 1},
         {"quick": True},
     ):
-        path.write_text(json.dumps(content | change))
-        table = made(folder)
-        lines = {line.label: line for line in table.parts[0].lines if line.kind == "measured"}
-        assert lines["MDM"].marks == lines["FLAME <b>"].marks == "a", change
-        assert lines["MFM"].marks == "b", change
-        assert all(cell is None or cell.rank == 0 for cell in lines["MFM"].cells), change
-        assert [cell.rank for cell in lines["MDM"].cells if cell] == [1, 2, 2, 1], change
-        reals = [line for line in table.parts[0].lines if line.kind == "real"]
-        assert [line.marks for line in reals] == ["a", "b"], change
+        path.write_text(json.dumps(content | changes))
+        part = made(folder).parts[0]
+        lines = {line.label: line for line in part.lines if line.kind == "measured"}
+        assert lines["MDM"].marks == lines["FLAME <b>"].marks == "a", changes
+        assert lines["MFM"].marks == "b", changes
+        assert all(cell is None or cell.rank == 0 for cell in lines["MFM"].cells), changes
+        assert [cell.rank for cell in lines["MDM"].cells if cell] == [1, 2, 2, 1], changes
+        assert [line.marks for line in part.lines if line.kind == "real"] == ["a", "b"], changes
 
 
-def test_clips_left_out_of_the_data_set_are_in_the_footnotes(folder):
-    (request,) = [needed[0] for row, needed in evaluations(_part(folder)) if row["label"] == "MDM"]
-    excluded = {"motions of HumanAct12, as data.source.humanact12 is not given": 1191}
-    data = {"dataset": "synthetic", "fingerprint": "f" * 16, "excluded": excluded}
-    put(request, folder, result(0.5, 0.4, 9.0, data=data))
-    (note,) = [text for _, text in made(folder).parts[0].notes if "excluded from" in text]
-    assert "; excluded from the data set: 1,191 motions of HumanAct12, as data.source.humanact12 is not given" in note
-    lengths = {"fingerprint": "f" * 16, "fps": 20.0, "lengths": [50, 60], "excluded": excluded}
+def test_footnotes_tell_what_was_left_out_the_skeleton_and_how_checkpoints_were_chosen(folder):
+    left_out = {"motions of HumanAct12, as data.source.humanact12 is not given": 1191}
+    for label in ("MDM", "MFM", "FLAME <b>"):
+        change(folder, label, ground_truth={"fid": {"mean": 0.0, "ci": 0.0, "replications": 5, "n": 400}})
+    change(folder, "MFM", checkpoint={"selected_by": "best val/text_to_motion_t2m/fid"})
+    notes = [note for _, note in made(folder).parts[0].notes]
+    assert "MFM: best checkpoint by val/text_to_motion_t2m/fid" in notes
+    assert "MDM; FLAME <b>: last checkpoint, not chosen by validation" in notes
+    assert "FID of real motions is 0 by construction: clips are taken whole" in markdown(made(folder))
+    change(folder, "MDM", data={"excluded": left_out})
+    words = "; excluded from the data set: 1,191 motions of HumanAct12, as data.source.humanact12 is not given"
+    assert [words in note for _, note in made(folder).parts[0].notes].count(True) == 1
+    lengths = {"fingerprint": "f" * 16, "fps": 20.0, "lengths": [50, 60], "excluded": left_out}
     (folder / "results" / "lengths").mkdir()
     (folder / "results" / "lengths" / "mine.json").write_text(json.dumps(lengths))
     table = build("x", {"title": "Lengths", "parts": {"All": {"lengths": ["mine"]}}}, folder / "results")
-    assert table.parts[0].notes[1] == ("", f"mine; excluded from the data set: 1,191 {next(iter(excluded))}")
+    assert table.parts[0].notes[1] == ("", f"mine{words}")
+    for skeleton, note in (
+        ({"stand_in": True, "smpl_sha256": None}, "joints of a stand-in skeleton, whose bones are not SMPL's"),
+        ({"stand_in": False, "smpl_sha256": "5" * 64}, "joints of SMPL's model file, sha256 555555555555"),
+        ({"stand_in": False, "smpl_sha256": None}, ""),
+    ):
+        change(folder, "MDM", skeleton=skeleton)
+        notes = [text for _, text in made(folder).parts[0].notes if "joints of" in text]
+        assert [note in text for text in notes] == [True] * bool(note)
 
 
 def test_a_missing_extractor_is_noted_beside_a_missing_checkpoint(folder):
@@ -231,14 +215,9 @@ def test_footnotes_list_what_differs_and_group_rows(folder):
         path.write_text(json.dumps(json.loads(path.read_text()) | reasons | {"seed": number // 2}))
     table = made(folder)
     notes = table.parts[1].notes
-    assert [note for note in notes if note[0]] == [
-        (
-            "a",
-            "protocol synthetic version 1; test split of synthetic (fingerprint ffffffffffffffff); N = 400, 5 "
-            "replications; seed 0; extractor sha256 eeeeeeeeeeee; not audited",
-        ),
-        ("b", "as a, but seed 1"),
-    ]
+    conditions = "protocol synthetic version 1; test split of synthetic (fingerprint ffffffffffffffff); N = 400, 5 "
+    conditions += "replications; seed 0; extractor sha256 eeeeeeeeeeee; not audited"
+    assert [note for note in notes if note[0]] == [("a", conditions), ("b", "as a, but seed 1")]
     labels = "MDM (guidance scale 1.0); MDM (guidance scale 2.5)"
     assert ("", f"{labels}: NOT VALID: real motions have fid 3, expected 0.002 +- 0.02") in notes
     assert sum("NOT VALID" in note for _, note in notes) == 1
@@ -248,43 +227,18 @@ def test_footnotes_list_what_differs_and_group_rows(folder):
 
 
 def test_a_row_that_is_not_valid_is_reported_by_the_exit_code(folder, capsys):
-    words = [f"table={folder / 'spec.yaml'}", "evaluate=false", f"results={folder / 'results'}", f"out={folder / 'a'}"]
-    assert main(["tables", *words]) == 0
+    assert command(folder, folder / "a") == 0
     assert "NOT VALID" not in capsys.readouterr().err
-    (row,) = [needed[0] for row, needed in evaluations(_part(folder)) if row["label"] == "MFM"]
-    path = row.path(folder / "results")
     reason = "training data of the extractor 1 and evaluated data 2 differ: splits may overlap"
-    path.write_text(json.dumps(json.loads(path.read_text()) | {"invalid_because": [reason], "valid": False}))
-    assert main(["tables", *words]) == 3
+    change(folder, "MFM", invalid_because=[reason], valid=False)
+    assert command(folder, folder / "a") == 3
     (line,) = [line for line in capsys.readouterr().err.splitlines() if "NOT VALID" in line]
     assert line == f"NOT VALID: spec, Text-to-motion, MFM: {reason}"
-    (row,) = [line for line in (folder / "a" / "spec.md").read_text().splitlines() if line.startswith("| MFM")]
+    text = (folder / "a" / "spec.md").read_text().splitlines()
+    (row,) = [line for line in text if line.startswith("| MFM")]
     assert "(NOT VALID)" in row
     assert "**" not in row, "not ranked"
-    best = next(line for line in (folder / "a" / "spec.md").read_text().splitlines() if line.startswith("| MDM"))
-    assert "**" in best
-
-
-def test_a_table_tells_how_its_checkpoints_were_chosen(folder):
-    for row, needed in evaluations(_part(folder)):
-        path = needed[0].path(folder / "results")
-        if row["label"] == "MFM":
-            content = json.loads(path.read_text())
-            content["checkpoint"]["selected_by"] = "best val/text_to_motion_t2m/fid"
-            path.write_text(json.dumps(content))
-    notes = [note for _, note in made(folder).parts[0].notes]
-    assert "MFM: best checkpoint by val/text_to_motion_t2m/fid" in notes
-    assert "MDM; FLAME <b>: last checkpoint, not chosen by validation" in notes
-
-
-def test_a_distance_of_0_between_real_motions_is_explained(folder):
-    for _, needed in evaluations(_part(folder)):
-        path = needed[0].path(folder / "results")
-        if path.exists():
-            content = json.loads(path.read_text())
-            content["ground_truth"]["fid"]["mean"] = 0.0
-            path.write_text(json.dumps(content))
-    assert "FID of real motions is 0 by construction: clips are taken whole" in markdown(made(folder))
+    assert "**" in next(line for line in text if line.startswith("| MDM"))
 
 
 TIMED = """
@@ -319,11 +273,8 @@ def test_times_are_compared_in_batches_of_the_same_size_alone(folder):
     (part,) = build("timed", spec, folder / "results").parts
     lines = [line for line in part.lines if line.kind == "measured"]
     texts = [[cell and cell.text for cell in line.cells] for line in lines]
-    assert texts == [
-        ["1", "1.000", None, None, None],
-        ["64", "0.016", None, None, None],
-        ["1", "1.000", "velocity", "12.2", "7.5"],
-    ], "results of earlier versions have no parameterization"
+    unknown = [None, None, None]  # of a checkpoint without these facts
+    assert texts == [["1", "1.000", *unknown], ["64", "0.016", *unknown], ["1", "1.000", "velocity", "12.2", "7.5"]]
     assert [line.marks for line in lines] == ["a", "b", "a"]
     assert "as a, but timed in batches of 64 on cpu" in [note for _, note in part.notes]
     assert [cell.rank for line in lines if (cell := line.cells[1])] == [1, 0, 1]
@@ -340,21 +291,6 @@ def test_the_batch_size_of_the_command_is_not_that_of_timed_rows(folder, monkeyp
     needed.clear()
     assert main(["tables", f"table={folder / 'spec.yaml'}", *words]) == 0
     assert {request.batch_size for request in needed} == {256}
-
-
-def test_sweeps_are_rows_and_lines_of_figures(folder):
-    lines = made(folder).parts[1].lines
-    measured = [line for line in lines if line.kind == "measured"]
-    assert [(line.label, line.cells[0].text) for line in measured if line.cells[0]] == [
-        ("MDM (guidance scale 1.0)", "5"),
-        ("MDM (guidance scale 2.5)", "5"),
-        ("MDM (guidance scale 1.0)", "10"),
-        ("MDM (guidance scale 2.5)", "10"),
-    ]
-    table = made(folder)
-    write(table, folder / "out")
-    assert set(table.drawn) == {"spec-steps-figure1", "spec-steps-figure2"}
-    assert "![Steps](spec-steps-figure1.svg)" in (folder / "out" / "spec.md").read_text()
 
 
 MARKUP = "<img src=x onerror=alert(1)>&"
@@ -379,42 +315,23 @@ def test_markup_in_specs_and_results_is_shown_as_text(folder, monkeypatch):
         text = (folder / "out" / f"spec.{suffix}").read_text()
         assert "<img" not in text
         assert text.count("&lt;img src=x onerror=alert(1)&gt;&amp;") > 15
-    text = latex(made(folder))
+    text = printing.latex(made(folder))
     assert r"A table, 50 \% \& more\_of\_it" in text
     assert text.count("{") == text.count("}")
     columns = {line.count(" & ") for line in text.splitlines() if line.endswith(r"\\") and "multicolumn" not in line}
     assert columns == {4, 2}
 
 
-def test_the_skeleton_of_the_joints_is_in_the_footnotes(folder):
-    (request,) = [needed[0] for row, needed in evaluations(_part(folder)) if row["label"] == "MDM"]
-    for skeleton, note in (
-        ({"stand_in": True, "smpl_sha256": None}, "joints of a stand-in skeleton, whose bones are not SMPL's"),
-        ({"stand_in": False, "smpl_sha256": "5" * 64}, "joints of SMPL's model file, sha256 555555555555"),
-        ({"stand_in": False, "smpl_sha256": None}, ""),
-    ):
-        put(request, folder, result(0.5, 0.4, 9.0, skeleton=skeleton))
-        notes = [text for _, text in made(folder).parts[0].notes if "joints of" in text]
-        assert len(notes) == bool(note)
-        assert all(note in text for text in notes)
-
-
 def test_published_numbers_are_marked_and_ranked_among_themselves(folder, monkeypatch):
     published = folder / "published.yaml"
-    published.write_text(
-        """
-spec:
-  Text-to-motion:
-    evaluator: an evaluator of theirs
-    source: "Someone, table 1"
-    notes: ["They print percent."]
-    rows:
-      - {label: Real, real: true, values: {FID: "0.002 ±.000", Diversity: "9.503 ±.065"}}
-      - {label: T2M, values: {FID: "1.067 ±.002", NFE: "1,000"}}
-      - {label: "MDM", values: {FID: "0.544 ±.044"}}
-      - {label: "MDM, corrected", source: elsewhere, values: {FID: "0.489"}}
-"""
-    )
+    printed = [
+        {"label": "Real", "real": True, "values": {"FID": "0.002 ±.000", "Diversity": "9.503 ±.065"}},
+        {"label": "T2M", "values": {"FID": "1.067 ±.002", "NFE": "1,000"}},
+        {"label": "MDM", "values": {"FID": "0.544 ±.044"}},
+        {"label": "MDM, corrected", "source": "elsewhere", "values": {"FID": "0.489"}},
+    ]
+    part = {"evaluator": "an evaluator of theirs", "source": "Someone, table 1", "notes": ["They print percent."]}
+    published.write_text(json.dumps({"spec": {"Text-to-motion": part | {"rows": printed}}}))
     monkeypatch.setattr(builder, "PUBLISHED", published)
     lines = rows(folder)
     real, best = lines["reported real: Real"].cells[0], lines["measured: MFM"].cells[0]
@@ -428,43 +345,40 @@ spec:
     text = markdown(made(folder))
     assert "†: as reported: Someone, table 1; measured with an evaluator of theirs" in text
     assert "They print percent." in text
-    published.write_text("spec: {Text-to-motion: {evaluator: e, source: s, rows: [{label: x, values: {FDI: 1}}]}}")
-    with pytest.raises(UserError, match="x: no column is called FDI"):
-        made(folder)
-    published.write_text("spec: {Txt: {evaluator: e, source: s, rows: []}}")
-    with pytest.raises(UserError, match="parts that are not in its spec: Txt"):
-        made(folder)
+    for wrong, message in (
+        ("Text-to-motion: {evaluator: e, source: s, rows: [{label: x, values: {FDI: 1}}]}", "no column is called FDI"),
+        ("Txt: {evaluator: e, source: s, rows: []}", "parts that are not in its spec: Txt"),
+    ):
+        published.write_text(f"spec: {{{wrong}}}")
+        with pytest.raises(UserError, match=message):
+            made(folder)
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("title: x", "the file has no parts"),
-        ("title: x\nparts: {}", "parts is {}, not a longer list"),
-        ("title: x\nprats: {}", "unknown key: prats. Did you mean parts?"),
-        ("title: x\nparts: {a: {rows: []}}", "parts.a: needs columns and rows, or recipes"),
-        (
-            "title: x\nparts: {a: {columns: {F: {value: fid, better: up}}, rows: []}}",
-            "better is \"up\", not 'higher', 'lower', 'real' or 'none'",
-        ),
-        ("title: x\nparts: {a: {columns: {F: fid}, rows: []}}", 'parts.a.columns.F is "fid", not a mapping'),
-        ("title: x\nparts: {a: {columns: {A: {value: fid}}, rows: [{ckpt: x}]}}", "parts.a.rows.0 has no label"),
-        ("title: x\nparts: {a: {columns: {A: {value: fid}}, rows: [{label: x, ckpt: x}]}}", "needs a protocol"),
-        (
-            "title: x\nparts: {a: {lengths: [kit]}}\nfigures: [{part: a, x: nfe}]",
-            "x=nfe needs y, a column or several of a",
-        ),
-        ("title: [", "not a readable YAML file"),
-        ("- 1", "not a mapping"),
-    ],
-)
-def test_malformed_specs_are_told_in_one_line(tmp_path, capsys, text, message):
-    path = tmp_path / "mine.yaml"
-    path.write_text(text)
-    assert main(["tables", f"table={path}", f"out={tmp_path / 'out'}"]) == 1
-    error = capsys.readouterr().err
-    assert message in error
-    assert error.count("\n") == 1
+def test_malformed_specs_are_refused(tmp_path, capsys):
+    path, row = tmp_path / "mine.yaml", "rows: [{label: x, ckpt: x}]"
+    for text, message in (
+        ("", "the file has no parts"),
+        ("parts: {}", "parts is {}, not a longer list"),
+        ("prats: {}", "unknown key: prats. Did you mean parts?"),
+        ("parts: {a: {rows: []}}", "parts.a: needs columns and rows, or recipes"),
+        ("parts: {a: {columns: {F: {value: fid, better: up}}, rows: []}}", "better is \"up\", not 'higher', 'lower'"),
+        ("parts: {a: {columns: {F: fid}, rows: []}}", 'parts.a.columns.F is "fid", not a mapping'),
+        ("parts: {a: {columns: {A: {value: fid}}, rows: [{ckpt: x}]}}", "parts.a.rows.0 has no label"),
+        (f"parts: {{a: {{columns: {{A: {{value: fid}}}}, {row}}}}}", "needs a protocol"),
+        ("parts: {a: {lengths: [kit]}}\nfigures: [{part: a, x: nfe}]", "x=nfe needs y, a column or several of a"),
+        ("[", "not a readable YAML file"),
+    ):
+        path.write_text(f"title: x\n{text}")
+        with pytest.raises(UserError, match=re.escape(message)):
+            load_spec(str(path))
+    for words, message in (
+        ([f"table={path}", f"out={tmp_path / 'out'}"], "not a readable YAML file"),
+        (["table=mdm_9"], "no table is called 'mdm_9'. Did you mean mdm_"),
+    ):
+        assert main(["tables", *words]) == 1
+        error = capsys.readouterr().err
+        assert message in error
+        assert error.count("\n") == 1
     assert not (tmp_path / "out").exists()
 
 
@@ -482,12 +396,7 @@ def test_an_index_lists_the_tables_with_their_measured_rows(tmp_path, capsys):
     assert names.index("flame_9") + 1 == names.index("flame_10")
 
 
-def test_an_unknown_table_names_those_there_are(capsys):
-    assert main(["tables", "table=mdm_9"]) == 1
-    assert "no table is called 'mdm_9'. Did you mean mdm_" in capsys.readouterr().err
-
-
-def test_distances_from_the_training_motions_are_drawn():
+def test_distances_from_the_training_motions_are_drawn(folder):
     real = Line("Real motions", "real", [], nearest=[0.01 * i for i in range(1, 1001)])
     copied = Line("copies", "measured", [], nearest=[0.0, 0.0, 0.5, 1.0])
     part = Part("Text", {}, [real, copied, Line("unmeasured", "measured", [])])
@@ -502,14 +411,9 @@ def test_distances_from_the_training_motions_are_drawn():
     assert shares[-1] == (10.0, 1.0)
     assert all(share == pytest.approx(distance / 10) for distance, share in shares)
     assert cumulative(copied.nearest) == [(0.0, 0.25), (0.0, 0.5), (0.5, 0.75), (1.0, 1.0)]
-
-
-def test_results_with_distances_are_drawn(folder):
     spec = (folder / "spec.yaml").read_text().partition("figures:")[0]
     (folder / "spec.yaml").write_text(spec + "figures: [{part: Text-to-motion, x: nearest}]\n")
-    (_, needed), *_ = evaluations(load_spec(str(folder / "spec.yaml"))["parts"]["Text-to-motion"])
-    nearest = {"generated": [0.01, 0.02], "real": [0.03, 0.07]}
-    put(needed[0], folder, result(0.544, 0.611, 9.559) | {"nearest": nearest})
+    change(folder, "MDM", nearest={"generated": [0.01, 0.02], "real": [0.03, 0.07]})
     table = made(folder)
     write(table, folder / "out")
     assert [line.nearest for line in table.parts[0].lines if line.nearest] == [[0.03, 0.07], [0.01, 0.02]]
@@ -517,13 +421,16 @@ def test_results_with_distances_are_drawn(folder):
 
 
 def test_ranks():
-    assert ranks([3.0, 1.0, None, 2.0], "lower", None) == [0, 1, 0, 2]
-    assert ranks([3.0, 1.0, 2.0], "higher", None) == [1, 0, 2]
-    assert ranks([3.0, 1.0, 2.0], "real", 1.9) == [0, 2, 1]
-    assert ranks([3.0, 1.0], "real", None) == [0, 0]
-    assert ranks([3.0, 3.0, 1.0], "higher", None) == [1, 1, 2]
-    assert ranks([3.0], "higher", None) == [0]
-    assert ranks([3.0, 4.0], "none", None) == [0, 0]
+    for values, better, real, expected in (
+        ([3.0, 1.0, None, 2.0], "lower", None, [0, 1, 0, 2]),
+        ([3.0, 1.0, 2.0], "higher", None, [1, 0, 2]),
+        ([3.0, 1.0, 2.0], "real", 1.9, [0, 2, 1]),
+        ([3.0, 1.0], "real", None, [0, 0]),
+        ([3.0, 3.0, 1.0], "higher", None, [1, 1, 2]),
+        ([3.0], "higher", None, [0]),
+        ([3.0, 4.0], "none", None, [0, 0]),
+    ):
+        assert ranks(values, better, real) == expected, (values, better)
 
 
 def test_numbers_have_the_decimals_of_their_column_and_are_never_all_zeros():
@@ -532,12 +439,21 @@ def test_numbers_have_the_decimals_of_their_column_and_are_never_all_zeros():
     assert [cell.text for line in lines if (cell := line.cells[0])] == ["103.6 ±0.0", "0.016 ±0.002", "0.0 ±0.0"]
 
 
-def test_wilson_interval():
-    share, low, high = wilson(42, 100)
-    assert share == 0.42
-    assert math.isclose(low, 0.3280, abs_tol=1e-3)
-    assert math.isclose(high, 0.5179, abs_tol=1e-3)
-    assert wilson(0, 0) == (0.0, 0.0, 1.0)
+MINE = """
+title: mine
+parts:
+  all:
+    protocol: synthetic
+    extractor: none
+    replications: 1
+    samples: 4
+    columns: {Action: {value: attributes/action, better: higher}, FID: {value: fid},
+      Steps: {value: num_inference_steps}}
+    rows:
+      - {label: tiny, ckpt: runs/tiny/default/checkpoints/last.ckpt, sampler: ddim, eta: 0.5,
+         num_inference_steps: [2, [0, 5, 9]]}
+      - {label: elsewhere, ckpt: runs/synthetic/mdm/default/checkpoints/last.ckpt}
+"""
 
 
 @pytest.mark.slow
@@ -546,28 +462,7 @@ def test_what_is_missing_is_evaluated_once(tmp_path, capsys, monkeypatch):
     words = ["data.source.clips=400", *TINY[1:], f"data_root={tmp_path / 'data'}", "run.dir=runs/tiny/default"]
     words += ["callbacks.samples=null", "trainer.val_check_interval=2", "trainer.max_steps=2"]
     assert main(["train", "quickstart", *words]) == 0
-    Path("mine.yaml").write_text(
-        """
-title: mine
-parts:
-  all:
-    protocol: synthetic
-    extractor: none
-    replications: 1
-    samples: 4
-    columns:
-      Action: {value: attributes/action, better: higher}
-      FID: {value: fid}
-      Steps: {value: num_inference_steps}
-    rows:
-      - label: tiny
-        ckpt: runs/tiny/default/checkpoints/last.ckpt
-        sampler: ddim
-        eta: 0.5
-        num_inference_steps: [2, [0, 5, 9]]
-      - {label: elsewhere, ckpt: runs/synthetic/mdm/default/checkpoints/last.ckpt}
-"""
-    )
+    Path("mine.yaml").write_text(MINE)
     needed = ["table=mine.yaml", "device=cpu"]
     assert main(["tables", *needed]) == 0
     shown = capsys.readouterr().out
@@ -581,9 +476,8 @@ parts:
     assert main(["tables", *needed]) == 0
     assert "evaluating" not in capsys.readouterr().out
     assert files(Path("runs/tables")) == first
-    assert (
-        main(["train", "quickstart", *words[:-1], "trainer.max_steps=3"]) == 0
-    )  # another checkpoint under the same name
+    # another checkpoint under the same name
+    assert main(["train", "quickstart", *words[:-1], "trainer.max_steps=3"]) == 0
     assert main(["tables", *needed]) == 0
     assert "evaluating 2 of 2" in capsys.readouterr().out
     assert files(Path("runs/tables"))["mine.md"] != first["mine.md"]
@@ -591,19 +485,14 @@ parts:
 
 def clip_file(folder: Path, weight: float, steps: int) -> str:
     """Writes an extractor and returns the sha256 of its weights."""
-    facts = {"actions": [], "max_frames": 60}
-    content = {
-        "config": {"experiment": "motion_clip/synthetic"},
-        "facts": facts,
-        "global_step": steps,
-        FORMAT_KEY: FORMAT,
-    }
-    torch.save(content | {"state_dict": {"w": torch.tensor([weight])}}, folder / "clip.ckpt")
+    content = {"config": {"experiment": "motion_clip/synthetic"}, "facts": {"actions": [], "max_frames": 60}}
+    content |= {"global_step": steps, FORMAT_KEY: FORMAT, "state_dict": {"w": torch.tensor([weight])}}
+    torch.save(content, folder / "clip.ckpt")
     return weights_sha256(folder / "clip.ckpt")
 
 
 def test_a_result_is_outdated_when_checkpoint_or_extractor_are_others_now(folder):
-    (request,) = [needed[0] for row, needed in evaluations(_part(folder)) if row["label"] == "MDM"]
+    request = request_of(folder, "MDM")
     content = json.loads(request.path(folder / "results").read_text())
     content["checkpoint"]["sha256"] = hashlib.sha256((folder / "mdm.ckpt").read_bytes()).hexdigest()
     content["extractor"]["sha256"] = clip_file(folder, 1.0, 600)

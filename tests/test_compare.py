@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.stats import ttest_rel
 from support.browser import CHROMIUM, browser
-from support.pages import a_run, data_of, players, put, result
+from support.pages import PROMPTS, a_run, data_of, motions, players, put, result
 from support.runs import TINY
 
 from flame_mdm.__main__ import main
@@ -18,19 +18,6 @@ from flame_mdm.errors import UserError
 from flame_mdm.reporting.compare import find
 from flame_mdm.reporting.intervals import paired_difference, percentiles
 from flame_mdm.reporting.study import tally
-
-PROMPTS = ("a person walks", "a person jumps", "a person <waves> & bows")
-
-
-def motions(folder: Path, prompts: tuple[str, ...] = PROMPTS, at: float = 0.0) -> Path:
-    """A folder of motion files, as `make sample` writes them; all stand at x = `at`."""
-    folder.mkdir(parents=True, exist_ok=True)
-    joints = np.random.default_rng(0).random((8, 22, 3)).astype(np.float32)
-    joints[..., 0] += at
-    for number, text in enumerate(prompts):
-        np.savez(folder / f"motion_{number:03d}.npz", joints=joints, fps=20.0, text=text)
-    (folder / "player.html").write_text("")
-    return folder
 
 
 @pytest.fixture

@@ -16,7 +16,7 @@ from flame_mdm.commands.prepare import main as prepare
 from flame_mdm.data import amass, humanml3d, t2m
 from flame_mdm.data.amass import Recording, key_of, load_bodies
 from flame_mdm.data.crops import Units
-from flame_mdm.data.humanml3d import HumanML3D, HumanML3DSMPL, Row
+from flame_mdm.data.humanml3d import HumanML3D, HumanML3DSMPL, IndexedClip
 from flame_mdm.data.store import write_store
 from flame_mdm.representations.humanml import HumanML
 from flame_mdm.representations.skeleton import SMPL22
@@ -88,7 +88,7 @@ def test_items_and_their_crops_and_words_are_the_published_ones(stem):
 def test_clips_lose_the_published_frames_of_their_recordings(stem):
     for subset, count, start, end, first, kept, sign in golden(stem)["crop_table"]:
         name = FIXTURE_SUBSETS[subset]
-        row = Row("000000", "P01" if name == "humanact12" else f"{name}/a_poses", start, end)
+        row = IndexedClip("000000", "P01" if name == "humanact12" else f"{name}/a_poses", start, end)
         frames = row.frames(count)
         assert (frames[0], len(frames), frames.step) == (first, kept, 1)
         assert row.humanact12 == (sign == 1)
@@ -107,7 +107,7 @@ def test_mirrored_joints_are_the_published_ones(stem):
 def test_parameters_of_a_clip_make_flames_features(stem):
     poses, translation, expected = (golden(stem)[f"prep/{key}"] for key in ("poses156", "trans", "feats147"))
     recording = Recording(np.repeat(poses, 5, 0), np.repeat(translation, 5, 0), np.zeros(16), "female", 100.0)
-    [motion] = humanml3d._parameters([Row("a", "CMU/a", 0, len(poses))], recording)
+    [motion] = humanml3d._parameters([IndexedClip("a", "CMU/a", 0, len(poses))], recording)
     np.testing.assert_allclose(SMPL().encode(torch.from_numpy(motion)), expected, atol=2e-6)
 
 

@@ -14,13 +14,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from support.pages import a_run, motions, result
 from test_architecture import FILES
-from test_compare import motions
-from test_report import a_run, result
 from test_tables import SPEC, put
 
 import flame_mdm
-from evaluators.protocol import Row
+from evaluators.protocol import DrawnClip
 from evaluators.sources import _write, read_samples
 from flame_mdm.__main__ import main
 from flame_mdm.checkpoints import hub, model_files
@@ -274,7 +273,7 @@ def _write_all(folder: Path, table: Table) -> None:
         write_motions(folder / "samples" / "mine", _made(), {"seed": 0})
 
 
-def _row(row: Any) -> Row:
+def _row(row: Any) -> DrawnClip:
     return row
 
 

@@ -6,6 +6,10 @@ from html import unescape
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+PROMPTS = ("a person walks", "a person jumps", "a person <waves> & bows")
+
 
 def a_run(folder: Path, name: str = "default", **changes: Any) -> Path:
     """The folder of a run of 10 logged steps; `changes` are keys of its configuration."""
@@ -14,6 +18,17 @@ def a_run(folder: Path, name: str = "default", **changes: Any) -> Path:
     (folder / "config.yaml").write_text(json.dumps(config))
     lines = [{"step": k, "train/loss": 2.0**-k, "val/p/fid": 3.0 + k, "val/p/fid/ci": 0.5} for k in range(10)]
     (folder / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    return folder
+
+
+def motions(folder: Path, prompts: tuple[str, ...] = PROMPTS, at: float = 0.0) -> Path:
+    """A folder of motion files, as `make sample` writes them; all stand at x = `at`."""
+    folder.mkdir(parents=True, exist_ok=True)
+    joints = np.random.default_rng(0).random((8, 22, 3)).astype(np.float32)
+    joints[..., 0] += at
+    for number, text in enumerate(prompts):
+        np.savez(folder / f"motion_{number:03d}.npz", joints=joints, fps=20.0, text=text)
+    (folder / "player.html").write_text("")
     return folder
 
 

@@ -1,13 +1,10 @@
 """Faults of motions, and the command that shows them."""
 
-import json
 import math
-import re
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
-import pytest
+from support.motions import Page
 
 from flame_mdm.__main__ import main
 from flame_mdm.formats.faults import LIMITS, find_faults
@@ -81,47 +78,35 @@ def freeze(joints: np.ndarray) -> None:
     joints[30:60] = joints[30]
 
 
-@pytest.mark.parametrize(
-    ("change", "expected"),
-    [
-        (lambda joints: slide(joints, 9), {("skating", f"{side}_foot", 20, 28) for side in ("left", "right")}),
+def test_faults_are_found_where_they_are():
+    feet, both = ("left_foot", "right_foot"), ("left", "right")
+    cases: list[tuple[Callable[[np.ndarray], None], set[tuple[str, str, int, int]]]] = [
+        (lambda joints: slide(joints, 9), {("skating", foot, 20, 28) for foot in feet}),
         (lambda joints: slide(joints, 8), set()),  # no longer than a step takes
         (pop, {("pop", "head", 30, 31)}),
         (stretch, {("bone length", "head", 30, 40)}),
-        (sink, {("penetration", f"{side}_{part}", 30, 40) for side in ("left", "right") for part in ("ankle", "foot")}),
+        (sink, {("penetration", f"{side}_{part}", 30, 40) for side in both for part in ("ankle", "foot")}),
         (lambda joints: float_(joints, 7, 0.0), {("floating", "body", 30, 36)}),
         (lambda joints: float_(joints, 6, 0.0), set()),
         (lambda joints: float_(joints, 16, 1.0), {("floating", "body", 30, 46)}),
-        (
-            lambda joints: float_(joints, 15, 1.0),
-            {("skating", f"{side}_foot", *span) for side in ("left", "right") for span in ((0, 29), (45, 79))},
-        ),
+        (lambda joints: float_(joints, 15, 1.0), {("skating", k, *span) for k in feet for span in ((0, 29), (45, 79))}),
         (knee, {("limit", "left_knee", 30, 40)}),
         (fold, {("limit", "left_elbow", 30, 40)}),
         (freeze, {("frozen", "body", 30, 60)}),
-    ],
-)
-def test_faults_are_found_where_they_are(change: Callable[[np.ndarray], None], expected: set):
-    joints = body()
-    change(joints)
-    found = kinds(joints)
-    names = {kind for kind, *_ in expected}
-    assert {fault for fault in found if fault[0] in names} == expected
-    assert names <= LIMITS.keys()
-    if not expected:
-        assert not found
+    ]
+    for change, expected in cases:
+        joints = body()
+        change(joints)
+        faults = kinds(joints)
+        names = {kind for kind, *_ in expected}
+        assert names <= LIMITS.keys()
+        assert {fault for fault in faults if fault[0] in names or not expected} == expected
 
 
 def test_knees_may_bend_backward():
     joints = body()
     joints[:, AT["left_knee"], 2] += 0.3
     assert not {fault for fault in kinds(joints) if fault[0] == "limit"}
-
-
-def page(path: Path) -> list[dict]:
-    match = re.search(r'<script type="application/json" id="data">(.*?)</script>', path.read_text(encoding="utf-8"))
-    assert match is not None
-    return json.loads(match[1])
 
 
 def test_the_command_prints_faults_marks_them_and_exits_with_3(tmp_path, capsys, monkeypatch):
@@ -136,7 +121,7 @@ def test_the_command_prints_faults_marks_them_and_exits_with_3(tmp_path, capsys,
     printed = capsys.readouterr().out
     assert "penetration: left_foot, frames 30 to 39, 0.06 m (limit 0.05)" in printed
     assert "motions: 1 of 2 motions with faults" in printed
-    shown = page(tmp_path / "both.html")
+    shown = Page(tmp_path / "both.html").motions
     assert [motion["id"] for motion in shown] == ["walks-after=good.npz/bad", "good"], "the worst first"
     assert [30, 40, "penetration"] in [mark[:3] for mark in shown[0]["marks"]]
     assert not shown[1]["marks"]
@@ -163,4 +148,4 @@ def test_a_data_set_is_inspected(tmp_path, capsys):
     printed = capsys.readouterr().out
     assert "0 of 40 motions with faults" in printed
     assert "the 3 worst motions" in printed
-    assert len(page(tmp_path / "page.html")) == 3
+    assert len(Page(tmp_path / "page.html").motions) == 3

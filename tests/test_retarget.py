@@ -1,5 +1,6 @@
 """Motions on the skeletons of other programs, and on a user's own characters."""
 
+import itertools
 import json
 import os
 import subprocess
@@ -107,26 +108,17 @@ def test_rotations_of_the_source_are_kept(kick: Motion):
     np.testing.assert_allclose(turned @ rig.neutral.swapaxes(1, 2), body[:, list(rig.sources)], atol=1e-9)
 
 
-def test_an_unknown_rig_is_refused(kick: Motion, tmp_path: Path):
-    with pytest.raises(UserError, match=r"rig=miximo: unknown\. Did you mean mixamo\? Use one of mixamo, unreal, "):
-        kick.save(tmp_path / "a.bvh", rig="miximo")
-    with pytest.raises(UserError, match=r"rig is only for \.bvh and \.glb"):
-        kick.save(tmp_path / "a.npz", rig="mixamo")
-    assert not list(tmp_path.iterdir())
-
-
 # Own characters -------------------------------------------------------------------------------------------------------
 
 
 def limbs_off(at: dict[str, np.ndarray], joints: np.ndarray, limbs: tuple[str, ...] = tuple(LIMBS)) -> float:
     """Median angle in degrees between the limbs of a character and those of a motion, of the worst limb."""
     angles = []
-    for side in SIDES:
-        for start in limbs:
-            ours = joints[:, JOINT[f"{side}_{LIMBS[start]}"]] - joints[:, JOINT[f"{side}_{start}"]]
-            theirs = at[f"{side}_{LIMBS[start]}"] - at[f"{side}_{start}"]
-            cosine = (ours * theirs).sum(1) / np.linalg.norm(ours, axis=1) / np.linalg.norm(theirs, axis=1)
-            angles.append(float(np.median(np.degrees(np.arccos(np.clip(cosine, -1, 1))))))
+    for side, start in itertools.product(SIDES, limbs):
+        ours = joints[:, JOINT[f"{side}_{LIMBS[start]}"]] - joints[:, JOINT[f"{side}_{start}"]]
+        theirs = at[f"{side}_{LIMBS[start]}"] - at[f"{side}_{start}"]
+        cosine = (ours * theirs).sum(1) / np.linalg.norm(ours, axis=1) / np.linalg.norm(theirs, axis=1)
+        angles.append(float(np.median(np.degrees(np.arccos(np.clip(cosine, -1, 1))))))
     return max(angles)
 
 
@@ -155,12 +147,13 @@ def test_a_character_with_odd_names_scale_and_rest_pose(kick: Motion, tmp_path: 
     assert all(file.document[part] == before[part] for part in ("meshes", "materials", "skins"))
     for side in SIDES:
         assert np.median((at[f"{side}_foot"] - at[f"{side}_ankle"])[standing, 2]) > 0  # it faces +z, as the motion does
-    world = characters.moved(characters.read(hero), kick)[0]
 
     def step(turns: np.ndarray) -> float:
+        """Degrees that any joint turns from one frame to the next, at most."""
         trace = np.einsum("fjab,fjab->fj", turns[1:], turns[:-1])
         return float(np.degrees(np.arccos(np.clip((trace - 1) / 2, -1, 1))).max())
 
+    world = characters.moved(characters.read(hero), kick)[0]
     assert step(world) < step(world_rotations(kick.posed().rotations.numpy())) + 10  # limbs do not flip
 
 
@@ -176,27 +169,27 @@ def test_a_character_in_its_own_proportions_is_the_motion(kick: Motion, tmp_path
             assert np.median(off) < 0.012, (name, joint)
 
 
-@pytest.mark.parametrize("up", ["y", "z"])
-def test_a_bvh_character_keeps_its_skeleton(kick: Motion, tmp_path: Path, up: str):
-    kick.save(tmp_path / "hero.bvh", rig="unreal", rest_pose=True)
-    file = bvh.read(tmp_path / "hero.bvh")
-    if up == "z":
-        turn = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]])
-        file = replace(file, offsets=file.offsets @ turn.T, end_offsets=file.end_offsets @ turn.T)
-        file = replace(file, frames=np.zeros_like(file.frames[:1]))  # its rest pose is that of the offsets
-        bvh.write(file, tmp_path / "hero.bvh")
-    line = kick.save(tmp_path / "out.bvh", character=tmp_path / "hero.bvh")
-    assert "22 of 23 joints follow the motion, 1 keep their angle" in line
-    out = bvh.read(tmp_path / "out.bvh")
-    assert (out.joints, out.parents, out.channels) == (file.joints, file.parents, file.channels)
-    np.testing.assert_array_equal(out.offsets, file.offsets)
-    character = characters.read(tmp_path / "hero.bvh")
-    positions = out.positions() @ character.rig.frame.T / 100
-    at = {joint: positions[:, number] for joint, number in character.map.items()}
-    assert limbs_off(at, kick.joints, ("shoulder", "elbow")) < 0.1
-    assert limbs_off(at, kick.joints) < 1
-    low = np.minimum(at["left_foot"][:, 1], at["right_foot"][:, 1])
-    np.testing.assert_allclose(np.median(low), np.median(kick.joints[..., 1].min(1)), atol=0.01)
+def test_a_bvh_character_keeps_its_skeleton(kick: Motion, tmp_path: Path):
+    for up in "yz":
+        kick.save(tmp_path / "hero.bvh", rig="unreal", rest_pose=True)
+        file = bvh.read(tmp_path / "hero.bvh")
+        if up == "z":
+            turn = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]])
+            file = replace(file, offsets=file.offsets @ turn.T, end_offsets=file.end_offsets @ turn.T)
+            file = replace(file, frames=np.zeros_like(file.frames[:1]))  # its rest pose is that of the offsets
+            bvh.write(file, tmp_path / "hero.bvh")
+        line = kick.save(tmp_path / "out.bvh", character=tmp_path / "hero.bvh")
+        assert "22 of 23 joints follow the motion, 1 keep their angle" in line
+        out = bvh.read(tmp_path / "out.bvh")
+        assert (out.joints, out.parents, out.channels) == (file.joints, file.parents, file.channels)
+        np.testing.assert_array_equal(out.offsets, file.offsets)
+        character = characters.read(tmp_path / "hero.bvh")
+        positions = out.positions() @ character.rig.frame.T / 100
+        at = {joint: positions[:, number] for joint, number in character.map.items()}
+        assert limbs_off(at, kick.joints, ("shoulder", "elbow")) < 0.1
+        assert limbs_off(at, kick.joints) < 1
+        low = np.minimum(at["left_foot"][:, 1], at["right_foot"][:, 1])
+        np.testing.assert_allclose(np.median(low), np.median(kick.joints[..., 1].min(1)), atol=0.01)
 
 
 def test_spines_of_other_lengths(kick: Motion, tmp_path: Path):
@@ -212,25 +205,16 @@ def test_spines_of_other_lengths(kick: Motion, tmp_path: Path):
 # Bad input ------------------------------------------------------------------------------------------------------------
 
 
-def test_a_template_of_names_is_printed(kick: Motion, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    hero, out = tmp_path / "hero.glb", str(tmp_path / "out.glb")
+def test_names_of_joints_are_read_from_a_file(kick: Motion, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    hero, names, out = tmp_path / "hero.glb", tmp_path / "hero.yaml", str(tmp_path / "out.glb")
     odd_character(hero, kick)
     kick.save(tmp_path / "a.npz")
-    (tmp_path / "hero.yaml").touch()  # as a shell does that redirects the output
+    names.touch()  # as a shell does that redirects the output
     assert main(["convert", str(tmp_path / "a.npz"), out, f"character={hero}"]) == 1
     printed = capsys.readouterr()
     assert printed.out.startswith("# Joints of hero.glb: ")
     assert {line.split(":")[0] for line in printed.out.splitlines()[1:]} == set(JOINT)
     assert "no joint found for pelvis, left_hip" in printed.err
-    assert "hero.yaml" in printed.err
-    assert printed.err.count("\n") == 1
-    assert not (tmp_path / "out.glb").exists()
-    write_names(tmp_path / "hero.yaml")
-    assert main(["convert", str(tmp_path / "a.npz"), out, f"character={hero}"]) == 0
-
-
-def test_wrong_names_are_refused(kick: Motion, tmp_path: Path):
-    odd_character(tmp_path / "hero.glb", kick)
     other: dict[str, Any]
     for other, message in (
         ({"left_nee": "x"}, r"hero\.yaml: left_nee is no joint of SMPL\. Did you mean left_knee"),
@@ -239,9 +223,11 @@ def test_wrong_names_are_refused(kick: Motion, tmp_path: Path):
         ({"left_knee": None}, r"no joint found for left_knee\. Write"),
         ({"left_knee": "Rig Bone-l_hgiht", "left_hip": "Rig Bone-l_eflac"}, "upright|has no joint"),
     ):
-        write_names(tmp_path / "hero.yaml", **other)
+        write_names(names, **other)
         with pytest.raises(UserError, match=message):
-            characters.read(tmp_path / "hero.glb")
+            characters.read(hero)
+    write_names(names)
+    assert main(["convert", str(tmp_path / "a.npz"), out, f"character={hero}"]) == 0
 
 
 def below_another(document: dict[str, Any], **fields: Any) -> None:
@@ -255,17 +241,21 @@ def exchanged(document: dict[str, Any]) -> None:
         node["name"] = node["name"].replace("Left", "?").replace("Right", "Left").replace("?", "Right")
 
 
+def with_joint(document: dict[str, Any], name: str, skin: dict[str, Any]) -> None:
+    """Adds a node below the first one, as a joint of a skin without bind matrices."""
+    document["nodes"].append({"name": name})
+    document["nodes"][0]["children"].append(len(document["nodes"]) - 1)
+    skin.setdefault("joints", []).append(len(document["nodes"]) - 1)
+    skin.pop("inverseBindMatrices", None)
+
+
 def two(document: dict[str, Any]) -> None:
-    document["nodes"].append({"name": "other"})
-    document["scenes"][0]["nodes"].append(len(document["nodes"]) - 1)
-    document["skins"].append({"joints": [len(document["nodes"]) - 1]})
+    document["skins"].append({})
+    with_joint(document, "other", document["skins"][1])
 
 
 def twice(document: dict[str, Any]) -> None:
-    document["nodes"].append({"name": "mixamorig:LeftLeg"})
-    document["nodes"][0]["children"].append(len(document["nodes"]) - 1)
-    document["skins"][0]["joints"].append(len(document["nodes"]) - 1)
-    del document["skins"][0]["inverseBindMatrices"]
+    with_joint(document, "mixamorig:LeftLeg", document["skins"][0])
 
 
 def short(document: dict[str, Any]) -> None:
@@ -324,12 +314,11 @@ def test_a_folder_is_converted(kick: Motion, tmp_path: Path, capsys: pytest.Capt
         ([folder, str(out)], "is a folder: name the format"),
         ([a, str(tmp_path / "c.bvh"), "format=bvh"], "format=... is for folders"),
         ([str(tmp_path / "empty"), str(out), "format=bvh"], "no motion files"),
-        ([a, str(tmp_path / "in" / "." / "a.npz")], "the same file as the input"),
         ([folder, folder, "format=json"], "b.json: the same file as the input"),
         ([str(tmp_path / "double"), str(out), "format=bvh"], "another motion has the same name"),
         ([a, "/proc/none/a.bvh"], "/proc/none/a.bvh: cannot be written"),
-        ([str(tmp_path / "missing.npz"), a], "missing.npz: no such file"),
-        ([a, str(tmp_path / "c.bvh"), "rig=unrael"], "rig=unrael: unknown. Did you mean unreal"),
+        ([a], "name an input and an output file"),
+        ([a, "out=a.glb", "unit=0.01"], "meters"),
     ):
         assert main(["convert", *words]) == 1
         assert message in capsys.readouterr().err
@@ -342,8 +331,8 @@ BLENDER = os.environ.get("FLAME_MDM_BLENDER", sys.executable)
 
 @pytest.mark.tools
 @pytest.mark.parametrize("ending", [".glb", ".bvh"])
-@pytest.mark.parametrize("name", [None, "mixamo", "unreal", "lafan1", "soma", "geno", "hero"])
-def test_blender_shows_the_pose(name: str | None, ending: str, kick: Motion, tmp_path: Path):
+@pytest.mark.parametrize("name", ["mixamo", "unreal", "lafan1", "soma", "geno", "hero"])
+def test_blender_shows_the_pose(name: str, ending: str, kick: Motion, tmp_path: Path):
     if subprocess.run([BLENDER, "-c", "import bpy"], capture_output=True).returncode:
         pytest.skip("no package bpy: set FLAME_MDM_BLENDER to a Python that has it")
     path, hero = tmp_path / f"a{ending}", tmp_path / f"hero{ending}"
@@ -360,20 +349,17 @@ def test_blender_shows_the_pose(name: str | None, ending: str, kick: Motion, tmp
         expected = positions[:, list(character.map.values())] * (1 if ending == ".glb" else 0.01)
     else:
         kick.save(path, rig=name)
-        rig = preset(name, kick.posed()) if name else None
-        names = rig.joints if rig else SMPL22.joints
-        sources = rig.sources if rig else range(len(names))
-        expected = kick.joints[:, [max(source, 0) for source in sources]]
-        expected[:, [source < 0 for source in sources]] = np.nan
-        expected += np.array(Glb(path).document["nodes"][-1]["translation"] if ending == ".glb" else [0, 0, 0])
+        rig = preset(name, kick.posed())
+        pairs = [(joint, source) for joint, source in zip(rig.joints, rig.sources, strict=True) if source >= 0]
+        names, expected = [joint for joint, _ in pairs], kick.joints[:, [source for _, source in pairs]]
+        if ending == ".glb":
+            expected = expected + np.array(Glb(path).document["nodes"][-1]["translation"])
     script = Path(__file__).parent / "support" / "blender.py"
     done = subprocess.run([BLENDER, script, path, "20"], capture_output=True, text=True, check=True)
     shown = json.loads(next(line for line in done.stdout.splitlines() if line.startswith("FOUND"))[5:])
     assert [frame for frame, _ in shown] == [0, (len(kick.joints) - 1) // 2, len(kick.joints) - 1]
-    compared = 0
     for frame, positions in shown:
+        assert len(positions.keys() & set(names)) >= len(SMPL22)
         for joint, position in zip(names, expected[frame], strict=True):
-            if joint in positions and np.isfinite(position).all():
+            if joint in positions:
                 np.testing.assert_allclose(positions[joint], position, atol=1e-4, err_msg=f"{joint}, frame {frame}")
-                compared += 1
-    assert compared >= 3 * len(SMPL22)

@@ -96,26 +96,19 @@ def drawn(document: dict[str, Any]) -> None:
 
 
 FAULTS: dict[str, tuple[Change, str]] = {
-    "negative child": (node(children=[-1]), "greater than or equal to 0"),
     "child that does not exist": (node(children=[999]), "child: there is no number 999"),
     "child of another type": (node(children=["0"]), "valid integer"),
-    "children of another type": (node(children={"0": 1}), "valid list"),
-    "two parents": (
-        lambda document: document["nodes"][0]["children"].append(document["nodes"][1]["children"][0]),
-        "two parents",
-    ),
+    "two parents": (lambda d: d["nodes"][0]["children"].append(d["nodes"][1]["children"][0]), "two parents"),
     "own ancestor": (unended, "damaged"),
     "many nodes": (lambda document: document["nodes"].extend([{}] * 100_000), "at most 4096"),
     "long chain": (deep, ""),
     "many primitives": (drawn, "parts of meshes"),
     "no buffers": (lambda document: document.pop("buffers"), "there is no number 0"),
-    "empty buffers": (put("buffers", []), "there is no number 0"),
     "buffers of another type": (put("buffers", ["x"]), "buffers.0"),
     "nothing stored": (unbuffered, ""),
     "no animations": (put("animations", None), "animations: Input should be a valid list"),
     "animation of nothing": (put("animations", [{"samplers": [], "channels": [SILENT]}]), "sampler"),
     "bool as a number": (item("bufferViews", byteOffset=True), "valid integer"),
-    "fraction as an index": (item("skins", joints=[0.5]), "valid integer"),
     "large integer": (item("accessors", count=HUGE), "accessors.0.count"),
     "long buffer": (item("buffers", byteLength=10**9), "a buffer of 1000000000 bytes"),
     "long view": (item("bufferViews", byteLength=10**9), "longer than its buffer"),
@@ -212,29 +205,26 @@ def mutated(value: Any, draw: random.Random) -> Any:
 
 
 @pytest.mark.robustness
-@pytest.mark.parametrize("seed", range(8))
-def test_mutated_characters_are_refused_or_written(seed: int, heroes: list[Path], tmp_path: Path):
-    """25 mutations per seed, 200 in all: changes in the document, in its bytes and in the binary part."""
-    draw, surprises, refused = random.Random(seed), [], 0
-    for number in range(25):
+def test_mutated_characters_are_refused_or_written(heroes: list[Path], tmp_path: Path):
+    """200 mutations: changes in the document, in its bytes and in the binary part."""
+    draw, surprises, refused = random.Random(0), [], 0
+    shutil.copy(heroes[1].with_suffix(".yaml"), tmp_path)
+    for number in range(200):
         hero = heroes[number % 3]
         path = tmp_path / hero.name
-        if hero.with_suffix(".yaml").exists():
-            shutil.copy(hero.with_suffix(".yaml"), tmp_path)
-        file = Glb(hero)
         if number % 5 < 3:
+            file = Glb(hero)
             for _ in range(draw.choice((1, 1, 1, 3))):
                 file.document = mutated(file.document, draw)
-            content = packed(json.dumps(file.document).encode(), file.binary)
+            file.save(path)
         else:
             data = bytearray(hero.read_bytes())
             for _ in range(draw.choice((1, 4, 64))):
                 data[draw.randrange(len(data) if number % 5 == 3 else 12_000)] = draw.randrange(256)
-            content = bytes(data)
-        path.write_bytes(content)
+            path.write_bytes(bytes(data))
         try:
             refused += bool(outcome(path, tmp_path / "out.glb"))
         except Exception as error:
             surprises.append((number, hero.name, repr(error)[:300]))
     assert not surprises
-    assert refused > 3
+    assert refused > 24

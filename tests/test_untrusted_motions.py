@@ -70,13 +70,13 @@ def changed(data: bytes, *, flags: int | None = None, method: int | None = None)
     """A zip archive with other flags or another method in all headers of its members."""
     content = bytearray(data)
     for magic, at in ((b"PK\3\4", 6), (b"PK\1\2", 8)):
-        place = content.find(magic)
-        while place >= 0:
+        start = content.find(magic)
+        while start >= 0:
             if flags is not None:
-                content[place + at : place + at + 2] = struct.pack("<H", flags)
+                content[start + at : start + at + 2] = struct.pack("<H", flags)
             if method is not None:
-                content[place + at + 2 : place + at + 4] = struct.pack("<H", method)
-            place = content.find(magic, place + 4)
+                content[start + at + 2 : start + at + 4] = struct.pack("<H", method)
+            start = content.find(magic, start + 4)
     return bytes(content)
 
 
@@ -96,6 +96,8 @@ def bvh_at(seconds: str) -> bytes:
 
 
 JOINTS = body(4).astype(float)
+LONG = np.zeros((4, 156), np.longdouble)
+FIELDS = np.zeros((4, 147), [("a", "f4")])
 BOMB = zip_bomb("joints.npy", header((300 * 2**20 // 528, 22, 3)))
 MOTIONS: list[tuple[str, bytes, str]] = [
     ("a.bvh", bvh_at("999999"), "frame time"),
@@ -103,22 +105,9 @@ MOTIONS: list[tuple[str, bytes, str]] = [
     ("a.bvh", bvh().replace("Frames: 3", "Frames: 1000000000").encode(), "1000000000"),
     ("a.bvh", bvh_at("1" * 40_000 + "x"), "Frame Time"),
     ("a.npz", npz(joints=JOINTS, fps=1e-7), "fps is 1e-07, not a number"),
-    ("a.npz", npz(joints=JOINTS, fps=1e300), "fps is 1e+300, not a number"),
-    (
-        "a.npz",
-        npz(poses=np.zeros((4, 156)), trans=np.zeros((4, 3)), mocap_framerate=1e-7),
-        "not a number",
-    ),
-    (
-        "a.npz",
-        npz(poses=np.zeros((4, 156), np.longdouble), trans=np.zeros((4, 3)), mocap_framerate=20),
-        "poses are not an array of real numbers",
-    ),
-    (
-        "a.npz",
-        npz(joints=JOINTS, fps=20, representation="smpl147", features=np.zeros((4, 147), [("a", "f4")])),
-        "features are not an array",
-    ),
+    ("a.npz", b"PK\x03\x04 cut", "damaged"),
+    ("a.npz", npz(poses=LONG, trans=np.zeros((4, 3)), mocap_framerate=20), "poses are not an array of real numbers"),
+    ("a.npz", npz(joints=JOINTS, fps=20, representation="smpl147", features=FIELDS), "features are not an array"),
     ("a.npz", zipped({"joints.npy": header((10**12, 22, 3)), "fps.npy": b"x"}), "declares"),
     ("a.npz", BOMB, "expand to"),
     ("a.npz", changed(npz(joints=JOINTS, fps=20), flags=1), "encrypted"),
@@ -131,6 +120,7 @@ MOTIONS: list[tuple[str, bytes, str]] = [
     ("a.npy", b"\x93NUMPY\x01\x00" + struct.pack("<H", 60000) + b"(" * 60000, "not an array"),
     ("a.npy", b"\x93NUMPY\x01\x00" + struct.pack("<H", 60) + b"(" * 60, "not an array"),
     ("a.json", b'{"joints": ' + b"[" * 10**6, "nested too deeply"),
+    ("a.json", b"[1, 2]", "not a motion in JSON"),
     ("a.json", json.dumps({"fps": 1e-7, "joints": JOINTS.tolist()}).encode(), "fps is 1e-07"),
     ("a.json", b"\xff\xfe{}", "a.json: not a UTF-8 text file"),
 ]
@@ -188,7 +178,7 @@ def test_motion_files(tmp_path: Path, folder: Callable):
         path.write_bytes(content)
         surprises(says, read, path, fps=20 if name == "a.npy" else None)
         if name.endswith(("npz", "bvh")):
-            surprises(says, of_folder, folder(lambda place, p=path: shutil.copy(p, place / f"b{p.suffix}")))
+            surprises(says, of_folder, folder(lambda to, p=path: shutil.copy(p, to / f"b{p.suffix}")))
     surprises.none()
 
 
@@ -365,18 +355,12 @@ def test_a_tar_archive_of_many_members_takes_little_memory(tmp_path: Path):
 def test_recordings_of_amass_are_bounded(tmp_path: Path):
     whole: dict[str, Any] = {"poses": np.zeros((4, 156)), "trans": np.zeros((4, 3)), "betas": np.zeros(16)}
     whole |= {"gender": "male", "mocap_framerate": 120.0}
-    for change in (
-        {"mocap_framerate": np.inf},
-        {"mocap_framerate": 1e-7},
-        {"mocap_framerate": [1, 2]},
-        {"betas": np.array(["x"])},
-        {"betas": np.zeros(())},
-        {"gender": np.array(["a", "b"])},
-        {"poses": np.zeros((4, 156), "S1")},
-        {"poses": np.zeros(())},
-    ):
-        with pytest.raises(ValueError, match="here: "):
-            read_amass(npz(**whole | change), "here")
+    changes = [("mocap_framerate", np.inf), ("mocap_framerate", 1e-7), ("mocap_framerate", [1, 2])]
+    changes += [("betas", np.array(["x"])), ("betas", np.zeros(())), ("gender", np.array(["a", "b"]))]
+    changes += [("poses", np.zeros((4, 156), "S1")), ("poses", np.zeros(()))]
+    for key, value in changes:
+        with pytest.raises(UserError, match="here: "):
+            read_amass(npz(**whole | {key: value}), "here")
 
 
 # Workers --------------------------------------------------------------------------------------------------------------
@@ -410,8 +394,6 @@ def doubled(levels: int) -> bytes:
 
 PICKLES = {
     "bytes": (b"\x80\x04\x8e" + struct.pack("<Q", 10**12) + b"x.", "too early"),
-    "bytearray": (b"\x80\x05\x96" + struct.pack("<Q", 10**12) + b"x.", "too early"),
-    "text": (b"\x80\x04\x8d" + struct.pack("<Q", 10**12) + b"x.", "too early"),
     "number": (b"\x80\x04\x8b" + struct.pack("<i", 2**31 - 1) + b"x.", "too early"),
     "frame": (b"\x80\x04\x95" + struct.pack("<Q", 10**12) + b"N.", "too early"),
     "memo": (b"\x80\x04Nr\xff\xff\xff\x7f.", "must contain"),
@@ -421,10 +403,8 @@ PICKLES = {
     "cycle": (b"\x80\x04]\x94h\x00a.", "nested too deeply"),
     "integers": (pickle.dumps({n * (2**61 - 1): 0 for n in range(2**10)}, 4), "is not text"),
     "complex": (pickle.dumps({complex(-1_000_003 * n, n): 0 for n in range(1, 2**10)}, 4), "it names builtins.complex"),
-    "complexes": (pickle.dumps({complex(-1_000_003 * n, n) for n in range(1, 2**10)}, 4), "a set"),
     "frozen": (pickle.dumps(frozenset([(1, 2), (3, 4)]), 4), "a set"),
     "old set": (pickle.dumps({(1, 2), (3, 4)}, 2), "it names __builtin__.set"),
-    "one key": (pickle.dumps({1j: 0}, 4), "it names builtins.complex"),
     "old dictionary": (b"((I1\nI2\ntI3\nd.", "is not text"),
     "digits": (b"L" + b"9" * 30 + b"L\n.", "must contain"),
     "attributes": (b"\x80\x04c_codecs\nencode\n}\x8c\x01aNsb.", "sets attributes"),
@@ -514,17 +494,17 @@ def test_every_field_of_a_store_is_checked(tmp_path: Path):
 
 
 def test_features_and_clips_of_a_store_of_other_kinds(tmp_path: Path):
-    surprises, place = Surprises(), tmp_path
+    surprises = Surprises()
     for content in (zipped({"a.npy": b"x"}), header((2**70, 263), "<f4"), header((-1, 263), "<f4")):
-        small_store(place, {}, {})
-        (place / "features.npy").write_bytes(content)
-        surprises("features.npy: damaged", opened, place)
-    small_store(place, {}, {})
-    (place / "clips.jsonl").write_bytes(b"\xff\xfe\n")
-    content = json.loads((place / "store.json").read_text())
+        small_store(tmp_path, {}, {})
+        (tmp_path / "features.npy").write_bytes(content)
+        surprises("features.npy: damaged", opened, tmp_path)
+    small_store(tmp_path, {}, {})
+    (tmp_path / "clips.jsonl").write_bytes(b"\xff\xfe\n")
+    content = json.loads((tmp_path / "store.json").read_text())
     content["sha256"]["clips.jsonl"] = hashlib.sha256(b"\xff\xfe\n").hexdigest()
-    (place / "store.json").write_text(json.dumps(content))
-    surprises("clips.jsonl: damaged: not a UTF-8 text file", opened, place)
+    (tmp_path / "store.json").write_text(json.dumps(content))
+    surprises("clips.jsonl: damaged: not a UTF-8 text file", opened, tmp_path)
     surprises.none()
 
 

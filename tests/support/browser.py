@@ -26,7 +26,6 @@ class Tab:
         self.requested: list[str] = []
         self.errors: list[str] = []
         self._number = 0
-        self._frames: dict[str, int] = {}
 
     def send(self, method: str, **parameters: Any) -> dict[str, Any]:
         return self.loop.run_until_complete(self._send(method, parameters))
@@ -39,17 +38,17 @@ class Tab:
             if message.get("id") == self._number:
                 assert "error" not in message, message["error"]
                 return message["result"]
-            known = message.get("params", {})
+            event = message.get("params", {})
             if message["method"] == "Network.requestWillBeSent":
-                self.requested.append(known["request"]["url"])
+                self.requested.append(event["request"]["url"])
             if message["method"] == "Runtime.exceptionThrown":
-                self.errors.append(str(known["exceptionDetails"]))
+                self.errors.append(str(event["exceptionDetails"]))
 
     def run(self, script: str) -> Any:
         """Returns the value of a JavaScript expression."""
-        found = self.send("Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True)
-        assert "exceptionDetails" not in found, found
-        return found["result"].get("value")
+        answer = self.send("Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True)
+        assert "exceptionDetails" not in answer, answer
+        return answer["result"].get("value")
 
     def wait(self, script: str, seconds: float = 30) -> Any:
         """Returns the value of an expression once it is true."""

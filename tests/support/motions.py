@@ -66,9 +66,9 @@ def posed(
         rotations[:, SMPL22.joints.index(name)] = Rotation.from_euler("xyz", vectors, degrees=True).as_matrix()
     headings = np.broadcast_to(heading, frames)[:, None] * [0.0, 1.0, 0.0]
     rotations[:, 0] = Rotation.from_rotvec(headings).as_matrix() @ rotations[:, 0]
-    place = np.broadcast_to([0.0, 0.955 * scale, 0.0] if root is None else root, (frames, 3))
+    pelvis = np.broadcast_to([0.0, 0.955 * scale, 0.0] if root is None else root, (frames, 3))
     offsets = torch.tensor(scale * np.array(ADULT[:22]))
-    return motion_of_poses(Poses(offsets, torch.tensor(rotations), torch.tensor(np.array(place))), 20)
+    return motion_of_poses(Poses(offsets, torch.tensor(rotations), torch.tensor(np.array(pelvis))), 20)
 
 
 class Page(HTMLParser):

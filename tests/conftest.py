@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 from hypothesis import settings
+from support.distributed import GlooPool
 from support.refusals import Refused
 from support.runs import TINY
 
@@ -39,6 +40,13 @@ def trained(tmp_path_factory, data_root) -> Path:
     words = [*TINY, f"data_root={data_root}", f"run.dir={folder}", "callbacks.samples=null", "callbacks.best=null"]
     assert main(["train", "quickstart", *words, "trainer.max_steps=2", "logger=csv"]) == 0
     return folder / "checkpoints" / "last.ckpt"
+
+
+@pytest.fixture(scope="session")
+def pool() -> Iterator[GlooPool]:
+    """Two processes of one group."""
+    with GlooPool() as pool:
+        yield pool
 
 
 @pytest.fixture

@@ -118,18 +118,11 @@ def test_data_without_labels_is_refused(monkeypatch, tmp_path, capsys):
 
 
 def test_recipes_build_the_sizes_of_their_data():
-    for recipe, more in (
-        ("synthetic", []),
-        ("synthetic", ["task=classifier_stgcn"]),
-        ("humanact12", []),
-        ("uestc", []),
-    ):
-        config = compose(f"classifier/{recipe}", more)
+    for words in (["synthetic"], ["synthetic", "task=classifier_stgcn"], ["humanact12"], ["uestc"]):
+        config = compose(f"classifier/{words[0]}", words[1:])
         task = ClassifierTask.build(config, instantiate(config["representation"]), actions=list("abcdefg"))
-        joints, mask = (
-            torch.randn(2, 12, len(task.representation.skeleton.parents), 3),
-            length_mask(torch.tensor([12, 7])),
-        )
+        joints = torch.randn(2, 12, len(task.representation.skeleton.parents), 3)
+        mask = length_mask(torch.tensor([12, 7]))
         assert task.logits(joints, mask).shape == (2, 7)
         assert len(task(joints, mask)) == 2
 
@@ -137,13 +130,7 @@ def test_recipes_build_the_sizes_of_their_data():
 @pytest.mark.slow
 def test_st_gcn_trains_by_the_same_recipe(data, tmp_path):
     sizes = ["task=classifier_stgcn", "task.network.widths=[8,8]", "task.network.strides=[1,2]"]
-    options = [
-        data,
-        f"run.dir={tmp_path}",
-        "trainer.max_steps=25",
-        "trainer.val_check_interval=25",
-        "optimizer.lr=0.01",
-    ]
+    options = [data, f"run.dir={tmp_path}", "trainer.max_steps=25", "trainer.val_check_interval=25"]
     assert main(["train", "classifier/synthetic", *RUN, *sizes, *options, "optimizer.lr=0.01"]) == 0
     assert validated(tmp_path / "checkpoints" / "last.ckpt")[-1] > 0.2
     network = OwnClassifierExtractor(str(tmp_path / "checkpoints" / "last.ckpt")).task.network

@@ -5,7 +5,6 @@ import os
 import re
 import sys
 from functools import partial
-from pathlib import Path
 from types import SimpleNamespace
 from typing import cast
 
@@ -26,11 +25,6 @@ from flame_mdm.task import MotionGeneration
 pytestmark = pytest.mark.slow
 
 
-def values(folder: Path) -> list[float]:
-    with (folder / "csv" / "metrics.csv").open() as file:
-        return [float(row["val/loss"]) for row in csv.DictReader(file) if row.get("val/loss")]
-
-
 def test_two_processes_are_one_with_both_batches(tiny, tmp_path):
     """Launched by Lightning."""
     words = [*tiny, *RUN, f"data_root={tmp_path / 'data'}"]
@@ -41,23 +35,23 @@ def test_two_processes_are_one_with_both_batches(tiny, tmp_path):
     batch = "batch: 2 clips = 1 x 2 processes x 1 accumulated; optimizer.lr=0.05 is not scaled with the batch size"
     assert batch in out
     assert out.count("steps: 0 to 4") == err.count("preparing synthetic:   0%") == 1  # the data, too, by one process
-    wanted = reference(words, 4)
+    expected = reference(words, 4)
     trained = read_checkpoint(tmp_path / "run" / "checkpoints" / "last.ckpt")["state_dict"]
-    torch.testing.assert_close(trained, wanted, rtol=1e-4, atol=1e-6)
+    torch.testing.assert_close(trained, expected, rtol=1e-4, atol=1e-6)
 
     # Validation: 3 clips in batches of one, so 2 batches on one process, 1 on the other.
     config = compose("quickstart", words)
     task = MotionGeneration.build(config, instantiate(config["representation"]))
-    task.load_state_dict(wanted)
+    task.load_state_dict(expected)
     data = instantiate(config["data"], representation=task.representation, seed=config["seed"])
     data.setup("fit")
     with torch.no_grad():
         for index, batch in enumerate(data.val_dataloader()):
             task.eval().validation_step(batch, index)
     assert len(data.val) == 3
-    assert values(tmp_path / "run")[-1] == pytest.approx(
-        float(cast(MeanMetric, task.val_losses["loss"]).compute()), rel=1e-4
-    )
+    with (tmp_path / "run" / "csv" / "metrics.csv").open() as file:
+        losses = [float(row["val/loss"]) for row in csv.DictReader(file) if row.get("val/loss")]
+    assert losses[-1] == pytest.approx(float(cast(MeanMetric, task.val_losses["loss"]).compute()), rel=1e-4)
 
 
 def test_torchrun_starts_a_killed_group_again(tiny, tmp_path):
@@ -84,49 +78,38 @@ def test_torchrun_starts_a_killed_group_again(tiny, tmp_path):
     assert not (tmp_path / "run" / "run.lock").exists()
 
 
-@pytest.mark.parametrize(("world", "batches"), [(1, 3), (2, 2), (5, 3)])
-def test_no_process_is_without_a_validation_batch(tiny, world, batches):
+def test_data_is_prepared_once_and_no_process_is_without_a_validation_batch(tiny):
     config = compose("quickstart", [*tiny, "data.batch_size=1"])
-    data = instantiate(config["data"], representation=instantiate(config["representation"]), seed=0)
+    representation = instantiate(config["representation"])
+    data = instantiate(config["data"], representation=representation, seed=0)
+    for part in (data, MotionGeneration.build(config, representation)):
+        assert part.prepare_data_per_node is False  # by which Lightning asks the first process of the first machine
     data.prepare_data()
     data.setup("fit")
-    data.trainer = SimpleNamespace(global_rank=0, world_size=world)  # type: ignore[assignment]
-    assert len(data.val_dataloader()) == batches
-    data.trainer.global_rank = world - 1  # type: ignore[union-attr]
-    assert len(data.val_dataloader()) >= 1
+    for world, batches in ((1, 3), (2, 2), (5, 3)):
+        data.trainer = SimpleNamespace(global_rank=0, world_size=world)  # type: ignore[assignment]
+        assert len(data.val_dataloader()) == batches
+        data.trainer.global_rank = world - 1  # type: ignore[union-attr]
+        assert len(data.val_dataloader()) >= 1
 
 
-def test_one_process_of_all_machines_prepares(tiny):
-    config = compose("quickstart", tiny)
-    representation = instantiate(config["representation"])
-    for part in (
-        instantiate(config["data"], representation=representation),
-        MotionGeneration.build(config, representation),
-    ):
-        assert part.prepare_data_per_node is False  # by which Lightning asks the first process of the first machine
-
-
-@pytest.mark.parametrize(("clips", "kept"), [(1, [2, 0]), (2, [2, 2])])
-def test_motion_clip_keeps_fewer_pairs_than_processes_once_each(clips, kept):
+def test_motion_clip_keeps_fewer_pairs_than_processes_once_each():
     """Every process is given all pairs then."""
     sizes = ["latent_dim=16", "ff_size=16", "num_layers=1", "embedding_dim=8"]
     words = ["condition=learned", "condition.features=16", *(f"task.network.{size}" for size in sizes)]
     config = compose("motion_clip/synthetic", words)
     batch = collate([(name, torch.randn(40, 263), "a person walks", None) for name in ("a", "b")])
-    for rank in range(2):
+    for clips, rank, kept in ((1, 0, 2), (1, 1, 0), (2, 0, 2), (2, 1, 2)):
         task = MotionCLIPTask.build(config, instantiate(config["representation"]))
         data = SimpleNamespace(val=range(clips))
         task.trainer = SimpleNamespace(global_rank=rank, world_size=2, datamodule=data)  # type: ignore[assignment]
         task.eval().validation_step(batch, 0)
-        assert len(torch.cat([torch.empty(0), *cast(list, task.val_metrics["loss"].keys)])) == kept[rank]
+        assert len(torch.cat([torch.empty(0), *cast(list, task.val_metrics["loss"].keys)])) == kept
 
 
 def test_processes_are_started_with_the_words_of_one_job(tiny, tmp_path, monkeypatch):
     seen = []
-
-    def note(config: dict) -> None:
-        seen.append((sys.argv[1:], config["run"]["dir"], config))
-
+    note = lambda config: seen.append((sys.argv[1:], config["run"]["dir"], config))  # noqa: E731
     monkeypatch.setattr(train, "main", partial(run_recipe, note, train.USAGE))
     monkeypatch.setattr(sys, "argv", ["flame-mdm", "train"])
     folder = f"run.dir={tmp_path / 'sweep'}"

@@ -2,6 +2,7 @@
 
 import json
 import pickle
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,7 +22,7 @@ from support.fixtures import (
 )
 from torch import Tensor, nn
 
-from evaluators.extractors import ClassifierExtractor, MARDMClipExtractor
+from evaluators.extractors import ClassifierExtractor, MARDMClipExtractor, T2MExtractor
 from evaluators.extractors.action_gru import NUM_ACTIONS, ActionGRU
 from evaluators.extractors.mardm import MARDMClip
 from evaluators.extractors.stgcn import STGCN, UESTC, JointSTGCN, Unconstrained
@@ -31,6 +32,7 @@ from flame_mdm.checkpoints.released_weights import load_strictly
 from flame_mdm.errors import UserError
 from flame_mdm.representations.essential import Essential
 from flame_mdm.representations.humanml import HumanML
+from flame_mdm.representations.rot6d import Rot6D
 
 FLIP = torch.tensor([1.0, -1.0, -1.0])
 
@@ -128,13 +130,13 @@ def test_t2m_normalizes_with_its_own_statistics_and_sees_nothing_past_the_end():
             plain(torch.zeros(1, length, 20), torch.ones(1, length, dtype=torch.bool))
 
 
-@pytest.fixture
-def word_folder(tmp_path):
-    words = ["unk", "sos", "eos", "a", "person", "walk", "left", "hand", "hop"]
-    vectors = np.arange(len(words) * 300, dtype=np.float64).reshape(len(words), 300)
-    np.save(tmp_path / "our_vab_data.npy", vectors)
-    (tmp_path / "our_vab_idx.pkl").write_bytes(pickle.dumps({word: row for row, word in enumerate(words)}))
-    return tmp_path
+WORDS = ["unk", "sos", "eos", "a", "person", "walk", "left", "hand", "hop"]
+
+
+def write_words(folder: Path) -> None:
+    """Writes word vectors by the authors' names: row times 300 and the 299 numbers after it."""
+    np.save(folder / "our_vab_data.npy", np.arange(len(WORDS) * 300, dtype=np.float64).reshape(len(WORDS), 300))
+    (folder / "our_vab_idx.pkl").write_bytes(pickle.dumps({word: row for row, word in enumerate(WORDS)}))
 
 
 def slots(words: Words, caption: int) -> list[tuple[int, str]]:
@@ -144,12 +146,12 @@ def slots(words: Words, caption: int) -> list[tuple[int, str]]:
     return [(row, PARTS_OF_SPEECH[part]) for row, part in zip(rows, parts, strict=True)]
 
 
-def test_words_have_vectors_and_parts_of_speech(word_folder):
-    vectors = WordVectors.read(word_folder)
+def test_words_have_vectors_and_parts_of_speech(tmp_path):
+    write_words(tmp_path)
+    vectors = WordVectors.read(tmp_path)
     captions = [["a/DET", "person/NOUN", "walk/VERB", "zigzag/NOUN", "left/ADJ", "hand/NOUN", "hop/X"], ["a/DET"] * 25]
     words = vectors(captions)
-    assert words.vectors.shape == (2, 22, 300)
-    assert words.parts.shape == (2, 22, 15)
+    assert (words.vectors.shape, words.parts.shape) == ((2, 22, 300), (2, 22, 15))
     without_vector = (0, "OTHER")
     assert slots(words, 0) == [
         *((1, "OTHER"), (3, "DET"), (4, "NOUN"), (5, "Act_VIP"), without_vector),
@@ -160,22 +162,20 @@ def test_words_have_vectors_and_parts_of_speech(word_folder):
     assert words.lengths.tolist() == [9, 22]
     assert vectors(captions, full_length=True).lengths.tolist() == [22, 22]
 
-
-def test_word_vectors_that_are_not_the_released_ones_are_refused(word_folder):
     with pytest.raises(FileNotFoundError, match=r"our_vab_data\.npy: no such file\. Give the folder of the GloVe"):
-        WordVectors.read(word_folder / "elsewhere")
-    index = word_folder / "our_vab_idx.pkl"
+        WordVectors.read(tmp_path / "elsewhere")
+    index = tmp_path / "our_vab_idx.pkl"
     for content, message in (
         (index.read_bytes()[:20], r"our_vab_idx\.pkl"),
         (pickle.dumps({"a": 0}), "have sos, eos, unk"),
         (pickle.dumps({"unk": 0, "sos": 1, "eos": 99}), "9 rows, but the index refers to more"),
     ):
         index.write_bytes(content)
-        with pytest.raises(ValueError, match=message):
-            WordVectors.read(word_folder)
+        with pytest.raises(UserError, match=message):
+            WordVectors.read(tmp_path)
 
 
-def released_folder(folder, features: int) -> T2MEvaluator:
+def released_folder(folder: Path, features: int) -> T2MEvaluator:
     """Writes statistics and random weights of the evaluator, by the authors' names."""
     torch.manual_seed(0)
     mean, std = np.random.default_rng(0).normal(size=features), np.full(features, 2.0)
@@ -187,10 +187,28 @@ def released_folder(folder, features: int) -> T2MEvaluator:
     return network
 
 
-def test_a_released_t2m_file_is_loaded_whole_or_not_at_all(tmp_path):
+def test_the_released_t2m_is_read_whole_or_not_at_all(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"lacks finest\.tar, mean\.npy"):
+        T2MExtractor(str(tmp_path))
     made = released_folder(tmp_path, 251)
+    write_words(tmp_path)
+    extractor, legacy = T2MExtractor(str(tmp_path)), T2MExtractor(str(tmp_path), full_length=True)
     x, mask = torch.randn(1, 40, 251), torch.ones(1, 40, dtype=torch.bool)
-    assert torch.equal(load_t2m(tmp_path)(x, mask), made(x, mask))
+    with torch.no_grad():
+        assert torch.equal(extractor.motions(x, torch.zeros(0), mask)["features"], made(x, mask))
+        captions = [["walk/VERB"], ["hop/VERB"], ["walk/VERB"] * 20]
+        full, short = (extractor.texts(["", "", ""], captions) for extractor in (legacy, extractor))
+    assert short.shape == (3, 512)
+    assert not torch.allclose(short[0], short[1], atol=1e-6)
+    assert not torch.allclose(full[0], short[0], atol=1e-3), "the slots behind the caption are read, too"
+    torch.testing.assert_close(full[2], short[2])
+    with pytest.raises(UserError, match="tagged words"):
+        extractor.texts(["walk"], [None])
+    kit = HumanML(skeleton="kit21", fps=12.5, variant="legacy")
+    extractor.check(kit, "kit")
+    with pytest.raises(UserError, match="bandai"):
+        extractor.check(kit, "bandai")
+
     file, path = torch.load(tmp_path / "finest.tar"), tmp_path / "finest.tar"
     torch.save({name: file[name] for name in T2M_PARTS[1:]}, path)
     with pytest.raises(UserError, match="contains no weights under 'movement_encoder', but motion_encoder"):
@@ -279,14 +297,6 @@ def test_the_gru_stops_at_the_end_and_starts_at_the_origin():
     torch.testing.assert_close(moved, features, atol=1e-4, rtol=0)
 
 
-def test_a_random_start_belongs_to_its_seed():
-    network = ActionGRU()
-    draw = [network.random_state(4, torch.Generator().manual_seed(seed)) for seed in (0, 0, 1)]
-    assert draw[0].shape == (2, 4, 128)
-    assert torch.equal(draw[0], draw[1])
-    assert not torch.equal(draw[0], draw[2])
-
-
 # ST-GCN ---------------------------------------------------------------------------------------------------------------
 
 NETWORKS = {"uestc": UESTC, "unconstrained": Unconstrained}
@@ -318,6 +328,7 @@ def stgcn_cases() -> list:
 @pytest.mark.golden
 @pytest.mark.parametrize("name", stgcn_cases())
 def test_stgcn_gives_the_authors_features_and_logits(name):
+    """Also for motions as this project gives them: 25 x 6 features, or 24 joints with y up."""
     arrays = golden("stgcn")
     network = NETWORKS[name]().eval()
     shapes = {key: list(value.shape) for key, value in network.state_dict().items()}
@@ -325,48 +336,36 @@ def test_stgcn_gives_the_authors_features_and_logits(name):
     np.testing.assert_allclose(network.A.numpy(), arrays[f"{name}/adjacency_A"], atol=1e-7)
     formula_weights(network)
     x = torch.from_numpy(arrays[f"{name}/x"]).permute(0, 3, 1, 2)
+    mask = torch.ones(x.shape[:2], dtype=torch.bool)
     with torch.no_grad():
-        features = STGCN.forward(network, x, torch.ones(x.shape[:2], dtype=torch.bool))
+        features = STGCN.forward(network, x, mask)
         assert_within(features, arrays, f"{name}/features")
         assert_within(network.fcn(features[..., None, None])[..., 0, 0], arrays, f"{name}/yhat")
-
-
-@pytest.mark.golden
-@pytest.mark.parametrize("name", stgcn_cases())
-def test_stgcn_reads_our_motions_as_the_authors_read_theirs(name):
-    """The fixture's inputs, given as this project gives motions: 25 x 6 features, or 24 joints with y up."""
-    arrays = golden("stgcn")
-    network = NETWORKS[name]().eval()
-    formula_weights(network)
-    x = torch.from_numpy(arrays[f"{name}/x"]).permute(0, 3, 1, 2)
-    mask = torch.ones(x.shape[:2], dtype=torch.bool)
-    if name == "uestc":
-        way = torch.randn(*x.shape[:2], 1, 6)
-        assert_within(network(torch.cat([x, way], 2).flatten(2), mask), arrays, f"{name}/features")
-    else:
-        joints = torch.randn(*x.shape[:2], 24, 3)
-        joints[:, :, [15, 12, 16, 18, 20, 17, 19, 21, 0, 1, 4, 7, 2, 5, 8]] = x * FLIP
-        seen = x - x[:, :, 8:9]  # from the pelvis
-        torch.testing.assert_close(network(joints, mask), STGCN.forward(network, seen, mask), atol=1e-5, rtol=0)
-        torch.testing.assert_close(network(joints + 7, mask), network(joints, mask), atol=1e-4, rtol=0)
+        if name == "uestc":
+            way = torch.randn(*x.shape[:2], 1, 6)
+            assert_within(network(torch.cat([x, way], 2).flatten(2), mask), arrays, f"{name}/features")
+        else:
+            joints = torch.randn(*x.shape[:2], 24, 3)
+            joints[:, :, [15, 12, 16, 18, 20, 17, 19, 21, 0, 1, 4, 7, 2, 5, 8]] = x * FLIP
+            seen = x - x[:, :, 8:9]  # from the pelvis
+            torch.testing.assert_close(network(joints, mask), STGCN.forward(network, seen, mask), atol=1e-5, rtol=0)
+            torch.testing.assert_close(network(joints + 7, mask), network(joints, mask), atol=1e-4, rtol=0)
 
 
 def small() -> JointSTGCN:
     return JointSTGCN((-1, 0, 1, 0), 5, widths=(4, 6), strides=(1, 2))
 
 
-@pytest.mark.parametrize(
-    ("make", "shape", "actions"), [(UESTC, (150,), 40), (Unconstrained, (24, 3), 12), (small, (4, 3), 5)]
-)
-def test_stgcn_classifies_and_sees_nothing_past_the_end(make, shape, actions):
-    torch.manual_seed(0)
-    network = make().eval()
-    x, mask = torch.randn(3, 20, *shape), torch.ones(3, 20, dtype=torch.bool)
-    with torch.no_grad():
-        features, logits = network(x, mask), network.logits(x, mask)
-    assert (features.shape, logits.shape) == ((3, network.fcn.in_channels), (3, actions))
-    torch.testing.assert_close(logits, features @ network.fcn.weight.flatten(1).T + network.fcn.bias)
-    assert_padding_is_not_seen(network, x, [20, 13, 1])
+def test_stgcn_classifies_and_sees_nothing_past_the_end():
+    for make, shape, actions in ((UESTC, (150,), 40), (Unconstrained, (24, 3), 12), (small, (4, 3), 5)):
+        torch.manual_seed(0)
+        network = make().eval()
+        x, mask = torch.randn(3, 20, *shape), torch.ones(3, 20, dtype=torch.bool)
+        with torch.no_grad():
+            features, logits = network(x, mask), network.logits(x, mask)
+        assert (features.shape, logits.shape) == ((3, network.fcn.in_channels), (3, actions))
+        torch.testing.assert_close(logits, features @ network.fcn.weight.flatten(1).T + network.fcn.bias)
+        assert_padding_is_not_seen(network, x, [20, 13, 1])
 
 
 def test_a_classifier_of_joints_does_not_see_where_the_motion_stands():
@@ -385,11 +384,16 @@ class _Runs:
         return (pytest.fail, ("code of the file was run",))
 
 
-@pytest.mark.parametrize(
-    ("make", "kind", "key"),
-    [(ActionGRU, "humanact12", "model"), (UESTC, "uestc", None), (Unconstrained, "humanact12_unconstrained", None)],
-)
-def test_released_weights_are_loaded_whole_or_not_at_all(tmp_path, make, kind, key):
+RELEASED = {
+    "humanact12": (ActionGRU, "model", 12),
+    "uestc": (UESTC, None, 40),
+    "humanact12_unconstrained": (Unconstrained, None, 12),
+}
+
+
+@pytest.mark.parametrize("kind", RELEASED)
+def test_released_weights_are_loaded_whole_or_not_at_all(tmp_path, kind):
+    make, key, actions = RELEASED[kind]
     path, state = tmp_path / "weights.tar", make().state_dict()
     name = next(iter(state))
 
@@ -397,9 +401,20 @@ def test_released_weights_are_loaded_whole_or_not_at_all(tmp_path, make, kind, k
         torch.save({key: content, "iteration": 3} if key else content, path)
 
     write(state)
-    loaded = ClassifierExtractor(kind, str(path)).network
-    assert not loaded.training
-    assert all(torch.equal(value, state[name]) for name, value in loaded.state_dict().items())
+    extractor = ClassifierExtractor(kind, str(path))
+    assert not extractor.network.training
+    assert all(torch.equal(value, state[name]) for name, value in extractor.network.state_dict().items())
+    x, mask = torch.randn(3, 20, 150), length_mask(torch.tensor([20, 9, 20]))
+    with torch.no_grad():
+        outputs = extractor.motions(x, Rot6D().decode(x), mask)
+    assert (outputs["logits"].shape, len(outputs["features"])) == ((3, actions), 3)
+    assert extractor.texts(["walk"], [None]) is None
+    extractor.check(Rot6D(), extractor.made_for[1])
+    with pytest.raises(UserError, match="bandai"):
+        extractor.check(Rot6D(), "bandai")
+    if make is not ActionGRU:
+        with pytest.raises(UserError, match="not recurrent"):
+            ClassifierExtractor(kind, str(path), random_start=True)
     for content, message in (
         ({k: v for k, v in state.items() if k != name}, rf"not the weights of {make.__name__}: Missing key.*{name}"),
         ({**state, "extra": torch.zeros(1)}, "Unexpected key.*extra"),
@@ -413,3 +428,21 @@ def test_released_weights_are_loaded_whole_or_not_at_all(tmp_path, make, kind, k
         ClassifierExtractor(kind, str(path))
     with pytest.raises(FileNotFoundError, match=r"absent\.tar: no such file\. Give the path of the weights"):
         ClassifierExtractor(kind, str(tmp_path / "absent.tar"))
+
+
+def test_a_random_start_is_a_function_of_the_motion(tmp_path):
+    torch.save({"model": ActionGRU().state_dict()}, tmp_path / "gru")
+    path = str(tmp_path / "gru")
+    plain, legacy = (ClassifierExtractor("humanact12", path, random_start=start) for start in (False, True))
+    x, mask = torch.randn(3, 20, 150), length_mask(torch.tensor([20, 9, 20]))
+    joints = Rot6D().decode(x)
+    with torch.no_grad():
+        drawn, again = legacy.motions(x, joints, mask), legacy.motions(x.flip(0), joints.flip(0), mask.flip(0))
+        alone = legacy.motions(x[1:2, :9], joints[1:2, :9], mask[1:2, :9])
+        zero = plain.motions(x, joints, mask)
+    for name in ("features", "logits"):
+        torch.testing.assert_close(drawn[name], again[name].flip(0))
+        torch.testing.assert_close(drawn[name][1:2], alone[name])
+        assert not torch.allclose(drawn[name], zero[name], atol=1e-3)
+    network: Any = legacy.network
+    assert not torch.allclose(network.linear2(drawn["features"]), drawn["logits"], atol=1e-3), "two draws"

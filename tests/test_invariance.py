@@ -1,7 +1,7 @@
 """Values of metrics, losses and validations are the same for any batches, order and number of processes."""
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -28,7 +28,6 @@ from evaluators.metrics import (
     retrieval,
     update_metrics,
 )
-from evaluators.metrics.confidence import mean_ci
 from evaluators.metrics.samples import SampleMetric
 from flame_mdm.batch import MotionBatch, length_mask
 from flame_mdm.errors import UserError
@@ -154,14 +153,6 @@ def test_values_depend_neither_on_the_batch_size_nor_on_the_order(size: int, exp
         assert measure(all_metrics(), batches(evaluation(), indices.split(size))) == expected
 
 
-def test_sets_may_come_one_after_the_other(expected: dict[str, Any]):
-    metric, values = distribution.FrechetMotionDistance(), evaluation()
-    metric.update(real=values["real"], real_keys=values["real_keys"])
-    assert metric.compute() is None
-    metric.update(generated=values["generated"], keys=values["keys"])
-    assert metric.compute() == expected["fid"]
-
-
 def test_draws_depend_on_the_seed(expected: dict[str, Any]):
     metrics = {name: metric for name, metric in all_metrics().items() if hasattr(metric, "seed")}
     for metric in metrics.values():
@@ -171,30 +162,17 @@ def test_draws_depend_on_the_seed(expected: dict[str, Any]):
     assert not [name for name in metrics if values[name] == expected[name]]
 
 
-@pytest.fixture(scope="module")
-def pool() -> Iterator[GlooPool]:
-    with GlooPool() as pool:
-        yield pool
-
-
 @pytest.mark.slow
 def test_values_do_not_depend_on_the_number_of_processes(pool: GlooPool, expected: dict[str, Any]):
-    """Samples dealt in turn, unevenly, all to one of the two, and none at all."""
+    """Samples dealt in turn, all to one of the two, and none at all."""
     values = evaluation()
-    for first in (range(0, COUNT, 2), range(30), range(COUNT), range(0)):
-        shares = [
-            torch.tensor(share, dtype=torch.long) for share in (list(first), list(set(range(COUNT)) - set(first)))
-        ]
+    for first in (range(0, COUNT, 2), range(COUNT)):
+        shares = [torch.tensor(list(share), dtype=torch.long) for share in (first, set(range(COUNT)) - set(first))]
         inputs = [batches(values, share.split(7)) if len(share) else [] for share in shares]
         results = pool.run(measure, *[(all_metrics(), batch) for batch in inputs])
         assert results == [expected, expected], first
     empty = measure(all_metrics(), [])
     assert pool.run(measure, (all_metrics(), []), (all_metrics(), [])) == [empty, empty]
-
-
-def test_a_failing_process_fails_the_test(pool: GlooPool):
-    with pytest.raises(RuntimeError, match=r"process 1: [^$]*no values"):
-        pool.run(mean_ci, ([1.0],), ([],))
 
 
 @pytest.mark.filterwarnings("error")
@@ -213,11 +191,7 @@ def test_too_few_samples_are_an_error():
         (retrieval.MultiPositiveRPrecision(), 31, "got 31 motions, needs at least 32"),
         (published_physics.MBenchQuality(30.0), 45, "defined at 20 frames per second, but the motions have 30"),
         (published_physics.PhysicalFootContact(20.0), 45, "defined at 30 frames per second, but the motions have 20"),
-        (
-            alignment.MutualInformationDivergence(),
-            12,
-            "got 12 samples, one more than features",
-        ),
+        (alignment.MutualInformationDivergence(), 12, "got 12 samples, one more than features"),
         (diversity.Diversity(pairs=300, replace=False), 45, "got 45 motions for 300 pairs, needs at least 300"),
         (diversity.TextMultimodality(), 45, "9 of 9 prompts do not have 30 motions but 5 to 5. Generate 30 for each"),
         (diversity.PairedMultimodality(), 45, "9 of 9 prompts do not have 20 motions"),
@@ -229,29 +203,28 @@ def test_too_few_samples_are_an_error():
 
 
 def test_samples_given_twice_and_features_that_are_not_finite_are_errors():
+    bad = evaluation()
+    for name in ("generated", "text", "real", "joints", "logits", "nearest"):
+        bad[name] = bad[name].clone()
+        bad[name][3, 0] = math.nan
     for name, metric in all_metrics().items():
         if isinstance(metric, SampleMetric):
             with pytest.raises(UserError, match="1 samples were given twice"):
                 measure({name: metric}, batches(evaluation(), [torch.arange(COUNT), torch.tensor([3])]))
-    for bad in (math.nan, math.inf):
-        values = evaluation()
-        for name in ("generated", "text", "real", "joints", "logits", "nearest"):
-            values[name] = values[name].clone()
-            values[name][3, 0] = bad
-        for name, metric in all_metrics().items():
-            with pytest.raises(UserError, match="not finite"):
-                measure({name: metric}, [values])
+            metric.reset()
+        with pytest.raises(UserError, match="not finite"):
+            measure({name: metric}, [bad])
 
 
 def test_wrong_inputs_are_errors():
-    values, parents, short = evaluation(), KIT21.parents, torch.arange(34) < 1
+    values = evaluation()
     for metric, change, message in (
         (alignment.MultimodalDistance(), {"text": values["text"][:-1]}, "45 keys, 45 generated, 44 text"),
         (distribution.FrechetMotionDistance(), {"keys": None}, "'generated' given without 'keys'"),
         (distribution.FrechetMotionDistance(), {"real": values["real"][:, :3]}, "6 features, but real ones have 3"),
         (reconstruction.DisplacementErrors(), {"kept": values["kept"] | True}, "no generated frame"),
         (reconstruction.TemosPositionErrors(), {"joints": values["joints"][:, :, :20]}, "20 joints, but defined only"),
-        (reconstruction.FlamePositionErrors(parents), {"mask": values["mask"] & short}, "got 1 frames"),
+        (reconstruction.TemosPositionErrors(), {"mask": values["mask"] & (torch.arange(34) < 1)}, "got 1 frames"),
     ):
         with pytest.raises(ValueError, match=f"{type(metric).__name__}: .*{message}"):
             measure({"metric": metric}, [values | change])
@@ -263,24 +236,18 @@ def test_wrong_inputs_are_errors():
 # Training of extractors -----------------------------------------------------------------------------------------------
 
 
-def pairs() -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Motions, lengths and text vectors of six pairs."""
-    generator = torch.Generator().manual_seed(3)
-    motions, texts = torch.randn(6, 9, 7, generator=generator), torch.randn(6, 10, generator=generator)
-    return motions, torch.tensor([9, 4, 7, 9, 2, 6]), texts
-
-
 MEANING = torch.tensor([[1, 10], [2, 20], [3, 30], [1, 40], [4, 50], [5, 20]])
 
 
 def loss_and_gradients(first: int, last: int, hard: bool = False) -> tuple[float, dict[str, torch.Tensor]]:
-    """Of the pairs first to last, with those of the other processes as negatives."""
+    """Of the pairs first to last of six, with those of the other processes as negatives."""
     torch.manual_seed(0)
     clip = MotionCLIP(
         7, 10, latent_dim=16, ff_size=24, num_layers=2, num_heads=4, dropout=0.0, max_frames=20, embedding_dim=8
     )
-    x, lengths, texts = pairs()
-    x, lengths, texts, meaning = x[first:last], lengths[first:last], texts[first:last], MEANING[first:last]
+    torch.manual_seed(3)
+    pairs = torch.randn(6, 9, 7), torch.tensor([9, 4, 7, 9, 2, 6]), torch.randn(6, 10), MEANING
+    x, lengths, texts, meaning = (values[first:last] for values in pairs)
     wrong = clip.text(torch.stack([texts + 0.1, texts.flip(1)], 1))
     more = {"meaning": meaning, "wrong_text": wrong} if hard else {}
     loss = info_nce(clip(x, length_mask(lengths, 9)), clip.text(texts), clip.logit_scale, **more)

@@ -36,10 +36,7 @@ def test_poses_face_forward_on_the_spot():
     torch.testing.assert_close(poses(moved(motion, 1.3, (2.0, -5.0)), FACING), still)
     local = still.unflatten(1, (22, 3))
     assert local[:, 0, [0, 2]].abs().max() == 0
-    torch.testing.assert_close(local[:, 0, 1], motion[:, 0, 1])
-    torch.testing.assert_close(
-        local.square().sum((1, 2)), (motion - motion[:, :1] * torch.tensor([1.0, 0, 1])).square().sum((1, 2))
-    )
+    torch.testing.assert_close(local[..., 1], motion[..., 1])
     right_hip, left_hip, right_shoulder, left_shoulder = FACING
     across = local[:, left_hip] - local[:, right_hip] + local[:, left_shoulder] - local[:, right_shoulder]
     assert across[:, 0].min() > 0
@@ -79,9 +76,6 @@ def test_copies_are_counted():
     nearest = torch.cat([torch.zeros(40, 1, dtype=torch.float64), torch.full((60, 1), 0.3, dtype=torch.float64)])
     metric.update(torch.arange(100), nearest, real)
     assert metric.compute() == {"joints": pytest.approx(0.3), "features": None, "copies": 0.4}
-    itself = NearestTraining()
-    itself.update(torch.arange(100), real.expand(-1, 2), real.expand(-1, 2))
-    assert itself.compute() == {"joints": pytest.approx(0.15), "features": pytest.approx(0.15), "copies": 0.01}
 
 
 def raised(side: str, turn: float) -> np.ndarray:
@@ -104,13 +98,8 @@ def test_sides_are_read_from_the_motion():
         assert read_side(right, content, 20) == "right"
     metric = SideAccuracy(fps=20)
     joints = torch.from_numpy(np.stack([left, left, right, right]))
-    requested = [
-        ("bye", "left"),
-        ("walk-turn-right", "right"),
-        ("raise-up-right-hand", "right"),
-        ("wave-both-hands", "both"),
-    ]
-    metric.update(joints, torch.ones(4, 40, dtype=torch.bool), requested)
+    hands = {"bye": "left", "walk-turn-right": "right", "raise-up-right-hand": "right", "wave-both-hands": "both"}
+    metric.update(joints, torch.ones(4, 40, dtype=torch.bool), list(hands.items()))
     assert metric.compute() == {"hand": 1.0, "path": 0.0, "hand_or_path": pytest.approx(2 / 3)}
     metric = SideAccuracy(fps=20)
     metric.update(joints[:1], torch.ones(1, 40, dtype=torch.bool), [("walk", "")])

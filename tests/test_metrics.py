@@ -1,54 +1,25 @@
 """Metrics: against the authors' code and against closed forms."""
 
 import math
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from scipy.linalg import sqrtm
+from scipy.spatial.transform import Rotation
 from support.fixtures import golden, golden_case, groups
 from support.motions import wander
 from torch import Tensor
+from torch.nn.functional import normalize
 from torchmetrics import Metric
 
-from evaluators.metrics import update_metrics
-from evaluators.metrics.accuracy import ActionAccuracy
-from evaluators.metrics.alignment import (
-    MotionCLIPScore,
-    MotionsForText,
-    MultimodalDistance,
-    MutualInformationDivergence,
-    TextsForMotion,
-    mutual_information_divergence,
-    retrieval_ranks,
-)
+from evaluators.metrics import accuracy, alignment, distribution, diversity, physics, reconstruction, update_metrics
+from evaluators.metrics.alignment import MotionsForText, MultimodalDistance, TextsForMotion, retrieval_ranks
 from evaluators.metrics.confidence import mean_ci
-from evaluators.metrics.distribution import (
-    FrechetMotionDistance,
-    KernelMotionDistance,
-    PrecisionRecall,
-    frechet_distance,
-    polynomial_mmd2,
-)
-from evaluators.metrics.diversity import (
-    ActionMultimodality,
-    Diversity,
-    JointVariance,
-    PairedMultimodality,
-    TextMultimodality,
-    pair_distance,
-)
-from evaluators.metrics.physics import Floating, FootSkating, Jitter, Penetration, StaticShare
-from evaluators.metrics.reconstruction import (
-    DisplacementErrors,
-    FlamePositionErrors,
-    KeptDrift,
-    PositionErrors,
-    TemosPositionErrors,
-    flame_parts,
-    temos_parts,
-)
+from evaluators.metrics.distribution import FrechetMotionDistance, PrecisionRecall, frechet_distance, polynomial_mmd2
+from evaluators.metrics.diversity import pair_distance
+from evaluators.metrics.reconstruction import FlamePositionErrors, TemosPositionErrors, flame_parts, temos_parts
 from evaluators.metrics.retrieval import TMRRetrieval, whole_set_retrieval
 from flame_mdm.batch import length_mask
 from flame_mdm.errors import UserError
@@ -103,18 +74,14 @@ def test_frechet_distance_equals_the_authors(case: str):
 @one
 def test_text_metrics_equal_guos(stem: str):
     text, motion, real = tensor("t2m/text"), tensor("t2m/motion"), tensor("t2m/gt_motion")
-    for size, expected in (
-        (int(array("t2m/batch")), array("t2m/R_precision_top123")),
-        (len(text), array("t2m/R_precision_one_batch_of_160")),
-    ):
+    for size, name in ((int(array("t2m/batch")), "top123"), (len(text), "one_batch_of_160")):
         ranks = []
         for own in torch.arange(len(text)).split(size):
             ranks.append(retrieval_ranks(text[own], motion, own.expand(len(own), -1), torch.arange(len(own))))
-            if not int(own[0]) and size == int(array("t2m/batch")):
-                hits = ranks[0][:, None] < torch.arange(1, 4)
-                np.testing.assert_array_equal(hits.numpy(), array("t2m/topk_batch0"))
-        rank = torch.cat(ranks)
-        np.testing.assert_allclose([(rank < k).double().mean().item() for k in (1, 2, 3)], expected, rtol=1e-12)
+        hits = torch.cat(ranks)[:, None] < torch.arange(1, 4)
+        np.testing.assert_allclose(hits.double().mean(0), array(f"t2m/R_precision_{name}"), rtol=1e-12)
+        if name == "top123":
+            np.testing.assert_array_equal(hits[:size], array("t2m/topk_batch0"))
     ids, values = keys(len(text)), {}
     values["matching_score"] = computed(MultimodalDistance(), generated=motion, text=text, keys=ids)
     values["fid"] = computed(FrechetMotionDistance(), generated=motion, keys=ids, real=real, real_keys=keys(len(real)))
@@ -150,10 +117,10 @@ def test_action_metrics_equal_the_authors(case: str):
 
 @one
 def test_accuracy_and_unconstrained_diversity_equal_the_authors(stem: str):
-    accuracy = ActionAccuracy()
+    metric = accuracy.ActionAccuracy()
     for logits, labels in zip(tensor("a2m/logits").split(7), tensor("a2m/logit_labels").split(7), strict=True):
-        accuracy.update(logits=logits, labels=labels)
-    assert accuracy.compute() == pytest.approx(float(array("a2m/accuracy")), rel=1e-6)
+        metric.update(logits=logits, labels=labels)
+    assert metric.compute() == pytest.approx(float(array("a2m/accuracy")), rel=1e-6)
     features = tensor("a2m/features")
     value = pair_distance(features[tensor("uncond/div_first")], features[tensor("uncond/div_second")])
     assert value == pytest.approx(float(array("uncond/diversity")), rel=1e-5)
@@ -203,7 +170,7 @@ def test_mid_equals_the_authors(case: str):
     ours, theirs = {}, {}
     for option in (option for option in MID_EPS if f"{case}/{option}" in FIXTURE):
         motions = real[: len(fake)] if option.startswith("real_as_fake") else fake
-        ours[option] = mutual_information_divergence(real, text, motions, MID_EPS[option]).item()
+        ours[option] = alignment.mutual_information_divergence(real, text, motions, MID_EPS[option]).item()
         theirs[option] = float(array(f"{case}/{option}"))
     if len(real) > real.shape[1] + text.shape[1]:
         assert ours == pytest.approx(theirs, rel=1e-6)
@@ -221,7 +188,7 @@ def test_flame_metrics_equal_the_authors(stem: str):
     rank = retrieval_ranks(fake, text, pools, torch.zeros_like(own))
     shares = [(rank < k).double().mean().item() for k in (1, 2, 3)]
     np.testing.assert_allclose(shares, array("flame/r_precision_top123"), rtol=1e-6)
-    metrics = {"mclip": MotionCLIPScore(), "mm_distance": MultimodalDistance(), "fd": FrechetMotionDistance()}
+    metrics = {"mclip": alignment.MotionCLIPScore(), "mm_distance": MultimodalDistance(), "fd": FrechetMotionDistance()}
     update_metrics(metrics, generated=fake, text=text, keys=own, real=real, real_keys=own)
     for name, metric in metrics.items():
         assert metric.compute() == pytest.approx(float(array(f"flame/{name}")), rel=2e-6)
@@ -241,7 +208,7 @@ def test_flame_position_errors_equal_the_authors(stem: str):
     np.testing.assert_allclose(averages(metric, pairs), expected, rtol=1e-6)
 
 
-def averages(metric: PositionErrors, pairs: list[Any]) -> list[float]:
+def averages(metric: reconstruction.PositionErrors, pairs: list[Any]) -> list[float]:
     """APE and AVE of pairs of parts, without what `update` does to motions."""
     position = torch.stack([metric.position_errors(*pair) for pair in pairs])
     variance = torch.stack([metric.variance_errors(*pair) for pair in pairs])
@@ -249,12 +216,14 @@ def averages(metric: PositionErrors, pairs: list[Any]) -> list[float]:
     return [*metric.average(position, frames).tolist(), *variance.mean(0).tolist()]
 
 
-def temos_names(case: str) -> list[str]:
-    return [f"{case}/{e}_{part}" for e in ("APE", "AVE") for part in ("root", "traj", "mean_pose", "mean_joints")]
+def temos_errors(case: str) -> list[float]:
+    parts = ("root", "traj", "mean_pose", "mean_joints")
+    return [float(array(f"temos_ape/{case}/{error}_{part}")) for error in ("APE", "AVE") for part in parts]
 
 
 @one
 def test_temos_position_errors_equal_the_authors(stem: str):
+    """Also of padded batches: their floor sees the padding, which the parts of padded motions reproduce."""
     fake, real = tensor("temos_ape/padded_text"), tensor("temos_ape/padded_ref")
     lengths = tensor("temos_ape/single/len_text_ref")
     values = computed(
@@ -265,26 +234,12 @@ def test_temos_position_errors_equal_the_authors(stem: str):
         real_mask=length_mask(lengths[:, 1], real.shape[1]),
         keys=keys(len(fake)),
     )
-    expected = [float(array(name)) for name in temos_names("temos_ape/single")]
-    assert list(values.values()) == pytest.approx(expected, rel=2e-6)
-
-
-@one
-def test_temos_position_errors_of_padded_batches_equal_the_authors(stem: str):
-    """Their floor sees the padding of a batch; the parts of padded motions reproduce it."""
+    assert list(values.values()) == pytest.approx(temos_errors("single"), rel=2e-6)
     metric, pairs = TemosPositionErrors(units_per_metre=1.0), []
-    for fake, real, length in zip(
-        tensor("temos_ape/padded_text"), tensor("temos_ape/padded_ref"), array("temos_ape/lengths"), strict=True
-    ):
-        pairs.append([{part: x[:length] for part, x in metric.parts(motion).items()} for motion in (fake, real)])
-    expected = [float(array(name)) for name in temos_names("temos_ape/padded")]
-    np.testing.assert_allclose(averages(metric, pairs), expected, rtol=2e-6)
-
-
-@one
-def test_temos_parts_equal_the_authors(stem: str):
-    length = int(array("temos_ape/lengths")[0])
-    parts = temos_parts(tensor("temos_ape/padded_text")[0])
+    for *motions, length in zip(fake, real, array("temos_ape/lengths"), strict=True):
+        pairs.append([{part: x[:length] for part, x in metric.parts(motion).items()} for motion in motions])
+    np.testing.assert_allclose(averages(metric, pairs), temos_errors("padded"), rtol=2e-6)
+    parts, length = temos_parts(fake[0]), int(array("temos_ape/lengths")[0])
     names = {"root": "root", "trajectory": "traj", "mean_local": "pose_local", "mean_global": "joints"}
     for part, name in names.items():
         expected = array(f"temos_ape/transform0/{name}")
@@ -323,8 +278,6 @@ def test_frechet_distance_of_normal_distributions():
     b = exactly_normal(np.array([0.0, 2.0, 5.0]), np.diag(other**2), 70, 1)
     assert frechet_distance(a, b).item() == pytest.approx(5 + ((deviations - other) ** 2).sum(), rel=1e-12)
 
-    from scipy.linalg import sqrtm
-
     s, t = covariance(20, 0), covariance(20, 1)
     a, b = exactly_normal(np.zeros(20), s, 100, 2), exactly_normal(np.ones(20), t, 60, 3)
     expected = 20 + np.trace(s + t) - 2 * np.trace(np.real(np.asarray(sqrtm(s @ t))))
@@ -348,47 +301,18 @@ def test_frechet_distance_of_a_set_to_itself_is_not_negative():
     assert 0 <= computed(FrechetMotionDistance(), generated=x, keys=ids, real=x.flip(0), real_keys=ids) < 1e-10
 
 
-def test_kernel_distance_by_loops():
-    generator = np.random.default_rng(0)
-    a, b = generator.normal(size=(7, 3)), generator.normal(size=(7, 3)) + 1
-
-    def kernel(x: np.ndarray, y: np.ndarray) -> float:
-        return float((x @ y / 3 + 1) ** 3)
-
-    within = sum(kernel(x[i], x[j]) for x in (a, b) for i in range(7) for j in range(7) if i != j) / 42
-    across = sum(kernel(x, y) for x in a for y in b) / 49
-    value = polynomial_mmd2(torch.from_numpy(a), torch.from_numpy(b)).item()
-    assert value == pytest.approx(within - 2 * across, rel=1e-12)
-
-
 def test_kernel_distance_of_whole_sets_is_one_value():
     """Subsets without replacement as large as the sets are permutations; with replacement, equal samples meet."""
     generator = torch.Generator().manual_seed(0)
     a, b = (torch.randn(50, 6, generator=generator) for _ in range(2))
     inputs = {"generated": a, "keys": torch.arange(50), "real": b, "real_keys": torch.arange(50)}
+    metric = distribution.KernelMotionDistance
     values = {
-        replace: computed(KernelMotionDistance(subsets=20, subset_size=50, replace=replace), **inputs)
-        for replace in (False, True)
+        replace: computed(metric(subsets=20, subset_size=50, replace=replace), **inputs) for replace in (False, True)
     }
     assert values[False]["mean"] == pytest.approx(polynomial_mmd2(a.double(), b.double()).item(), rel=1e-12)
     assert values[False]["std"] < 1e-12 < values[True]["std"]
     assert values[True]["mean"] > values[False]["mean"]
-
-
-def test_precision_and_recall_by_loops():
-    generator = np.random.default_rng(0)
-    real, fake = generator.normal(size=(40, 2)), generator.normal(size=(55, 2)) * [2, 0.5]
-    sets = {"generated": torch.from_numpy(fake), "real": torch.from_numpy(real)}
-    values = computed(PrecisionRecall(neighbors=2), **sets, keys=torch.arange(55), real_keys=torch.arange(40))
-
-    def coverage(points: np.ndarray, samples: np.ndarray) -> float:
-        covered = 0
-        for p in points:
-            reaches = [sorted(np.linalg.norm(samples - s, axis=1))[2] for s in samples]
-            covered += any(np.linalg.norm(p - s) <= r for s, r in zip(samples, reaches, strict=True))
-        return covered / len(points)
-
-    assert values == {"precision": coverage(fake[:40], real), "recall": coverage(real, fake[:40])}
 
 
 def test_mid_of_normal_distributions():
@@ -396,30 +320,25 @@ def test_mid_of_normal_distributions():
     r = 0.8
     both = exactly_normal(np.array([1.0, -2.0]), np.array([[4.0, 2 * r], [2 * r, 1.0]]), 500, 0)
     real, text = both[:, :1], both[:, 1:]
-    metric = MutualInformationDivergence(eps=0.0)
+    metric = alignment.MutualInformationDivergence(eps=0.0)
     value = computed(metric, generated=real, text=text, real=real, keys=torch.arange(500))
     assert value == pytest.approx(-math.log(1 - r**2) / 2, rel=1e-12)
-    assert mutual_information_divergence(real, text, real.roll(1, 0), 0.0).item() < 0 < value
+    assert alignment.mutual_information_divergence(real, text, real.roll(1, 0), 0.0).item() < 0 < value
 
 
-@pytest.mark.parametrize("metric", [TextsForMotion(), MotionsForText()])
-def test_r_precision_of_perfect_random_and_blind_features(metric: Metric):
+def test_r_precision_of_perfect_random_and_blind_features():
     count, generator = 1000, torch.Generator().manual_seed(0)
-    text = torch.randn(count, 8, generator=generator)
-    ids, blind, values = keys(count), torch.ones(count, 8), {}
-    for name, motion, seen in (
-        ("perfect", text.clone(), text),
-        ("random", torch.randn(count, 8, generator=generator), text),
-        ("blind", blind, blind),
-    ):
-        metric.reset()
-        values[name] = computed(metric, generated=motion, text=seen, text_keys=ids, keys=ids)
-    assert values["perfect"] == {"top1": 1.0, "top2": 1.0, "top3": 1.0}
-    for name in ("random", "blind"):
-        for k in (1, 2, 3):
-            chance = k / 32
-            tolerance = 4 * (chance * (1 - chance) / count) ** 0.5
-            assert values[name][f"top{k}"] == pytest.approx(chance, abs=tolerance)
+    text, random = torch.randn(2, count, 8, generator=generator)
+    ids, blind = keys(count), torch.ones(count, 8)
+    for metric in (TextsForMotion, MotionsForText):
+        perfect = computed(metric(), generated=text, text=text, text_keys=ids, keys=ids)
+        assert perfect == {"top1": 1.0, "top2": 1.0, "top3": 1.0}
+        for motion, seen in ((random, text), (blind, blind)):
+            values = computed(metric(), generated=motion, text=seen, text_keys=ids, keys=ids)
+            for k in (1, 2, 3):
+                chance = k / 32
+                tolerance = 4 * (chance * (1 - chance) / count) ** 0.5
+                assert values[f"top{k}"] == pytest.approx(chance, abs=tolerance)
 
 
 def test_texts_for_motion_never_draw_the_own_caption():
@@ -441,26 +360,22 @@ def test_motions_for_text_count_every_text_once():
     assert 1 <= round(hits) <= 2  # the one, and one whose partner an incomplete pool may leave out
 
 
-def test_retrieval_ranks_of_ties_and_neighbors():
-    candidates = torch.tensor([[0.0], [1.0], [1.0], [2.0]])
-    query = torch.tensor([[1.0], [1.0], [0.4]])
-    pools = torch.tensor([[0, 1, 2, 3]]).expand(3, -1)
+def test_ties_in_retrieval():
+    candidates, query = torch.tensor([[0.0], [1.0], [1.0], [2.0]]), torch.tensor([[1.0], [1.0], [0.4]])
+    pools = torch.arange(4).expand(3, -1)
     assert retrieval_ranks(query, candidates, pools, torch.tensor([1, 2, 3])).tolist() == [0, 1, 3]
-
-
-def test_whole_set_retrieval_counts_ties_by_half():
-    perfect = torch.eye(4)
-    assert whole_set_retrieval(perfect, (1,)) == {"t2m_top1": 1, "t2m_median": 1, "m2t_top1": 1, "m2t_median": 1}
-    assert whole_set_retrieval(torch.ones(4, 4), (1, 2))["t2m_median"] == 2.5
+    perfect = {"t2m_top1": 1, "t2m_median": 1, "m2t_top1": 1, "m2t_median": 1}
+    assert whole_set_retrieval(torch.eye(4), (1,)) == perfect
+    assert whole_set_retrieval(torch.ones(4, 4), (1, 2))["t2m_median"] == 2.5, "ties count by half"
 
 
 def test_diversity_of_two_points():
     features = torch.tensor([[0.0, 0.0], [3.0, 4.0]]).repeat(500, 1)
     for replace in (False, True):
-        value = computed(Diversity(pairs=1000, replace=replace), generated=features, keys=keys(1000))
+        value = computed(diversity.Diversity(pairs=1000, replace=replace), generated=features, keys=keys(1000))
         assert value == pytest.approx(2.5, abs=0.4)  # half of the pairs are 5 apart
     line = {"generated": torch.arange(1000.0)[:, None], "keys": torch.arange(1000)}
-    assert computed(Diversity(pairs=1000, replace=False), **line) == pytest.approx(1000 / 3, rel=0.1)
+    assert computed(diversity.Diversity(pairs=1000, replace=False), **line) == pytest.approx(1000 / 3, rel=0.1)
 
 
 def multimodality(metric: Metric, distances: Tensor, samples: int, kind: str = "groups") -> float | None:
@@ -474,14 +389,14 @@ def multimodality(metric: Metric, distances: Tensor, samples: int, kind: str = "
 
 def test_multimodality_in_each_definition():
     distances = torch.tensor([1.0, 3.0])
-    value = multimodality(TextMultimodality(), distances, 30)
+    value = multimodality(diversity.TextMultimodality(), distances, 30)
     assert value is not None
     assert 0 < value < 2
     assert (value * 10 / 2) % 1 == pytest.approx(0, abs=1e-9)  # the same pairs for all texts
     # sample i of the first set and of the second: 10 apart, thus on the same point for 10, on the other for 5
-    assert multimodality(PairedMultimodality(samples=10), distances, 20) == 0
-    assert multimodality(PairedMultimodality(samples=5), distances, 10) == 2
-    value = multimodality(ActionMultimodality(pairs=4000), distances, 30, "labels")
+    assert multimodality(diversity.PairedMultimodality(samples=10), distances, 20) == 0
+    assert multimodality(diversity.PairedMultimodality(samples=5), distances, 10) == 2
+    value = multimodality(diversity.ActionMultimodality(pairs=4000), distances, 30, "labels")
     assert value == pytest.approx(1, abs=0.05)  # a pair is apart every second time
 
 
@@ -489,7 +404,7 @@ def test_joint_variance_of_known_spread():
     """Motions of a text stand at x = -1 and x = 1: variance 4 / 3 of four; a second text has none."""
     still = torch.zeros(4, 6, 2, 3)
     still[::2, ..., 0], still[1::2, ..., 0] = -1, 1
-    metric = JointVariance(samples=4)
+    metric = diversity.JointVariance(samples=4)
     mask = length_mask(torch.full((4,), 5), 6)
     metric.update(joints=still, mask=mask, groups=torch.full((4,), 1), keys=keys(4, "a"))
     still[..., 0] = 7
@@ -499,11 +414,7 @@ def test_joint_variance_of_known_spread():
 
 def test_temos_parts_do_not_see_where_a_motion_stands():
     joints = wander(21, 30, 0).double() * 640
-    turn = torch.tensor(2.1, dtype=torch.float64)
-    cos, sin = turn.cos(), turn.sin()
-    rotation = torch.stack(
-        [torch.stack([cos, 0 * cos, sin]), torch.tensor([0.0, 1, 0]), torch.stack([-sin, 0 * cos, cos])]
-    )
+    rotation = torch.from_numpy(Rotation.from_euler("y", 2.1).as_matrix())
     moved = joints @ rotation.T + joints.new_tensor([300.0, 50.0, -20.0])
     for name, values in temos_parts(joints).items():
         torch.testing.assert_close(temos_parts(moved)[name], values, rtol=0, atol=1e-9)
@@ -525,7 +436,7 @@ def test_displacement_of_shifted_frames():
         ({"real_mask": mask}, 25 / 8, 10.0),
         ({"real_mask": short}, 10 / 6, 5.0),
     ):
-        values = computed(DisplacementErrors(), **motions, **change)
+        values = computed(reconstruction.DisplacementErrors(), **motions, **change)
         assert values == pytest.approx({"ade": ade, "fde": fde}, rel=1e-6)
 
 
@@ -539,10 +450,10 @@ def test_kept_joints_neither_err_nor_go_unseen_when_they_drift():
     kept = torch.ones(1, 10, 22, dtype=torch.bool)
     kept[:, :, 3] = False
     motions = {"joints": fake, "mask": mask, "real_joints": real, "real_mask": mask, "keys": keys, "kept": kept}
-    assert computed(DisplacementErrors(), **motions) == pytest.approx({"ade": 2, "fde": 2}, rel=1e-6)
-    assert computed(KeptDrift(), **motions) == pytest.approx({"mean": 1 / 210, "largest": 1}, rel=1e-6)
+    assert computed(reconstruction.DisplacementErrors(), **motions) == pytest.approx({"ade": 2, "fde": 2}, rel=1e-6)
+    assert computed(reconstruction.KeptDrift(), **motions) == pytest.approx({"mean": 1 / 210, "largest": 1}, rel=1e-6)
     nothing_kept = motions | {"kept": ~mask[..., None].expand_as(kept)}
-    assert computed(KeptDrift(), **nothing_kept) == {"mean": None, "largest": None}
+    assert computed(reconstruction.KeptDrift(), **nothing_kept) == {"mean": None, "largest": None}
 
 
 def test_best_and_worst_of_several_are_chosen_by_the_root():
@@ -569,93 +480,60 @@ def test_best_and_worst_of_several_are_chosen_by_the_root():
 
 def test_physics_of_simple_motions():
     frames, fps = 30, 20.0
-    still = torch.rand(1, frames, 22, 3, generator=torch.Generator().manual_seed(0))[:, :1].repeat(1, frames, 1, 1)
+    still = torch.rand(1, 1, 22, 3, generator=torch.Generator().manual_seed(0)).repeat(1, frames, 1, 1)
     still[..., 1] -= still[..., 1].amin()
     mask, ids = torch.ones(1, frames, dtype=torch.bool), torch.tensor([1])
-    time = torch.arange(frames).double() / fps
-    cubic = still.double().clone()
-    cubic[..., 0] += time[:, None] ** 3  # jerk 6 m/s^3
 
-    def physics(joints: Tensor) -> dict[str, Any]:
-        metrics = {
-            "below": Penetration(),
-            "above": Floating(),
-            "jerk": Jitter(fps),
-            "static": StaticShare(fps),
-            "skating": FootSkating(fps),
-        }
+    def measured(joints: Tensor) -> dict[str, Any]:
+        metrics = {"below": physics.Penetration(), "above": physics.Floating()}
+        metrics |= {"jerk": physics.Jitter(fps), "static": physics.StaticShare(fps)}
         update_metrics(metrics, joints=joints, mask=mask, keys=ids)
         return {name: metric.compute() for name, metric in metrics.items()}
 
-    values = physics(still)
-    assert (values["below"], values["above"], values["jerk"], values["static"]) == (0, 0, 0, 1)
-    assert physics(cubic)["jerk"] == pytest.approx(6, rel=1e-6)
-    assert physics(cubic)["static"] == 0
+    assert measured(still) == {"below": 0, "above": 0, "jerk": 0, "static": 1}
+    cubic = still.double().clone()
+    cubic[..., 0] += (torch.arange(frames).double() / fps)[:, None] ** 3  # jerk 6 m/s^3
+    values = measured(cubic)
+    assert (values["jerk"], values["static"]) == (pytest.approx(6, rel=1e-6), 0)
     lift = torch.tensor([0.0, 1.0, 0.0])
-    assert physics(still + 0.1 * lift)["above"] == pytest.approx(0.1, rel=1e-6)
-    assert physics(still - 0.1 * lift)["below"] == pytest.approx(0.1, rel=1e-6)
-    near = physics(still + 0.004 * lift) | physics(still - 0.004 * lift)
-    assert (near["above"], near["below"]) == (0, 0)
     half = still.clone()
     half[:, : frames // 2] -= 0.1 * lift
-    assert physics(half)["below"] == pytest.approx(0.05, rel=1e-6)
+    for joints, above, below in (
+        (still + 0.1 * lift, 0.1, 0),
+        (still - 0.1 * lift, 0, 0.1),
+        (still + 0.004 * lift, 0, 0),
+        (still - 0.004 * lift, 0, 0),
+        (half, 0, 0.05),
+    ):
+        values = measured(joints)
+        assert values["above"] == pytest.approx(above, rel=1e-6)
+        assert values["below"] == pytest.approx(below, rel=1e-6)
 
 
-# Intervals ------------------------------------------------------------------------------------------------------------
-
-
-def bootstrap(
-    count: int, statistic: Callable[[np.ndarray], Any], resamples: int = 1000, seed: int = 0
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Value, low and high of a statistic of `count` motions, given their indices, from sets drawn with replacement."""
-    generator = np.random.default_rng(seed)
-    value = np.asarray(statistic(np.arange(count)), np.float64)
-    drawn = np.stack([np.asarray(statistic(generator.integers(count, size=count))) for _ in range(resamples)])
-    return value, *percentiles(drawn, value)
-
-
-def test_bootstrap_of_a_mean_is_the_interval_in_closed_form():
+def test_a_bootstrap_of_a_mean_is_the_interval_in_closed_form():
     generator = np.random.default_rng(0)
     x = generator.normal(3, 2, 200)
-    value, low, high = bootstrap(200, lambda i: [x[i].mean(), -x[i].mean()], resamples=4000, seed=1)
+    drawn = x[generator.integers(200, size=(4000, 200))].mean(1)
     half = 1.96 * x.std() / 200**0.5
-    np.testing.assert_allclose(value, [x.mean(), -x.mean()])
-    np.testing.assert_allclose(low, value - half, atol=0.05 * half)
-    np.testing.assert_allclose(high, value + half, atol=0.05 * half)
-    inside = 0
-    for trial in range(300):
-        y = generator.normal(1, 1, 60)
-        _, low, high = bootstrap(60, lambda i, y=y: y[i].mean(), resamples=200, seed=trial)
-        inside += low <= 1 <= high
-    assert 0.91 < inside / 300 < 0.98
+    low, high = percentiles(drawn, np.asarray(x.mean()))
+    np.testing.assert_allclose([low, high], [x.mean() - half, x.mean() + half], atol=0.05 * half)
 
 
-def test_bootstrap_of_a_distance_is_at_its_value_and_pairs_are_sharper():
-    generator = torch.Generator().manual_seed(0)
+def test_a_bootstrap_of_a_distance_is_at_its_value():
+    generator, draws = torch.Generator().manual_seed(0), np.random.default_rng(0)
     real, noise = torch.randn(2, 150, 8, generator=generator, dtype=torch.float64)
-
-    def distance(i: np.ndarray, scale: float) -> float:
-        return frechet_distance(scale * noise[i], real).item()
-
-    value, low, high = bootstrap(150, lambda i: distance(i, 1.0), resamples=300)
+    value = frechet_distance(noise, real).item()
+    drawn = [frechet_distance(noise[draws.integers(150, size=150)], real).item() for _ in range(300)]
+    low, high = percentiles(np.array(drawn), np.asarray(value))
     assert low < value < high, "sets with repetitions are farther away, which is not the value's error"
-    difference, least, most = bootstrap(150, lambda i: distance(i, 1.02) - distance(i, 1.0), resamples=300)
-    assert low < value + difference < high, "one by one, the two cannot be told apart"
-    assert most - least < (high - low) / 4
 
 
 def test_normalized_features_compare_directions_alone():
-    generator = torch.Generator().manual_seed(0)
-    text = torch.nn.functional.normalize(torch.randn(64, 8, generator=generator), dim=-1)
+    text = normalize(torch.randn(64, 8, generator=torch.Generator().manual_seed(0)), dim=-1)
     lengths = torch.linspace(1, 10, 64)[:, None]
-    rows = {"generated": lengths * text, "text": text, "text_keys": torch.arange(64), "keys": torch.arange(64)}
-
-    def values(normalize: bool) -> tuple[float, float]:
-        metrics = {"top": MotionsForText(normalize=normalize), "distance": MultimodalDistance(normalize=normalize)}
-        update_metrics(metrics, **rows)
-        return metrics["top"].compute()["top1"], metrics["distance"].compute()
-
-    assert values(True) == (1.0, pytest.approx(0.0, abs=1e-6))
-    top1, distance = values(False)
-    assert top1 < 0.9
-    assert distance == pytest.approx(float((lengths - 1).mean()), rel=1e-6)
+    rows = {"generated": lengths * text, "text": text, "keys": torch.arange(64)}
+    for same in (True, False):
+        top1 = computed(MotionsForText(normalize=same), text_keys=rows["keys"], **rows)["top1"]
+        distance = computed(MultimodalDistance(normalize=same), **rows)
+        assert (top1 == 1) if same else (top1 < 0.9)
+        assert distance == pytest.approx(0 if same else float((lengths - 1).mean()), rel=1e-6, abs=1e-6)

@@ -7,13 +7,11 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-import pickle
 import tempfile
-import traceback
 from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import ExitStack
 from datetime import timedelta
-from multiprocessing.connection import Connection
-from pathlib import Path
 from typing import Any, Self
 
 import torch
@@ -22,86 +20,50 @@ SECONDS = 120
 
 
 class GlooPool:
-    """A process group of `size` processes of this machine, which run functions of test modules.
+    """A process group on this machine, which runs functions of test modules. Use as a context manager.
 
-    Use as a context manager. Each process computes with one thread, as the tests do.
+    Each process computes with one thread, as the tests do.
     """
 
     def __init__(self, size: int = 2):
         self.size = size
 
     def __enter__(self) -> Self:
-        self.folder = tempfile.TemporaryDirectory()
-        rendezvous = Path(self.folder.name) / "rendezvous"
-        spawn = multiprocessing.get_context("spawn")
-        self.connections: list[Connection] = []
-        self.processes = []
-        for rank in range(self.size):
-            here, there = spawn.Pipe()
-            process = spawn.Process(target=_work, args=(there, rank, self.size, f"file://{rendezvous}"), daemon=True)
-            process.start()
-            there.close()
-            self.connections.append(here)
-            self.processes.append(process)
-        if self.run(_rank_and_size) != [(rank, self.size) for rank in range(self.size)]:
-            raise RuntimeError("the processes do not see one another")
+        with ExitStack() as stack:
+            url = f"file://{stack.enter_context(tempfile.TemporaryDirectory())}/rendezvous"
+            spawn = multiprocessing.get_context("spawn")
+            self.ranks = [
+                stack.enter_context(ProcessPoolExecutor(1, spawn, _join, (rank, self.size, url)))
+                for rank in range(self.size)
+            ]
+            seen = self.run(_rank_and_size)
+            assert seen == [(rank, self.size) for rank in range(self.size)], "the processes do not see one another"
+            self.stack = stack.pop_all()
         return self
 
     def __exit__(self, *_: object) -> None:
-        for connection in self.connections:
-            connection.close()
-        for process in self.processes:
-            process.join(10)
-            if process.is_alive():
-                process.kill()
-        self.folder.cleanup()
+        for rank in self.ranks:
+            rank.submit(torch.distributed.destroy_process_group)
+        self.stack.close()
 
     def run(self, function: Callable[..., Any], *arguments: tuple[Any, ...]) -> list[Any]:
-        """Runs `function(*arguments[rank])` in every process.
+        """Returns the results of `function(*arguments[rank])` of every process; raises what a process raises.
 
         Args:
-            function: a function at the top of a module.
-            arguments: one tuple a process, or none for a function without arguments.
-
-        Returns:
-            The results in the order of the ranks.
-
-        Raises:
-            RuntimeError: a process raised, ended, or did not answer within two minutes.
+            function: A function at the top of a module.
+            arguments: One tuple per process, or none for a function without arguments.
         """
-        for rank, connection in enumerate(self.connections):
-            connection.send_bytes(pickle.dumps((function, arguments[rank] if arguments else ())))
-        results = []
-        for rank, connection in enumerate(self.connections):
-            try:
-                if not connection.poll(SECONDS):
-                    raise RuntimeError(f"process {rank} did not answer within {SECONDS} s")
-                error, result = pickle.loads(connection.recv_bytes())
-            except (EOFError, ConnectionResetError) as ended:
-                raise RuntimeError(f"process {rank} ended") from ended
-            if error:
-                raise RuntimeError(f"process {rank}: {error}")
-            results.append(result)
-        return results
+        ranks = zip(self.ranks, arguments or [()] * self.size, strict=True)
+        futures = [rank.submit(function, *values) for rank, values in ranks]
+        return [future.result(SECONDS) for future in futures]
 
 
-def _work(connection: Connection, rank: int, size: int, rendezvous: str) -> None:
+def _join(rank: int, size: int, url: str) -> None:
     os.environ["GLOO_SOCKET_IFNAME"] = "lo"
     torch.set_num_threads(1)
     torch.distributed.init_process_group(
-        "gloo", init_method=rendezvous, rank=rank, world_size=size, timeout=timedelta(seconds=SECONDS)
+        "gloo", init_method=url, rank=rank, world_size=size, timeout=timedelta(seconds=SECONDS)
     )
-    while True:
-        try:
-            function, arguments = pickle.loads(connection.recv_bytes())
-        except (EOFError, ConnectionResetError):  # the tests are over
-            break
-        try:
-            answer = None, function(*arguments)
-        except Exception:
-            answer = traceback.format_exc(), None
-        connection.send_bytes(pickle.dumps(answer))
-    torch.distributed.destroy_process_group()
 
 
 def _rank_and_size() -> tuple[int, int]:

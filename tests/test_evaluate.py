@@ -6,8 +6,6 @@ import multiprocessing
 import os
 import shutil
 import signal
-import subprocess
-import sys
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -17,7 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from support.runs import TINY
+from support.runs import TINY, finish, spawn
 
 from evaluators.evaluation import Evaluation
 from evaluators.evaluator import Evaluator, Extracted, Motions
@@ -361,9 +359,7 @@ def test_processes_share_the_work_and_get_one_result(runs, tmp_path, pool):
 LEAVES_NO_THREADS = """
 import sys
 from pathlib import Path
-
 from flame_mdm.__main__ import main
-
 code = main(sys.argv[1:])
 names = [path.read_text().strip() for path in Path("/proc/self/task").glob("*/comm")]
 sys.exit(code or ", ".join(name for name in names if "gloo" in name) or 0)
@@ -374,16 +370,14 @@ def test_torchrun_writes_one_result(runs, tmp_path):
     """And no thread of gloo is left, which could abort the process while Python shuts down."""
     script, out = tmp_path / "evaluate.py", tmp_path / "result.json"
     script.write_text(LEAVES_NO_THREADS)
-    words = [f"ckpt={runs.copy(tmp_path)}", "extractor=none", f"out={out}", "device=cpu", "samples=5", "replications=1"]
-    words += ["quick=true"]
-    torchrun = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2"]
-    command, environment = [*torchrun, str(script), "evaluate", *words], os.environ | {"OMP_NUM_THREADS": "1"}
-    done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.count("written:") == 1
+    torchrun = ["torch.distributed.run", "--standalone", "--nproc-per-node=2", str(script), "evaluate"]
+    words = [f"ckpt={runs.copy(tmp_path)}", "extractor=none", f"out={out}", "device=cpu"]
+    words += ["samples=5", "replications=1", "quick=true"]
+    code, printed, errors = finish(spawn([*torchrun, *words]))
+    assert code == 0, errors
+    assert printed.count("written:") == 1
     values: Any = read_result(out).values
-    assert values["jitter"].n == 5
-    assert values["multimodality"].mean is None, "not in quick evaluations"
+    assert (values["jitter"].n, values["multimodality"].mean) == (5, None)
     assert [path.name for path in motions(out).iterdir()] == ["rep_0.npz"]
 
 

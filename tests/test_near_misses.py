@@ -1,6 +1,7 @@
 """Near-miss captions: the same action, one attribute contradicted."""
 
 from dataclasses import replace
+from typing import Any
 
 from evaluators.near_misses import near_misses
 from flame_mdm.data.bandai import captions as bandai_captions
@@ -69,7 +70,8 @@ def test_the_action_of_bandai_contains_no_side():
 def test_no_near_misses():
     """One style in both sets of Bandai, and clips without an action."""
     pairs = [[bandai("walk", "feminine", 1), bandai("walk", "feminine", 2)]]
-    for attributes in ({}, {"tokens": [["a/DET"]]}, {"side": "left"}):
+    variants: list[dict[str, Any]] = [{}, {"tokens": [["a/DET"]]}, {"side": "left"}]
+    for attributes in variants:
         pairs.append([clip("a", ["x"], **attributes), clip("b", ["y"], **attributes | {"side": "right"})])
     assert [near_misses(pair) for pair in pairs] == [[{}, {}]] * 4
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import pytest
 import torch
-from support.distributed import GlooPool
 from support.fixtures import GENERATION, recipe
 from support.one_step import built, clips, shortened, two_steps
 
@@ -52,10 +51,9 @@ def test_every_recipe_trains_and_validates_a_step():
 
 
 @pytest.mark.slow
-def test_families_train_in_two_processes():
-    with GlooPool(2) as pool:
-        for name in FAMILIES:
-            (ours, total), (theirs, other) = pool.run(two_steps, (name,), (name,))
-            assert all(loss == loss for loss in (*ours, *theirs)), name
-            assert ours != theirs, f"{name}: not of their own batches"
-            assert total == other, f"{name}: not one set of weights"
+def test_families_train_in_two_processes(pool):
+    for name in FAMILIES:
+        (ours, total), (theirs, other) = pool.run(two_steps, (name,), (name,))
+        assert all(loss == loss for loss in (*ours, *theirs)), name
+        assert ours != theirs, f"{name}: not of their own batches"
+        assert total == other, f"{name}: not one set of weights"

@@ -1,10 +1,10 @@
 """Bodies: a sound mesh, bound to clips and skinned."""
 
 import sys
+from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 from support.motions import posed, sway
 
@@ -89,7 +89,7 @@ def test_joints_of_the_body_are_those_of_the_motion_and_soles_are_on_the_floor()
 
 
 def test_bent_and_twisted_limbs_keep_nine_tenths_of_their_volume():
-    turns: dict[str, ArrayLike]
+    turns: dict[str, Any]
     for turns, part in (
         ({"left_elbow": (0, -90, 0)}, ("left_shoulder", "left_elbow")),
         ({"left_knee": (90, 0, 0)}, ("left_hip", "left_knee")),

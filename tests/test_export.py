@@ -105,7 +105,7 @@ def test_only_the_root_sees_the_heading(clips):
 
 
 def test_bent_limbs_show_their_twist():
-    turns: dict[str, ArrayLike]
+    turns: dict[str, Any]
     for side, sign in (("left", 1), ("right", -1)):
         for limb, turns in (
             ("hip", {f"{side}_hip": (0, 34, 0), f"{side}_knee": (69, 0, 0)}),

@@ -6,45 +6,59 @@ import os
 from dataclasses import dataclass, field, fields
 from typing import Any, Literal
 
+from flame_mdm.checkpoints.locating import Which
 from flame_mdm.config import Config
 from flame_mdm.errors import UserError
-from flame_mdm.sampler_options import SamplerOptions
+from flame_mdm.sampler_options import SamplerOptions, option, same_option
 from flame_mdm.sampling.request import EditRequest
 
 MIN_RESAMPLES = 100
 
 
 @dataclass(frozen=True, kw_only=True)
-class EvaluationRequest:
-    """The keys of an evaluation, which `flame-mdm evaluate --help` explains.
+class EvaluationKeys:
+    """Keys of an evaluation that are the same on the command line and in Python, with their help texts."""
+
+    protocol: str | None = option(None, "a name in experiments/evaluation, or a file; default: the model decides")
+    extractor: str | None = option(None, "a motion-CLIP, or as the protocol requires; none = no extractor")
+    smpl: str | None = option(lambda: os.environ.get("FLAME_MDM_SMPL"), "SMPL's model file (.pkl or .npz), for joints")
+    from_samples: str | None = option(None, "a folder of motions of other systems, instead of ckpt; needs data=")
+    baseline: str | None = option(None, "real, shuffled, noisy or static motions, instead of ckpt; needs data=")
+    split: Literal["train", "val", "test"] = option("test", "train, val or test")
+    seed: int = option(0, "seed of the noise and of the drawn motions")
+    replications: int | None = option(None, "replications and samples: override the protocol; the result says so")
+    samples: int | None = option(None, "number of motions")
+    resamples: int = option(0, "sets of motions drawn for 95 % intervals over motions, such as 200")
+    multimodality: bool = option(True, "false = skip metrics that need several samples per prompt; the result says so")
+    quick: bool = option(False, "two replications of 64 motions, to check that everything works; the result says so")
+    force: bool = option(False, "generate even if real motions miss the expected values; the result says so")
+    method: str | None = same_option(EditRequest, "method")
+    until: float | None = same_option(EditRequest, "until")
+    strength: float | None = same_option(EditRequest, "strength")
+    batch_size: int | None = option(None, "motions at once: 64, or what a protocol that measures time says")
+    device: str | None = option(None, "default: cuda if available")
+    data_root: str = option("", "folder of the prepared data sets; default: the checkpoint's, or FLAME_MDM_DATA")
+    out: str | None = option(None, "the JSON file; default: next to the generated motions")
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluationRequest(EvaluationKeys):
+    """What is evaluated, and how: the keys of `flame-mdm evaluate`, with data set and representation composed.
 
     Raises:
         UserError: If keys contradict each other, or a value is out of range.
     """
 
     ckpt: str | None = None
-    which: Literal["last", "best"] = "last"
-    from_samples: str | None = None
-    baseline: str | None = None
+    which: Which = "last"
     data: Config | None = None
     representation: Config | None = None
-    protocol: str | None = None
-    extractor: str | None = None
-    smpl: str | None = field(default_factory=lambda: os.environ.get("FLAME_MDM_SMPL"))
-    split: Literal["train", "val", "test"] = "test"
-    seed: int = 0
-    replications: int | None = None
-    samples: int | None = None
-    resamples: int = 0
-    multimodality: bool = True
-    quick: bool = False
-    force: bool = False
     options: SamplerOptions = field(default_factory=SamplerOptions)
-    editing: EditRequest = field(default_factory=EditRequest)
-    batch_size: int | None = None
-    device: str | None = None
-    data_root: str | None = None
-    out: str | None = None
+
+    @property
+    def editing(self) -> EditRequest:
+        """How motions are edited, where the protocol edits."""
+        return EditRequest(method=self.method, until=self.until, strength=self.strength)
 
     @classmethod
     def of(cls, config: Config) -> EvaluationRequest:
@@ -53,10 +67,10 @@ class EvaluationRequest:
         def values(kind: Any) -> dict[str, Any]:
             return {key.name: config[key.name] for key in fields(kind) if key.name in config}
 
-        sampling = {"options": SamplerOptions(**values(SamplerOptions)), "editing": EditRequest(**values(EditRequest))}
-        return cls(**values(cls) | sampling)
+        return cls(**values(cls) | {"options": SamplerOptions(**values(SamplerOptions))})
 
     def __post_init__(self) -> None:
+        _ = self.editing  # checks its keys
         what = [name for name in ("ckpt", "from_samples", "baseline") if getattr(self, name) is not None]
         if len(what) != 1:
             raise UserError(

@@ -1,12 +1,11 @@
-"""Resuming a run: damaged and foreign checkpoints, full disks, bad losses, and one run per directory."""
+"""Resuming a run: damaged and foreign checkpoints, other data, bad losses, and one run per directory."""
 
 import copy
 import json
-import os
-import resource
+import multiprocessing
 import subprocess
-import sys
-from collections.abc import Callable, Iterator
+import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -18,30 +17,24 @@ from support.runs import TINY
 from flame_mdm.__main__ import main
 from flame_mdm.checkpoints.loading import load
 from flame_mdm.checkpoints.model_files import FORMAT_KEY, read_checkpoint
+from flame_mdm.commands import browse, evaluate, prepare, train
 from flame_mdm.config import instantiate
+from flame_mdm.data.folder import Folder
+from flame_mdm.data.store import Store
+from flame_mdm.data.synthetic import Synthetic
 from flame_mdm.errors import UserError
 from flame_mdm.processes.diffusion import GaussianDiffusion
 from flame_mdm.task import MotionGeneration
+from flame_mdm.training import checkpointing
 from flame_mdm.training.averaging import MovingAverage
-from flame_mdm.training.checkpointing import (
-    LAST,
-    PREVIOUS,
-    AtomicCheckpoints,
-    Resumed,
-    check_training_state,
-    directly_in,
-    newest,
-)
+from flame_mdm.training.checkpointing import LAST, PREVIOUS, AtomicCheckpoints, directly_in, newest
 from flame_mdm.training.guards import only_run
 
 pytestmark = pytest.mark.slow
 
-QUICK = [
-    "callbacks.samples=null",
-    "logger=tensorboard",
-    "callbacks.checkpoints.every_n_steps=2",
-    "trainer.val_check_interval=2",
-]
+STORE = "synthetic-humanml-clean-smpl22"
+QUICK = ["callbacks.samples=null", "logger=tensorboard", "trainer.val_check_interval=2"]
+QUICK += ["callbacks.checkpoints.every_n_steps=2"]
 
 
 @pytest.fixture(scope="module")
@@ -89,21 +82,21 @@ def best(run) -> tuple[dict[str, Any], dict[str, Any]]:
     return content, next(state for name, state in content["callbacks"].items() if name.startswith("ModelCheckpoint"))
 
 
-@pytest.mark.parametrize("name", ["../../victim", "../../victim.txt", "../checkpoints/../../victim", "link/victim.txt"])
-def test_a_foreign_checkpoint_removes_no_other_files(resume, best, tmp_path, name):
+def test_a_foreign_checkpoint_removes_no_other_files(resume, best, tmp_path):
     content, state = best
     folder, infinite = tmp_path / "run" / "checkpoints", torch.tensor(float("inf"))
     (tmp_path / "victim").mkdir()
     for file in (tmp_path / "victim" / "file.txt", tmp_path / "victim.txt"):
         file.write_text("mine")
-    path = f"{folder}/{name}"
-    state |= {f"{kind}_model_path": path for kind in ("best", "kth_best", "last")}
-    state |= {"dirpath": str(folder), "best_k_models": {path: infinite}, "kth_value": infinite}
     assert resume() == 0
     (folder / "link").symlink_to(tmp_path)
-    assert resume(content, "trainer.max_steps=8") == 0
-    assert (tmp_path / "victim" / "file.txt").read_text() == (tmp_path / "victim.txt").read_text() == "mine"
-    assert (folder / "best.ckpt").is_file()
+    for name in ("../../victim", "../../victim.txt", "../checkpoints/../../victim", "link/victim.txt"):
+        path = f"{folder}/{name}"
+        state |= {f"{kind}_model_path": path for kind in ("best", "kth_best", "last")}
+        state |= {"dirpath": str(folder), "best_k_models": {path: infinite}, "kth_value": infinite}
+        assert resume(content, "trainer.max_steps=8") == 0
+        assert (tmp_path / "victim" / "file.txt").read_text() == (tmp_path / "victim.txt").read_text() == "mine"
+        assert (folder / "best.ckpt").is_file()
 
 
 def test_only_files_directly_in_the_folder_are_removed(tmp_path):
@@ -157,7 +150,7 @@ def test_junk_in_the_state_of_training_is_named(run, best):
     names = {"best": next(key for key, value in content["callbacks"].items() if value is state)}
 
     def check(content: dict[str, Any]) -> None:
-        check_training_state(Resumed(run / "checkpoints" / LAST, 4, content), task, trainer)
+        checkpointing.check_training_state(checkpointing.Resumed(run / "checkpoints" / LAST, 4, content), task, trainer)
 
     check(content)
     assert state["best_model_path"], "paths of the run itself are kept"
@@ -188,24 +181,19 @@ def parts(config: dict[str, Any]) -> tuple[MotionGeneration, Trainer]:
     return task, instantiate(config["trainer"] | {"max_steps": 6}, **options)
 
 
-def test_junk_is_one_line_of_the_command(resume, best, capsys, tmp_path):
-    content, _ = best
-    for key, value in (("loops", None), ("global_step", "x"), ("optimizer_states", [3])):
-        capsys.readouterr()
-        assert resume(content | {key: value}) == 1
-        assert f"{LAST}: damaged: " in one_error(capsys)
-        (tmp_path / "run" / "checkpoints" / PREVIOUS).unlink(missing_ok=True)
+def test_junk_is_one_line_of_the_command(resume, best, capsys):
+    assert resume(best[0] | {"optimizer_states": [3]}) == 1
+    assert f"{LAST}: damaged: " in one_error(capsys)
 
 
-def test_files_of_version_0_1_are_one_line(resume, best, run, tmp_path, capsys):
-    content, _ = best
-    old = {key: value for key, value in content.items() if key != FORMAT_KEY}
-    torch.save(old, tmp_path / "old.ckpt")
+def test_files_of_version_0_1_are_one_line(best, tmp_path):
+    content, file = best[0], tmp_path / "old.ckpt"
+    torch.save({key: value for key, value in content.items() if key != FORMAT_KEY}, file)
     with pytest.raises(UserError, match=r"old\.ckpt: written by version 0\.1 of flame_mdm, .* Train or import the"):
-        load(tmp_path / "old.ckpt")
-    torch.save(content | {FORMAT_KEY: 3}, tmp_path / "new.ckpt")
+        load(file)
+    torch.save(content | {FORMAT_KEY: 3}, file)
     with pytest.raises(UserError, match="has format 3, but this version reads 2"):
-        load(tmp_path / "new.ckpt")
+        load(file)
 
 
 def test_a_checkpoint_does_not_switch_compilation_on(best, tmp_path, monkeypatch):
@@ -216,18 +204,68 @@ def test_a_checkpoint_does_not_switch_compilation_on(best, tmp_path, monkeypatch
     assert load(tmp_path / "compiled.ckpt").config["task"]["compile"]
 
 
-def test_other_code_and_other_seeds_are_named(resume, tmp_path, capsys):
+def test_other_code_is_named(resume, tmp_path, capsys):
     assert resume(None, "trainer.max_steps=4") == 0  # copies the run
     path = tmp_path / "run" / "provenance.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | {"commit": "0" * 40}))
-    capsys.readouterr()
-    assert resume(None, "seed=5") == 1
-    assert "seed (0 there, 5 here)" in one_error(capsys)
     assert resume() == 0
     assert "resuming with different code: results may differ" in capsys.readouterr().out
 
 
-# Damage, full disks, bad losses ---------------------------------------------------------------------------------------
+# Other data -----------------------------------------------------------------------------------------------------------
+
+
+def prepared(root: Path, clips: int, *more: str) -> list[str]:
+    return ["data=synthetic", f"data.source.clips={clips}", f"data_root={root}", *more]
+
+
+def tree(*folders: Path) -> dict[Path, bytes]:
+    return {path: path.read_bytes() for folder in folders for path in folder.rglob("*") if path.is_file()}
+
+
+def test_a_run_does_not_resume_on_other_data(run, tmp_path, data_root, capsys, monkeypatch):
+    """The store changes, and the recipe does not: the same options, but other files or another version of the code."""
+    original, root = Synthetic.clips, tmp_path / "data"
+    monkeypatch.setattr(Synthetic, "clips", lambda self, fps: list(original(self, fps))[:59])
+    assert prepare.main(prepared(root, 60)) == 0
+    capsys.readouterr()
+    before = tree(run, root)
+    assert train.main([*words(run, root), "trainer.max_steps=6"]) == 1
+    line = one_error(capsys)
+    fingerprints = [Store(folder / STORE).fingerprint for folder in (data_root, root)]
+    assert all(part in line for part in (f"{run}/checkpoints/last.ckpt", *fingerprints, "run.name=..."))
+    assert tree(run, root) == before
+
+
+def test_a_store_of_other_options_is_refused_everywhere(tmp_path, trained, capsys):
+    root, run = tmp_path / "data", tmp_path / "run"
+    assert prepare.main(prepared(root, 61)) == 0
+    capsys.readouterr()
+    before = tree(root)
+    message = f"error: {root / STORE}: prepared with clips=61, but the recipe has clips=60. Prepare it again with force"
+    for command, line in (
+        (train, [*words(run, root), "trainer.max_steps=2"]),
+        (prepare, prepared(root, 60)),
+        (prepare, prepared(root, 60, "verify=true")),
+        (browse, prepared(root, 60, f"out={tmp_path / 'page.html'}")),
+        (evaluate, [f"ckpt={trained}", "extractor=none", "quick=true", f"data_root={root}"]),
+    ):
+        assert command.main(line) == 1
+        assert one_error(capsys).startswith(message)
+    assert tree(root) == before
+    assert [path.name for path in tmp_path.iterdir()] == ["data"]
+    assert prepare.main(prepared(root, 60, "force=true")) == 0
+    assert prepare.main(prepared(root, 60)) == 0
+
+
+def test_options_that_decide_the_data_count_but_paths_do_not():
+    source = Folder("here", mirror=True, exclude=("b", "a"))
+    assert source.options == {"motion": "joints", "mirror": True, "exclude": ["b", "a"]}
+    assert Folder("there", "joints", True, ["b", "a"]).options == source.options
+    assert Synthetic(3).options == {"clips": 3, "seed": 0, "min_seconds": 2.0, "max_seconds": 3.0}
+
+
+# Damage, bad losses --------------------------------------------------------------------------------------------------
 
 
 def test_a_damaged_checkpoint_gives_way_to_the_one_before(resume, tmp_path, capsys):
@@ -254,25 +292,6 @@ def test_a_damaged_checkpoint_gives_way_to_the_one_before(resume, tmp_path, caps
     assert newest(tmp_path / "absent") is None
 
 
-@pytest.fixture
-def file_limit() -> Iterator[Callable[[int], None]]:
-    """Sets the maximum size of files; writing more fails as on a full disk."""
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    yield lambda size: resource.setrlimit(resource.RLIMIT_FSIZE, (size, limits[1]))
-    resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-
-
-def test_a_full_disk_leaves_the_checkpoint_before(tmp_path, file_limit):
-    io = AtomicCheckpoints(tmp_path)
-    io.save_checkpoint({"global_step": 1, "config": {}, "facts": {}, "state_dict": {}}, tmp_path / LAST)
-    before = (tmp_path / LAST).read_bytes()
-    file_limit(100_000)
-    with pytest.raises(UserError, match=r"last\.ckpt: the checkpoint of step 2 cannot be written .*File too large"):
-        io.save_checkpoint({"global_step": 2, "state_dict": {"a": torch.zeros(100_000)}}, tmp_path / LAST)
-    assert [path.name for path in tmp_path.iterdir()] == [LAST]
-    assert (tmp_path / LAST).read_bytes() == before
-
-
 def break_loss(monkeypatch: pytest.MonkeyPatch, step: int, change: Callable[[torch.Tensor], torch.Tensor]) -> None:
     """Changes the loss terms of a training step."""
     original, count = GaussianDiffusion.loss, [0]
@@ -285,11 +304,9 @@ def break_loss(monkeypatch: pytest.MonkeyPatch, step: int, change: Callable[[tor
     monkeypatch.setattr(GaussianDiffusion, "loss", loss)
 
 
-@pytest.mark.parametrize(
-    ("change", "reason"), [(lambda v: v * float("nan"), "is nan"), (lambda v: v * 1e6, "(typical: ")]
-)
-def test_a_bad_loss_stops_before_a_checkpoint_is_spoiled(tmp_path, data_root, monkeypatch, capsys, change, reason):
-    break_loss(monkeypatch, 5, change)
+@pytest.mark.parametrize(("factor", "reason"), [(float("nan"), "is nan"), (1e6, "(typical: ")])
+def test_a_bad_loss_stops_before_a_checkpoint_is_spoiled(tmp_path, data_root, monkeypatch, capsys, factor, reason):
+    break_loss(monkeypatch, 5, lambda value: value * factor)
     assert main(["train", *words(tmp_path, data_root), "trainer.max_steps=8", "trainer.log_every_n_steps=2"]) == 1
     message = one_error(capsys)
     assert "the loss of step 5 " in message
@@ -314,30 +331,26 @@ def test_out_of_memory_names_the_batch(tmp_path, data_root, monkeypatch, capsys)
 
 # One run per directory ------------------------------------------------------------------------------------------------
 
-HOLD = """
-import sys, pathlib
-from flame_mdm.training.guards import only_run
-with only_run(pathlib.Path(sys.argv[1])):
-    print("held", flush=True)
-    sys.stdin.read()
-"""
+
+def hold(folder: Path, held: Any) -> None:
+    with only_run(folder):
+        held.set()
+        time.sleep(60)
 
 
 def test_a_second_run_in_the_folder_is_refused_and_a_dead_one_taken_over(tmp_path, capsys):
     (tmp_path / "checkpoints").mkdir()
     for name in (LAST, "step=0000010.partial"):
         (tmp_path / "checkpoints" / name).touch()
-    command = [sys.executable, "-c", HOLD, str(tmp_path)]
-    pipe, environment = subprocess.PIPE, {**os.environ, "OMP_NUM_THREADS": "1"}
-    with subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True, env=environment) as other:
-        assert other.stdout is not None
-        assert other.stdout.readline() == "held\n"
-        with (
-            pytest.raises(UserError, match=f"process {other.pid} on .* is training in this directory"),
-            only_run(tmp_path),
-        ):
-            pass
-        other.kill()
+    context = multiprocessing.get_context("fork")
+    held = context.Event()
+    other = context.Process(target=hold, args=(tmp_path, held))
+    other.start()
+    assert held.wait(30)
+    with pytest.raises(UserError, match=f"process {other.pid} on .* is training in this dir"), only_run(tmp_path):
+        pass
+    other.kill()
+    other.join()
     with only_run(tmp_path):
         assert [path.name for path in (tmp_path / "checkpoints").iterdir()] == [LAST], "unfinished ones are removed"
     assert f"process {other.pid} on " in capsys.readouterr().out

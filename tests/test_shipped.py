@@ -15,10 +15,10 @@ from flame_mdm.safe_io import sha256
 def test_the_model_follows_its_prompts():
     model = flame_mdm.load("quickstart")
     assert all(value.dtype == torch.float32 for value in model.parameters())
-    texts, wanted = zip(*prompts(), strict=True)
+    texts, expected = zip(*prompts(), strict=True)
     motions = flame_mdm.generate(model, texts, seconds=2.5, num_inference_steps=10, cleanup=True)
     read = [read_attributes(motion.joints, 20) for motion in motions]
-    assert np.mean([a.get("action") == b["action"] for a, b in zip(read, wanted, strict=True)]) >= 0.7
+    assert np.mean([a.get("action") == b["action"] for a, b in zip(read, expected, strict=True)]) >= 0.7
 
 
 def test_shipped_names_come_after_paths(tmp_path, monkeypatch, capsys):

@@ -1,3 +1,5 @@
+"""Training: what a run leaves, resuming and signals; sampling from its checkpoint."""
+
 import json
 import os
 import re
@@ -12,11 +14,12 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from support.runs import finish, spawn
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from torchmetrics import MeanMetric
 
 import flame_mdm
 from flame_mdm.__main__ import main
-from flame_mdm.batch import MotionBatch, length_mask
 from flame_mdm.checkpoints.loading import load
 from flame_mdm.checkpoints.model_files import read_checkpoint
 from flame_mdm.config import compose, instantiate
@@ -28,10 +31,6 @@ from flame_mdm.sampling.generation import generate
 STEPS = ["trainer.val_check_interval=4", "callbacks.checkpoints.every_n_steps=4", "callbacks.samples=null"]
 
 
-def weights(path: Path) -> dict[str, torch.Tensor]:
-    return read_checkpoint(path)["state_dict"]
-
-
 def run(overrides: list[str], steps: int, folder: Path | None = None) -> Path:
     changes = [f"run.dir={folder}"] if folder else []
     assert main(["train", "quickstart", *overrides, *changes, f"trainer.max_steps={steps}"]) == 0
@@ -39,33 +38,28 @@ def run(overrides: list[str], steps: int, folder: Path | None = None) -> Path:
     return directory / "checkpoints" / "last.ckpt"
 
 
-@pytest.fixture(scope="module")
-def trained(tmp_path_factory, data_root):
-    """Checkpoint of a tiny experiment after 6 steps."""
-    from support.runs import TINY
-
-    folder = tmp_path_factory.mktemp("trained")
-    return run([*TINY, f"data_root={data_root}", f"run.dir={folder}", "trainer.val_check_interval=3"], 6)
+def same_weights(first: Path, second: Path) -> bool:
+    """Whether two checkpoints hold the same weights, averaged and not, bit for bit."""
+    a, b = read_checkpoint(first), read_checkpoint(second)
+    pairs = [(a.get(key, {}), b.get(key, {})) for key in ("state_dict", "current_model_state")]
+    return all(x.keys() == y.keys() and all(torch.equal(x[name], y[name]) for name in x) for x, y in pairs)
 
 
 def tensorboard_tags(folder: Path) -> set[str]:
-    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-
     events = EventAccumulator(str(folder))
     events.Reload()
     return set(events.Tags()["scalars"])
 
 
-def test_a_run_leaves_what_a_user_looks_for(trained):
-    folder = trained.parent.parent
+def test_a_run_leaves_what_a_user_looks_for(tiny, tmp_path):
+    checkpoint, folder = read_checkpoint(run([*tiny, "trainer.val_check_interval=1"], 2)), tmp_path / "run"
     files = ("config.yaml", "provenance.json", "metrics.jsonl", "report.html", "checkpoints/best.ckpt")
-    for name in (*files, "samples/step_0000006/player.html"):
+    for name in (*files, "samples/step_0000002/player.html"):
         assert (folder / name).is_file(), name
     assert "val/loss" in tensorboard_tags(folder / "tensorboard")
     assert "epoch" not in tensorboard_tags(folder / "tensorboard"), "always 0"
-    checkpoint = read_checkpoint(trained)
     assert checkpoint["config"]["experiment"] == "quickstart"
-    assert checkpoint["global_step"] == 6
+    assert checkpoint["global_step"] == 2
     training = checkpoint["facts"].pop("training")
     assert training.keys() == {"hours", "memory_gib", "processes", "speed", "precision", "device"}
     assert re.fullmatch(r"1 x (?!cpu).+, \d+ threads?", training["device"]), "names the processor"
@@ -74,52 +68,39 @@ def test_a_run_leaves_what_a_user_looks_for(trained):
     assert not list(folder.rglob("*.partial"))
 
 
-def test_a_resumed_run_adds_up_what_it_cost(tiny, tmp_path):
-    first = read_checkpoint(run([*tiny, *STEPS], 2, tmp_path / "run"))
+@pytest.mark.slow
+def test_training_learns(tiny):
+    checkpoint = run([*tiny, *STEPS, "optimizer.lr=0.01", "trainer.log_every_n_steps=1", "logger=csv"], 60)
+    rows = (checkpoint.parent.parent / "csv" / "metrics.csv").read_text().splitlines()
+    column = rows[0].split(",").index("train/loss")
+    losses = [float(row.split(",")[column]) for row in rows[1:] if row.split(",")[column]]
+    assert len(losses) == 60
+    assert np.mean(losses[-10:]) < 0.7 * np.mean(losses[:5])
+
+
+def test_a_resumed_run_is_the_uninterrupted_one_and_adds_up_what_it_cost(tiny, tmp_path):
+    overrides = [*tiny, *STEPS, "denoiser.dropout=0.1"]
+    parts = run(overrides, 5, tmp_path / "parts")
+    first = read_checkpoint(parts)
     training = first["facts"]["training"]
     assert 0 < training["hours"] < 1
     assert 0.01 < training["memory_gib"] < 1000
     assert training["processes"] == 1
-    path = tmp_path / "run" / "checkpoints" / "last.ckpt"
-    first["facts"]["training"] |= {"hours": 100.0, "memory_gib": 2000.0}
-    torch.save(first, path)
-    resumed = read_checkpoint(run([*tiny, *STEPS], 4, tmp_path / "run"))["facts"]["training"]
+    training |= {"hours": 100.0, "memory_gib": 2000.0}
+    torch.save(first, parts)
+    run(overrides, 11, tmp_path / "parts")
+    assert same_weights(parts, run(overrides, 11, tmp_path / "whole"))
+    resumed = read_checkpoint(parts)["facts"]["training"]
     assert 100 < resumed["hours"] < 101
     assert resumed["memory_gib"] == 2000
 
 
 @pytest.mark.slow
-def test_training_learns(tiny):
-    checkpoint = run([*tiny, *STEPS, "optimizer.lr=0.01", "trainer.log_every_n_steps=1", "logger=csv"], 120)
-    rows = (checkpoint.parent.parent / "csv" / "metrics.csv").read_text().splitlines()
-    column = rows[0].split(",").index("train/loss")
-    losses = [float(row.split(",")[column]) for row in rows[1:] if row.split(",")[column]]
-    assert len(losses) == 120
-    assert np.mean(losses[-20:]) < 0.7 * np.mean(losses[:5])
-
-
-@pytest.mark.parametrize(
-    "extra",
-    [
-        [],
-        pytest.param(["trainer.accumulate_grad_batches=2"], marks=pytest.mark.slow),
-        pytest.param(["ema=null", "data.num_workers=1", "data.resident=false"], marks=pytest.mark.slow),
-    ],
-)
-def test_a_resumed_run_is_the_uninterrupted_one(tiny, extra, tmp_path):
-    overrides = [*tiny, *STEPS, "denoiser.dropout=0.1", *extra]
-    run(overrides, 5, tmp_path / "parts")
-    parts = run(overrides, 11, tmp_path / "parts")
-    whole = run(overrides, 11, tmp_path / "whole")
-    for key in ("state_dict", "current_model_state"):
-        a, b = (read_checkpoint(path).get(key, {}) for path in (parts, whole))
-        assert a.keys() == b.keys()
-        assert all(torch.equal(a[name], b[name]) for name in a), key
-
-
 def test_a_decaying_learning_rate_resumes_where_it_was(tiny, tmp_path):
-    overrides = [*tiny, *STEPS, "lr_decay=0.5", "optimizer.lr=0.008", "callbacks.best=null"]
+    """Also with accumulated gradients, a loading process, and without averaged weights."""
+    overrides = [*tiny, *STEPS, "lr_decay=0.5", "optimizer.lr=0.008", "callbacks.best=null", "data.resident=false"]
     overrides += ["callbacks.checkpoints.keep_every_n_steps=6", "trainer.log_every_n_steps=1"]
+    overrides += ["trainer.accumulate_grad_batches=2", "data.num_workers=1", "ema=null"]
     whole = run(overrides, 8, tmp_path / "whole")
     lines = (json.loads(line) for line in (tmp_path / "whole" / "metrics.jsonl").read_text().splitlines())
     rates = [line["train/lr"] for line in lines if "train/lr" in line]
@@ -128,22 +109,21 @@ def test_a_decaying_learning_rate_resumes_where_it_was(tiny, tmp_path):
     parts.parent.mkdir(parents=True)
     parts.write_bytes((whole.parent / "step=0000006.ckpt").read_bytes())
     run(overrides, 8, tmp_path / "parts")
-    a, b = weights(parts), weights(whole)
-    assert all(torch.equal(a[name], b[name]) for name in a)
+    assert same_weights(parts, whole)
 
 
 def test_progress_counts_all_steps_and_shows_losses(tiny, capfd, monkeypatch):
     """Also after a resume; in a log file as plain lines, here one per step."""
     monkeypatch.setattr(ProgressBar, "SECONDS", 0.0)
-    overrides = [*tiny, *STEPS, "trainer.enable_progress_bar=true", "trainer.log_every_n_steps=2"]
-    run(overrides, 6)
-    run(overrides, 8)
+    overrides = [*tiny, "trainer.enable_progress_bar=true", "trainer.log_every_n_steps=2", "callbacks.samples=null"]
+    overrides += ["trainer.val_check_interval=2", "logger=csv", "callbacks.best=null"]
+    run(overrides, 3)
+    run([*overrides, "logger=tensorboard"], 4)
     lines = [line for line in capfd.readouterr().err.splitlines() if line.startswith("training:")]
     counts = [re.search(r" (\d+/\d+) \[", line) for line in lines]
-    steps = [*(f"{step}/6" for step in range(7)), "6/8", "7/8", "8/8"]
-    assert list(dict.fromkeys(found and found[1] for found in counts)) == steps
+    assert list(dict.fromkeys(count and count[1] for count in counts)) == ["0/3", "1/3", "2/3", "3/3", "3/4", "4/4"]
     assert "train/loss=" in lines[3]
-    assert "val/loss=" in lines[6]
+    assert "val/loss=" in lines[4]
     assert not any("\r" in line for line in lines)
 
 
@@ -158,45 +138,35 @@ def test_waiting_threads_soon_sleep():
         assert done.stdout.strip() == expected
 
 
-def test_a_finished_run_says_so_and_one_of_another_configuration_is_refused(tiny, capsys):
+def test_a_finished_run_says_so_another_configuration_is_refused_and_a_saved_one_repeats_it(tiny, tmp_path, capsys):
     for _ in range(2):
-        run([*tiny, *STEPS], 2)
+        first = run([*tiny, *STEPS], 2)
     assert "already trained for 2 steps" in capsys.readouterr().out
     assert main(["train", "quickstart", *tiny, *STEPS, "optimizer.lr=0.5", "trainer.max_steps=4"]) == 1
     message = capsys.readouterr().err
     assert "optimizer.lr (0.002 there, 0.5 here)" in message
     assert "run.name=" in message
-
-
-def test_a_saved_config_repeats_a_run(tiny, tmp_path):
-    first = run([*tiny, *STEPS], 3)
-    config = first.parent.parent / "config.yaml"
-    assert main(["train", str(config), f"run.dir={tmp_path / 'again'}"]) == 0
-    second = weights(tmp_path / "again" / "checkpoints" / "last.ckpt")
-    assert all(torch.equal(second[name], value) for name, value in weights(first).items())
+    assert main(["train", str(tmp_path / "run" / "config.yaml"), f"run.dir={tmp_path / 'again'}"]) == 0
+    assert same_weights(tmp_path / "again" / "checkpoints" / "last.ckpt", first)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("signum", [pytest.param(signal.SIGINT, marks=pytest.mark.robustness), signal.SIGTERM])
 def test_a_signal_stops_at_the_end_of_a_step_and_the_run_goes_on(tiny, signum, tmp_path):
     overrides = [*tiny, *STEPS, "trainer.max_steps=100000"]
-    command = [sys.executable, "-m", "flame_mdm", "train", "quickstart", *overrides]
-    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment)
+    process = spawn(["flame_mdm", "train", "quickstart", *overrides])
     checkpoint = tmp_path / "run" / "checkpoints" / "last.ckpt"
     deadline = time.monotonic() + 120
     while not checkpoint.exists() and time.monotonic() < deadline and process.poll() is None:
         time.sleep(0.05)
     process.send_signal(signum)
-    out, err = process.communicate(timeout=60)
-    assert process.returncode == 128 + signum, err
+    code, out, err = finish(process)
+    assert code == 128 + signum, err
     assert "Traceback" not in err
     step = read_checkpoint(checkpoint)["global_step"]
     assert f"stopped at step {step}. Run the same command to resume" in out
     run([*tiny, *STEPS], step + 2)
-    whole = run([*tiny, *STEPS], step + 2, tmp_path / "whole")
-    a, b = weights(checkpoint), weights(whole)
-    assert all(torch.equal(a[name], b[name]) for name in a)
+    assert same_weights(checkpoint, run([*tiny, *STEPS], step + 2, tmp_path / "whole"))
 
 
 def test_averaged_weights_are_what_is_loaded(trained):
@@ -204,30 +174,6 @@ def test_averaged_weights_are_what_is_loaded(trained):
     name = next(n for n in checkpoint["state_dict"] if n.startswith("denoiser.") and n.endswith("weight"))
     assert not torch.equal(checkpoint["state_dict"][name], checkpoint["current_model_state"][name])
     assert torch.equal(load(trained).state_dict()[name], checkpoint["state_dict"][name])
-
-
-def test_a_motion_does_not_depend_on_the_others(trained):
-    model = load(trained)
-    texts = ["a person walks", "a person jumps"]
-    together = generate(model, texts, frames=[30, 40], samples=2, seed=3)
-    alone = generate(model, texts[1], frames=40, samples=2, seed=3)
-    for a, b in zip(together[2:], alone, strict=True):
-        np.testing.assert_allclose(a.features, b.features, atol=1e-4)
-    assert np.abs(alone[0].features - alone[1].features).max() > 0.01
-    other = generate(model, texts[1], frames=40, seed=4)[0]
-    assert np.abs(alone[0].features - other.features).max() > 0.01
-
-
-def test_padding_changes_nothing(trained):
-    model = load(trained)
-
-    def motion(frames):
-        mask = length_mask(torch.tensor([24]), frames)
-        batch = MotionBatch(torch.zeros(1, frames, 263), mask, ["a"], ["a person walks"])
-        return model.generate(batch, seed=1)
-
-    assert torch.allclose(motion(24), motion(50)[:, :24], atol=1e-4)
-    assert (motion(50)[:, 24:] == 0).all()
 
 
 def test_validation_does_not_depend_on_the_batch_size(trained, data_root):
@@ -257,39 +203,24 @@ def test_unconditioned_samples_ignore_guidance(trained):
     np.testing.assert_allclose(a.features, b.features, atol=1e-5)
 
 
-def test_sampling_writes_motions_and_a_player(trained, tmp_path, capsys):
-    out = tmp_path / "out"
-    words = [f"ckpt={trained}", "text=a person's walk (slow), 100%", "seconds=1.5", "samples=2", f"out={out}", "seed=9"]
-    assert main(["sample", *words]) == 0
-    with np.load(out / "motion_001.npz") as motion:
-        assert motion["joints"].shape == (30, 22, 3)
-        assert str(motion["text"]) == "a person's walk (slow), 100%"
-        assert (int(motion["seed"]), float(motion["fps"])) == (9, 20.0)
-        assert len(str(motion["checkpoint"])) == 64
-    assert {p.name for p in out.iterdir()} >= {"player.html", "motions.gif", "motions.png", "motion_000.npz"}
-    assert "player.html" in capsys.readouterr().out
+def test_recipes_may_list_the_sampling_steps(trained, tmp_path):
+    content, steps = read_checkpoint(trained), [0, 2, 5, 9]
+    content["config"]["task"]["num_inference_steps"] = steps
+    torch.save(content, tmp_path / "last.ckpt")
+    listed = generate(load(tmp_path / "last.ckpt"), "a person walks", frames=20)[0]
+    chosen = generate(load(trained), "a person walks", frames=20, num_inference_steps=steps)[0]
+    np.testing.assert_array_equal(listed.features, chosen.features)
 
 
-def test_recipes_may_list_the_sampling_steps(data_root, tmp_path):
-    from support.runs import TINY
-
-    words = [f"data_root={data_root}", "callbacks.samples=null", "task.num_inference_steps=[0,2,5,9]"]
-    model = load(run([*TINY, *words], 1, tmp_path / "run"))
-
-    def features(**options: Any) -> np.ndarray:
-        return generate(model, "a person walks", frames=20, **options)[0].features
-
-    default, chosen, other = features(), features(num_inference_steps=[0, 2, 5, 9]), features(num_inference_steps=4)
-    np.testing.assert_array_equal(default, chosen)
-    assert not np.allclose(default, other)
-
-
-def test_sample_takes_every_option_of_sampling(trained, tmp_path):
-    out, text = tmp_path / "samples", "a person walks"
-    how: dict[str, Any] = {"frames": 40, "sampler": "ddim", "eta": 0.5, "num_inference_steps": [0, 2, 5, 9]}
+@pytest.mark.slow
+def test_sampling_writes_motions_and_a_player_and_takes_every_option(trained, tmp_path, capsys):
+    out, text = tmp_path / "samples", "a person's walk (slow), 100%"
+    how: dict[str, Any] = {"frames": 24, "sampler": "ddim", "eta": 0.5, "num_inference_steps": [0, 2, 5, 9], "seed": 9}
     words = [f"{key}={value}".replace(" ", "") for key, value in how.items()]
     words += ["samples=2", "shared_noise=true", "trajectory=true"]
     assert main(["sample", f"ckpt={trained}", f"text={text}", f"out={out}", *words]) == 0
+    assert "player.html" in capsys.readouterr().out
+    assert {p.name for p in out.iterdir()} >= {"player.html", "motions.gif", "motions.png", "motion_000.npz"}
     model = load(trained)
 
     def features(**change: Any) -> np.ndarray:
@@ -299,8 +230,10 @@ def test_sample_takes_every_option_of_sampling(trained, tmp_path):
     for name in ("motion_000.npz", "motion_001.npz"):  # of the same noise
         with np.load(out / name) as motion:
             np.testing.assert_allclose(motion["features"], features(), atol=1e-5)
+            assert motion["joints"].shape == (24, 22, 3)
+            assert (str(motion["text"]), int(motion["seed"]), float(motion["fps"])) == (text, 9, 20.0)
+            assert len(str(motion["checkpoint"])) == 64
     five = features(num_inference_steps=5)
-    assert len(five) == 40
     np.testing.assert_array_equal(features(num_inference_steps=[0, 2, 4, 7, 9]), five)
     for change in ({"spacing": "stride"}, {"eta": 0.0}, {"shared_noise": False}):
         assert not np.allclose(features(num_inference_steps=5, **change), five)
@@ -346,47 +279,28 @@ def test_stages_are_the_clean_estimates_up_to_the_motion(trained):
 
 BAD_REQUESTS = [
     (["text="], "the text is empty"),
-    (["text=  "], "the text is empty"),
     ([], "say what to sample: text=..., for example a "),
     (["text=a", "unconditioned=true"], "not text and unconditioned"),
     (["text=a", "seconds=30"], "up to 3 seconds (60 frames at 20 fps)"),
     (["text=a", "seconds=0"], "0 seconds (0 frames) are too short: give at least 0.1 seconds"),
     (["action=walk"], "action=walk: this model was trained on captions. Give text="),
-    (["text=a", "seconds=-1"], "are too short"),
     (["text=a", "sampler=euler"], "unknown sampler 'euler'"),
     (["text=a", "num_inference_steps=11"], "11"),
-    (["text=a", "num_inference_steps=[3,1]"], "got [3, 1]"),
     (["text=a", "num_inference_steps=[0,1.5]"], "num_inference_steps=[0, 1.5]: "),
     (["text=a", "eta=0.5"], "eta=0.5"),
     (["text=a", "spacing=even"], "spacing=even"),
-    (["text=a", "sead=3"], "unknown config key 'sead'. Did you mean seed"),
 ]
 
 
-def test_bad_requests_are_one_line(trained, tmp_path, capsys):
+def test_bad_requests_are_one_line(refused, trained):
     for words, message in BAD_REQUESTS:
-        assert main(["sample", f"ckpt={trained}", f"out={tmp_path / 'out'}", *words]) == 1, words
-        error = capsys.readouterr().err
-        assert message in error
-        assert error.count("\n") == 1
-        assert not (tmp_path / "out").exists()
+        refused("sample", f"ckpt={trained}", "out=out", *words, says=message)
 
 
-def test_bad_checkpoints_are_one_line(trained, tmp_path):
-    with pytest.raises(FileNotFoundError, match="no such checkpoint"):
-        load(tmp_path / "absent.ckpt")
-    data = trained.read_bytes()
-    for name, content in (("cut", data[: len(data) // 2]), ("empty", b""), ("text", b"hello"), ("folder", None)):
-        path = tmp_path / f"{name}.ckpt"
-        path.mkdir() if content is None else path.write_bytes(content)
-        with pytest.raises((UserError, FileNotFoundError), match=str(path)):
-            load(path)
+def test_a_checkpoint_without_a_recipe_or_of_another_shape_is_one_line(trained, tmp_path):
     torch.save({"state_dict": {}}, tmp_path / "foreign.ckpt")
     with pytest.raises(UserError, match="holds no recipe"):
         load(tmp_path / "foreign.ckpt")
-
-
-def test_a_checkpoint_of_another_shape_names_the_weight(trained, tmp_path):
     checkpoint = read_checkpoint(trained)
     checkpoint["config"]["denoiser"]["latent_dim"] = 32
     torch.save(checkpoint, tmp_path / "other.ckpt")
@@ -403,6 +317,6 @@ def test_an_unwritable_folder_is_one_line(tiny, tmp_path, capsys):
 def test_training_without_condition_in_bfloat16(tiny):
     overrides = [o for o in tiny if not o.startswith("condition.")]
     checkpoint = run([*overrides, *STEPS, "condition=none", "trainer.precision=bf16-mixed"], 2)
-    values = [value for value in weights(checkpoint).values() if value.is_floating_point()]
+    values = [value for value in read_checkpoint(checkpoint)["state_dict"].values() if value.is_floating_point()]
     assert all(value.dtype == torch.float32 and torch.isfinite(value).all() for value in values)
     assert generate(load(checkpoint), frames=24)[0].joints.shape == (24, 22, 3)

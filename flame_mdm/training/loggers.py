@@ -94,7 +94,8 @@ class WandbRun(WandbLogger):
         kept = read_json(self.path, Kept, "delete it to start a new wandb run") if self.path.exists() else {}
         step = kept.get("step")
         self.logged_step, self.rows = -1 if step is None else step, kept.get("rows", 0)
-        super().__init__(save_dir=save_dir, **({"id": kept.get("id") or secrets.token_hex(4)} | options))
+        options = {"id": kept.get("id") or secrets.token_hex(4), **options}
+        super().__init__(save_dir=save_dir, **options)
         self._wandb_init.pop("anonymous")  # wandb warns about it even if it is not set
 
     @rank_zero_only

@@ -23,19 +23,11 @@ from flame_mdm.task import MotionGeneration
 SECONDS = 120
 
 TINY = [
-    "data.source.clips=60",
-    "data.batch_size=8",
-    "denoiser.latent_dim=16",
-    "denoiser.ff_size=16",
-    "denoiser.num_layers=1",
-    "denoiser.num_heads=2",
-    "condition.features=16",
-    "process.num_train_timesteps=10",
-    "task.num_inference_steps=5",
-    "lr_decay=0",  # it depends on trainer.max_steps, which tests raise to resume
-    "trainer.accelerator=cpu",
-    "trainer.enable_progress_bar=false",
+    *("data.source.clips=60", "data.batch_size=8", "denoiser.latent_dim=16", "denoiser.ff_size=16"),
+    *("denoiser.num_layers=1", "denoiser.num_heads=2", "condition.features=16", "process.num_train_timesteps=10"),
+    *("task.num_inference_steps=5", "trainer.accelerator=cpu", "trainer.enable_progress_bar=false"),
     "callbacks.samples.seconds=1.5",
+    "lr_decay=0",  # it depends on trainer.max_steps, which tests raise to resume
 ]
 """Overrides that make the quick-start experiment train in a second."""
 

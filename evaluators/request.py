@@ -67,7 +67,7 @@ class EvaluationRequest(EvaluationKeys):
         def values(kind: Any) -> dict[str, Any]:
             return {key.name: config[key.name] for key in fields(kind) if key.name in config}
 
-        return cls(**values(cls) | {"options": SamplerOptions(**values(SamplerOptions))})
+        return cls(**values(cls), options=SamplerOptions(**values(SamplerOptions)))
 
     def __post_init__(self) -> None:
         _ = self.editing  # checks its keys

@@ -291,7 +291,7 @@ def test_kills_at_random_moments_change_nothing(command, trained, data_root, tmp
             return prepared(folder, 150)
         if command == "train":
             often = ["trainer.val_check_interval=50", "callbacks.checkpoints.every_n_steps=10"]
-            return words(data_root, folder, "denoiser.dropout=0.1", *often, "trainer.max_steps=400")
+            return words(data_root, folder, "denoiser.dropout=0.1", *often, "trainer.max_steps=120")
         folder.mkdir(exist_ok=True)
         shutil.copy(trained, folder)
         options = [

@@ -18,7 +18,6 @@ from flame_mdm.data.synthetic import Synthetic
 from flame_mdm.errors import UserError
 from flame_mdm.formats import bvh
 from flame_mdm.formats.motion import Motion
-from flame_mdm.formats.resampling import resample
 from flame_mdm.representations.humanml import HumanML
 from flame_mdm.representations.rot6d import Rot6D
 from flame_mdm.representations.skeleton import KIT21, SMPL22, SMPL24, find_joints, part_names
@@ -158,7 +157,12 @@ def test_exact_methods_keep_exactly(diffusion, motion, method, options):
 
 
 def test_other_methods_keep_roughly(diffusion, flow, motion):
-    assert edit(diffusion, motion, region="in_between", method="flame_code")[0].feature_error > 1e-3
+    calls = []
+    hook = diffusion.denoiser.register_forward_hook(lambda *_: calls.append(1))
+    again = {"method": "flame_code", "num_inference_steps": 4, "resample": 3}
+    assert edit(diffusion, motion, region="in_between", **again)[0].feature_error > 1e-3
+    hook.remove()
+    assert len(calls) == 1 + 3 * 3, "all steps but the last are taken three times"
     assert edit(flow, motion, region="in_between")[0].feature_error > 1e-3
     assert edit(flow, motion, region="in_between", method="mdm")[0].feature_error == 0
 
@@ -206,16 +210,8 @@ def test_a_variation_starts_from_the_noised_motion(kind, strength, motion, reque
     assert edit(model, motion, strength=strength, joints="upper_body", method="mdm")[0].feature_error == 0
 
 
-def test_resampling_takes_each_step_more_often(diffusion, motion):
-    calls = []
-    hook = diffusion.denoiser.register_forward_hook(lambda *_: calls.append(1))
-    edit(diffusion, motion, region="in_between", method="flame", num_inference_steps=4, resample=3)
-    hook.remove()
-    assert len(calls) == 1 + 3 * 3
-
-
 def test_an_edit_depends_on_its_own_seed_alone(diffusion, motion):
-    one = edit(diffusion, motion, "a person jumps", region="in_between", samples=1, seed=3)[0]
+    one = flame_mdm.edit(diffusion, motion, "a person jumps", region="in_between", samples=1, seed=3)[0]
     many = edit(diffusion, motion, ["a person jumps", "a person bows"], region="in_between", samples=2, seed=3)
     np.testing.assert_allclose(one.features, many[0].features, atol=1e-5)
     assert [m.text for m in many] == ["a person jumps"] * 2 + ["a person bows"] * 2
@@ -265,14 +261,6 @@ def test_joints_of_any_rate_and_facing(diffusion, motion, tmp_path, fps, turned)
         np.testing.assert_allclose(read.features, motion.features, atol=1e-4)
 
 
-def test_resampling_keeps_the_time():
-    t = np.arange(61) / 30
-    joints = np.sin(2 * t)[:, None, None] * np.ones((1, 22, 3))
-    new = resample(joints, 30, 20, cubic=True)
-    assert len(new) == 41
-    np.testing.assert_allclose(new[:, 3, 1], np.sin(2 * np.arange(41) / 20), atol=1e-4)
-
-
 def test_a_bvh_file_of_a_known_skeleton(diffusion, tmp_path):
     joints, file = 100 * walk(50), tmp_path / "take.bvh"
     names = tuple(dict.fromkeys(("joint_Root", *bandai.JOINTS.values())))
@@ -282,100 +270,80 @@ def test_a_bvh_file_of_a_known_skeleton(diffusion, tmp_path):
     positions[:, names.index("Hips")] = joints[:, 0]
     channels, parents = (("Xposition", "Yposition", "Zposition"),) * len(names), (-1, *[0] * (len(names) - 1))
     skeleton = (parents, np.zeros((len(names), 3)), channels, (), np.zeros((0, 3)))
-
-    def read(*joint_names: str) -> Motion:
-        bvh.write(bvh.Bvh(joint_names, *skeleton, positions.reshape(len(joints), -1), 50.0), file)
-        return read_motion(diffusion.representation, file)
-
+    bvh.write(bvh.Bvh(names, *skeleton, positions.reshape(len(joints), -1), 50.0), file)
     expected = read_motion(diffusion.representation, npz(tmp_path, joints=walk(20), fps=20))
     others = [joint for joint in range(22) if joint != bandai.SPINE1]
-    assert np.abs(read(*names).joints - expected.joints)[:, others].max() < 0.02
-    assert read("Bip01", *names[1:]).features.shape == expected.features.shape
-    with pytest.raises(ValueError, match=r"take\.bvh: unknown skeleton\. Bandai-Namco .* missing: Hand_R\. .*Tail"):
-        read(*names[:-1], "Tail")
+    assert np.abs(read_motion(diffusion.representation, file).joints - expected.joints)[:, others].max() < 0.02
 
 
-def test_a_clip_of_a_prepared_set_and_a_part_of_it(diffusion, store):
+def test_parts_of_clips_and_of_files_in_world_coordinates(diffusion, store, tmp_path):
     stored = read_motion(diffusion.representation, CLIP, data_root=store)
     assert stored.text
     part = read_motion(diffusion.representation, CLIP, data_root=store, cut=(0.5, 1.5))
     assert np.array_equal(part.features, stored.features[10:30])
-
-
-def test_cuts_of_world_coordinates_begin_at_the_origin(tmp_path):
-    representation = Rot6D()
-    features = np.cumsum(np.ones((40, 150), np.float32), 0)
-    file = npz(tmp_path, joints=np.zeros((40, 24, 3)), features=features, fps=20, representation=representation.name)
-    part = read_motion(representation, file, cut=[1, 2])
-    assert part.features[0, 144:147].tolist() == [0, 0, 0]
+    world = {"features": np.cumsum(np.ones((40, 150), np.float32), 0), "representation": Rot6D().name}
+    part = read_motion(Rot6D(), npz(tmp_path, joints=np.zeros((40, 24, 3)), fps=20, **world), cut=[1, 2])
+    assert part.features[0, 144:147].tolist() == [0, 0, 0], "the root begins at the origin"
 
 
 # Bad requests ---------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({}, r"no part of the motion is kept: choose region.*strength=0\.5"),
-        ({"region": [0, 40]}, "no part of the motion is kept"),
-        ({"joints": []}, "the entire motion is kept"),
-        ({"region": [5, 5]}, r"region=\[5, 5\] is not a range of this motion, which has 40 frames \(2 seconds\)"),
-        ({"region_seconds": [1.5, 2.5]}, r"region_seconds=\[1.5, 2.5\] is not a range"),
-        ({"region": [1, 2, 3]}, r"write \[begin, end\], or several"),
-        ({"region": [[1, 2], 3]}, r"write \[begin, end\], or several"),
-        ({"region": []}, r"write \[begin, end\], or several"),
-        ({"region": [1, 2], "region_seconds": [1, 2]}, "give region or region_seconds, not both"),
-        ({"region": "inbetween"}, "region=inbetween is unknown. Did you mean in_between"),
-        ({"joints": "uper_body"}, "no joint or part 'uper_body'. Did you mean upper_body"),
-        ({"joints": ["left_hnad"]}, "Did you mean left_hip"),
-        ({"region": "suffix", "method": "mfm"}, "method=mfm is not supported by GaussianDiffusion; .* mdm, flame"),
-        ({"region": "suffix", "method": "repaint"}, "method=repaint is unknown. Choose from mdm, flame, flame_code"),
-        ({"region": "suffix", "until": 0.3}, "until=0.3 is an option of method=mfm, not of mdm"),
-        ({"region": "suffix", "resample": 3}, "resample=3 is an option of method=flame"),
-        ({"region": "suffix", "seconds": 3}, "an edit is as long as its motion: omit seconds"),
-        ({"region": "suffix", "texts": "walks | jumps"}, "an edit keeps a single motion"),
-        ({"regoin": "suffix"}, "edit has no option regoin. Did you mean region"),
-        ({"strength": 0.0}, "strength=0: give a number above 0, up to 1"),
-        ({"strength": float("nan")}, "strength=nan: give a number"),
-    ],
-)
-def test_bad_edits_are_one_line(diffusion, motion, options, message):
-    with pytest.raises(UserError, match=message) as caught:
-        edit(diffusion, motion, **options)
-    assert "\n" not in str(caught.value)
-
-
-def test_what_a_model_cannot_edit(flow, motion):
-    with pytest.raises(UserError, match="method=flame is not supported by FlowMatching; this model supports: mdm, mfm"):
-        edit(flow, motion, region="suffix", method="flame")
-    long = r"walk: 40 frames, but the model was trained on at most 36 \(1.8 seconds\): select a part with cut="
-    with pytest.raises(UserError, match=long):
-        edit(build(TINY, max_frames=36), motion, region="suffix")
+def test_bad_edits_are_one_line(diffusion, flow, motion):
+    short, suffix = build(TINY, max_frames=36), {"region": "suffix"}
+    cases: list[tuple[MotionGeneration, dict, str]] = [
+        (diffusion, {}, r"no part of the motion is kept: choose region.*strength=0\.5"),
+        (diffusion, {"region": [0, 40]}, "no part of the motion is kept"),
+        (diffusion, {"joints": []}, "the entire motion is kept"),
+        (diffusion, {"region": [5, 5]}, r"region=\[5, 5\] is not a range of this motion, which has 40 frames \(2 sec"),
+        (diffusion, {"region_seconds": [1.5, 2.5]}, r"region_seconds=\[1.5, 2.5\] is not a range"),
+        *((diffusion, {"region": ranges}, r"write \[begin, end\], or sev") for ranges in ([1, 2, 3], [[1, 2], 3], [])),
+        (diffusion, {"region": [1, 2], "region_seconds": [1, 2]}, "give region or region_seconds, not both"),
+        (diffusion, {"region": "inbetween"}, "region=inbetween is unknown. Did you mean in_between"),
+        (diffusion, {"joints": "uper_body"}, "no joint or part 'uper_body'. Did you mean upper_body"),
+        (diffusion, suffix | {"method": "mfm"}, "method=mfm is not supported by GaussianDiffusion; .* mdm, flame"),
+        (diffusion, suffix | {"method": "repaint"}, "method=repaint is unknown. Choose from mdm, flame, flame_code"),
+        (diffusion, suffix | {"until": 0.3}, "until=0.3 is an option of method=mfm, not of mdm"),
+        (diffusion, suffix | {"resample": 3}, "resample=3 is an option of method=flame"),
+        (diffusion, suffix | {"seconds": 3}, "an edit is as long as its motion: omit seconds"),
+        (diffusion, suffix | {"texts": "walks | jumps"}, "an edit keeps a single motion"),
+        (diffusion, {"regoin": "suffix"}, "edit has no option regoin. Did you mean region"),
+        *((diffusion, {"strength": value}, "strength=.*: give a number above 0, up to 1") for value in (0.0, np.nan)),
+        (flow, suffix | {"method": "flame"}, "not supported by FlowMatching; this model supports: mdm, mfm"),
+        (
+            short,
+            suffix,
+            r"walk: 40 frames, but .* at most 36 \(1.8 seconds\): select a part with cut=",
+        ),
+    ]
+    for model, options, message in cases:
+        with pytest.raises(UserError, match=message) as error:
+            edit(model, motion, **options)
+        assert "\n" not in str(error.value), message
 
 
 def test_motions_that_cannot_be_read_are_one_line(diffusion, store, tmp_path):
     joints = np.zeros((9, 22, 3))
     clean = {"joints": joints, "fps": 20, "representation": "humanml-clean-smpl22"}
     for arrays, message in (
-        ({"joints": np.zeros((9, 21, 3)), "fps": 20}, r"shape \(9, 21, 3\), but humanml-clean-smpl22 takes"),
-        ({"joints": np.zeros((9, 22)), "fps": 20}, r"joints of shape \(9, 22\), not \(frames, joints, 3\)"),
+        ({"joints": joints[:, :21], "fps": 20}, r"shape \(9, 21, 3\), but humanml-clean-smpl22 takes"),
+        ({"joints": joints[..., 0], "fps": 20}, r"joints of shape \(9, 22\), not \(frames, joints, 3\)"),
         ({"fps": 20}, "contains fps; a motion has joints and fps"),
         (clean | {"features": joints[..., 0]}, r"features of shape \(9, 22\), not \(frames, 263\)"),
     ):
-        with pytest.raises(ValueError, match=rf"{tmp_path}/motion\.npz.*{message}") as caught:
+        with pytest.raises(UserError, match=rf"{tmp_path}/motion\.npz.*{message}") as error:
             read_motion(diffusion.representation, npz(tmp_path, **arrays))
-        assert "\n" not in str(caught.value)
-    for error, source, options, message in (
-        (FileNotFoundError, tmp_path / "absent.npz", {}, r"absent\.npz: no such file"),
-        (FileNotFoundError, tmp_path / "absent.bvh", {}, r"absent\.bvh: no such file"),
-        (FileNotFoundError, "kit:1", {"data_root": store}, "no prepared data set"),
-        (UserError, "walk", {}, r"Give a \.npz, \.bvh, \.json, \.npy file, or dataset:id"),
-        (UserError, CLIP[:-2] + "3", {"data_root": store}, r"has no clip .*\. Did you mean synthetic_0_000003"),
-        (UserError, CLIP, {"data_root": store, "cut": [1, 99]}, f"is not a range of {CLIP}, which lasts"),
+        assert "\n" not in str(error.value)
+    for source, options, message in (
+        (tmp_path / "absent.npz", {}, r"absent\.npz: no such file"),
+        ("kit:1", {}, "no prepared data set"),
+        ("walk", {}, r"Give a \.npz, \.bvh, \.json, \.npy file, or dataset:id"),
+        (CLIP[:-2] + "3", {}, r"has no clip .*\. Did you mean synthetic_0_000003"),
+        (CLIP, {"cut": [1, 99]}, f"is not a range of {CLIP}, which lasts"),
     ):
-        with pytest.raises(error, match=message):
-            read_motion(diffusion.representation, source, **options)
-    with pytest.raises(ValueError, match=r"motion.npz: motion: shape \(9, 22, 3\), expected \(frames, 3 \+ 3 x joints"):
+        with pytest.raises((UserError, FileNotFoundError), match=message):
+            read_motion(diffusion.representation, source, data_root=store, **options)
+    with pytest.raises(UserError, match=r"motion.npz: motion: shape \(9, 22, 3\), expected \(frames, 3 \+ 3 x joints"):
         read_motion(SMPL(), npz(tmp_path, joints=joints, fps=20))
 
 
@@ -391,12 +359,8 @@ def test_the_command_writes_the_original_beside_the_edits(trained, store, tmp_pa
     assert (out / "trajectory.png").is_file()
     printed = capsys.readouterr().out
     assert "Largest change in the kept part: 0 in normalized features" in printed
-    assert "m in world joint positions" in printed
-    for name in ("player.html", "motions.gif", "motions.png"):
-        assert (out / name).stat().st_size > 1000
-    page = (out / "player.html").read_text()
-    assert "original: " in page
-    assert page.count('"frames":') == 3
+    assert (out / "motions.gif").stat().st_size > 1000
+    assert (out / "player.html").read_text().count('"frames":') == 3
     with np.load(out / "motion_000.npz") as original, np.load(out / "motion_002.npz") as edited:
         keep = edited["keep"]
         assert str(edited["text"]) == "it's a (jump), $5"
@@ -405,20 +369,3 @@ def test_the_command_writes_the_original_beside_the_edits(trained, store, tmp_pa
         assert not np.allclose(edited["features"][~keep], original["features"][~keep], atol=1e-2)
     # what was written can be edited again
     assert main(["edit", f"ckpt={trained}", f"motion={out}/motion_001.npz", f"out={out}/again", *words[5:]]) == 0
-
-
-def test_bad_words_are_one_line(trained, store, capsys):
-    for words, message in (
-        ([], "say what to sample: text=..."),
-        (["text=jump", "unconditioned=true"], "not text and unconditioned"),
-        (["unconditioned=true", "motion=null"], "no motion to edit"),
-    ):
-        assert main(["edit", f"ckpt={trained}", f"motion={CLIP}", f"data_root={store}", *words]) == 1
-        output = capsys.readouterr().err
-        assert message in output
-        assert output.startswith("error: ")
-        assert output.count("\n") == 1
-
-
-def test_the_python_api_is_there_though_the_command_is_a_module_of_that_name(diffusion, motion):
-    assert flame_mdm.edit(diffusion, motion, region="suffix")[0].feature_error == 0

@@ -33,16 +33,14 @@ def test_guidance_is_two_passes_in_one(scale):
     assert denoise.calls == 1
 
 
-def test_without_a_learned_variance_all_channels_are_guided():
+def test_without_a_learned_variance_all_channels_are_guided_and_scale_one_is_the_denoiser_itself():
     x_t = torch.randn(2, 4, 2)
     guided = classifier_free_guidance(lambda *args: sees_condition(*args)[..., :2], 3.0, features=2)
     expected = (x_t + 10 + 3 * (COND.pooled[:, None] - 10)) * MASK[..., None]
     torch.testing.assert_close(guided(x_t, torch.zeros(2), MASK, COND), expected)
-
-
-def test_scale_one_is_the_denoiser_itself():
-    assert classifier_free_guidance(sees_condition, 1.0, 2) is sees_condition
     assert classifier_free_guidance(sees_condition, 1, 2) is sees_condition
+    with pytest.raises(ValueError, match="no null"):
+        guided(*ZEROS, MASK, Condition(COND.pooled, COND.tokens, None))
 
 
 def test_doubled_conditions_and_masks_are_made_once_per_run_and_follow_a_change():
@@ -62,9 +60,3 @@ def test_doubled_conditions_and_masks_are_made_once_per_run_and_follow_a_change(
     pooled = [1, 2, 10, 10]
     assert [cond.pooled.flatten().tolist() for cond in conditions] == [pooled, pooled, [2, 3, 10, 10], pooled, pooled]
     assert [torch.equal(mask, torch.cat([MASK, MASK])) for mask in masks] == [True, True, True, False, True]
-
-
-def test_there_is_no_guidance_without_a_null():
-    lone = Condition(COND.pooled, COND.tokens, None)
-    with pytest.raises(ValueError, match="no null"):
-        classifier_free_guidance(sees_condition, 2.0, 2)(*ZEROS, MASK, lone)

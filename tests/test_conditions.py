@@ -21,22 +21,8 @@ from flame_mdm.conditions.tokens import LearnedTokens
 from flame_mdm.errors import UserError
 
 EXPERIMENTS = ROOT / "experiments"
-WORDS = [
-    "a",
-    "person",
-    "man",
-    "walks",
-    "waves",
-    "with",
-    "the",
-    "left",
-    "right",
-    "hand",
-    "slowly",
-    "forward",
-    "and",
-    "turns",
-]
+WORDS = ["a", "person", "man", "walks", "waves", "with", "the", "left", "right", "hand", "slowly"]
+WORDS += ["forward", "and", "turns"]
 LONG = "a man turns slowly and walks forward and waves with the right hand"
 CAPTIONS = ["a person walks", "a person waves with the left hand", LONG, "a person walks"]
 WIDTH, CPU = 16, torch.device("cpu")
@@ -252,10 +238,8 @@ def test_every_parameter_takes_part_and_the_null_replaces_vector_and_tokens(outp
 def test_gives_what_the_model_gives_for_each_caption_alone(kind: str, models):
     import transformers as tf
 
-    limit = 9
-    cond = PretrainedText(models[kind], WIDTH, limit, "projection" if kind == "clip" else "mean", tokens=True)(
-        batch_of(CAPTIONS)
-    )
+    limit, pooling = 9, "projection" if kind == "clip" else "mean"
+    cond = PretrainedText(models[kind], WIDTH, limit, pooling, tokens=True)(batch_of(CAPTIONS))
     loader = {"clip": tf.CLIPTextModelWithProjection, "t5": tf.T5EncoderModel}.get(kind, tf.AutoModel)
     network = loader.from_pretrained(models[kind]).eval()
     for i, caption in enumerate(CAPTIONS):
@@ -337,7 +321,7 @@ def encoder(models) -> PretrainedText:
     return PretrainedText(models["roberta"], WIDTH, 20, "pooler", tokens=True, encode_null=True)
 
 
-def test_each_caption_is_encoded_once_and_the_cache_gives_the_live_values(encoder, tmp_path, monkeypatch):
+def test_each_caption_is_encoded_once_and_the_cache_gives_the_live_values(encoder, models, tmp_path, monkeypatch):
     captions, encode, new = [], PretrainedText._encode, "a man walks"
 
     def counting(self, texts, *args):
@@ -360,25 +344,10 @@ def test_each_caption_is_encoded_once_and_the_cache_gives_the_live_values(encode
     assert len(captions) == 4
     assert_same(encoder(batch_of([CAPTIONS[0], new])), live_with_new)
     assert captions[4:] == [new]
-
-
-def test_options_and_captions_have_their_own_caches(encoder, models, tmp_path):
-    encoder.precompute(CAPTIONS, tmp_path)
-    encoder.precompute(CAPTIONS[:1], tmp_path)
-    PretrainedText(models["roberta"], WIDTH, 9, "pooler", tokens=True).precompute(CAPTIONS, tmp_path)
-    PretrainedText(models["roberta"], WIDTH, 20, "mean", tokens=True).precompute(CAPTIONS, tmp_path)
+    encoder.precompute(CAPTIONS[:1], tmp_path)  # options and captions have caches of their own
+    for limit, pooling in ((9, "pooler"), (20, "mean")):
+        PretrainedText(models["roberta"], WIDTH, limit, pooling, tokens=True).precompute(CAPTIONS, tmp_path)
     assert len(list(tmp_path.iterdir())) == 4
-
-
-def test_pooled_encoders_store_no_tokens(models, tmp_path):
-    encoder = PretrainedText(models["bert"], WIDTH, 20, "mean", normalize=True)
-    live = encoder(batch_of(CAPTIONS))
-    encoder.precompute(CAPTIONS, tmp_path)
-    encoder.load_cache(CAPTIONS, tmp_path)
-    (folder,) = tmp_path.iterdir()
-    assert (folder / CaptionCache.TOKENS).stat().st_size == 0
-    assert_same(encoder(batch_of(CAPTIONS)), live)
-    torch.testing.assert_close(live.pooled.norm(dim=1), torch.ones(4))
 
 
 @pytest.mark.parametrize("damage", ["cut", "changed", "gone"])
@@ -403,12 +372,14 @@ def test_damage_is_found_and_repaired_aloud(encoder, tmp_path, damage: str):
 @pytest.mark.parametrize("tokens", [True, False])
 @pytest.mark.parametrize("moved", [True, False])
 def test_a_batch_is_gathered_bit_for_bit_from_the_arrays(models, tmp_path, tokens, moved):
-    encoder = PretrainedText(models["bert"], WIDTH, 30, "mean", tokens=tokens)
+    encoder = PretrainedText(models["bert"], WIDTH, 30, "mean", tokens=tokens, normalize=not tokens)
     captions = [*CAPTIONS, ""]
     encoder.precompute([*CAPTIONS, "a person"], tmp_path)
     live = encoder._look_up(captions, CPU)
     encoder.load_cache([*CAPTIONS, "a person"], tmp_path)
     assert encoder.cache_size() > 0
+    (file,) = tmp_path.rglob(CaptionCache.TOKENS)
+    assert (file.stat().st_size > 0) == tokens
     if moved:
         encoder.move_cache(CPU)
     cache = encoder._cache
@@ -421,6 +392,7 @@ def test_a_batch_is_gathered_bit_for_bit_from_the_arrays(models, tmp_path, token
         assert torch.equal(rows[number, : len(own)], torch.from_numpy(own).float())
         assert not rows[number, len(own) :].any()
         assert token_mask[number].tolist() == [True] * len(own) + [False] * (rows.shape[1] - len(own))
+    assert tokens or torch.allclose(encoder(batch_of(captions)).pooled.norm(dim=1), torch.ones(5))
     for a, b in zip(live, (pooled, rows, token_mask), strict=True):
         torch.testing.assert_close(a, b)
     # With a caption outside the cache, the others keep their cached values.

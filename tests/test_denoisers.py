@@ -12,7 +12,6 @@ from support.fixtures import ROOT
 from flame_mdm.batch import Condition, length_mask
 from flame_mdm.denoisers import Denoiser
 from flame_mdm.denoisers.flame import FLAME
-from flame_mdm.denoisers.layers import sinusoid
 from flame_mdm.denoisers.mdm import MDMDecoder, MDMEncoder
 from flame_mdm.denoisers.unet import MaskedGroupNorm, MDMUNet
 from flame_mdm.errors import UserError
@@ -145,13 +144,6 @@ def test_runs_under_bf16_autocast(path: Path) -> None:
         y = denoiser(x_t.float(), t, mask, cond)
     error = (y.float() - exact)[mask].square().mean().sqrt() / exact[mask].std()
     assert error < 0.05
-
-
-def test_sinusoid_is_the_papers() -> None:
-    table = sinusoid(torch.tensor([0.0, 1.0, 2.5]), 4)
-    angle = torch.tensor([[0.0, 0.0], [1.0, 0.01], [2.5, 0.025]])
-    torch.testing.assert_close(table[:, 0::2], angle.sin())
-    torch.testing.assert_close(table[:, 1::2], angle.cos())
 
 
 def test_group_norm_without_padding_is_torchs() -> None:

@@ -240,18 +240,19 @@ def test_average_padding_gives_short_motions_less_weight():
 
 def test_unknown_options_and_impossible_steps_are_refused():
     names = ("schedule", "prediction", "variance", "timestep_sampling")
-    cases: list[tuple[Any, dict[str, Any], str]] = [
+    cases: list[tuple[Any, Any, str]] = [
         *((GaussianDiffusion, {name: "other"}, "other") for name in names),
         *((FlowMatching, {name: "epsilon"}, "epsilon") for name in ("time_distribution", "prediction")),
         (GaussianDiffusion, {"num_train_timesteps": 1}, "1"),
         (FlowMatching, {"sigma_min": 1.0}, "1.0"),
-        *((timesteps, {"total": 1000, "count": count}, "choose") for count in (0, 1001)),
-        (timesteps, {"total": 1000, "count": 400, "spacing": "stride"}, "choose"),
-        (timesteps, {"total": 1000, "count": 5, "spacing": "karras"}, "choose"),
+        *(
+            (timesteps, steps, "choose")
+            for steps in ((1000, 0), (1000, 1001), (1000, 400, "stride"), (1000, 5, "karras"))
+        ),
     ]
     for build, options, message in cases:
         with pytest.raises(UserError, match=message):
-            build(**options)
+            build(**options) if isinstance(options, dict) else build(*options)
 
 
 def test_loss_aware_sampling_needs_a_full_history_and_then_follows_the_last_ten_losses():

@@ -2,12 +2,12 @@
 
 import itertools
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from support.motions import synthetic
 
 import flame_mdm
 from evaluators.selection import text_fit
@@ -15,7 +15,6 @@ from flame_mdm.__main__ import main
 from flame_mdm.batch import Condition, MotionBatch
 from flame_mdm.errors import UserError
 from flame_mdm.formats.faults import find_faults
-from flame_mdm.formats.readers import read
 from flame_mdm.processes.windows import Windows, blended, spans, window_tensors
 from flame_mdm.sampling.generation import best
 from flame_mdm.sampling.request import read_parts
@@ -27,12 +26,6 @@ CPU = torch.device("cpu")
 @pytest.fixture(scope="module")
 def model() -> flame_mdm.MotionGeneration:
     return flame_mdm.load("quickstart")
-
-
-def test_parts_of_a_text_and_their_seconds():
-    parts = [("walks forward", 3.0), ("turns left", None), ("sits down", 2.5)]
-    assert read_parts("walks forward @3 | turns left| sits down @ 2.5s") == parts
-    assert read_parts("a person walks") == [("a person walks", None)]
 
 
 @pytest.mark.parametrize("lengths", [[40], [30, 50, 24], [100], [200, 24, 61]])
@@ -97,12 +90,14 @@ def test_a_part_longer_than_training_and_one_as_long_as_training(model):
         flame_mdm.generate(model, text, seconds=20)
 
 
-def test_a_continued_motion_begins_with_it(model, tmp_path):
+def test_a_continued_motion_begins_with_it_and_knows_its_parts(model, tmp_path):
+    assert read_parts("walks @3 | turns left| sits @ 2.5s") == [("walks", 3.0), ("turns left", None), ("sits", 2.5)]
     begin = flame_mdm.generate(model, "a person walks forward", seconds=2, num_inference_steps=5)[0]
     begin.save(tmp_path / "walk.npz")
     options = {"after": tmp_path / "walk.npz", "seconds": 1.5, "num_inference_steps": 5}
-    motion = flame_mdm.generate(model, "a person bows", **options)[0]
-    assert len(motion.joints) == 40 + 30
+    motion = flame_mdm.generate(model, "a person bows @1 | a person jumps", **options)[0]
+    assert motion.parts == (("a person bows", 40, 60), ("a person jumps", 60, 90))
+    assert len(motion.joints) == 40 + 20 + 30
     np.testing.assert_allclose(motion.joints[:40], begin.joints, atol=1e-5)
     step = np.linalg.norm(np.diff(motion.joints, axis=0), axis=-1).max(1)
     assert step[39] < 3 * step.max() / 2
@@ -149,57 +144,28 @@ def test_bad_requests_give_one_clear_line(model):
         assert "\n" not in str(raised.value), message
 
 
-def test_the_command_writes_a_sequence(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    words = ["text=a person walks @1 | a person bows", "frames=20", "samples=1", "num_inference_steps=3"]
-    assert main(["sample", "quickstart", *words, "out=first"]) == 0
-    assert "1 motion of 40 frames" in capsys.readouterr().out
-    assert main(["sample", "quickstart", *words, "after=first/motion_000.npz"]) == 0
-    (path,) = Path("samples").rglob("motion_000.npz")
-    assert "after" in path.parent.name
-    assert len(read(path).joints) == 80
+def test_the_best_of_several_candidates_is_kept(model):
+    text, options, groups = "a person walks forward", {"seconds": 1.5, "num_inference_steps": 4}, list[int]()
 
-
-class _Scores:
-    """Prefers the motion whose root goes farthest, and remembers how many it saw."""
-
-    def __init__(self) -> None:
-        self.seen: list[int] = []
-
-    def __call__(self, motions: Sequence[flame_mdm.Motion]) -> list[float]:
-        self.seen.append(len(motions))
+    def score(motions: Sequence[flame_mdm.Motion]) -> list[float]:
+        """How far the root goes."""
+        groups.append(len(motions))
         return [float(np.linalg.norm(motion.joints[-1, 0])) for motion in motions]
 
-
-def test_the_best_of_several_candidates_is_kept(model):
-    text, options = "a person walks forward", {"seconds": 1.5, "num_inference_steps": 4}
     several = flame_mdm.generate(model, text, samples=6, **options)
-    score = _Scores()
     chosen = flame_mdm.generate(model, text, samples=2, candidates=3, score=score, **options)
-    assert len(chosen) == len(score.seen) == 2
+    assert len(chosen) == len(groups) == 2
     for motion, group in zip(chosen, (several[:3], several[3:]), strict=True):
         faultless = [motion for motion in group if not find_faults(motion)] or group
         np.testing.assert_allclose(motion.joints, faultless[int(np.argmax(score(faultless)))].joints, atol=1e-4)
 
 
 def test_without_a_score_the_fewest_faulty_frames_decide():
-    moved = np.linspace(0, 1, 20)[:, None, None] * np.array([1, 0, 1])
-    joints = np.tile(np.linspace(0, 1, 22)[None, :, None], (20, 1, 3)) + moved
-    worse, better = joints.copy(), joints.copy()
-    worse[[5, 9], 3, 0] += 5
-    better[5, 3, 0] += 5
-    motions = [flame_mdm.Motion(joints, 20) for joints in (worse, better)]
-    assert best(motions) is motions[1]
-    assert best(motions, lambda motions: [2.0, 1.0]) is motions[0]
-
-
-def test_the_parts_of_a_motion(model):
-    text = "a person walks @1 | a person bows @1.5"
-    (motion,) = flame_mdm.generate(model, text, num_inference_steps=2)
-    assert motion.parts == (("a person walks", 0, 20), ("a person bows", 20, 50))
-    (after,) = flame_mdm.generate(model, text, num_inference_steps=2, after=motion)
-    assert after.parts == (("a person walks", 50, 70), ("a person bows", 70, 100))
-    assert len(after.joints) == 100
+    worse, better = synthetic(), synthetic()
+    worse.joints[[5, 9], 3, 0] += 5
+    better.joints[5, 3, 0] += 5
+    assert best([worse, better]) is better
+    assert best([worse, better], lambda motions: [2.0, 1.0]) is worse
 
 
 def test_a_scorer_is_a_motion_clip(model, tmp_path, capsys):

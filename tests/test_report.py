@@ -229,20 +229,16 @@ def test_names_are_text_not_html(tmp_path):
 
 
 def test_missing_and_damaged_files_are_named(tmp_path, capsys):
-    for case, (name, content, message) in enumerate(
-        (
-            ("metrics.jsonl", "hello\n", "metrics.jsonl: line 1 is damaged"),
-            ("metrics.jsonl", '{"step": 1}\n{"stop": 2}\n', "metrics.jsonl: line 2 is damaged"),
-            ("metrics.jsonl", "[]\n", "metrics.jsonl: line 1 is damaged"),
-            ("provenance.json", "{", "provenance.json: not a JSON file"),
-            ("provenance.json", "[]", r"provenance.json: damaged: the file is \[\], not a mapping"),
-        )
+    folder = a_run(tmp_path / "damaged")
+    for name, content, message in (
+        ("metrics.jsonl", '{"step": 1}\n{"stop": 2}\n', "metrics.jsonl: line 2 is damaged"),
+        ("provenance.json", "[]", r"provenance.json: damaged: the file is \[\], not a mapping"),
     ):
-        folder = a_run(tmp_path / f"run{case}")
         (folder / name).write_text(content)
         with pytest.raises(UserError, match=message):
             write_report(folder)
-        assert not (folder / "report.html").exists()
+        (folder / name).unlink()
+    assert not (folder / "report.html").exists()
     folder = a_run(tmp_path / "run")
     (folder / "metrics.jsonl").unlink()
     assert "there is no metrics.jsonl in the folder" in write_report(folder).read_text()

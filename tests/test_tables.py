@@ -358,19 +358,17 @@ def test_malformed_specs_are_refused(tmp_path, capsys):
     path, row = tmp_path / "mine.yaml", "rows: [{label: x, ckpt: x}]"
     for text, message in (
         ("", "the file has no parts"),
-        ("parts: {}", "parts is {}, not a longer list"),
         ("prats: {}", "unknown key: prats. Did you mean parts?"),
         ("parts: {a: {rows: []}}", "parts.a: needs columns and rows, or recipes"),
         ("parts: {a: {columns: {F: {value: fid, better: up}}, rows: []}}", "better is \"up\", not 'higher', 'lower'"),
-        ("parts: {a: {columns: {F: fid}, rows: []}}", 'parts.a.columns.F is "fid", not a mapping'),
         ("parts: {a: {columns: {A: {value: fid}}, rows: [{ckpt: x}]}}", "parts.a.rows.0 has no label"),
         (f"parts: {{a: {{columns: {{A: {{value: fid}}}}, {row}}}}}", "needs a protocol"),
         ("parts: {a: {lengths: [kit]}}\nfigures: [{part: a, x: nfe}]", "x=nfe needs y, a column or several of a"),
-        ("[", "not a readable YAML file"),
     ):
         path.write_text(f"title: x\n{text}")
         with pytest.raises(UserError, match=re.escape(message)):
             load_spec(str(path))
+    path.write_text("title: [")
     for words, message in (
         ([f"table={path}", f"out={tmp_path / 'out'}"], "not a readable YAML file"),
         (["table=mdm_9"], "no table is called 'mdm_9'. Did you mean mdm_"),

@@ -63,7 +63,8 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Store:
     clips = [Clip(f"{k}{HOSTILE}", walk, texts, "train" if k else "val", f"{k}", 0) for k in range(3)]
     clips.append(Clip(f"3{HOSTILE}", np.concatenate([walk] * 8), texts, "train", "3", 0))
     source = OwnClips(*clips, Clip(f"M3{HOSTILE}", walk, [], "train", "3", 0))
-    source.name, source.actions, source.excluded = HOSTILE, (HOSTILE,), {HOSTILE: 3}
+    source.name, source.actions = HOSTILE, (HOSTILE,)
+    source.excluded[HOSTILE] = 3
     return write_store(tmp_path_factory.mktemp("browse") / "hostile", source, HumanML())
 
 

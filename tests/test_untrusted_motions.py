@@ -23,9 +23,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from support.motions import bvh_text, sway
 from support.refusals import Refused, bounded, carry_out
 from support.runs import no_children
-from test_fuzz import body, bvh
 
 from evaluators.sources import read_samples
 from flame_mdm.__main__ import main
@@ -92,17 +92,17 @@ def zip_bomb(name: str, start: bytes = b"") -> bytes:
 
 
 def bvh_at(seconds: str) -> bytes:
-    return bvh().replace("Frame Time: 0.05", f"Frame Time: {seconds}").encode()
+    return bvh_text().replace("Frame Time: 0.05", f"Frame Time: {seconds}").encode()
 
 
-JOINTS = body(4).astype(float)
+JOINTS = sway(4).joints
 LONG = np.zeros((4, 156), np.longdouble)
 FIELDS = np.zeros((4, 147), [("a", "f4")])
 BOMB = zip_bomb("joints.npy", header((300 * 2**20 // 528, 22, 3)))
 MOTIONS: list[tuple[str, bytes, str]] = [
     ("a.bvh", bvh_at("999999"), "frame time"),
     ("a.bvh", bvh_at("0.0000011"), "frame time"),
-    ("a.bvh", bvh().replace("Frames: 3", "Frames: 1000000000").encode(), "1000000000"),
+    ("a.bvh", bvh_text().replace("Frames: 3", "Frames: 1000000000").encode(), "1000000000"),
     ("a.bvh", bvh_at("1" * 40_000 + "x"), "Frame Time"),
     ("a.npz", npz(joints=JOINTS, fps=1e-7), "fps is 1e-07, not a number"),
     ("a.npz", b"PK\x03\x04 cut", "damaged"),
@@ -164,7 +164,7 @@ def folder(tmp_path: Path) -> Callable[[Callable[[Path], Any]], Path]:
         path = tmp_path / f"data{next(numbers)}"
         path.mkdir()
         for name in "ac":
-            np.savez(path / f"{name}.npz", joints=body(60), fps=20.0)
+            np.savez(path / f"{name}.npz", joints=sway(60).joints, fps=20.0)
         change(path)
         return path
 
@@ -298,7 +298,7 @@ def packed(opener: Callable, content: bytes) -> bytes:
 
 
 def archive_cases() -> Iterator[tuple[bytes, str]]:
-    whole = bvh().encode()
+    whole = bvh_text().encode()
     yield sparse(TAKE, 40 * 10**9), "sparse"
     yield member(TAKE, 10**12) + bytes(1024), "damaged archive"
     for target in (TAKE, "/etc/passwd", "../../x", "none"):

@@ -53,8 +53,11 @@ def guarded(action: Callable[[], None], signums: Sequence[int] = ()) -> int:
         say("interrupted", error=True)
         return 130
     except Exception as error:
+        verbose = os.environ.get("FLAME_MDM_TRACEBACK") == "1"
+        if isinstance(error, MemoryError) and not verbose:
+            error.__traceback__ = None  # frees what the frames hold: printing a line takes memory, too
         line = explanation(error)
-        if line is None or os.environ.get("FLAME_MDM_TRACEBACK") == "1":
+        if line is None or verbose:
             traceback.print_exc()
         say(f"error: {line}" if line is not None else REPORT, error=True)
         return BUG if line is None else 1

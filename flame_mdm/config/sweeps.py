@@ -172,3 +172,5 @@ def _check_whole(config: Config, name: str) -> None:
     for key in ("experiment", "seed", "ema", "logger"):
         if key not in config:
             raise UserError(f"{name}: no {key}. Begin the recipe with the defaults of another recipe, or with /base")
+    if isinstance(config["seed"], int) and not 0 <= config["seed"] < 2**32:
+        raise UserError(f"seed={config['seed']}: must be from 0 to {2**32 - 1}")

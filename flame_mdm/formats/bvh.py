@@ -231,6 +231,8 @@ def parse(data: bytes, name: str, header: bool = False) -> Bvh:
             source.fail(f"unexpected {keyword[:40]}")
     if blocks or not joints:
         source.fail("MOTION before the end of the hierarchy")
+    if not source.text.upper().endswith("MOTION"):
+        source.fail(f"expected MOTION at the end of its line, found {source.text[:40]}")
 
     count = int(source.labeled(r"Frames:\s*(\d{1,18})", "Frames: and a number"))
     fps = _fps(
@@ -254,7 +256,7 @@ class _Source:
     """Lines of a BVH file, read one after the other; tracks the line number for error messages."""
 
     def __init__(self, data: bytes, name: str):
-        self.name, self.line = name, 1
+        self.name, self.line, self.text = name, 1, ""
         try:
             lines = data.decode("utf-8-sig").splitlines()
         except UnicodeDecodeError as error:
@@ -264,14 +266,14 @@ class _Source:
         self.line, first = next(self.lines, (1, ""))
         if first.upper() != "HIERARCHY":
             self.fail("not a BVH file (it must begin with HIERARCHY)")
-        self.tokens = ((number, token) for number, line in self.lines for token in line.split())
+        self.tokens = ((number, token, line) for number, line in self.lines for token in line.split())
 
     def fail(self, what: str) -> NoReturn:
         raise UserError(f"{self.name}, line {self.line}: {what}")
 
     def token(self, expected: str = "") -> str:
         """Returns the next word of the hierarchy; it must be `expected` (case-insensitive) if that is given."""
-        self.line, token = next(self.tokens, (self.line, ""))
+        self.line, token, self.text = next(self.tokens, (self.line, "", ""))
         if not token:
             self.fail("the file ends inside the hierarchy")
         if expected and token.upper() != expected:

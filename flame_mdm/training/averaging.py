@@ -9,6 +9,8 @@ from lightning.pytorch.callbacks import WeightAveraging
 from torch import Tensor
 from torch.optim.swa_utils import get_ema_multi_avg_fn
 
+from flame_mdm.errors import UserError
+
 
 class MovingAverage(WeightAveraging):
     """Exponential moving average of the weights, which replaces them in validation and in the saved model.
@@ -21,9 +23,14 @@ class MovingAverage(WeightAveraging):
         decay: average = decay * average + (1 - decay) * weights.
         update_every_n_steps: number of steps between updates, which are at its multiples.
         update_starting_at_step: up to this step, updates copy the weights instead of averaging them; so does the first.
+
+    Raises:
+        UserError: If the decay is not from 0 to 1.
     """
 
     def __init__(self, decay: float, update_every_n_steps: int = 1, update_starting_at_step: int = 0):
+        if not 0 <= decay <= 1:
+            raise UserError(f"ema.decay={decay}: must be from 0 to 1")
         super().__init__(use_buffers=False)
         self.average = get_ema_multi_avg_fn(decay)
         self.update_every_n_steps, self.update_starting_at_step = update_every_n_steps, update_starting_at_step

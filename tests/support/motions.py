@@ -5,6 +5,7 @@ import json
 from functools import cache
 from html.parser import HTMLParser
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -69,6 +70,15 @@ def posed(
     pelvis = np.broadcast_to([0.0, 0.955 * scale, 0.0] if root is None else root, (frames, 3))
     offsets = torch.tensor(scale * np.array(ADULT[:22]))
     return motion_of_poses(Poses(offsets, torch.tensor(rotations), torch.tensor(np.array(pelvis))), 20)
+
+
+@cache
+def bvh_text() -> str:
+    """A BVH file of SMPL's body in its rest pose, in centimeters: 3 frames at 20 per second."""
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "pose.bvh"
+        posed(3, root=[[0, 0.9, 0]] * 3).save(path)
+        return path.read_text()
 
 
 class Page(HTMLParser):

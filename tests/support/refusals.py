@@ -5,6 +5,7 @@ import re
 import resource
 import signal
 import time
+import traceback
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -41,7 +42,6 @@ class Refused:
             return
         before = self._tree()
         self.capture.readouterr()
-
         late = False
 
         def alarm(*_: object) -> None:
@@ -58,12 +58,7 @@ class Refused:
         try:
             code: object = main([command, *words])
         except BaseException as error:
-            last = error.__traceback__
-            while last and last.tb_next:
-                last = last.tb_next
-            code = f"{type(error).__name__}: {error}" + (
-                f" ({last.tb_frame.f_code.co_filename}:{last.tb_lineno})" if last else ""
-            )
+            code = f"{type(error).__name__}: {error} ({traceback.extract_tb(error.__traceback__)[-1]})"
         finally:
             signal.setitimer(signal.ITIMER_PROF, 0)
             signal.alarm(0)
@@ -71,12 +66,13 @@ class Refused:
             for signum, handler in handlers.items():
                 signal.signal(signum, handler)
         out, err = self.capture.readouterr()
+        changed = self._tree() ^ before
         faults = [
             f"no end after {self.seconds} s" if late else "",  # which code that catches every exception hides
             f"it ended with {code}" if code not in (1, 2) else "",
-            f"it left {sorted(map(str, self._tree() ^ before))}" if self._tree() != before else "",
+            f"it left {sorted(map(str, changed))}" if changed else "",
             "a traceback" if "Traceback" in out + err else "",
-            f"it said {err!r}" if not one_line(err, command) or says not in err else "",
+            f"it said {err!r}" if not one_line(err) or says not in err else "",
             "it ran out of memory" if "out of memory" in err else "",
         ]
         if any(faults):
@@ -104,7 +100,7 @@ def address_space() -> int:
     return pages * resource.getpagesize()
 
 
-def one_line(err: str, command: str) -> bool:
+def one_line(err: str) -> bool:
     """Whether a refusal is one clear line.
 
     What goes before an error in the middle of work are its progress bars, on lines of their own.

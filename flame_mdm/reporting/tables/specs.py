@@ -75,9 +75,12 @@ class RowSpec(Options):
         return row
 
     @model_validator(mode="after")
-    def _one_source(self) -> RowSpec:
+    def _source_and_options(self) -> RowSpec:
         if len({"ckpt", "baseline", "from_samples"} & self.model_fields_set) != 1:
             raise ValueError("a row needs one of ckpt, baseline and from_samples")
+        for name in SWEPT:
+            if [] in (getattr(self, name), *as_list(getattr(self, name))):
+                raise ValueError(f"{name} contains an empty list. Remove it")
         return self
 
 

@@ -65,7 +65,8 @@ class Runs:
         """The model in another folder; its motions are kept there, and no test sees those of another."""
         model = folder / "model" / "checkpoints" / "last.ckpt"
         model.parent.mkdir(parents=True, exist_ok=True)
-        return shutil.copy(self.model, model)
+        shutil.copy(self.model, model)
+        return model
 
     def evaluate(self, out: Path, *words: str, model: Path | None = None) -> Any:
         """The result of the command, for the model in the folder of `out`."""

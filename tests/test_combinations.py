@@ -54,7 +54,7 @@ class TwoJoints(Representation):
     def encode(self, *_: Any) -> Any:
         raise NotImplementedError
 
-    statistics = joint_features = encode
+    statistics = joint_features = encode  # type: ignore[assignment]
 
 
 class Oracle(Denoiser):

@@ -346,7 +346,8 @@ def test_each_caption_is_encoded_once_and_the_cache_gives_the_live_values(encode
     assert captions[4:] == [new]
     encoder.precompute(CAPTIONS[:1], tmp_path)  # options and captions have caches of their own
     for limit, pooling in ((9, "pooler"), (20, "mean")):
-        PretrainedText(models["roberta"], WIDTH, limit, pooling, tokens=True).precompute(CAPTIONS, tmp_path)
+        encoder = PretrainedText(models["roberta"], WIDTH, limit, pooling, tokens=True)  # type: ignore[arg-type]
+        encoder.precompute(CAPTIONS, tmp_path)
     assert len(list(tmp_path.iterdir())) == 4
 
 

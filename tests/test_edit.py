@@ -342,7 +342,7 @@ def test_motions_that_cannot_be_read_are_one_line(diffusion, store, tmp_path):
         (CLIP, {"cut": [1, 99]}, f"is not a range of {CLIP}, which lasts"),
     ):
         with pytest.raises((UserError, FileNotFoundError), match=message):
-            read_motion(diffusion.representation, source, data_root=store, **options)
+            read_motion(diffusion.representation, source, data_root=store, **options)  # type: ignore[arg-type]
     with pytest.raises(UserError, match=r"motion.npz: motion: shape \(9, 22, 3\), expected \(frames, 3 \+ 3 x joints"):
         read_motion(SMPL(), npz(tmp_path, joints=joints, fps=20))
 

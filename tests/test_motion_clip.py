@@ -42,7 +42,7 @@ def test_released_weights_give_the_authors_outputs(stem):
     sizes = {"latent_dim": width, "ff_size": len(state["transformer.layers.0.feed_forward.0.weight"])}
     sizes["num_layers"] = len({name.split(".")[2] for name in state if name.startswith("transformer.layers.")})
     sizes |= {"num_heads": meta(arrays)["config"]["heads"], "max_frames": len(state["length_embedding.weight"])}
-    clip = MotionCLIP(features, texts, dropout=0.1, embedding_dim=embedding, blind_features=3, **sizes)
+    clip = MotionCLIP(features, texts, dropout=0.1, embedding_dim=embedding, blind_features=3, **sizes)  # type: ignore[arg-type]
     load_strictly(clip, state, stem)
     x = torch.from_numpy(arrays["in/motion"]).transpose(1, 2)
     mask = length_mask(torch.from_numpy(arrays["in/motion_length"]), x.shape[1])

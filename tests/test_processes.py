@@ -51,7 +51,7 @@ def test_schedule_is_that_of_the_papers(key):
     elif table == "sqrt_recipm1_alphas_cumprod":
         value = tables["noise"] / tables["signal"]
     else:
-        value = tables[TABLES.get(table, table)]
+        value = tables[str(TABLES.get(table, table))]
     np.testing.assert_allclose(value.numpy(), GAUSSIAN[key], rtol=1e-9)
 
 

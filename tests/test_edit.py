@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -334,13 +335,14 @@ def test_motions_that_cannot_be_read_are_one_line(diffusion, store, tmp_path):
         with pytest.raises(UserError, match=rf"{tmp_path}/motion\.npz.*{message}") as error:
             read_motion(diffusion.representation, npz(tmp_path, **arrays))
         assert "\n" not in str(error.value)
-    for source, options, message in (
+    sources: list[tuple[Any, dict[str, Any], str]] = [
         (tmp_path / "absent.npz", {}, r"absent\.npz: no such file"),
         ("kit:1", {}, "no prepared data set"),
         ("walk", {}, r"Give a \.npz, \.bvh, \.json, \.npy file, or dataset:id"),
         (CLIP[:-2] + "3", {}, r"has no clip .*\. Did you mean synthetic_0_000003"),
         (CLIP, {"cut": [1, 99]}, f"is not a range of {CLIP}, which lasts"),
-    ):
+    ]
+    for source, options, message in sources:
         with pytest.raises((UserError, FileNotFoundError), match=message):
             read_motion(diffusion.representation, source, data_root=store, **options)  # type: ignore[arg-type]
     with pytest.raises(UserError, match=r"motion.npz: motion: shape \(9, 22, 3\), expected \(frames, 3 \+ 3 x joints"):

@@ -4,6 +4,7 @@ import json
 import math
 import re
 from itertools import islice
+from typing import Any
 
 import pytest
 import torch
@@ -39,7 +40,7 @@ def test_released_weights_give_the_authors_outputs(stem):
     arrays = golden(stem)
     state = our_names(weights(arrays) | {"text_model.encoder.weight": torch.zeros(1)})
     (embedding, texts), (width, features) = state["text_projection.weight"].shape, state["input.weight"].shape
-    sizes = {"latent_dim": width, "ff_size": len(state["transformer.layers.0.feed_forward.0.weight"])}
+    sizes: dict[str, Any] = {"latent_dim": width, "ff_size": len(state["transformer.layers.0.feed_forward.0.weight"])}
     sizes["num_layers"] = len({name.split(".")[2] for name in state if name.startswith("transformer.layers.")})
     sizes |= {"num_heads": meta(arrays)["config"]["heads"], "max_frames": len(state["length_embedding.weight"])}
     clip = MotionCLIP(features, texts, dropout=0.1, embedding_dim=embedding, blind_features=3, **sizes)  # type: ignore[arg-type]

@@ -102,8 +102,8 @@ def test_the_committed_page_is_rendered_from_the_committed_figures():
     assert (ROOT / "docs" / "benchmarks" / "speed.md").read_text() == run.render(sections)
 
 
-PROCESSES = ("loading", "startup", "ddp")
-"""Sections that start processes, whose start takes longer than what they measure."""
+PROCESSES = ("loading", "startup", "ddp", "steps", "host")
+"""Sections that start processes or train several models, which takes longer than what they measure."""
 ALONE = [pytest.param(name, marks=pytest.mark.robustness if name in PROCESSES else ()) for name in run.SECTIONS]
 
 

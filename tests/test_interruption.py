@@ -1,6 +1,7 @@
 """Commands that are told to stop, and two that prepare the same data at once, as real processes."""
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -9,9 +10,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from support.runs import TINY
+from support.runs import spawn
 
-from flame_mdm.__main__ import main
 from flame_mdm.config import guarded
 from flame_mdm.data.store import Store
 from flame_mdm.progress import ProgressBar
@@ -22,9 +22,7 @@ STORE = "synthetic-humanml-clean-smpl22"
 
 
 def start(command: str, *words: str) -> subprocess.Popen[str]:
-    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    line = [sys.executable, "-m", "flame_mdm", command, *words]
-    return subprocess.Popen(line, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment)
+    return spawn(["flame_mdm", command, *words])
 
 
 def wait_for(condition: Callable[[], object], process: subprocess.Popen[str]) -> None:
@@ -54,17 +52,15 @@ def test_a_preparation_that_is_stopped_leaves_nothing(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_an_evaluation_that_is_stopped_leaves_whole_replications(tmp_path, data_root):
-    run = [*TINY, f"data_root={data_root}", f"run.dir={tmp_path / 'run'}", "callbacks.samples=null", "logger=csv"]
-    assert main(["train", "quickstart", *run, "callbacks.best=null", "trainer.max_steps=1"]) == 0
-    checkpoint = tmp_path / "run" / "checkpoints" / "last.ckpt"
+def test_an_evaluation_that_is_stopped_leaves_whole_replications(tmp_path, trained, data_root):
+    checkpoint = shutil.copy(trained, tmp_path / "last.ckpt")
     options = [f"ckpt={checkpoint}", "extractor=none", "split=train", f"data_root={data_root}", "batch_size=4"]
     process = start("evaluate", *options, "replications=20", "samples=20")
     wait_for(lambda: list(tmp_path.rglob("rep_0.npz")), process)
     stopped(process)
-    left = [path.name for path in tmp_path.rglob("evaluation/**/*") if path.is_file()]
-    assert left
-    assert all(name.startswith("rep_") and name.endswith(".npz") for name in left)
+    names = [path.name for path in tmp_path.rglob("*") if path.is_file() and path.name != "last.ckpt"]
+    assert names
+    assert all(name.startswith("rep_") and name.endswith(".npz") for name in names)
 
 
 @pytest.fixture
@@ -104,8 +100,9 @@ def test_the_second_process_takes_over_from_one_that_is_killed(both, tmp_path):
     Store(tmp_path / STORE).verify()
 
 
-@pytest.mark.parametrize(("signum", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
-@pytest.mark.parametrize("fails", [True, False])
+@pytest.mark.parametrize(
+    ("signum", "code", "fails"), [(signal.SIGTERM, 143, True), (signal.SIGINT, 130, True), (signal.SIGINT, 130, False)]
+)
 def test_a_library_that_fails_after_a_signal_does_not_hide_it(signum, code, fails, capsys):
     def command() -> None:
         try:

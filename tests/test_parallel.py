@@ -1,3 +1,5 @@
+"""Work in several processes, with results in order."""
+
 import math
 import os
 import time
@@ -6,7 +8,6 @@ from itertools import islice
 from multiprocessing import active_children
 
 import pytest
-from support.runs import no_children
 
 from flame_mdm.data import parallel
 from flame_mdm.data.parallel import in_order
@@ -58,6 +59,8 @@ def test_each_process_has_one_thread(monkeypatch):
 
 
 def test_an_error_ends_the_other_tasks():
+    from support.runs import no_children  # imports torch, which processes that import this file need not
+
     before = active_children()
     start = time.monotonic()
     with pytest.raises(ValueError, match="non-negative"):

@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 import torch
 from support.fixtures import ROOT
-from support.motions import bvh_text, sway
+from support.motions import adult, bvh_text
 from support.pages import a_run
 from support.refusals import one_line
 from support.runs import TINY, finish, spawn
@@ -37,13 +37,13 @@ pytestmark = pytest.mark.slow
 
 TEXT = "text=a person walks"
 CASES: dict[str, Any] = read_yaml(ROOT / "tests" / "support" / "refused.yaml")
-FOUR = sway(4).joints.astype(np.float32)
+FOUR = adult(4)
 
 
 @pytest.fixture
 def fill(bad, trained, tmp_path) -> Callable[[str], str]:
     """Fills the names of files into a word of a case, and makes the files."""
-    np.savez(tmp_path / "walk.npz", joints=sway(30).joints, fps=20.0)
+    np.savez(tmp_path / "walk.npz", joints=adult(30), fps=20.0)
     run, other = a_run(bad / "run"), a_run(bad / "other", name="two")
     os.mkfifo(bad / "pipe.npz")
     for name in ("folder.npz", "folder.yaml", "folder.txt", "empty"):
@@ -277,12 +277,16 @@ def test_damaged_motions(refused, bad, trained):
 def test_damaged_own_data(refused, bad, tmp_path):
     refused.every = 9
 
-    def case(name: str, data: str | bytes | None, *more: str) -> None:
-        folder, root = bad / f"data{refused.count}", tmp_path / f"prepared{refused.count}"
+    def own_data(name: str) -> Path:
+        folder = bad / name
         folder.mkdir()
         for clip in "abc":
-            np.savez(folder / f"{clip}.npz", joints=sway(60).joints, fps=20.0)
+            np.savez(folder / f"{clip}.npz", joints=adult(60), fps=20.0)
             (folder / f"{clip}.txt").write_text("a person stands\n")
+        return folder
+
+    def case(name: str, data: str | bytes | None, *more: str) -> None:
+        folder, root = own_data(f"data{refused.count}"), tmp_path / f"prepared{refused.count}"
         (folder / name).unlink(missing_ok=True)
         if data is not None:
             (folder / "b.npz").unlink() if name == "b.bvh" else None
@@ -290,6 +294,7 @@ def test_damaged_own_data(refused, bad, tmp_path):
         refused.watched.append(root)
         refused("prepare", "data=folder", f"source={folder}", f"data_root={root}", *more)
 
+    assert main(["prepare", "data=folder", f"source={own_data('whole')}", f"data_root={bad / 'root'}"]) == 0
     for data in (None, "", "\n\n", "# x\n", b"\xff\xfe\xff"):
         case("b.txt", data)
     case("b.npy", "x")

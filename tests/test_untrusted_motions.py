@@ -23,7 +23,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.motions import bvh_text, sway
+from support.motions import adult, bvh_text
 from support.refusals import Refused, bounded, carry_out
 from support.runs import no_children
 
@@ -95,7 +95,7 @@ def bvh_at(seconds: str) -> bytes:
     return bvh_text().replace("Frame Time: 0.05", f"Frame Time: {seconds}").encode()
 
 
-JOINTS = sway(4).joints
+JOINTS = adult(4).astype(float)
 LONG = np.zeros((4, 156), np.longdouble)
 FIELDS = np.zeros((4, 147), [("a", "f4")])
 BOMB = zip_bomb("joints.npy", header((300 * 2**20 // 528, 22, 3)))
@@ -164,7 +164,7 @@ def folder(tmp_path: Path) -> Callable[[Callable[[Path], Any]], Path]:
         path = tmp_path / f"data{next(numbers)}"
         path.mkdir()
         for name in "ac":
-            np.savez(path / f"{name}.npz", joints=sway(60).joints, fps=20.0)
+            np.savez(path / f"{name}.npz", joints=adult(60), fps=20.0)
         change(path)
         return path
 

@@ -72,6 +72,11 @@ def posed(
     return motion_of_poses(Poses(offsets, torch.tensor(rotations), torch.tensor(np.array(pelvis))), 20)
 
 
+def adult(frames: int) -> np.ndarray:
+    """Joints (F, 22, 3) float32 of SMPL's body, which turns left and right."""
+    return posed(frames, heading=np.sin(np.arange(frames) / 5)).joints.astype(np.float32)
+
+
 @cache
 def bvh_text() -> str:
     """A BVH file of SMPL's body in its rest pose, in centimeters: 3 frames at 20 per second."""

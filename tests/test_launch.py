@@ -63,9 +63,9 @@ def cluster(tmp_path: Path) -> dict[str, str]:
 
 @pytest.mark.slow
 def test_a_slurm_job_that_runs_out_of_time_is_requeued_and_ends_as_if_it_had_not(tiny, tmp_path, cluster):
-    """Two tasks; SIGUSR2, which submitit asks SLURM for, comes at step 2 of 3."""
+    """Two tasks; SIGUSR2, which submitit asks SLURM for, comes at step 1 of 3."""
     words = [*tiny, *RUN, "callbacks.samples=null", "trainer.max_steps=3"]
-    time_over = alarm(tmp_path, "time", step=2, rank=0, attempt=0, counter="SLURM_RESTART_COUNT", signal="SIGUSR2")
+    time_over = alarm(tmp_path, "time", step=1, rank=0, attempt=0, counter="SLURM_RESTART_COUNT", signal="SIGUSR2")
     launch = ["launch=slurm", "hydra.launcher.partition=gpu", "hydra.launcher.timeout_min=90"]
     code, out, err = finish(spawn(["flame_mdm", "train", "quickstart", *words, *time_over, *TWO, *launch], **cluster))
     logs = "\n".join(path.read_text() for path in (tmp_path / "run" / ".submitit").rglob("*.out"))
@@ -76,7 +76,7 @@ def test_a_slurm_job_that_runs_out_of_time_is_requeued_and_ends_as_if_it_had_not
     while len(codes := (tmp_path / "codes").read_text().split()) < 2 and time.monotonic() < deadline:
         time.sleep(0.1)  # the result of a job stands in its file before the job has ended
     assert codes == ["140", "0"]  # 128 + SIGUSR2
-    assert "steps: 3 to 3" in logs
+    assert "steps: 2 to 3" in logs
     checkpoints = tmp_path / "run" / "checkpoints"
     assert sorted(path.name for path in checkpoints.iterdir()) == ["last.ckpt", "previous.ckpt"]
     checkpoint = read_checkpoint(checkpoints / "last.ckpt")

@@ -511,8 +511,8 @@ def test_what_does_not_fit_is_refused(runs, capsys, tmp_path):
         ("condition text", {"protocol": "action_to_motion"}),
         ("at least 1", {"samples": 0}),
         ("at least 1", {"batch_size": 0}),
-        ("does not edit motions", {"editing": EditRequest(method="mdm")}),
-        ("option of method=mfm", {"protocol": "editing_prediction", "editing": EditRequest(until=0.3)}),
+        ("does not edit motions", {"method": "mdm"}),
+        ("option of method=mfm", {"protocol": "editing_prediction", "until": 0.3}),
         ("give exactly one of", {"baseline": "real"}),
         ("needs a protocol", {"ckpt": None, "baseline": "real", "data": {"name": "synthetic"}}),
     ):

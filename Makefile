@@ -6,11 +6,11 @@
 PYTHON ?= python3
 VENV := .venv
 READY := $(VENV)/.ready
-COMMANDS := train sample demo edit evaluate audit tables benchmark prepare browse inspect convert compare report import export push
+COMMANDS := train adapt distill sample demo edit evaluate audit tables benchmark prepare browse inspect convert compare report import export push
 PYTEST := $(VENV)/bin/python -m pytest -n 2 --dist loadfile
 export MAKEFLAGS
 
-.PHONY: $(COMMANDS) help setup test test-fast test-tools test-robustness lint bench docs
+.PHONY: $(COMMANDS) help setup test test-fast test-tools test-robustness lint bench docs web blender
 
 ifneq ($(filter $(COMMANDS),$(firstword $(MAKECMDGOALS))),)
 ifneq ($(words $(MAKECMDGOALS)),1)
@@ -30,7 +30,7 @@ setup: $(READY) ## install into .venv
 
 $(READY): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
-	$(VENV)/bin/python -m pip install -q -c constraints.txt -e '.[dev,offline,video,demo,docs]'
+	$(VENV)/bin/python -m pip install -q -c constraints.txt -e '.[dev,offline,video,demo,docs,onnx]'
 	@touch $@
 
 test: $(READY) ## run all tests, except those that need outside tools
@@ -39,7 +39,7 @@ test: $(READY) ## run all tests, except those that need outside tools
 test-fast: $(READY) ## run the tests that take a few seconds at most
 	@$(PYTEST) -m "not tools and not robustness and not slow"
 
-test-tools: $(READY) ## run the tests that need outside tools: a browser, ffmpeg
+test-tools: $(READY) ## run the tests that need outside tools: a browser, ffmpeg, Blender
 	@$(PYTEST) -m tools
 
 test-robustness: $(READY) ## run all malformed inputs, process kills and full disks; before a release, and after changes to readers
@@ -57,3 +57,10 @@ bench: $(READY) ## measure speed, write docs/benchmarks/speed.md; ONLY=host,step
 docs: $(READY) ## write the pages that are generated from the code, and build the site in build/docs
 	@$(VENV)/bin/python docs/generate.py
 	@$(VENV)/bin/python -m sphinx -W --keep-going -q docs build/docs
+	@if [ -d build/web ]; then mkdir -p build/docs/web && cp -r build/web/. build/docs/web; fi
+
+web: $(READY) ## build the page that samples in the browser, in build/web; needs Node.js
+	@$(VENV)/bin/python tools/web.py
+
+blender: $(READY) ## build the extension of Blender in build/; PLATFORM=windows-x64, macos-arm64 or linux-x64, default: this machine
+	@$(VENV)/bin/python tools/blender.py $(PLATFORM)

@@ -2,8 +2,8 @@
 
 Three tables: milliseconds per network call that the sampling loop itself takes, with a denoiser that returns a stored
 tensor; the samplers with MDM's encoder, which take turns within a run, so that a busy machine slows all of them; and
-latency at batch 1 and throughput at batch 64 of that encoder for 10, 50 and 1000 steps. Gives medians, and ratios to
-the first row.
+latency at batch 1 and throughput at batch 64 of that encoder for 1, 2 and 4 steps of a distilled model, which has no
+guidance, and for 10, 50 and 1000 steps. Gives medians, and ratios to the first row.
 """
 
 import argparse
@@ -33,6 +33,7 @@ RUNS = [
     (GaussianDiffusion(), "dpm_solver_pp_2m", 50),
     (GaussianDiffusion(), "ddim", 10),
     (GaussianDiffusion(), "dpm_solver_pp_2m", 10),
+    (GaussianDiffusion(), "consistency", 4),
     (FlowMatching(), "euler", 50),
     (FlowMatching(), "euler", 10),
     (FlowMatching(), "midpoint", 10),
@@ -95,22 +96,24 @@ def measure_loops(args: argparse.Namespace) -> list[Row]:
 
 
 def measure_steps(denoise: Denoise, args: argparse.Namespace) -> list[Row]:
-    """Returns seconds per run and motions per second by batch size and number of steps of the ancestral sampler."""
+    """Returns seconds per run and motions per second by batch size and number of steps, distilled and ancestral."""
     rows: list[Row] = []
     guided = classifier_free_guidance(denoise, args.guidance_scale, args.features)
     first = 0.0
     for batch in (1, 64):
         fixed, mask, cond = inputs(batch, args)
         noise = seeded_noise([str(i) for i in range(batch)], *fixed.shape[1:], seed=0, replication=0, like=fixed)
-        run = partial(GaussianDiffusion().sample, guided, noise, mask, cond)
-        short = taken = seconds(partial(run, options("ancestral", 10)), 3)
-        for steps in (10, 50, 1000):
-            estimate = short * steps / 10
-            if steps > 10:
-                taken = estimate if estimate > args.longest else seconds(partial(run, options("ancestral", steps)), 1)
+        sample = partial(GaussianDiffusion().sample, noise=noise, mask=mask, cond=cond)
+        runs = {f"{n}, distilled": partial(sample, denoise, options=options("consistency", n)) for n in (1, 2, 4)}
+        runs |= {f"{n:,}": partial(sample, guided, options=options("ancestral", n)) for n in (10, 50, 1000)}
+        short = 0.0
+        for name, run in runs.items():
+            estimate = short * int(name.replace(",", "")) / 10 if short else 0.0
+            taken = estimate if estimate > args.longest else seconds(run, 1 if short else 3)
+            short = short or taken * (name == "10")
             first = first or taken
             how = ", estimated from 10" if estimate > args.longest else ""
-            row: Row = {"batch": str(batch), "steps": f"{steps:,}{how}", "seconds": taken}
+            row: Row = {"batch": str(batch), "steps": f"{name}{how}", "seconds": taken}
             rows.append(row | {"motions per second": batch / taken, "ratio": taken / first})
     return rows
 

@@ -22,23 +22,25 @@ html_show_sphinx = html_show_copyright = False
 myst_heading_anchors = 3
 
 
-def sidebar(index: str) -> str:
-    """Returns the sidebar: the links of docs/index.md by section, then all other pages; each page once."""
-    sections = [(part.splitlines()[0], re.findall(r"\]\(([\w/-]+)\.md[)#]", part)) for part in index.split("\n## ")[1:]]
-    pages = sorted(str(path.relative_to(DOCS).with_suffix("")) for path in DOCS.rglob("*.md"))
-    seen, trees = {"index"}, ""
-    for title, listed in [*sections, ("Results of audits", [page for page in pages if "/audit/" in page])]:
-        new = [page for page in dict.fromkeys(listed) if page not in seen]
-        seen.update(new)
-        trees += f"\n```{{toctree}}\n:hidden:\n:caption: {title}\n\n" + "\n".join(new) + "\n```\n"
-    return trees
+def sidebar(index: str) -> dict[str, list[str]]:
+    """Returns the pages of the sidebar by section, those that docs/index.md links to; each page once."""
+    seen, sections = {"index"}, {}
+    for part in index.split("\n## ")[1:]:
+        pages = dict.fromkeys(re.findall(r"\]\(([\w/-]+)\.md[)#]", part))
+        sections[part.splitlines()[0]] = [page for page in pages if page not in seen]
+        seen.update(pages)
+    return sections
 
 
 def start_page(app: Any, name: str, source: list[str]) -> None:
     """Replaces the list of pages by the README and the sidebar; links to the README lead there."""
+    sections = sidebar((DOCS / "index.md").read_text(encoding="utf-8"))
     if name == "index":
         readme = (DOCS.parent / "README.md").read_text(encoding="utf-8")
-        source[0] = readme.replace("](docs/", "](") + sidebar(source[0])
+        trees = (f":caption: {title}\n\n" + "\n".join(pages) for title, pages in sections.items())
+        source[0] = readme.replace("](docs/", "](") + "".join(f"\n```{{toctree}}\n:hidden:\n{t}\n```\n" for t in trees)
+    elif not any(name in pages for pages in sections.values()):
+        source[0] = f"---\norphan: true\n---\n\n{source[0]}"
     source[0] = re.sub(r"\]\((\.\./)+README\.md", lambda match: f"]({'../' * name.count('/')}index.md", source[0])
 
 

@@ -27,6 +27,14 @@ def head(name: str) -> tuple[str, str]:
     return what.strip(), ("Deviations" + deviations if deviations else "")
 
 
+FILTER = (
+    '<input type="search" placeholder="Filter: kit, decoder, table 3 ..." oninput="for (const row of '
+    "document.querySelectorAll('tbody tr')) "
+    'row.hidden = !row.textContent.toLowerCase().includes(this.value.toLowerCase())">'
+)
+"""A field above the table of recipes; code hosts leave it out."""
+
+
 def recipes_page() -> str:
     """Returns the page of all recipes, with the paper, table and row that each reproduces."""
     page = f"""# Recipes
@@ -34,21 +42,20 @@ def recipes_page() -> str:
 {HEAD}
 Each row of the papers' tables that FLAME (Kim et al., AAAI 2023, arXiv:2209.00349), MDM (Tevet et al., ICLR 2023,
 arXiv:2209.14916) or Motion Flow Matching (Hu et al., 2023, arXiv:2312.08895) fill has a recipe: `make train
-EXP=humanml3d/mdm`. Recipes that name no table are not rows of a paper. "Those of mdm"
-are the deviations of the recipe `mdm` in the same folder. Some deviations hold for all recipes: a batch contains
-motions of about the same length, every sample of a batch has the same weight, and checkpoints are chosen on validation
-clips.
+EXP=humanml3d/mdm`. Recipes that name no table are not rows of a paper; their files list how they deviate. "Those of
+mdm" are the deviations of the recipe `mdm` in the same folder. Some hold for all recipes: a batch contains motions of
+about the same length, every sample of a batch has the same weight, and checkpoints are chosen on validation clips.
 """
-    folder = None
+    page += f"\n{FILTER}\n\n| recipe | what it reproduces |\n|---|---|\n"
     for name in sorted(recipes(), key=lambda name: ("/" in name, name)):
-        if name.rpartition("/")[0] != folder:
-            folder = name.rpartition("/")[0]
-            page += f"\n## {folder or 'First steps'}\n\n| recipe | paper, table, row | deviations |\n|---|---|---|\n"
         what, deviations = head(name)
         what = re.sub(r"(Kim|Tevet|Hu) et al\., (AAAI |ICLR )?\d{4}, arXiv:[\d.]+(, )?", "", what).replace(" ()", "")
-        what = re.sub(r" Not a (row of (the|a) paper|benchmark row)\.", "", what)
+        what = re.sub(r" (Not a (row of (the|a) paper|benchmark row)|Trains in [\w ']+)\.", "", what)
         deviations = re.sub(r"^Deviations(:| from)\s*", lambda m: "" if m[1] == ":" else "from ", deviations)
-        page += f"| `{name}` | {what} | {deviations} |\n"
+        if ", table" not in what:
+            what = re.split(r"(?<!al)\. ", what)[0].rstrip(".") + "."
+        folded = f" <details><summary>deviations</summary>{deviations}</details>"
+        page += f"| `{name}` | {what}{folded * (', table' in what and bool(deviations))} |\n"
     return page
 
 
@@ -106,19 +113,22 @@ def hyperparameters_page() -> str:
     page = f"""# Hyperparameters
 
 {HEAD}
-Values of the recipes, in the order of the papers' tables. Bold: the paper gives the same value. If the two differ,
-both are shown. The other values are not in the papers; most are those of the authors' code. "–": the recipe has no
-such value. Text encoders go by the id of their checkpoint; where a paper names the kind alone (MFM: CLIP, T5; MDM:
-sentence-BERT), the checkpoint is our choice.
+Values of the recipes. Bold: the paper gives the same value. If the two differ, both are shown. The other values are not
+in the papers; most are those of the authors' code. "–": the recipe has no such value. Where a paper names only the kind
+of a text encoder (MFM: CLIP, T5; MDM: sentence-BERT), the checkpoint is our choice.
 """
     for table in TABLES:
         columns = {name: values(name, sizes) for name in table.columns}
         rows = [key for key in LABELS if any(key in papers for papers in table.columns.values())]
-        page += f"\n## {table.title}\n\n| | {' | '.join(f'`{name}`' for name in columns)} |\n"
-        page += f"|---|{'---|' * len(columns)}\n"
-        for key in rows:
-            cells = [_cell(ours.get(key), table.columns[name].get(key)) for name, ours in columns.items()]
-            page += f"| {LABELS[key]} | {' | '.join(cells)} |\n"
+        cells = {
+            key: [_cell(ours.get(key), table.columns[name].get(key)) for name, ours in columns.items()] for key in rows
+        }
+        equal = [key for key in rows if all(cell.startswith("**") for cell in cells[key])]
+        shared = (LABELS[key] + f" {cells[key][0]}" * (len(set(cells[key])) == 1) for key in equal)
+        page += f"\n## {table.title}\n\n" + f"As in the paper: {'; '.join(shared)}.\n" * bool(equal)
+        if equal != rows:
+            page += f"\n| | {' | '.join(f'`{name}`' for name in columns)} |\n|---|{'---|' * len(columns)}\n"
+        page += "".join(f"| {LABELS[key]} | {' | '.join(cells[key])} |\n" for key in rows if key not in equal)
     page += "\n## Deviations from the papers\n\n"
     for (name, key), reason in DEVIATIONS.items():
         page += f"- `{name}`, {LABELS[key]}: {reason}.\n"

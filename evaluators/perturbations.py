@@ -14,6 +14,7 @@ import torch
 
 from flame_mdm.formats.resampling import resample
 from flame_mdm.representations.humanml import HumanML
+from flame_mdm.representations.skeleton import SKELETONS
 
 Joints = np.ndarray
 Draws = np.random.Generator
@@ -60,6 +61,18 @@ def pop(joints: Joints, centimeters: float, draws: Draws, *, last: bool = False)
     popped = joints.copy()
     popped[-1 if last else frame] += centimeters / 100 * way / np.linalg.norm(way)
     return popped
+
+
+def draw_in(joints: Joints, centimeters: float) -> Joints:
+    """Moves the wrists toward the axis of the trunk, as far as it at most, and the elbows half as far."""
+    names = next(skeleton.joints for skeleton in SKELETONS.values() if len(skeleton) == joints.shape[1])
+    changed, neck = joints.copy(), joints[:, names.index("neck")]
+    for side in ("left", "right"):
+        elbow, wrist = (names.index(f"{side}_{name}") for name in ("elbow", "wrist"))
+        way = joints[:, 0] + 0.4 * (neck - joints[:, 0]) - joints[:, wrist]
+        way *= np.minimum(1, centimeters / 100 / np.linalg.norm(way, axis=-1, keepdims=True))
+        changed[:, wrist], changed[:, elbow] = joints[:, wrist] + way, joints[:, elbow] + way / 2
+    return changed
 
 
 def freeze(joints: Joints, percent: float) -> Joints:
@@ -145,6 +158,7 @@ PERTURBATIONS = [
     _P("shorter bones", "joints", "all bones shorter", "%", _PERCENT, lambda x, g, *_: resize(x, -g)),
     _P("pop", "joints", "one frame displaced", "cm", _PERCENT, lambda x, g, r, _: pop(x, g, r)),
     _P("last-frame pop", "joints", "last frame displaced", "cm", _PERCENT, lambda x, g, r, _: pop(x, g, r, last=True)),
+    _P("arms inside", "joints", "wrists moved into the trunk", "cm", (10, 20, 30), lambda x, g, *_: draw_in(x, g)),
     _P("mirrored", "meaning", "left and right exchanged, captions kept", "% of motions", _SHARES),
     _P("reversed", "meaning", "played backward", "% of motions", _SHARES),
     _P("slower", "meaning", "played at this speed", "x", (0.9, 0.75, 0.5), lambda x, g, _, fps: play(x, g, fps)),

@@ -17,6 +17,7 @@ from flame_mdm.config import instantiate, trust
 from flame_mdm.data.body_model import load_offsets
 from flame_mdm.data.datamodule import Clips, MotionDataModule
 from flame_mdm.errors import UserError
+from flame_mdm.generator import MotionGenerator
 from flame_mdm.representations import Representation
 from flame_mdm.representations.rot6d import Rot6D
 from flame_mdm.representations.smpl import SMPL
@@ -25,7 +26,6 @@ from flame_mdm.sampler_options import SamplerOptions
 from flame_mdm.sampling.editing import method_options
 from flame_mdm.sampling.request import EditRequest
 from flame_mdm.schemas import UsedSkeleton
-from flame_mdm.task import MotionGeneration
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,7 +46,7 @@ class Plan:
         path: of the result file.
     """
 
-    model: MotionGeneration | None
+    model: MotionGenerator | None
     file: Path | None
     sampling: dict[str, Any]
     data: MotionDataModule
@@ -118,7 +118,7 @@ def make_plan(request: EvaluationRequest, device: str) -> Plan:
     )
 
 
-def open_data(request: EvaluationRequest, model: MotionGeneration | None) -> MotionDataModule:
+def open_data(request: EvaluationRequest, model: MotionGenerator | None) -> MotionDataModule:
     """Returns the prepared data, with its own representation. The model keeps the statistics of its training data.
 
     Raises:
@@ -168,7 +168,7 @@ def set_bones(smpl: str | None, representation: Representation) -> UsedSkeleton 
 
 def sampling_options(
     protocol: Protocol,
-    model: MotionGeneration,
+    model: MotionGenerator,
     options: SamplerOptions | None = None,
     editing: EditRequest | None = None,
 ) -> tuple[SamplerOptions, dict[str, Any]]:

@@ -17,11 +17,11 @@ from flame_mdm.config import EXPERIMENTS, Config, check, instantiate, plain
 from flame_mdm.data.datamodule import Clips
 from flame_mdm.data.store import Entry
 from flame_mdm.errors import UserError, did_you_mean
+from flame_mdm.generator import MotionGenerator
 from flame_mdm.representations import Representation
 from flame_mdm.safe_io import read_yaml
 from flame_mdm.schemas import ClosedSchema, Int, Number, check_shape
 from flame_mdm.seeds import key
-from flame_mdm.task import MotionGeneration
 
 FOLDER = EXPERIMENTS / "evaluation"
 QUICK_REPLICATIONS, QUICK_SAMPLES = 2, 64
@@ -79,7 +79,8 @@ class Protocol(ClosedSchema):
         name: name of the file, with that of the variant.
         version: raised when the protocol changes; values of different versions are not comparable.
         condition: condition of the generated motions.
-        extractor: a mapping with the `_target_` of an `Extractor`; the evaluation provides its path. None = not needed.
+        extractor: a mapping with the `_target_` of an `Extractor`, and its `path` unless the evaluation has to provide
+            one. None = not needed.
         metrics: mappings with the `_target_` of a metric, by name.
         replications: number of repetitions of the evaluation.
         samples: motions per replication. Clips are drawn at random, and repeatedly if there are too few. None = each
@@ -158,7 +159,9 @@ class Protocol(ClosedSchema):
         return self.model_copy(update={**changed, "quick": quick, "multimodality": several}), changed
 
     def open_extractor(self, path: str | None, representation: Representation, dataset: str) -> Extractor | None:
-        """Opens the extractor at `path`, on the device of the representation; None if not needed, or `path` is "none".
+        """Opens an extractor on the device of the representation; None if not needed, or `path` is "none".
+
+        Without a `path`, it is the one that the protocol names.
 
         Raises:
             UserError: If a required extractor is missing, or belongs to another representation or data set.
@@ -166,6 +169,7 @@ class Protocol(ClosedSchema):
         """
         if self.extractor is None or path == "none":
             return None
+        path = path or self.extractor.get("path")
         if path is None:
             raise UserError(
                 f"protocol {self.name} needs a feature extractor. Give extractor=FILE, such as a checkpoint of make "
@@ -248,7 +252,7 @@ class Protocol(ClosedSchema):
                 f"{clips.store.info['dataset']} has clips without {self.condition}. Choose another protocol"
             )
 
-    def check_model(self, model: MotionGeneration) -> None:
+    def check_model(self, model: MotionGenerator) -> None:
         """Checks that the model was trained with the condition of the protocol.
 
         Raises:
@@ -353,7 +357,7 @@ def digest(values: Any) -> str:
 
 
 def open_protocol(
-    name: str, clips: Clips, representation: Representation, model: MotionGeneration | None, **size: Any
+    name: str, clips: Clips, representation: Representation, model: MotionGenerator | None, **size: Any
 ) -> tuple[Protocol, dict[str, Any]]:
     """Returns a protocol for a split and a model, and the options changed by `Protocol.resized`.
 
@@ -368,7 +372,7 @@ def open_protocol(
     return protocol, changed
 
 
-def default_protocol(model: MotionGeneration) -> str:
+def default_protocol(model: MotionGenerator) -> str:
     """Returns the name of the default protocol for a model."""
     condition, dataset = model.conditioned_on, model.facts.get("dataset", "")
     if condition == "none":

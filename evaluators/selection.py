@@ -9,11 +9,11 @@ import torch.nn.functional as F
 
 from evaluators.extractors import MotionCLIPExtractor
 from flame_mdm.formats.motion import Motion
-from flame_mdm.task import MotionGeneration
+from flame_mdm.generator import MotionGenerator
 
 
 def text_fit(
-    path: str, model: MotionGeneration, device: str | torch.device = "cpu"
+    path: str, model: MotionGenerator, device: str | torch.device = "cpu"
 ) -> Callable[[Sequence[Motion]], list[float]]:
     """Returns a score for `flame_mdm.generate`: the cosine similarity of a motion and its text, mean over its parts.
 

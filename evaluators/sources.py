@@ -19,6 +19,7 @@ from evaluators.protocol import DrawnClip, Protocol
 from flame_mdm.batch import Edit, MotionBatch, length_mask, pad_to
 from flame_mdm.data.datamodule import Clips
 from flame_mdm.errors import UserError
+from flame_mdm.generator import MotionGenerator
 from flame_mdm.progress import ProgressBar
 from flame_mdm.representations import Representation
 from flame_mdm.safe_io import atomic_write, read_npz, regular_file
@@ -26,7 +27,6 @@ from flame_mdm.sampler_options import SamplerOptions
 from flame_mdm.sampling.editing import kept_parts
 from flame_mdm.sampling.request import EditRequest
 from flame_mdm.seeds import key, normal
-from flame_mdm.task import MotionGeneration
 
 NOISE = 0.5
 """Standard deviation of the noise in noisy baselines, in normalized features."""
@@ -86,7 +86,7 @@ class Generator:
 
     def __init__(
         self,
-        model: MotionGeneration,
+        model: MotionGenerator,
         protocol: Protocol,
         clips: Clips,
         options: SamplerOptions,

@@ -19,15 +19,17 @@ if "OMP_WAIT_POLICY" not in os.environ:
 if TYPE_CHECKING:
     from flame_mdm.checkpoints.loading import load
     from flame_mdm.formats.motion import Motion
+    from flame_mdm.generator import MotionGenerator as MotionGenerator
     from flame_mdm.sampling.editing import edit
     from flame_mdm.sampling.generation import generate
-    from flame_mdm.task import MotionGeneration
+    from flame_mdm.training.adaptation import adapt
 
-__all__ = ["Motion", "MotionGeneration", "edit", "generate", "load"]
+__all__ = ["Motion", "adapt", "edit", "generate", "load"]
 
 _MODULES = {
+    "adapt": "training.adaptation",
     "load": "checkpoints.loading",
-    "MotionGeneration": "task",
+    "MotionGenerator": "generator",
     "generate": "sampling.generation",
     "Motion": "formats.motion",
     "edit": "sampling.editing",

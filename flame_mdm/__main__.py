@@ -10,6 +10,8 @@ from flame_mdm.errors import UserError, did_you_mean, say
 
 COMMANDS = {
     "train": "train or resume a recipe",
+    "adapt": "teach a trained model the motions in a folder",
+    "distill": "train a model that samples in one to four steps from one that takes more",
     "sample": "generate motions from a checkpoint",
     "demo": "ask for motions in the browser",
     "edit": "keep part of a motion and resample the rest",
@@ -24,7 +26,7 @@ COMMANDS = {
     "compare": "compare runs side by side, or conduct a user study",
     "report": "write the report page of a run",
     "import": "import a checkpoint released by the authors of a paper",
-    "export": "write a checkpoint as a model file",
+    "export": "write a checkpoint as a model file, or as ONNX graphs",
     "push": "upload a model file to the Hugging Face hub",
 }
 """Command -> purpose. Commands are in `commands/NAME.py`; `import` is in `commands/import_released.py`."""

@@ -85,12 +85,13 @@ class Condition:
             return Condition(pooled, tokens, self.token_mask, null)
         size = max(self.tokens.shape[1], null.tokens.shape[1])
         tokens = torch.where(drop[:, None, None], pad_to(null.tokens.to(self.tokens), size), pad_to(self.tokens, size))
-        token_mask = torch.where(drop[:, None], pad_to(null.token_mask, size), pad_to(self.token_mask, size))
+        replaced = drop[:, None]
+        token_mask = (replaced & pad_to(null.token_mask, size)) | (~replaced & pad_to(self.token_mask, size))
         return Condition(pooled, tokens, token_mask, null)
 
     def with_null(self) -> Condition:
         """Returns the batch followed by its null conditions (2B), for classifier-free guidance in one forward pass."""
-        batch = len(self.pooled)
+        batch = self.pooled.shape[0]
         twice = Condition(
             torch.cat([self.pooled, self.pooled]),
             torch.cat([self.tokens, self.tokens]),

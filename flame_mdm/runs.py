@@ -132,15 +132,20 @@ def newest_samples(folder: Path, file: str) -> Path | None:
     return max((path for path in folders if path.name.removeprefix("step_").isdecimal()), default=None)
 
 
+def check_run(folder: Path) -> None:
+    """Raises `UserError` if the folder is not a run directory."""
+    if not (folder / CONFIG).exists():
+        raise UserError(f"{folder}: contains no {CONFIG}; give a run directory, such as runs/synthetic/mdm/default")
+
+
 def read_run(folder: Path) -> Run:
     """Returns the content of a run directory.
 
     Raises:
         UserError: If the folder is not a run directory, or a file is damaged.
     """
+    check_run(folder)
     path = folder / CONFIG
-    if not path.exists():
-        raise UserError(f"{folder}: contains no {CONFIG}; give a run directory, such as runs/synthetic/mdm/default")
     config = read_saved(path)
     try:
         check_shape(config, RunConfig)

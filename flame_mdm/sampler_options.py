@@ -42,8 +42,8 @@ class SamplerOptions:
     guidance_scale: float | None = option(None, "scale of classifier-free guidance; 1 = off. Default: the recipe's")
     sampler: str | None = option(
         None,
-        "ancestral, ddim or dpm_solver_pp_2m for diffusion; euler, midpoint, heun, rk4 or dopri5 for flow matching. "
-        "Default: the recipe's",
+        "ancestral, ddim or dpm_solver_pp_2m for diffusion; euler, midpoint, heun, rk4 or dopri5 for flow matching; "
+        "consistency for distilled models. Default: the recipe's",
     )
     num_inference_steps: int | Sequence[int] | None = option(
         None,

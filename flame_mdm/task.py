@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Any, Self
 
 import torch
 from lightning import LightningModule
@@ -14,19 +13,18 @@ from torch import Tensor
 from torch.optim.lr_scheduler import LambdaLR
 from torchmetrics import MeanMetric
 
-from flame_mdm.batch import Condition, Denoise, Edit, MotionBatch, pad_to
+from flame_mdm.batch import Condition, MotionBatch, sent
 from flame_mdm.conditions import ConditionEncoder
 from flame_mdm.conditions.vocabulary import vocabulary
-from flame_mdm.config import Config, instantiate, parameters
+from flame_mdm.config import Config, instantiate
+from flame_mdm.data.adaptation import KEPT
 from flame_mdm.data.datamodule import MotionDataModule
 from flame_mdm.denoisers import Denoiser
 from flame_mdm.errors import UserError
+from flame_mdm.generator import MotionGenerator
 from flame_mdm.losses import MotionLosses
 from flame_mdm.processes import Process
-from flame_mdm.processes.guidance import classifier_free_guidance
-from flame_mdm.processes.windows import Windows, blended
 from flame_mdm.representations import Representation
-from flame_mdm.sampler_options import SamplerOptions
 from flame_mdm.seeds import key, normal, seed_generator, seeded_noise, uniform
 
 
@@ -114,7 +112,7 @@ class Task(LightningModule):
         checkpoint["config"], checkpoint["facts"] = self.config, self.facts
 
 
-class MotionGeneration(Task):
+class MotionGeneration(MotionGenerator, Task):
     """Trains any denoiser with any process, and samples from it.
 
     Args:
@@ -128,8 +126,6 @@ class MotionGeneration(Task):
         seed: of all random draws in training, which are functions of (seed, batch number, rank).
         compile: compile the denoiser with torch.compile.
     """
-
-    noun = "a motion generator"
 
     def __init__(
         self,
@@ -148,19 +144,10 @@ class MotionGeneration(Task):
         compile: bool = False,
     ):
         super().__init__(condition, representation, optimizer=optimizer, seed=seed)
-        if not isinstance(denoiser, Denoiser):
-            raise UserError(f"{type(denoiser).__name__} is no denoiser: derive it from flame_mdm.denoisers.Denoiser")
         if not 0 <= cond_drop_prob <= 1:
             raise UserError(f"task.cond_drop_prob={cond_drop_prob}: give a probability from 0 to 1")
-        if num_inference_steps is None:  # a recipe may come from a file
-            raise UserError("task.num_inference_steps=null: give the number of sampling steps")
-        try:
-            self.sampler_options = SamplerOptions(
-                guidance_scale=guidance_scale, sampler=sampler, num_inference_steps=num_inference_steps
-            )
-        except UserError as error:
-            raise UserError(f"task.{error}") from error
-        self.denoiser, self.process = denoiser, process
+        options = {"guidance_scale": guidance_scale, "sampler": sampler, "num_inference_steps": num_inference_steps}
+        self.combine(denoiser, process, condition, representation, **options)
         self.losses = MotionLosses(representation.to_joints, representation.skeleton.feet, **losses)
         self.cond_drop_prob = cond_drop_prob
         self.val_losses = torch.nn.ModuleDict()
@@ -168,53 +155,19 @@ class MotionGeneration(Task):
             self.denoiser.compile()
 
     @classmethod
-    def build(cls, config: Config, representation: Representation, *, actions: Sequence[str] = ()) -> Self:
-        """Builds the parts of a recipe and combines them. Derives sizes that depend on other parts."""
-
-        def part(name: str, **derived: Any) -> Any:
-            legal = parameters(config[name]["_target_"])
-            derived = {k: v for k, v in derived.items() if k in legal or "**" in legal}
-            return instantiate(config[name], **derived)
-
-        process: Process = part("process")
-        condition: ConditionEncoder = part("condition", num_actions=len(actions))
-        width = representation.features
-        denoiser: Denoiser = part(
-            "denoiser",
-            in_features=width,
-            out_features=process.out_features(width),
-            cond_features=condition.features,
-            length_unit=_length_unit(config),
-        )
+    def of_parts(cls, config: Config, *parts: Any) -> Self:
         options = {k: v for k, v in config["task"].items() if k != "_target_"}
-        task = cls(
-            denoiser,
-            process,
-            condition,
-            representation,
-            losses=config["losses"],
-            optimizer=config["optimizer"],
-            seed=config["seed"],
-            **options,
-        )
-        task.config, task.facts = config, {"actions": list(actions)}
-        return task
-
-    def describe(self) -> str:
-        return type(self.denoiser).__name__
-
-    @property
-    def conditioned_on(self) -> Literal["none", "text", "action"]:
-        """The condition that the model was trained with."""
-        return self.condition.reads if self.condition.features else "none"
+        return cls(*parts, **options, **{name: config[name] for name in ("losses", "optimizer", "seed")})
 
     def setup(self, stage: str) -> None:
-        """Also stores the vocabulary of the training captions."""
+        """Also stores the vocabulary of the training captions, and tells it to the text encoder."""
         super().setup(stage)
         data: MotionDataModule = self.trainer.datamodule  # type: ignore[attr-defined]
         if self.conditioned_on == "text":
             captions = (caption for clip in data.train.clips for caption in clip.captions)
             self.facts |= vocabulary(captions, share=data.source.captions_may_be_shared)
+            self.facts |= {"verbs": list(data.source.verbs)} if data.source.verbs else {}
+            self.condition.seen = frozenset(self.facts["vocabulary"])
 
     # Training ---------------------------------------------------------------------------------------------------------
 
@@ -230,27 +183,47 @@ class MotionGeneration(Task):
             self.sampler_options,
         )
 
+    def on_train_start(self) -> None:
+        """Trains the text encoder on the captions alone, if the recipe says so and the training begins from nothing."""
+        super().on_train_start()
+        if self.global_step == 0 and not self.config.keys() & {"base", "distillation"}:
+            data: MotionDataModule = self.trainer.datamodule  # type: ignore[attr-defined]
+            self.condition.pretrain([clip.captions for clip in data.train.clips], self.seed)
+
     def training_step(self, batch: MotionBatch, batch_idx: int) -> Tensor:
         """Returns the loss of one batch. Random draws are functions of (seed, batch number, rank)."""
         seed_generator(key("step", self.seed, batch_idx, self.global_rank), self.device)
         cond = self.condition(batch)
         if cond.null is not None:  # even if the probability is 0, since DDP requires a gradient for every parameter
-            cond = cond.drop(torch.rand(len(batch), device=self.device) < self.cond_drop_prob)
-        terms = self.process.loss(self.denoiser, batch.x, batch.mask, cond, auxiliary=self.losses)
+            dropped = torch.rand(len(batch), device=self.device) < self.cond_drop_prob
+            if self.config.get("base"):  # guidance would lead away from the clips that are taught
+                dropped &= sent(torch.tensor([name.startswith(KEPT) for name in batch.ids]), self.device)
+            cond = cond.drop(dropped)
+        terms = self.loss_terms(batch, cond)
         trainer = self._trainer  # None where a step is computed without one
         if trainer is None or (trainer.global_step + 1) % trainer.log_every_n_steps == 0:  # type: ignore[attr-defined]
             self.log_dict({f"train/{name}": value.mean() for name, value in terms.items()}, batch_size=len(batch))
         return terms["loss"].mean()
 
-    def validation_step(self, batch: MotionBatch, batch_idx: int) -> None:
-        """Accumulates the validation losses. Each clip always gets the same time and noise."""
+    def loss_terms(
+        self, batch: MotionBatch, cond: Condition, u: Tensor | None = None, noise: Tensor | None = None
+    ) -> dict[str, Tensor]:
+        """Returns the losses (B,) of the motions of a batch by name; "loss" is their sum.
+
+        Uniform numbers u (B,) in (0, 1), which decide on the times, and noise (B, F, D) are drawn if not given.
+        """
+        t = None if u is None else self.process.training_times(u)
+        return self.process.loss(self.denoiser, batch.x, batch.mask, cond, t=t, noise=noise, auxiliary=self.losses)
+
+    def losses_of(self, batch: MotionBatch) -> dict[str, Tensor]:
+        """Returns the losses (B,) of clips. Each clip always gets the same time and noise."""
         keys = torch.tensor([key("validation", name) for name in batch.ids], device=self.device)
-        t = self.process.training_times(uniform(keys, (1,))[0][:, 0])
-        noise = normal(keys, *batch.x.shape[1:])
-        terms = self.process.loss(
-            self.denoiser, batch.x, batch.mask, self.condition(batch), t=t, noise=noise, auxiliary=self.losses
-        )
-        for name, value in terms.items():
+        u, noise = uniform(keys, (1,))[0][:, 0], normal(keys, *batch.x.shape[1:])
+        return self.loss_terms(batch, self.condition(batch), u, noise)
+
+    def validation_step(self, batch: MotionBatch, batch_idx: int) -> None:
+        """Accumulates the validation losses."""
+        for name, value in self.losses_of(batch).items():
             if name not in self.val_losses:
                 self.val_losses[name] = MeanMetric().to(self.device)
             metric = self.val_losses[name]
@@ -263,67 +236,3 @@ class MotionGeneration(Task):
             assert isinstance(metric, MeanMetric)
             self.log(f"val/{name}", metric.compute(), prog_bar=name == "loss")
             metric.reset()
-
-    # Sampling ---------------------------------------------------------------------------------------------------------
-
-    @torch.no_grad()
-    def generate(
-        self,
-        batch: MotionBatch,
-        options: SamplerOptions | None = None,
-        *,
-        seed: int = 0,
-        replication: int = 0,
-        edit: Edit | None = None,
-        windows: Windows | None = None,
-        unconditioned: bool = False,
-        shared_noise: bool = False,
-        trajectory: list[Tensor] | None = None,
-    ) -> Tensor:
-        """Samples motions for the conditions, lengths and ids of `batch`; its `x` is ignored.
-
-        Options of the sampler that are None have the values of the recipe. The noise of a motion is a function of
-        (seed, replication, id), so the motion is the same in any batch. `unconditioned` samples a conditional model
-        with its null condition. With `shared_noise`, all motions get the same noise, a function of (seed, replication)
-        only. The normalized clean estimate (B, F, D) of each denoiser call is appended to `trajectory`. With `windows`,
-        motions may be longer than those in training, and the conditions are those of the windows.
-
-        Returns:
-            (B, F, D) normalized, 0 past the end of each motion.
-        """
-        was_training = self.training
-        if was_training:  # setting the mode of all modules takes as long as a small network
-            self.eval()
-        options = self.sampler_options if options is None else options.over(self.sampler_options)
-        denoise: Denoise = self.denoiser
-        described = batch if windows is None else windows.batch
-        if unconditioned and self.condition.features:
-            nothing = torch.zeros(len(described), dtype=torch.long, device=batch.x.device)
-            cond = self.condition(replace(described, text=[""] * len(described), action=nothing)).drop(nothing == 0)
-        else:
-            cond = self.condition(described)
-        scale = options.guidance_scale
-        if scale is not None and cond.null is not None and self.condition.features and not unconditioned:
-            denoise = classifier_free_guidance(self.denoiser, scale, self.representation.features)
-        if windows is not None:
-            denoise = blended(denoise, windows)
-        mask, frames, features = batch.mask, batch.mask.shape[1], self.representation.features
-        if windows is None and not self.denoiser.mask_padding:
-            # This denoiser attends to padding, so the padded length must be the same as in training.
-            mask = pad_to(mask, max(frames, self.facts.get("max_frames", 0)))
-            if edit is not None:
-                size = mask.shape[1]
-                edit = replace(edit, known=pad_to(edit.known, size), keep=~pad_to(~edit.keep, size))
-        ids = ["shared"] * len(batch) if shared_noise else batch.ids
-        noise = seeded_noise(ids, mask.shape[1], features, seed=seed, replication=replication, like=batch.x)
-        x = self.process.sample(denoise, noise, mask, cond, options, edit=edit, trajectory=trajectory)
-        if was_training:
-            self.train()
-        return x[:, :frames]
-
-
-def _length_unit(config: Config) -> Any:
-    """Returns the number of which all lengths in training are multiples; 1 for imported models without a data set."""
-    data = config.get("data")
-    crop = data.get("crop") if isinstance(data, dict) else None
-    return crop.get("unit", 1) if isinstance(crop, dict) else 1

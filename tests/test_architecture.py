@@ -16,7 +16,7 @@ FILES = sorted([*(ROOT / "flame_mdm").rglob("*.py"), *(ROOT / "evaluators").rglo
 
 AXES = {"denoisers", "processes", "conditions", "representations"}
 GROUND = {"errors", "signals", "sampler_options", "losses", "safe_io", "config", "batch", "seeds", "progress"}
-MODELS = GROUND | AXES | {"visualize", "formats", "data", "task"}
+MODELS = GROUND | AXES | {"visualize", "formats", "data", "generator", "task"}
 ALL = MODELS | {"sampling", "checkpoints", "schemas", "runs", "reporting", "training"}
 MAY_IMPORT: dict[str, set[str]] = {
     "errors": set(),
@@ -35,7 +35,8 @@ MAY_IMPORT: dict[str, set[str]] = {
     "visualize": GROUND | {"representations"},
     "formats": GROUND | {"representations", "visualize"},
     "data": GROUND | {"representations", "visualize", "formats"},
-    "task": GROUND | AXES | {"data"},
+    "generator": GROUND | AXES,
+    "task": GROUND | AXES | {"data", "generator"},
     "schemas": GROUND,
     "runs": GROUND | {"schemas"},
     "reporting": GROUND | {"representations", "visualize", "formats", "data", "schemas", "runs"},
@@ -43,7 +44,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "checkpoints": MODELS | {"schemas"},
     "training": ALL - {"training"},
     "demo": MODELS | {"sampling", "checkpoints"},
-    "__init__": MODELS | {"sampling", "checkpoints"},
+    "__init__": MODELS | {"sampling", "checkpoints", "training"},
     "evaluators": ALL,
     "commands": ALL | {"evaluators", "demo"},
     "__main__": GROUND | {"commands"},
@@ -168,6 +169,7 @@ def test_strings_outside_commands_name_no_module_of_the_evaluators():
         ("flame_mdm.formats.readers", "def f():\n    from flame_mdm.data.folder import read_bvh"),
         ("flame_mdm.data.store", "from flame_mdm.task import MotionGeneration"),
         ("flame_mdm.task", "from flame_mdm.checkpoints import model_files as checkpoints"),
+        ("flame_mdm.generator", "from flame_mdm.data.store import Store"),
         ("flame_mdm.schemas", "from flame_mdm.runs import read_run"),
         ("flame_mdm.runs", "from flame_mdm.reporting.tables.build import build"),
         ("flame_mdm.reporting.tables.build", "from flame_mdm.task import load"),

@@ -9,6 +9,7 @@ import pytest
 import torch
 from support.browser import CHROMIUM, browser
 from support.motions import HOSTILE, Page, synthetic, unpacked
+from support.runs import TINY
 from support.stores import OwnClips, clip
 
 from flame_mdm.__main__ import main
@@ -112,13 +113,13 @@ def test_the_command_shows_writes_and_refuses(tmp_path, data_root, capsys):
 
     def run(*words: str) -> int:
         out.unlink(missing_ok=True)
-        words = ("data=synthetic", "data.source.clips=60", f"data_root={data_root}", f"out={out}", *words)
+        words = ("data=synthetic", TINY[0], f"data_root={data_root}", f"out={out}", *words)
         return main(["browse", *words])
 
     assert run("clips=10") == 0
-    assert "page.html: 10 of 60 clips" in capsys.readouterr().out
+    assert "page.html: 10 of 120 clips" in capsys.readouterr().out
     assert len(Page(out).motions) == 10
-    assert Page(out).texts["h1"] == "synthetic: 10 of 60 clips"
+    assert Page(out).texts["h1"] == "synthetic: 10 of 120 clips"
     assert run("split=train", "search=walks") == 0
     assert Page(out).motions
     assert all("walks" in m["caption"] and m["group"] == "train" for m in Page(out).motions)

@@ -3,6 +3,8 @@
 import argparse
 import copy
 import json
+import subprocess
+import sys
 import tempfile
 from functools import cache
 from pathlib import Path
@@ -22,8 +24,8 @@ from flame_mdm.checkpoints.loading import load
 from flame_mdm.checkpoints.released import import_flame, import_mdm
 from flame_mdm.checkpoints.released_weights import released_state
 from flame_mdm.errors import UserError
+from flame_mdm.generator import MotionGenerator
 from flame_mdm.sampling.generation import generate
-from flame_mdm.task import MotionGeneration
 
 MDM = ["mdm_trans_enc", "mdm_trans_dec", "mdm_trans_dec_emb", "mdm_trans_dec_bert", "mdm_gru"]
 MDM += ["mdm_action_rot6d", "mdm_uncond_rot6d", "mfm"]
@@ -40,7 +42,7 @@ def statistics_folder(folder: Path, features: int) -> Path:
 
 
 @cache
-def imported(stem: str, mask_frames: bool, time_token: bool) -> MotionGeneration:
+def imported(stem: str, mask_frames: bool, time_token: bool) -> MotionGenerator:
     """The fixture's network as a released file, imported by the command, and loaded."""
     arrays = golden(stem)
     config = meta(arrays)["config"]
@@ -61,7 +63,7 @@ def imported(stem: str, mask_frames: bool, time_token: bool) -> MotionGeneration
 
 
 @cache
-def imported_flame() -> MotionGeneration:
+def imported_flame() -> MotionGenerator:
     arrays = golden("flame_text2motion")
     state, generator = weights(arrays), torch.Generator().manual_seed(0)
     width = state["text_pooler_proj.weight"].shape[1]
@@ -82,7 +84,7 @@ def imported_flame() -> MotionGeneration:
     return model
 
 
-def condition(arrays: Arrays, model: MotionGeneration, dtype: torch.dtype) -> Condition:
+def condition(arrays: Arrays, model: MotionGenerator, dtype: torch.dtype) -> Condition:
     """The fixture's condition, its null included: zeros in place of the embedding."""
     batch = len(arrays["in/x_t"])
     pooled, tokens, token_mask = torch.zeros(batch, model.condition.features), torch.zeros(batch, 0, 0), None
@@ -263,7 +265,7 @@ def test_options_of_mdm(tmp_path):
     model = load(tmp_path / "ours.safetensors")
     assert model.facts["actions"][9] == "phone"
     assert model.facts["max_frames"] == 40
-    assert model.sampler_options.guidance_scale == model.losses.weights["velocity"] == 1
+    assert model.sampler_options.guidance_scale == model.config["losses"]["velocity"] == 1
     assert model.sampler_options.num_inference_steps == 50
     process = model.config["process"]
     assert (process["num_train_timesteps"], process["schedule"], process["variance"]) == (50, "linear", "fixed_large")
@@ -287,7 +289,7 @@ def test_options_of_mfm(tmp_path):
         assert (model.sampler_options.sampler, model.sampler_options.num_inference_steps) == (sampler, steps)
         assert (process["odeint_grid"], process["quantize_time"]) == (odeint_grid, True)
         assert model.config["denoiser"]["num_heads"] == 2
-        assert model.losses.weights["joints"] == 1
+        assert model.config["losses"]["joints"] == 1
 
 
 def test_averaged_weights_are_taken_and_models_that_attend_to_padding_are_sampled_at_their_length(tmp_path):
@@ -451,3 +453,9 @@ def test_push_writes_a_card_and_uploads_these_files_alone(trained, tmp_path, cap
     assert capsys.readouterr().err == f"error: me/walker: upload failed: no token. The files are in {folder}\n"
     assert main(["push", str(trained), "walker"]) == 1
     assert "not a repository name. Write user/name" in capsys.readouterr().err
+
+
+def test_a_model_is_sampled_without_importing_lightning_and_the_compiler():
+    program = "import sys, flame_mdm; flame_mdm.generate(flame_mdm.load('quickstart'), 'a person walks', seconds=1)"
+    slow = "{'lightning', 'torchmetrics', 'transformers', 'torch._dynamo', 'scipy.stats'}"
+    subprocess.run([sys.executable, "-c", f"{program}; assert not {slow} & {{*sys.modules}}"], check=True)

@@ -132,6 +132,6 @@ def test_st_gcn_trains_by_the_same_recipe(data, tmp_path):
     sizes = ["task=classifier_stgcn", "task.network.widths=[8,8]", "task.network.strides=[1,2]"]
     options = [data, f"run.dir={tmp_path}", "trainer.max_steps=25", "trainer.val_check_interval=25"]
     assert main(["train", "classifier/synthetic", *RUN, *sizes, *options, "optimizer.lr=0.01"]) == 0
-    assert validated(tmp_path / "checkpoints" / "last.ckpt")[-1] > 0.2
+    assert validated(tmp_path / "checkpoints" / "last.ckpt")[-1] > 0.1  # of 22 actions
     network = OwnClassifierExtractor(str(tmp_path / "checkpoints" / "last.ckpt")).task.network
     assert isinstance(network, JointSTGCN)

@@ -8,8 +8,10 @@ import torch
 
 from evaluators.metrics.attributes import read_attributes
 from evaluators.metrics.physics import FootSkating
+from evaluators.perturbations import draw_in
 from flame_mdm.data.synthetic import Synthetic
 from flame_mdm.formats.cleanup import cleaned, cleanup
+from flame_mdm.formats.faults import find_faults
 from flame_mdm.formats.motion import Motion
 from flame_mdm.representations.humanml import HumanML
 from flame_mdm.representations.skeleton import SKELETONS, SMPL22
@@ -20,8 +22,8 @@ FPS = 20
 @pytest.fixture(scope="module")
 def clips() -> list:
     """The first clips of the synthetic set."""
-    source = Synthetic(40)
-    return [source.clip(index, FPS) for index in range(40)]
+    source = Synthetic(100)
+    return [source.clip(index, FPS) for index in range(100)]
 
 
 def skating(motions: list[np.ndarray]) -> float:
@@ -73,7 +75,7 @@ def test_faults_are_repaired(clips):
 def test_contacts_of_the_features_find_feet_that_slide_fast():
     """The feet of a run slide about as fast as they would swing, so only the features tell which of them stand."""
     representation = HumanML(fps=FPS, skeleton="smpl22", variant="clean")
-    clip = Synthetic(1000).clip(117, FPS)
+    clip = Synthetic(1000).clip(143, FPS)
     assert clip.attributes["action"] == "run"
     features = representation.encode(torch.from_numpy(clip.motion))
     contacts = representation.contacts(features)
@@ -93,6 +95,23 @@ def test_a_pinned_foot_keeps_its_leg():
     assert np.ptp(slide[:, 10, 0]) > 0.05
     assert np.ptp(after[:, 10, 0]) < 0.005
     assert np.ptp(np.linalg.norm(after[:, 4] - after[:, 1], axis=-1)) < 1e-5
+
+
+def test_hands_leave_the_body_without_a_jolt():
+    """Wrists of a walk are drawn 25 cm into the trunk and back within a second; all bones keep their lengths."""
+    clip = next(clip for clip in Synthetic(100).clips(FPS) if clip.attributes["action"] == "walk")
+    motion, pull = (
+        np.asarray(clip.motion, float),
+        np.exp(-(((np.arange(len(clip.motion)) - 25) / 7) ** 2))[:, None, None],
+    )
+    motion = motion + pull * (draw_in(motion, 25) - motion)
+    before = [fault for fault in find_faults(Motion(motion, FPS)) if fault.kind == "inside"]
+    after = cleanup(motion, FPS, SMPL22)
+    assert before
+    assert not [fault for fault in find_faults(Motion(after, FPS)) if fault.kind in ("inside", "pop")]
+    jerk = [np.linalg.norm(np.diff(x, n=3, axis=0), axis=-1).mean() for x in (motion, after)]
+    assert jerk[1] < 1.1 * jerk[0]
+    assert np.ptp(bones(after), axis=0).max() < 1e-5
 
 
 def test_any_length_and_skeleton():

@@ -120,7 +120,7 @@ def test_columns_stay_readable_on_a_phone(three, tmp_path):
     page(three, tmp_path / "out.html")
     with browser(tmp_path / "profile", 390, 844) as tab:
         tab.open((tmp_path / "out.html").as_uri())
-        tab.wait("document.readyState === 'complete' && document.querySelectorAll('td').length > 30")
+        tab.wait("document.readyState === 'complete' && document.querySelectorAll('td').length > 15")
         assert tab.run("document.body.scrollWidth") <= 390, "tables scroll, not the page"
         cells = "[...document.querySelectorAll('th, td')].filter((cell) => cell.textContent)"
         assert min(tab.run(f"{cells}.map((cell) => cell.clientWidth)")) >= 50

@@ -117,7 +117,9 @@ def test_every_recipe_constructs_without_network(monkeypatch):
             config = compose(f"condition/{path.stem}", overrides=["+denoiser.latent_dim=24"])
         encoder = instantiate(config.condition, **({"num_actions": 5} if path.stem == "action" else {}))
         assert isinstance(encoder, ConditionEncoder), path
-        assert encoder.features == widths.get(path.stem, 384 if "minilm" in path.stem else 768), path
+        assert encoder.features == widths.get(
+            path.stem.removesuffix("_pretrained"), 384 if "minilm" in path.stem else 768
+        ), path
         if isinstance(encoder, PretrainedText):
             assert not list(encoder.parameters()), path
             assert len(encoder._pretrained.revision or "") == 40, path
@@ -209,6 +211,25 @@ def test_learned_tokens_are_the_transformer_layer_of_torch_over_padded_captions(
     torch.testing.assert_close(cond.pooled, tokens.sum(1) / real.sum(1, keepdim=True), rtol=0, atol=1e-6)
     left, right = encoder(batch_of(["left then right", "right then left"])).pooled
     assert (left - right).abs().max() > 0.01, "the order of words has no effect"
+
+
+def test_pretraining_draws_captions_of_the_same_clip_together():
+    groups = [[f"{who} {does}" for who in ("he", "she", "a man")] for does in ("walks fast", "jumps up", "sits down")]
+    encoders = []
+    for _ in range(2):
+        torch.manual_seed(0)
+        encoder = LearnedTokens(16, heads=2, buckets=512, pretrain_steps=60)
+        encoder.pretrain([*groups, ["waves"]], seed=1)
+        encoders.append(encoder.eval())
+    pooled = torch.nn.functional.normalize(
+        encoders[0](batch_of([text for group in groups for text in group])).pooled, dim=-1
+    )
+    similarity = (pooled @ pooled.T).unflatten(0, (3, 3)).unflatten(2, (3, 3)).mean((1, 3))
+    assert similarity.diagonal().min() > similarity[~torch.eye(3, dtype=torch.bool)].max() + 0.3
+    for name, value in encoders[0].state_dict().items():
+        torch.testing.assert_close(value, encoders[1].state_dict()[name], rtol=0, atol=0)
+    encoders[0].pretrain([["he walks", "she walks"]], seed=1)  # nothing to compare with
+    assert torch.equal(encoders[0].null, encoders[1].null)
 
 
 def test_long_and_empty_captions():

@@ -373,7 +373,7 @@ def test_help_and_wrong_words_do_not_wait_for_torch():
 
 
 def test_the_package_lists_its_public_names_alone():
-    assert dir(flame_mdm) == ["Motion", "MotionGeneration", "edit", "generate", "load"]
+    assert dir(flame_mdm) == ["Motion", "adapt", "edit", "generate", "load"]
     assert all(getattr(flame_mdm, name) for name in dir(flame_mdm))
 
 

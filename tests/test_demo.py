@@ -52,7 +52,7 @@ def test_a_link_reproduces_its_request_and_names_every_option_that_is_not_left_t
     for request in (DemoRequest(text="a person walks"), EDITED, PATH, DemoRequest(text="ü & = # % + ' \" <b>")):
         assert parsed(request.query()) == request
         assert parsed(request.query() + "&__theme=dark") == request
-    sampling = ["guidance_scale", "num_inference_steps", "sampler", "cleanup"]
+    sampling = ["guidance_scale", "num_inference_steps", "sampler", "cleanup", "split"]
     keys = ["model", "text", "seconds", "samples", "seed", *sampling, "edit", "edit"]
     assert [key for key, _ in parse_qsl(EDITED.query())] == keys
 
@@ -119,7 +119,8 @@ def studio() -> Any:
 
 def test_the_command_lines_and_the_python_lines_give_the_same_motions(studio, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    for request in (PATH, DemoRequest(text="a person walks", **FAST), EDITED):
+    varied = PATH.model_copy(update={"edits": (DemoEdit(strength=0.5, samples=2),)})
+    for request in (varied, DemoRequest(text="a person walks", **FAST), EDITED):
         ours = studio.motions(request)
         names: dict[str, Any] = {}
         exec(request.python("text", "cpu"), names)
@@ -129,8 +130,9 @@ def test_the_command_lines_and_the_python_lines_give_the_same_motions(studio, tm
                 continue
             program, *words = shlex.split(line)
             assert (program, main(words)) == ("flame-mdm", 0)
-        folder = Path(words[-1].removeprefix("out="))
-        files = sorted(folder.glob("motion_*.npz"))[len(request.edits) > 0 :]
+        count = len(request.edits)
+        folders = sorted(Path().glob(f"edit_{count}*" if count else "motions"))
+        files = [file for folder in folders for file in sorted(folder.glob("motion_*.npz"))[count > 0 :]]
         assert len(ours) == len(names["motions"]) == len(files)
         for motion, program, file in zip(ours, names["motions"], files, strict=True):
             assert motion.cleanup == (not request.path)
@@ -147,6 +149,30 @@ def test_an_edit_keeps_the_rest_of_the_motion(studio):
     after = studio.motions(base.model_copy(update={"edits": (change,)}))[0]
     np.testing.assert_allclose(after.joints[:9], before.joints[:9], atol=1e-4)
     assert np.abs(after.joints[12:] - before.joints[12:]).max() > 0.02
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"edits": (DemoEdit(text="a person waves", region_seconds=(0.5, 1.0)),)},
+        {"text": "a person walks @1 | a person waves", "path": ((0.0, 0.8),)},
+    ],
+    ids=["edit", "parts_and_path"],
+)
+def test_variations_keep_edits_parts_and_path(studio, changes):
+    request = DemoRequest(text="a person runs forward").model_copy(update={**FAST, **changes, "cleanup": False})
+    before = studio.motions(request)[0]
+    vary = DemoEdit(strength=0.5, samples=3, seed=1)
+    varied = studio.motions(request.model_copy(update={"edits": (*request.edits, vary)}))
+    assert len(varied) == 3
+    for motion in varied:
+        assert (len(motion.joints), motion.text) == (len(before.joints), before.text)
+        moved = np.linalg.norm(motion.joints - before.joints, axis=-1)
+        assert 0.002 < moved.mean() < 0.25  # near the motion, but another one
+        if request.path:
+            goal = request.targets("text")["root"][0]
+            assert motion.joints[round(20 * goal["time"]), 0, [0, 2]] == pytest.approx(goal["position"], abs=0.03)
+    assert varied[0].joints.tolist() != varied[1].joints.tolist()
 
 
 def test_a_request_stops_within_a_step_and_the_next_one_runs(studio):
@@ -273,7 +299,7 @@ def generated(server: str, query: str, session: str = "") -> list[Any]:
     page = get(server)[1].decode()
     config = re.findall(r"window.gradio_config = (\{.*?\});</script>", page, re.DOTALL)[0]
     functions = json.loads(config)["dependencies"]
-    show = next(function["id"] for function in functions if len(function["outputs"]) == 7)
+    show = next(function["id"] for function in functions if len(function["outputs"]) == 8)
     status, body = get(f"{server}/gradio_api/queue/join", body_of(show, query, session=session))
     assert status == 200, body
     _, stream = get(f"{server}/gradio_api/queue/data?session_hash={session}")
@@ -297,6 +323,19 @@ def test_a_bad_request_gets_one_clear_line(server):
         if status != 400 or not (body.decode() in text or text in body.decode() or b"not in memory" in body):
             wrong.append((bad[:40], body[:300]))
     assert not wrong
+
+
+def test_a_sentence_becomes_parts_and_a_suggestion_a_button(server):
+    request = DemoRequest(text="a person walks. Then she waves the lefft hand", **FAST)
+    _, notes, query, *_, text = generated(server, request.query())
+    assert text == parsed(query).text == "a person walks | she waves the lefft hand"
+    assert (
+        '<p class="warning">never seen in training: lefft. <button type="button">she waves the left hand</button></p>'
+        in notes
+    )
+    assert generated(server, request.model_copy(update={"split": False}).query())[-1] == request.text
+    assert "knows no word of it" in (refused := generated(server, query_of("text=asdf+qwer"))[1])
+    assert '<button type="button">a person ' in refused
 
 
 @pytest.mark.slow
@@ -439,7 +478,7 @@ def test_a_person_uses_the_page(server, tmp_path):
         assert frames[0] != frames[1]
 
         files = tab.run(f"Object.fromEntries({LINKS}.map(a => [a.text, a.href]))")
-        assert list(files)[:4] == ["BVH", "GLB", "NPZ", "MP4"]
+        assert list(files)[:8] == ["Blender", "Unreal", "Unity", "Mixamo", "BVH", "GLB", "NPZ", "MP4"]
         shown = joints_of(files["NPZ"])
         assert shown.shape == (60, 22, 3)
         bvh = get(files["BVH"])[1].decode()
@@ -467,7 +506,13 @@ def test_a_person_uses_the_page(server, tmp_path):
         assert [url for url in tab.requested if not url.startswith((server, "data:", "blob:", "about:"))] == []
         assert tab.errors == []
         tab.size(390, 844)
+        tab.open(link)
+        tab.wait("document.querySelectorAll('#examples img').length > 8 && !!document.querySelector('#files a')", 60)
         assert tab.run("document.documentElement.scrollWidth <= innerWidth")
+        assert tab.run("document.documentElement.scrollHeight") < 1900
+        example = tab.run("document.querySelectorAll('#examples button')[3].textContent")
+        tab.click("#examples button:nth-child(4)")
+        tab.wait(f"new URLSearchParams(location.search).get('text') === {json.dumps(example)}")
 
 
 @in_chromium

@@ -16,6 +16,7 @@ from torchmetrics import MeanMetric
 from evaluators.extractors.motion_clip import MotionCLIPTask
 from flame_mdm.__main__ import main
 from flame_mdm.batch import collate
+from flame_mdm.checkpoints.loading import load_task
 from flame_mdm.checkpoints.model_files import read_checkpoint
 from flame_mdm.commands import train
 from flame_mdm.config import compose, instantiate
@@ -39,16 +40,16 @@ def test_two_processes_are_one_with_both_batches(tiny, tmp_path):
     trained = read_checkpoint(tmp_path / "run" / "checkpoints" / "last.ckpt")["state_dict"]
     torch.testing.assert_close(trained, expected, rtol=1e-4, atol=1e-6)
 
-    # Validation: 3 clips in batches of one, so 2 batches on one process, 1 on the other.
+    # Validation: 5 clips in batches of one, so 3 batches on one process, 2 on the other.
     config = compose("quickstart", words)
-    task = MotionGeneration.build(config, instantiate(config["representation"]))
+    task = load_task(tmp_path / "run" / "checkpoints" / "last.ckpt", MotionGeneration)
     task.load_state_dict(expected)
     data = instantiate(config["data"], representation=task.representation, seed=config["seed"])
     data.setup("fit")
     with torch.no_grad():
         for index, batch in enumerate(data.val_dataloader()):
             task.eval().validation_step(batch, index)
-    assert len(data.val) == 3
+    assert len(data.val) == 5
     with (tmp_path / "run" / "csv" / "metrics.csv").open() as file:
         losses = [float(row["val/loss"]) for row in csv.DictReader(file) if row.get("val/loss")]
     assert losses[-1] == pytest.approx(float(cast(MeanMetric, task.val_losses["loss"]).compute()), rel=1e-4)
@@ -86,7 +87,7 @@ def test_data_is_prepared_once_and_no_process_is_without_a_validation_batch(tiny
         assert part.prepare_data_per_node is False  # by which Lightning asks the first process of the first machine
     data.prepare_data()
     data.setup("fit")
-    for world, batches in ((1, 3), (2, 2), (5, 3)):
+    for world, batches in ((1, 5), (2, 3), (7, 5)):
         data.trainer = SimpleNamespace(global_rank=0, world_size=world)  # type: ignore[assignment]
         assert len(data.val_dataloader()) == batches
         data.trainer.global_rank = world - 1  # type: ignore[union-attr]

@@ -152,7 +152,7 @@ def test_skeletons_are_recognized(name: str, tmp_path: Path):
         motion = only(tmp_path)
         for joint, names in sources.items():
             furthest = np.abs(motion[:, number[joint]] - WALK[:, number[joint]]).max()
-            assert furthest < (1e-4 if len(names) == 1 else 0.25), (prefix, joint)
+            assert furthest < (1e-4 if len(names) == 1 else 0.35), (prefix, joint)
 
 
 def test_a_skeleton_file_maps_any_joints(tmp_path: Path):
@@ -467,5 +467,5 @@ def test_the_tutorial_works_as_it_is_written(
     assert "not computed: " in output
     assert output.count("\nclips: ") == 3, "of preparation and two trainings"
     assert "mine as humanml-clean-smpl22 at 20 fps" in output
-    assert list(tmp_path.glob("samples/mine/*/*/*.html"))
+    assert list(tmp_path.glob("samples/mine/**/*.html"))
     assert set(read_skeleton(tmp_path / "mine" / "skeleton.yaml")["map"]) == set(SMPL22.joints)

@@ -20,6 +20,7 @@ def body() -> np.ndarray:
     """Joints (80, 22, 3) of a body that stands on the floor, arms down, toes forward, and swings its arms."""
     offsets = 0.1 * np.array(SMPL22.raw_offsets, float)
     offsets[[4, 5, 7, 8], 1] = -0.4
+    offsets[[13, 14], 0] = 0.22, -0.22
     offsets[[18, 19, 20, 21], 1] = -0.25
     pose = np.zeros((22, 3))
     for joint, parent in enumerate(SMPL22.parents):
@@ -74,6 +75,10 @@ def fold(joints: np.ndarray) -> None:
     joints[30:40, AT["left_wrist"]] = joints[30:40, AT["left_shoulder"]]
 
 
+def hand(joints: np.ndarray) -> None:
+    joints[30:40, AT["left_wrist"]] = joints[30:40, AT["spine1"]] + [0.02, 0, 0.02]
+
+
 def freeze(joints: np.ndarray) -> None:
     joints[30:60] = joints[30]
 
@@ -92,6 +97,7 @@ def test_faults_are_found_where_they_are():
         (lambda joints: float_(joints, 15, 1.0), {("skating", k, *span) for k in feet for span in ((0, 29), (45, 79))}),
         (knee, {("limit", "left_knee", 30, 40)}),
         (fold, {("limit", "left_elbow", 30, 40)}),
+        (hand, {("inside", "left_wrist", 30, 40)}),
         (freeze, {("frozen", "body", 30, 60)}),
     ]
     for change, expected in cases:

@@ -98,7 +98,7 @@ def test_every_kind_is_converted_edited_and_own_data(
 def test_a_motion_without_features_is_edited(walk: Motion, model: MotionGeneration):
     result = edit(model, walk, region="prediction", num_inference_steps=2)[0]
     assert result.original.features.shape == (len(result.joints), 263)
-    assert repr(result).startswith("Edited('#0', 52 frames, 20 fps")
+    assert repr(result).startswith("Edited('#0', 53 frames, 20 fps")
 
 
 def test_every_kind_with_a_frame_rate_is_compared(folder: Path):

@@ -17,7 +17,7 @@ from flame_mdm.seeds import normal
 METERS, FRAMES, MAX_STEPS = 10.0, 60, 50
 
 
-GENERATION = [name for name in recipes() if "process" in recipe(name)]
+GENERATION = [name for name in recipes() if "process" in recipe(name) and "distillation" not in recipe(name)]
 
 
 def family(name: str) -> str:

@@ -6,6 +6,8 @@ import torch
 
 from evaluators import perturbations as p
 from flame_mdm.data.synthetic import Synthetic
+from flame_mdm.formats.faults import find_faults
+from flame_mdm.formats.motion import Motion
 from flame_mdm.representations.humanml import HumanML
 
 
@@ -47,6 +49,16 @@ def test_resizing_scales_all_bones_and_keeps_track_and_floor(walk):
     torch.testing.assert_close(ours, 1.1 * theirs)
     np.testing.assert_allclose(changed[:, 0, [0, 2]], walk[:, 0, [0, 2]])
     np.testing.assert_allclose(changed[..., 1], 1.1 * walk[..., 1])
+
+
+def test_wrists_are_drawn_into_the_trunk_and_found_there(walk):
+    changed = p.draw_in(walk, 10) - walk
+    np.testing.assert_allclose(
+        np.linalg.norm(changed[:, [18, 19, 20, 21]], axis=-1), [[0.05, 0.05, 0.1, 0.1]] * len(walk)
+    )
+    assert not np.delete(changed, [18, 19, 20, 21], 1).any()
+    kinds = [{fault.kind for fault in find_faults(Motion(p.draw_in(walk, grade), 20.0))} for grade in (0, 40)]
+    assert ["inside" in kind for kind in kinds] == [False, True]
 
 
 def test_a_pop_displaces_one_frame_as_a_whole(walk):

@@ -188,7 +188,8 @@ def test_an_interrupted_preparation_leaves_nothing(
 WHERE = {
     "babel": "babel.is.tue.mpg.de",
     "bandai": "github.com/BandaiNamcoResearchInc",
-    "folder": "give a folder of .bvh, .npz, .npy, .json files",
+    "cmu": "clone https://github.com/una-dinosauria/cmu-mocap",
+    "folder": "give a folder of .npz, .bvh, .amc, .json, .npy files",
     "humanact12": "github.com/Mathux/ACTOR",
     "humanml3d": "github.com/EricGuo5513/HumanML3D",
     "humanml3d_smpl": "github.com/EricGuo5513/HumanML3D",
@@ -235,7 +236,7 @@ def words_of(data: str, takes: Path, root: Path) -> list[str]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("data", sorted({*WHERE} - {"folder"}))  # own data goes this way in the tests of its tutorial
+@pytest.mark.parametrize("data", sorted({*WHERE} - {"folder", "cmu"}))  # the tests of the tutorial and of CMU do so
 def test_every_set_from_raw_files_to_a_training_step(data: str, takes: Path, tmp_path: Path):
     words = [f"data={data}", *words_of(data, takes, tmp_path)]
     words += ["data.source.workers=1"] if data in ("bandai", "humanml3d_smpl", "babel") else []
@@ -243,7 +244,7 @@ def test_every_set_from_raw_files_to_a_training_step(data: str, takes: Path, tmp
     store = prepared(tmp_path / "data", *words)
 
     condition = "action" if data in ("humanact12", "uestc") else "learned"
-    tiny = [word for word in TINY if "clips" not in word and "samples" not in word and "features" not in word]
+    tiny = [word for word in TINY if not any(part in word for part in ("clips", "samples", "condition"))]
     few = ["data.batch_size=4", "data.num_workers=0", "trainer.max_steps=1", "callbacks.samples=null"]
     recipe = [f"data={data}", *tiny, *few, f"condition={condition}", f"data_root={tmp_path / 'data'}"]
     recipe += [f"run.dir={tmp_path / 'run'}"]

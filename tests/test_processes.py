@@ -155,6 +155,7 @@ PROCESSES: dict[str, GaussianDiffusion | FlowMatching] = {
     **{path.stem: instantiate(OmegaConf.load(path)) for path in RECIPES},
     "x0": GaussianDiffusion(prediction="x0"),
     "epsilon": GaussianDiffusion(prediction="epsilon"),
+    "skip": GaussianDiffusion(prediction="epsilon", variance="learned_range", skip=True, min_snr=5.0),
     "velocity": GaussianDiffusion(prediction="velocity", schedule="linear"),
     "learned": GaussianDiffusion(num_train_timesteps=50, prediction="epsilon", variance="learned_range"),
     "flow": FlowMatching(),
@@ -207,6 +208,22 @@ def test_oracle_has_no_loss_and_padding_has_no_say(name):
     torch.testing.assert_close(other["loss"], terms["loss"])
 
 
+def test_weights_of_the_error_and_the_skip_are_those_of_the_noise():
+    """At T = 1000 and step 900, SNR < 1: the error of the noise counts 1, and min(SNR, 5) / SNR at step 10."""
+    torch.manual_seed(0)
+    x, noise, t = torch.randn(2, 4, 3), torch.randn(2, 4, 3), torch.tensor([10.0, 900.0])
+    mask, wrong = torch.ones(2, 4, dtype=torch.bool), torch.randn(2, 4, 3)
+    plain = GaussianDiffusion(prediction="epsilon", min_snr=5.0)
+    signal, sigma = (torch.as_tensor(plain.schedule.at(name, t, x)) for name in ("signal", "noise"))
+    terms = plain.loss(lambda *_: noise + wrong, x, mask, NO_CONDITION, t=t, noise=noise)
+    weight = torch.tensor([5 * (sigma[0] / signal[0]).square().item(), 1.0])
+    torch.testing.assert_close(terms["mse"], weight * wrong.square().mean((1, 2)))
+    skip = GaussianDiffusion(prediction="epsilon", min_snr=5.0, skip=True)
+    output = (noise + wrong - sigma * skip.corrupt(x, noise, t)) / signal
+    for name, term in skip.loss(lambda *_: output, x, mask, NO_CONDITION, t=t, noise=noise).items():
+        torch.testing.assert_close(term, terms[name], rtol=1e-4, atol=0)
+
+
 def test_hybrid_loss_trains_the_variance_alone():
     torch.manual_seed(0)
     process = GaussianDiffusion(400, prediction="epsilon", variance="learned_range", vlb_weight=0.002)
@@ -244,6 +261,8 @@ def test_unknown_options_and_impossible_steps_are_refused():
         *((GaussianDiffusion, {name: "other"}, "other") for name in names),
         *((FlowMatching, {name: "epsilon"}, "epsilon") for name in ("time_distribution", "prediction")),
         (GaussianDiffusion, {"num_train_timesteps": 1}, "1"),
+        (GaussianDiffusion, {"skip": True}, "epsilon"),
+        (GaussianDiffusion, {"min_snr": -1.0}, "min_snr=-1.0"),
         (FlowMatching, {"sigma_min": 1.0}, "1.0"),
         *(
             (timesteps, steps, "choose")

@@ -1,6 +1,7 @@
 """Several prompts in one request: a file of prompts, a length per prompt, and the video of each."""
 
 import importlib.util
+import json
 import sys
 from pathlib import Path
 
@@ -12,7 +13,7 @@ from flame_mdm.__main__ import main
 from flame_mdm.errors import UserError
 from flame_mdm.formats.readers import read
 
-PROMPTS = ["a person walks", "a person jumps: 100%, twice", "人が歩く"]
+PROMPTS = ["a person walks", "a person jumps: 100%, twice", "人が歩く, waving"]
 
 
 @pytest.fixture
@@ -30,8 +31,10 @@ def test_each_prompt_of_a_file_is_sampled_as_if_alone(here, trained, capsys):
     Path("p.txt").write_bytes(b"\xef\xbb\xbf" + "\r\n\r\n".join(f" {text} " for text in PROMPTS).encode())
     assert main(["sample", str(trained), "prompts=p.txt", "seconds=[1,1.5,1]", "samples=2"]) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert [line[:22] for line in lines if "motions of" in line] == [f"2 motions of {f} frames" for f in (20, 30, 20)]
-    assert "warning: 'a person jumps: 100%, twice': never seen in training: 100" in "\n".join(lines)
+    page = lines[-1].removeprefix("6 motions for 3 prompts, a folder for each: ")
+    assert page == "samples/quickstart/p.html"
+    assert all(json.dumps(text, ensure_ascii=True)[1:-1] in Path(page).read_text() for text in PROMPTS)
+    assert "warning: 'a person jumps: 100%, twice': never seen in training: " in "\n".join(lines)
     together = folders(here / "samples")
     assert list(together) == sorted(PROMPTS, key=lambda text: together[text])
     text, kept = PROMPTS[1], {path.name for path in together[PROMPTS[1]].iterdir()}
@@ -44,13 +47,16 @@ def test_each_prompt_of_a_file_is_sampled_as_if_alone(here, trained, capsys):
     assert len(folders(here / "samples")) == 3
 
 
-def test_a_chosen_folder_gets_a_folder_per_prompt(here, trained):
+def test_a_chosen_folder_gets_a_folder_per_prompt(here, trained, monkeypatch):
     Path("p.txt").write_text("a person walks\na person jumps\na person walks\n")
-    words = ["prompts=p.txt", "seconds=1", "samples=1", "trajectory=true", "out=mine"]
+    words = ["prompts=p.txt", "seconds=1", "samples=1", "trajectory=true", "out=mine", "open=true"]
+    opened: list[str] = []
+    monkeypatch.setattr("webbrowser.open", opened.append)
     assert main(["sample", str(trained), *words]) == 0
-    names = ["a-person-jumps-seed0-seconds=1", "a-person-walks-seed0-seconds=1"]
-    assert sorted(path.name for path in Path("mine").iterdir()) == names
-    twice = [read(path) for path in sorted(Path("mine/a-person-walks-seed0-seconds=1").glob("motion_*.npz"))]
+    assert opened == [Path("mine/p.html").resolve().as_uri()]
+    jumps, walks, _ = sorted(Path("mine").iterdir())
+    assert [jumps.name[:-7], walks.name[:-7]] == ["a-person-jumps-seconds=1", "a-person-walks-seconds=1"]
+    twice = [read(path) for path in sorted(walks.glob("motion_*.npz"))]
     assert len(twice) == 2
     assert np.abs(twice[0].joints - twice[1].joints).max() > 0.001
     assert [path.parent.name[:14] for path in Path("mine").rglob("trajectory.png")] == ["a-person-walks"]
@@ -101,7 +107,7 @@ def test_a_video_is_written_when_asked_for(here, trained, monkeypatch, capsys):
     words = ["sample", str(trained), "text=a person walks", "samples=2", "seconds=1", "out=out"]
     if importlib.util.find_spec("av"):
         assert main([*words, "mp4=true", "trajectory=true"]) == 0
-        assert capsys.readouterr().out.rstrip().endswith("out/motions.gif, out/motions.mp4")
+        assert capsys.readouterr().out.rstrip().endswith("out/player.html, motions.gif, motions.mp4")
         assert b"ftyp" in Path("out/motions.mp4").read_bytes()[:12]
         Path("out/motion_1_of_mine.npz").touch()
         assert main(words) == 0

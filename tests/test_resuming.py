@@ -227,7 +227,7 @@ def test_a_run_does_not_resume_on_other_data(run, tmp_path, data_root, capsys, m
     """The store changes, and the recipe does not: the same options, but other files or another version of the code."""
     original, root = Synthetic.clips, tmp_path / "data"
     monkeypatch.setattr(Synthetic, "clips", lambda self, fps: list(original(self, fps))[:59])
-    assert prepare.main(prepared(root, 60)) == 0
+    assert prepare.main(prepared(root, 120)) == 0
     capsys.readouterr()
     before = tree(run, root)
     assert train.main([*words(run, root), "trainer.max_steps=6"]) == 1
@@ -242,20 +242,20 @@ def test_a_store_of_other_options_is_refused_everywhere(tmp_path, trained, capsy
     assert prepare.main(prepared(root, 61)) == 0
     capsys.readouterr()
     before = tree(root)
-    message = f"error: {root / STORE}: prepared with clips=61, but the recipe has clips=60. Prepare it again with force"
+    message = f"error: {root / STORE}: prepared with clips=61, but the recipe has clips=120. Prepare it again"
     for command, line in (
         (train, [*words(run, root), "trainer.max_steps=2"]),
-        (prepare, prepared(root, 60)),
-        (prepare, prepared(root, 60, "verify=true")),
-        (browse, prepared(root, 60, f"out={tmp_path / 'page.html'}")),
+        (prepare, prepared(root, 120)),
+        (prepare, prepared(root, 120, "verify=true")),
+        (browse, prepared(root, 120, f"out={tmp_path / 'page.html'}")),
         (evaluate, [f"ckpt={trained}", "extractor=none", "quick=true", f"data_root={root}"]),
     ):
         assert command.main(line) == 1
         assert one_error(capsys).startswith(message)
     assert tree(root) == before
     assert [path.name for path in tmp_path.iterdir()] == ["data"]
-    assert prepare.main(prepared(root, 60, "force=true")) == 0
-    assert prepare.main(prepared(root, 60)) == 0
+    assert prepare.main(prepared(root, 120, "force=true")) == 0
+    assert prepare.main(prepared(root, 120)) == 0
 
 
 def test_options_that_decide_the_data_count_but_paths_do_not():

@@ -2,31 +2,29 @@
 
 import itertools
 import json
-import os
 import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from support.fixtures import blender
 from support.glb import Glb, changed, odd_character, write_names
 from support.motions import synthetic
 
 from flame_mdm.__main__ import main
 from flame_mdm.errors import UserError
 from flame_mdm.formats import bvh, characters
-from flame_mdm.formats.characters import LIMBS, SIDES
 from flame_mdm.formats.motion import Motion
 from flame_mdm.formats.readers import read
 from flame_mdm.formats.retarget import preset, presets, retarget
+from flame_mdm.formats.rig import LIMBS, SIDES
 from flame_mdm.representations.skeleton import SMPL22
-from flame_mdm.visualize.body import world_rotations
+from flame_mdm.visualize.posture import JOINT, world_rotations
 
 BLENDED = {"cmu": ("spine1", "left_collar", "right_collar"), "100style": ("spine3",)}
 """Joints that the reader of these skeletons places between two of the file's."""
-JOINT = {name: number for number, name in enumerate(SMPL22.joints)}
 
 
 @pytest.fixture
@@ -325,16 +323,11 @@ def test_a_folder_is_converted(kick: Motion, tmp_path: Path, capsys: pytest.Capt
     assert not (tmp_path / "c.bvh").exists()
 
 
-BLENDER = os.environ.get("FLAME_MDM_BLENDER", sys.executable)
-"""A Python that has the package bpy."""
-
-
 @pytest.mark.tools
 @pytest.mark.parametrize("ending", [".glb", ".bvh"])
 @pytest.mark.parametrize("name", ["mixamo", "unreal", "lafan1", "soma", "geno", "hero"])
 def test_blender_shows_the_pose(name: str, ending: str, kick: Motion, tmp_path: Path):
-    if subprocess.run([BLENDER, "-c", "import bpy"], capture_output=True).returncode:
-        pytest.skip("no package bpy: set FLAME_MDM_BLENDER to a Python that has it")
+    python = blender()
     path, hero = tmp_path / f"a{ending}", tmp_path / f"hero{ending}"
     if name == "hero":
         if ending == ".glb":
@@ -355,7 +348,7 @@ def test_blender_shows_the_pose(name: str, ending: str, kick: Motion, tmp_path: 
         if ending == ".glb":
             expected = expected + np.array(Glb(path).document["nodes"][-1]["translation"])
     script = Path(__file__).parent / "support" / "blender.py"
-    done = subprocess.run([BLENDER, script, path, "20"], capture_output=True, text=True, check=True)
+    done = subprocess.run([python, script, path, "20"], capture_output=True, text=True, check=True)
     shown = json.loads(next(line for line in done.stdout.splitlines() if line.startswith("FOUND"))[5:])
     assert [frame for frame, _ in shown] == [0, (len(kick.joints) - 1) // 2, len(kick.joints) - 1]
     for frame, positions in shown:

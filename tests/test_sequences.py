@@ -24,7 +24,7 @@ CPU = torch.device("cpu")
 
 
 @pytest.fixture(scope="module")
-def model() -> flame_mdm.MotionGeneration:
+def model() -> flame_mdm.MotionGenerator:
     return flame_mdm.load("quickstart")
 
 

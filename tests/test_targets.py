@@ -18,7 +18,7 @@ TEXT = "a person walks forward"
 
 
 @pytest.fixture(scope="module")
-def model() -> flame_mdm.MotionGeneration:
+def model() -> flame_mdm.MotionGenerator:
     return flame_mdm.load("quickstart")
 
 

@@ -21,20 +21,21 @@ from flame_mdm.visualize.bodies import hairline, smooth, with_helpers
 from flame_mdm.visualize.body import (
     HAIR,
     HELPERS,
-    JOINT,
     MANNEQUIN,
     SHIRT,
     SHOES,
     SKIN,
     TROUSERS,
     TWISTED,
-    orthonormal,
     packed,
 )
+from flame_mdm.visualize.posture import JOINT, orthonormal
 
 A_POSE = {"shoulder": (0, 0, -46), "elbow": (0, -14, 0), "hip": (0, 0, 4), "ankle": (0, 0, -4)}
 """Degrees about x, y, z from the rest pose of SMPL to the pose in which the mesh is stored, for the left side. Arms
 mostly hang, so the skin is stretched less from here than from outstretched arms."""
+KNUCKLES, CURL = 0.088, 0.034
+"""Distance of the knuckles from the wrist, and radius of the arc of the fingers, in meters."""
 CELL = 0.005
 VERTICES = 1150
 """Number of vertices of a half before it is mirrored."""
@@ -181,7 +182,7 @@ def arm() -> dict[str, Field]:
         "-10 0 0 34 37; 50 0 3 37 42; 110 0 2 34 40; 190 0 0 26 32; 250 0 0 21 28; 275 0 0 20 28",
     )
     wrist = JOINT["left_wrist"]
-    hand_axes = orthonormal(turned[wrist] @ np.array([1, -0.06, -0.04]), turned[wrist] @ np.array([0, 1.0, 0]))
+    hand_axes = axes_of_hand(turned[wrist])
     palm = tube(
         joints[wrist],
         hand_axes,
@@ -212,6 +213,27 @@ def arm() -> dict[str, Field]:
 
     parts["hand"] = hand
     return parts
+
+
+def axes_of_hand(wrist: np.ndarray) -> np.ndarray:
+    return orthonormal(wrist @ np.array([1, -0.06, -0.04]), wrist @ np.array([0, 1.0, 0]))
+
+
+def curled(points: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Returns points and normals (V, 3) of the left half with fingers bent into a loose fist."""
+    joints, turned = pose()
+    wrist, axes = joints[JOINT["left_wrist"]], axes_of_hand(turned[JOINT["left_wrist"]])
+    local = (points - wrist) @ axes.T
+    fingers = (np.linalg.norm(local, axis=1) < 0.25) & (local[:, 2] < 0.06)  # the thumb stays straight
+    beyond = np.where(fingers, np.maximum(local[:, 0] - KNUCKLES, 0), 0)
+    angle = beyond / CURL
+    bend = Rotation.from_rotvec(-angle[:, None] * [0, 0, 1]).as_matrix()
+    radius = (CURL + local[:, 1])[:, None] * np.stack([np.sin(angle), np.cos(angle)], 1)
+    bent = np.column_stack([local[:, 0] - beyond + radius[:, 0], radius[:, 1] - CURL, local[:, 2]])
+    moved = beyond[:, None] > 0
+    return np.where(moved, wrist + bent @ axes, points), np.where(
+        moved, (bend @ (normals @ axes.T)[..., None])[..., 0] @ axes, normals
+    )
 
 
 def head() -> Field:
@@ -419,6 +441,8 @@ def make() -> dict[str, np.ndarray]:
     mirrored = [*SMPL22.mirrored, *(22 + (k + half) % len(HELPERS) for k in range(len(HELPERS)))]
     triangles = np.concatenate([triangles, copies[triangles[:, ::-1]]])
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    colors = paint(points)
+    points, normals = curled(points, normals)
     normals = np.concatenate([normals, normals[beside] * flip])
     near = normals[triangles].sum(1)
     np.add.at(normals, triangles.ravel(), np.repeat(near, 3, axis=0))  # folds are softer than the surface's gradient
@@ -426,7 +450,7 @@ def make() -> dict[str, np.ndarray]:
         np.concatenate([points, points[beside] * flip]),
         normals,
         np.concatenate([weights, weights[beside][:, mirrored]]),
-        np.concatenate([paint(points), paint(points)[beside]]),
+        np.concatenate([colors, colors[beside]]),
         triangles,
         joints,
         turned,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Self
@@ -36,8 +37,8 @@ LENGTH = 10.0
 class CalibratedMotionCLIPTask(MotionCLIPTask):
     """Trains motion-CLIP so that its distances have a known scale, and texts differ by their details.
 
-    - Texts: motions of clips with the same captions are not negatives of each other's captions. Near-miss captions (see
-      `near_misses`) are additional negatives.
+    - Texts: motions of clips with the same captions or attributes are not negatives of each other's captions. Near-miss
+      captions (see `near_misses`) are additional negatives.
     - Motions: half of the motions have a noisy copy. The distance of both, scaled to length 1, is trained to be the
       strength of the noise, drawn from [0, 1], small values more often. One half of the copies has white noise on the
       joints and is encoded again, as motions from files are; the other half has white noise on normalized features, as
@@ -47,7 +48,7 @@ class CalibratedMotionCLIPTask(MotionCLIPTask):
     """
 
     representation: HumanML
-    meanings: dict[str, int]
+    meanings: dict[str, list[int]]
     near_misses: dict[str, list[list[str]]]
 
     @classmethod
@@ -76,7 +77,13 @@ class CalibratedMotionCLIPTask(MotionCLIPTask):
         """Looks up the near misses of the training clips."""
         super().on_fit_start()
         clips = self.trainer.datamodule.train.clips  # type: ignore[attr-defined]
-        self.meanings = {clip.id: key("captions", *sorted(clip.captions)) for clip in clips}
+        self.meanings = {
+            clip.id: [
+                key("captions", *sorted(clip.captions)),
+                key("attributes", json.dumps(clip.attributes if "action" in clip.attributes else clip.id)),
+            ]
+            for clip in clips
+        }
         pairs = zip(clips, near_misses(clips), strict=True)
         self.near_misses = {clip.id: list(texts.values()) for clip, texts in pairs}
 
@@ -90,7 +97,7 @@ class CalibratedMotionCLIPTask(MotionCLIPTask):
             cond = cond.drop(torch.zeros(len(cond.pooled), dtype=torch.bool, device=self.device))
         text, wrong_text = self.network.text(cond.pooled).tensor_split([len(batch)])
         meaning = [
-            [self.meanings[name], key("caption", text)] for name, text in zip(batch.ids, batch.text, strict=True)
+            [*self.meanings[name], key("caption", text)] for name, text in zip(batch.ids, batch.text, strict=True)
         ]
 
         chosen = torch.randperm(len(batch))[: (len(batch) + 1) // 2].to(self.device)

@@ -1,4 +1,4 @@
-"""Attributes of a motion, read from its joints by geometric rules: action, side, count, direction, speed.
+"""Attributes of a motion, read from its joints by geometric rules: action, side, count, direction, speed, amount.
 
 The rules are independent of how a motion was generated. They read what a person would see in a clip of a few seconds
 that shows one action of the synthetic set; each threshold is stated next to its rule. The joints are the 22 of SMPL.
@@ -16,11 +16,12 @@ from torch import Tensor
 from evaluators.metrics.samples import Share
 
 PELVIS, NECK, HEAD = 0, 12, 15
-HIPS, ANKLES, TOES, SHOULDERS, ELBOWS, WRISTS = (1, 2), (7, 8), (10, 11), (16, 17), (18, 19), (20, 21)
+HIPS, ANKLES, TOES, COLLARS = (1, 2), (7, 8), (10, 11), (13, 14)
+SHOULDERS, ELBOWS, WRISTS = (16, 17), (18, 19), (20, 21)
 SIDES = ("left", "right")
 BONES = [(1, 4), (2, 5), (4, 7), (5, 8), (16, 18), (17, 19), (18, 20), (19, 21)]  # thighs, shins, arms
 
-ATTRIBUTES = ("action", "side", "count", "direction", "speed")
+ATTRIBUTES = ("action", "side", "count", "direction", "speed", "amount")
 
 
 def read_attributes(joints: np.ndarray, fps: float) -> dict[str, str | int]:
@@ -31,8 +32,8 @@ def read_attributes(joints: np.ndarray, fps: float) -> dict[str, str | int]:
         fps: frames per second.
 
     Returns:
-        "action", and those of "side", "count", "direction", "speed" that the action has; empty if no action of the set
-        is recognized, for example in noise, or if the joints do not form a body.
+        "action", and those of "side", "count", "direction", "speed", "amount" that the action has; empty if no action
+        of the set is recognized, for example in noise, or if the joints do not form a body.
     """
     joints = np.asarray(joints, np.float64)
     if len(joints) < fps or not np.isfinite(joints).all():
@@ -43,25 +44,43 @@ def read_attributes(joints: np.ndarray, fps: float) -> dict[str, str | int]:
     floor = np.percentile(smooth[:, TOES, 1], 10)
     forward, left, turned = _heading(smooth)
 
+    lowered = _lowered(smooth, floor, forward, fps)
+    if lowered or not _stands(smooth):
+        return lowered
+    jumps = _count((smooth[:, TOES, 1] - floor).min(1), 0.07, 0.035)
+    # A leap goes more than 45 cm with both feet side by side, a dance sways at least three times by more than 3.5 cm to
+    # one side and the other, and a hand that picks something up comes within 42 cm of the floor.
+    stride = ((smooth[:, TOES[0]] - smooth[:, TOES[1]])[:, [0, 2]] * forward).sum(-1)
+    if jumps and np.abs(stride).max() < 0.25 and np.linalg.norm((smooth[-1] - smooth[0])[PELVIS, [0, 2]]) > 0.45:
+        return {"action": "leap"}
     walked = _locomotion(smooth, forward, left, turned, fps)
     if walked:
         return walked
-    jumps = _count((smooth[:, TOES, 1] - floor).min(1), 0.07, 0.035)
     if jumps:
         return {"action": "jump", "count": jumps}
+    sway = (smooth[:, PELVIS][:, [0, 2]] * left.mean(0)).sum(-1)
+    sway -= gaussian_filter1d(sway, 0.5 * fps, mode="nearest")
+    if _count(sway, 0.035, -0.035) + _count(-sway, 0.035, -0.035) >= 3:
+        return {"action": "dance"}
     kicked = _kick(smooth, floor, forward)
     if kicked:
         return kicked
+    hands = smooth[:, WRISTS, 1] - floor
+    side = int(hands.min(0).argmin())
+    if hands[:, side].min() < 0.42 and np.ptp(hands[:, side]) > 0.3:
+        return {"action": "pick", "side": SIDES[side]}
     pelvis = smooth[:, PELVIS, 1]
     squats = _count(np.percentile(pelvis, 95) - pelvis, 0.18, 0.1)
     if squats:
         return {"action": "squat", "count": squats}
-    trunk = smooth[:, NECK] - smooth[:, PELVIS]
-    if np.degrees(np.arctan2(np.linalg.norm(trunk[:, [0, 2]], axis=-1), trunk[:, 1])).max() > 28:
+    if _tilt(smooth).max() > 28:
         return {"action": "bow"}
     if abs(turned) > 45:
-        return {"action": "turn", "direction": "left" if turned > 0 else "right"}
-    return _arms(smooth, fps)
+        amount = "half" if abs(turned) > 135 else "quarter"
+        return {"action": "turn", "direction": "left" if turned > 0 else "right", "amount": amount}
+    gesture = _arms(smooth, forward, fps)
+    nods = _nods(smooth, forward) if gesture.get("action") == "stand" else 0
+    return {"action": "nod", "count": nods} if nods else gesture
 
 
 def _heading(smooth: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
@@ -74,17 +93,46 @@ def _heading(smooth: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
 
 
 def _is_a_body(joints: np.ndarray, smooth: np.ndarray) -> bool:
-    """Returns whether the body is upright, its limbs are 15 to 60 cm long and keep their length within 25 %, and its
-    joints are less than 2 cm off a smooth curve.
+    """Returns whether limbs are 15 to 60 cm long and keep their length within 25 %, and joints are less than 2 cm off a
+    smooth curve.
     """
     bones = np.stack([np.linalg.norm(smooth[:, a] - smooth[:, b], axis=-1) for a, b in BONES])
     length = np.median(bones, 1, keepdims=True)
     steady = (np.abs(bones / np.maximum(length, 1e-6) - 1) < 0.25).mean() > 0.9
     sized = bool(((length > 0.15) & (length < 0.6)).all())
-    upright = np.median(smooth[:, NECK, 1] - smooth[:, PELVIS, 1]) > 0.25
-    standing = np.median(smooth[:, PELVIS, 1] - smooth[:, TOES, 1].min(1)) > 0.5
     calm = np.median(np.linalg.norm(joints - smooth, axis=-1)) < 0.02
-    return bool(steady and sized and upright and standing and calm)
+    return bool(steady and sized and calm)
+
+
+def _stands(smooth: np.ndarray) -> bool:
+    """Returns whether the neck is 25 cm above the pelvis and the pelvis 50 cm above the toes, half of the time."""
+    upright = np.median(smooth[:, NECK, 1] - smooth[:, PELVIS, 1]) > 0.25
+    return bool(upright and np.median(smooth[:, PELVIS, 1] - smooth[:, TOES, 1].min(1)) > 0.5)
+
+
+def _tilt(smooth: np.ndarray) -> np.ndarray:
+    """Returns the angle (F,) between the trunk and the vertical in degrees."""
+    trunk = smooth[:, NECK] - smooth[:, PELVIS]
+    return np.degrees(np.arctan2(np.linalg.norm(trunk[:, [0, 2]], axis=-1), trunk[:, 1]))
+
+
+def _lowered(smooth: np.ndarray, floor: float, forward: np.ndarray, fps: float) -> dict[str, str | int]:
+    """Reads crawling, lying down, sitting down and standing up from the height of the pelvis and the tilt of the trunk.
+
+    A standing pelvis is higher than 78 cm; a seated one, at the end or the beginning, is at 35 to 72 cm. Who lies has
+    the pelvis below 35 cm and the trunk tilted by more than 55 degrees; so has a crawling trunk, which moves forward.
+    """
+    pelvis, tilt = smooth[:, PELVIS, 1] - floor, _tilt(smooth)
+    first, last = (slice(0, max(1, round(0.1 * fps))), slice(-max(1, round(0.1 * fps)), None))
+    ends = [pelvis[part].mean() for part in (first, last)]
+    moved = ((smooth[-1] - smooth[0])[PELVIS, [0, 2]] * forward.mean(0)).sum()
+    if np.median(tilt) > 55 and 0.35 < np.median(pelvis) < 0.65 and abs(moved) > 0.33:
+        return {"action": "crawl", "direction": "forward" if moved > 0 else "backward"}
+    if ends[1] < 0.35 and tilt[last].mean() > 55 and ends[0] > 0.78:
+        return {"action": "lie"}
+    if max(tilt[first].mean(), tilt[last].mean()) < 35 and 0.35 < min(ends) < 0.72 and max(ends) > 0.78:
+        return {"action": "sit" if ends[1] < ends[0] else "rise"}
+    return {}
 
 
 def _count(signal: np.ndarray, high: float, low: float) -> int:
@@ -108,7 +156,7 @@ def _locomotion(
     if np.ptp(np.percentile(smooth[:, ANKLES, 1], (5, 95), axis=0), axis=0).min() < 0.04:
         return {}
     velocity = np.gradient(ground, 1 / fps, axis=0)
-    speed = np.percentile(np.linalg.norm(velocity, axis=-1), 80)
+    speed = np.percentile(np.linalg.norm(velocity, axis=-1), 90)  # of the middle: walks begin and end in standing
     ahead, aside = (velocity * forward).sum(-1).mean(), (velocity * left).sum(-1).mean()
     if abs(turned) > 90:
         direction = "counterclockwise" if turned > 0 else "clockwise"
@@ -133,8 +181,8 @@ def _kick(smooth: np.ndarray, floor: float, forward: np.ndarray) -> dict[str, st
     return {"action": "kick", "side": SIDES[side], "count": kicks} if kicks and reach[side] > 0.35 else {}
 
 
-def _arms(smooth: np.ndarray, fps: float) -> dict[str, str | int]:
-    """Reads raised arms, waves and punches, or standing if there is none."""
+def _arms(smooth: np.ndarray, forward: np.ndarray, fps: float) -> dict[str, str | int]:
+    """Reads throws, salutes, raised arms, waves, claps and punches, or standing if there is none."""
     upper = smooth[:, ELBOWS] - smooth[:, SHOULDERS]
     fore = smooth[:, WRISTS] - smooth[:, ELBOWS]
     arm = smooth[:, WRISTS] - smooth[:, SHOULDERS]
@@ -142,6 +190,16 @@ def _arms(smooth: np.ndarray, fps: float) -> dict[str, str | int]:
     straight = np.linalg.norm(arm, axis=-1) / length
     above = arm[..., 1] / length
 
+    ahead = (arm[..., [0, 2]] * forward[:, None]).sum(-1)
+    from_head = smooth[:, WRISTS] - smooth[:, [HEAD]]
+    near = (np.linalg.norm(from_head, axis=-1) < 0.225) & (from_head[..., 1] > -0.08)
+    for side, name in enumerate(SIDES):
+        # A throw brings the hand from above the shoulder far to the front within half a second.
+        drawn = np.flatnonzero((above[:, side] > 0) & (ahead[:, side] < 0.1))
+        if any((ahead[i : i + round(0.5 * fps), side] > 0.38).any() for i in drawn):
+            return {"action": "throw", "side": name}
+        if near[:, side].sum() > 0.4 * fps and np.ptp(above[:, side]) > 0.5:
+            return {"action": "salute", "side": name}
     raised, waving = [], []
     for side, name in enumerate(SIDES):
         up = (fore[:, side, 1] > 0.2 * length[side]) & (above[:, side] > 0.1)
@@ -163,8 +221,19 @@ def _arms(smooth: np.ndarray, fps: float) -> dict[str, str | int]:
     punches = _count(reach[:, side], 0.8, 0.6)
     if punches:
         return {"action": "punch", "side": SIDES[side], "count": punches}
+    claps = _count(-np.linalg.norm(smooth[:, WRISTS[0]] - smooth[:, WRISTS[1]], axis=-1), -0.175, -0.28)
+    if claps:
+        return {"action": "clap", "count": claps}
     moved = np.ptp(smooth[:, [*WRISTS, *ANKLES, HEAD]], axis=0)
     return {"action": "stand"} if np.linalg.norm(moved, axis=-1).max() < 0.35 else {}
+
+
+def _nods(smooth: np.ndarray, forward: np.ndarray) -> int:
+    """Counts how often the head pitches forward by more than 32 degrees and comes back, seen from the shoulders."""
+    base = smooth[:, [NECK, *COLLARS, *SHOULDERS]].mean(1)
+    head = smooth[:, HEAD] - base - (smooth[:, NECK] - base).mean(0)
+    nod = np.degrees(np.arctan2((head[:, [0, 2]] * forward).sum(-1), head[:, 1]))
+    return _count(nod - np.percentile(nod, 30), 32, 22)
 
 
 def right_attributes(seen: Mapping[str, Any], requested: Mapping[str, Any]) -> dict[str, bool]:

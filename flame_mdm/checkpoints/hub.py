@@ -7,10 +7,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from flame_mdm.checkpoints.adapters import read_merged
 from flame_mdm.checkpoints.loading import find
 from flame_mdm.checkpoints.model_files import (
     FILE,
-    read_checkpoint,
     read_model_file,
     without_own_paths,
     write_model_file,
@@ -36,7 +36,7 @@ OTHER_LICENSE = (
 )
 
 
-def export(source: str | Path, out: str | Path, *, half: bool = False) -> Path:
+def export(source: str | Path, out: str | Path, *, half: bool = False, **adapted: Any) -> Path:
     """Writes the model of a checkpoint as a model file, and returns its path.
 
     Args:
@@ -44,12 +44,13 @@ def export(source: str | Path, out: str | Path, *, half: bool = False) -> Path:
         out: a .safetensors file, or a folder for `model.safetensors`.
         half: writes the weight matrices in half precision; vectors, such as the statistics of the features, stay as
             they are. Loaded models compute in single precision either way.
+        adapted: adapter and strength, as for `flame_mdm.load`; they are merged into the weights.
 
     Raises:
         FileNotFoundError, UserError: As for `flame_mdm.load`.
     """
     source, out = find(source), Path(out)
-    checkpoint = read_checkpoint(source)
+    checkpoint = read_merged(source, **adapted)
     origin = checkpoint.get("origin") or {
         "made": "trained with flame_mdm",
         "steps": checkpoint.get("global_step"),

@@ -2,43 +2,64 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import torch
 from hydra.utils import get_class
 from torch.overrides import TorchFunctionMode
 
+from flame_mdm.checkpoints.adapters import Paths, read_merged
 from flame_mdm.checkpoints.locating import Which, find
-from flame_mdm.checkpoints.model_files import read_checkpoint
 from flame_mdm.config import Config, instantiate, trust
 from flame_mdm.config.signatures import walk
 from flame_mdm.errors import UserError
-from flame_mdm.task import MotionGeneration, Task
+from flame_mdm.generator import DistilledGenerator, MotionGenerator
+
+if TYPE_CHECKING:
+    from flame_mdm.task import Task
 
 NO_GPU = "PyTorch finds no GPU" if torch.version.cuda or torch.version.hip else "this PyTorch was built without CUDA"
 """Why no GPU can be used, if PyTorch has none."""
 
 
-def load(source: str | Path, device: str | torch.device = "cpu", *, which: Which = "last") -> MotionGeneration:
-    """Loads a trained model for sampling; arguments as for `find`, errors as for `find` and `load_task`."""
-    return load_task(find(source, which), MotionGeneration, device)
+def load(
+    source: str | Path,
+    device: str | torch.device = "cpu",
+    *,
+    which: Which = "last",
+    adapter: Paths = (),
+    strength: float | Sequence[float] = 1.0,
+) -> MotionGenerator:
+    """Loads a trained model for sampling; `source` and `which` as for `find`, errors as for `find` and `load_task`.
+
+    `adapter` are files that `flame_mdm.adapt` wrote for this model, `strength` that of each, or of all: 0 = the model
+    without them, 1 = as trained.
+    """
+    return load_task(find(source, which), MotionGenerator, device, adapter=adapter, strength=strength)
 
 
-Trained = TypeVar("Trained", bound=Task)
+Trained = TypeVar("Trained", bound="Task | MotionGenerator")
+GENERATORS = {
+    "flame_mdm.task.MotionGeneration": MotionGenerator,
+    "flame_mdm.training.distillation.ConsistencyDistillation": DistilledGenerator,
+}
+"""Classes of the task in recipes of generators, and those that are loaded instead, without Lightning."""
 
 PARTS = ("task", "representation", "process", "condition", "denoiser")
 """Parts of a recipe from which a model is built."""
 
 
-def load_task(path: Path, kind: type[Trained], device: str | torch.device = "cpu") -> Trained:
+def load_task(path: Path, kind: type[Trained], device: str | torch.device = "cpu", **adapted: Any) -> Trained:
     """Loads the task of a checkpoint in evaluation mode, with averaged weights if its recipe averages them.
 
     Args:
         path: a .ckpt or .safetensors file.
         kind: expected class of the task.
         device: device of the task.
+        adapted: adapter and strength, as for `load`.
 
     Raises:
         FileNotFoundError: If the file does not exist.
@@ -46,7 +67,7 @@ def load_task(path: Path, kind: type[Trained], device: str | torch.device = "cpu
             do not match its recipe.
     """
     check_device(device)
-    checkpoint = read_checkpoint(path)
+    checkpoint = read_merged(path, **adapted)
     try:
         return _build(checkpoint, kind).eval().to(device)
     except Exception as error:  # a nonsensical recipe may fail anywhere
@@ -80,13 +101,14 @@ def _build(checkpoint: dict[str, Any], kind: type[Trained]) -> Trained:
     for name in ("task", "representation", *parts):
         if "_target_" not in (config[name] if isinstance(config.get(name), dict) else {}):
             raise UserError(f"damaged: its recipe has no {name}")
-    task_class = get_class(config["task"]["_target_"])
-    if not issubclass(task_class, kind):
-        noun = task_class.noun if issubclass(task_class, Task) else task_class.__name__
-        raise UserError(f"holds {noun}, not {kind.noun}. Give another checkpoint")
+    classes: dict[str, Any] = dict(GENERATORS) if kind is MotionGenerator else {}
     targets = [str(node["_target_"]) for _, node in walk(parts) if "_target_" in node]
-    for target in targets:
-        get_class(target)  # imports modules here, since tensors that they create must not be on the meta device
+    # imports modules here, since tensors that they create must not be on the meta device
+    classes |= {target: get_class(target) for target in targets if target not in classes}
+    task_class = classes[config["task"]["_target_"]]
+    if not issubclass(task_class, kind):
+        noun = getattr(task_class, "noun", task_class.__name__)
+        raise UserError(f"holds {noun}, not {kind.noun}. Give another checkpoint")
     own = all(target.startswith(("flame_mdm.", "evaluators.")) for target in targets)
     uncompiled = config | {"task": {name: value for name, value in config["task"].items() if name != "compile"}}
     with ExitStack() as stack:
@@ -96,6 +118,8 @@ def _build(checkpoint: dict[str, Any], kind: type[Trained]) -> Trained:
         representation = instantiate(config["representation"])
         task = task_class.build(uncompiled, representation, actions=checkpoint["facts"]["actions"])
     task.config, task.facts = config, checkpoint["facts"]
+    if "vocabulary" in task.facts:
+        task.condition.seen = frozenset(task.facts["vocabulary"])
     kinds = {name: value.dtype for name, value in task.state_dict().items()}
     state = {name: value.to(kinds.get(name, value.dtype)) for name, value in state.items()}
     try:
@@ -118,4 +142,8 @@ class _CallLimit(TorchFunctionMode):
         self.left -= 1
         if self.left < 0:
             raise UserError("its recipe describes a larger model than the weights saved with it")
+        # on the meta device, drawing numbers imports torch's compiler, which takes longer than building the model
+        if func is torch.nn.init.normal_:
+            return kwargs["tensor"] if kwargs else args[0]
+        func = torch.empty if func is torch.randn else func
         return func(*args, **(kwargs or {}))

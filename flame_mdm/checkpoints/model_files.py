@@ -27,7 +27,8 @@ FORMAT = 2
 """Format of checkpoints and model files: 2 since version 0.2.0."""
 FORMAT_KEY = "flame_mdm_format"
 """Key of the format in a checkpoint."""
-KEY = "flame_mdm"
+KEY, ADAPTER = "flame_mdm", "flame_mdm_adapter"
+"""Keys of the metadata of model files and of adapters."""
 FILE = "model.safetensors"
 MOST_FRAMES = 100_000
 """Maximum number of frames that a model file may declare: more than an hour at 20 frames per second."""
@@ -39,16 +40,11 @@ def read_model_file(path: Path) -> dict[str, Any]:
     Raises:
         UserError: If it is damaged, not a model file, or has another format.
     """
-    from safetensors import SafetensorError, safe_open
-
-    try:
-        with safe_open(path, framework="pt") as file:
-            metadata = file.metadata() or {}
-            state = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (it is no mapping)
-    except (SafetensorError, OSError, ValueError) as error:
-        raise UserError(f"{path}: damaged, or not a .safetensors file") from error
+    metadata, state = read_safetensors(path)
     text = metadata.get(KEY)
     if text is None:
+        if ADAPTER in metadata:
+            raise UserError(f"{path}: an adapter, which changes a model. Name its base first: BASE adapter={path}")
         raise UserError(
             f"{path}: weights without a recipe. Import released weights of MDM, MFM and FLAME with `flame-mdm import`"
         )
@@ -63,6 +59,18 @@ def read_model_file(path: Path) -> dict[str, Any]:
     if metadata.get("sha256") != content_sha256(text, state):
         raise UserError(f"{path}: damaged: it has changed since it was written. Download or export it again")
     return checked(path, model | {"state_dict": state})
+
+
+def read_safetensors(path: Path) -> tuple[dict[str, str], dict[str, Tensor]]:
+    """Returns metadata and tensors of a .safetensors file; raises `UserError` if it is damaged."""
+    from safetensors import SafetensorError, safe_open
+
+    try:
+        with safe_open(path, framework="pt") as file:
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (it is no mapping)
+            return file.metadata() or {}, tensors
+    except (SafetensorError, OSError, ValueError) as error:
+        raise UserError(f"{path}: damaged, or not a .safetensors file") from error
 
 
 def check_format(path: Path, number: Any) -> None:
@@ -117,6 +125,7 @@ class _Facts(TypedDict):
     fingerprint: NotRequired[str | None]
     training: NotRequired[_Training]
     vocabulary: NotRequired[list[str]]
+    verbs: NotRequired[list[str]]
     captions: NotRequired[list[str]]
 
 
@@ -207,10 +216,11 @@ def write_model_file(
 
 def content_sha256(text: str, state: Mapping[str, Tensor]) -> str:
     """Returns the sha256 of the recipe (JSON) and the weights of a model file."""
-    return hashlib.sha256(f"{text}\n{_sha256(state)}".encode()).hexdigest()
+    return hashlib.sha256(f"{text}\n{state_sha256(state)}".encode()).hexdigest()
 
 
-def _sha256(state: Mapping[str, Tensor]) -> str:
+def state_sha256(state: Mapping[str, Tensor]) -> str:
+    """Returns the sha256 of names, types, shapes and values of weights."""
     import torch
 
     digest = hashlib.sha256()
@@ -252,7 +262,7 @@ def weights_sha256(path: Path) -> str:
     Raises:
         FileNotFoundError, UserError: As for `read_checkpoint`.
     """
-    return _sha256(read_checkpoint(path)["state_dict"])
+    return state_sha256(read_checkpoint(path)["state_dict"])
 
 
 def without_own_paths(config: Mapping[str, Any]) -> dict[str, Any]:

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import os
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from glob import escape
 from pathlib import Path
+from typing import Any
 
 from flame_mdm.checkpoints.locating import Which, find
 from flame_mdm.config import EXPERIMENTS, Config, compose_data, instantiate
@@ -34,10 +36,22 @@ class ModelSettings:
 
 
 @dataclass(frozen=True, kw_only=True)
+class AdaptedSettings(ModelSettings):
+    """Keys that name a model and its adapters."""
+
+    adapter: list[str] | None = option(None, "files of `flame-mdm adapt` for this model, separated by spaces")
+    adapter_strength: float | Sequence[float] = option(1.0, "for all adapters, or a list; 0 = the model without them")
+
+    def adapters(self) -> dict[str, Any]:
+        """Returns the keywords `adapter` and `strength` of `flame_mdm.load`."""
+        return {"adapter": self.adapter or (), "strength": self.adapter_strength}
+
+
+@dataclass(frozen=True, kw_only=True)
 class FileSettings:
     """Keys that describe a motion file."""
 
-    fps: float | None = option(None, "frames per second; overrides the value in the file; required for .npy")
+    fps: float | None = option(None, "frames per second; overrides the value in the file; required for .npy, .amc")
     unit: float | None = option(None, "meters per length unit of the file; default 0.01 for most .bvh, 1 for .npy")
     up: str | None = option(None, "axis of the file that points up: y, z or -y; default that of skeleton.yaml, or y")
 
@@ -139,6 +153,19 @@ def check_motion(key: str, source: str | None) -> None:
         raise UserError(f"{key}={source}: neither a motion file ({kinds}) nor dataset:id")
     if not Path(source).exists():
         raise FileNotFoundError(f"{source}: no such file")
+
+
+def check_extractor(source: str | None) -> None:
+    """Checks that the files of an extractor exist, before torch is imported.
+
+    Raises:
+        FileNotFoundError, UserError: As raised by `flame_mdm.checkpoints.locating.find`.
+    """
+    if source not in (None, "none") and not Path(source).exists():
+        try:
+            find(source)
+        except (UserError, FileNotFoundError) as error:
+            raise UserError(f"extractor: {error}") from error
 
 
 def check_words(settings: BodySettings) -> None:

@@ -7,7 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import ClassVar
 
-from flame_mdm.commands import DataSettings
+from flame_mdm.commands import DataSettings, check_extractor
 from flame_mdm.config import run
 from flame_mdm.errors import UserError, say
 from flame_mdm.reporting.audit import card_name, read_card, write_card
@@ -56,6 +56,7 @@ def audit(settings: AuditSettings) -> None:
         )
     if settings.resamples == 0 or (settings.samples or 64) < 8:
         raise UserError(f"resamples={settings.resamples}, samples={settings.samples}: give 100, and 8 or more")
+    check_extractor(settings.extractor)
     from evaluators.audit import audit as measure
     from evaluators.request import EvaluationRequest
 

@@ -34,8 +34,8 @@ class BenchmarkSettings:
 
     Trains a motion-CLIP and a model of each kind, evaluates them, and writes a table and a report page, all in one
     command. If interrupted, the same command continues where it stopped.
-    NAME is a file in experiments/benchmark: synthetic and synthetic_medium, which need no download, bandai, or
-    bandai_full, for one GPU.
+    NAME is a file in experiments/benchmark: synthetic and synthetic_medium, which need no download, bandai and
+    few_steps, or bandai_full, for one GPU.
     """
 
     OBJECTS: ClassVar = ("exp",)

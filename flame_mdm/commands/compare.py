@@ -73,10 +73,10 @@ def compare(settings: CompareSettings) -> None:
         say(f"written: {out}")
         return
     assert settings.runs is not None
+    compared = find([Path(folder) for folder in settings.runs])
     from flame_mdm.visualize.bodies import load_body
 
     body = load_body(settings.body)
-    compared = find([Path(folder) for folder in settings.runs])
     shown = motions(compared, settings)
     if settings.rate:
         out = Path(settings.out or "runs/rate.html")
@@ -168,7 +168,8 @@ def _sampled(
     import torch
 
     from flame_mdm.checkpoints.loading import load
-    from flame_mdm.sampling.generation import generate
+    from flame_mdm.sampling.generation import sample_request
+    from flame_mdm.sampling.request import SamplingRequest
 
     model = load(compared_run.folder, "cuda" if torch.cuda.is_available() else "cpu")
     fps, longest = model.representation.fps, model.facts["max_frames"]
@@ -181,15 +182,14 @@ def _sampled(
         numbered = [prompt for prompt in prompts if prompt[1] == count]
         texts = [text for text, _ in numbered]
         labels = texts[0] in model.facts["actions"]
-        made = generate(
-            model,
-            None if labels else texts,
+        request = SamplingRequest(
+            texts=None if labels else texts,
             actions=texts if labels else None,
             seconds=settings.seconds,
             frames=[min(lengths[prompt], longest) for prompt in numbered if prompt in lengths] or None,
             seed=settings.seed + count,
         )
-        sampled |= zip(numbered, made, strict=True)
+        sampled |= zip(numbered, sample_request(model, request), strict=True)
     return {prompt: sampled[prompt] for prompt in prompts}
 
 

@@ -27,7 +27,8 @@ class ConvertSettings(BodySettings, FileSettings):
 
     Converts a motion file, or all motion files in a folder and the folders below it. The nearest skeleton.yaml in its
     folder or above applies (docs/own-data.md).
-    Inputs: .npz written by `make sample`, .npz of AMASS, .bvh, .json, and .npy with joint positions.
+    Inputs: .npz written by `make sample`, .npz of AMASS, .bvh, .amc with its .asf, .json, and .npy with joint
+    positions.
     Outputs: .bvh and .glb for Blender and game engines, .npz in the layout of AMASS, and .json and .npy with joint
     positions; .mp4 and .gif to look at. Units, axes and joint names: docs/formats.md
     """
@@ -38,7 +39,7 @@ class ConvertSettings(BodySettings, FileSettings):
     format: str | None = option(None, "if MOTION is a folder: ending of the files that are written to the folder OUT")
     figure: str = option("body", "mesh of .glb: body, or bones for rounded limbs")
     rest_pose: bool = option(False, "true = .bvh begins with a frame of the rest pose, arms out")
-    rig: str | None = option(None, "skeleton: mixamo, unreal, unity, lafan1, soma, cmu, geno or 100style")
+    rig: str | None = option(None, "skeleton: mixamo, unreal, unity, rigify, lafan1, soma, cmu, geno or 100style")
     character: str | None = option(None, "your own .glb or .bvh file, written with the motion: docs/characters.md")
 
 

@@ -7,6 +7,7 @@ from functools import partial
 from importlib.util import find_spec
 from typing import ClassVar
 
+from flame_mdm.checkpoints.locating import find
 from flame_mdm.config import run
 from flame_mdm.errors import UserError
 from flame_mdm.sampler_options import option
@@ -14,7 +15,7 @@ from flame_mdm.sampler_options import option
 
 @dataclass(frozen=True, kw_only=True)
 class DemoSettings:
-    """usage: flame-mdm demo [CKPT ...] [host=127.0.0.1] [port=7860] [hosts=NAME] [device=cuda]
+    """usage: flame-mdm demo [CKPT ...] [adapter=FILE] [host=127.0.0.1] [port=7860] [hosts=NAME] [device=cuda]
 
     Serves a page where you type a sentence, watch the motion, edit it and download it. Without CKPT, it uses the model
     in the package. It needs the extra demo: pip install "flame-mdm[demo]". docs/demo.md explains the page.
@@ -22,6 +23,7 @@ class DemoSettings:
 
     OBJECTS: ClassVar = ("ckpt",)
     ckpt: list[str] = option(lambda: ["quickstart"], "one or more models, separated by spaces, as for sample")
+    adapter: list[str] = option(list, "adapters of the first model to choose from, separated by spaces")
     host: str = option("127.0.0.1", "address to listen on: this computer alone; 0.0.0.0 = all networks")
     port: int = option(7860, "0 = any free port")
     hosts: list[str] = option(
@@ -40,10 +42,14 @@ def demo(settings: DemoSettings) -> None:
         raise UserError(f"port={settings.port}: give a number from 0 to 65535; 0 is any free port")
     if find_spec("gradio") is None:
         raise UserError('the demo needs the package gradio. Run pip install "flame-mdm[demo]"')
+    for name in settings.ckpt:
+        find(name)
 
     from flame_mdm.demo.app import serve
+    from flame_mdm.demo.request import PLUS
 
-    serve(settings.ckpt, settings.host, settings.port, settings.device, settings.hosts)
+    sources = [*settings.ckpt, *(f"{settings.ckpt[0]}{PLUS}{file}" for file in settings.adapter)]
+    serve(sources, settings.host, settings.port, settings.device, settings.hosts)
 
 
 main = partial(run, demo, DemoSettings)

@@ -19,19 +19,19 @@ from flame_mdm.sampling.request import EditRequest
 
 @dataclass(frozen=True, kw_only=True)
 class EditSettings(OutputSettings, EditRequest, FileSettings):
-    """usage: flame-mdm edit CKPT motion=walk.npz region=in_between text="a person jumps" [key=value ...]
-           flame-mdm edit CKPT motion=take.bvh cut=[0,3] joints=upper_body unconditioned=true
-           flame-mdm edit CKPT motion=bandai:CLIP region_seconds=[1,2] joints=[left_arm,head] method=flame ...
+    """usage: flame-mdm edit CKPT MOTION [OUT] region=in_between text="a person jumps" [key=value ...]
+           flame-mdm edit CKPT take.bvh cut=[0,3] joints=upper_body unconditioned=true
+           flame-mdm edit CKPT bandai:CLIP region_seconds=[1,2] joints=[left_arm,head] method=flame ...
 
     Keeps part of a motion and resamples the rest. Writes the original and the results (.npz), a GIF, and a player that
     opens in any browser. docs/editing.md explains the keys.
     """
 
-    OBJECTS: ClassVar = ("ckpt", "out")
+    OBJECTS: ClassVar = ("ckpt", "motion", "out")
     motion: str | None = option(None, "FILE (.npz, .bvh, .json, .npy) or dataset:id")
     cut: Sequence[float] | None = option(None, "[begin, end] in seconds: use only this part of the motion")
     data_root: str = option(lambda: os.environ.get("FLAME_MDM_DATA", "data"), "folder of the prepared data sets")
-    out: str | None = option(None, "folder; default samples/<experiment>/<run>-step<steps>-<hash>/edit-<motion>-...")
+    out: str | None = option(None, "folder; default samples/<experiment>/edit-<motion>-...-<hash>")
 
     def __post_init__(self) -> None:
         SamplerOptions.__post_init__(self)
@@ -41,7 +41,7 @@ class EditSettings(OutputSettings, EditRequest, FileSettings):
 IN_NAME = (
     *("region", "region_seconds", "joints", "method", "until", "strength"),
     *(entry.name for entry in fields(SamplerOptions)),
-    *("cut", "cleanup", "resample"),
+    *("cut", "cleanup", "resample", "targets", "adapter", "adapter_strength"),
 )
 """Keys that change the motions: the name of the folder contains those that differ from their defaults."""
 
@@ -68,7 +68,8 @@ def write_edits(settings: EditSettings) -> None:
     from flame_mdm.visualize.bodies import load_body
 
     body = load_body(settings.body)
-    model = load(file, settings.device or ("cuda" if torch.cuda.is_available() else "cpu"))
+    device = settings.device or ("cuda" if torch.cuda.is_available() else "cpu")
+    model = load(file, device, **settings.adapters())
     check_condition(settings, request, model)
     facts = {key: getattr(settings, key) for key in ("fps", "unit", "up", "cut", "data_root")}
     original = read_motion(model.representation, settings.motion, **facts)
@@ -80,7 +81,7 @@ def write_edits(settings: EditSettings) -> None:
     shown = replace(original, text=f"original: {original.text or original.id}")
     facts = {"seed": settings.seed, "checkpoint": digest, "keep": edits[0].keep}
     write_motions(folder, [shown, *edits], facts, stages, settings.mp4, body)
-    say(summary(folder, edits, settings.mp4))
+    say(summary(folder, edits, settings))
     say(
         f"{edits[0].keep.mean():.0%} of the features are kept. Largest change in the kept part: "
         f"{max(e.feature_error for e in edits):.3g} in normalized features, "

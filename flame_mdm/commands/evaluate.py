@@ -7,7 +7,7 @@ from functools import partial
 from typing import ClassVar
 
 from evaluators.request import EvaluationKeys, EvaluationRequest
-from flame_mdm.commands import DataSettings, ModelSettings, check_device
+from flame_mdm.commands import DataSettings, ModelSettings, check_device, check_extractor
 from flame_mdm.config import run
 from flame_mdm.sampler_options import SamplerOptions
 
@@ -38,6 +38,7 @@ def evaluate_request(settings: EvaluateSettings) -> None:
     request = EvaluationRequest.of(vars(settings) | nodes)
     if settings.ckpt is not None:
         settings.model_file()  # reports a missing file before torch is imported
+    check_extractor(settings.extractor)
     from evaluators.evaluation import evaluate
 
     evaluate(request)

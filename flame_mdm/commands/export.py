@@ -1,4 +1,4 @@
-"""`flame-mdm export CKPT OUT`: writes the model of a checkpoint as a model file."""
+"""`flame-mdm export CKPT OUT`: writes the model of a checkpoint as a model file, or as ONNX graphs."""
 
 from __future__ import annotations
 
@@ -6,21 +6,23 @@ from dataclasses import dataclass
 from functools import partial
 from typing import ClassVar
 
-from flame_mdm.commands import ModelSettings
+from flame_mdm.commands import AdaptedSettings
 from flame_mdm.config import run
 from flame_mdm.errors import UserError, say
 from flame_mdm.sampler_options import option
 
 
 @dataclass(frozen=True, kw_only=True)
-class ExportSettings(ModelSettings):
-    """usage: flame-mdm export CKPT OUT [half=true]
+class ExportSettings(AdaptedSettings):
+    """usage: flame-mdm export CKPT OUT [half=true] [format=onnx] [adapter=limp.safetensors]
 
-    Writes the averaged weights of a checkpoint, its recipe and the metadata of its data set as one .safetensors file.
+    Writes the averaged weights of a checkpoint, with its adapters merged into them, its recipe and the metadata of its
+    data set as one .safetensors file, or with format=onnx a folder to sample from without PyTorch: docs/export.md.
     """
 
     OBJECTS: ClassVar = ("ckpt", "out")
-    out: str | None = option(None, "a .safetensors file, or a folder for model.safetensors")
+    out: str | None = option(None, "a .safetensors file, or a folder; for format=onnx, a folder")
+    format: str = option("safetensors", "or onnx: graphs for onnxruntime, with a script that samples from them")
     half: bool = option(False, "true = weight matrices in half precision")
 
 
@@ -28,10 +30,15 @@ def export_model(settings: ExportSettings) -> None:
     """Writes the model file."""
     if settings.ckpt is None or settings.out is None:
         raise UserError("name a checkpoint and an output file: flame-mdm export CKPT model.safetensors")
+    if settings.format not in ("safetensors", "onnx"):
+        raise UserError(f"format={settings.format}: unknown. Use safetensors or onnx")
     file = settings.model_file()
-    from flame_mdm.checkpoints.hub import export
+    if settings.format == "onnx":
+        from flame_mdm.checkpoints.onnx_export import export_onnx as export
+    else:
+        from flame_mdm.checkpoints.hub import export
 
-    say(f"written: {export(file, settings.out, half=settings.half)}")
+    say(f"written: {export(file, settings.out, half=settings.half, **settings.adapters())}")
 
 
 main = partial(run, export_model, ExportSettings)

@@ -29,7 +29,8 @@ class InspectSettings(BodySettings, FileSettings, PreparedSettings):
     """usage: flame-mdm inspect MOTION|FOLDER|DATASET [OUT.html] [split=train] [clips=24] [fps=20] [unit=0.01] [up=z]
 
     Finds physical faults of a motion file, of all motion files in a folder, or of a prepared data set: sliding feet,
-    jumps, bones that change their length, joints below the floor, bodies that float or freeze, and impossible bends.
+    jumps, bones that change their length, joints below the floor, arms in the body, bodies that float or freeze, and
+    impossible bends.
     Limits, and how many real clips each flags: docs/motion-faults.md
     Prints the faults per frame and joint, and writes a player whose time line marks them; of a data set or a large
     folder, it shows the worst motions, at most `clips`. Exits with 3 if there are faults.

@@ -8,13 +8,13 @@ from typing import ClassVar
 
 from flame_mdm.commands import STORE, DataSettings
 from flame_mdm.config import instantiate, run
-from flame_mdm.errors import say
+from flame_mdm.errors import UserError, say
 from flame_mdm.sampler_options import option
 
 
 @dataclass(frozen=True, kw_only=True)
 class PrepareSettings(DataSettings):
-    """usage: flame-mdm prepare data=NAME [source=PATH] [representation=NAME] [check|verify|force=true]
+    """usage: flame-mdm prepare data=NAME [source=PATH] [captions=PATH] [representation=NAME] [check|verify|force=true]
 
     Converts a data set, as distributed by its owners, into a packed store under data/. `check=true` only lists the
     files that exist and those that are missing; `verify=true` checks an existing store; `force=true` rewrites it.
@@ -22,6 +22,7 @@ class PrepareSettings(DataSettings):
 
     OBJECTS: ClassVar = ("data",)
     source: str | None = option(None, "folder or archive, if the data set needs one")
+    captions: str | None = option(None, "folder of the captions, if the data set keeps them apart from the motions")
     check: bool = option(False, "list the files that exist and those that are missing, prepare nothing")
     verify: bool = option(False, "check and report on an existing store, write nothing")
     force: bool = option(False, "rewrite an existing store")
@@ -35,6 +36,10 @@ def prepare(settings: PrepareSettings) -> None:
         FileNotFoundError: If the raw data is missing.
     """
     node = settings.data_node(settings.source)
+    if settings.captions is not None:
+        if "captions" not in node["source"]:
+            raise UserError(f"captions={settings.captions}: {node['name']} takes none. Drop captions=")
+        node["source"]["captions"] = settings.captions
 
     from flame_mdm.data.store import write_store
     from flame_mdm.data.verify import deviations, lines, report

@@ -11,6 +11,7 @@ from flame_mdm.commands import BodySettings, check_words
 from flame_mdm.config import run
 from flame_mdm.errors import UserError, say
 from flame_mdm.reporting.report import write_report
+from flame_mdm.runs import check_run
 from flame_mdm.sampler_options import option
 
 
@@ -35,6 +36,8 @@ def report(settings: ReportSettings) -> None:
     if settings.runs is None:
         raise UserError("no run named. Name a run directory: flame-mdm report runs/synthetic/mdm/default")
     check_words(settings)
+    for folder in settings.runs:
+        check_run(Path(folder))
     from flame_mdm.visualize.bodies import load_body
 
     body = load_body(settings.body)

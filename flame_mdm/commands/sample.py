@@ -4,28 +4,30 @@ from __future__ import annotations
 
 import hashlib
 import re
+import webbrowser
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from flame_mdm.checkpoints.locating import find
-from flame_mdm.commands import BodySettings, ModelSettings, check_device, check_motion, check_words
+from flame_mdm.commands import AdaptedSettings, BodySettings, check_device, check_motion, check_words
 from flame_mdm.config import run
 from flame_mdm.errors import UserError, say, shortened
 from flame_mdm.safe_io import MEBIBYTE, read_text
 from flame_mdm.sampler_options import SamplerOptions, option, same_option
-from flame_mdm.sampling.request import EditRequest, SamplingRequest
+from flame_mdm.sampling.request import EditRequest, SamplingRequest, path_targets, read_path
 
 if TYPE_CHECKING:
     from flame_mdm.formats.motion import Motion
-    from flame_mdm.task import MotionGeneration
+    from flame_mdm.generator import MotionGenerator
+    from flame_mdm.visualize.body import Mesh
 
 
 @dataclass(frozen=True, kw_only=True)
-class OutputSettings(BodySettings, SamplerOptions, ModelSettings):
+class OutputSettings(BodySettings, SamplerOptions, AdaptedSettings):
     """Keys that `sample` and `edit` share."""
 
     text: str | None = same_option(SamplingRequest, "texts")
@@ -34,9 +36,16 @@ class OutputSettings(BodySettings, SamplerOptions, ModelSettings):
     samples: int = same_option(SamplingRequest, "samples", default=3)
     seed: int = same_option(SamplingRequest, "seed")
     cleanup: bool = same_option(SamplingRequest, "cleanup")
+    targets: str | None = same_option(SamplingRequest, "targets")
     trajectory: bool = option(False, "draw the clean estimates along the sampling of the first motion: trajectory.png")
     mp4: bool = option(False, 'also write motions.mp4; needs pip install "flame-mdm[video]"')
+    open: bool = option(False, "open the player in the browser")
     device: str | None = option(None, "default: cuda if available")
+
+    def show(self, page: Path) -> None:
+        """Opens a page in the browser if requested; the line about it is printed in any case."""
+        if self.open:
+            webbrowser.open(page.resolve().as_uri())
 
     def texts(self) -> list[str] | None:
         """Returns the texts; None if there are none."""
@@ -61,6 +70,8 @@ class OutputSettings(BodySettings, SamplerOptions, ModelSettings):
             raise UserError(f"give only one of {listed}=... and unconditioned=true, not {' and '.join(conditions)}")
         if self.mp4 and find_spec("av") is None:
             raise UserError('mp4=true: MP4 needs the package av. Run pip install "flame-mdm[video]", or write a GIF')
+        if self.targets is not None and not Path(self.targets).exists():
+            raise FileNotFoundError(f"{self.targets}: no such file")
         kinds = [SamplingRequest, SamplerOptions, *([EditRequest] if editing else [])]
         names = {entry.name for kind in kinds for entry in fields(kind)}
         values = {entry.name: getattr(self, entry.name) for entry in fields(self) if entry.name in names}
@@ -75,14 +86,14 @@ class OutputSettings(BodySettings, SamplerOptions, ModelSettings):
 @dataclass(frozen=True, kw_only=True)
 class SampleSettings(OutputSettings):
     """usage: flame-mdm sample CKPT text="a person walks in a circle clockwise" [seconds=3] [key=value ...]
-           flame-mdm sample CKPT text="walks forward @3 | turns left | sits down @2.5" [after=walk.npz] [loop=true]
-           flame-mdm sample CKPT text="walks forward" targets=path.json
+           flame-mdm sample CKPT text="walks forward @3 | turns around | bows @2.5" [after=walk.npz] [loop=true]
+           flame-mdm sample CKPT text="walks forward" path="0,1 0.5,2" | targets=FILE.json
            flame-mdm sample CKPT prompts=FILE.txt [seconds=[2,3.5,...]] [mp4=true]
            flame-mdm sample CKPT action=walk
            flame-mdm sample CKPT unconditioned=true
 
     Writes motions (.npz), a GIF, and a player that opens in any browser. A file of prompts has one per line; each gets
-    its own folder.
+    its own folder, and one page shows all.
     """
 
     OBJECTS: ClassVar = ("ckpt", "out")
@@ -90,12 +101,13 @@ class SampleSettings(OutputSettings):
     seconds: float | Sequence[float] | None = same_option(SamplingRequest, "seconds")
     frames: int | Sequence[int] | None = same_option(SamplingRequest, "frames")
     after: str | None = same_option(SamplingRequest, "after")
+    split: bool = same_option(SamplingRequest, "split")
     loop: bool = same_option(SamplingRequest, "loop")
-    targets: str | None = same_option(SamplingRequest, "targets")
+    path: str | None = option(None, 'way points on the floor, x,z in meters, instead of targets: "0,1 0.5,2"')
     candidates: int = same_option(SamplingRequest, "candidates")
     scorer: str | None = option(None, "a motion-CLIP that chooses the candidate that fits the text best")
     shared_noise: bool = same_option(SamplingRequest, "shared_noise")
-    out: str | None = option(None, "folder; default samples/<experiment>/<run>-step<steps>-<hash>/<text>-seed<seed>")
+    out: str | None = option(None, "folder; default samples/<experiment>/<text>-<hash>")
 
     def texts(self) -> list[str] | None:
         """Returns the text or the lines of the file of prompts; None if there are none."""
@@ -103,13 +115,26 @@ class SampleSettings(OutputSettings):
             raise UserError(f"text={self.text}: a file. To sample the prompts in it, give prompts={self.text}")
         return super().texts() if self.prompts is None else read_prompts(self.prompts)
 
+    def request(self, editing: bool = False) -> SamplingRequest:
+        """See `OutputSettings`; a path becomes targets."""
+        request = super().request(editing)
+        if self.path is None:
+            return request
+        if excess := [name for name in ("targets", "prompts", "frames") if getattr(self, name) is not None]:
+            raise UserError(f"path={self.path}: {excess[0]} cannot be given with a path. Give text and seconds")
+        way, usual = read_path(self.path), request.lengths(1.0)[0] or 3.0
+        return replace(request, targets=path_targets(way, sum(seconds or usual for _, seconds in request.parts[0])))
 
+
+GALLERY = 200
+"""Maximum number of motions on the page of a file of prompts, which has about 20 kB for each."""
 LENGTHS = ("seconds", "frames")
 """Keys that take one value, or one per prompt."""
 IN_NAME = (
     *LENGTHS,
     *(entry.name for entry in fields(SamplerOptions)),
-    *("shared_noise", "cleanup", "loop", "after", "targets", "scorer", "candidates"),
+    *("shared_noise", "cleanup", "loop", "after", "targets", "path", "scorer", "candidates"),
+    *("adapter", "adapter_strength"),
 )
 """Keys that change the motions: the name of the folder contains those that differ from their defaults."""
 
@@ -125,8 +150,6 @@ def sample(settings: SampleSettings) -> None:
     if settings.scorer is not None and (request.kind != "text" or settings.candidates == 1):
         raise UserError(f"scorer={settings.scorer} chooses among motions for a text: give text=... and candidates=8")
     check_motion("after", settings.after)
-    if settings.targets is not None and not Path(settings.targets).exists():
-        raise FileNotFoundError(f"{settings.targets}: no such file")
     file = settings.model_file()
     if settings.scorer is not None:
         try:
@@ -139,10 +162,16 @@ def sample(settings: SampleSettings) -> None:
     from flame_mdm.checkpoints.loading import load
     from flame_mdm.safe_io import sha256
     from flame_mdm.sampling.generation import sample_request, write_motions
+    from flame_mdm.sampling.request import understood
     from flame_mdm.visualize.bodies import load_body
 
     body = load_body(settings.body)
-    model = load(file, settings.device or ("cuda" if torch.cuda.is_available() else "cpu"))
+    device = settings.device or ("cuda" if torch.cuda.is_available() else "cpu")
+    model = load(file, device, **settings.adapters())
+    typed, request = request.prompts, understood(request, model)
+    for text in request.prompts:
+        if text not in typed:
+            say(f"sampled as a sequence: {text}. Add split=false to sample it as one action")
     check_condition(settings, request, model)
     score = None
     if settings.scorer is not None:
@@ -155,19 +184,26 @@ def sample(settings: SampleSettings) -> None:
     stages = [] if settings.trajectory else None
     motions = sample_request(model, request, score=score, stages=stages)
     digest = sha256(file)
-    for folder, made in _folders(settings, model, digest, motions).items():
+    folders = _folders(settings, model, digest, motions)
+    for folder, made in folders.items():
         facts = {"seed": settings.seed, "checkpoint": digest}
         write_motions(folder, made, facts, stages if made[0] is motions[0] else None, settings.mp4, body)
-        say(summary(folder, made, settings.mp4))
-        if settings.targets is not None:
-            say(_distance(settings.targets, model, made))
+        if settings.prompts is None:
+            say(summary(folder, made, settings))
+        if request.targets is not None:
+            say(_distance(request.targets, model, made))
+    if settings.loop and settings.seconds is settings.frames is None:
+        seconds = len(motions[0].joints) / motions[0].fps
+        say(f"a loop has {seconds:g} seconds by default, so that one window covers it. For 3 seconds, add seconds=3")
+    if settings.prompts is not None:
+        say(_gallery(settings, folders, body))
 
 
 main = partial(run, sample, SampleSettings)
 
 
 def _folders(
-    settings: SampleSettings, model: MotionGeneration, digest: str, motions: Sequence[Motion]
+    settings: SampleSettings, model: MotionGenerator, digest: str, motions: Sequence[Motion]
 ) -> dict[Path, list[Motion]]:
     """Returns the folders to write, with the motions of each; a prompt that is listed twice has one folder."""
     changed = settings.changed(IN_NAME)
@@ -182,7 +218,7 @@ def _folders(
     return folders
 
 
-def _distance(targets: str, model: MotionGeneration, motions: Sequence[Motion]) -> str:
+def _distance(targets: Any, model: MotionGenerator, motions: Sequence[Motion]) -> str:
     """Returns a line that tells how far motions are from their targets."""
     import numpy as np
 
@@ -192,11 +228,23 @@ def _distance(targets: str, model: MotionGeneration, motions: Sequence[Motion]) 
     return f"distance from the targets: mean {np.mean(distances):.1f} cm, max {np.max(distances):.1f} cm"
 
 
-def summary(folder: Path, motions: Sequence[Motion], mp4: bool = False) -> str:
-    """Returns the line that tells what was written to a folder."""
+def summary(folder: Path, motions: Sequence[Motion], settings: OutputSettings) -> str:
+    """Opens the player if requested, and returns the line that tells what was written to a folder."""
     count = "1 motion" if len(motions) == 1 else f"{len(motions)} motions"
-    files = ["player.html", "motions.gif", *["motions.mp4"] * mp4]
-    return f"{count} of {len(motions[0].joints)} frames: {', '.join(str(folder / file) for file in files)}"
+    settings.show(folder / "player.html")
+    files = [str(folder / "player.html"), "motions.gif", *["motions.mp4"] * settings.mp4]
+    return f"{count} of {len(motions[0].joints)} frames: {', '.join(files)}"
+
+
+def _gallery(settings: SampleSettings, folders: Mapping[Path, list[Motion]], body: Mesh) -> str:
+    """Writes one page with the first motion of each prompt next to their folders, and returns a line about it."""
+    from flame_mdm.visualize import write_player
+
+    page = next(iter(folders)).with_name(f"{Path(str(settings.prompts)).stem}.html")
+    first = [replace(made[0], id=folder.name) for folder, made in folders.items()][:GALLERY]
+    write_player(page, first, f"{len(folders)} prompts", body=body)
+    settings.show(page)
+    return f"{sum(map(len, folders.values()))} motions for {len(folders)} prompts, a folder for each: {page}"
 
 
 def read_prompts(path: str, key: str = "prompts") -> list[str]:
@@ -222,32 +270,26 @@ def read_prompts(path: str, key: str = "prompts") -> list[str]:
     return prompts
 
 
-def default_folder(model: MotionGeneration, digest: str, what: str, seed: int, options: Mapping[str, Any]) -> Path:
-    """Returns `samples/<experiment>/<run>-step<steps>-<hash>/<what>-seed<seed>`, followed by all options not None.
+def default_folder(model: MotionGenerator, digest: str, what: str, seed: int, options: Mapping[str, Any]) -> Path:
+    """Returns `samples/<experiment>/<what>[-seed<seed>][-<option>=<value> ...]-<hash>`; omits options that are None.
 
-    Requests for different motions, and checkpoints with another `digest` (SHA-256), thus go to different folders, also
-    where the file system ignores case. A text that differs from its readable file name, even in case, is followed by
-    its hash. The names of experiment and run come from the checkpoint, which may be untrusted; they are cleaned, so the
-    folder is always within `samples`.
+    The hash is that of the checkpoint (`digest`, SHA-256) and of the request. Requests for different motions thus go to
+    different folders, also where the file system ignores case. The name of the experiment comes from the checkpoint,
+    which may be untrusted; it is cleaned, so the folder is always within `samples`.
     """
-    run = model.config.get("run")
-    name = run.get("name") if isinstance(run, dict) else None
-    parts = [_clean(str(name or "model")), f"step{model.steps}" if model.steps is not None else "", digest[:6]]
+    values = {key: str(value) for key, value in sorted(options.items()) if value is not None}
+    request = repr((digest, model.config.get("run"), what, seed, values))
+    chosen = re.sub(r"[^\w=.,-]+", "", "".join(f"-{key}={value}" for key, value in values.items()))[:60]
+    name = f"{_clean(what.lower())[:40].strip('-')}{f'-seed{seed}' * (seed != 0)}{chosen}"
     experiment = re.findall(r"[\w-][\w.-]*", str(model.config["experiment"]))
-    short = _clean(what.lower())[:60]
-    # File systems also fold other letters, such as the long s.
-    if short.replace("-", " ") != what or not what.isascii():
-        short = f"{short}-{hashlib.sha256(what.encode()).hexdigest()[:6]}".strip("-")
-    values = {key: re.sub(r"[^\w.,-]+", "", str(value)) for key, value in options.items() if value is not None}
-    suffix = "".join(f"-{key}={value}" for key, value in values.items())[:150]
-    return Path("samples", *experiment, "-".join(filter(None, parts)), f"{short}-seed{seed}{suffix}")
+    return Path("samples", *experiment, f"{name}-{hashlib.sha256(request.encode()).hexdigest()[:6]}")
 
 
 def _clean(name: str) -> str:
     return re.sub(r"[^\w]+", "-", name).strip("-")
 
 
-def check_condition(settings: OutputSettings, request: SamplingRequest, model: MotionGeneration) -> None:
+def check_condition(settings: OutputSettings, request: SamplingRequest, model: MotionGenerator) -> None:
     """Warns of words that the model has never seen.
 
     Raises:

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from contextlib import nullcontext
 from functools import partial
-from pathlib import Path
 
-from flame_mdm.config import Config, flatten, movable, read_saved
 from flame_mdm.config.sweeps import run_recipe
-from flame_mdm.errors import UserError
+from flame_mdm.training.start import train
 
 USAGE = """
 usage: flame-mdm train NAME [key=value ...] [--multirun]
@@ -18,63 +15,4 @@ key=value overrides one key (trainer.max_steps=1000); part=name replaces a compo
 Running the same command again resumes the run; run.name=other starts another run.
 """
 
-FREE = (
-    "data.num_workers",
-    "data.resident",
-    "data.root",
-    "data.source.path",
-    "data.source.workers",
-    "data_root",
-    "callbacks",
-    "logger",
-    "trainer.max_steps",
-    "trainer.max_time",
-    "trainer.devices",
-    "trainer.num_nodes",
-    "trainer.accelerator",
-    "trainer.strategy",
-    "trainer.log_every_n_steps",
-    "trainer.val_check_interval",
-    "trainer.limit_val_batches",
-    "trainer.enable_progress_bar",
-)
-"""Keys that may differ when a run is resumed."""
-
-
-def train(config: Config) -> None:
-    """Trains the composed experiment, or resumes the run in its directory.
-
-    Raises:
-        UserError: If the directory holds a run with another configuration, or the data or the recipe is unusable.
-        SystemExit: If interrupted, after a checkpoint is written. The exit code is 128 + the number of the signal.
-    """
-    folder = Path(config["run"]["dir"])
-    _same_run(folder, config)
-
-    from lightning.pytorch.utilities import rank_zero_only
-
-    from flame_mdm.training.fit import fit
-    from flame_mdm.training.guards import only_run
-
-    with only_run(folder) if rank_zero_only.rank == 0 else nullcontext():
-        fit(folder, config)
-
-
 main = partial(run_recipe, train, USAGE)
-
-
-def _same_run(folder: Path, config: Config) -> None:
-    """Raises `UserError` if the folder holds a run with another configuration."""
-    if not (folder / "config.yaml").exists():
-        return
-    saved, requested = flatten(movable(read_saved(folder / "config.yaml"))), flatten(movable(config))
-    differing = [
-        f"{key} ({saved.get(key, 'absent')} there, {requested.get(key, 'absent')} here)"
-        for key in sorted(saved.keys() | requested.keys())
-        if saved.get(key) != requested.get(key) and not key.startswith(FREE)
-    ]
-    if differing:
-        raise UserError(
-            f"{folder} holds a run with another configuration: {'; '.join(differing)}. Choose another name with "
-            "run.name=..., or delete that folder"
-        )

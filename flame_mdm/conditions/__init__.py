@@ -1,7 +1,7 @@
 """Condition encoders: text, action labels, or unconditional."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -20,6 +20,8 @@ class ConditionEncoder(nn.Module, ABC):
     """What it encodes."""
     max_words: int | None = None
     """Maximum number of words per caption, where the encoder counts words."""
+    seen: Collection[str] | None = None
+    """Words of the training captions, once they are known."""
 
     @abstractmethod
     def forward(self, batch: MotionBatch) -> Condition:
@@ -28,6 +30,9 @@ class ConditionEncoder(nn.Module, ABC):
         Raises:
             ValueError: the batch lacks the captions or labels that the encoder reads.
         """
+
+    def pretrain(self, groups: Sequence[Sequence[str]], seed: int) -> None:
+        """Trains the encoder on captions alone, if it can, before the first step; `groups` are captions of a clip."""
 
     def precompute(self, captions: Sequence[str], folder: Path) -> None:
         """Fills the encoder's cache on disk, if it has one, for these captions. Called in one process only."""
@@ -54,7 +59,7 @@ class Unconditional(ConditionEncoder):
     features = 0
 
     def forward(self, batch: MotionBatch) -> Condition:
-        return self._nothing(batch, len(batch), null=self._nothing(batch, 1))
+        return self._nothing(batch, batch.x.shape[0], null=self._nothing(batch, 1))
 
     @staticmethod
     def _nothing(batch: MotionBatch, size: int, null: Condition | None = None) -> Condition:

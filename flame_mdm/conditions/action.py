@@ -33,5 +33,5 @@ class ActionLabels(ConditionEncoder):
 
     @staticmethod
     def _condition(pooled: torch.Tensor, null: Condition | None = None) -> Condition:
-        token_mask = torch.ones(len(pooled), 1, dtype=torch.bool, device=pooled.device)
+        token_mask = torch.ones(pooled.shape[0], 1, dtype=torch.bool, device=pooled.device)
         return Condition(pooled, pooled[:, None], token_mask, null)

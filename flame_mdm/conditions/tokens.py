@@ -1,5 +1,8 @@
 """Small text encoder that is trained with the model and needs no download."""
 
+from collections.abc import Sequence
+
+import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
@@ -7,6 +10,10 @@ from torch.nn import functional
 from flame_mdm.batch import Condition, MotionBatch, length_mask, sent
 from flame_mdm.conditions import ConditionEncoder, vocabulary
 from flame_mdm.errors import UserError
+from flame_mdm.progress import ProgressBar
+from flame_mdm.seeds import key, seed_generator
+
+PAIRS, TEMPERATURE = 64, 0.1  # of the contrastive loss
 
 START = "<start>"
 """Inserted before every caption, so that the empty caption also has a token; no caption contains this word."""
@@ -16,7 +23,8 @@ class LearnedTokens(ConditionEncoder):
     """Hashed words, learned positions and one transformer layer; the null is one learned vector.
 
     A word is the sum of two rows of the table, selected by its hash, see `vocabulary.hashed`. Captions are lowercased,
-    punctuation separates words, and words after `max_words` are dropped.
+    punctuation separates words, and words after `max_words` are dropped. Words that the training captions do not
+    contain are replaced by a form that they do contain (walked, walks), or dropped: their vectors are random.
 
     Each distinct caption of a batch is encoded once, so that samples with the same caption share its dropout. Linear
     layers skip the padding.
@@ -26,7 +34,13 @@ class LearnedTokens(ConditionEncoder):
     """
 
     def __init__(
-        self, features: int = 256, buckets: int = 4096, max_words: int = 32, heads: int = 4, dropout: float = 0.1
+        self,
+        features: int = 256,
+        buckets: int = 4096,
+        max_words: int = 32,
+        heads: int = 4,
+        dropout: float = 0.1,
+        pretrain_steps: int = 0,
     ):
         """Builds the encoder.
 
@@ -36,22 +50,49 @@ class LearnedTokens(ConditionEncoder):
             max_words: maximum number of words per caption.
             heads: attention heads; divides `features`.
             dropout: dropout rate of the transformer layer.
+            pretrain_steps: number of steps of `pretrain`.
         """
         super().__init__()
         self.features, self.buckets, self.max_words = features, buckets, max_words
+        self.pretrain_steps = pretrain_steps
         self.words = nn.Embedding(buckets, features)
-        self.positions = nn.Parameter(0.02 * torch.randn(max_words + 1, features))
+        self.positions = nn.Parameter(nn.init.normal_(torch.empty(max_words + 1, features), std=0.02))
         self.layer = nn.TransformerEncoderLayer(
             features, heads, 2 * features, dropout, "gelu", batch_first=True, norm_first=True
         )
         self.norm = nn.LayerNorm(features)
-        self.null = nn.Parameter(0.02 * torch.randn(features))
+        self.null = nn.Parameter(nn.init.normal_(torch.empty(features), std=0.02))
         self._rows: dict[str, Tensor] = {}  # rows (T, 2) of the captions met so far
 
     def rows(self, caption: str) -> list[tuple[int, int]]:
         """Returns the two rows of the table for the start token and each word of a caption."""
-        words = [START, *vocabulary.words(caption)[: self.max_words]]
-        return [vocabulary.hashed(word, self.buckets) for word in words]
+        words = vocabulary.words(caption)
+        if self.seen:
+            words = [form for word in words if (form := vocabulary.known_form(word, self.seen))]
+        return [vocabulary.hashed(word, self.buckets) for word in [START, *words[: self.max_words]]]
+
+    def pretrain(self, groups: Sequence[Sequence[str]], seed: int) -> None:
+        """Draws pooled vectors of captions of the same clip together, and those of other clips apart.
+
+        Each step compares two captions each of `PAIRS` clips (Gao et al. 2021, "SimCSE", equation 1). The loss of the
+        motions alone teaches a small model many words slowly. Clips with a single caption are not used.
+        """
+        groups, device = [captions for captions in groups if len(set(captions)) > 1], self.null.device
+        optimizer = torch.optim.AdamW(self.parameters(), lr=1e-3)
+        seed_generator(key("pretrain", seed), device)
+        steps = self.pretrain_steps if len(groups) > 1 else 0
+        for step in ProgressBar(range(steps), desc="training the text encoder on captions", disable=not steps or None):
+            draw = np.random.default_rng((seed, step))
+            clips = draw.choice(len(groups), min(PAIRS, len(groups)), replace=False)
+            pairs = [draw.choice(sorted(set(groups[clip])), 2, replace=False).tolist() for clip in clips]
+            texts = [text for side in zip(*pairs, strict=True) for text in side]
+            x = torch.zeros(len(texts), 1, 1, device=device)
+            pooled = self(MotionBatch(x=x, mask=x[..., 0] == 0, ids=texts, text=texts)).pooled
+            first, second = functional.normalize(pooled, dim=-1).chunk(2)
+            loss = functional.cross_entropy(first @ second.T / TEMPERATURE, torch.arange(len(first), device=device))
+            optimizer.zero_grad()
+            loss.backward()
+            optimizer.step()
 
     def forward(self, batch: MotionBatch) -> Condition:
         if batch.text is None:
@@ -71,6 +112,18 @@ class LearnedTokens(ConditionEncoder):
         of_sample = sent(torch.tensor([numbers[caption] for caption in batch.text]), device)
         return Condition(pooled[of_sample], tokens[of_sample], token_mask[of_sample], self._null())
 
+    def encode(self, words: Tensor, counts: Tensor) -> Condition:
+        """Encodes captions as `forward` does, without the branches that a graph cannot have.
+
+        Args:
+            words: (B, S, 2) int64, the `rows` of each caption; any number past its end.
+            counts: (B,) int64, length of each caption.
+        """
+        token_mask = length_mask(counts, words.shape[1])
+        index = torch.arange(token_mask.numel(), device=words.device)
+        tokens = self._encode(words.flatten(0, 1), index, token_mask) * token_mask[..., None]
+        return Condition(tokens.sum(1) / counts[:, None], tokens, token_mask, self._null())
+
     def _encode(self, rows: Tensor, index: Tensor, token_mask: Tensor) -> Tensor:
         """Encodes captions; padding takes part only in attention.
 
@@ -88,7 +141,8 @@ class LearnedTokens(ConditionEncoder):
             return padded.index_copy(0, index, y).unflatten(0, token_mask.shape)
 
         layer, attention = self.layer, self.layer.self_attn
-        x = self.words(rows).sum(1) + functional.embedding(index % token_mask.shape[1], self.positions)
+        positions = torch.arange(token_mask.shape[1], device=index.device).repeat(token_mask.shape[0])[index]
+        x = self.words(rows).sum(1) + functional.embedding(positions, self.positions)
         qkv = pad(functional.linear(layer.norm1(x), attention.in_proj_weight, attention.in_proj_bias))
         query, key, value = qkv.unflatten(2, (3, attention.num_heads, -1)).permute(2, 0, 3, 1, 4)
         dropout = attention.dropout if self.training else 0.0

@@ -1,15 +1,31 @@
-"""Vocabulary of the training captions: words that a model has never seen, and captions near a text."""
+"""Vocabulary of the training captions: unknown words of a text, what it may mean, and sentences of several actions."""
 
 from __future__ import annotations
 
+import difflib
 import re
 import zlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from functools import cache
 from typing import Any
+
+from flame_mdm.errors import UserError, shortened
 
 WORD = re.compile(r"[^\W_]+")
 MAX_CAPTIONS = 1000
 """Maximum number of training captions that a checkpoint keeps."""
+FUNCTION_WORDS = frozenset(
+    WORD.findall(
+        "a an the this that some one and or then of to in on at by with from for as is are was were be been it its s t "
+        "he she they you i we his her their your my him them who while person people human figure man woman men women "
+        "boy girl guy lady someone somebody will"
+    )
+)
+"""Words that do not tell what happens; a text of these alone says nothing, and none of them is worth a warning."""
+SUFFIXES = ("ing", "ed", "es", "s", "d", "")
+BREAK = re.compile(r"[.!?;]+\s+|[.,;]?\s+(?:and\s+)?(?:then|afterwards|after that)\b,?\s*|\s*\n\s*", re.IGNORECASE)
+BEGINNING = re.compile(r"^(?:(?:and|then|first|next|finally|afterwards|after that)\b[\s,]*)+", re.IGNORECASE)
+SUBJECT = r"(?:(?:he|she|they|you|it|(?:a|the|this) \w+|someone|somebody)\s+)?(?:(?:is|are|will)\s+)?"
 
 
 def words(text: str) -> list[str]:
@@ -46,6 +62,16 @@ def vocabulary(captions: Iterable[str], *, share: bool) -> dict[str, list[str]]:
     return kept
 
 
+def known_form(word: str, seen: Collection[str]) -> str | None:
+    """Returns the word, or the same word with another ending (walked, walks), if it is known; otherwise None."""
+    if word in seen:
+        return word
+    stems = [word.removesuffix(suffix) for suffix in SUFFIXES if word.endswith(suffix)]
+    stems += [stem[:-1] for stem in stems if len(stem) > 3 and stem[-1] in f"e{stem[-2]}"]  # waving, hopping
+    forms = (stem + ending for stem in stems if len(stem) > 2 for ending in ("", "e", "s", "es", "ing", "ed"))
+    return next((form for form in forms if form in seen), None)
+
+
 def advice(text: str, facts: Mapping[str, Any], max_words: int | None = None) -> list[str]:
     """Returns lines about words that a model has never seen in training or does not read.
 
@@ -55,22 +81,103 @@ def advice(text: str, facts: Mapping[str, Any], max_words: int | None = None) ->
         max_words: maximum number of words that the text encoder reads; None = no such limit.
     """
     lines, prompt = [], words(text)
-    seen = set(facts.get("vocabulary", prompt))
-    if unseen := [word for word in dict.fromkeys(prompt) if word not in seen]:
-        line = f"never seen in training: {', '.join(unseen)}. The model guesses from the other words"
-        near = ", ".join(f"'{caption}'" for caption in nearest(text, facts.get("captions", ())))
-        lines.append(line + f". The nearest training captions: {near}" * bool(near))
+    if unknown := _unknown(text, facts):
+        lines.append(f"never seen in training: {', '.join(unknown)}.{_suggested(text, facts)}")
     if max_words is not None and len(prompt) > max_words:
         lines.append(f"only the first {max_words} words are read, not '{' '.join(prompt[max_words:])}'")
     return lines
 
 
+def check_known(text: str, facts: Mapping[str, Any]) -> None:
+    """Checks that a model knows a word of a text that says what happens.
+
+    Raises:
+        UserError: If it knows none.
+    """
+    if facts.get("vocabulary") and _unknown(text, facts) == _content(text):
+        raise UserError(
+            f"'{shortened(text, 60)}': the model knows no word of it that says what happens."
+            + (_suggested(text, facts) or " Use words of its training captions")
+        )
+
+
+def _content(text: str) -> list[str]:
+    """Returns the words of a text without function words, each once."""
+    return [word for word in dict.fromkeys(words(text)) if word not in FUNCTION_WORDS]
+
+
+def _unknown(text: str, facts: Mapping[str, Any]) -> list[str]:
+    """Returns the content words of a text of which the model knows no form."""
+    seen = facts.get("vocabulary")
+    return [] if seen is None else [word for word in _content(text) if known_form(word, seen) is None]
+
+
+def _suggested(text: str, facts: Mapping[str, Any]) -> str:
+    """Returns " Did you mean '...'?": the text with similar known words, or the nearest training caption, if any."""
+    fixed = text.lower()
+    for word in (unknown := _unknown(text, facts)):
+        similar = [other for other in facts["vocabulary"] if other[0] == word[0]]
+        if not (near := difflib.get_close_matches(word, similar, 1, 0.75)):
+            break
+        fixed = re.sub(rf"\b{word}\b", near[0], fixed)
+    else:
+        if unknown:
+            return f" Did you mean '{fixed}'?"
+    captions = facts.get("captions", ())
+    near = nearest(text, captions, 1) or plainest(captions)[:1]
+    return f" Did you mean '{near[0]}'?" if near else ""
+
+
+def in_parts(text: str, verbs: Collection[str]) -> list[str]:
+    """Splits a sentence with several actions: "walks, turns left and waves. Then she sits" has four parts.
+
+    It is split at ends of sentences and at "then"; if verbs are known, also at commas followed by a verb, and in such
+    an enumeration at "and" followed by one. "Raises both hands and waves" is one action. Parts without a verb belong to
+    their neighbor. "In limp style" at the end, which adapters teach, belongs to each part.
+
+    Args:
+        text: the sentence.
+        verbs: all forms of the verbs that the model knows; none = unknown.
+    """
+    comma, also = _before_verb(tuple(verbs))
+    parts: list[str] = []
+    for sentence in BREAK.split(text):
+        clauses = comma.split(sentence)
+        if len(clauses) > 1:
+            clauses = [part for clause in clauses for part in also.split(clause)]
+        parts += [part for clause in clauses if WORD.search(part := BEGINNING.sub("", clause).strip(" .,;!?"))]
+    merged: list[str] = []
+    for part in parts:
+        if merged and verbs and not (set(words(part)) & set(verbs) and set(words(merged[-1])) & set(verbs)):
+            merged[-1] += f", {part}"
+        else:
+            merged.append(part)
+    if len(merged) < 2:
+        return [text]
+    (style,) = re.findall(r" in \w+ style$", merged[-1]) or [""]
+    return [part.removesuffix(style) + style for part in merged]
+
+
+@cache
+def _before_verb(verbs: tuple[str, ...]) -> tuple[re.Pattern[str], re.Pattern[str]]:
+    """Returns the patterns of a comma and of an "and" that a verb follows."""
+    finite = "|".join(re.escape(verb) for verb in sorted(verbs) if not verb.endswith("ing")) or "(?!)"
+    verb = rf"(?={SUBJECT}(?:\w+ly\s+)?(?:{finite})\b)"
+    return re.compile(rf",\s*(?:and\s+)?{verb}", re.IGNORECASE), re.compile(rf"\s+and\s+{verb}", re.IGNORECASE)
+
+
+def plainest(captions: Iterable[str]) -> list[str]:
+    """Returns captions, those about "a person" first, and the shortest of them first."""
+    return sorted(captions, key=lambda caption: (not caption.startswith("a person "), len(caption), caption))
+
+
 def nearest(text: str, captions: Sequence[str], count: int = 3) -> list[str]:
     """Returns the captions that share the largest part of their words with a text, best first; none if none does."""
     prompt = set(words(text))
+    content = prompt - FUNCTION_WORDS or prompt
 
     def similarity(caption: str) -> float:
         others = set(words(caption))
-        return len(prompt & others) / (len(prompt | others) or 1)
+        return len(content & others) and len(content & others) + len(prompt & others) / len(prompt | others)
 
     return sorted((c for c in captions if similarity(c)), key=similarity, reverse=True)[:count]

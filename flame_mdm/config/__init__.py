@@ -8,4 +8,4 @@ from flame_mdm.config.command_line import run
 from flame_mdm.config.composition import EXPERIMENTS, compose, compose_data, groups, recipes
 from flame_mdm.config.entry import guarded
 from flame_mdm.config.signatures import Config, check, parameters
-from flame_mdm.config.trust import trust
+from flame_mdm.config.trust import foreign, trust

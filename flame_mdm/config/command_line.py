@@ -21,7 +21,7 @@ Settings = TypeVar("Settings")
 """Dataclass of a command: its docstring is the usage, its fields made by `option` are the keys.
 
 `OBJECTS` names the keys of the leading words that have no key. The last one takes all remaining words if it is a list.
-A field `composed` receives the words for Hydra, such as `data.source.path=...` and `representation=...`.
+A field `composed` receives the words for Hydra: keys with a dot, such as `data.source.path`, and those in `COMPOSED`.
 """
 
 
@@ -72,7 +72,9 @@ def read_settings(kind: type[Settings], words: Sequence[str]) -> Settings:
             raise UserError(f"unexpected word '{word}'. Write key=value, and quote text: key='a b'")
         if key in annotations:
             values[key] = _value(key, text, annotations[key])
-        elif "composed" in {entry.name for entry in fields(kind)} and "." in key:  # type: ignore[arg-type]
+        elif "composed" in {entry.name for entry in fields(kind)} and (  # type: ignore[arg-type]
+            "." in key or key in getattr(kind, "COMPOSED", ())
+        ):
             composed.append(word)
         else:
             raise UserError(f"unknown config key '{key}'.{did_you_mean(key, annotations)}")

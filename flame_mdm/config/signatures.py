@@ -13,6 +13,7 @@ import math
 import re
 import sys
 from collections.abc import Iterator, Mapping, Sequence
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -177,7 +178,10 @@ def signature(target: str, where: str) -> dict[str, str]:
         methods = (child for child in ast.iter_child_nodes(owner[1]) if isinstance(child, ast.FunctionDef))
         node = next(((owner[0], method) for method in methods if method.name == name), None)
     if node is None:
-        raise UserError(f"{where}={target}: no such class or function")
+        package = module.partition(".")[0]
+        missing = package and find_spec(package) is None
+        hint = f". Python finds no {package}: set PYTHONPATH to the folder that contains it" if missing else ""
+        raise UserError(f"{where}={target}: no such class or function{hint}")
     return _arguments(*node)
 
 

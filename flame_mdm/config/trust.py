@@ -12,7 +12,7 @@ from flame_mdm.errors import UserError
 from flame_mdm.safe_io import read_yaml
 
 MODULES = {
-    "task": ("flame_mdm.task",),
+    "task": ("flame_mdm.task", "flame_mdm.training.distillation"),
     "denoiser": ("flame_mdm.denoisers",),
     "process": ("flame_mdm.processes",),
     "condition": ("flame_mdm.conditions",),
@@ -33,17 +33,24 @@ def trust(config: Config) -> None:
         UserError: If it names anything else, or an argument is illegal.
     """
     added = [name for name in os.environ.get("FLAME_MDM_TRUST", "").split(",") if name]
-    for path, mapping in walk(config):
-        if "_target_" not in mapping:
-            continue
-        target, kind = mapping["_target_"], path[0] if path else ""
-        package = str(target).partition(".")[0]
-        if not (isinstance(target, str) and (package in added or _is_of_kind(target, kind))):
+    for where, target in foreign(config).items():
+        package = target.partition(".")[0]
+        if package not in added:
             raise UserError(
-                f"the checkpoint's configuration names {target} at {'.'.join(path)}. Its code is only run if "
+                f"the checkpoint's configuration names {target} at {where}. Its code is only run if "
                 f"you trust it: set FLAME_MDM_TRUST={package}"
             )
     check(config)
+
+
+def foreign(config: Config) -> dict[str, str]:
+    """Returns what parts of a configuration name besides the classes of their kind in this framework: place -> name."""
+    named = [(path, node["_target_"]) for path, node in walk(config) if "_target_" in node]
+    return {
+        ".".join(path): str(target)
+        for path, target in named
+        if not (isinstance(target, str) and _is_of_kind(target, path[0] if path else ""))
+    }
 
 
 def _is_of_kind(target: str, kind: str) -> bool:

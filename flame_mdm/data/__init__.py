@@ -62,6 +62,8 @@ class MotionSource(ABC):
     read them. They are saved in the store, and commands compare them with the recipe's."""
     actions: tuple[str, ...] = ()
     """Names of the action labels, in the order of their numbers; empty for sets without labels."""
+    verbs: tuple[str, ...] = ()
+    """All forms of the verbs in the captions, if they are known: sentences of several actions are split at them."""
     captions_may_be_shared: bool = False
     """Whether the license allows checkpoints to contain captions."""
     published_split: bool = False

@@ -1,4 +1,4 @@
-"""Reader of zip and tar archives of motion data without unpacking: regular files only, with size limits."""
+"""Reader of zip and tar archives of motion data: regular files only, with size limits."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import lzma
 import tarfile
 import zipfile
 from collections.abc import Callable, Iterator
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import IO, Any
 
 from flame_mdm.errors import UserError
@@ -42,6 +42,25 @@ def members(path: Path, read: Callable[[str], bool] = lambda name: False) -> Ite
                 return
             with unpack(file) if unpack else file as unpacked:
                 yield from _tar_members(path, _Bounded(unpacked, size), read)
+
+
+def unpack(path: Path, folder: Path, is_wanted: Callable[[str], bool]) -> Path:
+    """Unpacks members of an archive into a folder and returns the deepest folder that contains all of them.
+
+    Raises:
+        UserError: As for `members`, or if the name of a member leads out of the folder.
+    """
+    folder.mkdir(parents=True)
+    for name, content in members(path, is_wanted):
+        if is_wanted(name):
+            if ".." in PurePosixPath(name).parts or PurePosixPath(name).is_absolute():
+                raise UserError(f"{path}: {name[:80]} leads out of the archive")
+            with naming(path, OSError, ValueError, what="cannot be unpacked: "):
+                (folder / name).parent.mkdir(parents=True, exist_ok=True)
+                (folder / name).write_bytes(content)
+    while len(inside := list(folder.iterdir())) == 1 and inside[0].is_dir():
+        folder = inside[0]
+    return folder
 
 
 def _zip_members(file: IO[bytes], size: int, read: Callable[[str], bool]) -> Iterator[tuple[str, bytes]]:

@@ -275,9 +275,11 @@ class MotionDataModule(LightningDataModule):
         trainer = self.trainer
         first = trainer.global_step * trainer.accumulate_grad_batches if trainer else 0
         rank, world = (trainer.global_rank, trainer.world_size) if trainer else (0, 1)
-        lengths, size = self.train.lengths, self.batch_size
-        sampler = TrainingBatches(lengths, size, seed=self.seed, first=first, rank=rank, world=world)
-        return self._loader(self.train, sampler)
+        return self._loader(self.train, self.training_batches(seed=self.seed, first=first, rank=rank, world=world))
+
+    def training_batches(self, **of_process: int) -> Sampler[list[Draw]]:
+        """Returns the endless batches of a process; the arguments are those of `TrainingBatches`."""
+        return TrainingBatches(self.train.lengths, self.batch_size, **of_process)
 
     def val_dataloader(self) -> Loader:
         """Returns each validation clip once across all processes.

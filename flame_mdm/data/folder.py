@@ -20,9 +20,9 @@ import torch
 from flame_mdm.data import Clip, MotionSource, Split, hashed_split, name_hash, without
 from flame_mdm.data.parallel import in_order
 from flame_mdm.errors import UserError, printable
-from flame_mdm.formats import bvh
+from flame_mdm.formats import ENDINGS, TREES
 from flame_mdm.formats.body import check_feet, check_size, head_height, leg_length
-from flame_mdm.formats.layouts import array_layout, layout_name, map_bvh, read_skeleton, skeleton_file
+from flame_mdm.formats.layouts import array_layout, layout_name, map_bvh, read_skeleton, read_tree, skeleton_file
 from flame_mdm.formats.readers import read_arrays, smpl_motion
 from flame_mdm.formats.resampling import resample, resampled_frames
 from flame_mdm.representations import rotation
@@ -30,7 +30,6 @@ from flame_mdm.representations.skeleton import SMPL22
 from flame_mdm.representations.smpl import SMPL
 from flame_mdm.safe_io import read_json, read_text, regular_file
 
-MOTIONS = (".bvh", ".npz", ".npy", ".json")
 FORBIDDEN_CHARACTERS = re.compile("[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
 """Characters not allowed in the name of a motion: names are stored as text, one clip per line."""
 LOOK_FPS = 20.0
@@ -198,7 +197,7 @@ class Folder(MotionSource):
         """Path in the folder without extension -> file, sorted."""
         files: dict[str, Path] = {}
         for path in sorted(self.path.rglob("*")) if self.path.is_dir() else ():
-            if path.suffix.lower() in MOTIONS and path != self.path / TABLES[1]:
+            if path.suffix.lower() in ENDINGS and path != self.path / TABLES[1]:
                 name = path.relative_to(self.path).with_suffix("").as_posix()
                 if FORBIDDEN_CHARACTERS.search(name):
                     raise UserError(
@@ -210,7 +209,7 @@ class Folder(MotionSource):
                 files[name] = path
         if not files:
             what = "no motion in it" if self.path.is_dir() else "a file" if self.path.exists() else "no such folder"
-            raise FileNotFoundError(f"{self.path}: {what}; give a folder of {', '.join(MOTIONS)} files")
+            raise FileNotFoundError(f"{self.path}: {what}; give a folder of {', '.join(ENDINGS)} files")
         return without(dict(sorted(files.items())), self.exclude, self.path)
 
     def changed(self, store: Path) -> list[str]:
@@ -297,8 +296,8 @@ def _read(kind: str, fps: float, task: Task, header: bool = False) -> tuple[np.n
     """
     path, where, layout_options = task
     try:
-        if path.suffix.lower() == ".bvh":
-            file = bvh.read_header(path) if header else bvh.read(path)
+        if path.suffix.lower() in TREES:
+            file = read_tree(path, layout_options.get("fps") if path.suffix.lower() == ".amc" else None, header)
             frames, rate = len(file.frames), file.fps
             if header:
                 resampled_frames(frames, rate, fps, len(file.joints))

@@ -1,33 +1,33 @@
 """The synthetic data set: procedural motions with captions and exact attributes; needs no download.
 
 `docs/synthetic.md` describes the grammar of the captions and the limits of the data set. To add an action, write its
-motion in `synthetic_motions.py`, a line in `ACTIONS`, and its captions in `synthetic.yaml`.
+motion in `synthetic_motions`, a line in `ACTIONS`, and its captions in `synthetic.yaml`.
 """
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Iterator, Mapping
-from functools import cache, partial
-from pathlib import Path
-from typing import Any, NamedTuple
+from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 
 from flame_mdm.data import Clip, MotionSource, hashed_split
-from flame_mdm.data import synthetic_motions as motions
+from flame_mdm.data.grammar import content, draw_captions
 from flame_mdm.data.parallel import in_order
-from flame_mdm.data.synthetic_motions import Attributes, Body
+from flame_mdm.data.synthetic_motions import gestures, locomotion, postures
+from flame_mdm.data.synthetic_motions.body import Attributes, Body
 from flame_mdm.errors import UserError
-from flame_mdm.safe_io import read_yaml
 
-TIMES = ("", "once", "twice", "three times")
-NUMBERS = ("", "one", "two", "three")
 WAYS = {"forward": 0.3, **dict.fromkeys(("backward", "left", "right", "clockwise", "counterclockwise"), 0.14)}
 MIN_EVENT_SECONDS = 0.8
 """Minimum duration of a repetition in seconds; it limits how many fit into a clip."""
 AT_ONCE = 32
 """Number of clips that a process makes at a time."""
+CAPTIONS = 8
+"""Captions per clip."""
+PARTIAL = 0.25
+"""Share of the training clips whose captions leave out some attributes; those of val and test state all of them."""
 
 
 class Action(NamedTuple):
@@ -40,6 +40,8 @@ class Action(NamedTuple):
         max_count: maximum number of repetitions; 0 = the action is not repeated.
         directions: directions, equally often, or with their probabilities.
         speeds: speeds of the direction forward, equally often.
+        amounts: how far the body turns, equally often.
+        seconds: minimum duration.
     """
 
     motion: Callable[[np.random.Generator, np.ndarray, Attributes], Body]
@@ -48,6 +50,8 @@ class Action(NamedTuple):
     max_count: int = 0
     directions: tuple[str, ...] | Mapping[str, float] = ()
     speeds: tuple[str, ...] = ()
+    amounts: tuple[str, ...] = ()
+    seconds: float = 0.0
 
     def draw(self, rng: np.random.Generator, name: str, max_seconds: float) -> Attributes:
         """Draws the attributes of a clip of at most `max_seconds`."""
@@ -64,39 +68,35 @@ class Action(NamedTuple):
             drawn["direction"] = self.directions[0] if one else str(rng.choice(self.directions))
         if self.speeds and drawn["direction"] == "forward":
             drawn["speed"] = str(rng.choice(self.speeds))
+        if self.amounts:
+            drawn["amount"] = str(rng.choice(self.amounts))
         return drawn
 
 
 ACTIONS = {
-    "walk": Action(motions.walk, 6, directions=WAYS, speeds=("slow", "normal", "fast")),
-    "run": Action(motions.run, directions=("forward",)),
-    "turn": Action(motions.turn, 2, directions=("left", "right")),
-    "jump": Action(motions.jump, 2, max_count=3),
-    "wave": Action(motions.wave, 2, ("left", "right", "both")),
-    "raise": Action(motions.raise_arms, 2, ("left", "right", "both")),
-    "kick": Action(motions.kick, 2, ("left", "right"), max_count=2),
-    "punch": Action(motions.punch, 2, ("left", "right"), max_count=3),
-    "squat": Action(motions.squat, max_count=2),
-    "bow": Action(motions.bow),
-    "stand": Action(motions.stand),
+    "walk": Action(locomotion.walk, 6, directions=WAYS, speeds=("slow", "normal", "fast")),
+    "run": Action(locomotion.run, directions=("forward",)),
+    "turn": Action(locomotion.turn, 3, directions=("left", "right"), amounts=("quarter", "half")),
+    "jump": Action(postures.jump, 2, max_count=3),
+    "wave": Action(gestures.wave, 2, ("left", "right", "both")),
+    "raise": Action(gestures.raise_arms, 2, ("left", "right", "both")),
+    "kick": Action(postures.kick, 2, ("left", "right"), max_count=2),
+    "punch": Action(gestures.punch, 2, ("left", "right"), max_count=3),
+    "squat": Action(postures.squat, max_count=2),
+    "bow": Action(postures.bow),
+    "stand": Action(gestures.stand),
+    "sit": Action(postures.sit),
+    "rise": Action(postures.rise),
+    "dance": Action(locomotion.dance),
+    "leap": Action(postures.leap),
+    "pick": Action(postures.pick, 2, ("left", "right")),
+    "throw": Action(gestures.throw, 2, ("left", "right")),
+    "crawl": Action(locomotion.crawl, directions=("forward",)),
+    "lie": Action(postures.lie, seconds=2.6),
+    "clap": Action(gestures.clap, 2, max_count=3),
+    "salute": Action(gestures.salute, 2, ("left", "right")),
+    "nod": Action(gestures.nod, 2, max_count=3),
 }
-
-
-@cache
-def _words() -> dict[str, Any]:
-    return read_yaml(Path(__file__).with_suffix(".yaml"))
-
-
-def captions(attributes: Attributes) -> list[str]:
-    """Returns four predicates that state exactly the attributes: "walks forward slowly", "kicks twice with ...", ..."""
-    side, count = attributes.get("side", attributes.get("direction")), int(attributes.get("count", 0))
-    named = [str(attributes.get(name, "")) for name in ("action", "side", "direction", "speed")]
-    kind = " ".join(word for word in named if word not in ("", "normal"))
-    endings = {"s": "s", "es": "es"} if count > 1 else {"s": "", "es": ""}
-    return [
-        phrase.format(side=side, times=TIMES[count], number=NUMBERS[count], **endings)
-        for phrase in _words()["captions"][re.sub("left|right", "{side}", kind)]
-    ]
 
 
 class Synthetic(MotionSource):
@@ -108,6 +108,7 @@ class Synthetic(MotionSource):
     name = "synthetic"
     captions_may_be_shared = True
     actions = tuple(ACTIONS)
+    verbs = tuple(sorted({form for forms in content()["verbs"].values() for form in forms}))
 
     def __init__(
         self, clips: int = 5000, seed: int = 0, min_seconds: float = 2.0, max_seconds: float = 3.0, workers: int = 0
@@ -140,23 +141,34 @@ class Synthetic(MotionSource):
         shares = np.array([action.share for action in ACTIONS.values()], float)
         action = str(rng.choice(list(ACTIONS), p=shares / shares.sum()))
         attributes = ACTIONS[action].draw(rng, action, self.max_seconds)
-        shortest = max(self.min_seconds, 0.35 + MIN_EVENT_SECONDS * int(attributes.get("count", 0)))
-        seconds = rng.uniform(shortest, self.max_seconds)
-        subjects = rng.permutation(["a person", "someone", "the person", "a human"])
-        texts = [f"{subject} {predicate}" for subject, predicate in zip(subjects, captions(attributes), strict=True)]
+        repeating = 0.35 + MIN_EVENT_SECONDS * int(attributes.get("count", 0))
+        shortest = max(self.min_seconds, repeating, ACTIONS[action].seconds)
+        seconds = rng.uniform(min(shortest, self.max_seconds), self.max_seconds)
         name = f"synthetic_{self.seed}_{index:06d}"
+        split = hashed_split(name, val=5, test=10)
+        words = np.random.default_rng((self.seed, index, 1))  # so that motions do not depend on the grammar
+        incomplete = split == "train" and words.random() < PARTIAL
+        texts, stated = draw_captions(words, attributes, CAPTIONS, incomplete)
         t = np.arange(round(seconds * fps) + 1) / fps
         return Clip(
             id=name,
             motion=ACTIONS[action].motion(rng, t, attributes).joints().astype(np.float32),
             captions=texts,
-            split=hashed_split(name, val=5, test=10),
+            split=split,
             source=name,
             action=self.actions.index(action),
-            attributes=attributes,
+            attributes=stated,
         )
 
 
 def prompts() -> list[tuple[str, Attributes]]:
     """Returns fixed prompts with their attributes, for dashboard samples and `evaluators.metrics.attributes`."""
-    return [(f"a person {captions(attributes)[0]}", dict(attributes)) for attributes in _words()["prompts"]]
+    return [(row["text"], {name: row[name] for name in row if name != "text"}) for row in content()["prompts"]]
+
+
+def example(attributes: Attributes, fps: float = 20.0) -> np.ndarray:
+    """Returns the joints (F, 22, 3) of a motion of three seconds with at least these attributes, such as a prompt's."""
+    action, name = ACTIONS[str(attributes["action"])], str(attributes["action"])
+    draws = (action.draw(np.random.default_rng(seed), name, 3.0) for seed in range(1000))
+    drawn = next(drawn for drawn in draws if attributes.items() <= drawn.items())
+    return action.motion(np.random.default_rng(0), np.arange(0, 3, 1 / fps), drawn).joints().astype(np.float32)

@@ -45,7 +45,7 @@ def serve(
     """Serves the page until the process is interrupted.
 
     Args:
-        sources: Names of models, as for `flame_mdm.load`; the first is selected at first.
+        sources: Names of models, as for `Studio`; the first is selected at first.
         host: Address to listen on; 127.0.0.1 is this computer alone, 0.0.0.0 all networks.
         port: Port to listen on; 0 = any free one.
         device: Device of the models; default: cuda if available.
@@ -117,7 +117,7 @@ def web_app(studio: Studio, device: str | None = None, hosts: Collection[str] = 
             return PlainTextResponse(first_line(error), 400)
         finally:
             waiting -= 1
-        name = f"{'-'.join(request.text.lower().split())[:60] or 'motion'}-{number}{extension}"
+        name = f"{'-'.join(request.text.lower().split())[:60] or 'motion'}-{int(number) + 1}{extension}"
         name = "".join(c for c in name if c.isascii() and (c.isalnum() or c in "-."))
         headers = {"Content-Disposition": f'attachment; filename="{name}"'}
         return Response(content, media_type="application/octet-stream", headers=headers)

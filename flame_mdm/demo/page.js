@@ -51,8 +51,9 @@ const editor = (() => {
     if (event.target.closest('#parts')) write('text', join(read()))
   })
   document.addEventListener('click', (event) => {
-    if (event.target.closest('#examples button')) {
-      write('text', event.target.textContent)
+    const example = event.target.closest('#examples button, #notes button')
+    if (example) {
+      write('text', example.textContent)
       setTimeout(() => document.querySelector('#go').click(), 50)  // after the field's value has been taken over
     }
     const row = event.target.closest('#parts .remove')?.parentElement, floor = event.target.closest('#floor svg')
@@ -98,7 +99,7 @@ const links = (() => {
       const value = link.get(key)
       if (value === null) return key === 'text' ? '' : values[k]
       if (NUMBERS.includes(key)) return Number.isFinite(+value) ? +value : values[k]
-      return key === 'cleanup' ? !/^(false|f|no|n|off|0)$/i.test(value) : value
+      return ['cleanup', 'split'].includes(key) ? !/^(false|f|no|n|off|0)$/i.test(value) : value
     })
     return [location.search.slice(1), ...shown]
   }
@@ -116,9 +117,7 @@ const links = (() => {
   }
 
   function vary(query, motion, seed) {
-    const link = new URLSearchParams(query), last = link.getAll('edit').at(-1)
-    const text = (last ? JSON.parse(last).text : link.get('text')) || ''
-    return withEdit(query, { motion, text, strength: STRENGTH, samples: SAMPLES, seed })
+    return withEdit(query, { motion, strength: STRENGTH, samples: SAMPLES, seed })
   }
   return { compose, read, change, vary }
 })()

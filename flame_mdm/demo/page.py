@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import re
+from base64 import b64encode
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import cache
 from html import escape
+from importlib.util import find_spec
 from threading import Event
 from types import SimpleNamespace
 from typing import Any
@@ -12,23 +16,32 @@ from urllib.parse import parse_qsl
 
 import gradio as gr
 
+from flame_mdm.data.synthetic import example, prompts
 from flame_mdm.demo.request import MAX_TEXT, DemoRequest, parse_query
 from flame_mdm.demo.studio import FORMATS, Studio
 from flame_mdm.errors import UserError, first_line, markdown_text, one_line
 from flame_mdm.formats.motion import Motion
 from flame_mdm.formats.retarget import presets
+from flame_mdm.generator import MotionGenerator
 from flame_mdm.processes.guidance import STEERING_STEPS
 from flame_mdm.visualize import player_page
+from flame_mdm.visualize.render import thumbnail
 
 QUEUE = 64
 """Maximum number of waiting requests; further ones are told to come back."""
 PARTS = ("left_arm", "right_arm", "left_leg", "right_leg", "upper_body", "lower_body")
 RIGGED = (".bvh", ".glb")
+OFF = {} if find_spec("av") else {".mp4": "<span>MP4 is off: it needs the package av (pip install av)</span>"}
+"""Formats that cannot be written here, and why."""
+PROGRAMS = {"Blender": "", "Unreal": "&amp;rig=unreal", "Unity": "&amp;rig=unity", "Mixamo": "&amp;rig=mixamo"}
+"""Programs with a button of their own: the .glb file in their skeleton. Other skeletons are under "More"."""
+EXAMPLES = 12
 EMPTY = '<div class="empty">Describe a motion, then press Generate</div>'
 EDITORS = """<div id="parts"><div class="head"><span>Action</span><span>Seconds</span></div>
 <div class="list"></div><button type="button" class="add">+ Add an action</button></div>
 <details id="floor"><summary>Path on the floor</summary><svg role="img" aria-label="Floor from above"></svg>
 <div><output></output><button type="button" class="clear">Clear</button></div></details>"""
+FOLD = "() => ({ __type__: 'update', open: innerWidth > 760 })"
 SHOW_LINK = "(query) => { history.replaceState(null, '', '?' + query); return location.href }"
 
 
@@ -44,7 +57,7 @@ def build_page(studio: Studio, device: str | None = None) -> gr.Blocks:
     def show(query: str, web: gr.Request, progress: gr.Progress = gr.Progress()) -> dict[Any, Any]:  # noqa: B008
         stop = stops[str(web.session_hash)] = Event()
         try:
-            request = parse_query(parse_qsl(query, max_num_fields=50))
+            request = studio.understood(parse_query(parse_qsl(query, max_num_fields=50)))
             model = studio.model(request.model)
             runs = 1 + len(request.edits) + STEERING_STEPS * bool(request.path)
             steps = request.num_inference_steps or model.sampler_options.num_inference_steps
@@ -55,7 +68,7 @@ def build_page(studio: Studio, device: str | None = None) -> gr.Blocks:
 
             return _result(ui, studio, device, request, studio.motions(request, report, stop))
         except UserError as error:
-            return {ui.notes: f'<p class="error" role="alert">{escape(one_line(first_line(error)))}</p>'}
+            return {ui.notes: _note("error", first_line(error))}
         finally:
             stops.pop(str(web.session_hash), None)
 
@@ -69,13 +82,17 @@ def build_page(studio: Studio, device: str | None = None) -> gr.Blocks:
 
     def switch(name: str) -> list[Any]:
         choices = list(studio.model(name).process.samplers)
-        return [_buttons(_examples(studio, name)), gr.Dropdown(choices=choices, value=None), _vocabulary(studio, name)]
+        return [
+            _buttons(_examples(studio.model(name))),
+            gr.Dropdown(choices=choices, value=None),
+            _vocabulary(studio.model(name)),
+        ]
 
     with gr.Blocks(title="flame_mdm", analytics_enabled=False) as blocks:
         ui = _layout(studio)
         form = {"model": ui.model, "text": ui.text, "seconds": ui.seconds, "seed": ui.seed, "samples": ui.samples}
         form |= {"guidance_scale": ui.guidance, "num_inference_steps": ui.steps, "sampler": ui.sampler}
-        form |= {"cleanup": ui.cleanup, "path": ui.path}
+        form |= {"cleanup": ui.cleanup, "split": ui.split, "path": ui.path}
         fields, edit = list(form.values()), [ui.query, ui.chosen, ui.new, ui.begin, ui.end, ui.parts, ui.again]
         quick: dict[str, Any] = {"queue": False, "show_progress": "hidden", "api_visibility": "private"}
         read, compose = (f"(...values) => links.{name}({list(form)}, values)" for name in ("read", "compose"))
@@ -90,7 +107,7 @@ def build_page(studio: Studio, device: str | None = None) -> gr.Blocks:
             ui.new.submit(None, edit, ui.request, js=change, **quick),
             ui.variations.click(None, [ui.query, ui.chosen, ui.again], ui.request, js=vary, **quick),
         ]
-        outputs = [ui.player, ui.notes, ui.query, ui.files, ui.command, ui.python, ui.chosen]
+        outputs = [ui.player, ui.notes, ui.query, ui.files, ui.command, ui.python, ui.chosen, ui.text]
         run: dict[str, Any] = {"show_progress_on": ui.player, "concurrency_limit": 1, "concurrency_id": "model"}
         running = [event.then(show, ui.request, outputs, api_visibility="private", **run) for event in first]
         for event in running:
@@ -99,6 +116,7 @@ def build_page(studio: Studio, device: str | None = None) -> gr.Blocks:
         ui.model.change(switch, ui.model, [ui.examples, ui.sampler, ui.words], **quick)
         for event in (ui.text.change, ui.seconds.change, ui.path.change):
             event(None, [ui.text, ui.seconds, ui.path], None, js=sketch, **quick)
+        blocks.load(None, None, ui.edit, js=FOLD, **quick)
         blocks.unload(leave)
     blocks.queue(max_size=QUEUE, default_concurrency_limit=1)
     return blocks
@@ -107,25 +125,28 @@ def build_page(studio: Studio, device: str | None = None) -> gr.Blocks:
 def _layout(studio: Studio) -> SimpleNamespace:
     """Returns the components of the page by name, after placing them in the current `gr.Blocks`."""
     names = list(studio.files)
-    samplers, captions = list(studio.model(names[0]).process.samplers), _examples(studio, names[0])
+    model = studio.model(names[0])
+    samplers, examples = list(model.process.samplers), _examples(model)
     ui = SimpleNamespace()
     gr.Markdown("# Ask for a motion", elem_id="title")
+    ui.examples = gr.HTML(_buttons(examples), elem_id="examples")
     with gr.Row(elem_id="stage"):
         with gr.Column(elem_id="ask"):
             label = "What the person does"
-            ui.text = gr.Textbox(captions[0], label=label, max_length=MAX_TEXT, lines=2, autofocus=True, elem_id="text")
+            ui.text = gr.Textbox(
+                next(iter(examples)), label=label, max_length=MAX_TEXT, lines=2, autofocus=True, elem_id="text"
+            )
             gr.HTML(EDITORS, js_on_load="editor()")
             label = "Way points: meters to the left, meters ahead"
             ui.path = gr.Textbox(label=label, placeholder="0,1 0.5,2", max_length=MAX_TEXT, elem_id="path")
             with gr.Row():
-                ui.go = gr.Button("Generate", variant="primary", elem_id="go")
-                ui.cancel = gr.Button("Cancel")
+                ui.go = gr.Button("Generate", variant="primary", min_width=90, elem_id="go")
+                ui.cancel = gr.Button("Cancel", min_width=90)
         with gr.Column(elem_id="show"):
             ui.notes = gr.HTML(elem_id="notes")
             ui.player = gr.HTML(EMPTY, elem_id="player")
             ui.files = gr.HTML(elem_id="files")
         with gr.Column(elem_id="options"):
-            ui.examples = gr.HTML(_buttons(captions), elem_id="examples")
             with gr.Row():
                 ui.seconds = gr.Number(3, label="Seconds", step=0.5, min_width=90)
                 ui.seed = gr.Number(0, label="Seed", precision=0, min_width=90)
@@ -138,9 +159,10 @@ def _layout(studio: Studio) -> SimpleNamespace:
                     ui.sampler = gr.Dropdown(samplers, value=None, label="Sampler", min_width=120)
                 label = "Clean up: smooth motion, feet that do not slide (not with a path)"
                 ui.cleanup = gr.Checkbox(True, label=label)
+                ui.split = gr.Checkbox(True, label="Split a sentence into its actions")
             with gr.Accordion("Words the model knows", open=False):
-                ui.words = gr.Markdown(_vocabulary(studio, names[0]))
-    with gr.Accordion("Keep a part of this motion, change the rest", elem_id="edit"):
+                ui.words = gr.Markdown(_vocabulary(model))
+    with gr.Accordion("Keep a part of this motion, change the rest", elem_id="edit") as ui.edit:
         gr.Markdown("Choose a time, body parts, or both. They change; everything else is kept.")
         ui.chosen = gr.Radio([("1", 0)], value=0, label="Motion to edit", visible=False)
         with gr.Row():
@@ -167,24 +189,28 @@ def _result(
 ) -> dict[Any, Any]:
     """Returns the values of the components that show the motions of a request."""
     kind = studio.model(request.model).conditioned_on
-    scene = list(motions)
+    names = [f"Motion {number + 1}" * (len(motions) > 1) for number in range(len(motions))]
+    scene = [replace(motion, id=name) for motion, name in zip(motions, names, strict=True)]
     if request.edits:  # next to the motion before the last edit
         *before, last = request.edits
         original = studio.motions(request.model_copy(update={"edits": tuple(before)}))[last.motion]
-        scene.insert(0, replace(original, text=f"before: {original.text}"))
+        scene.insert(0, replace(original, id="before", text=f"before: {original.text}"))
     query = escape(request.query())
     links = ""
     for number in range(len(motions)):
         address = f"?{query}&amp;motion={number}"
-        files = [(f"motion{extension}{address}", name) for extension, name in FORMATS.items()]
+        files = [(f"motion{extension}{address}", name) for extension, name in FORMATS.items() if extension not in OFF]
+        programs = [(f"motion.glb{address}{rig}", name) for name, rig in PROGRAMS.items()]
         rigs = [(f"motion{end}{address}&amp;rig={rig}", f"{rig} {end[1:]}") for rig in presets() for end in RIGGED]
-        links += f"<div>{f'Motion {number + 1}' * (len(motions) > 1)}{_links(files)}</div>"
-        links += f"<details><summary>for other skeletons</summary><div>{_links(rigs)}</div></details>"
-    text = request.edits[-1].text if request.edits else request.text
+        links += f"<div>{names[number]} For {_links(programs)}</div>"
+        links += f"<div>Files {_links(files)}{''.join(OFF.values())}</div>"
+        links += f"<details><summary>More</summary><div>{_links(rigs)}</div></details>"
+    text = (request.edits[-1].text if request.edits else "") or request.text
     player = escape(player_page(scene, text or "Motion"))
     return {
         ui.player: f'<iframe title="Player" sandbox="allow-scripts allow-downloads" srcdoc="{player}"></iframe>',
-        ui.notes: "".join(f'<p class="warning">{escape(line)}</p>' for line in studio.advice(request)),
+        ui.text: request.text,
+        ui.notes: "".join(_note("warning", line) for line in studio.advice(request)),
         ui.query: request.query(),
         ui.files: links,
         ui.command: request.command(kind, device),
@@ -193,22 +219,39 @@ def _result(
     }
 
 
+def _note(kind: str, line: str) -> str:
+    """Returns a message; a suggested text is a button that replaces the text of the form."""
+    shown = re.sub(r"Did you mean &#x27;(.+?)&#x27;\?$", r'<button type="button">\1</button>', escape(one_line(line)))
+    alert = ' role="alert"' if kind == "error" else ""
+    return f'<p class="{kind}"{alert}>{shown}</p>'
+
+
 def _links(files: Sequence[tuple[str, str]]) -> str:
     return "".join(f'<a href="{address}" download>{name}</a>' for address, name in files)
 
 
-def _examples(studio: Studio, name: str) -> list[str]:
-    """Returns up to six texts or actions of the training data."""
-    model = studio.model(name)
+def _examples(model: MotionGenerator) -> dict[str, str]:
+    """Returns texts or actions of the training data, and the address of a picture of each; "" = no picture."""
+    if model.facts.get("dataset") == "synthetic" and model.conditioned_on == "text":
+        actions = {str(attributes["action"]): text for text, attributes in reversed(prompts())}
+        texts = [text for action, text in reversed(actions.items()) if action in model.facts["actions"]]
+        return {text: _picture(text) for text in texts[:: -(-len(texts) // EXAMPLES)]}
     texts = list(model.facts["actions"] if model.conditioned_on == "action" else model.facts.get("captions", ()))
-    return [one_line(text) for text in texts[:: max(1, len(texts) // 6)][:6]] or ["a person walks"]
+    return {one_line(text): "" for text in texts[:: max(1, len(texts) // 6)][:6]} or {"a person walks": ""}
 
 
-def _buttons(texts: Sequence[str]) -> str:
-    return "<p>Examples</p>" + "".join(f'<button type="button">{escape(text)}</button>' for text in texts)
+@cache
+def _picture(prompt: str) -> str:
+    motion = Motion(example(dict(prompts())[prompt]), 20.0)
+    return f"data:image/webp;base64,{b64encode(thumbnail(motion)).decode()}"
 
 
-def _vocabulary(studio: Studio, name: str) -> str:
-    model = studio.model(name)
+def _buttons(examples: Mapping[str, str]) -> str:
+    image = '<img src="{}" alt="">'
+    texts = (f"{picture and image.format(picture)}{escape(text)}" for text, picture in examples.items())
+    return "".join(f'<button type="button">{text}</button>' for text in texts)
+
+
+def _vocabulary(model: MotionGenerator) -> str:
     words = model.facts["actions"] if model.conditioned_on == "action" else model.facts.get("vocabulary", ())
     return ", ".join(map(markdown_text, words)) or "The model does not list them."

@@ -8,8 +8,6 @@ from __future__ import annotations
 import json
 import shlex
 from collections.abc import Iterable
-from itertools import accumulate, pairwise
-from math import dist
 from typing import Annotated, Any, Literal, TypeVar
 from urllib.parse import urlencode
 
@@ -17,13 +15,15 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainSeriali
 from pydantic_core import PydanticCustomError
 
 from flame_mdm.errors import UserError, did_you_mean, one_line, shortened
-from flame_mdm.sampling.request import read_parts
+from flame_mdm.sampling.request import path_targets, read_parts
 
 MAX_TEXT, MAX_SECONDS, MAX_SAMPLES, MAX_STEPS, MAX_EDITS = 300, 30, 4, 1000, 8
 """Limits of a request: characters, seconds, motions, sampling steps, edits."""
 MAX_SEED = 2**31 - 1
+ALL = -1  # as the number of a motion: all motions so far
+PLUS = " + "
+"""Between the names of a model and of its adapter."""
 MAX_WAY_POINTS, FAR = 16, 20.0  # a path: way points, and meters along x and z
-ARRIVAL = 0.2  # seconds before the end of the motion at which the last way point is reached
 
 PLAIN = r"^[^\x00-\x1f\x7f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069]*$"
 """Text without control characters, those of writing direction included."""
@@ -61,7 +61,8 @@ class DemoEdit(BaseModel):
         text: what the person does in the new part; "" = unconditioned.
         region_seconds: begin and end of the new part; None = all of the motion.
         joints: body parts to resample; none = all.
-        strength: None = from noise; otherwise a variation of the motion, as in `flame_mdm.sampling.editing.edit`.
+        strength: None = from noise; otherwise a variation, as in `flame_mdm.sampling.editing.edit`. One of the entire
+            motion keeps text, parts and path of the request, and repeats the edits since.
     """
 
     model_config = RULES
@@ -78,8 +79,7 @@ class DemoRequest(BaseModel):
     """Everything that determines the motions that the demo shows; keys are those of `flame-mdm sample`.
 
     Attributes:
-        path: way points of the root over the floor, x and z in meters. Their times are proportional to the distance
-            along the path from the start, x = z = 0, and the last is reached `ARRIVAL` seconds before the end.
+        path: way points of the root over the floor, x and z in meters; see `flame_mdm.sampling.request.path_targets`.
     """
 
     model_config = RULES
@@ -92,12 +92,14 @@ class DemoRequest(BaseModel):
     num_inference_steps: Annotated[int, Field(ge=1, le=MAX_STEPS)] | None = None
     sampler: Annotated[str, StringConstraints(max_length=40, pattern=PLAIN)] | None = None
     cleanup: bool = True
+    split: bool = True
     path: Path = ()
     edits: Annotated[tuple[DemoEdit, ...], Field(max_length=MAX_EDITS)] = ()
 
     def query(self) -> str:
         """Returns the query string of a link to this request; `parse_query` reads it."""
-        values = self.model_dump(exclude={"edits"}, mode="json") | {"cleanup": str(self.cleanup).lower()}
+        values = self.model_dump(exclude={"edits"}, mode="json")
+        values |= {name: str(values[name]).lower() for name in ("cleanup", "split")}
         pairs = {key: value for key, value in values.items() if value not in (None, "")}
         edits = [change.model_dump_json(exclude_defaults=True) for change in self.edits]
         return urlencode([*pairs.items(), *(("edit", text) for text in edits)])
@@ -105,10 +107,7 @@ class DemoRequest(BaseModel):
     def targets(self, kind: str) -> dict[str, Any]:
         """Returns the targets of `flame_mdm.generate` that lead along the path; `kind` as for `steps`."""
         parts = read_parts(self.text) if self.text and kind != "none" else [("", None)]
-        end = sum(seconds or self.seconds for _, seconds in parts) - ARRIVAL
-        way = list(accumulate(dist(*pair) for pair in pairwise([(0.0, 0.0), *self.path])))
-        times = [round(end * done / (way[-1] or 1.0), 3) for done in way]
-        return {"root": [{"time": time, "position": list(at)} for time, at in zip(times, self.path, strict=True)]}
+        return path_targets(self.path, sum(seconds or self.seconds for _, seconds in parts))
 
     def steps(self, kind: str) -> list[tuple[int | None, dict[str, Any]]]:
         """Returns the steps to the motions: the number of the motion to edit, None for the first step, and keywords of
@@ -119,47 +118,63 @@ class DemoRequest(BaseModel):
         """
         names = ("guidance_scale", "num_inference_steps", "sampler")
         shared = {name: value for name in names if (value := getattr(self, name)) is not None}
-        steps: list[tuple[int | None, dict[str, Any]]] = []
-        for part in (self, *self.edits):
-            keywords: dict[str, Any] = {} if kind == "none" or not part.text else {f"{kind}s": part.text}
-            if isinstance(part, DemoRequest):
-                keywords["seconds"] = part.seconds
-                keywords |= {"targets": part.targets(kind)} if part.path else {}
-            else:
-                region = None if part.region_seconds is None else list(part.region_seconds)
-                editing = {"region_seconds": region, "joints": list(part.joints) or None, "strength": part.strength}
-                keywords |= {name: value for name, value in editing.items() if value is not None}
-            keywords |= {"samples": part.samples, "seed": part.seed, **shared}
-            steps.append((None if isinstance(part, DemoRequest) else part.motion, keywords))
+        path = {"targets": self.targets(kind)} if self.path else {}
+        split = {} if self.split else {"split": False}
+
+        def keywords(part: DemoRequest | DemoEdit, text: str, **others: Any) -> dict[str, Any]:
+            condition = {} if kind == "none" or not text else {f"{kind}s": text}
+            return {**condition, **others, "samples": part.samples, "seed": part.seed, **shared}
+
+        first = keywords(self, self.text, seconds=self.seconds, **split, **path)
+        steps: list[tuple[int | None, dict[str, Any]]] = [(None, first)]
+        whole = 1  # number of steps up to the last one that makes entire motions
+        for part in self.edits:
+            region = None if part.region_seconds is None else list(part.region_seconds)
+            editing = {"region_seconds": region, "joints": list(part.joints) or None, "strength": part.strength}
+            editing = {name: value for name, value in editing.items() if value is not None}
+            if editing.keys() != {"strength"}:
+                steps.append((part.motion, keywords(part, part.text, **editing)))
+                continue
+            sources = [*(source for source, _ in steps[whole:]), part.motion]
+            source = next(source for source in sources if source != ALL)
+            again = [(ALL, others | {"samples": 1}) for _, others in steps[whole:]]
+            steps[whole:] = [(source, keywords(part, part.text or self.text, **editing, **path)), *again]
+            whole += 1
         if self.cleanup and not self.path:  # cleanup moves the root off the way points, by 0.3 m in one example
             steps[-1][1]["cleanup"] = True
         return steps
 
     def command(self, kind: str, device: str | None) -> str:
         """Returns the command lines that write the same motions; `device` if it is not the default."""
-        lines, folder = [], "motions"
+        lines, files, (model, _, adapter) = [], [""], self.model.partition(PLUS)
         for number, (source, keywords) in enumerate(self.steps(kind)):
-            words = ["flame-mdm", "sample" if source is None else "edit", self.model]
-            if source is not None:  # the folder of an edit begins with the original
-                words.append(f"motion={folder}/motion_{source + (number > 1):03d}.npz")
-                folder = f"edit_{number}"
             keys = {{"texts": "text", "actions": "action"}.get(key, key): value for key, value in keywords.items()}
             keys |= {} if keys.keys() & {"text", "action"} else {"unconditioned": True}
+            keys |= {"adapter": adapter} if adapter else {}
             keys |= {"device": device} if device else {}
             if "targets" in keys:
                 lines.append(f"echo {shlex.quote(json.dumps(keys['targets']))} > path.json")
                 keys["targets"] = "path.json"
-            words += [f"{key}={_word(value)}" for key, value in keys.items()]
-            lines.append(shlex.join([*words, f"out={folder}"]))
+            edited = [files[source or 0]] if source != ALL else files
+            files = []
+            for index, file in enumerate(edited, 1):
+                folder = f"edit_{number}" + f"_{index}" * (len(edited) > 1) if number else "motions"
+                words = ["edit", model, f"motion={file}"] if number else ["sample", model]
+                words += [f"{key}={_word(value)}" for key, value in keys.items()]
+                lines.append(shlex.join(["flame-mdm", *words, f"out={folder}"]))
+                # the folder of an edit begins with the original
+                files += [f"{folder}/motion_{k + (number > 0):03d}.npz" for k in range(keys["samples"])]
         return "\n".join(lines)
 
     def python(self, kind: str, device: str) -> str:
         """Returns the lines of Python that make the same motions."""
-        lines = ["import flame_mdm", "", f"model = flame_mdm.load({self.model!r}{f', {device!r}' * (device != 'cpu')})"]
+        model, _, adapter = self.model.partition(PLUS)
+        options = f", {device!r}" * (device != "cpu") + f", adapter={adapter!r}" * bool(adapter)
+        lines = ["import flame_mdm", "", f"model = flame_mdm.load({model!r}{options})"]
         for source, keywords in self.steps(kind):
-            call = "generate(model" if source is None else f"edit(model, motions[{source}]"
-            options = "".join(f", {key}={value!r}" for key, value in keywords.items())
-            lines.append(f"motions = flame_mdm.{call}{options})")
+            call = {None: "generate(model", ALL: "edit(model, motion"}.get(source, f"edit(model, motions[{source}]")
+            call = f"flame_mdm.{call}" + "".join(f", {key}={value!r}" for key, value in keywords.items()) + ")"
+            lines.append(f"motions = [{call}[0] for motion in motions]" if source == ALL else f"motions = {call}")
         return "\n".join([*lines, 'motions[0].save("motion.bvh")  # or .glb, .npz, .mp4'])
 
 

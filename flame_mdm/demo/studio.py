@@ -12,14 +12,14 @@ from typing import Any
 
 from flame_mdm.checkpoints.loading import find, load
 from flame_mdm.conditions.vocabulary import advice
-from flame_mdm.demo.request import MAX_SECONDS, DemoRequest
+from flame_mdm.demo.request import ALL, MAX_SECONDS, PLUS, DemoRequest, checked
 from flame_mdm.errors import UserError, did_you_mean, one_line
 from flame_mdm.formats.cleanup import cleaned
 from flame_mdm.formats.motion import Motion
+from flame_mdm.generator import MotionGenerator
 from flame_mdm.sampling.editing import edit
 from flame_mdm.sampling.generation import generate
-from flame_mdm.sampling.request import read_parts
-from flame_mdm.task import MotionGeneration
+from flame_mdm.sampling.request import SamplingRequest, read_parts, understood
 
 KEPT = 64
 """Number of requests whose motions stay in memory; a download or an edit of them needs no model."""
@@ -37,7 +37,7 @@ class Studio:
     """Makes the motions of requests with a fixed set of models.
 
     Args:
-        sources: Names of models, as for `flame_mdm.load`; requests can choose no other.
+        sources: Names of models, as for `flame_mdm.load`, or "MODEL + ADAPTER"; requests can choose no other.
         device: Device of all models.
 
     Raises:
@@ -46,19 +46,20 @@ class Studio:
 
     def __init__(self, sources: Sequence[str], device: str):
         self.device = device
-        self.files = {name: find(name) for name in sources}
-        self._models: dict[str, MotionGeneration] = {}
+        self.files = {name: find(name.partition(PLUS)[0]) for name in sources}
+        self._models: dict[str, MotionGenerator] = {}
         self._made: OrderedDict[tuple[Any, ...], list[Motion]] = OrderedDict()
         self._working, self._memory = Lock(), Lock()
         self.model(sources[0])
 
-    def model(self, name: str) -> MotionGeneration:
+    def model(self, name: str) -> MotionGenerator:
         """Returns a model by its name in `sources`; loads it at the first request."""
         if name not in self.files:
             near = did_you_mean(name, self.files)
             raise UserError(f"unknown model {name[:60]!r}.{near} This page has: {', '.join(self.files)}")
         if name not in self._models:
-            self._models[name] = load(self.files[name], self.device)
+            adapter = name.partition(PLUS)[2]
+            self._models[name] = load(self.files[name], self.device, adapter=[adapter] if adapter else ())
         return self._models[name]
 
     def motions(
@@ -101,7 +102,8 @@ class Studio:
                     elif source >= len(motions):
                         raise UserError(f"motion={source}: there are {len(motions)} motions, numbered from 0")
                     else:
-                        made = [*edit(model, motions[source], **arguments)]
+                        chosen = motions if source == ALL else [motions[source]]
+                        made = [result for motion in chosen for result in edit(model, motion, **arguments)]
                     with self._memory:
                         self._made[key] = motions = made
                         self._made.move_to_end(key)
@@ -110,6 +112,13 @@ class Studio:
             finally:
                 hook.remove()
         return _cleaned(model, motions) if cleanup else motions
+
+    def understood(self, request: DemoRequest) -> DemoRequest:
+        """Returns the request with a sentence of several actions as a sequence; errors as for `generate`."""
+        if not request.text or (model := self.model(request.model)).conditioned_on != "text":
+            return request
+        text = understood(SamplingRequest(texts=request.text, split=request.split), model).prompts[0]
+        return checked(DemoRequest, request.model_dump() | {"text": text})
 
     def advice(self, request: DemoRequest) -> list[str]:
         """Returns warnings of words that the model has never seen."""
@@ -146,7 +155,7 @@ class Studio:
             return path.read_bytes()
 
 
-def _plan(model: MotionGeneration, request: DemoRequest) -> tuple[list[tuple[int | None, dict[str, Any]]], bool]:
+def _plan(model: MotionGenerator, request: DemoRequest) -> tuple[list[tuple[int | None, dict[str, Any]]], bool]:
     """Returns the steps of a request, and whether the motions are cleaned up at the end."""
     if model.conditioned_on != "none" and not request.text:
         raise UserError("the text is empty. Describe what the person does")
@@ -157,6 +166,6 @@ def _plan(model: MotionGeneration, request: DemoRequest) -> tuple[list[tuple[int
     return steps, bool(steps[-1][1].pop("cleanup", False))
 
 
-def _cleaned(model: MotionGeneration, motions: Sequence[Motion]) -> list[Motion]:
+def _cleaned(model: MotionGenerator, motions: Sequence[Motion]) -> list[Motion]:
     contacts = model.representation.contacts
     return [cleaned(motion, contacts(motion.features)) for motion in motions]

@@ -31,7 +31,7 @@ def sinusoid(position: Tensor, features: int) -> Tensor:
 
 def with_prefix(mask: Tensor, prefix: int) -> Tensor:
     """Extends a mask (B, N) to (B, prefix + N); the prefix is always real."""
-    return torch.cat([mask.new_ones(len(mask), prefix), mask], 1)
+    return torch.cat([mask.new_ones(mask.shape[0], prefix), mask], 1)
 
 
 class Attention(nn.Module):
@@ -55,14 +55,17 @@ class Attention(nn.Module):
 
     def forward(self, x: Tensor, mask: Tensor | None, memory: Tensor | None = None) -> Tensor:
         """Attends from x (B, N, C) to the real entries (mask (B, S), None = all) of memory (B, S, C), or of x."""
+
+        def heads(y: Tensor, parts: int) -> Tensor:
+            return y.unflatten(-1, (parts, self.num_heads, -1)).permute(2, 0, 3, 1, 4)
+
         if memory is None:
-            query, key, value = self.qkv(x).chunk(3, -1)
+            query, key, value = heads(self.qkv(x), 3)
         else:
             size = x.shape[-1]
             weight, bias = self.qkv.weight, self.qkv.bias
-            query = functional.linear(x, weight[:size], bias[:size])
-            key, value = functional.linear(memory, weight[size:], bias[size:]).chunk(2, -1)
-        query, key, value = (y.unflatten(-1, (self.num_heads, -1)).transpose(1, 2) for y in (query, key, value))
+            (query,) = heads(functional.linear(x, weight[:size], bias[:size]), 1)
+            key, value = heads(functional.linear(memory, weight[size:], bias[size:]), 2)
         y = self.attend(
             query,
             key,

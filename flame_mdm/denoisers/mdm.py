@@ -67,8 +67,9 @@ class MDMEncoder(Denoiser):
         else:
             prefix = self.condition(t, cond.pooled)[:, None]
         size = prefix.shape[1]
-        frame_positions = 1 + self.max_tokens + torch.arange(x_t.shape[1], device=x_t.device)
-        positions = torch.cat([torch.arange(size, device=x_t.device), frame_positions])
+        positions = torch.arange(1 + self.max_tokens + x_t.shape[1], device=x_t.device)
+        if size <= self.max_tokens:  # frames keep their positions
+            positions = torch.cat([positions[:size], positions[1 + self.max_tokens :]])
         frames = self.input(x_t)
         x = torch.cat([prefix, frames + prefix[:, :1] if self.condition_frames else frames], 1)
         x = self.dropout(x + sinusoid(positions, x.shape[-1]).to(x_t.dtype))

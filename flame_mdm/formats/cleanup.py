@@ -1,4 +1,4 @@
-"""Cleanup of generated motion: smooth joints, constant bone lengths, feet that stay where they touch the floor."""
+"""Cleanup of generated motion: smooth joints, constant bone lengths, feet that stay in place, hands out of the body."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ from math import comb
 
 import numpy as np
 from scipy.linalg import solveh_banded
-from scipy.ndimage import gaussian_filter1d
+from scipy.ndimage import gaussian_filter1d, maximum_filter1d
 
+from flame_mdm.formats.limbs import depths, unit
 from flame_mdm.formats.motion import Motion
 from flame_mdm.representations.skeleton import Skeleton
 
@@ -27,6 +28,8 @@ on the floor may slide along with the body; a swinging foot is faster than the b
 DRIFT = 0.2
 """Speed in meters per second up to which the body may slide over its feet; the legs compensate for the difference.
 Above 1.5 times this speed, the body follows its feet entirely."""
+CLEAR = 0.15
+"""Seconds in which a hand that would be inside the body starts to avoid it."""
 REACH = 0.999
 """Maximum distance from hip to ankle relative to the length of the straight leg, unless it was longer before."""
 
@@ -42,11 +45,11 @@ def cleaned(motion: Motion, contacts: np.ndarray | None = None) -> Motion:
 
 
 def cleanup(joints: np.ndarray, fps: float, skeleton: Skeleton, contacts: np.ndarray | None = None) -> np.ndarray:
-    """Removes pops, changes of bone lengths and sliding feet from a motion.
+    """Removes pops, changes of bone lengths, sliding feet and hands inside the body from a motion.
 
     In this order: paths of the joints are smoothed, bones get their median lengths, the body moves over the ground so
     that its feet in contact stand still on average, and two-bone inverse kinematics keeps each toe in place during its
-    contacts.
+    contacts and moves hands out of the trunk and the thighs.
 
     Args:
         joints: (F, J, 3) in meters, y up.
@@ -70,6 +73,8 @@ def cleanup(joints: np.ndarray, fps: float, skeleton: Skeleton, contacts: np.nda
         contact = np.clip(2 * contacts[:-1, [skeleton.feet.index(toe) for toe in toes]] - 0.5, 0, 1)
     for chain, weight in zip(skeleton.chains[:2], contact.T, strict=True):
         _bend(motion, chain[1:], _pin(motion[:, chain[-1]], weight))
+    for side in ("left", "right"):
+        _push_out(motion, skeleton, side, fps)
     return motion.astype(np.float32)
 
 
@@ -149,8 +154,30 @@ def _pin(toe: np.ndarray, contact: np.ndarray) -> np.ndarray:
     return shift
 
 
+def _push_out(motion: np.ndarray, skeleton: Skeleton, side: str, fps: float) -> None:
+    """Moves the wrist of an arm away from the axis of the trunk or thigh until neither it nor the hand is inside.
+
+    The shift grows and fades within `CLEAR` seconds before and after.
+    """
+    arm = [skeleton.joints.index(f"{side}_{name}") for name in ("shoulder", "elbow", "wrist")]
+    arm += [joint for joint, name in enumerate(skeleton.joints) if name == f"{side}_hand"]
+    frames = max(1.0, CLEAR * fps)
+    other = skeleton.joints.index("right_shoulder" if side == "left" else "left_shoulder")
+    aside = unit(motion[:, arm[0]] - motion[:, other])  # a hand near the axis goes to its own side
+    for _ in range(4):
+        depth, away = (values[:, 1:] for values in depths(motion, skeleton.joints, side))
+        deepest = depth.argmax(1)[:, None]
+        size = np.maximum(np.take_along_axis(depth, deepest, 1), 0)
+        if not size.any():
+            return
+        away = size * (np.take_along_axis(away, deepest[..., None], 1)[:, 0] + 0.7 * aside)
+        away = unit(gaussian_filter1d(away, frames, axis=0, mode="nearest"))
+        size = gaussian_filter1d(maximum_filter1d(size, 2 * round(frames) + 1, axis=0), frames / 2, axis=0)
+        _bend(motion, arm, size * away)
+
+
 def _bend(motion: np.ndarray, leg: Sequence[int], shift: np.ndarray) -> None:
-    """Moves the foot of a leg (hip, knee, ankle, other joints of the foot) by `shift` (F, 3) and bends the knee."""
+    """Moves the foot of a leg (hip, knee, ankle, other joints of the foot) by `shift` (F, 3); hands work alike."""
     hip, knee, ankle, *foot = (motion[:, joint].copy() for joint in leg)
     thigh, shin = (np.linalg.norm(bone[0]) for bone in (knee - hip, ankle - knee))
     before = np.linalg.norm(ankle - hip, axis=-1, keepdims=True)

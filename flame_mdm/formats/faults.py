@@ -1,4 +1,4 @@
-"""Physical faults of motions: sliding feet, jumps, changing bones, penetration, floating, bends, freezing."""
+"""Physical faults: sliding feet, jumps, changing bones, penetration, arms in the body, floating, bends, freezing."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.ndimage import binary_opening
 
+from flame_mdm.formats.limbs import depths, unit
 from flame_mdm.formats.motion import Motion
 
 LOW = 0.05
@@ -20,6 +21,7 @@ LIMITS = {
     "pop": (200.0, "m/s^2", "a joint jumps: it accelerates by more than 200 m/s^2 and stops within two frames"),
     "bone length": (0.1, "of its median", "the length of a bone differs from its median by more than 10 % and 1 cm"),
     "penetration": (0.05, "m", "a joint is more than 5 cm below the floor, y = 0"),
+    "inside": (0.035, "m", "an elbow, a wrist or the middle of a hand is more than 3.5 cm inside the trunk or a thigh"),
     "floating": (
         LOW,
         "m",
@@ -56,6 +58,7 @@ def find_faults(motion: Motion) -> list[Fault]:
         *_runs("pop", names, *_pops(joints, fps)),
         *_runs("bone length", names, *_stretched(joints, skeleton.edges)),
         *_runs("penetration", names, -joints[..., 1] > LIMITS["penetration"][0], -joints[..., 1]),
+        *_runs("inside", names, *_inside(joints, names)),
         *_runs("limit", names, *_bends(joints, names)),
     ]
     height = joints[..., 1].min(1)[:, None]
@@ -105,6 +108,15 @@ def _stretched(joints: np.ndarray, edges: Sequence[tuple[int, int]]) -> tuple[np
     return flags, change
 
 
+def _inside(joints: np.ndarray, names: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
+    """Finds elbows and wrists in the body; the hand counts as the wrist."""
+    depth = np.zeros(joints.shape[:2])
+    for side in ("left", "right"):
+        elbow, wrist, hand = depths(joints, names, side)[0].T
+        depth[:, names.index(f"{side}_elbow")], depth[:, names.index(f"{side}_wrist")] = elbow, np.maximum(wrist, hand)
+    return depth > LIMITS["inside"][0], depth
+
+
 def _bends(joints: np.ndarray, names: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
     """Finds knees that bend forward, judged by the direction of the foot, and knees and elbows folded into the limb."""
     limit, flags, worst = LIMITS["limit"][0], np.zeros(joints.shape[:2], bool), np.zeros(joints.shape[:2])
@@ -114,19 +126,15 @@ def _bends(joints: np.ndarray, names: Sequence[str]) -> tuple[np.ndarray, np.nda
             (f"{side}_shoulder", f"{side}_elbow", f"{side}_wrist"),
         ):
             upper, middle, lower = (joints[:, names.index(name)] for name in chain)
-            a, b = _unit(middle - upper), _unit(lower - middle)
+            a, b = unit(middle - upper), unit(lower - middle)
             bend = np.degrees(np.arccos(np.clip((a * b).sum(-1), -1, 1)))
             at = names.index(chain[1])
             flags[:, at], worst[:, at] = 180 - bend < limit, 180 - bend
             if "knee" in chain[1]:
-                toes = _unit(joints[:, names.index(f"{side}_foot")] - lower)
+                toes = unit(joints[:, names.index(f"{side}_foot")] - lower)
                 front = toes - (toes * b).sum(-1, keepdims=True) * b
-                tilt = np.degrees(np.arcsin(np.clip(-(a * _unit(front)).sum(-1), -1, 1)))
+                tilt = np.degrees(np.arcsin(np.clip(-(a * unit(front)).sum(-1), -1, 1)))
                 forward = (tilt > limit) & (np.linalg.norm(front, axis=-1) > 0.5)  # a pointed foot has no front
                 flags[:, at] |= forward
                 worst[:, at] = np.where(forward, tilt, worst[:, at])
     return flags, worst
-
-
-def _unit(vectors: np.ndarray) -> np.ndarray:
-    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-9)

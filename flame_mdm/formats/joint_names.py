@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Mapping
 from pathlib import Path
 
 from flame_mdm.errors import UserError, did_you_mean
 from flame_mdm.formats.layouts import LAYOUTS
-from flame_mdm.formats.retarget import JOINT, joint_names, presets
+from flame_mdm.formats.retarget import joint_names, presets
+from flame_mdm.formats.rig import matched, plain, recognized
 from flame_mdm.safe_io import read_yaml
-
-REQUIRED = ("hip", "knee", "ankle", "shoulder", "elbow", "wrist")
-"""Joints of both sides that a character must have, beside the pelvis."""
+from flame_mdm.visualize.posture import JOINT
 
 
 class UnknownJoints(UserError):
@@ -37,15 +35,11 @@ def identify(path: Path, names: Mapping[int, str]) -> dict[str, int]:
     """
     listed = path.with_suffix(".yaml")
     chosen = read_yaml(listed) if listed.exists() else None
-    candidates = _listed(path, listed, chosen, names) if chosen else _recognized(names)
-    if double := next((joint for joint, numbers in candidates.items() if len(numbers) > 1), None):
-        same = ", ".join(names[number] for number in candidates[double])
-        raise UserError(f"{path}: {len(candidates[double])} joints for {double}: {same}. Rename all but one")
-    numbers = {joint: number for joint, (number,) in candidates.items()}
+    candidates = _listed(path, listed, chosen, names) if chosen else recognized(names, known_skeletons())
+    numbers, missing = matched(path, names, candidates)
     if twice := next((joint for joint, number in numbers.items() if list(numbers.values()).count(number) > 1), None):
         raise UserError(f"{listed}: {names[numbers[twice]]} is listed for {twice} and for another joint. Remove one")
-    required = ["pelvis", *(f"{side}_{name}" for name in REQUIRED for side in ("left", "right"))]
-    if missing := [joint for joint in JOINT if joint in required and joint not in numbers]:
+    if missing:
         own = {joint: f" {json.dumps(names[number])}" for joint, number in numbers.items()}
         template = [f"# Joints of {path.name}: {', '.join(names.values())}"]
         template += [f"{joint}:{own.get(joint, '')}" for joint in JOINT]
@@ -73,17 +67,7 @@ def _listed(path: Path, listed: Path, chosen: object, names: Mapping[int, str]) 
     return candidates
 
 
-def _recognized(names: Mapping[int, str]) -> dict[str, list[int]]:
-    """Returns the numbers of the joints that the most similar known skeleton names."""
-    plain: dict[str, list[int]] = {}
-    for number, name in names.items():
-        plain.setdefault(_plain(name), []).append(number)
+def known_skeletons() -> list[dict[str, str]]:
+    """Returns the joints of known skeletons: `plain` name -> joint of SMPL."""
     skeletons = [*map(joint_names, presets().values()), LAYOUTS["SMPL"].map, LAYOUTS["Bandai-Namco"].map]
-    plain_names = [{_plain(name): joint for joint, name in map.items() if isinstance(name, str)} for map in skeletons]
-    nearest = max(plain_names, key=lambda skeleton: len(skeleton.keys() & plain.keys()))
-    return {joint: plain[name] for name, joint in nearest.items() if name in plain}
-
-
-def _plain(name: str) -> str:
-    """Returns a name in lower case, without signs, Mixamo's prefix and the part before a colon."""
-    return re.sub(r"[\W_]", "", re.sub(r"^mixamorig\d*[_:]?", "", name.rpartition(":")[2])).lower()
+    return [{plain(name): joint for joint, name in map.items() if isinstance(name, str)} for map in skeletons]

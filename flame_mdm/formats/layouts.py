@@ -13,7 +13,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
 
 from flame_mdm.errors import UserError
-from flame_mdm.formats import bvh
+from flame_mdm.formats import asf, bvh
 from flame_mdm.formats.resampling import RATES
 from flame_mdm.formats.retarget import joint_names, presets
 from flame_mdm.representations.skeleton import SKELETONS, SMPL22
@@ -97,17 +97,25 @@ LAYOUTS: dict[str, Layout] = {
 _TOELESS = {f"{name} without toes": layout.without_toes() for name, layout in LAYOUTS.items()}
 
 
+def read_tree(path: Path, rate: float | None = None, header: bool = False) -> bvh.Bvh:
+    """Reads a BVH file, its header alone as `bvh.read_header` does, or an AMC file; `rate` overrides its frame rate."""
+    if path.suffix.lower() == ".amc":
+        return asf.read(path, rate)
+    file = bvh.read_header(path) if header else bvh.read(path)
+    return file if rate is None else replace(file, fps=rate)
+
+
 def read_bvh(
     path: Path, fps: float | None = None, fields: Mapping[str, Any] = {}, rate: float | None = None
 ) -> tuple[np.ndarray, float, Layout]:
-    """Reads the joints of SMPL from a BVH file with a known skeleton.
+    """Reads the joints of SMPL from a BVH or AMC file with a known skeleton.
 
     Args:
         path: the file.
         fps: target frames per second; None = those of the file. Rotations are interpolated, so bones keep their length.
         fields: fields of `Layout` that override the known ones. Known skeletons whose arrays are in meters are in
             centimeters in BVH files, as written by `flame_mdm.formats`.
-        rate: overrides the frame rate of the file.
+        rate: overrides the frame rate of the file; AMC files have none.
 
     Returns:
         Joints (F, 22, 3) float32 in meters, y up; frames per second; the layout of the file, with its frame rate.
@@ -116,8 +124,7 @@ def read_bvh(
         FileNotFoundError: If the file does not exist.
         UserError: If the file is damaged or has an unknown skeleton.
     """
-    file = bvh.read(path)
-    return map_bvh(path, file if rate is None else replace(file, fps=rate), fps, fields)
+    return map_bvh(path, read_tree(path, rate), fps, fields)
 
 
 def map_bvh(

@@ -23,7 +23,8 @@ from flame_mdm.errors import UserError, shortened
 from flame_mdm.formats import bvh, characters, skinned
 from flame_mdm.formats.characters import Character
 from flame_mdm.formats.poses import Poses, solve
-from flame_mdm.formats.retarget import CENTIMETER, Rig, continuous_euler, preset, retarget, smpl
+from flame_mdm.formats.retarget import continuous_euler, preset, retarget, smpl
+from flame_mdm.formats.rig import CENTIMETER, Rig
 from flame_mdm.representations import rotation
 from flame_mdm.representations.skeleton import SMPL22, Skeleton
 from flame_mdm.representations.smpl import ADULT
@@ -188,6 +189,14 @@ class Motion:
         return path
 
 
+def amass_parameters(poses: Poses) -> tuple[np.ndarray, np.ndarray]:
+    """Returns axis-angle vectors (F, 66) of 22 joints and translation (F, 3) in AMASS's coordinates: meters, z up."""
+    world = poses.rotations.clone()
+    world[:, 0] = AMASS_AXES @ world[:, 0]
+    turns = rotation.matrix_to_axis_angle(world).flatten(1).numpy()
+    return turns, (poses.root @ AMASS_AXES.T).numpy() - np.array(ADULT[0])
+
+
 def motion_of_poses(poses: Poses, fps: float, text: str = "", id: str = "") -> Motion:
     """Returns the motion of a body whose rotations are known."""
     return Motion(poses.joints().float().numpy(), fps, SMPL22, text, id, poses)
@@ -203,12 +212,10 @@ def _write_npz(motion: Motion, path: Path, facts: dict[str, Any]) -> str:
         del content["features"], content["representation"]
     what = f"{len(motion.skeleton)} joints in meters, y up"
     if motion.poses is not None:
-        world = motion.poses.rotations.clone()
-        world[:, 0] = AMASS_AXES @ world[:, 0]
-        turns = rotation.matrix_to_axis_angle(world).flatten(1).numpy()
+        turns, translation = amass_parameters(motion.poses)
         content |= {
             "poses": np.pad(turns, ((0, 0), (0, 90))),  # hands at rest
-            "trans": (motion.poses.root @ AMASS_AXES.T).numpy() - np.array(ADULT[0]),
+            "trans": translation,
             "betas": np.zeros(16),
             "gender": "neutral",
             "mocap_framerate": motion.fps,

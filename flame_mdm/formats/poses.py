@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -15,6 +16,8 @@ from flame_mdm.representations.smpl import ADULT
 
 CHILDREN = tuple(tuple(joint for joint, parent in enumerate(SMPL22.parents) if parent == j) for j in range(len(SMPL22)))
 PELVIS, SPINE3 = 0, 9
+ALIKE = ((0,), (1, 2), (3,), (4, 5), (6,), (7, 8), (9,), (12,), (13, 14), (16, 17), (18, 19))
+"""Joints with children, from the root outward; those of both sides together."""
 SPINE = {3: 1 / 3, 6: 2 / 3}
 """Joints between pelvis and chest -> fraction of the rotation from pelvis to chest."""
 FORWARD = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
@@ -28,6 +31,8 @@ FOOT = 0.3
 SMOOTH = 0.1
 """Seconds over which the bend is averaged before it determines the twist, so that an arm does not spin when it passes
 through the straight position. Joint positions do not depend on the twist."""
+SQUARINGS = 12
+"""Squarings that isolate an eigenvector; others shrink by the power 4,096."""
 
 
 @dataclass(eq=False)
@@ -79,72 +84,108 @@ def solve(joints: Tensor, fps: float) -> Poses:
             f"these joints have shape {tuple(joints.shape)}: write them as .json or .npy"
         )
     joints = joints.double()
-    bones = SMPL22.bones(joints)
-    lengths = torch.linalg.vector_norm(bones, dim=-1).mean(0)
+    lengths = torch.linalg.vector_norm(SMPL22.bones(joints), dim=-1).mean(0)
     if (lengths[1:] < 1e-4).any():
         name = SMPL22.joints[int(lengths[1:].argmin()) + 1]
         raise UserError(f"the bone that ends in {name} has no length, so its direction is undefined")
-    adult = torch.tensor(ADULT[: len(SMPL22)], dtype=torch.float64)
+    offsets, quaternions = solve_checked(joints, fps)
+    return Poses(offsets, rotation.quaternion_to_matrix(quaternions), joints[:, 0])
+
+
+def solve_checked(joints: Tensor, fps: float) -> tuple[Tensor, Tensor]:
+    """Returns offsets (22, 3) and quaternions (F, 22, 4) of `solve` in the joints' precision, without checks.
+
+    Nothing branches on numbers, so that it can be exported as a graph; joints that are alike are solved together, so
+    that the graph is small.
+    """
+    bones = SMPL22.bones(joints)
+    lengths = torch.linalg.vector_norm(bones, dim=-1).mean(0)
+    adult = joints.new_tensor(ADULT[: len(SMPL22)])
     offsets = lengths[:, None] * F.normalize(adult, dim=-1)
     for joint in (PELVIS, SPINE3):
         children = list(CHILDREN[joint])
-        fitted = _fit(offsets[children], bones[:, children])
+        fitted = rotation.quaternion_to_matrix(_fit(offsets[children], bones[:, children]))
         shape = (fitted.mT[:, None] @ bones[:, children, :, None]).mean(0)[..., 0]
         offsets[children] = lengths[children, None] * F.normalize(shape, dim=-1)
-    chest = rotation.matrix_to_quaternion(_fit(offsets[list(CHILDREN[SPINE3])], bones[:, list(CHILDREN[SPINE3])]))
+    chest = _fit(offsets[list(CHILDREN[SPINE3])], bones[:, list(CHILDREN[SPINE3])])
 
-    turned: list[Tensor] = []  # world rotation of each joint
-    positions = [joints[:, 0]] + [joints[:, 0]] * (len(SMPL22) - 1)
-    for joint, children in enumerate(CHILDREN):
-        aims = joints[:, list(children)] - positions[joint][:, None]
-        if len(children) > 1:
-            turned.append(_fit(offsets[list(children)], aims))
-        elif not children:
-            turned.append(turned[SMPL22.parents[joint]])
+    turned: dict[int, Tensor] = {}  # world rotation (F, 4) of each joint
+    positions = {PELVIS: joints[:, 0]}
+    for group in ALIKE:
+        children = [CHILDREN[joint][0] for joint in group]
+        start = torch.stack([turned[max(SMPL22.parents[joint], 0)] for joint in group], 1) if turned else chest
+        if len(CHILDREN[group[0]]) > 1:
+            children = list(CHILDREN[group[0]])
+            swung = _fit(offsets[children], joints[:, children] - positions[group[0]][:, None])[:, None]
         else:
-            start = rotation.matrix_to_quaternion(turned[SMPL22.parents[joint]])
-            if joint in SPINE:
-                start = rotation.slerp(rotation.matrix_to_quaternion(turned[PELVIS]), chest, SPINE[joint])
-            swung = rotation.multiply(rotation.between(rotation.rotate(start, offsets[children[0]]), aims[:, 0]), start)
-            if joint in BENDS:
-                swung = rotation.multiply(_twist(joint, swung, offsets[children[0]], bones, fps), swung)
-            turned.append(rotation.quaternion_to_matrix(swung))
-        for child in children:
-            positions[child] = positions[joint] + turned[joint] @ offsets[child]
-    world = torch.stack(turned, 1)
-    above = world[:, [max(parent, 0) for parent in SMPL22.parents]]
-    local = above.mT @ world
-    local[:, 0] = world[:, 0]
-    return Poses(offsets, local, joints[:, 0])
+            if group[0] in SPINE:
+                start = rotation.slerp(turned[PELVIS], chest, SPINE[group[0]])[:, None]
+            aims = joints[:, children] - torch.stack([positions[joint] for joint in group], 1)
+            swung = rotation.multiply(rotation.between(rotation.rotate(start, offsets[children]), aims), start)
+            if group[0] in BENDS:
+                swung = rotation.multiply(_twist(group, swung, offsets[children], bones, fps), swung)
+        for number, joint in enumerate(group):
+            turned[joint] = swung[:, number]
+        turned |= {child: turned[SMPL22.parents[child]] for child in children if not CHILDREN[child]}
+        reached = rotation.rotate(swung, offsets[children])
+        for number, child in enumerate(children):
+            positions[child] = positions[SMPL22.parents[child]] + reached[:, number]
+    world = torch.stack([turned[joint] for joint in range(len(SMPL22))], 1)
+    above = rotation.inverse(world[:, list(SMPL22.parents[1:])])
+    return offsets, rotation.standardize(torch.cat([world[:, :1], rotation.multiply(above, world[:, 1:])], 1))
 
 
 def _fit(offsets: Tensor, bones: Tensor) -> Tensor:
-    """Returns rotations (F, 3, 3) that best align K offsets (K, 3) with K bones (F, K, 3)."""
-    u, _, vt = torch.linalg.svd(bones.mT @ offsets)
-    sign = torch.ones_like(bones[:, 0])
-    sign[:, 2] = torch.linalg.det(u @ vt)
-    return (u * sign[:, None]) @ vt
+    """Returns quaternions (F, 4) that best align K offsets (K, 3) with K bones (F, K, 3).
+
+    They are dominant eigenvectors of symmetric matrices (Horn 1987, "Closed-form solution of absolute orientation
+    using unit quaternions"), which repeated squaring isolates.
+    """
+    (a, b, c), (d, e, f), (g, h, i) = (row.unbind(-1) for row in (offsets.mT @ bones).unbind(-2))
+    elements = [
+        *(a + e + i, f - h, g - c, b - d),
+        *(f - h, a - e - i, b + d, g + c),
+        *(g - c, b + d, e - a - i, f + h),
+        *(b - d, g + c, f + h, i - a - e),
+    ]
+    power = torch.stack(elements, -1).unflatten(-1, (4, 4))
+    power = power / torch.linalg.vector_norm(power, dim=(1, 2), keepdim=True) + torch.eye(4, dtype=bones.dtype)
+    for _ in range(SQUARINGS):
+        power = power @ power
+        power = power / power.diagonal(dim1=1, dim2=2).sum(-1)[:, None, None]
+    largest = power.diagonal(dim1=1, dim2=2).argmax(-1)
+    return F.normalize(power.gather(1, largest[:, None, None].expand(-1, 1, 4))[:, 0], dim=-1)
 
 
-def _twist(joint: int, swung: Tensor, offset: Tensor, bones: Tensor, fps: float) -> Tensor:
-    """Returns quaternions (F, 4) that rotate a limb about its axis so that the hinge at its end matches the bend."""
-    middle = CHILDREN[joint][0]
-    end = CHILDREN[middle][0]
-    axis = F.normalize(rotation.rotate(swung, offset), dim=-1)
-    hinge = rotation.rotate(swung, F.normalize(torch.linalg.cross(offset, BENDS[joint]), dim=-1))
+def _twist(group: Sequence[int], swung: Tensor, offsets: Tensor, bones: Tensor, fps: float) -> Tensor:
+    """Returns quaternions (F, G, 4) that rotate limbs about their axes so that the hinges at their ends match bends.
+
+    Args:
+        group: the G joints at which the limbs begin.
+        swung: quaternions (F, G, 4) of the limbs before.
+        offsets: (G, 3) of the limbs.
+        bones: (F, 22, 3), all of them.
+        fps: frames per second.
+    """
+    middle = [CHILDREN[joint][0] for joint in group]
+    end = [CHILDREN[joint][0] for joint in middle]
+    axis = F.normalize(rotation.rotate(swung, offsets), dim=-1)
+    forward = BENDS[group[0]].to(offsets).expand_as(offsets)
+    hinge = rotation.rotate(swung, F.normalize(torch.linalg.cross(offsets, forward), dim=-1))
     limb, beyond = F.normalize(bones[:, middle], dim=-1), F.normalize(bones[:, end], dim=-1)
     bend = torch.linalg.cross(limb, beyond)
-    if joint in (1, 2):
-        bend = bend + FOOT * torch.linalg.cross(F.normalize(bones[:, CHILDREN[end][0]], dim=-1), limb)
+    if group[0] == SMPL22.joints.index("left_hip"):
+        bend = bend + FOOT * torch.linalg.cross(F.normalize(bones[:, [CHILDREN[j][0] for j in end]], dim=-1), limb)
     across = torch.linalg.cross(axis, hinge)
     shown = torch.stack([(bend * hinge).sum(-1), (bend * across).sum(-1)], -1)
-    shown = _smooth(shown, SMOOTH * fps)
+    shown = _smooth(shown.flatten(1), SMOOTH * fps).unflatten(1, (-1, 2))
     shown = torch.linalg.vector_norm(shown, dim=-1, keepdim=True) * shown + shown.new_tensor([STRAIGHT**2, 0.0])
-    return rotation.axis_angle_to_quaternion(axis * torch.atan2(shown[:, 1], shown[:, 0])[:, None])
+    return rotation.axis_angle_to_quaternion(axis * torch.atan2(shown[..., 1], shown[..., 0])[..., None])
 
 
 def _smooth(x: Tensor, frames: float) -> Tensor:
     """Smooths (F, N) over time with a Gaussian whose standard deviation is `frames`."""
-    from scipy.ndimage import gaussian_filter1d
-
-    return torch.from_numpy(gaussian_filter1d(x.numpy(), frames, axis=0, mode="nearest"))
+    reach = int(4 * frames + 0.5)
+    weights = torch.exp(-0.5 * (torch.arange(-reach, reach + 1) / frames) ** 2).to(x)
+    padded = torch.cat([x[:1].expand(reach, -1), x, x[-1:].expand(reach, -1)])
+    return F.conv1d(padded.T[:, None], weights[None, None] / weights.sum())[:, 0].T

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from flame_mdm.errors import UserError
-from flame_mdm.formats import ENDINGS
+from flame_mdm.formats import ENDINGS, TREES
 from flame_mdm.formats.body import check_size, leg_length
 from flame_mdm.formats.layouts import array_layout, read_bvh
 from flame_mdm.formats.motion import AMASS_AXES, Motion, motion_of_poses
@@ -42,13 +42,13 @@ def read(
     fields: Mapping[str, Any] = {},
     any_size: bool = False,
 ) -> Motion:
-    """Reads a motion: `.npz` of this project, of AMASS or with joints and fps, `.bvh`, `.json`, or joints `.npy`.
+    """Reads a motion: `.npz` of this project, of AMASS or with joints and fps, `.bvh`, `.amc`, `.json`, or `.npy`.
 
     Args:
         path: the file.
-        fps: frames per second, overrides the rate in the file; an .npy file has none.
-        unit: meters per unit of length in the file, for .bvh (default: that of its skeleton, mostly centimeters) and
-            .npy (default 1).
+        fps: frames per second, overrides the rate in the file; .npy and .amc files have none.
+        unit: meters per unit of length in the file, for .bvh and .amc (default: that of its skeleton, mostly
+            centimeters) and .npy (default 1).
         resample_to: target frame rate; joints are interpolated with cubic splines, the rotations of .bvh and AMASS on
             the sphere. Default: frames are not resampled.
         fields: fields of `Layout` that override those of a known skeleton, as from `find_skeleton`; `fps` and `unit`
@@ -65,12 +65,13 @@ def read(
         raise UserError(f"{path}: unknown kind of motion file. Use one of {', '.join(ENDINGS)}")
     regular_file(path)
     if unit is not None and suffix in (".npz", ".json"):
-        raise UserError(f"{path}: lengths in {suffix} files are in meters; unit is only for .bvh and .npy")
+        raise UserError(f"{path}: lengths in {suffix} files are in meters; unit is only for .bvh, .amc and .npy")
     fields = fields if unit is None else {**fields, "unit": unit}
     with _named(path):
         rate = None if fps is None else frame_rate(fps)
-        if suffix != ".bvh":
+        if suffix not in TREES:
             return _of_arrays(path, rate, resample_to, fields, any_size)
+        rate = fields.get("fps") if suffix == ".amc" and rate is None else rate
         joints, rate, layout = read_bvh(path, resample_to, fields, rate)
         if not any_size:
             check_size(leg_length(joints), layout.unit, layout.children)

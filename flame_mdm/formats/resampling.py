@@ -9,7 +9,6 @@ import math
 from typing import Any
 
 import numpy as np
-from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from flame_mdm.errors import UserError
@@ -99,6 +98,8 @@ def resample(values: np.ndarray, rate: float, fps: float, cubic: bool = False) -
     """
     before, after, share = frame_pairs(len(values), rate, fps, math.prod(values.shape[1:-1]))
     if cubic and len(values) > 1:
+        from scipy.interpolate import CubicSpline  # here, because few motions need it
+
         return CubicSpline(np.arange(len(values)), values)(before + share)
     share = share.reshape(-1, *[1] * (values.ndim - 1))
     return (1 - share) * values[before] + share * values[after]

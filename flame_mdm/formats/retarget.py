@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,103 +14,18 @@ from torch import Tensor
 
 from flame_mdm.errors import UserError, did_you_mean
 from flame_mdm.formats.poses import Poses
+from flame_mdm.formats.rig import CENTIMETER, Rig
 from flame_mdm.representations import rotation
 from flame_mdm.representations.skeleton import SMPL22
 from flame_mdm.safe_io import read_yaml
-from flame_mdm.visualize.body import world_rotations
+from flame_mdm.visualize.posture import JOINT, world_rotations
 
-JOINT = {name: number for number, name in enumerate(SMPL22.joints)}
 DIRECTIONS = {
     **{"up": (0, 1, 0), "down": (0, -1, 0), "forward": (0, 0, 1), "back": (0, 0, -1)},
 }
-CENTIMETER = 0.01
 SMPL_ORDERS = tuple("YXZ" if name.endswith("shoulder") else "YZX" for name in SMPL22.joints)
 """Euler order of each of SMPL's joints, chosen to keep gimbal lock (middle angle at 90 degrees) away from common poses:
 bent knees, elbows and hips, a hanging arm, a body that turns or bows."""
-
-
-@dataclass(frozen=True, eq=False)
-class Rig:
-    """A skeleton with J joints in its rest pose, in meters, y up, facing +z.
-
-    Attributes:
-        joints: names; parents precede their children.
-        parents: index of each joint's parent, -1 for a root.
-        positions: (J, 3) of the joints.
-        turns: (J, 3, 3), rotations of the joints in the world.
-        sources: for each joint, the index of the joint of SMPL whose rotation it takes, or -1.
-        neutral: (J, 3, 3), rotations of these joints in the world while SMPL's are those of its rest pose.
-        unit: meters per unit of length in BVH files.
-        orders: of the Euler angles of each joint in BVH files.
-        moving: every joint has channels of its position in BVH files, not only the pelvis and joints above it.
-        frame: (3, 3), rotation from the world of the file.
-        scales: (J,), units of the world per unit in the frame of each joint; none = 1.
-    """
-
-    joints: tuple[str, ...]
-    parents: tuple[int, ...]
-    positions: np.ndarray
-    turns: np.ndarray
-    sources: tuple[int, ...]
-    neutral: np.ndarray
-    orders: tuple[str, ...]
-    unit: float = CENTIMETER
-    moving: bool = False
-    frame: np.ndarray = field(default_factory=lambda: np.eye(3))
-    scales: np.ndarray = field(default_factory=lambda: np.ones(0))
-
-    @property
-    def hips(self) -> int:
-        """The joint of the pelvis."""
-        return self.sources.index(0)
-
-    def offsets(self) -> np.ndarray:
-        """Returns the position (J, 3) of each joint in the frame of its parent, or in the world of the file."""
-        return np.stack([self.within(self.positions[joint], joint) for joint in range(len(self.joints))])
-
-    def within(self, positions: np.ndarray, joint: int) -> np.ndarray:
-        """Converts positions (..., 3) in the world to the frame of a joint's parent in the rest pose."""
-        parent = self.parents[joint]
-        if parent < 0:
-            return positions @ self.frame
-        scale = self.scales[parent] if len(self.scales) else 1
-        return (positions - self.positions[parent]) @ self.turns[parent] / scale
-
-    def rest(self) -> np.ndarray:
-        """Returns the rotation (J, 3, 3) of each joint relative to its parent, or to the world of the file."""
-        return self.local(self.turns)
-
-    def local(self, turned: np.ndarray) -> np.ndarray:
-        """Converts rotations (..., J, 3, 3) in the world to those relative to parents, or to the world of the file."""
-        local = turned.copy()
-        for joint, parent in enumerate(self.parents):
-            above = turned[..., parent, :, :] if parent >= 0 else self.frame
-            local[..., joint, :, :] = np.swapaxes(above, -1, -2) @ turned[..., joint, :, :]
-        return local
-
-    def turned(self, body: np.ndarray) -> np.ndarray:
-        """Returns rotations (F, J, 3, 3) in the world, while SMPL's joints have the rotations `body` (F, 22, 3, 3).
-
-        Joints with a counterpart follow it; the others keep their angle to their parent.
-        """
-        rest, turned = self.rest(), np.tile(self.turns, (len(body), 1, 1, 1))
-        for joint, (parent, source) in enumerate(zip(self.parents, self.sources, strict=True)):
-            if source >= 0:
-                turned[:, joint] = body[:, source] @ self.neutral[joint]
-            elif parent >= 0:
-                turned[:, joint] = turned[:, parent] @ rest[joint]
-        return turned
-
-    def assembled(self, world: np.ndarray, pelvis: np.ndarray) -> np.ndarray:
-        """Returns positions (F, J, 3) of joints with world rotations (F, J, 3, 3), with the pelvis at (F, 3)."""
-        positions, hips = np.tile(self.positions, (len(world), 1, 1)), self.hips
-        for joint, parent in enumerate(self.parents):
-            if joint == hips:
-                positions[:, joint] = pelvis
-            elif parent >= 0:
-                offset = self.turns[parent].T @ (self.positions[joint] - self.positions[parent])
-                positions[:, joint] = positions[:, parent] + world[:, parent] @ offset
-        return positions
 
 
 @cache

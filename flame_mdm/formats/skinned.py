@@ -10,7 +10,8 @@ import torch
 
 from flame_mdm.formats.glb import Binary, quaternions
 from flame_mdm.formats.poses import Poses
-from flame_mdm.formats.retarget import Rig, retarget
+from flame_mdm.formats.retarget import retarget
+from flame_mdm.formats.rig import Rig
 from flame_mdm.representations.skeleton import SMPL22
 from flame_mdm.visualize.body import ANCHORS, FittedBody
 from flame_mdm.visualize.render import SIDE_COLORS

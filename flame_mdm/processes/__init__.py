@@ -46,6 +46,18 @@ class Process(nn.Module, ABC):
     def to_x0(self, output: Tensor, x_t: Tensor, t: Tensor) -> Tensor:
         """Returns the clean estimate (B, F, D); for target(x, noise, t) and corrupt(x, noise, t), it is x."""
 
+    def table_time(self, t: Tensor) -> Tensor:
+        """Converts times (B,) of this process to times for the denoiser in [0, 1000)."""
+        return t
+
+    def clean(self, denoise: Denoise, x_t: Tensor, t: Tensor, mask: Tensor, cond: Condition) -> Tensor:
+        """Returns the clean estimate (B, F, D) of a denoiser at times t (B,)."""
+        return self.to_x0(denoise(x_t, self.table_time(t), mask, cond).to(x_t.dtype), x_t, t)
+
+    @abstractmethod
+    def grid(self, count: int) -> list[float]:
+        """Returns `count` evenly spaced times, at most all, from pure noise to one interval before the data."""
+
     @abstractmethod
     def loss(
         self,

@@ -1,6 +1,7 @@
 """Gaussian diffusion (Ho et al. 2020) with a fixed or a learned variance (Nichol and Dhariwal 2021)."""
 
 import itertools
+import math
 from collections.abc import Sequence
 from typing import Literal, get_args
 
@@ -80,6 +81,8 @@ class GaussianDiffusion(Process):
         average_padding: bool = False,
         clip_x0: bool = False,
         timestep_sampling: TimestepSampling = "uniform",
+        skip: bool = False,
+        min_snr: float | None = None,
     ):
         """Builds the process.
 
@@ -97,16 +100,26 @@ class GaussianDiffusion(Process):
                 that short motions have less weight. The denoiser must return 0 there.
             clip_x0: clamp the clean estimate to [-1, 1] in sampling, as in FLAME's code.
             timestep_sampling: how training steps are drawn.
+            skip: only with prediction epsilon: the noise is sqrt(1 - ab) x_t + sqrt(ab) times the output (Karras et al.
+                2022, eq. 7, for data of variance 1), so that the network need not carry its input, and the clean
+                estimate divides nothing by the signal. The output is then a velocity, trained with the error of the
+                noise.
+            min_snr: weight of a step's squared error is that of min(SNR, min_snr) on the clean motion (Hang et al.
+                2023, eq. 4, there 5). None = 1, whatever is predicted.
 
         Raises:
-            UserError: If an option has an unknown value.
+            UserError: If an option has an unknown value, or needs prediction epsilon.
         """
         super().__init__()
         check_choice("prediction", prediction, get_args(Prediction))
         check_choice("variance", variance, get_args(Variance))
         check_choice("timestep_sampling", timestep_sampling, get_args(TimestepSampling))
+        if prediction != "epsilon" and skip:
+            raise UserError("skip=true needs prediction epsilon")
+        if min_snr is not None and not 0 < min_snr < math.inf:
+            raise UserError(f"min_snr={min_snr}: give a number above 0, such as 5, or null")
         self.schedule = build_schedule(schedule, num_train_timesteps)
-        self.prediction = prediction
+        self.prediction, self.skip, self.min_snr = prediction, skip, min_snr
         self.variance = variance
         self.vlb_weight = vlb_weight
         self.average_padding = average_padding
@@ -125,7 +138,7 @@ class GaussianDiffusion(Process):
     def target(self, x: Tensor, noise: Tensor, t: Tensor) -> Tensor:
         if self.prediction == "x0":
             return x
-        if self.prediction == "epsilon":
+        if self.prediction == "epsilon" and not self.skip:
             return noise
         return self.schedule.at("signal", t, x) * noise - self.schedule.at("noise", t, x) * x
 
@@ -135,9 +148,14 @@ class GaussianDiffusion(Process):
         if self.prediction == "x0":
             return output
         signal, noise = self.schedule.at("signal", t, x_t), self.schedule.at("noise", t, x_t)
-        if self.prediction == "epsilon":
+        if self.prediction == "epsilon" and not self.skip:
             return (x_t - noise * output) / signal
         return signal * x_t - noise * output
+
+    def grid(self, count: int) -> list[float]:
+        total = len(self.schedule)
+        count = min(count, total)
+        return [float(round(total * k / count) - 1) for k in range(count, 0, -1)]
 
     def log_variance(self, output: Tensor, x_t: Tensor, i: Tensor | int, schedule: Schedule) -> Tensor | float:
         """Returns the log-variance of x_{t-1} at step i of `schedule`: a number, (B, 1, 1), or (B, F, D) if learned."""
@@ -178,7 +196,10 @@ class GaussianDiffusion(Process):
             noise, averaged = noise * mask[..., None], torch.ones_like(mask)
         x_t = self.corrupt(x, noise, t)
         output = denoise(x_t, t, mask, cond).to(x_t.dtype)
-        terms = {"mse": masked_mse(output[..., : x.shape[-1]], self.target(x, noise, t), averaged)}
+        # With the skip, an error in the output is that in the noise divided by the signal.
+        scale = self.schedule.at("signal", t, x) if self.skip else 1.0
+        error = masked_mse(scale * output[..., : x.shape[-1]], scale * self.target(x, noise, t), averaged)
+        terms = {"mse": self._snr_weight(t) * error}
         if self.variance == "learned_range" and self.vlb_weight:
             scale = self.vlb_weight * len(self.schedule)
             terms["vlb"] = scale * masked_mean(self.vlb(output, x, x_t, t), averaged)
@@ -190,6 +211,14 @@ class GaussianDiffusion(Process):
             terms = {name: weights * term for name, term in terms.items()}
             loss = weights * loss
         return terms | {"loss": loss}
+
+    def _snr_weight(self, t: Tensor) -> Tensor | float:
+        """Returns the weight (B,) of the squared error of the prediction at steps t (B,)."""
+        if self.min_snr is None:
+            return 1.0
+        snr = torch.as_tensor((self.schedule.at("signal", t, t) / self.schedule.at("noise", t, t)) ** 2).flatten()
+        # A squared error of 1 in the clean motion is one of SNR in the noise, and of SNR + 1 in the velocity.
+        return snr.clamp(max=self.min_snr) / {"x0": 1.0, "epsilon": snr, "velocity": snr + 1}[self.prediction]
 
     def vlb(self, output: Tensor, x: Tensor, x_t: Tensor, t: Tensor) -> Tensor:
         """Returns terms of the variational bound (B, F, D) at steps t (B,), in nats (Ho et al. 2020, eq. 5).
@@ -216,8 +245,8 @@ class GaussianDiffusion(Process):
     ) -> Tensor:
         """See `Process.sample`. The denoiser is called once per step; draws of noise are numbered in order of use.
 
-        The steps are 2 to T steps placed by `options.spacing`, or the steps themselves in increasing order. An edit of
-        mode "x0" reproduces the kept part exactly.
+        The steps are 2 to T steps placed by `options.spacing`, or the steps themselves in increasing order; those of
+        "consistency" are 1 to T steps of `grid`. An edit of mode "x0" reproduces the kept part exactly.
         """
         sampler = self.find_sampler(options)
         if edit is not None:
@@ -261,6 +290,8 @@ class GaussianDiffusion(Process):
     def _steps(self, options: SamplerOptions) -> list[int]:
         chosen, total = options.num_inference_steps, len(self.schedule)
         if not isinstance(chosen, Sequence):
+            if options.sampler == "consistency" and chosen is not None and chosen <= total:
+                return [int(step) for step in reversed(self.grid(chosen))]
             if chosen is None or chosen < 2:
                 raise UserError(f"num_inference_steps is {chosen}: diffusion takes 2 to {total} steps")
             return timesteps(total, chosen, options.spacing or "linspace")

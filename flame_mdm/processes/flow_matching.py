@@ -1,5 +1,7 @@
 """Flow matching on straight paths (Lipman et al. 2023; Motion Flow Matching)."""
 
+import itertools
+from functools import partial
 from typing import Literal, get_args
 
 import torch
@@ -85,6 +87,9 @@ class FlowMatching(Process):
             return [*(torch.arange(count, dtype=torch.float32) * (1 / count)).tolist(), 1.0]
         return [i / count for i in range(count + 1)]
 
+    def grid(self, count: int) -> list[float]:
+        return self.times(count)[:-1]
+
     def loss(
         self,
         denoise: Denoise,
@@ -119,7 +124,8 @@ class FlowMatching(Process):
         edit: Edit | None = None,
         trajectory: list[Tensor] | None = None,
     ) -> Tensor:
-        """See `Process.sample`. Takes N >= 1 equal steps and draws only noise number 0; "dopri5" chooses its own steps.
+        """See `Process.sample`. Takes N >= 1 equal steps; "dopri5" chooses its own. Only "consistency" draws more noise
+        than number 0.
 
         An edit of mode "trajectory" overwrites the kept part early on the path (MFM, algorithm 1); after that, the
         model moves it freely. Mode "x0" overwrites the clean estimate of every call, which reproduces the kept part
@@ -139,11 +145,9 @@ class FlowMatching(Process):
             # Filling a tensor on the device with a number needs no copy and no synchronization.
             precision = torch.promote_types(x.dtype, torch.float32)
             time = t.expand(len(x)) if isinstance(t, Tensor) else x.new_full((len(x),), t, dtype=precision)
-
-            def clean(x: Tensor) -> Tensor:
-                return self.to_x0(denoise(x, self.table_time(time), mask, cond).to(x.dtype), x, time)
-
-            seen = x if imposed is None or imposed.guide is None else imposed.guide.steer(clean, x)
+            seen = x
+            if imposed is not None and imposed.guide is not None:
+                seen = imposed.guide.steer(lambda x: self.clean(denoise, x, time, mask, cond), x)
             output = denoise(seen, self.table_time(time), mask, cond).to(x.dtype)
             if self.prediction == "velocity" and trajectory is None and imposed is None:
                 return output
@@ -158,6 +162,11 @@ class FlowMatching(Process):
             return output if imposed is None else torch.where(imposed.keep, straight, output)
 
         start, times = noise(0), self.times(count)
+        if options.sampler == "consistency":
+            if edit is not None and edit.mode == "trajectory":
+                raise UserError("the sampler consistency forgets the path that method=mfm overwrites: use method=mdm")
+            loop = partial(sampler.loop, draws=map(noise, itertools.count(1)), sigma_min=self.sigma_min)
+            sampler = samplers.Sampler(loop)
         if edit is None:
             return sampler.loop(velocity, start, times) * mask[..., None]
         first = count - edit.steps(count)

@@ -45,7 +45,7 @@ def classifier_free_guidance(denoise: Denoise, scale: float | Tensor, features: 
         nonlocal seen, doubled
         if seen is None or seen[0] is not mask or seen[1] is not cond:
             seen, doubled = (mask, cond), (torch.cat([mask, mask]), cond.with_null())
-        with_cond, null = denoise(torch.cat([x_t, x_t]), torch.cat([t, t]), *doubled).chunk(2)
+        with_cond, null = denoise(torch.cat([x_t, x_t]), torch.cat([t, t]), *doubled).unflatten(0, (2, -1))
         mean = null[..., :features] + strength * (with_cond[..., :features] - null[..., :features])
         variance = with_cond[..., features:]
         return torch.cat([mean, variance], -1) if variance.shape[-1] else mean

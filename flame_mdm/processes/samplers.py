@@ -18,9 +18,6 @@ from flame_mdm.batch import Condition, Denoise, Edit
 from flame_mdm.processes.schedules import Schedule
 from flame_mdm.sampler_options import SamplerOptions
 
-with torch.device("cpu"):  # it holds tensors, and a network may be built on "meta" while this module is imported
-    from torchdiffeq import odeint
-
 Estimate = Callable[[Tensor, int], tuple[Tensor, Tensor | float]]
 """(x_t (B, F, D), step i) -> clean estimate (B, F, D) and log-variance of x_{t-1}, a number or (B, F, D)."""
 
@@ -115,6 +112,14 @@ def dpm_solver_pp_2m(x: Tensor, run: Descent) -> Tensor:
     return x
 
 
+def consistency(x: Tensor, run: Descent) -> Tensor:
+    """Estimates the clean motion, adds new noise of the next step, and repeats (Song et al. 2023, algorithm 1)."""
+    for i in run.steps:
+        x, _ = run.estimate(x, i)
+        x = run.schedule.corrupt(x, next(run.draws), i - 1) if i else x
+    return x
+
+
 def ancestral_step(
     x_t: Tensor, x0_hat: Tensor, log_variance: Tensor | float, schedule: Schedule, i: int, noise: Tensor | None
 ) -> Tensor:
@@ -174,6 +179,7 @@ DIFFUSION_SAMPLERS = {
     "ancestral": Sampler(ancestral, ("spacing",)),
     "ddim": Sampler(ddim, ("spacing", "eta")),
     "dpm_solver_pp_2m": Sampler(dpm_solver_pp_2m, ("spacing",), single_step=False),
+    "consistency": Sampler(consistency),
 }
 
 # Flows ----------------------------------------------------------------------------------------------------------------
@@ -222,9 +228,22 @@ def dopri5(velocity: Velocity, x: Tensor, times: Sequence[float]) -> Tensor:
     last step may go beyond the last time; the solver then interpolates back.
     """
     ends = torch.tensor([times[0], times[-1]], dtype=x.dtype, device=x.device)
+    from torchdiffeq import odeint  # here, because it imports much of scipy
+
     path = odeint(lambda t, y: velocity(y, t), x, ends, rtol=1e-5, atol=1e-5, method="dopri5")
     assert isinstance(path, Tensor)
     return path[-1]
+
+
+def consistency_flow(
+    velocity: Velocity, x: Tensor, times: Sequence[float], draws: Iterator[Tensor], sigma_min: float
+) -> Tensor:
+    """As `consistency`: goes straight to the data, adds new noise of the next time, and repeats."""
+    shrink = 1 - sigma_min
+    for t, end in pairwise(times):
+        x = (1 - shrink * t) * velocity(x, t) + shrink * x
+        x = end * x + (1 - shrink * end) * next(draws) if end < 1 else x
+    return x
 
 
 def rewrite(
@@ -249,4 +268,5 @@ FLOW_SAMPLERS = {
     "heun": Sampler(heun),
     "rk4": Sampler(rk4),
     "dopri5": Sampler(dopri5, single_step=False),
+    "consistency": Sampler(consistency_flow),
 }

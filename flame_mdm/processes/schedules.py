@@ -43,12 +43,12 @@ class Schedule:
     """
 
     def __init__(self, betas: Tensor):
-        """Computes the tables from the variances (N,) float64 of the N >= 2 noise steps."""
+        """Computes the tables from the variances (N,) float64 of the noise steps."""
         alphas_cumprod = (1 - betas).cumprod(0)
         previous = torch.cat([betas.new_ones(1), alphas_cumprod[:-1]])
         posterior_variance = betas * (1 - previous) / (1 - alphas_cumprod)
         # The posterior of step 0 has variance 0: its logarithm is that of step 1 (Nichol and Dhariwal 2021).
-        clipped = torch.cat([posterior_variance[1:2], posterior_variance[1:]])
+        clipped = torch.cat([posterior_variance[:2][-1:], posterior_variance[1:]])
         self.tables = {
             "betas": betas,
             "alphas_cumprod": alphas_cumprod,

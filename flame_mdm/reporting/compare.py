@@ -13,7 +13,7 @@ import numpy as np
 from flame_mdm.config import flatten
 from flame_mdm.errors import UserError
 from flame_mdm.reporting.intervals import paired_difference, percentiles
-from flame_mdm.reporting.page import number, page, render
+from flame_mdm.reporting.page import filled, number, page, render
 from flame_mdm.reporting.plots import Curve, charts
 from flame_mdm.reporting.report import charted, evaluation_title, last, marks, printed, sampling
 from flame_mdm.runs import CONFIG, Run, read_run
@@ -80,7 +80,7 @@ def comparison(
         "compare.html",
         title=" · ".join(c.label for c in compared),
         labels=list(runs),
-        facts=_facts(runs),
+        facts=filled(FACTS, _facts(runs)) if runs else None,
         differences=_differences(runs),
         player=_player(compared, shown, mesh),
         evaluations=_evaluations(runs),
@@ -90,6 +90,10 @@ def comparison(
         groups=_charts(runs),
     )
     return page("Comparison", body)
+
+
+FACTS = ("run", "steps", "passes", "parameters", "s/step", "samples per second", "device", "data", "folder")
+"""Column titles of `_facts`."""
 
 
 def _facts(runs: Mapping[str, Run]) -> list[list[str]]:
@@ -248,7 +252,7 @@ def _evaluations(runs: Mapping[str, Run]) -> list[tuple[str, list[str], list[lis
         ]
         heads = [f"{label} [{k}]" for k, (label, _) in enumerate(columns, 1)]
         notes = [(sampling(result), marks(result)) for result in results]
-        tables.append((title, ["", "real motions", *heads], rows, notes, tested(columns)))
+        tables.append((title, *filled(["", "real motions", *heads], rows), notes, tested(columns)))
     return tables
 
 

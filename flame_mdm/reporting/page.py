@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import functools
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -52,6 +53,13 @@ def number(value: float | None) -> str:
     if isinstance(value, float) and math.isfinite(value) and 0 < abs(value) < 1e-3:
         return f"{value:.2e}"
     return f"{value:,.0f}" if abs(value) >= 10_000 else f"{value:.4g}"
+
+
+def filled(head: Sequence[str], rows: Sequence[Sequence[str]]) -> tuple[list[str], list[list[str]]]:
+    """Returns a table without the columns and rows that have no value; the first column names the rows."""
+    rows = [row for row in rows if {*row[1:]} - {"–", ""}]
+    kept = [k for k in range(len(head)) if not k or {row[k] for row in rows} - {"–", ""}]
+    return [head[k] for k in kept], [[row[k] for k in kept] for row in rows]
 
 
 def interval(mean: float | None, half: float | None) -> str:

@@ -58,7 +58,7 @@ def matrix_to_quaternion(matrix: Tensor) -> Tensor:
     ]
     rows = torch.stack(outer, -1).unflatten(-1, (4, 4))
     largest = rows.diagonal(dim1=-2, dim2=-1).argmax(-1)
-    row = torch.take_along_dim(rows, largest[..., None, None], dim=-2).squeeze(-2)
+    row = rows.gather(-2, largest[..., None, None].expand(*largest.shape, 1, 4)).squeeze(-2)
     return standardize(F.normalize(row, dim=-1))
 
 
@@ -149,7 +149,7 @@ def between(a: Tensor, b: Tensor) -> Tensor:
     quaternion = torch.cat([lengths + (a * b).sum(-1, keepdim=True), torch.linalg.cross(a, b)], -1)
     size = torch.linalg.vector_norm(quaternion, dim=-1, keepdim=True)
     degenerate = size <= torch.finfo(a.dtype).eps ** 0.5 * lengths
-    if degenerate.any():
+    if torch.compiler.is_exporting() or degenerate.any():  # an exported graph has no branches
         basis = torch.eye(3, dtype=a.dtype, device=a.device)
         axis = F.normalize(torch.linalg.cross(a, basis[a.abs().argmin(-1)]), dim=-1)
         half_turn = F.pad(axis, (1, 0))

@@ -1,14 +1,16 @@
 """Skeleton definitions and forward kinematics."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
-
-import torch
-from torch import Tensor
+from typing import TYPE_CHECKING, Any
 
 from flame_mdm.errors import UserError, did_you_mean
+
+if TYPE_CHECKING:  # Blender has no torch
+    from torch import Tensor
 
 LEG, ARM = ("hip", "knee", "ankle", "foot", "toes"), ("collar", "shoulder", "elbow", "wrist", "hand")
 
@@ -97,6 +99,8 @@ def forward_kinematics(skeleton: Skeleton, rotations: Tensor, offsets: Tensor, r
 
 def global_rotations(rotations: Tensor, parents: Sequence[int]) -> Tensor:
     """Converts rotations (..., J, 3, 3) from parent to world frames, with one matrix product per level of the tree."""
+    import torch
+
     level = [0]
     joints, turned = [0], [rotations[..., :1, :, :]]
     while level := [joint for joint, parent in enumerate(parents) if parent in level]:

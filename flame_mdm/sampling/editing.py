@@ -16,14 +16,14 @@ from flame_mdm.errors import UserError
 from flame_mdm.formats.cleanup import cleaned
 from flame_mdm.formats.motion import Motion
 from flame_mdm.formats.readers import from_array
+from flame_mdm.generator import MotionGenerator
 from flame_mdm.processes import Process
 from flame_mdm.representations import Representation
 from flame_mdm.representations.skeleton import find_joints
 from flame_mdm.sampler_options import SamplerOptions
 from flame_mdm.sampling.generation import sample_request
 from flame_mdm.sampling.reading import read_motion, with_features
-from flame_mdm.sampling.request import METHODS, EditRequest, SamplingRequest
-from flame_mdm.task import MotionGeneration
+from flame_mdm.sampling.request import METHODS, EditRequest, Part, SamplingRequest, understood
 
 MFM_STEPS = 25
 """Sampling steps of MFM's edits: with `until` = 0.2, the path is overwritten in "the first 6 time steps" (i = 0 ... 5)
@@ -50,7 +50,7 @@ class Edited(Motion):
 
 
 def edit(
-    model: MotionGeneration,
+    model: MotionGenerator,
     motion: str | Path | Motion | np.ndarray | Tensor,
     texts: str | Sequence[str] | None = None,
     *,
@@ -82,7 +82,7 @@ def edit(
 
 
 def edit_request(
-    model: MotionGeneration,
+    model: MotionGenerator,
     motion: str | Path | Motion | np.ndarray | Tensor,
     request: SamplingRequest,
     *,
@@ -90,6 +90,7 @@ def edit_request(
     stages: list[Motion] | None = None,
 ) -> list[Edited]:
     """Edits a motion as `request.editing` says; for the other arguments, see `edit`."""
+    request = understood(request, model)
     representation, editing = model.representation, request.editing or EditRequest()
     if isinstance(motion, str | Path):
         motion = read_motion(representation, motion, fps=fps)
@@ -99,7 +100,7 @@ def edit_request(
         raise UserError(f"fps={fps:g}: this motion has {motion.fps:g} frames per second. Omit fps")
     original = with_features(representation, motion)
     length = len(original.features)
-    if length > (longest := model.facts["max_frames"]):
+    if length > (longest := model.facts["max_frames"]) and not request.is_sequence:
         raise UserError(
             f"{original.id or 'the motion'}: {length} frames, but the model was trained on at most {longest} "
             f"({longest / original.fps:g} seconds): select a part with cut=[begin, end] in seconds"
@@ -112,11 +113,12 @@ def edit_request(
         )
     if keep.all():
         raise UserError("the entire motion is kept: choose a region or joints to resample")
+    frames = tuple(_part_length(parts, length, original.fps) for parts in request.parts)
     how, options = method_options(model.process, editing, request.options)
     normalized = representation.normalize(torch.from_numpy(original.features).to(model.device))
     results = sample_request(
         model,
-        replace(request, frames=length, options=options, editing=None, cleanup=False),
+        replace(request, frames=frames, options=options, editing=None, cleanup=False),
         stages=stages,
         edit=Edit(normalized[None], keep[None].to(model.device), **how),
     )
@@ -130,6 +132,22 @@ def edit_request(
         facts = {"original": original, "keep": keep.numpy(), "feature_error": error, "joint_error": float(moved)}
         edits.append(Edited(**vars(result), **facts))
     return edits
+
+
+def _part_length(parts: Sequence[Part], length: int, fps: float) -> int:
+    """Returns the frames of each part that gives no seconds, so that all parts are as long as the motion.
+
+    Raises:
+        UserError: If this is not possible.
+    """
+    timed = [round(seconds * fps) for _, seconds in parts if seconds is not None]
+    rest, others = length - sum(timed), len(parts) - len(timed)
+    if rest < others or (rest % others if others else rest):
+        raise UserError(
+            f"'{' | '.join(words for words, _ in parts)}': the parts are not as long as the motion, which has "
+            f"{length / fps:g} seconds. Give each part its seconds, as in 'walks @2 | sits @1'"
+        )
+    return rest // max(1, others)
 
 
 def kept_parts(representation: Representation, length: int, editing: EditRequest) -> tuple[Tensor, Tensor]:

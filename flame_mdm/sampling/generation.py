@@ -18,12 +18,12 @@ from flame_mdm.errors import UserError
 from flame_mdm.formats.cleanup import cleaned
 from flame_mdm.formats.faults import find_faults
 from flame_mdm.formats.motion import Motion
+from flame_mdm.generator import MotionGenerator
 from flame_mdm.safe_io import atomic_folder
 from flame_mdm.sampling.reading import read_motion, with_features
-from flame_mdm.sampling.request import SamplingRequest, check_model
+from flame_mdm.sampling.request import SamplingRequest, check_model, understood
 from flame_mdm.sampling.sequences import motion_lengths, overlap, windows
 from flame_mdm.sampling.targets import Targets, read_targets
-from flame_mdm.task import MotionGeneration
 from flame_mdm.visualize import contact_sheet, write_gif, write_mp4, write_player
 from flame_mdm.visualize.body import Mesh
 
@@ -38,7 +38,7 @@ Score = Callable[[Sequence[Motion]], Sequence[float]]
 
 
 def generate(
-    model: MotionGeneration,
+    model: MotionGenerator,
     texts: str | Sequence[str] | None = None,
     *,
     score: Score | None = None,
@@ -49,7 +49,8 @@ def generate(
     """Generates motions for texts or actions, `samples` of each; unconditioned motions if neither is given.
 
     A motion depends only on its text, its length, the sample number and the seed, not on other texts. If a text is
-    given several times, sample numbers continue, so that its samples differ.
+    given several times, sample numbers continue, so that its samples differ. "A man walks, then sits down" becomes the
+    sequence "A man walks | sits down", unless `split=False`.
 
     Args:
         model: from `flame_mdm.load`.
@@ -63,14 +64,15 @@ def generate(
             guidance_scale, sampler and num_inference_steps.
 
     Raises:
-        UserError: If the request is invalid, or the model cannot do what is requested.
+        UserError: If the request is invalid, the model cannot do what is requested, or knows no word of a text that
+            says what happens.
     """
     request = SamplingRequest.of("generate", texts=texts, **keywords)
-    return sample_request(model, request, score=score, edit=edit, stages=stages)
+    return sample_request(model, understood(request, model), score=score, edit=edit, stages=stages)
 
 
 def sample_request(
-    model: MotionGeneration,
+    model: MotionGenerator,
     request: SamplingRequest,
     *,
     score: Score | None = None,
@@ -86,7 +88,7 @@ def sample_request(
     if request.editing is not None:
         raise UserError("this request edits a motion. Call flame_mdm.edit")
     if edit is not None:
-        request.check_edit()
+        request.check_edit(edit.strength is not None)
     check_model(request, model)
     plan = _plan(model, request, edit)
     motions: list[Motion] = []
@@ -128,7 +130,7 @@ class _Plan:
     edit: Edit | None
 
 
-def _plan(model: MotionGeneration, request: SamplingRequest, edit: Edit | None) -> _Plan:
+def _plan(model: MotionGenerator, request: SamplingRequest, edit: Edit | None) -> _Plan:
     captions = [prompt for prompt in request.prompts for _ in range(request.samples * request.candidates)]
     counts: Counter[str] = Counter()
     ids = []
@@ -155,7 +157,7 @@ def _plan(model: MotionGeneration, request: SamplingRequest, edit: Edit | None) 
     )
 
 
-def _features_before(model: MotionGeneration, after: str | Path | Motion) -> Tensor:
+def _features_before(model: MotionGenerator, after: str | Path | Motion) -> Tensor:
     """Returns the features (F, D) of the motion that is continued."""
     representation = model.representation
     motion = with_features(representation, after) if isinstance(after, Motion) else read_motion(representation, after)
@@ -164,7 +166,7 @@ def _features_before(model: MotionGeneration, after: str | Path | Motion) -> Ten
     return torch.from_numpy(motion.features)
 
 
-def _sample(model: MotionGeneration, plan: _Plan, rows: slice, trajectory: list[Tensor] | None) -> list[Motion]:
+def _sample(model: MotionGenerator, plan: _Plan, rows: slice, trajectory: list[Tensor] | None) -> list[Motion]:
     """Returns some motions of a plan, sampled in one batch."""
     request, conditions, lengths = plan.request, plan.conditions[rows], plan.lengths[rows]
     mask = length_mask(torch.tensor([sum(parts) for parts in lengths], device=model.device))
@@ -178,7 +180,9 @@ def _sample(model: MotionGeneration, plan: _Plan, rows: slice, trajectory: list[
         batch.action = torch.tensor([actions.index(name) for (name,) in conditions], device=model.device)
     edit = plan.edit
     if plan.targets is not None:
-        edit = plan.targets.edit(model.representation, batch.lengths.tolist(), model.device)
+        goal = plan.targets.edit(model.representation, batch.lengths.tolist(), model.device)
+        start = goal.known if edit is None else torch.where(goal.keep, goal.known, edit.known)
+        edit = replace(goal, known=start, strength=None if edit is None else edit.strength)
     if edit is not None:
         padded, keep = pad_to(edit.known, mask.shape[1]), pad_to(edit.keep, mask.shape[1])
         edit = replace(edit, known=padded.expand_as(x), keep=keep.expand_as(x))
@@ -195,7 +199,7 @@ def _sample(model: MotionGeneration, plan: _Plan, rows: slice, trajectory: list[
     return [_decoded(model, plan, rows.start + row, features) for row, features in enumerate(x)]
 
 
-def _decoded(model: MotionGeneration, plan: _Plan, row: int, x: Tensor) -> Motion:
+def _decoded(model: MotionGenerator, plan: _Plan, row: int, x: Tensor) -> Motion:
     """Returns motion number `row` of a plan from its normalized features (F, D)."""
     representation, lengths = model.representation, plan.lengths[row]
     features = representation.denormalize(x[: sum(lengths)].float())
@@ -238,7 +242,7 @@ class _First(list[torch.Tensor]):
         super().append(x[:1].cpu())
 
 
-def _stages(model: MotionGeneration, trajectory: Sequence[torch.Tensor], result: Motion) -> list[Motion]:
+def _stages(model: MotionGenerator, trajectory: Sequence[torch.Tensor], result: Motion) -> list[Motion]:
     """Returns up to `STAGES` of the first motion's clean estimates at equal intervals of the calls, and the motion."""
     count, stages = len(trajectory), []
     for call in sorted({index * count // STAGES for index in range(STAGES)}):

@@ -91,6 +91,9 @@ def with_features(representation: Representation, motion: Motion) -> Motion:
     try:
         joints = resample_joints(joints, motion.fps, representation.fps, cubic=True)
         features = representation.encode(torch.from_numpy(joints)).numpy()
+        if len(features) < len(joints):  # one row per step between frames: a further step keeps the number of frames
+            longer = np.concatenate([joints, joints[-1:] + [1, 0, 1] * (joints[-1:] - joints[-2:-1])])
+            features = representation.encode(torch.from_numpy(longer)).numpy()
         if motion.skeleton.joints[: len(SMPL22)] == SMPL22.joints:
             check_size(leg_length(joints), 1.0, children=True)
     except ValueError as error:

@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
+from itertools import accumulate, pairwise
 from numbers import Integral, Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -18,7 +19,7 @@ from flame_mdm.sampler_options import SamplerOptions, option
 
 if TYPE_CHECKING:
     from flame_mdm.formats.motion import Motion
-    from flame_mdm.task import MotionGeneration
+    from flame_mdm.generator import MotionGenerator
 
 MAX_SAMPLES = 10_000
 """Maximum number of samples per request; they are kept in memory until all are complete."""
@@ -42,6 +43,8 @@ REGIONS = ("in_between", "prediction", "prefix", "suffix", "interpolate")
 Part = tuple[str, float | None]
 """Text of a part of a sequence, and its seconds if the text gives them."""
 Ranges = Sequence[float] | Sequence[Sequence[float]]
+ARRIVAL = 0.2
+"""Seconds before the end of a motion at which the last way point of a path is reached."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,6 +99,11 @@ class EditRequest:
         if self.method is not None:
             self.method_options(self.method)
 
+    @property
+    def varies(self) -> bool:
+        """Whether the result is a variation of the entire motion, so that it can have parts and targets."""
+        return self.strength is not None and self.region is self.region_seconds is self.joints is None
+
     def ranges(self, name: str) -> list[tuple[float, float]] | None:
         """Returns the ranges of the field `name`; None if it has none."""
         value: Any = getattr(self, name)
@@ -140,7 +148,7 @@ class SamplingRequest:
 
     texts: str | Sequence[str] | None = option(
         None,
-        'what the person does; several actions in a row: "walks forward @3 | turns left | sits down @2" (seconds)',
+        'what the person does; several actions in a row: "walks forward @3 | turns around | bows @2" (seconds)',
     )
     actions: str | Sequence[str] | None = option(None, "a label, for models trained on labels")
     seconds: float | Sequence[float] | None = option(
@@ -155,6 +163,7 @@ class SamplingRequest:
     )
     seed: int = option(0, "seed of the noise")
     after: str | Path | Motion | None = option(None, "FILE or dataset:id: a motion that the result continues")
+    split: bool = option(True, 'sentences with several actions, "walks, then sits", become sequences, "walks | sits"')
     loop: bool = option(False, "the last frame leads to the first one")
     targets: str | Path | Mapping[str, Any] | None = option(
         None, "a JSON file of places to reach: way points, joints, poses; see docs/targets.md"
@@ -209,7 +218,7 @@ class SamplingRequest:
             name = self.after if isinstance(self.after, str | Path) else self.after.id
             raise UserError(f"after={name}: a motion that continues another cannot have {other}. Give one of the two")
         if self.editing is not None:
-            self.check_edit()
+            self.check_edit(self.editing.varies)
             if self.seconds is not None or self.frames is not None:
                 raise UserError("an edit is as long as its motion: omit seconds and frames, or give cut=[begin, end]")
 
@@ -248,14 +257,17 @@ class SamplingRequest:
             if not issubclass(type(length), Real) or not abs(length) < 1e9 or (name == "frames" and length % 1):
                 raise UserError(f"{shown} is not a valid length")
 
-    def check_edit(self) -> None:
+    def check_edit(self, varies: bool) -> None:
         """Checks that a request to edit a motion asks for nothing else.
 
         Raises:
-            UserError: If it asks for a sequence or targets.
+            UserError: If it asks for a sequence or targets; for a variation, if it continues a motion.
         """
-        if self.is_sequence or self.targets is not None:
-            raise UserError("an edit keeps a single motion: give neither parts (|), after, loop nor targets with it")
+        if self.after is not None or (not varies and (self.is_sequence or self.targets is not None)):
+            raise UserError(
+                "an edit keeps a single motion: give neither parts (|), after, loop nor targets with it. Variations of "
+                "an entire motion (strength=0.5) may have parts, loop and targets"
+            )
 
     @property
     def kind(self) -> Literal["text", "action", "none"]:
@@ -285,7 +297,28 @@ class SamplingRequest:
         return [None if length is None else length * scale for length in values]
 
 
-def check_model(request: SamplingRequest, model: MotionGeneration) -> None:
+def understood(request: SamplingRequest, model: MotionGenerator) -> SamplingRequest:
+    """Returns the request with its sentences of several actions as sequences, if `split` says so.
+
+    Texts with seconds or parts of their own are kept, and so are the texts of models that cannot make sequences.
+
+    Raises:
+        UserError: If the model knows no word of a text that says what happens.
+    """
+    if request.kind != "text" or model.conditioned_on != "text":
+        return request
+    from flame_mdm.conditions.vocabulary import check_known, in_parts  # its package imports torch
+
+    if request.split and request.editing is None and model.representation.relative:
+        verbs = model.facts.get("verbs", ())
+        texts = [t if "|" in t or "@" in t else " | ".join(in_parts(t, verbs)) for t in request.prompts]
+        request = replace(request, texts=texts)
+    for text in dict.fromkeys(name for parts in request.parts for name, _ in parts):
+        check_known(text, model.facts)
+    return request
+
+
+def check_model(request: SamplingRequest, model: MotionGenerator) -> None:
     """Checks that a model can do what is requested; the planning of a sampling run also checks the lengths.
 
     Raises:
@@ -336,3 +369,28 @@ def is_range(value: Any) -> bool:
         and len(value) == 2
         and all(isinstance(v, int | float) and math.isfinite(v) for v in value)
     )
+
+
+def read_path(text: str) -> list[tuple[float, float]]:
+    """Returns the way points of "x,z x,z ...", in meters.
+
+    Raises:
+        UserError: If the text is not of this form.
+    """
+    try:
+        points = [tuple(map(float, point.split(","))) for point in text.split()]
+    except ValueError:
+        points = []
+    if not points or any(len(point) != 2 for point in points):
+        raise UserError(f'path={text}: give way points as x,z in meters, such as path="0,1 0.5,2"')
+    return [(x, z) for x, z in points]
+
+
+def path_targets(path: Sequence[tuple[float, float]], seconds: float) -> dict[str, Any]:
+    """Returns targets for `flame_mdm.generate` that lead a motion of `seconds` along a path from x = z = 0.
+
+    The times of the way points are proportional to the distance along the path.
+    """
+    way = list(accumulate(math.dist(*pair) for pair in pairwise([(0.0, 0.0), *path])))
+    times = [round((seconds - ARRIVAL) * done / (way[-1] or 1.0), 3) for done in way]
+    return {"root": [{"time": time, "position": list(at)} for time, at in zip(times, path, strict=True)]}

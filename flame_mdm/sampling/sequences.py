@@ -8,9 +8,9 @@ import torch
 
 from flame_mdm.batch import MotionBatch
 from flame_mdm.errors import UserError
+from flame_mdm.generator import MotionGenerator
 from flame_mdm.processes.windows import Windows, spans, window_tensors
 from flame_mdm.sampling.request import Part, SamplingRequest
-from flame_mdm.task import MotionGeneration
 
 OVERLAP = 0.5
 """Seconds that neighboring windows share; see docs/sequences.md."""
@@ -18,12 +18,12 @@ MAX_SECONDS = 600
 """Maximum length of a sequence; all its windows are denoised at the same time."""
 
 
-def overlap(model: MotionGeneration) -> int:
+def overlap(model: MotionGenerator) -> int:
     """Returns the number of frames that neighboring windows share, which is even."""
     return 2 * round(min(OVERLAP * model.representation.fps, model.facts["max_frames"] / 3) / 2)
 
 
-def motion_lengths(model: MotionGeneration, request: SamplingRequest) -> list[list[int]]:
+def motion_lengths(model: MotionGenerator, request: SamplingRequest) -> list[list[int]]:
     """Returns the number of frames of each part of the motion of each prompt.
 
     Raises:
@@ -50,7 +50,7 @@ def motion_lengths(model: MotionGeneration, request: SamplingRequest) -> list[li
 
 
 def _part_lengths(
-    model: MotionGeneration, text: str, parts: Sequence[Part], usual: float | None, loop: bool
+    model: MotionGenerator, text: str, parts: Sequence[Part], usual: float | None, loop: bool
 ) -> list[int]:
     """Returns the number of frames of each part of a sequence.
 
@@ -77,7 +77,7 @@ def _part_lengths(
 
 
 def windows(
-    model: MotionGeneration,
+    model: MotionGenerator,
     conditions: Sequence[Sequence[str]],
     lengths: Sequence[Sequence[int]],
     actions: Sequence[str] | None,

@@ -38,10 +38,15 @@ class MovingAverage(WeightAveraging):
         self.weights: list[Tensor] = []
         self.begun = False
 
-    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+    def averaged(self) -> Any:
+        """Returns the copy of the task that has the averages; during validation, it has the weights instead."""
         assert self._average_model is not None
-        self.averages = [p.detach() for p in self._average_model.module.parameters()]
+        return self._average_model.module
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        self.averages = [p.detach() for p in self.averaged().parameters()]
         self.weights = [p.detach() for p in pl_module.parameters()]
+        assert self._average_model is not None
         self.begun = int(self._average_model.n_averaged) > 0
 
     def on_train_batch_end(
@@ -72,6 +77,5 @@ class MovingAverage(WeightAveraging):
         super().on_train_end(trainer, pl_module)
 
     def _copy_buffers(self, pl_module: LightningModule) -> None:
-        assert self._average_model is not None
-        for average, buffer in zip(self._average_model.module.buffers(), pl_module.buffers(), strict=True):
+        for average, buffer in zip(self.averaged().buffers(), pl_module.buffers(), strict=True):
             average.copy_(buffer)

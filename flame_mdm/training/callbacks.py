@@ -8,6 +8,7 @@ import signal
 import sys
 import time
 from collections.abc import Mapping, Sequence
+from importlib.util import find_spec
 from inspect import getdoc, signature
 from itertools import zip_longest
 from pathlib import Path
@@ -22,14 +23,18 @@ from torch.nn.utils import get_total_norm
 from torchmetrics import Metric
 
 from flame_mdm.batch import MotionBatch
+from flame_mdm.checkpoints.loading import PARTS
 from flame_mdm.conditions.action import ActionLabels
+from flame_mdm.conditions.vocabulary import plainest
+from flame_mdm.config import Config, foreign
 from flame_mdm.data.datamodule import Clips, MotionDataModule
 from flame_mdm.errors import UserError, say
 from flame_mdm.formats.motion import Motion
 from flame_mdm.progress import ProgressBar
 from flame_mdm.reporting.page import number
 from flame_mdm.reporting.report import write_report
-from flame_mdm.sampling.generation import generate, write_motions
+from flame_mdm.sampling.generation import sample_request, write_motions
+from flame_mdm.sampling.request import SamplingRequest
 from flame_mdm.signals import StopRequest
 from flame_mdm.task import MotionGeneration, Task
 from flame_mdm.training.loggers import log_video
@@ -197,13 +202,24 @@ class Report(Callback):
         if isinstance(pl_module, MotionGeneration):
             facts, kind = pl_module.facts, pl_module.conditioned_on
             key, names = {
-                "text": ("text", facts.get("captions", ())),
+                "text": ("text", plainest(facts.get("captions", ()))),
                 "action": ("action", facts["actions"]),
                 "none": ("unconditioned", ("true",)),
             }[kind]
             example = shlex.quote(next(iter(names), "a person walks"))
-            say(f"next: {_command('sample', self.folder, f'{key}={example}')}")
-            say(f"      {_command('evaluate', self.folder, 'extractor=none', 'quick=true')}")
+            own = _environment(pl_module.config)
+            say(f"next: {own}{_command('sample', self.folder, f'{key}={example}')}")
+            say(f"      {own}{_command('evaluate', self.folder, 'extractor=none', 'quick=true')}")
+
+
+def _environment(config: Config) -> str:
+    """Returns the variables that a command needs to load a model with classes from outside this framework."""
+    named = foreign({name: config[name] for name in PARTS if name in config}).values()
+    specs = {name: find_spec(name) for name in sorted({target.partition(".")[0] for target in named})}
+    files = [(Path(spec.origin), spec.submodule_search_locations) for spec in specs.values() if spec and spec.origin]
+    folders = {file.parents[inner is not None] for file, inner in files}
+    path = ":".join(sorted(os.path.relpath(folder) for folder in folders if folder.name != "site-packages"))
+    return f"PYTHONPATH={shlex.quote(path)} " * bool(path) + f"FLAME_MDM_TRUST={','.join(specs)} " * bool(specs)
 
 
 def _command(name: str, folder: Path, *words: str) -> str:
@@ -357,14 +373,14 @@ class SampleMotions(Callback):
         if not texts and (self.texts or rank):
             return []
         condition = model.conditioned_on if texts else "none"
-        return generate(
-            model,
-            texts if condition == "text" else None,
+        request = SamplingRequest(
+            texts=texts if condition == "text" else None,
             actions=texts if condition == "action" else None,
             frames=min(round(self.seconds * model.representation.fps), model.facts["max_frames"]),
             samples=len(texts) if texts and condition == "none" else 1 if texts else self.unconditioned,
             seed=0,
         )
+        return sample_request(model, request)
 
     def _measure_real(self, clips: Clips, task: LightningModule) -> dict[str, float | None]:
         """Computes all metrics of up to `REAL` training clips, which have the attributes that all prompts request."""

@@ -17,11 +17,12 @@ from lightning.fabric.plugins.environments.slurm import SLURMEnvironment
 from lightning.fabric.plugins.environments.torchelastic import TorchElasticEnvironment
 from lightning.pytorch.utilities import rank_zero_only
 
+from flame_mdm.checkpoints.adapters import attach, copy_weights
 from flame_mdm.checkpoints.loading import NO_GPU
 from flame_mdm.config import Config, instantiate
 from flame_mdm.data.datamodule import MotionDataModule
 from flame_mdm.errors import UserError, say
-from flame_mdm.task import Task
+from flame_mdm.task import MotionGeneration, Task
 from flame_mdm.training.averaging import MovingAverage
 from flame_mdm.training.callbacks import Interrupted, Measurements, Progress, Report
 from flame_mdm.training.checkpointing import AtomicCheckpoints, Resumed, check_training_state, newest
@@ -52,6 +53,11 @@ def fit(folder: Path, config: Config) -> None:
     if resumed:
         _check_same_data(resumed, data)
     task: Task = get_class(config["task"]["_target_"]).build(config, representation, actions=data.actions)
+    if isinstance(task, MotionGeneration):
+        if config.get("adapter"):
+            attach(task, config["adapter"])
+        if config.get("base") and not resumed:
+            copy_weights(task, config["base"])
     fast = config["run"].get("speed") == "fast"
     precision = accelerate(task, data, config) if fast else config["trainer"]["precision"]
     callbacks: list[Callback] = [WriteProvenance(config)]
@@ -156,6 +162,7 @@ def _quiet() -> None:
     for message in (
         ".*isinstance\\(treespec, LeafSpec\\).*",  # Lightning's own
         ".*does not have many workers.*",
+        ".*module\\(s\\) in eval mode at the start of training.*",  # a student without dropout
         ".*Checkpoint directory .* exists and is not empty.*",
         ".*sync_dist=True.*",  # the metrics are means over all processes already
     ):

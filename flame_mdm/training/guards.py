@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
@@ -16,7 +15,7 @@ from torch import Tensor
 
 from flame_mdm.batch import MotionBatch
 from flame_mdm.errors import UserError, say
-from flame_mdm.safe_io import locked
+from flame_mdm.safe_io import locked, write_json
 
 
 @contextmanager
@@ -114,7 +113,7 @@ class BadLoss(Callback):
             for part, value in zip(everyone, values, strict=True):
                 part["loss"] = str(value)
             if trainer.is_global_zero:
-                self.path.write_text(json.dumps({"step": step, "usual_loss": str(self.usual), "batches": everyone}))
+                write_json(self.path, {"step": step, "usual_loss": str(self.usual), "batches": everyone})
             raise UserError(
                 f"the loss of step {step} is {max(values, key=lambda v: v if v == v else float('inf')):g}"
                 + (f" (typical: {self.usual:.3g})" if self.usual < float("inf") else "")

@@ -43,7 +43,9 @@ class WriteProvenance(Callback):
             **environment(),
             "device": device_name(trainer),
             "parameters": sum(p.numel() for p in pl_module.parameters() if p.requires_grad),
-            "data": {name: fact for name, fact in pl_module.facts.items() if name not in ("vocabulary", "captions")},
+            "data": {
+                name: fact for name, fact in pl_module.facts.items() if name not in ("vocabulary", "verbs", "captions")
+            },
         }
         if trainer.global_step and (folder / PROVENANCE).exists():
             self._compare_code(read_json(folder / PROVENANCE, Provenance, "delete it to resume"), facts)

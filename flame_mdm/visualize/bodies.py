@@ -22,17 +22,15 @@ from flame_mdm.safe_io import atomic_write
 from flame_mdm.visualize.body import (
     HAIR,
     HELPERS,
-    JOINT,
     SHIRT,
     SHOES,
     SKIN,
     TROUSERS,
     Mesh,
     mannequin,
-    orthonormal,
     packed,
-    shortest_turn,
 )
+from flame_mdm.visualize.posture import JOINT, orthonormal, shortest_turns
 
 SHAPE = {"gender": 0.5, "age": 2 / 3, "height": 0.45, "weight": 0.4}
 """Anny's numbers and their defaults, 0 to 1: male to female, baby to old (2/3: a young adult), small to tall, light to
@@ -172,7 +170,7 @@ def _turns(joints: np.ndarray) -> np.ndarray:
         name = SMPL22.joints[parent]
         along, level = joints[joint] - joints[parent], [1, 0, 1] if name.endswith("ankle") else 1
         if name not in ("pelvis", "spine3"):
-            turns[parent] = shortest_turn(usual[joint] * level, along * level)
+            turns[parent] = shortest_turns(usual[joint] * level, along * level)
     for side in ("left", "right"):
         shoulder, elbow, wrist = (JOINT[f"{side}_{name}"] for name in ("shoulder", "elbow", "wrist"))
         upper, lower = joints[elbow] - joints[shoulder], joints[wrist] - joints[elbow]

@@ -11,9 +11,9 @@ from scipy.spatial.transform import Rotation
 
 from flame_mdm.errors import UserError
 from flame_mdm.representations.skeleton import SMPL22
+from flame_mdm.visualize.posture import JOINT, complete, world_rotations
 from flame_mdm.visualize.scene import Shown
 
-JOINT = {name: number for number, name in enumerate(SMPL22.joints)}
 TWISTED = {"hip": 0.4, "shoulder": 0.4, "elbow": 0.55}
 """Joints whose limb has a helper bone, and how much of the twist about the limb this has: of the joint's own twist, and
 for the elbow of the twist of the wrist."""
@@ -32,13 +32,6 @@ SKIN, HAIR, SHIRT, TROUSERS, SHOES = MATERIALS = (
     *((98, 106, 124), (64, 62, 66)),
 )
 """Colors of the figure."""
-UPRIGHT = np.cos(np.radians(30))
-"""The head is level on average in frames in which the chest is tilted by less than this angle, given as its cosine."""
-STANDING = 0.02
-"""A foot stands flat in frames in which it is at most this many meters above its lowest position."""
-TOES = (0.02, 0.09, np.radians(60))
-"""The toes stay flat while their joint is lower than the first height; above the second one they follow the foot. The
-last number is the largest bend."""
 
 
 class Mesh:
@@ -168,8 +161,7 @@ def fit_body(motion: Shown, body: Mesh | None = None) -> FittedBody:
     """Fits a body to a clip and computes the rotations of its bones.
 
     The body's joints are the motion's, but higher by the thickness of the sole: in motions, the lowest joint is on the
-    floor. If rotations are solved for, positions determine neither the head's pitch, whose median while the chest is
-    upright is taken as level, nor the toes, which stay flat on the floor while the heel rises.
+    floor. Rotations that are solved for are completed.
 
     Args:
         motion: the clip.
@@ -184,27 +176,12 @@ def fit_body(motion: Shown, body: Mesh | None = None) -> FittedBody:
     offsets = np.array(poses.offsets)
     fit, wide = proportions(body, offsets)
     neutral = np.tile(np.eye(3), (len(SMPL22), 1, 1))
-    for side in ("left", "right"):
-        ankle, toe = JOINT[f"{side}_ankle"], JOINT[f"{side}_foot"]
-        if motion.poses is None:
-            flat = _flat_foot(joints[:, ankle], joints[:, toe], offsets[toe])
-            neutral[ankle] = neutral[toe] = shortest_turn(flat, offsets[toe])
-            offsets[toe] = flat
+    if motion.poses is None:
+        neutral, world, offsets = complete(joints, offsets, world)
+    for toe in (JOINT["left_foot"], JOINT["right_foot"]):
         _, high, long = body.rest[toe]
         tall = (wide * body.sole - offsets[toe, 1]) / (body.sole - high)
-        fit[ankle] = np.diag([wide, tall, offsets[toe, 2] / long])
-    if motion.poses is None:
-        neck, head = JOINT["neck"], JOINT["head"]
-        x, y, z = (joints[:, head] - joints[:, neck]).T
-        chest = world[:, JOINT["spine3"]]
-        upright = chest[:, 1, 1] > UPRIGHT if chest[:, 1, 1].max() > UPRIGHT else slice(None)
-        sine, cosine = chest[:, [0, 2], 2].T / np.linalg.norm(chest[:, [0, 2], 2], axis=1)
-        usual = np.median(np.stack([x * cosine - z * sine, y, x * sine + z * cosine], 1)[upright], 0)
-        neutral[head] = shortest_turn(offsets[head], usual).T
-    world = world @ neutral
-    if motion.poses is None:
-        for toe in (JOINT["left_foot"], JOINT["right_foot"]):
-            world[:, toe] = world[:, toe] @ _toes(world[:, toe], joints[:, toe, 1])
+        fit[SMPL22.parents[toe]] = np.diag([wide, tall, offsets[toe, 2] / long])
     turns = body.turns
     rest = np.zeros((len(SMPL22), 3))
     for parent, joint in SMPL22.edges:
@@ -290,48 +267,6 @@ def proportions(body: Mesh, offsets: np.ndarray) -> tuple[np.ndarray, float]:
             long = np.clip(ratio[children[0]], *np.multiply((0.6, 1.6), wide))
             fit[joint] += (long - wide) * np.outer(along, along)
     return fit, wide
-
-
-def world_rotations(rotations: np.ndarray) -> np.ndarray:
-    """Returns rotations (..., 22, 3, 3) in the world from those relative to parents."""
-    world = rotations.copy()
-    for parent, joint in SMPL22.edges:
-        world[..., joint, :, :] = world[..., parent, :, :] @ rotations[..., joint, :, :]
-    return world
-
-
-def orthonormal(direction: np.ndarray, u: np.ndarray) -> np.ndarray:
-    """Returns axes as rows (3, 3): the direction, then `u` made orthogonal to it, then the third one."""
-    along = direction / np.linalg.norm(direction)
-    across = u - (u @ along) * along
-    across /= np.linalg.norm(across)
-    return np.stack([along, across, np.cross(along, across)])
-
-
-def shortest_turn(start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """Returns the smallest rotation (3, 3) that turns one direction into another."""
-    a, b = start / np.linalg.norm(start), end / np.linalg.norm(end)
-    axis = np.cross(a, b)
-    sine = np.linalg.norm(axis)
-    return Rotation.from_rotvec(axis / max(sine, 1e-9) * np.arctan2(sine, a @ b)).as_matrix()
-
-
-def _flat_foot(ankle: np.ndarray, toe: np.ndarray, offset: np.ndarray) -> np.ndarray:
-    """Returns the position of the toes relative to the ankle while the foot stands flat, in the rest pose."""
-    height = ankle[:, 1] + toe[:, 1]
-    flat = height <= height.min() + STANDING
-    length = np.linalg.norm(offset)
-    drop = np.clip(np.median((ankle - toe)[flat, 1]), 0.1 * length, 0.8 * length)
-    ahead = offset * [1, 0, 1] / np.linalg.norm(offset[[0, 2]])
-    return np.sqrt(length**2 - drop**2) * ahead - [0, drop, 0]
-
-
-def _toes(foot: np.ndarray, height: np.ndarray) -> np.ndarray:
-    """Returns rotations (F, 3, 3) of the toes relative to the foot, which has rotations (F, 3, 3) in the world."""
-    low, high, most = TOES
-    down = np.clip(np.arcsin(np.clip(-foot[:, 1, 2], -1, 1)), 0, most)
-    near = np.clip((high - height) / (high - low), 0, 1)
-    return Rotation.from_rotvec(np.outer(-down * near, [1, 0, 0])).as_matrix()
 
 
 def _with_helpers(world: np.ndarray, offsets: np.ndarray) -> np.ndarray:

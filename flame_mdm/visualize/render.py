@@ -1,7 +1,10 @@
 """Still images and videos of motions, drawn with Pillow."""
 
+import io
 import math
+import os
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from fractions import Fraction
 from importlib import import_module
 from pathlib import Path
@@ -149,6 +152,16 @@ def contact_sheet(
         sheet.save(temporary, format="PNG", optimize=True)
 
 
+def thumbnail(motion: Shown, height: int = 120) -> bytes:
+    """Returns the pose that differs most from the first one as a WebP image, `height` pixels high and 0.7 as wide."""
+    poses = motion.joints - motion.joints[:, :1] * [1, 0, 1]
+    frame = int(np.linalg.norm(poses - poses[0], axis=2).sum(1).argmax())
+    image = _figure(motion, try_fit(motion)[0], frame, round(height / 0.92))
+    left, content = (image.width - 0.7 * height) / 2, io.BytesIO()
+    image.crop((round(left), 0, round(left + 0.7 * height), height)).save(content, "WEBP", quality=85)
+    return content.getvalue()
+
+
 def _palette() -> Image.Image:
     """Returns one palette of all colors and their blends at smoothed edges, so that colors do not flicker."""
     limbs = [color for side in SIDE_COLORS.values() for color in (side, _shade(side, LIT), _shade(side, DARK))]
@@ -172,18 +185,23 @@ def _video(motions: Sequence[Shown], fps: float, size: int, mesh: Mesh | None) -
     lines = [_lines(motion, body, size, size) for motion, body in zip(motions, bodies, strict=True)]
     captions = [_caption(own, size, max(map(len, lines)), size) for own in lines]
     count = max(1, math.ceil(seconds * fps - 1e-6))
-    for tick in range(count):
-        for k, motion in enumerate(motions):
-            if frame_at(motion, tick / fps) != frames[k]:
-                frames[k] = frame_at(motion, tick / fps)
-                panels[k] = _below(_figure(motion, bodies[k], frames[k], size), captions[k])
-        height = panels[0].height
-        image = Image.new("RGB", (columns * size, math.ceil(len(motions) / columns) * height + 3), PAPER)
-        for k, panel in enumerate(panels):
-            image.paste(panel, (k % columns * size, k // columns * height))
-        done = image.width * (tick + 1) / count
-        ImageDraw.Draw(image).rectangle((0, image.height - 3, done, image.height), TRAIL)
-        yield image
+
+    def draw(k: int, frame: int) -> Image.Image:
+        if frame == frames[k]:
+            return panels[k]
+        return _below(_figure(motions[k], bodies[k], frame, size), captions[k])
+
+    with ThreadPoolExecutor(min(len(motions), os.cpu_count() or 1)) as pool:
+        for tick in range(count):
+            now = [frame_at(motion, tick / fps) for motion in motions]
+            panels, frames = list(pool.map(draw, range(len(motions)), now)), now
+            height = panels[0].height
+            image = Image.new("RGB", (columns * size, math.ceil(len(motions) / columns) * height + 3), PAPER)
+            for k, panel in enumerate(panels):
+                image.paste(panel, (k % columns * size, k // columns * height))
+            done = image.width * (tick + 1) / count
+            ImageDraw.Draw(image).rectangle((0, image.height - 3, done, image.height), TRAIL)
+            yield image
 
 
 def _figure(motion: Shown, body: FittedBody | None, frame: int, size: int) -> Image.Image:

@@ -1,6 +1,7 @@
 """Run by a Python with the package bpy: opens a motion file in Blender, prints its joints in three frames as JSON."""
 
 import json
+import os
 import sys
 
 import bpy  # pyright: ignore[reportMissingImports]
@@ -21,4 +22,5 @@ for frame in (first, (first + last) // 2, last):
     heads = {bone.name: armature.matrix_world @ bone.head for bone in armature.pose.bones}
     # from Blender's z up to y up
     shown.append((frame - first, {name: [head.x, head.z, -head.y] for name, head in heads.items()}))
-print("FOUND" + json.dumps(shown))
+print("FOUND" + json.dumps(shown), flush=True)
+os._exit(0)  # Blender 4.2 crashes when it exits after an import of glTF

@@ -8,6 +8,8 @@ that need them skip where that folder is absent.
 import hashlib
 import json
 import os
+import subprocess
+import sys
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -28,6 +30,15 @@ Arrays = dict[str, np.ndarray]
 
 GENERATION = [name for name in recipes() if name.partition("/")[0] not in ("classifier", "motion_clip", "t2m")]
 """Names of the recipes of models that generate motions."""
+
+
+@cache
+def blender() -> str:
+    """A Python that has the package bpy; tests skip without one."""
+    python = os.environ.get("FLAME_MDM_BLENDER", sys.executable)
+    if subprocess.run([python, "-c", "import bpy"], capture_output=True, check=False).returncode:
+        pytest.skip("no package bpy: set FLAME_MDM_BLENDER to a Python that has it")
+    return python
 
 
 @cache

@@ -14,18 +14,21 @@ from pathlib import Path
 
 import pytest
 import torch
+from hydra.utils import get_class
 
 from flame_mdm.batch import MotionBatch, collate
 from flame_mdm.config import compose, instantiate
 from flame_mdm.data.datamodule import TrainingBatches
 from flame_mdm.task import MotionGeneration
+from flame_mdm.training.distillation import ConsistencyDistillation
 
 SECONDS = 120
 
 TINY = [
-    *("data.source.clips=60", "data.batch_size=8", "denoiser.latent_dim=16", "denoiser.ff_size=16"),
-    *("denoiser.num_layers=1", "denoiser.num_heads=2", "condition.features=16", "process.num_train_timesteps=10"),
+    *("data.source.clips=120", "data.batch_size=8", "denoiser.latent_dim=16", "denoiser.ff_size=16"),
+    *("denoiser.num_layers=1", "denoiser.num_heads=2", "process.num_train_timesteps=10"),
     *("task.num_inference_steps=5", "trainer.accelerator=cpu", "trainer.enable_progress_bar=false"),
+    *("condition.features=16", "condition.pretrain_steps=10"),
     "callbacks.samples.seconds=1.5",
     "lr_decay=0",  # it depends on trainer.max_steps, which tests raise to resume
 ]
@@ -69,17 +72,22 @@ def alarm(folder: Path, name: str, **arguments: object) -> list[str]:
     return [f"+callbacks.{name}.{key}={value}" for key, value in values.items()]
 
 
-def reference(words: list[str], steps: int) -> dict[str, torch.Tensor]:
+def reference(words: list[str], steps: int, name: str = "quickstart") -> dict[str, torch.Tensor]:
     """Weights of one process that averages the gradients of both processes' batches."""
-    config = compose("quickstart", words)
+    config = compose(name, words)
     torch.manual_seed(config["seed"])
     representation = instantiate(config["representation"])
     data = instantiate(config["data"], representation=representation, seed=config["seed"])
     data.setup("fit")
     torch.manual_seed(config["seed"])
-    task = MotionGeneration.build(config, representation)
+    kind = get_class(config["task"]["_target_"])
+    task: MotionGeneration = kind.build(config, representation)
+    if isinstance(task, ConsistencyDistillation):
+        task.start_from_teacher()
+    else:
+        task.condition.pretrain([clip.captions for clip in data.train.clips], task.seed)
     rank = 0
-    task.__class__ = type("OfRank", (MotionGeneration,), {"global_rank": property(lambda self: rank)})
+    task.__class__ = type("OfRank", (kind,), {"global_rank": property(lambda self: rank)})  # type: ignore[arg-type]
     task.log_dict = lambda *_, **__: None  # type: ignore[method-assign]
     optimizer = task.make_optimizer()
     streams = [

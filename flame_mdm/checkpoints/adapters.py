@@ -1,0 +1,176 @@
+"""Adapters: small changes of a model's weights, learned from a few clips.
+
+A weight W (out, in) of attention or feed-forward becomes W + strength * up down, with `up` (out, rank) and `down`
+(rank, in) (Hu et al. 2021, arXiv:2106.09685); in the word table of a learned text encoder, a vector is added to a row
+of each new word. In training, `torch.nn.utils.parametrize` computes the weights, also for code that reads a weight
+without calling its layer, as cross-attention does. Loaded models hold the changed weights.
+
+Training changes all layers. Of a style, only the changes of the second half are kept: the first half learns that the
+clips show few actions, and with it the model would forget which action is requested.
+
+An adapter file (.safetensors) has these parts of a weight NAME as NAME.up, NAME.down and NAME.vectors, and `About` as
+JSON in its metadata.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor, nn
+from torch.nn.utils.parametrize import register_parametrization
+from typing_extensions import TypedDict
+
+from flame_mdm.checkpoints.locating import find
+from flame_mdm.checkpoints.model_files import ADAPTER, check_weights, read_checkpoint, read_safetensors, state_sha256
+from flame_mdm.conditions.tokens import START, LearnedTokens
+from flame_mdm.conditions.vocabulary import hashed
+from flame_mdm.denoisers.layers import TransformerLayer
+from flame_mdm.errors import UserError, first_line
+from flame_mdm.safe_io import atomic_write, parse_json, regular_file
+from flame_mdm.schemas import check_shape
+
+if TYPE_CHECKING:
+    from flame_mdm.generator import MotionGenerator
+
+ORIGINAL, CHANGE = ".parametrizations.weight.original", ".parametrizations.weight.0."
+FARTHER = 10.0
+"""Factor of the vectors of words, which have farther to go than weights: the rows of a table are from N(0, 1)."""
+Paths = str | Path | Sequence[str | Path]
+"""One file, or several."""
+
+
+class About(TypedDict):
+    """Description of an adapter: `rows` of the word table are changed, one for each of `words`; `base` is a hash."""
+
+    name: str
+    action: bool
+    rank: int
+    words: list[str]
+    rows: list[int]
+    captions: list[str]
+    base: str
+
+
+class Change(nn.Module):
+    """Changes a weight in training, see `changed`; adapter files contain the parts if they are `kept`."""
+
+    def __init__(self, rows: Sequence[int] = (), *, is_kept: bool = True, **parts: Tensor):
+        super().__init__()
+        self.rows, self.kept = rows, nn.ParameterDict(parts if is_kept else {})
+        self.dropped = nn.ParameterDict({} if is_kept else parts)
+
+    def forward(self, weight: Tensor) -> Tensor:
+        return changed(weight, dict((*self.kept.items(), *self.dropped.items())), self.rows)
+
+
+def changed(weight: Tensor, parts: Mapping[str, Tensor], rows: Sequence[int], strength: float = 1.0) -> Tensor:
+    """Returns a weight with a low-rank change, or with vectors added to some of its rows."""
+    if "vectors" in parts:
+        return weight.index_add(0, torch.tensor(rows, device=weight.device), strength * FARTHER * parts["vectors"])
+    return weight + strength * (parts["up"] @ parts["down"])
+
+
+def word_rows(encoder: LearnedTokens, words: Iterable[str], vocabulary: Iterable[str]) -> list[int]:
+    """Returns for each word one of its two rows of the table, if possible one that no word of the vocabulary has."""
+    used = {row for word in (START, *vocabulary) for row in hashed(word, encoder.buckets)}
+    pairs = (hashed(word, encoder.buckets) for word in words)
+    return [second if first in used and second not in used else first for first, second in pairs]
+
+
+def attach(model: MotionGenerator, about: About) -> None:
+    """Freezes a model and adds changes that start at 0; raises `UserError` if its denoiser has no transformer."""
+    model.requires_grad_(False)
+    layers = [layer for layer in model.denoiser.modules() if isinstance(layer, TransformerLayer)]
+    if not layers:
+        raise UserError(f"{model.describe()} has no attention, which adapters change. Train all weights: full=true")
+    for number, layer in enumerate(layers):
+        for module in [module for module in layer.modules() if isinstance(module, nn.Linear)]:
+            up, size = torch.zeros(module.out_features, about["rank"]), module.in_features
+            down = torch.randn(about["rank"], size) * size**-0.5
+            change = Change(up=up, down=down, is_kept=about["action"] or number >= len(layers) // 2)
+            register_parametrization(module, "weight", change)
+    if isinstance(model.condition, LearnedTokens) and (rows := about["rows"]):
+        change = Change(rows, vectors=torch.zeros(len(rows), model.condition.features))
+        register_parametrization(model.condition.words, "weight", change)
+
+
+def copy_weights(model: MotionGenerator, base: str | Path) -> None:
+    """Copies the weights of a base, as for `find`, to a model, to which changes may be attached."""
+    own = model.state_dict()
+    for name, value in read_merged(find(base))["state_dict"].items():
+        own[name if name in own else name.removesuffix(".weight") + ORIGINAL] = value
+    try:
+        model.load_state_dict(own)
+    except RuntimeError as error:
+        raise UserError(f"base={base}: its weights do not fit the recipe: {first_line(error)}") from error
+
+
+def write_adapter(path: Path, trained: Path) -> None:
+    """Writes the adapter in a checkpoint of its training, atomically."""
+    from safetensors.torch import save
+
+    checkpoint = read_checkpoint(trained)
+    metadata = {"format": "pt", ADAPTER: json.dumps(checkpoint["config"]["adapter"])}
+    with atomic_write(path) as temporary:
+        temporary.write_bytes(save(_changes(checkpoint["state_dict"]), metadata))
+
+
+def read_merged(path: Path, adapter: Paths = (), strength: float | Sequence[float] = 1.0) -> dict[str, Any]:
+    """Reads a checkpoint or model file, with adapters merged into its weights; see `flame_mdm.load`."""
+    paths = [adapter] if isinstance(adapter, str | Path) else list(adapter)
+    strengths = [strength] * len(paths) if isinstance(strength, int | float) else list(strength)
+    if len(strengths) != len(paths) or not all(math.isfinite(value) for value in strengths):
+        raise UserError(f"adapter strength {strength}: give one number, or one for each of {len(paths)} adapters")
+    checkpoint = read_checkpoint(path)
+    state, config, facts = checkpoint["state_dict"], dict(checkpoint["config"]), dict(checkpoint["facts"])
+    plain = {name.replace(ORIGINAL, ".weight"): value for name, value in state.items() if CHANGE not in name}
+    if (trained := config.pop("adapter", None)) and (changes := _changes(state)):
+        _merge(plain, changes, check_shape(trained, About)["rows"], 1.0, path)
+    own = state_sha256(plain) if paths else ""
+    for file, weight in zip(paths, strengths, strict=True):
+        about, changes = _read(Path(file))
+        if about["base"] != own:
+            theirs = about["base"][:12]
+            raise UserError(
+                f"adapter={file}: made for the weights {theirs}, not {own[:12]}. Give the model it was made for"
+            )
+        _merge(plain, changes, about["rows"], weight, file)
+        for key, more in (("vocabulary", about["words"]), ("captions", about["captions"])):
+            if key in facts and weight:  # the base leaves out words that it does not know
+                facts[key] = list(dict.fromkeys([*more, *facts[key]]))
+    return checkpoint | {"state_dict": plain, "config": config, "facts": facts}
+
+
+def _changes(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    kept = f"{CHANGE}kept."
+    return {name.replace(kept, ".weight."): value for name, value in state.items() if kept in name}
+
+
+def _merge(
+    state: dict[str, Tensor], changes: Mapping[str, Tensor], rows: Sequence[int], strength: float, path: str | Path
+) -> None:
+    """Adds changes, as in an adapter file, to weights."""
+    try:
+        for name in {name.rpartition(".")[0] for name in changes}:
+            parts = {key.rpartition(".")[2]: part for key, part in changes.items() if key.rpartition(".")[0] == name}
+            state[name] = changed(state[name].float(), parts, rows, strength)
+    except (KeyError, RuntimeError, IndexError) as error:
+        raise UserError(f"{path}: damaged: the adapter does not fit the weights: {first_line(error)}") from error
+
+
+def _read(path: Path) -> tuple[About, dict[str, Tensor]]:
+    """Returns the description and the tensors of an adapter file."""
+    regular_file(path)
+    metadata, changes = read_safetensors(path)
+    if ADAPTER not in metadata:
+        raise UserError(f"adapter={path}: not an adapter. `flame-mdm adapt` writes them")
+    check_weights(changes, path)
+    try:
+        return check_shape(parse_json(metadata[ADAPTER]), About), changes
+    except ValueError as error:
+        raise UserError(f"adapter={path}: damaged: {error}") from error

@@ -1,0 +1,329 @@
+"""Export to ONNX: graphs for onnxruntime, with the sampling loop, the skeleton and the vocabulary as JSON."""
+
+from __future__ import annotations
+
+import logging
+import shutil
+import warnings
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from flame_mdm.batch import Condition, Edit, MotionBatch, length_mask
+from flame_mdm.checkpoints.loading import load
+from flame_mdm.checkpoints.runner import FORMAT, MIN_WORDS
+from flame_mdm.conditions.tokens import LearnedTokens
+from flame_mdm.conditions.vocabulary import FUNCTION_WORDS
+from flame_mdm.denoisers.gru import MDMGRU
+from flame_mdm.denoisers.unet import MDMUNet
+from flame_mdm.errors import UserError, first_line
+from flame_mdm.formats.poses import solve_checked
+from flame_mdm.generator import MotionGenerator
+from flame_mdm.processes import Process
+from flame_mdm.processes.guidance import classifier_free_guidance
+from flame_mdm.progress import ProgressBar
+from flame_mdm.representations.skeleton import SMPL22
+from flame_mdm.safe_io import atomic_folder, sha256, write_json
+from flame_mdm.sampler_options import SamplerOptions
+
+RUNNER = Path(__file__).with_name("runner.py")
+TOLERANCE = 1e-4
+"""Maximum difference between the outputs of a graph and of PyTorch, relative to the largest output."""
+FIXED_LENGTH = (MDMGRU, MDMUNet)
+"""Networks whose graphs have a fixed number of frames, that of the longest motion: shorter ones are padded."""
+TINY = 1e-6
+"""Probe of `to_x0` that no clipping of the clean estimate changes."""
+
+
+def export_onnx(source: str | Path, out: str | Path, *, half: bool = False, **adapted: Any) -> Path:
+    """Writes a model as a folder that `runner.py` in it samples from, with numpy and onnxruntime alone.
+
+    Args:
+        source: as for `flame_mdm.load`.
+        out: the folder, for `denoiser.onnx`, `joints.onnx`, `poses.onnx` (only for SMPL's 22 joints), `model.json` and
+            `runner.py`; docs/export.md describes them.
+        half: stores the weight matrices in half precision; graphs compute in single precision either way.
+        adapted: adapter and strength, as for `flame_mdm.load`.
+
+    Raises:
+        FileNotFoundError, UserError: As for `flame_mdm.load`; or if a part of the model cannot be exported, or a graph
+            does not compute what PyTorch does.
+    """
+    try:
+        import onnxruntime  # noqa: F401
+        import onnxscript  # noqa: F401
+    except ImportError as error:
+        raise UserError(f"format=onnx needs the package {error.name}: pip install flame-mdm[onnx]") from error
+    model = load(source, **adapted)
+    content = description(model)
+    with atomic_folder(out) as folder, torch.no_grad():
+        for graph in ProgressBar(graphs(model), desc="graphs", unit="graph"):
+            path = folder / f"{graph.name}.onnx"
+            write_graph(graph, path, half and graph.name == "denoiser")
+            content["sha256"][path.name] = sha256(path)
+        write_json(folder / "model.json", content, indent=None)
+        shutil.copy(RUNNER, folder / RUNNER.name)
+    return Path(out)
+
+
+def description(model: MotionGenerator) -> dict[str, Any]:
+    """Returns the content of `model.json`, without the hashes of the graphs.
+
+    Raises:
+        UserError: If the sampling loop cannot be written as numbers; see `sampling_plan`.
+    """
+    representation, skeleton, facts = model.representation, model.representation.skeleton, model.facts
+    encoder = model.condition
+    words = {"buckets": encoder.buckets, "max_words": encoder.max_words} if isinstance(encoder, LearnedTokens) else {}
+    return {
+        **{"format": FORMAT, "experiment": model.config["experiment"], "reads": model.conditioned_on, **words},
+        **{key: list(facts.get(key, ())) for key in ("actions", "vocabulary", "captions")},
+        "function_words": sorted(FUNCTION_WORDS),
+        **{"features": representation.features, "fps": representation.fps, "max_frames": facts["max_frames"]},
+        "padded_frames": facts["max_frames"] if _padded(model) else 0,
+        "skeleton": {"joints": skeleton.joints, "parents": skeleton.parents, "feet": skeleton.feet},
+        "clip_x0": bool(getattr(model.process, "clip_x0", False)),
+        "steps": sampling_plan(model.process, model.sampler_options),
+        "sha256": {},
+    }
+
+
+def _padded(model: MotionGenerator) -> bool:
+    return isinstance(model.denoiser, FIXED_LENGTH) or not model.denoiser.mask_padding
+
+
+# The sampling loop ----------------------------------------------------------------------------------------------------
+
+
+class Probe:
+    """Denoiser, noise and `Guide` that record how a sampler combines noise and clean estimates.
+
+    Noise number n is unit vector n, clean estimate number k is unit vector `calls` + 1 + k, so that every noisy motion
+    (1, 1, 2 `calls` + 1) lists its coefficients.
+    """
+
+    def __init__(self, process: Process, calls: int, variance: float):
+        """`calls` is the maximum number of calls; `variance` is the network's output for a learned variance."""
+        self.process, self.calls, self.variance, self.output = process, calls, variance, variance
+        self.time, self.draws = 0.0, 0
+        self.records: list[tuple[Tensor, int, list[float]]] = []  # x_t, draws before, (t, p, q) of each call
+
+    def unit(self, number: int) -> Tensor:
+        return functional.one_hot(torch.tensor(number), 2 * self.calls + 1).double()[None, None]
+
+    def noise(self, draw: int) -> Tensor:
+        self.draws = draw + 1
+        return self.unit(draw)
+
+    def denoise(self, x_t: Tensor, t: Tensor, mask: Tensor, cond: Condition) -> Tensor:
+        self.time = float(t[0])
+        return x_t.new_full((1, 1, self.process.out_features(x_t.shape[-1])), self.output)
+
+    def steer(self, clean: Callable[[Tensor], Tensor], x_t: Tensor) -> Tensor:
+        if len(self.records) == self.calls:
+            raise UserError("it chooses its own steps")
+        row = []
+        for self.output, x in ((0.0, x_t * 0 + TINY), (TINY, x_t * 0)):
+            row.append(float(clean(x)[0, 0, 0]) / TINY)
+        self.output = self.variance
+        self.records.append((x_t, self.draws, [self.time, *row]))
+        return x_t
+
+    def reach(self, x0_hat: Tensor) -> Tensor:
+        return self.unit(self.calls + len(self.records))
+
+
+def sampling_plan(process: Process, options: SamplerOptions) -> list[list[float]]:
+    """Returns the sampling loop as rows of 7 numbers (t, p, q, a, b, c, d), one for each call of the denoiser.
+
+    A call at time t, as the denoiser gets it, with output y gives the clean estimate x0 = p x + q y. Then
+    x <- a x + b x0 + c x0' + d noise, with the clean estimate x0' of the call before and new noise.
+
+    Raises:
+        UserError: If the process does not have the sampler, or the sampler is not of this form.
+    """
+    plans = [np.array(_plan(process, options, variance)) for variance in (0.0, 1.0)]
+    if not np.array_equal(plans[0], plans[1]):
+        raise UserError(
+            f"sampler={options.sampler} draws noise with the learned variance of this model, which the graph does not "
+            "have. Set task.sampler to ddim or dpm_solver_pp_2m"
+        )
+    return plans[0].tolist()
+
+
+def _plan(process: Process, options: SamplerOptions, variance: float) -> list[list[float]]:
+    steps = options.num_inference_steps
+    probe = Probe(process, 4 * (steps if isinstance(steps, int) else len(steps or ())), variance)
+    like, mask = probe.unit(0), torch.ones(1, 1, dtype=torch.bool)
+    edit = Edit(like * 0, torch.zeros_like(like, dtype=torch.bool), guide=probe)
+    try:
+        end = process.sample(probe.denoise, probe.noise, mask, Condition(like[0], like, mask), options, edit=edit)
+    except UserError as error:
+        raise UserError(f"sampler={options.sampler} cannot be exported: {error}") from error
+    rows = []
+    for number, (x_t, draws, row) in enumerate(probe.records):
+        after, drawn, _ = (*probe.records, (end, probe.draws, []))[number + 1]
+        last = probe.unit(probe.calls + number) * (number > 0)
+        columns = [x_t, probe.unit(probe.calls + 1 + number), last, probe.unit(draws) * (drawn > draws)]
+        matrix = torch.cat(columns, 1)[0].T.numpy()
+        solution = np.linalg.lstsq(matrix, after.numpy().ravel())[0]
+        if np.abs(matrix @ solution - after.numpy().ravel()).max() > 1e-9 * float(after.abs().max()):
+            raise UserError(f"sampler={options.sampler} combines more than two clean estimates, and is not exported")
+        rows.append([*row, *np.where(np.abs(solution) > 1e-12, solution, 0.0).tolist()])
+    return rows
+
+
+# Graphs ---------------------------------------------------------------------------------------------------------------
+
+
+class Graph(NamedTuple):
+    """A module to export. `examples` are its inputs by name; `dimensions` names their axes of any length."""
+
+    name: str
+    module: nn.Module
+    examples: dict[str, Tensor]
+    dimensions: dict[str, dict[int, Any]]
+    outputs: Sequence[str]
+
+
+class Call(nn.Module):
+    """One call of a model's denoiser, with its condition encoder and guidance.
+
+    Inputs are x_t (B, F, D), the time t (B,) as the denoiser gets it, lengths (B,) int64, and the condition: actions
+    (B,) int64, or rows of the word table (B, S, 2) int64 with the `counts` (B,) of each caption. The output is that of
+    the denoiser (B, F, D), without a learned variance.
+    """
+
+    def __init__(self, model: MotionGenerator):
+        """Raises `UserError` if the condition is encoded by a language model, which is not exported."""
+        super().__init__()
+        self.condition, self.denoiser = model.condition, model.denoiser
+        if model.conditioned_on == "text" and not isinstance(self.condition, LearnedTokens):
+            raise UserError(
+                f"{type(self.condition).__name__}: a language model is not exported to ONNX. Export a model with "
+                "condition=learned, action or none"
+            )
+        self.features = model.representation.features
+        self.scale = model.sampler_options.guidance_scale if model.condition.features else None
+
+    def forward(
+        self, x_t: Tensor, t: Tensor, lengths: Tensor, condition: Tensor | None = None, counts: Tensor | None = None
+    ) -> Tensor:
+        mask = length_mask(lengths, x_t.shape[1])
+        if isinstance(self.condition, LearnedTokens) and condition is not None and counts is not None:
+            cond = self.condition.encode(condition, counts)
+        else:
+            cond = self.condition(MotionBatch(x_t, mask, [], action=condition))
+        denoise = self.denoiser
+        if self.scale is not None and cond.null is not None:
+            denoise = classifier_free_guidance(denoise, self.scale, self.features)
+        return denoise(x_t, t, mask, cond)[..., : self.features]
+
+
+class Function(nn.Module):
+    """A function as a module, which PyTorch's exporter takes."""
+
+    def __init__(self, function: Callable[..., Any]):
+        super().__init__()
+        self.function = function
+
+    def forward(self, x: Tensor) -> Any:
+        return self.function(x)
+
+
+def graphs(model: MotionGenerator) -> list[Graph]:
+    """Returns the graphs of a model: the guided denoiser, decoding to joints and, for SMPL's skeleton, to rotations."""
+    representation, encoder, longest = model.representation, model.condition, model.facts["max_frames"]
+    batch, frames = torch.export.Dim("batch", max=1024), torch.export.Dim("frames", min=4, max=max(longest, 5))
+    x = torch.randn(2, min(longest, 9), representation.features)
+    fixed = isinstance(model.denoiser, FIXED_LENGTH)
+    inputs = {"x_t": torch.randn(2, longest, representation.features) if fixed else x}
+    inputs |= {"t": torch.tensor([7.0, 3.0]), "lengths": torch.tensor([x.shape[1], 2])}
+    dimensions: dict[str, dict[int, Any]] = {name: {0: batch} for name in inputs}
+    if not fixed:
+        dimensions["x_t"][1] = frames
+    if isinstance(encoder, LearnedTokens):
+        most = encoder.positions.shape[0]
+        most = min(most, getattr(model.denoiser, "max_tokens", 0) or most)
+        inputs |= {"condition": torch.randint(encoder.buckets, (2, 5, 2)), "counts": torch.tensor([5, 3])}
+        words = torch.export.Dim("words", min=MIN_WORDS, max=most)
+        dimensions |= {"condition": {0: batch, 1: words}, "counts": {0: batch}}
+    elif encoder.features:
+        inputs["condition"] = torch.tensor([0, len(model.facts["actions"]) - 1])
+        dimensions["condition"] = {0: batch}
+    to_joints = Function(representation.to_joints)
+    made = [
+        Graph("denoiser", Call(model), inputs, dimensions, ["output"]),
+        Graph("joints", to_joints, {"x": x}, {"x": {0: batch, 1: frames}}, ["joints"]),
+    ]
+    if representation.skeleton.name == SMPL22.name:
+        solver = Function(partial(solve_checked, fps=representation.fps))
+        joints = {"joints": representation.to_joints(x[0]) + torch.randn(x.shape[1], len(SMPL22), 3)}
+        made.append(Graph("poses", solver, joints, {"joints": {0: frames}}, ["offsets", "quaternions"]))
+    return made
+
+
+def write_graph(graph: Graph, path: Path, half: bool) -> None:
+    """Writes a graph and compares what it computes with PyTorch, for its examples and for a batch of one.
+
+    Raises:
+        UserError: If PyTorch cannot export the module, or the results differ.
+    """
+    import onnxruntime
+
+    examples = list(graph.examples.values())
+    dimensions = [graph.dimensions.get(name) for name in graph.examples]
+    logging.getLogger("torch.onnx").setLevel(logging.ERROR)
+    raw = path.with_suffix(".raw")
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            exported = torch.export.export(
+                graph.module.eval(), tuple(examples), dynamic_shapes=dimensions, strict=False
+            )
+            names = {"input_names": list(graph.examples), "output_names": graph.outputs}
+            program = torch.onnx.export(exported, dynamo=True, verbose=False, optimize=False, **names)
+            assert program is not None
+            program.save(raw)
+        # onnxruntime optimizes in a second what takes PyTorch's exporter a minute.
+        options = onnxruntime.SessionOptions()
+        options.log_severity_level = 3
+        options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_ENABLE_BASIC
+        options.optimized_model_filepath = str(path)
+        onnxruntime.InferenceSession(raw, options, providers=["CPUExecutionProvider"])
+    except Exception as error:  # the exporter raises many kinds
+        raise UserError(f"the {graph.name} cannot be exported to ONNX: {first_line(error)}") from error
+    raw.unlink()
+    _shrink(path, half)
+    session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
+    single = examples if graph.name == "poses" else [example[:1] for example in examples]
+    for values in (examples, single):
+        outputs = session.run(None, {name: value.numpy() for name, value in zip(graph.examples, values, strict=True)})
+        expected = graph.module(*values)
+        for ours, theirs in zip(outputs, [expected] if isinstance(expected, Tensor) else expected, strict=True):
+            difference = float((torch.from_numpy(ours) - theirs).abs().max() / theirs.abs().max().clamp(min=1))
+            if not difference <= (100 * TOLERANCE if half else TOLERANCE):
+                raise UserError(f"the {graph.name} of onnxruntime and PyTorch differ by {difference:.2g}")
+
+
+def _shrink(path: Path, half: bool) -> None:
+    """Removes the descriptions of the nodes; with `half`, stores matrices in half precision, with a cast."""
+    import onnx
+    from onnx import numpy_helper
+
+    model = onnx.load(path)
+    for node in model.graph.node:
+        node.ClearField("metadata_props")
+        node.ClearField("doc_string")
+    for tensor in model.graph.initializer:
+        if half and tensor.data_type == onnx.TensorProto.FLOAT and len(tensor.dims) > 1:
+            name, values = tensor.name, numpy_helper.to_array(tensor).astype(np.float16)
+            tensor.CopyFrom(numpy_helper.from_array(values, f"{name}.half"))
+            model.graph.node.insert(0, onnx.helper.make_node("Cast", [tensor.name], [name], to=onnx.TensorProto.FLOAT))
+    onnx.save(model, path)

@@ -1,0 +1,244 @@
+"""Sampling from a folder of `flame-mdm export CKPT OUT format=onnx`, with numpy and onnxruntime alone.
+
+python runner.py FOLDER "a person walks forward" motion.npz seconds=3 seed=0
+
+The same text, length and seed give the same motion as `flame_mdm.generate`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+import sys
+import zlib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+FORMAT = 1
+MIN_WORDS = 3
+"""Least number of tokens of a graph, with padding."""
+WORD = re.compile(r"[^\W_]+")
+NUMBERS, LARGEST = {"features": 1, "max_frames": 2, "padded_frames": 0}, 100_000
+"""Whole numbers of `model.json` and the smallest valid ones; the largest one of all numbers."""
+MASK = (1 << 64) - 1
+
+
+class Sampler:
+    """A model in a folder.
+
+    Attributes:
+        content: the content of `model.json`.
+        denoiser, joints, poses: sessions of onnxruntime; `poses` is None for other skeletons than SMPL's.
+    """
+
+    def __init__(self, folder: str | Path, threads: int = 1):
+        """Opens a folder.
+
+        Raises:
+            ValueError: If a file is missing, damaged or of another version.
+        """
+        import onnxruntime
+
+        self.folder = Path(folder)
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = threads
+        try:
+            self.content = checked(json.loads((self.folder / "model.json").read_text(encoding="utf-8")))
+            sessions = {}
+            for name, digest in self.content["sha256"].items():
+                graph = (self.folder / name).read_bytes()
+                if hashlib.sha256(graph).hexdigest() != digest:
+                    raise ValueError(f"{name} has changed since it was exported")
+                sessions[name] = onnxruntime.InferenceSession(graph, options, providers=["CPUExecutionProvider"])
+            self.denoiser, self.joints = sessions["denoiser.onnx"], sessions["joints.onnx"]
+            self.poses = sessions.get("poses.onnx")
+        except Exception as error:  # onnxruntime raises its own kinds
+            reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
+            raise ValueError(f"{self.folder}: not an exported model ({reason}). Export the model again") from error
+
+    def unknown(self, text: str) -> list[str]:
+        """Returns the words of a text, without function words, of which the model knows no form.
+
+        Raises:
+            ValueError: If it knows none of them.
+        """
+        seen, skipped = set(self.content["vocabulary"]), set(self.content["function_words"])
+        content = [word for word in dict.fromkeys(words(text)) if seen and word not in skipped]
+        unknown = [word for word in content if not known_form(word, seen)]
+        if seen and unknown == content:
+            raise ValueError(f"'{text}': the model knows no word of it that says what happens")
+        return unknown
+
+    def generate(self, prompt: str = "", seconds: float | None = None, seed: int = 0, sample: int = 0) -> np.ndarray:
+        """Returns normalized features (F, D) of one motion, for a text or an action; "" for an unconditional model.
+
+        Args:
+            prompt: what the person does.
+            seconds: length; None = 3, or the longest motion in training if that is shorter.
+            seed: of the noise.
+            sample: number of the motion, if several are generated for one text.
+
+        Raises:
+            ValueError: If the length or the action is not one of the model's, or the result is not finite.
+        """
+        content = self.content
+        longest, fps = content["max_frames"], content["fps"]
+        frames = min(round(3 * fps), longest) if seconds is None else round(seconds * fps)
+        if not 2 <= frames <= longest:
+            raise ValueError(f"seconds={seconds}: give {2 / fps:g} to {longest / fps:g} seconds")
+        padded = max(frames, content["padded_frames"])
+        inputs = {"lengths": np.array([frames]), **self._condition(prompt)}
+        number = key("noise", seed, 0, f"{prompt}#{sample}")
+        x, draw = normal(number, padded, content["features"]), 1
+        before = np.zeros_like(x)
+        for t, of_x, of_output, keep, clean, last, noise in content["steps"]:
+            output = self._run(self.denoiser, {"x_t": x[None], "t": np.array([t], np.float32), **inputs})[0][0]
+            x0_hat = np.float32(of_x) * x + np.float32(of_output) * output
+            if content["clip_x0"]:
+                x0_hat = x0_hat.clip(-1, 1)
+            x = np.float32(keep) * x + np.float32(clean) * x0_hat + np.float32(last) * before
+            if noise:
+                x, draw = x + np.float32(noise) * normal(number + draw, padded, content["features"]), draw + 1
+            before = x0_hat
+        if not np.isfinite(x).all():
+            raise ValueError(f"the model returned non-finite numbers for '{prompt}'. Export it again")
+        return x[:frames]
+
+    def decode(self, x: np.ndarray) -> np.ndarray:
+        """Returns joints (F, J, 3) in meters, y up, of normalized features (F, D)."""
+        return self._run(self.joints, {"x": x[None]})[0][0]
+
+    def rotations(self, joints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Returns offsets (22, 3) from the parents in the rest pose (arms out), and local quaternions (F, 22, 4).
+
+        Quaternions are (w, x, y, z), the root's in the world. Only for SMPL's 22 joints.
+        """
+        if self.poses is None:
+            raise ValueError("rotations are computed only for SMPL's 22 joints")
+        offsets, quaternions = self._run(self.poses, {"joints": joints})
+        return offsets, quaternions
+
+    def _run(self, graph: Any, inputs: dict[str, np.ndarray]) -> list[np.ndarray]:
+        try:
+            return graph.run(None, inputs)
+        except Exception as error:  # onnxruntime raises its own kinds
+            raise ValueError(
+                f"{self.folder}: model.json and the graphs do not match. Export the model again"
+            ) from error
+
+    def _condition(self, prompt: str) -> dict[str, np.ndarray]:
+        content = self.content
+        if content["reads"] == "none":
+            return {}
+        if content["reads"] == "action":
+            if prompt not in content["actions"]:
+                raise ValueError(f"unknown action '{prompt}'; this model knows: {', '.join(content['actions'])}")
+            return {"condition": np.array([content["actions"].index(prompt)])}
+        read = words(prompt)
+        if seen := set(content["vocabulary"]):
+            read = [form for word in read if (form := known_form(word, seen))]
+        rows = [hashed(word, content["buckets"]) for word in ["<start>", *read[: content["max_words"]]]]
+        padding = [(0, 0)] * max(0, MIN_WORDS - len(rows))
+        return {"condition": np.array([[*rows, *padding]]), "counts": np.array([len(rows)])}
+
+
+def checked(content: Any) -> dict[str, Any]:
+    """Returns the content of `model.json`; raises `ValueError` if it is not of this format."""
+    if not isinstance(content, dict) or content.get("format") != FORMAT:
+        raise ValueError(f"model.json is not of format {FORMAT}")
+    least = {**NUMBERS, **({"buckets": 1, "max_words": 1} if content.get("reads") == "text" else {})}
+    right = {
+        "steps": isinstance(content.get("steps"), list)
+        and np.shape(content["steps"])[1:] == (7,)
+        and np.isfinite(np.array(content["steps"], float)).all(),
+        "reads": content.get("reads") in ("text", "action", "none"),
+        "skeleton": isinstance(content.get("skeleton"), dict),
+        "sha256": isinstance(content.get("sha256"), dict)
+        and all(Path(name).name == name for name in content["sha256"]),
+        "clip_x0": isinstance(content.get("clip_x0"), bool),
+        **{
+            name: isinstance(content.get(name), list) and all(isinstance(text, str) for text in content[name])
+            for name in ("actions", "vocabulary", "captions", "function_words")
+        },
+        "fps": type(content.get("fps")) in (int, float) and 0 < content["fps"] <= LARGEST,
+        **{name: type(content.get(name)) is int and low <= content[name] <= LARGEST for name, low in least.items()},
+    }
+    if wrong := [name for name, valid in right.items() if not valid]:
+        raise ValueError(f"model.json is damaged: {', '.join(wrong)}")
+    return content
+
+
+def words(text: str) -> list[str]:
+    """See `flame_mdm.conditions.vocabulary.words`."""
+    return WORD.findall(text.lower())
+
+
+def known_form(word: str, seen: set[str]) -> str | None:
+    """See `flame_mdm.conditions.vocabulary.known_form`."""
+    stems = [word.removesuffix(suffix) for suffix in ("ing", "ed", "es", "s", "d", "") if word.endswith(suffix)]
+    stems += [stem[:-1] for stem in stems if len(stem) > 3 and stem[-1] in f"e{stem[-2]}"]
+    forms = [stem + ending for stem in stems if len(stem) > 2 for ending in ("", "e", "s", "es", "ing", "ed")]
+    return next((form for form in [word, *forms] if form in seen), None)
+
+
+def hashed(word: str, buckets: int) -> tuple[int, int]:
+    """See `flame_mdm.conditions.vocabulary.hashed`."""
+    number = zlib.crc32(word.encode())
+    return number % buckets, number // buckets % buckets
+
+
+def key(*parts: str | int) -> int:
+    """See `flame_mdm.seeds.key`."""
+    text = "\x1f".join(str(part) for part in parts)
+    return int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "big") >> 1
+
+
+def mixed(counters: np.ndarray) -> np.ndarray:
+    """Hashes uint64 counters (splitmix64)."""
+    x = counters + np.uint64(0x9E3779B97F4A7C15)
+    x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    x = (x ^ (x >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return x ^ (x >> np.uint64(31))
+
+
+def normal(number: int, frames: int, features: int) -> np.ndarray:
+    """Returns standard normal noise (F, D) float32 of a key; see `flame_mdm.seeds.normal`."""
+    pairs = (features + 1) // 2
+    first = mixed(mixed(np.array([number & MASK], np.uint64)))
+    positions = np.arange(frames * pairs, dtype=np.uint64) * np.uint64(0x9E3779B97F4A7C15)
+    bits = mixed(first + positions)
+    low, high = ((part & np.uint64(0xFFFFFF)).astype(np.float32) for part in (bits, bits >> np.uint64(40)))
+    half, scale = np.float32(0.5), np.float32(2.0**-24)
+    radius, angle = np.sqrt(-2 * np.log((low + half) * scale)), np.float32(2 * np.pi) * ((high + half) * scale)
+    both = np.stack([radius * np.cos(angle), radius * np.sin(angle)], -1)
+    return both.reshape(frames, 2 * pairs)[:, :features]
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Writes one motion as .npz with `joints` (F, J, 3) in meters and `fps`."""
+    positional = [word for word in arguments if not re.match(r"(seconds|seed)=", word)]
+    options = dict(word.split("=", 1) for word in arguments if word not in positional)
+    if len(positional) != 3:
+        print('usage: python runner.py FOLDER "TEXT OR ACTION" motion.npz [seconds=3] [seed=0]', file=sys.stderr)
+        return 2
+    folder, prompt, out = positional
+    try:
+        sampler = Sampler(folder)
+        if unknown := sampler.unknown(prompt):
+            print(f"warning: never seen in training: {', '.join(unknown)}")
+        seconds = float(options["seconds"]) if "seconds" in options else None
+        joints = sampler.decode(sampler.generate(prompt, seconds, int(options.get("seed", 0))))
+        np.savez_compressed(out, joints=joints, fps=sampler.content["fps"], text=prompt)
+    except (ValueError, OSError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    print(f"{out}: {len(joints)} frames at {sampler.content['fps']:g} per second, joints in meters, y up")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

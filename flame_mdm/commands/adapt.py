@@ -1,0 +1,50 @@
+"""`flame-mdm adapt CKPT source=FOLDER name=WORD`: teaches a trained model the motions in a folder."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from functools import partial
+from typing import ClassVar
+
+from flame_mdm.commands import ModelSettings
+from flame_mdm.config import run
+from flame_mdm.errors import UserError
+from flame_mdm.sampler_options import option
+
+
+@dataclass(frozen=True, kw_only=True)
+class AdaptSettings(ModelSettings):
+    """usage: flame-mdm adapt CKPT [OUT] source=FOLDER name=limp [trainer.max_steps=2000] [key=value ...]
+
+    Teaches a trained model the motions in a folder, and keeps what it knows. Prompts that end with "in limp style" then
+    ask for them. Writes the adapter OUT/limp.safetensors, for `sample` and `load`, and a page that compares motions
+    before and after. Run the same command to resume. docs/own-motion.md explains the steps.
+    """
+
+    OBJECTS: ClassVar = ("ckpt", "out")
+    COMPOSED: ClassVar = ("ema", "logger", "lr_decay", "seed")
+    source: str | None = option(None, "folder of motions with captions: docs/own-data.md")
+    name: str | None = option(None, "one word for prompts: 'a person walks in NAME style'")
+    out: str | None = option(None, "run directory; default runs/adapt/NAME")
+    action: bool = option(False, "true = the clips show an action that the model does not know, instead of a style")
+    full: bool = option(False, "true = train all weights; the result is a model instead of an adapter")
+    force: bool = option(False, "true = accept clips that drift upward or float")
+    rank: int = option(8, "of the changes of the weights; more for motions far from what the model knows")
+    data_root: str = option(lambda: os.environ.get("FLAME_MDM_DATA", "data"), "folder of the prepared data sets")
+    composed: tuple[str, ...] = ()
+
+
+def adapt(settings: AdaptSettings) -> None:
+    """Trains the adapter."""
+    if settings.source is None or settings.name is None:
+        raise UserError("name the folder of motions and the adapter: flame-mdm adapt CKPT source=my_clips name=limp")
+    file = settings.model_file()
+    keys = ("source", "name", "out", "action", "full", "force", "rank", "data_root")
+
+    from flame_mdm.training.adaptation import adapt as teach
+
+    teach(file, overrides=settings.composed, **{key: getattr(settings, key) for key in keys})
+
+
+main = partial(run, adapt, AdaptSettings)

@@ -1,0 +1,84 @@
+"""`flame-mdm distill CKPT [OUT] key=value ...`: trains a student of a model that samples in one to four steps."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, ClassVar
+
+from omegaconf import OmegaConf
+
+from flame_mdm.commands import ModelSettings
+from flame_mdm.commands.train import USAGE, train
+from flame_mdm.config import EXPERIMENTS, Config, movable, run, save
+from flame_mdm.config.sweeps import run_recipe
+from flame_mdm.errors import UserError
+from flame_mdm.safe_io import read_yaml
+from flame_mdm.sampler_options import option
+
+SHARE_OF_STEPS, SHARE_OF_RATE = 0.2, 0.1
+
+
+@dataclass(frozen=True, kw_only=True)
+class DistillSettings(ModelSettings):
+    """usage: flame-mdm distill CKPT [OUT] [key=value ...]
+
+    Trains a student of a model that predicts the clean motion or the velocity (MDM, MFM): it samples in 1, 2 or 4
+    steps, with the guidance built in. Its recipe is that of the model, with the keys in
+    experiments/distillation/consistency.yaml, a fifth of the training steps and a tenth of the learning rate. Its data
+    are in FLAME_MDM_DATA, or where the model's were. trainer.max_steps=1000 overrides a key of the recipe. Running the
+    same command again resumes the run. See docs/few-steps.md.
+    """
+
+    OBJECTS: ClassVar = ("ckpt", "out")
+    COMPOSED: ClassVar = ("seed", "lr_decay", "ema")
+    out: str | None = option(None, "run directory. Default: runs/RECIPE_distilled/default")
+    composed: tuple[str, ...] = ()
+
+
+def distill(settings: DistillSettings) -> None:
+    """Trains the student, or resumes the run in its directory."""
+    recipe = student_recipe(settings)
+    with tempfile.TemporaryDirectory() as folder:  # processes that Lightning starts read the file, too
+        path = Path(folder, "student.yaml")
+        save(recipe, path)
+        if code := run_recipe(train, USAGE, [str(path), *settings.composed]):
+            raise SystemExit(code)
+
+
+def student_recipe(settings: DistillSettings) -> Config:
+    """Returns the recipe of a student.
+
+    Raises:
+        FileNotFoundError, UserError: If there is no such model, or it cannot be a teacher.
+    """
+    file = settings.model_file()
+    from flame_mdm.training.distillation import read_teacher
+
+    teacher = read_teacher(file)
+    recipe: Any = teacher.config
+    if not teacher.steps or not isinstance(recipe.get("data"), dict) or "trainer" not in recipe:
+        raise UserError(f"{settings.ckpt}: was not trained by this framework, so that its data and steps are unknown")
+    name = f"{recipe['experiment']}_distilled"
+    root = os.environ.get("FLAME_MDM_DATA", recipe["data_root"])
+    steps = max(1, round(SHARE_OF_STEPS * teacher.steps))
+    own: Config = {
+        "experiment": name,
+        "data_root": root,
+        "data": {"root": root},
+        "run": {"name": "default", "dir": settings.out or f"runs/{name}/default"},
+        "optimizer": {"lr": SHARE_OF_RATE * recipe["optimizer"]["lr"]},
+        "trainer": {"max_steps": steps, "val_check_interval": min(steps, recipe["trainer"]["val_check_interval"])},
+        "distillation": {"teacher": str(file)},
+    }
+    if samples := recipe["callbacks"].get("samples"):
+        own["callbacks"] = {"samples": {"every_n_steps": min(steps, samples["every_n_steps"])}}
+    shared = read_yaml(EXPERIMENTS / "distillation" / "consistency.yaml")
+    merged: Any = OmegaConf.to_container(OmegaConf.merge(movable(recipe), shared, own))
+    return merged
+
+
+main = partial(run, distill, DistillSettings)

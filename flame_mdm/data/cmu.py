@@ -1,0 +1,413 @@
+"""The CMU motion capture database with the sentences of HumanML3D and KIT-ML: text-to-motion without registration.
+
+Motions: http://mocap.cs.cmu.edu, free for all uses, as ASF/AMC or converted to BVH. Captions: Guo et al., CVPR 2022
+(HumanML3D), and Plappert et al., Big Data 2016 (KIT-ML). `docs/cmu.md` says what to download and what differs.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import Counter, defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from functools import cached_property, partial
+from pathlib import Path, PurePosixPath
+from shutil import rmtree
+from tempfile import mkdtemp
+from typing import Any, Literal, NamedTuple
+from weakref import finalize
+
+import numpy as np
+import torch
+
+from flame_mdm.data import SPLITS, Clip, MotionSource, Split, archives, hashed_split, required, some, without
+from flame_mdm.data.humanml3d import FPS, HumanML3D, IndexedClip, read_index
+from flame_mdm.data.parallel import in_order
+from flame_mdm.data.t2m import MAX_LENGTH, Cut, Description, cuts
+from flame_mdm.errors import UserError
+from flame_mdm.formats.body import check_feet, check_size, leg_length
+from flame_mdm.formats.bvh import Bvh
+from flame_mdm.formats.layouts import LAYOUTS, find_skeleton, map_bvh, read_tree
+from flame_mdm.formats.motion import amass_parameters
+from flame_mdm.formats.poses import solve
+from flame_mdm.representations.skeleton import SMPL22
+from flame_mdm.representations.smpl import ADULT
+from flame_mdm.safe_io import naming, read_json, read_text, read_yaml, regular_file
+
+FACTS: dict[str, Any] = read_yaml(Path(__file__).with_suffix(".yaml"))
+FILE = re.compile(r"(\d{2,3}_\d{2,3})\.(amc|bvh)", re.IGNORECASE)
+SUFFIXES = (".amc", ".asf", ".bvh", ".csv", ".json", ".txt", ".yaml", ".zip")
+"""Files that are read of an archive."""
+RATES = (120.0, 60.0)
+"""Frame rates of the recordings, the usual one first."""
+SLACK = 0.05  # seconds, one frame at 20 fps, by which durations may differ
+LISTED = 20  # failures that are printed
+SHORTEST = 40  # rows of features of a clip, as in HumanML3D
+BLENDED = 3  # frames after the T-pose of a Daz-friendly file that are blended with it
+FASTEST = 15.0  # m/s of the pelvis, above which a conversion is damaged; sprinters reach 12
+MAP = {**LAYOUTS["CMU ASF"].map, "pelvis": "pelvis", "neck": {"lowerneck": 0.5, "head": 0.5}, "head": "face"}
+_HIP, _KNEE, _ANKLE, _HEAD = (ADULT[SMPL22.joints.index(n)] for n in ("left_hip", "left_knee", "left_ankle", "head"))
+ADULT_LEG = float(np.linalg.norm(_KNEE) + np.linalg.norm(_ANKLE))
+GET_IT = (
+    "clone https://github.com/una-dinosauria/cmu-mocap or unpack ASF/AMC files of http://mocap.cs.cmu.edu, clone "
+    "https://github.com/EricGuo5513/HumanML3D, and give SOURCE=/path/to/the/motions CAPTIONS=/path/to/HumanML3D"
+)
+
+
+class Item(NamedTuple):
+    """Captions of a clip of HumanML3D, frames `start` to `end` at 20 fps, or of an entire recording."""
+
+    id: str
+    split: Split
+    source: str
+    descriptions: list[Description]
+    start: int = 0
+    end: int | None = None
+    mirrored: bool = False
+    any_length: bool = False
+
+    def cuts(self, frames: int) -> list[Cut]:
+        """Returns the clips of a motion of `frames` rows of features, by the rules of HumanML3D unless `any_length`."""
+        if self.any_length:
+            return [Cut(self.id, 0, frames, self.descriptions)] if frames >= SHORTEST else []
+        return cuts(self.id, frames, self.descriptions, SHORTEST)
+
+
+Task = tuple[list[Path], tuple[float | None, int | None, bool], Sequence[tuple[int, int | None, bool]]]
+"""Files of a recording, tried in this order, arguments of `decide_rate`, and parts: start, end, mirrored."""
+
+
+class Outcome(NamedTuple):
+    """The parts of a recording, its frame rate, the file's and what decided; or an error."""
+
+    motions: list[np.ndarray]
+    rate: float = 0.0
+    header: float | None = None
+    reason: str = ""
+    error: str = ""
+
+
+class CMU(MotionSource):
+    """Clips of HumanML3D, and recordings with captions of KIT-ML, on the 22 joints of SMPL.
+
+    HumanML3D's clips keep their names, splits and mirrored copies. Other recordings are in the test (val) split if a
+    clip of HumanML3D's test (val) split is cut from them, and are split by subject if HumanML3D has no clip of them.
+    """
+
+    name = "cmu"
+
+    def __init__(
+        self,
+        path: str,
+        captions: str | None = None,
+        motion: Literal["joints", "smpl"] = "joints",
+        descriptions: bool = False,
+        exclude: Sequence[str] = (),
+        workers: int = 0,
+    ):
+        """Stores the arguments; reads no files.
+
+        Args:
+            path: folder with recordings such as 02_01.bvh, or 02_01.amc and 02.asf, in any subfolders; or a zip or tar
+                archive of one, which is unpacked into a temporary folder.
+            captions: clone of HumanML3D's repository, or a folder with texts, splits and index; default: `path`.
+                KIT-ML's captions of AMASS, kitml*.json, are used if they are in one of the two folders.
+            motion: "joints" for representations of joint positions; "smpl" for those of SMPL's rotations, which are
+                computed from the positions.
+            descriptions: use CMU's short description of recordings that have no other caption.
+            exclude: recordings to leave out, such as 02_01.
+            workers: number of processes; 0 = one per core, 1 = this process only.
+        """
+        if motion not in ("joints", "smpl"):
+            raise UserError(f"data.source.motion={motion}: give joints or smpl")
+        self.archive, self.workers = Path(path), workers
+        self._captions = captions
+        self.motion, self.descriptions, self.exclude = motion, descriptions, tuple(exclude)
+        self.options = {"motion": motion, "descriptions": descriptions, "exclude": list(exclude)}
+        self._outcomes: dict[str, Outcome] = {}
+        self._counts: Counter[str] = Counter()
+
+    @cached_property
+    def path(self) -> Path:
+        """The folder of the recordings."""
+        if not self.archive.is_file():
+            return self.archive
+        folder = Path(mkdtemp(prefix="cmu-"))
+        finalize(self, rmtree, folder, ignore_errors=True)
+        return archives.unpack(self.archive, folder / self.archive.name, _is_read)
+
+    @property
+    def captions(self) -> Path:
+        """The folder of the captions."""
+        return self.path if self._captions is None else Path(self._captions)
+
+    @cached_property
+    def files(self) -> dict[str, list[Path]]:
+        """Recording -> its files, the best first; without recordings that are known to be bad."""
+        files: defaultdict[str, list[Path]] = defaultdict(list)
+        for path in sorted(self.path.rglob("*")):
+            if match := FILE.fullmatch(path.name):
+                files[match[1]].append(path)
+        if not files:
+            required(self.path, GET_IT)
+            raise FileNotFoundError(f"{self.path}: no recording such as 02_01.bvh or 02_01.amc in it; {GET_IT}")
+        kept = without(files, self.exclude, self.path)
+        good = {name: sorted(kept[name], key=_rank) for name in sorted(kept) if not _is_in("bad", name)}
+        self._exclude("recordings by data.source.exclude", len(files) - len(kept))
+        self._exclude("recordings known to be bad", len(kept) - len(good))
+        return good
+
+    @cached_property
+    def humanml3d(self) -> tuple[list[IndexedClip], dict[str, list[Description]], Mapping[str, Split]]:
+        """HumanML3D's clips of CMU recordings, captions by name, and splits."""
+        required(self.captions, f"it is the folder of the captions: {GET_IT}")
+        for pattern in ("*.csv", "*.json", "*/texts.zip", "texts.zip"):
+            for file in self.captions.glob(pattern):
+                _check_pointer(file)
+        if files := sorted(self.captions.glob("humanml3d_test_captions*.json")):
+            rows, texts = read_index(self.captions / "humanml3d_index_cmu.csv"), _test_captions(files[0])
+            splits: Mapping[str, Split] = dict.fromkeys(texts, SPLITS[2])
+        else:
+            inner = self.captions / "HumanML3D"
+            source = HumanML3D(str(inner if inner.is_dir() else self.captions))
+            rows, texts, splits = source.rows, source.texts, source.names
+        wrong = FACTS["wrong_captions"]
+        return [row for row in rows if row.key.startswith("CMU/") and row.name not in wrong], texts, splits
+
+    @cached_property
+    def kit(self) -> list[tuple[str, str, str, float]]:
+        """Id, recording, text and seconds of KIT-ML's captions of CMU recordings; empty if there is no file of them."""
+        path = next(
+            (file for folder in (self.captions, self.path) for file in sorted(folder.glob("kitml*.json"))), None
+        )
+        with naming(path, AttributeError, KeyError, TypeError, ValueError, what="not KIT-ML's captions of AMASS: "):
+            return [
+                (f"kit{number}", _recording(entry["path"]), str(text["text"]), float(entry["duration"]))
+                for number, entry in (read_json(path).items() if path else ())
+                if entry["path"].startswith("CMU/")
+                for text in entry["annotations"]
+            ]
+
+    @cached_property
+    def items(self) -> dict[str, list[Item]]:
+        """Recording -> what is cut from it, for all recordings that are present and have captions."""
+        files, (rows, texts, splits) = self.files, self.humanml3d
+        items: defaultdict[str, list[Item]] = defaultdict(list)
+        cut_from: defaultdict[str, set[Split]] = defaultdict(set)
+        for row in rows:
+            trial = _recording(row.key)
+            cut_from[trial].add(splits.get(row.name, "train"))
+            names = [name for name in (row.name, f"M{row.name}") if name in splits and texts.get(name)]
+            self._exclude("clips of HumanML3D without their recording", trial not in files)
+            self._exclude("clips of HumanML3D without captions", trial in files and not names)
+            for name in names if trial in files else ():
+                items[trial].append(Item(name, splits[name], row.name, texts[name], row.start, row.end, name[0] == "M"))
+
+        def whole(trial: str, id_: str, text: str, any_length: bool) -> Item:
+            of_clips: list[Split] = [split for split in SPLITS if split in cut_from[trial]]
+            split = of_clips[-1] if of_clips else hashed_split(f"CMU subject {trial.partition('_')[0]}", val=5, test=10)
+            return Item(id_, split, f"recording {trial}", [Description(text, [])], any_length=any_length)
+
+        for id_, trial, text, _ in self.kit:
+            if trial in files:
+                items[trial].append(whole(trial, id_, text, any_length=False))
+        for trial, text in _descriptions(self.path).items() if self.descriptions else ():
+            if trial in files and not items[trial]:
+                items[trial].append(whole(trial, trial, text, any_length=True))
+        captioned = {trial: items[trial] for trial in files if items[trial]}
+        self._exclude("recordings without a caption", len(files) - len(captioned))
+        if not captioned:
+            raise UserError(f"{self.captions}: no captions of the recordings in {self.path}; {GET_IT}")
+        return captioned
+
+    def count(self) -> int:
+        items = [item for items in self.items.values() for item in items]
+        ends = {id_: round(seconds * FPS) for id_, _, _, seconds in self.kit}
+        return sum(len(item.cuts((item.end or ends.get(item.id, SHORTEST + 1)) - item.start - 1)) for item in items)
+
+    def clips(self, fps: float) -> Iterator[Clip]:
+        """Yields the clips of all recordings that can be read, sorted by recording; `findings` lists the others."""
+        self.check_fps(fps, FPS)
+        last = {_recording(row.key): row.end for row in sorted(self.humanml3d[0], key=lambda row: row.end)}
+        seconds = {trial: length for _, trial, _, length in self.kit}
+        evidence = {trial: (seconds.get(trial), last.get(trial), _is_in("sixty", trial)) for trial in self.items}
+        parts = {trial: [(i.start, i.end, i.mirrored) for i in items] for trial, items in self.items.items()}
+        tasks: list[Task] = [(self.files[trial], evidence[trial], parts[trial]) for trial in self.items]
+        for trial, outcome in zip(self.items, in_order(partial(_read, self.motion), tasks, self.workers), strict=True):
+            self._outcomes[trial] = outcome._replace(motions=[])
+            self._exclude("recordings that cannot be read", outcome.error != "")
+            for item, motion in zip(self.items[trial], outcome.motions, strict=not outcome.error):
+                kept = item.cuts(len(motion) - 1)
+                self._exclude(f"motions shorter than {SHORTEST} frames or of {MAX_LENGTH} or more", not kept)
+                for cut in kept:
+                    if item.end and not item.mirrored:
+                        self._counts["clips of HumanML3D"] += cut.id == item.id
+                        self._counts["captions of HumanML3D"] += len(cut.descriptions)
+                    captions, tokens, *_ = map(list, zip(*cut.descriptions, strict=True))
+                    facts = {"recording": trial} | ({"tokens": tokens} if all(tokens) else {})
+                    yield Clip(
+                        cut.id, motion, captions, item.split, item.source, None, facts, "", (cut.start, cut.length)
+                    )
+        if all(outcome.error for outcome in self._outcomes.values()):
+            raise UserError(f"{self.path}: no recording can be read; {self.findings()[0]}")
+
+    def counts(self) -> dict[str, float]:
+        """Returns the coverage of HumanML3D's index under the names of `published.yaml`."""
+        return dict(self._counts)
+
+    def findings(self) -> list[str]:
+        """Returns what decided the frame rates, which files have another one, and which recordings failed."""
+        read = {trial: outcome for trial, outcome in self._outcomes.items() if not outcome.error}
+        decided = Counter((outcome.rate, outcome.reason) for outcome in read.values())
+        lines = [f"{count} recordings at {rate:g} fps by {reason}" for (rate, reason), count in sorted(decided.items())]
+        if other := [trial for trial, outcome in read.items() if outcome.header not in (None, outcome.rate)]:
+            lines.append(f"{len(other)} files say another rate, which is ignored: {some(other)}")
+        errors = [f"left out: {outcome.error}" for outcome in self._outcomes.values() if outcome.error]
+        return lines + errors[:LISTED] + [f"left out: {len(errors) - LISTED} more"] * (len(errors) > LISTED)
+
+    def _exclude(self, reason: str, count: int) -> None:
+        if count:
+            self.excluded[reason] += count
+
+
+def _is_in(fact: str, trial: str) -> bool:  # or its subject is
+    return not {trial, trial.partition("_")[0]}.isdisjoint(FACTS[fact])
+
+
+def _is_read(name: str) -> bool:
+    return PurePosixPath(name).suffix.lower() in SUFFIXES and "__MACOSX" not in name
+
+
+def _rank(path: Path) -> int:
+    """Returns 0 for original files, 1 for conversions, 2 for Daz-friendly ones, whose legs often jump."""
+    return path.suffix.lower() != ".amc" and 1 + ("daz" in str(path).lower())
+
+
+def _recording(key: str) -> str:
+    """Returns the recording of an AMASS path, such as CMU/02/02_01_poses."""
+    return PurePosixPath(key).stem.removesuffix("_poses")
+
+
+def _test_captions(path: Path) -> dict[str, list[Description]]:
+    """Returns captions by name of a JSON list of test captions; `segment` is the part described, in seconds."""
+    texts: defaultdict[str, list[Description]] = defaultdict(list)
+    with naming(path, KeyError, TypeError, ValueError, what="not a list of captions of HumanML3D: "):
+        for entry in read_json(path):
+            begin, end = map(float, entry["segment"] or (0, 0))
+            name = "M" * bool(entry["mirrored"]) + entry["base"]
+            texts[name] += [Description(str(caption), [], begin, end) for caption in entry["captions"]]
+    return texts
+
+
+def _descriptions(path: Path) -> dict[str, str]:
+    """Returns CMU's short descriptions of recordings, from a list in a folder; empty if there is none."""
+    texts: dict[str, str] = {}
+    if (listed := path / "cmu_fps.json").exists():
+        with naming(listed, AttributeError, KeyError, TypeError, what="not a list of recordings: "):
+            texts = {trial: str(entry["desc"]) for trial, entry in read_json(listed).items()}
+    elif (listed := path / "cmu-mocap-index-text.txt").exists():
+        texts = dict(re.findall(r"^(\d+_\d+)\s+(\S.*?)\s*$", read_text(listed), re.MULTILINE))
+    return {trial: text for trial, text in texts.items() if text not in ("", "Unknown")}
+
+
+def _check_pointer(path: Path) -> None:
+    """Raises `UserError` if a file is what Git LFS puts in the place of a large one."""
+    if path.exists() and regular_file(path) < 1024 and path.read_bytes().startswith(b"version https://git-lfs"):
+        raise UserError(f"{path}: a Git LFS pointer, not the file. Run `git lfs pull` in its repository")
+
+
+# Motions --------------------------------------------------------------------------------------------------------------
+
+
+def decide_rate(
+    frames: int, header: float | None, seconds: float | None, last: int | None, is_sixty: bool
+) -> tuple[float, str]:
+    """Returns the frame rate of a recording of `frames` frames and what decided it.
+
+    Durations are trusted first, by KIT-ML in `seconds` and by HumanML3D's `last` frame at 20 fps; then CMU's list;
+    then the `header` of the file: conversions say 120 for nearly all recordings.
+    """
+    rates = RATES if header in (None, *RATES) else (*RATES, header)
+    if fitting := [rate for rate in rates if seconds and abs(frames / rate - seconds) < SLACK]:
+        return fitting[0], "KIT-ML's duration"
+    if last and header != RATES[1] and frames / RATES[0] + SLACK < last / FPS <= frames / RATES[1] + SLACK:
+        return RATES[1], "HumanML3D's last frame"
+    if is_sixty or header is None:
+        return RATES[is_sixty], "CMU's list"
+    return header, "the file"
+
+
+def standardize(tree: Bvh) -> tuple[Bvh, dict[str, Any]]:
+    """Returns a recording with the bones of CMU's own files, and the fields of `Layout` for them.
+
+    The MotionBuilder-friendly conversion lost a bone of the trunk and of each hand: the trunk's three bones are equally
+    long, and the hand's is half as long as the one before. The Daz-friendly one moves another figure, whose bones are
+    replaced by a CMU subject's. Both begin with a T-pose, which is removed. Joints `pelvis` and `face` are added where
+    SMPL has pelvis and head. Other skeletons are returned unchanged, with no fields.
+    """
+    is_original, unit, blended = "lfemur" in tree.joints, LAYOUTS["CMU ASF"].unit, 0
+    if "LHipJoint" in tree.joints:
+        offsets, at = tree.offsets.copy(), tree.joints.index
+        for child, (share, bone) in FACTS["lost"].items():
+            if child in tree.joints and not offsets[at(child)].any():
+                offsets[at(child)] = share * offsets[at(bone)]
+        tree = replace(tree, offsets=offsets, joints=tuple(FACTS["motionbuilder"].get(n, n) for n in tree.joints))
+    elif "lButtock" in tree.joints:
+        tree, unit, blended = _added(tree.with_end_joints(), upperback=("abdomen", [0, 0, 0])), 0.01, BLENDED
+        rows = [FACTS["daz"].get(name, [name, *offset]) for name, offset in zip(tree.joints, tree.offsets, strict=True)]
+        tree = replace(tree, joints=tuple(row[0] for row in rows), offsets=np.array([row[1:] for row in rows], float))
+    if "lfemur" not in tree.joints:
+        return tree, {}
+    if not (is_original or tree.frames[0, 3:6].any()) and len(tree.frames) > 1 + blended:
+        frames = tree.frames[1:].copy()
+        frames[:blended, 6:] = frames[blended, 6:]
+        tree = replace(tree, frames=frames)
+    bone = dict(zip(tree.joints, tree.offsets, strict=True))
+    scale = float(np.linalg.norm(bone["ltibia"]) + np.linalg.norm(bone["lfoot"])) / ADULT_LEG
+    pelvis = (bone["lfemur"] + bone["rfemur"]) / 2 - [0, scale * _HIP[1], 0]
+    tree = _added(tree, pelvis=("root", pelvis), face=("head", [0, 0, scale * _HEAD[2]]))
+    return tree, {"map": MAP, "unit": unit}
+
+
+def _added(tree: Bvh, **joints: tuple[str, Any]) -> Bvh:
+    """Returns a tree with more joints: name -> parent and offset (3,)."""
+    return replace(
+        tree,
+        joints=(*tree.joints, *joints),
+        parents=(*tree.parents, *(tree.joints.index(parent) for parent, _ in joints.values())),
+        offsets=np.concatenate([tree.offsets, [offset for _, offset in joints.values()]]),
+        channels=tree.channels + ((),) * len(joints),
+    )
+
+
+def _read(kind: str, task: Task) -> Outcome:
+    """Returns the parts of a recording from the first of its files that can be read, or the first error."""
+    errors, (files, evidence, parts) = [], task
+    for file in files:
+        try:
+            _check_pointer(file)
+            tree, fields = standardize(read_tree(file, None if _rank(file) else RATES[0]))
+            header = tree.fps if _rank(file) else None
+            rate, reason = decide_rate(len(tree.frames), header, *evidence)
+            joints, _, layout = map_bvh(file, replace(tree, fps=rate), FPS, fields or find_skeleton(file))
+            with naming(file):
+                check_size(leg_length(joints), layout.unit)
+                check_feet(joints)
+                if (speed := np.linalg.norm(np.diff(joints[:, 0], axis=0), axis=1).max(initial=0.0) * FPS) > FASTEST:
+                    raise UserError(f"the body jumps, it moves at {speed:.0f} m/s: a damaged conversion")
+        except (UserError, OSError) as error:
+            errors.append(str(error))
+            continue
+        motions = [_part(joints[start:end], mirrored, kind) for start, end, mirrored in parts]
+        return Outcome(motions, rate, header, reason)
+    return Outcome([], error=errors[0])
+
+
+def _part(joints: np.ndarray, mirrored: bool, kind: str) -> np.ndarray:
+    """Returns joints, or (F, 75) translation and SMPL's rotations of the adult body, in AMASS's coordinates."""
+    part = SMPL22.mirror(torch.from_numpy(joints)) if mirrored else torch.from_numpy(joints)
+    if kind == "joints" or len(joints) <= SHORTEST:
+        return part.numpy()
+    floor = part.new_tensor([0, float(part[..., 1].min()), 0])
+    turns, translation = amass_parameters(solve((part - floor) * (ADULT_LEG / leg_length(joints)), FPS))
+    return np.concatenate([translation, np.pad(turns, ((0, 0), (0, 6)))], 1).astype(np.float32)

@@ -1,0 +1,188 @@
+"""ASF/AMC motion capture files, as recorded by Acclaim and the CMU database: a skeleton and its motion in two files.
+
+An ASF file lists the bones of a subject: direction and length in the world while standing in the rest pose, the axes C
+in which the bone turns, and its degrees of freedom. An AMC file has their angles per frame. With the angles' rotation
+M, a bone turns by C M C^-1 relative to its parent. Orders such as XYZ mean that x is applied first: C = Rz Ry Rx.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator
+from itertools import chain
+from pathlib import Path
+from typing import NamedTuple, NoReturn
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from flame_mdm.errors import UserError
+from flame_mdm.formats.bvh import CHANNELS, LARGEST, Bvh
+from flame_mdm.formats.resampling import check_frames, frame_rate
+from flame_mdm.safe_io import read_text
+
+MOVES = ("TX", "TY", "TZ")
+TURNS = ("RX", "RY", "RZ")
+_POSITIONS, _ROTATIONS = CHANNELS[:3], CHANNELS[:2:-1]
+
+
+class Bone(NamedTuple):
+    """A bone: vector (3,) from its start to its end, axes C as a rotation, and degrees of freedom in file order."""
+
+    vector: np.ndarray
+    axes: Rotation
+    order: str
+    freedoms: tuple[str, ...]
+
+
+def read(path: Path, fps: float | None) -> Bvh:
+    """Reads an AMC file and its skeleton as a tree of joints; each bone gives a joint of its name at its start.
+
+    Args:
+        path: the AMC file; the skeleton is that of `skeleton_of`.
+        fps: frames per second, which AMC files do not contain: 120 for most of CMU's recordings.
+
+    Raises:
+        FileNotFoundError: If the file does not exist.
+        UserError: If a file is damaged, or there is no frame rate; the message names file and line.
+    """
+    text = read_text(path)
+    bones, parents = read_skeleton(skeleton_of(path))
+    if fps is None:
+        raise UserError(f"{path}: AMC files contain no frame rate: give fps=120, or `fps: 120` in skeleton.yaml")
+    angles = _angles(_Lines(text, str(path)), bones)
+    names = tuple(bones)
+    columns, channels = [], []
+    for name, bone in bones.items():
+        values = dict(zip(bone.freedoms, angles[name].T, strict=True))
+        if name == "root":
+            columns.append(np.stack([values.get(move, np.zeros(len(angles[name]))) for move in MOVES], 1))
+        if turns := [f"R{axis}" for axis in bone.order if f"R{axis}" in values]:
+            order = "".join(turn[1] for turn in turns).lower()  # lower case: about fixed axes
+            turned = Rotation.from_euler(order, np.stack([values[turn] for turn in turns], 1), degrees=True)
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # in gimbal lock, any third angle is as good
+                columns.append((bone.axes * turned * bone.axes.inv()).as_euler("ZYX", degrees=True))
+        channels.append(_POSITIONS * (name == "root") + _ROTATIONS * bool(turns))
+    ends = [names.index(name) for name in names if name not in parents.values()]
+    return Bvh(
+        joints=names,
+        parents=tuple(names.index(parents[name]) if name in parents else -1 for name in names),
+        offsets=np.stack([bones[parents[name]].vector if name in parents else np.zeros(3) for name in names]),
+        channels=tuple(channels),
+        end_parents=tuple(ends),
+        end_offsets=np.stack([bones[names[joint]].vector for joint in ends]),
+        frames=np.concatenate(columns, 1),
+        fps=frame_rate(fps),
+    )
+
+
+def skeleton_of(path: Path) -> Path:
+    """Returns the ASF file next to an AMC file: that of its name, of its subject (02.asf), or the only one."""
+    own = (path.with_suffix(".asf"), path.with_name(path.stem.partition("_")[0] + ".asf"))
+    files = sorted(path.parent.glob("*.asf"))
+    chosen = next((file for file in own if file.exists()), files[0] if len(files) == 1 else None)
+    if chosen is None:
+        raise UserError(f"{path}: no skeleton {own[1].name} next to it; AMC files need their ASF file")
+    return chosen
+
+
+def read_skeleton(path: Path) -> tuple[dict[str, Bone], dict[str, str]]:
+    """Returns the bones of an ASF file, parents before their children, and the parent of each bone but the root."""
+    lines = _Lines(read_text(path), str(path))
+    root = Bone(np.zeros(3), Rotation.identity(), "XYZ", (*MOVES, *TURNS))
+    read: dict[str, Bone] = {"root": root}
+    parents: dict[str, str] = {}
+    section, degrees, fields = "", True, dict[str, list[str]]()
+    for words in lines:
+        word = words[0].lower()
+        if word.startswith(":"):
+            section = word
+        elif section == ":units" and word == "angle":
+            degrees = words[1:] != ["rad"]
+        elif section == ":root" and word == "order":
+            read["root"] = root._replace(freedoms=tuple(word.upper() for word in words[1:]))
+        elif section == ":root" and word == "axis":
+            read["root"] = read["root"]._replace(order=lines.order(words[1:]))
+        elif section == ":root" and word in ("position", "orientation") and any(lines.numbers(words[1:], 3)):
+            lines.fail(f"a root whose {word} is not 0 0 0 is not supported")
+        elif section == ":bonedata" and word == "begin":
+            fields = {}
+        elif section == ":bonedata" and word == "end":
+            read[fields.get("name", [""])[0]] = _bone(lines, fields, degrees)
+        elif section == ":bonedata":
+            fields[word] = words[1:]
+        elif section == ":hierarchy" and word not in ("begin", "end"):
+            for child in words[1:]:
+                if child not in read or words[0] not in {"root", *parents} or child in {"root", *parents}:
+                    lines.fail(f"bone {child[:40]} is unknown, has two parents, or precedes its parent")
+                parents[child] = words[0]
+    if not parents:
+        lines.fail("not an ASF file (no bones in a :hierarchy)")
+    return {name: read[name] for name in ("root", *parents)}, parents
+
+
+def _bone(lines: _Lines, fields: dict[str, list[str]], degrees: bool) -> Bone:
+    if missing := [name for name in ("name", "direction", "length", "axis") if not fields.get(name)]:
+        lines.fail(f"a bone without {missing[0]}")
+    freedoms = tuple(word.upper() for word in fields.get("dof", ()))
+    if not set(freedoms) <= set(TURNS) or len(set(freedoms)) < len(freedoms):
+        lines.fail(f"degrees of freedom must be among rx, ry and rz, found {' '.join(fields['dof'])[:40]}")
+    direction, (length,) = lines.numbers(fields["direction"], 3), lines.numbers(fields["length"], 1)
+    axis, order = lines.numbers(fields["axis"][:3], 3), lines.order(fields["axis"][3:])
+    axes = Rotation.from_euler(order.lower(), [axis["XYZ".index(letter)] for letter in order], degrees)
+    return Bone(np.array(direction) * length, axes, order, freedoms)
+
+
+def _angles(lines: _Lines, bones: dict[str, Bone]) -> dict[str, np.ndarray]:
+    """Returns the values (F, N) of the N degrees of freedom of each bone; angles in degrees."""
+    rows: dict[str, list[list[float]]] = {name: [] for name, bone in bones.items() if bone.freedoms}
+    frames, factor = 0, 1.0
+    for words in chain(lines, [["0"]]):
+        if words[0].startswith(":"):
+            factor = np.degrees(1) if words[0].upper() == ":RADIANS" else factor
+        elif len(words) == 1 and words[0].isdigit():
+            if absent := [name for name, values in rows.items() if len(values) != frames]:
+                lines.fail(f"frame {frames} ends without {', '.join(absent)[:80]}")
+            frames += 1
+        elif words[0] not in rows or len(rows[words[0]]) != frames - 1:
+            lines.fail(f"{words[0][:40]} is no moving bone of the skeleton, outside of a frame, or there twice")
+        else:
+            rows[words[0]].append(lines.numbers(words[1:], len(bones[words[0]].freedoms)))
+    if frames < 2:
+        lines.fail("not an AMC file (no frames)")
+    check_frames(frames)
+    factors = {name: [factor if kind in TURNS else 1.0 for kind in bone.freedoms] for name, bone in bones.items()}
+    return {name: np.array(rows.get(name, [[]] * (frames - 1)), float) * factors[name] for name in bones}
+
+
+class _Lines:
+    """The lines of a file as words, without comments; tracks the line number for error messages."""
+
+    def __init__(self, text: str, name: str):
+        self.text, self.name, self.line = text, name, 1
+
+    def __iter__(self) -> Iterator[list[str]]:
+        for number, line in enumerate(self.text.removeprefix("\ufeff").splitlines(), 1):
+            self.line = number
+            if (words := line.split()) and not line.startswith("#"):
+                yield words
+
+    def fail(self, what: str) -> NoReturn:
+        raise UserError(f"{self.name}, line {self.line}: {what}")
+
+    def numbers(self, words: list[str], count: int) -> list[float]:
+        """Returns the words as `count` finite numbers."""
+        try:
+            values = [float(word) for word in words]
+        except ValueError as error:
+            self.fail(str(error)[:80])
+        if len(values) != count or not all(abs(value) <= LARGEST for value in values):
+            self.fail(f"expected {count} numbers, found {' '.join(words)[:40]}")
+        return values
+
+    def order(self, words: list[str]) -> str:
+        order = "".join(words).upper()
+        if sorted(order) != list("XYZ"):
+            self.fail(f"an order of axes is needed, such as XYZ, found {order[:40]}")
+        return order

@@ -1,0 +1,354 @@
+"""Skeletons of other programs and characters, and how they move as a body does.
+
+It needs numpy alone: the extension of Blender contains this file.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from flame_mdm.errors import UserError
+from flame_mdm.representations.skeleton import SMPL22
+from flame_mdm.visualize.posture import JOINT, orthonormal, shortest_turns
+
+CENTIMETER = 0.01
+SIDES = ("left", "right")
+LEGS = (("hip", "knee"), ("knee", "ankle"))
+LIMBS = {"hip": "knee", "knee": "ankle", "shoulder": "elbow", "elbow": "wrist"}
+"""Joints whose bone takes the direction of the motion's bone -> the joint at the end of this bone."""
+REQUIRED = ("hip", "knee", "ankle", "shoulder", "elbow", "wrist")
+"""Joints of both sides that a character must have, beside the pelvis."""
+SPINE = ("spine1", "spine2", "spine3")
+TILT = 45
+"""Degrees between trunk and vertical at which a rest pose is refused."""
+SNAP = 8
+"""Largest angle in degrees between the facing direction and an axis at which the character is assumed to face along
+the axis."""
+BEND = 0.15
+"""Minimum sine of the bend of an elbow or knee in the rest pose from which the twist of the limb is read."""
+GROUND = 0.1
+"""Largest height in meters at which the lowest joint of a clip counts as on the floor: in recordings it is often a
+little above."""
+STRAIGHT = 0.05
+"""Distance of the knee from the straight line of the leg, relative to the thigh, at which the bend and the front of the
+thigh have the same weight for where the knee points."""
+REACH = 0.999
+"""Maximum distance from hip to ankle relative to the length of the straight leg."""
+
+
+@dataclass(frozen=True, eq=False)
+class Rig:
+    """A skeleton with J joints in its rest pose, in meters, y up, facing +z.
+
+    Attributes:
+        joints: names; parents precede their children.
+        parents: index of each joint's parent, -1 for a root.
+        positions: (J, 3) of the joints.
+        turns: (J, 3, 3), rotations of the joints in the world.
+        sources: for each joint, the index of the joint of SMPL whose rotation it takes, or -1.
+        neutral: (J, 3, 3), rotations of these joints in the world while SMPL's are those of its rest pose.
+        unit: meters per unit of length in BVH files.
+        orders: of the Euler angles of each joint in BVH files.
+        moving: every joint has channels of its position in BVH files, not only the pelvis and joints above it.
+        frame: (3, 3), rotation from the world of the file.
+        scales: (J,), units of the world per unit in the frame of each joint; none = 1.
+    """
+
+    joints: tuple[str, ...]
+    parents: tuple[int, ...]
+    positions: np.ndarray
+    turns: np.ndarray
+    sources: tuple[int, ...]
+    neutral: np.ndarray
+    orders: tuple[str, ...]
+    unit: float = CENTIMETER
+    moving: bool = False
+    frame: np.ndarray = field(default_factory=lambda: np.eye(3))
+    scales: np.ndarray = field(default_factory=lambda: np.ones(0))
+
+    @property
+    def hips(self) -> int:
+        """The joint of the pelvis."""
+        return self.sources.index(0)
+
+    def offsets(self) -> np.ndarray:
+        """Returns the position (J, 3) of each joint in the frame of its parent, or in the world of the file."""
+        return np.stack([self.within(self.positions[joint], joint) for joint in range(len(self.joints))])
+
+    def within(self, positions: np.ndarray, joint: int) -> np.ndarray:
+        """Converts positions (..., 3) in the world to the frame of a joint's parent in the rest pose."""
+        parent = self.parents[joint]
+        if parent < 0:
+            return positions @ self.frame
+        scale = self.scales[parent] if len(self.scales) else 1
+        return (positions - self.positions[parent]) @ self.turns[parent] / scale
+
+    def rest(self) -> np.ndarray:
+        """Returns the rotation (J, 3, 3) of each joint relative to its parent, or to the world of the file."""
+        return self.local(self.turns)
+
+    def local(self, turned: np.ndarray) -> np.ndarray:
+        """Converts rotations (..., J, 3, 3) in the world to those relative to parents, or to the world of the file."""
+        local = turned.copy()
+        for joint, parent in enumerate(self.parents):
+            above = turned[..., parent, :, :] if parent >= 0 else self.frame
+            local[..., joint, :, :] = np.swapaxes(above, -1, -2) @ turned[..., joint, :, :]
+        return local
+
+    def turned(self, body: np.ndarray) -> np.ndarray:
+        """Returns rotations (F, J, 3, 3) in the world, while SMPL's joints have the rotations `body` (F, 22, 3, 3).
+
+        Joints with a counterpart follow it; the others keep their angle to their parent.
+        """
+        rest, turned = self.rest(), np.tile(self.turns, (len(body), 1, 1, 1))
+        for joint, (parent, source) in enumerate(zip(self.parents, self.sources, strict=True)):
+            if source >= 0:
+                turned[:, joint] = body[:, source] @ self.neutral[joint]
+            elif parent >= 0:
+                turned[:, joint] = turned[:, parent] @ rest[joint]
+        return turned
+
+    def assembled(self, world: np.ndarray, pelvis: np.ndarray) -> np.ndarray:
+        """Returns positions (F, J, 3) of joints with world rotations (F, J, 3, 3), with the pelvis at (F, 3)."""
+        positions, hips = np.tile(self.positions, (len(world), 1, 1)), self.hips
+        for joint, parent in enumerate(self.parents):
+            if joint == hips:
+                positions[:, joint] = pelvis
+            elif parent >= 0:
+                offset = self.turns[parent].T @ (self.positions[joint] - self.positions[parent])
+                positions[:, joint] = positions[:, parent] + world[:, parent] @ offset
+        return positions
+
+
+# Names of joints ------------------------------------------------------------------------------------------------------
+
+
+def plain(name: str) -> str:
+    """Returns a name in lower case, without signs, Mixamo's prefix and the part before a colon."""
+    return re.sub(r"[\W_]", "", re.sub(r"^mixamorig\d*[_:]?", "", name.rpartition(":")[2])).lower()
+
+
+def recognized(names: Mapping[int, str], skeletons: Sequence[Mapping[str, str]]) -> dict[str, list[int]]:
+    """Returns the numbers of the joints that the most similar skeleton names: joint of SMPL -> numbers."""
+    numbers: dict[str, list[int]] = {}
+    for number, name in names.items():
+        numbers.setdefault(plain(name), []).append(number)
+    nearest = max(skeletons, key=lambda skeleton: len(skeleton.keys() & numbers.keys()))
+    return {joint: numbers[name] for name, joint in nearest.items() if name in numbers}
+
+
+def matched(
+    source: object, names: Mapping[int, str], candidates: Mapping[str, Sequence[int]]
+) -> tuple[dict[str, int], list[str]]:
+    """Returns the number of each joint of SMPL that a character has, and the required ones that it lacks.
+
+    Raises:
+        UserError: If it has several joints for one of SMPL's.
+    """
+    if double := next((joint for joint, numbers in candidates.items() if len(numbers) > 1), None):
+        same = ", ".join(names[number] for number in candidates[double])
+        raise UserError(f"{source}: {len(candidates[double])} joints for {double}: {same}. Rename all but one")
+    required = ["pelvis", *(f"{side}_{name}" for name in REQUIRED for side in SIDES)]
+    missing = [joint for joint in JOINT if joint in required and joint not in candidates]
+    return {joint: number for joint, (number,) in candidates.items()}, missing
+
+
+# Characters -----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class RestPose:
+    """A character's skeleton in its rest pose, y up, facing +z, in its own unit.
+
+    Attributes:
+        rig: the skeleton; its neutral rotations are those of `fitted`, which depend on the motion.
+        map: SMPL's joint -> index of the character's.
+        floor: height of the lowest point in the rest pose.
+    """
+
+    rig: Rig
+    map: Mapping[str, int]
+    floor: float
+
+    def position(self, joint: str) -> np.ndarray:
+        """Returns the position (3,) of SMPL's joint in the rest pose."""
+        return self.rig.positions[self.map[joint]]
+
+
+def rest_pose(
+    source: object,
+    names: Sequence[str],
+    parents: Sequence[int],
+    positions: np.ndarray,
+    turned: np.ndarray,
+    joints: Mapping[str, int],
+    lowest: Sequence[np.ndarray] | np.ndarray,
+    vertical: Sequence[int] | None = None,
+) -> RestPose:
+    """Returns a rest pose, turned to y up and +z ahead.
+
+    Args:
+        source: the character, for messages.
+        names, parents: of the J joints; parents precede their children.
+        positions: (J, 3) in a world of any unit and direction.
+        turned: (J, 3, 3), rotations of the joints in this world.
+        joints: SMPL's joint -> index of the character's.
+        lowest: points that include the lowest one.
+        vertical: (3,), up; None = the one of y and z along which the trunk points.
+
+    Raises:
+        UserError: If the rest pose is not upright, a limb has no length, or left and right are exchanged.
+    """
+    at = {joint: positions[number] for joint, number in joints.items()}
+
+    def middle(name: str) -> np.ndarray:
+        return (at[f"left_{name}"] + at[f"right_{name}"]) / 2
+
+    trunk, legs = middle("shoulder") - middle("hip"), middle("hip") - middle("ankle")
+    _, y, z = np.eye(3)
+    up = max((y, -y, z, -z), key=lambda axis: trunk @ axis) if vertical is None else np.array(vertical)
+    shortest = max(1e-4 * float(np.linalg.norm(legs)), 1e-9)
+    for side in SIDES:
+        for start, end in LIMBS.items():
+            if np.linalg.norm(at[f"{side}_{start}"] - at[f"{side}_{end}"]) <= shortest:
+                raise UserError(f"{source}: the bone from {side}_{start} to {side}_{end} has no length")
+    tilt = max(np.degrees(np.arccos(np.clip(v @ up / max(np.linalg.norm(v), 1e-9), -1, 1))) for v in (trunk, legs))
+    if not tilt <= TILT:
+        raise UserError(
+            f"{source}: the rest pose is not upright, it leans by {tilt:.0f} degrees. It must be a T-pose or an A-pose"
+        )
+    left = at["left_hip"] + at["left_shoulder"] - at["right_hip"] - at["right_shoulder"]
+    left = left - up * (up @ left)
+    if np.linalg.norm(left) <= shortest:
+        raise UserError(f"{source}: left and right joints of the rest pose are at the same points")
+    left = left / np.linalg.norm(left)
+    nearest = np.eye(3)[np.abs(left).argmax()] * np.sign(left[np.abs(left).argmax()])
+    left = nearest if nearest @ left > np.cos(np.radians(SNAP)) else left
+    frame = np.stack([left, up, np.cross(left, up)])
+    feet = [at[f"{side}_foot"] - at[f"{side}_ankle"] for side in SIDES if f"{side}_foot" in at]
+    if feet and frame[2] @ np.sum(feet, 0) < 0:
+        raise UserError(
+            f"{source}: the toes point backward. Are left and right exchanged, or is the character mirrored?"
+        )
+    sources = dict(joints)
+    spine = [joint for joint in SPINE if joint in sources]
+    if spine:  # the arms start at the last joint of the spine, which moves as the chest
+        sources["spine3"] = sources.pop(spine[-1])
+    of = {number: JOINT[joint] for joint, number in sources.items()}
+    rig = Rig(
+        joints=tuple(names),
+        parents=tuple(parents),
+        positions=positions @ frame.T,
+        turns=frame @ turned,
+        sources=tuple(of.get(number, -1) for number in range(len(names))),
+        neutral=np.tile(np.eye(3), (len(names), 1, 1)),
+        orders=("",) * len(names),
+        frame=frame,
+    )
+    return RestPose(rig, joints, float(np.min(np.asarray(lowest) @ frame[1])))
+
+
+# Moving a character ---------------------------------------------------------------------------------------------------
+
+
+def fitted(character: RestPose, offsets: np.ndarray) -> Rig:
+    """Returns the skeleton with its neutral rotations: limbs have the directions of a body's in its rest pose.
+
+    Args:
+        character: the character.
+        offsets: (22, 3), position of each joint of the body relative to its parent in the rest pose.
+    """
+    rig, turns = character.rig, np.tile(np.eye(3), (len(SMPL22), 1, 1))
+    for side in SIDES:
+        for (start, middle, end), bend in ((("hip", "knee", "ankle"), -1), (("shoulder", "elbow", "wrist"), 1)):
+            first, second, third = (character.position(f"{side}_{name}") for name in (start, middle, end))
+            ours = [offsets[JOINT[f"{side}_{name}"]] for name in (middle, end)]
+            theirs = [second - first, third - second]
+            hinge, usual = np.cross(ours[0], [0, 0, bend]), np.cross(theirs[0], [0, 0, bend])
+            shown = np.cross(theirs[0], theirs[1]) / (np.linalg.norm(theirs[0]) * np.linalg.norm(theirs[1]))
+            clear = np.linalg.norm(shown) > BEND and shown @ usual > 0
+            for name, bone, their_bone in zip((start, middle), ours, theirs, strict=True):
+                turn = orthonormal(bone, hinge).T @ orthonormal(their_bone, shown if clear else usual)
+                turns[JOINT[f"{side}_{name}"]] = turn
+        turns[JOINT[f"{side}_wrist"]] = turns[JOINT[f"{side}_elbow"]]
+    neutral = np.stack([turns[max(source, 0)] @ turn for source, turn in zip(rig.sources, rig.turns, strict=True)])
+    return replace(rig, neutral=neutral)
+
+
+def follow(
+    character: RestPose, joints: np.ndarray, offsets: np.ndarray, neutral: np.ndarray, world: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, Rig]:
+    """Moves a character as a body moves.
+
+    Args:
+        character: its rest pose.
+        joints: (F, 22, 3), positions of the body's joints in meters.
+        offsets: (22, 3), position of each joint of the body relative to its parent in the rest pose.
+        neutral: (22, 3, 3), rotation of each part of the body in the rest pose.
+        world: (F, 22, 3, 3), rotations of these parts in the world.
+
+    Returns:
+        Rotations (F, J, 3, 3) and positions (F, J, 3) of its joints in the world, and its skeleton for this motion.
+    """
+    rig, neutral = fitted(character, offsets), neutral.copy()
+    turned = world @ np.swapaxes(neutral, 1, 2)
+    neutral[JOINT["neck"]] = neutral[JOINT["head"]]
+    turned = turned @ neutral
+    joints = joints.astype(float)
+    lowest = joints[..., 1].min()
+    joints[..., 1] -= lowest if abs(lowest) <= GROUND else 0
+    size = _leg([offsets[JOINT[f"{s}_{name}"]] for s in SIDES for name in ("knee", "ankle")])
+    own = [character.position(f"{s}_{b}") - character.position(f"{s}_{a}") for s in SIDES for a, b in LEGS]
+    scale = _leg(own) / size
+    # heights of the ankles above the floor while the feet are flat
+    flat = {s: (neutral[JOINT[f"{s}_ankle"]].T @ offsets[JOINT[f"{s}_foot"]])[1] for s in SIDES}
+    higher = {s: character.position(f"{s}_ankle")[1] - character.floor + scale * flat[s] for s in SIDES}
+
+    hips = scale * joints[:, [JOINT["left_hip"], JOINT["right_hip"]]].mean(1)
+    hips[:, 1] += np.mean(list(higher.values()))
+    world = rig.turned(turned)
+    positions = rig.assembled(world, np.zeros_like(hips))
+    pelvis = hips - positions[:, [character.map[f"{s}_hip"] for s in SIDES]].mean(1)
+    positions = rig.assembled(world, pelvis)
+    for side in SIDES:
+        hip, knee, ankle = (character.map[f"{side}_{name}"] for name in ("hip", "knee", "ankle"))
+        target = scale * joints[:, JOINT[f"{side}_ankle"]] + [0, higher[side], 0]
+        if f"{side}_foot" in character.map:
+            toe = character.map[f"{side}_foot"]
+            target = scale * joints[:, JOINT[f"{side}_foot"]] - (positions[:, toe] - positions[:, ankle])
+            target[:, 1] += rig.positions[toe, 1] - character.floor
+        forward = turned[:, JOINT[f"{side}_hip"], :, 2]
+        bent = _bent(positions[:, hip], positions[:, knee], positions[:, ankle], target, forward)
+        for name, bone, start, end in (
+            ("hip", bent - positions[:, hip], hip, knee),
+            ("knee", target - bent, knee, ankle),
+        ):
+            number = JOINT[f"{side}_{name}"]
+            turned[:, number] = shortest_turns(positions[:, end] - positions[:, start], bone) @ turned[:, number]
+    world = rig.turned(turned)
+    return world, rig.assembled(world, pelvis), rig
+
+
+def _leg(bones: Sequence[np.ndarray]) -> float:
+    return float(np.sum([np.linalg.norm(bone) for bone in bones])) / 2
+
+
+def _bent(hip: np.ndarray, knee: np.ndarray, ankle: np.ndarray, target: np.ndarray, forward: np.ndarray) -> np.ndarray:
+    """Returns where a knee (F, 3) is if the ankle is at `target`, or as near as the leg reaches; it bends as before."""
+    thigh, shin = np.linalg.norm(knee - hip, axis=1), np.linalg.norm(ankle - knee, axis=1)
+    line = target - hip
+    length = np.maximum(np.linalg.norm(line, axis=1), 1e-9)
+    line = line / length[:, None]
+    length = np.clip(length, np.abs(thigh - shin) / REACH, REACH * (thigh + shin))
+    along = (thigh**2 - shin**2 + length**2) / (2 * length)
+    before = ankle - hip
+    out = (knee - hip) - before * ((knee - hip) * before).sum(1, keepdims=True) / (before**2).sum(1, keepdims=True)
+    # a straight leg does not show where its knee points
+    out = out + STRAIGHT * thigh[:, None] * forward
+    out = out - line * (out * line).sum(1, keepdims=True)
+    out = out / np.linalg.norm(out, axis=1, keepdims=True)
+    return hip + along[:, None] * line + np.sqrt(np.maximum(thigh**2 - along**2, 0))[:, None] * out

@@ -1,0 +1,194 @@
+"""Models that generate motions: the four parts, and sampling. Training is in `flame_mdm.task`.
+
+This module does not import Lightning, whose import takes longer than sampling a motion.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any, Literal, Self
+
+import torch
+from torch import Tensor, nn
+
+from flame_mdm.batch import Denoise, Edit, MotionBatch, pad_to
+from flame_mdm.conditions import ConditionEncoder
+from flame_mdm.config import Config, instantiate, parameters
+from flame_mdm.denoisers import Denoiser
+from flame_mdm.errors import UserError
+from flame_mdm.processes import Process
+from flame_mdm.processes.guidance import classifier_free_guidance
+from flame_mdm.processes.windows import Windows, blended
+from flame_mdm.representations import Representation
+from flame_mdm.sampler_options import SamplerOptions
+from flame_mdm.seeds import seeded_noise
+
+
+class MotionGenerator(nn.Module):
+    """A denoiser, a process, a condition encoder and a representation, and how to sample from them."""
+
+    noun = "a motion generator"
+    """What its checkpoints hold, for messages."""
+    denoiser: Denoiser
+    process: Process
+    condition: ConditionEncoder
+    representation: Representation
+    sampler_options: SamplerOptions
+    """Defaults of `generate`, from the recipe."""
+    config: Config
+    """The recipe, saved in checkpoints."""
+    facts: dict[str, Any]
+    """Facts about the training data for sampling and evaluation: actions, maximum length, fingerprint."""
+    steps: int | None = None
+    """Number of training steps of the loaded checkpoint; None if unknown."""
+
+    @classmethod
+    def build(cls, config: Config, representation: Representation, *, actions: Sequence[str] = ()) -> Self:
+        """Builds the parts of a recipe and combines them. Derives sizes that depend on other parts."""
+
+        def part(name: str, **derived: Any) -> Any:
+            legal = parameters(config[name]["_target_"])
+            derived = {k: v for k, v in derived.items() if k in legal or "**" in legal}
+            return instantiate(config[name], **derived)
+
+        process: Process = part("process")
+        condition: ConditionEncoder = part("condition", num_actions=len(actions))
+        width = representation.features
+        denoiser: Denoiser = part(
+            "denoiser",
+            in_features=width,
+            out_features=process.out_features(width),
+            cond_features=condition.features,
+            length_unit=_length_unit(config),
+        )
+        model = cls.of_parts(config, denoiser, process, condition, representation)
+        model.config, model.facts = config, {"actions": list(actions)}
+        return model
+
+    @classmethod
+    def of_parts(cls, config: Config, *parts: Any) -> Self:
+        """Combines denoiser, process, condition and representation, with the sampling of the recipe `config`."""
+        model = cls()
+        options = ("guidance_scale", "sampler", "num_inference_steps")
+        model.combine(*parts, **{name: config["task"][name] for name in options})
+        return model
+
+    def combine(
+        self,
+        denoiser: Denoiser,
+        process: Process,
+        condition: ConditionEncoder,
+        representation: Representation,
+        **options: Any,
+    ) -> None:
+        """Stores the parts and the defaults of sampling; raises `UserError` if one of them is invalid."""
+        if not isinstance(denoiser, Denoiser):
+            raise UserError(f"{type(denoiser).__name__} is no denoiser: derive it from flame_mdm.denoisers.Denoiser")
+        if options["num_inference_steps"] is None:  # a recipe may come from a file
+            raise UserError("task.num_inference_steps=null: give the number of sampling steps")
+        try:
+            self.sampler_options = SamplerOptions(**options)
+        except UserError as error:
+            raise UserError(f"task.{error}") from error
+        self.condition, self.representation = condition, representation
+        self.denoiser, self.process = denoiser, process
+
+    @property
+    def device(self) -> torch.device:
+        """Device of the model."""
+        return self.representation.mean.device
+
+    def describe(self) -> str:
+        """Returns the name of the network, for the first line of a run's output."""
+        return type(self.denoiser).__name__
+
+    @property
+    def conditioned_on(self) -> Literal["none", "text", "action"]:
+        """The condition that the model was trained with."""
+        return self.condition.reads if self.condition.features else "none"
+
+    @torch.no_grad()
+    def generate(
+        self,
+        batch: MotionBatch,
+        options: SamplerOptions | None = None,
+        *,
+        seed: int = 0,
+        replication: int = 0,
+        edit: Edit | None = None,
+        windows: Windows | None = None,
+        unconditioned: bool = False,
+        shared_noise: bool = False,
+        trajectory: list[Tensor] | None = None,
+    ) -> Tensor:
+        """Samples motions for the conditions, lengths and ids of `batch`; its `x` is ignored.
+
+        Options of the sampler that are None have the values of the recipe. The noise of a motion is a function of
+        (seed, replication, id), so the motion is the same in any batch. `unconditioned` samples a conditional model
+        with its null condition. With `shared_noise`, all motions get the same noise, a function of (seed, replication)
+        only. The normalized clean estimate (B, F, D) of each denoiser call is appended to `trajectory`. With `windows`,
+        motions may be longer than those in training, and the conditions are those of the windows.
+
+        Returns:
+            (B, F, D) normalized, 0 past the end of each motion.
+        """
+        was_training = self.training
+        if was_training:  # setting the mode of all modules takes as long as a small network
+            self.eval()
+        options = self.sampler_options if options is None else options.over(self.sampler_options)
+        denoise: Denoise = self.denoiser
+        described = batch if windows is None else windows.batch
+        if unconditioned and self.condition.features:
+            nothing = torch.zeros(len(described), dtype=torch.long, device=batch.x.device)
+            cond = self.condition(replace(described, text=[""] * len(described), action=nothing)).drop(nothing == 0)
+        else:
+            cond = self.condition(described)
+        scale = options.guidance_scale
+        if scale is not None and cond.null is not None and self.condition.features and not unconditioned:
+            denoise = classifier_free_guidance(self.denoiser, scale, self.representation.features)
+        if windows is not None:
+            denoise = blended(denoise, windows)
+        mask, frames, features = batch.mask, batch.mask.shape[1], self.representation.features
+        if windows is None and not self.denoiser.mask_padding:
+            # This denoiser attends to padding, so the padded length must be the same as in training.
+            mask = pad_to(mask, max(frames, self.facts.get("max_frames", 0)))
+            if edit is not None:
+                size = mask.shape[1]
+                edit = replace(edit, known=pad_to(edit.known, size), keep=~pad_to(~edit.keep, size))
+        ids = ["shared"] * len(batch) if shared_noise else batch.ids
+        noise = seeded_noise(ids, mask.shape[1], features, seed=seed, replication=replication, like=batch.x)
+        x = self.process.sample(denoise, noise, mask, cond, options, edit=edit, trajectory=trajectory)
+        if was_training:
+            self.train()
+        return x[:, :frames]
+
+
+class DistilledGenerator(MotionGenerator):
+    """A student of `flame_mdm.training.distillation`, with the guidance built in."""
+
+    def combine(self, *parts: Any, **options: Any) -> None:
+        """See `MotionGenerator.combine`. Edits cannot rewrite a path, since the sampler of students forgets it."""
+        super().combine(*parts, **options)
+        self.process.edit_modes = tuple(mode for mode in self.process.edit_modes if mode != "trajectory")
+
+    def generate(self, batch: MotionBatch, options: SamplerOptions | None = None, **keywords: Any) -> Tensor:
+        """See `MotionGenerator.generate`.
+
+        Raises:
+            UserError: If guidance or motions without condition are requested, as the student has learned neither.
+        """
+        scale = None if options is None else options.guidance_scale
+        if scale not in (None, 1):
+            raise UserError(f"guidance_scale={scale}: the guidance is built into this distilled model. Omit it")
+        if keywords.get("unconditioned") and self.condition.features:
+            needed = self.condition.reads
+            raise UserError(f"this distilled model needs a {needed}: it did not learn to sample without. Add one")
+        return super().generate(batch, options, **keywords)
+
+
+def _length_unit(config: Config) -> Any:
+    """Returns the number of which all lengths in training are multiples; 1 for imported models without a data set."""
+    data = config.get("data")
+    crop = data.get("crop") if isinstance(data, dict) else None
+    return crop.get("unit", 1) if isinstance(crop, dict) else 1

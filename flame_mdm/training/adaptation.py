@@ -1,0 +1,207 @@
+"""Adaptation of a trained model to a few clips of the user; `docs/own-motion.md` is the guide."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from lightning.pytorch.utilities import rank_zero_only
+
+from flame_mdm.batch import collate
+from flame_mdm.checkpoints.adapters import About, read_merged, word_rows, write_adapter
+from flame_mdm.checkpoints.hub import export
+from flame_mdm.checkpoints.loading import load_task
+from flame_mdm.checkpoints.locating import find
+from flame_mdm.checkpoints.model_files import state_sha256
+from flame_mdm.conditions.tokens import LearnedTokens
+from flame_mdm.conditions.vocabulary import words
+from flame_mdm.config import EXPERIMENTS, Config, check, instantiate
+from flame_mdm.config.composition import ConfigSource, plan_composition, quoted, resolve
+from flame_mdm.data import Clip, MotionSource
+from flame_mdm.data.adaptation import LessonData, check_clips, styled
+from flame_mdm.data.folder import Folder
+from flame_mdm.data.store import Store, write_store
+from flame_mdm.errors import UserError, say
+from flame_mdm.formats.motion import Motion
+from flame_mdm.reporting.page import number, page, render
+from flame_mdm.safe_io import write_text
+from flame_mdm.sampling.generation import BATCH, generate
+from flame_mdm.task import MotionGeneration
+from flame_mdm.training.start import train
+from flame_mdm.visualize import player_page
+
+SAMPLED, COMPARED = 300, 32
+"""Motions sampled from a model whose training data are not there; clips with which the page compares models."""
+OF_BASE = ("task", "losses", "representation", "process", "condition", "denoiser")
+"""Parts of the recipe that an adaptation has from its base."""
+
+
+def adapt(
+    base: str | Path,
+    source: str | Path,
+    name: str,
+    out: str | Path | None = None,
+    *,
+    action: bool = False,
+    full: bool = False,
+    force: bool = False,
+    rank: int = 8,
+    data_root: str | Path = "data",
+    overrides: Sequence[str] = (),
+) -> Path:
+    """Teaches a text-conditioned model the motions in a folder; resumes an interrupted run.
+
+    Args:
+        base: as for `flame_mdm.load`.
+        source, name: folder of motions with captions, and the word with which prompts ask for them: "in NAME style".
+        out: the run directory; default runs/adapt/NAME.
+        action: the clips show an action that the model does not know, instead of a style.
+        full: train all weights; the result is a model file instead of an adapter.
+        force: accept clips that drift upward or float.
+        rank: of the changes of the weights; more for motions far from what the model knows.
+        data_root: folder of the prepared data sets; without the base's, 300 motions are sampled from the base.
+        overrides: overrides of `experiments/adapt.yaml`, such as "trainer.max_steps=2000".
+
+    Returns:
+        The adapter or model file, OUT/NAME.safetensors. OUT/adaptation.html compares motions before and after.
+
+    Raises:
+        FileNotFoundError, UserError: If the base, a motion or a caption cannot be used, or an argument is invalid.
+    """
+    file, out = find(base), Path(out or f"runs/adapt/{name}")
+    if not re.fullmatch(r"[^\W_]+", name):
+        raise UserError(f"name={name}: give one word of letters and digits, since prompts say 'in {name} style'")
+    if rank < 1:
+        raise UserError(f"rank={rank}: give 1 or more")
+    model = load_task(file, MotionGeneration)
+    if "distillation" in model.config:
+        teacher = model.config["distillation"]["teacher"]
+        raise UserError(f"{base}: a distilled model. Adapt its teacher, {teacher}, and distill the result")
+    if model.conditioned_on != "text":
+        raise UserError(f"{base}: conditioned on {model.conditioned_on}; adapt needs a model conditioned on text")
+    captions = sorted({text for note in Folder(str(source)).notes.values() for text in note.texts})
+    if not captions:
+        raise UserError(f"{source}: no captions. Write what happens into NAME.txt next to each motion, or captions.csv")
+    if not force:
+        check_clips(source, model.representation.fps)
+    config = _recipe(model, captions, name, out, overrides)
+    config["base"], config["adapter"] = str(base), None if full else _about(model, captions, name, rank, file, action)
+    model.facts.pop("vocabulary", None)  # with it, texts whose words are taught here would be refused
+    prior = _prior(model, Path(data_root), out / "data", captions)
+    config["data"]["source"] |= {"path": str(source), "prior": str(prior)}
+    check(config)
+    train(config)
+    path, last = out / f"{name}.safetensors", out / "checkpoints" / "last.ckpt"
+    if rank_zero_only.rank == 0:
+        export(last, path) if full else write_adapter(path, last)
+        data = instantiate(config["data"], representation=model.representation)
+        made = load_task(path if full else file, MotionGeneration, adapter=() if full else path)
+        body = _comparison(name, data, model, made)
+        write_text(out / "adaptation.html", page(f"Adaptation: {name}", body))
+        say(f"written: {path}", f"before and after: {out / 'adaptation.html'} (open in any browser)")
+    if torch.distributed.is_initialized():  # the launcher ends all processes when the first one exits
+        torch.distributed.barrier()
+    return path
+
+
+def _about(model: MotionGeneration, captions: Sequence[str], name: str, rank: int, file: Path, action: bool) -> About:
+    texts, seen = [styled(text, name) for text in captions], model.facts.get("vocabulary", ())
+    new = [word for word in dict.fromkeys(words(" ".join(texts))) if word not in seen]
+    return {
+        "name": name,
+        "action": action,
+        "rank": rank,
+        "words": new,
+        "rows": word_rows(model.condition, new, seen) if isinstance(model.condition, LearnedTokens) else [],
+        "captions": texts[:20],
+        "base": state_sha256(read_merged(file)["state_dict"]),
+    }
+
+
+def _recipe(model: MotionGeneration, captions: Sequence[str], name: str, out: Path, overrides: Sequence[str]) -> Config:
+    """Returns `experiments/adapt.yaml` with the parts of the base."""
+    if own := [word for word in overrides if word.partition(".")[0] in OF_BASE]:
+        raise UserError(f"{own[0]}: an adaptation keeps the {own[0].partition('.')[0]} of its base. Drop it")
+    config = resolve(plan_composition(ConfigSource(EXPERIMENTS, "adapt"), [quoted(f"run.dir={out}"), *overrides]))
+    config |= {part: model.config[part] for part in OF_BASE if part in model.config}
+    config["experiment"], config["run"]["name"], config["data"]["name"] = f"adapt/{name}", name, name
+    data, longest = model.config.get("data") or {}, model.facts["max_frames"] // 4 * 4
+    config["data"]["crop"] = data.get("crop") or config["data"]["crop"] | {"max_frames": longest}
+    if not any(word.startswith("optimizer.lr=") for word in overrides):
+        config["optimizer"]["lr"] = (model.config.get("optimizer") or config["optimizer"])["lr"]
+    config["data"]["source"]["motion"] = (data.get("source") or {}).get("motion", "joints")
+    texts = [*captions[:: -(-len(captions) // 3)], *list(model.facts.get("captions", ()))[:3]]
+    config["callbacks"]["samples"]["prompts"] = [styled(text, name) for text in texts]
+    return config
+
+
+def _prior(model: MotionGeneration, root: Path, own: Path, captions: Sequence[str]) -> Path:
+    """Returns the store of the base's training data if it is in `root`, otherwise one of motions sampled from it."""
+    representation = model.representation
+    folder = root / f"{(model.config.get('data') or {}).get('name')}-{representation.name}"
+    if (folder / "store.json").exists() and Store(folder).fingerprint == model.facts.get("fingerprint"):
+        return folder
+    folder = own / f"prior-{representation.name}"
+    if not (folder / "store.json").exists():
+        say(f"the training data of the base are not in {root}: sampling {SAMPLED} motions of it instead")
+        write_store(folder, _Samples(model, list(model.facts.get("captions", ())) or captions), representation)
+    return folder
+
+
+class _Samples(MotionSource):
+    """`SAMPLED` motions of a model for some captions, a tenth of them for validation."""
+
+    name, workers = "prior", 1
+
+    def __init__(self, model: MotionGeneration, captions: Sequence[str]):
+        self.model = model
+        self.captions = [captions[row * len(captions) // SAMPLED] for row in range(SAMPLED)]
+
+    def count(self) -> int:
+        return SAMPLED
+
+    def statistics(self) -> tuple[np.ndarray, np.ndarray]:
+        return self.model.representation.mean.numpy(), self.model.representation.std.numpy()
+
+    def clips(self, fps: float) -> Iterator[Clip]:
+        frames, encoded = self.model.facts["max_frames"], self.model.representation.name
+        for first in range(0, SAMPLED, BATCH):
+            made = generate(self.model, self.captions[first : first + BATCH], frames=frames, seed=first)
+            for row, motion in enumerate(made, first):
+                assert motion.features is not None
+                split, name = "train" if row % 10 else "val", f"sample_{row:03d}"
+                yield Clip(name, motion.features, [motion.text], split, name, encoded=encoded)
+
+
+def _comparison(name: str, data: LessonData, before: MotionGeneration, after: MotionGeneration) -> str:
+    """Returns the page that compares motions and losses of two models."""
+    data.setup("fit")
+    clips, made_by = data.train.clips, before.representation
+    own, kept = (rows[:: -(-len(rows) // COMPARED)] for rows in data.halves())
+    plain, taught = ({clips[row].captions[0]: clips[row] for row in rows} for rows in (kept, own))
+    texts = [*list(taught)[:3], *(styled(text, name) for text in list(plain)[:3]), *list(plain)[:3]]
+    models = {"before": before, "after": after}
+    made = ([replace(motion, id=label) for motion in generate(model, texts)] for label, model in models.items())
+    beside: list[Motion] = []
+    for text, clip in list(taught.items())[:4]:
+        joints = made_by.decode(torch.from_numpy(data.store.motion(clip)[: data.crop.longest()].copy())).numpy()
+        beside.append(Motion(joints, made_by.fps, made_by.skeleton, text, "your clip"))
+        beside += [replace(motion, id="model") for motion in generate(after, text, frames=len(joints))]
+    rows: list[list[str]] = []
+    for what, chosen in ((f"loss on {len(own)} of your clips", own), (f"loss on {len(kept)} clips it knew", kept)):
+        batch = collate(data.train.__getitems__([(int(row), -1) for row in chosen]))
+        with torch.no_grad():
+            rows.append([what, *(number(float(model.losses_of(batch)["loss"].mean())) for model in models.values())])
+    runs = [generate(model, list(plain), seed=seed) for model, seed in ((before, 0), (after, 0), (before, 1))]
+    first, *others = (np.concatenate([motion.joints for motion in motions]) for motions in runs)
+    moved = [number(100 * float(np.linalg.norm(joints - first, axis=-1).mean())) for joints in others]
+    rows.append(
+        [f"joints move in {len(plain)} motions without the style, cm", f"{moved[1]} with another seed", moved[0]]
+    )
+    players = {"prompts": [motion for pair in zip(*made, strict=True) for motion in pair], "clips": beside}
+    pages = {part: player_page(motions, "", columns=2) for part, motions in players.items()}
+    return render("adaptation.html", name=name, rows=rows, **pages)

@@ -1,0 +1,160 @@
+"""Training of models that sample in one to four steps, from a teacher that takes more."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Self
+
+import torch
+from torch import Tensor
+
+from flame_mdm.batch import Condition, Denoise, MotionBatch
+from flame_mdm.checkpoints.loading import PARTS, find, load_task
+from flame_mdm.checkpoints.model_files import weights_sha256
+from flame_mdm.config import Config, flatten
+from flame_mdm.errors import UserError
+from flame_mdm.generator import DistilledGenerator, MotionGenerator
+from flame_mdm.processes.consistency import consistency_terms
+from flame_mdm.processes.guidance import classifier_free_guidance
+from flame_mdm.representations import Representation
+from flame_mdm.task import MotionGeneration, Task
+from flame_mdm.training.averaging import MovingAverage
+
+
+class ConsistencyDistillation(DistilledGenerator, MotionGeneration):
+    """A student that starts as its teacher and learns to sample in one to four steps, with the guidance built in.
+
+    Its parts, data and captions are those of the teacher, which is only needed in training. The text encoder is not
+    trained, and nothing has dropout. The section `distillation` of the recipe has these keys:
+
+        teacher: a checkpoint, as for `flame_mdm.load`. The hash of its weights becomes the student's fact "teacher".
+        guidance_scale: of the teacher's steps; null = the default of the teacher.
+        intervals: numbers of times of the grid; each is used for an equal share of the training.
+    """
+
+    @classmethod
+    def build(cls, config: Config, representation: Representation, *, actions: Sequence[str] = ()) -> Self:
+        task = super().build(config, representation, actions=actions)
+        task.condition.requires_grad_(False)
+        return task.eval()
+
+    def train(self, mode: bool = True) -> Self:
+        """Stays in evaluation mode: dropout would be noise in the targets."""
+        return super().train(False)
+
+    def setup(self, stage: str) -> None:
+        """Also starts from the teacher."""
+        super().setup(stage)
+        self.start_from_teacher()
+
+    def start_from_teacher(self) -> None:
+        """Reads the teacher, and takes over its weights.
+
+        Raises:
+            FileNotFoundError, UserError: If the recipe names no teacher, or one that does not suit.
+        """
+        options = self.config["distillation"]
+        try:
+            path = find(options["teacher"])
+        except FileNotFoundError as error:
+            raise UserError(f"distillation.teacher={error}. Train it first, or name another") from error
+        teacher = read_teacher(path)
+        _check_same(teacher, self)
+        self.load_state_dict(teacher.state_dict())
+        self.facts |= {"teacher": weights_sha256(path)}
+        scale = options["guidance_scale"]
+        self.teacher_guidance = teacher.sampler_options.guidance_scale if scale is None else scale
+        # In lists, since they are no parts of the student.
+        self.teacher, self.target = [copy.deepcopy(self.denoiser).requires_grad_(False)], [self.denoiser]
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Checks that a resumed run has the same teacher.
+
+        Raises:
+            UserError: If the weights of the teacher have changed.
+        """
+        if checkpoint["facts"].get("teacher") != self.facts["teacher"]:
+            raise UserError(
+                f"distillation.teacher={self.config['distillation']['teacher']}: its weights have changed since this "
+                "run began. Restore them, or start another run with run.name=..."
+            )
+
+    def on_fit_start(self) -> None:
+        super().on_fit_start()
+        self.teacher[0].to(self.device)
+
+    def on_train_start(self) -> None:
+        """Takes the targets from the moving average of the weights, if the recipe has one."""
+        Task.on_train_start(self)  # and does not pretrain the text encoder, which is the teacher's
+        for callback in self.trainer.callbacks:  # type: ignore[attr-defined]
+            if isinstance(callback, MovingAverage):
+                average = callback.averaged()
+                if not self.trainer.global_step:  # it was copied before the weights of the teacher came
+                    average.load_state_dict(self.state_dict())
+                self.target = [average.denoiser]
+
+    def loss_terms(
+        self, batch: MotionBatch, cond: Condition, u: Tensor | None = None, noise: Tensor | None = None
+    ) -> dict[str, Tensor]:
+        """See `MotionGeneration.loss_terms`. Validation, which gives u, is at the times of the last grid."""
+        trainer, counts = self._trainer, self.config["distillation"]["intervals"]
+        progress, is_validation = 1.0, u is not None
+        if not is_validation and trainer is not None and trainer.max_steps > 0:
+            progress = trainer.global_step / trainer.max_steps
+        times = torch.tensor(self.process.grid(counts[min(int(progress * len(counts)), len(counts) - 1)]))
+        u = torch.rand(len(batch), device=self.device) if u is None else u
+        teacher: Denoise = self.teacher[0]
+        if cond.null is not None and self.condition.features and self.teacher_guidance is not None:
+            teacher = classifier_free_guidance(teacher, self.teacher_guidance, self.representation.features)
+        return consistency_terms(
+            self.process,
+            self.denoiser,
+            self.denoiser if is_validation else self.target[0],
+            teacher,
+            batch.x,
+            batch.mask,
+            cond,
+            times=times.to(self.device),
+            index=(u * len(times)).long().clamp(max=len(times) - 1),
+            noise=torch.randn_like(batch.x) if noise is None else noise,
+            auxiliary=self.losses,
+        )
+
+
+def read_teacher(path: Path) -> MotionGenerator:
+    """Loads a model that can be a teacher.
+
+    Raises:
+        FileNotFoundError: If there is no such checkpoint.
+        UserError: If it is not a model that generates motions, predicts noise, or is a student itself.
+    """
+    teacher = load_task(path, MotionGenerator)
+    if isinstance(teacher, DistilledGenerator):
+        raise UserError(f"{path}: distilled already. Give its teacher, {teacher.config['distillation']['teacher']}")
+    if teacher.process.prediction == "epsilon":
+        raise UserError(
+            f"{path}: predicts noise, whose clean estimate is divided by almost nothing at the noisiest times. Give a "
+            "model that predicts the clean motion or the velocity (MDM, MFM)"
+        )
+    return teacher
+
+
+def _check_same(teacher: MotionGenerator, student: ConsistencyDistillation) -> None:
+    """Raises `UserError` if teacher and student differ in a part, or in the data."""
+    name = student.config["distillation"]["teacher"]
+    for part in PARTS[1:]:
+        theirs, ours = flatten(teacher.config[part]), flatten(student.config[part])
+        for key in theirs.keys() | ours.keys():
+            if theirs.get(key) != ours.get(key):
+                raise UserError(
+                    f"distillation.teacher={name}: has {part}.{key}={theirs.get(key)}, but the student has "
+                    f"{ours.get(key)}. Both need the same parts: use `flame-mdm distill {name}`"
+                )
+    before, now = teacher.facts.get("fingerprint"), student.facts.get("fingerprint")
+    if None not in (before, now) and before != now:
+        raise UserError(
+            f"distillation.teacher={name}: trained on data with fingerprint {before}, but {student.facts['dataset']} "
+            f"has {now}. Give the data of the teacher"
+        )

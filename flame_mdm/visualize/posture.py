@@ -1,0 +1,103 @@
+"""Posture of a body in motion: rotations in the world, also those that joint positions do not determine.
+
+It needs numpy alone: the extension of Blender contains this file.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from flame_mdm.representations.skeleton import SMPL22
+
+JOINT = {name: number for number, name in enumerate(SMPL22.joints)}
+UPRIGHT = np.cos(np.radians(30))
+"""The head is level on average in frames in which the chest is tilted by less than this angle, given as its cosine."""
+STANDING = 0.02
+"""A foot stands flat in frames in which it is at most this many meters above its lowest position."""
+TOES = (0.02, 0.09, np.radians(60))
+"""The toes stay flat while their joint is lower than the first height; above the second one they follow the foot. The
+last number is the largest bend."""
+
+
+def complete(joints: np.ndarray, offsets: np.ndarray, world: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Completes rotations solved from positions, which determine neither the head's pitch nor the toes.
+
+    The median pitch of the head while the chest is upright is taken as level, and the toes stay flat on the floor while
+    the heel rises.
+
+    Args:
+        joints: (F, 22, 3), positions in meters, y up.
+        offsets: (22, 3), position of each joint relative to its parent in the rest pose.
+        world: (F, 22, 3, 3), rotations of the joints in the world.
+
+    Returns:
+        Rotation (22, 3, 3) of each part of the body in the rest pose; rotations (F, 22, 3, 3) of these parts in the
+        world; offsets (22, 3) of a body that stands on flat feet.
+    """
+    neutral, offsets = np.tile(np.eye(3), (len(SMPL22), 1, 1)), offsets.copy()
+    for side in ("left", "right"):
+        ankle, toe = JOINT[f"{side}_ankle"], JOINT[f"{side}_foot"]
+        flat = _flat_foot(joints[:, ankle], joints[:, toe], offsets[toe])
+        neutral[ankle] = neutral[toe] = shortest_turns(flat, offsets[toe])
+        offsets[toe] = flat
+    neck, head = JOINT["neck"], JOINT["head"]
+    x, y, z = (joints[:, head] - joints[:, neck]).T
+    chest = world[:, JOINT["spine3"]]
+    upright = chest[:, 1, 1] > UPRIGHT if chest[:, 1, 1].max() > UPRIGHT else slice(None)
+    sine, cosine = chest[:, [0, 2], 2].T / np.linalg.norm(chest[:, [0, 2], 2], axis=1)
+    usual = np.median(np.stack([x * cosine - z * sine, y, x * sine + z * cosine], 1)[upright], 0)
+    neutral[head] = shortest_turns(offsets[head], usual).T
+    world = world @ neutral
+    for toe in (JOINT["left_foot"], JOINT["right_foot"]):
+        world[:, toe] = world[:, toe] @ _toes(world[:, toe], joints[:, toe, 1])
+    return neutral, world, offsets
+
+
+def world_rotations(rotations: np.ndarray) -> np.ndarray:
+    """Returns rotations (..., 22, 3, 3) in the world from those relative to parents."""
+    world = rotations.copy()
+    for parent, joint in SMPL22.edges:
+        world[..., joint, :, :] = world[..., parent, :, :] @ rotations[..., joint, :, :]
+    return world
+
+
+def orthonormal(direction: np.ndarray, u: np.ndarray) -> np.ndarray:
+    """Returns axes as rows (3, 3): the direction, then `u` made orthogonal to it, then the third one."""
+    along = direction / np.linalg.norm(direction)
+    across = u - (u @ along) * along
+    across /= np.linalg.norm(across)
+    return np.stack([along, across, np.cross(along, across)])
+
+
+def shortest_turns(start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """Returns the smallest rotations (..., 3, 3) that turn directions (..., 3) into others."""
+    a, b = (vector / np.linalg.norm(vector, axis=-1, keepdims=True) for vector in (start, end))
+    axis = np.cross(a, b)
+    sine = np.linalg.norm(axis, axis=-1)
+    return rotations_about(axis / np.maximum(sine, 1e-9)[..., None], np.arctan2(sine, (a * b).sum(-1)))
+
+
+def rotations_about(axis: np.ndarray, angle: np.ndarray) -> np.ndarray:
+    """Returns rotations (..., 3, 3) about unit vectors (..., 3) by angles (...)."""
+    x, y, z = np.moveaxis(axis, -1, 0)
+    cross = np.stack([0 * x, -z, y, z, 0 * x, -x, -y, x, 0 * x], -1).reshape(*axis.shape, 3)
+    sine, cosine = np.sin(angle)[..., None, None], np.cos(angle)[..., None, None]
+    return np.eye(3) + sine * cross + (1 - cosine) * (cross @ cross)
+
+
+def _flat_foot(ankle: np.ndarray, toe: np.ndarray, offset: np.ndarray) -> np.ndarray:
+    """Returns the position of the toes relative to the ankle while the foot stands flat, in the rest pose."""
+    height = ankle[:, 1] + toe[:, 1]
+    flat = height <= height.min() + STANDING
+    length = np.linalg.norm(offset)
+    drop = np.clip(np.median((ankle - toe)[flat, 1]), 0.1 * length, 0.8 * length)
+    ahead = offset * [1, 0, 1] / np.linalg.norm(offset[[0, 2]])
+    return np.sqrt(length**2 - drop**2) * ahead - [0, drop, 0]
+
+
+def _toes(foot: np.ndarray, height: np.ndarray) -> np.ndarray:
+    """Returns rotations (F, 3, 3) of the toes relative to the foot, which has rotations (F, 3, 3) in the world."""
+    low, high, most = TOES
+    down = np.clip(np.arcsin(np.clip(-foot[:, 1, 2], -1, 1)), 0, most)
+    near = np.clip((high - height) / (high - low), 0, 1)
+    return rotations_about(np.tile([1.0, 0, 0], (len(foot), 1)), -down * near)

@@ -1,0 +1,122 @@
+"""ASF/AMC files: joints in closed form, damaged files. CMU's own files are in test_cmu.py."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from flame_mdm.__main__ import main
+from flame_mdm.errors import UserError
+from flame_mdm.formats import asf
+
+SKELETON = """# two bones: an arm along x that turns about its own axes, and a hand without freedoms
+:units
+  mass 1.0
+  length 0.45
+  angle deg
+:root
+   order TX TY TZ RX RY RZ
+   axis XYZ
+   position 0 0 0
+   orientation 0 0 0
+:bonedata
+  begin
+     id 1
+     name arm
+     direction 1 0 0
+     length 2
+     axis 0 0 90 XYZ
+     dof rx rz
+     limits (-160.0 20.0)
+            (-70.0 70.0)
+  end
+  begin
+     id 2
+     name hand
+     direction 0 1 0
+     length 3
+     axis 0 0 0 XYZ
+  end
+:hierarchy
+  begin
+    root arm
+    arm hand
+  end
+"""
+MOTION = """#!OML:ASF x.ASF
+:FULLY-SPECIFIED
+:DEGREES
+1
+root 10 20 30 0 0 0
+arm 0 0
+2
+root 10 20 30 0 0 90
+arm 90 0
+3
+root 0 0 0 10 20 30
+arm 40 50
+"""
+
+
+@pytest.fixture
+def files(tmp_path):
+    (tmp_path / "07.asf").write_text(SKELETON)
+    (tmp_path / "07_01.amc").write_text(MOTION)
+    return tmp_path
+
+
+def test_joints_in_closed_form(files):
+    motion = asf.read(files / "07_01.amc", 120)
+    assert (motion.joints, motion.parents, motion.end_parents) == (("root", "arm", "hand"), (-1, 0, 1), (2,))
+    positions = motion.with_end_joints().positions()
+    assert positions[0].tolist() == [[10, 20, 30], [10, 20, 30], [12, 20, 30], [12, 23, 30]]
+    # the arm's x axis is the world's y: by 90 degrees about it, x becomes -z; then the root turns x to y
+    np.testing.assert_allclose(positions[1], [[10, 20, 30], [10, 20, 30], [10, 20, 28], [7, 20, 28]], atol=1e-12)
+
+    def turn(axis: str, degrees: float) -> np.ndarray:
+        return Rotation.from_euler(axis, degrees, degrees=True).as_matrix()
+
+    root, axes = turn("z", 30) @ turn("y", 20) @ turn("x", 10), turn("z", 90)
+    arm = root @ axes @ turn("z", 50) @ turn("x", 40) @ axes.T
+    np.testing.assert_allclose(positions[2, 2:], [arm @ [2, 0, 0], arm @ [2, 3, 0]], atol=1e-12)
+
+
+def test_radians_and_the_only_skeleton_of_a_folder(files):
+    radians = (
+        MOTION.replace(":DEGREES", ":RADIANS").replace("0 0 90", "0 0 1.5707963").replace("arm 90", "arm 1.5707963")
+    )
+    (files / "07_01.amc").write_text(radians.partition("3\nroot")[0])
+    (files / "07.asf").rename(files / "someone.asf")
+    positions = asf.read(files / "07_01.amc", 120).positions()
+    np.testing.assert_allclose(positions[1, 2], [10, 20, 28], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("arm 40 50", "arm 40", "07_01.amc, line 12: expected 2 numbers, found 40"),
+        ("arm 40 50", "leg 40 50", "line 12: leg is no moving bone"),
+        ("arm 40 50\n", "", "line 11: frame 3 ends without arm"),
+        (MOTION, "", "line 1: not an AMC file"),
+        (MOTION, "version https://git-lfs.github.com/spec/v1\n", "line 1: version is no moving bone"),
+        ("dof rx rz", "dof rx l", "07.asf, line 21: degrees of freedom must be among rx, ry and rz"),
+        ("axis 0 0 90 XYZ", "axis 0 0 90 XXZ", "line 21: an order of axes is needed"),
+        ("    arm hand", "    arm foot", "line 32: bone foot is unknown"),
+        ("   position 0 0 0", "   position 0 1 0", "line 9: a root whose position is not 0 0 0"),
+        ("     length 2\n", "", "line 20: a bone without length"),
+        (SKELETON, "HIERARCHY\n", "07.asf, line 1: not an ASF file"),
+    ],
+)
+def test_damaged_files_are_named_with_their_line(files, old, new, message):
+    for name in ("07.asf", "07_01.amc"):
+        (files / name).write_text((files / name).read_text().replace(old, new))
+    with pytest.raises(UserError, match=message):
+        asf.read(files / "07_01.amc", 120)
+
+
+def test_missing_skeletons_and_rates_get_one_line(files, capsys):
+    assert main(["convert", str(files / "07_01.amc"), str(files / "out.npz")]) == 1
+    assert "AMC files contain no frame rate: give fps=120, or `fps: 120` in skeleton.yaml" in capsys.readouterr().err
+    (files / "07.asf").unlink()
+    assert main(["convert", str(files / "07_01.amc"), str(files / "out.npz"), "fps=120"]) == 1
+    assert "no skeleton 07.asf next to it" in capsys.readouterr().err
+    assert not (files / "out.npz").exists()

@@ -1,0 +1,127 @@
+"""The extension of Blender, built by tools/blender.py and used in Blender without a window."""
+
+import importlib.util
+import json
+import os
+import subprocess
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from support.fixtures import ROOT, blender
+from support.glb import Glb
+from support.motions import synthetic
+
+import flame_mdm
+from flame_mdm.errors import UserError
+from flame_mdm.formats import characters
+from flame_mdm.formats.joint_names import known_skeletons
+
+pytestmark = [pytest.mark.tools, pytest.mark.slow, pytest.mark.timeout(900)]
+WALK = {"sentence": "a person walks forward", "seconds": 2.2, "seed": 1, "in_place": False, "onto_selected": False}
+KICK = {"sentence": "a person kicks with the left foot twice", "seconds": 3, "seed": 0, "onto_selected": False}
+WAVE = {"sentence": "a person waves with both hands", "seconds": 3, "seed": 2, "in_place": False, "onto_selected": True}
+
+
+@pytest.fixture(scope="module")
+def tool() -> Any:
+    spec = importlib.util.spec_from_file_location("blender_tool", ROOT / "tools" / "blender.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(scope="module")
+def package(tool: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    blender()
+    path = tmp_path_factory.mktemp("blender") / "flame_mdm.zip"
+    tool.build("quickstart", path, tool.this_machine())
+    return path
+
+
+def run(package: Path, requests: list[Any], folder: Path) -> list[Any]:
+    """What tests/support/blender_extension.py finds: names and joints (F, J, 3) of each motion, or an error."""
+    (folder / "requests.json").write_text(json.dumps(requests))
+    command = [
+        blender(),
+        ROOT / "tests" / "support" / "blender_extension.py",
+        package,
+        folder / "requests.json",
+        folder,
+    ]
+    environment = os.environ | {"BLENDER_USER_RESOURCES": str(folder / "blender"), "PYTHONPATH": ""}
+    done = subprocess.run(command, check=False, capture_output=True, text=True, env=environment)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return json.loads((folder / "results.json").read_text())
+
+
+def test_blender_shows_the_motions_of_the_package(package: Path, tmp_path: Path) -> None:
+    assert package.stat().st_size <= 40e6
+    hero = tmp_path / "hero.glb"
+    synthetic("kick").save(hero, rig="mixamo")
+    model = flame_mdm.load("quickstart")
+    walk, kick, wave = (
+        flame_mdm.generate(model, r["sentence"], seconds=r["seconds"], seed=r["seed"])[0] for r in (WALK, KICK, WAVE)
+    )
+    requests = [[WALK, 20, None], [KICK | {"in_place": True}, 30, None], [WAVE, 20, str(hero)]]
+    first, second, third = run(package, requests, tmp_path)
+    for (names, joints), motion in ((first, walk), (second, kick)):
+        order = [names.index(name) for name in motion.skeleton.joints]
+        if motion is kick:  # 30 frames per second
+            assert len(joints) == round((len(motion.joints) - 1) * 1.5) + 1
+            joints = joints[::3]
+            motion.joints[..., [0, 2]] -= motion.joints[:, :1, [0, 2]]
+            motion.joints = motion.joints[::2]
+        assert np.abs(np.array(joints)[:, order] - motion.joints).max() < 1e-3
+    wave.save(tmp_path / "python.glb", character=hero)
+    file, character = Glb(tmp_path / "python.glb"), characters.read(hero)
+    assert isinstance(character.file, characters.glb.Glb)
+    names, joints = third
+    for number in character.map.values():
+        expected = file.worlds()[:, character.file.nodes[number], :3, 3]
+        actual = np.array(joints)[:, names.index(character.rig.joints[number])]
+        assert np.abs(actual - expected).max() < 1e-3
+    assert (tmp_path / "picture.png").stat().st_size > 10_000
+
+
+def test_what_cannot_be_generated_is_refused_in_one_line(package: Path, tmp_path: Path) -> None:
+    requests = [WALK | {"sentence": "qwer asdf"}, WALK | {"sentence": " "}, WALK | {"seconds": 9}]
+    errors = run(package, [[request, 20, None] for request in [*requests, WALK | {"onto_selected": True}]], tmp_path)
+    for error, says in zip(
+        errors, ("knows no word", "sentence is empty", "give 0.1 to 3", "select an arm"), strict=True
+    ):
+        assert says in error
+        assert "\n" not in error
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "says"),
+    [
+        ("model/denoiser.onnx", lambda data: data[:-9] + b"x" * 9, "denoiser.onnx has changed since it was exported"),
+        ("model/model.json", lambda data: data[:-9], "not an exported model"),
+        ("skeletons.json", lambda data: data[:-9], "skeletons.json is damaged"),
+    ],
+)
+def test_a_damaged_extension_says_so_in_one_line(
+    package: Path, tmp_path: Path, name: str, change: Callable[[bytes], bytes], says: str
+) -> None:
+    damaged, hero = tmp_path / "flame_mdm.zip", tmp_path / "hero.glb"
+    with zipfile.ZipFile(package) as source, zipfile.ZipFile(damaged, "w") as target:
+        for item in source.namelist():
+            target.writestr(item, change(source.read(item)) if item == name else source.read(item))
+    synthetic("kick").save(hero, rig="mixamo")
+    (error,) = run(damaged, [[WAVE, 20, str(hero)]], tmp_path)
+    assert says in error
+    assert "\n" not in error
+
+
+def test_an_unknown_platform_is_refused(tool: Any, tmp_path: Path) -> None:
+    with pytest.raises(UserError, match=r"PLATFORM=linux-x86: unknown\. Did you mean linux-x64"):
+        tool.build("quickstart", tmp_path / "x.zip", "linux-x86")
+    assert list(tmp_path.iterdir()) == []
+    assert any("thighl" in names and "spine006" in names for names in known_skeletons())

@@ -1,0 +1,277 @@
+"""CMU's motions with the captions of HumanML3D and KIT-ML: conversions, rates, splits, bad files, the real files."""
+
+import gc
+import json
+import math
+import re
+import tarfile
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from support.fixtures import SHARED, needs_third_party
+
+from flame_mdm.__main__ import main
+from flame_mdm.data import archives, cmu
+from flame_mdm.data.store import Store, write_store
+from flame_mdm.errors import UserError
+from flame_mdm.formats import asf, bvh
+from flame_mdm.formats.layouts import map_bvh
+from flame_mdm.representations.humanml import HumanML
+from flame_mdm.representations.skeleton import SMPL22
+from flame_mdm.representations.smpl import SMPL
+
+ARCHIVE = SHARED / "data" / "cmu-part.tar.xz"
+SIDE = """lhipjoint root .7 -.7 .2 .14 -|lfemur lhipjoint 0 -1 0 .4 rx ry rz|ltibia lfemur 0 -1 0 .42 rx|
+lfoot ltibia 0 -.3 .95 .13 rx rz|ltoes lfoot 0 0 1 .06 -|lclavicle thorax .95 .3 0 .2 -|
+lhumerus lclavicle 1 0 0 .28 rx ry rz|lradius lhumerus 1 0 0 .19 rx|
+lwrist lradius 1 0 0 .095 -|lhand lwrist 1 0 0 .05 -"""
+TRUNK = """lowerback root 0 1 0 .12 rx ry rz|upperback lowerback 0 1 0 .12 rx ry rz|thorax upperback 0 1 0 .12 rx ry rz|
+lowerneck thorax 0 1 0 .09 rx ry rz|upperneck lowerneck 0 1 0 .09 -|head upperneck 0 1 0 .09 -"""
+BONES = [row.split() for text in (TRUNK, SIDE, re.sub(r"\bl", "r", SIDE)) for row in text.split("|")]
+"""Name, parent, direction, length in meters, degrees of freedom."""
+UNIT = 0.0254 / 0.45
+
+
+def write_asf(path: Path) -> None:
+    lines = [":units", "length 0.45", "angle deg", ":root", "order TX TY TZ RX RY RZ", "axis XYZ", ":bonedata"]
+    for name, _, x, y, z, length, *freedoms in BONES:
+        sign = "-" if name.startswith("r") else ""
+        size = float(length) / UNIT * np.linalg.norm([float(x), float(y), float(z)])
+        lines += ["begin", f"name {name}", f"direction {sign}{x} {y} {z}", f"length {size}", "axis 0 0 20 XYZ"]
+        lines += [f"dof {' '.join(freedoms)}" * (freedoms != ["-"]), "end"]
+    lines += [":hierarchy", "begin", *(f"{parent} {name}" for name, parent, *_ in BONES), "end"]
+    path.write_text("\n".join(lines) + "\n")
+
+
+def write_amc(path: Path, frames: int, seed: int = 0) -> None:
+    """A body that walks along z and swings its limbs; different for each seed."""
+    lines = [":DEGREES"]
+    for frame in range(frames):
+        phase = math.sin(frame / 20 + seed)
+        lines += [str(frame + 1), f"root 0 {0.95 / UNIT} {frame * 0.01 / UNIT} {2 * phase} {5 * phase} 1"]
+        for number, (name, *_, last) in enumerate(BONES):
+            count = BONES[number].count("rx") + BONES[number].count("ry") + BONES[number].count("rz")
+            angles = (str(12 * phase * (-1) ** (number + k)) for k in range(count))
+            lines += [f"{name} {' '.join(angles)}"] * (last != "-")
+    path.write_text("\n".join(lines) + "\n")
+
+
+def motionbuilder(tree: bvh.Bvh) -> bvh.Bvh:
+    """The recording as the public conversion has it: T-pose first, without the vectors of thorax and wrist bones."""
+    names = {bone: name for name, bone in cmu.FACTS["motionbuilder"].items()}
+    lost = ("lowerneck", "lclavicle", "rclavicle", "lhand", "rhand")
+    offsets = np.where(np.isin(tree.joints, lost)[:, None], 0, tree.offsets)
+    pose = np.concatenate([tree.frames[:1, :3], np.zeros((1, tree.frames.shape[1] - 3))], 1)
+    frames = np.concatenate([pose, tree.frames])
+    return replace(tree, joints=tuple(names[name] for name in tree.joints), offsets=offsets, frames=frames)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """Motions in `motions` and a clone of HumanML3D in `clone`."""
+    motions, clone = tmp_path / "motions", tmp_path / "clone"
+    for path in (motions / "02", motions / "60", clone / "HumanML3D" / "texts"):
+        path.mkdir(parents=True)
+    write_asf(motions / "02" / "02.asf")
+    for seed, name in enumerate(("02_01", "02_02", "02_03")):
+        write_amc(motions / "02" / f"{name}.amc", 400, seed)
+    bvh.write(motionbuilder(asf.read(motions / "02" / "02_02.amc", 120)), motions / "60" / "60_01.bvh")
+    rows = [
+        "02/02_01_poses.npy,0,60,000001.npy",
+        "02/02_02_poses.npy,6,66,000002.npy",
+        "9/9_1_poses.npy,0,60,000003.npy",
+    ]
+    rows += ["60/60_01_poses.npy,20,130,000004.npy"]
+    table = ["source_path,start_frame,end_frame,new_name", *(f"./pose_data/CMU/{row}" for row in rows)]
+    table += ["./pose_data/KIT/3/x_poses.npy,0,99,000009.npy"]
+    (clone / "index.csv").write_text("\n".join(table) + "\n")
+    for name in ("000001", "000002", "000003", "000004"):
+        for mirrored, side in (("", "left"), ("M", "right")):
+            part = f"the {side} arm swings#the/DET arm/NOUN#0.5#2.75\n" * (name == "000002")
+            text = f"a person walks to the {side}#a/DET person/NOUN#0.0#0.0\n{part}"
+            (clone / "HumanML3D" / "texts" / f"{mirrored}{name}.txt").write_text(text)
+    for split, names in {"train": ("000001", "000003", "000004"), "val": (), "test": ("000002",)}.items():
+        listed = [mark + name for name in names for mark in ("", "M")]
+        (clone / "HumanML3D" / f"{split}.txt").write_text("\n".join(listed))
+    entries = {trial: {"path": f"CMU/02/{trial}_poses", "duration": 400 / 120} for trial in ("02_02", "02_03")}
+    for trial, entry in entries.items():
+        entry["annotations"] = [{"text": f"Somebody moves in {trial}."}]
+    (clone / "kitml.json").write_text(json.dumps(dict(zip(("00001", "00002"), entries.values(), strict=True))))
+    return tmp_path
+
+
+def source(folder: Path, **options) -> cmu.CMU:
+    return cmu.CMU(str(folder / "motions"), str(folder / "clone"), **options)
+
+
+def test_clips_have_their_motion_captions_and_splits(folder):
+    humanml = HumanML("smpl22", "legacy")
+    data = source(folder)
+    store = write_store(folder / "store", data, humanml)
+    clips = {clip.id: clip for clip in store.clips}
+    assert (store.info["clips"], data.count()) == ({"train": 4, "val": 1, "test": 5}, 10)
+    assert {name for name, clip in clips.items() if clip.split == "test"} == {
+        *("000002", "M000002", "000002@0.5-2.75", "M000002@0.5-2.75", "kit00001"),
+    }
+    assert clips["M000002@0.5-2.75"].captions == ["the right arm swings"]
+    assert clips["kit00001"].source != clips["000002"].source
+    assert store.info["excluded"] == {"clips of HumanML3D without their recording": 1}
+    assert store.info["counts"]["clips of HumanML3D"] == 3
+    recording = asf.read(folder / "motions/02/02_02.amc", 120)
+    tree, fields = cmu.standardize(recording)
+    joints = map_bvh(Path("x"), tree, 20, fields)[0][6:66]
+    for name, motion in (("000002", joints), ("M000002", SMPL22.mirror(torch.from_numpy(joints)).numpy())):
+        expected = humanml.encode(torch.from_numpy(motion))
+        np.testing.assert_allclose(store.motion(clips[name]), expected, atol=1e-5)
+    assert clips["000004"].length == 109, "60 frames per second: 401 frames are 6.7 s"
+    again = write_store(folder / "again", source(folder, workers=2), humanml)
+    assert again.fingerprint == store.fingerprint
+
+
+def test_an_archive_gives_the_clips_of_its_folder_and_is_not_left_behind(folder, monkeypatch):
+    temporary = folder / "temporary"
+    temporary.mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(temporary))
+    with tarfile.open(folder / "motions.tar.xz", "w:xz") as archive:
+        archive.add(folder / "motions", "cmu/motions")
+    data = cmu.CMU(str(folder / "motions.tar.xz"), str(folder / "clone"))
+    stores = [
+        write_store(folder / str(n), of, HumanML("smpl22", "legacy")) for n, of in enumerate((source(folder), data))
+    ]
+    assert stores[0].fingerprint == stores[1].fingerprint
+    del data
+    with tarfile.open(folder / "evil.tar", "w") as archive:
+        archive.add(folder / "motions/02/02.asf", "cmu/../../02.asf")
+    with pytest.raises(UserError, match=r"evil\.tar: cmu/\.\./\.\./02\.asf leads out of the archive"):
+        cmu.CMU(str(folder / "evil.tar")).count()
+    gc.collect()
+    assert not list(temporary.iterdir())
+
+
+def test_conversions_have_the_joints_of_the_original(folder):
+    original, _ = cmu.standardize(asf.read(folder / "motions/02/02_02.amc", 120))
+    converted, fields = cmu.standardize(bvh.read(folder / "motions/60/60_01.bvh"))
+    assert len(converted.frames) == len(original.frames) == 400
+    both = [map_bvh(Path("x"), tree, None, fields)[0] for tree in (original, converted)]
+    np.testing.assert_allclose(both[0], both[1], atol=1e-5)
+    hips = both[0][:, [1, 2]].mean(1) - both[0][:, 0]
+    scale = 0.82 / cmu.ADULT_LEG
+    assert np.linalg.norm(hips, axis=1) == pytest.approx(0.085 * scale, rel=1e-4), "SMPL's pelvis is above the hips"
+
+
+def test_rotations_are_those_of_the_positions(folder):
+    store = write_store(folder / "store", source(folder, motion="smpl"), SMPL())
+    clip = next(clip for clip in store.clips if clip.id == "000001")
+    joints = SMPL().decode(torch.from_numpy(np.array(store.motion(clip)))).numpy()[:, :22]
+    assert joints[..., 1].min() == pytest.approx(0, abs=0.06), "the adult body stands on the floor"
+    speed = np.linalg.norm(np.diff(joints[:, 0], axis=0), axis=1) * 20
+    assert speed.mean() == pytest.approx(1.2 * cmu.ADULT_LEG / 0.82, rel=0.05), "and walks as it does, to its scale"
+
+
+@pytest.mark.parametrize(
+    ("known", "header", "rate", "reason"),
+    [
+        ((10.0, None, True), 120.0, 120, "KIT-ML's duration"),
+        ((20.0, None, False), 120.0, 60, "KIT-ML's duration"),
+        ((None, 201, False), 120.0, 120, "the file"),
+        ((None, 202, False), 120.0, 60, "HumanML3D's last frame"),
+        ((None, None, True), 120.0, 60, "CMU's list"),
+        ((None, 390, False), 60.0, 60, "the file"),
+        ((None, None, False), None, 120, "CMU's list"),
+    ],
+)
+def test_rates_of_1200_frames(known, header, rate, reason):
+    assert cmu.decide_rate(1200, header, *known) == (rate, reason)
+
+
+def test_bad_recordings_are_listed_and_the_good_ones_prepared(folder, capsys):
+    motions = folder / "motions"
+    (motions / "02/02_01.amc").write_text("version https://git-lfs.github.com/spec/v1\noid sha256:0\n")
+    (motions / "02/02_03.amc").write_text((motions / "02/02_03.amc").read_text().replace("ltibia", "lshin", 1))
+    (motions / "18_01.bvh").write_text("known to be bad")
+    (motions / "02/02_02.bvh").write_text("not read, the original is there")
+    words = ["data=cmu", f"source={motions}", f"data_root={folder}", "data.source.workers=1"]
+    assert main(["prepare", *words, f"captions={folder / 'clone'}"]) == 0
+    output = capsys.readouterr().out
+    assert "02_01.amc: a Git LFS pointer, not the file. Run `git lfs pull` in its repository\n" in output
+    assert "lshin is no moving bone of the skeleton" in output
+    assert "1 files say another rate, which is ignored: 60_01" in output
+    assert "excluded: 1 recordings known to be bad" in output
+    assert Store(folder / "cmu-humanml-legacy-smpl22").info["clips"] == {"train": 2, "val": 0, "test": 5}
+
+
+def test_wrong_folders_get_one_line(folder):
+    for path, captions, message in [
+        ("none", "clone", "none: not found; clone https"),
+        ("clone", "clone", "no recording such as 02_01.bvh or 02_01.amc in it; clone https"),
+        ("motions", "none", "none: not found; it is the folder of the captions"),
+        ("motions", "motions", "index.csv"),
+    ]:
+        with pytest.raises(FileNotFoundError, match=message):
+            cmu.CMU(str(folder / path), str(folder / captions)).count()
+    (folder / "motions/index.csv").write_text("version https://git-lfs.github.com/spec/v1\noid sha256:0\n")
+    with pytest.raises(UserError, match=r"index\.csv: a Git LFS pointer, not the file"):
+        cmu.CMU(str(folder / "motions")).count()
+    for name in ("texts/000002.txt", "train.txt"):
+        (folder / "clone/HumanML3D" / name).unlink()
+    with pytest.raises(FileNotFoundError, match=r"train\.txt: not found; clone https"):
+        source(folder).count()
+    with pytest.raises(UserError, match=r"data\.source\.exclude: .* has no 99_99"):
+        _ = source(folder, exclude=["99_99"]).files
+    (folder / "clone/kitml.json").write_text("[1]")
+    with pytest.raises(UserError, match=r"kitml\.json: not KIT-ML's captions of AMASS"):
+        _ = source(folder).kit
+
+
+# CMU's own files ------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def real(tmp_path_factory):
+    """Some files of the archive, unpacked."""
+    folder = tmp_path_factory.mktemp("real")
+    wanted_names = ("asf_amc/01.", "asf_amc/02", "daz_bvh/02_0", ".json", ".csv")
+    for name, content in archives.members(ARCHIVE, lambda name: any(part in name for part in wanted_names)):
+        if content:
+            file = folder / Path(name).relative_to("cmu")
+            file.parent.mkdir(parents=True, exist_ok=True)
+            file.write_bytes(content)
+    return folder
+
+
+@needs_third_party
+@pytest.mark.slow
+def test_angles_are_those_of_the_public_conversion(real):
+    """The first frame of 02_03.bvh in https://github.com/una-dinosauria/cmu-mocap: Euler angles z, y, x."""
+    motion = asf.read(real / "asf_amc/02_03.amc", 120)
+    expected = {
+        **{"root": (9.2872, 16.95, -34.2762, 1.1618, 3.3939, 8.2094), "rtoes": (-1.1835, 6.9042, -19.4319)},
+        **{"lradius": (128.0347, -53.758, -92.2485), "lowerneck": (-2.7887, 3.2343, -15.4607)},
+    }
+    columns = dict(zip(motion.joints, motion.columns(), strict=True))
+    for name, angles in expected.items():
+        np.testing.assert_allclose(motion.frames[0, columns[name]], angles, atol=1.1e-4, err_msg=name)
+
+
+@needs_third_party
+@pytest.mark.slow
+def test_the_archive(real):
+    """Rates as CMU lists them; Daz-friendly files agree with the original ones at the same bone lengths."""
+    listed = json.loads((real / "cmu_fps.json").read_text())
+    assert {t for t, entry in listed.items() if entry["fps"] == 60} == {t for t in listed if cmu._is_in("sixty", t)}
+    names = ["02_04", "02_05", "02_07", "02_08", "02_09"]
+    for name in names:
+        parts = [(0, None, False)]
+        files = (real / "asf_amc" / f"{name}.amc", real / "daz_bvh" / f"{name}.bvh")
+        both = [cmu._read("joints", ([file], (None, None, False), parts)).motions[0] for file in files]
+        bones = [SMPL22.bones(torch.from_numpy(joints).double()) for joints in both]
+        lengths = torch.linalg.vector_norm(bones[0], dim=-1, keepdim=True)
+        same = [torch.nn.functional.normalize(bone, dim=-1) * lengths for bone in bones]
+        joints = [SMPL22.assemble(bone, torch.zeros(len(bone), 3).double()) for bone in same]
+        assert float(torch.linalg.vector_norm(joints[0] - joints[1], dim=-1).mean()) < 0.02, name
+    clips = {clip.id: clip for clip in cmu.CMU(str(real), workers=1).clips(20)}
+    assert {"000327", "M000327", "kit02278"} & clips.keys() == {"000327", "M000327"}, "02_06 takes 18 seconds"
+    assert clips["kit02279"].captions == ["A person is doing sidewards punches like with paddle at ping-pong."]

@@ -1,0 +1,229 @@
+"""Export to ONNX: the sampling loop as numbers, graphs of each denoiser, and the runner without PyTorch."""
+
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hydra.utils import instantiate
+from support.fixtures import ROOT, recipe
+from torch import Tensor
+
+import flame_mdm
+from flame_mdm.__main__ import main
+from flame_mdm.batch import Condition, length_mask
+from flame_mdm.checkpoints import onnx_export as onnx
+from flame_mdm.checkpoints import runner
+from flame_mdm.conditions import vocabulary
+from flame_mdm.errors import UserError
+from flame_mdm.formats.poses import solve
+from flame_mdm.processes import Process
+from flame_mdm.processes.diffusion import GaussianDiffusion
+from flame_mdm.processes.flow_matching import FlowMatching
+from flame_mdm.representations import rotation
+from flame_mdm.safe_io import read_yaml
+from flame_mdm.sampler_options import SamplerOptions
+from flame_mdm.seeds import key, seeded_noise
+from flame_mdm.task import MotionGeneration
+
+SIZES = {"latent_dim": 16, "ff_size": 24, "num_layers": 2, "num_heads": 2, "channels": [8, 8, 16], "num_groups": 4}
+CONFIGS = {  # those that differ in more than their sizes
+    repr(config | {name: value for name, value in SIZES.items() if name in config}): path
+    for path in sorted((ROOT / "experiments" / "denoiser").glob("*.yaml"))
+    for config in [{key: value for key, value in read_yaml(path).items() if key not in ("dropout", "max_frames")}]
+}.values()
+NETWORKS = [(path, "learned") for path in CONFIGS]
+NETWORKS += [
+    (p, name) for p in CONFIGS if p.stem in ("flame_small", "mdm_encoder_small") for name in ("action", "none")
+]
+NOTHING = Condition(torch.zeros(1, 0), torch.zeros(1, 0, 0), None)
+
+
+def network(x_t: Tensor, t: Tensor, *_: Any) -> Tensor:
+    """A denoiser that is not linear, with a learned variance."""
+    return torch.cat([torch.sin(3 * x_t + t[:, None, None]), torch.cos(x_t)], -1)
+
+
+def followed(plan: list[list[float]], clip: bool, noise: Any) -> Tensor:
+    """Motion that the rows of a plan lead to."""
+    x, draw, before = noise(0), 1, torch.zeros(())
+    for t, of_x, of_output, keep, clean, last, scale in plan:
+        x0_hat = of_x * x + of_output * network(x, torch.tensor([t]))[..., : x.shape[-1]]
+        x0_hat = x0_hat.clamp(-1, 1) if clip else x0_hat
+        x = keep * x + clean * x0_hat + last * before
+        if scale:
+            x, draw = x + scale * noise(draw), draw + 1
+        before = x0_hat
+    return x
+
+
+DIFFUSION = [("ancestral", {}), ("ddim", {}), ("ddim", {"eta": 0.7}), ("dpm_solver_pp_2m", {}), ("consistency", {})]
+CASES = [
+    *((GaussianDiffusion(50, prediction=p), name, options) for p in ("x0", "epsilon") for name, options in DIFFUSION),
+    (GaussianDiffusion(50, prediction="velocity", variance="fixed_large", clip_x0=True), "ancestral", {}),
+    (GaussianDiffusion(50, variance="learned_range"), "ddim", {"spacing": "stride", "num_inference_steps": 10}),
+    (GaussianDiffusion(50), "ancestral", {"num_inference_steps": [0, 3, 20, 49]}),
+    *(
+        (FlowMatching(prediction=p), name, {})
+        for p in ("velocity", "x0")
+        for name in ("euler", "midpoint", "heun", "consistency")
+    ),
+    (FlowMatching(quantize_time=True, odeint_grid=True), "euler", {}),
+]
+
+
+@pytest.mark.parametrize(("process", "sampler", "options"), CASES)
+def test_a_plan_leads_to_the_motion_of_the_sampler(process: Process, sampler: str, options: dict[str, Any]) -> None:
+    requested = SamplerOptions(**{"sampler": sampler, "num_inference_steps": 8} | options)
+    like = torch.zeros(1, 5, 4, dtype=torch.float64)
+    noise = seeded_noise(["a"], 5, 4, seed=1, replication=0, like=like)
+    mask = torch.ones(1, 5, dtype=torch.bool)
+    width = process.out_features(4)
+    expected = process.sample(lambda *inputs: network(*inputs)[..., :width], noise, mask, NOTHING, requested)
+    plan = onnx.sampling_plan(process, requested)
+    assert np.shape(plan)[1] == 7
+    torch.testing.assert_close(
+        followed(plan, getattr(process, "clip_x0", False), noise), expected, atol=1e-9, rtol=1e-7
+    )
+
+
+@pytest.mark.parametrize(
+    ("process", "sampler", "says"),
+    [
+        (GaussianDiffusion(50, variance="learned_range"), "ancestral", "learned variance"),
+        (FlowMatching(), "rk4", "combines more than two"),
+        (FlowMatching(), "dopri5", "chooses its own steps"),
+        (FlowMatching(), "ddim", "unknown sampler"),
+    ],
+)
+def test_samplers_of_another_form_are_refused_in_one_line(process: Process, sampler: str, says: str) -> None:
+    with pytest.raises(UserError, match=says):
+        onnx.sampling_plan(process, SamplerOptions(sampler=sampler, num_inference_steps=6))
+
+
+def test_noise_and_words_of_the_runner_are_those_of_the_package() -> None:
+    noise = seeded_noise(["a person walks#0"], 60, 263, seed=3, replication=0, like=torch.zeros(1))
+    number = runner.key("noise", 3, 0, "a person walks#0")
+    assert number == key("noise", 3, 0, "a person walks#0")
+    for draw in (0, 1, 49):
+        np.testing.assert_allclose(runner.normal(number + draw, 60, 263), noise(draw)[0].numpy(), atol=2e-6)
+    text = "Él kicks, twice: a_b don't"
+    assert runner.words(text) == vocabulary.words(text)
+    assert all(runner.hashed(word, 97) == vocabulary.hashed(word, 97) for word in runner.words(text))
+
+
+def tiny(path: Path, condition: str) -> MotionGeneration:
+    """A model with random weights."""
+    config = dict(recipe("quickstart"))
+    denoiser: Any = read_yaml(path)
+    config["denoiser"] = denoiser | {name: value for name, value in SIZES.items() if name in denoiser}
+    target = {"learned": "tokens.LearnedTokens", "action": "action.ActionLabels", "none": "Unconditional"}[condition]
+    sizes = {"learned": {"features": 16, "buckets": 50, "max_words": 8}, "action": {"features": 16}, "none": {}}
+    config["condition"] = {"_target_": f"flame_mdm.conditions.{target}", **sizes[condition]}
+    config["representation"] = {"_target_": "flame_mdm.representations.essential.Essential"}
+    torch.manual_seed(0)
+    model = MotionGeneration.build(config, instantiate(config["representation"]), actions=["walk", "run", "sit"])
+    model.facts |= {"max_frames": 40}
+    return model.eval()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("path", "condition"), NETWORKS, ids=lambda value: getattr(value, "stem", value))
+def test_graphs_of_each_denoiser_compute_what_pytorch_does(path: Path, condition: str, tmp_path: Path) -> None:
+    import onnxruntime
+
+    model = tiny(path, condition)
+    graph = onnx.graphs(model)[0]
+    with torch.no_grad():
+        onnx.write_graph(graph, tmp_path / "denoiser.onnx", half=False)
+        session = onnxruntime.InferenceSession(tmp_path / "denoiser.onnx")
+        for batch, frames, words in ((1, 4, 3), (3, 17, 9)):
+            frames = 40 if isinstance(model.denoiser, onnx.FIXED_LENGTH) else frames
+            lengths = torch.randint(2, frames + 1, (batch,))
+            inputs = {"x_t": torch.randn(batch, frames, model.representation.features), "t": torch.rand(batch) * 999}
+            inputs |= {"lengths": lengths}
+            if condition == "learned":
+                inputs |= {
+                    "condition": torch.randint(50, (batch, words, 2)),
+                    "counts": torch.randint(1, words + 1, (batch,)),
+                }
+            elif condition == "action":
+                inputs |= {"condition": torch.arange(batch)}
+            expected = graph.module(*inputs.values())
+            output = torch.from_numpy(session.run(None, {name: x.numpy() for name, x in inputs.items()})[0])
+            mask = length_mask(lengths, frames)
+            torch.testing.assert_close(output[mask], expected[mask], atol=1e-4, rtol=1e-4)
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("onnx") / "model"
+    assert main(["export", "quickstart", str(folder), "format=onnx", "half=true"]) == 0
+    return folder
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_the_runner_samples_the_motions_of_the_package_without_pytorch(exported: Path, tmp_path: Path) -> None:
+    model = flame_mdm.load("quickstart")
+    text, seconds = "a person kicks with the left foot twice", 2.2
+    for seed in (0, 1, 2):
+        out = tmp_path / f"{seed}.npz"
+        words = [str(exported), text, str(out), f"seconds={seconds}", f"seed={seed}"]
+        script = f"import sys, runpy; sys.argv = ['runner.py', *{words}]; sys.modules['torch'] = None\n"
+        script += f"runpy.run_path({str(exported / 'runner.py')!r}, run_name='__main__')"
+        assert subprocess.run([sys.executable, "-I", "-c", script], check=False).returncode == 0
+        motion = flame_mdm.generate(model, text, seconds=seconds, seed=seed)[0]
+        with np.load(out) as file:
+            assert np.abs(file["joints"] - motion.joints).max() < 1e-3
+    sampler = runner.Sampler(exported)
+    offsets, quaternions = sampler.rotations(motion.joints)
+    poses = solve(torch.from_numpy(motion.joints), motion.fps)
+    np.testing.assert_allclose(offsets, poses.offsets.numpy(), atol=1e-5)
+    matrices = rotation.quaternion_to_matrix(torch.from_numpy(quaternions))
+    torch.testing.assert_close(matrices.double(), poses.rotations, atol=2e-3, rtol=0)
+    assert sampler.unknown("a person walks backflipping") == ["backflipping"]
+    for wrong in ({"seconds": 9}, {"seconds": 0}):
+        with pytest.raises(ValueError, match=r"give 0\.1 to 3 seconds"):
+            sampler.generate(text, **wrong)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+@pytest.mark.parametrize(
+    ("file", "change", "says"),
+    [
+        ("joints.onnx", lambda data: data[:-9] + b"x" * 9, "joints.onnx has changed"),
+        ("model.json", lambda data: data[:-9], "not an exported model"),
+        ("model.json", lambda data: data.replace(b'"format": 1', b'"format": 2'), "not of format 1"),
+        ("model.json", lambda data: data.replace(b'"fps": 20', b'"fps": "x"'), "damaged: fps"),
+        ("model.json", lambda data: data.replace(b"[[49.0,", b"[[49.0, 1,"), "not an exported model"),
+        ("model.json", lambda data: data.replace(b'"fps": 20', b'"fps": 0'), "damaged: fps"),
+        ("model.json", lambda data: data.replace(b'"clip_x0"', b'"x0"'), "damaged: clip_x0"),
+        ("model.json", lambda data: re.sub(rb'"features": \d+', b'"features": 9', data), "do not match"),
+    ],
+)
+def test_a_changed_folder_is_refused_in_one_line(
+    exported: Path, tmp_path: Path, capfd: Any, file: str, change: Any, says: str
+) -> None:
+    for path in exported.iterdir():
+        (tmp_path / path.name).write_bytes(change(path.read_bytes()) if path.name == file else path.read_bytes())
+    assert runner.main([str(tmp_path), "walk", str(tmp_path / "out.npz")]) == 1
+    error = capfd.readouterr().err
+    assert says in error
+    assert error.count("\n") == 1
+
+
+def test_models_with_a_language_model_and_unknown_formats_are_refused(refused: Any, tmp_path: Path) -> None:
+    refused("export", "quickstart", str(tmp_path / "x"), "format=tflite", says="format=tflite: unknown")
+    model = tiny(NETWORKS[0][0], "learned")
+    model.condition = torch.nn.Module()  # type: ignore[assignment]
+    model.condition.features, model.condition.reads = 16, "text"  # type: ignore[union-attr]
+    with pytest.raises(UserError, match="a language model is not exported"):
+        onnx.graphs(model)
+    assert json.dumps(onnx.sampling_plan(model.process, model.sampler_options))

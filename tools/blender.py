@@ -1,0 +1,94 @@
+"""Builds the extension of Blender 4.2 or later, build/flame_mdm-PLATFORM.zip: `make blender [PLATFORM=windows-x64]`.
+
+It samples with the model in this package. Wheels of onnxruntime come from the package index.
+"""
+
+from __future__ import annotations
+
+import platform
+import re
+import subprocess
+import sys
+import tempfile
+import zipfile
+from importlib.metadata import requires, version
+from pathlib import Path
+
+from flame_mdm.checkpoints.onnx_export import RUNNER, export_onnx
+from flame_mdm.errors import UserError, did_you_mean, say
+from flame_mdm.formats import rig
+from flame_mdm.formats.joint_names import known_skeletons
+from flame_mdm.representations import skeleton
+from flame_mdm.safe_io import atomic_write, write_json, write_text
+from flame_mdm.visualize import posture
+
+SOURCE = Path(__file__).with_suffix("")
+PYTHON = "3.11"
+"""Python of Blender 4.2 to 5.0."""
+PLATFORMS = {
+    "linux-x64": ("manylinux_2_28_x86_64", "manylinux2014_x86_64"),
+    "windows-x64": ("win_amd64",),
+    "macos-arm64": ("macosx_14_0_arm64",),
+}
+"""Names of Blender -> tags of wheels."""
+MODULES = (
+    RUNNER,
+    *(Path(str(module.__file__)) for module in (skeleton, posture, rig, sys.modules[UserError.__module__])),
+)
+"""Modules that the extension contains as they are here; they need numpy alone."""
+
+
+def this_machine() -> str:
+    """Returns Blender's name of this platform, such as linux-x64."""
+    system = {"Darwin": "macos"}.get(platform.system(), platform.system().lower())
+    return f"{system}-{'arm64' if platform.machine().lower() in ('arm64', 'aarch64') else 'x64'}"
+
+
+def build(model: str, out: Path, target: str) -> None:
+    """Writes the extension with a model, for one platform.
+
+    Raises:
+        UserError: If the platform is unknown, or pip finds no wheels for it.
+    """
+    if target not in PLATFORMS:
+        raise UserError(f"PLATFORM={target}: unknown.{did_you_mean(target, PLATFORMS)} Use {', '.join(PLATFORMS)}")
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(temporary)
+        fetch_wheels(folder / "wheels", target)
+        export_onnx(model, folder / "model", half=True)
+        (folder / "model" / RUNNER.name).unlink()
+        for path in (*MODULES, SOURCE / "__init__.py"):
+            # inside Blender, the extension is not a package of its own name
+            code = re.sub(r"from flame_mdm\.(\w+\.)*(\w+) import", r"from .\2 import", path.read_text(encoding="utf-8"))
+            write_text(folder / path.name, code)
+        write_json(folder / "skeletons.json", known_skeletons(), indent=None)
+        wheels = ", ".join(f'"./wheels/{path.name}"' for path in sorted((folder / "wheels").iterdir()))
+        manifest = (SOURCE / "blender_manifest.toml").read_text(encoding="utf-8")
+        manifest += f'version = "{version("flame-mdm")}"\nplatforms = ["{target}"]\nwheels = [{wheels}]\n'
+        write_text(folder / "blender_manifest.toml", manifest)
+        with atomic_write(out) as file, zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as packed:
+            for path in sorted(path for path in folder.rglob("*") if path.is_file()):
+                packed.write(path, path.relative_to(folder))
+
+
+def fetch_wheels(folder: Path, target: str) -> None:
+    """Downloads the wheels of onnxruntime, in the version that exported the model, and of what it requires."""
+    names = [re.split(r"[^\w-]", line)[0] for line in requires("onnxruntime") or [] if "extra ==" not in line]
+    pinned = [f"{name}=={version(name)}" for name in ("onnxruntime", *names) if name != "numpy"]  # Blender has numpy
+    command = [sys.executable, "-m", "pip", "download", "--quiet", "--no-deps", "--only-binary=:all:", *pinned]
+    command += [f"--python-version={PYTHON}", f"--dest={folder}", *(f"--platform={tag}" for tag in PLATFORMS[target])]
+    done = subprocess.run(command, check=False, capture_output=True, text=True)
+    if done.returncode:
+        reason = (done.stderr.strip().splitlines() or ["no message"])[-1]
+        raise UserError(f"pip cannot fetch wheels of onnxruntime for {target}: {reason}")
+
+
+if __name__ == "__main__":
+    try:
+        target = sys.argv[1] if sys.argv[1:] else this_machine()
+        path = Path(f"build/flame_mdm-{target}.zip")
+        build("quickstart", path, target)
+        say(f"written: {path}. In Blender: Edit > Preferences > Get Extensions > Install from Disk")
+    except UserError as error:
+        say(f"error: {error}", error=True)
+        sys.exit(1)

@@ -1,0 +1,146 @@
+// Samples motions with onnxruntime-web: flame_mdm/checkpoints/runner.py in JavaScript. The same text, length and seed give the same motion.
+import * as ort from "./ort/ort.wasm.min.mjs";
+
+ort.env.wasm.wasmPaths = new URL("./ort/", import.meta.url).href;
+ort.env.wasm.numThreads = 1; // threads need headers that a static server does not send
+ort.env.logLevel = "error";
+
+const FORMAT = 1, MIN_WORDS = 3, fround = Math.fround, TURN = fround(2 * Math.PI), SCALE = 2 ** -24;
+
+export const words = (text) => text.toLowerCase().match(/[\p{L}\p{N}]+/gu) ?? [];
+const digest = async (bytes) => new Uint8Array(await crypto.subtle.digest("SHA-256", bytes));
+const integers = (numbers, shape) => new ort.Tensor("int64", BigInt64Array.from(numbers, BigInt), shape);
+
+export function knownForm(word, seen) { // see flame_mdm.conditions.vocabulary.known_form
+  const stems = ["ing", "ed", "es", "s", "d", ""].filter((end) => word.endsWith(end)).map((end) => word.slice(0, word.length - end.length));
+  stems.push(...stems.filter((stem) => stem.length > 3 && ["e", stem.at(-2)].includes(stem.at(-1))).map((stem) => stem.slice(0, -1)));
+  const forms = stems.filter((stem) => stem.length > 2).flatMap((stem) => ["", "e", "s", "es", "ing", "ed"].map((end) => stem + end));
+  return [word, ...forms].find((form) => seen.has(form));
+}
+
+function hashed(word, buckets) { // CRC-32 of a word -> two rows of the word table
+  let crc = -1;
+  for (const byte of new TextEncoder().encode(word)) {
+    crc ^= byte;
+    for (let k = 0; k < 8; k++) crc = (crc >>> 1) ^ (crc & 1 ? 0xedb88320 : 0);
+  }
+  crc = ~crc >>> 0;
+  return [crc % buckets, Math.floor(crc / buckets) % buckets];
+}
+
+// ---- noise: splitmix64 on two 32-bit halves, and Box-Muller in single precision ----
+let high = 0, low = 0;
+function add(h, l) {
+  const sum = low + l;
+  high = (high + h + (sum > 0xffffffff)) >>> 0;
+  low = sum >>> 0;
+}
+function multiply(h, l) {
+  const a = low & 0xffff, b = low >>> 16, c = l & 0xffff, d = l >>> 16, middle = a * d + b * c + Math.floor(a * c / 65536);
+  high = (b * d + Math.floor(middle / 65536) + Math.imul(high, l) + Math.imul(low, h)) >>> 0;
+  low = ((middle & 0xffff) << 16 | (a * c) & 0xffff) >>> 0;
+}
+function fold(bits) {
+  low = (low ^ (high << (32 - bits) | low >>> bits)) >>> 0;
+  high = (high ^ high >>> bits) >>> 0;
+}
+function mix() {
+  add(0x9e3779b9, 0x7f4a7c15); fold(30);
+  multiply(0xbf58476d, 0x1ce4e5b9); fold(27);
+  multiply(0x94d049bb, 0x133111eb); fold(31);
+}
+
+export function normal(key, draw, frames, features) { // key: 64 bits; standard normal noise (frames * features)
+  const number = BigInt.asUintN(64, key + BigInt(draw)), noise = new Float32Array(frames * features);
+  [high, low] = [Number(number >> 32n), Number(number & 0xffffffffn)];
+  mix(); mix();
+  let [h, l] = [high, low];
+  for (let frame = 0; frame < frames; frame++) for (let k = 0; k < features; k += 2) {
+    [high, low] = [h, l];
+    mix();
+    const u = fround(fround((low & 0xffffff) + 0.5) * SCALE), angle = fround(TURN * fround(fround((high >>> 8) + 0.5) * SCALE));
+    const radius = fround(Math.sqrt(-2 * fround(Math.log(u))));
+    noise[frame * features + k] = radius * fround(Math.cos(angle));
+    if (k + 1 < features) noise[frame * features + k + 1] = radius * fround(Math.sin(angle));
+    [high, low] = [h, l];
+    add(0x9e3779b9, 0x7f4a7c15);
+    [h, l] = [high, low];
+  }
+  return noise;
+}
+
+// ---- the model ----
+function check(content) {
+  const numbers = { features: 1, fps: 1, max_frames: 2, padded_frames: 0, buckets: 1, max_words: 1 }, graphs = ["denoiser.onnx", "joints.onnx", "poses.onnx"];
+  const wrong = Object.keys(numbers).filter((name) => !(content?.[name] >= numbers[name]));
+  wrong.push(...["steps", "vocabulary", "captions", "function_words"].filter((name) => !Array.isArray(content?.[name])));
+  if (!wrong.length && !content.steps.every((row) => row.length === 7 && row.every(Number.isFinite))) wrong.push("steps");
+  if (content?.format !== FORMAT || content.reads !== "text" || !graphs.every((name) => content.sha256?.[name])) wrong.push("format");
+  if (wrong.length) throw new Error(`model.json is damaged: ${wrong.join(", ")}`);
+}
+
+async function download(name) {
+  const answer = await fetch(name);
+  if (!answer.ok) throw new Error(`${name}: ${answer.status} ${answer.statusText}`);
+  return answer.arrayBuffer();
+}
+
+export async function json(name) {
+  const text = new TextDecoder().decode(await download(name));
+  try { return JSON.parse(text); } catch { throw new Error(`${name} is damaged: not JSON`); }
+}
+
+export class Sampler {
+  static async open() { // the graph of rotations is opened when it is first used
+    if (!globalThis.crypto?.subtle) throw new Error("this page needs https, or http://localhost");
+    const sampler = new Sampler();
+    sampler.content = await json("model.json");
+    check(sampler.content);
+    [sampler.denoiser, sampler.joints] = await Promise.all(["denoiser.onnx", "joints.onnx"].map((name) => sampler.graph(name)));
+    return sampler;
+  }
+
+  async graph(name) {
+    const bytes = await download(name), hash = Array.from(await digest(bytes), (b) => b.toString(16).padStart(2, "0")).join("");
+    if (hash !== this.content.sha256[name]) throw new Error(`${name} has changed since it was exported`);
+    try { return await ort.InferenceSession.create(bytes); } catch { throw new Error(`${name} is damaged`); }
+  }
+
+  async generate(text, frames, seed, progress = () => {}) { // normalized features (frames * D)
+    const { features, steps, clip_x0: clip, padded_frames: least, buckets, max_words: most } = this.content;
+    const bytes = await digest(new TextEncoder().encode(["noise", seed, 0, `${text}#0`].join("\x1f")));
+    const key = bytes.slice(0, 8).reduce((sum, byte) => sum << 8n | BigInt(byte), 0n) >> 1n;
+    const seen = new Set(this.content.vocabulary);
+    const read = seen.size ? words(text).map((word) => knownForm(word, seen)).filter(Boolean) : words(text);
+    const rows = ["<start>", ...read.slice(0, most)].map((word) => hashed(word, buckets)), count = rows.length;
+    while (rows.length < MIN_WORDS) rows.push([0, 0]);
+    const fixed = { lengths: integers([frames], [1]), counts: integers([count], [1]), condition: integers(rows.flat(), [1, rows.length, 2]) };
+    const padded = Math.max(frames, least), shape = [1, padded, features];
+    let x = normal(key, 0, padded, features), draw = 1;
+    const before = new Float32Array(x.length);
+    for (const [number, [t, p, q, a, b, c, d]] of steps.entries()) {
+      const inputs = { x_t: new ort.Tensor("float32", x, shape), t: new ort.Tensor("float32", [t], [1]), ...fixed };
+      const y = (await this.denoiser.run(inputs)).output.data, noise = d ? normal(key, draw++, padded, features) : before;
+      x = x.map((value, i) => {
+        const clean = p * value + q * y[i], x0 = clip ? Math.min(1, Math.max(-1, clean)) : clean;
+        const next = a * value + b * x0 + c * before[i] + d * noise[i];
+        before[i] = x0;
+        return next;
+      });
+      progress((number + 1) / steps.length);
+    }
+    if (!x.every(Number.isFinite)) throw new Error("the model returned non-finite numbers");
+    return x.slice(0, frames * features);
+  }
+
+  async decode(x) { // joints (frames * J * 3) in meters, y up
+    const { features } = this.content;
+    return (await this.joints.run({ x: new ort.Tensor("float32", x, [1, x.length / features, features]) })).joints.data;
+  }
+
+  async rotations(joints) { // offsets (22 * 3) of the rest pose and local quaternions (frames * 22 * 4), w first
+    this.poses ??= await this.graph("poses.onnx");
+    const { offsets, quaternions } = await this.poses.run({ joints: new ort.Tensor("float32", joints, [joints.length / 66, 22, 3]) });
+    return { offsets: offsets.data, quaternions: quaternions.data };
+  }
+}

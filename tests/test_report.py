@@ -57,7 +57,7 @@ def evaluated(tmp_path_factory, data_root, printed) -> Path:
     """A run of 8 steps that evaluates while it trains."""
     folder = tmp_path_factory.mktemp("evaluated")
     (folder / "mine.yaml").write_text(EVALUATE)
-    with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(printed):
+    with contextlib.redirect_stdout(printed):
         return run(folder / "run", data_root, "trainer.max_steps=8", recipe=str(folder / "mine.yaml"))
 
 

@@ -1,7 +1,7 @@
 """Runs the benchmarks and writes docs/benchmarks/speed.md: `python benchmarks/run.py [only=a,b] [device=cuda]`.
 
 Each benchmark runs in a process, one after another. With `only`, the other sections keep their figures. `device=cuda`
-measures the sections that use a GPU, which are added to the page. Sections whose script is gone keep their figures.
+adds the sections of a GPU to the page. Sections that were measured once, by a script of an earlier commit, stay.
 """
 
 import datetime
@@ -21,14 +21,13 @@ from sections import body
 from flame_mdm.training.provenance import environment
 
 PAGE = Path(__file__).parent.parent / "docs" / "benchmarks" / "speed.md"
-SECTIONS = ["host", "steps", "loading", "sampling", "evaluation", "startup", "ddp"]
-ON_GPU = ["steps", "sampling"]
+SECTIONS = ["steps", "sampling"]
 HEAD = """# Speed
 
 `make bench` measures the speed of the framework and writes this page and [speed.json](speed.json). Every comparison is
 a ratio of two measurements in one run, on an idle machine unless the section says otherwise; the absolute figures next
-to it hold for that machine alone. `make bench ONLY=host,steps` repeats some sections, `make bench DEVICE=cuda` adds
-those of a GPU. Sections that name a commit were measured once, by a script of that commit.
+to it hold for that machine alone. `make bench ONLY=steps` repeats some sections, `make bench DEVICE=cuda` adds those
+of a GPU. Sections that name a commit were measured once, by a script of that commit.
 [Which options to choose](../speed.md) is a page of its own.
 """
 
@@ -98,10 +97,9 @@ def main(*words: str) -> None:
         raise SystemExit(f"DEVICE={device}: give cpu or cuda")
     if device == "cuda" and not torch.cuda.is_available():
         raise SystemExit("DEVICE=cuda: torch finds no CUDA GPU on this machine")
-    possible = ON_GPU if device == "cuda" else SECTIONS
-    chosen = options["only"].split(",") if options.get("only") else possible
-    if unknown := [name for name in chosen if name not in possible]:
-        raise SystemExit(f"ONLY={','.join(unknown)}: give some of {', '.join(possible)}")
+    chosen = options["only"].split(",") if options.get("only") else SECTIONS
+    if unknown := [name for name in chosen if name not in SECTIONS]:
+        raise SystemExit(f"ONLY={','.join(unknown)}: give some of {', '.join(SECTIONS)}")
     data = PAGE.with_suffix(".json")
     sections: dict[str, Any] = json.loads(data.read_text()) if data.exists() else {}
     for number, name in enumerate(chosen, 1):

@@ -7,8 +7,11 @@ run. On CUDA, the section also has the memory and an estimate of the hours of ea
 """
 
 import argparse
+import itertools
+import statistics
 import sys
 import tempfile
+import time
 import warnings
 from collections.abc import Callable, Sequence
 from copy import deepcopy
@@ -20,14 +23,15 @@ from typing import Any
 import numpy as np
 import torch
 from cost import cost, hours, training_step
-from host import framework
 from hydra.utils import get_class
+from lightning import Callback
 from sections import Row, Section, section, show, take_turns
 from torch import Tensor, nn
 
 from flame_mdm.batch import MotionBatch, padded_length
 from flame_mdm.config import compose, instantiate
 from flame_mdm.data.datamodule import TrainingBatches
+from flame_mdm.training import fit as training
 from flame_mdm.training.speed import accelerate
 
 WIDTH, LONGEST = 263, 196
@@ -45,6 +49,10 @@ RECIPES = [
     *("humanml3d/flame", "kit/mdm", "kit/mfm", "kit/flame"),
 ]
 SPEEDS = ("reference", "fast")
+QUIET = [
+    *("trainer.accelerator=cpu", "trainer.enable_progress_bar=false", "trainer.val_check_interval=1000000"),
+    *("callbacks.samples=null", "callbacks.best=null", "callbacks.checkpoints.every_n_steps=1000000", "logger=csv"),
+]
 
 
 class Peer(nn.Module):
@@ -172,6 +180,28 @@ def backbones(names: Sequence[str], rounds: int, peak: dict[str, float], device:
         row |= {f"share of peak, {s}": f"{operations / taken / peak[s]:.0%}" for s, taken in times.items()}
         rows.append(row)
     return rows
+
+
+class Clock(Callback):
+    """Records the time after every step."""
+
+    def __init__(self) -> None:
+        self.times: list[float] = []
+
+    def on_train_batch_end(self, *_: Any) -> None:
+        self.times.append(time.perf_counter())
+
+
+def framework(steps: int, folder: Path, *words: str) -> float:
+    """Returns the median milliseconds per step of the quickstart, trained by the framework with other settings."""
+    run, clock = Path(tempfile.mkdtemp(dir=folder)), Clock()
+    words = (*QUIET, f"data_root={folder / 'data'}", f"run.dir={run}", f"trainer.max_steps={steps}", *words)
+    config = compose("quickstart", words)
+    config["callbacks"]["clock"] = {"_target_": f"{__name__}.clock"}
+    globals()["clock"] = lambda: clock
+    training.fit(run, config)
+    times = clock.times[min(50, steps // 2) :]  # the first ones warm up
+    return 1000 * statistics.median(b - a for a, b in itertools.pairwise(times))
 
 
 def quickstart(clips: int, steps: int, rounds: int) -> list[Row]:

@@ -20,13 +20,8 @@ import steps  # noqa: E402
 from flame_mdm.config import compose  # noqa: E402
 
 TOY = {
-    "host": "12",
     "steps": "--quick",
-    "loading": "100 3",
     "sampling": "--frames 4 --latent-dim 16 --num-layers 1 --repeats 1 --longest 0",
-    "evaluation": "--clips 40",
-    "startup": "1",
-    "ddp": "1",
 }
 
 
@@ -42,25 +37,25 @@ def page(tmp_path, monkeypatch) -> Path:
 
 
 def test_the_page_is_rendered_from_the_figures_and_keeps_those_that_are_not_measured_again(page):
-    run.main("only=host,steps", "device=")
+    run.main("only=steps,sampling", "device=")
     data = page.with_suffix(".json")
     kept = json.loads(data.read_text())
-    kept["host"]["date"] = "2001-02-03"
+    kept["sampling"]["date"] = "2001-02-03"
     data.write_text(json.dumps(kept))
     run.main("only=steps")
     again = json.loads(data.read_text())
-    assert again["host"] == kept["host"]
+    assert again["sampling"] == kept["sampling"]
     text = page.read_text()
     assert text == run.render(again)
-    assert "| host | 1,234 |" in text
-    assert "`benchmarks/host.py`, 2001-02-03, machine 1." in text
-    assert text.index("## Title of host") < text.index("## Title of steps")
+    assert "| sampling | 1,234 |" in text
+    assert "`benchmarks/sampling.py`, 2001-02-03, machine 1." in text
+    assert text.index("## Title of steps") < text.index("## Title of sampling")
     assert "torch: " in text.split("## Machine")[1].split("##")[0]
 
 
 def test_unknown_sections_and_devices_are_refused_in_one_line(page, monkeypatch):
     for word, start in (
-        ("only=host,none", "ONLY=none: give some of host, "),
+        ("only=steps,none", "ONLY=none: give some of steps, "),
         ("device=tpu", "DEVICE=tpu: give cpu"),
     ):
         with pytest.raises(SystemExit, match=start):
@@ -102,13 +97,8 @@ def test_the_committed_page_is_rendered_from_the_committed_figures():
     assert (ROOT / "docs" / "benchmarks" / "speed.md").read_text() == run.render(sections)
 
 
-PROCESSES = ("loading", "startup", "ddp", "steps", "host")
-"""Sections that start processes or train several models, which takes longer than what they measure."""
-ALONE = [pytest.param(name, marks=pytest.mark.robustness if name in PROCESSES else ()) for name in run.SECTIONS]
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ALONE)
+@pytest.mark.parametrize("name", ["sampling", pytest.param("steps", marks=pytest.mark.robustness)])  # trains models
 def test_every_benchmark_runs_at_a_toy_size(name):
     section = import_module(name).measure(*TOY[name].split())
     numbers = [value for rows in section["tables"].values() for row in rows for value in row.values()]

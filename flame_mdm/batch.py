@@ -69,11 +69,7 @@ class Condition:
     null: Condition | None = None
 
     def drop(self, drop: Tensor) -> Condition:
-        """Returns conditions in which samples with `drop` (B,) bool True are replaced by the null condition.
-
-        Raises:
-            ValueError: If there is no null condition.
-        """
+        """Returns conditions in which samples with `drop` (B,) bool True are replaced by the null condition."""
         if self.null is None:
             raise ValueError("this condition has no null to drop to")
         null = self.null

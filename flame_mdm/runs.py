@@ -139,11 +139,7 @@ def check_run(folder: Path) -> None:
 
 
 def read_run(folder: Path) -> Run:
-    """Returns the content of a run directory.
-
-    Raises:
-        UserError: If the folder is not a run directory, or a file is damaged.
-    """
+    """Returns the content of a run directory; raises `UserError` if it is none, or a file is damaged."""
     check_run(folder)
     path = folder / CONFIG
     config = read_saved(path)
@@ -159,11 +155,7 @@ def read_run(folder: Path) -> Run:
 
 
 def read_history(folder: Path) -> dict[str, dict[int, float]]:
-    """Returns the curves of a run, name -> step -> value, sorted; {} if the run has no history.
-
-    Raises:
-        UserError: If the file is damaged.
-    """
+    """Returns the sorted curves of a run, name -> step -> value; raises `UserError` if the file is damaged."""
     curves: dict[str, dict[int, float]] = {}
     for record in records(folder / HISTORY):
         for name, value in record.items():
@@ -173,11 +165,7 @@ def read_history(folder: Path) -> dict[str, dict[int, float]]:
 
 
 def records(path: Path) -> list[dict[str, Any]]:
-    """Returns the lines of a history; ignores an incomplete last line, left by a killed process.
-
-    Raises:
-        UserError: If another line is damaged.
-    """
+    """Returns the lines of a history; ignores an incomplete last line, left by a killed process."""
     if not path.exists():
         return []
     *lines, _ = safe_io.read_text(path, HISTORY_LIMIT).split("\n")

@@ -55,10 +55,8 @@ ZIP_ERRORS = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, Run
 def atomic_write(path: str | Path) -> Iterator[Path]:
     """Yields a temporary path next to `path` that is renamed to `path` at the end; a failure leaves no files behind.
 
-    The temporary name is unique, so that several processes can write the same file; the last one wins.
-
-    Raises:
-        UserError: If the file cannot be written, for instance because the disk is full.
+    The temporary name is unique, so that several processes can write the same file; the last one wins. Raises
+    `UserError` if the file cannot be written, for instance because the disk is full.
     """
     path = Path(path)
     temporary = path.with_name(f".{path.stem[:80]}.{os.getpid()}-{secrets.token_hex(4)}{path.suffix}")
@@ -75,9 +73,6 @@ def atomic_folder(path: str | Path) -> Iterator[Path]:
     """Yields a temporary folder next to `path` that is renamed to `path` at the end; a failure leaves no files behind.
 
     If the folder `path` exists, the new files replace files of the same name, and other files are kept.
-
-    Raises:
-        UserError: If `path` is a file, or something in it cannot be written.
     """
     path = Path(path)
     if path.exists() and not path.is_dir():
@@ -174,16 +169,11 @@ def locked(path: Path, busy: Callable[[str], object], advice: str) -> Iterator[s
     """Holds a lock file, with process and host in it, that no other process holds, here or on other hosts.
 
     The operating system releases the lock when a process ends in any way, so a free lock in a file that still names a
-    process was left behind by one that died. POSIX record locks also hold between hosts on NFS and Lustre, unlike the
-    locks of `filelock`. Windows has neither.
+    process was left behind by one that died; yields that name, or "". POSIX record locks also hold between hosts on NFS
+    and Lustre, unlike the locks of `filelock`. Windows has neither.
 
-    Args:
-        path: the lock file; removed at the end.
-        busy: called with the owner if another process holds the lock; raises, or returns to wait.
-        advice: what to do on file systems without locks.
-
-    Yields:
-        The process that died and left the file behind; "" if there is none.
+    If another process holds the lock, calls `busy` with its name, which raises, or returns to wait. `advice` is for
+    file systems without locks.
     """
     while True:
         with made_folder(path.parent), path.open("a+") as file:
@@ -319,17 +309,11 @@ def read_npz(
     only: Collection[str] | None = None,
     header: bool = False,
 ) -> dict[str, np.ndarray]:
-    """Returns the arrays of an .npz file by name.
+    """Returns the arrays of an .npz file, or seekable open file, by name, without those in `skip`, or `only` some.
 
-    Args:
-        source: a path, or a seekable open file.
-        skip: names of arrays not to read.
-        only: names of arrays to read if they exist; None = all.
-        header: read only the first row of arrays of two and more dimensions; all their rows are that one.
-
-    Raises:
-        UserError: If the file is damaged or encrypted, contains objects, declares wrong sizes, or expands to more than
-            `ARRAYS_LIMIT` bytes and more than `INFLATION` times its size. The message names the path, if any.
+    With `header`, reads only the first row of arrays of two and more dimensions; all their rows are that one. Raises
+    `UserError` if the file is damaged or encrypted, contains objects, declares wrong sizes, or expands to more than
+    `ARRAYS_LIMIT` bytes and more than `INFLATION` times its size.
     """
     with _opened(source) as (file, size), zipfile.ZipFile(file) as archive:
         members = {member.filename.removesuffix(".npy"): member for member in archive.infolist()}
@@ -344,12 +328,8 @@ def read_npz(
 
 
 def read_npy(source: Path | IO[bytes], *, mmap: bool = False, header: bool = False) -> np.ndarray:
-    """Returns the array of an .npy file; raises the errors of `read_npz`.
-
-    Args:
-        source: a path, or a seekable open file.
-        mmap: memory-map the file, read-only, instead of loading it; requires a path.
-        header: as in `read_npz`.
+    """Returns the array of an .npy file; `header` and errors as for `read_npz`. `mmap` maps it read-only; requires a
+    path.
     """
     import numpy as np
 

@@ -258,14 +258,9 @@ _adapter = functools.cache(TypeAdapter)
 
 
 def check_shape(content: Any, kind: type[T] | Any) -> T:
-    """Returns content of a file converted to the expected type.
+    """Returns content of a file converted to a `Schema` or another type that pydantic supports.
 
-    Args:
-        content: mappings, lists, texts, numbers.
-        kind: a `Schema`, or any other type that pydantic supports.
-
-    Raises:
-        ValueError: If the content has another type; the message gives key, found value and expected type.
+    Raises `ValueError` if it has another type; the message gives key, found value and expected type.
     """
     if large := _too_large(content):
         raise ValueError(f"{large[:40]} ... is too large for a JSON integer; the maximum is {MAX_INTEGER:,}")
@@ -304,16 +299,8 @@ def _first_error(error: ValidationError, content: Any) -> str:
 
 
 def read_json(path: Path, kind: type[T] | Any, remedy: str = "") -> T:
-    """Returns the content of a JSON file of at most `LIMIT` bytes, converted to the expected type.
-
-    Args:
-        path: the file.
-        kind: see `check_shape`.
-        remedy: what to do if the file is damaged.
-
-    Raises:
-        FileNotFoundError: If the file does not exist.
-        UserError: If the file has other content.
+    """Returns the content of a JSON file of at most `LIMIT` bytes, as for `check_shape`; a `UserError` ends with
+    `remedy`.
     """
     message = f"; {remedy}" if remedy else ""
     try:
@@ -327,9 +314,5 @@ def read_json(path: Path, kind: type[T] | Any, remedy: str = "") -> T:
 
 
 def read_result(path: Path) -> Result:
-    """Returns a result of `flame-mdm evaluate`.
-
-    Raises:
-        UserError: If the file is damaged.
-    """
+    """Returns a result of `flame-mdm evaluate`."""
     return read_json(path, Result, "delete it, then run `flame-mdm evaluate` or `flame-mdm tables` again")

@@ -98,10 +98,8 @@ class Task(LightningModule):
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": decay, "interval": "step"}}
 
     def on_train_start(self) -> None:
-        """Enables gradient clipping for fused optimizers in bfloat16.
-
-        With mixed precision, Lightning refuses to clip the gradients of fused optimizers, because they may be scaled.
-        In bfloat16, gradients are not scaled.
+        """Enables gradient clipping for fused optimizers in bfloat16, whose gradients are not scaled; Lightning refuses
+        it.
         """
         if self.trainer.precision == "bf16-mixed":
             for optimizer in self.trainer.optimizers:

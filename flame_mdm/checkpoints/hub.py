@@ -37,17 +37,14 @@ OTHER_LICENSE = (
 
 
 def export(source: str | Path, out: str | Path, *, half: bool = False, **adapted: Any) -> Path:
-    """Writes the model of a checkpoint as a model file, and returns its path.
+    """Writes the model of a checkpoint as a model file, and returns its path; errors as for `flame_mdm.load`.
 
     Args:
         source: as for `flame_mdm.load`.
         out: a .safetensors file, or a folder for `model.safetensors`.
         half: writes the weight matrices in half precision; vectors, such as the statistics of the features, stay as
             they are. Loaded models compute in single precision either way.
-        adapted: adapter and strength, as for `flame_mdm.load`; they are merged into the weights.
-
-    Raises:
-        FileNotFoundError, UserError: As for `flame_mdm.load`.
+        adapted: adapter and strength, which are merged into the weights.
     """
     source, out = find(source), Path(out)
     checkpoint = read_merged(source, **adapted)
@@ -71,17 +68,9 @@ def export(source: str | Path, out: str | Path, *, half: bool = False, **adapted
 def push(
     source: str | Path, repository: str, folder: str | Path, *, upload: bool = True, private: bool = False
 ) -> Path:
-    """Writes a folder with a model file and its card, and uploads it to the Hugging Face hub.
+    """Writes a folder with a model file, its recipe and its card, and uploads it to the hub as "user/name".
 
-    Args:
-        source: as for `flame_mdm.load`.
-        repository: "user/name" on the hub.
-        folder: folder for `model.safetensors`, `config.yaml` and the model card, `README.md`.
-        upload: whether to upload the folder.
-        private: whether a new repository is private.
-
-    Raises:
-        FileNotFoundError, UserError: As for `flame_mdm.load`; or if the hub cannot be reached, or refuses the upload.
+    `source` and errors are as for `flame_mdm.load`; raises `UserError` also if the hub cannot be reached or refuses.
     """
     if not re.fullmatch(r"\w[\w.-]*/\w[\w.-]*", repository):
         raise UserError(f"{repository}: not a repository name. Write user/name")

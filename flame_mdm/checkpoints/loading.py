@@ -53,18 +53,11 @@ PARTS = ("task", "representation", "process", "condition", "denoiser")
 
 
 def load_task(path: Path, kind: type[Trained], device: str | torch.device = "cpu", **adapted: Any) -> Trained:
-    """Loads the task of a checkpoint in evaluation mode, with averaged weights if its recipe averages them.
+    """Loads the task of a .ckpt or .safetensors file in evaluation mode, with averaged weights if its recipe has them.
 
-    Args:
-        path: a .ckpt or .safetensors file.
-        kind: expected class of the task.
-        device: device of the task.
-        adapted: adapter and strength, as for `load`.
-
-    Raises:
-        FileNotFoundError: If the file does not exist.
-        UserError: If it is not a checkpoint of this framework, holds another kind of task, is damaged, or its weights
-            do not match its recipe.
+    `kind` is the expected class of the task, `adapted` adapter and strength, as for `load`. Raises `UserError` if the
+    file is not a checkpoint of this framework, holds another kind of task, is damaged, or its weights do not match its
+    recipe.
     """
     check_device(device)
     checkpoint = read_merged(path, **adapted)

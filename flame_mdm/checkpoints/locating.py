@@ -17,16 +17,12 @@ SHIPPED = {path.stem: path for path in sorted((Path(__file__).parents[1] / "mode
 
 
 def find(source: str | Path, which: Which = "last") -> Path:
-    """Returns the file of a model.
+    """Returns the file of a model; raises `FileNotFoundError` or `UserError` if there is none.
 
     Args:
         source: a file; a run directory; a folder with one .safetensors file; the name of a model in this package, such
             as "quickstart"; or "user/name[@revision]" on the Hugging Face hub. An existing path comes first.
         which: for a run directory, the last checkpoint or the one with the best validation result.
-
-    Raises:
-        FileNotFoundError: If the file does not exist, or the run has no such checkpoint.
-        UserError: If the folder does not hold exactly one model file, or the model cannot be downloaded from the hub.
     """
     if which not in get_args(Which):
         raise UserError(f"which={which}: write last or best")

@@ -35,11 +35,7 @@ MOST_FRAMES = 100_000
 
 
 def read_model_file(path: Path) -> dict[str, Any]:
-    """Reads a model file as `config`, `facts`, `origin` and `state_dict`.
-
-    Raises:
-        UserError: If it is damaged, not a model file, or has another format.
-    """
+    """Reads a model file as `config`, `facts`, `origin` and `state_dict`; raises `UserError` if it is damaged."""
     metadata, state = read_safetensors(path)
     text = metadata.get(KEY)
     if text is None:
@@ -74,11 +70,7 @@ def read_safetensors(path: Path) -> tuple[dict[str, str], dict[str, Tensor]]:
 
 
 def check_format(path: Path, number: Any) -> None:
-    """Checks the format of a checkpoint or model file; that of version 0.1 is 1 in model files and None in checkpoints.
-
-    Raises:
-        UserError: If it is another format than `FORMAT`.
-    """
+    """Raises `UserError` for a format other than `FORMAT`; version 0.1 wrote 1 or, in checkpoints, None."""
     if number in (1, None):
         raise UserError(
             f"{path}: written by version 0.1 of flame_mdm, whose files this version does not read. Train or import the "
@@ -142,11 +134,7 @@ class _Checkpoint(TypedDict):
 
 
 def checked(path: Path, content: Any) -> dict[str, Any]:
-    """Returns the content of a checkpoint or model file: a recipe of plain values, metadata of the data, and weights.
-
-    Raises:
-        UserError: If it is something else, or its weights are declared to be larger than the file.
-    """
+    """Returns the content of a checkpoint or model file, if it is a recipe of plain values, metadata and weights."""
     if not isinstance(content, dict) or not {"config", "facts", "state_dict"} <= content.keys():
         raise UserError(
             f"{path}: not a checkpoint of this framework: it holds no recipe. Import released checkpoints with "
@@ -172,12 +160,7 @@ def checked(path: Path, content: Any) -> dict[str, Any]:
 
 
 def check_weights(weights: Mapping[Any, Any], path: Path) -> None:
-    """Checks weights from the file at `path`.
-
-    Raises:
-        UserError: If a name is not text, a value is not a dense tensor of real numbers, or all values together are
-            declared to be larger than the file.
-    """
+    """Raises `UserError` unless weights are dense real tensors by name, together not larger than the file at `path`."""
     import torch
 
     kinds = (torch.float64, torch.float32, torch.float16, torch.bfloat16)
@@ -196,15 +179,7 @@ def check_weights(weights: Mapping[Any, Any], path: Path) -> None:
 def write_model_file(
     path: Path, state: Mapping[str, Tensor], *, config: Mapping[str, Any], facts: Mapping[str, Any], origin: Any
 ) -> None:
-    """Writes a model file atomically.
-
-    Args:
-        path: the .safetensors file to write.
-        state: the state dict of a task.
-        config: its recipe.
-        facts: metadata of its data set, for sampling and evaluation.
-        origin: origin of the weights, as plain values.
-    """
+    """Writes a model file atomically: weights, recipe, metadata of the data set, and origin of the weights."""
     from safetensors.torch import save
 
     tensors = {name: value.detach().cpu().clone().contiguous() for name, value in state.items()}
@@ -231,14 +206,8 @@ def state_sha256(state: Mapping[str, Tensor]) -> str:
 
 
 def read_checkpoint(path: Path) -> dict[str, Any]:
-    """Reads a checkpoint or model file. Only plain values and tensors are unpickled.
-
-    Args:
-        path: a .ckpt or .safetensors file, as returned by `flame_mdm.checkpoints.loading.find`.
-
-    Raises:
-        FileNotFoundError: If the file does not exist.
-        UserError: If it is damaged, or not a checkpoint of this framework.
+    """Reads a checkpoint or model file; raises `UserError` if it is damaged. Only plain values and tensors are
+    unpickled.
     """
     if path.suffix == ".safetensors":
         return read_model_file(path)
@@ -254,13 +223,9 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
 
 
 def weights_sha256(path: Path) -> str:
-    """Returns the sha256 of the names, types, shapes and values of the weights in a checkpoint or model file.
+    """Returns the sha256 of names, types, shapes and values of the weights in a checkpoint or model file.
 
-    It depends on nothing else in the file: a checkpoint and a model file exported from it in full precision have the
-    same one.
-
-    Raises:
-        FileNotFoundError, UserError: As for `read_checkpoint`.
+    It depends on nothing else: a model file exported from a checkpoint in full precision has the same one.
     """
     return state_sha256(read_checkpoint(path)["state_dict"])
 

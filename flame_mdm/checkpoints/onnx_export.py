@@ -44,16 +44,10 @@ TINY = 1e-6
 def export_onnx(source: str | Path, out: str | Path, *, half: bool = False, **adapted: Any) -> Path:
     """Writes a model as a folder that `runner.py` in it samples from, with numpy and onnxruntime alone.
 
-    Args:
-        source: as for `flame_mdm.load`.
-        out: the folder, for `denoiser.onnx`, `joints.onnx`, `poses.onnx` (only for SMPL's 22 joints), `model.json` and
-            `runner.py`; docs/export.md describes them.
-        half: stores the weight matrices in half precision; graphs compute in single precision either way.
-        adapted: adapter and strength, as for `flame_mdm.load`.
-
-    Raises:
-        FileNotFoundError, UserError: As for `flame_mdm.load`; or if a part of the model cannot be exported, or a graph
-            does not compute what PyTorch does.
+    The folder has `denoiser.onnx`, `joints.onnx`, `poses.onnx` (only for SMPL's 22 joints), `model.json` and
+    `runner.py`; docs/export.md describes them. `half` stores weight matrices in half precision. Source, adapters and
+    errors are as for `flame_mdm.load`; raises `UserError` also if a part cannot be exported, or a graph does not
+    compute what PyTorch does.
     """
     try:
         import onnxruntime  # noqa: F401
@@ -73,11 +67,7 @@ def export_onnx(source: str | Path, out: str | Path, *, half: bool = False, **ad
 
 
 def description(model: MotionGenerator) -> dict[str, Any]:
-    """Returns the content of `model.json`, without the hashes of the graphs.
-
-    Raises:
-        UserError: If the sampling loop cannot be written as numbers; see `sampling_plan`.
-    """
+    """Returns the content of `model.json`, without the hashes of the graphs; errors as for `sampling_plan`."""
     representation, skeleton, facts = model.representation, model.representation.skeleton, model.facts
     encoder = model.condition
     words = {"buckets": encoder.buckets, "max_words": encoder.max_words} if isinstance(encoder, LearnedTokens) else {}
@@ -142,11 +132,9 @@ class Probe:
 def sampling_plan(process: Process, options: SamplerOptions) -> list[list[float]]:
     """Returns the sampling loop as rows of 7 numbers (t, p, q, a, b, c, d), one for each call of the denoiser.
 
-    A call at time t, as the denoiser gets it, with output y gives the clean estimate x0 = p x + q y. Then
-    x <- a x + b x0 + c x0' + d noise, with the clean estimate x0' of the call before and new noise.
-
-    Raises:
-        UserError: If the process does not have the sampler, or the sampler is not of this form.
+    A call at time t, as the denoiser gets it, with output y gives the clean estimate x0 = p x + q y. Then x <- a x + b
+    x0 + c x0' + d noise, with the clean estimate x0' of the call before and new noise. Raises `UserError` if the
+    process does not have the sampler, or the sampler is not of this form.
     """
     plans = [np.array(_plan(process, options, variance)) for variance in (0.0, 1.0)]
     if not np.array_equal(plans[0], plans[1]):
@@ -270,11 +258,7 @@ def graphs(model: MotionGenerator) -> list[Graph]:
 
 
 def write_graph(graph: Graph, path: Path, half: bool) -> None:
-    """Writes a graph and compares what it computes with PyTorch, for its examples and for a batch of one.
-
-    Raises:
-        UserError: If PyTorch cannot export the module, or the results differ.
-    """
+    """Writes a graph; raises `UserError` if it computes something else than PyTorch, for a batch of two or of one."""
     import onnxruntime
 
     examples = list(graph.examples.values())

@@ -97,10 +97,7 @@ class Released:
 def import_mdm(
     state: Mapping[str, Tensor], args: Mapping[str, Any], *, num_heads: int = 4, time_token: bool = False
 ) -> Released:
-    """Converts a network of MDM or MFM.
-
-    It may be an encoder, a decoder, a decoder + token or a GRU, conditioned on text (CLIP or DistilBERT), on actions or
-    on nothing.
+    """Converts an encoder, decoder, decoder + token or GRU of MDM or MFM, for text (CLIP, DistilBERT), actions or none.
 
     Args:
         state: see `released_state`.
@@ -109,9 +106,6 @@ def import_mdm(
         num_heads: number of attention heads, 4 in all released models; it is neither in the weights nor in `args`.
         time_token: whether the decoder's input token is the time alone, as in the code since February 2025. The
             released model with an input token is older.
-
-    Raises:
-        ValueError: If a weight is missing, unknown, or does not match the network described by `args`.
     """
     arch = args.get("arch", "trans_enc")
     if arch not in NETWORKS:
@@ -150,15 +144,7 @@ def import_mdm(
 
 
 def import_flame(state: Mapping[str, Tensor], *, num_heads: int = 8) -> Released:
-    """Converts FLAME's network, without its RoBERTa.
-
-    Args:
-        state: see `released_state`.
-        num_heads: number of attention heads, 8 in the released models; it cannot be read from the weights.
-
-    Raises:
-        ValueError: If a weight is missing or unknown.
-    """
+    """Converts FLAME's network, without its RoBERTa; its 8 attention heads cannot be read from the weights."""
     learned = {key: value for key, value in state.items() if not key.startswith("lm.")}
     names, num_layers = layer_names(learned, "tf_decoder", DECODER_LAYER)
     ours = renamed(learned, {**_FLAME, **names})
@@ -290,10 +276,6 @@ def import_released(
         num_heads: number of attention heads, if it differs from the released models.
         time_token: see `import_mdm`.
         run_code: whether to load pickles that hold more than weights, which runs any code in them.
-
-    Raises:
-        FileNotFoundError: If a file does not exist.
-        UserError: If it is damaged, or not a released model of this kind.
     """
     file, out = Path(file), Path(out)
     if (args is None) != (kind in ("flame", "mclip")):
@@ -334,11 +316,7 @@ def _model(
     num_heads: int | None,
     time_token: bool,
 ) -> MotionGeneration:
-    """Builds a model from released weights, with the sampling of the authors' code; arguments as for `import_released`.
-
-    Raises:
-        ValueError: If it is not such a model, `args` has unsupported options, or the statistics do not match.
-    """
+    """Builds a model from released weights, with the sampling of the authors' code; see `import_released`."""
     if args.get("dynamic", "flow") != "flow":
         raise ValueError(f"dynamic={args['dynamic']}: only the flow models of MFM can be imported")
     if kind == "mfm" and args.get("text_emebed", "clip") != "clip":  # spelled like this by the authors

@@ -31,16 +31,9 @@ DECODER_LAYER = {**_LAYER, "norm2.": "cross_norm.", "norm3.": "feed_forward_norm
 
 
 def read_released(path: Path, *, run_code: bool = False, advice: str = "Save only its state dict") -> Mapping[str, Any]:
-    """Reads the content of a released file.
+    """Reads a released file; with `run_code` also pickles that hold more than weights, which runs any code in them.
 
-    Args:
-        path: the file.
-        run_code: whether to load pickles that hold more than weights, which runs any code in them.
-        advice: what to do about a file with other objects than plain weights.
-
-    Raises:
-        FileNotFoundError: If the file does not exist.
-        UserError: If it is damaged, or holds other objects than plain weights.
+    Raises `UserError` if it is damaged, or holds other objects than plain weights, with `advice` what to do about them.
     """
     try:
         check_torch(path)
@@ -63,16 +56,7 @@ def read_released(path: Path, *, run_code: bool = False, advice: str = "Save onl
 
 
 def read_weights(path: Path, key: str | None = None) -> dict[str, Tensor]:
-    """Reads a state dict from a released file, without running code in it.
-
-    Args:
-        path: the file.
-        key: key of the state dict in the file; None = the file is the state dict.
-
-    Raises:
-        FileNotFoundError: If the file does not exist.
-        UserError: If it is damaged, holds more than plain values and tensors, or lacks `key`.
-    """
+    """Returns the state dict in a released file, or under a key of it; raises `UserError` if there is none."""
     content = read_released(path)
     state = content if key is None else content.get(key)
     if not isinstance(state, Mapping) or not all(isinstance(value, Tensor) for value in state.values()):
@@ -83,13 +67,8 @@ def read_weights(path: Path, key: str | None = None) -> dict[str, Tensor]:
 def released_state(checkpoint: Mapping[str, Any], *, ema: bool = True) -> dict[str, Tensor]:
     """Finds the network's state dict in the content of a released file of MDM, MFM or FLAME.
 
-    Args:
-        checkpoint: a flat state dict (MDM, MFM), {"model", "model_avg"} (MDM trained with `--use_ema`) or FLAME's
-            Lightning checkpoint with "state_dict".
-        ema: whether to use averaged weights if the file has them, as in the authors' evaluation.
-
-    Raises:
-        ValueError: If the file has none of these layouts.
+    That is a flat state dict (MDM, MFM), {"model", "model_avg"} (MDM trained with `--use_ema`) or FLAME's Lightning
+    checkpoint with "state_dict". `ema` takes averaged weights if the file has them, as in the authors' evaluation.
     """
     prefixes = ("ema_model.model.", "net.") if ema else ("net.",)
     if "model_avg" in checkpoint:
@@ -116,11 +95,7 @@ def layer_names(state: Mapping[str, Tensor], stack: str, layer: Mapping[str, str
 
 
 def renamed(state: Mapping[str, Tensor], prefixes: Mapping[str, str]) -> dict[str, Tensor]:
-    """Replaces the prefix of every name.
-
-    Raises:
-        ValueError: If a name has none of the prefixes.
-    """
+    """Replaces the prefix of every name; raises `ValueError` if a name has none of the prefixes."""
     result, unknown = {}, []
     for key, value in state.items():
         theirs = next((prefix for prefix in prefixes if key.startswith(prefix)), None)
@@ -134,11 +109,7 @@ def renamed(state: Mapping[str, Tensor], prefixes: Mapping[str, str]) -> dict[st
 
 
 def shape_of(state: Mapping[str, Tensor], key: str, ndim: int = 2) -> torch.Size:
-    """Returns the shape of a weight.
-
-    Raises:
-        ValueError: If it is missing, or has another number of dimensions.
-    """
+    """Returns the shape of a weight; raises `ValueError` if it is missing, or has another number of dimensions."""
     if key not in state:
         raise ValueError(f"released weights: {key} is missing: not a network of this kind, or a damaged file")
     if state[key].ndim != ndim:
@@ -149,11 +120,7 @@ def shape_of(state: Mapping[str, Tensor], key: str, ndim: int = 2) -> torch.Size
 def load_strictly(
     network: Network, state: Mapping[str, Tensor], source: str | Path, *, assign: bool = False
 ) -> Network:
-    """Loads all weights into a network, and returns it in evaluation mode; `assign` as for `load_state_dict`.
-
-    Raises:
-        UserError: If a weight is missing, unknown or has another shape; the message begins with `source`.
-    """
+    """Loads all weights into a network, and returns it in evaluation mode; a `UserError` begins with `source`."""
     try:
         network.load_state_dict(state, strict=True, assign=assign)
     except RuntimeError as error:

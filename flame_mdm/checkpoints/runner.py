@@ -36,11 +36,7 @@ class Sampler:
     """
 
     def __init__(self, folder: str | Path, threads: int = 1):
-        """Opens a folder.
-
-        Raises:
-            ValueError: If a file is missing, damaged or of another version.
-        """
+        """Opens a folder; raises `ValueError` if a file is missing, damaged or of another version."""
         import onnxruntime
 
         self.folder = Path(folder)
@@ -61,11 +57,7 @@ class Sampler:
             raise ValueError(f"{self.folder}: not an exported model ({reason}). Export the model again") from error
 
     def unknown(self, text: str) -> list[str]:
-        """Returns the words of a text, without function words, of which the model knows no form.
-
-        Raises:
-            ValueError: If it knows none of them.
-        """
+        """Returns the content words of a text that the model does not know; raises `ValueError` if it knows none."""
         seen, skipped = set(self.content["vocabulary"]), set(self.content["function_words"])
         content = [word for word in dict.fromkeys(words(text)) if seen and word not in skipped]
         unknown = [word for word in content if not known_form(word, seen)]
@@ -76,14 +68,9 @@ class Sampler:
     def generate(self, prompt: str = "", seconds: float | None = None, seed: int = 0, sample: int = 0) -> np.ndarray:
         """Returns normalized features (F, D) of one motion, for a text or an action; "" for an unconditional model.
 
-        Args:
-            prompt: what the person does.
-            seconds: length; None = 3, or the longest motion in training if that is shorter.
-            seed: of the noise.
-            sample: number of the motion, if several are generated for one text.
-
-        Raises:
-            ValueError: If the length or the action is not one of the model's, or the result is not finite.
+        `seconds` is None for 3, or the longest motion in training if that is shorter; `sample` numbers the motions of
+        one text. Raises `ValueError` if the length or the action is not one of the model's, or the result is not
+        finite.
         """
         content = self.content
         longest, fps = content["max_frames"], content["fps"]

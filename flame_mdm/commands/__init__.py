@@ -84,11 +84,7 @@ class DataSettings:
 
     @cached_property
     def nodes(self) -> Config:
-        """The composed configuration of the data set and its representation: `data` and `representation`.
-
-        Raises:
-            UserError: If no data set is named, or a key is unknown.
-        """
+        """The composed configuration of the data set and its representation: `data` and `representation`."""
         if self.data is None:
             names = ", ".join(sorted(path.stem for path in (EXPERIMENTS / "data").glob("*.yaml")))
             raise UserError(f"no data set named. Add data=NAME, one of: {names}; folder is for your own motions")
@@ -100,11 +96,7 @@ class DataSettings:
         return name, [*([f"representation={self.representation}"] if self.representation else []), *self.composed]
 
     def data_node(self, source: str | None = None) -> Config:
-        """Returns the configuration of the data set, with the path given as `source`.
-
-        Raises:
-            UserError: If no data set is named, or it takes no source.
-        """
+        """Returns the configuration of the data set, with the path given as `source`."""
         node = self.nodes["data"]
         if source == "":
             raise UserError("source= is empty. Give the folder of the data set, or drop it")
@@ -120,11 +112,7 @@ class PreparedSettings(DataSettings):
     """Keys of commands that open a prepared data set, which may also be named by its `data.name`."""
 
     def choice(self, name: str) -> tuple[str, list[str]]:
-        """See `DataSettings`; the name of a prepared set of the user's own motions stands for its keys.
-
-        Raises:
-            UserError: If it was prepared in several representations and none is chosen.
-        """
+        """See `DataSettings`; the name of a prepared set of the user's own motions stands for its keys."""
         root = Path(self.data_root)
         file, words = super().choice(name)
         if (EXPERIMENTS / "data" / f"{name}.yaml").exists() or not any(root.glob(f"{escape(name)}-*/{STORE}")):
@@ -140,12 +128,7 @@ class PreparedSettings(DataSettings):
 
 
 def check_motion(key: str, source: str | None) -> None:
-    """Checks that a motion file exists and has a known ending; `dataset:id` is left to its reader.
-
-    Raises:
-        FileNotFoundError: If the file does not exist.
-        UserError: If its ending is unknown.
-    """
+    """Checks that a motion file exists and has a known ending; `dataset:id` is left to its reader."""
     if source is None or (":" in source and Path(source).suffix.lower() not in ENDINGS):
         return
     if Path(source).suffix.lower() not in ENDINGS:
@@ -156,11 +139,7 @@ def check_motion(key: str, source: str | None) -> None:
 
 
 def check_extractor(source: str | None) -> None:
-    """Checks that the files of an extractor exist, before torch is imported.
-
-    Raises:
-        FileNotFoundError, UserError: As raised by `flame_mdm.checkpoints.locating.find`.
-    """
+    """Checks that the files of an extractor exist, before torch is imported."""
     if source not in (None, "none") and not Path(source).exists():
         try:
             find(source)
@@ -169,11 +148,7 @@ def check_extractor(source: str | None) -> None:
 
 
 def check_words(settings: BodySettings) -> None:
-    """Checks the name of the body, before torch is imported.
-
-    Raises:
-        UserError: If it is unknown.
-    """
+    """Checks the name of the body, before torch is imported."""
     if settings.body.split()[:1] not in (["mannequin"], ["anny"]):
         raise UserError(
             f'body={settings.body}: unknown. Use mannequin, anny, or anny with its shape: body="anny age=0.9"'
@@ -181,11 +156,7 @@ def check_words(settings: BodySettings) -> None:
 
 
 def check_device(device: str | None) -> None:
-    """Checks the name of a device, before torch is imported.
-
-    Raises:
-        UserError: If it is unknown.
-    """
+    """Checks the name of a device, before torch is imported."""
     if device is not None and not re.fullmatch(r"cpu|mps|xpu|cuda(:\d+)?", device):
         raise UserError(
             f"device={device}: unknown.{did_you_mean(device, ['cpu', 'cuda'])} Give cpu, cuda or cuda:NUMBER"

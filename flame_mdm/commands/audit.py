@@ -39,11 +39,7 @@ class AuditSettings(DataSettings):
 
 
 def audit(settings: AuditSettings) -> None:
-    """Audits an evaluator, or renders existing cards.
-
-    Raises:
-        UserError: If a key is missing or wrong, a card is damaged, or data, protocol and extractor do not match.
-    """
+    """Audits an evaluator, or renders existing cards."""
     out = Path(settings.out)
     if settings.cards is not None:
         if len(settings.cards) > 2:

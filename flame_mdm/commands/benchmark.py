@@ -48,11 +48,7 @@ class BenchmarkSettings:
 
 
 def benchmark(settings: BenchmarkSettings) -> None:
-    """Trains and evaluates the models listed in a file of experiments/benchmark, and writes a report page.
-
-    Raises:
-        UserError: If the file does not exist, a training run fails, or a model is worse than expected.
-    """
+    """Trains and evaluates the models listed in a file of experiments/benchmark, and writes a report page."""
     names = sorted(path.stem for path in (EXPERIMENTS / "benchmark").glob("*.yaml"))
     if settings.exp not in names:
         raise UserError(f"no benchmark named. Add EXP=NAME, one of: {', '.join(names)}")
@@ -98,12 +94,7 @@ class Times:
 
 
 def train(words: Sequence[str], times: Times, data_root: str | None) -> None:
-    """Runs `flame-mdm train` in a separate process.
-
-    Raises:
-        UserError: If training fails.
-        SystemExit: If training is interrupted.
-    """
+    """Runs `flame-mdm train` in a separate process; raises `SystemExit` if it is interrupted."""
     root = [f"data_root={data_root}"] if data_root else []
     say(f"== training {' '.join(words)}")
     begin = time.monotonic()
@@ -118,11 +109,7 @@ def train(words: Sequence[str], times: Times, data_root: str | None) -> None:
 
 
 def check(table: Table, expected: Mapping[str, Mapping[str, Mapping[str, Sequence[float]]]]) -> list[tuple[str, bool]]:
-    """Compares values of a table with their expected ranges.
-
-    Returns:
-        For each expected range, a line that describes the check, and whether the value is within the range.
-    """
+    """Returns a line for each expected range of a value of a table, and whether the value is within it."""
     values = {
         (part.name, line.label, column): cell.value if cell is not None and not line.state else None
         for part in table.parts

@@ -35,13 +35,7 @@ class BrowseSettings(BodySettings, PreparedSettings):
 
 
 def browse(settings: BrowseSettings) -> None:
-    """Prepares the data set if needed, and writes the page.
-
-    Raises:
-        UserError: If no data set is named, no clip matches, or the folder `motions` holds other motions; or if the raw
-            data is damaged.
-        FileNotFoundError: If the raw data is missing.
-    """
+    """Prepares the data set if needed, and writes the page."""
     check_words(settings)
     node = settings.data_node(settings.source)
     if settings.clips < 1:

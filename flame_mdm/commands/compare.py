@@ -52,12 +52,7 @@ class CompareSettings(BodySettings):
 
 
 def compare(settings: CompareSettings) -> None:
-    """Writes the requested page, or counts ratings.
-
-    Raises:
-        UserError: If not exactly one of `runs` and `ratings` is given, there are fewer than two runs, a folder holds no
-            run, or a file of ratings is malformed.
-    """
+    """Writes the requested page, or counts ratings."""
     if (settings.runs is None) == (settings.ratings is None):
         raise UserError('give either runs="A B" to compare runs, or ratings="x.json y.json" to count ratings')
     check_words(settings)
@@ -106,10 +101,6 @@ def motions(compared: Sequence[ComparedRun], settings: CompareSettings) -> list[
 
     The last checkpoint of each run is sampled for `texts`. Without `texts`, it is sampled for the captions of the first
     folder of motions, at the lengths of these motions. Without either, the newest samples of each run are used.
-
-    Raises:
-        UserError: If a file of texts is empty, or `generate` refuses the request.
-        ValueError: If a file is damaged.
     """
     real = {c.label: _read(c.folder) for c in compared if c.run is None}
     prompts: dict[Prompt, float | None] = {}
@@ -139,11 +130,7 @@ def _read(folder: Path) -> dict[Prompt, Motion]:
 
 
 def read_texts(texts: str) -> list[str]:
-    """Returns texts that are separated by semicolons, or the lines of a .txt file, without duplicates.
-
-    Raises:
-        UserError: If there is no text, or the file does not exist or is not a text file.
-    """
+    """Returns texts that are separated by semicolons, or the lines of a .txt file, without duplicates."""
     if texts.endswith(".txt"):
         return list(dict.fromkeys(read_prompts(texts, "texts")))
     parts = [part.strip() for part in texts.split(";") if part.strip()]
@@ -155,15 +142,10 @@ def read_texts(texts: str) -> list[str]:
 def _sampled(
     compared_run: ComparedRun, prompts: Mapping[Prompt, float | None], settings: CompareSettings
 ) -> dict[Prompt, Motion]:
-    """Samples a run's last checkpoint for texts or action labels.
+    """Samples a run's last checkpoint for texts or action labels, each with its seconds or, if None, the default.
 
     Motions longer than the model supports are shortened to its maximum. If a prompt is requested several times, its
     repetitions use the seeds after the configured one.
-
-    Args:
-        compared_run: the run.
-        prompts: length in seconds of each motion; None = the default length of `generate`.
-        config: the settings of the command.
     """
     import torch
 

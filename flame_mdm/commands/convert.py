@@ -44,12 +44,7 @@ class ConvertSettings(BodySettings, FileSettings):
 
 
 def convert(settings: ConvertSettings) -> None:
-    """Converts one file or a folder.
-
-    Raises:
-        UserError: If the input or the output is not named, the folder has no motions, or as raised by `Motion.save`.
-        FileNotFoundError: If a file does not exist.
-    """
+    """Converts one file or a folder."""
     if settings.motion is None or settings.out is None:
         raise UserError("name an input and an output file: flame-mdm convert motion.npz walk.bvh")
     check_words(settings)

@@ -33,11 +33,7 @@ class DemoSettings:
 
 
 def demo(settings: DemoSettings) -> None:
-    """Serves the page until interrupted.
-
-    Raises:
-        UserError: If gradio is not installed, the port is invalid or in use, or a model cannot be found or loaded.
-    """
+    """Serves the page until interrupted."""
     if not 0 <= settings.port <= 65535:
         raise UserError(f"port={settings.port}: give a number from 0 to 65535; 0 is any free port")
     if find_spec("gradio") is None:

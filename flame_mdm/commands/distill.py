@@ -50,11 +50,7 @@ def distill(settings: DistillSettings) -> None:
 
 
 def student_recipe(settings: DistillSettings) -> Config:
-    """Returns the recipe of a student.
-
-    Raises:
-        FileNotFoundError, UserError: If there is no such model, or it cannot be a teacher.
-    """
+    """Returns the recipe of a student."""
     file = settings.model_file()
     from flame_mdm.training.distillation import read_teacher
 

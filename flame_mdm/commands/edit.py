@@ -47,11 +47,7 @@ IN_NAME = (
 
 
 def write_edits(settings: EditSettings) -> None:
-    """Edits a motion, and writes the original and the results.
-
-    Raises:
-        UserError: If not exactly one condition is requested, or `flame_mdm.sampling.editing.edit` refuses the request.
-    """
+    """Edits a motion, and writes the original and the results."""
     request = settings.request(editing=True)
     if settings.motion is None:
         raise UserError("no motion to edit. Give motion=FILE (.npz, .bvh, .json, .npy) or motion=dataset:id")

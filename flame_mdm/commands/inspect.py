@@ -52,13 +52,7 @@ class InspectSettings(BodySettings, FileSettings, PreparedSettings):
 
 
 def inspect(settings: InspectSettings) -> None:
-    """Prints faults, writes the page, and exits with 3 if there are any.
-
-    Raises:
-        UserError: If nothing is named, there are no motions, or the data set is unknown.
-        FileNotFoundError: If a file does not exist.
-        SystemExit: With 3, if there are faults.
-    """
+    """Prints faults, writes the page, and exits with 3 if there are any."""
     if settings.clips < 1:
         raise UserError(f"clips={settings.clips}: must be at least 1")
     check_words(settings)

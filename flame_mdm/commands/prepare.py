@@ -29,12 +29,7 @@ class PrepareSettings(DataSettings):
 
 
 def prepare(settings: PrepareSettings) -> None:
-    """Writes or verifies the store of a data set.
-
-    Raises:
-        UserError: If no data set is named, or the data set takes no source; or if the raw data is damaged.
-        FileNotFoundError: If the raw data is missing.
-    """
+    """Writes or verifies the store of a data set."""
     node = settings.data_node(settings.source)
     if settings.captions is not None:
         if "captions" not in node["source"]:

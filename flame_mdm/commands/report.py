@@ -28,11 +28,7 @@ class ReportSettings(BodySettings):
 
 
 def report(settings: ReportSettings) -> None:
-    """Writes the report of each run.
-
-    Raises:
-        UserError: If no run is named, or a folder holds no run.
-    """
+    """Writes the report of each run."""
     if settings.runs is None:
         raise UserError("no run named. Name a run directory: flame-mdm report runs/synthetic/mdm/default")
     check_words(settings)

@@ -52,12 +52,7 @@ class OutputSettings(BodySettings, SamplerOptions, AdaptedSettings):
         return None if self.text is None else [self.text]
 
     def request(self, editing: bool = False) -> SamplingRequest:
-        """Returns what is requested of the model.
-
-        Raises:
-            UserError: If more than one condition is requested, a file cannot be read, a value is invalid, or a package
-                is missing.
-        """
+        """Returns what is requested of the model; raises `UserError` if it is more than one condition, or invalid."""
         check_words(self)
         check_device(self.device)
         if self.text is not None and not self.text.strip():
@@ -140,12 +135,7 @@ IN_NAME = (
 
 
 def sample(settings: SampleSettings) -> None:
-    """Samples the requested motions and writes them.
-
-    Raises:
-        UserError: If not exactly one condition is requested, the file of prompts cannot be read, or the model cannot
-            do what is requested.
-    """
+    """Samples the requested motions and writes them."""
     request = settings.request()
     if settings.scorer is not None and (request.kind != "text" or settings.candidates == 1):
         raise UserError(f"scorer={settings.scorer} chooses among motions for a text: give text=... and candidates=8")
@@ -248,15 +238,7 @@ def _gallery(settings: SampleSettings, folders: Mapping[Path, list[Motion]], bod
 
 
 def read_prompts(path: str, key: str = "prompts") -> list[str]:
-    """Returns the lines of a text file that are not blank.
-
-    Args:
-        path: the file, UTF-8 or ASCII.
-        key: key of the command that names the file, for the messages.
-
-    Raises:
-        UserError: If the file does not exist, is not a text file, is larger than 1 MiB, or contains no text.
-    """
+    """Returns the lines of a text file that are not blank; error messages name `key`, which names the file."""
     try:
         text = read_text(path, MEBIBYTE)
     except FileNotFoundError:
@@ -290,11 +272,7 @@ def _clean(name: str) -> str:
 
 
 def check_condition(settings: OutputSettings, request: SamplingRequest, model: MotionGenerator) -> None:
-    """Warns of words that the model has never seen.
-
-    Raises:
-        UserError: If no condition is requested; the message gives examples.
-    """
+    """Warns of words that the model has never seen; raises `UserError` with examples if no condition is requested."""
     if request.kind == "text":
         from flame_mdm.conditions.vocabulary import advice
 

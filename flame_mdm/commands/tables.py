@@ -43,13 +43,7 @@ class TablesSettings:
 
 
 def tables(settings: TablesSettings) -> None:
-    """Runs missing evaluations and renders the tables.
-
-    Raises:
-        UserError: If a spec is malformed, or an evaluation fails. After a failed evaluation, the tables are still
-            written.
-        SystemExit: With code `INVALID` if a row is not valid; the tables are written, and each reason is printed.
-    """
+    """Runs missing evaluations and renders the tables; exits with `INVALID` if a row is not valid."""
     from flame_mdm.reporting.page import page, render
     from flame_mdm.reporting.tables.build import NOT_VALID, build
     from flame_mdm.reporting.tables.format import write
@@ -82,11 +76,7 @@ def tables(settings: TablesSettings) -> None:
 
 
 def evaluate_missing(specs: Mapping[str, Config], results: Path, settings: TablesSettings) -> list[str]:
-    """Runs the evaluations of specs whose results are missing or outdated, and counts lengths of data sets.
-
-    Returns:
-        One line per failed evaluation.
-    """
+    """Runs evaluations whose results are missing or outdated, and counts lengths; returns one line per failure."""
     from evaluators.evaluation import evaluate
     from evaluators.protocol import protocol_config
     from evaluators.request import EvaluationRequest

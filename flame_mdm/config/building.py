@@ -24,15 +24,9 @@ RUN_DIR = "${run.dir}"
 def plain(config: Any, where: str | Path, *, but: str = "") -> None:
     """Checks that the content of an untrusted file has only plain values and text keys, and no interpolations.
 
-    Hydra and OmegaConf resolve interpolations (`${...}`), which can run any code and read any environment variable.
-
-    Args:
-        config: mappings, lists and values.
-        where: the file, for messages.
-        but: an interpolation that is allowed at the beginning of a text.
-
-    Raises:
-        UserError: If it contains an interpolation or another kind of value, is nested too deeply, or contains itself.
+    Hydra and OmegaConf resolve interpolations (`${...}`), which can run any code and read any environment variable. The
+    one in `but` is allowed at the beginning of a text. Raises `UserError`, which names the file `where`, also if the
+    content is nested too deeply, or contains itself.
     """
     count = 0
 
@@ -65,11 +59,8 @@ def plain(config: Any, where: str | Path, *, but: str = "") -> None:
 
 
 def read_saved(path: Path) -> Config:
-    """Reads the saved configuration of a run, with `RUN_DIR` for its directory.
-
-    Raises:
-        FileNotFoundError: If the file does not exist.
-        UserError: If it is damaged, or not the configuration of a run.
+    """Returns the saved configuration of a run, with `RUN_DIR` for its directory; raises `UserError` if it is no such
+    file.
     """
     config = read_yaml(path)
     if not isinstance(config, dict) or not isinstance(config.get("run"), dict):
@@ -94,15 +85,8 @@ def instantiate(node: Config, **derived: Any) -> Any:
     """Instantiates the object described by a mapping with a `_target_`, including nested ones.
 
     It supports Hydra's keys `_target_` and `_recursive_`. Interpolations are treated as plain text. Mappings and lists
-    are passed as plain copies, as with Hydra's `_convert_: all`.
-
-    Args:
-        node: the mapping.
-        derived: further arguments, derived from other parts of the recipe.
-
-    Raises:
-        UserError: If the class or function does not exist, or refuses its arguments. A `UserError` or
-            `FileNotFoundError` of the class or function is passed through.
+    are passed as plain copies, as with Hydra's `_convert_: all`. `derived` are further arguments, from other parts of
+    the recipe. Raises `UserError` if the class or function does not exist, or refuses its arguments.
     """
     if not isinstance(node, Mapping) or not isinstance(node.get("_target_"), str):
         raise UserError(f"no _target_, the name of a class, in {str(node)[:80]}")

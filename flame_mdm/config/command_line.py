@@ -55,13 +55,10 @@ def run(command: Callable[[Settings], None], kind: type[Settings], argv: Sequenc
 
 
 def read_settings(kind: type[Settings], words: Sequence[str]) -> Settings:
-    """Returns the settings of a command from words `key=value`.
+    """Returns the settings of a command from words `key=value`; raises `UserError` for unknown keys and wrong types.
 
     Values of keys of type `str` are taken literally; lists of texts are split like words of a shell; other values are
     read with Hydra's grammar.
-
-    Raises:
-        UserError: If a key is unknown, or a value does not have the type of its field.
     """
     annotations = _annotations(kind)
     values: dict[str, Any] = {}

@@ -50,12 +50,8 @@ def recipes() -> list[str]:
 def compose(name: str, overrides: Sequence[str] = ()) -> Config:
     """Composes a recipe with overrides such as `trainer.max_steps=10` or `denoiser=mdm_encoder`, and checks it.
 
-    Args:
-        name: a file in `experiments/` without its suffix, or the path of a recipe or of a saved `config.yaml`.
-        overrides: overrides in Hydra's grammar.
-
-    Raises:
-        UserError: If an experiment, group, option or key is unknown (with the nearest names), or a value is malformed.
+    `name` is a file in `experiments/` without its suffix, or the path of a recipe or of a saved `config.yaml`. Raises
+    `UserError` if an experiment, group, option or key is unknown (with the nearest names), or a value is malformed.
     """
     config = resolve(plan_composition(find_recipe(name), overrides))
     check(config)
@@ -63,16 +59,10 @@ def compose(name: str, overrides: Sequence[str] = ()) -> Config:
 
 
 def compose_data(name: str, overrides: Sequence[str] = (), *, data_root: str = "data", seed: int = 0) -> Config:
-    """Composes a data set and its representation: a mapping with the keys `data` and `representation`.
+    """Composes a file in experiments/data and its representation: a mapping with the keys `data` and `representation`.
 
-    Args:
-        name: a file in `experiments/data` without its suffix.
-        overrides: overrides such as `representation=smpl` or `data.source.clips=100`.
-        data_root: folder of the prepared data sets.
-        seed: of the data that are generated.
-
-    Raises:
-        UserError: As for `compose`.
+    Overrides are such as `representation=smpl` or `data.source.clips=100`; errors as for `compose`. `data_root` is the
+    folder of the prepared data sets, and `seed` that of generated data.
     """
     first = [f"+seed={seed}", quoted(f"+data_root={data_root}")]
     config = resolve(plan_composition(ConfigSource(EXPERIMENTS, None), [f"+data={name}", *overrides], first))
@@ -230,11 +220,7 @@ def resolve(plan: Plan) -> Config:
 
 
 def _legal(config: Config, override: Override) -> str:
-    """Returns the override as text for Hydra.
-
-    Raises:
-        UserError: If its key is neither in the recipe nor a parameter of the `_target_`.
-    """
+    """Returns the override as text for Hydra; raises `UserError` if neither recipe nor `_target_` has its key."""
     line = override_word(override)
     if override.is_delete() or override.is_force_add() or override.is_add() or line.startswith("hydra."):
         return line

@@ -23,11 +23,7 @@ Config = dict[str, Any]
 
 
 def check(config: Config) -> None:
-    """Checks that each `_target_` exists and is only given arguments that it takes.
-
-    Raises:
-        UserError: If not; the message names the key and the nearest legal ones.
-    """
+    """Raises `UserError` with the nearest legal keys if a `_target_` does not exist, or does not take an argument."""
     for path, node in walk(config):
         if "_target_" not in node:
             continue
@@ -52,11 +48,7 @@ KINDS: dict[str, tuple[type | tuple[type, ...], str]] = {
 
 
 def check_kind(key: str, value: Any, annotation: str) -> None:
-    """Checks a value against the annotation of a parameter. Unknown annotations allow any value.
-
-    Raises:
-        UserError: If the annotation rules out the value.
-    """
+    """Raises `UserError` if the annotation of a parameter rules out a value. Unknown annotations allow any value."""
     required = []
     for kind in _alternatives(ast.parse(annotation or "Any", mode="eval").body):
         description = _mismatch(value, kind)
@@ -155,15 +147,8 @@ def unknown_key(config: Config, parts: Sequence[str], depth: int, node: Any) -> 
 
 
 def parameters(target: str, *, where: str = "_target_", exact: bool = True) -> frozenset[str]:
-    """Returns the argument names of a class or function, read from its source.
-
-    Args:
-        target: dotted name of the class or function.
-        where: key of the target, for messages.
-        exact: whether to include "**", which stands for any argument.
-
-    Raises:
-        UserError: If `target` is not found.
+    """Returns the argument names of a class or function, read from its source; `exact` includes "**", which is any
+    argument.
     """
     names = frozenset(signature(target, where))
     return names if exact else names - {"**"}

@@ -40,10 +40,9 @@ INTERRUPT = STOP[:1]
 
 
 def run_recipe(command: Callable[[Config], None], usage: str, argv: Sequence[str]) -> int:
-    """Runs a command line `RECIPE key=value ...` and returns the exit code.
+    """Runs a command line `RECIPE key=value ...` and returns the exit code; options of Hydra are passed on.
 
-    Options of Hydra (`--multirun`, `--cfg job`) are passed on. `launch=...` passes each job of a sweep, or the only
-    job, to that launcher, and waits for them.
+    `launch=...` passes each job of a sweep, or the only job, to that launcher, and waits for them.
     """
     words = make_variables() if "--from-make" in argv else list(argv)
     if not words or any(word in ("-h", "--help") for word in words):
@@ -114,12 +113,8 @@ def _serve(command: Callable[[Config], None], words: Sequence[str], codes: list[
 
 
 def launch(jobs: Sequence[Callable[[], int]], words: Sequence[str], folder: Path) -> None:
-    """Passes jobs to a launcher of Hydra and waits for them.
-
-    Args:
-        jobs: functions that do the work and return an exit code.
-        words: `launch=NAME`, and keys of the launcher.
-        folder: where the output of the jobs is written.
+    """Passes jobs to a launcher of Hydra, given as `launch=NAME` and its keys, and waits; output is written to
+    `folder`.
     """
     resolve(plan_composition(find_recipe("quickstart"), words))  # checks the words
     say(f"waiting for the jobs; their output is in {folder}/.submitit")
@@ -145,11 +140,7 @@ POSITIVE = ("val_check_interval", "log_every_n_steps", "accumulate_grad_batches"
 
 
 def _check_whole(config: Config, name: str) -> None:
-    """Checks that a recipe has everything that a run needs.
-
-    Raises:
-        UserError: If a part or a key is missing, or a value is out of range.
-    """
+    """Raises `UserError` if a part or key that a run needs is missing, or a value is out of range."""
     plain(config, name)  # otherwise the checkpoints of the run would be refused
     for key in ("run", "trainer", "data", "representation", "task", "optimizer", "callbacks"):
         node = config.get(key)

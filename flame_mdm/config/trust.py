@@ -23,14 +23,11 @@ MODULES = {
 
 
 def trust(config: Config) -> None:
-    """Checks parts of a configuration from a checkpoint: each may only name classes of its kind, with legal arguments.
+    """Checks that parts of a configuration from a checkpoint only name classes of their kind, with legal arguments.
 
     A class is of the kind of a part if it is defined in a module that `MODULES` lists for this part, or named by a file
     in the folder of `experiments/` for this part. The environment variable FLAME_MDM_TRUST adds packages, separated by
     commas, of which any part may name anything. Nothing that the configuration names is imported here.
-
-    Raises:
-        UserError: If it names anything else, or an argument is illegal.
     """
     added = [name for name in os.environ.get("FLAME_MDM_TRUST", "").split(",") if name]
     for where, target in foreign(config).items():

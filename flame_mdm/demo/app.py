@@ -42,7 +42,7 @@ def serve(
     device: str | None = None,
     hosts: Collection[str] = (),
 ) -> None:
-    """Serves the page until the process is interrupted.
+    """Serves the page until the process is interrupted; raises `UserError` if the port is in use or a model unusable.
 
     Args:
         sources: Names of models, as for `Studio`; the first is selected at first.
@@ -50,9 +50,6 @@ def serve(
         port: Port to listen on; 0 = any free one.
         device: Device of the models; default: cuda if available.
         hosts: Further names under which the page is reached, such as that of a web server in front of it.
-
-    Raises:
-        UserError: If the port is in use, or a model cannot be found or loaded.
     """
     import torch
 
@@ -87,10 +84,8 @@ class Server(uvicorn.Server):
 def web_app(studio: Studio, device: str | None = None, hosts: Collection[str] = ()) -> Guard:
     """Returns the application: the page at `/`, files at `/motion.bvh?...` with the query string of a link.
 
-    Args:
-        studio: Makes the motions.
-        device: Device to name in command lines; None = the default.
-        hosts: Names of this server, besides localhost and addresses in numbers.
+    `device` is named in command lines, None = the default; `hosts` are names of this server, besides localhost and
+    numbers.
     """
     app = FastAPI(openapi_url=None)
     writers, waiting = asyncio.Semaphore(WRITERS), 0

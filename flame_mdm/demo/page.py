@@ -46,12 +46,7 @@ SHOW_LINK = "(query) => { history.replaceState(null, '', '?' + query); return lo
 
 
 def build_page(studio: Studio, device: str | None = None) -> gr.Blocks:
-    """Returns the page; the server calls its functions `show`, `halt` and `switch`.
-
-    Args:
-        studio: Makes the motions.
-        device: Device to name in command lines; None = the default.
-    """
+    """Returns the page; command lines name `device`. The server calls its functions `show`, `halt` and `switch`."""
     stops: dict[str, Event] = {}
 
     def show(query: str, web: gr.Request, progress: gr.Progress = gr.Progress()) -> dict[Any, Any]:  # noqa: B008

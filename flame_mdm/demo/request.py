@@ -110,11 +110,10 @@ class DemoRequest(BaseModel):
         return path_targets(self.path, sum(seconds or self.seconds for _, seconds in parts))
 
     def steps(self, kind: str) -> list[tuple[int | None, dict[str, Any]]]:
-        """Returns the steps to the motions: the number of the motion to edit, None for the first step, and keywords of
-        `flame_mdm.generate` or `flame_mdm.edit`. Motions are edited as the model made them and cleaned up at the end.
+        """Returns the number of the motion to edit, None at first, and keywords of `generate` or `edit`, for each step.
 
-        Args:
-            kind: What the model was trained on: text, action or none.
+        Motions are edited as the model made them and cleaned up at the end. The model was trained on `kind`: text,
+        action, none.
         """
         names = ("guidance_scale", "num_inference_steps", "sampler")
         shared = {name: value for name in names if (value := getattr(self, name)) is not None}
@@ -185,11 +184,7 @@ def _word(value: Any) -> str:
 
 
 def parse_query(pairs: Iterable[tuple[str, str]]) -> DemoRequest:
-    """Returns the request of a link's query string; keys that begin with "__" belong to the host and are skipped.
-
-    Raises:
-        UserError: If a key is unknown or given twice, or a value is invalid.
-    """
+    """Returns the request of a link's query string; raises `UserError`. Keys with "__" belong to the host."""
     values: dict[str, Any] = {}
     edits: list[Any] = []
     for key, value in pairs:
@@ -209,11 +204,7 @@ Checked = TypeVar("Checked", bound=BaseModel)
 
 
 def checked(kind: type[Checked], values: dict[str, Any]) -> Checked:
-    """Returns a request or an edit with these values; empty ones are left to the defaults.
-
-    Raises:
-        UserError: If a value is invalid; the message quotes it.
-    """
+    """Returns a request or an edit; empty values are left to the defaults. A `UserError` quotes the invalid value."""
     try:
         return kind(**{key: value for key, value in values.items() if value not in (None, "")})
     except ValidationError as error:

@@ -34,14 +34,11 @@ class Stopped(UserError):
 
 
 class Studio:
-    """Makes the motions of requests with a fixed set of models.
+    """Makes the motions of requests with a fixed set of models, of which the first is loaded at once.
 
     Args:
         sources: Names of models, as for `flame_mdm.load`, or "MODEL + ADAPTER"; requests can choose no other.
         device: Device of all models.
-
-    Raises:
-        UserError: If a model cannot be found, or the first, which is loaded at once, cannot be loaded.
     """
 
     def __init__(self, sources: Sequence[str], device: str):
@@ -65,15 +62,10 @@ class Studio:
     def motions(
         self, request: DemoRequest, report: Callable[[int], None] = lambda calls: None, stop: Event | None = None
     ) -> list[Motion]:
-        """Returns the motions of a request, from memory if they were made before.
+        """Returns the motions of a request, from memory if they were made before; ends one that takes too long.
 
-        Args:
-            request: What to make.
-            report: Called before each call of the network, with the number of calls so far.
-            stop: Once set, the next call raises `Stopped`.
-
-        Raises:
-            UserError: If the model refuses the request, or it took too long or was canceled.
+        Before each call of the network, `report` gets the number of calls so far; once `stop` is set, it raises
+        `Stopped`.
         """
         with self._working:
             model = self.model(request.model)
@@ -133,9 +125,6 @@ class Studio:
         """Returns the bytes of a motion file; `number` counts the motions of the request from 0.
 
         The motion comes from memory, so that a file costs no work of the model and waits for nobody's request.
-
-        Raises:
-            UserError: If there is no such format, motion or rig, or the motion is not in memory.
         """
         if extension not in FORMATS:
             raise UserError(f"{one_line(extension[:20])}: not a format of this page. Use {', '.join(FORMATS)}")

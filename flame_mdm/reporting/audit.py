@@ -89,11 +89,7 @@ def card_of(dataset: str, sha256: str | None) -> Path | None:
 
 
 def read_card(path: Path) -> AuditCard:
-    """Returns a card.
-
-    Raises:
-        UserError: If the file is damaged.
-    """
+    """Returns a card; raises `UserError` if the file is damaged."""
     return read_json(path, AuditCard, "run `flame-mdm audit` again")
 
 

@@ -28,14 +28,9 @@ BARS = 30
 
 
 def find(clips: Sequence[Entry], split: str | None, search: str) -> list[list[Entry]]:
-    """Returns the clips of a split whose id and captions contain all words of `search`.
+    """Returns the clips of a split (None = all) whose id and captions contain all words of `search`, in any case.
 
     Each clip is grouped with its mirrored copy, original first; a group matches if one of its clips does.
-
-    Args:
-        clips: all clips of a store.
-        split: None = all splits.
-        search: words, in any order and case.
     """
     ids = {clip.id for clip in clips}
     families: dict[str, list[Entry]] = {}
@@ -103,17 +98,9 @@ def write_clips(
 ) -> None:
     """Writes clips as `motion_000_ID.npz` ..., in the layout of generated motions, each with one caption.
 
-    A clip with several captions gets the first one that no earlier clip has, so captions are unique if possible.
-
-    Args:
-        folder: where to write.
-        store: the prepared data set.
-        representation: of the features in the store.
-        clips: the clips to write.
-        longest: maximum length in frames; clips are cut as for training and evaluation.
-
-    Raises:
-        UserError: If the folder holds other motions, which would be mistaken for motions of this selection.
+    A clip with several captions gets the first one that no earlier clip has, so captions are unique if possible. Clips
+    are cut to `longest` frames. Raises `UserError` if the folder holds other motions, which would be mistaken for
+    these.
     """
     import torch
 

@@ -41,11 +41,7 @@ class ComparedRun:
 
 
 def find(folders: Sequence[Path]) -> list[ComparedRun]:
-    """Returns the runs in some folders, labeled by recipe and run name, or by folder where these are ambiguous.
-
-    Raises:
-        UserError: If there are fewer than two folders, or a folder holds neither a run nor motions.
-    """
+    """Returns the runs in two or more folders, labeled by recipe and run name, or by folder if ambiguous."""
     if len(set(folders)) < 2:
         raise UserError(f'a comparison needs two or more runs: runs="A B", not {" ".join(map(str, folders))}')
     compared = []

@@ -98,10 +98,8 @@ def standalone(plot: str) -> str:
 
 
 def charts(curves: Mapping[str, tuple[Mapping[str, Curve], Mapping[str, Curve]]]) -> list[Markup]:
-    """Draws a chart of each title, and lists those whose curves have a single point in one table.
-
-    Args:
-        curves: by title, the curves of the chart and the half widths of their intervals, as for `chart`.
+    """Draws a chart of each title, and lists those whose curves have a single point in one table; values as for
+    `chart`.
     """
     single = {title for title, (lines, _) in curves.items() if {len(line) for line in lines.values()} <= {0, 1}}
     names = list(dict.fromkeys(name for title in curves if title in single for name in curves[title][0]))
@@ -116,14 +114,9 @@ def charts(curves: Mapping[str, tuple[Mapping[str, Curve], Mapping[str, Curve]]]
 
 
 def chart(title: str, curves: Mapping[str, Curve], bands: Mapping[str, Curve] | None = None) -> Markup:
-    """Draws curves over training steps in one chart, and lists their last values.
+    """Draws curves over training steps in one chart, and lists their last values, without those that are not finite.
 
-    The y-axis is logarithmic if the values span more than `LOG_RANGE`.
-
-    Args:
-        title: what the values are.
-        curves: by name; values that are not finite are skipped.
-        bands: half widths of the 95 % intervals of some of the curves.
+    The y-axis is logarithmic if the values span more than `LOG_RANGE`. `bands` are half widths of 95 % intervals.
     """
     spread = {name: {x: abs(width) for x, width in _finite(curve)} for name, curve in (bands or {}).items()}
     series = [Series(name, _finite(curve), spread.get(name, {})) for name, curve in curves.items()]

@@ -22,11 +22,7 @@ COST = ("lr", "grad_norm", "samples_per_second", "seconds_per_step", "gpu_memory
 
 
 def write_report(folder: Path, mesh: Mesh | None = None) -> Path:
-    """Writes `report.html` into a run directory, and returns its path. The same folder gives the same bytes.
-
-    Raises:
-        UserError: If the folder holds no run, or a file is damaged.
-    """
+    """Writes `report.html` into a run directory, and returns its path. The same folder gives the same bytes."""
     from omegaconf import OmegaConf
 
     run = read_run(folder)
@@ -106,11 +102,7 @@ def _curves(run: Run, name: str, families: list[str]) -> tuple[dict[str, Curve],
 
 
 def charted(curves: Mapping[str, Curve]) -> dict[str, dict[str, list[str]]]:
-    """Groups curves into charts. Training and validation curves with the same name share a chart.
-
-    Returns:
-        heading -> rest of the name (`loss`) -> families, the first parts of the names (`train`, `val`).
-    """
+    """Groups curves into charts: heading -> rest of the name (`loss`) -> families that share it (`train`, `val`)."""
     samples = "Samples for the fixed prompts"
     groups: dict[str, dict[str, list[str]]] = {"Losses": {}, "Validation": {}, samples: {}, "Training curves": {}}
     for name in curves.keys() - constants(curves).keys():

@@ -65,11 +65,8 @@ def rating_page(
 ) -> str:
     """Returns a page that asks which of two motions fits a text better: the first run's or another run's.
 
-    The first run is compared with each other run. Order and sides are random, from `seed`. The page saves the answers
-    to a file for `tally`.
-
-    Raises:
-        UserError: If two runs have no prompt in common, apart from the empty one.
+    Order and sides are random, from `seed`. The page saves the answers to a file for `tally`. Raises `UserError` if two
+    runs have no prompt in common, apart from the empty one.
     """
     from flame_mdm.visualize import player_page
 
@@ -97,14 +94,10 @@ def rating_page(
 
 
 def tally(files: Sequence[Path]) -> list[dict[str, Any]]:
-    """Counts the answers of several raters.
+    """Counts the answers of several raters; raises `UserError` if a file is malformed or given twice.
 
-    Returns:
-        For each pair of labels: `a`, `b`, `wins_a`, `wins_b`, `raters`, `share_a`, the share of answers for a, and
-        `interval_a`, its 95 % interval (Wilson 1927), which treats all answers as independent.
-
-    Raises:
-        UserError: If a file is malformed, or contains a rater's answers to the same page a second time.
+    Returns for each pair of labels: `a`, `b`, `wins_a`, `wins_b`, `raters`, `share_a`, the share of answers for a, and
+    `interval_a`, its 95 % interval (Wilson 1927), which treats all answers as independent.
     """
     raters: dict[tuple[str, str], Path] = {}
     counts: dict[tuple[str, str], dict[str, Any]] = {}

@@ -68,9 +68,6 @@ def adapt(
 
     Returns:
         The adapter or model file, OUT/NAME.safetensors. OUT/adaptation.html compares motions before and after.
-
-    Raises:
-        FileNotFoundError, UserError: If the base, a motion or a caption cannot be used, or an argument is invalid.
     """
     file, out = find(base), Path(out or f"runs/adapt/{name}")
     if not re.fullmatch(r"[^\W_]+", name):

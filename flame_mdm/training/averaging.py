@@ -20,12 +20,9 @@ class MovingAverage(WeightAveraging):
     device. Buffers are copied, not averaged.
 
     Args:
-        decay: average = decay * average + (1 - decay) * weights.
+        decay: average = decay * average + (1 - decay) * weights, from 0 to 1.
         update_every_n_steps: number of steps between updates, which are at its multiples.
         update_starting_at_step: up to this step, updates copy the weights instead of averaging them; so does the first.
-
-    Raises:
-        UserError: If the decay is not from 0 to 1.
     """
 
     def __init__(self, decay: float, update_every_n_steps: int = 1, update_starting_at_step: int = 0):

@@ -55,10 +55,8 @@ class Interrupted(Exception):
 class Checkpoints(Checkpoint):
     """Writes `last.ckpt` periodically, at the last step and when interrupted, and keeps some checkpoints permanently.
 
-    SIGINT, SIGTERM, SIGUSR1 and SIGUSR2 stop training at the end of the current step; with several processes, at the
-    end of the next one. Validation is never interrupted, since averaged weights replace the trained ones meanwhile. A
-    second SIGINT stops immediately. So does a second SIGTERM, if it comes more than one second after the first, since
-    `timeout` sends two at once.
+    Signals stop training at the end of the current step (`StopRequest`); with several processes, at the end of the next
+    one. Validation is never interrupted, since averaged weights replace the trained ones meanwhile.
 
     Args:
         folder: folder of the checkpoints.
@@ -235,10 +233,7 @@ def explain_metrics(
 ) -> list[str]:
     """Returns lines that explain metrics by their docstrings, with their values next to those of real motions.
 
-    Args:
-        values: by metric, or by metric/part; None = no value.
-        real: the same for real motions; values may be missing.
-        metrics: classes by name.
+    Values are by metric, or by metric/part; None = no value, and those of real motions may be missing.
     """
     lines = []
     for name, metric in metrics.items():

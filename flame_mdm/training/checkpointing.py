@@ -42,13 +42,9 @@ class Resumed(NamedTuple):
 
 
 class AtomicCheckpoints(TorchCheckpointIO):
-    """Writes checkpoints atomically: to a temporary file, synced and then renamed.
+    """Writes checkpoints atomically: to a temporary file, synced and then renamed; removes files in `folder` alone.
 
-    The former `last.ckpt` is kept as `previous.ckpt`.
-
-    Args:
-        folder: folder of the checkpoints; files elsewhere are never removed.
-        resumed: the checkpoint from which the run resumes, which is not read again.
+    The former `last.ckpt` is kept as `previous.ckpt`. The checkpoint `resumed` is not read again.
     """
 
     def __init__(self, folder: Path, resumed: Resumed | None = None):
@@ -68,11 +64,7 @@ class AtomicCheckpoints(TorchCheckpointIO):
             Path(path).unlink()
 
     def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None) -> None:
-        """Writes a checkpoint.
-
-        Raises:
-            UserError: If it cannot be written, for example on a full disk. Earlier checkpoints remain unchanged.
-        """
+        """Writes a checkpoint; raises `UserError` if that fails, as on a full disk. Earlier ones stay."""
         path = Path(path)
         partial = path.with_suffix(".partial")
         try:
@@ -94,14 +86,7 @@ class AtomicCheckpoints(TorchCheckpointIO):
 
 
 def newest(folder: Path) -> Resumed | None:
-    """Returns the checkpoint to resume from: the last one, or the previous one if the last is damaged.
-
-    Args:
-        folder: folder in which `AtomicCheckpoints` writes; it need not exist.
-
-    Raises:
-        UserError: If all existing checkpoints are damaged.
-    """
+    """Returns the checkpoint to resume from: the last one, or the previous one if the last is damaged."""
     paths = [folder / name for name in (LAST, PREVIOUS) if (folder / name).exists()]
     for path in paths:
         try:
@@ -121,13 +106,10 @@ def newest(folder: Path) -> Resumed | None:
 
 
 def check_training_state(resumed: Resumed, task: Task, trainer: Trainer) -> None:
-    """Checks that a checkpoint holds the state of training `task` with `trainer`, before `Trainer.fit` is called.
+    """Raises `UserError` unless a checkpoint holds the state of training `task` with `trainer`, before `Trainer.fit`.
 
     The state of a `ModelCheckpoint` is dropped if it names a path that is not directly in the folder of the
     checkpoints: the run directory was moved, or the path is an attack on other files.
-
-    Raises:
-        UserError: If a part is missing or has other types or shapes.
     """
     content, path = resumed.content, resumed.path
     if fault := next(_faults(content, path, task, trainer), None):

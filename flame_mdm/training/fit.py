@@ -33,11 +33,7 @@ from flame_mdm.training.speed import accelerate
 
 
 def fit(folder: Path, config: Config) -> None:
-    """Trains a recipe in its run directory, from the newest checkpoint if there is one.
-
-    Raises:
-        UserError, SystemExit: As for `flame-mdm train`.
-    """
+    """Trains a recipe in its run directory, from the newest checkpoint if there is one."""
     _quiet()
     check_devices(config["trainer"])
     torch.set_float32_matmul_precision("high")
@@ -103,12 +99,9 @@ def fit(folder: Path, config: Config) -> None:
 
 
 def check_devices(trainer: Config) -> None:
-    """Checks that this machine has the accelerator and the number of devices of a recipe.
+    """Raises `UserError` if this machine does not have the GPUs of a recipe; other accelerators are left to Lightning.
 
     `accelerator=cpu` may start any number of processes; `auto` starts one per core at most, since users mean GPUs.
-
-    Raises:
-        UserError: If not. Other accelerators than GPU and CPU are left to Lightning.
     """
     accelerator, devices = trainer.get("accelerator", "auto"), trainer.get("devices", 1)
     gpus, cores = torch.cuda.device_count(), os.cpu_count() or 1
@@ -140,11 +133,7 @@ def _requeue() -> None:
 
 
 def _check_same_data(resumed: Resumed, data: MotionDataModule) -> None:
-    """Checks, on the first process, that a resumed run has the data that it was trained on.
-
-    Raises:
-        UserError: If the data has another fingerprint.
-    """
+    """Checks, on the first process, that a resumed run has the data that it was trained on."""
     if rank_zero_only.rank:
         return
     data.prepare_data()

@@ -20,11 +20,7 @@ from flame_mdm.safe_io import locked, write_json
 
 @contextmanager
 def only_run(folder: Path) -> Iterator[None]:
-    """Holds the lock `run.lock` in the run directory for the duration of the run; the file names process and host.
-
-    Raises:
-        UserError: If another process holds the lock, on this host or on another host of a shared file system.
-    """
+    """Holds the lock `run.lock` in the run directory; raises `UserError` if a process on any host holds it."""
 
     def refuse(owner: str) -> None:
         raise UserError(
@@ -89,11 +85,7 @@ class BadLoss(Callback):
         self.check(trainer)
 
     def check(self, trainer: Trainer) -> None:
-        """Checks the losses since the last check, on all processes at the same step.
-
-        Raises:
-            UserError: If a loss of any process is bad.
-        """
+        """Raises `UserError` if a loss since the last check is bad, on all processes at the same step."""
         if not self.seen:
             return
         mine = torch.stack([s[-1].float() for s in self.seen])

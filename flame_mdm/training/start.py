@@ -34,9 +34,7 @@ FREE = (
 def train(config: Config) -> None:
     """Trains the composed experiment, or resumes the run in its directory.
 
-    Raises:
-        UserError: If the directory holds a run with another configuration, or the data or the recipe is unusable.
-        SystemExit: If interrupted, after a checkpoint is written. The exit code is 128 + the number of the signal.
+    An interruption raises `SystemExit` with 128 + the number of the signal, after a checkpoint is written.
     """
     folder = Path(config["run"]["dir"])
     _same_run(folder, config)

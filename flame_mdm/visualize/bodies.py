@@ -63,13 +63,9 @@ CLOTHES = {"neck": SKIN, "head": SKIN, "wrist": SKIN, "ankle": SHOES, "foot": SH
 
 
 def load_body(name: str) -> Mesh:
-    """Returns the mesh of a body. Anny's is made once per shape, with a progress bar, and kept in the user's cache.
+    """Returns the mesh of a body: mannequin, or anny, with numbers of `SHAPE`, such as "anny gender=1 age=0.9".
 
-    Args:
-        name: mannequin; or anny, with numbers of `SHAPE`, such as "anny gender=1 age=0.9".
-
-    Raises:
-        UserError: If the body or a number is unknown, or the package anny is required and not installed.
+    Anny's is made once per shape, with a progress bar, and kept in the user's cache.
     """
     kind, *options = name.split() or [""]
     if kind not in ("mannequin", "anny") or (options and kind != "anny"):
@@ -99,11 +95,7 @@ def _anny(name: str, options: list[str]) -> Path:
 
 
 def bake(shape: dict[str, float]) -> dict[str, np.ndarray]:
-    """Returns the arrays of the file of a figure of Anny: `packed`.
-
-    Raises:
-        UserError: If the package anny is not installed.
-    """
+    """Returns the arrays of the file of a figure of Anny: `packed`."""
     try:
         package = import_module("anny")
     except ImportError:

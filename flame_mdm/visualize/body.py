@@ -51,11 +51,7 @@ class Mesh:
     """
 
     def __init__(self, path: Path) -> None:
-        """Reads a file.
-
-        Raises:
-            UserError: If the file is missing or damaged.
-        """
+        """Reads a file; raises `UserError` if it is missing or damaged."""
         try:
             with np.load(path, allow_pickle=False) as file:
                 self.stored = {name: file[name] for name in file.files}
@@ -158,17 +154,11 @@ class FittedBody:
 
 
 def fit_body(motion: Shown, body: Mesh | None = None) -> FittedBody:
-    """Fits a body to a clip and computes the rotations of its bones.
+    """Fits a body (None = the mannequin) to a clip and computes the rotations of its bones.
 
     The body's joints are the motion's, but higher by the thickness of the sole: in motions, the lowest joint is on the
-    floor. Rotations that are solved for are completed.
-
-    Args:
-        motion: the clip.
-        body: the mesh; None = the mannequin.
-
-    Raises:
-        UserError: If the skeleton is not SMPL's, or a limb is much longer or shorter than people's.
+    floor. Rotations that are solved for are completed. Raises `UserError` if the skeleton is not SMPL's, or a limb is
+    much longer or shorter than people's.
     """
     poses, body = motion.posed(), body or mannequin()
     joints = motion.joints[:, : len(SMPL22)].astype(float)
@@ -225,17 +215,10 @@ def bound(body: Mesh, stretched: np.ndarray, rest: np.ndarray) -> np.ndarray:
 
 
 def proportions(body: Mesh, offsets: np.ndarray) -> tuple[np.ndarray, float]:
-    """Compares the bones of a clip with those of a mesh.
+    """Returns the linear map (22, 3, 3) of each joint's part to a clip's proportions, and the ratio of widths.
 
-    Args:
-        body: the mesh.
-        offsets: (22, 3), position of each joint relative to its parent in the rest pose.
-
-    Returns:
-        The linear map (22, 3, 3) of each joint's part in the rest pose, and the ratio of widths.
-
-    Raises:
-        UserError: If a limb is much longer or shorter than people's.
+    `offsets` (22, 3) are the positions of the clip's joints relative to their parents in the rest pose. Raises
+    `UserError` if a limb is much longer or shorter than people's.
     """
     lengths, usual = np.linalg.norm(offsets, axis=1), np.linalg.norm(body.rest, axis=1)
     ratio = np.divide(lengths, usual, out=np.ones_like(lengths), where=usual > 0)

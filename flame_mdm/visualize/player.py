@@ -20,11 +20,7 @@ MILLIMETER = 0.001
 
 
 def write_player(path: str | Path, motions: Sequence[Shown], title: str = "Motions", **options: Any) -> None:
-    """Writes the page of `player_page` to a file; the options are those of `player_page`.
-
-    Raises:
-        UserError: If there are no motions.
-    """
+    """Writes the page of `player_page` to a file; the options are those of `player_page`."""
     path = Path(path)
     check_any(motions, path)
     write_text(path, player_page(motions, title, **options))

@@ -42,17 +42,10 @@ def frames_array(motion: Shown, size: int = 256, body: Mesh | None = None) -> np
 
 
 def write_gif(path: str | Path, motions: Sequence[Shown], size: int = 256, body: Mesh | None = None) -> None:
-    """Writes a looping animation of motions side by side, with captions below.
+    """Writes a looping animation of motions side by side, with captions below, in panels of `size` pixels.
 
-    Args:
-        path: the GIF to write.
-        motions: drawn at the highest of their frame rates; a motion that ends earlier stays at its last frame. The
-            format allows at most 50 frames per second, so frames of faster motions are dropped.
-        size: width and height of a panel in pixels.
-        body: the body to draw; None = the mannequin.
-
-    Raises:
-        UserError: If there are no motions.
+    It has the highest frame rate of the motions, but at most 50 per second, the limit of the format: frames of faster
+    motions are dropped. A motion that ends earlier stays at its last frame. `body` None = the mannequin.
     """
     path = Path(path)
     check_any(motions, path)
@@ -74,11 +67,7 @@ def write_gif(path: str | Path, motions: Sequence[Shown], size: int = 256, body:
 
 
 def write_mp4(path: str | Path, motions: Sequence[Shown], size: int = 384, body: Mesh | None = None) -> None:
-    """Writes the animation of `write_gif` as H.264 video (yuv420p), with no limit on the frame rate.
-
-    Raises:
-        UserError: If the package av is not installed, or there are no motions.
-    """
+    """Writes the animation of `write_gif` as H.264 video (yuv420p), with no limit on the frame rate."""
     path = Path(path)
     check_any(motions, path)
     av = video_package(str(path))
@@ -98,14 +87,7 @@ def write_mp4(path: str | Path, motions: Sequence[Shown], size: int = 384, body:
 
 
 def video_package(name: str) -> ModuleType:
-    """Returns the package av, which writes MP4.
-
-    Args:
-        name: what needs it, for the error message.
-
-    Raises:
-        UserError: If it is not installed.
-    """
+    """Returns the package av, which writes MP4; the `UserError` without it begins with what needs it."""
     try:
         return import_module("av")
     except ImportError:
@@ -119,15 +101,7 @@ def contact_sheet(
 ) -> None:
     """Writes one PNG with a row per motion: its poses at equally spaced times from first to last, and its caption.
 
-    Args:
-        path: the PNG to write.
-        motions: one row each.
-        frames: poses per row.
-        size: width and height of a pose in pixels.
-        body: the body to draw; None = the mannequin.
-
-    Raises:
-        UserError: If there are no motions, or fewer than one pose per row.
+    `frames` is the number of poses per row, `size` their width and height in pixels.
     """
     path = Path(path)
     check_any(motions, path)
@@ -205,13 +179,8 @@ def _video(motions: Sequence[Shown], fps: float, size: int, mesh: Mesh | None) -
 
 
 def _figure(motion: Shown, body: FittedBody | None, frame: int, size: int) -> Image.Image:
-    """Draws one pose on the ground, (size, size) pixels; the camera follows the root smoothed over one second.
-
-    Args:
-        motion: the motion.
-        body: its body; None = its skeleton is drawn.
-        frame: the frame to draw.
-        size: width and height of the image.
+    """Draws one pose (without a body, the skeleton) on the ground; the camera follows the root smoothed over one
+    second.
     """
     side = size * SMOOTH
     image = Image.new("RGB", (side, side), PAPER)

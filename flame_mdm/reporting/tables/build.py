@@ -28,16 +28,9 @@ NOT_VALID = "NOT VALID"
 
 
 def build(name: str, spec: Config, results: Path, sizes: Sizes | None = None) -> Table:
-    """Builds the table of a spec from existing results and published numbers.
+    """Builds the table of a spec from existing results and published numbers; raises `UserError` if they do not match.
 
-    Args:
-        name: Name of the table.
-        spec: From `load_spec`.
-        results: Folder of the results.
-        sizes: Counts features and parameters of a recipe, for tables of hyperparameters that show them.
-
-    Raises:
-        UserError: If a published number or a result does not match the spec.
+    `sizes` counts features and parameters of a recipe, for tables of hyperparameters that show them.
     """
     published = _published(PUBLISHED, PUBLISHED.stat().st_mtime_ns).get(name, {}) if PUBLISHED.exists() else {}
     unknown = published.keys() - spec["parts"].keys()
@@ -127,13 +120,7 @@ def _measured(name: str, part: Config, reported: Config | None, results: Path) -
 
 
 def _warnings(lines: Sequence[Line], distances: Sequence[bool], columns: Sequence[str]) -> list[tuple[str, str]]:
-    """Returns the footnotes on rows that are not valid, on how checkpoints were chosen, and on distances of 0.
-
-    Args:
-        lines: The measured rows and those of real motions.
-        distances: Which columns are Fréchet distances.
-        columns: Labels of the columns.
-    """
+    """Returns the footnotes on invalid rows, on the choice of checkpoints, and on columns whose distances are 0."""
     reasons = [(line.label, line.facts.get("not valid because")) for line in lines]
     notes = _by_text([(label, f"NOT VALID: {reason}") for label, reason in reasons if reason])
     selected = [(line.label, line.facts.get("chosen by", "").partition(" ")) for line in lines]

@@ -346,14 +346,10 @@ def fragment(table: Table) -> Markup:
 
 
 def draw(part: Part, figure: Plot | str) -> str | None:
-    """Draws a figure of a part as SVG; None if it has no points.
+    """Draws a figure of a part, or the histogram of that name, as SVG; None if it has no points.
 
     Curves are named after rows; measured ones are solid, reported ones dashed. If closer to real motions is better in
     a column, real motions are a dotted line. `points` makes it a scatter plot.
-
-    Args:
-        part: the table with the values.
-        figure: what to draw, or the name of one of the part's histograms.
     """
     if isinstance(figure, str):
         edges, counts = part.histograms[figure]
@@ -411,10 +407,7 @@ WRITERS: dict[str, Callable[[Table], str]] = {"md": markdown, "tex": latex, "csv
 def ranks(values: Sequence[float | None], better: str, real: float | None) -> list[int]:
     """Ranks values: 1 for the best, 2 for the second best, 0 for all others. A single value is not ranked.
 
-    Args:
-        values: None = missing.
-        better: higher, lower, real (closest to `real`) or none.
-        real: the value for real motions.
+    `better` is higher, lower, real (closest to the value `real` of real motions) or none; a missing value is None.
     """
     there = [v for v in values if v is not None]
     if better == "none" or len(there) < 2 or (better == "real" and real is None):

@@ -160,14 +160,7 @@ def spec_names() -> list[str]:
 
 
 def load_spec(name: str) -> Config:
-    """Loads the spec of a table.
-
-    Args:
-        name: a name in experiments/tables, or the path of a .yaml file.
-
-    Raises:
-        UserError: If the file does not exist, or is not a valid spec.
-    """
+    """Loads the spec of a table by its name in experiments/tables, or the path of a .yaml file."""
     path = Path(name) if name.endswith((".yaml", ".yml")) else SPECS / f"{name}.yaml"
     if not path.is_file() or path == PUBLISHED:
         names = spec_names()

@@ -13,6 +13,7 @@ import pytest
 import torch
 from hypothesis import settings
 from support.distributed import GlooPool
+from support.fixtures import recipe
 from support.refusals import Refused
 from support.runs import TINY
 
@@ -49,6 +50,13 @@ def pool() -> Iterator[GlooPool]:
     """Two processes of one group."""
     with GlooPool() as pool:
         yield pool
+
+
+@pytest.fixture
+def composed_once(monkeypatch) -> None:
+    """What tables and pages read from recipes comes from recipes that are composed once."""
+    for module in ("flame_mdm.reporting.settings", "flame_mdm.commands.tables"):
+        monkeypatch.setattr(f"{module}.compose", recipe)
 
 
 @pytest.fixture

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
-from support.runs import TINY, TWO, finish, spawn
+from support.runs import TINY
 
 import flame_mdm
 from flame_mdm.__main__ import main
@@ -17,7 +17,6 @@ from flame_mdm.checkpoints.model_files import read_checkpoint, weights_sha256, w
 from flame_mdm.conditions.tokens import LearnedTokens
 from flame_mdm.conditions.vocabulary import hashed
 from flame_mdm.config import compose, instantiate
-from flame_mdm.data.adaptation import fault_of
 from flame_mdm.data.store import Store
 from flame_mdm.data.synthetic import Synthetic
 from flame_mdm.demo.request import DemoRequest
@@ -169,15 +168,6 @@ def test_new_words_get_rows_that_no_known_word_has():
     assert (row, word_rows(encoder, ["limp"], [other])) == (first, [second])
 
 
-def test_clips_that_drift_or_float_are_named(tmp_path):
-    joints = next(iter(Synthetic(clips=1).clips(20.0))).motion.astype(float)
-    up = np.zeros_like(joints)
-    up[..., 1] = np.linspace(0, 0.2, len(up))[:, None]
-    assert "drifts upward by" in fault_of(joints + up, 20.0)
-    up[5:, :, 1] = 0.3
-    assert not fault_of(joints, 20.0)
-
-
 # From clips to a prompt -----------------------------------------------------------------------------------------------
 
 STYLED = "A person hobbles in limp style"
@@ -230,15 +220,6 @@ def test_all_weights_and_half_of_each_batch_from_the_data_of_the_base(trained, c
     for _ in range(3):
         sources = [name.startswith("prior/") for name in next(batches).ids]
         assert sources == [False, False, True, True]
-
-
-@pytest.mark.slow
-def test_two_processes(trained, clips, tmp_path, data_root):
-    words = ["adapt", str(trained), str(tmp_path / "run"), f"source={clips}", "name=limp", *STEPS]
-    words.append("trainer.max_steps=2")
-    code, _, err = finish(spawn(["flame_mdm", *words, *TWO, f"data_root={data_root}"]))
-    assert code == 0, err
-    assert (tmp_path / "run" / "limp.safetensors").stat().st_size < 300_000
 
 
 def test_unusable_requests_are_refused(refused, trained, clips, tmp_path):

@@ -12,8 +12,6 @@ from support.stores import BABEL_FILES, label, sequence, small_babel, write_amas
 
 from flame_mdm.data.amass import read
 from flame_mdm.data.babel import FPS, Babel, Window
-from flame_mdm.data.crops import Whole
-from flame_mdm.data.datamodule import MotionDataModule
 from flame_mdm.data.store import write_store
 from flame_mdm.errors import UserError
 from flame_mdm.representations.smpl import SMPL
@@ -123,21 +121,6 @@ def test_the_official_training_set_stays_whole_and_val_is_divided_by_motion(tmp_
     assert source.excluded == {"labels of the val part on motions of the train part": 1}
     flames = Counter(w.split for w in open_babel(tmp_path / "babel", tmp_path / "amass", True).windows)
     assert flames["val"] + flames["test"] == 4 * 37
-
-
-def test_flames_split_is_marked(small: tuple[Path, Path], tmp_path: Path):
-    source = open_babel(*small, published_split=True)
-    store = write_store(tmp_path / "store", source, SMPL())
-    assert store.info["published_split"] is True
-    held_out = [clip for clip in store.clips if clip.id.startswith("val")]
-    assert {clip.split for clip in held_out} == {"val", "test"}
-    assert all((int(c.id[4:]) % 5 == 0) == (c.split == "test") for c in held_out)
-    ours = MotionDataModule(open_babel(*small), SMPL(), root=str(tmp_path), name="x", batch_size=1, crop=Whole())
-    ours.folder = store.folder
-    with pytest.raises(
-        ValueError, match="prepared with published_split=True, but the recipe has published_split=False"
-    ):
-        ours.open()
 
 
 def test_absent_and_damaged_motions_are_named(small: tuple[Path, Path]):

@@ -17,8 +17,6 @@ import run  # noqa: E402
 import sections  # noqa: E402
 import steps  # noqa: E402
 
-from flame_mdm.config import compose  # noqa: E402
-
 TOY = {
     "steps": "--quick",
     "sampling": "--frames 4 --latent-dim 16 --num-layers 1 --repeats 1 --longest 0",
@@ -66,17 +64,6 @@ def test_unknown_sections_and_devices_are_refused_in_one_line(page, monkeypatch)
     assert not page.exists()
 
 
-def test_sections_of_a_gpu_are_added_to_the_page(page, monkeypatch):
-    run.main("only=steps")
-    monkeypatch.setattr(run.torch.cuda, "is_available", lambda: True)
-    monkeypatch.setattr(run.torch.cuda, "get_device_name", lambda: "Some GPU")
-    run.main("device=cuda", "only=steps")
-    text = page.read_text()
-    assert text.index("## Title of steps\n") < text.index("## Title of steps on a GPU\n")
-    assert "GPU: Some GPU" in text
-    assert "machine 2." in text
-
-
 def test_hours_of_a_recipe_follow_from_the_sustained_rate(monkeypatch):
     assert cost.hours(3.6e12, 500_000, 1e12) == pytest.approx(500)
     monkeypatch.setattr(steps, "RECIPES", ["humanml3d/mdm"])
@@ -84,12 +71,6 @@ def test_hours_of_a_recipe_follow_from_the_sustained_rate(monkeypatch):
     slow, fast = rows
     assert slow["hours"] == pytest.approx(slow["TFLOP per step"] * slow["steps"] / 3600)
     assert fast["hours"] == pytest.approx(slow["hours"] / 4)
-
-
-def test_the_operations_of_a_step_grow_with_its_batch():
-    config = compose("synthetic/mdm_gru", ["condition=none"])
-    one, two = (cost.cost(config, rows, 20)[0] for rows in (4, 8))
-    assert 0 < one < two <= 2 * one
 
 
 def test_the_committed_page_is_rendered_from_the_committed_figures():

@@ -11,14 +11,11 @@ from support.motions import posed, sway
 from flame_mdm.errors import UserError
 from flame_mdm.formats.motion import Motion
 from flame_mdm.representations.skeleton import KIT21, SMPL22
-from flame_mdm.representations.smpl import ADULT
 from flame_mdm.visualize import frames_array, player_page, render
 from flame_mdm.visualize.bodies import load_body
 from flame_mdm.visualize.body import ANCHORS, Mesh, fit_body, mannequin, rasterize, try_fit
 from flame_mdm.visualize.posture import JOINT
 from flame_mdm.visualize.scene import sides
-
-REST = np.array(ADULT[:22])
 
 
 def volume(points: np.ndarray, triangles: np.ndarray) -> float:

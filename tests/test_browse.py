@@ -10,15 +10,14 @@ import torch
 from support.browser import CHROMIUM, browser
 from support.motions import HOSTILE, Page, synthetic, unpacked
 from support.runs import TINY
-from support.stores import OwnClips, clip
+from support.stores import OwnClips
 
 from flame_mdm.__main__ import main
 from flame_mdm.data import Clip
 from flame_mdm.data.store import Entry, Store, write_store
 from flame_mdm.formats.readers import read
-from flame_mdm.reporting.browse import choose, describe, find, motion, write_clips, write_page
+from flame_mdm.reporting.browse import choose, describe, find, write_clips, write_page
 from flame_mdm.representations.humanml import HumanML
-from flame_mdm.representations.rot6d import Rot6D
 
 
 def entry(name: str, split: str = "train", *captions: str) -> Entry:
@@ -100,12 +99,6 @@ def test_statistics_count_all_clips_whether_shown_or_not(store):
     bars = [note.split("</title>")[0] for note in about.split("<title>")[1:]]
     for split, count in (("train", 4), ("val", 1)):
         assert sum(int(bar.split(": ")[1].split()[0]) for bar in bars if bar.endswith(split)) == count
-
-
-def test_motions_without_a_floor_stand_on_one(tmp_path):
-    falling = clip("a", motion=np.zeros((9, 75), np.float32))  # in the camera's coordinates
-    store = write_store(tmp_path / "falling", OwnClips(falling), Rot6D())
-    assert motion(store, Rot6D(), store.clips[0]).joints[..., 1].min() == pytest.approx(0, abs=1e-6)
 
 
 def test_the_command_shows_writes_and_refuses(tmp_path, data_root, capsys):

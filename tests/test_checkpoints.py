@@ -22,7 +22,6 @@ from flame_mdm.batch import Condition, MotionBatch
 from flame_mdm.checkpoints import hub, model_files
 from flame_mdm.checkpoints.loading import load
 from flame_mdm.checkpoints.released import import_flame, import_mdm
-from flame_mdm.checkpoints.released_weights import released_state
 from flame_mdm.errors import UserError
 from flame_mdm.generator import MotionGenerator
 from flame_mdm.sampling.generation import generate
@@ -233,18 +232,6 @@ def test_every_weight_is_used_or_the_import_fails() -> None:
     ):
         with pytest.raises(ValueError, match=message):
             import_mdm(weights_, args)
-
-
-def test_layouts_of_released_files() -> None:
-    raw, averaged = {"w": torch.zeros(1)}, {"w": torch.ones(1)}
-    assert released_state(raw)["w"] == 0
-    assert released_state({"model": raw, "model_avg": averaged})["w"] == 1
-    assert released_state({"model": raw, "model_avg": averaged}, ema=False)["w"] == 0
-    lightning = {"epoch": 3, "state_dict": {"net.w": raw["w"], "ema_model.model.w": averaged["w"]}}
-    assert released_state(lightning) == {"w": averaged["w"]}
-    assert released_state(lightning, ema=False) == {"w": raw["w"]}
-    with pytest.raises(ValueError, match="has epoch, optimizer"):
-        released_state({"epoch": 3, "optimizer": {}})
 
 
 # Options of released models -------------------------------------------------------------------------------------------

@@ -13,7 +13,6 @@ from support.runs import TINY
 from evaluators.extractors import OwnClassifierExtractor
 from evaluators.extractors.action_gru import ActionGRU
 from evaluators.extractors.classifier import ClassifierTask
-from evaluators.extractors.stgcn import JointSTGCN
 from flame_mdm.__main__ import main
 from flame_mdm.batch import length_mask
 from flame_mdm.config import compose, instantiate
@@ -125,13 +124,3 @@ def test_recipes_build_the_sizes_of_their_data():
         mask = length_mask(torch.tensor([12, 7]))
         assert task.logits(joints, mask).shape == (2, 7)
         assert len(task(joints, mask)) == 2
-
-
-@pytest.mark.slow
-def test_st_gcn_trains_by_the_same_recipe(data, tmp_path):
-    sizes = ["task=classifier_stgcn", "task.network.widths=[8,8]", "task.network.strides=[1,2]"]
-    options = [data, f"run.dir={tmp_path}", "trainer.max_steps=25", "trainer.val_check_interval=25"]
-    assert main(["train", "classifier/synthetic", *RUN, *sizes, *options, "optimizer.lr=0.01"]) == 0
-    assert validated(tmp_path / "checkpoints" / "last.ckpt")[-1] > 0.1  # of 22 actions
-    network = OwnClassifierExtractor(str(tmp_path / "checkpoints" / "last.ckpt")).task.network
-    assert isinstance(network, JointSTGCN)

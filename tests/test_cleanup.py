@@ -87,16 +87,6 @@ def test_contacts_of_the_features_find_feet_that_slide_fast():
     assert with_features < 0.02
 
 
-def test_a_pinned_foot_keeps_its_leg():
-    motion = np.repeat(Synthetic(1).clip(0, FPS).motion[:1], 30, 0)
-    slide = motion.copy()
-    slide[:, [4, 7, 10], 0] += 0.03 * np.sin(np.arange(30) / 5)[:, None].astype(np.float32)
-    after = cleanup(slide, FPS, SMPL22)
-    assert np.ptp(slide[:, 10, 0]) > 0.05
-    assert np.ptp(after[:, 10, 0]) < 0.005
-    assert np.ptp(np.linalg.norm(after[:, 4] - after[:, 1], axis=-1)) < 1e-5
-
-
 def test_hands_leave_the_body_without_a_jolt():
     """Wrists of a walk are drawn 25 cm into the trunk and back within a second; all bones keep their lengths."""
     clip = next(clip for clip in Synthetic(100).clips(FPS) if clip.attributes["action"] == "walk")

@@ -6,14 +6,12 @@ from typing import Any
 
 import pytest
 import torch
-from support.analytic import oracle
 from torch import Tensor
 
 from flame_mdm.batch import Condition, MotionBatch, length_mask
 from flame_mdm.config import EXPERIMENTS, compose, parameters
 from flame_mdm.denoisers import Denoiser
 from flame_mdm.errors import UserError
-from flame_mdm.processes import Process
 from flame_mdm.processes.diffusion import GaussianDiffusion
 from flame_mdm.processes.flow_matching import FlowMatching
 from flame_mdm.representations import Representation
@@ -55,17 +53,6 @@ class TwoJoints(Representation):
         raise NotImplementedError
 
     statistics = joint_features = encode  # type: ignore[assignment]
-
-
-class Oracle(Denoiser):
-    """Knows the motions and answers what the process wants to hear, also for the doubled batch of guidance."""
-
-    def __init__(self, x: Tensor, process: Process):
-        super().__init__()
-        self.x, self.process = x, process
-
-    def forward(self, x_t: Tensor, t: Tensor, mask: Tensor, cond: Condition) -> Tensor:
-        return oracle(self.process, self.x.repeat(len(x_t) // len(self.x), 1, 1))(x_t, t, mask, cond)
 
 
 @cache
@@ -196,19 +183,6 @@ def test_another_seed_replication_text_or_scale_is_another_motion(process):
         (task.generate(motions, unconditioned=True), 1e-6),
     ):
         assert (other - x)[0].abs().max() > least
-
-
-@pytest.mark.parametrize(("process", "sampler"), [(p, s) for p in PROCESSES for s in samplers(p)])
-def test_an_oracle_returns_the_data(process, sampler):
-    options: dict[str, Any] = {"quantize_time": False} if process == FLOW else {}
-    task = build("mdm_encoder", process, **options)
-    motions = batch()
-    task.denoiser = Oracle(motions.x, task.process)
-    x = task.generate(motions, SamplerOptions(sampler=sampler, num_inference_steps=5))
-    left = 5e-4 if process == FLOW else 1e-6  # a flow keeps sigma_min = 1e-4 times the noise
-    torch.testing.assert_close(x, motions.x, rtol=0, atol=left)
-    joints = task.representation.to_joints(x)
-    torch.testing.assert_close(joints, task.representation.to_joints(motions.x), rtol=0, atol=2 * left)
 
 
 @pytest.mark.parametrize(("process", "sampler"), [(p, s) for p in ("x0", FLOW) for s in samplers(p)])

@@ -14,7 +14,7 @@ from support.fixtures import ROOT
 from torch import Tensor
 
 from flame_mdm.batch import Condition, MotionBatch
-from flame_mdm.conditions import ConditionEncoder, Unconditional
+from flame_mdm.conditions import ConditionEncoder
 from flame_mdm.conditions.action import ActionLabels
 from flame_mdm.conditions.text import CaptionCache, Pretrained, PretrainedText
 from flame_mdm.conditions.tokens import LearnedTokens
@@ -126,13 +126,6 @@ def test_every_recipe_constructs_without_network(monkeypatch):
 
 
 # No condition, actions, learned tokens --------------------------------------------------------------------------------
-
-
-def test_no_condition_is_empty_and_its_own_null():
-    cond = Unconditional()(batch_of(["a", "b"]))
-    assert (cond.pooled.shape, cond.tokens.shape) == ((2, 0), (2, 0, 0))
-    assert cond.drop(torch.tensor([True, False])).pooled.shape == (2, 0)
-    assert cond.with_null().tokens.shape == (4, 0, 0)
 
 
 def test_actions_are_rows_of_a_table_of_unit_normal_numbers_and_their_null_is_zero():
@@ -421,18 +414,6 @@ def test_a_batch_is_gathered_bit_for_bit_from_the_arrays(models, tmp_path, token
     mixed, mixed_rows, _ = encoder._look_up([*captions, "a man waves"], CPU)
     assert torch.equal(mixed[: len(captions)], pooled)
     assert torch.equal(mixed_rows[: len(captions), : rows.shape[1]], rows)
-
-
-def test_interruption_leaves_nothing_behind(encoder, tmp_path, monkeypatch):
-    def interrupt(*_):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(PretrainedText, "_encode", interrupt)
-    with pytest.raises(KeyboardInterrupt):
-        encoder.precompute(CAPTIONS, tmp_path)
-    assert not list(tmp_path.iterdir())
-    with pytest.raises(FileNotFoundError, match="precompute"):
-        encoder.load_cache(CAPTIONS, tmp_path)
 
 
 # Errors ---------------------------------------------------------------------------------------------------------------

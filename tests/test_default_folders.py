@@ -5,9 +5,6 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import pytest
-
-from flame_mdm.__main__ import main
 from flame_mdm.commands.sample import default_folder
 
 
@@ -38,15 +35,3 @@ def test_no_checkpoint_leads_out_of_the_folder(tmp_path, monkeypatch):
         assert ".." not in path.parts
         assert "\0" not in str(path)
         assert path.resolve().is_relative_to(tmp_path / "samples")
-
-
-@pytest.mark.slow
-def test_sweeps_and_smaller_requests_leave_no_stale_motions(trained, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    words = ["sample", str(trained), "text=a person walks", "seconds=1"]
-    assert main([*words, "samples=1", "guidance_scale=1,2.5", "--multirun"]) == 0
-    written = sorted(path.parent.name[:-7] for path in tmp_path.glob("samples/quickstart/*/motion_000.npz"))
-    assert written == [f"a-person-walks-guidance_scale={scale}-seconds=1" for scale in ("1", "2.5")]
-    for count in (3, 1):
-        assert main([*words, f"samples={count}", f"out={tmp_path / 'out'}"]) == 0
-        assert len(list((tmp_path / "out").glob("motion_*.npz"))) == count

@@ -155,32 +155,6 @@ def test_group_norm_without_padding_is_torchs() -> None:
     torch.testing.assert_close(norm(x, torch.ones(2, 1, 5)), expected)
 
 
-@pytest.mark.parametrize("network", [MDMEncoder, MDMDecoder])
-def test_attention_to_padding_is_the_legacy_flag(network: type[Denoiser]) -> None:
-    """Without the mask, padding is seen by every frame, as in the released models."""
-    denoiser = network(D, D, C, **TRANSFORMER, mask_padding=False).double().eval()
-    x_t, t, mask, cond = batch()
-    y = denoiser(x_t, t, mask, cond)
-    assert_same(denoiser(x_t, t, torch.ones_like(mask), cond), y)
-    x_t[1, -1] += 1
-    assert ((denoiser(x_t, t, mask, cond) - y)[1, 0].abs() > 1e-9).any()
-
-
-def test_gru_recurs_over_frames_or_by_flag_over_the_batch() -> None:
-    x_t, t, mask, cond = batch()
-    changed = x_t.clone()
-    changed[0, 0] += 1
-
-    def reached(gru: Denoiser) -> torch.Tensor:
-        return (gru(changed, t, mask, cond) - gru(x_t, t, mask, cond)).abs().amax(-1) > 1e-12
-
-    frames, legacy = reached(tiny("mdm_gru.yaml")), reached(tiny("mdm_gru.yaml", recur_over_batch=True))
-    assert frames[0].all()
-    assert not frames[1:].any()
-    assert legacy[:, 0].all()
-    assert not legacy[:, 1:].any()
-
-
 @pytest.mark.parametrize("length_token", [True, False])
 @pytest.mark.parametrize("cross_attention", [True, False])
 def test_flame_ablations(length_token: bool, cross_attention: bool) -> None:
@@ -233,16 +207,6 @@ def test_token_positions_do_not_move_the_frames() -> None:
     assert_same(encoder(x_t, t, mask, Condition(cond.pooled, cond.tokens, two)), encoder(x_t, t, mask, fewer))
     with pytest.raises(UserError, match=r"6 condition tokens: denoiser\.max_tokens \(5\)"):
         encoder(*batch(tokens=6))
-
-
-def test_action_embedding_is_added_as_it_is() -> None:
-    encoder = MDMEncoder(D, D, 16, **TRANSFORMER, project_condition=False).double()
-    assert not [name for name in encoder.state_dict() if "projection" in name]
-    x_t, t, mask, cond = batch(cond_features=16)
-    unconditioned = MDMEncoder(D, D, 0, **TRANSFORMER).double()
-    unconditioned.load_state_dict(encoder.state_dict())
-    zero = Condition(torch.zeros_like(cond.pooled), cond.tokens, cond.token_mask)
-    assert_same(encoder(x_t, t, mask, zero), unconditioned(x_t, t, mask, zero))
 
 
 def test_bad_options_are_named() -> None:

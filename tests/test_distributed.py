@@ -13,9 +13,7 @@ import torch
 from support.runs import RUN, TWO, alarm, finish, reference, spawn
 from torchmetrics import MeanMetric
 
-from evaluators.extractors.motion_clip import MotionCLIPTask
 from flame_mdm.__main__ import main
-from flame_mdm.batch import collate
 from flame_mdm.checkpoints.loading import load_task
 from flame_mdm.checkpoints.model_files import read_checkpoint
 from flame_mdm.commands import train
@@ -92,20 +90,6 @@ def test_data_is_prepared_once_and_no_process_is_without_a_validation_batch(tiny
         assert len(data.val_dataloader()) == batches
         data.trainer.global_rank = world - 1  # type: ignore[union-attr]
         assert len(data.val_dataloader()) >= 1
-
-
-def test_motion_clip_keeps_fewer_pairs_than_processes_once_each():
-    """Every process is given all pairs then."""
-    sizes = ["latent_dim=16", "ff_size=16", "num_layers=1", "embedding_dim=8"]
-    words = ["condition=learned", "condition.features=16", *(f"task.network.{size}" for size in sizes)]
-    config = compose("motion_clip/synthetic", words)
-    batch = collate([(name, torch.randn(40, 263), "a person walks", None) for name in ("a", "b")])
-    for clips, rank, kept in ((1, 0, 2), (1, 1, 0), (2, 0, 2), (2, 1, 2)):
-        task = MotionCLIPTask.build(config, instantiate(config["representation"]))
-        data = SimpleNamespace(val=range(clips))
-        task.trainer = SimpleNamespace(global_rank=rank, world_size=2, datamodule=data)  # type: ignore[assignment]
-        task.eval().validation_step(batch, 0)
-        assert len(torch.cat([torch.empty(0), *cast(list, task.val_metrics["loss"].keys)])) == kept
 
 
 def test_processes_are_started_with_the_words_of_one_job(tiny, tmp_path, monkeypatch):

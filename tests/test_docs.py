@@ -36,19 +36,10 @@ NOT_COMPOSED = {
 }
 """Commands of each page that are not composed: they name a part that the reader writes (mine, my_set), or leave a name
 open (...)."""
-TARGETS = {
-    "setup",
-    "test",
-    "test-fast",
-    "test-tools",
-    "test-robustness",
-    "lint",
-    "bench",
-    "docs",
-    "web",
-    "blender",
-    "help",
-}
+TARGETS = {"setup", "test", "test-fast", "test-tools", "test-robustness", "lint", "bench", "docs"}
+TARGETS |= {"web", "blender", "help"}
+    ["setup", "test", "test-fast", "test-tools", "test-robustness", "lint", "bench", "docs", "web", "blender", "help"]
+)
 
 
 def broken_links(page: Path, text: str) -> list[str]:
@@ -194,8 +185,10 @@ def strings() -> Iterator[str]:
     """Yields the strings of the code, with … for what is filled in."""
     for path in [*(ROOT / "flame_mdm").rglob("*.py"), *(ROOT / "evaluators").rglob("*.py")]:
         for node in ast.walk(ast.parse(path.read_text())):
-            parts = node.values if isinstance(node, ast.JoinedStr) else [node]
-            yield "".join(str(part.value) if isinstance(part, ast.Constant) else "…" for part in parts)
+            if isinstance(node, ast.JoinedStr):
+                yield "".join(str(part.value) if isinstance(part, ast.Constant) else "…" for part in node.values)
+            elif isinstance(node, ast.Constant):
+                yield str(node.value)
 
 
 def test_messages_on_the_page_of_first_problems_are_those_of_the_code():

@@ -13,18 +13,15 @@ from support.runs import TINY
 import flame_mdm
 from flame_mdm.__main__ import main
 from flame_mdm.config import compose, instantiate
-from flame_mdm.data import bandai
 from flame_mdm.data.store import write_store
 from flame_mdm.data.synthetic import Synthetic
 from flame_mdm.errors import UserError
-from flame_mdm.formats import bvh
 from flame_mdm.formats.motion import Motion
 from flame_mdm.representations.humanml import HumanML
 from flame_mdm.representations.rot6d import Rot6D
 from flame_mdm.representations.skeleton import KIT21, SMPL22, SMPL24, find_joints, part_names
 from flame_mdm.representations.smpl import SMPL
 from flame_mdm.sampling.editing import Edited, edit
-from flame_mdm.sampling.generation import generate, write_motions
 from flame_mdm.sampling.reading import read_motion
 from flame_mdm.seeds import seeded_noise
 from flame_mdm.task import MotionGeneration
@@ -243,15 +240,6 @@ def npz(folder: Path, **arrays) -> Path:
     return folder / "motion.npz"
 
 
-def test_samples_are_read_as_they_are(diffusion, tmp_path):
-    motions = generate(diffusion, "a person waves", frames=24)
-    write_motions(tmp_path, motions, {"seed": 0})
-    read = read_motion(diffusion.representation, tmp_path / "motion_000.npz")
-    assert np.array_equal(read.features, motions[0].features)
-    np.testing.assert_allclose(read.joints, motions[0].joints, atol=1e-5)
-    assert read.text == "a person waves"
-
-
 @pytest.mark.parametrize(("fps", "turned"), [(20, 2.0), (50, 0.0), (100, -1.3), (10, 3.0)])
 def test_joints_of_any_rate_and_facing(diffusion, motion, tmp_path, fps, turned):
     read = read_motion(diffusion.representation, npz(tmp_path, joints=walk(fps, turned), fps=fps))
@@ -261,21 +249,6 @@ def test_joints_of_any_rate_and_facing(diffusion, motion, tmp_path, fps, turned)
     assert np.abs(read.joints[:count] - motion.joints).max() < (0.15 if fps == 10 else 0.01)
     if fps == 20:
         np.testing.assert_allclose(read.features[:count], motion.features, atol=2e-3)  # facing is smoothed over time
-
-
-def test_a_bvh_file_of_a_known_skeleton(diffusion, tmp_path):
-    joints, file = 100 * walk(50), tmp_path / "take.bvh"
-    names = tuple(dict.fromkeys(("joint_Root", *bandai.JOINTS.values())))
-    positions = np.zeros((len(joints), len(names), 3))
-    for joint, name in enumerate(bandai.JOINTS.values()):
-        positions[:, names.index(name)] = joints[:, joint]
-    positions[:, names.index("Hips")] = joints[:, 0]
-    channels, parents = (("Xposition", "Yposition", "Zposition"),) * len(names), (-1, *[0] * (len(names) - 1))
-    skeleton = (parents, np.zeros((len(names), 3)), channels, (), np.zeros((0, 3)))
-    bvh.write(bvh.Bvh(names, *skeleton, positions.reshape(len(joints), -1), 50.0), file)
-    expected = read_motion(diffusion.representation, npz(tmp_path, joints=walk(20), fps=20))
-    others = [joint for joint in range(22) if joint != bandai.SPINE1]
-    assert np.abs(read_motion(diffusion.representation, file).joints - expected.joints)[:, others].max() < 0.02
 
 
 def test_parts_of_clips_and_of_files_in_world_coordinates(diffusion, store, tmp_path):

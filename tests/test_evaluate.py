@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from support.runs import TINY, finish, spawn
+from support.runs import TINY
 
 from evaluators.evaluation import Evaluation
 from evaluators.evaluator import Evaluator, Extracted, Motions
@@ -29,7 +29,7 @@ from flame_mdm.__main__ import main
 from flame_mdm.checkpoints.loading import load
 from flame_mdm.checkpoints.locating import SHIPPED
 from flame_mdm.checkpoints.model_files import read_checkpoint
-from flame_mdm.config import compose, instantiate
+from flame_mdm.config import instantiate
 from flame_mdm.data.datamodule import MotionDataModule
 from flame_mdm.data.synthetic import Synthetic
 from flame_mdm.errors import UserError
@@ -186,13 +186,6 @@ def test_quick_results_few_motions_and_clips_left_out_are_marked(runs, tmp_path,
     assert "excluded from the data set: 1191 motions of HumanAct12" in out
     assert "QUICK RUN, NOT FOR PUBLICATION" in out
     assert biased in out
-
-
-def test_results_of_models_in_the_package_go_to_the_working_directory(runs):
-    config, root = compose("quickstart", DATA[1:]), str(runs.root)
-    parts = {"data": config["data"], "representation": config["representation"], "data_root": root}
-    request = EvaluationRequest(ckpt="quickstart", extractor="none", quick=True, **parts)
-    assert make_plan(request, "cpu").path.parts[:3] == ("runs", "quickstart", "evaluation")
 
 
 def test_clips_that_may_have_been_seen_in_training_are_marked():
@@ -357,31 +350,6 @@ def test_processes_share_the_work_and_get_one_result(runs, tmp_path, pool):
     assert passes == 2 * 3, "real, real again for comparisons of sets, and measured; in each replication"
     assert baselines == [(alone, passes)] * 2
     assert ends == ["UserError", "SystemExit"], "one says why"
-
-
-LEAVES_NO_THREADS = """
-import sys
-from pathlib import Path
-from flame_mdm.__main__ import main
-code = main(sys.argv[1:])
-names = [path.read_text().strip() for path in Path("/proc/self/task").glob("*/comm")]
-sys.exit(code or ", ".join(name for name in names if "gloo" in name) or 0)
-"""
-
-
-def test_torchrun_writes_one_result(runs, tmp_path):
-    """And no thread of gloo is left, which could abort the process while Python shuts down."""
-    script, out = tmp_path / "evaluate.py", tmp_path / "result.json"
-    script.write_text(LEAVES_NO_THREADS)
-    torchrun = ["torch.distributed.run", "--standalone", "--nproc-per-node=2", str(script), "evaluate"]
-    words = [f"ckpt={runs.copy(tmp_path)}", "extractor=none", f"out={out}", "device=cpu"]
-    words += ["samples=5", "replications=1", "quick=true"]
-    code, printed, errors = finish(spawn([*torchrun, *words]))
-    assert code == 0, errors
-    assert printed.count("written:") == 1
-    values: Any = read_result(out).values
-    assert (values["jitter"].n, values["multimodality"].mean) == (5, None)
-    assert [path.name for path in motions(out).iterdir()] == ["rep_0.npz"]
 
 
 # Motions of others ----------------------------------------------------------------------------------------------------
@@ -587,24 +555,6 @@ def test_metrics_of_2026(runs):
     assert values["generated kimodo/fullbody_keyframe"] == pytest.approx(drift, abs=0.01)
 
 
-def test_models_without_text_are_measured_by_protocols_of_their_own(runs):
-    words = [word for word in GENERATOR if not word.startswith("condition")]
-    for condition, protocol in (("action", "action_to_motion_own"), ("none", "unconditioned")):
-        size = ["condition.features=16"] if condition == "action" else []
-        config = compose("quickstart", [*words, f"condition={condition}", *size])
-        model = MotionGenerator.build(config, instantiate(config["representation"]), actions=Synthetic.actions).eval()
-        model.facts = {"dataset": "synthetic"}
-        assert default_protocol(model) == protocol
-        evaluation = runs.evaluation(protocol, samples=4)
-        evaluation.protocol.check_model(model)
-        evaluation.protocol.check_data(evaluation.clips)
-        options = sampling_options(evaluation.protocol, model)
-        source = Generator(model, evaluation.protocol, evaluation.clips, *options, seed=0, batch_size=4, progress=False)
-        assert means(evaluation.run(source))["generated fid"] is None
-        with pytest.raises(UserError, match=f"trained with condition {condition}"):
-            runs.evaluation().protocol.check_model(model)
-
-
 def test_smoothing_takes_each_motion_for_itself(runs):
     rough, smooth = runs.evaluation("text_to_motion", samples=8), runs.evaluation("text_to_motion_flame", samples=8)
     one, other = (evaluation.run(runs.generator(evaluation)) for evaluation in (rough, smooth))
@@ -674,43 +624,6 @@ def test_edits_keep_what_they_are_to_keep(runs, tmp_path, name):
         assert np.abs(motion - real)[~kept].max() > 0.1
 
 
-def test_training_motions_are_their_own_nearest(runs, tmp_path):
-    protocol = tmp_path / "copies.yaml"
-    protocol.write_text(
-        "version: 1\ncondition: text\nreplications: 1\nsamples: 30\n"
-        "extractor: {_target_: evaluators.extractors.MotionCLIPExtractor}\n"
-        "metrics: {nearest: {_target_: evaluators.metrics.memorization.NearestTraining}}\n"
-    )
-    data = runs.data()
-    measured: dict[str, Any] = {}
-    for split in ("train", "test"):
-        evaluation = runs.evaluation(str(protocol), features=True)
-        evaluation = replace(evaluation, clips=data.clips(split), training=data.clips("train"))
-        measured[split] = evaluation.run(Baseline("real", evaluation.clips, "text", 0))
-    distance = {split: x.values["nearest/joints"].mean for split, x in measured.items()}
-    assert distance["train"] < 1e-6  # rounding, as batches differ
-    assert distance["test"] > 0.001
-    assert measured["train"].nearest == {kind: pytest.approx([0.0] * 30, abs=1e-6) for kind in ("generated", "real")}
-    assert measured["test"].nearest["real"] == sorted(measured["test"].nearest["real"])
-
-
-def test_baselines_show_what_each_metric_sees(runs):
-    values: dict[str, Any] = {}
-    for kind in Baseline.KINDS:
-        evaluation = runs.evaluation(features=True)
-        measured = evaluation.run(Baseline(kind, evaluation.clips, "text", 0))
-        values |= {name.replace("generated", kind): mean for name, mean in means(measured).items()}
-    truth: Any = {name: value.mean for name, value in (measured.ground_truth or {}).items()}
-    assert values["real attributes/all"] > 0.95
-    assert values["shuffled fid"] == pytest.approx(truth["fid"], rel=1e-3), "the same motions"
-    assert values["shuffled attributes/all"] < 0.5
-    assert values["noisy jitter"] > 5 * truth["jitter"]
-    assert values["noisy foot_skating"] > 5 * truth["foot_skating"]
-    assert values["static static_share"] == 1
-    assert values["static jitter"] < 0.1
-    assert values["static fid"] > 10 * truth["fid"]
-
-
 def test_shuffled_motions_are_all_there_and_belong_to_what_others_ask_for(runs):
     clips = runs.data().test
     rows = load_protocol("synthetic", clips.representation).rows(clips, 0, 0)
@@ -728,15 +641,6 @@ def test_shuffled_motions_are_all_there_and_belong_to_what_others_ask_for(runs):
         Baseline("shufled", clips, "text", 0)
     with pytest.raises(UserError, match="without text or labels cannot be shuffled"):
         Baseline("shuffled", clips, "none", 0)
-
-
-def test_static_motions_of_poses_hold_the_first_frame(runs):
-    clips = runs.data().test
-    rows = load_protocol("synthetic", clips.representation).rows(clips, 0, 0)[:3]
-    clips.representation = Rot6D()
-    clips.store.motion = lambda clip: np.random.default_rng(0).normal(size=(clip.length, 150))
-    for motion in Baseline("static", clips, "text", 0)("rep_0", rows, 0).features:
-        assert (motion == motion[0]).all()
 
 
 # Evaluation during training -------------------------------------------------------------------------------------------

@@ -1,7 +1,6 @@
 """Full disks, loading processes that die or stop, kills at random moments; what the start of a command imports."""
 
 import io
-import json
 import multiprocessing
 import os
 import random
@@ -14,7 +13,6 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -26,10 +24,7 @@ from support.runs import TINY, finish, spawn
 from flame_mdm.checkpoints.model_files import read_checkpoint
 from flame_mdm.commands import prepare, train
 from flame_mdm.conditions.text import CaptionCache
-from flame_mdm.data.store import Store, write_store
-from flame_mdm.data.synthetic import Synthetic
 from flame_mdm.errors import UserError
-from flame_mdm.representations.humanml import HumanML
 from flame_mdm.signals import StopRequest
 from flame_mdm.training.checkpointing import LAST, AtomicCheckpoints, newest
 from flame_mdm.training.guards import lost_worker
@@ -92,38 +87,6 @@ def test_a_cache_of_captions_without_room_leaves_nothing(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.fixture
-def small_disk(tmp_path) -> Iterator[Path]:
-    """A disk of 2 MiB."""
-    folder = tmp_path / "disk"
-    folder.mkdir()
-    mount = ["mount", "-t", "tmpfs", "-o", "size=2m", "tmpfs", str(folder)]
-    if shutil.which("mount") is None or subprocess.run(mount, capture_output=True, check=False).returncode:
-        pytest.skip("mounting is not permitted here")
-    yield folder
-    subprocess.run(["umount", str(folder)], check=True)
-
-
-@pytest.mark.robustness
-def test_a_full_disk_ends_a_preparation_in_one_line(small_disk):
-    """In a process of its own: one that writes through a memory map is killed (SIGBUS)."""
-    code, _, err = finish(spawn(["flame_mdm", "prepare", *prepared(small_disk / "data", 25)]))
-    assert code == 0, f"the disk has room for the data once: {err}"
-    shutil.rmtree(small_disk / "data")
-    code, _, err = finish(spawn(["flame_mdm", "prepare", *prepared(small_disk / "data", 100)]))
-    assert code == 1, err
-    line = err.splitlines()[-1]
-    assert line.startswith(f"error: {small_disk / 'data' / STORE / 'features.npy'}: cannot be written: No space left")
-    assert " are free on the disk of " in line
-    assert list(small_disk.iterdir()) == []
-
-
-def test_the_packed_array_is_the_one_that_numpy_writes(tmp_path):
-    store = write_store(tmp_path / "store", Synthetic(clips=3), HumanML())
-    np.save(tmp_path / "other.npy", np.array(store.features))
-    assert (tmp_path / "store" / "features.npy").read_bytes() == (tmp_path / "other.npy").read_bytes()
-
-
 # Loading processes ----------------------------------------------------------------------------------------------------
 
 
@@ -167,25 +130,6 @@ def test_a_killed_loading_process_is_named_in_one_line(training, tmp_path, data_
     assert train.main(words(data_root, tmp_path / "run", f"trainer.max_steps={resumed.step + 2}")) == 0
 
 
-@pytest.mark.robustness
-def test_a_second_sigterm_ends_a_run_whose_loading_processes_hang(training):
-    process, workers = training
-    for pid in workers:
-        os.kill(pid, signal.SIGSTOP)
-    time.sleep(0.5)  # the batches that are loaded already are used up
-    for _ in range(2):  # `timeout` sends two together, which is one request
-        process.send_signal(signal.SIGTERM)
-    time.sleep(1.2)
-    assert process.poll() is None
-    process.send_signal(signal.SIGTERM)
-    code, out, err = finish(process)
-    assert code == 143, err
-    assert "Traceback" not in err
-    assert "press Ctrl-C or send SIGTERM again to stop immediately" in out
-    assert "stopped immediately. Run the same command to resume" in out
-    assert not running(workers)
-
-
 def test_which_second_signal_ends_a_run_at_once(monkeypatch):
     request = StopRequest()
     monkeypatch.setattr("flame_mdm.signals.kill_children", lambda: None)
@@ -220,11 +164,11 @@ def test_torch_messages_about_lost_workers_are_understood(tmp_path, monkeypatch)
 # Kills ----------------------------------------------------------------------------------------------------------------
 
 KILLS = int(os.environ.get("FLAME_MDM_KILLS", "4"))
-"""Kills of each command, half of them SIGKILL and half SIGTERM."""
+"""Kills, half of them SIGKILL and half SIGTERM."""
 
 
-def work(command: str, line: list[str], log: Path, signum: int, seconds: float, writing: bool) -> None:
-    """Runs a command in this process until a signal: after some seconds, or while it writes the next checkpoint."""
+def work(line: list[str], log: Path, signum: int, seconds: float, writing: bool) -> None:
+    """Trains in this process until a signal: after some seconds, or while it writes the next checkpoint."""
     save = torch.save
 
     def half(checkpoint: object, file: io.BufferedWriter) -> None:
@@ -248,16 +192,16 @@ def work(command: str, line: list[str], log: Path, signum: int, seconds: float, 
         timer.daemon = True
         if signum:
             timer.start()
-        code = import_module(f"flame_mdm.commands.{command}").main(line)
+        code = train.main(line)
         sys.stdout.flush()
     os._exit(code)
 
 
-def killed(*arguments: Any, log: Path, signum: int = 0, seconds: float = 0, writing: bool = False) -> bool:
-    """Runs a command in a process forked from one that has imported everything; returns whether the signal ended it."""
+def killed(line: list[str], log: Path, signum: int = 0, seconds: float = 0, writing: bool = False) -> bool:
+    """Trains in a process forked from one that has imported everything; returns whether the signal ended it."""
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["flame_mdm.training.fit", "evaluators.evaluation"])
-    process = context.Process(target=work, args=(*arguments, log, signum, seconds, writing))
+    context.set_forkserver_preload(["flame_mdm.training.fit"])
+    process = context.Process(target=work, args=(line, log, signum, seconds, writing))
     process.start()
     process.join()
     expected = (0, -signum, 128 + signum) if signum else (0,)
@@ -265,75 +209,29 @@ def killed(*arguments: Any, log: Path, signum: int = 0, seconds: float = 0, writ
     return process.exitcode != 0
 
 
-def result(command: str, folder: Path) -> Any:
-    """What must be the same after kills: weights, data, values."""
-    if command == "prepare":
-        return Store(folder / STORE).info, [path.name for path in folder.iterdir()]
-    if command == "train":
-        content = read_checkpoint(folder / "checkpoints" / LAST)
-        states = content["state_dict"], content["current_model_state"]
-        return content["global_step"], [{name: x.numpy().tobytes() for name, x in state.items()} for state in states]
-    report = json.loads((folder / "result.json").read_text())
-    report["checkpoint"].pop("path")
-    for key in ("command", "commit", "changed"):  # the code may be edited meanwhile
-        report["environment"].pop(key)
-    report["cost"].pop("seconds_per_sample")
-    return report
+def result(folder: Path) -> Any:
+    """What must be the same after kills."""
+    content = read_checkpoint(folder / "checkpoints" / LAST)
+    states = content["state_dict"], content["current_model_state"]
+    return content["global_step"], [{name: x.numpy().tobytes() for name, x in state.items()} for state in states]
 
 
 @pytest.mark.robustness
-@pytest.mark.parametrize("command", ["train", "prepare", "evaluate"])
-def test_kills_at_random_moments_change_nothing(command, trained, data_root, tmp_path):
+def test_kills_at_random_moments_change_nothing(data_root, tmp_path):
+    """Of a training; tests/test_evaluate.py and tests/test_interruption.py kill evaluations and preparations."""
     log, draw = tmp_path / "log", random.Random(0)
 
     def line(folder: Path) -> list[str]:
-        if command == "prepare":
-            return prepared(folder, 150)
-        if command == "train":
-            often = ["trainer.val_check_interval=50", "callbacks.checkpoints.every_n_steps=10"]
-            return words(data_root, folder, "denoiser.dropout=0.1", *often, "trainer.max_steps=120")
-        folder.mkdir(exist_ok=True)
-        shutil.copy(trained, folder)
-        options = [
-            "protocol=synthetic",
-            "extractor=none",
-            "replications=3",
-            "split=train",
-            "batch_size=4",
-            "samples=16",
-        ]
-        return [f"ckpt={folder / LAST}", *options, f"data_root={data_root}", f"out={folder / 'result.json'}"]
+        often = ["trainer.val_check_interval=50", "callbacks.checkpoints.every_n_steps=10"]
+        return words(data_root, folder, "denoiser.dropout=0.1", *often, "trainer.max_steps=120")
 
     whole, folder = tmp_path / "whole", tmp_path / "killed"
     begin = time.monotonic()
-    killed(command, line(whole), log=log)
+    killed(line(whole), log)
     longest = time.monotonic() - begin
     for number in range(KILLS):
-        signum, writing = signal.SIGTERM if number % 2 else signal.SIGKILL, command == "train" and number % 4 == 2
-        while not killed(
-            command, line(folder), log=log, signum=signum, seconds=draw.uniform(0, longest), writing=writing
-        ):
+        signum = signal.SIGTERM if number % 2 else signal.SIGKILL
+        while not killed(line(folder), log, signum, draw.uniform(0, longest), writing=number % 4 == 2):
             shutil.rmtree(folder)  # too late
-        left = sorted(path.name for path in folder.rglob("*")) if folder.exists() else []
-        print(f"{command} {number + 1}: {signal.Signals(signum).name}{', writing' * writing} leaves {left}")
-        assert STORE not in left or Store(folder / STORE).info == result(command, whole)[0], "not complete"
-    killed(command, line(folder), log=log)
-    assert result(command, folder) == result(command, whole)
-
-
-def test_help_and_misspelled_keys_do_not_wait_for_torch(tmp_path):
-    code = """
-import sys
-from importlib import import_module
-def run(command, words):
-    try:
-        return import_module(f"flame_mdm.commands.{command}").main(words)
-    except SystemExit as stop:
-        return stop.code
-for command in "train sample edit evaluate prepare browse convert export".split():
-    assert run(command, ["--help"]) == 0, command
-    assert run(command, (["quickstart"] if command == "train" else []) + ["seeed=1"]) in (1, 2), command
-    assert not {"torch", "lightning", "transformers", "scipy"} & set(sys.modules), command
-"""
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path, check=False)
-    assert done.returncode == 0, done.stderr
+    killed(line(folder), log)
+    assert result(folder) == result(whole)

@@ -15,7 +15,7 @@ from support.fixtures import ROOT
 from support.stores import write_amass
 
 from flame_mdm.__main__ import main
-from flame_mdm.data import hashed_split, store
+from flame_mdm.data import hashed_split
 from flame_mdm.data.folder import Folder
 from flame_mdm.data.store import Store, write_store
 from flame_mdm.data.synthetic import Synthetic
@@ -362,22 +362,6 @@ def test_a_first_frame_in_an_unusual_pose_is_not_an_error(tmp_path: Path):
     assert Folder(str(tmp_path)).check()[0].startswith("SMPL, unit 1, 30 fps: 1 motion, ")
     np.savez(tmp_path / "a.npz", joints=np.tile(motion[:1], (30, 1, 1)), fps=30)
     assert "the toes point backwards" in Folder(str(tmp_path)).check()[0]
-
-
-@pytest.mark.slow
-def test_the_store_does_not_depend_on_the_number_of_workers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    mine = tmp_path / "mine"
-    for number, inch in enumerate((1, INCH, 1)):
-        mixamo(mine / f"{number}" / "a.bvh", inch)
-    skeleton(mine / "1", unit=0.0254)
-    write_amass(mine / "b.npz", 90, 60.0)
-    monkeypatch.setattr(store, "CHUNK", 60)
-    contents = []
-    for workers in (1, 2):
-        source = Folder(str(mine), mirror=True, workers=workers)
-        folder = write_store(tmp_path / f"{workers}", source, HumanML()).folder
-        contents.append([path.read_bytes() for path in sorted(folder.iterdir())])
-    assert contents[0] == contents[1]
 
 
 def test_from_ten_motions_on_each_split_has_some(tmp_path: Path):

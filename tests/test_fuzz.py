@@ -7,7 +7,6 @@ import io
 import json
 import os
 import pickle
-import shutil
 import zipfile
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -28,9 +27,15 @@ from support.runs import TINY, finish, spawn
 from flame_mdm.__main__ import main
 from flame_mdm.checkpoints.hub import export
 from flame_mdm.checkpoints.model_files import read_checkpoint
+from flame_mdm.commands.tables import sizes
 from flame_mdm.errors import UserError
-from flame_mdm.reporting.tables.specs import evaluations, load_spec
+from flame_mdm.reporting.report import write_report
+from flame_mdm.reporting.study import tally
+from flame_mdm.reporting.tables.build import build
+from flame_mdm.reporting.tables.specs import load_spec
+from flame_mdm.runs import read_history
 from flame_mdm.safe_io import read_yaml
+from flame_mdm.schemas import read_result
 from flame_mdm.training.loggers import WandbRun
 
 pytestmark = pytest.mark.slow
@@ -237,97 +242,35 @@ def broken_arrays() -> Iterator[dict[str, Any]]:
     yield amass | {"poses": np.zeros((0, 156)), "trans": np.zeros((0, 3))}
 
 
-def test_damaged_motions(refused, bad, trained):
-    refused.every = 6
-    for text in broken_bvh():
-        (bad / "bad.bvh").write_text(text)
-        refused("convert", str(bad / "bad.bvh"), "out=out.json")
-    (bad / "bad.bvh").write_bytes(b"HIERARCHY\n\xff\xfe")
-    refused("convert", str(bad / "bad.bvh"), "out=out.json")
-    run = a_run(bad / "run")
-    (bad / "motions").mkdir()
-    for path in (bad / "bad.npz", bad / "motions" / "motion.npz"):
-        for content in broken_arrays():
-            np.savez(path, **content)
-            if path.name == "motion.npz":
-                refused("compare", f"runs={run} {bad / 'motions'}")
-                continue
-            refused("convert", str(path), "out=out.bvh")
-            if "poses" not in content:
-                refused("edit", f"ckpt={trained}", f"motion={path}", "region=in_between", TEXT)
-    for suffix in ("npz", "npy"):
-        stream = io.BytesIO()
-        np.savez(stream, joints=FOUR, fps=20.0) if suffix == "npz" else np.save(stream, FOUR)
-        path = bad / f"bad.{suffix}"
-        for number, data in enumerate(mangled(stream.getvalue(), 24, 5)):
-            if number < 5 or number % 3 == 0:  # zip files may begin anywhere; headers have no checksum
-                path.write_bytes(data)
-                refused("convert", str(path), "out=out.json", *(["fps=20"] if suffix == "npy" else []))
+def broken_json() -> Iterator[bytes]:
     texts = [*NO_JSON, '{"joints": []}', '{"joints": [], "fps": 20}']
     texts += [f'{{"joints": {joints}, "fps": 20}}' for joints in ('"x"', "[[[1]]]", "[[1], [1, 2]]")]
     rates = (0, -1, "x", None, [], {}, float("nan"), True)
     texts += [json.dumps({"joints": FOUR.tolist(), "fps": fps}) for fps in rates]
     numbers = (float("nan"), float("inf"), 1e300)
     texts += [json.dumps({"joints": np.full((4, 22, 3), x).tolist(), "fps": 20}) for x in numbers]
-    for data in (*(text.encode() for text in texts), b"\xff\xfe{}"):
-        (bad / "bad.json").write_bytes(data)
-        refused("convert", str(bad / "bad.json"), "out=out.bvh")
+    yield from (text.encode() for text in texts)
+    yield b"\xff\xfe{}"
 
 
-def test_damaged_own_data(refused, bad, tmp_path):
-    refused.every = 9
-
-    def own_data(name: str) -> Path:
-        folder = bad / name
-        folder.mkdir()
-        for clip in "abc":
-            np.savez(folder / f"{clip}.npz", joints=adult(60), fps=20.0)
-            (folder / f"{clip}.txt").write_text("a person stands\n")
-        return folder
-
-    def case(name: str, data: str | bytes | None, *more: str) -> None:
-        folder, root = own_data(f"data{refused.count}"), tmp_path / f"prepared{refused.count}"
-        (folder / name).unlink(missing_ok=True)
-        if data is not None:
-            (folder / "b.npz").unlink() if name == "b.bvh" else None
-            (folder / name).write_bytes(data.encode() if isinstance(data, str) else data)
-        refused.watched.append(root)
-        refused("prepare", "data=folder", f"source={folder}", f"data_root={root}", *more)
-
-    assert main(["prepare", "data=folder", f"source={own_data('whole')}", f"data_root={bad / 'root'}"]) == 0
-    for data in (None, "", "\n\n", "# x\n", b"\xff\xfe\xff"):
-        case("b.txt", data)
-    case("b.npy", "x")
-    for name, key in (("captions.csv", "captions"), ("captions.json", "captions_json"), ("skeleton.yaml", "skeletons")):
-        for text in CASES[key]:
-            case(name, text)
-    case("captions.csv", b"id,text\na,\xff\n")
-    for content in list(broken_arrays())[::3]:
-        stream = io.BytesIO()
-        np.savez(stream, **content)
-        case("b.npz", stream.getvalue())
-    for text in list(broken_bvh())[::7]:
-        case("b.bvh", text)
-    source = [f"data.source.{word}" for word in ("exclude=[none]", "motion=none", "mirror=maybe", "path=null")]
-    for word in (*source, "representation=none", "data.name=null"):
-        case("b.none", None, word)
+def written(content: dict[str, Any] | np.ndarray) -> bytes:
+    """The bytes of an array or of named arrays in a file."""
+    stream = io.BytesIO()
+    np.savez(stream, **content) if isinstance(content, dict) else np.save(stream, content)
+    return stream.getvalue()
 
 
-def test_damaged_stores(refused, bad, data_root, trained):
+def test_damaged_motions(refused, bad):
     refused.every = 6
-    whole = data_root / "synthetic-humanml-clean-smpl22"
-    for name in ("store.json", "clips.jsonl", "statistics.npz", "features.npy"):
-        content = (whole / name).read_bytes()
-        for number, data in enumerate([*mangled(content, 9, 6), None]):
-            if data is not None and ((name == "features.npy" and number > 4) or (name == "store.json" and number != 4)):
-                continue  # store.json holds the checksums of the others, not its own
-            root = bad / f"{name}{number}"
-            shutil.copytree(whole, root / whole.name)
-            file = root / whole.name / name
-            file.unlink() if data is None else file.write_bytes(data)
-            refused("evaluate", f"ckpt={trained}", "extractor=none", "quick=true", f"data_root={root}")
-            if name != "store.json" or data is not None:
-                refused("browse", "data=synthetic", "data.source.clips=60", f"data_root={root}")
+    cases = [("bvh", text.encode()) for text in broken_bvh()] + [("bvh", b"HIERARCHY\n\xff\xfe")]
+    cases += [("npz", written(content)) for content in broken_arrays()] + [("json", data) for data in broken_json()]
+    for suffix, whole in (("npz", {"joints": FOUR, "fps": 20.0}), ("npy", FOUR)):
+        damaged = list(mangled(written(whole), 24, 5))
+        cases += [(suffix, data) for data in (*damaged[:5], *damaged[6::3])]  # cut: zip files may begin anywhere
+    for suffix, data in cases:
+        (bad / f"bad.{suffix}").write_bytes(data)
+        out = "out=out.bvh" if suffix == "json" else "out=out.json"
+        refused("convert", str(bad / f"bad.{suffix}"), out, *(["fps=20"] if suffix == "npy" else []))
 
 
 def test_strange_texts_are_legal(trained, tmp_path, monkeypatch):
@@ -398,94 +341,46 @@ def malformed(name: str, content: Any = None, count: int = 2) -> list[str]:
     return [*texts, *(text[: int(at)] for at in draw.integers(1, len(text) - 1, 8))]
 
 
-def whole(name: str) -> str:
-    return json.dumps(CASES["files"][name]["content"])
+def reader(name: str, folder: Path) -> tuple[Path, Callable[[], object]]:
+    """The path of a file of results or runs, and what reads it."""
+    run, path = a_run(folder / "run"), folder / f"{name}{'.yaml' if name in ('spec', 'config') else '.json'}"
+    if name in ("provenance", "bad_batch", "config"):
+        return run / path.name, lambda: write_report(run)
+    if name in ("pairs", "lengths"):
+        part = {"ratings": str(path)} if name == "pairs" else {"lengths": ["lengths"]}
+        (folder / "lengths").mkdir()
+        path = path if name == "pairs" else folder / "lengths" / path.name
+        return path, lambda: build("x", {"title": "x", "parts": {"A": part}}, folder, sizes)
+    reads: dict[str, Callable[[], object]] = {
+        "spec": lambda: load_spec(str(path)),
+        "result": lambda: read_result(path),
+        "ratings": lambda: tally([path]),
+        "wandb": lambda: WandbRun(str(folder), offline=True),
+    }
+    return path, reads[name]
 
 
-def test_specs_of_tables(refused, bad):
-    refused.every = 8
-    path = bad / "mine.yaml"
-    words = [f"table={path}", "evaluate=false", "results=none"]
-    path.write_text(whole("spec"))
-    assert main(["tables", *words, f"out={bad / 'out'}"]) == 0, "but for what is changed below"
-    for data in (*(text.encode() for text in (*malformed("spec"), *NO_YAML)), b"title: \xff\n"):
-        path.write_bytes(data)
-        refused("tables", *words)
+@pytest.mark.parametrize("name", CASES["files"])
+def test_files_of_results_and_runs(name, tmp_path):
+    path, read = reader(name, tmp_path)
+    content = CASES["files"][name].get("content") or json.loads(path.read_text())
+    path.write_text(json.dumps(content))
+    if name != "wandb":  # which would start a run
+        read()
+    for text in (*malformed(name, content), *(NO_YAML if path.suffix == ".yaml" else [])):
+        path.write_text(text, encoding="utf-8")
+        with pytest.raises(UserError) as error:
+            print(text[:200], read())
+        assert "\n" not in str(error.value), text[:200]
 
 
-def test_damaged_results(refused, bad):
-    refused.every = 5
-    spec, run = bad / "mine.yaml", a_run(bad / "run")
-    content = CASES["files"]["spec"]["content"]
-    spec.write_text(json.dumps({"title": "x", "parts": {"A": content["parts"]["A"]}}))
-    ((_, (request, _)), _) = evaluations(load_spec(str(spec))["parts"]["A"])
-    in_table, in_run = request.path(bad / "results"), run / "evaluation" / "p-1" / "x" / "result.json"
-    words = [f"table={spec}", "evaluate=false", f"results={bad / 'results'}"]
-    for path in (in_table, in_run):
-        path.parent.mkdir(parents=True)
-        path.write_text(whole("result"))
-    assert main(["tables", *words, f"out={bad / 'out'}"]) == 3  # written, but the result is not valid
-    assert main(["report", str(run)]) == 0
-    (run / "report.html").unlink()
-    refused.watched.append(run)
-    numbers = [whole("result").replace("4.5", number) for number in ("1e999", "4.5.5", "1_0")]
-    for number, text in enumerate([*malformed("result"), *numbers]):
-        for path in (in_table, in_run):
-            path.write_text(text)
-        refused(*(["tables", *words] if number % 4 < 2 else ["report", str(run)]))
-
-
-def test_damaged_runs(refused, bad):
-    refused.every = 9
-    run, other = a_run(bad / "run"), a_run(bad / "other")
-    refused.watched.append(run)
-
-    def case(name: str, text: str) -> None:
-        before = (run / name).read_bytes() if (run / name).exists() else None
-        (run / name).write_text(text, encoding="utf-8")
-        refused("report", str(run))
-        if refused.count % 6 == 0 and name != "bad_batch.json":  # which comparisons do not read
-            refused("compare", f"runs={run} {other}")
-        (run / name).unlink() if before is None else (run / name).write_bytes(before)
-
-    for name in ("provenance", "bad_batch"):
-        for text in malformed(name):
-            case(f"{name}.json", text)
-    for text in (*malformed("config", json.loads((run / "config.yaml").read_text()), 3), *NO_YAML):
-        case("config.yaml", text)
-    line = '{"step": 3, "train/loss": 1.5}\n'
+def test_histories(tmp_path):
+    run, line = a_run(tmp_path / "run"), '{"step": 3, "train/loss": 1.5}\n'
     wrong = ('"x"', "null", "[]", "{}", "true", "1_0", "'1'")
-    broken_lines = [line.replace("1.5", value) for value in wrong]
-    broken_lines += [line.replace("3", step) for step in (*wrong, "-1", "1.5", "NaN", "1e999", "9" * 400)]
-    broken_lines += ["\n", *(f"{text}\n" for text in NO_JSON if text != "null"), line.replace("step", "stop")]
-    for number, text in enumerate((*broken_lines, line[:-9] + "\n")):
-        case("metrics.jsonl", [text, line + text, text + line][number % 3])
-    for name in ("provenance.json", "metrics.jsonl", "config.yaml"):
-        folder = a_run(bad / f"bytes-{name}")
-        (folder / name).write_bytes(b"\xff\xfe{}\n")
-        refused("report", str(folder))
-
-
-def test_other_damaged_files(refused, bad, tmp_path):
-    """Ratings and lengths of tables, times of benchmarks, notes for W&B."""
-    refused.every = 8
-    path, spec = bad / "ratings.json", bad / "mine.yaml"
-    for text in malformed("ratings"):
-        path.write_text(text)
-        refused("compare", f"ratings={path}")
-    spec.write_text(json.dumps({"title": "x", "parts": {"C": {"lengths": ["a"]}, "D": {"ratings": str(path)}}}))
-    words = [f"table={spec}", "evaluate=false", f"results={bad}"]
-    (bad / "lengths").mkdir()
-    for file, name in ((path, "pairs"), (bad / "lengths" / "a.json", "lengths")):
-        for text in malformed(name):
-            file.write_text(text)
-            refused("tables", *words)
-        file.write_text(whole(name))
-    assert main(["tables", *words, f"out={bad / 'out'}"]) == 0
-    for text in (*NO_JSON, '{"a": "x"}', '{"a": null}', '{"a": [1]}', '{"a": true}'):
-        (bad / "times.json").write_text(text)
-        refused("benchmark", "synthetic", "evaluate=false", f"out={bad}")
-    for text in malformed("wandb", count=3):
-        (tmp_path / "wandb.json").write_text(text)
-        with pytest.raises(UserError, match=r"wandb\.json"):
-            WandbRun(str(tmp_path), offline=True)
+    broken = [line.replace("1.5", value) for value in wrong] + ["\n", line.replace("step", "stop")]
+    broken += [line.replace("3", step) for step in (*wrong, "-1", "1.5", "NaN", "1e999", "9" * 400)]
+    for text in (*broken, *(f"{text}\n" for text in NO_JSON if text != "null")):
+        for content in (text, line + text, text + line):
+            (run / "metrics.jsonl").write_text(content, encoding="utf-8")
+            with pytest.raises(UserError, match=r"metrics\.jsonl"):
+                read_history(run)

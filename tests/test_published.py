@@ -12,7 +12,7 @@ import yaml
 from support.fixtures import ROOT, recipe
 
 from evaluators.evaluator import Evaluator, Motions
-from evaluators.protocol import load_protocol, protocol_config
+from evaluators.protocol import load_protocol
 from flame_mdm.commands.tables import sizes
 from flame_mdm.config import EXPERIMENTS, Config, instantiate, recipes
 from flame_mdm.errors import UserError
@@ -35,6 +35,9 @@ REPORTED = {f"{name}: {label}": part for name, parts in PUBLISHED.items() for la
 NUMBER = re.compile(r"(\d{1,3}(,\d{3})*|\d+)(\.\d+)?(M|%)?( ±\d*\.\d+)?")
 UNREAD = "humanml3d/mdm_motion272"
 """Recipe of features that no evaluator reads."""
+
+
+pytestmark = pytest.mark.usefixtures("composed_once")
 
 
 @cache
@@ -198,41 +201,6 @@ def expected_values() -> dict[str, dict[str, Any]]:
     return yaml.safe_load((EXPERIMENTS / "evaluation" / "text_to_motion_t2m.yaml").read_text())["expected"]
 
 
-def test_edits_are_measured_alike_by_both_extractors():
-    for name in ("prediction", "in_between", "interpolation", "upper_body"):
-        clip, t2m = (protocol_config(f"editing_{name}{end}") for end in ("", "_t2m"))
-        assert t2m.pop("extractor")["_target_"].endswith(".T2MExtractor")
-        assert clip.pop("extractor")["_target_"].endswith(".MotionCLIPExtractor")
-        assert t2m.pop("expected") == {data: {"fid": values["fid"]} for data, values in expected_values().items()}
-        assert t2m == clip | {"name": f"editing_{name}_t2m"}
-
-
-def test_small_models_say_what_they_predict():
-    page = (ROOT / "docs" / "benchmarks" / "synthetic.md").read_text()
-    for name in ("synthetic", "bandai"):
-        part = next(iter(SPECS[name]["parts"].values()))
-        assert part["columns"]["Predicts"] == {"value": "prediction"}
-        for row in models(part):
-            process = recipe(trained(row))["process"]
-            assert name != "synthetic" or f"| {row['label']} <sup>a</sup> | {process['prediction']} |" in page
-
-
-def test_protocols_cite_tables_of_their_task():
-    for path in (EXPERIMENTS / "evaluation").glob("*.yaml"):
-        text = path.read_text()
-        head = re.sub(r"\n# ", " ", text.partition("\nversion:")[0])
-        for paper, numbers in re.findall(r"(FLAME|MDM|MFM)(?:,|'s) tables? (\d(?:(?:,| and| to) \d)*)", head):
-            for number in re.findall(r"\d", numbers):
-                parts = SPECS[f"{paper.lower()}_{number}"]["parts"].values()
-                tasks = {protocol_config(part["protocol"])["condition"] for part in parts if "protocol" in part}
-                assert tasks == {yaml.safe_load(text)["condition"]}, f"{path.stem}: {paper}, table {number}"
-
-
-def test_motion_lengths_are_those_of_data_sets():
-    for part in (part for part in PARTS.values() if "lengths" in part):
-        assert all((EXPERIMENTS / "data" / f"{name}.yaml").is_file() for name in part["lengths"])
-
-
 def test_a_published_column_without_a_counterpart_is_refused(tmp_path):
     spec = SPECS["mdm_2"]
     columns = {label: column for label, column in spec["parts"]["KIT-ML"]["columns"].items() if label != "FID"}
@@ -243,59 +211,6 @@ def test_a_published_column_without_a_counterpart_is_refused(tmp_path):
 
 # What the papers say of themselves, twice or in other places ----------------------------------------------------------
 
-ROWS = """
-flame_1: {HumanML3D: 5, BABEL: 5}
-flame_2: {KIT-ML: 5}
-flame_3: {HumanML3D: 2}
-flame_4: {HumanML3D: 4}
-flame_5: {HumanML3D: 8}
-flame_9: {DDPM: 9, DDIM: 9}
-flame_10: {HumanML3D: 6}
-mdm_1: {HumanML3D: 13}  # three of them the authors' corrections
-mdm_2: {KIT-ML: 5}
-mdm_3: {HumanAct12: 7}
-mdm_4: {UESTC: 5}
-mdm_5: {HumanAct12: 3}
-mdm_6: {HumanML3D: 5}
-mdm_7: {HumanAct12: 7}
-mdm_figure_4: {User study: 1}
-mfm_1: {KIT-ML: 8}
-mfm_2: {HumanML3D: 8}
-mfm_3: {Prediction: 2, Upper body: 2, In-between: 2}
-mfm_figure_4: {HumanML3D: 2}
-"""
-
-
-def test_rows_and_cells_are_those_of_the_papers():
-    counts = {f"{name}: {part}": n for name, parts in yaml.safe_load(ROWS).items() for part, n in parts.items()}
-    assert {name: len(part["rows"]) for name, part in REPORTED.items() if name not in SETTINGS} == counts
-    holes = {}
-    for name, part in REPORTED.items():
-        columns = {column for row in part["rows"] for column in row["values"]}
-        holes[name] = sum(len(columns - row["values"].keys()) for row in part["rows"] if "source" not in row)
-    assert {name: count for name, count in holes.items() if count} == {
-        "mdm_1: HumanML3D": 3 + 2 * 10,  # multimodality of real motions, JL2P, Text2Gesture; top 1 and 2 of all
-        **{"mdm_2: KIT-ML": 3, "mfm_2: HumanML3D": 4},
-        "mfm_1: KIT-ML": 3,  # NFE of what generates frame by frame
-    }
-    assert SPECS["mdm_5"]["parts"]["HumanAct12"]["columns"]["Diversity"]["better"] == "higher", "the paper's arrow"
-
-
-def test_papers_repeat_their_main_rows():
-    main = rows("flame_1", "HumanML3D")["FLAME (Ours)"]
-    assert main == rows("flame_4", "HumanML3D")["+ frozen language model"]
-    assert {"Sampling steps": "1,000"} | main == PUBLISHED["flame_9"]["DDPM"]["rows"][0]["values"]
-    text, steps = rows("mdm_1", "HumanML3D"), rows("mdm_6", "HumanML3D")
-    assert steps["Real"] == text["Real"]
-    assert steps["T = 1000"].items() <= text["MDM (ours)"].items()
-    actions, losses = rows("mdm_3", "HumanAct12"), rows("mdm_7", "HumanAct12")
-    assert losses["Real"] == actions["Real (ours)"]
-    assert all(losses[label] == actions[label] for label in ("MDM (ours)", "w/o foot contact"))
-    kit, humanml3d = PUBLISHED["mfm_1"]["KIT-ML"]["rows"], PUBLISHED["mfm_2"]["HumanML3D"]["rows"]
-    assert [row for row in humanml3d if row["label"] != "MotionGPT"] == kit[:-1]
-    assert kit[-1] == {"label": "Our MFM", "values": {"NFE": "50", "Parameters, M": "17.9M"}}
-    assert round(settings("humanml3d/mfm")["parameters"], 1) == 17.9
-
 
 def test_real_motions_have_what_protocols_expect():
     names = {"mm_dist": "MM-Dist", "diversity": "Diversity", "fid": "FID"}
@@ -303,21 +218,6 @@ def test_real_motions_have_what_protocols_expect():
     for table, part, data in (("mdm_1", "HumanML3D", "humanml3d"), ("mdm_2", "KIT-ML", "kit")):
         real, expected = rows(table, part)["Real"], expected_values()[data]
         assert {n: float(real[c].split()[0]) for n, c in names.items()} == {n: expected[n][0] for n in names}
-
-
-def test_published_numbers_grow_where_they_must():
-    seconds = [float(row["values"]["Seconds per motion"]) for row in PUBLISHED["flame_5"]["HumanML3D"]["rows"]]
-    assert seconds == sorted(seconds)
-    for part in ("DDPM", "DDIM"):  # fewer steps, a larger distance
-        distances = [float(row["values"]["FD"]) for row in PUBLISHED["flame_9"][part]["rows"]]
-        assert distances == sorted(distances)
-    for name, part in REPORTED.items():
-        for row in part["rows"]:
-            tops = [row["values"].get(f"R precision (top {k})") for k in (1, 2, 3)]
-            if None not in tops:
-                shares = [float(top) for top in tops]
-                assert shares == sorted(shares), f"{name}, {row['label']}"
-                assert shares[2] <= 1, "a share, in all tables"
 
 
 # How settings stand beside reported ones ------------------------------------------------------------------------------

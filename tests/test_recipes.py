@@ -2,6 +2,7 @@
 
 import importlib.util
 import sys
+from functools import cache
 from typing import Any
 
 import pytest
@@ -20,6 +21,8 @@ assert SPEC.loader is not None
 generate: Any = importlib.util.module_from_spec(SPEC)
 sys.modules["generate"] = generate
 SPEC.loader.exec_module(generate)
+generate.values = cache(generate.values)  # the tables and the pages show the same ones
+pytestmark = pytest.mark.usefixtures("composed_once")
 
 
 def test_recipes_have_the_values_of_their_papers():

@@ -9,7 +9,6 @@ import shlex
 import struct
 from collections.abc import Iterator
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
@@ -25,8 +24,6 @@ from flame_mdm.reporting.plots import chart, charts
 from flame_mdm.reporting.report import charted, constants, write_report
 from flame_mdm.runs import read_history, read_run
 from flame_mdm.training import callbacks
-from flame_mdm.training.callbacks import Measurements
-from flame_mdm.training.loggers import History
 
 pytestmark = pytest.mark.slow
 
@@ -107,21 +104,6 @@ def test_the_norm_is_that_before_clipping_and_taken_for_the_log_alone(tmp_path, 
     assert pace == pytest.approx(16, rel=1e-4), "samples of a step, not of a batch"
 
 
-def test_memory_is_told_on_cuda(monkeypatch):
-    monkeypatch.setattr(torch.cuda, "max_memory_allocated", lambda device: 3 * 2**29)
-    logged = {}
-    data = SimpleNamespace(batch_size=8, train=range(80))
-    trainer: Any = SimpleNamespace(log_every_n_steps=5, world_size=1, accumulate_grad_batches=1, datamodule=data)
-    trainer.global_step = 9
-    model: Any = SimpleNamespace(device=torch.device("cuda"), log=lambda name, value, **_: logged.update({name: value}))
-    measurements = Measurements()
-    measurements.on_train_start(trainer, model)
-    trainer.global_step = 10
-    measurements.on_train_batch_end(trainer, model, None, cast(Any, range(8)), 9)
-    assert logged["train/gpu_memory_gib"] == 1.5
-    assert logged["train/epochs"] == 1
-
-
 def test_a_resumed_history_is_that_of_the_uninterrupted_run(tmp_path, data_root):
     parts = run(tmp_path / "parts", data_root, "trainer.max_steps=4", "callbacks.samples=null")
     with (parts / "metrics.jsonl").open("a") as file:  # what a killed run leaves behind
@@ -134,12 +116,6 @@ def test_a_resumed_history_is_that_of_the_uninterrupted_run(tmp_path, data_root)
         assert a[name] == b[name]
     steps = [json.loads(line)["step"] for line in (parts / "metrics.jsonl").read_text().splitlines()]
     assert steps == sorted(steps)
-
-
-def test_a_history_of_a_run_that_begins_anew_is_another(tmp_path):
-    (tmp_path / "metrics.jsonl").write_text('{"step": 40, "train/loss": 1.0}\n')
-    History(tmp_path).log_metrics({"train/loss": 2.0}, 3)
-    assert read_history(tmp_path) == {"train/loss": {3: 2.0}}
 
 
 # Weights & Biases -----------------------------------------------------------------------------------------------------

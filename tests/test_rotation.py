@@ -162,14 +162,6 @@ def test_gradients_are_finite_and_right():
             assert gradient[0, 0].item() == pytest.approx(1)
 
 
-def test_multiply_is_matrix_multiplication_and_inverse_undoes():
-    a, b, v = random_quaternions(0), random_quaternions(1), random_quaternions(2)[:, 1:]
-    product = rotation.quaternion_to_matrix(a) @ rotation.quaternion_to_matrix(b)
-    same(rotation.quaternion_to_matrix(rotation.multiply(a, b)), product, 1e-12)
-    same(rotation.rotate(a, v), (rotation.quaternion_to_matrix(a) @ v[..., None])[..., 0], 1e-12)
-    same(rotation.rotate(rotation.inverse(a), rotation.rotate(a, v)), v, 1e-12)
-
-
 def test_slerp():
     a, b = random_quaternions(3), random_quaternions(4)
     same(rotation.slerp(a, b, 0.0), a, 1e-12)

@@ -38,8 +38,6 @@ NOT_COMPOSED = {
 open (...)."""
 TARGETS = {"setup", "test", "test-fast", "test-tools", "test-robustness", "lint", "bench", "docs"}
 TARGETS |= {"web", "blender", "help"}
-    ["setup", "test", "test-fast", "test-tools", "test-robustness", "lint", "bench", "docs", "web", "blender", "help"]
-)
 
 
 def broken_links(page: Path, text: str) -> list[str]:

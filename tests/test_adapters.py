@@ -19,8 +19,6 @@ from flame_mdm.conditions.vocabulary import hashed
 from flame_mdm.config import compose, instantiate
 from flame_mdm.data.store import Store
 from flame_mdm.data.synthetic import Synthetic
-from flame_mdm.demo.request import DemoRequest
-from flame_mdm.demo.studio import Studio
 from flame_mdm.errors import UserError
 from flame_mdm.task import MotionGeneration
 from flame_mdm.training import adaptation
@@ -102,19 +100,6 @@ def test_several_adapters_add_up_and_export_merges_them(taught, tmp_path):
     torch.testing.assert_close(both.state_dict()[table], words)
     merged = export(taught / "base.safetensors", tmp_path / "merged.safetensors", adapter=files, strength=[0.5, 2])
     assert torch.equal(sampled(flame_mdm.load(merged)), sampled(both))
-
-
-def test_the_demo_offers_a_model_with_and_without_an_adapter(taught):
-    base, adapter = str(taught / "base.safetensors"), str(taught / "limp.safetensors")
-    studio = Studio([base, f"{base} + {adapter}"], "cpu")
-    expected = flame_mdm.load(base, adapter=adapter).state_dict()
-    torch.testing.assert_close(dict(studio.model(f"{base} + {adapter}").state_dict()), dict(expected), rtol=0, atol=0)
-    request = DemoRequest(model=f"{base} + {adapter}", text="a person walks")
-    assert f"flame-mdm sample {base} 'text=a person walks'" in request.command("text", None)
-    assert f"adapter={adapter}" in request.command("text", None)
-    assert f"flame_mdm.load({base!r}, adapter={adapter!r})" in request.python("text", "cpu")
-    with pytest.raises(UserError, match="give one number, or one for each of 1 adapters"):
-        flame_mdm.load(base, adapter=adapter, strength=[1, 2])
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,6 @@ import csv
 import json
 from collections.abc import Mapping
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -22,8 +21,7 @@ from evaluators.perturbations import PERTURBATIONS
 from evaluators.protocol import load_protocol
 from flame_mdm.__main__ import main
 from flame_mdm.data.synthetic import Synthetic
-from flame_mdm.reporting.audit import PHYSICS, Seen, card_name, card_of, findings, read_card, seen, write_card
-from flame_mdm.reporting.tables.format import Part, Table, fragment, markdown
+from flame_mdm.reporting.audit import PHYSICS, Seen, card_name, findings, read_card, seen, write_card
 from flame_mdm.representations.humanml import HumanML
 from flame_mdm.schemas import AuditCard, AuditedPerturbation, check_shape
 from flame_mdm.seeds import key
@@ -209,25 +207,6 @@ def test_an_audit_resumes_and_gives_the_same_card(tmp_path, monkeypatch, capsys)
     assert "extractor=none" in capsys.readouterr().err
 
 
-def test_results_and_tables_link_to_the_card_of_their_extractor(card, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    assert card_of("x", "ab" * 32) is None
-    path, _ = write_card([card], Path("runs/audit"))
-    assert card_of("x", "ab" * 32) == path
-    assert card_of("x", None) is card_of("x", "cd" * 32) is None
-    monkeypatch.setenv("FLAME_MDM_AUDITS", "elsewhere")
-    assert card_of("x", "ab" * 32) is None
-    committed = card_of("synthetic", None)
-    assert committed == Path("docs/benchmarks/audit/synthetic-none.html"), "an installed package knows its name"
-    notes = [f"extractor; audit {path}; <i>", f"audit {committed}", "not audited", f"https://e.com/{path}"]
-    part = Part("p", {}, [], [(mark, note) for mark, note in zip("abcd", notes, strict=True)])
-    table = Table("t", "t", [part], folder=Path("runs/tables"))
-    assert '<a href="../audit/x-abababababab.html">' in fragment(table)
-    assert fragment(table).count("<a ") == markdown(table).count("](") == 1
-    assert "](../audit/x-abababababab.html); " in markdown(table)
-    assert "&lt;i&gt;" in fragment(table)
-
-
 def test_each_broken_model_is_ranked_last_by_a_headline_metric():
     """Shuffled, noisy and static motions of the committed table of the synthetic set."""
     with (ROOT / "docs" / "benchmarks" / "synthetic.csv").open(encoding="utf-8") as file:
@@ -258,11 +237,6 @@ def test_committed_cards_are_listed_complete_and_small(path, tmp_path):
         assert kept.stat().st_size <= 300_000
     assert card.motions >= 368
     by_name = {perturbation.name: perturbation for perturbation in card.perturbations}
-    jitter, frozen = (seen(card, by_name[name], "jitter") for name in ("jitter", "frozen"))
-    assert jitter is not None
-    assert jitter.grade == 1
-    assert frozen is not None
-    assert frozen.rewarded
     for name in ("wrong captions", "near misses"):
         responses = {metric: seen(card, by_name[name], metric) for metric in card.metrics}
         noticed = {metric for metric, response in responses.items() if response and response.grade is not None}

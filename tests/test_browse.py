@@ -1,7 +1,6 @@
 """The page that shows a data set: which clips, what it says of them, and nothing from them that runs."""
 
 import shutil
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +15,7 @@ from flame_mdm.__main__ import main
 from flame_mdm.data import Clip
 from flame_mdm.data.store import Entry, Store, write_store
 from flame_mdm.formats.readers import read
-from flame_mdm.reporting.browse import choose, describe, find, write_clips, write_page
+from flame_mdm.reporting.browse import choose, describe, find, write_page
 from flame_mdm.representations.humanml import HumanML
 
 
@@ -141,14 +140,6 @@ def test_the_command_shows_writes_and_refuses(tmp_path, data_root, capsys):
     assert not out.exists()
     assert main(["browse"]) == 1
     assert "data=NAME, one of: " in capsys.readouterr().err
-
-
-def test_a_caption_names_one_motion_where_it_can(store, tmp_path):
-    by_id = {clip.id: clip for clip in store.clips}
-    copy = by_id[f"M3{HOSTILE}"]  # has a label only
-    clips = [*(by_id[f"{number}{HOSTILE}"] for number in range(3)), copy, replace(copy, action=None)]
-    write_clips(tmp_path, store, HumanML(), clips, 30)
-    assert [read(path).text for path in sorted(tmp_path.glob("*.npz"))] == [HOSTILE, "walks", HOSTILE, HOSTILE, ""]
 
 
 def test_own_data_are_shown_by_their_name(tmp_path, monkeypatch, capsys):

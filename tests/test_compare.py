@@ -8,14 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.stats import ttest_rel
-from support.browser import CHROMIUM, browser
 from support.pages import PROMPTS, a_run, data_of, motions, players, put, result
 from support.runs import TINY
 
 from flame_mdm.__main__ import main
 from flame_mdm.commands.compare import read_texts
 from flame_mdm.errors import UserError
-from flame_mdm.reporting.compare import find
 from flame_mdm.reporting.intervals import paired_difference, percentiles
 from flame_mdm.reporting.study import tally
 
@@ -111,24 +109,6 @@ def test_what_is_not_paired_has_no_difference(three, tmp_path, capsys):
         assert message in printed
         assert message in unescape(text)
         assert "95 %" not in printed
-
-
-@pytest.mark.tools
-@pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed")
-def test_columns_stay_readable_on_a_phone(three, tmp_path):
-    put(three[0])
-    page(three, tmp_path / "out.html")
-    with browser(tmp_path / "profile", 390, 844) as tab:
-        tab.open((tmp_path / "out.html").as_uri())
-        tab.wait("document.readyState === 'complete' && document.querySelectorAll('td').length > 15")
-        assert tab.run("document.body.scrollWidth") <= 390, "tables scroll, not the page"
-        cells = "[...document.querySelectorAll('th, td')].filter((cell) => cell.textContent)"
-        assert min(tab.run(f"{cells}.map((cell) => cell.clientWidth)")) >= 50
-
-
-def test_runs_of_the_same_name_go_by_their_folders(tmp_path):
-    folders = [a_run(tmp_path / name) for name in ("a", "b")]
-    assert [compared.label for compared in find(folders)] == [str(f) for f in folders]
 
 
 def test_runs_without_a_common_prompt_are_compared_and_not_judged(three, tmp_path, capsys):

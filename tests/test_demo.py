@@ -27,7 +27,7 @@ from support.browser import CHROMIUM, browser
 from support.fixtures import ROOT
 
 from flame_mdm.__main__ import main
-from flame_mdm.demo.request import MAX_EDITS, DemoEdit, DemoRequest, checked, parse_query
+from flame_mdm.demo.request import MAX_EDITS, DemoEdit, DemoRequest, parse_query
 from flame_mdm.errors import UserError
 from flame_mdm.formats.readers import read
 from flame_mdm.formats.retarget import presets
@@ -101,13 +101,6 @@ def query_of(bad: str) -> str:
     keys = {key for key, _ in parse_qsl(bad, keep_blank_values=True)}
     rest = {"text": "a person walks", **FAST}
     return "&".join([bad, urlencode({key: value for key, value in rest.items() if key not in keys})])
-
-
-def test_a_cleared_field_is_left_to_the_default():
-    walk = DemoRequest(text="a person walks")
-    assert checked(DemoRequest, {"text": "a person walks", "sampler": "", "seed": None}) == walk
-    with pytest.raises(UserError, match=r"unknown option seeds\. Did you mean seed"):
-        checked(DemoRequest, {"seeds": 1})
 
 
 @pytest.fixture(scope="module")

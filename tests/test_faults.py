@@ -16,14 +16,12 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 from support.runs import TINY, finish, spawn
 
 from flame_mdm.checkpoints.model_files import read_checkpoint
 from flame_mdm.commands import prepare, train
-from flame_mdm.conditions.text import CaptionCache
 from flame_mdm.errors import UserError
 from flame_mdm.signals import StopRequest
 from flame_mdm.training.checkpointing import LAST, AtomicCheckpoints, newest
@@ -77,14 +75,6 @@ def test_a_preparation_without_room_leaves_nothing(tmp_path, capsys):
         assert line.startswith(f"error: {file}: cannot be written: File too large. ")
         assert f" are free on the disk of {tmp_path / 'data'}" in line
         assert list(tmp_path.iterdir()) == []
-
-
-def test_a_cache_of_captions_without_room_leaves_nothing(tmp_path):
-    encoded = [(np.zeros(384), np.zeros((4, 384)))] * 100
-    message = r"text/model: cannot be written: File too large\. .* are free on the disk of"
-    with file_limit(10_000), pytest.raises(UserError, match=message):
-        CaptionCache.write(tmp_path / "text" / "model", [str(n) for n in range(100)], encoded, 384)
-    assert list(tmp_path.iterdir()) == []
 
 
 # Loading processes ----------------------------------------------------------------------------------------------------

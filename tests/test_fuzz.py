@@ -6,8 +6,6 @@
 import io
 import json
 import os
-import pickle
-import zipfile
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from copy import deepcopy
@@ -17,7 +15,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 from support.fixtures import ROOT
 from support.motions import adult, bvh_text
 from support.pages import a_run
@@ -26,7 +23,6 @@ from support.runs import TINY, finish, spawn
 
 from flame_mdm.__main__ import main
 from flame_mdm.checkpoints.hub import export
-from flame_mdm.checkpoints.model_files import read_checkpoint
 from flame_mdm.commands.tables import sizes
 from flame_mdm.errors import UserError
 from flame_mdm.reporting.report import write_report
@@ -142,50 +138,6 @@ def mangled(data: bytes, count: int, seed: int) -> Iterator[bytes]:
             yield data[:at] + draw.bytes(int(draw.integers(1, 50))) + data[at + 20 :]
 
 
-class Bomb:
-    """What an untrusted pickle may hold: unpickled, it makes a file in the current folder."""
-
-    def __reduce__(self):
-        return os.system, ("touch owned",)
-
-
-def foreign(content: dict[str, Any]) -> Iterator[Any]:
-    """Checkpoints that PyTorch can write and that are none of this framework, or hold nonsense."""
-    yield from ([], 3, "text", None, {}, {"state_dict": {}}, torch.zeros(3), Bomb())
-    yield {"config": Bomb(), "facts": {}, "state_dict": {}}
-    for key in ("config", "facts", "state_dict"):
-        yield from (content | {key: value} for value in ([], 3, "text", None, {}, {"a": "b"}, {1: 2}))
-    for part in ("task", "denoiser", "process", "condition", "representation"):
-        for value in (None, 3, {}, {"_target_": "os.system"}, {"_target_": "torch.nn.Linear"}, {"_target_": 3}):
-            yield content | {"config": content["config"] | {part: value}}
-    state, facts = content["state_dict"], content["facts"]
-    name = next(iter(state))
-    for value in (torch.zeros(3), "x", None, torch.zeros(0)):
-        yield content | {"state_dict": state | {name: value}}
-    yield content | {"state_dict": {f"x{key}": value for key, value in state.items()}}
-    for fact in ({"actions": None}, {"actions": 3}, {"max_frames": None}, {"max_frames": "x"}, {"max_frames": -1}):
-        yield content | {"facts": facts | fact}
-
-
-def test_foreign_checkpoints(refused, trained, bad):
-    refused.every = 5
-    path = bad / "bad.ckpt"
-    for number, value in enumerate(foreign(read_checkpoint(trained))):
-        torch.save(value, path)
-        refused("sample", f"ckpt={path}", TEXT)
-        if number % 10 == 0:
-            refused("evaluate", f"ckpt={path}", "extractor=none", "quick=true")
-            refused("import", "mdm", str(path), str(trained), "out=out.safetensors")
-    refused.every = 1
-    path.write_bytes(pickle.dumps(Bomb()))
-    for words in (["sample", f"ckpt={path}", TEXT], ["export", str(path), "out=x"]):
-        refused(*words)
-    refused("import", "flame", str(path), "out=x")
-    with zipfile.ZipFile(path, "w") as file:
-        file.writestr("readme.txt", "hello")
-    refused("sample", f"ckpt={path}", TEXT)
-
-
 def test_damaged_checkpoints(refused, trained, bad):
     refused.every = 6
     model = Path(export(trained, bad / "whole.safetensors")).read_bytes()
@@ -198,14 +150,6 @@ def test_damaged_checkpoints(refused, trained, bad):
                 refused("sample", f"ckpt={path}", TEXT)
                 refused("evaluate", f"ckpt={path}", "extractor=none", "quick=true")
                 refused("push", str(path), "a/b", "dry_run=true")
-    path, size = bad / "bad.safetensors", int.from_bytes(model[:8], "little")
-    head = json.loads(model[8 : 8 + size])
-    recipe = json.loads(head["__metadata__"]["flame_mdm"])
-    for change in (None, {"format": 99}, {"config": None}, {"config": {}}, {"facts": 3}, {"sha256": ""}):
-        text = "{" if change is None else json.dumps(recipe | change)
-        changed = json.dumps(head | {"__metadata__": {"flame_mdm": text}}).encode()
-        path.write_bytes(len(changed).to_bytes(8, "little") + changed + model[8 + size :])
-        refused("sample", f"ckpt={path}", TEXT)
 
 
 # Motion files and data ------------------------------------------------------------------------------------------------

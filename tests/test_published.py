@@ -9,13 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from support.fixtures import ROOT, recipe
+from support.fixtures import recipe
 
 from evaluators.evaluator import Evaluator, Motions
 from evaluators.protocol import load_protocol
 from flame_mdm.commands.tables import sizes
 from flame_mdm.config import EXPERIMENTS, Config, instantiate, recipes
-from flame_mdm.errors import UserError
 from flame_mdm.processes.diffusion import GaussianDiffusion
 from flame_mdm.processes.flow_matching import FlowMatching
 from flame_mdm.reporting.settings import values as recipe_values
@@ -201,14 +200,6 @@ def expected_values() -> dict[str, dict[str, Any]]:
     return yaml.safe_load((EXPERIMENTS / "evaluation" / "text_to_motion_t2m.yaml").read_text())["expected"]
 
 
-def test_a_published_column_without_a_counterpart_is_refused(tmp_path):
-    spec = SPECS["mdm_2"]
-    columns = {label: column for label, column in spec["parts"]["KIT-ML"]["columns"].items() if label != "FID"}
-    narrow = spec | {"parts": {"KIT-ML": spec["parts"]["KIT-ML"] | {"columns": columns}}}
-    with pytest.raises(UserError, match="no column is called FID"):
-        builder.build("mdm_2", narrow, tmp_path, sizes)
-
-
 # What the papers say of themselves, twice or in other places ----------------------------------------------------------
 
 
@@ -234,17 +225,3 @@ def test_each_setting_stands_beside_the_reported_one(tmp_path, monkeypatch):
     assert "Action-to-motion has 512 more parameters per class." in notes
     monkeypatch.setattr(builder, "PUBLISHED", tmp_path / "absent.yaml")
     assert texts("flame_6", tmp_path)[0] == ["HumanML3D", "BABEL"]
-
-
-def test_the_docs_tell_what_each_table_needs():
-    page = (ROOT / "docs" / "tables.md").read_text()
-    lines = [line for line in page.partition("## All tables")[2].splitlines() if line.startswith("| `")]
-    for name, spec in SPECS.items():
-        (line,) = [line for line in lines if f"`{name}`" in line.split("|")[1]]
-        for part in spec["parts"].values():
-            needed: set[str] = set()
-            if kind := extracted(part.get("extractor", ""))[0]:
-                extractor = part["extractor"]
-                needed.add(trained({"ckpt": extractor}) if kind == "MotionCLIPExtractor" else extractor)
-            needed |= {*part.get("lengths", []), *filter(None, [part.get("ratings")])}
-            assert all(f"`{word}`" in line for word in needed), f"{name}: {sorted(needed)}"

@@ -296,7 +296,7 @@ def reader(name: str, folder: Path) -> tuple[Path, Callable[[], object]]:
         path = path if name == "pairs" else folder / "lengths" / path.name
         return path, lambda: build("x", {"title": "x", "parts": {"A": part}}, folder, sizes)
     reads: dict[str, Callable[[], object]] = {
-        "spec": lambda: load_spec(str(path)),
+        "spec": lambda: build("x", load_spec(str(path)), folder, sizes),
         "result": lambda: read_result(path),
         "ratings": lambda: tally([path]),
         "wandb": lambda: WandbRun(str(folder), offline=True),

@@ -129,17 +129,9 @@ def test_the_command_shows_writes_and_refuses(tmp_path, data_root, capsys):
             decoded = HumanML().decode(torch.from_numpy(arrays["features"])).numpy()
             np.testing.assert_allclose(decoded, arrays["joints"], atol=1e-6)
 
-    capsys.readouterr()
-    for words, message in (
-        (["split=test", "clips=1", f"motions={folder}"], "holds other motions, such as motion_001_"),
-        (["split=dev"], "no split is called dev. Available: train, val, test"),
-        (["search=it's ${a} swimmer"], "in its id or captions"),
-    ):
-        assert run(*words) == 1
-        assert message in capsys.readouterr().err
+    assert run("split=test", "clips=1", f"motions={folder}") == 1
+    assert "holds other motions, such as motion_001_" in capsys.readouterr().err
     assert not out.exists()
-    assert main(["browse"]) == 1
-    assert "data=NAME, one of: " in capsys.readouterr().err
 
 
 def test_own_data_are_shown_by_their_name(tmp_path, monkeypatch, capsys):

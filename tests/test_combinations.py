@@ -8,10 +8,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from flame_mdm.batch import Condition, MotionBatch, length_mask
+from flame_mdm.batch import MotionBatch, length_mask
 from flame_mdm.config import EXPERIMENTS, compose, parameters
-from flame_mdm.denoisers import Denoiser
-from flame_mdm.errors import UserError
 from flame_mdm.processes.diffusion import GaussianDiffusion
 from flame_mdm.processes.flow_matching import FlowMatching
 from flame_mdm.representations import Representation
@@ -201,26 +199,3 @@ def test_one_encoding_a_run_and_one_forward_a_call(process, sampler):
         assert sampler == "dopri5" or len(forwards) == steps * CALLS_A_STEP.get(sampler, 1)
         for hook in hooks:
             hook.remove()
-
-
-class Mean(Denoiser):
-    """A network from outside of the framework that attends to padding."""
-
-    mask_padding = False
-
-    def forward(self, x_t: Tensor, t: Tensor, mask: Tensor, cond: Condition) -> Tensor:
-        return 0.5 * x_t + x_t.mean(1, keepdim=True)
-
-
-def test_a_denoiser_that_attends_to_padding_is_sampled_at_the_length_of_its_training():
-    task = build("mdm_encoder", "x0")
-    task.facts["max_frames"], task.denoiser = 15, Mean()
-    together, alone = task.generate(batch()), task.generate(batch(slice(2, 3)))
-    torch.testing.assert_close(alone[0, : LENGTHS[2]], together[2, : LENGTHS[2]])
-    task.denoiser.mask_padding = True
-    alone = task.generate(batch(slice(2, 3)))
-    assert (alone[0, : LENGTHS[2]] - together[2, : LENGTHS[2]]).abs().max() > 1e-3
-    parts: Any = (torch.nn.Linear(7, 7), task.process, task.condition, task.representation)
-    options: Any = {"cond_drop_prob": 0, "guidance_scale": 1, "sampler": "ddim", "num_inference_steps": 5}
-    with pytest.raises(UserError, match="Linear is no denoiser: derive it from"):
-        MotionGeneration(*parts, losses={}, optimizer={}, **options)

@@ -157,23 +157,6 @@ def test_runs_are_sampled_for_texts_or_for_what_a_folder_of_motions_shows(tmp_pa
     assert again[0]["joints"] != made[0]["joints"]
 
 
-def test_bad_requests_are_one_line(three, capsys):
-    for words, message in (
-        ([], "give either runs="),
-        (["runs=a b", "ratings=c"], "give either runs="),
-        (["runs=a a"], "two or more runs"),
-        (["runs=/nowhere /nothing"], "/nowhere: neither a run"),
-        (["runs={0} {1}", "texts= ; "], "contains no text"),
-        (["runs={0} {1}", "texts=absent.txt"], "texts=absent.txt: no such file"),
-        (["runs={0} {1}", "texts=a person walks"], "no such checkpoint"),
-        (["runs={0} {0}/samples/step_0000009"], "no such checkpoint"),
-    ):
-        assert main(["compare", *(word.format(*three) for word in words)]) == 1, words
-        error = capsys.readouterr().err
-        assert message in error
-        assert error.count("\n") == 1
-
-
 # Judgement ------------------------------------------------------------------------------------------------------------
 
 
@@ -227,21 +210,3 @@ def test_ratings_of_several_people_are_counted_once(tmp_path, capsys):
     assert "ours over real: 4 of 6 answers, 66.7% (30.0% to 90.3%), 2 raters" in capsys.readouterr().out
     with pytest.raises(UserError, match=r"copy\.json: ann also answered this page in .*x\.json"):
         tally([files[0], ratings(tmp_path / "copy.json", "ab")])
-
-
-def test_malformed_ratings_are_refused(tmp_path):
-    path = tmp_path / "ratings.json"
-    rated = '{{"study": "s", "rater": "x", "ratings": [{}]}}'
-    for content, message in (
-        ("hello", "not a JSON file"),
-        ("[]", r"the file is \[\], not a mapping"),
-        ('{"rater": "x"}', "the file has no study"),
-        (rated.format("").replace("x", ""), 'rater is "", not a non-empty text'),
-        (rated.format(""), r"ratings is \[\], not a longer list"),
-        (rated.format("3"), "ratings.0 is 3, not a mapping"),
-        (rated.format('{"a": "u", "b": "v", "choice": "c"}'), 'ratings.0.choice is "c", not'),
-        (rated.format('{"a": "u", "b": "u", "choice": "a"}'), "rating 1 compares u with itself"),
-    ):
-        path.write_text(content)
-        with pytest.raises(UserError, match=f"{path}: .*{message}"):
-            tally([path])

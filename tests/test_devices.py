@@ -34,13 +34,3 @@ def test_a_cpu_may_be_told_to_run_more_processes_than_cores(monkeypatch):
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
     check_devices({"accelerator": "auto", "devices": 2})
     check_devices({"accelerator": "cpu", "devices": 8})
-
-
-def test_other_commands_name_the_devices_of_the_machine(trained, capsys):
-    for device in ("gpu", "cuda:77", "abacus"):
-        for words in (["sample", str(trained), "text=a person walks"], ["evaluate", str(trained), "extractor=none"]):
-            assert main([*words, f"device={device}"]) == 1
-            error = capsys.readouterr().err
-            assert error.startswith(f"error: device={device}: ")
-            assert "cpu" in error
-            assert error.count("\n") == 1

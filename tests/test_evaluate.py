@@ -471,7 +471,7 @@ def unused(name: str, rows: list[DrawnClip], replication: int) -> Samples:
     raise AssertionError("sampled before all was checked")
 
 
-def test_what_does_not_fit_is_refused(runs, capsys, tmp_path):
+def test_what_does_not_fit_is_refused(runs, tmp_path):
     for message, keys in (
         ("resamples=20: give 0, or 100 or more", {"resamples": 20}),
         ("needs a feature extractor", {"extractor": None, "protocol": "text_to_motion"}),
@@ -490,12 +490,6 @@ def test_what_does_not_fit_is_refused(runs, capsys, tmp_path):
         with pytest.raises((UserError, FileNotFoundError)) as refusal:
             make_plan(EvaluationRequest(**values), "cpu")
         assert message in str(refusal.value)
-    broken, out = tmp_path / "broken.ckpt", tmp_path / "result.json"
-    broken.write_bytes(runs.model.read_bytes()[:1000])
-    assert main(["evaluate", f"ckpt={broken}", f"out={out}", "extractor=none"]) == 1
-    (line,) = [line for line in capsys.readouterr().err.splitlines() if "error:" in line]
-    assert "damaged" in line
-    assert not out.exists()
 
 
 def own(folder: Path, old: str, new: str) -> str:

@@ -281,26 +281,13 @@ def test_a_folder_is_converted(kick: Motion, tmp_path: Path, capsys: pytest.Capt
     short = Motion(kick.joints[:5], 20)
     for name in ("in/a.npz", "in/below/b.json", "double/a.npz", "double/a.json"):
         short.save(tmp_path / name)
-    (tmp_path / "empty").mkdir()
-    a, folder, out = str(tmp_path / "in" / "a.npz"), str(tmp_path / "in"), tmp_path / "out"
+    folder, out = str(tmp_path / "in"), tmp_path / "out"
     assert main(["convert", folder, str(out), "format=bvh", "rig=mixamo"]) == 0
     assert [str(path.relative_to(out)) for path in sorted(out.rglob("*.bvh"))] == ["a.bvh", "below/b.bvh"]
     assert main(["convert", folder, str(tmp_path / "on"), f"character={out / 'a.bvh'}"]) == 0
     assert (tmp_path / "on" / "below" / "b.bvh").exists()
-    capsys.readouterr()
-    for words, message in (
-        ([folder, str(out)], "is a folder: name the format"),
-        ([a, str(tmp_path / "c.bvh"), "format=bvh"], "format=... is for folders"),
-        ([str(tmp_path / "empty"), str(out), "format=bvh"], "no motion files"),
-        ([folder, folder, "format=json"], "b.json: the same file as the input"),
-        ([str(tmp_path / "double"), str(out), "format=bvh"], "another motion has the same name"),
-        ([a, "/proc/none/a.bvh"], "/proc/none/a.bvh: cannot be written"),
-        ([a], "name an input and an output file"),
-        ([a, "out=a.glb", "unit=0.01"], "meters"),
-    ):
-        assert main(["convert", *words]) == 1
-        assert message in capsys.readouterr().err
-    assert not (tmp_path / "c.bvh").exists()
+    assert main(["convert", str(tmp_path / "double"), str(out), "format=bvh"]) == 1
+    assert "another motion has the same name" in capsys.readouterr().err
 
 
 @pytest.mark.tools

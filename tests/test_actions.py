@@ -125,22 +125,10 @@ def data_of(source, root: Path, **options) -> MotionDataModule:
     return data
 
 
-def assert_batch(data: MotionDataModule):
-    """The first training batch has crops that start at the origin, and the labels of their clips."""
-    batch = next(iter(data.train_dataloader()))
-    assert batch.x.shape == (8, 60, 150)
-    assert batch.mask.all()
-    assert (batch.x[:, 0, 144:] == 0).all(), "a clip does not start at the origin"
-    assert (batch.text, batch.action is None) == (None, False)
-    actions = {clip.id: clip.action for clip in data.store.clips}
-    assert batch.action.tolist() == [actions[name] for name in batch.ids]  # type: ignore[union-attr]
-
-
 def test_humanact12_from_raw_file_to_batch(tmp_path: Path):
     write_humanact12(tmp_path / "raw")
     source = HumanAct12(str(tmp_path / "raw"))
     data = data_of(source, tmp_path)
-    assert_batch(data)
     assert source.count() == len(data.store.clips) == 360
     assert data.store.info["actions"] == list(HumanAct12.actions)
     assert data.store.info["published_split"] is False
@@ -300,7 +288,6 @@ def test_classifiers_see_smpls_joints_or_the_result_says_that_they_do_not(tmp_pa
 def test_uestc_from_raw_files_to_batch(tmp_path: Path):
     source = UESTC(str(write_uestc(tmp_path / "uestc")))
     data = data_of(source, tmp_path)
-    assert_batch(data)
     info = data.store.info
     assert len(info["actions"]) == 40
     assert info["excluded"] == {"videos of view 8, side 2": 1, "training clips that are too short": 1}

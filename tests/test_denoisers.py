@@ -112,18 +112,6 @@ def test_all_weights_get_gradients_and_time_is_continuous(path: Path) -> None:
     assert (at(400.0001) - at(400.0)).abs().max() < (at(400.5) - at(400.0)).abs().max() / 100
 
 
-@each_denoiser
-def test_unconditioned(path: Path) -> None:
-    denoiser = tiny(path, cond_features=0)
-    x_t, t, mask, _ = batch()
-    nothing = Condition(torch.zeros(len(x_t), 0), torch.zeros(len(x_t), 0, 0), None)
-    if config_of(path).get("max_tokens"):
-        with pytest.raises(UserError, match="tokens"):
-            denoiser(x_t, t, mask, nothing)
-    else:
-        assert denoiser(x_t, t, mask, nothing).isfinite().all()
-
-
 def test_paper_sizes() -> None:
     sizes = {"mdm_encoder": 17_880_327, "mdm_decoder": 26_293_511, "mdm_decoder_token": 26_293_511}
     sizes |= {"mdm_gru": 4_472_071, "mdm_unet": 23_565_959, "flame": 64_905_766}  # U-Net: 23.47M in the paper

@@ -143,13 +143,6 @@ def test_humanact12_from_raw_file_to_batch(tmp_path: Path):
     assert len(published.val) == 0
 
 
-def test_neighbors_stay_in_one_split(tmp_path: Path):
-    path = write_humanact12(tmp_path / "raw", 480, y=[0] * 430 + [5] * 50)
-    splits = [clip.split for clip in HumanAct12(str(path)).clips(20.0)]
-    assert all(len(set(splits[start : start + 10])) == 1 for start in range(0, 430, 10))
-    assert Counter(splits[:430]) == {"train": 300, "val": 40, "test": 90}
-
-
 @golden_case("smpl147")
 def test_samples_are_those_of_actor(stem: str, tmp_path: Path):
     """The whole way: pickle, store, crop, sample."""

@@ -1,4 +1,3 @@
-import os
 import shutil
 import tarfile
 import tempfile
@@ -274,20 +273,6 @@ def test_archives_give_the_same_clips_and_leave_no_files(tiny, tmp_path, monkeyp
         same(clips(path), expected)
     assert not list(temporary.iterdir())
     assert sorted(tmp_path.iterdir()) == [*archives, temporary]
-
-
-@pytest.mark.slow
-def test_a_damaged_take_is_named_unless_excluded(tiny, tmp_path):
-    root = shutil.copytree(tiny, tmp_path / "copy")
-    id_ = "dataset-2_run_active_017"
-    (path,) = root.rglob(f"{id_}.bvh")
-    os.truncate(path, 9000)
-    for workers in (1, 2):
-        with pytest.raises(ValueError, match=rf"{id_}.bvh, line \d+: .*data.source.exclude=\[{id_}\]"):
-            clips(root, workers=workers)
-    rest = clips(root, exclude=[id_])
-    assert {clip.source for clip in rest} == set(TAKES) - {id_}
-    assert Bandai(str(root), exclude=[id_]).count() == len(rest)
 
 
 def test_wrong_input_is_explained(tiny, tmp_path):

@@ -12,10 +12,8 @@ import pytest
 ROOT = Path(__file__).parent.parent
 sys.path.append(str(ROOT / "benchmarks"))  # the scripts import each other
 
-import cost  # noqa: E402
 import run  # noqa: E402
 import sections  # noqa: E402
-import steps  # noqa: E402
 
 TOY = {
     "steps": "--quick",
@@ -62,15 +60,6 @@ def test_unknown_sections_and_devices_are_refused_in_one_line(page, monkeypatch)
     with pytest.raises(SystemExit, match=r"^DEVICE=cuda: torch finds no CUDA GPU on this machine$"):
         run.main("device=cuda")
     assert not page.exists()
-
-
-def test_hours_of_a_recipe_follow_from_the_sustained_rate(monkeypatch):
-    assert cost.hours(3.6e12, 500_000, 1e12) == pytest.approx(500)
-    monkeypatch.setattr(steps, "RECIPES", ["humanml3d/mdm"])
-    rows: list[Any] = [*steps.recipe_hours(1e12), *steps.recipe_hours(4e12)]
-    slow, fast = rows
-    assert slow["hours"] == pytest.approx(slow["TFLOP per step"] * slow["steps"] / 3600)
-    assert fast["hours"] == pytest.approx(slow["hours"] / 4)
 
 
 def test_the_committed_page_is_rendered_from_the_committed_figures():

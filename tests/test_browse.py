@@ -1,6 +1,5 @@
 """The page that shows a data set: which clips, what it says of them, and nothing from them that runs."""
 
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -132,30 +131,6 @@ def test_the_command_shows_writes_and_refuses(tmp_path, data_root, capsys):
     assert run("split=test", "clips=1", f"motions={folder}") == 1
     assert "holds other motions, such as motion_001_" in capsys.readouterr().err
     assert not out.exists()
-
-
-def test_own_data_are_shown_by_their_name(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    Path("files").mkdir()
-    for name in ("a", "b"):
-        np.save(f"files/{name}.npy", synthetic().joints)
-    Path("files/skeleton.yaml").write_text("fps: 20\n")
-    Path("files/captions.csv").write_text("id,text,split\na,a person walks,train\nb,a person walks,test\n")
-    assert main(["browse", "data=folder", "source=files", "data.name=my set", "data.source.mirror=true"]) == 0
-    shutil.rmtree("files")  # a prepared set is enough from here on
-    assert main(["browse", "my set", "page.html"]) == 0
-    assert [m["id"] for m in Page(Path("page.html")).motions] == ["a", "Ma", "b"], "with the options of its preparation"
-    capsys.readouterr()
-    assert main(["browse", "data=my set", "source=files", "out=page.html"]) == 0
-    assert "already prepared; source=files is not read" in capsys.readouterr().out
-    shutil.copytree("data/my set-humanml-clean-smpl22", "data/my set-smpl147")
-    assert main(["browse", "data=my set", "representation=humanml_clean"]) == 0
-    for name, message in (
-        ("my set", "was prepared as humanml_clean and as smpl. Add rep"),
-        ("my", "no data is called"),
-    ):
-        assert main(["browse", f"data={name}"]) == 1
-        assert message in capsys.readouterr().err
 
 
 @pytest.mark.tools

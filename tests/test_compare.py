@@ -111,15 +111,6 @@ def test_what_is_not_paired_has_no_difference(three, tmp_path, capsys):
         assert "95 %" not in printed
 
 
-def test_runs_without_a_common_prompt_are_compared_and_not_judged(three, tmp_path, capsys):
-    other = a_run(tmp_path / "other", name="other")
-    motions(other / "samples" / "step_0000009", ("a person swims",))
-    assert "no prompt in common" in page([three[0], other], tmp_path / "out.html")
-    assert main(["compare", f"runs={three[0]} {other}", "rate=true", f"out={tmp_path / 'rate.html'}"]) == 1
-    assert "have no prompt in common" in capsys.readouterr().err
-    assert not (tmp_path / "rate.html").exists()
-
-
 @pytest.mark.slow
 def test_runs_are_sampled_for_texts_or_for_what_a_folder_of_motions_shows(tmp_path, trained, data_root, capsys):
     model, other = trained.parent.parent, tmp_path / "b"

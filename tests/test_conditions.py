@@ -174,20 +174,6 @@ def test_repeated_captions_are_encoded_once_and_get_the_gradients_of_all():
     torch.testing.assert_close(gradients, expected, rtol=1e-5, atol=1e-5)
 
 
-@pytest.mark.parametrize("where", ["attention", "dropout", "dropout1", "dropout2"])
-def test_dropout_in_training_only_and_shared_by_repeated_captions(where: str):
-    encoder = LearnedTokens(16, heads=2, dropout=0.0)
-    if where == "attention":
-        encoder.layer.self_attn.dropout = 0.5
-    else:
-        getattr(encoder.layer, where).p = 0.5
-    first, second = (encoder(batch_of(CAPTIONS[:1] * 2)).pooled for _ in range(2))
-    assert torch.equal(first[0], first[1])
-    assert not torch.allclose(first, second)
-    encoder.eval()
-    assert torch.equal(encoder(batch_of(CAPTIONS)).pooled, encoder(batch_of(CAPTIONS)).pooled)
-
-
 @pytest.mark.parametrize("training", [False, True])
 def test_learned_tokens_are_the_transformer_layer_of_torch_over_padded_captions(training: bool):
     torch.manual_seed(0)

@@ -273,17 +273,6 @@ def test_convert_and_edit_read_files_as_prepare_does(tmp_path: Path, monkeypatch
     np.testing.assert_allclose(np.load("made.npy"), WALK, atol=1e-6)
 
 
-def test_the_nearest_skeleton_file_applies(tmp_path: Path):
-    mixamo(tmp_path / "a" / "x.bvh")
-    mixamo(tmp_path / "b" / "deep" / "y.bvh", INCH, "theirs_")
-    skeleton(tmp_path / "b", unit=0.0254, map={joint: f"theirs_{name}" for joint, name in MIXAMO.items()})
-    source = Folder(str(tmp_path))
-    one, two = source.clips(30.0)
-    np.testing.assert_allclose(one.motion, two.motion, atol=1e-4)
-    assert len(source.findings()) == 2
-    assert "own map, unit 0.0254, 30 fps (" in source.findings()[1]
-
-
 def test_feet_without_toes_end_at_the_end_sites(tmp_path: Path):
     mixamo(tmp_path / "a.bvh")
     mixamo(tmp_path / "b.bvh", toes=0.999)

@@ -77,13 +77,6 @@ def rows(table: str, part: str) -> dict[str, dict[str, str]]:
     return {row["label"]: row["values"] for row in PUBLISHED[table][part]["rows"]}
 
 
-def texts(table: str, folder: Path) -> tuple[list[str], dict[str, list[str | None]], list[str]]:
-    """Columns, cells by label, and notes of a table with one part."""
-    (part,) = builder.build(table, SPECS[table], folder, sizes).parts
-    lines = {line.label: [cell and cell.text for cell in line.cells] for line in part.lines}
-    return list(part.columns), lines, [text for _, text in part.notes]
-
-
 def test_there_is_a_table_for_each_of_the_papers(tmp_path):
     tables = {f"{paper}_{n}" for paper, last in (("flame", 10), ("mdm", 8), ("mfm", 5)) for n in range(1, last + 1)}
     figures = {"flame_figure_4", "flame_figure_7", "mdm_figure_4"} | {f"mfm_figure_{n}" for n in (1, 4, 5, 7)}
@@ -212,16 +205,3 @@ def test_real_motions_have_what_protocols_expect():
 
 
 # How settings stand beside reported ones ------------------------------------------------------------------------------
-
-
-def test_each_setting_stands_beside_the_reported_one(tmp_path, monkeypatch):
-    columns, lines, _ = texts("flame_6", tmp_path)
-    assert columns == ["HumanML3D", "HumanML3D, reported", "BABEL", "BABEL, reported"]
-    assert lines["Maximum text length"] == ["20", "20 words", "20", "20 words"]
-    assert list(lines) == list(SPECS["flame_6"]["parts"]["HumanML3D and BABEL"]["keys"])
-    columns, lines, notes = texts("mdm_8", tmp_path)  # more recipes than settings: recipes are rows
-    assert columns == ["Parameters, M", "Parameters, M, reported"]
-    assert lines["U-net"] == ["23.57", "23.47"]
-    assert "Action-to-motion has 512 more parameters per class." in notes
-    monkeypatch.setattr(builder, "PUBLISHED", tmp_path / "absent.yaml")
-    assert texts("flame_6", tmp_path)[0] == ["HumanML3D", "BABEL"]

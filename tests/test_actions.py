@@ -197,7 +197,6 @@ def test_the_unconstrained_reference_is_read(tmp_path: Path):
         read_unconstrained(tmp_path / "x.npy")
 
 
-@pytest.mark.slow
 def test_unconditioned_motions_are_compared_with_the_reference_motions(tmp_path: Path):
     """24 joints as models generate them, y up, and the same as the 15 of the file, y down and not from the pelvis."""
     torch.manual_seed(0)

@@ -43,11 +43,8 @@ def test_every_recipe_composes_is_short_and_says_what_it_is():
 
 WRONG = {
     "trainer.max_step=5": "unknown config key 'trainer.max_step'. Did you mean trainer.max_steps",
-    "max_steps=5": "unknown config key 'max_steps'. Did you mean trainer.max_steps?",
     "denoiser=mdm_encodr": "no denoiser is called 'mdm_encodr'. Did you mean mdm_encoder",
-    "denoiser.latent_dims=3": "Did you mean denoiser.latent_dim?",
     "data.source.clip=3": "Did you mean data.source.clips",
-    "nonsense": "cannot read an override",
     "trainer.max_steps=[1": "cannot read an override",
     "+denoiser.heads=3": "unknown config key 'denoiser.heads'. Did you mean denoiser.num_heads?",
     "denoiser._target_=flame_mdm.denoisers.mdm.Encoder": "no such class or function",
@@ -274,15 +271,12 @@ def test_words_become_typed_settings(words, values):
         (["flie=x"], "unknown config key 'flie'. Did you mean file?"),
         (["x", "file=y"], "file is given twice"),
         (["steps=1.5"], "steps=1.5: must be a whole number or a list"),
-        (["steps=[1,x]"], "steps=[1, 'x']: must be"),
         (["loop=yes"], "loop=yes: must be true or false"),
         (["rate=nan"], "rate=nan: must be a finite number or null"),
         (["rate=1,2"], "Add --multirun"),
         (["which=first"], "which=first: must be one of last, best"),
-        (["rate=[1"], "cannot read an override"),
         (["names='a"], "No closing quotation"),
         (["--fast"], "unknown option --fast"),
-        (["rate=1,2", "--multirun", "steps=x"], "steps=x: must be"),
     ],
 )
 def test_wrong_words_are_one_line(words, message, capsys):

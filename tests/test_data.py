@@ -128,31 +128,6 @@ def test_crops_follow_the_rule_of_the_field_or_repeat_the_last_frame():
     np.testing.assert_array_equal(Whole(1, 10)(30, generator), np.arange(10))
 
 
-@pytest.mark.parametrize("crop", [Units(40, 196, 4), Whole(1, 90), Fixed(60)])
-def test_drawn_numbers_follow_the_rule(crop):
-    """Those of training are a function of seed, batch and clip; those of one clip do not depend on the others."""
-    frames = np.random.default_rng(0).integers(40, 300, 5000)
-    first, length = crop.draw(frames, integers(np.arange(5000)))
-    last = np.minimum(first + length, frames)
-    assert (first >= 0).all()
-    assert (length <= crop.longest()).all()
-    for count, begin, size in zip(frames[:50], first, length, strict=False):
-        assert begin + size <= count or isinstance(crop, Fixed)
-    for index in (0, 7, 4999):
-        alone = crop.draw(frames[[index]], integers(np.array([index])))
-        assert (alone[0][0], alone[1][0]) == (first[index], length[index])
-    assert (last <= frames).all()
-    fixed = crop.draw(frames, None)
-    for index in range(20):
-        indices = crop(int(frames[index]), None)
-        assert (indices[0], len(indices)) == (fixed[0][index], fixed[1][index])
-    if isinstance(crop, Units):
-        whole = np.minimum(frames, 196) // 4 * 4
-        assert abs((length < whole).mean() - 1 / 3) < 0.02
-        spare = frames - length
-        assert abs((first / np.maximum(spare, 1))[spare > 20].mean() - 0.5) < 0.02
-
-
 def test_integers_are_uniform_and_independent():
     below = integers(np.arange(60_000))
     first, second, many = below(6), below(6), below(np.tile([1, 2, 3], 20_000))

@@ -423,12 +423,6 @@ def test_a_person_uses_the_page(server, tmp_path):
         assert list(files)[:8] == ["Blender", "Unreal", "Unity", "Mixamo", "BVH", "GLB", "NPZ", "MP4"]
         shown = joints_of(files["NPZ"])
         assert shown.shape == (60, 22, 3)
-        bvh = get(files["BVH"])[1].decode()
-        assert (bvh.count("JOINT"), bvh.count("Frames: 60")) == (21, 1)
-        glb = get(files["GLB"])[1]
-        size = int.from_bytes(glb[12:16], "little")
-        content = json.loads(glb[20 : 20 + size])
-        assert (glb[:4], len(glb), len(content["skins"])) == (b"glTF", int.from_bytes(glb[8:12], "little"), 1)
 
         tab.type("#edit [placeholder=start]", "1.5")
         click(tab, "Change")
@@ -467,10 +461,6 @@ def test_a_person_writes_a_sequence_in_rows_and_draws_a_path(server, tmp_path):
         tab.send("Input.insertText", text="a person stands")
         tab.type("[aria-label='Seconds of action 1']", "2")
         assert tab.run(text) == "a person walks @2 | a person stands"
-        click(tab, "+ Add an action")
-        tab.wait("document.querySelectorAll('#parts .part').length === 3")
-        tab.click("[aria-label='Remove action 3']")
-        tab.wait("document.querySelectorAll('#parts .part').length === 2")
         tab.type("#text textarea", "a person walks @1.5 | <b> | stands @2")
         rows = "[...document.querySelectorAll('#parts .part')]"
         values = f"{rows}.map(row => [...row.querySelectorAll('input')].map(input => input.value))"

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator
+from copy import deepcopy
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,7 @@ from support.fixtures import ROOT
 from support.motions import synthetic
 
 from flame_mdm.__main__ import COMMANDS
-from flame_mdm.config import sweeps
+from flame_mdm.config import composition, sweeps
 
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 OWN = ("mine", "my_", "NAME", "...")
@@ -116,7 +117,21 @@ def is_composed(program: str, command: str, words: tuple[str, ...]) -> bool:
         return main.func(lambda settings: None, *main.args[1:], words) == 0
 
 
-def test_links_names_paths_and_commands_exist(tmp_path, monkeypatch):
+@pytest.fixture
+def composed_once(monkeypatch):
+    """Hydra composes once what several commands name."""
+    resolve, known = composition.resolve, {}
+
+    def once(plan: composition.Plan) -> dict[str, Any]:
+        key = repr(plan[:3])
+        known[key] = known.get(key) or resolve(plan)
+        return deepcopy(known[key])
+
+    for module in (composition, sweeps):
+        monkeypatch.setattr(module, "resolve", once)
+
+
+def test_links_names_paths_and_commands_exist(tmp_path, monkeypatch, composed_once):
     wrong = {}
     for number, page in enumerate(PAGES):
         text, name = page.read_text(), str(page.relative_to(ROOT)).removeprefix("docs/")

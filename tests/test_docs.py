@@ -118,7 +118,7 @@ def is_composed(program: str, command: str, words: tuple[str, ...]) -> bool:
 
 
 @pytest.fixture
-def composed_once(monkeypatch):
+def resolved_once(monkeypatch):
     """Hydra composes once what several commands name."""
     resolve, known = composition.resolve, {}
 
@@ -131,7 +131,7 @@ def composed_once(monkeypatch):
         monkeypatch.setattr(module, "resolve", once)
 
 
-def test_links_names_paths_and_commands_exist(tmp_path, monkeypatch, composed_once):
+def test_links_names_paths_and_commands_exist(tmp_path, monkeypatch, resolved_once):
     wrong = {}
     for number, page in enumerate(PAGES):
         text, name = page.read_text(), str(page.relative_to(ROOT)).removeprefix("docs/")

@@ -1,7 +1,5 @@
 """Sets of perturbed motions and texts that an audit measures."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple

@@ -1,7 +1,5 @@
 """Evaluation during training."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from hydra.utils import get_class

@@ -1,7 +1,5 @@
 """Work shared by the processes of an evaluation. Without a process group, there is one process."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager

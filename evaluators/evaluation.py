@@ -1,7 +1,5 @@
 """Evaluations: real motions are measured first, then motions are generated and measured, and the result is written."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path

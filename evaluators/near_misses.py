@@ -1,7 +1,5 @@
 """Near-miss captions: captions that name the action of a clip, but contradict it in one attribute."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 from flame_mdm.data.store import Entry

@@ -4,8 +4,6 @@ Each function takes joints (F, J, 3) in meters, y up, and returns as many frames
 come from a generator alone, so that the grades of a perturbation share theirs.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 

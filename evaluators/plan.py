@@ -1,7 +1,5 @@
 """From the request of an evaluation to its parts: model, data, protocol, extractor, source and file names."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Results of evaluations: averages over replications, provenance, and what is printed."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 

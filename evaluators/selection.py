@@ -1,7 +1,5 @@
 """Selection of the best of several generated motions by how well they fit their texts."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 
 import torch

@@ -1,7 +1,5 @@
 """Sources of the motions to evaluate: a model, files of another system, or sanity-check baselines."""
 
-from __future__ import annotations
-
 import hashlib
 import time
 from collections import Counter

@@ -1,7 +1,5 @@
 """Feature extractors for evaluation: a common interface to trained and released networks."""
 
-from __future__ import annotations
-
 import hashlib
 from abc import ABC, abstractmethod
 from collections.abc import Sequence

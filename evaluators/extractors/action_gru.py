@@ -1,7 +1,5 @@
 """The action classifier of HumanAct12: a GRU over joint positions (Guo et al. 2020, "Action2Motion")."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor, nn
 

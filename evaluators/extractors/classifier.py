@@ -1,7 +1,5 @@
 """Training of action classifiers, whose features measure action-to-motion on data sets without a released one."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Self
 

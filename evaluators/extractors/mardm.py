@@ -3,8 +3,6 @@
 The networks load the released weights. MARDM's other evaluator is `evaluators.extractors.t2m` for 67 features.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Motion-CLIP (Kim et al. 2023, "FLAME", table 8): a joint embedding of motions and texts, trained contrastively."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from typing import Self

@@ -1,7 +1,5 @@
 """Motion-CLIP calibrated by hard cases: near-miss captions, and copies of motions with noise of known strength."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from dataclasses import replace

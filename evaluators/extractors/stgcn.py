@@ -1,7 +1,5 @@
 """Action classifiers with graph convolutions over skeleton and time (Yan et al. 2018, "ST-GCN")."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import torch

@@ -4,8 +4,6 @@ The networks load the released weights. The authors' code returns embeddings in 
 they are in the order of the input.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple, Self

@@ -1,7 +1,5 @@
 """Training of Guo et al.'s evaluator (`evaluators.extractors.t2m`), if the released one cannot be used."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Self

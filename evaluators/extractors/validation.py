@@ -1,7 +1,5 @@
 """Validation that is shared by the tasks that train feature extractors."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor, nn
 from torchmetrics import Metric

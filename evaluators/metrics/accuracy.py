@@ -1,7 +1,5 @@
 """Action recognition accuracy of generated motions."""
 
-from __future__ import annotations
-
 from torch import Tensor
 
 from evaluators.metrics.samples import Share

@@ -1,7 +1,5 @@
 """Alignment of generated motions with their texts: R-precision, distances and MID."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 import torch.nn.functional as F

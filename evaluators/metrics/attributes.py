@@ -4,8 +4,6 @@ The rules are independent of how a motion was generated. They read what a person
 that shows one action of the synthetic set; each threshold is stated next to its rule. The joints are the 22 of SMPL.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

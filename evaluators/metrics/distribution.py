@@ -1,7 +1,5 @@
 """Distances between the feature distributions of generated and real motions: FID, KID, precision and recall."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from torch import Tensor

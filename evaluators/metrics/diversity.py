@@ -1,7 +1,5 @@
 """Diversity and multimodality: how much generated motions differ from one another."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from torch import Tensor

@@ -1,7 +1,5 @@
 """Memorization: distance of generated motions from the training motions, compared to that of held-out real motions."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Physical plausibility: foot skating, floor contact, jitter and static motions."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

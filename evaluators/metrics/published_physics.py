@@ -4,8 +4,6 @@ Values of different benchmarks are not comparable with one another, nor with tho
 floor is y = 0 in all of them: motions are not moved.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 

@@ -1,7 +1,5 @@
 """Errors of generated motions against the real motion of the same text, or the motion that was edited."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 
 import torch

@@ -1,7 +1,5 @@
 """Retrieval with several correct answers: equal and similar captions, and the protocols of TMR."""
 
-from __future__ import annotations
-
 import functools
 import json
 import re

@@ -1,7 +1,5 @@
 """Base classes of metrics: shares of events, and values computed from all samples, sorted by key."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

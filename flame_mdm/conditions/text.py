@@ -1,7 +1,5 @@
 """Pretrained language models as text encoders, with their outputs cached on disk."""
 
-from __future__ import annotations
-
 import hashlib
 import importlib.util
 import json

@@ -1,7 +1,5 @@
 """Vocabulary of the training captions: unknown words of a text, what it may mean, and sentences of several actions."""
 
-from __future__ import annotations
-
 import difflib
 import re
 import zlib

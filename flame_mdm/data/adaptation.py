@@ -1,7 +1,5 @@
 """Data of an adaptation: a few clips of the user, and clips of what the model knows, half of each batch."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import cached_property

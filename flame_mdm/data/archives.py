@@ -1,7 +1,5 @@
 """Reader of zip and tar archives of motion data: regular files only, with size limits."""
 
-from __future__ import annotations
-
 import bz2
 import gzip
 import lzma

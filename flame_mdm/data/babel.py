@@ -4,8 +4,6 @@ Punnakkal et al., "BABEL: Bodies, Action and Behavior with English Labels", CVPR
 Language-based Motion Synthesis & Editing", AAAI 2023, appendix "BABEL". `docs/babel.md` describes the set.
 """
 
-from __future__ import annotations
-
 import math
 from collections import defaultdict
 from collections.abc import Iterator

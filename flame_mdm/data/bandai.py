@@ -4,8 +4,6 @@ Kobayashi, Liao, Inoue, Yojima, Takahashi, "Motion Capture Dataset for Practical
 Stylization", arXiv 2306.08861, 2023; CC BY-NC 4.0. `docs/bandai.md` describes the set and how it is prepared.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Container, Generator, Iterator, Sequence
 from contextlib import closing

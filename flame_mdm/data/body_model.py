@@ -1,7 +1,5 @@
 """The rest pose of SMPL from its licensed model file, which users download at https://smpl.is.tue.mpg.de."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

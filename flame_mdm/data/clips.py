@@ -1,7 +1,5 @@
 """Clips of a split, and the samples that batches draw from them."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from functools import cached_property
 

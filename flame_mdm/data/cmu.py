@@ -4,8 +4,6 @@ Motions: http://mocap.cs.cmu.edu, free for all uses, as ASF/AMC or converted to 
 (HumanML3D), and Plappert et al., Big Data 2016 (KIT-ML). `docs/cmu.md` says what to download and what differs.
 """
 
-from __future__ import annotations
-
 import re
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping, Sequence

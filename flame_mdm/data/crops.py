@@ -1,7 +1,5 @@
 """Crop rules: which frames of a clip a training sample contains, as in the authors' code."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ Every batch is a function of (seed, step, rank). No generator state needs to be 
 batches as an uninterrupted one.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from functools import partial

@@ -1,7 +1,5 @@
 """Own data: a folder of motions (BVH, AMASS or joint files) with captions, described in `docs/own-data.md`."""
 
-from __future__ import annotations
-
 import csv
 import io
 import math

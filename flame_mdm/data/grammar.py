@@ -1,7 +1,5 @@
 """Captions drawn from the grammar of the synthetic data set, which `synthetic.yaml` contains and describes."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from functools import cache

@@ -4,8 +4,6 @@ Guo et al., "Action2Motion: Conditioned Generation of 3D Human Motions", ACM MM 
 "Action-Conditioned 3D Human Motion Synthesis with Transformer VAE", ICCV 2021. Described in `docs/actions.md`.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from functools import cached_property

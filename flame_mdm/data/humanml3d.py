@@ -4,8 +4,6 @@ Guo et al., "Generating Diverse and Natural 3D Human Motions From Text", CVPR 20
 download and how the data set is prepared.
 """
 
-from __future__ import annotations
-
 import csv
 import io
 from collections import defaultdict

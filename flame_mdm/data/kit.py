@@ -3,8 +3,6 @@
 Plappert, Mandery, Asfour, "The KIT Motion-Language Dataset", Big Data 2016. `docs/kit.md` says what to download.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from functools import cached_property
 from itertools import islice

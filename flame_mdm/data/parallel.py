@@ -1,7 +1,5 @@
 """Parallel processing of many files in worker processes, with results in order."""
 
-from __future__ import annotations
-
 import os
 import threading
 import time

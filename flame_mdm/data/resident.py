@@ -1,7 +1,5 @@
 """Data sets that are kept on the training device, where batches are gathered without workers and copies."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path

@@ -8,8 +8,6 @@ Python's C unpickler allocates as much memory as a file of ten bytes requests. T
 unpickler in Python: no read may request more bytes than are left in the file, and repeated content counts each time.
 """
 
-from __future__ import annotations
-
 import pickle
 import re
 import struct

@@ -11,8 +11,6 @@ A store is a folder that is written once and never changed:
 Verification adds a report to the folder, `verify.json`.
 """
 
-from __future__ import annotations
-
 import functools
 import hashlib
 import io

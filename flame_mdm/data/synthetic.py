@@ -4,8 +4,6 @@
 motion in `synthetic_motions`, a line in `ACTIONS`, and its captions in `synthetic.yaml`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from typing import NamedTuple

@@ -6,8 +6,6 @@ train.txt val.txt test.txt  names; the mirrored copy of NAME is MNAME
 Mean.npy Std.npy            (D,)
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections import Counter

@@ -4,8 +4,6 @@ Ji et al., "A Large-scale RGB-D Database for Arbitrary-view Human Action Recogni
 et al., "Action-Conditioned 3D Human Motion Synthesis with Transformer VAE", ICCV 2021. Described in `docs/actions.md`.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Verification report of a prepared data set: contents, comparison with published figures, anomalies."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections import Counter, defaultdict

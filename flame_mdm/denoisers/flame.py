@@ -1,7 +1,5 @@
 """The network of FLAME (Kim et al. 2023, section "Architecture", tables 4, 6 and 7)."""
 
-from __future__ import annotations
-
 import math
 
 import torch

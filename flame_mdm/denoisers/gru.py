@@ -1,7 +1,5 @@
 """The recurrent network of the Human Motion Diffusion Model (Tevet et al. 2023, "MDM", section 4.1, appendix C)."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor, nn
 

@@ -1,7 +1,5 @@
 """Layers shared by the denoisers: sinusoids, post-norm transformer, embedding of time and condition."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 

@@ -1,7 +1,5 @@
 """The transformers of the Human Motion Diffusion Model (Tevet et al. 2023, "MDM", section 3 and appendix C)."""
 
-from __future__ import annotations
-
 from typing import Literal
 
 import torch

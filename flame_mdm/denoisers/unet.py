@@ -4,8 +4,6 @@ The paper specifies convolutions over time, joints as channels, 23.47 M paramete
 (Ho et al. 2020, appendix B) with the scale-and-shift injection of Dhariwal and Nichol 2021.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import torch

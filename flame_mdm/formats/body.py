@@ -1,7 +1,5 @@
 """Size and feet of a body, to detect motion files with wrong units or maps."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -7,8 +7,6 @@ legs. Then both legs are bent: the toes reach the scaled positions of the motion
 that they have in the rest pose.
 """
 
-from __future__ import annotations
-
 import copy
 from dataclasses import dataclass, replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Cleanup of generated motion: smooth joints, constant bone lengths, feet that stay in place, hands out of the body."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from math import comb

@@ -1,7 +1,5 @@
 """Physical faults: sliding feet, jumps, changing bones, penetration, arms in the body, floating, bends, freezing."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import NamedTuple

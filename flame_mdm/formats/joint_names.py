@@ -1,7 +1,5 @@
 """Names of a character's joints: those of a known skeleton, or of a `.yaml` file next to the character."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Arms inside the body: how deep elbows, wrists and hands are in the trunk or a thigh, and the way out."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

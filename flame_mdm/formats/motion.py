@@ -5,8 +5,6 @@ twist of a bone. They are never exported as rotations, which come from joint pos
 from features and files that contain SMPL's rotations.
 """
 
-from __future__ import annotations
-
 import json
 import sys
 import tempfile

@@ -1,7 +1,5 @@
 """Joint rotations from joint positions, by analytic inverse kinematics of SMPL's first 22 joints."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Readers of motion files; writers are in `flame_mdm.formats.motion`. `docs/formats.md` describes the files."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager

@@ -3,8 +3,6 @@
 Rates and lengths are limited, because a file of a few bytes can declare any value.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

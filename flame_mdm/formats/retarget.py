@@ -1,7 +1,5 @@
 """Motions on the skeletons of other programs and data sets; `rigs.yaml` contains their names, rest poses and axes."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
 from pathlib import Path

@@ -3,8 +3,6 @@
 It needs numpy alone: the extension of Blender contains this file.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace

@@ -1,7 +1,5 @@
 """A skinned figure and its motion as a .glb file, for Blender, game engines and web viewers."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -5,8 +5,6 @@ outputs are averaged where windows overlap (Bar-Tal et al. 2023, "MultiDiffusion
 Outputs are affine in the clean estimate for equal x_t and t, so this blends the clean estimates.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

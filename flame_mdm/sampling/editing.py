@@ -1,7 +1,5 @@
 """Motion editing without additional training: part of a motion is kept, the rest is resampled."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Motion sampling, with text, action or no condition, and output files of one request."""
 
-from __future__ import annotations
-
 import re
 from collections import Counter
 from collections.abc import Callable, Sequence

@@ -1,7 +1,5 @@
 """Motions from files and prepared data sets, with the features of a model."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Lengths of motions, and the windows that cover sequences of actions."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import torch

@@ -1,7 +1,5 @@
 """Targets in the world: way points of the root, joint positions, and whole poses at given times."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Callable, Mapping, Sequence

@@ -5,8 +5,6 @@ kinematics, so that a foot on the ground does not move at all; hands do the same
 lengths are close to HumanML3D's reference skeleton (Guo et al. 2022).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

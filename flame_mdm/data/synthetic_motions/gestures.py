@@ -1,7 +1,5 @@
 """Gestures of arms and head, on planted feet."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from flame_mdm.data.synthetic_motions.body import SIDES, SIGN, Attributes, Body, ease, events, pulse

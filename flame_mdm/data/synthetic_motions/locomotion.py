@@ -1,7 +1,5 @@
 """Walking, running, turning, dancing and crawling: footprints along a path, and a pelvis that follows it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 

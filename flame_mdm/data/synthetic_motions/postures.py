@@ -1,7 +1,5 @@
 """Motions of the whole body about one spot: jumps, kicks, bends, sitting and lying."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from flame_mdm.data.synthetic_motions.body import HIP, SHIN, SIDES, SIGN, THIGH, Attributes, Body, ease, events, pulse

@@ -96,7 +96,6 @@ class OwnExtractor(Extractor):
         self.fingerprint = self.task.facts.get("fingerprint")
 
     def check(self, representation: Representation, dataset: str) -> None:
-        """Checks that representation and data set are those of its training."""
         own, advice = self.task.representation, f"Train one with make train EXP={self.recipes}/..."
         if not self.reads(representation):
             raise UserError(
@@ -115,7 +114,6 @@ class OwnExtractor(Extractor):
         return (own.name, own.fps, own.features) == (representation.name, representation.fps, representation.features)
 
     def motions(self, features: Tensor, joints: Tensor, mask: Tensor) -> dict[str, Tensor]:
-        """Computes features of motions."""
         return {"features": self.task(features, mask)}
 
 
@@ -130,7 +128,6 @@ class MotionCLIPExtractor(OwnExtractor):
         self.encoded: dict[str, Tensor] = {}
 
     def texts(self, captions: Sequence[str], tokens: Sequence[Sequence[str] | None]) -> Tensor:
-        """Computes features of captions; each caption is encoded once."""
         new = sorted(set(captions) - self.encoded.keys())
         if new:
             self.encoded |= dict(zip(new, self.task.text(new), strict=True))
@@ -150,7 +147,6 @@ class OwnT2MExtractor(OwnExtractor):
         return part or super().reads(representation)
 
     def texts(self, captions: Sequence[str], tokens: Sequence[Sequence[str] | None]) -> Tensor:
-        """Computes features of captions, which need tokens if the evaluator did not learn its words."""
         if self.task.learns_words:
             return self.task.text([words(caption) for caption in captions])
         return self.task.text(_tagged(self.path, tokens))
@@ -163,7 +159,6 @@ class OwnClassifierExtractor(OwnExtractor):
     task: ClassifierTask
 
     def motions(self, features: Tensor, joints: Tensor, mask: Tensor) -> dict[str, Tensor]:
-        """Computes features and class scores of motions."""
         return {"features": self.task(joints, mask), "logits": self.task.logits(joints, mask)}
 
 
@@ -219,7 +214,6 @@ class ReleasedExtractor(Extractor):
             )
 
     def motions(self, features: Tensor, joints: Tensor, mask: Tensor) -> dict[str, Tensor]:
-        """Computes features of motions."""
         return {"features": self.network(features, mask)}
 
 
@@ -244,7 +238,6 @@ class T2MExtractor(ReleasedExtractor):
         self.used = self.network.used
 
     def texts(self, captions: Sequence[str], tokens: Sequence[Sequence[str] | None]) -> Tensor:
-        """Computes features of captions, which need tokens."""
         return self.network.text(self.words(_tagged(self.path, tokens), full_length=self.full_length))
 
 
@@ -263,7 +256,6 @@ class MARDMClipExtractor(ReleasedExtractor):
         self.network = load_mardm_clip(self.path).to(device)
 
     def texts(self, captions: Sequence[str], tokens: Sequence[Sequence[str] | None]) -> Tensor:
-        """Computes features of captions."""
         return self.network.text(clip_tokens(captions).to(self.network.mean.device))
 
 
@@ -308,7 +300,6 @@ class ClassifierExtractor(ReleasedExtractor):
             raise UserError(f"random_start: the classifier {kind} is not recurrent")
 
     def motions(self, features: Tensor, joints: Tensor, mask: Tensor) -> dict[str, Tensor]:
-        """Computes features and class scores of motions."""
         x = joints if self.input == "joints" else features
         start: dict[str, tuple[Tensor, ...]] = {"features": (), "logits": ()}
         if self.random_start:

@@ -130,5 +130,4 @@ class ClassifierTask(Task):
         self.val_metrics["accuracy"].update(logits, labels)  # type: ignore[operator]
 
     def on_validation_epoch_end(self) -> None:
-        """Logs the mean cross-entropy and the accuracy over all clips, over all processes."""
         log_validation(self, self.val_metrics)

@@ -162,7 +162,6 @@ class PooledLoss(TextAndMotion):
         super().update(scale * generated, text, keys)
 
     def value(self, motion: Tensor, text: Tensor) -> float:
-        """Returns the mean loss per pair, in nats."""
         losses = []
         for begin in range(0, len(motion), POOL):
             pool = slice(max(0, min(begin, len(motion) - POOL)), begin + POOL)
@@ -203,7 +202,6 @@ class MotionCLIPTask(Task):
 
     @classmethod
     def build(cls, config: Config, representation: Representation, *, actions: Sequence[str] = ()) -> Self:
-        """Builds the task of a recipe, and passes the widths of motions and texts to the network."""
         condition: ConditionEncoder = instantiate(config["condition"])
         widths = {"in_features": representation.features, "text_features": condition.features}
         network: MotionCLIP = instantiate(config["task"]["network"], **widths)
@@ -263,13 +261,11 @@ class MotionCLIPTask(Task):
         return loss
 
     def validation_step(self, batch: MotionBatch, batch_idx: int) -> None:
-        """Adds the pairs of a batch to the metrics."""
         motion = F.normalize(self.network(batch.x, batch.mask), dim=-1)
         text = F.normalize(self.network.text(self.condition(batch).pooled), dim=-1)
         update_pairs(self, self.val_metrics, batch, motion, text, scale=self.network.logit_scale.exp())
 
     def on_validation_epoch_end(self) -> None:
-        """Logs the loss in pools of 32, and both kinds of R-precision by cosine."""
         log_validation(self, self.val_metrics)
 
 

@@ -86,7 +86,6 @@ class CalibratedMotionCLIPTask(MotionCLIPTask):
         self.near_misses = {clip.id: list(texts.values()) for clip, texts in pairs}
 
     def training_step(self, batch: MotionBatch, batch_idx: int) -> Tensor:
-        """Returns the loss of one batch, with the pairs of the other processes as negatives."""
         torch.manual_seed(key("step", self.seed, batch_idx, self.global_rank))
         assert batch.text is not None
         wrong = [self.near_miss(name, number, batch_idx) for name in batch.ids for number in range(NEAR_MISSES)]

@@ -92,7 +92,6 @@ class MatchingLoss(TextAndMotion):
         self.margin = margin
 
     def value(self, motion: Tensor, text: Tensor) -> float | None:
-        """Returns the loss; None with fewer than two pairs."""
         return matching_loss(motion, text, self.margin).item() if len(motion) > 1 else None
 
 
@@ -152,7 +151,6 @@ class T2MTask(Task):
 
     @classmethod
     def build(cls, config: Config, representation: Representation, *, actions: Sequence[str] = ()) -> Self:
-        """Builds the network of a recipe for the features of the data."""
         options = {name: value for name, value in config["task"].items() if name not in ("_target_", "network")}
         statistics = {"mean": representation.mean.clone(), "std": representation.std.clone()}
         network: T2MEvaluator = instantiate(config["task"]["network"], **statistics)
@@ -264,7 +262,6 @@ class T2MTask(Task):
         return self(self.representation.denormalize(batch.x), batch.mask), self.text(tokens)
 
     def validation_step(self, batch: MotionBatch, batch_idx: int) -> None:
-        """Adds the pairs of a batch to the metrics."""
         update_pairs(self, self.val_metrics, batch, *self._embed(batch))
         errors = reconstruction_terms(self.network, self.decoder, batch)["reconstruction"]
         self.val_metrics["reconstruction"].update(errors)  # type: ignore[operator]

@@ -12,11 +12,7 @@ class ActionAccuracy(Share):
     higher_is_better = True
 
     def update(self, logits: Tensor, labels: Tensor) -> None:
-        """Adds class scores (B, A) and requested classes (B,).
-
-        Raises:
-            UserError: If scores contain NaN or infinity.
-        """
+        """Raises `UserError` if scores contain NaN or infinity."""
         if not logits.isfinite().all():
             raise UserError("ActionAccuracy: class scores are not finite. Look for motions that are not finite")
         self.hits += (logits.argmax(1) == labels).sum()

@@ -35,7 +35,6 @@ class RPrecision(SampleMetric):
     Args:
         pool: candidates in a pool, including the correct one.
         top: largest k.
-        seed: of the random draws.
     """
 
     higher_is_better = True
@@ -47,11 +46,9 @@ class RPrecision(SampleMetric):
         self.names = [f"top{k}" for k in range(1, top + 1)]
 
     def update(self, generated: Tensor, text: Tensor, text_keys: Tensor, keys: Tensor) -> None:
-        """Adds features of motions and of their texts, each (B, E), with the keys of captions and motions (B,)."""
         self.keep(keys=keys, generated=generated, text=text, text_keys=text_keys)
 
     def value(self, generated: Tensor, text: Tensor, text_keys: Tensor) -> dict[str, float | None]:
-        """Returns the fractions."""
         ranks = self.ranks(generated, text, text_keys, np.random.default_rng(self.seed))
         return {name: int((ranks < k).sum()) / len(ranks) for k, name in enumerate(self.names, 1)}
 
@@ -70,7 +67,6 @@ class TextsForMotion(RPrecision):
     """
 
     def ranks(self, generated: Tensor, text: Tensor, text_keys: Tensor, generator: np.random.Generator) -> Tensor:
-        """Returns the rank of the own text in a pool of texts, for each motion."""
         _, first, own = np.unique(text_keys.cpu().numpy(), return_index=True, return_inverse=True)
         self.need(len(first), self.pool, "different captions")
         others = self.pool - 1
@@ -105,7 +101,6 @@ class MotionsForText(RPrecision):
         self.normalize = normalize
 
     def ranks(self, generated: Tensor, text: Tensor, text_keys: Tensor, generator: np.random.Generator) -> Tensor:
-        """Returns the rank of the own motion in a pool of motions, for each text."""
         count = len(generated)
         if self.normalize:
             generated, text = F.normalize(generated, dim=-1), F.normalize(text, dim=-1)
@@ -135,7 +130,6 @@ class TextAndMotion(SampleMetric):
     states = ("generated", "text")
 
     def update(self, generated: Tensor, text: Tensor, keys: Tensor) -> None:
-        """Adds features of motions and of their texts, each (B, E), with the keys of the motions (B,)."""
         self.keep(keys=keys, generated=generated, text=text)
 
 
@@ -155,7 +149,6 @@ class MultimodalDistance(TextAndMotion):
         self.normalize = normalize
 
     def value(self, generated: Tensor, text: Tensor) -> float:
-        """Returns the mean distance, in units of the features."""
         if self.normalize:
             generated, text = F.normalize(generated, dim=-1), F.normalize(text, dim=-1)
         return torch.linalg.vector_norm(generated - text, dim=-1).mean().item()
@@ -167,7 +160,6 @@ class MotionCLIPScore(TextAndMotion):
     higher_is_better = True
 
     def value(self, generated: Tensor, text: Tensor) -> float:
-        """Returns the mean cosine."""
         return F.cosine_similarity(generated, text).mean().item()
 
 
@@ -233,10 +225,8 @@ class MutualInformationDivergence(SampleMetric):
         self.eps = eps
 
     def update(self, generated: Tensor, text: Tensor, real: Tensor, keys: Tensor) -> None:
-        """Adds features (B, E) of generated motions, of their texts and of the real motions, with keys (B,)."""
         self.keep(keys=keys, generated=generated, text=text, real=real)
 
     def value(self, generated: Tensor, text: Tensor, real: Tensor) -> float:
-        """Returns the divergence."""
         self.need(len(text), real.shape[1] + text.shape[1] + 1, "samples, one more than features of motion and text")
         return mutual_information_divergence(real, text, generated, self.eps).item()

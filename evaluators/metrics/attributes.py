@@ -244,11 +244,7 @@ def right_attributes(seen: Mapping[str, Any], requested: Mapping[str, Any]) -> d
 
 
 class AttributeAccuracy(Share):
-    """Fraction of motions that show the requested value, by attribute; see `right_attributes`.
-
-    Args:
-        fps: frames per second of the motions.
-    """
+    """Fraction of motions that show the requested value, by attribute; see `right_attributes`."""
 
     higher_is_better = True
     names = (*ATTRIBUTES, "action_and_side", "all")
@@ -258,16 +254,10 @@ class AttributeAccuracy(Share):
         self.fps = fps
 
     def update(self, joints: Tensor, mask: Tensor, requested: Sequence[Mapping[str, str | int | float]]) -> None:
-        """Adds motions.
-
-        Args:
-            joints: (B, F, 22, 3) in meters, y up.
-            mask: (B, F) bool, True = real frame.
-            requested: of each motion, some of action, side, count, direction, speed; at least the action.
+        """Adds motions; `requested` has at least the action of each.
 
         Raises:
-            ValueError: If `requested` does not have one entry per motion, lacks an action, or names an unknown
-                attribute.
+            ValueError: If there is not one request per motion, or one lacks an action or has an unknown attribute.
         """
         if len(requested) != len(joints):
             raise ValueError(f"attributes: {len(joints)} motions but {len(requested)} sets of requested attributes")
@@ -304,9 +294,6 @@ class SideAccuracy(Share):
     """Share of motions that show the requested side, left or right, on the Bandai set; see `read_side`.
 
     `hand` is about gestures, `path` about turns and sideways walks, `hand_or_path` about both; chance is 0.5.
-
-    Args:
-        fps: frames per second of the motions.
     """
 
     higher_is_better = True
@@ -317,10 +304,7 @@ class SideAccuracy(Share):
         self.fps = fps
 
     def update(self, joints: Tensor, mask: Tensor, sides: Sequence[tuple[str, str]]) -> None:
-        """Adds motions: joints (B, F, 22, 3) in meters, mask (B, F), and B pairs of content and side.
-
-        Pairs with another side than left and right are ignored.
-        """
+        """Adds motions; those requested with another side than left and right are ignored."""
         for motion, real, (content, side) in zip(joints.detach().cpu(), mask.cpu(), sides, strict=True):
             if side in SIDES:
                 right = read_side(motion[real].numpy(), content, self.fps) == side

@@ -30,7 +30,6 @@ class FrechetMotionDistance(TwoSets):
     higher_is_better = False
 
     def value(self, generated: Tensor, real: Tensor) -> float:
-        """Returns the distance, at least 0."""
         for name, features in (("generated", generated), ("real", real)):
             self.need(len(features), 2, f"{name} motions")
         return max(frechet_distance(generated, real).item(), 0.0)  # rounding may give a value slightly below 0
@@ -56,7 +55,6 @@ class KernelMotionDistance(TwoSets):
         subset_size: samples per subset, from either set.
         replace: whether to draw with replacement, as the code of MoDi and MDM does if there are more real motions than
             `subset_size`. Samples that are drawn twice then increase the value.
-        seed: of the random draws.
     """
 
     higher_is_better = False
@@ -67,7 +65,6 @@ class KernelMotionDistance(TwoSets):
         self.subsets, self.subset_size, self.replace, self.seed = subsets, subset_size, replace, seed
 
     def value(self, generated: Tensor, real: Tensor) -> dict[str, float | None]:
-        """Returns `mean` and `std` (N in the denominator) over the subsets."""
         for name, features in (("generated", generated), ("real", real)):
             self.need(len(features), self.subset_size, f"{name} motions for subsets of {self.subset_size}")
         generator = np.random.default_rng(self.seed)
@@ -113,7 +110,6 @@ class PrecisionRecall(TwoSets):
         self.neighbors = neighbors
 
     def value(self, generated: Tensor, real: Tensor) -> dict[str, float | None]:
-        """Returns `precision` and `recall`."""
         size = min(len(generated), len(real))
         self.need(size, self.neighbors + 1, "motions in the smaller set")
         generated, real = generated[:size], real[:size]

@@ -23,7 +23,6 @@ class Diversity(SampleMetric):
     Args:
         pairs: number of pairs.
         replace: whether a motion may be drawn twice for the same side.
-        seed: of the random draws.
     """
 
     higher_is_better = None
@@ -34,11 +33,9 @@ class Diversity(SampleMetric):
         self.pairs, self.replace, self.seed = pairs, replace, seed
 
     def update(self, generated: Tensor, keys: Tensor) -> None:
-        """Adds features (B, E) of motions, with keys (B,)."""
         self.keep(keys=keys, generated=generated)
 
     def value(self, features: Tensor) -> float:
-        """Returns the mean distance, in units of the features."""
         self.need(len(features), 2 if self.replace else self.pairs, f"motions for {self.pairs} pairs")
         generator = np.random.default_rng(self.seed)
         first, second = (
@@ -57,11 +54,9 @@ class PromptMultimodality(SampleMetric):
     """Motions per prompt."""
 
     def update(self, generated: Tensor, groups: Tensor, keys: Tensor) -> None:
-        """Adds features (B, E) of motions, with the keys (B,) of their prompts and of the motions."""
         self.keep(keys=keys, generated=generated, groups=groups)
 
     def value(self, features: Tensor, groups: Tensor) -> float:
-        """Returns the mean distance, in units of the features."""
         return self.distance(features[self.by_group(groups, self.samples)])
 
     def distance(self, features: Tensor) -> float:
@@ -79,7 +74,6 @@ class TextMultimodality(PromptMultimodality):
     Args:
         samples: motions per text.
         pairs: pairs per text.
-        seed: of the random draws.
     """
 
     def __init__(self, samples: int = 30, pairs: int = 10, seed: int = 0):
@@ -87,7 +81,6 @@ class TextMultimodality(PromptMultimodality):
         self.samples, self.pairs, self.seed = samples, pairs, seed
 
     def distance(self, features: Tensor) -> float:
-        """Returns the mean distance of the drawn pairs."""
         generator = np.random.default_rng(self.seed)
         first, second = (
             torch.from_numpy(generator.choice(self.samples, self.pairs, replace=False)).to(features.device)
@@ -111,7 +104,6 @@ class PairedMultimodality(PromptMultimodality):
         self.samples = 2 * samples
 
     def distance(self, features: Tensor) -> float:
-        """Returns the mean distance between the first and second half of each prompt's motions."""
         first, second = features.chunk(2, dim=1)
         return pair_distance(first, second)
 
@@ -125,7 +117,6 @@ class ActionMultimodality(SampleMetric):
 
     Args:
         pairs: pairs per class.
-        seed: of the random draws.
     """
 
     higher_is_better = None
@@ -136,11 +127,9 @@ class ActionMultimodality(SampleMetric):
         self.pairs, self.seed = pairs, seed
 
     def update(self, generated: Tensor, labels: Tensor, keys: Tensor) -> None:
-        """Adds features (B, E) of motions, with their classes and keys (B,)."""
         self.keep(keys=keys, generated=generated, labels=labels)
 
     def value(self, features: Tensor, labels: Tensor) -> float:
-        """Returns the mean distance, in units of the features."""
         generator = np.random.default_rng(self.seed)
         pairs = []
         for label in labels.unique():
@@ -174,12 +163,10 @@ class JointVariance(SampleMetric):
         self.add_state("motions", [], dist_reduce_fx="cat")
 
     def update(self, joints: Tensor, mask: Tensor, groups: Tensor, keys: Tensor) -> None:
-        """Adds motions (B, F, J, 3) with masks (B, F), and the keys (B,) of their prompts and of the motions."""
         self.motions += real_frames("JointVariance", joints, mask)
         self.keep(keys=keys, groups=groups)
 
     def value(self, groups: Tensor) -> float:
-        """Returns the variance."""
         motions = [self.motions[index] for index in self.order("keys").tolist()]
         values = []
         for members in self.by_group(groups, self.samples).tolist():

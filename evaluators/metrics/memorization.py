@@ -97,7 +97,6 @@ class NearestTraining(SampleMetric):
     names = ("joints", "features", "copies")
 
     def update(self, keys: Tensor, nearest: Tensor, real_nearest: Tensor) -> None:
-        """Adds the distances of generated motions and of the real motions paired with them, and keys (B,)."""
         self.keep(keys=keys, nearest=nearest, real_nearest=real_nearest)
 
     def value(self, nearest: Tensor, real: Tensor) -> dict[str, float | None]:

@@ -22,7 +22,6 @@ class FootSkating(Share):
     and it averages the ratios of the motions, while here every frame transition has the same weight.
 
     Args:
-        fps: frames per second of the motions.
         toes: indices of the toe joints; the default is for the 22 SMPL joints.
     """
 
@@ -33,7 +32,6 @@ class FootSkating(Share):
         self.fps, self.toes = fps, list(toes)
 
     def update(self, joints: Tensor, mask: Tensor) -> None:
-        """Adds motions: joints (B, F, J, 3) in meters, y up; mask (B, F) bool, True = real frame."""
         real_frames("FootSkating", joints, mask)
         toes = joints[:, :, self.toes].double()
         moved = (toes[:, 1:, :, [0, 2]] - toes[:, :-1, :, [0, 2]]).norm(dim=-1)
@@ -51,7 +49,6 @@ class MeanOverFrames(SampleMetric):
     states = ("total", "frames")
 
     def update(self, joints: Tensor, mask: Tensor, keys: Tensor) -> None:
-        """Adds motions (B, F, J, 3) in meters, y up, with masks (B, F) and keys (B,)."""
         motions = real_frames(type(self).__name__, joints, mask)
         values = [self.frame_values(motion.double()) for motion in motions]
         if values:
@@ -59,7 +56,6 @@ class MeanOverFrames(SampleMetric):
             self.keep(keys=keys, total=total[:, None], frames=total.new_tensor([[len(v)] for v in values]))
 
     def value(self, total: Tensor, frames: Tensor) -> float | None:
-        """Returns the mean; None if there is no frame to measure."""
         return (total.sum() / frames.sum()).item() if frames.sum() else None
 
     def frame_values(self, motion: Tensor) -> Tensor:
@@ -73,7 +69,6 @@ class DistanceFromFloor(MeanOverFrames):
     side: int
 
     def frame_values(self, motion: Tensor) -> Tensor:
-        """Returns the distance in each frame."""
         distance = self.side * motion[..., 1].amin(1)
         return torch.where(distance > TOLERANCE, distance, 0.0)
 
@@ -103,9 +98,6 @@ class Jitter(MeanOverFrames):
 
     Computed by third differences, as in Yi et al. 2022 (PIP). It grows with the frame rate: compare only values for
     equal frame rates.
-
-    Args:
-        fps: frames per second of the motions.
     """
 
     def __init__(self, fps: float):
@@ -122,9 +114,6 @@ class StaticShare(Share):
 
     A generator that stands still has many static motions, but so do real data sets with standing people: compare with
     the value of real motions.
-
-    Args:
-        fps: frames per second of the motions.
     """
 
     higher_is_better = False
@@ -134,7 +123,6 @@ class StaticShare(Share):
         self.fps = fps
 
     def update(self, joints: Tensor, mask: Tensor) -> None:
-        """Adds motions: joints (B, F, J, 3) in meters, y up; mask (B, F). Motions with one frame are ignored."""
         for motion in real_frames("StaticShare", joints, mask):
             moved = motion.double().diff(dim=0).norm(dim=-1)
             if len(moved):

@@ -23,9 +23,6 @@ class MeanOverMotions(SampleMetric):
     """Means over motions of values that each motion has, or does not have if they are undefined for it.
 
     `measured` is the fraction of motions that have all values.
-
-    Args:
-        fps: frames per second of the motions.
     """
 
     higher_is_better = False
@@ -48,11 +45,7 @@ class MeanOverMotions(SampleMetric):
             self.keep(keys=keys, values=values.nan_to_num(), defined=~values.isnan())
 
     def value(self, values: Tensor, defined: Tensor) -> dict[str, float | None]:
-        """Returns the mean of each value, and `measured`.
-
-        Raises:
-            UserError: If the values are not defined at the frame rate of the motions.
-        """
+        """Returns the mean of each value, and `measured`; raises `UserError` at any but the required frame rate."""
         if self.required_fps and self.fps != self.required_fps:
             raise UserError(
                 f"{type(self).__name__}: defined at {self.required_fps:g} frames per second, but the motions have "
@@ -89,7 +82,6 @@ class MBenchQuality(MeanOverMotions):
         self.toes = list(toes)
 
     def update(self, joints: Tensor, mask: Tensor, keys: Tensor) -> None:
-        """Adds motions (B, F, J, 3) in meters, y up, with masks (B, F) and keys (B,)."""
         self.keep_values(keys, [mbench_quality(x, self.toes) for x in real_frames("MBenchQuality", joints, mask)])
 
 
@@ -175,7 +167,6 @@ class KimodoQuality(MeanOverMotions):
     All speeds are in three dimensions. A motion of one frame has no values.
 
     Args:
-        fps: frames per second of the motions.
         feet: indices of left heel, left toe, right heel and right toe.
     """
 
@@ -188,7 +179,6 @@ class KimodoQuality(MeanOverMotions):
         self.feet = list(feet)
 
     def update(self, joints: Tensor, mask: Tensor, keys: Tensor, contacts: Tensor | None = None) -> None:
-        """Adds motions (B, F, J, 3) in meters, y up, with masks (B, F), keys (B,) and contacts (B, F, 4) bool."""
         motions = real_frames("KimodoQuality", joints, mask)
         labels = [None] * len(motions) if contacts is None else contacts[mask].split(mask.sum(1).tolist())
         pairs = zip(motions, labels, strict=True)
@@ -231,7 +221,6 @@ class KimodoConstraints(MeanOverMotions):
         self.names = (*self.NAMES, "root2d_err_p95")
 
     def update(self, joints: Tensor, real_joints: Tensor, mask: Tensor, kept: Tensor, keys: Tensor) -> None:
-        """Adds motions and their real ones (B, F, J, 3), mask (B, F), kept parts (B, F, J) bool, and keys (B,)."""
         motions = real_frames("KimodoConstraints", joints, mask)
         parts = kept[mask].split(mask.sum(1).tolist())
         errors = []
@@ -276,7 +265,6 @@ class PhysicalFootContact(MeanOverMotions):
         self.feet = list(feet)
 
     def update(self, joints: Tensor, mask: Tensor, keys: Tensor) -> None:
-        """Adds motions (B, F, J, 3) in meters, y up, with masks (B, F) and keys (B,)."""
         motions = real_frames("PhysicalFootContact", joints, mask)
         self.keep_values(keys, [{"pfc": physical_foot_contact(x, self.feet)} for x in motions])
 
@@ -319,7 +307,6 @@ class TransitionJerk(SampleMetric):
         self.real, self.window = JERK_OF_REAL_MOTIONS.get(round(fps, 6)), window or (60 if fps == 20 else 30)
 
     def update(self, joints: Tensor, mask: Tensor, kept: Tensor, keys: Tensor) -> None:
-        """Adds motions (B, F, J, 3) in meters, masks (B, F), kept parts (B, F, J) bool, and keys (B,)."""
         lengths = mask.sum(1).tolist()
         totals, counts = [], []
         for motion, part in zip(real_frames("TransitionJerk", joints, mask), kept[mask].split(lengths), strict=True):
@@ -332,7 +319,6 @@ class TransitionJerk(SampleMetric):
             self.keep(keys=keys, total=torch.stack(totals), windows=torch.tensor(counts))
 
     def value(self, total: Tensor, windows: Tensor) -> dict[str, float | None]:
-        """Returns `peak`, `area` and `windows`."""
         count = int(windows.sum())
         peak, area = peak_and_area(total.sum(0) / count, self.real) if count else (None, None)
         return {"peak": peak, "area": area, "windows": count}

@@ -79,14 +79,10 @@ class PositionErrors(SampleMetric):
         groups: Tensor | None = None,
         references: Sequence[Tensor] | None = None,
     ) -> None:
-        """Adds generated motions (B, F, J, 3) and the real ones in the same order (B, F', J, 3), with their masks.
-
-        They are compared up to the end of the shorter one. `groups` are the keys of the prompts, if each has several
-        motions. `references` are the real motions (F', J, 3) at the frame rate of their recordings.
+        """Adds pairs of motions, compared up to the end of the shorter one; `references` are needed for upsampling.
 
         Raises:
-            UserError: If a motion has fewer than two frames, or motions are compared at the frame rate of the
-                recordings, but there are no references.
+            UserError: If a motion has fewer than two frames, or a needed reference is missing.
         """
         name = type(self).__name__
         generated, real_motions = real_frames(name, joints, mask), real_frames(name, real_joints, real_mask)
@@ -116,10 +112,7 @@ class PositionErrors(SampleMetric):
             )
 
     def value(self, groups: Tensor, position: Tensor, variance: Tensor, frames: Tensor) -> dict[str, float | None]:
-        """Returns `ape_root`, `ape_trajectory`, `ape_mean_local`, `ape_mean_global`, and the same with `ave_`.
-
-        With several motions per text, the names have the prefix `best_` or `worst_`.
-        """
+        """Returns "ape" and "ave" of each of `PARTS`, such as `ape_root`; of several per text, `best_ape_root` ..."""
         texts = self.by_group(groups, self.samples)
         root = (position[:, 0] / frames[:, 0])[texts]
         values: list[float] = []
@@ -164,22 +157,18 @@ class TemosPositionErrors(PositionErrors):
         self.units_per_metre = units_per_metre
 
     def parts(self, joints: Tensor) -> dict[str, Tensor]:
-        """Returns `temos_parts` in thousands of KIT units."""
         if joints.shape[1] != 21:
             raise UserError(f"TemosPositionErrors: {joints.shape[1]} joints, but defined only for KIT's 21 (MMM)")
         return {part: values / 1000 for part, values in temos_parts(joints * self.units_per_metre).items()}
 
     def position_errors(self, a: Mapping[str, Tensor], b: Mapping[str, Tensor]) -> Tensor:
-        """Returns the distance of each part, averaged over joints and summed over frames."""
         distance = [(a[part] - b[part]).norm(dim=-1) for part in PARTS]
         return torch.stack([d.sum() if d.ndim == 1 else d.mean(1).sum() for d in distance])
 
     def variance_errors(self, a: Mapping[str, Tensor], b: Mapping[str, Tensor]) -> Tensor:
-        """Returns the distance of the variances of each part, averaged over joints."""
         return torch.stack([(a[part].var(0) - b[part].var(0)).norm(dim=-1).mean() for part in PARTS])
 
     def average(self, position: Tensor, frames: Tensor) -> Tensor:
-        """Gives each frame the same weight."""
         return position.sum(0) / frames.sum(0)
 
 
@@ -201,22 +190,18 @@ class FlamePositionErrors(PositionErrors):
         self.parents = tuple(parents)
 
     def parts(self, joints: Tensor) -> dict[str, Tensor]:
-        """Returns `flame_parts`, with the first joint as the root."""
         return flame_parts(joints, joints[:, 0], self.parents)
 
     def position_errors(self, a: Mapping[str, Tensor], b: Mapping[str, Tensor]) -> Tensor:
-        """Returns the distance of each part, summed over frames."""
         along_axes = (a["trajectory"] - b["trajectory"]).abs().sum(-1)
         root, local, all_joints = ((a[p] - b[p]).norm(dim=-1) for p in ("root", "mean_local", "mean_global"))
         return torch.stack([root.sum(), along_axes.sum(), local.mean(1).sum(), all_joints.mean(1).sum()])
 
     def variance_errors(self, a: Mapping[str, Tensor], b: Mapping[str, Tensor]) -> Tensor:
-        """Returns the distance of the variances of each part."""
         root, trajectory, local, all_joints = (a[part].var(0) - b[part].var(0) for part in PARTS)
         return torch.stack([root.norm(), trajectory.norm(), local.norm(dim=-1).mean(), all_joints.mean(0).norm()])
 
     def average(self, position: Tensor, frames: Tensor) -> Tensor:
-        """Gives each clip the same weight."""
         return (position / frames).mean(0)
 
 
@@ -242,19 +227,7 @@ class DisplacementErrors(SampleMetric):
         keys: Tensor,
         kept: Tensor | None = None,
     ) -> None:
-        """Adds motions (B, F, J, 3) and the real ones in the same order (B, F', J, 3), with their masks.
-
-        Args:
-            joints: generated or edited motions.
-            mask: (B, F), True = real frame.
-            real_joints: the real motions.
-            real_mask: (B, F').
-            keys: of the motions.
-            kept: (B, F, J), True = this joint of this frame was kept; None = all were generated.
-
-        Raises:
-            UserError: If nothing of a motion was generated.
-        """
+        """Raises `UserError` if nothing of a motion was generated; without `kept`, all of it was."""
         errors = []
         for distance, old in _distances(type(self).__name__, joints, mask, real_joints, real_mask, kept):
             new = ~old
@@ -266,7 +239,6 @@ class DisplacementErrors(SampleMetric):
             self.keep(keys=keys, errors=torch.stack(errors))
 
     def value(self, errors: Tensor) -> dict[str, float | None]:
-        """Returns `ade` and `fde`."""
         return dict(zip(self.names, errors.mean(0).tolist(), strict=True))
 
 
@@ -284,7 +256,6 @@ class KeptDrift(SampleMetric):
     def update(
         self, joints: Tensor, mask: Tensor, real_joints: Tensor, real_mask: Tensor, keys: Tensor, kept: Tensor
     ) -> None:
-        """Adds edits and their original motions; arguments as for `DisplacementErrors`."""
         pairs = list(_distances(type(self).__name__, joints, mask, real_joints, real_mask, kept))
         edited = [number for number, (_, old) in enumerate(pairs) if old.any()]
         kept_distances = [pairs[number][0][pairs[number][1]] for number in edited]

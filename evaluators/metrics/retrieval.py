@@ -84,7 +84,6 @@ class CaptionMetric(SampleMetric):
         self.encoder = None if encoder is None else json.dumps(encoder, sort_keys=True)
 
     def update(self, generated: Tensor, text: Tensor, captions: Sequence[str], keys: Tensor) -> None:
-        """Adds features of motions and of their texts, each (B, E), with the B captions and the keys (B,)."""
         if not len(captions):
             return
         caption_keys = torch.tensor([key(plain_caption(caption)) for caption in captions])
@@ -111,7 +110,6 @@ class MultiPositiveRPrecision(CaptionMetric):
         encoder: as for all metrics of this module.
         pool: motions in a pool.
         top: largest k.
-        seed: of the pools.
         normalize: whether to rank by cosine instead of Euclidean distance, as for `MotionsForText`.
     """
 
@@ -129,7 +127,6 @@ class MultiPositiveRPrecision(CaptionMetric):
         self.names = (*tops, "proper", "positives")
 
     def value(self, motion: Tensor, text: Tensor, caption_keys: Tensor, meaning: Tensor) -> dict[str, float | None]:
-        """Returns the values."""
         self.need(len(motion), self.pool, "motions")
         if self.normalize:
             motion, text = F.normalize(motion, dim=-1), F.normalize(text, dim=-1)
@@ -174,7 +171,6 @@ class TMRRetrieval(CaptionMetric):
         encoder: as for all metrics of this module; without an encoder, `dissimilar` has no value.
         subset: number of dissimilar motions, at most half of all.
         ids: ids of the dissimilar motions, such as TMR's; None = chosen as above.
-        seed: of the batches.
     """
 
     TOP = (1, 2, 3, 5, 10)
@@ -194,7 +190,6 @@ class TMRRetrieval(CaptionMetric):
         self.names = [f"{protocol}_{value}" for protocol in self.PROTOCOLS for value in values]
 
     def value(self, motion: Tensor, text: Tensor, caption_keys: Tensor, meaning: Tensor) -> dict[str, float | None]:
-        """Returns the values, such as `threshold_t2m_top1`; None for protocols that do not apply."""
         similarity = F.normalize(text, dim=-1) @ F.normalize(motion, dim=-1).T
         values = {
             "all": whole_set_retrieval(similarity, self.TOP),

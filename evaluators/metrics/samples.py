@@ -34,6 +34,8 @@ def real_frames(name: str, joints: Tensor, mask: Tensor) -> list[Tensor]:
 class MotionMetric(Metric):
     """Base class of all metrics.
 
+    Several of them take `fps`, the frame rate of the motions, and `seed`, of the random draws.
+
     Attributes:
         names: names of the values; empty if there is only one.
     """

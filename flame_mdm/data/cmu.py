@@ -250,7 +250,6 @@ class CMU(MotionSource):
             raise UserError(f"{self.path}: no recording can be read; {self.findings()[0]}")
 
     def counts(self) -> dict[str, float]:
-        """Returns the coverage of HumanML3D's index under the names of `published.yaml`."""
         return dict(self._counts)
 
     def findings(self) -> list[str]:

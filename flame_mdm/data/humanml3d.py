@@ -130,7 +130,6 @@ class HumanML3D(T2MFolder):
         return super().count()
 
     def check(self) -> list[str]:
-        """Returns lines about motions already created and files missing for the others."""
         if not self.amass:
             return super().check()
         todo = self._todo()
@@ -330,7 +329,6 @@ class HumanML3DSMPL(MotionSource):
         return sum(len(self.folder.texts[row.name]) for row in self.rows)
 
     def check(self) -> list[str]:
-        """Returns lines about the number of motions and the missing files."""
         return [f"{len(self.rows)} motions in the index", *(f"missing: {line}" for line in self._missing())]
 
     def _missing(self) -> list[str]:

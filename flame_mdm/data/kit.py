@@ -89,7 +89,6 @@ class KITTemos(MotionSource):
         return sum(self._fits(name) for name in self.frames)
 
     def clips(self, fps: float) -> Iterator[Clip]:
-        """Yields all motions, in the order of the splits."""
         self.check_fps(fps, MMM_FPS / 8)
         ghosh = set(read_names(self.splits / "ghosh-test", "")) if (self.splits / "ghosh-test").is_file() else set()
         self.excluded.clear()
@@ -115,7 +114,6 @@ class KITTemos(MotionSource):
             )
 
     def counts(self) -> dict[str, int]:
-        """Returns the figures of the folder under the names of `published.yaml`."""
         files = [path for path in self.path.glob("*_annotations.json") if _json(path)]
         texts = sum(len(_json(path)) for path in files)
         lists = (self.splits / split for split in (*SPLITS, "ghosh-test"))

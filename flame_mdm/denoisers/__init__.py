@@ -33,4 +33,7 @@ class Denoiser(nn.Module, ABC):
 
         Returns:
             (B, F, out_features).
+
+        Raises:
+            UserError: If a motion is too long for the network, or condition tokens are missing or too many.
         """

@@ -65,11 +65,6 @@ class FLAME(Denoiser):
         self.output = nn.Linear(latent_dim, out_features)
 
     def forward(self, x_t: Tensor, t: Tensor, mask: Tensor, cond: Condition) -> Tensor:
-        """See `Denoiser.forward`.
-
-        Raises:
-            UserError: If a motion is longer than `max_frames`.
-        """
         x = self.input(x_t)
         prefix = [cosine_first_sinusoid(t, x.shape[-1]).to(x_t.dtype)]
         if self.length_embedding is not None:

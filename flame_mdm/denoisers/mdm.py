@@ -49,11 +49,6 @@ class MDMEncoder(Denoiser):
         self.output = nn.Linear(latent_dim, out_features)
 
     def forward(self, x_t: Tensor, t: Tensor, mask: Tensor, cond: Condition) -> Tensor:
-        """See `Denoiser.forward`.
-
-        Raises:
-            UserError: If condition tokens are needed but missing, or there are more than `max_tokens`.
-        """
         token_mask = mask[:, :0]
         if self.max_tokens:
             tokens, token_mask = condition_tokens(cond)
@@ -117,11 +112,6 @@ class MDMDecoder(Denoiser):
         self.output = nn.Linear(latent_dim, out_features)
 
     def forward(self, x_t: Tensor, t: Tensor, mask: Tensor, cond: Condition) -> Tensor:
-        """See `Denoiser.forward`.
-
-        Raises:
-            UserError: If condition tokens are needed but missing.
-        """
         x = self.input(x_t)
         if self.input_token == "condition":
             x = torch.cat([self.condition(t, cond.pooled)[:, None], x], 1)

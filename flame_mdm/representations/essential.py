@@ -33,9 +33,7 @@ class Essential(HumanML):
         self.mean, self.std = self.mean[: self.features], self.std[: self.features]
 
     def encode_many(self, motions: Sequence[Tensor]) -> list[Tensor]:
-        """Encodes several motions."""
         return [features[:, : self.features].clone() for features in super().encode_many(motions)]
 
     def joint_features(self, joints: Iterable[int]) -> Tensor:
-        """Returns (D,) bool, True for the features of these joints; the root features belong to joint 0."""
         return super().joint_features(joints)[: self.features]

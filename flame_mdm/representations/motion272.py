@@ -106,7 +106,6 @@ class Motion272(Representation):
         return cut
 
     def statistics(self, features: Tensor | Frames) -> tuple[Tensor, Tensor]:
-        """Returns the mean of each feature, and the std averaged over each entry of `slices`."""
         return grouped_statistics(features, self.slices.values())
 
     def joint_features(self, joints: Iterable[int]) -> Tensor:

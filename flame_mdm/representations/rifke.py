@@ -79,7 +79,6 @@ class Rifke(Representation):
         return torch.atan2(-across[:, 2], across[:, 0])
 
     def joint_features(self, joints: Iterable[int]) -> Tensor:
-        """Returns (D,) bool, True for the features of these joints."""
         part = self.joint_mask(joints)
         return torch.cat([part[:1], part[1:].repeat_interleave(3), part[:1].expand(3)])
 

@@ -163,11 +163,7 @@ class OwnClassifierExtractor(OwnExtractor):
 
 
 def _tagged(path: Path, tokens: Sequence[Sequence[str] | None]) -> list[Sequence[str]]:
-    """Returns the tokens of captions.
-
-    Raises:
-        UserError: If a caption has no tokens.
-    """
+    """Returns the tokens of captions. Raises `UserError` if a caption has no tokens."""
     tagged = [words for words in tokens if words is not None]
     if len(tagged) < len(tokens):
         raise UserError(f"extractor {path}: needs tagged words, but the data set has captions without them")

@@ -69,11 +69,7 @@ class ClassifierTask(Task):
         return task
 
     def setup(self, stage: str) -> None:
-        """Sets up the task.
-
-        Raises:
-            UserError: If a clip for training or validation has no label.
-        """
+        """Sets up the task. Raises `UserError` if a clip for training or validation has no label."""
         super().setup(stage)
         data: MotionDataModule = self.trainer.datamodule  # type: ignore[attr-defined]
         bare = [clip.id for clip in (*data.train.clips, *data.val.clips) if clip.action is None]

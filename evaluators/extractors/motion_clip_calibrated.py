@@ -51,11 +51,7 @@ class CalibratedMotionCLIPTask(MotionCLIPTask):
 
     @classmethod
     def build(cls, config: Config, representation: Representation, *, actions: Sequence[str] = ()) -> Self:
-        """Builds the task of a recipe.
-
-        Raises:
-            UserError: If the representation does not encode joints.
-        """
+        """Builds the task of a recipe. Raises `UserError` if the representation does not encode joints."""
         if not isinstance(representation, HumanML):
             raise UserError(
                 f"representation={representation.name}: {cls.__name__} adds noise to joints and encodes them again, "

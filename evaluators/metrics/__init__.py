@@ -69,11 +69,7 @@ def required_inputs(metric: Metric) -> list[str]:
 
 
 def update_metrics(metrics: Mapping[str, Metric], **features: Any) -> None:
-    """Updates each metric with the inputs that it takes.
-
-    Raises:
-        UserError: If a required input is missing.
-    """
+    """Updates each metric with the inputs that it takes. Raises `UserError` if a required input is missing."""
     for name, metric in metrics.items():
         missing = [needed for needed in required_inputs(metric) if needed not in features]
         if missing:

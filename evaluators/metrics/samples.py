@@ -142,11 +142,7 @@ class SampleMetric(MotionMetric):
         return sorted_rows if len(order) else None
 
     def order(self, keys: str) -> Tensor:
-        """Returns the indices that sort samples by their keys.
-
-        Raises:
-            UserError: If two samples have the same key.
-        """
+        """Returns the indices that sort samples by their keys. Raises `UserError` if two samples have the same key."""
         values, order = dim_zero_cat(getattr(self, keys)).sort()
         twice = int((values[1:] == values[:-1]).sum())
         if twice:

@@ -325,11 +325,7 @@ class CaptionCache:
     POOLED, TOKENS, INDEX = "pooled.f32", "tokens.f16", "index.json"
 
     def __init__(self, folder: Path):
-        """Opens a cache.
-
-        Raises:
-            UserError: If the index cannot be read, or an array has the wrong size.
-        """
+        """Opens a cache. Raises `UserError` if the index cannot be read, or an array has the wrong size."""
         self.folder = folder
         try:
             index = json.loads((folder / self.INDEX).read_text())
@@ -372,11 +368,7 @@ class CaptionCache:
         return pooled, tokens, token_mask
 
     def verify(self) -> None:
-        """Checks the hashes of the arrays.
-
-        Raises:
-            UserError: If an array has changed since it was written.
-        """
+        """Checks the hashes of the arrays. Raises `UserError` if an array has changed since it was written."""
         for name, expected in self.sha256.items():
             if sha256(self.folder / name) != expected:
                 raise UserError(f"{self.folder / name} is damaged (its sha256 differs from the index)")

@@ -87,11 +87,7 @@ def advice(text: str, facts: Mapping[str, Any], max_words: int | None = None) ->
 
 
 def check_known(text: str, facts: Mapping[str, Any]) -> None:
-    """Checks that a model knows a word of a text that says what happens.
-
-    Raises:
-        UserError: If it knows none.
-    """
+    """Checks that a model knows a word of a text that says what happens. Raises `UserError` if it knows none."""
     if facts.get("vocabulary") and _unknown(text, facts) == _content(text):
         raise UserError(
             f"'{shortened(text, 60)}': the model knows no word of it that says what happens."

@@ -372,11 +372,7 @@ def is_range(value: Any) -> bool:
 
 
 def read_path(text: str) -> list[tuple[float, float]]:
-    """Returns the way points of "x,z x,z ...", in meters.
-
-    Raises:
-        UserError: If the text is not of this form.
-    """
+    """Returns the way points of "x,z x,z ...", in meters. Raises `UserError` if the text is not of this form."""
     try:
         points = [tuple(map(float, point.split(","))) for point in text.split()]
     except ValueError:

@@ -50,11 +50,7 @@ def dealt(function: Callable[[Item], T], items: Sequence[Item]) -> list[T]:
 def processes(device: str | None) -> Iterator[str]:
     """Joins the processes started by torchrun, if any, and yields the device of this process.
 
-    Args:
-        device: the device; None = a GPU if there is one.
-
-    Raises:
-        UserError: If this machine has no such device.
+    Without `device`, it is a GPU if there is one. Raises `UserError` if this machine has no such device.
     """
     if device is None:
         local = int(os.environ.get("LOCAL_RANK", 0))

@@ -86,13 +86,13 @@ class Evaluation:
     def run(
         self, source: Source | None, *, ground_truth: bool = True, force: bool = False, resamples: int = 0
     ) -> Measured:
-        """Evaluates real motions of all replications, and then the motions of the source.
+        """Evaluates real motions of all replications, and then the motions of the source, if there is one.
 
         Of several processes, each generates and extracts a share of the batches. The first one computes the metrics;
         all return the result.
 
         Args:
-            source: source of the motions; None = real motions only.
+            source: source of the motions.
             ground_truth: whether real motions are measured.
             force: generate even if real motions do not have the values that the protocol expects.
             resamples: number of sets drawn from the motions of the first replication, for intervals by bootstrap.
@@ -143,11 +143,7 @@ class Evaluation:
         several: Evaluator | None,
         ground_truth: bool,
     ) -> list[tuple[Extracted, Extracted]]:
-        """Measures real motions, and returns for each replication those that motions of the source are compared with.
-
-        Raises:
-            UserError: If the motions lack an input that a metric needs.
-        """
+        """Measures real motions; returns for each replication those that motions of the source are compared with."""
         scores: Scores = []
         real_sets = []
         for replication in range(self.protocol.replications):
@@ -186,10 +182,7 @@ class Evaluation:
         return evaluator.extract(motions)
 
     def _unexpected(self, values: Mapping[str, Value | None]) -> list[str]:
-        """Returns a line for each value of real motions that differs from the expected one.
-
-        Nothing is expected in a quick evaluation, or on splits other than the test split.
-        """
+        """Returns a line for each value of real motions of the test split that differs from the expected one."""
         # Without test clips (HumanAct12), the training clips are the test split, so they are checked.
         info = self.clips.store.info
         if self.protocol.quick or (self.clips.clips[0].split != "test" and info["clips"]["test"]):

@@ -115,11 +115,7 @@ class Evaluator:
 
     @torch.no_grad()
     def extract(self, motions: Motions) -> Extracted:
-        """Runs the feature pass over motions; all processes call it with the same motions and get the same result.
-
-        Raises:
-            UserError: If a motion contains NaN or infinity.
-        """
+        """Runs the feature pass over the same motions in all processes; raises `UserError` if one is not finite."""
         rows: dict[str, Any] = {"keys": self._keys(motions.ids)}
         # Batches of similar lengths need little padding.
         order = np.argsort([len(x) for x in motions.features], kind="stable").tolist()
@@ -204,14 +200,9 @@ class Evaluator:
     def score(
         self, generated: Extracted, paired: Extracted, real: Extracted, seed: int
     ) -> tuple[dict[str, float | None], dict[str, str]]:
-        """Computes all metrics.
+        """Computes all metrics of generated motions and of the real ones paired with them, in the same order.
 
-        Args:
-            generated: motions to measure.
-            paired: the corresponding real motions, in the same order.
-            real: real motions for comparisons of sets. They are a separate draw, since the distance of a set from
-                itself is 0.
-            seed: of the random draws of metrics.
+        Comparisons of sets use `real`, a separate draw, since the distance of a set from itself is 0.
 
         Returns:
             The values by name, `metric` or `metric/part`, None if not computable; and by metric, why a value is
@@ -232,13 +223,10 @@ class Evaluator:
     def resample(
         self, generated: Extracted, paired: Extracted, real: Extracted, seed: int, resamples: int
     ) -> dict[str, list[float | None]]:
-        """Computes all metrics of `resamples` sets of motions drawn with replacement, for a bootstrap.
+        """Computes all metrics of `resamples` sets of motions drawn with replacement, for a bootstrap; see `score`.
 
         Both sets of comparisons of sets are drawn. The draws are functions of `seed` and the numbers of motions alone,
-        so that those of two models are of the same clips. Arguments as for `score`.
-
-        Returns:
-            (resamples,) values by name, None if not computable; empty in all processes but the first.
+        so that those of two models are of the same clips. Returns (resamples,) values by name, like `score`.
         """
         if not is_first() or not len(generated) or not resamples:
             return {}
@@ -302,11 +290,7 @@ class Evaluator:
         return any(name in required_inputs(metric) for metric in make_metrics(self.metrics).values())
 
     def check(self, motions: Extracted, metrics: Mapping[str, Metric] | None = None) -> dict[str, Metric]:
-        """Returns the metrics that can be computed: all of them, or those that need no features.
-
-        Raises:
-            UserError: If the motions lack an input that a metric needs.
-        """
+        """Returns the metrics that can be computed, without `skip_features` all; `UserError` if an input is missing."""
         available = {*motions.rows, "joints", "mask", "real_joints", "real_mask"}
         available |= {"real"} if "generated" in motions.rows else set()
         available |= {"kept"} if motions.kept is not None else set()

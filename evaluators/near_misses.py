@@ -13,14 +13,11 @@ _Stated = frozenset[tuple[str, str | int | float]]
 
 
 def near_misses(clips: Sequence[Entry]) -> list[dict[str, list[str]]]:
-    """Finds the near-miss captions of each clip among the captions of the other clips.
+    """Returns the near misses of each clip among the captions of the others, sorted, by the attribute that differs.
 
     A caption of another clip is a near miss if both clips show the same action, and of the attributes that both have
     (side, style, count, direction, speed, ...), exactly one differs. An attribute that only one of them has does not
     matter: "walks backward" is a near miss of a slow walk forward.
-
-    Returns:
-        For each clip, its near misses by the name of the attribute that differs, sorted; {} if there are none.
     """
     stated = [_stated(clip) for clip in clips]
     captions: dict[_Stated, set[str]] = {}

@@ -146,16 +146,7 @@ def open_data(request: EvaluationRequest, model: MotionGenerator | None) -> Moti
 
 
 def set_bones(smpl: str | None, representation: Representation) -> UsedSkeleton | None:
-    """Sets the bone offsets of a representation of SMPL rotations from SMPL's model file.
-
-    Args:
-        smpl: the file; None = the offsets of a stand-in skeleton remain.
-        representation: of the motions; nothing is set if it consists of joint positions.
-
-    Raises:
-        UserError: If the file is no SMPL model.
-        FileNotFoundError: If it does not exist.
-    """
+    """Sets the bones of a representation of SMPL's rotations from its model file; without one, a stand-in remains."""
     if not isinstance(representation, SMPL | Rot6D):
         return None
     if smpl is None:
@@ -173,8 +164,7 @@ def sampling_options(
     """Returns the options of the sampler and those of `Edit`: the requested ones, otherwise those of the recipe.
 
     Raises:
-        UserError: If an editing option is given but nothing is edited, or the model's process does not allow the edit,
-            the sampler or one of its options.
+        UserError: If nothing is edited but an editing option is given, or the process does not allow an option.
     """
     options, editing = options or SamplerOptions(), editing or EditRequest()
     edit: dict[str, Any] = {}

@@ -129,14 +129,9 @@ class Protocol(ClosedSchema):
         quick: bool = False,
         multimodality: bool = True,
     ) -> tuple[Protocol, dict[str, Any]]:
-        """Returns the protocol with another size, and the options that changed.
+        """Returns the protocol with another size for a split of `clips`, and the options that changed; None = as it is.
 
-        Args:
-            clips: number of clips in the split.
-            replications, samples: new values; None = unchanged, or those of a quick evaluation.
-            batch_size: new batch size of a protocol that measures time.
-            quick: whether the evaluation is quick.
-            multimodality: False = skip multimodality.
+        A quick evaluation has few motions and replications. `batch_size` is for protocols that measure time.
 
         Raises:
             UserError: If a number is less than 1.
@@ -164,8 +159,7 @@ class Protocol(ClosedSchema):
         Without a `path`, it is the one that the protocol names.
 
         Raises:
-            UserError: If a required extractor is missing, or belongs to another representation or data set.
-            FileNotFoundError: If the file does not exist.
+            FileNotFoundError, UserError: If it is missing, or belongs to another representation or data set.
         """
         if self.extractor is None or path == "none":
             return None
@@ -235,11 +229,7 @@ class Protocol(ClosedSchema):
     # Whether data and model fit ---------------------------------------------------------------------------------------
 
     def check_data(self, clips: Clips) -> None:
-        """Checks that the data has the captions or labels that the protocol needs.
-
-        Raises:
-            UserError: If a clip has no caption or label, or there is no clip.
-        """
+        """Raises `UserError` if there is no clip, or one lacks the caption or label that the protocol needs."""
         rows = self.rows(clips, 0, 0)
         incomplete = {
             "text": any(row.caption is None for row in rows),
@@ -253,11 +243,7 @@ class Protocol(ClosedSchema):
             )
 
     def check_model(self, model: MotionGenerator) -> None:
-        """Checks that the model was trained with the condition of the protocol.
-
-        Raises:
-            UserError: If it was trained with another condition.
-        """
+        """Raises `UserError` if the model was trained with another condition."""
         if self.condition not in ("none", model.conditioned_on):
             raise UserError(
                 f"protocol {self.name} generates motions from {self.condition}, but the checkpoint was trained "
@@ -278,13 +264,10 @@ def protocol_names(folder: Path = FOLDER) -> list[str]:
 
 
 def protocol_config(name: str) -> Config:
-    """Returns the options of a protocol.
+    """Returns the options of a protocol, named in experiments/evaluation, or of a .yaml file.
 
     A file may hold `variants`. Protocol `editing_in_between` is the variant `in_between` of editing.yaml: its options
     replace those of the file.
-
-    Args:
-        name: a name in experiments/evaluation, or the path of a .yaml file.
 
     Raises:
         UserError: If there is no such protocol.
@@ -316,14 +299,10 @@ def _read(path: Path) -> Config:
 
 
 def load_protocol(name: str, representation: Representation) -> Protocol:
-    """Loads a protocol for motions of a representation.
+    """Loads a protocol, see `protocol_config`, for motions of a representation.
 
     Its file may use ${representation.fps}, ${representation.feet}, ${representation.toes} and
     ${representation.parents}.
-
-    Args:
-        name: a name in experiments/evaluation, or the path of a .yaml file.
-        representation: of the motions.
 
     Raises:
         UserError: If the protocol does not exist, or an option of it or of a metric is missing or unknown.

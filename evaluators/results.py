@@ -32,12 +32,7 @@ def averages(
     scores: Sequence[tuple[Mapping[str, float | None], int]],
     resampled: Mapping[str, list[float | None]] | None = None,
 ) -> dict[str, Value | None]:
-    """Returns means over replications; None if one replication has no value.
-
-    Args:
-        scores: values by metric, and number of motions, of each replication.
-        resampled: values of the sets of a bootstrap, by metric.
-    """
+    """Returns means over replications, None if one has no value, with the values `resampled` by a bootstrap."""
     table: dict[str, Value | None] = {}
     for name in scores[0][0] if scores else ():
         values = [replication[name] for replication, _ in scores]
@@ -122,11 +117,7 @@ def _excluded(data: MotionDataModule, split: Split) -> dict[str, int]:
 
 
 def _overlaps(request: EvaluationRequest, plan: Plan) -> list[str]:
-    """Returns reasons why values are not valid: evaluated clips may be training clips of the model or extractor.
-
-    `make train` trains on the training split, so that an extractor of the same data has seen the others only if they
-    are the training split, too: the footnotes of tables mark published splits like that.
-    """
+    """Returns reasons why values are not valid: evaluated clips may be training clips of the model or extractor."""
     evaluated, extractor, reasons = plan.data.store.fingerprint, plan.extractor, []
     for what, trained in (
         ("training data", plan.model.facts.get("fingerprint") if plan.model else None),

@@ -15,12 +15,7 @@ def text_fit(
 ) -> Callable[[Sequence[Motion]], list[float]]:
     """Returns a score for `flame_mdm.generate`: the cosine similarity of a motion and its text, mean over its parts.
 
-    Selection biases the score of the network that selects: evaluate with a different one.
-
-    Args:
-        path: run or checkpoint of a motion-CLIP.
-        model: the model that generates the motions.
-        device: of the network.
+    Selection by a motion-CLIP biases its own score: evaluate with a different one.
 
     Raises:
         FileNotFoundError, UserError: If the checkpoint does not exist, or was trained for other motions.

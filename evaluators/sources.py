@@ -343,11 +343,7 @@ class Baseline:
 
 
 def read_samples(path: Path) -> dict[str, np.ndarray]:
-    """Reads a file of generated motions; see `SampleFolder`.
-
-    Raises:
-        UserError: If the file is damaged, or an array is missing.
-    """
+    """Reads a file of generated motions, see `SampleFolder`; raises `UserError` if it is damaged or incomplete."""
     content = read_npz(path)
     frames = {name: content[name] for name in ("features", "joints") if name in content}
     if not {"ids", "lengths"} <= content.keys() or not frames:

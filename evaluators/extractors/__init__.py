@@ -41,32 +41,20 @@ class Extractor(ABC):
 
     @abstractmethod
     def check(self, representation: Representation, dataset: str) -> None:
-        """Checks that the network was trained for these motions.
-
-        Raises:
-            UserError: If it was trained for another representation or data set.
-        """
+        """Raises `UserError` if the network was trained for another representation or data set."""
 
     @abstractmethod
     def motions(self, features: Tensor, joints: Tensor, mask: Tensor) -> dict[str, Tensor]:
-        """Computes features of motions.
+        """Returns "features" (B, E) of motions, and "logits" (B, A) of classifiers.
 
         Args:
             features: (B, F, D) in the data's units.
             joints: (B, F, J, 3) in meters, y up.
             mask: (B, F), True = real frame.
-
-        Returns:
-            "features" (B, E), and "logits" (B, A) of classifiers.
         """
 
     def texts(self, captions: Sequence[str], tokens: Sequence[Sequence[str] | None]) -> Tensor | None:
-        """Computes features (B, E) of captions; None if the network does not support text.
-
-        Args:
-            captions: the texts.
-            tokens: their "word/PART" tokens, if known.
-        """
+        """Returns features (B, E) of captions with "word/PART" tokens, if known; None if it does not read text."""
         return None
 
     def reference(self) -> Tensor | None:

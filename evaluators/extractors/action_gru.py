@@ -24,16 +24,12 @@ class ActionGRU(nn.Module):
         self.linear2 = nn.Linear(self.features, num_actions)
 
     def forward(self, joints: Tensor, mask: Tensor, state: Tensor | None = None) -> Tensor:
-        """Computes features of motions.
+        """Returns features (B, 30) in (-1, 1) of motions, which the network sees with y down and from the first pelvis.
 
         Args:
-            joints: (B, F, J, 3) in meters, y up; the 24 SMPL joints for the released weights. The network sees them
-                with y down and from the first position of the pelvis, as published.
+            joints: (B, F, J, 3) in meters, y up; the 24 SMPL joints for the released weights.
             mask: (B, F) bool, True = real frame; every motion has at least one.
             state: (layers, B, hidden) initial state; None = zeros.
-
-        Returns:
-            (B, 30) in (-1, 1).
         """
         joints = joints * joints.new_tensor([1.0, -1.0, -1.0])
         return self.published(joints - joints[:, :1, :1], mask, state)

@@ -52,11 +52,7 @@ class ClassifierTask(Task):
 
     @classmethod
     def build(cls, config: Config, representation: Representation, *, actions: Sequence[str] = ()) -> Self:
-        """Builds the network of a recipe for the skeleton and the actions of the data.
-
-        Raises:
-            UserError: If there are fewer than two actions.
-        """
+        """Builds the network for the skeleton and actions of the data; raises `UserError` with fewer than two."""
         if len(actions) < 2:
             raise UserError(f"a classifier needs a data set with at least two actions, but this one has {len(actions)}")
         parents = representation.skeleton.parents
@@ -108,19 +104,13 @@ class ClassifierTask(Task):
         return self.logits(joints.masked_fill(past_end, 0), batch.mask), batch.action
 
     def on_validation_epoch_start(self) -> None:
-        """Copies the running statistics of the first process, which checkpoints contain, to all processes.
-
-        Before, each process has the statistics of its own batches.
-        """
+        """Gives all processes the running statistics of the first, which checkpoints contain."""
         if torch.distributed.is_initialized() and torch.distributed.get_world_size() > 1:
             for buffer in self.network.buffers():
                 torch.distributed.broadcast(buffer, 0)
 
     def validation_step(self, batch: MotionBatch, batch_idx: int) -> None:
-        """Adds the clips of a batch to loss and accuracy.
-
-        If there are fewer clips than processes, each process has all of them, which does not change the values.
-        """
+        """Adds the clips of a batch; with fewer clips than processes, each has all of them, which changes no value."""
         logits, labels = self._classified(batch)
         self.val_metrics["loss"].update(F.cross_entropy(logits, labels, reduction="none"))  # type: ignore[operator]
         self.val_metrics["accuracy"].update(logits, labels)  # type: ignore[operator]

@@ -100,10 +100,7 @@ def clip_tokens(captions: Sequence[str]) -> Tensor:
 
 
 def load_mardm_clip(folder: Path) -> MARDMClip:
-    """Loads the evaluator with the authors' weights.
-
-    Args:
-        folder: of finest.tar (from text_mot_match_clip/model), mean.npy and std.npy (eval_mean and eval_std).
+    """Loads the evaluator with the authors' weights: `MARDMClipExtractor` describes the folder.
 
     Raises:
         FileNotFoundError: If a file does not exist.

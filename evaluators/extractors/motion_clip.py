@@ -79,11 +79,7 @@ class MotionCLIP(nn.Module):
         self.logit_scale = nn.Parameter(torch.tensor(math.log(1 / 0.07)))
 
     def forward(self, x: Tensor, mask: Tensor) -> Tensor:
-        """Returns features (B, E) of normalized motions (B, F, D) with mask (B, F).
-
-        Raises:
-            UserError: If a motion is longer than `max_frames`.
-        """
+        """Returns features (B, E) of normalized motions (B, F, D) with mask (B, F), of at most `max_frames`."""
         lengths = mask.sum(1)
         if x.shape[1] > self.max_frames and lengths.max() > self.max_frames:
             raise UserError(
@@ -111,21 +107,17 @@ def info_nce(
     meaning: Tensor | None = None,
     wrong_text: Tensor | None = None,
 ) -> Tensor:
-    """Contrastive loss over the pairs of all processes.
+    """Contrastive loss over the pairs of all processes: the mean of both cross-entropies.
 
     Oord et al. 2018, eq. 4; symmetric, as in Radford et al. 2021. Each process compares its own pairs with all motions
     and texts. If all processes have the same number of pairs, the average over processes, as of gradients in DDP, is
     the loss and gradient of a single process with all pairs.
 
     Args:
-        motion: (B, E) features.
-        text: (B, E) features.
+        motion, text: (B, E) features.
         logit_scale: (), logarithm of the inverse temperature.
         meaning: (B, M) int64. Pairs that are equal in one of the M numbers are not negatives of each other.
         wrong_text: (B, K, E) features of texts that are negatives of one motion each.
-
-    Returns:
-        (), the mean of both cross-entropies.
     """
     motion, text = F.normalize(motion, dim=-1), F.normalize(text, dim=-1)
     motions, texts = _of_all_processes(motion), _of_all_processes(text)
@@ -280,11 +272,7 @@ _MCLIP = {
 
 
 def our_names(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Returns the weights of FLAME's released network by our names, without its RoBERTa (`text_model.*`).
-
-    Raises:
-        ValueError: If a name is unknown, or there is no CLS token.
-    """
+    """Returns the weights of FLAME's released network by our names, without its RoBERTa, or raises `ValueError`."""
     learned = {name: value for name, value in state.items() if not name.startswith("text_model.")}
     layers, _ = layer_names(learned, "motion_encoder.motion_encoder", ENCODER_LAYER)
     ours = renamed(learned, {**layers, **_MCLIP})

@@ -128,16 +128,10 @@ def calibration_error(motion: Tensor, copy: Tensor, strength: Tensor) -> Tensor:
 
 
 def noisy_copies(representation: HumanML, x: Tensor, lengths: Tensor, strength: Tensor) -> Tensor:
-    """Returns copies of normalized motions with noise, drawn from torch's generator of the processor.
+    """Returns copies (B, F, D) of normalized motions with noise, drawn from torch's generator of the processor.
 
-    Args:
-        representation: of the motions.
-        x: (B, F, D), 0 past the end of each motion.
-        lengths: (B,), number of frames.
-        strength: (B,) of the noise: on the joints of the first half of the motions, on the features of the others.
-
-    Returns:
-        (B, F, D), 0 past the end of each motion.
+    The strength (B,) of the noise is on the joints of the first half of the motions, and on the features of the others.
+    Motions and copies are 0 past their ends.
     """
     half, frames = (len(x) + 1) // 2, lengths.tolist()
     joints = representation.to_joints(x[:half]).cpu()

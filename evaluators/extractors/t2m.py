@@ -68,12 +68,7 @@ class WordVectors:
 
     @classmethod
     def read(cls, folder: Path) -> Self:
-        """Reads the released vectors, our_vab_data.npy and our_vab_idx.pkl.
-
-        Raises:
-            FileNotFoundError: If a file is not in `folder`.
-            UserError: If a file does not have the expected content.
-        """
+        """Reads our_vab_data.npy and our_vab_idx.pkl; raises `FileNotFoundError`, or `UserError` for other content."""
         data, index = folder / "our_vab_data.npy", folder / "our_vab_idx.pkl"
         for file in (data, index):
             if not file.is_file():
@@ -182,11 +177,7 @@ class T2MEvaluator(nn.Module):
         self.motion_encoder = _Recurrent(movement_latent, motion_hidden, embedding)
 
     def forward(self, x: Tensor, mask: Tensor) -> Tensor:
-        """Returns embeddings (B, E) of motions (B, F, D) in the data's units, with mask (B, F).
-
-        Raises:
-            UserError: If a motion is shorter than 4 frames or longer than `max_frames`.
-        """
+        """Returns embeddings (B, E) of motions (B, F, D) of 4 to `max_frames` frames, with mask (B, F)."""
         lengths = mask.sum(1)
         if lengths.min() < UNIT or lengths.max() > self.max_frames:
             raise UserError(
@@ -278,12 +269,9 @@ def read_statistics(folder: Path) -> list[Tensor]:
 
 
 def load_t2m(folder: Path) -> T2MEvaluator:
-    """Loads the evaluator with the authors' weights.
+    """Loads the evaluator with the authors' weights: `T2MExtractor` describes the folder.
 
-    Args:
-        folder: of finest.tar (text_mot_match/model/finest.tar of t2m or kit), and its mean.npy and std.npy; in MDM,
-            these are t2m_mean.npy or kit_mean.npy; in MARDM, eval_mean.npy, whose 67 or 64 features tell its evaluator
-            apart.
+    MARDM's evaluator is told apart by its 67 or 64 features.
 
     Raises:
         FileNotFoundError: If a file does not exist.

@@ -58,19 +58,15 @@ def reconstruction_terms(network: T2MEvaluator, decoder: nn.Module, batch: Motio
 
 
 def matching_loss(motion: Tensor, text: Tensor, margin: float, fits: Tensor | None = None) -> Tensor:
-    """Contrastive loss of Guo et al. 2022 (Hadsell et al. 2006, eq. 4, without its factor 1/2).
+    """Contrastive loss () of Guo et al. 2022 (Hadsell et al. 2006, eq. 4, without its factor 1/2).
 
     Each text is compared with its own motion, and with that of the nearest previous pair that it does not fit. The
     authors shift the motions by a random number of places instead, which also pushes matching pairs apart.
 
     Args:
-        motion: (B, E) embeddings.
-        text: (B, E) embeddings.
+        motion, text: (B, E) embeddings.
         margin: Euclidean distance beyond which a wrong pair adds no loss.
         fits: (B, B) bool, True = the text of the row describes the motion of the column; None = only its own.
-
-    Returns:
-        (), squared distance.
     """
     count = len(motion)
     own = torch.arange(count, device=motion.device)
@@ -201,11 +197,7 @@ class T2MTask(Task):
         return self.words.vectors if isinstance(self.words, WordVectors) else torch.zeros(0)
 
     def set_extra_state(self, state: Tensor) -> None:
-        """Restores the word vectors of a checkpoint.
-
-        Raises:
-            UserError: If a resumed run is given other word vectors.
-        """
+        """Restores the word vectors of a checkpoint; raises `UserError` if a resumed run is given others."""
         if self.learns_words:
             return
         if isinstance(self.words, WordVectors) and not torch.equal(self.words.vectors, state.cpu()):

@@ -45,11 +45,7 @@ if TYPE_CHECKING:
 
 
 def make_metrics(configs: Mapping[str, Config], **options: Any) -> dict[str, Metric]:
-    """Creates metrics from mappings with a `_target_`.
-
-    Args:
-        configs: the mappings, by name.
-        options: further arguments, for those metrics that take them.
+    """Creates metrics from mappings with a `_target_`, by name; `options` are further arguments, where they are legal.
 
     Raises:
         UserError: If a mapping has no `_target_`.

@@ -9,16 +9,12 @@ from evaluators.metrics.samples import SampleMetric
 
 
 def retrieval_ranks(queries: Tensor, candidates: Tensor, pools: Tensor, own: Tensor) -> Tensor:
-    """Returns the number of candidates that rank before the correct one, by Euclidean distance.
+    """Returns (N,) how many candidates are closer than the correct one, or equally close and earlier in the pool.
 
     Args:
-        queries: (N, E) features.
-        candidates: (M, E) features.
+        queries, candidates: (N, E) and (M, E) features.
         pools: (N, P) indices of the candidates of each query.
         own: (N,) position of the correct candidate in each pool.
-
-    Returns:
-        (N,) int64: the number of candidates that are closer, or equally close and earlier in the pool.
     """
     ranks = []
     for query, pool, right in zip(queries.split(16), pools.split(16), own.split(16), strict=True):
@@ -110,11 +106,7 @@ class MotionsForText(RPrecision):
 
 
 def own_pools(count: int, pool: int, seed: int | np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Draws the pools of `MotionsForText`.
-
-    Returns:
-        The samples in random order (N,), the pool of each (N, P), and its own position there (N,).
-    """
+    """Returns samples in random order (N,), the pool of each (N, P) for `MotionsForText`, and its place there (N,)."""
     order = np.random.default_rng(seed).permutation(count)
     start = np.minimum(np.arange(count) // pool * pool, count - pool)
     return order, order[start[:, None] + np.arange(pool)], np.arange(count) - start

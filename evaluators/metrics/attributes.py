@@ -23,11 +23,7 @@ ATTRIBUTES = ("action", "side", "count", "direction", "speed", "amount")
 
 
 def read_attributes(joints: np.ndarray, fps: float) -> dict[str, str | int]:
-    """Reads one clip of the 22 SMPL joints.
-
-    Args:
-        joints: (F, 22, 3) in meters, y up, with any position and heading.
-        fps: frames per second.
+    """Reads one clip (F, 22, 3) of SMPL's joints in meters, y up, with any position and heading.
 
     Returns:
         "action", and those of "side", "count", "direction", "speed", "amount" that the action has; empty if no action
@@ -254,11 +250,7 @@ class AttributeAccuracy(Share):
         self.fps = fps
 
     def update(self, joints: Tensor, mask: Tensor, requested: Sequence[Mapping[str, str | int | float]]) -> None:
-        """Adds motions; `requested` has at least the action of each.
-
-        Raises:
-            ValueError: If there is not one request per motion, or one lacks an action or has an unknown attribute.
-        """
+        """Raises `ValueError` unless there is one request per motion, with an action and no unknown attribute."""
         if len(requested) != len(joints):
             raise ValueError(f"attributes: {len(joints)} motions but {len(requested)} sets of requested attributes")
         for motion, real, attributes in zip(joints.detach().cpu(), mask.cpu(), requested, strict=True):
@@ -270,14 +262,10 @@ class AttributeAccuracy(Share):
 
 
 def read_side(joints: np.ndarray, content: str, fps: float) -> str:
-    """Reads the side of a motion of the Bandai set: left or right.
+    """Reads the side, left or right, of a motion (F, 22, 3) of the Bandai set.
 
-    Args:
-        joints: (F, 22, 3) in meters, y up.
-        content: of the set's contents with a side: walk-turn-left and -right are read from the turn of the body,
-            walk-left and -right from the direction of travel, all others from the hand that rises higher above its
-            shoulder. The name's own side is not used.
-        fps: frames per second.
+    walk-turn-left and -right are read from the turn of the body, walk-left and -right from the direction of travel, all
+    others from the hand that rises higher above its shoulder. The content's own side is not used.
     """
     smooth = gaussian_filter1d(np.asarray(joints, np.float64), 0.05 * fps, axis=0, mode="nearest")
     if content.startswith("walk"):

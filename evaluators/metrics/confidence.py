@@ -6,14 +6,11 @@ import numpy as np
 
 
 def mean_ci(values: Sequence[float]) -> tuple[float, float]:
-    """Returns the mean of R replications, and the half width of its 95 % confidence interval.
+    """Returns the mean of R replications, at least one, and the half width of its 95 % confidence interval.
 
     The half width is 1.96 std / sqrt(R), with R in the denominator of the variance, as in the code of Guo et al. 2022,
     MDM and MFM. It measures the variation of the evaluation, not of training. ACTOR's tables show 1.96 times the
     variance instead.
-
-    Raises:
-        ValueError: If there are no values.
     """
     if not len(values):
         raise ValueError("mean_ci: no values")

@@ -17,11 +17,8 @@ CLOSE = 0.01
 def poses(joints: Tensor, facing: Sequence[int]) -> Tensor:
     """Returns joints (F, J, 3) relative to the pelvis on the ground, turned to face z in every frame, as (F, 3J).
 
-    Two motions with the same poses differ only in the path and the direction in which they move.
-
-    Args:
-        joints: in meters, y up.
-        facing: `Skeleton.facing`.
+    Two motions with the same poses differ only in the path and the direction in which they move. `facing` is that of
+    `Skeleton`.
     """
     right_hip, left_hip, right_shoulder, left_shoulder = facing
     left = joints[:, left_hip] - joints[:, right_hip] + joints[:, left_shoulder] - joints[:, right_shoulder]
@@ -49,15 +46,11 @@ class TrainingMotions:
     facing: Sequence[int]
 
     def nearest(self, joints: Sequence[Tensor], features: Tensor | None) -> Tensor:
-        """Returns the distances (B, 2), without features (B, 1), of motions from the nearest training motion.
+        """Returns the distances (B, 2), without features (B, 1), of motions (F, J, 3) from the nearest training motion.
 
         The first is the root mean square distance of the joints in meters, over all joints and every fourth frame, from
         the best window of the same length; infinite if no training motion is as long. The second is the distance of the
-        features.
-
-        Args:
-            joints: (F, J, 3) each.
-            features: (B, E); None without an extractor.
+        features (B, E).
         """
         squares = self.poses.square().sum(-1)
         left = torch.cat([torch.arange(int(length), 0, -1) for length in self.lengths])  # frames to the motion's end

@@ -115,12 +115,7 @@ def _speed(points: Tensor) -> Tensor:
 
 
 def mbench_floating(motion: Tensor, feet: Tensor, contact: Tensor) -> tuple[int, int, int]:
-    """Counts the frames of `foot_floating`.
-
-    Args:
-        motion: (F, J, 3).
-        feet: (F, 2, 3), left and right.
-        contact: (F, 2) bool.
+    """Counts the frames of `foot_floating` of a motion (F, J, 3) with two feet (F, 2, 3) in contact or not (F, 2).
 
     Returns:
         Frames in which the feet on the ground move unlike the body; frames of feet in the air that move much less than

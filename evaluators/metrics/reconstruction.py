@@ -18,12 +18,9 @@ RIFKE = Rifke()
 def temos_parts(joints: Tensor) -> dict[str, Tensor]:
     """Returns root (F, 3), trajectory (F, 2), local (F, 20, 3) and global (F, 21, 3) positions, as compared by TEMOS.
 
-    The motion is placed on the floor, with its first root at x = z = 0 and its first heading along +z. Local positions
-    are those of all joints except the root, relative to the body in each frame: root at x = z = 0, heading along +z, y
-    above the floor. Floor and heading are those of `Rifke`, with their peculiarities.
-
-    Args:
-        joints: (F, 21, 3) MMM joints in KIT units, y up; float64.
+    The motion (F, 21, 3), in KIT units, is placed on the floor, with its first root at x = z = 0 and its first heading
+    along +z. Local positions are those of all joints except the root, relative to the body in each frame: root at
+    x = z = 0, heading along +z, y above the floor. Floor and heading are those of `Rifke`, with their peculiarities.
     """
     ground = joints[:, :1] * joints.new_tensor([1.0, 0.0, 1.0])
     floor = joints.new_tensor([0.0, 1.0, 0.0]) * RIFKE.floor(joints)
@@ -38,13 +35,7 @@ def temos_parts(joints: Tensor) -> dict[str, Tensor]:
 
 
 def flame_parts(joints: Tensor, root: Tensor, parents: Sequence[int]) -> dict[str, Tensor]:
-    """Returns root (F, 3), trajectory (F, 2), bones (F, J - 1, 3) and joints (F, J, 3), as compared by FLAME's code.
-
-    Args:
-        joints: (F, J, 3) positions, y up.
-        root: (F, 3) translation of the body.
-        parents: parent of each joint, -1 for the root.
-    """
+    """Returns root (F, 3), trajectory (F, 2), bones (F, J - 1, 3) and joints (F, J, 3), as compared by FLAME's code."""
     bones = joints[:, 1:] - joints[:, list(parents[1:])]
     return {"root": root, "trajectory": root[:, [0, 2]], "mean_local": bones, "mean_global": joints}
 
@@ -79,7 +70,7 @@ class PositionErrors(SampleMetric):
         groups: Tensor | None = None,
         references: Sequence[Tensor] | None = None,
     ) -> None:
-        """Adds pairs of motions, compared up to the end of the shorter one; `references` are needed for upsampling.
+        """Compares pairs of motions up to the end of the shorter one; upsampling needs `references`.
 
         Raises:
             UserError: If a motion has fewer than two frames, or a needed reference is missing.

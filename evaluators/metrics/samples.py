@@ -15,9 +15,7 @@ Value = float | dict[str, float | None] | None
 
 
 def real_frames(name: str, joints: Tensor, mask: Tensor) -> list[Tensor]:
-    """Splits joints (B, F, J, 3) with mask (B, F) into motions (F, J, 3) without padding.
-
-    Without padding, sums over a motion round the same way in every batch.
+    """Splits joints (B, F, J, 3) with mask (B, F) into motions (F, J, 3), whose sums round the same way in every batch.
 
     Raises:
         UserError: If a motion contains NaN or infinity; the message begins with `name`.
@@ -96,11 +94,7 @@ class SampleMetric(MotionMetric):
             self.add_state(name, [], dist_reduce_fx="cat")
 
     def keep(self, **rows: Tensor) -> None:
-        """Adds rows by the names of their states, which include the keys.
-
-        Raises:
-            ValueError: If the tensors have different numbers of rows.
-        """
+        """Adds equally many rows by the names of their states, which include the keys; `ValueError` otherwise."""
         if len({len(values) for values in rows.values()}) > 1:
             sizes = ", ".join(f"{len(values)} {name}" for name, values in rows.items())
             raise ValueError(f"{type(self).__name__}: got {sizes}. Give one of each per sample")
@@ -119,11 +113,7 @@ class SampleMetric(MotionMetric):
         raise NotImplementedError
 
     def rows(self, keys: str, *names: str) -> list[Tensor] | None:
-        """Returns rows in the order of their keys, floats as float64; None if there are none.
-
-        Raises:
-            UserError: If a sample was given twice, or contains NaN or infinity.
-        """
+        """Returns finite rows in the order of their keys, floats as float64; None if there are none."""
         if not getattr(self, keys):
             return None
         order = self.order(keys)
@@ -153,11 +143,7 @@ class SampleMetric(MotionMetric):
         return order
 
     def by_group(self, groups: Tensor, samples: int) -> Tensor:
-        """Returns the indices (C, S) of the samples of each group.
-
-        Raises:
-            UserError: If a group does not have S samples.
-        """
+        """Returns the indices (C, S) of the samples of each group; raises `UserError` if one has not S samples."""
         names, sizes = groups.unique(return_counts=True)
         wrong = int((sizes != samples).sum())
         if wrong:
@@ -203,11 +189,7 @@ class TwoSets(SampleMetric):
                 self.keep(**{key_name: of, name: features})
 
     def compute(self) -> Any:
-        """Returns the value of generated (N, E) and real (M, E) features; None, or None by name, if a set is empty.
-
-        Raises:
-            UserError: If the two have different widths.
-        """
+        """Returns the value of generated (N, E) and real (M, E) features; None, or None by name, if a set is empty."""
         generated, real = self.rows("keys", "generated"), self.rows("real_keys", "real")
         if generated is None or real is None:
             return dict.fromkeys(self.names) if self.names else None

@@ -12,7 +12,7 @@ from evaluators.collectives import is_first, processes, shared
 from evaluators.evaluator import Evaluator, Extracted, Motions
 from evaluators.extractors import Extractor
 from evaluators.metrics.distribution import FrechetMotionDistance
-from evaluators.plan import make_plan
+from evaluators.plan import Plan
 from evaluators.protocol import DrawnClip, Protocol
 from evaluators.request import EvaluationRequest
 from evaluators.results import averages, make_result, mean_cost, show
@@ -40,7 +40,7 @@ def evaluate(request: EvaluationRequest) -> None:
             raise UserError(f"out={request.out} is a folder. Name the JSON file to write")
         Path(request.out).parent.mkdir(parents=True, exist_ok=True)
     with processes(request.device) as device:
-        plan = make_plan(request, device)
+        plan = Plan(request, device)
         result = make_result(request, plan)
         evaluation = Evaluation(
             plan.protocol,

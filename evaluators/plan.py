@@ -2,18 +2,16 @@
 
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from evaluators.extractors import Extractor
 from evaluators.protocol import Protocol, default_protocol, digest, open_protocol
 from evaluators.request import EvaluationRequest
 from evaluators.sources import Baseline, Generator, SampleFolder, Source
 from flame_mdm.checkpoints.loading import find, load
 from flame_mdm.config import instantiate, trust
 from flame_mdm.data.body_model import load_offsets
-from flame_mdm.data.datamodule import Clips, MotionDataModule
+from flame_mdm.data.datamodule import MotionDataModule
 from flame_mdm.errors import UserError
 from flame_mdm.generator import MotionGenerator
 from flame_mdm.representations import Representation
@@ -26,7 +24,6 @@ from flame_mdm.sampling.request import EditRequest
 from flame_mdm.schemas import UsedSkeleton
 
 
-@dataclass(frozen=True, kw_only=True)
 class Plan:
     """All parts of an evaluation, opened and checked before anything is measured.
 
@@ -36,84 +33,53 @@ class Plan:
         data, clips: the data set, and the evaluated split.
         representation: of the motions, on the device to compute on.
         skeleton: the bones of joints computed from SMPL's rotations; None if the data has joint positions.
-        protocol: in the requested size.
-        changed: options that differ from the protocol.
+        protocol: in the requested size; `changed` has the options that differ.
         extractor: None = metrics that need features are skipped.
         source: of the motions.
         batch_size: motions per batch.
         path: of the result file.
-    """
-
-    model: MotionGenerator | None
-    file: Path | None
-    sampling: dict[str, Any]
-    data: MotionDataModule
-    clips: Clips
-    representation: Representation
-    skeleton: UsedSkeleton | None
-    protocol: Protocol
-    changed: dict[str, Any]
-    extractor: Extractor | None
-    source: Source
-    batch_size: int
-    path: Path
-
-
-def make_plan(request: EvaluationRequest, device: str) -> Plan:
-    """Opens the parts of an evaluation.
 
     Raises:
         UserError: If model, data, protocol and extractor do not match.
         FileNotFoundError: If a file is missing.
     """
-    file = find(request.ckpt, request.which) if request.ckpt is not None else None
-    model = load(file, device) if file is not None else None
-    data = open_data(request, model)
-    representation = model.representation if model else data.representation.to(device)
-    skeleton = set_bones(request.smpl, representation)
-    clips = data.clips(request.split)
-    size = {
-        name: getattr(request, name) for name in ("replications", "samples", "quick", "multimodality", "batch_size")
-    }
-    name = request.protocol or (default_protocol(model) if model else "")
-    protocol, changed = open_protocol(name, clips, representation, model, **size)
-    extractor = protocol.open_extractor(request.extractor, representation, data.store.info["dataset"])
-    batch_size = protocol.batch_size or request.batch_size or 64
-    sampling: dict[str, Any] = {}
+
     source: Source
-    if model is not None and file is not None:
-        options, edit = sampling_options(protocol, model, request.options, request.editing)
-        sampling = options.chosen() | {"edit": edit}
-        folder = _motions_folder(request, file, protocol, sampling, data, batch_size)
-        source = Generator(
-            model, protocol, clips, options, edit, seed=request.seed, batch_size=batch_size, folder=folder
-        )
-        path = folder / "result"
-    elif request.baseline is not None:
-        source = Baseline(request.baseline, clips, protocol.condition, request.seed)
-        split = f"-{request.split}" if request.split != "test" else ""
-        path = Path("runs/baselines") / data.store.info["dataset"] / protocol.title / f"{request.baseline}{split}"
-    else:
-        source = SampleFolder(Path(str(request.from_samples)), representation)
-        protocol = protocol.model_copy(update={"replications": len(source.files), "samples": None})
-        path = Path(str(request.from_samples)) / protocol.title
-    suffix = f"-{extractor.sha256[:8]}" if extractor else ""
-    suffix += "-quick" if request.quick else f"-{protocol.replications}x" if "replications" in changed else ""
-    return Plan(
-        model=model,
-        file=file,
-        sampling=sampling,
-        data=data,
-        clips=clips,
-        representation=representation,
-        skeleton=skeleton,
-        protocol=protocol,
-        changed=changed,
-        extractor=extractor,
-        source=source,
-        batch_size=batch_size,
-        path=Path(request.out or path.with_name(f"{path.name}{suffix}.json")),
-    )
+
+    def __init__(self, request: EvaluationRequest, device: str):
+        self.file = find(request.ckpt, request.which) if request.ckpt is not None else None
+        self.model = model = load(self.file, device) if self.file is not None else None
+        self.data = data = open_data(request, model)
+        self.representation = model.representation if model else data.representation.to(device)
+        self.skeleton = set_bones(request.smpl, self.representation)
+        self.clips = data.clips(request.split)
+        names = ("replications", "samples", "quick", "multimodality", "batch_size")
+        size = {name: getattr(request, name) for name in names}
+        name = request.protocol or (default_protocol(model) if model else "")
+        protocol, self.changed = open_protocol(name, self.clips, self.representation, model, **size)
+        self.extractor = protocol.open_extractor(request.extractor, self.representation, data.store.info["dataset"])
+        self.batch_size = protocol.batch_size or request.batch_size or 64
+        self.sampling: dict[str, Any] = {}
+        if model is not None and self.file is not None:
+            options, edit = sampling_options(protocol, model, request.options, request.editing)
+            self.sampling = options.chosen() | {"edit": edit}
+            folder = _motions_folder(request, self.file, protocol, self.sampling, data, self.batch_size)
+            self.source = Generator(
+                model, protocol, self.clips, options, edit, seed=request.seed, batch_size=self.batch_size, folder=folder
+            )
+            path = folder / "result"
+        elif request.baseline is not None:
+            self.source = Baseline(request.baseline, self.clips, protocol.condition, request.seed)
+            split = f"-{request.split}" if request.split != "test" else ""
+            path = Path("runs/baselines") / data.store.info["dataset"] / protocol.title / f"{request.baseline}{split}"
+        else:
+            self.source = SampleFolder(Path(str(request.from_samples)), self.representation)
+            protocol = protocol.model_copy(update={"replications": len(self.source.files), "samples": None})
+            path = Path(str(request.from_samples)) / protocol.title
+        self.protocol = protocol
+        suffix = f"-{self.extractor.sha256[:8]}" if self.extractor else ""
+        suffix += "-quick" if request.quick else f"-{protocol.replications}x" if "replications" in self.changed else ""
+        self.path = Path(request.out or path.with_name(f"{path.name}{suffix}.json"))
 
 
 def open_data(request: EvaluationRequest, model: MotionGenerator | None) -> MotionDataModule:

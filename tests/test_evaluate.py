@@ -20,7 +20,7 @@ from support.runs import TINY
 from evaluators.evaluation import Evaluation
 from evaluators.evaluator import Evaluator, Extracted, Motions
 from evaluators.extractors import MotionCLIPExtractor
-from evaluators.plan import make_plan, sampling_options
+from evaluators.plan import Plan, sampling_options
 from evaluators.protocol import FOLDER, DrawnClip, default_protocol, load_protocol, protocol_config, protocol_names
 from evaluators.request import EvaluationRequest
 from evaluators.results import _overlaps
@@ -488,7 +488,7 @@ def test_what_does_not_fit_is_refused(runs, tmp_path):
     ):
         values: Any = {"ckpt": str(runs.model), "extractor": "none"} | keys
         with pytest.raises((UserError, FileNotFoundError)) as refusal:
-            make_plan(EvaluationRequest(**values), "cpu")
+            Plan(EvaluationRequest(**values), "cpu")
         assert message in str(refusal.value)
 
 
@@ -650,7 +650,7 @@ def test_a_missing_extractor_of_the_selection_stops_before_training(runs, tmp_pa
 
 def test_the_synthetic_set_has_an_evaluator_in_the_package(runs):
     """It is the default of the protocol, and finds texts with the attributes of real motions."""
-    plan = make_plan(EvaluationRequest(ckpt=str(runs.model), data_root=str(runs.root)), "cpu")
+    plan = Plan(EvaluationRequest(ckpt=str(runs.model), data_root=str(runs.root)), "cpu")
     assert isinstance(plan.extractor, MotionCLIPExtractor)
     assert plan.extractor.path == SHIPPED["motion_clip_synthetic"]
     assert plan.extractor.path.stat().st_size < 3e6

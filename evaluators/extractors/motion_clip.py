@@ -32,6 +32,21 @@ class MotionCLIP(nn.Module):
 
     The features are not scaled to length 1, since Fréchet distance and MID use them unscaled. The temperature is
     learned, with an initial value of 0.07.
+
+    Args:
+        in_features: D of the motions.
+        text_features: C, width of the pooled condition.
+        latent_dim: width of the transformer.
+        ff_size: hidden width of its feed-forward layers.
+        num_layers: number of its layers.
+        num_heads: attention heads.
+        dropout: probability inside the layers.
+        max_frames: longest motion that the length token supports.
+        embedding_dim: E, width of the joint space.
+        blind_features: number of features at the beginning of each frame that are set to 0. It is 3 in FLAME's
+            code, whose motions begin with the root's translation: scores do not depend on position and height.
+        roughness: whether the absolute second differences of the features over time are inputs, too. They show
+            noise, which is lost in the mean over frames otherwise.
     """
 
     def __init__(
@@ -49,23 +64,6 @@ class MotionCLIP(nn.Module):
         blind_features: int = 0,
         roughness: bool = False,
     ):
-        """Builds the network.
-
-        Args:
-            in_features: D of the motions.
-            text_features: C, width of the pooled condition.
-            latent_dim: width of the transformer.
-            ff_size: hidden width of its feed-forward layers.
-            num_layers: number of its layers.
-            num_heads: attention heads.
-            dropout: probability inside the layers.
-            max_frames: longest motion that the length token supports.
-            embedding_dim: E, width of the joint space.
-            blind_features: number of features at the beginning of each frame that are set to 0. It is 3 in FLAME's
-                code, whose motions begin with the root's translation: scores do not depend on position and height.
-            roughness: whether the absolute second differences of the features over time are inputs, too. They show
-                noise, which is lost in the mean over frames otherwise.
-        """
         super().__init__()
         self.roughness = roughness
         self.max_frames, self.blind_features = max_frames, blind_features

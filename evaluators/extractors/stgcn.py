@@ -41,6 +41,13 @@ class STGCN(nn.Module):
     The dropout of the published training code is omitted. Past the end of a motion, the convolutions see zeros, as at
     the end of the longest one, so features do not depend on the other motions of a batch. In the published evaluations,
     all motions have 60 frames, and short clips repeat their last frame.
+
+    Args:
+        in_channels: C, channels per joint.
+        num_actions: number of classes.
+        parents: parent of each joint, -1 for the center.
+        widths: channels after each block.
+        strides: temporal stride of each block.
     """
 
     def __init__(
@@ -51,15 +58,6 @@ class STGCN(nn.Module):
         widths: Sequence[int],
         strides: Sequence[int],
     ):
-        """Builds the network.
-
-        Args:
-            in_channels: C, channels per joint.
-            num_actions: number of classes.
-            parents: parent of each joint, -1 for the center.
-            widths: channels after each block.
-            strides: temporal stride of each block.
-        """
         super().__init__()
         graph = adjacency(parents)
         self.register_buffer("A", graph)

@@ -135,6 +135,18 @@ class T2MEvaluator(nn.Module):
     Features are in the data's units, and are normalized with the statistics of the released weights, not with those of
     the data set. As in the authors' code for real motions, motions are padded to `max_frames` with zeros after
     normalization; the convolutions see 3 frames past the end.
+
+    Args:
+        mean: (D,) the evaluator's mean: 263 or 251 features.
+        std: (D,) its standard deviation.
+        movement_hidden: channels after the first convolution.
+        movement_latent: channels of a movement vector.
+        text_hidden: width of the text GRU.
+        motion_hidden: width of the motion GRU.
+        embedding: E, width of the joint space.
+        max_frames: length to which every motion is padded.
+        used_features: number of features that the network sees, from the first; MARDM's sees 67 (KIT: 64). None =
+            all but the contacts.
     """
 
     mean: Tensor
@@ -153,20 +165,6 @@ class T2MEvaluator(nn.Module):
         max_frames: int = 196,
         used_features: int | None = None,
     ):
-        """Builds the networks; widths are those of the released weights.
-
-        Args:
-            mean: (D,) the evaluator's mean: 263 or 251 features.
-            std: (D,) its standard deviation.
-            movement_hidden: channels after the first convolution.
-            movement_latent: channels of a movement vector.
-            text_hidden: width of the text GRU.
-            motion_hidden: width of the motion GRU.
-            embedding: E, width of the joint space.
-            max_frames: length to which every motion is padded.
-            used_features: number of features that the network sees, from the first; MARDM's sees 67 (KIT: 64). None =
-                all but the contacts.
-        """
         super().__init__()
         self.max_frames = max_frames
         self.register_buffer("mean", mean.float())

@@ -39,6 +39,24 @@ class PretrainedText(ConditionEncoder):
         "pooler": tanh of a linear map of the first token, as in BERT. RoBERTa is published without such a map, so
             transformers initializes it at random each time the model is loaded; FLAME was trained with one such draw.
             Here it is drawn with a fixed seed and saved in the state dict, where a released checkpoint can replace it.
+
+    Args:
+        model: name on the Hugging Face hub, or a folder.
+        features: C, width of the model's outputs.
+        max_tokens: maximum number of word pieces per caption, including special ones; the rest is truncated.
+        pooling: how the pooled vector is computed, see above.
+        revision: commit on the hub, 40 hex digits; required for models from the hub.
+        package: installed Python package whose folder `model` contains the files, instead of the hub.
+        sha256: hash of the package's model.safetensors, checked before loading; required with `package`.
+        normalize: scale the pooled vector to length 1.
+        tokens: return the last hidden states as tokens; otherwise there are 0 tokens.
+        attend_padding: pad every caption to `max_tokens` and treat the padding as real, as FLAME and MFM do.
+        encode_null: the null is the encoded "" (FLAME); otherwise it is zeros (MDM), with the token mask of the
+            sample it replaces.
+        freeze: False fine-tunes the language model together with the motion model.
+
+    Raises:
+        ValueError: `pooling` is unknown.
     """
 
     pooler_weight: Tensor
@@ -59,26 +77,6 @@ class PretrainedText(ConditionEncoder):
         encode_null: bool = False,
         freeze: bool = True,
     ):
-        """Stores the options; loads the language model only if it is fine-tuned.
-
-        Args:
-            model: name on the Hugging Face hub, or a folder.
-            features: C, width of the model's outputs.
-            max_tokens: maximum number of word pieces per caption, including special ones; the rest is truncated.
-            pooling: how the pooled vector is computed, see above.
-            revision: commit on the hub, 40 hex digits; required for models from the hub.
-            package: installed Python package whose folder `model` contains the files, instead of the hub.
-            sha256: hash of the package's model.safetensors, checked before loading; required with `package`.
-            normalize: scale the pooled vector to length 1.
-            tokens: return the last hidden states as tokens; otherwise there are 0 tokens.
-            attend_padding: pad every caption to `max_tokens` and treat the padding as real, as FLAME and MFM do.
-            encode_null: the null is the encoded "" (FLAME); otherwise it is zeros (MDM), with the token mask of the
-                sample it replaces.
-            freeze: False fine-tunes the language model together with the motion model.
-
-        Raises:
-            ValueError: `pooling` is unknown.
-        """
         super().__init__()
         if pooling not in POOLINGS:
             raise UserError(f"condition.pooling={pooling} is unknown: choose one of {', '.join(POOLINGS)}")

@@ -31,6 +31,14 @@ class LearnedTokens(ConditionEncoder):
 
     The pooled vector is the mean of the tokens, and the null token is the null vector, so that all parameters receive
     gradients whether a denoiser reads the pooled vector or the tokens.
+
+    Args:
+        features: C, the width of the tokens and of the pooled vector.
+        buckets: rows of the word table.
+        max_words: maximum number of words per caption.
+        heads: attention heads; divides `features`.
+        dropout: dropout rate of the transformer layer.
+        pretrain_steps: number of steps of `pretrain`.
     """
 
     def __init__(
@@ -42,16 +50,6 @@ class LearnedTokens(ConditionEncoder):
         dropout: float = 0.1,
         pretrain_steps: int = 0,
     ):
-        """Builds the encoder.
-
-        Args:
-            features: C, the width of the tokens and of the pooled vector.
-            buckets: rows of the word table.
-            max_words: maximum number of words per caption.
-            heads: attention heads; divides `features`.
-            dropout: dropout rate of the transformer layer.
-            pretrain_steps: number of steps of `pretrain`.
-        """
         super().__init__()
         self.features, self.buckets, self.max_words = features, buckets, max_words
         self.pretrain_steps = pretrain_steps

@@ -70,7 +70,7 @@ class MotionSource(ABC):
     """Whether the split is the one used in papers although it tests on clips seen in training or leaves no validation
     clips. Saved in the store and in every result."""
     workers: int = 0
-    """Number of processes that read and encode; 0 = one per core, 1 = this process only."""
+    """Number of processes that read and encode; 0 = one per core, 1 = this process only. Most sources take it."""
 
     @cached_property
     def excluded(self) -> Counter[str]:

@@ -68,6 +68,13 @@ class Babel(MotionSource):
     Both splits train on BABEL's entire train part and use 20 % of its val part for testing. Our split uses 20 % of the
     motions, so that no motion is in two splits. FLAME's split uses every fifth clip, so that overlapping windows of one
     label are in both val and test.
+
+    Args:
+        path: folder with `train.json`, `extra_train.json`, `val.json` and `extra_val.json` (BABEL v1.0).
+        amass: folder of AMASS's SMPL+H G release, as archives or unpacked.
+        published_split: use FLAME's split, in which clips of val and test overlap.
+        length: frames per clip at 20 frames per second.
+        stride: frames between the windows of a label.
     """
 
     name = "babel"
@@ -81,16 +88,6 @@ class Babel(MotionSource):
         stride: int = 10,
         workers: int = 0,
     ):
-        """Stores the arguments; reads no files.
-
-        Args:
-            path: folder with `train.json`, `extra_train.json`, `val.json` and `extra_val.json` (BABEL v1.0).
-            amass: folder of AMASS's SMPL+H G release, as archives or unpacked.
-            published_split: use FLAME's split, in which clips of val and test overlap.
-            length: frames per clip at 20 frames per second.
-            stride: frames between the windows of a label.
-            workers: number of processes that read AMASS; 0 = one per core, 1 = this process only.
-        """
         self.path, self.amass, self.published_split = Path(path), Amass(Path(amass)), published_split
         self.length, self.stride, self.workers = length, stride, workers
         self.options = {"published_split": published_split, "length": length, "stride": stride}

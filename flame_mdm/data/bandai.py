@@ -116,6 +116,14 @@ class Bandai(MotionSource):
 
     Mirrored copies belong to the split of their take. Only those of the training split are yielded: validation and test
     contain originals only.
+
+    Args:
+        path: a clone of the original repository, any folder above the BVH files, or a zip or tar archive of one.
+        motion: "joints" for representations of joint positions, "smpl" for those of SMPL's rotations.
+        mirror: yield a mirrored copy after each clip of the training split.
+        exclude: takes to leave out, by the name of the BVH file without extension.
+        split: "takes" holds out takes of combinations of content and style that training sees; "compositional"
+            holds out the combinations `HELD_OUT`, whose contents and styles training sees only in others.
     """
 
     name = "bandai"
@@ -131,17 +139,6 @@ class Bandai(MotionSource):
         exclude: Sequence[str] = (),
         split: SplitRule = "takes",
     ):
-        """Stores the arguments; reads no files.
-
-        Args:
-            path: a clone of the original repository, any folder above the BVH files, or a zip or tar archive of one.
-            motion: "joints" for representations of joint positions, "smpl" for those of SMPL's rotations.
-            mirror: yield a mirrored copy after each clip of the training split.
-            workers: number of processes that read and convert; 0 = one per core, 1 = this process only.
-            exclude: takes to leave out, by the name of the BVH file without extension.
-            split: "takes" holds out takes of combinations of content and style that training sees; "compositional"
-                holds out the combinations `HELD_OUT`, whose contents and styles training sees only in others.
-        """
         for name, value, values in (("split", split, get_args(SplitRule)), ("motion", motion, ("joints", "smpl"))):
             if value not in values:
                 raise UserError(f"data.source.{name}={value}: give {' or '.join(values)}")

@@ -90,6 +90,16 @@ class CMU(MotionSource):
 
     HumanML3D's clips keep their names, splits and mirrored copies. Other recordings are in the test (val) split if a
     clip of HumanML3D's test (val) split is cut from them, and are split by subject if HumanML3D has no clip of them.
+
+    Args:
+        path: folder with recordings such as 02_01.bvh, or 02_01.amc and 02.asf, in any subfolders; or a zip or tar
+            archive of one, which is unpacked into a temporary folder.
+        captions: clone of HumanML3D's repository, or a folder with texts, splits and index; default: `path`.
+            KIT-ML's captions of AMASS, kitml*.json, are used if they are in one of the two folders.
+        motion: "joints" for representations of joint positions; "smpl" for those of SMPL's rotations, which are
+            computed from the positions.
+        descriptions: use CMU's short description of recordings that have no other caption.
+        exclude: recordings to leave out, such as 02_01.
     """
 
     name = "cmu"
@@ -103,19 +113,6 @@ class CMU(MotionSource):
         exclude: Sequence[str] = (),
         workers: int = 0,
     ):
-        """Stores the arguments; reads no files.
-
-        Args:
-            path: folder with recordings such as 02_01.bvh, or 02_01.amc and 02.asf, in any subfolders; or a zip or tar
-                archive of one, which is unpacked into a temporary folder.
-            captions: clone of HumanML3D's repository, or a folder with texts, splits and index; default: `path`.
-                KIT-ML's captions of AMASS, kitml*.json, are used if they are in one of the two folders.
-            motion: "joints" for representations of joint positions; "smpl" for those of SMPL's rotations, which are
-                computed from the positions.
-            descriptions: use CMU's short description of recordings that have no other caption.
-            exclude: recordings to leave out, such as 02_01.
-            workers: number of processes; 0 = one per core, 1 = this process only.
-        """
         if motion not in ("joints", "smpl"):
             raise UserError(f"data.source.motion={motion}: give joints or smpl")
         self.archive, self.workers = Path(path), workers

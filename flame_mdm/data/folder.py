@@ -75,6 +75,13 @@ class Folder(MotionSource):
 
     If the tables give no split, 85 % of the sources are used for training, 5 % for validation and 10 % for testing,
     selected by a hash of their names.
+
+    Args:
+        path: the folder; motions may be in subfolders.
+        motion: "joints" for representations of joint positions; "smpl" for those of SMPL's rotations, which only
+            AMASS files contain.
+        mirror: yield a mirrored copy after each clip of the training split; joints only.
+        exclude: motions to leave out, by their path in the folder without extension.
     """
 
     name = "folder"
@@ -88,16 +95,6 @@ class Folder(MotionSource):
         exclude: Sequence[str] = (),
         workers: int = 0,
     ):
-        """Stores the arguments; reads no files.
-
-        Args:
-            path: the folder; motions may be in subfolders.
-            motion: "joints" for representations of joint positions; "smpl" for those of SMPL's rotations, which only
-                AMASS files contain.
-            mirror: yield a mirrored copy after each clip of the training split; joints only.
-            exclude: motions to leave out, by their path in the folder without extension.
-            workers: number of processes that read; 0 = one per core, 1 = this process only.
-        """
         if motion not in ("joints", "smpl") or (mirror and motion == "smpl"):
             raise UserError(f"data.source.motion={motion}, mirror={mirror}: give joints, or smpl with mirror=false")
         self.path, self.motion, self.mirror, self.exclude = Path(path), motion, mirror, tuple(exclude)

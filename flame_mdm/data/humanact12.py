@@ -31,6 +31,10 @@ class HumanAct12(MotionSource):
 
     The file names neither subjects nor recordings. Our split (70 % train, 10 % val, 20 % test of each action) keeps
     neighboring clips together. The papers use no split: every clip is used for training and for testing.
+
+    Args:
+        path: `humanact12poses.pkl`, or the folder that contains it.
+        published_split: use all clips for training and for testing.
     """
 
     name = "humanact12"
@@ -40,12 +44,6 @@ class HumanAct12(MotionSource):
     )
 
     def __init__(self, path: str, published_split: bool = False):
-        """Stores the arguments; reads no files.
-
-        Args:
-            path: `humanact12poses.pkl`, or the folder that contains it.
-            published_split: use all clips for training and for testing.
-        """
         self.path, self.published_split = Path(path), published_split
         self.options = {"published_split": published_split}
 

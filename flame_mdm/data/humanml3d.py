@@ -82,7 +82,17 @@ def by_recording(rows: Iterable[IndexedClip]) -> tuple[dict[str, list[IndexedCli
 
 
 class HumanML3D(T2MFolder):
-    """The processed folder with 263 features; missing motions are first created from AMASS if `amass` is given."""
+    """The processed folder with 263 features; missing motions are first created from AMASS if `amass` is given.
+
+    Args: all but `path` and `exclude` are for creating the folder from AMASS.
+        path, exclude: as for `T2MFolder`; the folder must contain texts and splits.
+        amass: folder of AMASS's SMPL+H G archives, packed or unpacked.
+        body_models: folder of the extended SMPL+H model.
+        humanact12: folder or zip of HumanAct12's joints; default `humanact12` or `pose_data/humanact12.zip` next to
+            `path`.
+        index: default `index.csv` in `path` or next to it.
+        bone_lengths: 22 bone lengths, in meters, of the skeleton that all motions are retargeted to.
+    """
 
     name = "humanml3d"
     representation = "humanml-legacy-smpl22"
@@ -102,19 +112,6 @@ class HumanML3D(T2MFolder):
         bone_lengths: Sequence[float] | None = None,
         workers: int = 0,
     ):
-        """Stores the arguments; reads no files. All but `path` and `exclude` are for creating the folder from AMASS.
-
-        Args:
-            path: the folder; it must contain texts and splits.
-            exclude: names to leave out; a mirrored copy has its own name.
-            amass: folder of AMASS's SMPL+H G archives, packed or unpacked.
-            body_models: folder of the extended SMPL+H model.
-            humanact12: folder or zip of HumanAct12's joints; default `humanact12` or `pose_data/humanact12.zip` next to
-                `path`.
-            index: default `index.csv` in `path` or next to it.
-            bone_lengths: 22 bone lengths, in meters, of the skeleton that all motions are retargeted to.
-            workers: number of processes; 0 = one per core, 1 = this process only.
-        """
         super().__init__(path, exclude)
         self.amass = Amass(Path(amass)) if amass else None
         self.body_models = Path(body_models) if body_models else None
@@ -281,6 +278,14 @@ class HumanML3DSMPL(MotionSource):
     caption of the whole motion. Clips are named NAME#0, NAME#1 ...; those of one motion share its frames. Unlike in
     FLAME's code, the frames trimmed from the start of five subsets are taken into account when `index.csv` is applied,
     so that motion and caption match.
+
+    Args:
+        path: folder with the texts and splits of HumanML3D; no motions are needed.
+        amass: folder of AMASS's SMPL+H G archives, packed or unpacked.
+        humanact12: FLAME's `humanact12_processed.pkl`; without it, the clips of HumanAct12 are left out.
+        index: default `index.csv` in `path` or next to it.
+        published_split: train on the validation clips as well (FLAME's "final"); none are left for validation.
+        exclude: names to leave out.
     """
 
     name = "humanml3d-smpl"
@@ -296,17 +301,6 @@ class HumanML3DSMPL(MotionSource):
         exclude: Sequence[str] = (),
         workers: int = 0,
     ):
-        """Stores the arguments; reads no files.
-
-        Args:
-            path: folder with the texts and splits of HumanML3D; no motions are needed.
-            amass: folder of AMASS's SMPL+H G archives, packed or unpacked.
-            humanact12: FLAME's `humanact12_processed.pkl`; without it, the clips of HumanAct12 are left out.
-            index: default `index.csv` in `path` or next to it.
-            published_split: train on the validation clips as well (FLAME's "final"); none are left for validation.
-            exclude: names to leave out.
-            workers: number of processes; 0 = one per core, 1 = this process only.
-        """
         self.folder, self.amass = HumanML3D(path, exclude, index=index), Amass(Path(amass))
         self.humanact12 = Path(humanact12) if humanact12 else None
         self.published_split, self.workers = published_split, workers

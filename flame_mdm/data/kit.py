@@ -37,6 +37,11 @@ class KITTemos(MotionSource):
     Petrovich, Black, Varol, "TEMOS", ECCV 2022, whose rules FLAME follows. Training and validation leave out motions
     of fewer than 10 or more than 500 frames. The test split keeps all motions, but only their first caption; the clips
     of Ghosh et al.'s test split have the attribute `ghosh_test`.
+
+    Args:
+        path: folder with `NUMBER_fke.csv`, `NUMBER_annotations.json` and `NUMBER_meta.json`.
+        splits: folder `datasets/kit-splits` of https://github.com/Mathux/TEMOS.
+        exclude: numbers to leave out.
     """
 
     name = "kit-temos"
@@ -44,14 +49,6 @@ class KITTemos(MotionSource):
     get_it = "get datasets/kit-splits of https://github.com/Mathux/TEMOS"
 
     def __init__(self, path: str, splits: str, exclude: Sequence[str] = (), workers: int = 0):
-        """Stores the arguments; reads no files.
-
-        Args:
-            path: folder with `NUMBER_fke.csv`, `NUMBER_annotations.json` and `NUMBER_meta.json`.
-            splits: folder `datasets/kit-splits` of https://github.com/Mathux/TEMOS.
-            exclude: numbers to leave out.
-            workers: number of processes; 0 = one per core, 1 = this process only.
-        """
         self.path, self.splits, self.workers = Path(path), Path(splits), workers
         self.exclude = frozenset(str(name) for name in exclude)
         self.options = {"exclude": list(exclude)}

@@ -121,6 +121,10 @@ class T2MFolder(MotionSource):
     """A processed folder. Cuts and mirrored copies have the split of their motion, which is also their source.
 
     The attribute `tokens` contains the words with their parts of speech, one list per caption.
+
+    Args:
+        path: the folder.
+        exclude: names to leave out; a mirrored copy has its own name.
     """
 
     representation: str
@@ -130,12 +134,6 @@ class T2MFolder(MotionSource):
     get_it: str
 
     def __init__(self, path: str, exclude: Sequence[str] = ()):
-        """Stores the arguments; reads no files.
-
-        Args:
-            path: the folder.
-            exclude: names to leave out; a mirrored copy has its own name.
-        """
         self.path, self.exclude = Path(path), frozenset(str(name) for name in exclude)
         self.options = {"exclude": list(exclude)}
 

@@ -53,18 +53,16 @@ class UESTC(MotionSource):
     """The clips of `vibe_cache_refined.pkl`, rotated to the front view, as raw motions of the SMPL representations.
 
     As published, training clips of fewer than `min_frames` frames are left out and all test clips are kept.
+
+    Args:
+        path: the folder that contains `vibe_cache_refined.pkl` and `info`.
+        published_split: train on all 51 training subjects; otherwise 5 of them are used for validation.
+        min_frames: minimum length of a training clip; published: three quarters of 60.
     """
 
     name = "uestc"
 
     def __init__(self, path: str, published_split: bool = False, min_frames: int = 45):
-        """Stores the arguments; reads no files.
-
-        Args:
-            path: the folder that contains `vibe_cache_refined.pkl` and `info`.
-            published_split: train on all 51 training subjects; otherwise 5 of them are used for validation.
-            min_frames: minimum length of a training clip; published: three quarters of 60.
-        """
         self.path, self.published_split, self.min_frames = Path(path), published_split, min_frames
         self.options = {"published_split": published_split, "min_frames": min_frames}
 

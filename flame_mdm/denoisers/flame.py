@@ -16,6 +16,18 @@ class FLAME(Denoiser):
 
     ML embeds the length of the motion, TS is the sinusoid of the time, CLS the projected pooled condition.
     The output of frames past the end of a motion is 0.
+
+    Args:
+        max_frames: maximum length of a motion that ML can embed.
+        length_token: False omits ML (table 4, first row).
+        cross_attention: False gives a transformer encoder over ML, TS, CLS and frames (table 4, first two rows).
+        condition_frames: also add TS and CLS to every frame. A small network then learns to follow the text in
+            fewer steps than from tokens alone.
+        length_unit: ML embeds the length rounded down to a multiple of this. `task.build` passes the unit of the
+            windows in training: ML knows no other lengths.
+
+    Raises:
+        UserError: If `length_unit` is not a positive whole number.
     """
 
     def __init__(
@@ -35,20 +47,6 @@ class FLAME(Denoiser):
         condition_frames: bool = False,
         length_unit: int = 1,
     ):
-        """Builds the network; `Denoiser` describes the arguments that several networks have.
-
-        Args:
-            max_frames: maximum length of a motion that ML can embed.
-            length_token: False omits ML (table 4, first row).
-            cross_attention: False gives a transformer encoder over ML, TS, CLS and frames (table 4, first two rows).
-            condition_frames: also add TS and CLS to every frame. A small network then learns to follow the text in
-                fewer steps than from tokens alone.
-            length_unit: ML embeds the length rounded down to a multiple of this. `task.build` passes the unit of the
-                windows in training: ML knows no other lengths.
-
-        Raises:
-            UserError: If `length_unit` is not a positive whole number.
-        """
         super().__init__()
         if type(length_unit) is not int or length_unit < 1:
             raise UserError(f"length_unit is {length_unit}: choose a number of frames, 1 or more")

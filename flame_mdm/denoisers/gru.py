@@ -12,6 +12,10 @@ class MDMGRU(Denoiser):
     """GRU over the frames, with time + condition concatenated to each frame.
 
     It runs forward in time, so that padding at the end does not affect real frames.
+
+    Args:
+        recur_over_batch: recurs from sample to sample instead of from frame to frame, as MDM's released code does
+            because of swapped axes. Only for reproduction: results then depend on the order of the batch.
     """
 
     def __init__(
@@ -26,12 +30,6 @@ class MDMGRU(Denoiser):
         project_condition: bool = True,
         recur_over_batch: bool = False,
     ):
-        """Builds the network; `Denoiser` describes the arguments that several networks have.
-
-        Args:
-            recur_over_batch: recurs from sample to sample instead of from frame to frame, as MDM's released code does
-                because of swapped axes. Only for reproduction: results then depend on the order of the batch.
-        """
         super().__init__()
         self.condition = TimeAndCondition(latent_dim, cond_features, project_condition)
         self.input = nn.Linear(in_features + latent_dim, latent_dim)

@@ -12,7 +12,16 @@ from flame_mdm.errors import UserError
 
 
 class MDMEncoder(Denoiser):
-    """Transformer encoder over [time + condition, frame 1, frame 2, ...]; the network of MDM and of MFM."""
+    """Transformer encoder over [time + condition, frame 1, frame 2, ...]; the network of MDM and of MFM.
+
+    Args:
+        max_tokens: 0 = the pooled condition is added to the time. Otherwise the maximum number of condition tokens
+            between the time and the frames (MFM with T5: 30); frames keep their positions if there are fewer.
+        mask_padding: False lets frames attend to the padding, as the released models of MDM and MFM do: they are
+            sampled at the padded length of their training and cropped.
+        condition_frames: also add time + condition (with `max_tokens`, the time) to every frame. A small network
+            then learns to follow the text in fewer steps than from a single token.
+    """
 
     def __init__(
         self,
@@ -30,16 +39,6 @@ class MDMEncoder(Denoiser):
         mask_padding: bool = True,
         condition_frames: bool = False,
     ):
-        """Builds the network; `Denoiser` describes the arguments that several networks have.
-
-        Args:
-            max_tokens: 0 = the pooled condition is added to the time. Otherwise the maximum number of condition tokens
-                between the time and the frames (MFM with T5: 30); frames keep their positions if there are fewer.
-            mask_padding: False lets frames attend to the padding, as the released models of MDM and MFM do: they are
-                sampled at the padded length of their training and cropped.
-            condition_frames: also add time + condition (with `max_tokens`, the time) to every frame. A small network
-                then learns to follow the text in fewer steps than from a single token.
-        """
         super().__init__()
         self.max_tokens, self.mask_padding, self.condition_frames = max_tokens, mask_padding, condition_frames
         self.condition = TimeAndCondition(latent_dim, cond_features, project_condition)
@@ -72,7 +71,16 @@ class MDMEncoder(Denoiser):
 
 
 class MDMDecoder(Denoiser):
-    """Transformer decoder over the frames, with time + condition as cross-attention memory."""
+    """Transformer decoder over the frames, with time + condition as cross-attention memory.
+
+    Args:
+        input_token: token before the frames: "condition" is the paper's "+ input token", where time + condition
+            are both input token and memory, as in the released model; "time" is MDM's code since February 2025,
+            where the token is only the time.
+        token_memory: use all condition tokens as memory, with the time added to each (MDM with DistilBERT), instead
+            of the pooled vector.
+        mask_padding: False lets frames attend to the padding, as the released models without `mask_frames` do.
+    """
 
     def __init__(
         self,
@@ -90,16 +98,6 @@ class MDMDecoder(Denoiser):
         token_memory: bool = False,
         mask_padding: bool = True,
     ):
-        """Builds the network; `Denoiser` describes the arguments that several networks have.
-
-        Args:
-            input_token: token before the frames: "condition" is the paper's "+ input token", where time + condition
-                are both input token and memory, as in the released model; "time" is MDM's code since February 2025,
-                where the token is only the time.
-            token_memory: use all condition tokens as memory, with the time added to each (MDM with DistilBERT), instead
-                of the pooled vector.
-            mask_padding: False lets frames attend to the padding, as the released models without `mask_frames` do.
-        """
         super().__init__()
         if input_token not in ("none", "condition", "time"):
             raise UserError(f"input_token is none, condition or time, not {input_token!r}")

@@ -21,6 +21,10 @@ class MDMUNet(Denoiser):
 
     Padded frames are zeroed before every convolution, as if the motion ended there, and excluded from the statistics of
     the norms. A frame of a coarser level is real if the first of its two finer frames is.
+
+    Args:
+        channels: width of each level; each level has half the frame rate of the previous one.
+        num_groups: groups of the group norms; divides all widths.
     """
 
     def __init__(
@@ -35,12 +39,6 @@ class MDMUNet(Denoiser):
         dropout: float,
         project_condition: bool = True,
     ):
-        """Builds the network; `Denoiser` describes the arguments that several networks have.
-
-        Args:
-            channels: width of each level; each level has half the frame rate of the previous one.
-            num_groups: groups of the group norms; divides all widths.
-        """
         super().__init__()
 
         def block(in_channels: int, out_channels: int) -> ResidualBlock:

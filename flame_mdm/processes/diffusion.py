@@ -66,7 +66,32 @@ class LossAwareTimesteps(nn.Module):
 
 
 class GaussianDiffusion(Process):
-    """Gaussian diffusion over T steps. t is the step 0 ... T - 1 as a float, passed unchanged to the denoiser."""
+    """Gaussian diffusion over T steps. t is the step 0 ... T - 1 as a float, passed unchanged to the denoiser.
+
+    Args:
+        num_train_timesteps: T.
+        schedule: name of the noise schedule.
+        prediction: meaning of the first D channels of the denoiser's output: the clean motion, the noise, or the
+            velocity sqrt(ab) noise - sqrt(1 - ab) x (Salimans and Ho 2022).
+        variance: variance of the reverse process: that of the posterior, beta, or learned between the two, from a
+            second set of D channels (Nichol and Dhariwal 2021, eq. 15).
+        vlb_weight: lambda in L_simple + lambda L_vlb (FLAME, eq. 4 and 15), if the variance is learned. L_vlb is
+            the sum over T steps, estimated by T times the term of one step. So 0.001 at T = 1000, the value of
+            Nichol and Dhariwal, corresponds to 1 in FLAME's code.
+        average_padding: average losses over the padded length with noise 0 in the padding, as in FLAME's code, so
+            that short motions have less weight. The denoiser must return 0 there.
+        clip_x0: clamp the clean estimate to [-1, 1] in sampling, as in FLAME's code.
+        timestep_sampling: how training steps are drawn.
+        skip: only with prediction epsilon: the noise is sqrt(1 - ab) x_t + sqrt(ab) times the output (Karras et al.
+            2022, eq. 7, for data of variance 1), so that the network need not carry its input, and the clean
+            estimate divides nothing by the signal. The output is then a velocity, trained with the error of the
+            noise.
+        min_snr: weight of a step's squared error is that of min(SNR, min_snr) on the clean motion (Hang et al.
+            2023, eq. 4, there 5). None = 1, whatever is predicted.
+
+    Raises:
+        UserError: If an option has an unknown value, or needs prediction epsilon.
+    """
 
     edit_modes = ("x0", "x_t")
     samplers = samplers.DIFFUSION_SAMPLERS
@@ -84,32 +109,6 @@ class GaussianDiffusion(Process):
         skip: bool = False,
         min_snr: float | None = None,
     ):
-        """Builds the process.
-
-        Args:
-            num_train_timesteps: T.
-            schedule: name of the noise schedule.
-            prediction: meaning of the first D channels of the denoiser's output: the clean motion, the noise, or the
-                velocity sqrt(ab) noise - sqrt(1 - ab) x (Salimans and Ho 2022).
-            variance: variance of the reverse process: that of the posterior, beta, or learned between the two, from a
-                second set of D channels (Nichol and Dhariwal 2021, eq. 15).
-            vlb_weight: lambda in L_simple + lambda L_vlb (FLAME, eq. 4 and 15), if the variance is learned. L_vlb is
-                the sum over T steps, estimated by T times the term of one step. So 0.001 at T = 1000, the value of
-                Nichol and Dhariwal, corresponds to 1 in FLAME's code.
-            average_padding: average losses over the padded length with noise 0 in the padding, as in FLAME's code, so
-                that short motions have less weight. The denoiser must return 0 there.
-            clip_x0: clamp the clean estimate to [-1, 1] in sampling, as in FLAME's code.
-            timestep_sampling: how training steps are drawn.
-            skip: only with prediction epsilon: the noise is sqrt(1 - ab) x_t + sqrt(ab) times the output (Karras et al.
-                2022, eq. 7, for data of variance 1), so that the network need not carry its input, and the clean
-                estimate divides nothing by the signal. The output is then a velocity, trained with the error of the
-                noise.
-            min_snr: weight of a step's squared error is that of min(SNR, min_snr) on the clean motion (Hang et al.
-                2023, eq. 4, there 5). None = 1, whatever is predicted.
-
-        Raises:
-            UserError: If an option has an unknown value, or needs prediction epsilon.
-        """
         super().__init__()
         check_choice("prediction", prediction, get_args(Prediction))
         check_choice("variance", variance, get_args(Variance))

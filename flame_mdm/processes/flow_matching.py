@@ -17,7 +17,21 @@ TimeDistribution = Literal["uniform", "logit_normal"]
 
 
 class FlowMatching(Process):
-    """Straight path from noise at t = 0 to motion at t = 1; the denoiser predicts its velocity and is passed 1000 t."""
+    """Straight path from noise at t = 0 to motion at t = 1; the denoiser predicts its velocity and is passed 1000 t.
+
+    Args:
+        sigma_min: standard deviation of the noise left at t = 1 (Lipman et al. 2023, eq. 20-23).
+        prediction: output of the denoiser: the velocity of the path (MFM), or the clean motion, from which the
+            velocity is computed. A network narrower than the motion cannot represent the noise in the velocity.
+        time_distribution: distribution of training times: uniform on [0, 1), or the logistic of a normal variable,
+            which favors the middle (Esser et al. 2024, eq. 19).
+        quantize_time: pass floor(1000 t), a row of the time table, to the denoiser, as in MFM's code.
+        odeint_grid: use float32 multiples of 1 / N as times, like torchdiffeq's Euler steps in MFM's code. For some
+            N, a time is one row of the table lower than with N equal steps (never for 10, 20 or 30).
+
+    Raises:
+        UserError: If the prediction or time distribution is unknown, or sigma_min is not in [0, 1).
+    """
 
     edit_modes = ("trajectory", "x0")
     samplers = samplers.FLOW_SAMPLERS
@@ -30,21 +44,6 @@ class FlowMatching(Process):
         quantize_time: bool = False,
         odeint_grid: bool = False,
     ):
-        """Builds the process.
-
-        Args:
-            sigma_min: standard deviation of the noise left at t = 1 (Lipman et al. 2023, eq. 20-23).
-            prediction: output of the denoiser: the velocity of the path (MFM), or the clean motion, from which the
-                velocity is computed. A network narrower than the motion cannot represent the noise in the velocity.
-            time_distribution: distribution of training times: uniform on [0, 1), or the logistic of a normal variable,
-                which favors the middle (Esser et al. 2024, eq. 19).
-            quantize_time: pass floor(1000 t), a row of the time table, to the denoiser, as in MFM's code.
-            odeint_grid: use float32 multiples of 1 / N as times, like torchdiffeq's Euler steps in MFM's code. For some
-                N, a time is one row of the table lower than with N equal steps (never for 10, 20 or 30).
-
-        Raises:
-            UserError: If the prediction or time distribution is unknown, or sigma_min is not in [0, 1).
-        """
         super().__init__()
         check_choice("prediction", prediction, ("velocity", "x0"))
         check_choice("time_distribution", time_distribution, get_args(TimeDistribution))

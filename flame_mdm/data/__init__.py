@@ -136,11 +136,7 @@ def some(names: Iterable[str]) -> str:
 
 
 def without(named: Mapping[str, Value], exclude: Collection[str], path: Path) -> dict[str, Value]:
-    """Returns the values of names that `data.source.exclude` does not contain.
-
-    Raises:
-        UserError: If it contains an unknown name.
-    """
+    """Returns the values of names that are not excluded; raises `UserError` if an excluded name is unknown."""
     if unknown := set(exclude) - named.keys():
         raise UserError(f"data.source.exclude: {path} has no {some(unknown)}")
     return {name: value for name, value in named.items() if name not in exclude}
@@ -158,10 +154,9 @@ def hashed_split(name: str, val: int, test: int) -> Split:
 
 
 def split_blocks(name: str, clips: int, size: int, *, val: float, test: float) -> dict[int, Split]:
-    """Returns the split of each block of `size` consecutive clips, drawn by a hash of `name` and its number.
+    """Returns the split of each block of `size` consecutive clips, which may look alike, drawn by a hash of `name`.
 
-    Neighboring clips may come from one recording and look alike. `val` and `test` are shares of the blocks, at least
-    one block each.
+    `val` and `test` are shares of the blocks, at least one block each.
     """
     blocks = sorted(range(-(-clips // size)), key=lambda block: name_hash(f"{name}_{block}"))
     tested, validated = (max(1, round(share * len(blocks))) for share in (test, val))

@@ -80,8 +80,7 @@ class Recording(NamedTuple):
     def every(self, fps: float) -> Recording:
         """Returns every int(self.fps / fps)-th frame without interpolation, as HumanML3D, FLAME and users of BABEL do.
 
-        For 20 fps, every second frame is kept at 59.94 Hz and every twelfth at 250 Hz, so the resulting rate is only
-        approximately `fps`.
+        At 59.94 or 250 Hz, the resulting rate is only approximately `fps`.
         """
         step = int(self.fps / fps)
         if step < 1:
@@ -92,9 +91,8 @@ class Recording(NamedTuple):
 def key_of(path: str) -> str | None:
     """Returns the key of a recording, such as `BioMotionLab_NTroje/rub001/0000_x_poses`, or None outside a subset.
 
-    All names of a subset give the same key. Accepts paths from index files (`./pose_data/KIT/3/x_poses.npy`), from
-    archives and from unpacked folders, nested or not. Ignores case, and treats spaces as underscores, which later
-    releases use.
+    All names of a subset give the same key, in index files, archives and unpacked folders, nested or not. Case is
+    ignored, and spaces are underscores, as in later releases.
     """
     *folders, file = PurePosixPath(path).parts
     for depth in range(len(folders) - 1, -1, -1):
@@ -181,12 +179,9 @@ class Amass:
     def map(
         self, arguments: Mapping[str, Argument], function: Callable[[Argument, Recording], Result], workers: int = 0
     ) -> Iterator[tuple[str, Result]]:
-        """Calls `function(arguments[key], recording)` for each key in worker processes; yields (key, result), sorted.
+        """Yields (key, `function(arguments[key], recording)`) for the keys of `key_of`, sorted, from worker processes.
 
-        Args:
-            arguments: key of `key_of` -> first argument of the function; picklable.
-            function: picklable; the file name is prepended to its `UserError`s.
-            workers: number of processes; 0 = one per core, 1 = this process only.
+        Function and arguments are picklable; the file name is prepended to its `UserError`s.
         """
         if absent := self.missing(arguments):
             raise FileNotFoundError(f"{self.root}: {'; '.join(absent)}")
@@ -262,9 +257,8 @@ class Body(NamedTuple):
 def load_bodies(folder: Path) -> dict[str, Body]:
     """Loads the bodies `male` and `female` of the extended SMPL+H model: only template, shape and joint regressor.
 
-    Args:
-        folder: contains `male/model.npz` and `female/model.npz` (from the model's archive), or `SMPLH_MALE.npz` and
-            `SMPLH_FEMALE.npz`, directly or in a subfolder `smplh`.
+    The folder contains `male/model.npz` and `female/model.npz` (from the model's archive), or `SMPLH_MALE.npz` and
+    `SMPLH_FEMALE.npz`, directly or in a subfolder `smplh`.
     """
     return {gender: _load_body(Path(folder), gender) for gender in ("male", "female")}
 

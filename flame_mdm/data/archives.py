@@ -43,11 +43,7 @@ def members(path: Path, read: Callable[[str], bool] = lambda name: False) -> Ite
 
 
 def unpack(path: Path, folder: Path, is_wanted: Callable[[str], bool]) -> Path:
-    """Unpacks members of an archive into a folder and returns the deepest folder that contains all of them.
-
-    Raises:
-        UserError: As for `members`, or if the name of a member leads out of the folder.
-    """
+    """Unpacks members and returns the deepest folder of them all; raises `UserError` if a name leads out."""
     folder.mkdir(parents=True)
     for name, content in members(path, is_wanted):
         if is_wanted(name):

@@ -240,8 +240,7 @@ def smpl_motion(skeleton: bvh.Bvh, rotations: np.ndarray, translations: np.ndarr
 
     Args:
         skeleton: the file.
-        rotations: (F, J, 3, 3) of its joints in the frame of the parent.
-        translations: (F, J, 3) in the frame of the parent, centimeters.
+        rotations, translations: (F, J, 3, 3) and (F, J, 3) in centimeters, in the frame of the parent.
 
     Returns:
         (F, 3 + 72) float32: position of the pelvis in meters, then rotations. Hands (22 and 23) do not rotate.
@@ -329,10 +328,7 @@ def _take(id_: str, rule: SplitRule) -> Take:
 
 
 def _files(path: Path, ids: Container[str]) -> Iterator[tuple[str, bytes]]:
-    """Yields path and content of the BVH files in a folder or archive; the content is empty for other ids.
-
-    Archives are not unpacked to disk: that would take 550 MB, which would have to be removed after every error.
-    """
+    """Yields path and content, empty for other ids, of BVH files in a folder or archive, which is not unpacked."""
 
     def belongs(name: str) -> bool:
         return FILE.fullmatch(PurePosixPath(name).name) is not None

@@ -14,12 +14,10 @@ Offsets = tuple[tuple[float, float, float], ...]
 
 
 def load_offsets(path: Path) -> Offsets:
-    """Returns where each of SMPL's 24 joints sits relative to its parent in the rest pose of the mean shape, meters.
+    """Returns the position of SMPL's 24 joints relative to their parents in the rest pose of the mean shape, meters.
 
-    The first is the pelvis relative to the origin of the model. No code of the file runs.
-
-    Args:
-        path: SMPL's .pkl as downloaded, or an .npz with the same arrays.
+    The first is the pelvis relative to the origin. `path` is SMPL's .pkl as downloaded, of which no code runs, or an
+    .npz with the same arrays.
     """
     with naming(path, KeyError, TypeError, IndexError, ValueError, what="not a SMPL model of 24 joints: "):
         if path.suffix == ".npz":

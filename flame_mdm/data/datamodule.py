@@ -234,13 +234,7 @@ class MotionDataModule(LightningDataModule):
         self.choose_device()
 
     def choose_device(self, more: int = 0) -> torch.device | None:
-        """Decides whether the data set is kept on the training device.
-
-        Args:
-            more: bytes that the text encoder needs there as well.
-
-        Returns:
-            The device, or None.
+        """Returns the device on which the data set is kept, with `more` bytes of the text encoder; None = on none.
 
         Raises:
             UserError: `resident` is true, but the device has not enough free memory.

@@ -33,17 +33,9 @@ def content() -> dict[str, Any]:
 def draw_captions(
     rng: np.random.Generator, attributes: Attributes, count: int, partial: bool = False
 ) -> tuple[list[str], dict[str, Any]]:
-    """Draws different captions of a clip.
+    """Draws `count` different captions of a clip with these attributes, and returns them with those that they state.
 
-    Args:
-        rng: generator of the draws.
-        attributes: of the clip: action, and those that it has of side, count, direction, amount and speed.
-        count: number of captions.
-        partial: whether the captions leave out some attributes, all of them the same ones, if the grammar has such
-            captions for this action.
-
-    Returns:
-        The captions, and the attributes that they state.
+    With `partial`, they leave out some attributes, all of them the same ones, if the grammar has such captions.
     """
     everything = {name for name, value in attributes.items() if name != "action" and UNSAID.get(name) != value}
     captions: list[str] = []

@@ -99,12 +99,9 @@ def read(path: Path, actions: int = len(HumanAct12.actions)) -> list[tuple[np.nd
 def read_unconstrained(path: Path) -> np.ndarray:
     """Reads the reference motions of unconstrained generation (Tevet et al. 2023, section 4.3; Raab et al. 2022).
 
-    Args:
-        path: `humanact12_unconstrained_modi_struct.npy`, (N, 15 or more, 3, F).
-
     Returns:
-        (N, F, 15, 3) float32, joints in the order of the file: SMPL's joints 15, 12, 16, 18, 20, 17, 19, 21, 0, 1, 4,
-        7, 2, 5, 8.
+        (N, F, 15, 3) float32 of `humanact12_unconstrained_modi_struct.npy`, (N, 15 or more, 3, F): SMPL's joints 15,
+        12, 16, 18, 20, 17, 19, 21, 0, 1, 4, 7, 2, 5, 8.
     """
     data = read_npy(path)
     if data.dtype.kind not in "fiu" or data.ndim != 4 or data.shape[1] < 15 or data.shape[2] != 3:
@@ -113,11 +110,7 @@ def read_unconstrained(path: Path) -> np.ndarray:
 
 
 def find(path: Path, name: str) -> Path:
-    """Returns `path` if it is a file, else the file of this name in that folder or one of its subfolders.
-
-    Raises:
-        FileNotFoundError: If there is no such file; the message says where it is published.
-    """
+    """Returns `path` or the file of this name in it or a subfolder; the error says where it is published."""
     for file in (path, path / name, *sorted(path.glob(f"*/{name}"))):
         if file.is_file():
             return file

@@ -65,8 +65,8 @@ def parse(text: str, where: str) -> list[Description]:
 def cuts(name: str, frames: int, descriptions: Sequence[Description], shortest: int) -> list[Cut]:
     """Returns the items of a motion of `frames` frames, in the published order.
 
-    A description of a part gives a separate item named NAME@from-to; the second item of the same part is named
-    NAME@from-to#2. As published, a motion that is too short or too long gives no items, even if parts of it would fit.
+    A description of a part gives a separate item, NAME@from-to, and the second of the same part NAME@from-to#2. As
+    published, a motion that is too short or too long gives none, even if parts of it would fit.
     """
     if not shortest <= frames < MAX_LENGTH:
         return []

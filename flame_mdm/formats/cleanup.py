@@ -79,9 +79,7 @@ def cleanup(joints: np.ndarray, fps: float, skeleton: Skeleton, contacts: np.nda
 def _least_squares(frames: int, *terms: tuple[int, np.ndarray | float, np.ndarray | float]) -> np.ndarray:
     """Returns x (frames, N) with the minimum sum of all terms: weight (n-th differences of x - target)^2.
 
-    Args:
-        frames: length of x.
-        terms: n, weight (frames - n,) or a number, and target (frames - n, N) or a number; one must be an array.
+    A term is n, weight (frames - n,) or a number, and target (frames - n, N) or a number; one is an array.
     """
     width = next(target.shape[1] for _, _, target in terms if isinstance(target, np.ndarray))
     matrix, right = np.zeros((4, frames)), np.zeros((frames, width))
@@ -153,10 +151,7 @@ def _pin(toe: np.ndarray, contact: np.ndarray) -> np.ndarray:
 
 
 def _push_out(motion: np.ndarray, skeleton: Skeleton, side: str, fps: float) -> None:
-    """Moves the wrist of an arm away from the axis of the trunk or thigh until neither it nor the hand is inside.
-
-    The shift grows and fades within `CLEAR` seconds before and after.
-    """
+    """Moves a wrist away from the axis of trunk or thigh until neither it nor the hand is inside."""
     arm = [skeleton.joints.index(f"{side}_{name}") for name in ("shoulder", "elbow", "wrist")]
     arm += [joint for joint, name in enumerate(skeleton.joints) if name == f"{side}_hand"]
     frames = max(1.0, CLEAR * fps)

@@ -171,14 +171,7 @@ class _Document(_Object):
         yield from (("node of a scene", self.nodes, node) for scene in self.scenes for node in scene.nodes)
 
     def check(self, size: int) -> None:
-        """Checks indices, byte ranges and rotations.
-
-        Args:
-            size: of the binary part in bytes.
-
-        Raises:
-            ValueError: If a part does not fit the others.
-        """
+        """Raises `ValueError` if indices, byte ranges in the binary part of `size` bytes, or rotations do not fit."""
         for purpose, items, index in self.indices():
             if index >= len(items):
                 raise ValueError(f"{purpose}: there is no number {index}, only {len(items)} of them")
@@ -204,11 +197,7 @@ class _Document(_Object):
 
 
 def _ordered(nodes: Sequence[_Node]) -> tuple[list[int], dict[int, int]]:
-    """Returns the indices of nodes in an order in which parents precede their children, and the parents of children.
-
-    Raises:
-        ValueError: If a node has two parents or is its own ancestor.
-    """
+    """Returns an order of nodes with parents first, and the parents; raises `ValueError` if they form no trees."""
     above = {child: number for number, node in enumerate(nodes) for child in node.children}
     if len(above) != sum(len(node.children) for node in nodes):
         raise ValueError("a node has two parents")
@@ -312,11 +301,7 @@ def _chunks(content: bytes) -> tuple[Any, bytes]:
 
 
 def _skins(parts: _Document, data: bytes, rank: dict[int, int]) -> tuple[Skin, ...]:
-    """Returns the skins; `rank` converts indices of nodes to their numbers.
-
-    Raises:
-        ValueError: If bounds or matrices are missing or unusable.
-    """
+    """Returns the skins, whose bounds and matrices must be usable; `rank` converts indices to numbers of nodes."""
     corners: list[list[np.ndarray]] = [[np.zeros((0, 3))] for _ in parts.skins]
     for node in (node for node in parts.nodes if min(node.mesh, node.skin) >= 0):
         for primitive in parts.meshes[node.mesh].primitives:

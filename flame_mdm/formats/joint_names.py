@@ -21,11 +21,9 @@ class UnknownJoints(UserError):
 
 
 def identify(path: Path, names: Mapping[int, str]) -> dict[str, int]:
-    """Returns the numbers of the joints that correspond to SMPL's.
+    """Returns the numbers of the joints that correspond to SMPL's, among numbers -> names of a character.
 
-    Args:
-        path: the character; a file of the same name that ends in .yaml may list the names of its joints.
-        names: number -> name of each joint.
+    A file of the character's name that ends in .yaml may list the names.
 
     Raises:
         UserError: If the file of names is invalid, or a joint is there twice.

@@ -151,12 +151,7 @@ def map_bvh(
 
 
 def array_layout(path: Path, joints: np.ndarray, fields: Mapping[str, Any]) -> tuple[Layout, tuple[str, ...]]:
-    """Returns the layout of an array and the names of its joints, from `fields` or inferred from their number.
-
-    Raises:
-        UserError: If the shape is not (frames, joints, 3), or no known skeleton has this number of joints or these
-            names.
-    """
+    """Returns layout and joint names of an array (F, J, 3), from `fields` or inferred from their number."""
     if joints.ndim != 3 or joints.shape[2] != 3 or not len(joints):
         raise UserError(f"{path}: joints of shape {joints.shape}, not (frames, joints, 3)")
     count = joints.shape[1]
@@ -180,11 +175,7 @@ def layout_name(layout: Layout) -> str:
 
 
 def find_layout(path: Path, names: Sequence[str], fields: Mapping[str, Any]) -> Layout:
-    """Returns the known layout for joints with these names, overridden by `fields`.
-
-    Raises:
-        UserError: If no known layout has these names; the message begins with the missing ones.
-    """
+    """Returns the known layout for joints with these names, overridden by `fields`; errors begin with missing ones."""
     candidates = {"the map": Layout(fields["map"])} if "map" in fields else LAYOUTS | _TOELESS
     name, nearest = min(candidates.items(), key=lambda item: len(item[1].used - set(names)))
     if missing := sorted(nearest.used - set(names)):
@@ -219,11 +210,7 @@ class _Fields(BaseModel):
 
 
 def skeleton_file(path: Path) -> Path | None:
-    """Returns the nearest `skeleton.yaml` in the folder of a file or above it.
-
-    Raises:
-        UserError: If it is not a regular file.
-    """
+    """Returns the nearest `skeleton.yaml`, a regular file, in the folder of a file or above it."""
     for folder in path.absolute().parents:
         if os.path.lexists(folder / "skeleton.yaml"):
             regular_file(folder / "skeleton.yaml")
@@ -232,11 +219,7 @@ def skeleton_file(path: Path) -> Path | None:
 
 
 def find_skeleton(path: Path, up: str | None = None) -> dict[str, Any]:
-    """Returns the fields of `Layout` for a file: those of `skeleton_file`, overridden by `up` (y, z or -y).
-
-    Raises:
-        UserError: If `up` is no axis, or the skeleton file is invalid.
-    """
+    """Returns the fields of `Layout` for a file: those of its `skeleton_file`, overridden by `up` (y, z or -y)."""
     if up is not None and up not in UP:
         raise UserError(f"up={up}: the axis that points up is one of {', '.join(UP)}")
     file = skeleton_file(path)
@@ -244,11 +227,7 @@ def find_skeleton(path: Path, up: str | None = None) -> dict[str, Any]:
 
 
 def read_skeleton(path: Path) -> dict[str, Any]:
-    """Reads the fields of `Layout` in a skeleton file; the others are those of a known skeleton.
-
-    Raises:
-        UserError: If the file cannot be read, or a key or value is invalid; the message names the file and the key.
-    """
+    """Reads some fields of `Layout` from a skeleton file; a `UserError` names the file and the key."""
     data = read_yaml(path)
     allowed = _Fields.model_fields.keys()
     if not isinstance(data, dict) or not set(data) <= allowed:

@@ -13,16 +13,11 @@ the trunk is; and radius of a thigh, relative to its length."""
 
 
 def depths(joints: np.ndarray, names: Sequence[str], side: str) -> tuple[np.ndarray, np.ndarray]:
-    """Measures an arm against capsules about the trunk and the thighs, whose sizes follow from the bone lengths.
-
-    Args:
-        joints: (F, J, 3) in meters.
-        names: of the J joints.
-        side: left or right, of the arm.
+    """Measures the left or right arm against capsules about trunk and thighs, whose sizes follow from the bones.
 
     Returns:
         Depth (F, 3) in meters of the elbow, the wrist and the middle of the hand, negative outside; and unit vectors
-        (F, 3, 3) from the axis of the part in which a point is deepest.
+        (F, 3, 3) from the axis of the part in which a point is deepest; of joints (F, J, 3) in meters.
     """
     at = {name: joints[:, number] for number, name in enumerate(names)}
     elbow, wrist = at[f"{side}_elbow"], at[f"{side}_wrist"]

@@ -100,11 +100,7 @@ class Motion:
         return f"{type(self).__name__}({name!r}, {len(self.joints)} frames, {self.fps:g} fps, {self.skeleton.name})"
 
     def posed(self) -> Poses:
-        """Returns the rotations; if they are not known, computes them from joint positions.
-
-        Raises:
-            UserError: If the skeleton is not SMPL's.
-        """
+        """Returns the rotations; if they are not known, computes them from joint positions of SMPL's skeleton."""
         if self.poses is not None:
             return self.poses
         joints = torch.from_numpy(self.joints)

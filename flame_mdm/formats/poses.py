@@ -134,10 +134,9 @@ def solve_checked(joints: Tensor, fps: float) -> tuple[Tensor, Tensor]:
 
 
 def _fit(offsets: Tensor, bones: Tensor) -> Tensor:
-    """Returns quaternions (F, 4) that best align K offsets (K, 3) with K bones (F, K, 3).
+    """Returns quaternions (F, 4) that best align K offsets (K, 3) with K bones (F, K, 3), by repeated squaring.
 
-    They are dominant eigenvectors of symmetric matrices (Horn 1987, "Closed-form solution of absolute orientation
-    using unit quaternions"), which repeated squaring isolates.
+    They are dominant eigenvectors (Horn 1987, "Closed-form solution of absolute orientation using unit quaternions").
     """
     (a, b, c), (d, e, f), (g, h, i) = (row.unbind(-1) for row in (offsets.mT @ bones).unbind(-2))
     elements = [
@@ -156,14 +155,9 @@ def _fit(offsets: Tensor, bones: Tensor) -> Tensor:
 
 
 def _twist(group: Sequence[int], swung: Tensor, offsets: Tensor, bones: Tensor, fps: float) -> Tensor:
-    """Returns quaternions (F, G, 4) that rotate limbs about their axes so that the hinges at their ends match bends.
+    """Returns quaternions (F, G, 4) that rotate limbs, which begin at G joints, about their axes until hinges match.
 
-    Args:
-        group: the G joints at which the limbs begin.
-        swung: quaternions (F, G, 4) of the limbs before.
-        offsets: (G, 3) of the limbs.
-        bones: (F, 22, 3), all of them.
-        fps: frames per second.
+    `swung` (F, G, 4) are the limbs before, with `offsets` (G, 3); `bones` (F, 22, 3) are all of them.
     """
     middle = [CHILDREN[joint][0] for joint in group]
     end = [CHILDREN[joint][0] for joint in middle]

@@ -115,12 +115,7 @@ def _named(path: Path) -> Iterator[None]:
 
 
 def from_array(joints: Any, fps: float | None) -> Motion:
-    """Returns a motion of joint positions.
-
-    Args:
-        joints: array or tensor (F, J, 3) in meters, y up, in the order of a known skeleton, which the number of joints
-            identifies.
-        fps: frames per second.
+    """Returns a motion of joints (F, J, 3) in meters, y up, of the known skeleton with this number of joints.
 
     Raises:
         UserError: If the shape is another one, the values are not numbers, or there is no frame rate.
@@ -140,11 +135,7 @@ def read_arrays(path: Path, header: bool = False) -> dict[str, Any]:
     """Reads the arrays of an .npz, .json or .npy motion: joints, or poses and trans as in AMASS; and fps if present.
 
     `posed_joints`, as in files of NVIDIA's Kimodo, are returned as joints. With `header`, arrays of .npz and .npy files
-    repeat their first frame; the others are neither read nor checked.
-
-    Raises:
-        FileNotFoundError: If the file does not exist.
-        UserError: If the file is damaged or contains no motion; the message names the file.
+    repeat their first frame; the others are neither read nor checked. A `UserError` names the file.
     """
     suffix = path.suffix.lower()
     with _named(path):
@@ -195,11 +186,7 @@ def _read_json(path: Path) -> dict[str, Any]:
 
 
 def smpl_motion(data: dict[str, Any], fps: float | None = None) -> tuple[Tensor, Tensor]:
-    """Returns translation (F, 3) and quaternions (F, 24, 4), float64, of AMASS arrays, resampled to `fps` if given.
-
-    Raises:
-        UserError: If there are fewer than 24 joints, or too many frames.
-    """
+    """Returns translation (F, 3) and quaternions (F, 24, 4), float64, of AMASS arrays, resampled to `fps` if given."""
     poses = data["poses"].reshape(len(data["poses"]), -1)
     frames = None if fps is None else frame_pairs(len(poses), data["fps"], fps, poses.shape[1] // 3)
     translation, rotations = read_pose(torch.from_numpy(np.concatenate([data["trans"], poses], 1)))

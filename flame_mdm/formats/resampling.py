@@ -20,15 +20,7 @@ MAX_RESAMPLED = 1_000_000
 
 
 def frame_rate(value: Any, name: str = "fps") -> float:
-    """Returns a frame rate from a file as a float.
-
-    Args:
-        value: one number, built-in or NumPy.
-        name: its name in the file.
-
-    Raises:
-        UserError: If the value is not one number within `RATES`.
-    """
+    """Returns a frame rate, `name` in its file, as a float; raises `UserError` if it is no number in `RATES`."""
     number = np.asarray(value)
     if number.shape or number.dtype.kind not in "fiu" or not RATES[0] <= float(number) <= RATES[1]:
         shown = f"{float(number):g}" if not number.shape and number.dtype.kind in "fiu" else f"{value}"[:40]
@@ -43,18 +35,12 @@ def check_frames(frames: int) -> None:
 
 
 def resampled_frames(frames: int, rate: float, fps: float, joints: int, slack: float = 0.0) -> int:
-    """Returns the number of frames of a motion after resampling, from its first to its last frame.
+    """Returns the number of frames after resampling from `rate` to `fps`, from the first to the last frame.
 
-    Args:
-        frames: number of frames before.
-        rate: frames per second before.
-        fps: frames per second after.
-        joints: number of joints.
-        slack: fraction of a frame by which the last frame may be past the end.
+    The last frame may be past the end by `slack` of a frame.
 
     Raises:
-        UserError: If there are more than `MAX_FRAMES` frames before, or more than `MAX_RESAMPLED` joint positions
-            after upsampling.
+        UserError: If there are more than `MAX_FRAMES` frames before, or more than `MAX_RESAMPLED` positions after.
     """
     check_frames(frames)
     count = math.floor((frames - 1) * fps / rate + slack) + 1
@@ -71,11 +57,7 @@ def frame_pairs(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Returns the frames before and after each new frame, and its position between them, 0 to 1.
 
-    New frames are at times 0, 1/fps, 2/fps, ... up to the last frame of the motion. Arguments are those of
-    `resampled_frames`.
-
-    Raises:
-        UserError: If `resampled_frames` raises it.
+    New frames are at times 0, 1/fps, 2/fps, ... up to the last frame of the motion; see `resampled_frames`.
     """
     times = np.arange(resampled_frames(frames, rate, fps, joints, slack)) * rate / fps
     before = np.minimum(times.astype(int), frames - 1)
@@ -83,16 +65,9 @@ def frame_pairs(
 
 
 def resample(values: np.ndarray, rate: float, fps: float, cubic: bool = False) -> np.ndarray:
-    """Resamples positions (F, ...) from `rate` to `fps` frames per second.
+    """Resamples positions (F, ...) from `rate` to `fps` frames per second, within the limits of `resampled_frames`.
 
-    Args:
-        values: positions.
-        rate: frames per second before.
-        fps: frames per second after.
-        cubic: interpolate with cubic splines, which preserve bone lengths to about 0.1 %; otherwise linearly.
-
-    Raises:
-        UserError: If `resampled_frames` raises it.
+    Cubic splines preserve bone lengths to about 0.1 %; otherwise, it is linear.
     """
     before, after, share = frame_pairs(len(values), rate, fps, math.prod(values.shape[1:-1]))
     if cubic and len(values) > 1:

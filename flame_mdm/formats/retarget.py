@@ -55,15 +55,7 @@ def smpl(poses: Poses) -> Rig:
 
 
 def preset(name: str, poses: Poses) -> Rig:
-    """Returns a known skeleton with the bone lengths of a body: its joints are where those of the body are.
-
-    Args:
-        name: of a skeleton in `rigs.yaml`.
-        poses: the body.
-
-    Raises:
-        UserError: If no skeleton has this name.
-    """
+    """Returns a skeleton of `rigs.yaml` with the bone lengths of a body; raises `UserError` if the name is unknown."""
     if name not in presets():
         raise UserError(f"rig={name}: unknown.{did_you_mean(name, presets())} Use one of {', '.join(presets())}")
     data = presets()[name]
@@ -144,11 +136,7 @@ def _axes(axes: dict[str, Any], part: str, joint: str, bone: np.ndarray, right: 
 
 
 def retarget(poses: Poses, rig: Rig) -> tuple[np.ndarray, np.ndarray]:
-    """Moves a skeleton with the bone lengths of a body as this body moves.
-
-    Returns:
-        Rotations (F, J, 3, 3) relative to parents, or of roots in the world; positions (F, 3) of the hips in the world.
-    """
+    """Returns rotations (F, J, 3, 3) of `Rig.local` and hips (F, 3) in the world of a skeleton that moves as a body."""
     return rig.local(rig.turned(world_rotations(poses.rotations.numpy()))), poses.root.numpy()
 
 

@@ -142,11 +142,7 @@ def recognized(names: Mapping[int, str], skeletons: Sequence[Mapping[str, str]])
 def matched(
     source: object, names: Mapping[int, str], candidates: Mapping[str, Sequence[int]]
 ) -> tuple[dict[str, int], list[str]]:
-    """Returns the number of each joint of SMPL that a character has, and the required ones that it lacks.
-
-    Raises:
-        UserError: If it has several joints for one of SMPL's.
-    """
+    """Returns numbers of a character's joints by SMPL's, each at most once, and the required ones that it lacks."""
     if double := next((joint for joint, numbers in candidates.items() if len(numbers) > 1), None):
         same = ", ".join(names[number] for number in candidates[double])
         raise UserError(f"{source}: {len(candidates[double])} joints for {double}: {same}. Rename all but one")
@@ -256,9 +252,7 @@ def rest_pose(
 def fitted(character: RestPose, offsets: np.ndarray) -> Rig:
     """Returns the skeleton with its neutral rotations: limbs have the directions of a body's in its rest pose.
 
-    Args:
-        character: the character.
-        offsets: (22, 3), position of each joint of the body relative to its parent in the rest pose.
+    `offsets` (22, 3) are the positions of the body's joints relative to their parents in the rest pose.
     """
     rig, turns = character.rig, np.tile(np.eye(3), (len(SMPL22), 1, 1))
     for side in SIDES:
@@ -280,17 +274,13 @@ def fitted(character: RestPose, offsets: np.ndarray) -> Rig:
 def follow(
     character: RestPose, joints: np.ndarray, offsets: np.ndarray, neutral: np.ndarray, world: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, Rig]:
-    """Moves a character as a body moves.
+    """Moves a character as a body moves; returns rotations (F, J, 3, 3), positions (F, J, 3) and the skeleton for it.
 
     Args:
         character: its rest pose.
         joints: (F, 22, 3), positions of the body's joints in meters.
         offsets: (22, 3), position of each joint of the body relative to its parent in the rest pose.
-        neutral: (22, 3, 3), rotation of each part of the body in the rest pose.
-        world: (F, 22, 3, 3), rotations of these parts in the world.
-
-    Returns:
-        Rotations (F, J, 3, 3) and positions (F, J, 3) of its joints in the world, and its skeleton for this motion.
+        neutral, world: (22, 3, 3) and (F, 22, 3, 3), rotations of its parts in the rest pose and in the world.
     """
     rig, neutral = fitted(character, offsets), neutral.copy()
     turned = world @ np.swapaxes(neutral, 1, 2)

@@ -22,20 +22,12 @@ SIDES = 10
 
 
 def write(path: Path, poses: Poses, rig: Rig, fps: float, text: str, name: str, body: FittedBody | None = None) -> None:
-    """Writes a .glb file in meters, y up; the rest pose faces +z, as the format requires.
+    """Writes a .glb file of the motion in meters, y up; the rest pose faces +z, as the format requires.
 
     It contains one node per joint, one animation that rotates all nodes and moves the hips, with one key per frame in
-    seconds, and one mesh skinned to the joints: a body, stored in an A-pose, or rounded limbs. The node above the
-    joints lifts a body by the thickness of its soles; its toes bend as in pictures.
-
-    Args:
-        path: the file.
-        poses: the motion.
-        rig: the skeleton, with the bone lengths of the motion.
-        fps: frames per second.
-        text: the caption.
-        name: of the animation, if there is no caption.
-        body: the body of this motion; None = rounded limbs.
+    seconds, and one mesh skinned to the joints: a body, stored in an A-pose, or rounded limbs if it is None. The node
+    above the joints lifts a body by the thickness of its soles; its toes bend as in pictures. The rig has the bone
+    lengths of the motion. The animation is called `text`, or `name` if there is none.
     """
     binary = Binary()
     rest = poses.rest().numpy()
@@ -117,11 +109,7 @@ def _linear(colors: np.ndarray) -> np.ndarray:
 
 
 def _limbs(rest: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Returns the limbs of the rest pose: a mesh with N corners.
-
-    Positions and normals (N, 3), linear colors (N, 4), joints and weights (N, 4), triangles, inverse bind matrices
-    (22, 4, 4).
-    """
+    """Returns the limbs of the rest pose: positions, normals, colors, joints, weights, triangles, inverse binds."""
     thickness, side_of, parents = radii(SMPL22), sides(SMPL22), SMPL22.parents
     limbs = []
     for joint, parent in enumerate(parents):

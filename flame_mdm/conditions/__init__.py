@@ -25,11 +25,7 @@ class ConditionEncoder(nn.Module, ABC):
 
     @abstractmethod
     def forward(self, batch: MotionBatch) -> Condition:
-        """Encodes the conditions of a batch, on the device of `batch.x`.
-
-        Raises:
-            ValueError: the batch lacks the captions or labels that the encoder reads.
-        """
+        """Encodes the conditions of a batch, on the device of `batch.x`; raises `ValueError` if it has none."""
 
     def pretrain(self, groups: Sequence[Sequence[str]], seed: int) -> None:
         """Trains the encoder on captions alone, if it can, before the first step; `groups` are captions of a clip."""
@@ -38,11 +34,10 @@ class ConditionEncoder(nn.Module, ABC):
         """Fills the encoder's cache on disk, if it has one, for these captions. Called in one process only."""
 
     def load_cache(self, captions: Sequence[str], folder: Path) -> None:
-        """Opens the cache that `precompute` filled. Called in every process.
+        """Opens the cache that `precompute` filled, in every process.
 
         Raises:
-            FileNotFoundError: If there is no cache for these captions.
-            ValueError: the cache is damaged.
+            FileNotFoundError, ValueError: If there is no cache for these captions, or it is damaged.
         """
 
     def cache_size(self) -> int:

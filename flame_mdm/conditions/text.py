@@ -257,8 +257,7 @@ class Pretrained:
         """Loads a new copy of the network, float32.
 
         Raises:
-            FileNotFoundError: If the model is not available locally and cannot be downloaded.
-            UserError: If the weights have an unexpected hash or are incomplete, or no commit is given for the hub.
+            FileNotFoundError, UserError: If it cannot be had, has an unexpected hash or gaps, or names no commit.
         """
         from transformers import AutoConfig, AutoModel, CLIPTextModelWithProjection, T5EncoderModel, logging
 

@@ -111,27 +111,16 @@ class LearnedTokens(ConditionEncoder):
         return Condition(pooled[of_sample], tokens[of_sample], token_mask[of_sample], self._null())
 
     def encode(self, words: Tensor, counts: Tensor) -> Condition:
-        """Encodes captions as `forward` does, without the branches that a graph cannot have.
-
-        Args:
-            words: (B, S, 2) int64, the `rows` of each caption; any number past its end.
-            counts: (B,) int64, length of each caption.
-        """
+        """Encodes `rows` (B, S, 2) of captions of lengths (B,) as `forward` does, without branches, for a graph."""
         token_mask = length_mask(counts, words.shape[1])
         index = torch.arange(token_mask.numel(), device=words.device)
         tokens = self._encode(words.flatten(0, 1), index, token_mask) * token_mask[..., None]
         return Condition(tokens.sum(1) / counts[:, None], tokens, token_mask, self._null())
 
     def _encode(self, rows: Tensor, index: Tensor, token_mask: Tensor) -> Tensor:
-        """Encodes captions; padding takes part only in attention.
+        """Encodes captions as (N, S, C), 0 past their ends; padding takes part only in attention.
 
-        Args:
-            rows: (T, 2), rows of the table of all real tokens.
-            index: (T,), their positions among the N * S of the padded captions.
-            token_mask: (N, S) bool, True = real token.
-
-        Returns:
-            (N, S, C), 0 past the end of each caption.
+        `rows` (T, 2) of the table are of all real tokens, and `index` (T,) has their places in `token_mask` (N, S).
         """
 
         def pad(y: Tensor) -> Tensor:

@@ -43,14 +43,9 @@ def hashed(word: str, buckets: int) -> tuple[int, int]:
 
 
 def vocabulary(captions: Iterable[str], *, share: bool) -> dict[str, list[str]]:
-    """Returns what a checkpoint keeps of the training captions.
+    """Returns what a checkpoint keeps of the training captions: all words, sorted, as "vocabulary".
 
-    Args:
-        captions: of all training clips.
-        share: whether the license of the data allows to redistribute captions.
-
-    Returns:
-        "vocabulary": all words, sorted; with `share` also "captions": up to `MAX_CAPTIONS` of them, evenly spaced.
+    If the license allows to `share` captions, also up to `MAX_CAPTIONS` of them, evenly spaced, as "captions".
     """
     distinct = sorted(set(captions))
     kept = {"vocabulary": sorted({word for caption in distinct for word in words(caption)})}
@@ -71,12 +66,9 @@ def known_form(word: str, seen: Collection[str]) -> str | None:
 
 
 def advice(text: str, facts: Mapping[str, Any], max_words: int | None = None) -> list[str]:
-    """Returns lines about words that a model has never seen in training or does not read.
+    """Returns lines about words of a prompt that a model, of these facts, has never seen in training or does not read.
 
-    Args:
-        text: the prompt.
-        facts: of the checkpoint; imported models have no vocabulary, and their words are not checked.
-        max_words: maximum number of words that the text encoder reads; None = no such limit.
+    Imported models have no vocabulary, so their words are not checked; `max_words` None = no limit.
     """
     lines, prompt = [], words(text)
     if unknown := _unknown(text, facts):
@@ -125,13 +117,9 @@ def _suggested(text: str, facts: Mapping[str, Any]) -> str:
 def in_parts(text: str, verbs: Collection[str]) -> list[str]:
     """Splits a sentence with several actions: "walks, turns left and waves. Then she sits" has four parts.
 
-    It is split at ends of sentences and at "then"; if verbs are known, also at commas followed by a verb, and in such
-    an enumeration at "and" followed by one. "Raises both hands and waves" is one action. Parts without a verb belong to
-    their neighbor. "In limp style" at the end, which adapters teach, belongs to each part.
-
-    Args:
-        text: the sentence.
-        verbs: all forms of the verbs that the model knows; none = unknown.
+    It is split at ends of sentences and at "then"; if `verbs`, all forms of those that the model knows, are given, also
+    at commas followed by a verb, and in such an enumeration at "and" followed by one. "Raises both hands and waves" is
+    one action. Parts without a verb belong to their neighbor; "in limp style" at the end, which adapters teach, to all.
     """
     comma, also = _before_verb(tuple(verbs))
     parts: list[str] = []

@@ -127,11 +127,7 @@ class MDMDecoder(Denoiser):
 
 
 def condition_tokens(cond: Condition) -> tuple[Tensor, Tensor]:
-    """Returns the tokens (B, S, C) and their mask (B, S).
-
-    Raises:
-        UserError: If the condition encoder returns no tokens.
-    """
+    """Returns the tokens (B, S, C) and their mask (B, S); raises `UserError` if there are none."""
     if cond.token_mask is None or not cond.tokens.shape[1]:
         raise UserError("this denoiser needs condition tokens, but the condition encoder has none: choose another one")
     return cond.tokens, cond.token_mask

@@ -104,11 +104,7 @@ class Process(nn.Module, ABC):
         """
 
     def find_sampler(self, options: SamplerOptions) -> Sampler:
-        """Returns the requested sampler.
-
-        Raises:
-            UserError: If the process has no such sampler, or the sampler does not have one of the options.
-        """
+        """Returns the requested sampler; raises `UserError` if there is none, or it has not one of the options."""
         name = options.sampler
         if name is None or name not in self.samplers:
             raise UserError(f"unknown sampler '{name}': {type(self).__name__} has {', '.join(self.samplers)}")
@@ -122,11 +118,7 @@ class Process(nn.Module, ABC):
         return self.samplers[name]
 
     def check_edit(self, edit: Edit, mask: Tensor) -> None:
-        """Checks an edit before a long run.
-
-        Raises:
-            UserError: If the process does not support its mode, or its shape does not match the motions.
-        """
+        """Raises `UserError` if the process does not support an edit, or its shape is not that of the motions."""
         if edit.mode not in self.edit_modes:
             modes = ", ".join(self.edit_modes)
             raise UserError(f"edit mode '{edit.mode}' is not supported: {type(self).__name__} has {modes}")
@@ -142,10 +134,6 @@ class Process(nn.Module, ABC):
 
 
 def check_choice(name: str, value: str, choices: Sequence[str]) -> None:
-    """Checks an option of a process that has a few values.
-
-    Raises:
-        UserError: If the value is not one of the choices.
-    """
+    """Raises `UserError` if an option of a process is not one of its choices."""
     if value not in choices:
         raise UserError(f"unknown {name} '{value}': choose from {', '.join(choices)}")

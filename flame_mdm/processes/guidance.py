@@ -70,16 +70,10 @@ class Positions:
 def steer(
     clean: Callable[[Tensor], Tensor], x_t: Tensor, to_joints: Callable[[Tensor], Tensor], positions: Positions
 ) -> Tensor:
-    """Returns noisy motions whose clean estimates are nearer to positions in the world.
+    """Returns noisy motions (B, F, D) whose `clean` estimates are nearer to positions in the world.
 
     Steps along the gradient through the denoiser (Chung et al. 2023, "Diffusion posterior sampling"), of Polyak's
     length up to `STEERING_LIMIT`. The entire body adapts, since the denoiser decides how.
-
-    Args:
-        clean: returns the clean estimates (B, F, D) of noisy motions (B, F, D).
-        x_t: (B, F, D).
-        to_joints: decodes (B, F, D) as joints (B, F, J, 3) in meters.
-        positions: the goal.
     """
     for _ in range(STEERING_STEPS):
         with torch.enable_grad():

@@ -95,11 +95,7 @@ class Schedule:
 
 
 def build_schedule(name: ScheduleName, num_train_timesteps: int) -> Schedule:
-    """Returns the schedule of this name with T steps.
-
-    Raises:
-        UserError: If the name is unknown, or the number of steps is not in [2, `MAX_STEPS`].
-    """
+    """Returns the schedule of this name with 2 to `MAX_STEPS` steps."""
     if name not in get_args(ScheduleName):
         raise UserError(f"unknown schedule '{name}': choose from {', '.join(get_args(ScheduleName))}")
     if not 2 <= num_train_timesteps <= MAX_STEPS:

@@ -48,19 +48,16 @@ def blended(denoise: Denoise, windows: Windows) -> Denoise:
 
 
 def spans(lengths: Sequence[int], longest: int, overlap: int, loop: bool = False) -> list[tuple[int, int, int]]:
-    """Covers the consecutive parts of a motion with windows.
+    """Covers the consecutive parts of a motion with windows: part, first frame and number of frames of each.
 
     The windows of a part reach half the overlap into its neighbors. A part that does not fit into one window gets
-    several.
+    several. A loop has windows that begin before frame 0.
 
     Args:
         lengths: frames of each part.
         longest: maximum number of frames of a window, more than `overlap`.
         overlap: frames that two windows share, even.
         loop: whether the first part follows the last one.
-
-    Returns:
-        Part, first frame and number of frames of each window. A loop has windows that begin before frame 0.
     """
     total, begin, windows = sum(lengths), 0, []
     for part, length in enumerate(lengths):

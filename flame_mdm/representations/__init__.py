@@ -91,10 +91,7 @@ class Representation(nn.Module, ABC):
         return mask
 
     def contacts(self, features: Features) -> Features | None:
-        """Returns the columns (..., F, N) of features for contacts of `skeleton.feet` with the floor, about 0 to 1.
-
-        None if there are none.
-        """
+        """Returns columns (..., F, N), about 0 to 1, of contacts of `skeleton.feet` with the floor, or None."""
         columns = self.slices.get("contacts")
         return None if columns is None else features[..., columns]
 

@@ -96,11 +96,7 @@ class HumanML(Representation):
         self.contact_threshold = contact_threshold
 
     def encode(self, motion: Tensor) -> Tensor:
-        """Encodes joints (T, J, 3) in meters, y up, as features (T - 1, D) float32.
-
-        Raises:
-            UserError: If there are fewer than 3 frames, another number of joints, or non-finite coordinates.
-        """
+        """Encodes finite joints (T >= 3, J, 3) in meters, y up, as features (T - 1, D) float32."""
         return self.encode_many([motion])[0]
 
     def encode_many(self, motions: Sequence[Tensor]) -> list[Tensor]:
@@ -127,11 +123,7 @@ class HumanML(Representation):
         return list(torch.cat([part.float() for part in features], 1).split([length - 1 for length in lengths]))
 
     def canonicalize(self, motion: Tensor) -> Tensor:
-        """Returns canonical joints (T, J, 3) float64 of joints (T, J, 3) in meters, equal to `decode(encode(motion))`.
-
-        Raises:
-            UserError: As in `encode`.
-        """
+        """Returns canonical joints (T, J, 3) float64 of joints (T, J, 3) in meters, `decode(encode(motion))`."""
         return self._canonical([motion])[0] / self.units_per_metre
 
     def decode(self, features: Tensor) -> Tensor:
@@ -143,10 +135,7 @@ class HumanML(Representation):
         return torch.cat([root[..., None, :], turned + ground[..., None, :]], -2) / self.units_per_metre
 
     def statistics(self, features: Tensor | Frames) -> tuple[Tensor, Tensor]:
-        """Returns the mean of each feature, and the std averaged over each entry of `slices`.
-
-        Averaging preserves the relative scales within an entry.
-        """
+        """Returns the mean of each feature, and the std averaged over each entry of `slices`, to keep scales."""
         return grouped_statistics(features, self.slices.values())
 
     def joint_features(self, joints: Iterable[int]) -> Tensor:

@@ -37,11 +37,7 @@ class Motion272(Representation):
         self.offsets = offsets
 
     def encode(self, motion: Tensor) -> Tensor:
-        """Encodes a raw motion (F, 3 + 3 K) as features (F, 272) float32.
-
-        Raises:
-            UserError: If there are fewer than 2 frames, or as in `read_pose`.
-        """
+        """Encodes a raw motion (F >= 2, 3 + 3 K) as features (F, 272) float32; see `read_pose`."""
         translation, rotations = read_pose(motion)
         if len(motion) < 2:
             raise UserError("motion: 1 frame, but encoding needs at least 2; leave the motion out")
@@ -115,15 +111,7 @@ class Motion272(Representation):
 
 
 def face_forward(translation: Tensor, rotations: Tensor) -> tuple[Tensor, Tensor]:
-    """Rotates a motion about the y axis through the origin, so that the root faces +z in the first frame.
-
-    Args:
-        translation: (F, 3).
-        rotations: (F, J, 3, 3), root first.
-
-    Returns:
-        Both, turned.
-    """
+    """Turns translation (F, 3) and rotations (F, J, 3, 3) about y, so that the root faces +z in the first frame."""
     turn = _about_y(-_heading(rotations[:1]))
     return translation @ turn[0].T, torch.cat([(turn @ rotations[:, 0])[:, None], rotations[:, 1:]], 1)
 

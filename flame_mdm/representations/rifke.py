@@ -34,11 +34,7 @@ class Rifke(Representation):
         self.units_per_metre = units_per_metre
 
     def encode(self, motion: Tensor) -> Tensor:
-        """Encodes joints (T, 21, 3) in meters, y up, as features (T, 64) float32.
-
-        Raises:
-            UserError: If there are no frames, another number of joints, or non-finite coordinates.
-        """
+        """Encodes finite joints (T, 21, 3) in meters, y up, as features (T, 64) float32."""
         if motion.ndim != 3 or motion.shape[1:] != (21, 3) or not len(motion):
             raise UserError(f"motion: shape {tuple(motion.shape)}, but {self.name} takes (frames, 21, 3)")
         check_finite(motion)
@@ -53,10 +49,7 @@ class Rifke(Representation):
         return torch.cat([root[:, 1:2], local.flatten(1), turn[:, None], way[:, ::2]], 1).float()
 
     def decode(self, features: Tensor) -> Tensor:
-        """Decodes features (..., T, 64) to joints (..., T, 21, 3) in meters. Differentiable.
-
-        The root of the first frame is at x = z = 0, facing +z.
-        """
+        """Decodes (..., T, 64) to joints (..., T, 21, 3) in meters, the first root at 0, facing +z. Differentiable."""
         turned, way = features[..., 61].cumsum(-1), features[..., 62:]
         heading = turned - turned[..., :1]
         way = torch.stack([way[..., 0], torch.zeros_like(heading), way[..., 1]], -1)

@@ -189,11 +189,7 @@ def part_names(skeleton: Skeleton) -> dict[str, list[int]]:
 
 
 def find_joints(skeleton: Skeleton, names: str | Sequence[str]) -> list[int]:
-    """Returns the indices of joints given by names of joints or body parts.
-
-    Raises:
-        UserError: If a name is unknown; the message suggests similar ones.
-    """
+    """Returns the indices of joints given by names of joints or body parts; a `UserError` suggests similar names."""
     parts = part_names(skeleton)
     indices = parts | {name: [index] for index, name in enumerate(skeleton.joints)}
     chosen: list[Any] = list(names) if isinstance(names, list | tuple) else [names]

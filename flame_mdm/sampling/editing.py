@@ -133,11 +133,7 @@ def edit_request(
 
 
 def _part_length(parts: Sequence[Part], length: int, fps: float) -> int:
-    """Returns the frames of each part that gives no seconds, so that all parts are as long as the motion.
-
-    Raises:
-        UserError: If this is not possible.
-    """
+    """Returns the frames of each part that gives no seconds, so that all parts are as long as the motion."""
     timed = [round(seconds * fps) for _, seconds in parts if seconds is not None]
     rest, others = length - sum(timed), len(parts) - len(timed)
     if rest < others or (rest % others if others else rest):
@@ -149,10 +145,7 @@ def _part_length(parts: Sequence[Part], length: int, fps: float) -> int:
 
 
 def kept_parts(representation: Representation, length: int, editing: EditRequest) -> tuple[Tensor, Tensor]:
-    """Returns the mask of an edit of a motion with `length` frames.
-
-    Returns:
-        (F, D) bool, True if this feature of this frame is kept; (F, J) bool, the same for joints.
+    """Returns which features (F, D) and joints (F, J) of each frame an edit of a motion with `length` frames keeps.
 
     Raises:
         UserError: If a range is outside of the motion, or a joint is unknown.

@@ -3,7 +3,7 @@
 import re
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,7 @@ from flame_mdm.safe_io import atomic_folder
 from flame_mdm.sampling.reading import read_motion, with_features
 from flame_mdm.sampling.request import SamplingRequest, check_model, understood
 from flame_mdm.sampling.sequences import motion_lengths, overlap, windows
-from flame_mdm.sampling.targets import Targets, read_targets
+from flame_mdm.sampling.targets import read_targets
 from flame_mdm.visualize import contact_sheet, write_gif, write_mp4, write_player
 from flame_mdm.visualize.body import Mesh
 
@@ -88,7 +88,7 @@ def sample_request(
     if edit is not None:
         request.check_edit(edit.strength is not None)
     check_model(request, model)
-    plan = _plan(model, request, edit)
+    plan = _Plan(model, request, edit)
     motions: list[Motion] = []
     for begin in range(0, len(plan.ids), BATCH):
         trajectory = _First() if stages is not None and not begin else None
@@ -103,56 +103,31 @@ def sample_request(
     return motions
 
 
-@dataclass
 class _Plan:
-    """All motions of a request.
+    """All motions of a request: `captions`, `ids` that seed the noise, and `conditions` and `lengths` of their parts.
 
-    Attributes:
-        request: the request.
-        captions: text or action of each motion, with all its parts.
-        ids: names that seed the noise: the caption and the number of the sample.
-        conditions: text or action of each part of each motion.
-        lengths: frames of each part of each motion; the first part begins with the overlap with `before`.
-        before: features (F, D) of the motion that all continue, in the data's units.
-        targets: places to reach in the world.
-        edit: the part (1, F, D) to keep in every motion.
+    The first part begins with the overlap with `before`, the features (F, D) of a motion that all continue. Each motion
+    keeps the part (1, F, D) of `edit` and reaches `targets` in the world.
     """
 
-    request: SamplingRequest
-    captions: list[str]
-    ids: list[str]
-    conditions: list[list[str]]
-    lengths: list[list[int]]
-    before: Tensor | None
-    targets: Targets | None
-    edit: Edit | None
-
-
-def _plan(model: MotionGenerator, request: SamplingRequest, edit: Edit | None) -> _Plan:
-    captions = [prompt for prompt in request.prompts for _ in range(request.samples * request.candidates)]
-    counts: Counter[str] = Counter()
-    ids = []
-    for caption in captions:
-        ids.append(f"{caption}#{counts[caption]}")
-        counts[caption] += 1
-    before = None if request.after is None else _features_before(model, request.after)
-    lengths = motion_lengths(model, request)
-    if before is not None:  # its last frames are generated again, but kept
-        shared = overlap(model)
-        lengths = [[shared + first, *others] for first, *others in lengths]
-        ending = model.representation.normalize(before[-shared:].to(model.device))[None]
-        edit = Edit(ending, torch.ones_like(ending, dtype=torch.bool))
-    copies = request.samples * request.candidates
-    return _Plan(
-        request=request,
-        captions=captions,
-        ids=ids,
-        conditions=[[name for name, _ in parts] for parts in request.parts for _ in range(copies)],
-        lengths=[parts for parts in lengths for _ in range(copies)],
-        before=before,
-        targets=None if request.targets is None else read_targets(model.representation, request.targets),
-        edit=edit,
-    )
+    def __init__(self, model: MotionGenerator, request: SamplingRequest, edit: Edit | None):
+        copies = request.samples * request.candidates
+        self.request, self.edit, self.ids = request, edit, list[str]()
+        self.captions = [prompt for prompt in request.prompts for _ in range(copies)]
+        counts: Counter[str] = Counter()
+        for caption in self.captions:
+            self.ids.append(f"{caption}#{counts[caption]}")
+            counts[caption] += 1
+        self.before = None if request.after is None else _features_before(model, request.after)
+        lengths = motion_lengths(model, request)
+        if self.before is not None:  # its last frames are generated again, but kept
+            shared = overlap(model)
+            lengths = [[shared + first, *others] for first, *others in lengths]
+            ending = model.representation.normalize(self.before[-shared:].to(model.device))[None]
+            self.edit = Edit(ending, torch.ones_like(ending, dtype=torch.bool))
+        self.lengths = [parts for parts in lengths for _ in range(copies)]
+        self.conditions = [[name for name, _ in parts] for parts in request.parts for _ in range(copies)]
+        self.targets = None if request.targets is None else read_targets(model.representation, request.targets)
 
 
 def _features_before(model: MotionGenerator, after: str | Path | Motion) -> Tensor:

@@ -73,8 +73,7 @@ def with_features(representation: Representation, motion: Motion) -> Motion:
     """Returns the motion if it has features of this representation, otherwise computes them from its joints.
 
     Raises:
-        UserError: If the features have another shape, the body has the wrong size, the motion is too long, or its
-            joints cannot be encoded.
+        UserError: If shape or size are wrong, the motion is too long, or its joints cannot be encoded.
     """
     name = f"{motion.id}: " if motion.id else ""
     fits = motion.representation == representation.name and math.isclose(motion.fps, representation.fps)

@@ -115,11 +115,7 @@ class EditRequest:
         return [(begin, end) for begin, end in listed]
 
     def method_options(self, method: str) -> dict[str, Any]:
-        """Returns the options of `flame_mdm.batch.Edit` for a method that the process supports.
-
-        Raises:
-            UserError: If the method does not have an option of this request.
-        """
+        """Returns the options of `flame_mdm.batch.Edit` for a method, which must have those of this request."""
         options = dict(METHODS[method])
         if self.until is not None and options["mode"] != "trajectory":
             raise UserError(f"until={self.until:g} is an option of method=mfm, not of {method}")
@@ -177,12 +173,7 @@ class SamplingRequest:
 
     @classmethod
     def of(cls, function: str, editing: bool = False, /, **keywords: Any) -> SamplingRequest:
-        """Returns the request of keyword arguments: fields of this class, of `SamplerOptions` and of `EditRequest`.
-
-        Args:
-            function: name of the function that got the keywords, for messages.
-            editing: whether the request is an edit; the keywords may then be those of `EditRequest`.
-            keywords: the values.
+        """Returns the request of keywords: fields of this class, `SamplerOptions` and, of edits, `EditRequest`.
 
         Raises:
             UserError: If a keyword is unknown, or a value is invalid.
@@ -258,11 +249,7 @@ class SamplingRequest:
                 raise UserError(f"{shown} is not a valid length")
 
     def check_edit(self, varies: bool) -> None:
-        """Checks that a request to edit a motion asks for nothing else.
-
-        Raises:
-            UserError: If it asks for a sequence or targets; for a variation, if it continues a motion.
-        """
+        """Raises `UserError` if a request to edit a motion, or to vary all of it, asks for more than that."""
         if self.after is not None or (not varies and (self.is_sequence or self.targets is not None)):
             raise UserError(
                 "an edit keeps a single motion: give neither parts (|), after, loop nor targets with it. Variations of "
@@ -322,8 +309,7 @@ def check_model(request: SamplingRequest, model: MotionGenerator) -> None:
     """Checks that a model can do what is requested; the planning of a sampling run also checks the lengths.
 
     Raises:
-        UserError: If the model was not trained for the condition, does not know the action, cannot generate sequences,
-            or does not have the sampler or its options.
+        UserError: If the model lacks the condition, the action, sequences, the sampler or one of its options.
     """
     model.process.find_sampler(request.options.over(model.sampler_options))
     if request.kind not in ("none", model.conditioned_on):
@@ -340,11 +326,7 @@ def check_model(request: SamplingRequest, model: MotionGenerator) -> None:
 
 
 def read_parts(text: str) -> list[Part]:
-    """Splits "walks @3 | sits down" into parts: [("walks", 3.0), ("sits down", None)].
-
-    Raises:
-        UserError: If a part is empty, or its length is not a number above 0.
-    """
+    """Splits "walks @3 | sits down" into parts, [("walks", 3.0), ("sits down", None)], or raises `UserError`."""
     parts: list[Part] = []
     for part in text.split("|"):
         words, at, number = (piece.strip() for piece in part.rpartition("@"))
@@ -383,10 +365,7 @@ def read_path(text: str) -> list[tuple[float, float]]:
 
 
 def path_targets(path: Sequence[tuple[float, float]], seconds: float) -> dict[str, Any]:
-    """Returns targets for `flame_mdm.generate` that lead a motion of `seconds` along a path from x = z = 0.
-
-    The times of the way points are proportional to the distance along the path.
-    """
+    """Returns targets that lead a motion of `seconds` along a path from x = z = 0, at an even speed."""
     way = list(accumulate(math.dist(*pair) for pair in pairwise([(0.0, 0.0), *path])))
     times = [round((seconds - ARRIVAL) * done / (way[-1] or 1.0), 3) for done in way]
     return {"root": [{"time": time, "position": list(at)} for time, at in zip(times, path, strict=True)]}

@@ -22,11 +22,7 @@ def overlap(model: MotionGenerator) -> int:
 
 
 def motion_lengths(model: MotionGenerator, request: SamplingRequest) -> list[list[int]]:
-    """Returns the number of frames of each part of the motion of each prompt.
-
-    Raises:
-        UserError: If a motion is too short or too long for the model.
-    """
+    """Returns the frames of each part of the motion of each prompt, none too short or too long for the model."""
     fps, longest = model.representation.fps, model.facts["max_frames"]
     frames = request.lengths(fps)
     if request.is_sequence:
@@ -50,15 +46,7 @@ def motion_lengths(model: MotionGenerator, request: SamplingRequest) -> list[lis
 def _part_lengths(
     model: MotionGenerator, text: str, parts: Sequence[Part], usual: float | None, loop: bool
 ) -> list[int]:
-    """Returns the number of frames of each part of a sequence.
-
-    Args:
-        model: the model.
-        text: all parts, for messages.
-        parts: of the text.
-        usual: frames of parts that give no seconds; None = 3 seconds, or what fits into one window if that is shorter.
-        loop: whether the sequence is a loop.
-    """
+    """Returns the frames of each part of a sequence; parts without seconds have `usual` ones, by default 3 s."""
     fps, shared = model.representation.fps, overlap(model)
     if usual is None:
         usual = min(3 * fps, model.facts["max_frames"] - shared * (loop or len(parts) > 1))
@@ -81,14 +69,9 @@ def windows(
     actions: Sequence[str] | None,
     loop: bool,
 ) -> Windows:
-    """Returns the windows of several sequences.
+    """Returns the windows of several sequences, by text or action and frames of each part.
 
-    Args:
-        model: the model.
-        conditions: text or action of each part of each sequence.
-        lengths: frames of the parts.
-        actions: all names of actions if the conditions are actions.
-        loop: whether the end of each sequence leads to its start.
+    `actions` are all names of actions, if the conditions are actions. The end of a loop leads to its start.
     """
     longest, shared, device = model.facts["max_frames"], overlap(model), model.device
     covering = [(row, *span) for row, parts in enumerate(lengths) for span in spans(parts, longest, shared, loop)]

@@ -83,11 +83,7 @@ class Targets:
     poses: tuple[tuple[int, Tensor], ...]
 
     def edit(self, representation: Representation, lengths: Sequence[int], device: torch.device) -> Edit:
-        """Returns the edit of motions of these lengths: poses are imposed, positions guide the clean estimates.
-
-        Raises:
-            UserError: If a target is later than the last frame of a motion.
-        """
+        """Returns the edit of motions of these lengths: poses are imposed, positions guide the clean estimates."""
         last = max([0, *self.positions.frames.tolist(), *(frame for frame, _ in self.poses)])
         if last >= min(lengths):
             fps = representation.fps

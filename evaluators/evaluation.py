@@ -64,24 +64,15 @@ class Evaluation:
     """A protocol on a split of a data set.
 
     If there are several processes, all create and run it together.
-
-    Attributes:
-        protocol: what is measured.
-        clips: the split.
-        extractor: an opened extractor; None = metrics that need features have no value.
-        representation: of the motions, on the device to compute on.
-        seed: of all random draws.
-        batch_size: of the extractor.
-        training: the training split, for metrics that look for copies of its motions.
     """
 
-    protocol: Protocol
-    clips: Clips
-    extractor: Extractor | None
-    representation: Representation
-    seed: int = 0
-    batch_size: int = 64
-    training: Clips | None = None
+    protocol: Protocol  # what is measured
+    clips: Clips  # the split
+    extractor: Extractor | None  # an opened extractor; None = metrics that need features have no value
+    representation: Representation  # of the motions, on the device to compute on
+    seed: int = 0  # of all random draws
+    batch_size: int = 64  # of the extractor
+    training: Clips | None = None  # the training split, for metrics that look for copies of its motions
 
     def run(
         self, source: Source | None, *, ground_truth: bool = True, force: bool = False, resamples: int = 0

@@ -39,28 +39,18 @@ FEATURES = {"generated", "real", "text", "logits"}
 
 @dataclass
 class Motions:
-    """N real or generated motions, with their conditions.
+    """N real or generated motions, with their conditions."""
 
-    Attributes:
-        ids: unique names.
-        features: (F, D) float32 each, in the data's units.
-        captions: of motions with text.
-        tokens: "word/PART" tokens of the captions, if the data has them.
-        labels: classes of motions with action labels.
-        groups: names of the prompts, if several motions share a prompt.
-        requested: requested attributes, if the data has them.
-        edit: parts kept from real motions, as `region` and `joints` of `flame_mdm.sampling.editing.kept_parts`.
-        references: of real motions, joints (F', J, 3) at the frame rate of the recording, if the data has them.
-    """
-
-    ids: list[str]
-    features: list[np.ndarray]
-    captions: list[str] | None = None
-    tokens: list[list[str] | None] | None = None
-    labels: list[int] | None = None
-    groups: list[str] | None = None
-    requested: list[Mapping[str, Any]] | None = None
+    ids: list[str]  # unique names
+    features: list[np.ndarray]  # (F, D) float32 each, in the data's units
+    captions: list[str] | None = None  # of motions with text
+    tokens: list[list[str] | None] | None = None  # "word/PART" tokens of the captions, if the data has them
+    labels: list[int] | None = None  # classes of motions with action labels
+    groups: list[str] | None = None  # names of the prompts, if several motions share a prompt
+    requested: list[Mapping[str, Any]] | None = None  # requested attributes, if the data has them
+    # parts kept from real motions, as `region` and `joints` of `flame_mdm.sampling.editing.kept_parts`
     edit: Mapping[str, Any] | None = None
+    # of real motions, joints (F', J, 3) at the frame rate of the recording, if the data has them
     references: list[np.ndarray] | None = None
 
     def __len__(self) -> int:
@@ -69,17 +59,11 @@ class Motions:
 
 @dataclass
 class Extracted:
-    """Metric inputs of N motions.
+    """Metric inputs of N motions."""
 
-    Attributes:
-        rows: tensors or lists of N entries, by the names in `evaluators.metrics`.
-        joints: (F, J, 3) each; empty if no metric needs them.
-        kept: (F, J) each, True = kept by an edit; None if the motions are not edits.
-    """
-
-    rows: dict[str, Any]
-    joints: list[Tensor]
-    kept: list[Tensor] | None = None
+    rows: dict[str, Any]  # tensors or lists of N entries, by the names in `evaluators.metrics`
+    joints: list[Tensor]  # (F, J, 3) each; empty if no metric needs them
+    kept: list[Tensor] | None = None  # (F, J) each, True = kept by an edit; None if the motions are not edits
 
     def __len__(self) -> int:
         return len(self.rows["keys"])

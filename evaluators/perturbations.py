@@ -124,23 +124,15 @@ def encode(representation: HumanML, motions: Sequence[Joints]) -> list[np.ndarra
 
 @dataclass(frozen=True)
 class Perturbation:
-    """A perturbation of a set of motions, and its grades.
+    """A perturbation of a set of motions, and its grades."""
 
-    Attributes:
-        name: unique name.
-        group: joints, meaning, set or plumbing.
-        about: what is done.
-        unit: of the grades. Shares ("% of motions", "% of captions", "% of actions") say how many are replaced.
-        grades: from weak to strong; () = not graded.
-        change: returns joints; arguments are joints, grade, generator and frames per second. None = it concerns
-            features, captions or the set, which `evaluators.audit_sets` replaces.
-    """
-
-    name: str
-    group: str
-    about: str
-    unit: str = ""
-    grades: Sequence[float] = (1,)
+    name: str  # unique name
+    group: str  # joints, meaning, set or plumbing
+    about: str  # what is done
+    unit: str = ""  # of the grades. Shares ("% of motions", "% of captions", "% of actions") say how many are replaced.
+    grades: Sequence[float] = (1,)  # from weak to strong; () = not graded
+    # returns joints; arguments are joints, grade, generator and frames per second. None = it concerns features,
+    # captions or the set, which `evaluators.audit_sets` replaces.
     change: Callable[[Joints, float, Draws, float], Joints] | None = None
 
 

@@ -29,21 +29,13 @@ QUICK_REPLICATIONS, QUICK_SAMPLES = 2, 64
 
 @dataclass(frozen=True)
 class DrawnClip:
-    """A clip, and the frames and caption drawn from it for one motion to generate.
+    """A clip, and the frames and caption drawn from it for one motion to generate."""
 
-    Attributes:
-        id: unique name of the motion.
-        clip: the real clip that it is compared with.
-        frames: indices of the frames drawn from the clip.
-        caption: index of the caption drawn from the clip; None = the clip has none.
-        prompt: name shared by all motions with the same caption and length.
-    """
-
-    id: str
-    clip: Entry
-    frames: np.ndarray
-    caption: int | None
-    prompt: str
+    id: str  # unique name of the motion
+    clip: Entry  # the real clip that it is compared with
+    frames: np.ndarray  # indices of the frames drawn from the clip
+    caption: int | None  # index of the caption drawn from the clip; None = the clip has none
+    prompt: str  # name shared by all motions with the same caption and length
 
     @property
     def text(self) -> str:
@@ -53,19 +45,12 @@ class DrawnClip:
 
 
 class Multimodality(ClosedSchema):
-    """A second evaluation with several motions per prompt.
+    """A second evaluation with several motions per prompt."""
 
-    Attributes:
-        prompts: number of prompts; None = all prompts of the split.
-        samples: motions per prompt.
-        replications: number of repetitions.
-        metrics: as in `Protocol`.
-    """
-
-    prompts: Int | None
-    samples: Int
-    replications: Int
-    metrics: dict[str, Config]
+    prompts: Int | None  # number of prompts; None = all prompts of the split
+    samples: Int  # motions per prompt
+    replications: Int  # number of repetitions
+    metrics: dict[str, Config]  # as in `Protocol`
 
 
 class Protocol(ClosedSchema):
@@ -74,50 +59,39 @@ class Protocol(ClosedSchema):
     The caption and crop of a clip, and the noise of its generated motion, are functions of (seed, replication, id).
     Motions are generated at the length of the real clip. Real motions are measured first, with the same metrics,
     against a second draw of real motions.
-
-    Attributes:
-        name: name of the file, with that of the variant.
-        version: raised when the protocol changes; values of different versions are not comparable.
-        condition: condition of the generated motions.
-        extractor: a mapping with the `_target_` of an `Extractor`, and its `path` unless the evaluation has to provide
-            one. None = not needed.
-        metrics: mappings with the `_target_` of a metric, by name.
-        replications: number of repetitions of the evaluation.
-        samples: motions per replication. Clips are drawn at random, and repeatedly if there are too few. None = each
-            clip of the split once.
-        real_samples: real motions per replication in comparisons of sets, drawn likewise; None = each clip once.
-        multimodality: a second evaluation with several motions per prompt; None = none.
-        edit: `region` and `joints` of `sampling.editing.kept_parts`: motions are edits of real motions; None = motions
-            are generated from scratch.
-        smoothing: standard deviation, in frames, of a Gaussian filter over time that is applied to the features of
-            generated motions before they are measured, with mirrored ends; None = no filter.
-        batch_size: motions per batch, if the protocol measures time; a first batch is not timed. None = the protocol
-            does not measure time and uses the batch size of the evaluation.
-        only: attributes that evaluated clips must have; {} = all clips of the split.
-        expected: by data set or sha256 of the extractor, the values that real motions of the test split must have:
-            metric -> [value, tolerance]. If they differ, nothing is generated.
-        quick: whether the evaluation is a quick one, set by `resized`.
-        sha256: hash of the content of the file, set by `load_protocol`.
     """
 
     model_config = ConfigDict(strict=True, frozen=True)
 
-    name: str
-    version: Int
-    condition: Literal["text", "action", "none"]
+    name: str  # name of the file, with that of the variant
+    version: Int  # raised when the protocol changes; values of different versions are not comparable
+    condition: Literal["text", "action", "none"]  # condition of the generated motions
+    # a mapping with the `_target_` of an `Extractor`, and its `path` unless the evaluation has to provide one. None =
+    # not needed.
     extractor: Config | None
-    metrics: dict[str, Config]
-    replications: Annotated[Int, Field(ge=1)]
+    metrics: dict[str, Config]  # mappings with the `_target_` of a metric, by name
+    replications: Annotated[Int, Field(ge=1)]  # number of repetitions of the evaluation
+    # motions per replication. Clips are drawn at random, and repeatedly if there are too few. None = each clip of the
+    # split once.
     samples: Annotated[Int, Field(ge=1)] | None = None
+    # real motions per replication in comparisons of sets, drawn likewise; None = each clip once
     real_samples: Annotated[Int, Field(ge=1)] | None = None
-    multimodality: Multimodality | None = None
+    multimodality: Multimodality | None = None  # a second evaluation with several motions per prompt; None = none
+    # `region` and `joints` of `sampling.editing.kept_parts`: motions are edits of real motions; None = motions are
+    # generated from scratch
     edit: dict[str, Any] | None = None
+    # standard deviation, in frames, of a Gaussian filter over time that is applied to the features of generated motions
+    # before they are measured, with mirrored ends; None = no filter
     smoothing: Number | None = None
+    # motions per batch, if the protocol measures time; a first batch is not timed. None = the protocol does not measure
+    # time and uses the batch size of the evaluation.
     batch_size: Annotated[Int, Field(ge=1)] | None = None
-    only: dict[str, Any] = Field({})
+    only: dict[str, Any] = Field({})  # attributes that evaluated clips must have; {} = all clips of the split
+    # by data set or sha256 of the extractor, the values that real motions of the test split must have: metric ->
+    # [value, tolerance]. If they differ, nothing is generated.
     expected: dict[str, dict[str, Annotated[list[Number], Field(min_length=2, max_length=2)]]] = Field({})
-    quick: bool = False
-    sha256: str = ""
+    quick: bool = False  # whether the evaluation is a quick one, set by `resized`
+    sha256: str = ""  # hash of the content of the file, set by `load_protocol`
 
     def resized(
         self,

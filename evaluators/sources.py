@@ -32,19 +32,13 @@ NOISE = 0.5
 
 @dataclass
 class Samples:
-    """Motions to measure, and the cost of generating them.
+    """Motions to measure, and the cost of generating them."""
 
-    Attributes:
-        rows: what was requested, in order.
-        features: (F, D) float32 each, in the data's units.
-        cost: denoiser calls per motion, seconds per motion, and batch size; empty if no model was used.
-        captions: captions of the motions, if they differ from those of the rows.
-    """
-
-    rows: list[DrawnClip]
-    features: list[np.ndarray]
+    rows: list[DrawnClip]  # what was requested, in order
+    features: list[np.ndarray]  # (F, D) float32 each, in the data's units
+    # denoiser calls per motion, seconds per motion, and batch size; empty if no model was used
     cost: dict[str, float] = field(default_factory=dict)
-    captions: list[str] | None = None
+    captions: list[str] | None = None  # captions of the motions, if they differ from those of the rows
 
 
 class Source(Interface):

@@ -29,15 +29,10 @@ from flame_mdm.task import Task
 
 
 class Extractor(ABC):
-    """A network that computes features of motions, and of texts if it supports them.
+    """A network that computes features of motions, and of texts if it supports them."""
 
-    Attributes:
-        sha256: of its weights or files. Values of extractors with different hashes are not comparable.
-        fingerprint: of the data it was trained on, if known.
-    """
-
-    sha256: str
-    fingerprint: str | None = None
+    sha256: str  # of its weights or files. Values of extractors with different hashes are not comparable.
+    fingerprint: str | None = None  # of the data it was trained on, if known
 
     @abstractmethod
     def check(self, representation: Representation, dataset: str) -> None:

@@ -42,17 +42,11 @@ SPECIAL = {word: part for part, words in _SPECIAL_WORDS.items() for word in word
 
 
 class Words(NamedTuple):
-    """Input of the text encoder for B captions.
+    """Input of the text encoder for B captions."""
 
-    Attributes:
-        vectors: (B, 22, 300) GloVe vectors.
-        parts: (B, 22, 15) one-hot parts of speech.
-        lengths: (B,) int64, number of slots up to and including the end mark.
-    """
-
-    vectors: Tensor
-    parts: Tensor
-    lengths: Tensor
+    vectors: Tensor  # (B, 22, 300) GloVe vectors
+    parts: Tensor  # (B, 22, 15) one-hot parts of speech
+    lengths: Tensor  # (B,) int64, number of slots up to and including the end mark
 
 
 class WordVectors:

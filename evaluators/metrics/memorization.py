@@ -31,19 +31,12 @@ def poses(joints: Tensor, facing: Sequence[int]) -> Tensor:
 
 @dataclass
 class TrainingMotions:
-    """The training motions that a motion may be a copy of.
+    """The training motions that a motion may be a copy of."""
 
-    Attributes:
-        poses: (N, 3J) of all frames of all motions, one after another; see the function `poses`.
-        lengths: (M,) frames of each motion.
-        features: (M, E) of the extractor; None without an extractor.
-        facing: `Skeleton.facing`.
-    """
-
-    poses: Tensor
-    lengths: Tensor
-    features: Tensor | None
-    facing: Sequence[int]
+    poses: Tensor  # (N, 3J) of all frames of all motions, one after another; see the function `poses`
+    lengths: Tensor  # (M,) frames of each motion
+    features: Tensor | None  # (M, E) of the extractor; None without an extractor
+    facing: Sequence[int]  # `Skeleton.facing`
 
     def nearest(self, joints: Sequence[Tensor], features: Tensor | None) -> Tensor:
         """Returns the distances (B, 2), without features (B, 1), of motions (F, J, 3) from the nearest training motion.

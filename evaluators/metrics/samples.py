@@ -33,13 +33,10 @@ class MotionMetric(Metric):
     """Base class of all metrics.
 
     Several of them take `fps`, the frame rate of the motions, and `seed`, of the random draws.
-
-    Attributes:
-        names: names of the values; empty if there is only one.
     """
 
     full_state_update = False
-    names: Sequence[str] = ()
+    names: Sequence[str] = ()  # names of the values; empty if there is only one
 
     @property
     def update_called(self) -> bool:

@@ -20,34 +20,26 @@ Value = TypeVar("Value")
 
 @dataclass
 class Clip:
-    """One motion that a data set yields to be written into a store.
+    """One motion that a data set yields to be written into a store."""
 
-    Attributes:
-        id: unique name; a mirrored copy is named `M` + the name of its original.
-        motion: input of the representation, at its frame rate; for joint-based representations the joint positions
-            (F, J, 3) in meters, y up, in the joint order of its skeleton.
-        captions: descriptions of the motion, each complete; empty for data sets with action labels only.
-        split: mirrored copies and cuts of a take belong to the split of that take.
-        source: the take the clip comes from; clips of one source are never in two splits.
-        action: index into the data set's `actions`, or None.
-        attributes: exact facts about the motion, if the data set knows them (side, count, direction, speed, tagged
-            words of the captions ...); plain values that JSON can hold.
-        encoded: if the release contains features, the name of the representation that `motion` (F, D) is in; the
-            features are stored unchanged. If empty, `motion` is raw.
-        window: (first, length): the clip is this cut of its motion. Consecutive clips with the identical array object
-            share its frames in the store. Only for representations with one row per frame.
-        reference: (F', J, 3) joints in meters at the frame rate of the recording, for protocols that compare at it.
-    """
-
-    id: str
+    id: str  # unique name; a mirrored copy is named `M` + the name of its original
+    # input of the representation, at its frame rate; for joint-based representations the joint positions (F, J, 3) in
+    # meters, y up, in the joint order of its skeleton
     motion: np.ndarray
-    captions: list[str]
-    split: Split
-    source: str
-    action: int | None = None
+    captions: list[str]  # descriptions of the motion, each complete; empty for data sets with action labels only
+    split: Split  # mirrored copies and cuts of a take belong to the split of that take
+    source: str  # the take the clip comes from; clips of one source are never in two splits
+    action: int | None = None  # index into the data set's `actions`, or None
+    # exact facts about the motion, if the data set knows them (side, count, direction, speed, tagged words of the
+    # captions ...); plain values that JSON can hold
     attributes: Mapping[str, Any] = field(default_factory=dict)
+    # if the release contains features, the name of the representation that `motion` (F, D) is in; the features are
+    # stored unchanged. If empty, `motion` is raw.
     encoded: str = ""
+    # (first, length): the clip is this cut of its motion. Consecutive clips with the identical array object share its
+    # frames in the store. Only for representations with one row per frame.
     window: tuple[int, int] | None = None
+    # (F', J, 3) joints in meters at the frame rate of the recording, for protocols that compare at it
     reference: np.ndarray | None = None
 
 

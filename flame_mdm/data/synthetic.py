@@ -29,27 +29,17 @@ PARTIAL = 0.25
 
 
 class Action(NamedTuple):
-    """An action and the attributes that its clips have besides its name, drawn in this order.
+    """An action and the attributes that its clips have besides its name, drawn in this order."""
 
-    Attributes:
-        motion: makes the body's curves over times (F,) in seconds, for the attributes.
-        share: how often the action occurs, relative to the others.
-        sides: sides that move, equally often.
-        max_count: maximum number of repetitions; 0 = the action is not repeated.
-        directions: directions, equally often, or with their probabilities.
-        speeds: speeds of the direction forward, equally often.
-        amounts: how far the body turns, equally often.
-        seconds: minimum duration.
-    """
-
+    # makes the body's curves over times (F,) in seconds, for the attributes
     motion: Callable[[np.random.Generator, np.ndarray, Attributes], Body]
-    share: int = 1
-    sides: tuple[str, ...] = ()
-    max_count: int = 0
-    directions: tuple[str, ...] | Mapping[str, float] = ()
-    speeds: tuple[str, ...] = ()
-    amounts: tuple[str, ...] = ()
-    seconds: float = 0.0
+    share: int = 1  # how often the action occurs, relative to the others
+    sides: tuple[str, ...] = ()  # sides that move, equally often
+    max_count: int = 0  # maximum number of repetitions; 0 = the action is not repeated
+    directions: tuple[str, ...] | Mapping[str, float] = ()  # directions, equally often, or with their probabilities
+    speeds: tuple[str, ...] = ()  # speeds of the direction forward, equally often
+    amounts: tuple[str, ...] = ()  # how far the body turns, equally often
+    seconds: float = 0.0  # minimum duration
 
     def draw(self, rng: np.random.Generator, name: str, max_seconds: float) -> Attributes:
         """Draws the attributes of a clip of at most `max_seconds`."""

@@ -39,27 +39,16 @@ MAX_LABELED_LINE = 200
 
 @dataclass(frozen=True, eq=False)
 class Bvh:
-    """A skeleton and its motion. J joints, E end sites, F frames, C channels; lengths in the file's unit.
+    """A skeleton and its motion. J joints, E end sites, F frames, C channels; lengths in the file's unit."""
 
-    Attributes:
-        joints: J names; end sites are not joints.
-        parents: index of each joint's parent, smaller than its own; -1 for a root.
-        offsets: (J, 3) float64, rest position of each joint in its parent's frame.
-        channels: names of each joint's channels in the order of its columns, from `CHANNELS`.
-        end_parents: the parent joint of each end site.
-        end_offsets: (E, 3) float64, position of each end site in the frame of that joint.
-        frames: (F, C) float64, the channels of all joints in joint order; angles in degrees.
-        fps: frames per second.
-    """
-
-    joints: tuple[str, ...]
-    parents: tuple[int, ...]
-    offsets: np.ndarray
-    channels: tuple[tuple[str, ...], ...]
-    end_parents: tuple[int, ...]
-    end_offsets: np.ndarray
-    frames: np.ndarray
-    fps: float
+    joints: tuple[str, ...]  # J names; end sites are not joints
+    parents: tuple[int, ...]  # index of each joint's parent, smaller than its own; -1 for a root
+    offsets: np.ndarray  # (J, 3) float64, rest position of each joint in its parent's frame
+    channels: tuple[tuple[str, ...], ...]  # names of each joint's channels in the order of its columns, from `CHANNELS`
+    end_parents: tuple[int, ...]  # the parent joint of each end site
+    end_offsets: np.ndarray  # (E, 3) float64, position of each end site in the frame of that joint
+    frames: np.ndarray  # (F, C) float64, the channels of all joints in joint order; angles in degrees
+    fps: float  # frames per second
 
     def columns(self) -> list[slice]:
         """Returns the columns of `frames` with each joint's channels."""

@@ -223,27 +223,16 @@ class Skin:
 
 @dataclass(frozen=True, eq=False)
 class Glb:
-    """A valid .glb file. N nodes, in an order in which parents precede their children.
+    """A valid .glb file. N nodes, in an order in which parents precede their children."""
 
-    Attributes:
-        document: the JSON part, with the lists `buffers`, `bufferViews` and `accessors`.
-        data: the binary part.
-        nodes: index of each node in the document.
-        names: name of each node.
-        parents: number of each node's parent, -1 for a root.
-        locals: (N, 4, 4), coordinates of each node to those of its parent.
-        worlds: (N, 4, 4), coordinates of each node to those of the world.
-        skins: skins of meshes.
-    """
-
-    document: dict[str, Any]
-    data: bytes
-    nodes: tuple[int, ...]
-    names: tuple[str, ...]
-    parents: tuple[int, ...]
-    locals: np.ndarray
-    worlds: np.ndarray
-    skins: tuple[Skin, ...]
+    document: dict[str, Any]  # the JSON part, with the lists `buffers`, `bufferViews` and `accessors`
+    data: bytes  # the binary part
+    nodes: tuple[int, ...]  # index of each node in the document
+    names: tuple[str, ...]  # name of each node
+    parents: tuple[int, ...]  # number of each node's parent, -1 for a root
+    locals: np.ndarray  # (N, 4, 4), coordinates of each node to those of its parent
+    worlds: np.ndarray  # (N, 4, 4), coordinates of each node to those of the world
+    skins: tuple[Skin, ...]  # skins of meshes
 
 
 def read(path: Path) -> Glb:

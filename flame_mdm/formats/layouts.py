@@ -32,25 +32,15 @@ Source = str | Mapping[str, float]
 
 @dataclass(frozen=True)
 class Layout:
-    """Mapping from the joints of files to the 22 joints of SMPL, in meters, y up.
+    """Mapping from the joints of files to the 22 joints of SMPL, in meters, y up."""
 
-    Attributes:
-        map: for each of SMPL's joints, the corresponding joint in the files.
-        joints: names of the joints of arrays, in order; BVH files contain their own.
-        unit: meters per unit of length in the files.
-        up: the axis that points up.
-        mirrored: the files contain mirrored motion; the sign of x is changed.
-        fps: frames per second, for files that do not contain it.
-        children: the bodies may be those of children.
-    """
-
-    map: Mapping[str, Source]
-    joints: tuple[str, ...] = ()
-    unit: float = 1.0
-    up: str = "y"
-    mirrored: bool = False
-    fps: float | None = None
-    children: bool = False
+    map: Mapping[str, Source]  # for each of SMPL's joints, the corresponding joint in the files
+    joints: tuple[str, ...] = ()  # names of the joints of arrays, in order; BVH files contain their own
+    unit: float = 1.0  # meters per unit of length in the files
+    up: str = "y"  # the axis that points up
+    mirrored: bool = False  # the files contain mirrored motion; the sign of x is changed
+    fps: float | None = None  # frames per second, for files that do not contain it
+    children: bool = False  # the bodies may be those of children
 
     @property
     def used(self) -> set[str]:

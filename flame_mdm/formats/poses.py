@@ -35,18 +35,13 @@ SQUARINGS = 12
 
 @dataclass(eq=False)
 class Poses:
-    """A body in motion, in meters, y up; the rest pose is SMPL's: arms out to the sides, facing +z, left at +x.
+    """A body in motion, in meters, y up; the rest pose is SMPL's: arms out to the sides, facing +z, left at +x."""
 
-    Attributes:
-        offsets: (22, 3) float64, position of each joint of `SMPL22` relative to its parent in the rest pose.
-        rotations: (F, 22, 3, 3) float64, of the root in the world and of each other joint relative to its parent. A
-            joint's rotation applies to the bones that leave it.
-        root: (F, 3) float64, position of the pelvis.
-    """
-
-    offsets: Tensor
+    offsets: Tensor  # (22, 3) float64, position of each joint of `SMPL22` relative to its parent in the rest pose
+    # (F, 22, 3, 3) float64, of the root in the world and of each other joint relative to its parent. A joint's rotation
+    # applies to the bones that leave it.
     rotations: Tensor
-    root: Tensor
+    root: Tensor  # (F, 3) float64, position of the pelvis
 
     def joints(self) -> Tensor:
         """Returns joint positions (F, 22, 3)."""

@@ -40,32 +40,20 @@ REACH = 0.999
 
 @dataclass(frozen=True, eq=False)
 class Rig:
-    """A skeleton with J joints in its rest pose, in meters, y up, facing +z.
+    """A skeleton with J joints in its rest pose, in meters, y up, facing +z."""
 
-    Attributes:
-        joints: names; parents precede their children.
-        parents: index of each joint's parent, -1 for a root.
-        positions: (J, 3) of the joints.
-        turns: (J, 3, 3), rotations of the joints in the world.
-        sources: for each joint, the index of the joint of SMPL whose rotation it takes, or -1.
-        neutral: (J, 3, 3), rotations of these joints in the world while SMPL's are those of its rest pose.
-        unit: meters per unit of length in BVH files.
-        orders: of the Euler angles of each joint in BVH files.
-        moving: every joint has channels of its position in BVH files, not only the pelvis and joints above it.
-        frame: (3, 3), rotation from the world of the file.
-        scales: (J,), units of the world per unit in the frame of each joint; none = 1.
-    """
-
-    joints: tuple[str, ...]
-    parents: tuple[int, ...]
-    positions: np.ndarray
-    turns: np.ndarray
-    sources: tuple[int, ...]
-    neutral: np.ndarray
-    orders: tuple[str, ...]
-    unit: float = CENTIMETER
+    joints: tuple[str, ...]  # names; parents precede their children
+    parents: tuple[int, ...]  # index of each joint's parent, -1 for a root
+    positions: np.ndarray  # (J, 3) of the joints
+    turns: np.ndarray  # (J, 3, 3), rotations of the joints in the world
+    sources: tuple[int, ...]  # for each joint, the index of the joint of SMPL whose rotation it takes, or -1
+    neutral: np.ndarray  # (J, 3, 3), rotations of these joints in the world while SMPL's are those of its rest pose
+    orders: tuple[str, ...]  # of the Euler angles of each joint in BVH files
+    unit: float = CENTIMETER  # meters per unit of length in BVH files
+    # every joint has channels of its position in BVH files, not only the pelvis and joints above it
     moving: bool = False
-    frame: np.ndarray = field(default_factory=lambda: np.eye(3))
+    frame: np.ndarray = field(default_factory=lambda: np.eye(3))  # (3, 3), rotation from the world of the file
+    # (J,), units of the world per unit in the frame of each joint; none = 1
     scales: np.ndarray = field(default_factory=lambda: np.ones(0))
 
     @property
@@ -156,17 +144,11 @@ def matched(
 
 @dataclass(frozen=True, eq=False)
 class RestPose:
-    """A character's skeleton in its rest pose, y up, facing +z, in its own unit.
+    """A character's skeleton in its rest pose, y up, facing +z, in its own unit."""
 
-    Attributes:
-        rig: the skeleton; its neutral rotations are those of `fitted`, which depend on the motion.
-        map: SMPL's joint -> index of the character's.
-        floor: height of the lowest point in the rest pose.
-    """
-
-    rig: Rig
-    map: Mapping[str, int]
-    floor: float
+    rig: Rig  # the skeleton; its neutral rotations are those of `fitted`, which depend on the motion
+    map: Mapping[str, int]  # SMPL's joint -> index of the character's
+    floor: float  # height of the lowest point in the rest pose
 
     def position(self, joint: str) -> np.ndarray:
         """Returns the position (3,) of SMPL's joint in the rest pose."""

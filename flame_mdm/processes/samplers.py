@@ -27,17 +27,13 @@ Velocity = Callable[[Tensor, float | Tensor], Tensor]
 
 @dataclass(frozen=True)
 class Sampler:
-    """A sampling loop and what it can do.
+    """A sampling loop and what it can do."""
 
-    Attributes:
-        loop: of a diffusion: (x_t, `Descent`) -> x after its last step. Of a flow: (velocity, x, times) -> x at the
-            last time.
-        options: fields of `SamplerOptions` that it has besides guidance_scale, sampler and num_inference_steps.
-        single_step: whether each step depends on the previous x alone, so that an edit can come between two steps.
-    """
-
+    # of a diffusion: (x_t, `Descent`) -> x after its last step. Of a flow: (velocity, x, times) -> x at the last time.
     loop: Callable[..., Tensor]
+    # fields of `SamplerOptions` that it has besides guidance_scale, sampler and num_inference_steps
     options: tuple[str, ...] = ()
+    # whether each step depends on the previous x alone, so that an edit can come between two steps
     single_step: bool = True
 
 
@@ -54,21 +50,13 @@ class CountedDenoise:
 
 
 class Descent(NamedTuple):
-    """What a diffusion sampler needs besides x_t.
+    """What a diffusion sampler needs besides x_t."""
 
-    Attributes:
-        estimate: calls the denoiser.
-        schedule: of the sampling steps.
-        steps: numbers i of the steps to take, falling.
-        draws: noise, in order of use.
-        options: of the sampler.
-    """
-
-    estimate: Estimate
-    schedule: Schedule
-    steps: Sequence[int]
-    draws: Iterator[Tensor]
-    options: SamplerOptions
+    estimate: Estimate  # calls the denoiser
+    schedule: Schedule  # of the sampling steps
+    steps: Sequence[int]  # numbers i of the steps to take, falling
+    draws: Iterator[Tensor]  # noise, in order of use
+    options: SamplerOptions  # of the sampler
 
 
 # Diffusion ------------------------------------------------------------------------------------------------------------

@@ -16,19 +16,12 @@ from flame_mdm.batch import Condition, Denoise, MotionBatch, length_mask
 
 @dataclass
 class Windows:
-    """W windows of at most L frames that cover B motions.
+    """W windows of at most L frames that cover B motions."""
 
-    Attributes:
-        batch: conditions and masks (W, L) of the windows; its `x` has no features.
-        rows: (W,) int64, the motion of each window.
-        frames: (W, L) int64, the frame of the motion at each frame of a window.
-        weights: (W, L), 0 past the end of a window; they sum to 1 at each frame of a motion.
-    """
-
-    batch: MotionBatch
-    rows: Tensor
-    frames: Tensor
-    weights: Tensor
+    batch: MotionBatch  # conditions and masks (W, L) of the windows; its `x` has no features
+    rows: Tensor  # (W,) int64, the motion of each window
+    frames: Tensor  # (W, L) int64, the frame of the motion at each frame of a window
+    weights: Tensor  # (W, L), 0 past the end of a window; they sum to 1 at each frame of a motion
 
 
 def blended(denoise: Denoise, windows: Windows) -> Denoise:

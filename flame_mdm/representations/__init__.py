@@ -17,15 +17,11 @@ Features = TypeVar("Features", np.ndarray, Tensor)
 
 @dataclass(frozen=True)
 class Frames:
-    """The frames (N, D) of a data set, for `Representation.statistics`: they are read in parts, as often as needed.
+    """The frames (N, D) of a data set, for `Representation.statistics`: they are read in parts, as often as needed."""
 
-    Attributes:
-        arrays: returns all frames as arrays (F, D) of any length, each time in the same order.
-        count: number of frames.
-    """
-
+    # returns all frames as arrays (F, D) of any length, each time in the same order
     arrays: Callable[[], Iterable[np.ndarray]]
-    count: int
+    count: int  # number of frames
 
     def __len__(self) -> int:
         return self.count

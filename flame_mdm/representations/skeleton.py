@@ -17,29 +17,20 @@ LEG, ARM = ("hip", "knee", "ankle", "foot", "toes"), ("collar", "shoulder", "elb
 
 @dataclass(frozen=True)
 class Skeleton:
-    """A tree of joints; parents precede their children, joint 0 is the root.
+    """A tree of joints; parents precede their children, joint 0 is the root."""
 
-    Attributes:
-        name: key in `SKELETONS`.
-        joints: names in the order of the data; the prefixes `left_` and `right_` mark the sides.
-        parents: parent of each joint, -1 for the root.
-        chains: paths followed by HumanML3D's inverse kinematics.
-        raw_offsets: (J, 3) unit direction, in the rest pose, of the bone that ends in a joint, 0 for the root; from
-            HumanML3D's `paramUtil.py`.
-        facing: right hip, left hip, right shoulder, left shoulder: the heading is the cross product of the vertical and
-            the direction from left to right.
-        feet: joints that touch the ground, in the order of HumanML3D's contact features.
-        leg: (knee, ankle), whose bones measure the size of a body.
-    """
-
-    name: str
-    joints: tuple[str, ...]
-    parents: tuple[int, ...]
-    chains: tuple[tuple[int, ...], ...]
+    name: str  # key in `SKELETONS`
+    joints: tuple[str, ...]  # names in the order of the data; the prefixes `left_` and `right_` mark the sides
+    parents: tuple[int, ...]  # parent of each joint, -1 for the root
+    chains: tuple[tuple[int, ...], ...]  # paths followed by HumanML3D's inverse kinematics
+    # (J, 3) unit direction, in the rest pose, of the bone that ends in a joint, 0 for the root; from HumanML3D's
+    # `paramUtil.py`
     raw_offsets: tuple[tuple[int, int, int], ...]
+    # right hip, left hip, right shoulder, left shoulder: the heading is the cross product of the vertical and the
+    # direction from left to right
     facing: tuple[int, int, int, int]
-    feet: tuple[int, ...]
-    leg: tuple[int, int]
+    feet: tuple[int, ...]  # joints that touch the ground, in the order of HumanML3D's contact features
+    leg: tuple[int, int]  # (knee, ankle), whose bones measure the size of a body
 
     def __len__(self) -> int:
         return len(self.joints)

@@ -72,14 +72,10 @@ class PositionGuide:
 
 @dataclass(frozen=True)
 class Targets:
-    """What motions should reach.
+    """What motions should reach."""
 
-    Attributes:
-        positions: coordinates in the world.
-        poses: frames and features (D,), in the data's units, of poses that may be anywhere on the floor.
-    """
-
-    positions: Positions
+    positions: Positions  # coordinates in the world
+    # frames and features (D,), in the data's units, of poses that may be anywhere on the floor
     poses: tuple[tuple[int, Tensor], ...]
 
     def edit(self, representation: Representation, lengths: Sequence[int], device: torch.device) -> Edit:

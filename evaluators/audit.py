@@ -40,8 +40,7 @@ TOTALS: dict[type[Metric], tuple[str, str]] = {
     **dict.fromkeys((physics.Penetration, physics.Floating, physics.Jitter), ("total", "frames")),
 }
 """States of metrics of joints: their value is the sum of the first over motions, divided by that of the second."""
-TRUTH = "attributes/all"
-"""Share of motions that show every requested attribute."""
+TRUTH = "attributes/all"  # share of motions that show every requested attribute
 
 
 def audit(request: EvaluationRequest, cache: Path) -> AuditCard:

@@ -24,8 +24,7 @@ from flame_mdm.safe_io import write_json
 from flame_mdm.schemas import Cost, Measured, Value
 from flame_mdm.seeds import key
 
-Scores = list[tuple[dict[str, float | None], int]]
-"""Values by metric, and number of motions, of each replication."""
+Scores = list[tuple[dict[str, float | None], int]]  # values by metric, and number of motions, of each replication
 
 
 def evaluate(request: EvaluationRequest) -> None:

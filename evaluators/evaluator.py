@@ -30,11 +30,9 @@ from flame_mdm.sampling.editing import kept_parts
 from flame_mdm.sampling.request import EditRequest
 from flame_mdm.seeds import key
 
-CHUNK = 64
-"""Motions per metric update; more do not fit into a processor's cache."""
+CHUNK = 64  # motions per metric update; more do not fit into a processor's cache
 
-FEATURES = {"generated", "real", "text", "logits"}
-"""Inputs of metrics that an extractor provides."""
+FEATURES = {"generated", "real", "text", "logits"}  # inputs of metrics that an extractor provides
 
 
 @dataclass

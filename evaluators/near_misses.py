@@ -4,10 +4,8 @@ from collections.abc import Sequence
 
 from flame_mdm.data.store import Entry
 
-ACTION = ("action", "content")
-"""Names of the attribute that says what is done; clips without it have no near misses."""
-UNSAID = "normal"
-"""Value that captions do not mention: such captions are less exact, but not wrong."""
+ACTION = ("action", "content")  # names of the attribute that says what is done; clips without it have no near misses
+UNSAID = "normal"  # value that captions do not mention: such captions are less exact, but not wrong
 
 _Stated = frozenset[tuple[str, str | int | float]]
 

@@ -17,10 +17,8 @@ from flame_mdm.representations.skeleton import SKELETONS
 Joints = np.ndarray
 Draws = np.random.Generator
 GROUND = np.array([1.0, 0.0, 1.0])
-WOBBLE = 1.0
-"""Frequency of the wobble, in Hz."""
-BLEND = 0.4
-"""Seconds over which the poses of another motion are blended in."""
+WOBBLE = 1.0  # frequency of the wobble, in Hz
+BLEND = 0.4  # seconds over which the poses of another motion are blended in
 
 
 def jitter(joints: Joints, millimeters: float, draws: Draws) -> Joints:

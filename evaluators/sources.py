@@ -26,8 +26,7 @@ from flame_mdm.sampling.editing import kept_parts
 from flame_mdm.sampling.request import EditRequest
 from flame_mdm.seeds import key, normal
 
-NOISE = 0.5
-"""Standard deviation of the noise in noisy baselines, in normalized features."""
+NOISE = 0.5  # standard deviation of the noise in noisy baselines, in normalized features
 
 
 @dataclass

@@ -69,8 +69,7 @@ class OwnExtractor(Extractor):
 
     task: Task
     trained: type[Task]
-    recipes: str
-    """Folder of the recipes that train it."""
+    recipes: str  # folder of the recipes that train it
 
     def __init__(self, path: str, device: str | torch.device = "cpu"):
         self.path = find(path)
@@ -165,10 +164,8 @@ class ReleasedExtractor(Extractor):
 
     FILES: tuple[str, ...] = ()
     network: nn.Module
-    made_for: tuple[str, str]
-    """Names of the representation and the data set that it was trained on."""
-    used = 0
-    """Number of features that it reads, from the first."""
+    made_for: tuple[str, str]  # names of the representation and the data set that it was trained on
+    used = 0  # number of features that it reads, from the first
 
     def __init__(self, path: str):
         self.path = Path(path)

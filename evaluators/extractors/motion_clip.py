@@ -23,8 +23,7 @@ from flame_mdm.representations import Representation
 from flame_mdm.seeds import key
 from flame_mdm.task import Task
 
-POOL = 32
-"""Pairs per pool in which validation ranks, as in R-precision."""
+POOL = 32  # pairs per pool in which validation ranks, as in R-precision
 
 
 class MotionCLIP(nn.Module):

@@ -20,14 +20,11 @@ from flame_mdm.representations import Representation
 from flame_mdm.representations.humanml import HumanML
 from flame_mdm.seeds import key
 
-NEAR_MISSES = 2
-"""Near-miss captions per motion and step, of different attributes if possible."""
-JITTER = 0.02
-"""Standard deviation of joint positions, in meters, at which the strength of noise is 1."""
+NEAR_MISSES = 2  # Near-miss captions per motion and step, of different attributes if possible
+JITTER = 0.02  # standard deviation of joint positions, in meters, at which the strength of noise is 1
 FEATURE_NOISE = 0.3
 """Standard deviation of normalized features at which it is 1; positions of joints then err by about 20 mm, too."""
-WEIGHT = 5.0
-"""Weight of `calibration_error`, compared with `info_nce`."""
+WEIGHT = 5.0  # weight of `calibration_error`, compared with `info_nce`
 LENGTH = 10.0
 """Length of all features: the FID of noise of strength s, which moves all motions alike, is about (10 s)^2."""
 

@@ -21,10 +21,8 @@ from flame_mdm.data.t2m import MAX_TOKENS, frame_tokens
 from flame_mdm.errors import UserError
 from flame_mdm.safe_io import read_npy
 
-UNIT = 4
-"""Frames per vector of the movement encoder."""
-CONTACTS = 4
-"""Number of features at the end of each frame that the evaluator ignores."""
+UNIT = 4  # frames per vector of the movement encoder
+CONTACTS = 4  # number of features at the end of each frame that the evaluator ignores
 PARTS_OF_SPEECH = (
     *("VERB", "NOUN", "DET", "ADP", "NUM", "AUX", "PRON", "ADJ", "ADV"),
     *("Loc_VIP", "Body_VIP", "Obj_VIP", "Act_VIP", "Desc_VIP", "OTHER"),

@@ -50,8 +50,7 @@ class PromptMultimodality(SampleMetric):
 
     higher_is_better = None
     states = ("generated", "groups")
-    samples: int
-    """Motions per prompt."""
+    samples: int  # motions per prompt
 
     def update(self, generated: Tensor, groups: Tensor, keys: Tensor) -> None:
         self.keep(keys=keys, generated=generated, groups=groups)

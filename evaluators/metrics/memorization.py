@@ -8,10 +8,8 @@ from torch import Tensor
 
 from evaluators.metrics.samples import SampleMetric
 
-STEP = 4
-"""Every fourth frame of a motion is compared, which takes a quarter of the time. A copy still has distance 0."""
-CLOSE = 0.01
-"""Share of the held-out real motions that are closer to a training motion than the limit of a copy."""
+STEP = 4  # Every fourth frame of a motion is compared, which takes a quarter of the time. A copy still has distance 0.
+CLOSE = 0.01  # share of the held-out real motions that are closer to a training motion than the limit of a copy
 
 
 def poses(joints: Tensor, facing: Sequence[int]) -> Tensor:

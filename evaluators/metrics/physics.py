@@ -6,10 +6,8 @@ from torch import Tensor
 from evaluators.metrics.samples import SampleMetric, Share, real_frames
 from flame_mdm.formats.faults import LIMITS, LOW
 
-TOLERANCE = 0.005
-"""Distance from the floor, in meters, that counts as 0."""
-STANDING = 0.03
-"""Speed in meters per second below which a motion counts as static."""
+TOLERANCE = 0.005  # distance from the floor, in meters, that counts as 0
+STANDING = 0.03  # speed in meters per second below which a motion counts as static
 
 
 class FootSkating(Share):

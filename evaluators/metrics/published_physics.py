@@ -27,12 +27,9 @@ class MeanOverMotions(SampleMetric):
 
     higher_is_better = False
     states = ("values", "defined")
-    NAMES: tuple[str, ...]
-    """Names of the values of a motion."""
-    DIRECTIONS: Mapping[str, bool | None] = {}
-    """Values for which higher is better (True), or neither (None)."""
-    required_fps: float | None = None
-    """The only frame rate at which the values are defined; None = any."""
+    NAMES: tuple[str, ...]  # names of the values of a motion
+    DIRECTIONS: Mapping[str, bool | None] = {}  # values for which higher is better (True), or neither (None)
+    required_fps: float | None = None  # the only frame rate at which the values are defined; None = any
 
     def __init__(self, fps: float = 0):
         super().__init__()

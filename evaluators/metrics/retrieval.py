@@ -17,10 +17,8 @@ from flame_mdm.conditions import ConditionEncoder
 from flame_mdm.config import Config, instantiate
 from flame_mdm.seeds import key
 
-SAME = 0.9
-"""Cosine above which TMR considers captions the same: its threshold 0.95 is of (cosine + 1) / 2."""
-BATCH = 32
-"""Size of TMR's batches."""
+SAME = 0.9  # cosine above which TMR considers captions the same: its threshold 0.95 is of (cosine + 1) / 2
+BATCH = 32  # size of TMR's batches
 
 
 @functools.cache

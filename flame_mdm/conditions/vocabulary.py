@@ -10,8 +10,7 @@ from typing import Any
 from flame_mdm.errors import UserError, shortened
 
 WORD = re.compile(r"[^\W_]+")
-MAX_CAPTIONS = 1000
-"""Maximum number of training captions that a checkpoint keeps."""
+MAX_CAPTIONS = 1000  # maximum number of training captions that a checkpoint keeps
 FUNCTION_WORDS = frozenset(
     WORD.findall(
         "a an the this that some one and or then of to in on at by with from for as is are was were be been it its s t "

@@ -56,8 +56,7 @@ class MotionSource(ABC):
     """Names of the action labels, in the order of their numbers; empty for sets without labels."""
     verbs: tuple[str, ...] = ()
     """All forms of the verbs in the captions, if they are known: sentences of several actions are split at them."""
-    captions_may_be_shared: bool = False
-    """Whether the license allows checkpoints to contain captions."""
+    captions_may_be_shared: bool = False  # whether the license allows checkpoints to contain captions
     published_split: bool = False
     """Whether the split is the one used in papers although it tests on clips seen in training or leaves no validation
     clips. Saved in the store and in every result."""

@@ -21,8 +21,7 @@ DRIFT, FLOAT = 0.05, 0.1
 """Limits in meters of a clip: rise of its floor from the first to the last second, and median height above it."""
 PRIOR = {"train": 2000, "val": 64}
 """Maximum number of clips of each split that are kept of what the model knows, evenly spaced in its data."""
-KEPT = "prior/"
-"""Beginning of the names of these clips."""
+KEPT = "prior/"  # beginning of the names of these clips
 
 
 class Lesson(MotionSource):

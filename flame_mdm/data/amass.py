@@ -56,8 +56,7 @@ Argument = TypeVar("Argument")
 Result = TypeVar("Result")
 ARCHIVE_ENDINGS = (".tar.bz2", ".tar.xz", ".tar.gz", ".tar")
 CHUNK = 32
-_Files = Path | dict[str, Path]
-"""An archive, or a mapping from key to file."""
+_Files = Path | dict[str, Path]  # an archive, or a mapping from key to file
 GET_IT = "register at https://amass.is.tue.mpg.de, download the SMPL+H G archives and put them there"
 
 

@@ -14,8 +14,7 @@ from flame_mdm.safe_io import MEBIBYTE, ZIP_ERRORS, check_expansion, check_membe
 
 MEMBER_LIMIT = 512 * MEBIBYTE
 """Maximum size of one unpacked member in bytes. Motions, captions and arrays are far smaller."""
-HEADER_LIMIT = MEBIBYTE // 16
-"""Maximum size in bytes of a header that describes the next member."""
+HEADER_LIMIT = MEBIBYTE // 16  # maximum size in bytes of a header that describes the next member
 _UNPACKERS = {b"\x1f\x8b": gzip.open, b"BZ": bz2.open, b"\xfd7zXZ": lzma.open}
 _HEADERS = (tarfile.XHDTYPE, tarfile.XGLTYPE, tarfile.SOLARIS_XHDTYPE, tarfile.GNUTYPE_LONGNAME)
 _HEADERS += (tarfile.GNUTYPE_LONGLINK,)

@@ -68,8 +68,7 @@ REST = {
 # y up <-> AMASS's z up: (-x, z, y), so that motions look the same after the SMPL representation decodes them.
 AXES = np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 1.0, 0.0]])
 
-WORDS = read_yaml(Path(__file__).with_suffix(".yaml"))
-"""Contents, styles and captions."""
+WORDS = read_yaml(Path(__file__).with_suffix(".yaml"))  # contents, styles and captions
 CONTENTS_1, STYLES_1 = tuple(WORDS["dataset_1"]["contents"]), tuple(WORDS["dataset_1"]["styles"])
 STYLES_2 = tuple(WORDS["dataset_2"]["styles"])
 TAKES_2: dict[str, list[int]] = WORDS["dataset_2"]["takes"]

@@ -14,11 +14,9 @@ from flame_mdm.data.store import Store
 from flame_mdm.representations import Representation
 from flame_mdm.seeds import integers, key
 
-Draw = tuple[int, int]
-"""(index of a clip, number of the batch that it is drawn for; -1 in evaluation)."""
+Draw = tuple[int, int]  # (index of a clip, number of the batch that it is drawn for; -1 in evaluation)
 
-Sample = tuple[str, Tensor, str | None, int | None]
-"""(id, x (F, D), caption, action), input of `collate`."""
+Sample = tuple[str, Tensor, str | None, int | None]  # (id, x (F, D), caption, action), input of `collate`
 
 
 class Clips(Dataset[Sample]):

@@ -34,10 +34,8 @@ from flame_mdm.safe_io import naming, read_json, read_text, read_yaml, regular_f
 
 FACTS: dict[str, Any] = read_yaml(Path(__file__).with_suffix(".yaml"))
 FILE = re.compile(r"(\d{2,3}_\d{2,3})\.(amc|bvh)", re.IGNORECASE)
-SUFFIXES = (".amc", ".asf", ".bvh", ".csv", ".json", ".txt", ".yaml", ".zip")
-"""Files that are read of an archive."""
-RATES = (120.0, 60.0)
-"""Frame rates of the recordings, the usual one first."""
+SUFFIXES = (".amc", ".asf", ".bvh", ".csv", ".json", ".txt", ".yaml", ".zip")  # files that are read of an archive
+RATES = (120.0, 60.0)  # frame rates of the recordings, the usual one first
 SLACK = 0.05  # seconds, one frame at 20 fps, by which durations may differ
 LISTED = 20  # failures that are printed
 SHORTEST = 40  # rows of features of a clip, as in HumanML3D

@@ -30,10 +30,8 @@ from flame_mdm.safe_io import read_json, read_text, regular_file
 
 FORBIDDEN_CHARACTERS = re.compile("[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
 """Characters not allowed in the name of a motion: names are stored as text, one clip per line."""
-LOOK_FPS = 20.0
-"""Frame rate for which `Folder.check` says whether motions can be resampled."""
-SPLITTABLE = 10
-"""Number of motions from which on each split has at least one."""
+LOOK_FPS = 20.0  # frame rate for which `Folder.check` says whether motions can be resampled
+SPLITTABLE = 10  # number of motions from which on each split has at least one
 TABLES = ("captions.csv", "captions.json")
 COLUMNS = ("id", "text", "action", "split", "source")
 
@@ -48,8 +46,7 @@ class Note:
     source: str | None = None
 
 
-Task = tuple[Path, str, dict[str, Any]]
-"""A motion, its skeleton.yaml or "", and the content of that file."""
+Task = tuple[Path, str, dict[str, Any]]  # a motion, its skeleton.yaml or "", and the content of that file
 
 
 class Facts(NamedTuple):

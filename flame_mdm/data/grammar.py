@@ -12,8 +12,7 @@ from flame_mdm.safe_io import read_yaml
 
 Attributes = Mapping[str, Any]
 
-UNSAID = {"speed": "normal", "amount": "quarter"}
-"""Values that a caption need not state."""
+UNSAID = {"speed": "normal", "amount": "quarter"}  # values that a caption need not state
 TENSES = ("present",) * 5 + ("progressive",) * 3 + ("past", "past", "future")
 CHOICE = re.compile(r"\[([^\[\]]*)\]")
 SLOT = re.compile(r"\{(\w+)(?:\.(\w+))?\}")

@@ -16,14 +16,11 @@ from flame_mdm.data import Clip, MotionSource, Split, restricted_pickle, split_b
 from flame_mdm.errors import UserError
 from flame_mdm.safe_io import naming, read_npy
 
-FPS = 20.0
-"""Frames per second at which the authors' code plays the action data sets; frames are not resampled."""
+FPS = 20.0  # frames per second at which the authors' code plays the action data sets; frames are not resampled
 
-NO_NUMBERS = (TypeError, ValueError, OverflowError)
-"""Errors that NumPy raises for what does not consist of numbers."""
+NO_NUMBERS = (TypeError, ValueError, OverflowError)  # errors that NumPy raises for what does not consist of numbers
 
-BLOCK = 10
-"""Number of consecutive clips in the file that go to one split together: they may be cut from one recording."""
+BLOCK = 10  # number of consecutive clips in the file that go to one split together: they may be cut from one recording
 
 
 class HumanAct12(MotionSource):

@@ -68,13 +68,11 @@ def in_order(function: Callable[[Task], Result], tasks: Iterable[Task], workers:
 @dataclass
 class _Pool:
     executor: ProcessPoolExecutor
-    others: list[BaseProcess]
-    """Children of this process that do not belong to the pool."""
+    others: list[BaseProcess]  # children of this process that do not belong to the pool
     users: int = 0
 
 
-_pool: _Pool | None = None
-"""The pool in use, if any."""
+_pool: _Pool | None = None  # the pool in use, if any
 
 
 @contextmanager

@@ -21,8 +21,7 @@ from flame_mdm.errors import UserError, first_line
 from flame_mdm.safe_io import check_expansion, regular_file
 
 DTYPE = re.compile(r"[biufcSU]\d{1,9}|O8?")
-VALUE = 512
-"""Bytes that each value counts as, so that a small file cannot repeat lists without end."""
+VALUE = 512  # bytes that each value counts as, so that a small file cannot repeat lists without end
 
 
 class _Object:

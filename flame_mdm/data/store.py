@@ -37,10 +37,8 @@ from flame_mdm.representations import Frames, Representation
 from flame_mdm.safe_io import locked, parse_json, read_json, read_npy, read_npz, regular_file, sha256, writing
 
 FORMAT = 1
-CHUNK = 4096
-"""Frames that are encoded together."""
-BLOCK = 8192
-"""Frames that are read together for the statistics."""
+CHUNK = 4096  # frames that are encoded together
+BLOCK = 8192  # frames that are read together for the statistics
 _Motion = tuple[str, str, np.ndarray]
 """Clip that names a motion in errors, name of the representation or "", and the motion itself."""
 

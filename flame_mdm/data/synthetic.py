@@ -18,12 +18,9 @@ from flame_mdm.data.synthetic_motions.body import Attributes, Body
 from flame_mdm.errors import UserError
 
 WAYS = {"forward": 0.3, **dict.fromkeys(("backward", "left", "right", "clockwise", "counterclockwise"), 0.14)}
-MIN_EVENT_SECONDS = 0.8
-"""Minimum duration of a repetition in seconds; it limits how many fit into a clip."""
-AT_ONCE = 32
-"""Number of clips that a process makes at a time."""
-CAPTIONS = 8
-"""Captions per clip."""
+MIN_EVENT_SECONDS = 0.8  # minimum duration of a repetition in seconds; it limits how many fit into a clip
+AT_ONCE = 32  # number of clips that a process makes at a time
+CAPTIONS = 8  # captions per clip
 PARTIAL = 0.25
 """Share of the training clips whose captions leave out some attributes; those of val and test state all of them."""
 

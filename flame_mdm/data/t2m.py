@@ -20,11 +20,9 @@ from flame_mdm.data import SPLITS, Clip, MotionSource, Split, archives, required
 from flame_mdm.errors import UserError
 from flame_mdm.safe_io import naming, read_npy, read_text
 
-TAG_FPS = 20
-"""Frames per second of the tags `from` and `to`, also in KIT-ML, whose motions have 12.5."""
+TAG_FPS = 20  # frames per second of the tags `from` and `to`, also in KIT-ML, whose motions have 12.5
 
-MAX_LENGTH = 200
-"""Motions and cuts of this many frames or more are left out."""
+MAX_LENGTH = 200  # motions and cuts of this many frames or more are left out
 
 MAX_TOKENS = 20
 
@@ -127,8 +125,7 @@ class T2MFolder(MotionSource):
         exclude: names to leave out; a mirrored copy has its own name.
     """
 
-    representation: str
-    """Name of the representation of the features in the folder."""
+    representation: str  # name of the representation of the features in the folder
     fps: float
     shortest: int
     get_it: str

@@ -25,14 +25,11 @@ TRAIN_SUBJECTS = (
 )
 """Training subjects of the cross-subject protocol: 51 of 118; the other 67 are for testing."""
 
-VAL_SUBJECTS = 5
-"""Number of training subjects that our split uses for validation."""
+VAL_SUBJECTS = 5  # number of training subjects that our split uses for validation
 
-ROOT = 8
-"""Index of the middle of the hips among VIBE's 49 joints, which ACTOR uses as the root."""
+ROOT = 8  # index of the middle of the hips among VIBE's 49 joints, which ACTOR uses as the root
 
-FOCAL_LENGTH, IMAGE_SIZE = 500.0, 540.0
-"""Camera in pixels that ACTOR assumes, since VIBE estimates only a scale."""
+FOCAL_LENGTH, IMAGE_SIZE = 500.0, 540.0  # camera in pixels that ACTOR assumes, since VIBE estimates only a scale
 
 NAME = re.compile(r"a(\d+)_d(\d+)_p(\d+)_c(\d+)(_.*)?")
 

@@ -20,8 +20,7 @@ from flame_mdm.representations import Representation
 from flame_mdm.safe_io import read_yaml, write_text
 
 PUBLISHED = Path(__file__).with_name("published.yaml")
-STILL_DISTANCE = 0.01
-"""Meters; a clip in which no joint moves farther from its first position counts as still."""
+STILL_DISTANCE = 0.01  # meters; a clip in which no joint moves farther from its first position counts as still
 
 MAX_FRAMES = 500_000
 """Maximum number of training frames from which statistics are recomputed, so that they fit in memory."""

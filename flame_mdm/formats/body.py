@@ -7,13 +7,10 @@ import numpy as np
 from flame_mdm.errors import UserError
 from flame_mdm.representations.skeleton import SMPL22
 
-LEG = (0.6, 1.2)
-"""Shortest and longest leg of an adult, in meters: hip to knee to ankle."""
-CHILD = 0.25
-"""Shortest leg of a child in meters, at about one year."""
+LEG = (0.6, 1.2)  # shortest and longest leg of an adult, in meters: hip to knee to ankle
+CHILD = 0.25  # shortest leg of a child in meters, at about one year
 USUAL_LEG = 0.83
-FOOT = 0.02
-"""Shortest foot in meters, ankle to toes."""
+FOOT = 0.02  # shortest foot in meters, ankle to toes
 UNITS = {
     **{"meters": 1.0, "centimeters": 0.01, "millimeters": 0.001, "inches": 0.0254, "feet": 0.3048},
     **{"the unit of CMU's recordings": 0.0564444},

@@ -29,10 +29,8 @@ from flame_mdm.safe_io import TEXT_LIMIT, regular_file, write_text
 CHANNELS = tuple(f"{axis}{kind}" for kind in ("position", "rotation") for axis in "XYZ")
 HEADER = 1 << 16
 """Bytes that contain the hierarchy and the first frame of most files: 15 KiB for a body with all its fingers."""
-MAX_JOINTS = 4096
-"""Maximum number of joints and end sites of a file."""
-LARGEST = 1e9
-"""Largest number that is read."""
+MAX_JOINTS = 4096  # maximum number of joints and end sites of a file
+LARGEST = 1e9  # largest number that is read
 MAX_LABELED_LINE = 200
 """Maximum length of a line with a label. Python needs quadratic time for numbers with many digits."""
 

@@ -12,12 +12,9 @@ from flame_mdm.formats.limbs import depths, unit
 from flame_mdm.formats.motion import Motion
 from flame_mdm.representations.skeleton import Skeleton
 
-SMOOTHNESS = 0.034
-"""Weight of the squared third differences of a joint's path, relative to its squared change."""
-OUTLIER = 0.03
-"""Distance in meters from the smooth path at which a position has half its weight."""
-LOW = 0.07
-"""Height in meters above the floor at which a toe counts as in the air."""
+SMOOTHNESS = 0.034  # weight of the squared third differences of a joint's path, relative to its squared change
+OUTLIER = 0.03  # distance in meters from the smooth path at which a position has half its weight
+LOW = 0.07  # height in meters above the floor at which a toe counts as in the air
 SLOW = 0.5
 """Horizontal speed in meters per second at which a low toe counts as off the ground, while the body stands still."""
 SHARE, SHARE_PINNED = 0.5, 0.4
@@ -26,8 +23,7 @@ on the floor may slide along with the body; a swinging foot is faster than the b
 DRIFT = 0.2
 """Speed in meters per second up to which the body may slide over its feet; the legs compensate for the difference.
 Above 1.5 times this speed, the body follows its feet entirely."""
-CLEAR = 0.15
-"""Seconds in which a hand that would be inside the body starts to avoid it."""
+CLEAR = 0.15  # seconds in which a hand that would be inside the body starts to avoid it
 REACH = 0.999
 """Maximum distance from hip to ankle relative to the length of the straight leg, unless it was longer before."""
 

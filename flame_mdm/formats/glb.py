@@ -31,8 +31,7 @@ LIMIT, DOCUMENT_LIMIT = 512 * MEBIBYTE, 16 * MEBIBYTE
 """Maximum size of a file that is read, and of its JSON part, which takes many times its size in memory."""
 MAX_NODES, MAX_ITEMS = 4096, 65_536
 """Maximum number of nodes, and of all other items of one list. Characters have some hundreds of nodes."""
-LARGEST = 1e9
-"""Largest coordinate or matrix entry that is read."""
+LARGEST = 1e9  # largest coordinate or matrix entry that is read
 
 # The document ---------------------------------------------------------------------------------------------------------
 

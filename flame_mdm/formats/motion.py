@@ -36,10 +36,8 @@ END_SITES = {
     **{"left_wrist": ADULT[22], "right_wrist": ADULT[23]},
 }
 """Tips of head, toes and hands beyond the last joints, in meters; without them programs do not draw these bones."""
-ENDINGS = (".bvh", ".glb", ".npz", ".json", ".npy", ".gif", ".mp4")
-"""Extensions of the files that are written."""
-FIGURES = ("body", "bones")
-"""Meshes of .glb files; the first is the default."""
+ENDINGS = (".bvh", ".glb", ".npz", ".json", ".npy", ".gif", ".mp4")  # extensions of the files that are written
+FIGURES = ("body", "bones")  # meshes of .glb files; the first is the default
 
 
 @dataclass(eq=False, repr=False)

@@ -16,21 +16,18 @@ CHILDREN = tuple(tuple(joint for joint, parent in enumerate(SMPL22.parents) if p
 PELVIS, SPINE3 = 0, 9
 ALIKE = ((0,), (1, 2), (3,), (4, 5), (6,), (7, 8), (9,), (12,), (13, 14), (16, 17), (18, 19))
 """Joints with children, from the root outward; those of both sides together."""
-SPINE = {3: 1 / 3, 6: 2 / 3}
-"""Joints between pelvis and chest -> fraction of the rotation from pelvis to chest."""
+SPINE = {3: 1 / 3, 6: 2 / 3}  # joints between pelvis and chest -> fraction of the rotation from pelvis to chest
 FORWARD = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
 BENDS = {1: -FORWARD, 2: -FORWARD, 16: FORWARD, 17: FORWARD}
 """Hips and shoulders -> direction in which the knee or elbow bends the limb in the rest pose."""
 STRAIGHT = 0.15
 """Sine of the bend of a knee or elbow at which the bend and the parent's rotation have the same weight for the twist of
 the limb. Weights are squared, so that a clear bend dominates."""
-FOOT = 0.3
-"""Weight of the foot relative to the shin in the twist of a thigh: it determines the twist of a straight leg."""
+FOOT = 0.3  # weight of the foot relative to the shin in the twist of a thigh: it determines the twist of a straight leg
 SMOOTH = 0.1
 """Seconds over which the bend is averaged before it determines the twist, so that an arm does not spin when it passes
 through the straight position. Joint positions do not depend on the twist."""
-SQUARINGS = 12
-"""Squarings that isolate an eigenvector; others shrink by the power 4,096."""
+SQUARINGS = 12  # squarings that isolate an eigenvector; others shrink by the power 4,096
 
 
 @dataclass(eq=False)

@@ -28,8 +28,7 @@ CAMERA_AXES = torch.diag(torch.tensor([1.0, -1, -1], dtype=torch.float64))
 ROTATED = {"smpl147": 147, "rot6d-25": 150, "motion272": 272}
 """Representations that contain SMPL's rotations -> number of features."""
 KIMODO_FPS = 30.0
-JSON_LIMIT = 128 * MEBIBYTE
-"""Maximum size of a `.json` motion; parsed, it takes many times its size."""
+JSON_LIMIT = 128 * MEBIBYTE  # maximum size of a `.json` motion; parsed, it takes many times its size
 
 
 def read(

@@ -11,10 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from flame_mdm.errors import UserError
 
-RATES = (0.1, 1000.0)
-"""Lowest and highest frame rate of a motion file, in frames per second."""
-MAX_FRAMES = 500_000
-"""Maximum number of frames of a motion: 70 minutes at 120 frames per second."""
+RATES = (0.1, 1000.0)  # lowest and highest frame rate of a motion file, in frames per second
+MAX_FRAMES = 500_000  # maximum number of frames of a motion: 70 minutes at 120 frames per second
 MAX_RESAMPLED = 1_000_000
 """Maximum number of joint positions after upsampling: 38 minutes of 22 joints at 20 frames per second."""
 

@@ -21,21 +21,18 @@ LIMBS = {"hip": "knee", "knee": "ankle", "shoulder": "elbow", "elbow": "wrist"}
 REQUIRED = ("hip", "knee", "ankle", "shoulder", "elbow", "wrist")
 """Joints of both sides that a character must have, beside the pelvis."""
 SPINE = ("spine1", "spine2", "spine3")
-TILT = 45
-"""Degrees between trunk and vertical at which a rest pose is refused."""
+TILT = 45  # degrees between trunk and vertical at which a rest pose is refused
 SNAP = 8
 """Largest angle in degrees between the facing direction and an axis at which the character is assumed to face along
 the axis."""
-BEND = 0.15
-"""Minimum sine of the bend of an elbow or knee in the rest pose from which the twist of the limb is read."""
+BEND = 0.15  # minimum sine of the bend of an elbow or knee in the rest pose from which the twist of the limb is read
 GROUND = 0.1
 """Largest height in meters at which the lowest joint of a clip counts as on the floor: in recordings it is often a
 little above."""
 STRAIGHT = 0.05
 """Distance of the knee from the straight line of the leg, relative to the thigh, at which the bend and the front of the
 thigh have the same weight for where the knee points."""
-REACH = 0.999
-"""Maximum distance from hip to ankle relative to the length of the straight leg."""
+REACH = 0.999  # maximum distance from hip to ankle relative to the length of the straight leg
 
 
 @dataclass(frozen=True, eq=False)

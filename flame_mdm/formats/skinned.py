@@ -15,10 +15,8 @@ from flame_mdm.visualize.body import ANCHORS, FittedBody
 from flame_mdm.visualize.render import SIDE_COLORS
 from flame_mdm.visualize.scene import radii, sides
 
-VERTICES, INDICES = 34962, 34963
-"""Uses of a buffer view."""
-SIDES = 10
-"""Number of corners of a limb's cross section."""
+VERTICES, INDICES = 34962, 34963  # uses of a buffer view
+SIDES = 10  # number of corners of a limb's cross section
 
 
 def write(path: Path, poses: Poses, rig: Rig, fps: float, text: str, name: str, body: FittedBody | None = None) -> None:

@@ -18,8 +18,7 @@ from flame_mdm.sampler_options import SamplerOptions
 Prediction = Literal["x0", "epsilon", "velocity"]
 Variance = Literal["fixed_small", "fixed_large", "learned_range"]
 TimestepSampling = Literal["uniform", "loss_aware"]
-UNIFORM_SHARE = 0.001
-"""Probability that `LossAwareTimesteps` draws uniformly, so that every step can be drawn."""
+UNIFORM_SHARE = 0.001  # probability that `LossAwareTimesteps` draws uniformly, so that every step can be drawn
 
 
 class LossAwareTimesteps(nn.Module):

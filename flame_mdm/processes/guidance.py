@@ -9,8 +9,7 @@ from torch import Tensor
 
 from flame_mdm.batch import Condition, Denoise
 
-STEERING_STEPS = 2
-"""Gradient steps before each step of the sampler."""
+STEERING_STEPS = 2  # gradient steps before each step of the sampler
 STEERING_LIMIT = 0.02
 """Maximum length of such a step, as RMS over the normalized features. With longer steps, x_t is no longer like noisy
 motions of the training where the denoiser depends on it only weakly: in one trial, arms grew by a third."""

@@ -21,8 +21,7 @@ from flame_mdm.sampler_options import SamplerOptions
 Estimate = Callable[[Tensor, int], tuple[Tensor, Tensor | float]]
 """(x_t (B, F, D), step i) -> clean estimate (B, F, D) and log-variance of x_{t-1}, a number or (B, F, D)."""
 
-Velocity = Callable[[Tensor, float | Tensor], Tensor]
-"""(x (B, F, D), time t) -> dx/dt (B, F, D)."""
+Velocity = Callable[[Tensor, float | Tensor], Tensor]  # (x (B, F, D), time t) -> dx/dt (B, F, D)
 
 
 @dataclass(frozen=True)

@@ -26,13 +26,11 @@ from flame_mdm.visualize import contact_sheet, write_gif, write_mp4, write_playe
 from flame_mdm.visualize.body import Mesh
 
 BATCH = 32
-STAGES = 10
-"""Number of clean estimates shown of one sampling run: one per tenth of it, as in figure 5 of MFM."""
+STAGES = 10  # number of clean estimates shown of one sampling run: one per tenth of it, as in figure 5 of MFM
 REQUEST_FILES = re.compile(r"motion_\d{3,}\.npz|motions\.mp4|trajectory\.png")
 """Files that some requests write and others do not."""
 
-Score = Callable[[Sequence[Motion]], Sequence[float]]
-"""Scores motions; higher is better."""
+Score = Callable[[Sequence[Motion]], Sequence[float]]  # scores motions; higher is better
 
 
 def generate(

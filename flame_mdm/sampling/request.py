@@ -21,10 +21,8 @@ if TYPE_CHECKING:
     from flame_mdm.formats.motion import Motion
     from flame_mdm.generator import MotionGenerator
 
-MAX_SAMPLES = 10_000
-"""Maximum number of samples per request; they are kept in memory until all are complete."""
-MAX_TEXT_LENGTH = 2000
-"""Maximum number of characters of a text; captions of the data sets are far shorter."""
+MAX_SAMPLES = 10_000  # maximum number of samples per request; they are kept in memory until all are complete
+MAX_TEXT_LENGTH = 2000  # maximum number of characters of a text; captions of the data sets are far shorter
 TRAINED_ON = {
     "text": ("was trained on captions", 'text="a person walks"'),
     "action": ("was trained on action labels", "action=NAME"),
@@ -40,11 +38,9 @@ METHODS: dict[str, dict[str, Any]] = {
 REGIONS = ("in_between", "prediction", "prefix", "suffix", "interpolate")
 """Editing tasks that name the frames to resample; see `EditRequest`."""
 
-Part = tuple[str, float | None]
-"""Text of a part of a sequence, and its seconds if the text gives them."""
+Part = tuple[str, float | None]  # text of a part of a sequence, and its seconds if the text gives them
 Ranges = Sequence[float] | Sequence[Sequence[float]]
-ARRIVAL = 0.2
-"""Seconds before the end of a motion at which the last way point of a path is reached."""
+ARRIVAL = 0.2  # seconds before the end of a motion at which the last way point of a path is reached
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,10 +10,8 @@ from flame_mdm.generator import MotionGenerator
 from flame_mdm.processes.windows import Windows, spans, window_tensors
 from flame_mdm.sampling.request import Part, SamplingRequest
 
-OVERLAP = 0.5
-"""Seconds that neighboring windows share; see docs/sequences.md."""
-MAX_SECONDS = 600
-"""Maximum length of a sequence; all its windows are denoised at the same time."""
+OVERLAP = 0.5  # seconds that neighboring windows share; see docs/sequences.md
+MAX_SECONDS = 600  # maximum length of a sequence; all its windows are denoised at the same time
 
 
 def overlap(model: MotionGenerator) -> int:

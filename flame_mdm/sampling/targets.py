@@ -19,14 +19,10 @@ from flame_mdm.representations import Representation, rotation
 from flame_mdm.safe_io import MEBIBYTE, read_text
 from flame_mdm.sampling.reading import read_motion
 
-SMOOTHNESS = 0.2
-"""Seconds over which a correction fades; see docs/targets.md."""
-MAX_SPEED = 8.0
-"""Meters per second that way points may require."""
-REACH = 2.5
-"""Maximum height of a joint above the floor, and its maximum distance from where the body stands, in meters."""
-MAX_COORDINATES = 600
-"""Maximum number of coordinates; they are solved for together in every step."""
+SMOOTHNESS = 0.2  # seconds over which a correction fades; see docs/targets.md
+MAX_SPEED = 8.0  # meters per second that way points may require
+REACH = 2.5  # maximum height of a joint above the floor, and its maximum distance from where the body stands, in meters
+MAX_COORDINATES = 600  # maximum number of coordinates; they are solved for together in every step
 KEYS = {
     "root": ({"time", "position"}, set[str]()),
     "joints": ({"time", "joint", "position"}, set[str]()),

@@ -126,8 +126,7 @@ def pick(rng: np.random.Generator, t: np.ndarray, requested: Attributes) -> Body
     return body
 
 
-CHAIR = 0.54
-"""Height of the pelvis on a chair whose seat is 45 cm high."""
+CHAIR = 0.54  # height of the pelvis on a chair whose seat is 45 cm high
 
 
 def _seat(body: Body, seated: np.ndarray, bent: np.ndarray) -> None:

@@ -18,7 +18,7 @@ import numpy as np
 import torch
 
 from flame_mdm.errors import UserError, shortened
-from flame_mdm.formats import bvh, characters, skinned
+from flame_mdm.formats import WRITTEN, bvh, characters, skinned
 from flame_mdm.formats.characters import Character
 from flame_mdm.formats.poses import Poses, solve
 from flame_mdm.formats.retarget import continuous_euler, preset, retarget, smpl
@@ -36,7 +36,6 @@ END_SITES = {
     **{"left_wrist": ADULT[22], "right_wrist": ADULT[23]},
 }
 """Tips of head, toes and hands beyond the last joints, in meters; without them programs do not draw these bones."""
-ENDINGS = (".bvh", ".glb", ".npz", ".json", ".npy", ".gif", ".mp4")  # extensions of the files that are written
 FIGURES = ("body", "bones")  # meshes of .glb files; the first is the default
 
 
@@ -139,8 +138,8 @@ class Motion:
         """
         path = Path(path)
         ending = path.suffix.lower()
-        if ending not in ENDINGS:
-            raise UserError(f"{path}: unknown kind of motion file. Use one of {', '.join(ENDINGS)}")
+        if ending not in WRITTEN:
+            raise UserError(f"{path}: unknown kind of motion file. Use one of {', '.join(WRITTEN)}")
         if figure not in FIGURES:
             raise UserError(f"figure={figure}: unknown. Use {' or '.join(FIGURES)}")
         if (figure != FIGURES[0] and ending != ".glb") or (rest_pose and ending != ".bvh"):

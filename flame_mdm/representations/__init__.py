@@ -73,7 +73,9 @@ class Representation(nn.Module, ABC):
         """Decodes features (..., F, D) in the data's units to joints (..., F, J, 3), meters, y up. Differentiable."""
 
     def statistics(self, features: Tensor | Frames) -> tuple[Tensor, Tensor]:
-        """Returns mean and std (D,) for normalization, from all training frames (N, D); by default 0 and 1."""
+        """Returns mean and std (D,) for normalization, from all training frames (N, D); 0 and 1 without `slices`."""
+        if self.slices:
+            return grouped_statistics(features, self.slices.values())
         return torch.zeros(self.features), torch.ones(self.features)
 
     @abstractmethod

@@ -10,7 +10,7 @@ from scipy.ndimage import gaussian_filter1d
 from torch import Tensor
 
 from flame_mdm.errors import UserError
-from flame_mdm.representations import Frames, Representation, check_finite, grouped_statistics, rotation
+from flame_mdm.representations import Representation, check_finite, rotation
 from flame_mdm.representations.skeleton import SKELETONS
 
 LEGACY_SMOOTHING_FRAMES = 20
@@ -133,10 +133,6 @@ class HumanML(Representation):
         turned = rotation.rotate_y(local, heading[..., None])
         ground = root * root.new_tensor([1.0, 0.0, 1.0])
         return torch.cat([root[..., None, :], turned + ground[..., None, :]], -2) / self.units_per_metre
-
-    def statistics(self, features: Tensor | Frames) -> tuple[Tensor, Tensor]:
-        """Returns the mean of each feature, and the std averaged over each entry of `slices`, to keep scales."""
-        return grouped_statistics(features, self.slices.values())
 
     def joint_features(self, joints: Iterable[int]) -> Tensor:
         """Returns (D,) bool, True for the features of these joints; the root features belong to joint 0.

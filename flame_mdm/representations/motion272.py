@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from flame_mdm.errors import UserError
-from flame_mdm.representations import Features, Frames, Representation, grouped_statistics, rotation
+from flame_mdm.representations import Features, Representation, rotation
 from flame_mdm.representations.skeleton import SMPL22, forward_kinematics
 from flame_mdm.representations.smpl import ADULT, read_pose
 
@@ -100,9 +100,6 @@ class Motion272(Representation):
             cut[..., 0, self.slices[name]] = 0.0
         cut[..., 0, [2, 6]] = 1.0
         return cut
-
-    def statistics(self, features: Tensor | Frames) -> tuple[Tensor, Tensor]:
-        return grouped_statistics(features, self.slices.values())
 
     def joint_features(self, joints: Iterable[int]) -> Tensor:
         """Returns (D,) bool, True for the features of these joints; velocity and turn of the root belong to joint 0."""

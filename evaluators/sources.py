@@ -64,15 +64,11 @@ class Generator:
     processes each sample whole batches, so that motions do not depend on the number of processes.
 
     Args:
-        model: the model, on its device.
+        model, clips: the model, on its device, and the split.
         protocol: condition and edit of the motions, and whether they are timed.
-        clips: the split.
-        options: of the sampler.
-        edit: options of `Edit`, if motions are edited.
-        seed: of the noise.
-        batch_size: motions per batch.
+        options, edit: of the sampler, and of `Edit`, if motions are edited.
+        seed, batch_size: of the noise, and of the motions.
         folder: cache of the motions, `rep_0.npz` and so on, as `SampleFolder` reads them; None = no cache.
-        progress: whether to show a progress bar.
     """
 
     def __init__(

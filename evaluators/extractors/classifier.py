@@ -31,8 +31,7 @@ class ClassifierTask(Task):
     Args:
         network: the classifier.
         representation: of the motions; an extractor can only measure motions in this representation.
-        optimizer: a mapping with the `_target_` of a torch optimizer and its arguments.
-        seed: determines the random draws of a training step, together with the step and the rank.
+        optimizer, seed: as for `MotionCLIPTask`.
     """
 
     noun = "an action classifier"

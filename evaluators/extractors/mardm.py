@@ -45,14 +45,9 @@ class MARDMClip(nn.Module):
     """Embeds the essential features of motions, and captions, as vectors of length 1.
 
     Args:
-        mean: (67,) of the features.
-        std: (67,) of the features.
-        width: of the transformers.
-        hidden: width of their linear layers.
-        layers: of each transformer.
-        heads: of each layer.
-        words: size of the vocabulary.
-        slots: tokens of a caption.
+        mean, std: (67,) of the features.
+        width, hidden, layers, heads: of the transformers; `hidden` is the width of their linear layers.
+        words, slots: size of the vocabulary, and tokens of a caption.
     """
 
     mean: Tensor

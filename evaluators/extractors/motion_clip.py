@@ -33,15 +33,9 @@ class MotionCLIP(nn.Module):
     learned, with an initial value of 0.07.
 
     Args:
-        in_features: D of the motions.
-        text_features: C, width of the pooled condition.
-        latent_dim: width of the transformer.
-        ff_size: hidden width of its feed-forward layers.
-        num_layers: number of its layers.
-        num_heads: attention heads.
-        dropout: probability inside the layers.
+        in_features, text_features, embedding_dim: D of the motions, C of the pooled condition, E of the joint space.
+        latent_dim, ff_size, num_layers, num_heads, dropout: of the transformer, see `Denoiser`.
         max_frames: longest motion that the length token supports.
-        embedding_dim: E, width of the joint space.
         blind_features: number of features at the beginning of each frame that are set to 0. It is 3 in FLAME's
             code, whose motions begin with the root's translation: scores do not depend on position and height.
         roughness: whether the absolute second differences of the features over time are inputs, too. They show

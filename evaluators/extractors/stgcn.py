@@ -43,11 +43,9 @@ class STGCN(nn.Module):
     all motions have 60 frames, and short clips repeat their last frame.
 
     Args:
-        in_channels: C, channels per joint.
-        num_actions: number of classes.
+        in_channels, num_actions: C, channels per joint, and number of classes.
         parents: parent of each joint, -1 for the center.
-        widths: channels after each block.
-        strides: temporal stride of each block.
+        widths, strides: channels after each block, and its temporal stride.
     """
 
     def __init__(

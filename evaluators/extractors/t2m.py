@@ -129,13 +129,9 @@ class T2MEvaluator(nn.Module):
     normalization; the convolutions see 3 frames past the end.
 
     Args:
-        mean: (D,) the evaluator's mean: 263 or 251 features.
-        std: (D,) its standard deviation.
-        movement_hidden: channels after the first convolution.
-        movement_latent: channels of a movement vector.
-        text_hidden: width of the text GRU.
-        motion_hidden: width of the motion GRU.
-        embedding: E, width of the joint space.
+        mean, std: (D,) of the evaluator: 263 or 251 features.
+        movement_hidden, movement_latent: channels after the first convolution, and of a movement vector.
+        text_hidden, motion_hidden, embedding: widths of the GRUs and of the joint space.
         max_frames: length to which every motion is padded.
         used_features: number of features that the network sees, from the first; MARDM's sees 67 (KIT: 64). None =
             all but the contacts.

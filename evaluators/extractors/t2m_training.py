@@ -105,11 +105,9 @@ class T2MTask(Task):
         words: folder of our_vab_data.npy and our_vab_idx.pkl, see `WordVectors`, only read for training; "learned" for
             data sets whose words are not tagged, see `LearnedWords`.
         movement_steps: steps of the first stage.
-        sparsity: weight of the mean magnitude of movement vectors.
-        smoothness: weight of the mean magnitude of differences of successive movement vectors.
+        sparsity, smoothness: weights of the mean magnitude of movement vectors, and of differences of successive ones.
         margin: of `matching_loss`.
-        optimizer: a mapping with the `_target_` of a torch optimizer and its arguments.
-        seed: determines the dropout of a training step, together with the step and the rank.
+        optimizer, seed: as for `MotionCLIPTask`.
     """
 
     noun = "a trained evaluator of Guo et al."

@@ -96,12 +96,11 @@ class MotionDataModule(LightningDataModule):
     Args:
         source: the published data set.
         representation: encodes the clips; receives the statistics of the store.
-        root: folder of all prepared data sets.
-        name: name of the folder of this data set.
+        root, name: folder of all prepared data sets, and name of that of this one.
         batch_size: clips per process and step.
         num_workers: number of loading processes; 0 loads in the training process.
         crop: rule for the frames of a sample and the minimum length of a clip.
-        seed: seed of the random draws.
+        seed: of the random draws.
         resident: whether the data set is kept on the training device, where batches are gathered without workers. The
             batches are the same. "auto": yes, if it takes at most a quarter of the free memory.
         pad_multiple: batches are padded to multiples of this number of frames, at most to the longest sample of the

@@ -180,11 +180,10 @@ def _values(name: str, metric: MeanOverMotions, extracted: Extracted) -> Inputs:
 
 
 class _Measure:
-    """Values of metrics, without resampling and in each bootstrap resample of motions.
+    """Values of metrics, without resampling and in each bootstrap resample of motions, from cached inputs.
 
-    Intervals come from cached inputs: values of single motions or pairs are weighted by how often a resample draws the
-    motion, so candidates of retrieval are not resampled, and FID is computed again. Retrieval and diversity are means
-    over all pools and pairs that a protocol may draw, not of one draw.
+    Values of motions or pairs are weighted by how often they are drawn, so candidates of retrieval are not resampled;
+    FID is computed again. Retrieval and diversity are means over all pools and pairs that a protocol may draw.
     """
 
     def __init__(
@@ -313,9 +312,8 @@ def _agreement(
 ) -> dict[str, dict[str, float | None]]:
     """Returns how well metrics of pairs agree with exact attributes, by metric; {} if these are not known.
 
-    "auc" is the probability that a pair that shows every requested attribute has a better score than one that does not,
-    among real motions and all perturbations of the meaning at their strongest grade; "correlation" is Spearman's, of
-    the values of both metrics over all perturbations and grades.
+    "auc" is the probability that a pair with every requested attribute has a better score than one without, among real
+    motions and the strongest perturbations of the meaning; "correlation" is Spearman's over all of them and grades.
     """
     if TRUTH not in scores[0]:
         return {}

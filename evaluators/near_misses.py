@@ -26,10 +26,7 @@ def near_misses(clips: Sequence[Entry]) -> list[dict[str, list[str]]]:
 
 
 def _stated(clip: Entry) -> _Stated:
-    """Returns the attributes of a clip, its action as "action", without the words that other attributes state.
-
-    With side "left", "wave-left-hand" is "wave-{side}-hand", the same action as "wave-both-hands" with side "both".
-    """
+    """Returns the attributes of a clip; in its action, they are slots: "wave-left-hand" is "wave-{side}-hand"."""
     stated = {name: value for name, value in clip.attributes.items() if isinstance(value, str | int | float)}
     action = next((str(stated.pop(name)) for name in ACTION if name in stated), "")
     names = {str(value): f"{{{name}}}" for name, value in stated.items()}

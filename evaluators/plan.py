@@ -151,10 +151,9 @@ def _motions_folder(
     data: MotionDataModule,
     batch_size: int,
 ) -> Path:
-    """Returns the folder of the motions that a checkpoint generates with some options.
+    """Returns the folder of motions of a checkpoint and options, in its run directory or next to it.
 
-    It is in the run directory of the checkpoint, or next to a file that belongs to no run. Models in this package or on
-    the hub are not in the user's folders: their motions go to runs/NAME in the working directory.
+    Motions of models in this package or on the hub go to runs/NAME in the working directory.
     """
     if not Path(str(request.ckpt)).exists():
         run = Path("runs") / str(request.ckpt)

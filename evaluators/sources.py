@@ -297,8 +297,7 @@ class Baseline:
     def _shuffled(self, rows: Sequence[DrawnClip], replication: int) -> list[np.ndarray]:
         """Gives each row the real motion of a row with another caption or label.
 
-        Rows are sorted into groups with the same caption or label, in random order. Rotating the motions by the size of
-        the largest group moves every motion out of its group.
+        Rows are sorted into groups, in random order, and rotated by the size of the largest one, out of their groups.
         """
         names = [row.text if self.condition == "text" else str(row.clip.action) for row in rows]
         turn = {name: key("shuffle", self.seed, replication, name) for name in names}

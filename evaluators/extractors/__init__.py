@@ -4,7 +4,6 @@ import hashlib
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -235,21 +234,14 @@ class MARDMClipExtractor(ReleasedExtractor):
         return self.network.text(clip_tokens(captions).to(self.network.mean.device))
 
 
-class ReleasedClassifier(NamedTuple):
-    """A released action classifier: its network, the key of the weights in its file, its data set and its input."""
-
-    network: type[ActionGRU | UESTC | Unconstrained]
-    key: str | None
-    dataset: str
-    input: str
-
-
-CLASSIFIERS = {
-    "humanact12": ReleasedClassifier(ActionGRU, "model", "humanact12", "joints"),
-    "humanact12_unconstrained": ReleasedClassifier(Unconstrained, None, "humanact12", "joints"),
-    "uestc": ReleasedClassifier(UESTC, None, "uestc", "features"),
+CLASSIFIERS: dict[str, tuple[type[ActionGRU | UESTC | Unconstrained], str | None, str, str]] = {
+    "humanact12": (ActionGRU, "model", "humanact12", "joints"),
+    "humanact12_unconstrained": (Unconstrained, None, "humanact12", "joints"),
+    "uestc": (UESTC, None, "uestc", "features"),
 }
-"""The authors' files are action_recognition_model_humanact12.tar (humanact12_gru.tar in MDM),
+"""Released action classifiers: network, key of the weights in its file, data set and input.
+
+The authors' files are action_recognition_model_humanact12.tar (humanact12_gru.tar in MDM),
 humanact12_gru_modi_struct.pth.tar (not a GRU despite its name) and uestc_rot6d_stgcn.tar."""
 
 

@@ -87,9 +87,7 @@ def _heading(smooth: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
 
 
 def _is_a_body(joints: np.ndarray, smooth: np.ndarray) -> bool:
-    """Returns whether limbs are 15 to 60 cm long and keep their length within 25 %, and joints are less than 2 cm off a
-    smooth curve.
-    """
+    """Returns whether limbs have 15 to 60 cm and vary by less than 25 %, and joints are within 2 cm of a curve."""
     bones = np.stack([np.linalg.norm(smooth[:, a] - smooth[:, b], axis=-1) for a, b in BONES])
     length = np.median(bones, 1, keepdims=True)
     steady = (np.abs(bones / np.maximum(length, 1e-6) - 1) < 0.25).mean() > 0.9

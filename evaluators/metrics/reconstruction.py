@@ -262,9 +262,7 @@ class KeptDrift(SampleMetric):
 def _distances(
     name: str, joints: Tensor, mask: Tensor, real_joints: Tensor, real_mask: Tensor, kept: Tensor | None
 ) -> Iterator[tuple[Tensor, Tensor]]:
-    """Yields, for each pair of motions up to the end of the shorter one, distances (F, J) in float64 and a mask of the
-    kept joints (F, J).
-    """
+    """Yields distances (F, J) in float64 and a mask of the kept joints (F, J), up to the end of the shorter motion."""
     motions = zip(real_frames(name, joints, mask), real_frames(name, real_joints, real_mask), strict=True)
     for number, (motion, real) in enumerate(motions):
         length = min(len(motion), len(real))

@@ -375,12 +375,19 @@ class CaptionCache:
         cls, folder: Path, captions: Sequence[str], encoded: Iterable[tuple[np.ndarray, np.ndarray]], features: int
     ) -> None:
         """Writes a cache next to `folder` and renames it when it is complete."""
-        partial = folder.with_name(f".{folder.name}-{uuid.uuid4().hex}")
+        partial, offsets = folder.with_name(f".{folder.name}-{uuid.uuid4().hex}"), [0]
         with made_folder(folder.parent):
             try:
                 with writing(folder, partial):
                     partial.mkdir()
-                    cls._write(partial, captions, encoded, features)
+                    with (partial / cls.POOLED).open("wb") as pooled, (partial / cls.TOKENS).open("wb") as tokens:
+                        for vector, rows in encoded:
+                            pooled.write(vector.astype(np.float32).tobytes())
+                            tokens.write(rows.astype(np.float16).tobytes())
+                            offsets.append(offsets[-1] + len(rows))
+                    hashes = {name: sha256(partial / name) for name in (cls.POOLED, cls.TOKENS)}
+                    index = {"captions": list(captions), "offsets": offsets, "features": features, "sha256": hashes}
+                    (partial / cls.INDEX).write_text(json.dumps(index))
                 try:
                     partial.rename(folder)
                 except OSError:
@@ -388,20 +395,6 @@ class CaptionCache:
                         raise
             finally:
                 shutil.rmtree(partial, ignore_errors=True)
-
-    @classmethod
-    def _write(
-        cls, folder: Path, captions: Sequence[str], encoded: Iterable[tuple[np.ndarray, np.ndarray]], features: int
-    ) -> None:
-        offsets = [0]
-        with (folder / cls.POOLED).open("wb") as pooled, (folder / cls.TOKENS).open("wb") as tokens:
-            for vector, rows in encoded:
-                pooled.write(vector.astype(np.float32).tobytes())
-                tokens.write(rows.astype(np.float16).tobytes())
-                offsets.append(offsets[-1] + len(rows))
-        hashes = {name: sha256(folder / name) for name in (cls.POOLED, cls.TOKENS)}
-        index = {"captions": list(captions), "offsets": offsets, "features": features, "sha256": hashes}
-        (folder / cls.INDEX).write_text(json.dumps(index))
 
     def _open(self, name: str, dtype: type, shape: tuple[int, int]) -> Tensor:
         path = self.folder / name

@@ -281,10 +281,9 @@ def _look(kind: str, task: Task) -> Facts | str:
 
 
 def _read(kind: str, fps: float, task: Task, header: bool = False) -> tuple[np.ndarray, Facts]:
-    """Reads and checks a motion: joints or, if `kind` is "smpl", a raw motion of the SMPL representation.
+    """Reads and checks joints or, if `kind` is "smpl", a raw motion; with `header`, only its header and first frame.
 
-    With `header`, reads only the header and the first frame, and returns that frame; raises `UnclearPose` if the feet
-    look wrong in it.
+    Raises `UnclearPose` if the feet look wrong in a single frame.
     """
     path, where, layout_options = task
     try:

@@ -62,11 +62,7 @@ class _File:
 
 
 class _Unpickler(pickle._Unpickler):
-    """Reads the pickle in a file of `size` bytes; objects of names that begin with one of `opaque` become their state.
-
-    Raises:
-        UserError: If the content takes far more memory than the file has bytes.
-    """
+    """Reads the pickle in a file of `size` bytes; objects of names that begin with one of `opaque` become states."""
 
     dispatch = dict(pickle._Unpickler.dispatch)  # noqa: RUF012
     stack: list[Any]
@@ -151,10 +147,7 @@ class _Unpickler(pickle._Unpickler):
 
 
 def _with_text_keys(load: Callable[[Any], None], first: int) -> Callable[[_Unpickler], None]:
-    """Returns the handler of an opcode that takes keys and values from the stack, the first key from index `first`.
-
-    Of keys of other types, a file could contain many with the same hash, which makes reading quadratic.
-    """
+    """Returns the handler of an opcode that takes keys from index `first`: others than text could share a hash."""
 
     def checked(self: _Unpickler) -> None:
         if not all(type(key) is str for key in self.stack[first::2]):

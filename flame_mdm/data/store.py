@@ -159,13 +159,7 @@ def _write(folder: Path, source: MotionSource, representation: Representation, t
 
 
 class _Writer(ExitStack):
-    """Writes features.npy, clips.jsonl and references.npz clip by clip; memory grows by a few numbers per clip.
-
-    Args:
-        folder: the store, named in errors.
-        partial: its temporary folder.
-        features: number of features of a frame.
-    """
+    """Writes the files of a store clip by clip into its temporary folder `partial`; keeps a few numbers per clip."""
 
     def __init__(self, folder: Path, partial: Path, features: int):
         super().__init__()

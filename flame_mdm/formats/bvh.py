@@ -340,8 +340,7 @@ def write(bvh: Bvh, path: str | Path) -> None:
 def _fps(seconds: str) -> float | None:
     """Returns frames per second from a frame time in text; None if it is out of range.
 
-    Files round the frame time (0.0333333 for 1/30), which could move a clip's last frame past its end in resampling.
-    So if the frame time is a rounded integer rate, that integer is returned.
+    A rounded time (0.0333333 for 1/30) means the integer, or resampling could move the last frame past the end.
     """
     time = float(seconds)
     if not 1 / RATES[1] <= time <= 1 / RATES[0]:

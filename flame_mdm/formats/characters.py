@@ -88,10 +88,9 @@ def _read_glb(path: Path) -> Character:
 
 
 def _rest(file: glb.Glb, pelvis: int) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the matrices (N, 4, 4) of nodes in the pose in which the skin was bound, and corners around its meshes.
+    """Returns matrices (N, 4, 4) of nodes in the pose in which the skin was bound, and corners around its meshes.
 
-    Nodes may be stored in another pose. Then the skin's own frame is turned into the world by the multiple of 90
-    degrees that the pelvis, which is nearly upright, shows.
+    If they are stored in another pose, the pelvis, which is nearly upright, shows how the skin's frame is turned.
     """
     worlds, corners = file.worlds.copy(), []
     rest: dict[int, np.ndarray] = {}

@@ -4,7 +4,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-POINTS = ("elbow", "wrist", "hand")
 PALM = 0.3
 """Distance from the wrist to the middle of the hand, relative to the forearm, whose direction the hand continues."""
 TRUNK, WIDTH, THIGH = 0.18, 1.4, 0.17

@@ -27,18 +27,9 @@ class Gait:
 
 
 def _walk_along(body: Body, rng: np.random.Generator, gait: Gait, speed: float, path: Path, first: int) -> np.ndarray:
-    """Moves the pelvis along a path, from standing to standing, and places the feet on either side of it.
+    """Moves the pelvis at `speed`, in m/s, along a path, and places the feet on either side of it, `first` first.
 
-    Args:
-        body: a standing body; its pelvis, heading and feet are replaced.
-        rng: draws the times of the first and the last step.
-        gait: parameters of the steps.
-        speed: speed along the path after acceleration, meters per second.
-        path: the path.
-        first: the side that steps first.
-
-    Returns:
-        (F,) how far the right foot is in front of the left one, in meters, relative to the heading of the pelvis.
+    Returns (F,) how far the right foot is in front of the left one, in meters, relative to the heading of the pelvis.
     """
     t, start = body.t, rng.uniform(0.08, 0.18)
     seconds = t[-1] - rng.uniform(0.06, 0.16) - start  # until the last foot is down

@@ -156,8 +156,7 @@ class T2MTask(Task):
         """Sets up the task, reads the word vectors, and collects the tagged words of all captions.
 
         Raises:
-            FileNotFoundError: If the word vectors do not exist.
-            UserError: If they are damaged, captions have no tagged words, or the batch size is less than 2.
+            FileNotFoundError, UserError: If one of them is missing or damaged, or the batch size is less than 2.
         """
         super().setup(stage)
         data: MotionDataModule = self.trainer.datamodule  # type: ignore[attr-defined]

@@ -177,8 +177,7 @@ class _Writer(ExitStack):
     def add(self, name: str, clip: Clip, features: np.ndarray) -> None:
         """Writes a clip of the data set `name`, and the features of its motion unless the previous clip has the same.
 
-        Raises:
-            UserError: If the clip exceeds its motion, or its id or split contradicts that of another clip.
+        Raises `UserError` if the clip exceeds its motion, or its id or split contradicts that of another clip.
         """
         if clip.motion is not self._motion:
             self._motion, self._begin = clip.motion, self.frames

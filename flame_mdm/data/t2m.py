@@ -103,8 +103,7 @@ def read_splits(folder: Path, ending: str, exclude: Collection[str], get_it: str
     """Returns name -> split, in the order of the lists train, val and test in a folder, without excluded names.
 
     Raises:
-        FileNotFoundError: If the folder or a list is missing.
-        UserError: If a name is in two splits, or `exclude` has an unknown name.
+        FileNotFoundError, UserError: If a list is missing, a name is in two splits, or `exclude` has an unknown name.
     """
     splits: dict[str, Split] = {}
     for split in SPLITS:

@@ -11,16 +11,9 @@ from flame_mdm.errors import UserError
 
 
 def sinusoid(position: Tensor, features: int) -> Tensor:
-    """Returns sines in even and cosines in odd channels (Vaswani et al. 2017, section 3.5).
+    """Returns sines in even and cosines in odd of the (N, features) channels (Vaswani et al. 2017, section 3.5).
 
     Computed in float32 for any precision of the network, as in the training of the released weights.
-
-    Args:
-        position: (N,), integer or not.
-        features: width of the result, even.
-
-    Returns:
-        (N, features) float32.
     """
     channel = torch.arange(0, features, 2, device=position.device, dtype=torch.float32)
     angle = position.float()[:, None] * torch.exp(channel * (-math.log(10000.0) / features))

@@ -38,13 +38,10 @@ class Bone(NamedTuple):
 def read(path: Path, fps: float | None) -> Bvh:
     """Reads an AMC file and its skeleton as a tree of joints; each bone gives a joint of its name at its start.
 
-    Args:
-        path: the AMC file; the skeleton is that of `skeleton_of`.
-        fps: frames per second, which AMC files do not contain: 120 for most of CMU's recordings.
+    AMC files do not contain `fps`: it is 120 for most of CMU's recordings.
 
     Raises:
-        FileNotFoundError: If the file does not exist.
-        UserError: If a file is damaged, or there is no frame rate; the message names file and line.
+        FileNotFoundError, UserError: If a file is missing or damaged, with its line, or there is no frame rate.
     """
     text = read_text(path)
     bones, parents = read_skeleton(skeleton_of(path))

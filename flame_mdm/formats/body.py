@@ -29,12 +29,9 @@ def head_height(joints: np.ndarray) -> float:
 
 
 def check_size(leg: float, unit: float, children: bool = False) -> None:
-    """Raises `UserError` if a leg is too short or too long; the message says which unit would fit.
+    """Raises `UserError` if a leg, in meters, is too short or too long; the message says which unit would fit.
 
-    Args:
-        leg: length of the leg in meters, if `unit` is right.
-        unit: meters per unit of length in the file.
-        children: also accept the legs of children.
+    `unit` is that of the file, in meters; `children` accepts their legs, too.
     """
     shortest = CHILD if children else LEG[0]
     if shortest <= leg <= LEG[1]:

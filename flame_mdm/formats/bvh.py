@@ -108,9 +108,6 @@ class Bvh:
 
         Returns:
             Rotations (F', J, 3, 3) and translations (F', J, 3), F' = floor((F - 1) * fps / self.fps) + 1.
-
-        Raises:
-            UserError: If the resampled motion would have too many frames.
         """
         before, after, share = frame_pairs(len(self.frames), self.fps, fps, len(self.joints), slack=0)
         translations = self.translations()
@@ -121,15 +118,9 @@ class Bvh:
 def forward_kinematics(
     parents: Sequence[int], rotations: np.ndarray, translations: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Converts local to world coordinates: G_j = G_p R_j and p_j = p_p + G_p t_j for a joint j with parent p.
+    """Returns positions (F, J, 3) and rotations in the world: G_j = G_p R_j and p_j = p_p + G_p t_j, p the parent of j.
 
-    Args:
-        parents: index of each joint's parent, smaller than its own; -1 for a root.
-        rotations: (F, J, 3, 3) in the frame of the parent.
-        translations: (F, J, 3) in the frame of the parent.
-
-    Returns:
-        Positions (F, J, 3) and rotations (F, J, 3, 3) in the world.
+    Parents precede their children, -1 for a root; rotations (F, J, 3, 3) and translations are in a parent's frame.
     """
     positions, turned = translations.copy(), rotations.copy()
     for joint, parent in enumerate(parents):
@@ -141,22 +132,13 @@ def forward_kinematics(
 
 
 def read(path: str | Path) -> Bvh:
-    """Reads a BVH file.
-
-    Raises:
-        FileNotFoundError: If the file does not exist.
-        UserError: If it is not a complete and valid BVH file; the message names file and line.
-    """
+    """Reads a BVH file; raises `UserError`, with file and line, if it is not complete and valid."""
     regular_file(path, TEXT_LIMIT)
     return parse(Path(path).read_bytes(), str(path))
 
 
 def read_header(path: str | Path) -> Bvh:
-    """Reads a BVH file as if all its frames were equal to the first; other frames are not read, nor checked.
-
-    Raises:
-        FileNotFoundError, UserError: If `read` raises it; a file whose beginning is damaged is read as a whole.
-    """
+    """Reads a BVH file as if all its frames were equal to the first; a file with a damaged beginning is read whole."""
     size = regular_file(path, TEXT_LIMIT)
     with Path(path).open("rb") as stream:
         data = stream.read(HEADER)
@@ -168,11 +150,7 @@ def read_header(path: str | Path) -> Bvh:
 
 
 def parse(data: bytes, name: str, header: bool = False) -> Bvh:
-    """Reads the bytes of a BVH file; `name` is used in error messages. `header` repeats the first frame, see above.
-
-    Raises:
-        UserError: If `read` raises it.
-    """
+    """Reads the bytes of a BVH file, called `name` in errors; `header` repeats the first frame, see above."""
     source = _Source(data, name)
     joints: list[str] = []
     parents: list[int] = []

@@ -36,9 +36,8 @@ def read(path: str | Path) -> Character:
     """Reads a character. Names of joints are those of a known skeleton, or are in a `.yaml` file of the same name.
 
     Raises:
-        FileNotFoundError: If the file does not exist.
-        UserError: If the file is damaged or has no skin, its joints are not known (`UnknownJoints`), or its rest pose
-            cannot be used.
+        FileNotFoundError, UserError: If the file is missing or damaged, or has no skin, known joints (`UnknownJoints`)
+            or usable rest pose.
     """
     path = Path(path)
     if path.suffix.lower() == ".glb":

@@ -235,12 +235,7 @@ class Glb:
 
 
 def read(path: Path) -> Glb:
-    """Reads and validates a .glb file.
-
-    Raises:
-        FileNotFoundError: If the file does not exist.
-        UserError: If the file is not a regular file, is too large or damaged, or is not glTF 2.0 in one file.
-    """
+    """Reads a .glb file; raises `UserError` if it is too large or damaged, or is not glTF 2.0 in one file."""
     regular_file(path, LIMIT)
     content = path.read_bytes()
     if content[:4] != b"glTF":

@@ -109,10 +109,6 @@ def read_bvh(
 
     Returns:
         Joints (F, 22, 3) float32 in meters, y up; frames per second; the layout of the file, with its frame rate.
-
-    Raises:
-        FileNotFoundError: If the file does not exist.
-        UserError: If the file is damaged or has an unknown skeleton.
     """
     return map_bvh(path, read_tree(path, rate), fps, fields)
 

@@ -26,12 +26,9 @@ def classifier_free_guidance(denoise: Denoise, scale: float | Tensor, features: 
     scale - 1.
 
     Args:
-        denoise: the denoiser.
+        denoise: the denoiser; its condition must have a null.
         scale: guidance scale, one number or one per sample (B,). For the number 1, `denoise` itself is returned.
         features: D. Channels from D on (a learned variance) are not guided: those of the conditional half are returned.
-
-    Raises:
-        ValueError: In the first call, if the condition has no null.
     """
     if not isinstance(scale, Tensor) and scale == 1:
         return denoise

@@ -66,16 +66,10 @@ def spans(lengths: Sequence[int], longest: int, overlap: int, loop: bool = False
 def window_tensors(
     windows: Sequence[tuple[int, int, int]], totals: Sequence[int], overlap: int, width: int, device: torch.device
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Returns rows, frames, mask (W, L) and weights of `Windows`.
+    """Returns rows, frames, mask (W, L) and weights of `Windows` for motion, first frame and length of each window.
 
-    The weight of a window rises over the overlap at its start and falls over the one at its end.
-
-    Args:
-        windows: motion, first frame and number of frames of each window.
-        totals: number of frames of each motion.
-        overlap: frames that two windows share.
-        width: L. Past its end, a window holds the frames that follow in the motion; its first frame follows the last.
-        device: of the tensors.
+    The weight of a window rises over the overlap at its start and falls over the one at its end. Past its end, it holds
+    the frames that follow in the motion, which has one of `totals` frames; its first frame follows the last.
     """
     rows, first, size = torch.tensor(windows, device=device).T
     mask, position = length_mask(size, width), torch.arange(width, device=device)

@@ -70,17 +70,12 @@ class Skeleton:
 
 
 def forward_kinematics(skeleton: Skeleton, rotations: Tensor, offsets: Tensor, root: Tensor) -> Tensor:
-    """Computes joint positions of all frames from rotations. Differentiable.
+    """Computes joint positions (..., J, 3) from rotations and root (..., 3), in the unit of `offsets`. Differentiable.
 
     Args:
-        skeleton: the tree of joints.
         rotations: (..., J, 3, 3), the root's in the world and each other joint's relative to its parent. A joint's
             rotation applies to the bones that leave it, as in SMPL and BVH.
         offsets: (J, 3), position of each joint relative to its parent in the rest pose; the root's is not used.
-        root: (..., 3) position of the root.
-
-    Returns:
-        (..., J, 3) joint positions in the unit of `offsets`.
     """
     turned = global_rotations(rotations, skeleton.parents)
     bones = (turned[..., [max(parent, 0) for parent in skeleton.parents], :, :] @ offsets[..., None])[..., 0]

@@ -25,14 +25,10 @@ Replaces the licensed model files: bone lengths of HumanML3D's reference clip, r
 
 
 def read_pose(motion: Tensor) -> tuple[Tensor, Tensor]:
-    """Splits a raw SMPL motion into translation and joint rotations.
+    """Splits a raw SMPL motion (F, 3 + 3 K) into translation (F, 3) and matrices (F, 24, 3, 3), float64.
 
-    Args:
-        motion: (F, 3 + 3 K) translation in meters, then K >= 24 axis-angle vectors. Of SMPL+H's 52, the first 24 are
-            used, as in FLAME's code, so that the hands are its left_index1 and left_index2.
-
-    Returns:
-        Translation (F, 3) and matrices (F, 24, 3, 3), float64.
+    It is a translation in meters, then K >= 24 axis-angle vectors. Of SMPL+H's 52, the first 24 are used, as in FLAME's
+    code, so that the hands are its left_index1 and left_index2.
 
     Raises:
         UserError: If there are no frames, fewer than 24 joints, or non-finite numbers.

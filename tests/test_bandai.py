@@ -226,25 +226,6 @@ def test_compositional_split_holds_out_whole_combinations():
     assert splits[1, "walk", "old", 1] == splits[2, "walk", "elderly", 6] == "test"
 
 
-def test_captions_of_all_takes():
-    for dataset, content, style, _ in published():
-        side = side_of(content)
-        assert side in ("", "left", "right", "both")
-        for actual in {side, bandai.swap_sides(side)}:
-            texts = captions(content, style, actual)
-            assert len(set(texts)) == 4
-            for text in texts:
-                assert text.startswith(("a person ", "someone ", "the person "))
-                assert text == text.strip()
-                assert not any(fault in text for fault in ("{", "  ", " ,"))
-        for text in captions(content, style, side):
-            assert side in text if side in ("left", "right") else "left" not in text and "right" not in text
-        if style != "normal":
-            assert not set(captions(content, style, side)) & set(captions(content, "normal", side)), (dataset, content)
-    assert captions("walk", "happy", "")[0] == "a person walks forward happily"
-    assert len(Bandai.actions) == 25
-
-
 def test_archives_give_the_same_clips_and_leave_no_files(tiny, tmp_path, monkeypatch):
     files = sorted(tiny.rglob("*"), reverse=True)  # another order than that of the clips
     with zipfile.ZipFile(tmp_path / "set.zip", "w", zipfile.ZIP_DEFLATED) as archive:

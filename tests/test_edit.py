@@ -251,16 +251,6 @@ def test_joints_of_any_rate_and_facing(diffusion, motion, tmp_path, fps, turned)
         np.testing.assert_allclose(read.features[:count], motion.features, atol=2e-3)  # facing is smoothed over time
 
 
-def test_parts_of_clips_and_of_files_in_world_coordinates(diffusion, store, tmp_path):
-    stored = read_motion(diffusion.representation, CLIP, data_root=store)
-    assert stored.text
-    part = read_motion(diffusion.representation, CLIP, data_root=store, cut=(0.5, 1.5))
-    assert np.array_equal(part.features, stored.features[10:30])
-    world = {"features": np.cumsum(np.ones((40, 150), np.float32), 0), "representation": Rot6D().name}
-    part = read_motion(Rot6D(), npz(tmp_path, joints=np.zeros((40, 24, 3)), fps=20, **world), cut=[1, 2])
-    assert part.features[0, 144:147].tolist() == [0, 0, 0], "the root begins at the origin"
-
-
 # Bad requests ---------------------------------------------------------------------------------------------------------
 
 

@@ -107,7 +107,7 @@ def test_a_video_is_written_when_asked_for(here, trained, monkeypatch, capsys):
     assert not Path("other").exists()
 
 
-# Where motions are written if no folder is given -----------------------------------------------------------------------
+# Where motions are written if no folder is given ----------------------------------------------------------------------
 
 
 def folder(experiment: Any, text: str = "a person walks", seed: int = 0, run: Any = "default", **options: Any) -> str:

@@ -3,7 +3,6 @@
 import ast
 import importlib
 import importlib.util
-import os
 import re
 import shlex
 import shutil
@@ -224,33 +223,6 @@ def test_make_forwards_every_command_and_refuses_a_text_without_quotes():
     done = make("sample", "CKPT=x", "TEXT=a", "person", "walks")
     assert done.returncode == 2
     assert 'sample person walks: one command at a time; quote a value with spaces, as in TEXT="a' in done.stderr
-
-
-@pytest.mark.slow
-def test_the_denoiser_of_the_page_on_adding_parts_trains_and_is_sampled(tmp_path):
-    page = (ROOT / "docs" / "adding.md").read_text(encoding="utf-8")
-    files = dict(
-        re.findall(r"```\w+\n# (?:experiments/)?(my_package\.py|denoiser/mine\.yaml)\n(.*?)```", page, re.DOTALL)
-    )
-    files["mine.yaml"] = "# @package _global_\ndefaults: [/quickstart, override /denoiser: mine]\n"
-    for name, text in files.items():
-        (tmp_path / name).parent.mkdir(exist_ok=True)
-        (tmp_path / name).write_text(text)
-    program = f"{sys.executable} -P -m flame_mdm"
-
-    def run(line: str, path: str) -> subprocess.CompletedProcess[str]:
-        environment = os.environ | {"PYTHONPATH": f"{path}{os.pathsep}{ROOT}"}
-        return subprocess.run(
-            line, shell=True, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
-        )
-
-    train = f"{program} train mine.yaml trainer.max_steps=2 data.source.clips=60 task.num_inference_steps=2"
-    train += " condition.pretrain_steps=2"
-    assert "Python finds no my_package: set PYTHONPATH to the folder that contains it" in run(train, str(ROOT)).stderr
-    output = run(train, ".").stdout
-    command = re.findall(r"next: PYTHONPATH=\. (.*)", output)[0]
-    assert run(command.replace("flame-mdm", program), ".").returncode == 0
-    assert list(tmp_path.glob("samples/*/*/player.html"))
 
 
 # The notebook and the site --------------------------------------------------------------------------------------------

@@ -27,7 +27,7 @@ from flame_mdm.data import restricted_pickle, uestc
 from flame_mdm.data.body_model import load_offsets
 from flame_mdm.data.crops import Fixed
 from flame_mdm.data.datamodule import MotionDataModule
-from flame_mdm.data.humanact12 import HumanAct12, read_unconstrained
+from flame_mdm.data.humanact12 import HumanAct12
 from flame_mdm.data.uestc import TRAIN_SUBJECTS, UESTC, front_view
 from flame_mdm.errors import UserError
 from flame_mdm.representations import rotation
@@ -163,20 +163,6 @@ def test_samples_are_those_of_actor(stem: str, tmp_path: Path):
         assert action == label
         np.testing.assert_allclose(sample.numpy(), expected, atol=2e-6, err_msg=number)
     assert numbers
-
-
-def test_the_unconstrained_reference_is_read(tmp_path: Path):
-    data = np.random.default_rng(0).normal(size=(4, 18, 3, 60))
-    np.save(tmp_path / "x.npy", data)
-    motions = read_unconstrained(tmp_path / "x.npy")
-    assert (motions.shape, motions.dtype) == ((4, 60, 15, 3), np.float32)
-    np.testing.assert_allclose(motions[2, 7, 14], data[2, 14, :, 7], atol=1e-6)
-    np.save(tmp_path / "x.npy", data[:, :14])
-    with pytest.raises(ValueError, match=r"x\.npy: shape \(4, 14, 3, 60\)"):
-        read_unconstrained(tmp_path / "x.npy")
-    (tmp_path / "x.npy").write_bytes(b"PK")
-    with pytest.raises(ValueError, match=r"x\.npy: damaged"):
-        read_unconstrained(tmp_path / "x.npy")
 
 
 def test_unconditioned_motions_are_compared_with_the_reference_motions(tmp_path: Path):

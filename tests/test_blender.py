@@ -5,7 +5,6 @@ import json
 import os
 import subprocess
 import zipfile
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -99,24 +98,15 @@ def test_what_cannot_be_generated_is_refused_in_one_line(package: Path, tmp_path
         assert "\n" not in error
 
 
-@pytest.mark.parametrize(
-    ("name", "change", "says"),
-    [
-        ("model/denoiser.onnx", lambda data: data[:-9] + b"x" * 9, "denoiser.onnx has changed since it was exported"),
-        ("model/model.json", lambda data: data[:-9], "not an exported model"),
-        ("skeletons.json", lambda data: data[:-9], "skeletons.json is damaged"),
-    ],
-)
-def test_a_damaged_extension_says_so_in_one_line(
-    package: Path, tmp_path: Path, name: str, change: Callable[[bytes], bytes], says: str
-) -> None:
+def test_a_damaged_extension_says_so_in_one_line(package: Path, tmp_path: Path) -> None:
+    """The files of the model are read by the runner, which tests/test_onnx.py damages."""
     damaged, hero = tmp_path / "flame_mdm.zip", tmp_path / "hero.glb"
     with zipfile.ZipFile(package) as source, zipfile.ZipFile(damaged, "w") as target:
         for item in source.namelist():
-            target.writestr(item, change(source.read(item)) if item == name else source.read(item))
+            target.writestr(item, source.read(item)[: -9 if item == "skeletons.json" else None])
     synthetic("kick").save(hero, rig="mixamo")
     (error,) = run(damaged, [[WAVE, 20, str(hero)]], tmp_path)
-    assert says in error
+    assert "skeletons.json is damaged" in error
     assert "\n" not in error
 
 

@@ -471,15 +471,13 @@ def unused(name: str, rows: list[DrawnClip], replication: int) -> Samples:
     raise AssertionError("sampled before all was checked")
 
 
-def test_what_does_not_fit_is_refused(runs, tmp_path):
+def test_what_does_not_fit_is_refused(runs):
     for message, keys in (
         ("resamples=20: give 0, or 100 or more", {"resamples": 20}),
         ("needs a feature extractor", {"extractor": None, "protocol": "text_to_motion"}),
         ("holds a motion generator, not a motion-CLIP", {"extractor": str(runs.model)}),
-        ("no such checkpoint", {"extractor": str(tmp_path / "none.ckpt")}),
         ("Did you mean synthetic", {"protocol": "synthetical"}),
         ("condition text", {"protocol": "action_to_motion"}),
-        ("at least 1", {"samples": 0}),
         ("at least 1", {"batch_size": 0}),
         ("does not edit motions", {"method": "mdm"}),
         ("option of method=mfm", {"protocol": "editing_prediction", "until": 0.3}),

@@ -259,27 +259,20 @@ def test_bad_edits_are_one_line(diffusion, flow, motion):
     cases: list[tuple[MotionGeneration, dict, str]] = [
         (diffusion, {}, r"no part of the motion is kept: choose region.*strength=0\.5"),
         (diffusion, {"region": [0, 40]}, "no part of the motion is kept"),
-        (diffusion, {"joints": []}, "the entire motion is kept"),
         (diffusion, {"region": [5, 5]}, r"region=\[5, 5\] is not a range of this motion, which has 40 frames \(2 sec"),
-        (diffusion, {"region_seconds": [1.5, 2.5]}, r"region_seconds=\[1.5, 2.5\] is not a range"),
-        *((diffusion, {"region": ranges}, r"write \[begin, end\], or sev") for ranges in ([1, 2, 3], [[1, 2], 3], [])),
+        (diffusion, {"region": [[1, 2], 3]}, r"write \[begin, end\], or sev"),
         (diffusion, {"region": [1, 2], "region_seconds": [1, 2]}, "give region or region_seconds, not both"),
         (diffusion, {"region": "inbetween"}, "region=inbetween is unknown. Did you mean in_between"),
         (diffusion, {"joints": "uper_body"}, "no joint or part 'uper_body'. Did you mean upper_body"),
         (diffusion, suffix | {"method": "mfm"}, "method=mfm is not supported by GaussianDiffusion; .* mdm, flame"),
         (diffusion, suffix | {"method": "repaint"}, "method=repaint is unknown. Choose from mdm, flame, flame_code"),
         (diffusion, suffix | {"until": 0.3}, "until=0.3 is an option of method=mfm, not of mdm"),
-        (diffusion, suffix | {"resample": 3}, "resample=3 is an option of method=flame"),
         (diffusion, suffix | {"seconds": 3}, "an edit is as long as its motion: omit seconds"),
         (diffusion, suffix | {"texts": "walks | jumps"}, "an edit keeps a single motion"),
         (diffusion, {"regoin": "suffix"}, "edit has no option regoin. Did you mean region"),
         *((diffusion, {"strength": value}, "strength=.*: give a number above 0, up to 1") for value in (0.0, np.nan)),
         (flow, suffix | {"method": "flame"}, "not supported by FlowMatching; this model supports: mdm, mfm"),
-        (
-            short,
-            suffix,
-            r"walk: 40 frames, but .* at most 36 \(1.8 seconds\): select a part with cut=",
-        ),
+        (short, suffix, r"walk: 40 frames, but .* at most 36 \(1.8 seconds\): select a part with cut="),
     ]
     for model, options, message in cases:
         with pytest.raises(UserError, match=message) as error:

@@ -17,7 +17,7 @@ from flame_mdm import config
 from flame_mdm.__main__ import COMMANDS, main
 from flame_mdm.commands.evaluate import EvaluateSettings
 from flame_mdm.commands.inspect import InspectSettings
-from flame_mdm.config import check, compose, compose_data, flatten, guarded, instantiate, parameters, recipes, trust
+from flame_mdm.config import check, compose, compose_data, guarded, instantiate, parameters, recipes, trust
 from flame_mdm.config.command_line import read_settings, run
 from flame_mdm.config.entry import make_variables
 from flame_mdm.config.signatures import check_kind, source_file
@@ -225,10 +225,6 @@ def test_own_classes_outside_the_repository_need_no_registration(tmp_path, monke
     with pytest.raises(UserError) as error:
         instantiate({"_target_": "torch.nn.Linear", "in_features": "a", "out_features": []})
     assert "\n" not in str(error.value)
-
-
-def test_flatten():
-    assert flatten({"a": {"b": 1, "c": [2]}, "d": {}}) == {"a.b": 1, "a.c": [2], "d": {}}
 
 
 # Command lines --------------------------------------------------------------------------------------------------------

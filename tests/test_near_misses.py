@@ -20,20 +20,6 @@ def bandai(content: str, style: str, dataset: int = 2) -> Entry:
     return clip(f"{content}-{style}-{dataset}", bandai_captions(content, style, side), **facts)
 
 
-def test_exactly_one_attribute_differs_and_the_action_is_kept():
-    clips = [
-        clip("a", ["kicks once left"], action="kick", side="left", count=1),
-        clip("b", ["kicks twice left"], action="kick", side="left", count=2),
-        clip("c", ["kicks once right"], action="kick", side="right", count=1),
-        clip("d", ["kicks twice right"], action="kick", side="right", count=2),
-        clip("e", ["punches once left"], action="punch", side="left", count=1),
-        clip("f", ["bows"], action="bow"),
-    ]
-    assert near_misses(clips)[0] == {"count": ["kicks twice left"], "side": ["kicks once right"]}
-    assert near_misses(clips)[3] == {"count": ["kicks once right"], "side": ["kicks twice left"]}
-    assert near_misses(clips)[4:] == [{}, {}]
-
-
 def test_attributes_of_one_clip_alone_do_not_matter():
     slow = clip("a", ["walks forward slowly"], action="walk", direction="forward", speed="slow")
     fast = clip("b", ["walks forward quickly"], action="walk", direction="forward", speed="fast")

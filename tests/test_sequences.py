@@ -137,6 +137,9 @@ def test_bad_requests_give_one_clear_line(model):
         ("walks", {"second": 3}, "generate has no option second. Did you mean seconds"),
         (None, {"actions": "walk"}, "action=walk: this model was trained on captions"),
         (" ", {}, "empty text"),
+        ([], {}, "empty text"),  # is not an unconditioned motion
+        (["walk", 3], {}, r"^text=3 is not a string\. Give a string"),
+        ("walks", {"spacing": "even"}, "spacing=even"),
     ]
     for text, options, message in cases:
         with pytest.raises(UserError, match=message) as raised:
@@ -168,13 +171,15 @@ def test_without_a_score_the_fewest_faulty_frames_decide():
     assert best([worse, better], lambda motions: [2.0, 1.0]) is worse
 
 
-def test_a_scorer_is_a_motion_clip(model, tmp_path, capsys):
+def test_bad_words_and_scorers_are_one_line(model, tmp_path, capsys):
     with pytest.raises(FileNotFoundError, match="no such"):
         text_fit(str(tmp_path / "none.ckpt"), model)
     for words, message in (
-        (["scorer=none.ckpt"], "scorer=none.ckpt chooses among motions for a text"),
-        (["scorer=none.ckpt", "candidates=2"], "scorer: none.ckpt: no such checkpoint. Give a run"),
-        (["scorer=quickstart", "candidates=2"], "holds a motion generator, not a motion-CLIP"),
+        ([], "say what to sample: text=..., for example "),
+        (["text=walks", "unconditioned=true"], "not text and unconditioned"),
+        (["text=walks", "scorer=none.ckpt"], "scorer=none.ckpt chooses among motions for a text"),
+        (["text=walks", "scorer=none.ckpt", "candidates=2"], "scorer: none.ckpt: no such checkpoint. Give a run"),
+        (["text=walks", "scorer=quickstart", "candidates=2"], "holds a motion generator, not a motion-CLIP"),
     ):
-        assert main(["sample", "quickstart", "text=walks", *words]) == 1
+        assert main(["sample", "quickstart", *words]) == 1
         assert message in capsys.readouterr().err

@@ -369,13 +369,9 @@ def test_published_numbers_are_marked_and_ranked_among_themselves(folder, monkey
 def test_malformed_specs_are_refused(tmp_path, capsys):
     path, row = tmp_path / "mine.yaml", "rows: [{label: x, ckpt: x}]"
     for text, message in (
-        ("", "the file has no parts"),
-        ("prats: {}", "unknown key: prats. Did you mean parts?"),
         ("parts: {a: {rows: []}}", "parts.a: needs columns and rows, or recipes"),
-        ("parts: {a: {columns: {F: {value: fid, better: up}}, rows: []}}", "better is \"up\", not 'higher', 'lower'"),
         ("parts: {a: {columns: {A: {value: fid}}, rows: [{ckpt: x}]}}", "parts.a.rows.0 has no label"),
         (f"parts: {{a: {{columns: {{A: {{value: fid}}}}, {row}}}}}", "needs a protocol"),
-        ("parts: {a: {lengths: [kit]}}\nfigures: [{part: a, x: nfe}]", "x=nfe needs y, a column or several of a"),
     ):
         path.write_text(f"title: x\n{text}")
         with pytest.raises(UserError, match=re.escape(message)):
@@ -393,15 +389,15 @@ def test_malformed_specs_are_refused(tmp_path, capsys):
 
 
 def test_an_index_lists_the_tables_with_their_measured_rows(tmp_path, capsys):
-    needed = ["table=mdm_8 flame_10", "evaluate=false", f"results={tmp_path / 'none'}", f"out={tmp_path}"]
+    needed = ["table=flame_9 flame_10", "evaluate=false", f"results={tmp_path / 'none'}", f"out={tmp_path}"]
     assert main(["tables", *needed]) == 0
     assert f"all tables: {tmp_path / 'index.html'}" in capsys.readouterr().out
     rows = re.findall(r"<tr><td>(.*?)</tr>", (tmp_path / "index.html").read_text())
     assert [re.sub(r"<[^>]*>", "|", row).strip("|") for row in rows] == [
-        "mdm_8|||MDM, table 8: learned parameters||5 of 5",
+        "flame_9|||FLAME, table 9: sampling steps of DDPM and DDIM, on HumanML3D||0 of 8",
         "flame_10|||FLAME, table 10: guidance scale, on HumanML3D||0 of 6",
     ]
-    assert '<a href="mdm_8.html">' in rows[0]
+    assert '<a href="flame_9.html">' in rows[0]
     names = spec_names()
     assert names.index("flame_9") + 1 == names.index("flame_10")
 

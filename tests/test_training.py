@@ -18,12 +18,10 @@ from support.runs import TINY, finish, spawn
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from torchmetrics import MeanMetric
 
-import flame_mdm
 from flame_mdm.__main__ import main
 from flame_mdm.checkpoints.loading import load, load_task
 from flame_mdm.checkpoints.model_files import read_checkpoint
 from flame_mdm.config import compose, instantiate
-from flame_mdm.errors import UserError
 from flame_mdm.progress import ProgressBar
 from flame_mdm.sampling.editing import edit
 from flame_mdm.sampling.generation import generate
@@ -193,26 +191,10 @@ def test_validation_does_not_depend_on_the_batch_size(trained, data_root):
     assert values[0] == pytest.approx(values[1], rel=1e-5)
 
 
-def test_the_public_api_reads_well(trained):
-    motion = flame_mdm.generate(flame_mdm.load(trained), "a person waves with the left hand", seconds=1.5, seed=0)[0]
-    assert motion.joints.shape == (30, 22, 3)
-    assert motion.features.shape == (30, 263)
-    assert (motion.fps, motion.text) == (20, "a person waves with the left hand")
-
-
 def test_unconditioned_samples_ignore_guidance(trained):
     a = generate(load(trained), frames=24, guidance_scale=1.0)[0]
     b = generate(load(trained), frames=24, guidance_scale=7.0)[0]
     np.testing.assert_allclose(a.features, b.features, atol=1e-5)
-
-
-def test_recipes_may_list_the_sampling_steps(trained, tmp_path):
-    content, steps = read_checkpoint(trained), [0, 2, 5, 9]
-    content["config"]["task"]["num_inference_steps"] = steps
-    torch.save(content, tmp_path / "last.ckpt")
-    listed = generate(load(tmp_path / "last.ckpt"), "a person walks", frames=20)[0]
-    chosen = generate(load(trained), "a person walks", frames=20, num_inference_steps=steps)[0]
-    np.testing.assert_array_equal(listed.features, chosen.features)
 
 
 @pytest.mark.slow
@@ -278,48 +260,3 @@ def test_stages_are_the_clean_estimates_up_to_the_motion(trained):
     # The last step is the mean of the posterior, which is the estimate itself.
     np.testing.assert_allclose(stages[3].joints, motion.joints, atol=1e-5)
     assert np.abs(stages[0].joints - motion.joints).max() > 1e-3
-
-
-BAD_REQUESTS = [
-    (["text="], "the text is empty"),
-    ([], "say what to sample: text=..., for example "),
-    (["text=a walk", "unconditioned=true"], "not text and unconditioned"),
-    (["text=a walk", "seconds=30"], "up to 3 seconds (60 frames at 20 fps)"),
-    (["text=a walk", "seconds=0"], "0 seconds (0 frames) are too short: give at least 0.1 seconds"),
-    (["action=walk"], "action=walk: this model was trained on captions. Give text="),
-    (["text=a walk", "sampler=euler"], "unknown sampler 'euler'"),
-    (["text=a walk", "num_inference_steps=11"], "11"),
-    (["text=a walk", "num_inference_steps=[0,1.5]"], "num_inference_steps=[0, 1.5]: "),
-    (["text=a walk", "eta=0.5"], "eta=0.5"),
-    (["text=a walk", "spacing=even"], "spacing=even"),
-]
-
-
-def test_bad_requests_are_one_line(refused, trained):
-    for words, message in BAD_REQUESTS:
-        refused("sample", f"ckpt={trained}", "out=out", *words, says=message)
-
-
-def test_a_checkpoint_without_a_recipe_or_of_another_shape_is_one_line(trained, tmp_path):
-    torch.save({"state_dict": {}}, tmp_path / "foreign.ckpt")
-    with pytest.raises(UserError, match="holds no recipe"):
-        load(tmp_path / "foreign.ckpt")
-    checkpoint = read_checkpoint(trained)
-    checkpoint["config"]["denoiser"]["latent_dim"] = 32
-    torch.save(checkpoint, tmp_path / "other.ckpt")
-    with pytest.raises(UserError, match=r"the weights do not match the recipe .*: size mismatch for denoiser"):
-        load(tmp_path / "other.ckpt")
-
-
-def test_an_unwritable_folder_is_one_line(tiny, tmp_path, capsys):
-    (tmp_path / "file").write_text("")
-    assert main(["train", "quickstart", *tiny, f"run.dir={tmp_path / 'file' / 'run'}"]) == 1
-    assert capsys.readouterr().err.count("\n") == 1
-
-
-def test_training_without_condition_in_bfloat16(tiny):
-    overrides = [o for o in tiny if not o.startswith("condition.")]
-    checkpoint = run([*overrides, *STEPS, "condition=none", "trainer.precision=bf16-mixed"], 2)
-    values = [value for value in read_checkpoint(checkpoint)["state_dict"].values() if value.is_floating_point()]
-    assert all(value.dtype == torch.float32 and torch.isfinite(value).all() for value in values)
-    assert generate(load(checkpoint), frames=24)[0].joints.shape == (24, 22, 3)

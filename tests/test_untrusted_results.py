@@ -41,6 +41,7 @@ from flame_mdm.reporting.tables.format import (
     Table,
     comma_separated,
     draw,
+    fragment,
     latex,
     markdown,
     write,
@@ -301,7 +302,10 @@ def hostile_table() -> Table:
 def test_tables_hold_text_not_markup_and_no_formulas():
     table = hostile_table()
     table.drawn["t](x) -x-heading-b-a-http-b-31m-figure"] = ""
-    text, tex = markdown(table), latex(table)
+    text, tex, html = markdown(table), latex(table), str(fragment(table))
+    assert "<b>" not in html
+    assert html.count("&lt;b&gt;") > 3
+    assert tex.count("{") - tex.count("\\{") == tex.count("}") - tex.count("\\}")
     assert not [line for line in text.splitlines() if re.match(r"\s*(# Heading|<b>|\|`)", line)]
     assert "\\[a\\]" in text
     assert "&lt;b&gt;" in text

@@ -18,45 +18,15 @@ from flame_mdm.checkpoints.model_files import read_checkpoint
 from flame_mdm.config import compose
 from flame_mdm.errors import UserError
 
-SLURM = {
-    "sbatch": """
-        # Runs the job at once, and again when it is put back into the queue.
-        cp "$1" "$CLUSTER/script.sh"
-        echo "Submitted batch job 7"
-        (
-            export SLURM_JOB_ID=7 SLURM_JOB_NAME=quickstart SLURM_RESTART_COUNT=0
-            until bash "$CLUSTER/script.sh"; code=$?; echo "$code" >> "$CLUSTER/codes"; [ ! -e "$CLUSTER/requeue" ]; do
-                rm "$CLUSTER/requeue"
-                SLURM_RESTART_COUNT=$((SLURM_RESTART_COUNT + 1))
-            done
-        ) > "$CLUSTER/log" 2>&1 &
-    """,
-    "srun": """
-        # Starts two tasks; that of rank 0 decides the exit code.
-        while [[ $1 == --* ]]; do
-            if [[ $1 == --output ]]; then output=${2//%j/7}; fi
-            if [[ $1 == --unbuffered ]]; then shift; else shift 2; fi
-        done
-        export SLURM_NTASKS=2 SLURM_NTASKS_PER_NODE=2 SLURM_NNODES=1 SLURM_NODEID=0 SLURM_NODELIST=localhost
-        SLURM_PROCID=1 SLURM_LOCALID=1 "$@" >> "${output//%t/1}" 2>&1 &
-        SLURM_PROCID=0 SLURM_LOCALID=0 "$@" >> "${output//%t/0}" 2>&1
-        code=$?
-        wait
-        exit $code
-    """,
-    "scontrol": 'echo "$*" >> "$CLUSTER/listed"; touch "$CLUSTER/requeue"',
-    "sacct": 'echo "JobID|State|NodeList"; echo "7|RUNNING|localhost"',
-}
+SLURM = Path(__file__).parent / "support" / "slurm"
+"""The four programs of SLURM that submitit calls, as far as it needs them."""
 
 
 @pytest.fixture
 def cluster(tmp_path: Path) -> dict[str, str]:
-    """Environment variables with which the programs above are found."""
-    for name, script in SLURM.items():
-        (tmp_path / name).write_text(f"#!/bin/bash\n{script}\n")
-        (tmp_path / name).chmod(0o755)
+    """Environment variables with which these programs are found."""
     path = os.pathsep.join([str(tmp_path), str(ROOT), os.environ.get("PYTHONPATH", "")]).rstrip(os.pathsep)
-    programs = os.pathsep.join([str(tmp_path), os.environ["PATH"]])
+    programs = os.pathsep.join([str(SLURM), os.environ["PATH"]])
     address = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(free_port())}
     return {"CLUSTER": str(tmp_path), "PYTHONPATH": path, "PATH": programs, **address}
 

@@ -29,8 +29,15 @@ def test_the_model_follows_its_prompts():
 SENTENCES = read_yaml(ROOT / "tests" / "fixtures" / "sentences.yaml")
 
 
-@pytest.mark.parametrize("every", [5, pytest.param(1, marks=pytest.mark.robustness)])
-def test_the_model_understands_sentences_as_people_type_them(every):
+@pytest.mark.parametrize(
+    ("every", "least"),
+    [
+        (10, 0.8),
+        pytest.param(3, 0.85, marks=pytest.mark.slow),
+        pytest.param(1, 0.85, marks=[pytest.mark.slow, pytest.mark.robustness]),
+    ],
+)
+def test_the_model_understands_sentences_as_people_type_them(every, least):
     """A motion is right if it shows every attribute that its sentence states; a list holds what fits."""
     assert len(SENTENCES) == len({sentence["text"].lower() for sentence in SENTENCES}) == 300
     model, sentences, known = flame_mdm.load("quickstart"), SENTENCES[::every], []
@@ -46,7 +53,7 @@ def test_the_model_understands_sentences_as_people_type_them(every):
         seen = read_attributes(motion.joints, motion.fps)
         stated = {name: value if isinstance(value, list) else [value] for name, value in sentence.items()}
         right += all(seen.get(name) in values for name, values in stated.items() if name != "text")
-    assert right / len(sentences) >= 0.85
+    assert right / len(sentences) >= least
 
 
 def test_sentences_of_several_actions_become_sequences():

@@ -280,6 +280,11 @@ def test_incomplete_checkpoints(attacked, trained, changed, bad):
         lacking = {key: value for key, value in whole[part].items() if key != name}
         torch.save(whole | {part: lacking}, bad / "bad.ckpt")
         refuses(bad / "bad.ckpt", f"bad.ckpt: damaged: {part} has no {name}")
+    torch.save({"state_dict": {}}, bad / "bad.ckpt")
+    refuses(bad / "bad.ckpt", "holds no recipe")
+    refuses(
+        changed(config__denoiser__latent_dim=32), "the weights do not match the recipe saved with them: size mismatch"
+    )
     attacked("export", str(changed(config__denoiser={})), "out=x", says="damaged: config.denoiser")
     best = changed("best.ckpt", config__callbacks={"best": 5})
     attacked("evaluate", f"ckpt={best}", "extractor=none", "quick=true", says="damaged: config.callbacks.best is 5")

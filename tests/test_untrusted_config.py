@@ -183,7 +183,7 @@ def test_a_recipe_cannot_make_checkpoints_that_are_refused(attacked):
 
 
 def test_absurd_sizes(attacked, changed):
-    sizes = {"process__num_train_timesteps": [10**9], "denoiser__num_layers": [10**7, 90_000]}
+    sizes: dict[str, list[Any]] = {"process__num_train_timesteps": [10**9], "denoiser__num_layers": [10**7, 90_000]}
     sizes |= {"denoiser__latent_dim": [10**7, 60_000], "denoiser__ff_size": [10**12]}
     sizes |= {"condition__features": [60_000], "task__num_inference_steps": [10**9]}
     text = {"_target_": "flame_mdm.conditions.text.PretrainedText", "model": "a/b", "features": 60_000}

@@ -1,7 +1,5 @@
 """Common form of the benchmarks: each has a function `measure` that returns a section of docs/benchmarks/speed.md."""
 
-from __future__ import annotations
-
 import statistics
 import time
 from collections.abc import Callable, Mapping

@@ -1,7 +1,5 @@
 """Writes recipes.md and hyperparameters.md from the recipes: `make docs`."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from itertools import takewhile

@@ -1,7 +1,5 @@
 """The command line: `flame-mdm COMMAND OBJECT [OUT] key=value ...`, also `python -m flame_mdm COMMAND ...`."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Sequence
 from importlib import import_module

@@ -1,7 +1,5 @@
 """Errors that the user can fix, suggestions for misspelled names, and safe output."""
 
-from __future__ import annotations
-
 import difflib
 import html
 import re

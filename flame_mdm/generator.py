@@ -3,8 +3,6 @@
 This module does not import Lightning, whose import takes longer than sampling a motion.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, Literal, Self

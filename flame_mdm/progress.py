@@ -1,7 +1,5 @@
 """Progress bars that are readable in a terminal and in a log file."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Callable, Iterator
 from typing import IO, Any

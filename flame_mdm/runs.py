@@ -1,7 +1,5 @@
 """Run directories: layout, typed schemas of their files, and readers."""
 
-from __future__ import annotations
-
 import json
 import re
 from dataclasses import dataclass

@@ -1,11 +1,9 @@
 """Options of the samplers, shared by Python, command line, demo, evaluation and tables."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
-from typing import Any
+from typing import Any, Self
 
 from flame_mdm.errors import UserError
 
@@ -76,6 +74,6 @@ class SamplerOptions:
         values = {option.name: getattr(self, option.name) for option in fields(self)}
         return {k: list(v) if isinstance(v, tuple) else v for k, v in values.items() if v is not None}
 
-    def over(self, defaults: SamplerOptions) -> SamplerOptions:
+    def over(self, defaults: Self) -> Self:
         """Returns these options, with `defaults` for those that are None."""
         return replace(defaults, **self.chosen())

@@ -1,7 +1,5 @@
 """Typed schemas of files, and readers whose errors name file and key; results of evaluations and audits."""
 
-from __future__ import annotations
-
 import functools
 import json
 from pathlib import Path

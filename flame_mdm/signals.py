@@ -1,7 +1,5 @@
 """Signals: they end a command cleanly, or stop training at the end of a step."""
 
-from __future__ import annotations
-
 import os
 import signal
 import sys

@@ -1,7 +1,5 @@
 """Lightning modules that combine denoiser, process, condition and representation."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Self

@@ -1,7 +1,5 @@
 """Sharing of models: export from a checkpoint, model card, upload to the Hugging Face hub."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Files of models, found by path, run directory, name or hub id. This module does not import torch."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from typing import Literal, get_args

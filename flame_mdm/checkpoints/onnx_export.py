@@ -1,7 +1,5 @@
 """Export to ONNX: graphs for onnxruntime, with the sampling loop, the skeleton and the vocabulary as JSON."""
 
-from __future__ import annotations
-
 import logging
 import shutil
 import warnings

@@ -4,8 +4,6 @@ Each learned weight of a released network is used exactly once, or the import fa
 sinusoids are skipped.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Weights of files that the authors of a paper released: reading them, renaming them, and loading all of them."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Commands, one file each; `flame_mdm.__main__` lists them. This module has the keys that several commands share."""
 
-from __future__ import annotations
-
 import os
 import re
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """`flame-mdm adapt CKPT source=FOLDER name=WORD`: teaches a trained model the motions in a folder."""
 
-from __future__ import annotations
-
 import os
 from dataclasses import dataclass
 from functools import partial

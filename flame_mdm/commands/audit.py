@@ -1,7 +1,5 @@
 """`flame-mdm audit data=NAME extractor=FILE`: audits an evaluator, and writes its card."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`flame-mdm browse DATA`: shows a prepared data set as a web page."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`flame-mdm demo [CKPT ...]`: serves a page that generates motions from texts."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import partial
 from importlib.util import find_spec

@@ -1,7 +1,5 @@
 """`flame-mdm distill CKPT [OUT] key=value ...`: trains a student of a model that samples in one to four steps."""
 
-from __future__ import annotations
-
 import os
 import tempfile
 from dataclasses import dataclass

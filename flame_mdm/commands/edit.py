@@ -1,7 +1,5 @@
 """`flame-mdm edit CKPT motion=FILE`: keeps part of a motion and resamples the rest."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace

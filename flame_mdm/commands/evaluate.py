@@ -1,7 +1,5 @@
 """`flame-mdm evaluate CKPT`: evaluates a checkpoint, a folder of motions or a baseline under a protocol."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import partial
 from typing import ClassVar

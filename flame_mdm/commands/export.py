@@ -1,7 +1,5 @@
 """`flame-mdm export CKPT OUT`: writes the model of a checkpoint as a model file, or as ONNX graphs."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import partial
 from typing import ClassVar

@@ -1,7 +1,5 @@
 """`flame-mdm import KIND FILE [ARGS] out=FILE`: imports a checkpoint released by the authors of a paper."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`flame-mdm prepare DATA`: prepares a data set, or verifies a prepared one."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import partial
 from typing import ClassVar

@@ -1,7 +1,5 @@
 """`flame-mdm push CKPT user/name`: uploads a model file and its model card to the Hugging Face hub."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path

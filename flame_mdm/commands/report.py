@@ -1,7 +1,5 @@
 """`flame-mdm report RUN ...`: writes the report pages of runs."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`flame-mdm train NAME key=value ...`: trains an experiment, or resumes it."""
 
-from __future__ import annotations
-
 from functools import partial
 
 from flame_mdm.config.sweeps import run_recipe

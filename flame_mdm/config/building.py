@@ -1,7 +1,5 @@
 """Instantiation of configurations, and validation, reading and writing of configuration files."""
 
-from __future__ import annotations
-
 import copy
 import importlib
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """Command lines: a dataclass per command declares its keys, their defaults and their help."""
 
-from __future__ import annotations
-
 import shlex
 import textwrap
 from collections.abc import Callable, Mapping, Sequence

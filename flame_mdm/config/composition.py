@@ -1,7 +1,5 @@
 """Composition of recipes by Hydra, resolved to plain dicts."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What all command lines have in common: variables of make, signals, errors and exit codes."""
 
-from __future__ import annotations
-
 import errno
 import os
 import re

@@ -4,8 +4,6 @@ Signatures are read from source files, so that misspelled keys are reported imme
 does not run its code.
 """
 
-from __future__ import annotations
-
 import ast
 import difflib
 import functools

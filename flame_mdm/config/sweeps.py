@@ -1,7 +1,5 @@
 """The command line of `train`, which Hydra composes; sweeps; and jobs that Hydra's launchers start."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from itertools import groupby

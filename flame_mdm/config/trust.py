@@ -1,7 +1,5 @@
 """Checks of the classes that a configuration from a checkpoint names."""
 
-from __future__ import annotations
-
 import ast
 import functools
 import os

@@ -1,7 +1,5 @@
 """Server of the demo: the page, motion files, and the limits of both. It needs the extra `demo` (gradio)."""
 
-from __future__ import annotations
-
 import asyncio
 import os
 import socket

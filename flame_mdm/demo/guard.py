@@ -1,7 +1,5 @@
 """Guard of the demo's server: it passes on what the page itself requests, and refuses everything else."""
 
-from __future__ import annotations
-
 import asyncio
 import ipaddress
 import re

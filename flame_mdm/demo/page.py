@@ -1,7 +1,5 @@
 """The page: form, player, edits, downloads, links. `page.js` writes the links; the server reads and answers them."""
 
-from __future__ import annotations
-
 import re
 from base64 import b64encode
 from collections.abc import Mapping, Sequence

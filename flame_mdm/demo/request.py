@@ -3,8 +3,6 @@
 They are a `SamplingRequest`, which checks the values, and its edits, within the limits of a public page.
 """
 
-from __future__ import annotations
-
 import json
 import shlex
 from collections.abc import Iterable

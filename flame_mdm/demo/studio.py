@@ -1,7 +1,5 @@
 """Motions for the page: one request at a time on the model, the latest results in memory."""
 
-from __future__ import annotations
-
 import tempfile
 import time
 from collections import OrderedDict

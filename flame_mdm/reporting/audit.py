@@ -1,7 +1,5 @@
 """Cards of evaluator audits: one page per extractor and data set, or two cards side by side."""
 
-from __future__ import annotations
-
 import itertools
 import os
 import re

@@ -1,7 +1,5 @@
 """95 % intervals of values and of paired differences."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike
 

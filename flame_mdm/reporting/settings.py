@@ -1,7 +1,5 @@
 """Hyperparameters of recipes, for tables."""
 
-from __future__ import annotations
-
 import inspect
 from collections.abc import Callable
 from typing import Any

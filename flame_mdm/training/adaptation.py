@@ -1,7 +1,5 @@
 """Adaptation of a trained model to a few clips of the user; `docs/own-motion.md` is the guide."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import replace

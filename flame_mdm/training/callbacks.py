@@ -1,7 +1,5 @@
 """Training callbacks: checkpointing, interruption, progress, measurements, samples and the report."""
 
-from __future__ import annotations
-
 import os
 import shlex
 import signal

@@ -5,8 +5,6 @@ checking it. So `newest` and `check_training_state` check what a checkpoint says
 `AtomicCheckpoints` only removes files directly in the folder of the checkpoints.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterator
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Training of models that sample in one to four steps, from a teacher that takes more."""
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Training of a recipe: assembles data, task, callbacks and trainer, and handles interruptions and errors."""
 
-from __future__ import annotations
-
 import logging
 import os
 import signal

@@ -1,7 +1,5 @@
 """Safeguards for long runs: run lock, divergence detection, explanations of lost processes and exhausted memory."""
 
-from __future__ import annotations
-
 import re
 import shutil
 from collections.abc import Iterator, Mapping, Sequence

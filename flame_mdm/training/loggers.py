@@ -1,7 +1,5 @@
 """Loggers: a metrics file in the run directory, TensorBoard, Weights & Biases."""
 
-from __future__ import annotations
-
 import io
 import json
 import secrets

@@ -1,7 +1,5 @@
 """Run provenance: command, code version, machine, package versions and data."""
 
-from __future__ import annotations
-
 import platform
 import subprocess
 import sys

@@ -3,8 +3,6 @@
 The choices for CPUs are measured (docs/benchmarks/speed.md), those for CUDA are not yet.
 """
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor, nn
 

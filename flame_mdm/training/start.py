@@ -1,7 +1,5 @@
 """Start of a training run in its directory, or its continuation. This module does not import torch."""
 
-from __future__ import annotations
-
 from contextlib import nullcontext
 from pathlib import Path
 

@@ -5,8 +5,6 @@ Apache-2.0; its shapes and weights are those of MakeHuman and MPFB2, CC0. Topolo
 downloads and which are not free for commercial use, are never built.
 """
 
-from __future__ import annotations
-
 import os
 from concurrent.futures import ThreadPoolExecutor, wait
 from importlib import import_module

@@ -1,7 +1,5 @@
 """A body: its mesh, fitted to the bone lengths of a clip and skinned to a motion."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path

@@ -3,8 +3,6 @@
 It needs numpy alone: the extension of Blender contains this file.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from flame_mdm.representations.skeleton import SMPL22

@@ -1,7 +1,5 @@
 """Builds tables from existing results, published numbers, recipes, lengths and ratings."""
 
-from __future__ import annotations
-
 import difflib
 import functools
 import math

@@ -1,7 +1,5 @@
 """Specs of tables, the files in experiments/tables, and the evaluations that they need."""
 
-from __future__ import annotations
-
 import hashlib
 import itertools
 import json
@@ -10,7 +8,7 @@ import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import FailFast, Field, model_validator
 
@@ -75,7 +73,7 @@ class RowSpec(Options):
         return row
 
     @model_validator(mode="after")
-    def _source_and_options(self) -> RowSpec:
+    def _source_and_options(self) -> Self:
         if len({"ckpt", "baseline", "from_samples"} & self.model_fields_set) != 1:
             raise ValueError("a row needs one of ckpt, baseline and from_samples")
         for name in SWEPT:
@@ -95,7 +93,7 @@ class PartSpec(Options):
     ratings: str = ""
 
     @model_validator(mode="after")
-    def _one_kind(self) -> PartSpec:
+    def _one_kind(self) -> Self:
         kinds = [{"columns", "rows"}, {"recipes", "keys"}, {"lengths"}, {"ratings"}]
         if sum(kind <= self.model_fields_set for kind in kinds) != 1:
             raise ValueError("needs columns and rows, or recipes and keys, or lengths, or ratings")
@@ -130,7 +128,7 @@ class Spec(ClosedSchema):
     figures: list[FigureSpec] = Field([])
 
     @model_validator(mode="after")
-    def _figures(self) -> Spec:
+    def _figures(self) -> Self:
         _at_most("figures", sum(len(as_list(figure.y)) for figure in self.figures), MOST_FIGURES)
         for figure in self.figures:
             part = self.parts.get(figure.part)

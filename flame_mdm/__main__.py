@@ -3,6 +3,7 @@
 import sys
 from collections.abc import Sequence
 from importlib import import_module
+from typing import get_type_hints
 
 from flame_mdm.errors import UserError, did_you_mean, say
 
@@ -27,7 +28,7 @@ COMMANDS = {
     "export": "write a checkpoint as a model file, or as ONNX graphs",
     "push": "upload a model file to the Hugging Face hub",
 }
-"""Command -> purpose. Commands are in `commands/NAME.py`; `import` is in `commands/import_released.py`."""
+"""Command -> purpose. `commands/NAME.py` has its settings and `main(settings)`; `import` is in import_released.py."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -41,8 +42,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         from flame_mdm.config import guarded  # imports Hydra, for which --help does not wait
 
         return guarded(lambda: _unknown(name))
-    module = import_module(f"flame_mdm.commands.{'import_released' if name == 'import' else name}")
-    return module.main(rest)
+    command = import_module(f"flame_mdm.commands.{'import_released' if name == 'import' else name}").main
+    if name == "train":  # Hydra composes its recipe
+        return command(rest)
+    from flame_mdm.config import run
+
+    return run(command, get_type_hints(command)["settings"], rest)
 
 
 def _help() -> list[str]:

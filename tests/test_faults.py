@@ -20,8 +20,9 @@ import pytest
 import torch
 from support.runs import TINY, finish, spawn
 
+from flame_mdm.__main__ import main
 from flame_mdm.checkpoints.model_files import read_checkpoint
-from flame_mdm.commands import prepare, train
+from flame_mdm.commands import train
 from flame_mdm.errors import UserError
 from flame_mdm.signals import StopRequest
 from flame_mdm.training.checkpointing import LAST, AtomicCheckpoints, newest
@@ -69,7 +70,7 @@ def test_a_full_disk_leaves_the_checkpoint_before(tmp_path):
 def test_a_preparation_without_room_leaves_nothing(tmp_path, capsys):
     for size in (0, 100_000):
         with file_limit(size):
-            assert prepare.main(prepared(tmp_path / "data", 60)) == 1
+            assert main(["prepare", *prepared(tmp_path / "data", 60)]) == 1
         line = capsys.readouterr().err.splitlines()[-1]
         file = tmp_path / "data" / STORE / "features.npy"
         assert line.startswith(f"error: {file}: cannot be written: File too large. ")

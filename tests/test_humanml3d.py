@@ -12,7 +12,7 @@ import torch
 from support.fixtures import golden, golden_case, groups
 from support.stores import HUMANACT12, RECORDINGS, amass_file, line, published, write_downloads, write_folder
 
-from flame_mdm.commands.prepare import main as prepare
+from flame_mdm.__main__ import main
 from flame_mdm.data import amass, humanml3d, t2m
 from flame_mdm.data.amass import Recording, key_of, load_bodies
 from flame_mdm.data.crops import Units
@@ -410,7 +410,7 @@ def test_the_dry_run_lists_all_that_is_missing(mine, capsys):
     assert first == "0 of 6 motions and their mirrored copies are created"
     assert [line.split(":")[1] for line in missing] == [f" {mine}/bodies", " BioMotionLab_NTroje", " CMU"]
     words = [f"source={mine / 'HumanML3D/HumanML3D'}", f"data.source.amass={mine / 'amass'}"]
-    assert prepare(["data=humanml3d", "check=true", *words]) == 0
+    assert main(["prepare", "data=humanml3d", "check=true", *words]) == 0
     assert "missing: BioMotionLab_NTroje: missing" in capsys.readouterr().out
     assert not (mine / "HumanML3D" / "HumanML3D" / "new_joint_vecs").exists()
 

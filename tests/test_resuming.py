@@ -17,7 +17,7 @@ from support.runs import TINY
 from flame_mdm.__main__ import main
 from flame_mdm.checkpoints.loading import load
 from flame_mdm.checkpoints.model_files import FORMAT_KEY, read_checkpoint
-from flame_mdm.commands import browse, evaluate, prepare, train
+from flame_mdm.commands import train
 from flame_mdm.config import instantiate
 from flame_mdm.data.folder import Folder
 from flame_mdm.data.store import Store
@@ -215,7 +215,7 @@ def test_a_run_does_not_resume_on_other_data(run, tmp_path, data_root, capsys, m
     """The store changes, and the recipe does not: the same options, but other files or another version of the code."""
     original, root = Synthetic.clips, tmp_path / "data"
     monkeypatch.setattr(Synthetic, "clips", lambda self, fps: list(original(self, fps))[:59])
-    assert prepare.main(prepared(root, 120)) == 0
+    assert main(["prepare", *prepared(root, 120)]) == 0
     capsys.readouterr()
     before = tree(run, root)
     assert train.main([*words(run, root), "trainer.max_steps=6"]) == 1
@@ -227,23 +227,23 @@ def test_a_run_does_not_resume_on_other_data(run, tmp_path, data_root, capsys, m
 
 def test_a_store_of_other_options_is_refused_everywhere(tmp_path, trained, capsys):
     root, run = tmp_path / "data", tmp_path / "run"
-    assert prepare.main(prepared(root, 61)) == 0
+    assert main(["prepare", *prepared(root, 61)]) == 0
     capsys.readouterr()
     before = tree(root)
     message = f"error: {root / STORE}: prepared with clips=61, but the recipe has clips=120. Prepare it again"
     for command, line in (
-        (train, [*words(run, root), "trainer.max_steps=2"]),
-        (prepare, prepared(root, 120)),
-        (prepare, prepared(root, 120, "verify=true")),
-        (browse, prepared(root, 120, f"out={tmp_path / 'page.html'}")),
-        (evaluate, [f"ckpt={trained}", "extractor=none", "quick=true", f"data_root={root}"]),
+        ("train", [*words(run, root), "trainer.max_steps=2"]),
+        ("prepare", prepared(root, 120)),
+        ("prepare", prepared(root, 120, "verify=true")),
+        ("browse", prepared(root, 120, f"out={tmp_path / 'page.html'}")),
+        ("evaluate", [f"ckpt={trained}", "extractor=none", "quick=true", f"data_root={root}"]),
     ):
-        assert command.main(line) == 1
+        assert main([command, *line]) == 1
         assert one_error(capsys).startswith(message)
     assert tree(root) == before
     assert [path.name for path in tmp_path.iterdir()] == ["data"]
-    assert prepare.main(prepared(root, 120, "force=true")) == 0
-    assert prepare.main(prepared(root, 120)) == 0
+    assert main(["prepare", *prepared(root, 120, "force=true")]) == 0
+    assert main(["prepare", *prepared(root, 120)]) == 0
 
 
 def test_options_that_decide_the_data_count_but_paths_do_not():

@@ -2,11 +2,9 @@
 
 import os
 from dataclasses import dataclass
-from functools import partial
 from typing import ClassVar
 
 from flame_mdm.commands import ModelSettings
-from flame_mdm.config import run
 from flame_mdm.errors import UserError
 from flame_mdm.sampler_options import option
 
@@ -33,16 +31,13 @@ class AdaptSettings(ModelSettings):
     composed: tuple[str, ...] = ()
 
 
-def adapt(settings: AdaptSettings) -> None:
+def main(settings: AdaptSettings) -> None:
     """Trains the adapter."""
     if settings.source is None or settings.name is None:
         raise UserError("name the folder of motions and the adapter: flame-mdm adapt CKPT source=my_clips name=limp")
     file = settings.model_file()
     keys = ("source", "name", "out", "action", "full", "force", "rank", "data_root")
 
-    from flame_mdm.training.adaptation import adapt as teach
+    from flame_mdm.training.adaptation import adapt
 
-    teach(file, overrides=settings.composed, **{key: getattr(settings, key) for key in keys})
-
-
-main = partial(run, adapt, AdaptSettings)
+    adapt(file, overrides=settings.composed, **{key: getattr(settings, key) for key in keys})

@@ -1,12 +1,10 @@
 """`flame-mdm audit data=NAME extractor=FILE`: audits an evaluator, and writes its card."""
 
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import ClassVar
 
 from flame_mdm.commands import DataSettings, check_extractor
-from flame_mdm.config import run
 from flame_mdm.errors import UserError, say
 from flame_mdm.reporting.audit import card_name, read_card, write_card
 from flame_mdm.safe_io import write_json
@@ -36,7 +34,7 @@ class AuditSettings(DataSettings):
     out: str = option("runs/audit", "folder of the cards")
 
 
-def audit(settings: AuditSettings) -> None:
+def main(settings: AuditSettings) -> None:
     """Audits an evaluator, or renders existing cards."""
     out = Path(settings.out)
     if settings.cards is not None:
@@ -59,6 +57,3 @@ def audit(settings: AuditSettings) -> None:
     card = measure(request, out / "cache")
     write_json(out / f"{card_name(card)}.json", card.model_dump(), indent=None)
     say(*write_card([card], out))
-
-
-main = partial(run, audit, AuditSettings)

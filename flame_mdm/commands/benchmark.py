@@ -8,12 +8,11 @@ import sys
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
 from flame_mdm.commands.tables import TablesSettings, evaluate_missing
-from flame_mdm.config import EXPERIMENTS, run
+from flame_mdm.config import EXPERIMENTS
 from flame_mdm.errors import UserError, say
 from flame_mdm.reporting.page import page, render
 from flame_mdm.reporting.tables.build import build
@@ -47,7 +46,7 @@ class BenchmarkSettings:
     data_root: str = option("", "folder of the prepared data sets; default: the checkpoint's, or FLAME_MDM_DATA")
 
 
-def benchmark(settings: BenchmarkSettings) -> None:
+def main(settings: BenchmarkSettings) -> None:
     """Trains and evaluates the models listed in a file of experiments/benchmark, and writes a report page."""
     names = sorted(path.stem for path in (EXPERIMENTS / "benchmark").glob("*.yaml"))
     if settings.exp not in names:
@@ -74,9 +73,6 @@ def benchmark(settings: BenchmarkSettings) -> None:
     wrong = [line for line, right in checks if not right]
     if failed or wrong:
         raise UserError("; ".join([*failed, *wrong]))
-
-
-main = partial(run, benchmark, BenchmarkSettings)
 
 
 class Times:

@@ -1,12 +1,11 @@
 """`flame-mdm browse DATA`: shows a prepared data set as a web page."""
 
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import ClassVar
 
 from flame_mdm.commands import STORE, BodySettings, PreparedSettings, check_words
-from flame_mdm.config import instantiate, run
+from flame_mdm.config import instantiate
 from flame_mdm.errors import UserError, say
 from flame_mdm.reporting.browse import choose, find, write_clips, write_page
 from flame_mdm.sampler_options import option
@@ -32,7 +31,7 @@ class BrowseSettings(BodySettings, PreparedSettings):
     motions: str | None = option(None, "folder: also write the shown clips as motion files")
 
 
-def browse(settings: BrowseSettings) -> None:
+def main(settings: BrowseSettings) -> None:
     """Prepares the data set if needed, and writes the page."""
     check_words(settings)
     node = settings.data_node(settings.source)
@@ -68,6 +67,3 @@ def browse(settings: BrowseSettings) -> None:
     if settings.motions is not None:
         write_clips(Path(settings.motions), store, representation, clips, data.crop.longest())
         say(f"{settings.motions}: {len(clips)} motions")
-
-
-main = partial(run, browse, BrowseSettings)

@@ -5,13 +5,11 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
 from flame_mdm.commands import BodySettings, check_words
 from flame_mdm.commands.sample import read_prompts
-from flame_mdm.config import run
 from flame_mdm.errors import UserError, say
 from flame_mdm.reporting.compare import HEAD, MOTIONS, ComparedRun, Prompt, comparison, find, grouped, in_common, tested
 from flame_mdm.reporting.study import QUESTION, rating_page, tally
@@ -51,7 +49,7 @@ class CompareSettings(BodySettings):
     out: str | None = option(None, "default runs/compare.html, runs/rate.html or runs/ratings.json")
 
 
-def compare(settings: CompareSettings) -> None:
+def main(settings: CompareSettings) -> None:
     """Writes the requested page, or counts ratings."""
     if (settings.runs is None) == (settings.ratings is None):
         raise UserError('give either runs="A B" to compare runs, or ratings="x.json y.json" to count ratings')
@@ -81,9 +79,6 @@ def compare(settings: CompareSettings) -> None:
         say(*_tested({c.label: c.run for c in compared if c.run is not None}))
     write_text(out, content)
     say(out)
-
-
-main = partial(run, compare, CompareSettings)
 
 
 def _tested(runs: Mapping[str, Run]) -> list[str]:

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
 from flame_mdm.commands import BodySettings, FileSettings, check_motion, check_words
-from flame_mdm.config import run
 from flame_mdm.errors import UserError, say
 from flame_mdm.formats import ENDINGS, WRITTEN
 from flame_mdm.progress import ProgressBar
@@ -43,7 +41,7 @@ class ConvertSettings(BodySettings, FileSettings):
     character: str | None = option(None, "your own .glb or .bvh file, written with the motion: docs/characters.md")
 
 
-def convert(settings: ConvertSettings) -> None:
+def main(settings: ConvertSettings) -> None:
     """Converts one file or a folder."""
     if settings.motion is None or settings.out is None:
         raise UserError("name an input and an output file: flame-mdm convert motion.npz walk.bvh")
@@ -108,6 +106,3 @@ def _convert(settings: ConvertSettings, path: Path, out: Path, character: Charac
         say(f"legs {leg:.2f} m, head joint at {head:.2f} m")
         if not LEG[0] <= leg <= LEG[1]:
             say(f"adults have legs of {LEG[0]:g} to {LEG[1]:g} m: if the unit of {path} is wrong, set unit=...")
-
-
-main = partial(run, convert, ConvertSettings)

@@ -1,12 +1,10 @@
 """`flame-mdm demo [CKPT ...]`: serves a page that generates motions from texts."""
 
 from dataclasses import dataclass
-from functools import partial
 from importlib.util import find_spec
 from typing import ClassVar
 
 from flame_mdm.checkpoints.locating import find
-from flame_mdm.config import run
 from flame_mdm.errors import UserError
 from flame_mdm.sampler_options import option
 
@@ -30,7 +28,7 @@ class DemoSettings:
     device: str | None = option(None, "default: cuda if available")
 
 
-def demo(settings: DemoSettings) -> None:
+def main(settings: DemoSettings) -> None:
     """Serves the page until interrupted."""
     if not 0 <= settings.port <= 65535:
         raise UserError(f"port={settings.port}: give a number from 0 to 65535; 0 is any free port")
@@ -44,6 +42,3 @@ def demo(settings: DemoSettings) -> None:
 
     sources = [*settings.ckpt, *(f"{settings.ckpt[0]}{PLUS}{file}" for file in settings.adapter)]
     serve(sources, settings.host, settings.port, settings.device, settings.hosts)
-
-
-main = partial(run, demo, DemoSettings)

@@ -3,7 +3,6 @@
 import os
 import tempfile
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -11,7 +10,7 @@ from omegaconf import OmegaConf
 
 from flame_mdm.commands import ModelSettings
 from flame_mdm.commands.train import USAGE, train
-from flame_mdm.config import EXPERIMENTS, Config, movable, run, save
+from flame_mdm.config import EXPERIMENTS, Config, movable, save
 from flame_mdm.config.sweeps import run_recipe
 from flame_mdm.errors import UserError
 from flame_mdm.safe_io import read_yaml
@@ -37,7 +36,7 @@ class DistillSettings(ModelSettings):
     composed: tuple[str, ...] = ()
 
 
-def distill(settings: DistillSettings) -> None:
+def main(settings: DistillSettings) -> None:
     """Trains the student, or resumes the run in its directory."""
     recipe = student_recipe(settings)
     with tempfile.TemporaryDirectory() as folder:  # processes that Lightning starts read the file, too
@@ -73,6 +72,3 @@ def student_recipe(settings: DistillSettings) -> Config:
     shared = read_yaml(EXPERIMENTS / "distillation" / "consistency.yaml")
     merged: Any = OmegaConf.to_container(OmegaConf.merge(movable(recipe), shared, own))
     return merged
-
-
-main = partial(run, distill, DistillSettings)

@@ -3,13 +3,11 @@
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from functools import partial
 from pathlib import Path
 from typing import ClassVar
 
 from flame_mdm.commands import FileSettings, check_motion
 from flame_mdm.commands.sample import OutputSettings, check_condition, default_folder, summary
-from flame_mdm.config import run
 from flame_mdm.errors import UserError, say
 from flame_mdm.sampler_options import SamplerOptions, option
 from flame_mdm.sampling.request import EditRequest
@@ -44,7 +42,7 @@ IN_NAME = (
 """Keys that change the motions: the name of the folder contains those that differ from their defaults."""
 
 
-def write_edits(settings: EditSettings) -> None:
+def main(settings: EditSettings) -> None:
     """Edits a motion, and writes the original and the results."""
     request = settings.request(editing=True)
     if settings.motion is None:
@@ -83,6 +81,3 @@ def write_edits(settings: EditSettings) -> None:
     )
     if max(e.joint_error for e in edits) > 0.01:
         say("a kept part that follows a generated one begins where that one ends, so its place in the world may differ")
-
-
-main = partial(run, write_edits, EditSettings)

@@ -1,12 +1,10 @@
 """`flame-mdm evaluate CKPT`: evaluates a checkpoint, a folder of motions or a baseline under a protocol."""
 
 from dataclasses import dataclass
-from functools import partial
 from typing import ClassVar
 
 from evaluators.request import EvaluationKeys, EvaluationRequest
 from flame_mdm.commands import DataSettings, ModelSettings, check_device, check_extractor
-from flame_mdm.config import run
 from flame_mdm.sampler_options import SamplerOptions
 
 
@@ -29,7 +27,7 @@ class EvaluateSettings(EvaluationKeys, SamplerOptions, DataSettings, ModelSettin
         DataSettings.__post_init__(self)
 
 
-def evaluate_request(settings: EvaluateSettings) -> None:
+def main(settings: EvaluateSettings) -> None:
     """Evaluates what the settings name, and writes the result."""
     check_device(settings.device)
     nodes = settings.nodes if settings.data is not None else {"data": None, "representation": None}
@@ -40,6 +38,3 @@ def evaluate_request(settings: EvaluateSettings) -> None:
     from evaluators.evaluation import evaluate
 
     evaluate(request)
-
-
-main = partial(run, evaluate_request, EvaluateSettings)

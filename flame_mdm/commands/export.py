@@ -1,11 +1,9 @@
 """`flame-mdm export CKPT OUT`: writes the model of a checkpoint as a model file, or as ONNX graphs."""
 
 from dataclasses import dataclass
-from functools import partial
 from typing import ClassVar
 
 from flame_mdm.commands import AdaptedSettings
-from flame_mdm.config import run
 from flame_mdm.errors import UserError, say
 from flame_mdm.sampler_options import option
 
@@ -24,7 +22,7 @@ class ExportSettings(AdaptedSettings):
     half: bool = option(False, "true = weight matrices in half precision")
 
 
-def export_model(settings: ExportSettings) -> None:
+def main(settings: ExportSettings) -> None:
     """Writes the model file."""
     if settings.ckpt is None or settings.out is None:
         raise UserError("name a checkpoint and an output file: flame-mdm export CKPT model.safetensors")
@@ -37,6 +35,3 @@ def export_model(settings: ExportSettings) -> None:
         from flame_mdm.checkpoints.hub import export
 
     say(f"written: {export(file, settings.out, half=settings.half, **settings.adapters())}")
-
-
-main = partial(run, export_model, ExportSettings)

@@ -1,11 +1,9 @@
 """`flame-mdm import KIND FILE [ARGS] out=FILE`: imports a checkpoint released by the authors of a paper."""
 
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import ClassVar
 
-from flame_mdm.config import run
 from flame_mdm.errors import UserError, say
 from flame_mdm.sampler_options import option
 
@@ -34,7 +32,7 @@ class ImportSettings:
     run_code: bool = option(False, "load pickles that hold more than weights: THIS RUNS ANY CODE IN THE FILE")
 
 
-def import_model(settings: ImportSettings) -> None:
+def main(settings: ImportSettings) -> None:
     """Writes the model file of a released checkpoint."""
     if settings.kind not in KINDS:
         raise UserError(f"unknown kind of released model: {settings.kind}. Use {', '.join(KINDS[:-1])} or mclip")
@@ -46,6 +44,3 @@ def import_model(settings: ImportSettings) -> None:
     from flame_mdm.checkpoints.released import import_released
 
     say(f"written: {import_released(**vars(settings))}")
-
-
-main = partial(run, import_model, ImportSettings)

@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
 from flame_mdm.commands import BodySettings, FileSettings, PreparedSettings, check_words
-from flame_mdm.config import instantiate, run
+from flame_mdm.config import instantiate
 from flame_mdm.errors import UserError, say
 from flame_mdm.formats import ENDINGS
 from flame_mdm.progress import ProgressBar
@@ -51,7 +50,7 @@ class InspectSettings(BodySettings, FileSettings, PreparedSettings):
         super().__post_init__()
 
 
-def inspect(settings: InspectSettings) -> None:
+def main(settings: InspectSettings) -> None:
     """Prints faults, writes the page, and exits with 3 if there are any."""
     if settings.clips < 1:
         raise UserError(f"clips={settings.clips}: must be at least 1")
@@ -123,6 +122,3 @@ def _clips(settings: InspectSettings) -> tuple[str, int, Iterator[Motion]]:
         raise UserError(f"no split is called {settings.split}. Available: {', '.join(store.info['clips'])}")
     clips = [clip for clip in store.clips if settings.split in (None, clip.split)]
     return data.folder.name, len(clips), (motion(store, representation, clip) for clip in clips)
-
-
-main = partial(run, inspect, InspectSettings)

@@ -1,11 +1,10 @@
 """`flame-mdm prepare DATA`: prepares a data set, or verifies a prepared one."""
 
 from dataclasses import dataclass
-from functools import partial
 from typing import ClassVar
 
 from flame_mdm.commands import STORE, DataSettings
-from flame_mdm.config import instantiate, run
+from flame_mdm.config import instantiate
 from flame_mdm.errors import UserError, say
 from flame_mdm.sampler_options import option
 
@@ -26,7 +25,7 @@ class PrepareSettings(DataSettings):
     force: bool = option(False, "rewrite an existing store")
 
 
-def prepare(settings: PrepareSettings) -> None:
+def main(settings: PrepareSettings) -> None:
     """Writes or verifies the store of a data set."""
     node = settings.data_node(settings.source)
     if settings.captions is not None:
@@ -61,6 +60,3 @@ def prepare(settings: PrepareSettings) -> None:
     if info["excluded"]:
         say("excluded: " + ", ".join(f"{count} {reason}" for reason, count in info["excluded"].items()))
     say(f"{info['shape'][0]} frames with {info['shape'][1]} features, fingerprint {store.fingerprint}: {data.folder}")
-
-
-main = partial(run, prepare, PrepareSettings)

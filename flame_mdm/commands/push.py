@@ -1,12 +1,10 @@
 """`flame-mdm push CKPT user/name`: uploads a model file and its model card to the Hugging Face hub."""
 
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import ClassVar
 
 from flame_mdm.commands import ModelSettings
-from flame_mdm.config import run
 from flame_mdm.errors import UserError, say
 from flame_mdm.sampler_options import option
 
@@ -25,7 +23,7 @@ class PushSettings(ModelSettings):
     dry_run: bool = option(False, "true = write the folder, upload nothing")
 
 
-def push_model(settings: PushSettings) -> None:
+def main(settings: PushSettings) -> None:
     """Writes the folder and uploads it."""
     if settings.ckpt is None or settings.repository is None:
         raise UserError("name a checkpoint and a repository: flame-mdm push CKPT user/name")
@@ -36,6 +34,3 @@ def push_model(settings: PushSettings) -> None:
     folder = settings.out or Path("push") / name.rpartition("/")[2]
     folder = push(file, name, folder, upload=upload, private=settings.private)
     say(f"{f'uploaded to {name}' if upload else 'not uploaded'}: {folder}")
-
-
-main = partial(run, push_model, PushSettings)

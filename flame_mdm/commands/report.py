@@ -1,12 +1,10 @@
 """`flame-mdm report RUN ...`: writes the report pages of runs."""
 
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import ClassVar
 
 from flame_mdm.commands import BodySettings, check_words
-from flame_mdm.config import run
 from flame_mdm.errors import UserError, say
 from flame_mdm.reporting.report import write_report
 from flame_mdm.runs import check_run
@@ -25,7 +23,7 @@ class ReportSettings(BodySettings):
     runs: list[str] | None = option(None, "run directories, separated by spaces")
 
 
-def report(settings: ReportSettings) -> None:
+def main(settings: ReportSettings) -> None:
     """Writes the report of each run."""
     if settings.runs is None:
         raise UserError("no run named. Name a run directory: flame-mdm report runs/synthetic/mdm/default")
@@ -37,6 +35,3 @@ def report(settings: ReportSettings) -> None:
     body = load_body(settings.body)
     for folder in settings.runs:
         say(write_report(Path(folder), body))
-
-
-main = partial(run, report, ReportSettings)

@@ -7,14 +7,12 @@ import re
 import webbrowser
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from flame_mdm.checkpoints.locating import find
 from flame_mdm.commands import AdaptedSettings, BodySettings, check_device, check_motion, check_words
-from flame_mdm.config import run
 from flame_mdm.errors import UserError, say, shortened
 from flame_mdm.safe_io import MEBIBYTE, read_text
 from flame_mdm.sampler_options import SamplerOptions, option, same_option
@@ -134,7 +132,7 @@ IN_NAME = (
 """Keys that change the motions: the name of the folder contains those that differ from their defaults."""
 
 
-def sample(settings: SampleSettings) -> None:
+def main(settings: SampleSettings) -> None:
     """Samples the requested motions and writes them."""
     request = settings.request()
     if settings.scorer is not None and (request.kind != "text" or settings.candidates == 1):
@@ -187,9 +185,6 @@ def sample(settings: SampleSettings) -> None:
         say(f"a loop has {seconds:g} seconds by default, so that one window covers it. For 3 seconds, add seconds=3")
     if settings.prompts is not None:
         say(_gallery(settings, folders, body))
-
-
-main = partial(run, sample, SampleSettings)
 
 
 def _folders(

@@ -5,11 +5,11 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
-from flame_mdm.config import Config, compose, compose_data, instantiate, run
+from flame_mdm.config import Config, compose, compose_data, instantiate
 from flame_mdm.errors import UserError, first_line, say
 from flame_mdm.safe_io import sha256, write_json, write_text
 from flame_mdm.sampler_options import option
@@ -42,7 +42,7 @@ class TablesSettings:
     data_root: str = option("", "folder of the prepared data sets; default: the checkpoint's, or FLAME_MDM_DATA")
 
 
-def tables(settings: TablesSettings) -> None:
+def main(settings: TablesSettings) -> None:
     """Runs missing evaluations and renders the tables; exits with `INVALID` if a row is not valid."""
     from flame_mdm.reporting.page import page, render
     from flame_mdm.reporting.tables.build import NOT_VALID, build
@@ -160,6 +160,3 @@ def sizes(recipe: str) -> dict[str, float]:
             cond_features=config["condition"].get("features", 0),
         )
     return {"features": features, "parameters": sum(p.numel() for p in denoiser.parameters()) / 1e6}
-
-
-main = partial(run, tables, TablesSettings)

@@ -7,15 +7,13 @@ guidance, and for 10, 50 and 1000 steps. Gives medians, and ratios to the first 
 """
 
 import argparse
-import statistics
 import sys
-import time
 from collections.abc import Callable
 from functools import partial
 from itertools import product
 
 import torch
-from sections import Row, Section, section, show
+from sections import Row, Section, section, show, take_turns
 from torch import Tensor
 
 from flame_mdm.batch import Condition, Denoise, Edit
@@ -52,14 +50,9 @@ def inputs(batch: int, args: argparse.Namespace) -> tuple[Tensor, Tensor, Condit
     return noise, torch.ones(noise.shape[:2], dtype=torch.bool, device=args.device), cond
 
 
-def seconds(run: Callable[[], Tensor], repeats: int) -> float:
+def seconds(run: Callable[[], Tensor], repeats: int, device: str) -> float:
     """Returns the median time of a run, after one that warms up."""
-    times = []
-    for _ in range(repeats + 1):
-        start = time.perf_counter()
-        run().sum().item()  # waits for the device
-        times.append(time.perf_counter() - start)
-    return statistics.median(times[1:])
+    return take_turns({"run": run}, repeats, device)["run"]
 
 
 def options(sampler: str, steps: int) -> SamplerOptions:
@@ -83,14 +76,19 @@ def measure_loops(args: argparse.Namespace) -> list[Row]:
                 continue
             counted = CountedDenoise(denoise)
             run = partial(process.sample, counted, lambda draw: fixed, mask, cond, options(sampler, 50), edit=edit)
-            taken = seconds(run, 2 * args.repeats)
+            taken = seconds(run, 2 * args.repeats, args.device)
             cells.append(1e3 * taken * (2 * args.repeats + 1) / counted.calls)
         names = ("alone", "guided", "edited", "guided and edited")
         rows.append({"sampler": sampler, **dict(zip(names, cells, strict=True))})
     for batch in (1, 64):
         ids = [str(number) for number in range(batch)]
         noise = seeded_noise(ids, *fixed.shape[1:], seed=0, replication=0, like=fixed)
-        rows.append({"sampler": f"noise, batch {batch}", "alone": 1e3 * seconds(partial(noise, 1), 2 * args.repeats)})
+        rows.append(
+            {
+                "sampler": f"noise, batch {batch}",
+                "alone": 1e3 * seconds(partial(noise, 1), 2 * args.repeats, args.device),
+            }
+        )
         rows[-1] |= dict.fromkeys(names[1:])
     return rows
 
@@ -109,7 +107,7 @@ def measure_steps(denoise: Denoise, args: argparse.Namespace) -> list[Row]:
         short = 0.0
         for name, run in runs.items():
             estimate = short * int(name.replace(",", "")) / 10 if short else 0.0
-            taken = estimate if estimate > args.longest else seconds(run, 1 if short else 3)
+            taken = estimate if estimate > args.longest else seconds(run, 1 if short else 3, args.device)
             short = short or taken * (name == "10")
             first = first or taken
             how = ", estimated from 10" if estimate > args.longest else ""
@@ -122,34 +120,20 @@ def measure_samplers(denoise: Denoise, args: argparse.Namespace) -> list[Row]:
     """Returns one row per sampler."""
     fixed, mask, cond = inputs(args.batch, args)
     guided = classifier_free_guidance(denoise, args.guidance_scale, args.features)
-    samples: list[Callable[[Denoise], Tensor]] = [
-        lambda counted, process=process, sampler=sampler, count=count: process.sample(
-            counted, lambda draw: fixed, mask, cond, options(sampler, count)
+    counted = [CountedDenoise(guided) for _ in RUNS]
+    runs = {
+        f"{sampler} {count}": partial(process.sample, own, lambda draw: fixed, mask, cond, options(sampler, count))
+        for own, (process, sampler, count) in zip(counted, RUNS, strict=True)
+    }
+    times = take_turns(runs, args.repeats, args.device)
+    rows: list[Row] = []
+    for own, (_, sampler, count) in zip(counted, RUNS, strict=True):
+        taken, calls = times[f"{sampler} {count}"], own.calls // (args.repeats + 1)
+        row: Row = {"sampler": sampler, "steps": "" if sampler == "dopri5" else str(count), "network calls": calls}
+        rows.append(
+            row | {"ms": 1e3 * taken, "ms per call": 1e3 * taken / calls, "ratio": taken / next(iter(times.values()))}
         )
-        for process, sampler, count in RUNS
-    ]
-    seconds: list[list[float]] = [[] for _ in RUNS]
-    calls = [0] * len(RUNS)
-    for repeat in range(args.repeats + 1):
-        for index, sample in enumerate(samples):
-            counted = CountedDenoise(guided)
-            start = time.perf_counter()
-            sample(counted).sum().item()  # waits for the device
-            if repeat:  # the first round warms up
-                seconds[index].append(time.perf_counter() - start)
-            calls[index] = counted.calls
-    medians = [statistics.median(times) for times in seconds]
-    return [
-        {
-            "sampler": sampler,
-            "steps": "" if sampler == "dopri5" else str(count),
-            "network calls": nfe,
-            "ms": 1e3 * median,
-            "ms per call": 1e3 * median / nfe,
-            "ratio": median / medians[0],
-        }
-        for (_, sampler, count), nfe, median in zip(RUNS, calls, medians, strict=True)
-    ]
+    return rows
 
 
 @torch.no_grad()

@@ -90,14 +90,9 @@ def made_by(path: str | Path) -> str:
 
 @dataclass
 class Run:
-    """Content of a run directory.
+    """Content of a run directory: curves are name -> step -> value, results are by their path in the folder.
 
-    Attributes:
-        folder: the directory.
-        config: the recipe saved by the run.
-        provenance: None before training began.
-        curves: name -> step -> value.
-        results: path of a result file within the folder -> evaluation.
+    There is no provenance before training began.
     """
 
     folder: Path

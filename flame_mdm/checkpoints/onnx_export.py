@@ -67,23 +67,20 @@ def export_onnx(source: str | Path, out: str | Path, *, half: bool = False, **ad
 def description(model: MotionGenerator) -> dict[str, Any]:
     """Returns the content of `model.json`, without the hashes of the graphs; errors as for `sampling_plan`."""
     representation, skeleton, facts = model.representation, model.representation.skeleton, model.facts
-    encoder = model.condition
+    encoder, denoiser = model.condition, model.denoiser
+    padded = isinstance(denoiser, FIXED_LENGTH) or not denoiser.mask_padding
     words = {"buckets": encoder.buckets, "max_words": encoder.max_words} if isinstance(encoder, LearnedTokens) else {}
     return {
         **{"format": FORMAT, "experiment": model.config["experiment"], "reads": model.conditioned_on, **words},
         **{key: list(facts.get(key, ())) for key in ("actions", "vocabulary", "captions")},
         "function_words": sorted(FUNCTION_WORDS),
         **{"features": representation.features, "fps": representation.fps, "max_frames": facts["max_frames"]},
-        "padded_frames": facts["max_frames"] if _padded(model) else 0,
+        "padded_frames": facts["max_frames"] if padded else 0,
         "skeleton": {"joints": skeleton.joints, "parents": skeleton.parents, "feet": skeleton.feet},
         "clip_x0": bool(getattr(model.process, "clip_x0", False)),
         "steps": sampling_plan(model.process, model.sampler_options),
         "sha256": {},
     }
-
-
-def _padded(model: MotionGenerator) -> bool:
-    return isinstance(model.denoiser, FIXED_LENGTH) or not model.denoiser.mask_padding
 
 
 # The sampling loop ----------------------------------------------------------------------------------------------------

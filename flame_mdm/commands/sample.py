@@ -257,13 +257,10 @@ def default_folder(model: MotionGenerator, digest: str, what: str, seed: int, op
     values = {key: str(value) for key, value in sorted(options.items()) if value is not None}
     request = repr((digest, model.config.get("run"), what, seed, values))
     chosen = re.sub(r"[^\w=.,-]+", "", "".join(f"-{key}={value}" for key, value in values.items()))[:60]
-    name = f"{_clean(what.lower())[:40].strip('-')}{f'-seed{seed}' * (seed != 0)}{chosen}"
+    cleaned = re.sub(r"[^\w]+", "-", what.lower()).strip("-")[:40].strip("-")
+    name = f"{cleaned}{f'-seed{seed}' * (seed != 0)}{chosen}"
     experiment = re.findall(r"[\w-][\w.-]*", str(model.config["experiment"]))
     return Path("samples", *experiment, f"{name}-{hashlib.sha256(request.encode()).hexdigest()[:6]}")
-
-
-def _clean(name: str) -> str:
-    return re.sub(r"[^\w]+", "-", name).strip("-")
 
 
 def check_condition(settings: OutputSettings, request: SamplingRequest, model: MotionGenerator) -> None:

@@ -32,11 +32,8 @@ LONGEST_WORD = 2**17
 
 def groups() -> list[str]:
     """Returns the replaceable parts of a recipe: folders of `experiments/` whose files are options, not recipes."""
-    return sorted(p.name for p in EXPERIMENTS.iterdir() if p.is_dir() and not _is_recipe_folder(p))
-
-
-def _is_recipe_folder(folder: Path) -> bool:
-    return any("@package _global_" in file.read_text()[:200] for file in folder.glob("*.yaml"))
+    folders = {name.partition("/")[0] for name in recipes()}
+    return sorted(p.name for p in EXPERIMENTS.iterdir() if p.is_dir() and p.name not in folders)
 
 
 def recipes() -> list[str]:
@@ -96,9 +93,7 @@ def plan_composition(recipe: ConfigSource, overrides: Sequence[str], first: Sequ
     Overrides in `first` are passed to Hydra unchecked.
     """
     parsed = parse(overrides)
-    if recipe.saved:
-        _refuse_groups(parsed, recipe)
-    _check_groups(parsed)
+    _check_groups(parsed, recipe)
     first = [*first, *([f"hydra.searchpath=[file://{EXPERIMENTS}]"] if recipe.folder != EXPERIMENTS else [])]
     if recipe.experiment:
         first.append(f"experiment={recipe.experiment}")
@@ -178,11 +173,16 @@ def _is_group(override: Override) -> bool:
     return (EXPERIMENTS / override.key_or_group).is_dir()
 
 
-def _check_groups(overrides: Sequence[Override]) -> None:
+def _check_groups(overrides: Sequence[Override], recipe: ConfigSource) -> None:
     for override in overrides:
+        group = override.key_or_group
+        if _is_group(override) and recipe.saved and group != LAUNCH:
+            raise UserError(
+                f"{override_word(override)} replaces a part of a recipe, but {recipe.stem}.yaml is a saved "
+                "configuration, whose parts are fixed. Start from the experiment, or override single keys"
+            )
         if not _is_group(override) or override.is_delete():
             continue
-        group = override.key_or_group
         options = _options(group)
         for option in choices(override):
             if option not in options:
@@ -192,15 +192,6 @@ def _check_groups(overrides: Sequence[Override]) -> None:
         if group == LAUNCH and source_file("submitit") is None:
             raise UserError(
                 f"{override_word(override).lstrip('+')} needs hydra-submitit-launcher: pip install flame-mdm[slurm]"
-            )
-
-
-def _refuse_groups(overrides: Sequence[Override], recipe: ConfigSource) -> None:
-    for override in overrides:
-        if _is_group(override) and override.key_or_group != LAUNCH:
-            raise UserError(
-                f"{override_word(override)} replaces a part of a recipe, but {recipe.stem}.yaml is a saved "
-                "configuration, whose parts are fixed. Start from the experiment, or override single keys"
             )
 
 

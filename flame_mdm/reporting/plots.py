@@ -30,14 +30,7 @@ Curve = Mapping[int, float]
 
 @dataclass
 class Series:
-    """Points of one color, in ascending order.
-
-    Attributes:
-        name: in the legend.
-        points: x and y.
-        spread: half the width of the 95 % interval, by x.
-        kind: line, dashed or dots.
-    """
+    """Points (x, y) of one color, in ascending order, with half widths of 95 % intervals; line, dashed or dots."""
 
     name: str
     points: Sequence[tuple[float, float]]
@@ -47,13 +40,7 @@ class Series:
 
 @dataclass
 class Histogram:
-    """Stacked histogram.
-
-    Attributes:
-        edges: of the bars.
-        counts: by name, one count per bar.
-        unit: of the edges.
-    """
+    """Stacked histogram: edges of the bars and their unit, and one count per bar by name."""
 
     edges: Sequence[float]
     counts: Mapping[str, Sequence[int]]
@@ -62,17 +49,7 @@ class Histogram:
 
 @dataclass
 class Panel:
-    """One pair of axes.
-
-    Attributes:
-        content: series, or a histogram.
-        x: label of the x-axis.
-        y: label of the y-axis.
-        log_x: whether the x-axis is logarithmic.
-        from_zero: whether the x-axis begins at 0.
-        levels: values marked by horizontal lines.
-        legend: whether names are listed below the axes.
-    """
+    """One pair of axes, with their labels; the x-axis may be logarithmic, or begin at 0. `levels` are lines."""
 
     content: Sequence[Series] | Histogram
     x: str = ""

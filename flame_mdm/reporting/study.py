@@ -116,15 +116,12 @@ def tally(files: Sequence[Path]) -> list[dict[str, Any]]:
             pair = counts.setdefault((a, b), {"a": 0, "b": 0, "raters": set()})
             pair[choice] += 1
             pair["raters"].add(rater)
-    return [_pair(a, b, pair["a"], pair["b"], len(pair["raters"])) for (a, b), pair in counts.items()]
-
-
-def _pair(a: str, b: str, wins_a: int, wins_b: int, raters: int) -> dict[str, Any]:
-    share, low, high = wilson(wins_a, wins_a + wins_b)
-    return {
-        **{"a": a, "b": b, "wins_a": wins_a, "wins_b": wins_b, "raters": raters},
-        **{"share_a": share, "interval_a": [max(0.0, low), min(1.0, high)]},
-    }
+    pairs = []
+    for (a, b), pair in counts.items():
+        share, low, high = wilson(pair["a"], pair["a"] + pair["b"])
+        counted = {"a": a, "b": b, "wins_a": pair["a"], "wins_b": pair["b"], "raters": len(pair["raters"])}
+        pairs.append(counted | {"share_a": share, "interval_a": [max(0.0, low), min(1.0, high)]})
+    return pairs
 
 
 def wilson(wins: int, votes: int) -> tuple[float, float, float]:

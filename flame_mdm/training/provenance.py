@@ -46,19 +46,14 @@ class WriteProvenance(Callback):
             },
         }
         if trainer.global_step and (folder / PROVENANCE).exists():
-            self._compare_code(read_json(folder / PROVENANCE, Provenance, "delete it to resume"), facts)
+            before: Provenance = read_json(folder / PROVENANCE, Provenance, "delete it to resume")
+            kinds = {"commit": "code", "changed": "uncommitted changes", "packages": "packages"}
+            if different := [kind for name, kind in kinds.items() if getattr(before, name) != facts[name]]:
+                say(f"resuming with different {' and '.join(different)}: results may differ from an uninterrupted run")
         write_json(folder / PROVENANCE, facts)
         for logger in trainer.loggers:
             log_config(logger, self.config, facts)
         self._introduce(trainer, pl_module, facts)
-
-    @staticmethod
-    def _compare_code(before: Provenance, now: dict[str, Any]) -> None:
-        """Warns if a resumed run continues with other code or packages, since its results may then differ."""
-        kinds = {"commit": "code", "changed": "uncommitted changes", "packages": "packages"}
-        different = [kind for name, kind in kinds.items() if getattr(before, name) != now[name]]
-        if different:
-            say(f"resuming with different {' and '.join(different)}: results may differ from an uninterrupted run")
 
     def _introduce(self, trainer: Trainer, task: Task, facts: dict[str, Any]) -> None:
         count = facts["parameters"]

@@ -8,7 +8,6 @@ from concurrent.futures import ThreadPoolExecutor
 from fractions import Fraction
 from importlib import import_module
 from pathlib import Path
-from types import ModuleType
 from typing import NamedTuple
 
 import numpy as np
@@ -70,7 +69,12 @@ def write_mp4(path: str | Path, motions: Sequence[Shown], size: int = 384, body:
     """Writes the animation of `write_gif` as H.264 video (yuv420p), with no limit on the frame rate."""
     path = Path(path)
     check_any(motions, path)
-    av = video_package(str(path))
+    try:
+        av = import_module("av")
+    except ImportError:
+        raise UserError(
+            f'{path}: MP4 needs the package av. Run pip install "flame-mdm[video]", or write a GIF'
+        ) from None
     fps = max(motion.fps for motion in motions)
     with atomic_write(path) as temporary, av.open(str(temporary), "w", "mp4", {"movflags": "+faststart"}) as file:
         stream = file.add_stream("libx264", Fraction(fps).limit_denominator(1001), {"crf": "20"})
@@ -84,16 +88,6 @@ def write_mp4(path: str | Path, motions: Sequence[Shown], size: int = 384, body:
             frame = av.VideoFrame.from_ndarray(pixels).reformat(format="yuv420p", dst_colorspace=BT709)
             file.mux(stream.encode(frame))
         file.mux(stream.encode())
-
-
-def video_package(name: str) -> ModuleType:
-    """Returns the package av, which writes MP4; the `UserError` without it begins with what needs it."""
-    try:
-        return import_module("av")
-    except ImportError:
-        raise UserError(
-            f'{name}: MP4 needs the package av. Run pip install "flame-mdm[video]", or write a GIF'
-        ) from None
 
 
 def contact_sheet(

@@ -17,7 +17,7 @@ from flame_mdm.reporting.audit import card_of
 from flame_mdm.reporting.settings import LABELS, Sizes, setting_text, values
 from flame_mdm.reporting.study import Ratings, wilson
 from flame_mdm.reporting.tables.format import ABOUT, Cell, Line, Part, Plot, Table, ranks
-from flame_mdm.reporting.tables.specs import PUBLISHED, SWEPT, Evaluation, Lengths, as_list, evaluations, load_mapping
+from flame_mdm.reporting.tables.specs import PUBLISHED, SWEPT, Lengths, as_list, evaluations, load_mapping
 from flame_mdm.runs import made_by
 from flame_mdm.schemas import Checkpoint, Result, Value, read_json, read_result
 
@@ -91,17 +91,18 @@ def _measured(name: str, part: Config, reported: Config | None, results: Path) -
     truths: dict[str, Line] = {}
     missing: list[tuple[str, str]] = []
     for row, needed in evaluations(part):
-        read = [_result(evaluation, results) for evaluation in needed]
-        line = _line(row, read, values, [evaluation.path(results).name for evaluation in needed])
+        paths = [evaluation.path(results) for evaluation in needed]
+        read = [read_result(path) if path.exists() else None for path in paths]
+        line = _line(row, read, values, [path.name for path in paths])
         if not any(read):
             line.state = next(iter(needed[0].absent), "not evaluated")
         for evaluation, result in zip(needed, read, strict=True):
             if result is None:
                 commands = [made_by(path) for path in evaluation.absent.values()] or ["make tables evaluates it"]
                 missing += [(line.label, command) for command in commands]
-        timed = {e.path(results) for e, value in zip(needed, values, strict=True) if value == "seconds_per_sample"}
-        pairs = [(e, result) for e, result in zip(needed, read, strict=True) if result is not None]
-        line.marks = ",".join(dict.fromkeys(marks.of(_conditions(r, e.path(results) in timed)) for e, r in pairs))
+        timed = {path for path, value in zip(paths, values, strict=True) if value == "seconds_per_sample"}
+        pairs = [(path, result) for path, result in zip(paths, read, strict=True) if result is not None]
+        line.marks = ",".join(dict.fromkeys(marks.of(_conditions(r, path in timed)) for path, r in pairs))
         lines.append(line)
         if line.marks and line.marks not in truths:
             truth = Line("Real motions", "real", [_truth(r, v) for r, v in zip(read, values, strict=True)], line.marks)
@@ -128,11 +129,6 @@ def _warnings(lines: Sequence[Line], distances: Sequence[bool], columns: Sequenc
     zero = {label for cells in reals for label, distance, cell in cells if distance and cell and cell.value == 0}
     why = "clips are taken whole, so that both draws of real motions, which are compared, are the same"
     return notes + [("", f"{label} of real motions is 0 by construction: {why}") for label in sorted(zero)]
-
-
-def _result(evaluation: Evaluation, results: Path) -> Result | None:
-    path = evaluation.path(results)
-    return read_result(path) if path.exists() else None
 
 
 def _by_text(lines: Sequence[tuple[str, str]]) -> list[tuple[str, str]]:
@@ -280,19 +276,14 @@ def _print_cells(lines: Sequence[Line], columns: int) -> None:
     for index in range(columns):
         cells = [c for line in lines if not line.kind.startswith("reported") and (c := line.cells[index]) is not None]
         numbers = [abs(cell.value) for cell in cells if cell.value is not None]
-        decimals = _decimals(max(numbers, default=0.0))
+        largest = max(numbers, default=0.0) or 1.0
+        decimals = 3 if 0.1 <= largest < 10 else min(max(2 - math.floor(math.log10(largest)), 1), 6)
         short = all(cell.value == round(cell.value, 1) for cell in cells if cell.value is not None and cell.ci is None)
         for cell in cells:
             if cell.value is not None and not (cell.ci is None and cell.text and short):
                 small = 0 < abs(cell.value) < 10**-decimals
                 digits = 1 - math.floor(math.log10(abs(cell.value))) if small else decimals
                 cell.text = f"{cell.value:.{digits}f}" + (f" ±{cell.ci:.{digits}f}" if cell.ci is not None else "")
-
-
-def _decimals(largest: float) -> int:
-    if largest == 0 or 0.1 <= largest < 10:
-        return 3
-    return min(max(2 - math.floor(math.log10(largest)), 1), 6)
 
 
 def _rank(lines: Sequence[Line], columns: Mapping[str, str]) -> None:

@@ -62,14 +62,7 @@ LEGEND = (
 
 @dataclass
 class Cell:
-    """One cell of a table.
-
-    Attributes:
-        text: as printed.
-        value: the number.
-        ci: half width of its 95 % interval.
-        rank: 1 = best, 2 = second best, 0 = neither.
-    """
+    """Printed text of a cell, its number, half width of the 95 % interval, and rank: 1 = best, 2 = second best."""
 
     text: str
     value: float | None = None
@@ -83,17 +76,11 @@ NEAREST = "nearest"
 
 @dataclass
 class Line:
-    """One row of a table.
+    """One row of a table, of a kind in `KINDS`, with one cell per column; None if there is no value.
 
-    Attributes:
-        label: its name.
-        kind: a key of `KINDS`.
-        cells: one per column; None if there is no value.
-        marks: footnote marks; only rows with the same marks are compared.
-        state: "" if the row is complete and valid, otherwise the reason: "no checkpoint", "NOT VALID".
-        options: numbers for the x-axis of figures, such as num_inference_steps.
-        facts: provenance of its values, for the CSV file and the list below the table.
-        nearest: sorted distances of its motions from the nearest training motion, in meters.
+    Only rows with the same footnote marks are compared. `state` is "" if the row is complete and valid, otherwise the
+    reason: "no checkpoint", "NOT VALID". `options` are numbers for the x-axis of figures, `facts` the provenance of the
+    values, and `nearest` sorted distances of the motions from the nearest training motion, in meters.
     """
 
     label: str
@@ -118,15 +105,10 @@ class Plot:
 
 @dataclass
 class Part:
-    """One table.
+    """One table within the table of a paper.
 
-    Attributes:
-        name: its title within the table of a paper.
-        columns: label -> which values are better, a key of `ARROWS`.
-        lines: its rows.
-        notes: mark and text of each footnote; the mark may be empty.
-        figures: plots of columns.
-        histograms: name -> edges and counts.
+    `columns` are label -> which values are better, a key of `ARROWS`; `notes` mark (may be empty) and text of each
+    footnote; `histograms` name -> edges and counts.
     """
 
     name: str
@@ -188,22 +170,15 @@ def _is_ranked(table: Table) -> bool:
     return any(better != "none" for part in table.parts for better in part.columns.values())
 
 
-def _number(part: Part, index: int) -> str:
-    return f"{index + 1}" if len(part.figures) + len(part.histograms) > 1 else ""
-
-
 def figure_names(table: Table) -> list[tuple[Part, Plot | str, str]]:
     """Returns the figures of a table with their parts and file names, without suffix."""
     names: list[tuple[Part, Plot | str, str]] = []
     for part in table.parts:
-        slug = f"-{_slug(part.name)}" if len(table.parts) > 1 else ""
-        for index, figure in enumerate([*part.figures, *part.histograms]):
-            names.append((part, figure, f"{table.name}{slug}-figure{_number(part, index)}"))
+        slug = re.sub(r"[^a-z0-9]+", "-", f"-{part.name.lower()}").rstrip("-") if len(table.parts) > 1 else ""
+        figures = [*part.figures, *part.histograms]
+        for number, figure in enumerate(figures, 1):
+            names.append((part, figure, f"{table.name}{slug}-figure{number if len(figures) > 1 else ''}"))
     return names
-
-
-def _slug(text: str) -> str:
-    return re.sub(r"[^a-z0-9]+", "-", text.lower()).strip("-")
 
 
 # Markdown -------------------------------------------------------------------------------------------------------------
@@ -251,14 +226,13 @@ def _sources(table: Table) -> list[str]:
         for _, group in groupby(lines, lambda line: [line.facts.get(name) for name in SHARED]):
             some = list(group)
             values = {name: [line.facts[name] for line in some] for name in some[0].facts}
-            facts = ", ".join(f"{name} {_joined(texts)}" for name, texts in values.items() if any(texts))
+            joined = {
+                n: texts[:1] if len(set(texts)) == 1 else [t or "–" for t in texts] for n, texts in values.items()
+            }
+            facts = ", ".join(f"{name} {' / '.join(texts)}" for name, texts in joined.items() if any(values[name]))
             prefix = f"{part.name}: " if len(table.parts) > 1 else ""
             rows.append(f"{prefix}{' / '.join(dict.fromkeys(line.label for line in some))}: {facts}")
     return rows
-
-
-def _joined(values: Sequence[str]) -> str:
-    return values[0] if len(set(values)) == 1 else " / ".join(value or "–" for value in values)
 
 
 def _styled(cell: Cell | None, escape: Callable[[str], str], best: str, second: str) -> str:

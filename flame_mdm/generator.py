@@ -23,23 +23,29 @@ from flame_mdm.sampler_options import SamplerOptions
 from flame_mdm.seeds import seeded_noise
 
 
-class MotionGenerator(nn.Module):
-    """A denoiser, a process, a condition encoder and a representation, and how to sample from them."""
+class Trained:
+    """What all models have that checkpoints hold."""
 
-    noun = "a motion generator"
+    noun = "a model"
     """What its checkpoints hold, for messages."""
-    denoiser: Denoiser
-    process: Process
-    condition: ConditionEncoder
-    representation: Representation
-    sampler_options: SamplerOptions
-    """Defaults of `generate`, from the recipe."""
     config: Config
     """The recipe, saved in checkpoints."""
     facts: dict[str, Any]
     """Facts about the training data for sampling and evaluation: actions, maximum length, fingerprint."""
     steps: int | None = None
     """Number of training steps of the loaded checkpoint; None if unknown."""
+
+
+class MotionGenerator(Trained, nn.Module):
+    """A denoiser, a process, a condition encoder and a representation, and how to sample from them."""
+
+    noun = "a motion generator"
+    denoiser: Denoiser
+    process: Process
+    condition: ConditionEncoder
+    representation: Representation
+    sampler_options: SamplerOptions
+    """Defaults of `generate`, from the recipe."""
 
     @classmethod
     def build(cls, config: Config, representation: Representation, *, actions: Sequence[str] = ()) -> Self:

@@ -406,7 +406,7 @@ def check_torch(path: Path) -> None:
     with path.open("rb") as file:
         if file.read(4) != b"PK\3\4":  # formats of old versions, which are not archives
             return
-    damage = naming(path, *ZIP_ERRORS, OSError, what="damaged, or not a file of torch.save: ")
+    damage = naming(path, *ZIP_ERRORS, OSError, ValueError, what="damaged, or not a file of torch.save: ")
     with damage, zipfile.ZipFile(path) as archive:
         members = archive.infolist()
         if any(member.compress_type for member in members) or sum(m.file_size for m in members) > size:

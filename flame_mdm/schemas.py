@@ -124,18 +124,12 @@ class Cost(Schema):
 
 
 class Measured(Schema):
-    """What an evaluation measures.
+    """What an evaluation measures: `values` and, of real motions, `ground_truth`, by metric; None = not measured.
 
-    Attributes:
-        ground_truth, values: of real motions, and of the motions of the source, by metric; None = not measured.
-        not_computed: reasons, by metric.
-        invalid_because: reasons why the values are not valid; [] = they are.
-        forced: whether motions were generated although real motions do not have the expected values.
-        warnings: about values.
-        cost: per motion.
-        nearest: sorted distances in meters from the nearest training motion, of the "generated" and "real" motions of
-            the first replication, if a metric reads them.
-        seeds: of the draws of metrics, by replication.
+    `not_computed` has reasons by metric; `invalid_because` is [] if the values are valid. They are `forced` if motions
+    were generated although real motions do not have the expected values. `nearest` has sorted distances in meters from
+    the nearest training motion, of the "generated" and "real" motions of the first replication, if a metric reads them;
+    `seeds` those of the draws of metrics, by replication.
     """
 
     ground_truth: dict[str, Value | None] | None
@@ -156,8 +150,7 @@ class Result(Measured):
         quick: whether this is a quick evaluation, not for publication.
         changed: options that differ from the protocol.
         published_split: whether the published split tests on clips seen in training, or has no validation clips.
-        samples_sha256: hash of the files, if motions come from files.
-        baseline: kind, if motions come from a sanity-check baseline.
+        samples_sha256, baseline: hash of the files, or kind of the baseline, if no checkpoint made the motions.
         audit: path of the audit card of the extractor; None = not audited.
         skeleton: None if the data has joint positions.
     """
@@ -214,10 +207,8 @@ class AuditedExtractor(Schema):
 class AuditCard(ClosedSchema):
     """An evaluator audit, as `flame-mdm audit` writes it.
 
-    Attributes:
-        metrics: whether higher values are better; None = values near those of real motions.
-        real: value and half width of its 95 % interval, by metric.
-        truth: agreement with exact attributes: `auc` and `correlation`, by metric.
+    `metrics` says whether higher values are better; None = values near those of `real` motions, with half widths of
+    their 95 % intervals. `truth` is the agreement with exact attributes: `auc` and `correlation`, by metric.
     """
 
     format: Int

@@ -50,13 +50,10 @@ def raise_received() -> None:
 
 
 class StopRequest:
-    """Notes a signal that asks training to stop at the end of a step.
+    """Notes a signal, `signum`, that asks training to stop at the end of a step; 0 = none.
 
     A second SIGINT stops immediately. So does a second SIGTERM, if it comes more than one second after the first, since
     `timeout` sends two at once.
-
-    Attributes:
-        signum: the last signal received; 0 = none.
     """
 
     SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGUSR2)

@@ -19,24 +19,15 @@ from flame_mdm.data.adaptation import KEPT
 from flame_mdm.data.datamodule import MotionDataModule
 from flame_mdm.denoisers import Denoiser
 from flame_mdm.errors import UserError
-from flame_mdm.generator import MotionGenerator
+from flame_mdm.generator import MotionGenerator, Trained
 from flame_mdm.losses import MotionLosses
 from flame_mdm.processes import Process
 from flame_mdm.representations import Representation
 from flame_mdm.seeds import key, normal, seed_generator, seeded_noise, uniform
 
 
-class Task(LightningModule):
+class Task(Trained, LightningModule):
     """Base class of all models that `make train` trains; a recipe names the class in `task._target_`."""
-
-    noun = "a model"
-    """What its checkpoints hold, for messages."""
-    config: Config
-    """The recipe, saved in checkpoints."""
-    facts: dict[str, Any]
-    """Facts about the training data for sampling and evaluation: actions, maximum length, fingerprint."""
-    steps: int | None = None
-    """Number of training steps of the loaded checkpoint; None if unknown."""
 
     def __init__(self, condition: ConditionEncoder, representation: Representation, *, optimizer: Config, seed: int):
         super().__init__()

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, NotRequired
 
 from typing_extensions import TypedDict
 
-from flame_mdm.config import plain
+from flame_mdm.config import moved, plain
 from flame_mdm.errors import UserError
 from flame_mdm.safe_io import atomic_write, parse_json, read_torch
 from flame_mdm.schemas import Number, check_shape
@@ -211,13 +211,7 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
     """
     if path.suffix == ".safetensors":
         return read_model_file(path)
-    try:
-        checkpoint = read_torch(path)
-    except UserError:
-        raise
-    except ValueError as error:
-        raise UserError(f"{path}: damaged, or not a checkpoint of this framework") from error
-    checkpoint = checked(path, checkpoint)
+    checkpoint = checked(path, read_torch(path))
     check_format(path, checkpoint.get(FORMAT_KEY))
     return checkpoint
 
@@ -236,12 +230,6 @@ def without_own_paths(config: Mapping[str, Any]) -> dict[str, Any]:
         config.get("data_root"): "data",
         config.get("run", {}).get("dir"): f"runs/{config['experiment']}/default",
     }
-    own = {folder: other for folder, other in default.items() if folder and Path(folder).is_absolute()}
-
-    def moved(node: Any) -> Any:
-        if isinstance(node, dict):
-            return {name: moved(value) for name, value in node.items()}
-        folder = next((f for f in own if isinstance(node, str) and (node == f or node.startswith(f"{f}/"))), None)
-        return node if folder is None else own[folder] + node.removeprefix(folder)
-
-    return moved(dict(config))
+    return moved(
+        dict(config), {folder: other for folder, other in default.items() if folder and Path(folder).is_absolute()}
+    )

@@ -77,13 +77,10 @@ POOLER = "lm.pooler.dense."
 
 @dataclass
 class Released:
-    """A released network, converted to this framework.
+    """A released network: its `experiments/denoiser` mapping, and state dict.
 
-    Attributes:
-        config: its mapping as in `experiments/denoiser`: `_target_` and sizes.
-        features: in_features, out_features and cond_features, the first arguments of the class.
-        state: its state dict.
-        action_embedding: (actions, C), embedding of action labels, which is part of the condition encoder; or None.
+    `features` are in_features, out_features and cond_features. `action_embedding` (actions, C) belongs to the condition
+    encoder.
     """
 
     config: dict[str, Any]

@@ -69,14 +69,16 @@ def read_saved(path: Path) -> Config:
 
 def movable(config: Config) -> Config:
     """Returns a configuration with `RUN_DIR` for the run directory, so that `run.dir` changes all paths in it."""
-    folder = str(config["run"]["dir"])
+    folders = {str(config["run"]["dir"]): RUN_DIR}
+    return {name: value if name == "run" else moved(value, folders) for name, value in config.items()}
 
-    def moved(node: Any) -> Any:
-        if isinstance(node, dict):
-            return {name: moved(value) for name, value in node.items()}
-        return RUN_DIR + node.removeprefix(folder) if isinstance(node, str) and node.startswith(folder) else node
 
-    return {name: value if name == "run" else moved(value) for name, value in config.items()}
+def moved(node: Any, folders: Mapping[str, str]) -> Any:
+    """Returns a configuration whose paths in a folder are in another one, that of `folders`."""
+    if isinstance(node, dict):
+        return {name: moved(value, folders) for name, value in node.items()}
+    folder = next((f for f in folders if isinstance(node, str) and (node == f or node.startswith(f"{f}/"))), None)
+    return node if folder is None else folders[folder] + node.removeprefix(folder)
 
 
 def instantiate(node: Config, **derived: Any) -> Any:

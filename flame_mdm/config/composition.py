@@ -218,7 +218,7 @@ def _legal(config: Config, override: Override) -> str:
     for depth, part in enumerate(parts):
         if isinstance(node, Mapping) and part in node:
             node = node[part]
-        elif isinstance(node, Mapping) and "_target_" in node and part in parameters(node["_target_"], exact=False):
+        elif isinstance(node, Mapping) and "_target_" in node and part in parameters(node["_target_"]):
             return "++" + line
         elif isinstance(node, list) and part.isdigit() and int(part) < len(node):
             node = node[int(part)]

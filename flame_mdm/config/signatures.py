@@ -144,12 +144,9 @@ def unknown_key(config: Config, parts: Sequence[str], depth: int, node: Any) -> 
     return f"unknown config key '{key}'." + (f" Did you mean {', '.join(names)}?" if names else "")
 
 
-def parameters(target: str, *, where: str = "_target_", exact: bool = True) -> frozenset[str]:
-    """Returns the argument names of a class or function, read from its source; `exact` includes "**", which is any
-    argument.
-    """
-    names = frozenset(signature(target, where))
-    return names if exact else names - {"**"}
+def parameters(target: str) -> frozenset[str]:
+    """Returns the argument names of a class or function, read from its source; "**" stands for any argument."""
+    return frozenset(signature(target, "_target_"))
 
 
 @functools.cache

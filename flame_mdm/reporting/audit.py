@@ -29,11 +29,9 @@ LEGEND = (
 class Seen:
     """How a metric responds to a perturbation.
 
-    Attributes:
-        grade: smallest grade at which, and above which, the paired difference from real motions is not 0; None = none.
-        outside: the same for values outside the 95 % interval of real motions.
-        rewarded: whether the metric rates the strongest grade better than real motions.
-        monotone: whether every stronger grade differs at least as much, within its interval.
+    `grade` is the smallest one at which, and above which, the paired difference from real motions is not 0; `outside`
+    the same for values outside the 95 % interval of real motions; None = none. `rewarded`: the strongest grade is rated
+    better than real motions. `monotone`: every stronger grade differs at least as much, within its interval.
     """
 
     grade: float | None

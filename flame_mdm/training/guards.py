@@ -43,12 +43,9 @@ class BadLoss(Callback):
     """Stops training when a loss is not finite or explodes, before it reaches a checkpoint.
 
     Losses are only copied from the device at the log interval and for a checkpoint, so that steps do not wait for them.
-    The first bad batch is described in `bad_batch.json`: the step, and for each process the number of the batch, the
-    ids of its clips and its loss. Batch and random draws are functions of (seed, number), so it can be reproduced.
-
-    Args:
-        folder: the run directory.
-        factor: a loss greater than this factor times the median of the previous interval is an explosion.
+    The first bad batch is described in `bad_batch.json` in the run directory: the step, and for each process the number
+    of the batch, the ids of its clips and its loss. Batch and random draws are functions of (seed, number), so it can
+    be reproduced. A loss explodes if it exceeds `factor` times the median of the previous interval.
     """
 
     def __init__(self, folder: str, factor: float = 1000.0):

@@ -21,11 +21,8 @@ from flame_mdm.schemas import read_json
 class History(Logger):
     """Appends all logged values to `metrics.jsonl` in the run directory, as lines of JSON with `step`.
 
-    Reports and comparisons read this file, independent of the dashboard.
-
-    Args:
-        folder: the run directory.
-        step: step from which training resumes; later lines of a killed run are dropped.
+    Reports and comparisons read this file, independent of the dashboard. A run that resumes at `step` drops later
+    lines.
     """
 
     def __init__(self, folder: str | Path, step: int = 0):
@@ -81,10 +78,6 @@ class WandbRun(WandbLogger):
     `wandb.json` in the run directory stores the id of the run, its last step, and the number of its rows. Steps that
     are trained again after a kill have the same values and are not logged twice, so `trainer/global_step` never
     decreases.
-
-    Args:
-        save_dir: the run directory.
-        options: of `WandbLogger`.
     """
 
     def __init__(self, save_dir: str, **options: Any):

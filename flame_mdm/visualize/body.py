@@ -111,10 +111,8 @@ class FittedBody:
     """A body with the bone lengths of a clip, and its motion. F frames, B = 28 bones.
 
     Attributes:
-        mesh: the body.
         fit: (22, 3, 3), linear map of each joint's part of the stored mesh to the clip's proportions.
-        joints: (22, 3) of the stored pose with the clip's bone lengths, pelvis at 0.
-        points: (V, 3), the mesh in that pose.
+        joints: (22, 3) of the stored pose with the clip's bone lengths, pelvis at 0; `points` (V, 3) of the mesh in it.
         neutral: (22, 3, 3), rotation of each part of the mesh in the rest pose: of feet until their soles are flat, of
             the head until it is upright.
         turns: (F, B, 3, 3), rotation of each bone from the stored pose to each frame.

@@ -235,10 +235,8 @@ def _spread_label(part: Mapping[str, Any], row: Mapping[str, Any], single: Mappi
 
 def _evaluation(part: Mapping[str, Any], row: Mapping[str, Any], column: Mapping[str, Any]) -> Evaluation:
     keys = {name: row[name] for name in row if name not in ("label", "note")}
-    for name in ("protocol", "split", "extractor", "seed", "data", "replications", "samples", "multimodality"):
-        for level in (part, row, column):
-            if name in level:
-                keys[name] = level[name]
+    for level in (part, row, column):
+        keys |= {name: level[name] for name in Options.model_fields if name in level}
     if "ckpt" in keys:
         keys.pop("data", None)  # a checkpoint names its data set
     return Evaluation(row["label"], keys)

@@ -77,7 +77,6 @@ def hours(operations: float, steps: int, rate: float) -> float:
 
 
 def main() -> None:
-    """Prints a row per recipe."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("recipes", nargs="+")
     parser.add_argument("--tflops", type=float, default=2.7, help="sustained rate, 10^12 operations per second")

@@ -51,12 +51,10 @@ def machine() -> dict[str, str | int]:
 
 
 def child(name: str, out: str, *words: str) -> None:
-    """Measures one section and writes it as JSON."""
     Path(out).write_text(json.dumps(importlib.import_module(name).measure(*words)))
 
 
 def run(name: str, *words: str) -> dict[str, Any]:
-    """Returns a section that is measured in another process."""
     out = PAGE.with_suffix(f".{name}.part")
     try:
         line = [sys.executable, __file__, "--child", name, str(out), *words]
@@ -69,7 +67,6 @@ def run(name: str, *words: str) -> dict[str, Any]:
 
 
 def render(sections: dict[str, Any]) -> str:
-    """Returns the page of the measured sections."""
     order = sorted(sections, key=lambda name: ("script" in sections[name], name.endswith("_cuda"), _rank(name)))
     machines = list(dict.fromkeys(json.dumps(sections[name]["machine"]) for name in order))
     lines = [HEAD, "## In short\n", *(f"- {sections[name]['summary']}" for name in order), "\n## Machine\n"]
@@ -90,7 +87,6 @@ def _rank(name: str) -> int:
 
 
 def main(*words: str) -> None:
-    """Measures the chosen sections and writes the page after each."""
     options = dict(word.split("=", 1) for word in words)
     device = options.get("device") or "cpu"
     if device not in ("cpu", "cuda"):

@@ -56,7 +56,6 @@ def seconds(run: Callable[[], Tensor], repeats: int, device: str) -> float:
 
 
 def options(sampler: str, steps: int) -> SamplerOptions:
-    """Returns the options of a run."""
     return SamplerOptions(sampler=sampler, num_inference_steps=steps)
 
 
@@ -117,7 +116,6 @@ def measure_steps(denoise: Denoise, args: argparse.Namespace) -> list[Row]:
 
 
 def measure_samplers(denoise: Denoise, args: argparse.Namespace) -> list[Row]:
-    """Returns one row per sampler."""
     fixed, mask, cond = inputs(args.batch, args)
     guided = classifier_free_guidance(denoise, args.guidance_scale, args.features)
     counted = [CountedDenoise(guided) for _ in RUNS]
@@ -138,7 +136,6 @@ def measure_samplers(denoise: Denoise, args: argparse.Namespace) -> list[Row]:
 
 @torch.no_grad()
 def measure(*words: str) -> Section:
-    """Measures the three tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--batch", type=int, default=4)
     parser.add_argument("--frames", type=int, default=60)

@@ -38,7 +38,6 @@ def body(content: Section) -> str:
 
 
 def show(content: Section) -> None:
-    """Prints a section."""
     print(f"{body(content)}\n\n{content['summary']}")
 
 

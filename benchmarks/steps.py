@@ -72,7 +72,6 @@ class Peer(nn.Module):
 
 
 def peer_step(width: int, layers: int, device: str) -> Callable[[MotionBatch], None]:
-    """Returns a step of the plain PyTorch loop."""
     model = Peer(width, layers).to(device).train()
     optimizer = torch.optim.AdamW(model.parameters(), 1e-4)
 
@@ -229,7 +228,6 @@ def recipe_hours(rate: float) -> list[Row]:
 
 
 def measure(*words: str) -> Section:
-    """Measures on the device in `words`."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--device", choices=["cpu", "cuda"], default="cpu")
     parser.add_argument("--quick", action="store_true", help="tiny sizes, which show only that everything runs")

@@ -109,7 +109,6 @@ class Run:
 
     @property
     def samples(self) -> Path | None:
-        """Folder of the newest samples."""
         return newest_samples(self.folder, "motion_000.npz")
 
     @property

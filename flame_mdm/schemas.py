@@ -174,7 +174,6 @@ class Result(Measured):
 
     @property
     def stand_in_skeleton(self) -> bool:
-        """Whether joints are those of a stand-in skeleton."""
         return self.skeleton is not None and self.skeleton.stand_in
 
 
@@ -303,5 +302,4 @@ def read_json(path: Path, kind: type[T] | Any, remedy: str = "") -> T:
 
 
 def read_result(path: Path) -> Result:
-    """Returns a result of `flame-mdm evaluate`."""
     return read_json(path, Result, "delete it, then run `flame-mdm evaluate` or `flame-mdm tables` again")

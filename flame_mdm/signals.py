@@ -63,18 +63,15 @@ class StopRequest:
         self.handlers: dict[int, Any] = {}
 
     def install(self) -> None:
-        """Replaces the handlers of `SIGNALS`."""
         for signum in self.SIGNALS:
             self.handlers[signum] = signal.signal(signum, self.note)
 
     def restore(self) -> None:
-        """Installs the previous handlers again."""
         for signum, handler in self.handlers.items():
             signal.signal(signum, handler)
         self.handlers = {}
 
     def note(self, signum: int, frame: FrameType | None) -> None:
-        """Handles a signal."""
         repeated = self.signum == signum and time.monotonic() > self.time + 1
         if self.signum and (signum == signal.SIGINT or (signum == signal.SIGTERM and repeated)):
             kill_children()

@@ -70,7 +70,6 @@ class Task(Trained, LightningModule):
         return sorted({*data.captions(), *prompts}), data.folder.parent / "text"
 
     def make_optimizer(self) -> torch.optim.Optimizer:
-        """Returns the optimizer of the recipe with all trainable parameters."""
         return instantiate(self.optimizer, params=[p for p in self.parameters() if p.requires_grad])
 
     def configure_optimizers(self) -> OptimizerLRScheduler:
@@ -209,7 +208,6 @@ class MotionGeneration(MotionGenerator, Task):
         return self.loss_terms(batch, self.condition(batch), u, noise)
 
     def validation_step(self, batch: MotionBatch, batch_idx: int) -> None:
-        """Accumulates the validation losses."""
         for name, value in self.losses_of(batch).items():
             if name not in self.val_losses:
                 self.val_losses[name] = MeanMetric().to(self.device)

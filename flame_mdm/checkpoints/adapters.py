@@ -154,7 +154,6 @@ def _changes(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
 def _merge(
     state: dict[str, Tensor], changes: Mapping[str, Tensor], rows: Sequence[int], strength: float, path: str | Path
 ) -> None:
-    """Adds changes, as in an adapter file, to weights."""
     try:
         for name in {name.rpartition(".")[0] for name in changes}:
             parts = {key.rpartition(".")[2]: part for key, part in changes.items() if key.rpartition(".")[0] == name}
@@ -164,7 +163,6 @@ def _merge(
 
 
 def _read(path: Path) -> tuple[About, dict[str, Tensor]]:
-    """Returns the description and the tensors of an adapter file."""
     regular_file(path)
     metadata, changes = read_safetensors(path)
     if ADAPTER not in metadata:

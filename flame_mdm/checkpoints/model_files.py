@@ -190,12 +190,10 @@ def write_model_file(
 
 
 def content_sha256(text: str, state: Mapping[str, Tensor]) -> str:
-    """Returns the sha256 of the recipe (JSON) and the weights of a model file."""
     return hashlib.sha256(f"{text}\n{state_sha256(state)}".encode()).hexdigest()
 
 
 def state_sha256(state: Mapping[str, Tensor]) -> str:
-    """Returns the sha256 of names, types, shapes and values of weights."""
     import torch
 
     digest = hashlib.sha256()

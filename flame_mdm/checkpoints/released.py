@@ -163,7 +163,6 @@ def _checked(
     state: dict[str, Tensor],
     action_embedding: Tensor | None = None,
 ) -> Released:
-    """Checks names and shapes of weights against a network with these options."""
     with torch.device("meta"):
         expected = network(*features, **options)
     load_strictly(expected, state, "released weights", assign=True)
@@ -359,7 +358,6 @@ def _model(
 
 
 def _motion_clip(state: Mapping[str, Tensor], num_heads: int | None) -> Task:
-    """Imports FLAME's motion-CLIP, with the class named by its recipe."""
     from hydra.utils import get_class
 
     sizes = [] if num_heads is None else [f"task.network.num_heads={num_heads}"]
@@ -409,7 +407,6 @@ def _options(path: Path) -> Mapping[str, Any]:
 
 
 def _statistics(folder: Path) -> tuple[Tensor, Tensor]:
-    """Reads mean and standard deviation of the training data."""
     statistics = []
     for name in ("Mean.npy", "Std.npy"):
         try:

@@ -32,7 +32,6 @@ class AdaptSettings(ModelSettings):
 
 
 def main(settings: AdaptSettings) -> None:
-    """Trains the adapter."""
     if settings.source is None or settings.name is None:
         raise UserError("name the folder of motions and the adapter: flame-mdm adapt CKPT source=my_clips name=limp")
     file = settings.model_file()

@@ -35,7 +35,6 @@ class AuditSettings(DataSettings):
 
 
 def main(settings: AuditSettings) -> None:
-    """Audits an evaluator, or renders existing cards."""
     out = Path(settings.out)
     if settings.cards is not None:
         if len(settings.cards) > 2:

@@ -47,7 +47,6 @@ class BenchmarkSettings:
 
 
 def main(settings: BenchmarkSettings) -> None:
-    """Trains and evaluates the models listed in a file of experiments/benchmark, and writes a report page."""
     names = sorted(path.stem for path in (EXPERIMENTS / "benchmark").glob("*.yaml"))
     if settings.exp not in names:
         raise UserError(f"no benchmark named. Add EXP=NAME, one of: {', '.join(names)}")

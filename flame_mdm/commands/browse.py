@@ -32,7 +32,6 @@ class BrowseSettings(BodySettings, PreparedSettings):
 
 
 def main(settings: BrowseSettings) -> None:
-    """Prepares the data set if needed, and writes the page."""
     check_words(settings)
     node = settings.data_node(settings.source)
     if settings.clips < 1:

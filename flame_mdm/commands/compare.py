@@ -50,7 +50,6 @@ class CompareSettings(BodySettings):
 
 
 def main(settings: CompareSettings) -> None:
-    """Writes the requested page, or counts ratings."""
     if (settings.runs is None) == (settings.ratings is None):
         raise UserError('give either runs="A B" to compare runs, or ratings="x.json y.json" to count ratings')
     check_words(settings)
@@ -117,7 +116,6 @@ def motions(compared: Sequence[ComparedRun], settings: CompareSettings) -> list[
 
 
 def _read(folder: Path) -> dict[Prompt, Motion]:
-    """Returns the motions of a folder; equal captions are numbered."""
     from flame_mdm.formats.readers import read
 
     files = [path for path in sorted(folder.iterdir()) if path.suffix.lower() in MOTIONS and path.name[0] != "."]

@@ -42,7 +42,6 @@ class ConvertSettings(BodySettings, FileSettings):
 
 
 def main(settings: ConvertSettings) -> None:
-    """Converts one file or a folder."""
     if settings.motion is None or settings.out is None:
         raise UserError("name an input and an output file: flame-mdm convert motion.npz walk.bvh")
     check_words(settings)

@@ -29,7 +29,6 @@ class DemoSettings:
 
 
 def main(settings: DemoSettings) -> None:
-    """Serves the page until interrupted."""
     if not 0 <= settings.port <= 65535:
         raise UserError(f"port={settings.port}: give a number from 0 to 65535; 0 is any free port")
     if find_spec("gradio") is None:

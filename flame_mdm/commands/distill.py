@@ -37,7 +37,6 @@ class DistillSettings(ModelSettings):
 
 
 def main(settings: DistillSettings) -> None:
-    """Trains the student, or resumes the run in its directory."""
     recipe = student_recipe(settings)
     with tempfile.TemporaryDirectory() as folder:  # processes that Lightning starts read the file, too
         path = Path(folder, "student.yaml")
@@ -47,7 +46,6 @@ def main(settings: DistillSettings) -> None:
 
 
 def student_recipe(settings: DistillSettings) -> Config:
-    """Returns the recipe of a student."""
     file = settings.model_file()
     from flame_mdm.training.distillation import read_teacher
 

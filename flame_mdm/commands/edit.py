@@ -43,7 +43,6 @@ IN_NAME = (
 
 
 def main(settings: EditSettings) -> None:
-    """Edits a motion, and writes the original and the results."""
     request = settings.request(editing=True)
     if settings.motion is None:
         raise UserError("no motion to edit. Give motion=FILE (.npz, .bvh, .json, .npy) or motion=dataset:id")

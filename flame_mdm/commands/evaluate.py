@@ -28,7 +28,6 @@ class EvaluateSettings(EvaluationKeys, SamplerOptions, DataSettings, ModelSettin
 
 
 def main(settings: EvaluateSettings) -> None:
-    """Evaluates what the settings name, and writes the result."""
     check_device(settings.device)
     nodes = settings.nodes if settings.data is not None else {"data": None, "representation": None}
     request = EvaluationRequest.of(vars(settings) | nodes)

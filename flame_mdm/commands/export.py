@@ -23,7 +23,6 @@ class ExportSettings(AdaptedSettings):
 
 
 def main(settings: ExportSettings) -> None:
-    """Writes the model file."""
     if settings.ckpt is None or settings.out is None:
         raise UserError("name a checkpoint and an output file: flame-mdm export CKPT model.safetensors")
     if settings.format not in ("safetensors", "onnx"):

@@ -33,7 +33,6 @@ class ImportSettings:
 
 
 def main(settings: ImportSettings) -> None:
-    """Writes the model file of a released checkpoint."""
     if settings.kind not in KINDS:
         raise UserError(f"unknown kind of released model: {settings.kind}. Use {', '.join(KINDS[:-1])} or mclip")
     if settings.file is None or settings.out is None:

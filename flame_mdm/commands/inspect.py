@@ -51,7 +51,6 @@ class InspectSettings(BodySettings, FileSettings, PreparedSettings):
 
 
 def main(settings: InspectSettings) -> None:
-    """Prints faults, writes the page, and exits with 3 if there are any."""
     if settings.clips < 1:
         raise UserError(f"clips={settings.clips}: must be at least 1")
     check_words(settings)
@@ -86,7 +85,6 @@ def main(settings: InspectSettings) -> None:
 
 
 def _files(name: str) -> list[Path]:
-    """Returns a motion file, or the motion files of a folder."""
     path, kinds = Path(name), ", ".join(ENDINGS)
     if not path.exists():
         raise UserError(f"{path}: no such file. Give a motion file ({kinds}), a folder of them, or a prepared data set")

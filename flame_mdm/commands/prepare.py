@@ -26,7 +26,6 @@ class PrepareSettings(DataSettings):
 
 
 def main(settings: PrepareSettings) -> None:
-    """Writes or verifies the store of a data set."""
     node = settings.data_node(settings.source)
     if settings.captions is not None:
         if "captions" not in node["source"]:

@@ -24,7 +24,6 @@ class PushSettings(ModelSettings):
 
 
 def main(settings: PushSettings) -> None:
-    """Writes the folder and uploads it."""
     if settings.ckpt is None or settings.repository is None:
         raise UserError("name a checkpoint and a repository: flame-mdm push CKPT user/name")
     file = settings.model_file()

@@ -24,7 +24,6 @@ class ReportSettings(BodySettings):
 
 
 def main(settings: ReportSettings) -> None:
-    """Writes the report of each run."""
     if settings.runs is None:
         raise UserError("no run named. Name a run directory: flame-mdm report runs/synthetic/mdm/default")
     check_words(settings)

@@ -133,7 +133,6 @@ IN_NAME = (
 
 
 def main(settings: SampleSettings) -> None:
-    """Samples the requested motions and writes them."""
     request = settings.request()
     if settings.scorer is not None and (request.kind != "text" or settings.candidates == 1):
         raise UserError(f"scorer={settings.scorer} chooses among motions for a text: give text=... and candidates=8")
@@ -204,7 +203,6 @@ def _folders(
 
 
 def _distance(targets: Any, model: MotionGenerator, motions: Sequence[Motion]) -> str:
-    """Returns a line that tells how far motions are from their targets."""
     import numpy as np
 
     from flame_mdm.sampling.targets import errors, read_targets

@@ -43,7 +43,6 @@ class TablesSettings:
 
 
 def main(settings: TablesSettings) -> None:
-    """Runs missing evaluations and renders the tables; exits with `INVALID` if a row is not valid."""
     from flame_mdm.reporting.page import page, render
     from flame_mdm.reporting.tables.build import NOT_VALID, build
     from flame_mdm.reporting.tables.format import write

@@ -57,7 +57,6 @@ def check_kind(key: str, value: Any, annotation: str) -> None:
 
 
 def _alternatives(annotation: ast.expr) -> list[ast.expr]:
-    """Returns the members of a union; otherwise the annotation itself."""
     if isinstance(annotation, ast.BinOp):
         return [*_alternatives(annotation.left), *_alternatives(annotation.right)]
     if isinstance(annotation, ast.Constant) and isinstance(annotation.value, str):  # a forward reference

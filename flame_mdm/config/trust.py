@@ -49,7 +49,6 @@ def foreign(config: Config) -> dict[str, str]:
 
 
 def _is_of_kind(target: str, kind: str) -> bool:
-    """Returns whether a class belongs to a part."""
     modules = MODULES.get(kind, ())
     if modules and target in _shipped(kind):
         return True
@@ -64,6 +63,5 @@ def _is_of_kind(target: str, kind: str) -> bool:
 
 @functools.cache
 def _shipped(kind: str) -> frozenset[str]:
-    """Returns the classes that the files of a part in `experiments/` name."""
     nodes = [node for file in (EXPERIMENTS / kind).glob("*.yaml") for _, node in walk(read_yaml(file))]
     return frozenset(node["_target_"] for node in nodes if "_target_" in node)

@@ -74,7 +74,6 @@ class Server(uvicorn.Server):
     """Ends the streams to open pages before it waits for the running requests."""
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
-        """Stops the server; `sockets` are those it listens on."""
         self.config.app.closing.set()  # type: ignore[union-attr]
         await super().shutdown(sockets)
 

@@ -89,7 +89,6 @@ class Guard:
         self.closing = asyncio.Event()
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answers a request; see ASGI for the arguments."""
         if scope["type"] == "lifespan":
             return await self.app(scope, receive, send)
         if scope["type"] != "http":
@@ -142,7 +141,6 @@ class Guard:
             raise Refused(HTTPStatus.FORBIDDEN, "this request comes from a page of another site")
 
     def _check_content(self, method: str, path: str, body: bytes) -> None:
-        """Raises `Refused` if the page itself would not send this."""
         try:
             if method in ("GET", "HEAD") and READ.fullmatch(path) and not body:
                 return

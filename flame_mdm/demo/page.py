@@ -180,7 +180,6 @@ def _layout(studio: Studio) -> SimpleNamespace:
 def _result(
     ui: SimpleNamespace, studio: Studio, device: str | None, request: DemoRequest, motions: Sequence[Motion]
 ) -> dict[Any, Any]:
-    """Returns the values of the components that show the motions of a request."""
     kind = studio.model(request.model).conditioned_on
     names = [f"Motion {number + 1}" * (len(motions) > 1) for number in range(len(motions))]
     scene = [replace(motion, id=name) for motion, name in zip(motions, names, strict=True)]

@@ -164,7 +164,6 @@ class DemoRequest(BaseModel):
         return "\n".join(lines)
 
     def python(self, kind: str, device: str) -> str:
-        """Returns the lines of Python that make the same motions."""
         model, _, adapter = self.model.partition(PLUS)
         options = f", {device!r}" * (device != "cpu") + f", adapter={adapter!r}" * bool(adapter)
         lines = ["import flame_mdm", "", f"model = flame_mdm.load({model!r}{options})"]

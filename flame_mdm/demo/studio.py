@@ -111,7 +111,6 @@ class Studio:
         return checked(DemoRequest, request.model_dump() | {"text": text})
 
     def advice(self, request: DemoRequest) -> list[str]:
-        """Returns warnings of words that the model has never seen."""
         model = self.model(request.model)
         if model.conditioned_on != "text":
             return []

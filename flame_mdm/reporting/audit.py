@@ -62,7 +62,6 @@ def seen(card: AuditCard, perturbation: AuditedPerturbation, metric: str) -> See
 
 
 def card_name(card: AuditCard) -> str:
-    """Returns the name of the files of a card."""
     return _name(card.data.dataset, card.extractor.sha256 if card.extractor else None)
 
 
@@ -111,7 +110,6 @@ def write_card(cards: Sequence[AuditCard], out: Path) -> list[Path]:
 
 
 def _metrics(cards: Sequence[AuditCard]) -> list[str]:
-    """Returns the metrics of all cards, exact attributes last."""
     names = dict.fromkeys(metric for card in cards for metric in card.metrics)
     return sorted(names, key=lambda name: name.startswith("attributes"))
 
@@ -168,7 +166,6 @@ def findings(card: AuditCard) -> list[str]:
 
 
 def _cell(card: AuditCard, perturbation: AuditedPerturbation | None, metric: str) -> tuple[str, str]:
-    """Returns the text of a cell of the summary, and its class."""
     response = seen(card, perturbation, metric) if perturbation and metric in card.metrics else None
     if response is None or response.grade is None:
         return ("not computed", "faint") if response is None else ("–", "faint")

@@ -79,7 +79,6 @@ def write_page(
     title: str,
     body: Mesh | None = None,
 ) -> None:
-    """Writes a page that shows some clips of a store."""
     from flame_mdm.visualize import write_player
 
     write_player(
@@ -126,7 +125,6 @@ def write_clips(
 
 
 def describe(store: Store) -> Markup:
-    """Returns the header of the page as HTML: statistics of the whole store."""
     info, fps = store.info, store.info["fps"]
     splits = {name: [clip for clip in store.clips if clip.split == name] for name, n in info["clips"].items() if n}
     counts = Counter(info["actions"][clip.action] for clip in store.clips if clip.action is not None)

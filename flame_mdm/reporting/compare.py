@@ -147,7 +147,6 @@ class Difference(NamedTuple):
 
     @property
     def cells(self) -> list[str]:
-        """The row of a table."""
         intervals = [
             f"[{number(x[0])}, {number(x[1])}]" if x else "–" for x in (self.over_replications, self.over_motions)
         ]
@@ -237,7 +236,6 @@ def tested(columns: Sequence[tuple[str, Result]]) -> list[tuple[str, list[list[s
 
 
 def _evaluations(runs: Mapping[str, Run]) -> list[tuple[str, list[str], list[list[str]], list[Any], list[Any]]]:
-    """Returns title, column titles, rows, notes and differences of each table."""
     tables = []
     for title, columns in grouped(runs).items():
         results = [result for _, result in columns]

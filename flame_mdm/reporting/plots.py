@@ -119,7 +119,6 @@ class _Axis:
 
 
 def _drawn(panel: Panel) -> dict[str, Any] | None:
-    """Returns the template values of a panel; None if it has no points."""
     histogram = panel.content if isinstance(panel.content, Histogram) else None
     series = [] if isinstance(panel.content, Histogram) else panel.content
     points = {s.name: [(x, y) for x, y in s.points if x > 0 or not panel.log_x] for s in series}
@@ -170,7 +169,6 @@ def _drawn(panel: Panel) -> dict[str, Any] | None:
 
 
 def _bars(histogram: Histogram, at: Any) -> list[tuple[int, str, str, str, str, str]]:
-    """Returns color, left, top, width, height and tooltip of each bar."""
     bars = []
     for k, (begin, end) in enumerate(zip(histogram.edges, histogram.edges[1:], strict=False)):
         base = 0

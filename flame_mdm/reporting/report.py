@@ -61,7 +61,6 @@ def write_report(folder: Path, mesh: Mesh | None = None) -> Path:
 
 
 def last(curve: Curve) -> float | None:
-    """Returns the last value of a curve; None if it is empty."""
     return curve[max(curve)] if curve else None
 
 
@@ -96,7 +95,6 @@ def _player(run: Run, body: Mesh | None) -> str:
 
 
 def _curves(run: Run, name: str, families: list[str]) -> tuple[dict[str, Curve], dict[str, Curve]]:
-    """Returns the curves of a chart, and the half widths of their intervals."""
     lines: dict[str, Curve] = {family: run.curves[f"{family}/{name}"] for family in families}
     return lines, {family: run.curves.get(f"{family}/{name}/ci", {}) for family in families}
 
@@ -117,7 +115,6 @@ def charted(curves: Mapping[str, Curve]) -> dict[str, dict[str, list[str]]]:
 
 
 def constants(curves: Mapping[str, Curve]) -> dict[str, float]:
-    """Returns the values of constant curves, by name."""
     values = {
         name: set(curve.values()) for name, curve in curves.items() if len(curve) > 1 and not name.endswith("/ci")
     }
@@ -130,14 +127,12 @@ def _values(result: Result) -> list[list[str]]:
 
 
 def evaluation_title(result: Result) -> str:
-    """Returns the protocol, data and extractor of a result, as a title."""
     measured = f", extractor {result.extractor.sha256[:8]}" if result.extractor else ""
     protocol, data = result.protocol, result.data
     return f"{protocol.name} version {protocol.version}, {data.dataset} {result.split}{measured}"
 
 
 def sampling(result: Result) -> str:
-    """Describes how the evaluated motions were sampled."""
     checkpoint = result.checkpoint
     if checkpoint is None:
         return "motions from other systems"
@@ -163,7 +158,6 @@ def marks(result: Result) -> list[str]:
 
 
 def printed(value: Value | None) -> str:
-    """Returns the value of a metric with its interval."""
     return interval(value.mean, value.ci) if value else "–"
 
 

@@ -77,7 +77,6 @@ def value(config: Config, key: str) -> Any:
 
 
 def setting_text(value: Any) -> str:
-    """Returns the value of a hyperparameter as text."""
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, list | tuple):

@@ -118,7 +118,6 @@ def _about(model: MotionGeneration, captions: Sequence[str], name: str, rank: in
 
 
 def _recipe(model: MotionGeneration, captions: Sequence[str], name: str, out: Path, overrides: Sequence[str]) -> Config:
-    """Returns `experiments/adapt.yaml` with the parts of the base."""
     if own := [word for word in overrides if word.partition(".")[0] in OF_BASE]:
         raise UserError(f"{own[0]}: an adaptation keeps the {own[0].partition('.')[0]} of its base. Drop it")
     config = resolve(plan_composition(ConfigSource(EXPERIMENTS, "adapt"), [quoted(f"run.dir={out}"), *overrides]))
@@ -173,7 +172,6 @@ class _Samples(MotionSource):
 
 
 def _comparison(name: str, data: LessonData, before: MotionGeneration, after: MotionGeneration) -> str:
-    """Returns the page that compares motions and losses of two models."""
     data.setup("fit")
     clips, made_by = data.train.clips, before.representation
     own, kept = (rows[:: -(-len(rows) // COMPARED)] for rows in data.halves())

@@ -306,7 +306,6 @@ class SampleMotions(Callback):
 
     @property
     def texts(self) -> list[str]:
-        """The prompts without their requested attributes."""
         return [text for text, _ in self.prompts]
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:

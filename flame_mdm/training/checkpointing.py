@@ -57,7 +57,6 @@ class AtomicCheckpoints(TorchCheckpointIO):
         return resumed.content
 
     def remove_checkpoint(self, path: Any) -> None:
-        """Removes a checkpoint, which is a file directly in the folder."""
         if directly_in(self.folder, path) and Path(path).is_file():
             Path(path).unlink()
 

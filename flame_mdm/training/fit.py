@@ -114,7 +114,6 @@ def check_devices(trainer: Config) -> None:
 
 
 def _requeue() -> None:
-    """Requeues the SLURM job of this process."""
     job = os.environ.get("SLURM_JOB_ID")
     if job is None:
         return

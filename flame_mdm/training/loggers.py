@@ -32,12 +32,10 @@ class History(Logger):
 
     @property
     def name(self) -> str:
-        """Name of the logger."""
         return "history"
 
     @property
     def version(self) -> str:
-        """Always "", since a run has one history."""
         return ""
 
     @rank_zero_only
@@ -46,7 +44,6 @@ class History(Logger):
 
     @rank_zero_only
     def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:
-        """Appends a line."""
         if not self.begun:
             kept = [line for line in records(self.path) if line["step"] <= self.step]
             write_text(self.path, "".join(json.dumps(line) + "\n" for line in kept))
@@ -60,7 +57,6 @@ class TensorBoardRun(TensorBoardLogger):
 
     @rank_zero_only
     def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:
-        """Logs numbers at a step."""
         super().log_metrics({name: value for name, value in metrics.items() if name != "epoch"}, step)
 
 
@@ -109,7 +105,6 @@ class WandbRun(WandbLogger):
 
 
 def log_config(logger: Logger, config: Config, facts: Mapping[str, Any]) -> None:
-    """Logs configuration and provenance to the dashboard."""
     if isinstance(logger, TensorBoardLogger):
         for name, content in (("config", config), ("provenance", facts)):
             text = OmegaConf.to_yaml(OmegaConf.create(dict(content)))
@@ -119,7 +114,6 @@ def log_config(logger: Logger, config: Config, facts: Mapping[str, Any]) -> None
 
 
 def log_table(logger: Logger, name: str, head: Sequence[str], rows: Sequence[Sequence[Any]], step: int) -> None:
-    """Logs a table to the dashboard."""
     if isinstance(logger, TensorBoardLogger):
         lines = [head, ["---"] * len(head), *rows]
         logger.experiment.add_text(name, "\n".join(f"| {' | '.join(map(str, line))} |" for line in lines), step)
@@ -128,7 +122,6 @@ def log_table(logger: Logger, name: str, head: Sequence[str], rows: Sequence[Seq
 
 
 def log_video(logger: Logger, name: str, gif: Path, step: int) -> None:
-    """Logs an animation to the dashboard."""
     if isinstance(logger, TensorBoardLogger):
         from PIL import Image
         from tensorboard.compat.proto.summary_pb2 import Summary  # type: ignore[attr-defined]

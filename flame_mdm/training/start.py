@@ -47,7 +47,6 @@ def train(config: Config) -> None:
 
 
 def _same_run(folder: Path, config: Config) -> None:
-    """Raises `UserError` if the folder holds a run with another configuration."""
     if not (folder / "config.yaml").exists():
         return
     saved, requested = flatten(movable(read_saved(folder / "config.yaml"))), flatten(movable(config))

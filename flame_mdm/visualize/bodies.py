@@ -72,7 +72,6 @@ def load_body(name: str) -> Mesh:
 
 
 def _anny(name: str, options: list[str]) -> Path:
-    """Returns the file of Anny's figure; makes it if it does not exist."""
     shape = dict(SHAPE)
     for option in options:
         key, _, value = option.partition("=")
@@ -123,7 +122,6 @@ def bake(shape: dict[str, float]) -> dict[str, np.ndarray]:
 
 
 def _owner(bone: str) -> int:
-    """Returns the joint of SMPL that a bone of Anny follows."""
     name, _, side = bone.partition(".")
     for part, beginnings in PARTS.items():
         if name.startswith(tuple(beginnings.split())):

@@ -102,7 +102,6 @@ def packed(
 
 @cache
 def mannequin() -> Mesh:
-    """Returns the mesh of the mannequin, the default body."""
     return Mesh(MANNEQUIN)
 
 

@@ -349,7 +349,6 @@ def _caption(texts: Sequence[str], width: int, lines: int, size: int) -> Image.I
 
 
 def _below(image: Image.Image, caption: Image.Image) -> Image.Image:
-    """Returns the image with its caption below."""
     taller = Image.new("RGB", (image.width, image.height + caption.height), PAPER)
     taller.paste(image)
     taller.paste(caption, (0, image.height))

@@ -83,7 +83,6 @@ class _Marks:
 
 
 def _measured(name: str, part: Config, reported: Config | None, results: Path) -> Part:
-    """Builds a table of measured rows, followed by those of a paper."""
     columns = {label: column.get("better", "none") for label, column in part["columns"].items()}
     values = [column["value"] for column in part["columns"].values()]
     marks = _Marks()
@@ -166,7 +165,6 @@ def _conditions(result: Result, timed: bool) -> dict[str, str]:
 
 
 def _joints_of(result: Result) -> str:
-    """Describes the skeleton of joints that were computed from SMPL's rotations."""
     if result.stand_in_skeleton:
         return "joints of a stand-in skeleton, whose bones are not SMPL's"
     smpl = result.skeleton and result.skeleton.smpl_sha256
@@ -174,7 +172,6 @@ def _joints_of(result: Result) -> str:
 
 
 def _left_out(excluded: Mapping[str, int]) -> str:
-    """Describes the clips that were left out of a data set, by reason."""
     listed = ", ".join(f"{count:,} {reason}" for reason, count in excluded.items())
     return f"excluded from the data set: {listed}" if listed else ""
 
@@ -309,7 +306,6 @@ def _rank(lines: Sequence[Line], columns: Mapping[str, str]) -> None:
 def _reported(
     reported: Config, columns: Mapping[str, str], values: Sequence[str], part: str
 ) -> tuple[list[Line], list[tuple[str, str]]]:
-    """Returns the rows of a paper, and their footnotes."""
     notes: dict[str, str] = {}
     lines = []
     for row in reported["rows"]:
@@ -373,7 +369,6 @@ def _hyperparameters(name: str, part: Config, reported: Config | None, sizes: Si
 
 
 def _lengths(name: str, part: Config, results: Path) -> Part:
-    """Builds a table of the motion lengths of data sets."""
     columns = dict.fromkeys(["motions", "hours", "shortest", "median", "mean", "longest"], "none")
     lines, histograms = [], {}
     notes = [("", "lengths are in frames, at the frame rate of each data set")]

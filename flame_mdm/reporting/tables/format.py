@@ -185,7 +185,6 @@ def figure_names(table: Table) -> list[tuple[Part, Plot | str, str]]:
 
 
 def markdown(table: Table) -> str:
-    """Returns the table with its footnotes and figures as Markdown."""
     page = f"# {markdown_text(table.title)}\n"
     for part in table.parts:
         page += f"\n## {markdown_text(part.name)}\n\n" if len(table.parts) > 1 else "\n"
@@ -312,7 +311,6 @@ def _plain(value: float | None) -> str:
 
 
 def fragment(table: Table) -> Markup:
-    """Returns the table as HTML, the body of a page."""
     figures = {part.name: [name for owner, _, name in figure_names(table) if owner is part] for part in table.parts}
     values = {"blocks": _blocks, "head": _head, "label": _label, "bad": NO_RESULTS, "figures": figures}
     values |= {"linked": _linked, "filled": _filled}

@@ -177,7 +177,6 @@ def _at_most(what: str, count: int, most: int) -> None:
 
 
 def load_mapping(path: Path) -> Config:
-    """Returns the content of a YAML file whose values are plain."""
     content = read_yaml(path)
     if not isinstance(content, dict):
         raise UserError(f"{path}: not a mapping")
@@ -186,7 +185,6 @@ def load_mapping(path: Path) -> Config:
 
 
 def as_list(value: Any) -> list[Any]:
-    """Returns a list as it is, and another value as a list of one."""
     return value if isinstance(value, list) else [value]
 
 

@@ -13,14 +13,14 @@ from collections.abc import Iterator
 from copy import deepcopy
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, get_type_hints
 
 import pytest
 from support.fixtures import ROOT
 from support.motions import synthetic
 
 from flame_mdm.__main__ import COMMANDS
-from flame_mdm.config import composition, sweeps
+from flame_mdm.config import composition, run, sweeps
 
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 OWN = ("mine", "my_", "NAME", "...")
@@ -114,7 +114,9 @@ def is_composed(program: str, command: str, words: tuple[str, ...]) -> bool:
             escaped = [re.sub(r"([\\ ])", r"\\\1", word) for word in words]
             patch.setenv("MAKEFLAGS", " -- " + " ".join(reversed(escaped)))
             words = ("--from-make",)
-        return main.func(lambda settings: None, *main.args[1:], words) == 0
+        if command == "train":
+            return main.func(lambda config: None, *main.args[1:], words) == 0
+        return run(lambda settings: None, get_type_hints(main)["settings"], words) == 0
 
 
 @pytest.fixture

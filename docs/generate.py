@@ -92,9 +92,7 @@ def printed(text: str) -> Any:
 
 TABLES = published_tables()
 
-DEVIATIONS = {
-    ("humanml3d/mdm_unet", "parameters"): "no code is public; the widths are chosen to come close",
-}
+DEVIATIONS = {("humanml3d/mdm_unet", "parameters"): "no code is public; the widths are chosen to come close"}
 """Deviations of recipes from their papers, by (recipe, key), with the reason."""
 
 

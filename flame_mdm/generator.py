@@ -23,7 +23,7 @@ from flame_mdm.sampler_options import SamplerOptions
 from flame_mdm.seeds import seeded_noise
 
 
-class Trained:
+class Model:
     """What all models have that checkpoints hold."""
 
     noun = "a model"
@@ -36,7 +36,7 @@ class Trained:
     """Number of training steps of the loaded checkpoint; None if unknown."""
 
 
-class MotionGenerator(Trained, nn.Module):
+class MotionGenerator(Model, nn.Module):
     """A denoiser, a process, a condition encoder and a representation, and how to sample from them."""
 
     noun = "a motion generator"

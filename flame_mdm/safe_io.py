@@ -302,11 +302,7 @@ def _nodes(node: Any, counted: dict[int, float]) -> float:
 
 
 def read_npz(
-    source: Path | IO[bytes],
-    *,
-    skip: Collection[str] = (),
-    only: Collection[str] | None = None,
-    header: bool = False,
+    source: Path | IO[bytes], *, skip: Collection[str] = (), only: Collection[str] | None = None, header: bool = False
 ) -> dict[str, np.ndarray]:
     """Returns the arrays of an .npz file, or seekable open file, by name, without those in `skip`, or `only` some.
 

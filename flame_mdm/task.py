@@ -19,14 +19,14 @@ from flame_mdm.data.adaptation import KEPT
 from flame_mdm.data.datamodule import MotionDataModule
 from flame_mdm.denoisers import Denoiser
 from flame_mdm.errors import UserError
-from flame_mdm.generator import MotionGenerator, Trained
+from flame_mdm.generator import Model, MotionGenerator
 from flame_mdm.losses import MotionLosses
 from flame_mdm.processes import Process
 from flame_mdm.representations import Representation
 from flame_mdm.seeds import key, normal, seed_generator, seeded_noise, uniform
 
 
-class Task(Trained, LightningModule):
+class Task(Model, LightningModule):
     """Base class of all models that `make train` trains; a recipe names the class in `task._target_`."""
 
     def __init__(self, condition: ConditionEncoder, representation: Representation, *, optimizer: Config, seed: int):

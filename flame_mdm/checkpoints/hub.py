@@ -7,12 +7,7 @@ from typing import Any
 
 from flame_mdm.checkpoints.adapters import read_merged
 from flame_mdm.checkpoints.loading import find
-from flame_mdm.checkpoints.model_files import (
-    FILE,
-    read_model_file,
-    without_own_paths,
-    write_model_file,
-)
+from flame_mdm.checkpoints.model_files import FILE, read_model_file, without_own_paths, write_model_file
 from flame_mdm.config import save
 from flame_mdm.errors import UserError, first_line, markdown_text
 from flame_mdm.safe_io import read_text, sha256, write_text

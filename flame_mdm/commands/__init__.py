@@ -2,7 +2,8 @@
 
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from glob import escape
@@ -139,10 +140,17 @@ def check_motion(key: str, source: str | None) -> None:
 def check_extractor(source: str | None) -> None:
     """Checks that the files of an extractor exist, before torch is imported."""
     if source not in (None, "none") and not Path(source).exists():
-        try:
+        with about_key("extractor"):
             find(source)
-        except (UserError, FileNotFoundError) as error:
-            raise UserError(f"extractor: {error}") from error
+
+
+@contextmanager
+def about_key(key: str) -> Iterator[None]:
+    """Adds the key to errors about the model that it names."""
+    try:
+        yield
+    except (UserError, FileNotFoundError) as error:
+        raise UserError(f"{key}: {error}") from error
 
 
 def check_words(settings: BodySettings) -> None:

@@ -49,18 +49,12 @@ def main(settings: EditSettings) -> None:
     check_motion("motion", settings.motion)
     file = settings.model_file()
 
-    import torch
-
-    from flame_mdm.checkpoints.loading import load
     from flame_mdm.safe_io import sha256
     from flame_mdm.sampling.editing import edit_request
     from flame_mdm.sampling.generation import write_motions
     from flame_mdm.sampling.reading import read_motion
-    from flame_mdm.visualize.bodies import load_body
 
-    body = load_body(settings.body)
-    device = settings.device or ("cuda" if torch.cuda.is_available() else "cpu")
-    model = load(file, device, **settings.adapters())
+    model, body = settings.load(file)
     check_condition(settings, request, model)
     facts = {key: getattr(settings, key) for key in ("fps", "unit", "up", "cut", "data_root")}
     original = read_motion(model.representation, settings.motion, **facts)

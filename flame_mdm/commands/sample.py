@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from flame_mdm.checkpoints.locating import find
-from flame_mdm.commands import AdaptedSettings, BodySettings, check_device, check_motion, check_words
+from flame_mdm.commands import AdaptedSettings, BodySettings, about_key, check_device, check_motion, check_words
 from flame_mdm.errors import UserError, say, shortened
 from flame_mdm.safe_io import MEBIBYTE, read_text
 from flame_mdm.sampler_options import SamplerOptions, option, same_option
@@ -39,6 +39,16 @@ class OutputSettings(BodySettings, SamplerOptions, AdaptedSettings):
     mp4: bool = option(False, 'also write motions.mp4; needs pip install "flame-mdm[video]"')
     open: bool = option(False, "open the player in the browser")
     device: str | None = option(None, "default: cuda if available")
+
+    def load(self, file: Path) -> tuple[MotionGenerator, Mesh]:
+        """Returns the model with its adapters, and the body to draw."""
+        import torch
+
+        from flame_mdm.checkpoints.loading import load
+        from flame_mdm.visualize.bodies import load_body
+
+        body = load_body(self.body)
+        return load(file, self.device or ("cuda" if torch.cuda.is_available() else "cpu"), **self.adapters()), body
 
     def show(self, page: Path) -> None:
         """Opens a page in the browser if requested; the line about it is printed in any case."""
@@ -139,22 +149,14 @@ def main(settings: SampleSettings) -> None:
     check_motion("after", settings.after)
     file = settings.model_file()
     if settings.scorer is not None:
-        try:
+        with about_key("scorer"):
             find(settings.scorer)
-        except (UserError, FileNotFoundError) as error:
-            raise UserError(f"scorer: {error}") from error
 
-    import torch
-
-    from flame_mdm.checkpoints.loading import load
     from flame_mdm.safe_io import sha256
     from flame_mdm.sampling.generation import sample_request, write_motions
     from flame_mdm.sampling.request import understood
-    from flame_mdm.visualize.bodies import load_body
 
-    body = load_body(settings.body)
-    device = settings.device or ("cuda" if torch.cuda.is_available() else "cpu")
-    model = load(file, device, **settings.adapters())
+    model, body = settings.load(file)
     typed, request = request.prompts, understood(request, model)
     for text in request.prompts:
         if text not in typed:
@@ -164,10 +166,8 @@ def main(settings: SampleSettings) -> None:
     if settings.scorer is not None:
         from evaluators.selection import text_fit
 
-        try:
+        with about_key("scorer"):
             score = text_fit(settings.scorer, model, model.device)
-        except (UserError, FileNotFoundError) as error:
-            raise UserError(f"scorer: {error}") from error
     stages = [] if settings.trajectory else None
     motions = sample_request(model, request, score=score, stages=stages)
     digest = sha256(file)

@@ -17,17 +17,7 @@ from flame_mdm.progress import ProgressBar
 from flame_mdm.representations.skeleton import SMPL22
 from flame_mdm.representations.smpl import ADULT
 from flame_mdm.safe_io import atomic_write
-from flame_mdm.visualize.body import (
-    HAIR,
-    HELPERS,
-    SHIRT,
-    SHOES,
-    SKIN,
-    TROUSERS,
-    Mesh,
-    mannequin,
-    packed,
-)
+from flame_mdm.visualize.body import HAIR, HELPERS, SHIRT, SHOES, SKIN, TROUSERS, Mesh, mannequin, packed
 from flame_mdm.visualize.posture import JOINT, orthonormal, shortest_turns
 
 SHAPE = {"gender": 0.5, "age": 2 / 3, "height": 0.45, "weight": 0.4}

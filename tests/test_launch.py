@@ -80,10 +80,8 @@ def test_jobs_of_a_sweep_run_in_processes_and_folders_of_their_own(tmp_path, mon
 REFUSED = {
     "train quickstart launch=slurmm": "no launch is called 'slurmm'. Did you mean slurm?",
     "train quickstart launch=local trainer.devices=2": "launch=local runs each job in one process",
-    "train quickstart launch=slurm trainer.max_step=1": "Did you mean trainer.max_steps",
     "train quickstart launch=slurm seed=1,2 logger=csv,nothing": "no logger is called 'nothing'",
     "train quickstart launch=slurm hydra.launcher.partitionn=gpu": "partitionn",
-    "convert a b launch=slurm hydra.launcher.partitionn=gpu": "partitionn",
     "convert a b launch=slurm fps=1,x": "fps=x: must be a finite number",
 }
 

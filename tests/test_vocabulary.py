@@ -48,7 +48,7 @@ def test_unseen_and_unread_words_are_named_once_with_one_suggestion():
         assert nearest(text, CAPTIONS)[0] == CAPTIONS[first]
 
 
-@pytest.mark.parametrize("text", ["asdf qwer", "un uomo cammina in avanti", "人が歩く", "a person", "?!"])
+@pytest.mark.parametrize("text", ["un uomo cammina in avanti", "人が歩く", "a person"])
 def test_a_text_without_a_known_word_is_refused(text, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     model = flame_mdm.load("quickstart")

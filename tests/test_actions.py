@@ -28,6 +28,7 @@ from flame_mdm.data.body_model import load_offsets
 from flame_mdm.data.crops import Fixed
 from flame_mdm.data.datamodule import MotionDataModule
 from flame_mdm.data.humanact12 import HumanAct12
+from flame_mdm.data.store import write_store
 from flame_mdm.data.uestc import TRAIN_SUBJECTS, UESTC, front_view
 from flame_mdm.errors import UserError
 from flame_mdm.representations import rotation
@@ -163,6 +164,23 @@ def test_samples_are_those_of_actor(stem: str, tmp_path: Path):
         assert action == label
         np.testing.assert_allclose(sample.numpy(), expected, atol=2e-6, err_msg=number)
     assert numbers
+
+
+def test_another_humanact12_file_is_named(tmp_path: Path):
+    columns = {
+        r"humanact12poses\.pkl: lists differ in length": {"y": [0]},
+        "clip 0 has the label 12, not one of 0 to 11": {"y": [12] * 24},
+        r"clip 0 has poses \(20, 72\) and joints \(9, 18, 3\)": {"joints3D": [np.zeros((9, 18, 3))] * 24},
+        "clip humanact12_00": {"poses": [np.full((20 + 7 * (k % 15), 72), np.nan) for k in range(24)]},
+    }
+    for k, (message, changed) in enumerate(columns.items()):
+        path = write_humanact12(tmp_path / f"raw{k}", 24, **changed)
+        with pytest.raises(ValueError, match=message):
+            write_store(tmp_path / "store", HumanAct12(str(path)), Rot6D())
+    with pytest.raises(ValueError, match="it contains list"):
+        HumanAct12(str(written(tmp_path / "humanact12poses.pkl", [1]))).count()
+    with pytest.raises(FileNotFoundError, match=r"no humanact12poses\.pkl; the data set is published with ACTOR"):
+        HumanAct12(str(tmp_path / "nowhere")).count()
 
 
 def test_unconditioned_motions_are_compared_with_the_reference_motions(tmp_path: Path):

@@ -1,14 +1,18 @@
 """The command that prepares and verifies data sets: reports, misuse, interruption, the same result on any machine."""
 
+import gc
 import json
+import os
+import signal
 import subprocess
 import sys
 from hashlib import sha256
+from multiprocessing import active_children
 from pathlib import Path
 
 import numpy as np
 import pytest
-from support.runs import TINY
+from support.runs import TINY, no_children
 from support.stores import (
     TAKES,
     line,
@@ -23,7 +27,7 @@ from support.stores import (
 
 from flame_mdm.__main__ import main
 from flame_mdm.config import EXPERIMENTS, compose, instantiate
-from flame_mdm.data.bandai import split_of
+from flame_mdm.data.bandai import Bandai, split_of
 from flame_mdm.data.store import Store
 from flame_mdm.data.synthetic import Synthetic
 from flame_mdm.formats import bvh
@@ -145,6 +149,40 @@ def test_frames_are_not_kept_in_memory(tmp_path: Path):
     """400,000 frames, which have 420 MB, are prepared in less than 800 MB, of which PyTorch takes 330."""
     process = subprocess.run([sys.executable, "-c", LARGE, tmp_path], capture_output=True, text=True, check=True)
     assert int(process.stdout) < 800_000
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("how", "code"), [(signal.SIGTERM, 143), pytest.param(signal.SIGINT, 130, marks=pytest.mark.robustness)]
+)
+def test_an_interrupted_preparation_leaves_nothing(
+    how: signal.Signals, code: int, takes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    root = tmp_path / "data"
+    words = ["data=bandai", f"source={takes}"]
+    clips = 0
+    make = Bandai._clip
+
+    def interrupted(self: Bandai, *arguments, **options):
+        nonlocal clips
+        clips += 1
+        if clips == 5:
+            os.kill(os.getpid(), how)
+        return make(self, *arguments, **options)
+
+    gc.collect()  # readers that other tests left open end their processes
+    before = signal.getsignal(signal.SIGTERM)
+    earlier = active_children()
+    ignored = signal.signal(signal.SIGINT, signal.default_int_handler)  # it is, where the tests run in the background
+    with monkeypatch.context() as patch:
+        patch.setattr(Bandai, "_clip", interrupted)
+        assert main(["prepare", *words, f"data_root={root}", "data.source.workers=2"]) == code
+    signal.signal(signal.SIGINT, ignored)
+    assert not root.exists()
+    assert no_children(earlier)
+    assert signal.getsignal(signal.SIGTERM) is before
+    whole = prepared(tmp_path / "whole", *words, "data.source.workers=1")
+    assert prepared(root, *words, "data.source.workers=1").fingerprint == whole.fingerprint
 
 
 WHERE = {

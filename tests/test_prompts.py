@@ -11,8 +11,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+import flame_mdm
 from flame_mdm.__main__ import main
 from flame_mdm.commands.sample import default_folder
+from flame_mdm.errors import UserError
 from flame_mdm.formats.readers import read
 
 PROMPTS = ["a person walks", "a person jumps: 100%, twice", "人が歩く, waving"]
@@ -87,6 +89,22 @@ def test_a_bad_request_is_one_line_and_writes_nothing(here, trained, capsys):
         assert message in captured.err
         assert captured.err.count("\n") == 1
         assert not Path("samples").exists()
+
+
+def test_each_prompt_has_a_length_of_its_own(trained):
+    model = flame_mdm.load(trained)
+    motions = flame_mdm.generate(model, PROMPTS[:2], seconds=[1, 1.5], samples=2)
+    assert [(m.text, len(m.joints)) for m in motions] == [(PROMPTS[0], 20)] * 2 + [(PROMPTS[1], 30)] * 2
+    alone = flame_mdm.generate(model, PROMPTS[1], seconds=np.float32(1.5))[0]  # type: ignore[arg-type]
+    np.testing.assert_allclose(motions[2].joints, alone.joints, atol=1e-4)
+    assert [len(m.joints) for m in flame_mdm.generate(model, PROMPTS, frames=np.array([20, 21, 22]))] == [20, 21, 22]  # type: ignore[arg-type]
+    for seconds, message in (
+        ([1, 2], r"seconds=\[1, 2\]: 2 lengths for 1 prompt\. Give one length, or one per prompt"),
+        ([], "0 lengths for 1 prompt"),
+        *((value, "is not a valid length") for value in ([[1]], ["x"], [float("nan")], 10**400, "3")),
+    ):
+        with pytest.raises(UserError, match=message):
+            flame_mdm.generate(model, PROMPTS[0], seconds=seconds)  # type: ignore[arg-type]
 
 
 def test_a_video_is_written_when_asked_for(here, trained, monkeypatch, capsys):

@@ -46,10 +46,8 @@ TRUTH = "attributes/all"  # share of motions that show every requested attribute
 def audit(request: EvaluationRequest, cache: Path) -> AuditCard:
     """Measures perturbations of the motions of a split; see docs/audit.md.
 
-    Args:
-        request: data, protocol, extractor, split and seed; `samples` limits the number of motions; `resamples` is the
-            number of bootstrap resamples of motions, for the intervals.
-        cache: folder of the metric inputs of perturbed motions, with which a killed audit continues.
+    `samples` of the request limits the motions; `resamples` is the number of bootstrap resamples, for the intervals. A
+    killed audit continues with the metric inputs in the folder `cache`.
 
     Raises:
         UserError: If data, protocol and extractor do not match, or the data is not represented by joint positions.

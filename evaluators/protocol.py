@@ -128,9 +128,7 @@ class Protocol(ClosedSchema):
         return self.model_copy(update={**changed, "quick": quick, "multimodality": several}), changed
 
     def open_extractor(self, path: str | None, representation: Representation, dataset: str) -> Extractor | None:
-        """Opens an extractor on the device of the representation; None if not needed, or `path` is "none".
-
-        Without a `path`, it is the one that the protocol names.
+        """Opens an extractor at `path`, or that of the protocol; None if it is not needed, or `path` is "none".
 
         Raises:
             FileNotFoundError, UserError: If it is missing, or belongs to another representation or data set.

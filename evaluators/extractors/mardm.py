@@ -95,11 +95,6 @@ def clip_tokens(captions: Sequence[str]) -> Tensor:
 
 
 def load_mardm_clip(folder: Path) -> MARDMClip:
-    """Loads the evaluator with the authors' weights: `MARDMClipExtractor` describes the folder.
-
-    Raises:
-        FileNotFoundError: If a file does not exist.
-        UserError: If a file is damaged, or belongs to another network.
-    """
+    """Loads the evaluator with the authors' weights from a folder that `MARDMClipExtractor` describes."""
     path = folder / "finest.tar"
     return load_strictly(MARDMClip(*read_statistics(folder)), read_weights(path, "contrast_model"), path)

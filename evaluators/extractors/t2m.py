@@ -255,14 +255,7 @@ def read_statistics(folder: Path) -> list[Tensor]:
 
 
 def load_t2m(folder: Path) -> T2MEvaluator:
-    """Loads the evaluator with the authors' weights: `T2MExtractor` describes the folder.
-
-    MARDM's evaluator is told apart by its 67 or 64 features.
-
-    Raises:
-        FileNotFoundError: If a file does not exist.
-        UserError: If a file is damaged, or belongs to another data set.
-    """
+    """Loads the evaluator, or MARDM's with 67 or 64 features, from a folder that `T2MExtractor` describes."""
     mean, std = read_statistics(folder)
     network = T2MEvaluator(mean, std, used_features=len(mean) if len(mean) in (67, 64) else None)
     path = folder / "finest.tar"

@@ -156,7 +156,7 @@ class MotionCLIPScore(TextAndMotion):
 
 
 def mutual_information_divergence(real: Tensor, text: Tensor, generated: Tensor, eps: float) -> Tensor:
-    """Computes MID of generated motions, in float64.
+    """Computes MID of motions generated for the first texts, in float64; see `pointwise_mutual_information`.
 
     Kim et al. 2022, "Mutual Information Divergence": the mean pointwise mutual information of generated motions and
     their texts under a normal distribution fitted to the real pairs,
@@ -165,12 +165,6 @@ def mutual_information_divergence(real: Tensor, text: Tensor, generated: Tensor,
 
     where x is real, y is text, and z is both; covariances of generated motions (') are about the means of the real
     ones; inverses are those of S + eps I. The denominators are N - 1 and M - 1.
-
-    Args:
-        real: (N, E) features of real motions.
-        text: (N, T) features of their texts.
-        generated: (M, E) features of motions generated for the first M texts.
-        eps: added to the diagonal of covariances before they are inverted.
     """
     return pointwise_mutual_information(real, text, generated, text[: len(generated)], eps).mean()
 
@@ -181,10 +175,8 @@ def pointwise_mutual_information(
     """Computes the terms (M,) whose mean is MID; see `mutual_information_divergence`.
 
     Args:
-        real: (N, E) features of real motions.
-        text: (N, T) features of their texts.
-        generated: (M, E) features of generated motions.
-        requested: (M, T) features of the texts they were generated for.
+        real, text: (N, E) features of real motions, and (N, T) of their texts.
+        generated, requested: (M, E) features of generated motions, and (M, T) of the texts they were generated for.
         eps: added to the diagonal of covariances before they are inverted.
     """
     both, fake = torch.cat([real, text], 1), torch.cat([generated, requested], 1)

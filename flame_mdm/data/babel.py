@@ -32,20 +32,13 @@ PARTS: dict[str, tuple[str, ...]] = {"train": ("train", "extra_train"), "val": (
 
 @dataclass(frozen=True)
 class Label:
-    """One text for one segment of a motion.
+    """One text for one segment of a motion."""
 
-    Attributes:
-        motion: key of the AMASS recording, as returned by `amass.key_of`.
-        text: the description.
-        start, end: seconds; None if BABEL does not give them.
-        kind: whether the text is the annotator's words or the category of the action.
-    """
-
-    motion: str
+    motion: str  # key of the AMASS recording, as returned by `amass.key_of`
     text: str
-    start: float | None
+    start: float | None  # seconds, like the end; None if BABEL does not give them
     end: float | None
-    kind: Literal["words", "category"]
+    kind: Literal["words", "category"]  # the annotator's words or the category of the action
 
 
 @dataclass(frozen=True)

@@ -31,13 +31,8 @@ def cores() -> int:
 def in_order(function: Callable[[Task], Result], tasks: Iterable[Task], workers: int = 0) -> Generator[Result]:
     """Yields `function(task)` for each task, in the order of the tasks; reads only a few tasks ahead.
 
-    Nested calls, in which the results of one are tasks of the other, share their processes.
-
-    Args:
-        function: picklable, like the tasks and results.
-        tasks: arguments of the calls.
-        workers: number of processes; 1 = this process only, 0 = one per core as soon as the work takes `PATIENCE`
-            seconds.
+    Nested calls, in which the results of one are tasks of the other, share their processes. Function, tasks and results
+    are picklable. `workers` are processes; 1 = this one only, 0 = one per core as soon as the work takes `PATIENCE`.
 
     Raises:
         UserError: If a worker died, for instance because the system ran out of memory.

@@ -167,13 +167,10 @@ _dispatch |= {pickle.BUILD[0]: _Unpickler._load_build, pickle.BYTEARRAY8[0]: _Un
 def read(path: Path, opaque: tuple[str, ...] = ()) -> Any:
     """Returns the content of a pickle of arrays, numbers, text and plain containers; protocols 0 to 5.
 
-    Args:
-        path: of the file.
-        opaque: beginnings of names whose objects the file may contain, too; they are replaced by their state.
+    Objects whose names begin with one of `opaque` may be there, too, and are replaced by their state.
 
     Raises:
-        FileNotFoundError: If the file does not exist.
-        UserError: If it is not a regular file, is damaged or names other globals; the message gives the global.
+        FileNotFoundError, UserError: If the file is missing, damaged, or names other globals, as the message says.
     """
     size = regular_file(path)
     with path.open("rb") as file:

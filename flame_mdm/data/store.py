@@ -118,11 +118,7 @@ class Store:
 def write_store(folder: Path, source: MotionSource, representation: Representation) -> Store:
     """Encodes every clip of a data set and writes the store, under a temporary name until it is complete.
 
-    If another process is writing the store, waits for it and opens the result.
-
-    Raises:
-        FileNotFoundError, UserError: If the data set cannot be read, or features are not finite. No files are left
-            behind.
+    If another process is writing it, waits and opens the result. If data cannot be read, leaves no files behind.
     """
     total, before = source.count(), (folder / "store.json").exists()
     lock = folder.with_name(folder.name + ".lock")

@@ -155,10 +155,8 @@ def front_view(pose: np.ndarray, root: np.ndarray, camera: np.ndarray, video: Vi
     the depth z at which a camera of focal length f shows it in that size: z = f / (s w / 2) in an image w pixels wide.
 
     Args:
-        pose: (F, 72) axis-angle.
-        root: (F, 3) position of the root joint relative to the body.
+        pose, root: (F, 72) axis-angle, and (F, 3) position of the root joint relative to the body.
         camera: (F, 4) scales sx and sy, of which only the first is used, then the shift.
-        video: gives side and view.
 
     Returns:
         (F, 75) float32: translation relative to the first frame and pose, in camera axes.

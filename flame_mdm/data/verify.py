@@ -34,8 +34,7 @@ def report(data: MotionDataModule) -> dict[str, Any]:
         split), frames, still (ids), duplicates (groups of ids), duplicates_across_splits, statistics, excluded.
 
     Raises:
-        FileNotFoundError: If the data set is not prepared.
-        UserError: If the store is damaged: wrong hashes, non-finite numbers, or a source in two splits.
+        FileNotFoundError, UserError: If the store is missing, has wrong hashes or numbers, or a source in two splits.
     """
     store = data.open()
     store.verify()

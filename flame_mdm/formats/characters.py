@@ -129,12 +129,9 @@ def moved(character: Character, motion: Shown) -> tuple[np.ndarray, np.ndarray, 
 
 
 def write(path: Path, character: Character, motion: Shown, name: str) -> str:
-    """Writes the character's file with a motion, and returns a line that describes it.
+    """Writes the character's file with a motion, and returns a line that describes it; raises `UserError` if it cannot.
 
     A .glb file keeps its content and gets a further animation, the first one; a .bvh file gets other frames.
-
-    Raises:
-        UserError: If the file cannot be written, a joint of a .bvh file cannot turn, or `moved` raises it.
     """
     ending = ".bvh" if isinstance(character.file, bvh.Bvh) else ".glb"
     if path.suffix.lower() != ending:

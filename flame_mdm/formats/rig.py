@@ -167,8 +167,7 @@ def rest_pose(
     Args:
         source: the character, for messages.
         names, parents: of the J joints; parents precede their children.
-        positions: (J, 3) in a world of any unit and direction.
-        turned: (J, 3, 3), rotations of the joints in this world.
+        positions, turned: (J, 3) and rotations (J, 3, 3) in a world of any unit and direction.
         joints: SMPL's joint -> index of the character's.
         lowest: points that include the lowest one.
         vertical: (3,), up; None = the one of y and z along which the trunk points.

@@ -90,7 +90,7 @@ def reach(
     free: Tensor,
     smoothness: float,
 ) -> Tensor:
-    """Returns the motions nearest to `x` whose joints reach positions in the world.
+    """Returns the motions nearest to `x` (B, F, D) whose joints reach positions in the world.
 
     Gauss-Newton steps: of all changes that lead to the positions, the smallest one in normalized features, where
     changes are smooth in time: their covariance between frames is that of a Gaussian process. Bones get their median
@@ -98,9 +98,6 @@ def reach(
     where a change of half the size would shorten a bone that turns.
 
     Args:
-        x: (B, F, D) normalized features.
-        to_joints: decodes (F, D) as joints (F, J, 3) in meters.
-        positions: the goal.
         bones: (3, N) int64: frame, parent and child of bones that the change could stretch; all bones of a frame.
         free: (B, F, D) bool, features that may change.
         smoothness: standard deviation in frames of the Gaussian process.

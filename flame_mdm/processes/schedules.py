@@ -104,15 +104,11 @@ def build_schedule(name: ScheduleName, num_train_timesteps: int) -> Schedule:
 
 
 def timesteps(num_train_timesteps: int, num_inference_steps: int, spacing: str = "linspace") -> list[int]:
-    """Returns N increasing sampling steps from 0 ... T - 1.
+    """Returns N = `num_inference_steps` increasing sampling steps from 0 ... T - 1.
 
-    Args:
-        num_train_timesteps: T.
-        num_inference_steps: N.
-        spacing: "linspace" gives evenly spaced steps including both ends, rounded half to even ("N" in the code of MDM
-            and FLAME, after Nichol and Dhariwal 2021). "stride" counts from 0 with the smallest integer stride that
-            gives N steps, so that the last, noisiest step may be well below T - 1 ("ddimN" there, after Song et al.
-            2021).
+    The spacing "linspace" gives evenly spaced steps including both ends, rounded half to even ("N" in the code of MDM
+    and FLAME, after Nichol and Dhariwal 2021). "stride" counts from 0 with the smallest integer stride that gives N
+    steps, so that the last, noisiest step may be well below T - 1 ("ddimN" there, after Song et al. 2021).
 
     Raises:
         UserError: If N is not in 1 ... T, the spacing is unknown, or no stride gives N steps.

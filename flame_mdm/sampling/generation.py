@@ -233,15 +233,8 @@ def write_motions(
 ) -> None:
     """Writes `motion_000.npz` ..., `motions.gif`, `motions.png` and `player.html` into a folder, all or none.
 
-    Such files of an earlier request that are not written again are removed.
-
-    Args:
-        folder: where to write; other files in it are kept.
-        motions: the first eight are drawn.
-        facts: such as seed and checkpoint hash, added to each `.npz`.
-        stages: of a sampling run, drawn in `trajectory.png`.
-        mp4: also write `motions.mp4`.
-        body: the body to draw; None = the mannequin.
+    Such files of an earlier request that are not written again are removed. The first eight motions are drawn, and the
+    stages of a sampling run in `trajectory.png`; `facts`, such as seed and checkpoint hash, are added to each `.npz`.
     """
     scene = [replace(motion, text=motion.text or "unconditioned") for motion in motions]
     with atomic_folder(folder) as made:

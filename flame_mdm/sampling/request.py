@@ -283,10 +283,8 @@ class SamplingRequest:
 def understood(request: SamplingRequest, model: MotionGenerator) -> SamplingRequest:
     """Returns the request with its sentences of several actions as sequences, if `split` says so.
 
-    Texts with seconds or parts of their own are kept, and so are the texts of models that cannot make sequences.
-
-    Raises:
-        UserError: If the model knows no word of a text that says what happens.
+    Texts with seconds or parts of their own are kept, and so are those of models that cannot make sequences. Raises
+    `UserError` if the model knows no word of a text that says what happens.
     """
     if request.kind != "text" or model.conditioned_on != "text":
         return request

@@ -42,20 +42,13 @@ class Goal(NamedTuple):
 
 @dataclass(frozen=True)
 class PositionGuide:
-    """Leads motions to positions in the world; a `flame_mdm.batch.Guide`.
+    """Leads motions to positions in the world; a `flame_mdm.batch.Guide`."""
 
-    Attributes:
-        representation: decodes motions as joints.
-        positions: the goal.
-        bones: (3, N) frame, parent and child of the bones that keep their lengths.
-        poses, keep: (1, F, D) features that are imposed in any case, and where.
-    """
-
-    representation: Representation
-    positions: Positions
-    bones: Tensor
-    poses: Tensor
-    keep: Tensor
+    representation: Representation  # decodes motions as joints
+    positions: Positions  # the goal
+    bones: Tensor  # (3, N) frame, parent and child of the bones that keep their lengths
+    poses: Tensor  # (1, F, D) features that are imposed in any case
+    keep: Tensor  # and where
 
     def steer(self, clean: Callable[[Tensor], Tensor], x_t: Tensor) -> Tensor:
         return steer(clean, x_t, self.representation.to_joints, self.positions)

@@ -209,7 +209,7 @@ def result(folder: Path) -> Any:
 
 @pytest.mark.robustness
 def test_kills_at_random_moments_change_nothing(data_root, tmp_path):
-    """Of a training; tests/test_evaluate.py and tests/test_interruption.py kill evaluations and preparations."""
+    """Of a training; tests/test_evaluate.py kills an evaluation, tests/test_prepare.py interrupts a preparation."""
     log, draw = tmp_path / "log", random.Random(0)
 
     def line(folder: Path) -> list[str]:

@@ -33,7 +33,6 @@ of a GPU. Sections that name a commit were measured once, by a script of that co
 
 
 def machine() -> dict[str, str | int]:
-    """Returns the hardware and versions that a measurement depends on."""
     has, software = torch.cpu.get_capabilities(), environment()
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     facts: dict[str, str | int] = {

@@ -51,7 +51,6 @@ def inputs(batch: int, args: argparse.Namespace) -> tuple[Tensor, Tensor, Condit
 
 
 def seconds(run: Callable[[], Tensor], repeats: int, device: str) -> float:
-    """Returns the median time of a run, after one that warms up."""
     return take_turns({"run": run}, repeats, device)["run"]
 
 

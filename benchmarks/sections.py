@@ -26,13 +26,11 @@ def cell(value: str | float | None) -> str:
 
 
 def table(rows: list[Row]) -> str:
-    """Returns a Markdown table with the columns of the first row."""
     lines = [list(rows[0]), ["---", *["---:"] * (len(rows[0]) - 1)], *([cell(v) for v in row.values()] for row in rows)]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
 def body(content: Section) -> str:
-    """Returns the text and tables of a section as Markdown."""
     tables = (f"{caption[:1].upper()}{caption[1:]}:\n\n{table(rows)}" for caption, rows in content["tables"].items())
     return "\n\n".join([content["text"], *tables])
 

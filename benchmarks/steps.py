@@ -107,7 +107,6 @@ def recipe_step(config: dict[str, Any], speed: str, device: str) -> tuple[Callab
 
 
 def batch_of(lengths: np.ndarray, frames: int, device: str) -> MotionBatch:
-    """Returns random motions of given lengths, padded to `frames`."""
     mask = torch.arange(frames) < torch.from_numpy(lengths)[:, None]
     x = torch.randn(len(lengths), frames, WIDTH) * mask[..., None]
     return MotionBatch(x.to(device), mask.to(device), [str(i) for i in range(len(lengths))])

@@ -100,11 +100,9 @@ class MotionGenerator(Model, nn.Module):
 
     @property
     def device(self) -> torch.device:
-        """Device of the model."""
         return self.representation.mean.device
 
     def describe(self) -> str:
-        """Returns the name of the network, for the first line of a run's output."""
         return type(self.denoiser).__name__
 
     @property

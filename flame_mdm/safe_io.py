@@ -227,7 +227,6 @@ def regular_file(path: str | Path, limit: int | None = None) -> int:
 
 
 def read_text(path: str | Path, limit: int = TEXT_LIMIT) -> str:
-    """Returns the text of a UTF-8 file of at most `limit` bytes."""
     path = Path(path)
     regular_file(path, limit)
     try:

@@ -42,7 +42,6 @@ class Task(Model, LightningModule):
         raise NotImplementedError
 
     def describe(self) -> str:
-        """Returns the name of the network, for the first line of a run's output."""
         return type(getattr(self, "network", self)).__name__
 
     def prepare_data(self) -> None:

@@ -90,7 +90,6 @@ def push(
 
 
 def card(model: Mapping[str, Any], repository: str) -> str:
-    """Returns the model card for the hub: recipe, data, provenance, license."""
     config, facts, origin = model["config"], model["facts"], model["origin"]
     license_id, terms = LICENSES.get(facts.get("dataset", ""), OTHER_LICENSE)
     parts = {

@@ -42,7 +42,6 @@ class AdaptedSettings(ModelSettings):
     adapter_strength: float | Sequence[float] = option(1.0, "for all adapters, or a list; 0 = the model without them")
 
     def adapters(self) -> dict[str, Any]:
-        """Returns the keywords `adapter` and `strength` of `flame_mdm.load`."""
         return {"adapter": self.adapter or (), "strength": self.adapter_strength}
 
 

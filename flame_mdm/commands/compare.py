@@ -119,7 +119,12 @@ def _read(folder: Path) -> dict[Prompt, Motion]:
     from flame_mdm.formats.readers import read
 
     files = [path for path in sorted(folder.iterdir()) if path.suffix.lower() in MOTIONS and path.name[0] != "."]
-    return _by_prompt([read(path) for path in files])
+    numbered: dict[Prompt, Motion] = {}
+    counts: Counter[str] = Counter()
+    for motion in map(read, files):
+        numbered[motion.text, counts[motion.text]] = motion
+        counts[motion.text] += 1
+    return numbered
 
 
 def read_texts(texts: str) -> list[str]:
@@ -166,12 +171,3 @@ def _sampled(
         )
         sampled |= zip(numbered, sample_request(model, request), strict=True)
     return {prompt: sampled[prompt] for prompt in prompts}
-
-
-def _by_prompt(motions: Sequence[Motion]) -> dict[Prompt, Motion]:
-    counts: Counter[str] = Counter()
-    numbered: dict[Prompt, Motion] = {}
-    for motion in motions:
-        numbered[motion.text, counts[motion.text]] = motion
-        counts[motion.text] += 1
-    return numbered

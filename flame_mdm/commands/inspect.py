@@ -109,7 +109,6 @@ def _read(settings: InspectSettings, files: Sequence[Path]) -> tuple[str, int, I
 
 
 def _clips(settings: InspectSettings) -> tuple[str, int, Iterator[Motion]]:
-    """Returns the same of a prepared data set."""
     from flame_mdm.reporting.browse import motion
 
     node = settings.data_node(settings.source)

@@ -56,7 +56,6 @@ class OutputSettings(BodySettings, SamplerOptions, AdaptedSettings):
             webbrowser.open(page.resolve().as_uri())
 
     def texts(self) -> list[str] | None:
-        """Returns the texts; None if there are none."""
         return None if self.text is None else [self.text]
 
     def request(self, editing: bool = False) -> SamplingRequest:
@@ -81,7 +80,6 @@ class OutputSettings(BodySettings, SamplerOptions, AdaptedSettings):
         return SamplingRequest.of("sample", editing, texts=self.texts(), actions=self.action, **values)
 
     def changed(self, names: Iterable[str]) -> dict[str, Any]:
-        """Returns the values of keys that differ from their defaults."""
         defaults = {entry.name: entry.default for entry in fields(self)}
         return {name: value for name in names if (value := getattr(self, name)) != defaults[name]}
 

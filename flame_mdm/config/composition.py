@@ -118,7 +118,6 @@ def first_choice(override: Override) -> str:
 
 
 def choices(override: Override) -> list[str]:
-    """Returns the values of an override: one, or those of a sweep."""
     value = override.value()
     if isinstance(value, Glob):
         return value.filter(_options(override.key_or_group)) or [str(value)]

@@ -91,9 +91,7 @@ def _serve(command: Callable[[Config], None], words: Sequence[str], codes: list[
         HydraConfig.instance().cfg = None  # otherwise Lightning adds words for Hydra's command line
         task = [str(word) for word in hydra.overrides.task if not str(word).startswith(f"+{LAUNCH}=")]
         code = start(resolved, task)
-        if code > 128 or (
-            launcher and code
-        ):  # a signal ends the whole sweep, and a failed launched job counts as failed
+        if code > 128 or (launcher and code):  # a signal ends the whole sweep; a launched job counts as failed
             raise SystemExit(code)
 
     fixed = [repr(o.key_or_group) for o in parsed if not o.is_sweep_override()]
@@ -140,9 +138,11 @@ POSITIVE = ("val_check_interval", "log_every_n_steps", "accumulate_grad_batches"
 def _check_whole(config: Config, name: str) -> None:
     """Raises `UserError` if a part or key that a run needs is missing, or a value is out of range."""
     plain(config, name)  # otherwise the checkpoints of the run would be refused
-    for key in ("run", "trainer", "data", "representation", "task", "optimizer", "callbacks"):
+    values = ("experiment", "seed", "ema", "logger")
+    for key in ("run", "trainer", "data", "representation", "task", "optimizer", "callbacks", *values):
         node = config.get(key)
-        if not isinstance(node, Mapping) or (key not in ("run", "callbacks") and "_target_" not in node):
+        is_part = isinstance(node, Mapping) and (key in ("run", "callbacks") or "_target_" in node)
+        if not (is_part if key not in values else key in config):
             raise UserError(f"{name}: no {key}. Begin the recipe with the defaults of another recipe, or with /base")
     if not config["run"].get("dir"):
         raise UserError(f"{name}: run.dir is empty. Set it to the directory of the run")
@@ -158,8 +158,5 @@ def _check_whole(config: Config, name: str) -> None:
         value = config["trainer"].get(key)
         if isinstance(value, int | float) and value <= 0:
             raise UserError(f"trainer.{key}={value}: must be above 0")
-    for key in ("experiment", "seed", "ema", "logger"):
-        if key not in config:
-            raise UserError(f"{name}: no {key}. Begin the recipe with the defaults of another recipe, or with /base")
     if isinstance(config["seed"], int) and not 0 <= config["seed"] < 2**32:
         raise UserError(f"seed={config['seed']}: must be from 0 to {2**32 - 1}")

@@ -6,7 +6,7 @@ They are a `SamplingRequest`, which checks the values, and its edits, within the
 import json
 import shlex
 from collections.abc import Iterable
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal
 from urllib.parse import urlencode
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainSerializer, StringConstraints, ValidationError
@@ -194,21 +194,18 @@ def parse_query(pairs: Iterable[tuple[str, str]]) -> DemoRequest:
             raise UserError(f"{_shown(key)} is given twice. Remove one")
         elif not key.startswith("__"):
             values[key] = value
-    return checked(DemoRequest, values | ({"edits": edits} if edits else {}))
+    return checked(values | ({"edits": edits} if edits else {}))
 
 
-Checked = TypeVar("Checked", bound=BaseModel)
-
-
-def checked(kind: type[Checked], values: dict[str, Any]) -> Checked:
-    """Returns a request or an edit; empty values are left to the defaults. A `UserError` quotes the invalid value."""
+def checked(values: dict[str, Any]) -> DemoRequest:
+    """Returns a request; empty values are left to the defaults. A `UserError` quotes the invalid value."""
     try:
-        return kind(**{key: value for key, value in values.items() if value not in (None, "")})
+        return DemoRequest(**{key: value for key, value in values.items() if value not in (None, "")})
     except ValidationError as error:
         first = error.errors()[0]
         name = ".".join(str(part) for part in first["loc"])
         if first["type"] == "extra_forbidden":
-            raise UserError(f"unknown option {_shown(name)}.{did_you_mean(name, kind.model_fields)}") from None
+            raise UserError(f"unknown option {_shown(name)}.{did_you_mean(name, DemoRequest.model_fields)}") from None
         raise UserError(f"{name}={_shown(first['input'])}: {first['msg'].lower()}") from None
 
 

@@ -48,7 +48,6 @@ class Studio:
         self.model(sources[0])
 
     def model(self, name: str) -> MotionGenerator:
-        """Returns a model by its name in `sources`; loads it at the first request."""
         if name not in self.files:
             near = did_you_mean(name, self.files)
             raise UserError(f"unknown model {name[:60]!r}.{near} This page has: {', '.join(self.files)}")
@@ -108,7 +107,7 @@ class Studio:
         if not request.text or (model := self.model(request.model)).conditioned_on != "text":
             return request
         text = understood(SamplingRequest(texts=request.text, split=request.split), model).prompts[0]
-        return checked(DemoRequest, request.model_dump() | {"text": text})
+        return checked(request.model_dump() | {"text": text})
 
     def advice(self, request: DemoRequest) -> list[str]:
         model = self.model(request.model)

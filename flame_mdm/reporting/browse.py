@@ -54,7 +54,6 @@ def choose(families: Sequence[list[Entry]], most: int) -> list[list[Entry]]:
 
 
 def motion(store: Store, representation: Representation, clip: Entry) -> Motion:
-    """Returns a clip for the player, cut after `SECONDS`."""
     import torch
 
     from flame_mdm.formats.motion import Motion

@@ -70,7 +70,6 @@ def svg(title: str, panels: Sequence[Panel]) -> Markup | None:
 
 
 def standalone(plot: str) -> str:
-    """Returns an SVG with an embedded style sheet, for use outside of pages."""
     return str(plot).replace(">", f"><style>{(TEMPLATES / 'plot.css').read_text(encoding='utf-8')}</style>", 1)
 
 

@@ -117,9 +117,8 @@ class Measurements(Callback):
     """
 
     def __init__(self) -> None:
-        self.step = 0
-        self.since, self.steps, self.samples = 0.0, 0, 0
-        self.begin = 0.0
+        self.step, self.begin = 0, 0.0
+        self._restart()
         self.earlier: dict[str, float] = {}
 
     def on_load_checkpoint(self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]) -> None:
@@ -219,7 +218,6 @@ def _environment(config: Config) -> str:
 
 
 def _command(name: str, folder: Path, *words: str) -> str:
-    """Returns a command about a run, for make if make started this process."""
     if "MAKELEVEL" not in os.environ:
         return " ".join(("flame-mdm", name, str(folder), *words))
     pairs = (word.partition("=") for word in (f"ckpt={folder}", *words))

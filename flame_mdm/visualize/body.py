@@ -35,14 +35,11 @@ SKIN, HAIR, SHIRT, TROUSERS, SHOES = MATERIALS = (
 class Mesh:
     """A closed mesh in its stored pose, an A-pose with the pelvis at 0.
 
+    `stored` are the arrays of its file (`packed`), `points` (V, 3) and `joints` (22, 3) in meters, `colors` 0 to 255.
+
     Attributes:
-        stored: the arrays of its file; `packed` describes them.
-        points: (V, 3) in meters.
-        normals: (V, 3) unit vectors.
         weights: (V, 28), of the 22 joints of SMPL and `HELPERS`; at most four are not 0.
-        colors: (V, 3) of the clothes, 0 to 255.
         triangles: (T, 3), counterclockwise seen from outside.
-        joints: (22, 3) of the stored pose.
         turns: (28, 3, 3), rotation of each bone in the world from the rest pose of SMPL to the stored pose.
         rest: (22, 3), position of each joint relative to its parent in the rest pose of SMPL.
         sole: height of the toe joints above the soles.

@@ -49,7 +49,6 @@ def sides(skeleton: Skeleton) -> list[int]:
 
 
 def head(skeleton: Skeleton) -> int | None:
-    """Returns the joint that carries a head, if the skeleton names one."""
     return skeleton.joints.index("head") if "head" in skeleton.joints else None
 
 

@@ -131,7 +131,6 @@ def _warnings(lines: Sequence[Line], distances: Sequence[bool], columns: Sequenc
 
 
 def _by_text(lines: Sequence[tuple[str, str]]) -> list[tuple[str, str]]:
-    """Returns one note per text, with the labels of all rows that it is about."""
     labels: dict[str, dict[str, None]] = {}
     for label, text in lines:
         labels.setdefault(text, {})[label] = None
@@ -238,7 +237,6 @@ def _sampler(checkpoint: Checkpoint) -> str:
 
 
 def _about(result: Result, name: str) -> Any:
-    """Returns a fact about the model or its cost, by its name in `ABOUT`."""
     checkpoint, cost = result.checkpoint, result.cost
     facts: dict[str, Any] = dict(checkpoint or ()) | (checkpoint.edit if checkpoint else {}) | dict(cost or ())
     value = facts.get(name)

@@ -152,7 +152,6 @@ class Lengths(Schema):
 
 
 def spec_names() -> list[str]:
-    """Returns the names of all tables, in the order of their numbers."""
     names = [path.stem for path in SPECS.glob("*.yaml") if path != PUBLISHED]
     return sorted(names, key=lambda name: re.sub(r"\d+", lambda number: number[0].zfill(3), name))
 

@@ -105,9 +105,7 @@ class MotionGeneration(MotionGenerator, Task):
         losses: weights of `MotionLosses` on the clean estimate.
         optimizer: a mapping with the `_target_` of a torch optimizer and its arguments.
         cond_drop_prob: probability that a training sample gets the null condition.
-        guidance_scale: default of `generate`; 1 = off.
-        sampler: default of `generate`, one that the process supports.
-        num_inference_steps: default of `generate`: a number, or, of diffusion, the steps themselves.
+        guidance_scale, sampler, num_inference_steps: defaults of `generate`; see `SamplerOptions`.
         seed: of all random draws in training, which are functions of (seed, batch number, rank).
         compile: compile the denoiser with torch.compile.
     """

@@ -260,16 +260,7 @@ def import_released(
 ) -> Path:
     """Converts a released checkpoint of MDM, MFM, FLAME or FLAME's motion-CLIP into a model file, and returns its path.
 
-    Args:
-        kind: "mdm", "mfm", "flame" or "mclip".
-        file: the released file.
-        args: args.json next to it (MDM), or the Hydra configuration of its run (MFM); not for FLAME.
-        out: as for `export`.
-        stats: folder with Mean.npy and Std.npy of the training data, if it is normalized.
-        averaged: whether to use averaged weights if the file has them.
-        num_heads: number of attention heads, if it differs from the released models.
-        time_token: see `import_mdm`.
-        run_code: whether to load pickles that hold more than weights, which runs any code in them.
+    The arguments are the keys of `flame-mdm import`. Raises `UserError` if a file is damaged, or of another kind.
     """
     file, out = Path(file), Path(out)
     if (args is None) != (kind in ("flame", "mclip")):

@@ -42,12 +42,7 @@ def serve(
 ) -> None:
     """Serves the page until the process is interrupted; raises `UserError` if the port is in use or a model unusable.
 
-    Args:
-        sources: Names of models, as for `Studio`; the first is selected at first.
-        host: Address to listen on; 127.0.0.1 is this computer alone, 0.0.0.0 all networks.
-        port: Port to listen on; 0 = any free one.
-        device: Device of the models; default: cuda if available.
-        hosts: Further names under which the page is reached, such as that of a web server in front of it.
+    `sources` are as for `Studio`; the other arguments are the keys of `flame-mdm demo`.
     """
     import torch
 

@@ -32,11 +32,9 @@ class Stopped(UserError):
 
 
 class Studio:
-    """Makes the motions of requests with a fixed set of models, of which the first is loaded at once.
+    """Makes the motions of requests with a fixed set of models on a device, of which the first is loaded at once.
 
-    Args:
-        sources: Names of models, as for `flame_mdm.load`, or "MODEL + ADAPTER"; requests can choose no other.
-        device: Device of all models.
+    `sources` are names of models, as for `flame_mdm.load`, or "MODEL + ADAPTER"; requests can choose no other.
     """
 
     def __init__(self, sources: Sequence[str], device: str):

@@ -96,8 +96,8 @@ def rating_page(
 def tally(files: Sequence[Path]) -> list[dict[str, Any]]:
     """Counts the answers of several raters; raises `UserError` if a file is malformed or given twice.
 
-    Returns for each pair of labels: `a`, `b`, `wins_a`, `wins_b`, `raters`, `share_a`, the share of answers for a, and
-    `interval_a`, its 95 % interval (Wilson 1927), which treats all answers as independent.
+    `share_a` is the share of answers for a, and `interval_a` its 95 % interval, which treats all answers as
+    independent.
     """
     raters: dict[tuple[str, str], Path] = {}
     counts: dict[tuple[str, str], dict[str, Any]] = {}

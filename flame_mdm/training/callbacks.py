@@ -54,12 +54,8 @@ class Checkpoints(Checkpoint):
     """Writes `last.ckpt` periodically, at the last step and when interrupted, and keeps some checkpoints permanently.
 
     Signals stop training at the end of the current step (`StopRequest`); with several processes, at the end of the next
-    one. Validation is never interrupted, since averaged weights replace the trained ones meanwhile.
-
-    Args:
-        folder: folder of the checkpoints.
-        every_n_steps: number of steps after which `last.ckpt` is rewritten.
-        keep_every_n_steps: number of steps after which a checkpoint is kept permanently; None = none is kept.
+    one. Validation is never interrupted, since averaged weights replace the trained ones meanwhile. With
+    `keep_every_n_steps` None, no checkpoint is kept permanently.
     """
 
     def __init__(self, folder: str, every_n_steps: int, keep_every_n_steps: int | None = None):

@@ -1,8 +1,7 @@
 """Atomic checkpoints, and resuming from them after validation.
 
 A run directory may come from somebody else, and Lightning restores the state of loops, callbacks and optimizers without
-checking it. So `newest` and `check_training_state` check what a checkpoint says before Lightning reads it, and
-`AtomicCheckpoints` only removes files directly in the folder of the checkpoints.
+checking it. So `newest` and `check_training_state` check what a checkpoint says before Lightning reads it.
 """
 
 import os

@@ -1,7 +1,7 @@
 """Distillation: Gaussian data, for which everything is known; and runs of a student, from the command to the motion."""
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
@@ -39,41 +39,46 @@ def coefficients(process: Process, t: Tensor) -> tuple[Tensor, Tensor]:
 def gains(process: Process, times: Tensor) -> Tensor:
     """Gains k (N, D) of the exact f(x, t) = mean + k (x - a mean) after DDIM steps of the exact denoiser."""
     a, s = (value[:, 0] for value in coefficients(process, times))
-    k = a * VARIANCE / (a**2 * VARIANCE + s**2)  # that of the posterior mean
+    k = posterior(a, s)
     for n in reversed(range(len(times) - 1)):
         k[n] = k[n + 1] * (a[n + 1] * k[n] + s[n + 1] / s[n] * (1 - a[n] * k[n]))
     return k
 
 
-def denoiser(process: Process, gain: Tensor) -> Denoise:
-    """The denoiser with f = mean + k (x - a mean), where k (B, 1, D) is the gain at the time of each motion."""
+def denoiser(process: Process, gain: Callable[[Tensor, Tensor], Tensor]) -> Denoise:
+    """The denoiser with f = mean + gain(a, s) (x - a mean)."""
 
     def denoise(x_t: Tensor, table_time: Tensor, *_: object) -> Tensor:
         t = table_time / 1000 if isinstance(process, FlowMatching) else table_time
         a, s = coefficients(process, t)
-        f = MEAN + gain * (x_t - a * MEAN)
+        f = MEAN + gain(a, s) * (x_t - a * MEAN)
         return process.target(f, (x_t - a * f) / s, t)
 
     return denoise
 
 
-def posterior(process: Process, t: Tensor) -> Tensor:
-    """The gain (B, 1, D) of E[x | x_t], which a trained denoiser returns."""
-    a, s = coefficients(process, t)
+def posterior(a: Tensor, s: Tensor) -> Tensor:
+    """The gain of E[x | x_t], which a trained denoiser returns."""
     return a * VARIANCE / (a**2 * VARIANCE + s**2)
 
 
-def loss(process: Process, student: Denoise, times: Tensor, index: Tensor, auxiliary: bool = False) -> Tensor:
+def path(a: Tensor, s: Tensor) -> Tensor:
+    """The gain along the path of infinitely many steps."""
+    return (VARIANCE / (a**2 * VARIANCE + s**2)).sqrt()
+
+
+def loss(process: Process, student: Denoise, times: Tensor, index: Tensor, teacher_steps: int = 1) -> Tensor:
     x = MEAN + VARIANCE.sqrt() * torch.randn(len(index), 2, 3).double()
     return consistency_terms(
         process,
         student,
         student,
-        denoiser(process, posterior(process, times[index])),
+        denoiser(process, posterior),
         x,
         real(x),
         NO_CONDITION,
         times=times,
+        teacher_steps=teacher_steps,
         index=index,
         noise=torch.randn_like(x),
         auxiliary=lambda estimate, target, mask: {},
@@ -107,8 +112,10 @@ def test_the_exact_student_of_gaussian_data_has_no_loss(process):
         network.gain.copy_(exact[:, None])
         network.offset.copy_((MEAN - exact * coefficients(process, times)[0][:, 0] * MEAN)[:, None])
         assert loss(process, network, times, torch.arange(10)).max() < 1e-9
+        assert loss(process, network, times, torch.arange(2), teacher_steps=5).max() < 1e-9
         network.gain[0] += 0.1
         assert loss(process, network, times, torch.arange(10))[0] > 1e-3
+        assert loss(process, network, times, torch.arange(2), teacher_steps=5)[0] > 1e-3
 
 
 @pytest.mark.parametrize(
@@ -132,16 +139,9 @@ def test_a_network_learns_the_exact_student(process):
 def test_fine_grids_lead_to_the_data_and_so_do_one_two_and_four_calls(process):
     times = torch.tensor(process.grid(400)).double()
     a, s = (value[:, 0] for value in coefficients(process, times))
-    exact = (VARIANCE / (a**2 * VARIANCE + s**2)).sqrt()  # of the path itself
-    torch.testing.assert_close(gains(process, times), exact, atol=0.02, rtol=0)
-
-    def denoise(x_t: Tensor, table_time: Tensor, *rest: Any) -> Tensor:
-        t = table_time / 1000 if isinstance(process, FlowMatching) else table_time
-        a, s = coefficients(process, t)
-        return denoiser(process, (VARIANCE / (a**2 * VARIANCE + s**2)).sqrt())(x_t, table_time, *rest)
-
+    torch.testing.assert_close(gains(process, times), path(a, s), atol=0.02, rtol=0)
     for steps in (1, 2, 4):
-        counted = CountedDenoise(denoise)
+        counted = CountedDenoise(denoiser(process, path))
         noise = drawn((1000, 20, 3), torch.float64)
         x = sample(process, counted, noise, sampler="consistency", num_inference_steps=steps)
         assert counted.calls == steps

@@ -67,7 +67,7 @@ def path(a: Tensor, s: Tensor) -> Tensor:
     return (VARIANCE / (a**2 * VARIANCE + s**2)).sqrt()
 
 
-def loss(process: Process, student: Denoise, times: Tensor, index: Tensor, teacher_steps: int = 1) -> Tensor:
+def loss(process: Process, student: Denoise, times: Tensor, index: Tensor) -> Tensor:
     x = MEAN + VARIANCE.sqrt() * torch.randn(len(index), 2, 3).double()
     return consistency_terms(
         process,
@@ -78,7 +78,6 @@ def loss(process: Process, student: Denoise, times: Tensor, index: Tensor, teach
         real(x),
         NO_CONDITION,
         times=times,
-        teacher_steps=teacher_steps,
         index=index,
         noise=torch.randn_like(x),
         auxiliary=lambda estimate, target, mask: {},
@@ -112,10 +111,8 @@ def test_the_exact_student_of_gaussian_data_has_no_loss(process):
         network.gain.copy_(exact[:, None])
         network.offset.copy_((MEAN - exact * coefficients(process, times)[0][:, 0] * MEAN)[:, None])
         assert loss(process, network, times, torch.arange(10)).max() < 1e-9
-        assert loss(process, network, times, torch.arange(2), teacher_steps=5).max() < 1e-9
         network.gain[0] += 0.1
         assert loss(process, network, times, torch.arange(10))[0] > 1e-3
-        assert loss(process, network, times, torch.arange(2), teacher_steps=5)[0] > 1e-3
 
 
 @pytest.mark.parametrize(

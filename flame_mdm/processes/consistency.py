@@ -23,15 +23,14 @@ def consistency_terms(
     cond: Condition,
     *,
     times: Tensor,
-    teacher_steps: int = 1,
     index: Tensor,
     noise: Tensor,
     auxiliary: Auxiliary,
 ) -> dict[str, Tensor]:
-    """Returns the losses (B,) of f at x_t against f after steps of the teacher: "consistency", auxiliary, "loss".
+    """Returns the losses (B,) of f at x_t against f after one step of the teacher: "consistency", auxiliary, "loss".
 
-    The steps are those of DDIM with eta = 0, which for a flow is Euler's. After the last time comes the data, where f
-    is the teacher's estimate.
+    The step is that of DDIM with eta = 0, which for a flow is Euler's. After the last time of the grid comes the data,
+    where f is the teacher's estimate.
 
     Args:
         process: of student and teacher; predicts the clean motion or the velocity.
@@ -39,26 +38,21 @@ def consistency_terms(
         follower: computes f after the step, the target, without gradient: the student or an average of its weights.
         teacher: guided.
         x, mask, cond: motions (B, F, D), their real frames (B, F), and conditions.
-        times: (N * teacher_steps,), of the teacher, from pure noise on; see `Process.grid`. The student learns at every
-            `teacher_steps`-th of them.
-        teacher_steps: number of steps from one time of the student to the next.
-        index: (B,) int64, from 0 to N - 1, the number of the student's time of each motion.
+        times: (N,), from pure noise on; see `Process.grid`.
+        index: (B,) int64, the number of the time of each motion.
         noise: (B, F, D), standard normal.
         auxiliary: geometric losses of the estimate against the target.
     """
-    first = index * teacher_steps
-    t = times[first]
+    is_last = index == len(times) - 1
+    t, end = times[index], times[(index + 1).clamp(max=len(times) - 1)]
     x_t = process.corrupt(x, noise, t)
-    zeros, ones = torch.zeros_like(x), torch.ones_like(x)
     with torch.no_grad():
-        nearer, now = x_t, t
-        for step in range(1, teacher_steps + 1):
-            guided = process.clean(teacher, nearer, now, mask, cond)
-            left = (nearer - process.corrupt(guided, zeros, now)) / process.corrupt(zeros, ones, now)
-            now = times[(first + step).clamp(max=len(times) - 1)]
-            nearer = process.corrupt(guided, left, now)
-        is_last = first + teacher_steps == len(times)
-        target = torch.where(is_last[:, None, None], guided, process.clean(follower, nearer, now, mask, cond))
+        guided = process.clean(teacher, x_t, t, mask, cond)
+        left = (x_t - process.corrupt(guided, torch.zeros_like(x), t)) / process.corrupt(
+            torch.zeros_like(x), torch.ones_like(x), t
+        )
+        nearer = process.corrupt(guided, left, end)
+        target = torch.where(is_last[:, None, None], guided, process.clean(follower, nearer, end, mask, cond))
     estimate = process.clean(student, x_t, t, mask, cond)
     terms = {"consistency": masked_mse(estimate, target, mask)} | auxiliary(estimate, target, mask)
     return terms | {"loss": torch.stack(list(terms.values())).sum(0)}

@@ -30,7 +30,6 @@ class ConsistencyDistillation(DistilledGenerator, MotionGeneration):
         teacher: a checkpoint, as for `flame_mdm.load`. The hash of its weights becomes the student's fact "teacher".
         guidance_scale: of the teacher's steps; null = the default of the teacher.
         intervals: numbers of times of the grid; each is used for an equal share of the training.
-        teacher_steps: number of the teacher's steps from one time of the grid to the next.
     """
 
     @classmethod
@@ -98,14 +97,11 @@ class ConsistencyDistillation(DistilledGenerator, MotionGeneration):
         self, batch: MotionBatch, cond: Condition, u: Tensor | None = None, noise: Tensor | None = None
     ) -> dict[str, Tensor]:
         """See `MotionGeneration.loss_terms`. Validation, which gives u, is at the times of the last grid."""
-        trainer, options = self._trainer, self.config["distillation"]
-        counts, teacher_steps = options["intervals"], options["teacher_steps"]
+        trainer, counts = self._trainer, self.config["distillation"]["intervals"]
         progress, is_validation = 1.0, u is not None
         if not is_validation and trainer is not None and trainer.max_steps > 0:
             progress = trainer.global_step / trainer.max_steps
-        longest = len(self.process.grid(counts[min(int(progress * len(counts)), len(counts) - 1)] * teacher_steps))
-        count = longest // teacher_steps  # a short diffusion has fewer times
-        times = torch.tensor(self.process.grid(count * teacher_steps))
+        times = torch.tensor(self.process.grid(counts[min(int(progress * len(counts)), len(counts) - 1)]))
         u = torch.rand(len(batch), device=self.device) if u is None else u
         teacher: Denoise = self.teacher[0]
         if cond.null is not None and self.condition.features and self.teacher_guidance is not None:
@@ -119,8 +115,7 @@ class ConsistencyDistillation(DistilledGenerator, MotionGeneration):
             batch.mask,
             cond,
             times=times.to(self.device),
-            teacher_steps=teacher_steps,
-            index=(u * count).long().clamp(max=count - 1),
+            index=(u * len(times)).long().clamp(max=len(times) - 1),
             noise=torch.randn_like(batch.x) if noise is None else noise,
             auxiliary=self.losses,
         )

@@ -205,3 +205,75 @@ def test_real_motions_have_what_protocols_expect():
 
 
 # How settings stand beside reported ones ------------------------------------------------------------------------------
+
+
+ROWS = """
+flame_1: {HumanML3D: 5, BABEL: 5}
+flame_2: {KIT-ML: 5}
+flame_3: {HumanML3D: 2}
+flame_4: {HumanML3D: 4}
+flame_5: {HumanML3D: 8}
+flame_9: {DDPM: 9, DDIM: 9}
+flame_10: {HumanML3D: 6}
+mdm_1: {HumanML3D: 13}  # three of them the authors' corrections
+mdm_2: {KIT-ML: 5}
+mdm_3: {HumanAct12: 7}
+mdm_4: {UESTC: 5}
+mdm_5: {HumanAct12: 3}
+mdm_6: {HumanML3D: 5}
+mdm_7: {HumanAct12: 7}
+mdm_figure_4: {User study: 1}
+mfm_1: {KIT-ML: 8}
+mfm_2: {HumanML3D: 8}
+mfm_3: {Prediction: 2, Upper body: 2, In-between: 2}
+mfm_figure_4: {HumanML3D: 2}
+"""
+
+
+def test_rows_and_cells_are_those_of_the_papers():
+    counts = {f"{name}: {part}": n for name, parts in yaml.safe_load(ROWS).items() for part, n in parts.items()}
+    assert {name: len(part["rows"]) for name, part in REPORTED.items() if name not in SETTINGS} == counts
+    holes = {}
+    for name, part in REPORTED.items():
+        columns = {column for row in part["rows"] for column in row["values"]}
+        holes[name] = sum(len(columns - row["values"].keys()) for row in part["rows"] if "source" not in row)
+    assert {name: count for name, count in holes.items() if count} == {
+        "mdm_1: HumanML3D": 3 + 2 * 10,  # multimodality of real motions, JL2P, Text2Gesture; top 1 and 2 of all
+        **{"mdm_2: KIT-ML": 3, "mfm_2: HumanML3D": 4},
+        "mfm_1: KIT-ML": 3,  # NFE of what generates frame by frame
+    }
+    assert SPECS["mdm_5"]["parts"]["HumanAct12"]["columns"]["Diversity"]["better"] == "higher", "the paper's arrow"
+
+
+def test_papers_repeat_their_main_rows():
+    main = rows("flame_1", "HumanML3D")["FLAME (Ours)"]
+    assert main == rows("flame_4", "HumanML3D")["+ frozen language model"]
+    assert {"Sampling steps": "1,000"} | main == PUBLISHED["flame_9"]["DDPM"]["rows"][0]["values"]
+    text, steps = rows("mdm_1", "HumanML3D"), rows("mdm_6", "HumanML3D")
+    assert steps["Real"] == text["Real"]
+    assert steps["T = 1000"].items() <= text["MDM (ours)"].items()
+    actions, losses = rows("mdm_3", "HumanAct12"), rows("mdm_7", "HumanAct12")
+    assert losses["Real"] == actions["Real (ours)"]
+    assert all(losses[label] == actions[label] for label in ("MDM (ours)", "w/o foot contact"))
+    kit, humanml3d = PUBLISHED["mfm_1"]["KIT-ML"]["rows"], PUBLISHED["mfm_2"]["HumanML3D"]["rows"]
+    assert [row for row in humanml3d if row["label"] != "MotionGPT"] == kit[:-1]
+    assert kit[-1] == {"label": "Our MFM", "values": {"NFE": "50", "Parameters, M": "17.9M"}}
+    assert round(settings("humanml3d/mfm")["parameters"], 1) == 17.9
+
+
+def test_published_numbers_grow_where_they_must():
+    seconds = [float(row["values"]["Seconds per motion"]) for row in PUBLISHED["flame_5"]["HumanML3D"]["rows"]]
+    assert seconds == sorted(seconds)
+    for part in ("DDPM", "DDIM"):  # fewer steps, a larger distance
+        distances = [float(row["values"]["FD"]) for row in PUBLISHED["flame_9"][part]["rows"]]
+        assert distances == sorted(distances)
+    for name, part in REPORTED.items():
+        for row in part["rows"]:
+            tops = [row["values"].get(f"R precision (top {k})") for k in (1, 2, 3)]
+            if None not in tops:
+                shares = [float(top) for top in tops]
+                assert shares == sorted(shares), f"{name}, {row['label']}"
+                assert shares[2] <= 1, "a share, in all tables"
+
+
+# How settings stand beside reported ones ------------------------------------------------------------------------------

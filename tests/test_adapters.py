@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
-from support.runs import TINY
+from support.runs import TINY, TWO, finish, spawn
 
 import flame_mdm
 from flame_mdm.__main__ import main
@@ -19,6 +19,8 @@ from flame_mdm.conditions.vocabulary import hashed
 from flame_mdm.config import compose, instantiate
 from flame_mdm.data.store import Store
 from flame_mdm.data.synthetic import Synthetic
+from flame_mdm.demo.request import DemoRequest
+from flame_mdm.demo.studio import Studio
 from flame_mdm.errors import UserError
 from flame_mdm.task import MotionGeneration
 from flame_mdm.training import adaptation
@@ -220,3 +222,25 @@ def test_unusable_requests_are_refused(refused, trained, clips, tmp_path):
     refused(*lesson, says="1 of 4 motions have no caption")
     (clips / "rising.txt").write_text("a person rises")
     refused(*lesson, says="rising drifts upward by")
+
+
+def test_the_demo_offers_a_model_with_and_without_an_adapter(taught):
+    base, adapter = str(taught / "base.safetensors"), str(taught / "limp.safetensors")
+    studio = Studio([base, f"{base} + {adapter}"], "cpu")
+    expected = flame_mdm.load(base, adapter=adapter).state_dict()
+    torch.testing.assert_close(dict(studio.model(f"{base} + {adapter}").state_dict()), dict(expected), rtol=0, atol=0)
+    request = DemoRequest(model=f"{base} + {adapter}", text="a person walks")
+    assert f"flame-mdm sample {base} 'text=a person walks'" in request.command("text", None)
+    assert f"adapter={adapter}" in request.command("text", None)
+    assert f"flame_mdm.load({base!r}, adapter={adapter!r})" in request.python("text", "cpu")
+    with pytest.raises(UserError, match="give one number, or one for each of 1 adapters"):
+        flame_mdm.load(base, adapter=adapter, strength=[1, 2])
+
+
+@pytest.mark.slow
+def test_two_processes(trained, clips, tmp_path, data_root):
+    words = ["adapt", str(trained), str(tmp_path / "run"), f"source={clips}", "name=limp", *STEPS]
+    words.append("trainer.max_steps=2")
+    code, _, err = finish(spawn(["flame_mdm", *words, *TWO, f"data_root={data_root}"]))
+    assert code == 0, err
+    assert (tmp_path / "run" / "limp.safetensors").stat().st_size < 300_000

@@ -100,7 +100,7 @@ FRAMES, ACTIONS = 24, 40
 
 
 class Drawn(ConditionEncoder):
-    """What a frozen language model would return: vectors, and tokens where the recipe reads them, of its widths."""
+    """Stands in for a frozen language model: pooled vectors, and tokens if the recipe reads them, in its widths."""
 
     def __init__(self, features: int, tokens: int):
         super().__init__()

@@ -114,7 +114,7 @@ def _named(path: Path) -> Iterator[None]:
 
 
 def from_array(joints: Any, fps: float | None) -> Motion:
-    """Returns a motion of joints (F, J, 3) in meters, y up, of the known skeleton with this number of joints.
+    """Returns a motion of joints (F, J, 3) in meters, y up, of the built-in skeleton with this number of joints.
 
     Raises:
         UserError: If the shape is another one, the values are not numbers, or there is no frame rate.

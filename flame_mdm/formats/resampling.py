@@ -18,7 +18,7 @@ MAX_RESAMPLED = 1_000_000
 
 
 def frame_rate(value: Any, name: str = "fps") -> float:
-    """Returns a frame rate, `name` in its file, as a float; raises `UserError` if it is no number in `RATES`."""
+    """Returns a frame rate, `name` in its file, as a float; raises `UserError` unless it is a number in `RATES`."""
     number = np.asarray(value)
     if number.shape or number.dtype.kind not in "fiu" or not RATES[0] <= float(number) <= RATES[1]:
         shown = f"{float(number):g}" if not number.shape and number.dtype.kind in "fiu" else f"{value}"[:40]

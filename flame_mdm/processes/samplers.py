@@ -49,7 +49,7 @@ class CountedDenoise:
 
 
 class Descent(NamedTuple):
-    """What a diffusion sampler needs besides x_t."""
+    """Inputs of a diffusion sampler, apart from x_t."""
 
     estimate: Estimate  # calls the denoiser
     schedule: Schedule  # of the sampling steps

@@ -131,7 +131,8 @@ class MotionGeneration(MotionGenerator, Task):
             raise UserError(f"task.cond_drop_prob={cond_drop_prob}: give a probability from 0 to 1")
         options = {"guidance_scale": guidance_scale, "sampler": sampler, "num_inference_steps": num_inference_steps}
         self.combine(denoiser, process, condition, representation, **options)
-        self.losses = MotionLosses(representation.to_joints, representation.skeleton.feet, **losses)
+        skeleton = representation.skeleton
+        self.losses = MotionLosses(representation.to_joints, skeleton.feet, skeleton.edges, **losses)
         self.cond_drop_prob = cond_drop_prob
         self.val_losses = torch.nn.ModuleDict()
         if compile:

@@ -20,7 +20,8 @@ FIXTURE, FLOW = golden("mdm_losses"), golden("mfm")
 OURS = {"rot_mse": "mse", "vel_mse": "velocity", "rcxyz_mse": "joints", "fc": "foot_contact"}
 WEIGHTS = {"vel_mse": "lambda_vel", "rcxyz_mse": "lambda_rcxyz", "fc": "lambda_fc"}
 SMPL_FEET = [7, 10, 8, 11]
-ALL: dict[str, Any] = {"joints": 1.0, "velocity": 1.0, "foot_contact": 1.0}
+ALL: dict[str, Any] = {"joints": 1.0, "velocity": 1.0, "foot_contact": 1.0, "bone_length": 1.0}
+BONES = [(0, 1), (1, 2)]
 
 
 def linear_joints(matrix: np.ndarray) -> Callable[[Tensor], Tensor]:
@@ -93,7 +94,7 @@ def test_equal_motions_lose_nothing_but_sliding_feet():
     """One foot stands and slides in the estimate, the other moves in the data and is free to."""
     x = torch.zeros(1, 4, 9)
     x[..., 6] = torch.arange(4.0)
-    losses = MotionLosses(joints_as_features, [1, 2], **ALL)
+    losses = MotionLosses(joints_as_features, [1, 2], BONES, **ALL)
     mask = torch.ones(1, 4, dtype=torch.bool)
     assert all(loss == 0 for loss in losses(x, x, mask).values())
     slid = x.clone()
@@ -113,9 +114,22 @@ def test_equal_motions_lose_nothing_but_sliding_feet():
         assert (MotionLosses(joints_as_features, [1], foot_contact=1.0)(slow, slow, mask)["foot_contact"] > 0) == stands
 
 
+def test_bones_lose_their_change_of_length_and_not_their_turns():
+    """Bones of 1 m and 2 m are turned in the estimate; in one frame, the second is 0.3 m too long."""
+    points = torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 2, 0]])
+    x = points.flatten().repeat(1, 4, 1)
+    turned = points @ torch.tensor([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]]) + 5
+    x0_hat = turned.flatten().repeat(1, 4, 1)
+    losses = MotionLosses(joints_as_features, [], BONES, bone_length=2.0)
+    mask = torch.ones(1, 4, dtype=torch.bool)
+    assert losses(x0_hat, x, mask)["bone_length"].item() == pytest.approx(0, abs=1e-10)
+    x0_hat[0, 1, 7] += 0.3
+    assert losses(x0_hat, x, mask)["bone_length"].item() == pytest.approx(2 * 0.3**2 / (4 * 2), rel=1e-5)
+
+
 def test_padding_and_single_frames():
     torch.manual_seed(0)
-    losses = MotionLosses(joints_as_features, [0], **ALL)
+    losses = MotionLosses(joints_as_features, [0], BONES, **ALL)
     a, b = torch.randn(2, 3, 6, 9).unbind()
     mask = length_mask(torch.tensor([6, 3, 1]))
     spoiled = torch.where(mask[..., None], a, 1e6), torch.where(mask[..., None], b, -1e6)
@@ -143,7 +157,7 @@ def test_only_what_weighs_is_computed():
 def test_gradients_reach_the_estimate():
     x, mask = 0.001 * torch.randn(2, 4, 9), length_mask(torch.tensor([4, 2]))  # so still that all feet are in contact
     x0_hat = torch.randn(2, 4, 9, requires_grad=True)
-    losses = MotionLosses(joints_as_features, [0, 1], **ALL)
+    losses = MotionLosses(joints_as_features, [0, 1], BONES, **ALL)
     torch.stack(list(losses(x0_hat, x, mask).values())).sum().backward()
     assert x0_hat.grad is not None
     assert (x0_hat.grad[mask] != 0).all()

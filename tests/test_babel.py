@@ -123,7 +123,7 @@ def test_the_official_training_set_stays_whole_and_val_is_divided_by_motion(tmp_
     assert flames["val"] + flames["test"] == 4 * 37
 
 
-def test_absent_and_damaged_motions_are_named(small: tuple[Path, Path]):
+def test_absent_and_damaged_files_are_named(small: tuple[Path, Path]):
     path = small[1] / "CMU/03/03_01_poses.npz"
     data = bytearray(path.read_bytes())
     data[len(data) // 2] ^= 1
@@ -135,15 +135,11 @@ def test_absent_and_damaged_motions_are_named(small: tuple[Path, Path]):
         open_babel(*small).count()
     with pytest.raises(FileNotFoundError, match=r"register at https://amass"):
         open_babel(small[0], small[0] / "none").count()
-
-
-def test_damaged_labels_are_named(small: tuple[Path, Path]):
-    cases = {
-        "{": r"val\.json: not a JSON file",
-        "[1]": r"val\.json: not in the layout of BABEL",
-        '{"1": {"feat_p": "a/b"}}': r"val\.json: not in the layout of BABEL v1\.0: 'frame_ann'",
-    }
-    for content, message in cases.items():
+    for content, message in (
+        ("{", r"val\.json: not a JSON file"),
+        ("[1]", r"val\.json: not in the layout of BABEL"),
+        ('{"1": {"feat_p": "a/b"}}', r"val\.json: not in the layout of BABEL v1\.0: 'frame_ann'"),
+    ):
         (small[0] / "val.json").write_text(content)
         with pytest.raises(UserError, match=message):
             open_babel(*small).count()

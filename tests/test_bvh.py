@@ -82,14 +82,12 @@ def ends_of(motion: bvh.Bvh) -> np.ndarray:
     return positions[:, parents] + np.einsum("feij,ej->fei", turned[:, parents], motion.end_offsets)
 
 
-def test_position_channels_replace_the_offset():
+def test_position_channels_replace_the_offset_and_rotations_follow_the_order_of_the_channels():
     positions = arm().positions()
     assert positions[0].tolist() == [[0, 0, 0], [5, 0, 0], [5, -2, 0], [0, 7, 9]]
     # turned by 90 degrees about z: x goes to y, y to -x
     np.testing.assert_allclose(positions[1], [[0, 90, -3], [0, 95, -3], [2, 95, -3], [-8, 90, 6]], atol=1e-12)
 
-
-def test_rotations_follow_the_order_of_the_channels():
     rotations = arm().rotations()[2]
     hips = matrix("Z", 10) @ matrix("X", 20) @ matrix("Y", 30)
     shoulder = matrix("Y", 40) @ matrix("X", 50) @ matrix("Z", 60)
@@ -123,7 +121,7 @@ def test_what_is_written_reads_back(tmp_path):
     assert (tmp_path / "again.bvh").read_bytes() == (tmp_path / "tree.bvh").read_bytes()
 
 
-def test_resampling_keeps_the_last_frame():
+def test_resampling_turns_at_a_constant_rate_and_keeps_bones_and_the_last_frame():
     for frames, expected in ((1, 1), (2, 1), (3, 2), (4, 3), (7, 5), (128, 85), (130, 87)):
         motion = replace(tree(0, frames), fps=30.0)
         rotations, translations = motion.resample(20)
@@ -132,9 +130,6 @@ def test_resampling_keeps_the_last_frame():
         np.testing.assert_allclose(rotations[::2], motion.rotations()[::3][shared], atol=1e-12)
         np.testing.assert_allclose(translations[::2], motion.translations()[::3][shared], atol=1e-12)
 
-
-def test_resampling_turns_at_a_constant_rate_and_keeps_bones():
-    # 20 degrees the short way about z, 90 about the arm's x
     frames = "0 0 0 170 0 0 0 0 0 7\n3 6 9 -170 0 0 0 90 0 7\n"
     text = ARM[: ARM.index("0 0 0 0 0 0")].replace("Frames:\t3", "Frames:\t2") + frames
     motion = bvh.parse(text.encode(), "arm.bvh")

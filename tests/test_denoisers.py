@@ -6,7 +6,6 @@ from typing import Any
 import pytest
 import torch
 from hydra.utils import instantiate
-from omegaconf import OmegaConf
 from support.fixtures import ROOT
 
 from flame_mdm.batch import Condition, length_mask
@@ -15,6 +14,7 @@ from flame_mdm.denoisers.flame import FLAME
 from flame_mdm.denoisers.mdm import MDMDecoder, MDMEncoder
 from flame_mdm.denoisers.unet import MaskedGroupNorm, MDMUNet
 from flame_mdm.errors import UserError
+from flame_mdm.safe_io import read_yaml
 
 CONFIGS = sorted((ROOT / "experiments" / "denoiser").glob("*.yaml"))
 TRANSFORMER = {"latent_dim": 16, "ff_size": 24, "num_layers": 2, "num_heads": 2, "dropout": 0.0}
@@ -22,16 +22,10 @@ TINY = {**TRANSFORMER, "channels": [8, 8, 16], "num_groups": 4}
 D, C, LENGTHS = 7, 12, [11, 8, 1]
 
 
-def config_of(path: Path) -> dict:
-    config = OmegaConf.to_container(OmegaConf.load(path))
-    assert isinstance(config, dict)
-    return {str(key): value for key, value in config.items()}
-
-
 def tiny(path: str | Path, out_features: int = D, cond_features: int = C, **options) -> Denoiser:
     """The denoiser of a YAML in the smallest sizes, in float64 so that only real differences show."""
     torch.manual_seed(0)
-    config = config_of(ROOT / "experiments/denoiser" / path)
+    config = read_yaml(ROOT / "experiments/denoiser" / path)
     config |= {key: value for key, value in TINY.items() if key in config}
     return instantiate(config, D, out_features, cond_features, **options).double().eval()
 
@@ -98,12 +92,10 @@ def test_dropped_condition_is_the_null(path: Path) -> None:
 
 
 @each_denoiser
-def test_all_weights_get_gradients_and_time_is_continuous(path: Path) -> None:
+def test_time_is_continuous(path: Path) -> None:
+    """That all weights get gradients is tested with processes and conditions."""
     denoiser = tiny(path)
-    x_t, t, mask, cond = batch()
-    denoiser(x_t, t, mask, cond)[mask].square().sum().backward()
-    without = [name for name, p in denoiser.named_parameters() if p.grad is None or not p.grad.abs().sum() > 0]
-    assert without == []
+    x_t, _, mask, cond = batch()
 
     def at(t: float) -> torch.Tensor:
         return denoiser(x_t, torch.full((len(x_t),), t), mask, cond)[mask]
@@ -117,7 +109,7 @@ def test_paper_sizes() -> None:
     sizes |= {"mdm_gru": 4_472_071, "mdm_unet": 23_565_959, "flame": 64_905_766}  # U-Net: 23.47M in the paper
     for name, parameters in sizes.items():
         with torch.device("meta"):
-            config = config_of(ROOT / "experiments" / "denoiser" / f"{name}.yaml")
+            config = read_yaml(ROOT / "experiments" / "denoiser" / f"{name}.yaml")
             denoiser = instantiate(config, *((147, 294, 768) if name == "flame" else (263, 263, 512)))
         assert sum(p.numel() for p in denoiser.parameters()) == parameters, name
 
@@ -163,8 +155,7 @@ def test_flame_ablations(length_token: bool, cross_attention: bool) -> None:
 def test_flame_returns_zeros_past_the_end_and_knows_lengths_up_to_max_frames() -> None:
     x_t, t, mask, cond = batch()
     y = tiny("flame.yaml")(x_t, t, mask, cond)
-    assert (y[~mask] == 0).all()
-    assert (y[mask] != 0).all()
+    assert torch.equal((y != 0).all(-1), mask)
     flame = FLAME(D, D, C, **TRANSFORMER, max_frames=11).double()
     assert flame(*batch(frames=14)).isfinite().all()
     with pytest.raises(UserError, match=r"12 frames .* denoiser\.max_frames \(11\)"):

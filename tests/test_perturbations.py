@@ -22,28 +22,22 @@ def draws() -> np.random.Generator:
     return np.random.default_rng(0)
 
 
-def test_jitter_has_the_given_deviation_and_the_same_draws_at_all_grades(walk):
+def test_jitter_has_the_given_deviation_and_wobble_is_a_slow_sine(walk):
     weak, strong = (p.jitter(walk, sigma, draws()) - walk for sigma in (5, 20))
     assert weak.std() == pytest.approx(0.005, rel=0.03)
     np.testing.assert_allclose(4 * weak, strong, atol=1e-12)
-
-
-def test_wobble_is_a_slow_sine(walk):
     offset = p.wobble(walk, 20, draws(), fps=20.0) - walk
     np.testing.assert_allclose(offset[20:], offset[:-20], atol=1e-12)  # a period of one second
     assert np.linalg.norm(offset, axis=-1).max() <= 0.02 + 1e-12
     assert np.linalg.norm(offset[:20], axis=-1).max(0).min() > 0.0195
 
 
-def test_skating_multiplies_the_horizontal_speed_of_the_root_and_keeps_poses(walk):
+def test_skating_multiplies_the_speed_of_the_root_and_resizing_scales_all_bones(walk):
     changed = p.skate(walk, 1.5)
     np.testing.assert_allclose(changed - changed[:, :1], walk - walk[:, :1], atol=1e-12)
     steps = np.diff(changed[:, 0], axis=0)
     np.testing.assert_allclose(steps[:, [0, 2]], 1.5 * np.diff(walk[:, 0], axis=0)[:, [0, 2]], atol=1e-12)
     np.testing.assert_array_equal(changed[..., 1], walk[..., 1])
-
-
-def test_resizing_scales_all_bones_and_keeps_track_and_floor(walk):
     changed, skeleton = p.resize(walk, 10), HumanML().skeleton
     ours, theirs = (skeleton.bones(torch.from_numpy(x))[:, 1:].norm(dim=-1) for x in (changed, walk))
     torch.testing.assert_close(ours, 1.1 * theirs)
@@ -51,7 +45,7 @@ def test_resizing_scales_all_bones_and_keeps_track_and_floor(walk):
     np.testing.assert_allclose(changed[..., 1], 1.1 * walk[..., 1])
 
 
-def test_wrists_are_drawn_into_the_trunk_and_found_there(walk):
+def test_wrists_are_drawn_into_the_trunk_and_a_pop_displaces_one_frame(walk):
     changed = p.draw_in(walk, 10) - walk
     np.testing.assert_allclose(
         np.linalg.norm(changed[:, [18, 19, 20, 21]], axis=-1), [[0.05, 0.05, 0.1, 0.1]] * len(walk)
@@ -59,9 +53,6 @@ def test_wrists_are_drawn_into_the_trunk_and_found_there(walk):
     assert not np.delete(changed, [18, 19, 20, 21], 1).any()
     kinds = [{fault.kind for fault in find_faults(Motion(p.draw_in(walk, grade), 20.0))} for grade in (0, 40)]
     assert ["inside" in kind for kind in kinds] == [False, True]
-
-
-def test_a_pop_displaces_one_frame_as_a_whole(walk):
     for last in (False, True):
         offset = p.pop(walk, 5, draws(), last=last) - walk
         (frame,) = np.unique(np.nonzero(offset)[0])
@@ -70,7 +61,7 @@ def test_a_pop_displaces_one_frame_as_a_whole(walk):
         assert np.ptp(offset[frame], axis=0).max() < 1e-12
 
 
-def test_freezing_holds_a_frame_and_cropping_ends_before_it(walk):
+def test_freezing_cropping_speeds_and_frame_rates(walk):
     for percent, moving in ((10, 18), (50, 10), (100, 1)):
         frozen = p.freeze(walk[:20], percent)
         np.testing.assert_array_equal(frozen[:moving], walk[:moving])
@@ -78,8 +69,6 @@ def test_freezing_holds_a_frame_and_cropping_ends_before_it(walk):
     np.testing.assert_array_equal(p.crop(walk[:40], 25), walk[:30])
     assert len(p.crop(walk[:4], 90)) == 3
 
-
-def test_speeds_and_frame_rates_resample_time():
     ramp = np.arange(22.0)[:, None, None] * np.ones((1, 2, 3))
     np.testing.assert_allclose(p.play(ramp[:21], 2, 20.0)[:, 0, 0], np.arange(0, 21, 2))
     np.testing.assert_allclose(p.play(ramp[:21], 0.5, 20.0)[:, 0, 0], np.arange(21) / 2)

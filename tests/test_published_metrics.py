@@ -88,7 +88,7 @@ def test_mbench_equals_the_authors(case: str):
 
 
 @golden_case("mbench_quality")
-def test_mbench_averages_motions_as_the_authors_do(stem: str):
+def test_mbench_equals_the_authors_in_the_mean(stem: str):
     values = mean_over(MBenchQuality(20.0), MBENCH, meta(MBENCH)["config"]["summary_over"])
     expected = {name: float(MBENCH[f"out/summary/{theirs}"][0]) for name, theirs in MBENCH_NAMES.items()}
     assert values == pytest.approx(expected | {"measured": 1}, abs=1e-6)
@@ -164,7 +164,7 @@ def test_kimodos_percentile_is_over_motions(stem: str):
 
 
 @one
-def test_kimodos_retrieval_and_distances_equal_the_authors(stem: str):
+def test_kimodos_retrieval_distances_and_angles_equal_the_authors(stem: str):
     text, motion, real = (torch.from_numpy(KIMODO[f"in/tmr/{n}"]).double() for n in ("text", "motion", "gt_motion"))
     same = text @ text.T > 0.96  # their threshold 0.99 is converted to 0.98 of (cosine + 1) / 2
     for group, query, gallery in (("t2m_R", text, motion), ("m2m_R", motion, real), ("t2m_gt_R", text, real)):
@@ -178,10 +178,6 @@ def test_kimodos_retrieval_and_distances_equal_the_authors(stem: str):
     assert (alone < 3).double().mean().item() * 100 == pytest.approx(float(KIMODO["out/tmr/no_groups_R03"]))
     for name, a, b in (("gen_gt", motion, real), ("gen_text", motion, text), ("gt_text", real, text)):
         assert float(frechet_distance(a, b)) == pytest.approx(float(KIMODO[f"f64/tmr/FID/{name}"]), abs=1e-6)
-
-
-@one
-def test_angles_between_rotations_equal_the_reproductions(stem: str):
     pred, target = (torch.from_numpy(KIMODO[f"in/geodesic/{name}"]).double() for name in ("pred", "target"))
     angles = torch.rad2deg(rotation.matrix_to_axis_angle(pred @ target.mT).norm(dim=-1))
     # its arc cosine rounds near 0 and 180
@@ -233,13 +229,10 @@ def test_ranks_equal_tmrs(group: str):
 
 
 @golden_case("tmr_retrieval")
-def test_small_batches_equal_tmrs(stem: str):
+def test_retrieval_in_small_batches_and_by_protocol_equals_tmrs(stem: str, monkeypatch):
     similarity, batches = torch.from_numpy(TMR["in/sims"]).double(), torch.from_numpy(TMR["out/guo/batches"])
     assert_recall(batched_retrieval(similarity, batches, TOP), "out/guo")
 
-
-@golden_case("tmr_retrieval")
-def test_protocols_equal_tmrs_driver(stem: str, monkeypatch):
     ids, chosen = TMR["in/keyids"].tolist(), TMR["in/nsim_idx"]
     vectors = dict(zip(ids, torch.from_numpy(TMR["in/sent_emb"]), strict=True))
     monkeypatch.setattr("evaluators.metrics.retrieval.embedding", lambda encoder, caption: vectors[caption])
@@ -256,7 +249,7 @@ def test_protocols_equal_tmrs_driver(stem: str, monkeypatch):
 # Closed forms ---------------------------------------------------------------------------------------------------------
 
 
-def test_multi_positive_r_precision_of_an_example():
+def test_multi_positive_r_precision_of_an_example_and_dissimilar_captions():
     similarity = torch.tensor([[0.9, 0.8, 0.8, 0.1]])
     values = multi_positive(similarity, torch.tensor([[True, False, True, False]]), 2)
     assert values == pytest.approx(
@@ -264,6 +257,10 @@ def test_multi_positive_r_precision_of_an_example():
     )
     values = multi_positive(similarity, torch.tensor([[False, True, True, False]]), 2)
     assert (values["top1"], values["top2"], values["proper"]) == (0, 1, 0.5)
+    metric = TMRRetrieval(subset=2)
+    angles = torch.linspace(0, math.pi / 2, 5)
+    assert metric._dissimilar(torch.stack([angles.cos(), angles.sin()], 1)).tolist() == [0, 4]
+    assert not len(metric._dissimilar(torch.zeros(5, 0)))
 
 
 def test_equal_captions_count_as_correct_and_the_classic_value_stays():
@@ -282,14 +279,6 @@ def test_equal_captions_count_as_correct_and_the_classic_value_stays():
     assert values["single_top1"] == single["top1"] < 1
     assert 1 < values["positives"] < 2
     assert values["chance_top1"] == pytest.approx(values["positives"] / 32)
-
-
-def test_dissimilar_captions_are_taken_first():
-    """Vectors on a quarter circle: the two ends are the most dissimilar."""
-    metric = TMRRetrieval(subset=2)
-    angles = torch.linspace(0, math.pi / 2, 5)
-    assert metric._dissimilar(torch.stack([angles.cos(), angles.sin()], 1)).tolist() == [0, 4]
-    assert not len(metric._dissimilar(torch.zeros(5, 0)))
 
 
 def test_windows_of_transitions():

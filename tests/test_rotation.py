@@ -102,7 +102,7 @@ def test_euler_gimbal_lock():
 
 
 @given(axis_angle=vectors)
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=30)
 def test_round_trips(axis_angle: Tensor):
     matrix = rotation.axis_angle_to_matrix(axis_angle)
     same(matrix @ matrix.mT, torch.eye(3, dtype=torch.float64), 1e-12)
@@ -147,12 +147,11 @@ def test_slerp():
     same(rotation.slerp(a, b, 0.0), a, 1e-12)
     same_rotation(rotation.slerp(a, b, 1.0), b, 1e-12)
     same(rotation.slerp(a, a, 0.3), a, 1e-12)
-    quarter, half = rotation.slerp(a, b, 0.25), rotation.slerp(a, b, 0.5)
-    same_rotation(rotation.slerp(a, half, 0.5), quarter, 1e-12)
+    half = rotation.slerp(a, b, 0.5)
+    same_rotation(rotation.slerp(a, half, 0.5), rotation.slerp(a, b, 0.25), 1e-12)
     assert ((a * half).sum(-1) >= 0.5**0.5 - 1e-9).all(), "the longer way round"
     steps = torch.linspace(0, 1, 5, dtype=a.dtype)[:, None, None]
     same(rotation.slerp(a, b, steps)[2], half, 1e-12)
-    same(rotation.slerp(a, b, 0.5).norm(dim=-1), torch.ones(len(a), dtype=a.dtype), 1e-12)
 
 
 def test_rotate_y_is_the_rotation_about_the_vertical():

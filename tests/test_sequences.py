@@ -1,7 +1,9 @@
-"""Sequences of actions: texts with parts, windows that cover them, continued motions, loops and candidates."""
+"""Words of texts, sequences of actions, windows that cover them, continued motions, loops, candidates, and targets."""
 
 import itertools
+import json
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,12 +15,28 @@ import flame_mdm
 from evaluators.selection import text_fit
 from flame_mdm.__main__ import main
 from flame_mdm.batch import Condition, MotionBatch
+from flame_mdm.checkpoints.model_files import read_checkpoint
+from flame_mdm.conditions.tokens import LearnedTokens
+from flame_mdm.conditions.vocabulary import (
+    MAX_CAPTIONS,
+    advice,
+    check_known,
+    hashed,
+    in_parts,
+    known_form,
+    nearest,
+    vocabulary,
+    words,
+)
+from flame_mdm.data.synthetic import Synthetic
 from flame_mdm.errors import UserError
 from flame_mdm.formats.faults import find_faults
+from flame_mdm.processes.guidance import Positions, reach
 from flame_mdm.processes.windows import Windows, blended, spans, window_tensors
 from flame_mdm.sampling.generation import best
 from flame_mdm.sampling.request import read_parts
 from flame_mdm.sampling.sequences import overlap
+from flame_mdm.sampling.targets import errors, read_targets
 
 CPU = torch.device("cpu")
 
@@ -174,12 +192,202 @@ def test_without_a_score_the_fewest_faulty_frames_decide():
 def test_bad_words_and_scorers_are_one_line(model, tmp_path, capsys):
     with pytest.raises(FileNotFoundError, match="no such"):
         text_fit(str(tmp_path / "none.ckpt"), model)
-    for words, message in (
+    for options, message in (
         ([], "say what to sample: text=..., for example "),
         (["text=walks", "unconditioned=true"], "not text and unconditioned"),
         (["text=walks", "scorer=none.ckpt"], "scorer=none.ckpt chooses among motions for a text"),
         (["text=walks", "scorer=none.ckpt", "candidates=2"], "scorer: none.ckpt: no such checkpoint. Give a run"),
         (["text=walks", "scorer=quickstart", "candidates=2"], "holds a motion generator, not a motion-CLIP"),
     ):
-        assert main(["sample", "quickstart", *words]) == 1
+        assert main(["sample", "quickstart", *options]) == 1
         assert message in capsys.readouterr().err
+
+
+# Targets in the world: way points, joint positions and poses ----------------------------------------------------------
+
+
+TEXT = "a person walks forward"
+
+
+def bones(motion: flame_mdm.Motion) -> np.ndarray:
+    """Lengths (F, N) of all bones but those of the root."""
+    return np.linalg.norm(motion.skeleton.bones(torch.from_numpy(motion.joints)).numpy()[:, 1:], axis=-1)
+
+
+def test_a_linear_decoder_is_solved_exactly_and_changes_least():
+    """Two of six features decide on the position: both change by half, and smoothly in time."""
+    x, index = torch.zeros(1, 9, 6), torch.tensor([4])
+
+    def to_joints(features: torch.Tensor) -> torch.Tensor:
+        position = features[..., 0] + features[..., 1]
+        return torch.stack([position, features[..., 2], features[..., 3]], -1)[..., None, :]
+
+    goal = Positions(index, torch.tensor([0]), torch.tensor([0]), torch.tensor([2.0]))
+    free = torch.ones_like(x, dtype=torch.bool)
+    no_bones = torch.zeros(3, 0, dtype=torch.long)
+    moved = reach(x, to_joints, goal, no_bones, free, smoothness=1.0)[0]
+    assert moved[4, :2].tolist() == pytest.approx([1.0, 1.0], abs=1e-2)
+    assert moved[5, 0] == pytest.approx(float(moved[4, 0] * np.exp(-0.5)), rel=1e-4)
+    assert not moved[:, 2:].any()
+    free[..., 1] = False
+    moved = reach(x, to_joints, goal, no_bones, free, smoothness=1.0)[0]
+    assert moved[4, :2].tolist() == pytest.approx([2.0, 0.0], abs=1e-2)
+
+
+def test_way_points_joints_and_poses_are_reached(model, tmp_path):
+    bow = flame_mdm.generate(model, "a person bows", seconds=2, num_inference_steps=10)[0]
+    bow.save(tmp_path / "bow.npz")
+    content = {
+        "root": [{"time": 1, "position": [0.3, 0.4]}, {"time": 2, "position": [None, 1.2]}],
+        "joints": [{"time": 1.5, "joint": "right_wrist", "position": [None, 1.3, None]}],
+        "poses": [{"time": 2.4, "file": "bow.npz", "frame": 20}],
+    }
+    file = tmp_path / "targets.json"
+    file.write_text(json.dumps(content))
+    targets = read_targets(model.representation, file)
+    assert len(targets.positions.values) == 2 + 1 + 1 + 1
+    options: dict[str, Any] = {"seconds": 2.5, "num_inference_steps": 10}
+    motion, plain = (flame_mdm.generate(model, TEXT, targets=source, **options)[0] for source in (file, None))
+    assert errors(motion, targets).max() < 0.03 < errors(plain, targets).max()
+    local = slice(4, 4 + 21 * 3)
+    np.testing.assert_allclose(motion.features[48, local], bow.features[20, local], atol=1e-5)
+    arms = np.linalg.norm(motion.joints[:, 18:22] - motion.joints[:, 16:20], axis=-1)
+    np.testing.assert_allclose(arms[30], np.median(arms, 0), rtol=0.05)
+    # a pose at a position faces its heading
+    entry = {"time": 1.0, "file": str(tmp_path / "bow.npz"), "frame": 5, "position": [0.2, 0.5], "heading": 90}
+    pose = read_targets(model.representation, {"poses": [entry]}).positions.values.reshape(22, 3)
+    assert pose[0, [0, 2]].tolist() == pytest.approx([0.2, 0.5])
+    left = (pose[1] - pose[2] + pose[16] - pose[17]).numpy()
+    assert np.degrees(np.arctan2(-left[2], left[0])) == pytest.approx(90, abs=1e-3)
+
+
+def test_targets_of_a_sequence(model):
+    targets = {"root": [{"time": t, "position": [0.1 * t, 0.3 * t]} for t in (1, 2, 3, 4)]}
+    motion = flame_mdm.generate(model, f"{TEXT} @2.4 | {TEXT} @2.4", targets=targets, num_inference_steps=10)[0]
+    assert errors(motion, read_targets(model.representation, targets)).max() < 0.05
+
+
+def test_bad_targets_give_one_clear_line(model, tmp_path):
+    for content, message in (
+        ([], "give an object with root, joints, poses"),
+        ({"roots": []}, "unknown key 'roots'. Did you mean root?"),
+        ({"root": {"time": 1, "position": [0, 1]}}, "root is {.*}, not a list"),
+        ({"root": [{"time": "1", "position": [0, 1]}]}, r"root\[0\].time='1': give a number"),
+        ({"root": [[0, 1]]}, r"root\[0\] is \[0, 1\]. Give an object with position, time"),
+        ({"root": [{"time": 1, "position": [1]}]}, r"root\[0\].position=\[1\]: give 2 numbers"),
+        ({"root": [{"time": 1, "position": [0, 30]}]}, "30.0 m from the start in 1 seconds is impossible"),
+        ({"root": [{"time": 9, "position": [0, 1]}]}, "9 seconds is after .* last frame is at 1.95 seconds"),
+        ({"joints": [{"time": 1, "joint": "left_rist", "position": [0, 1, 0]}]}, "no joint 'left_rist'.*left_wrist"),
+        ({"joints": [{"time": 1, "joint": "head", "position": [0, 9, 0]}]}, "height 9 m is impossible"),
+        ({"poses": [{"time": 1, "file": "no.npz"}]}, "no.npz"),
+    ):
+        (tmp_path / "t.json").write_text(json.dumps(content))
+        with pytest.raises((UserError, FileNotFoundError), match=message) as raised:
+            flame_mdm.generate(model, TEXT, seconds=2, targets=tmp_path / "t.json")
+        assert "\n" not in str(raised.value)
+
+
+def test_the_command_prints_the_distance(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    Path("t.json").write_text('{"root": [{"time": 1.5, "position": [0.5, 0.5]}]}')
+    options = [f"text={TEXT}", "samples=1", "seconds=2", "num_inference_steps=4", "targets=t.json"]
+    assert main(["sample", "quickstart", *options]) == 0
+    assert "distance from the targets: mean " in capsys.readouterr().out
+    Path("t.json").write_text("{")
+    assert main(["sample", "quickstart", *options]) == 1
+    assert "targets=t.json: not JSON" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_targets_that_the_text_does_not_suggest_do_not_stretch_bones(model):
+    """Steering may not leave what the denoiser was trained on, and bones keep their lengths around a target."""
+    target = {"joints": [{"time": 1.5, "joint": "right_wrist", "position": [-0.5, 1.5, 0.2]}]}
+    options: dict[str, Any] = {"seconds": 3, "seed": 1, "num_inference_steps": 20}
+    before, after = (
+        flame_mdm.generate(model, "a person stands still", targets=t, **options)[0] for t in (None, target)
+    )
+    assert np.abs(np.median(bones(after), 0) / np.median(bones(before), 0) - 1).max() < 0.05
+    target = {"joints": [{"time": 1.5, "joint": "right_wrist", "position": [None, 1.4, None]}]}
+    lengths = bones(flame_mdm.generate(model, TEXT, seconds=3, targets=target, num_inference_steps=20)[0])
+    assert np.abs(lengths / np.median(lengths, 0) - 1).max() < 0.15  # 0.6, if kept in the frame of the target alone
+
+
+# What sampling makes of texts: known forms of words, unknown words, and sentences of several actions ------------------
+
+
+CAPTIONS = ["A person walks forward.", "a person waves with the left hand", "someone jumps"]
+
+
+def test_a_vocabulary_holds_every_word_once_and_captions_only_if_they_may_be_shared():
+    kept = vocabulary([*CAPTIONS, *CAPTIONS], share=False)
+    assert kept == {"vocabulary": sorted(set(" ".join(CAPTIONS).lower().replace(".", "").split()))}
+    assert vocabulary(CAPTIONS, share=True)["captions"] == sorted(CAPTIONS)
+    many = [f"caption {number:05d}" for number in range(3 * MAX_CAPTIONS)]
+    assert vocabulary(many, share=True)["captions"] == many[::3]
+    assert vocabulary([], share=True) == {"vocabulary": [], "captions": []}
+
+
+def test_unseen_and_unread_words_are_named_once_with_one_suggestion():
+    facts = vocabulary(CAPTIONS, share=True)
+    assert advice("A person WAVES, with the hand! They were walking", facts) == []  # walks; function words
+    (line,) = advice("a person dances the flamenco and dances with the left foot", facts)
+    assert line == f"never seen in training: dances, flamenco, foot. Did you mean '{CAPTIONS[1]}'?"
+    (line,) = advice("A person wakls forwrad.", facts)
+    assert line == "never seen in training: wakls, forwrad. Did you mean 'a person walks forward.'?"
+    assert advice("a person walks happily", {"vocabulary": ["walks"]}) == ["never seen in training: happily."]
+    text = "a person walks forward and then jumps"
+    assert advice(text, {}, max_words=5) == ["only the first 5 words are read, not 'then jumps'"]
+    assert advice(text, {}, max_words=7) == []
+    for text, first in (("walks", 0), ("jumps", 2), ("the left hand of a person", 1)):
+        assert nearest(text, CAPTIONS)[0] == CAPTIONS[first]
+
+
+def test_a_text_without_a_known_word_is_refused(model, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    for text in ("un uomo cammina in avanti", "人が歩く", "a person"):
+        with pytest.raises(UserError, match=r"the model knows no word of it that says what happens\. Did you mean"):
+            flame_mdm.generate(model, text)
+        check_known(text, {})  # models without a vocabulary read every word
+    with pytest.raises(UserError, match="knows no word"):
+        flame_mdm.edit(model, np.zeros((30, 22, 3)), text, fps=20, region="prefix")
+    assert main(["sample", "quickstart", f"text={text}"]) == 1
+    assert "knows no word of it" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_words_are_read_in_a_known_form_and_unknown_ones_are_dropped():
+    forms = {"walks": "walked", "wave": "waving", "hop": "hopping", "ball": "balls", "sits": "sit"}
+    assert {known_form(word, forms) for word in forms.values()} == set(forms)
+    assert [known_form(word, forms) for word in ("string", "hip", "s", "walkie")] == [None] * 4
+    tokens = LearnedTokens(features=8, heads=1, buckets=64)
+    every = tokens.rows("he walked moonily to the ball")
+    tokens.seen = {*forms, "the", "he"}
+    assert tokens.rows("he walked moonily to the balls") == tokens.rows("he walks the ball") == [
+        every[0], every[1], hashed("walks", 64), every[5], every[6]
+    ]  # fmt: skip
+
+
+SENTENCES = {
+    "walks forward. then he sits down. then he waves": ["walks forward", "he sits down", "he waves"],
+    "walks forward, turns left and waves": ["walks forward", "turns left", "waves"],
+    "First he walks forward. After that he quickly sits down; finally, he claps!":
+        ["he walks forward", "he quickly sits down", "he claps"],
+    "A man is walking forward and then turns left, and then a woman waves":
+        ["A man is walking forward", "turns left", "a woman waves"],
+    "raises both hands and waves": None, "bows forward and stands up again": None, "A woman is walking slowly.": None,
+    "stands still, waving": None, "walks forward. Slowly, very slowly": None,
+    "walks forward, head down": None, "Run!": None,
+}  # fmt: skip
+
+
+def test_sentences_of_several_actions_are_split_at_their_verbs():
+    for text, parts in SENTENCES.items():
+        assert in_parts(text, Synthetic.verbs) == (parts or [text])
+    assert in_parts("walks forward, turns left. Then waves", ()) == ["walks forward, turns left", "waves"]
+    assert in_parts("walks, then turns in limp style.", ()) == ["walks in limp style", "turns in limp style"]
+
+
+def test_checkpoints_know_the_words_of_their_training_clips(trained):
+    facts = read_checkpoint(trained)["facts"]
+    assert {"a", "person", "walks"} <= set(facts["vocabulary"])
+    assert facts["vocabulary"] == sorted({word for caption in facts["captions"] for word in words(caption)})

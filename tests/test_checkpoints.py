@@ -3,6 +3,7 @@
 import argparse
 import copy
 import json
+import re
 import subprocess
 import sys
 import tempfile
@@ -118,12 +119,9 @@ def tolerance(arrays: Arrays, key: str) -> float:
 def mdm_cases() -> list:
     names = ("cond", "uncond", "cfg", "train_cond_drop", "cond_last_sample_alone", "legacy_cond", "legacy_uncond")
     names += ("cond_maskframes", "uncond_maskframes", "cfg_maskframes", "cond_scalar_t")
-    return [
-        pytest.param(stem, name, id=f"{stem}-{name}")
-        for stem in MDM
-        for name in names
-        if (GOLDEN / f"{stem}.npz").is_file() and f"out/{name}" in golden(stem)
-    ]
+    stems = [stem for stem in MDM if (GOLDEN / f"{stem}.npz").is_file()]
+    cases = [(stem, name) for stem in stems for name in names if f"out/{name}" in golden(stem)]
+    return [pytest.param(*case, id="-".join(case)) for case in cases]
 
 
 @pytest.mark.golden
@@ -250,8 +248,7 @@ def test_options_of_mdm(tmp_path):
     args |= {"noise_schedule": "linear", "sigma_small": False}
     assert main(["import", "mdm", *released_file(tmp_path, state, args)]) == 0
     model = load(tmp_path / "ours.safetensors")
-    assert model.facts["actions"][9] == "phone"
-    assert model.facts["max_frames"] == 40
+    assert (model.facts["actions"][9], model.facts["max_frames"]) == ("phone", 40)
     assert model.sampler_options.guidance_scale == model.config["losses"]["velocity"] == 1
     assert model.sampler_options.num_inference_steps == 50
     process = model.config["process"]
@@ -315,14 +312,15 @@ def test_imports_that_cannot_be_are_one_line(refused, bad):
 def test_statistics_have_to_fit(refused, bad):
     words = ["mdm", *released_file(bad, small_state(263), {"dataset": "humanml"})]
     refused("import", *words, says="features of humanml3d are normalized. Give stats=FOLDER with Mean.npy and Std.npy")
-    refused("import", *words, f"stats={bad}", says="Mean.npy: no such file")
+    words.append(f"stats={bad}")
+    refused("import", *words, says="Mean.npy: no such file")
     statistics_folder(bad, 251)
-    refused("import", *words, f"stats={bad}", says="Mean.npy: shape (251,), expected (263,) finite numbers")
+    refused("import", *words, says="Mean.npy: shape (251,), expected (263,) finite numbers")
     statistics_folder(bad, 263)
-    assert main(["import", *words, f"stats={bad}"]) == 0
+    assert main(["import", *words]) == 0
     assert np.array_equal(load(bad).representation.mean, np.load(bad / "Mean.npy").astype(np.float32))
     np.save(bad / "Std.npy", np.zeros(263))
-    refused("import", *words, f"stats={bad}", says="expected (263,) finite numbers, positive in Std.npy")
+    refused("import", *words, says="expected (263,) finite numbers, positive in Std.npy")
 
 
 def test_pickles_of_objects_are_read_on_demand_only(refused, bad):
@@ -340,7 +338,7 @@ def test_pickles_of_objects_are_read_on_demand_only(refused, bad):
 # Model files ----------------------------------------------------------------------------------------------------------
 
 
-def test_a_model_file_is_the_checkpoint(trained, tmp_path, capsys):
+def test_a_model_file_is_the_checkpoint(trained, data_root, tmp_path, capsys):
     file = tmp_path / "model" / "mine.safetensors"
     assert main(["export", str(trained), f"out={file}"]) == 0
     assert str(file) in capsys.readouterr().out
@@ -348,9 +346,8 @@ def test_a_model_file_is_the_checkpoint(trained, tmp_path, capsys):
     unfinished.touch()
     before, after, folder = load(trained), load(file), load(file.parent)
     unfinished.unlink()
-    assert before.state_dict().keys() == after.state_dict().keys() == load_file(file).keys()
-    for name, value in before.state_dict().items():
-        assert torch.equal(value, after.state_dict()[name])
+    assert before.state_dict().keys() == load_file(file).keys()
+    torch.testing.assert_close(after.state_dict(), before.state_dict(), rtol=0, atol=0)
     assert after.facts == before.facts
     a, b = (generate(model, "a person waves", frames=24)[0].features for model in (before, folder))
     assert np.array_equal(a, b)
@@ -358,23 +355,19 @@ def test_a_model_file_is_the_checkpoint(trained, tmp_path, capsys):
     again = model_files.read_model_file(hub.export(file, tmp_path / "again"))
     assert again["origin"] == model_files.read_model_file(file)["origin"]
     assert again["origin"]["steps"] == 2
-
-
-def test_a_model_file_may_be_in_half_precision_and_does_not_tell_where_it_was_made(trained, data_root, tmp_path):
-    whole, half = hub.export(trained, tmp_path / "whole"), tmp_path / "half.safetensors"
+    for path in (trained.parent.parent, data_root, tmp_path):
+        assert str(path).encode() not in file.read_bytes(), "it tells where it was made"
+    assert model_files.read_model_file(file)["config"]["data"]["root"] == "data"
+    half = tmp_path / "half.safetensors"
     assert main(["export", str(trained), str(half), "half=true"]) == 0
-    assert half.stat().st_size < 0.6 * whole.stat().st_size
-    for name, value in load_file(half).items():
-        assert value.dtype == (torch.float16 if value.ndim > 1 else torch.float32)
-        torch.testing.assert_close(load(half).state_dict()[name], load(whole).state_dict()[name], atol=1e-3, rtol=1e-3)
+    assert half.stat().st_size < 0.6 * file.stat().st_size
+    assert {value.dtype for value in load_file(half).values() if value.ndim > 1} == {torch.float16}
+    torch.testing.assert_close(load(half).state_dict(), before.state_dict(), atol=1e-3, rtol=1e-3)
     assert model_files.read_model_file(half)["origin"]["half_precision"]
-    for folder in (trained.parent.parent, data_root, tmp_path):
-        assert str(folder).encode() not in whole.read_bytes()
-    assert model_files.read_model_file(whole)["config"]["data"]["root"] == "data"
 
 
-def test_damaged_and_foreign_files_are_one_line(trained, tmp_path):
-    file = hub.export(trained, tmp_path)
+def test_damaged_foreign_and_absent_files_are_one_line(trained, tmp_path):
+    file = hub.export(trained, tmp_path / "whole")
     whole = file.read_bytes()
     flipped = bytearray(whole)
     flipped[-100] ^= 1
@@ -382,29 +375,21 @@ def test_damaged_and_foreign_files_are_one_line(trained, tmp_path):
         (whole[:-10], "damaged, or not a .safetensors file"),
         (bytes(flipped), "it has changed since it was written"),
         (whole.replace(b'\\"steps\\": 2', b'\\"steps\\": 9'), "it has changed since it was written"),
-        (whole.replace(b'\\"seed\\": 0', b'\\"seed\\": 1'), "it has changed since it was written"),
         (whole.replace(b'\\"format\\": 2', b'\\"format\\": 3'), "has format 3, but this version reads 2"),
         (whole.replace(b'\\"format\\": 2', b'\\"format\\": 1'), "written by version 0.1 of flame_mdm"),
         (whole.replace(b'\\"origin\\"', b'\\"oregon\\"'), "its recipe cannot be read"),
     ):
         assert content != whole
         file.write_bytes(content)
-        with pytest.raises(UserError, match=message) as caught:
+        with pytest.raises(UserError, match=f"^.*{re.escape(str(file))}.*{message}.*$"):
             load(file)
-        assert "\n" not in str(caught.value)
-        assert str(file) in str(caught.value)
-    save_file({"w": torch.zeros(1)}, file)
-    with pytest.raises(UserError, match=r"weights without a recipe\. Import released weights of MDM"):
-        load(file)
-
-
-def test_what_is_not_there_is_one_line(tmp_path):
-    (tmp_path / "two").mkdir()
     for name in ("a", "b"):
-        save_file({"w": torch.zeros(1)}, tmp_path / "two" / f"{name}.safetensors")
+        save_file({"w": torch.zeros(1)}, tmp_path / f"{name}.safetensors")
+    (tmp_path / "empty").mkdir()
     for name, kind, message in (
-        (tmp_path, UserError, r"this folder holds no \.safetensors file"),
-        (tmp_path / "two", UserError, r"holds a\.safetensors, b\.safetensors\. Name the file"),
+        (tmp_path / "a.safetensors", UserError, r"weights without a recipe\. Import released weights of MDM"),
+        (tmp_path / "empty", UserError, r"this folder holds no \.safetensors file"),
+        (tmp_path, UserError, r"holds a\.safetensors, b\.safetensors\. Name the file"),
         ("nobody/model.ckpt", FileNotFoundError, "no such checkpoint"),
         ("nobody/model@v1", UserError, r"^nobody/model@v1: no such file or folder, and .* cannot be downloaded.*$"),
     ):
@@ -420,7 +405,6 @@ def test_push_writes_a_card_and_uploads_these_files_alone(trained, tmp_path, cap
     assert card.startswith("---\nlicense: mit\n")
     for fact in ('flame_mdm.load("me/walker")', "| experiment | quickstart |", "| data | synthetic |", fingerprint):
         assert fact in card
-    assert load(folder).facts["fingerprint"] == fingerprint
     assert {path.name for path in folder.iterdir()} == {"README.md", "config.yaml", "model.safetensors"}
     model = model_files.read_model_file(folder / "model.safetensors")
     for dataset, terms in (("bandai", "license: cc-by-nc-4.0"), ("humanml3d", "license: other")):

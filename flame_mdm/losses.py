@@ -104,8 +104,8 @@ class MotionLosses(nn.Module):
                 slide = torch.where(in_contact, differences(predicted[:, :, self.feet]), 0.0)
                 losses["foot_contact"] = masked_mean(slide.square(), moving)
             if self.weights["bone_length"]:
-                lengths = (bone_lengths(joints, self.edges) for joints in (predicted, real))
-                losses["bone_length"] = masked_mse(*lengths, mask)
+                lengths, real_lengths = (bone_lengths(joints, self.edges) for joints in (predicted, real))
+                losses["bone_length"] = masked_mse(lengths, real_lengths, mask)
         return {name: self.weights[name] * loss for name, loss in losses.items()}
 
     def _joints(self, x: Tensor) -> Tensor:

@@ -489,4 +489,5 @@ def test_cuts_of_motion272_start_like_whole_motions():
     assert not cut[0, :2].any()
     joints, whole = representation.decode(cut.double()), representation.decode(features.double())[20:]
     assert joints[0, 0, [0, 2]].abs().max() == 0
-    close(*(torch.cdist(points, points) for points in (joints.flatten(0, 1), whole.flatten(0, 1))), 1e-4)
+    distances, expected = (torch.cdist(points, points) for points in (joints.flatten(0, 1), whole.flatten(0, 1)))
+    close(distances, expected, 1e-4)

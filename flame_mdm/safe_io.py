@@ -301,14 +301,15 @@ def _nodes(node: Any, counted: dict[int, float]) -> float:
 
 
 def read_npz(
-    source: Path | IO[bytes], *, skip: Collection[str] = (), only: Collection[str] | None = None, header: bool = False
+    source: Path | IO[bytes], *, skip: Collection[str] = (), only: Collection[str] | None = None
 ) -> dict[str, np.ndarray]:
     """Returns the arrays of an .npz file, or seekable open file, by name, without those in `skip`, or `only` some.
 
-    With `header`, reads only the first row of arrays of two and more dimensions; all their rows are that one. Raises
-    `UserError` if the file is damaged or encrypted, contains objects, declares wrong sizes, or expands to more than
-    `ARRAYS_LIMIT` bytes and more than `INFLATION` times its size.
+    Raises `UserError` if the file is damaged or encrypted, contains objects, declares wrong sizes, or expands to more
+    than `ARRAYS_LIMIT` bytes and more than `INFLATION` times its size.
     """
+    from numpy.lib import format as npy
+
     with _opened(source) as (file, size), zipfile.ZipFile(file) as archive:
         members = {member.filename.removesuffix(".npy"): member for member in archive.infolist()}
         members = {n: m for n, m in members.items() if n not in skip and (only is None or n in only)}
@@ -317,19 +318,18 @@ def read_npz(
         for name, member in members.items():
             check_member(member)
             with archive.open(member) as content:
-                arrays[name] = _array(content, member.file_size, name, header)
+                _check_array(content, member.file_size, name)
+                arrays[name] = npy.read_array(content, allow_pickle=False)
         return arrays
 
 
-def read_npy(source: Path | IO[bytes], *, mmap: bool = False, header: bool = False) -> np.ndarray:
-    """Returns the array of an .npy file; `header` and errors as for `read_npz`. `mmap` maps it read-only; requires a
-    path.
-    """
+def read_npy(source: Path | IO[bytes], *, mmap: bool = False) -> np.ndarray:
+    """Returns the array of an .npy file; errors as for `read_npz`. `mmap` maps it read-only; requires a path."""
     import numpy as np
 
     with _opened(source) as (file, size):
-        array = _array(file, size, "the array", header or mmap)
-        return np.load(source, "r", allow_pickle=False) if mmap and array.size else array
+        count = _check_array(file, size, "the array")
+        return np.load(source if mmap and count else file, "r" if mmap and count else None, allow_pickle=False)
 
 
 @contextmanager
@@ -348,14 +348,16 @@ def _opened(source: Path | IO[bytes]) -> Iterator[tuple[IO[bytes], int]]:
             raise UserError(f"{name}damaged, or not a file of plain arrays: {first_line(error)}") from error
 
 
-def _array(file: IO[bytes], size: int, name: str, header: bool) -> np.ndarray:
-    """Returns the array of an .npy file of `size` bytes, which its header must declare before memory is allocated."""
-    import numpy as np
+def _check_array(file: IO[bytes], size: int, name: str) -> int:
+    """Checks that the header of an .npy file declares its `size` in bytes, before memory is allocated.
+
+    Returns the number of its elements.
+    """
     from numpy.lib import format as npy
 
     try:
         read_header = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}[npy.read_magic(file)]
-        shape, is_fortran, dtype = read_header(file)
+        shape, _, dtype = read_header(file)
     except KeyError as error:
         raise ValueError(f"{name}: its format is {error}, not 1.0 or 2.0") from error
     except (ValueError, EOFError, TypeError, RecursionError, MemoryError, SyntaxError, tokenize.TokenError) as error:
@@ -365,11 +367,8 @@ def _array(file: IO[bytes], size: int, name: str, header: bool) -> np.ndarray:
     count = math.prod(shape)
     if min(shape, default=0) < 0 or file.tell() + count * dtype.itemsize != size or (not dtype.itemsize and count > 1):
         raise ValueError(f"{name}: its header declares {shape} of {dtype}, which does not match the content")
-    if header and count and len(shape) > 1 and not is_fortran:
-        row = np.frombuffer(file.read(count // shape[0] * dtype.itemsize), dtype)
-        return np.broadcast_to(row.reshape(1, *shape[1:]), shape)
     file.seek(0)
-    return npy.read_array(file, allow_pickle=False)
+    return count
 
 
 def check_member(member: zipfile.ZipInfo) -> None:

@@ -313,26 +313,6 @@ def test_check_lists_skeletons_and_all_failures(tmp_path: Path):
     assert all(re.fullmatch(pattern, line) for pattern, line in zip(expected, lines, strict=True)), lines
 
 
-def test_check_reads_headers_only(tmp_path: Path):
-    long = mixamo(tmp_path / "long.bvh", frames=2000)
-    text = long.read_text().splitlines()
-    assert len("\n".join(text)) > 2 * bvh.HEADER
-    long.write_text("\n".join([*text[:-1], "not a number"]) + "\n")
-    write_amass(tmp_path / "amass.npz", 90, 60.0)
-    missing = np.where(np.arange(len(WALK))[:, None, None], np.nan, WALK)
-    np.savez_compressed(tmp_path / "walk.npz", joints=missing, fps=30)
-    torn = tmp_path / "torn.npz"
-    np.savez_compressed(torn, joints=WALK + 1e-3 * np.random.default_rng(0).normal(size=WALK.shape), fps=30)
-    content = bytearray(torn.read_bytes())
-    content[len(content) // 2] ^= 255
-    torn.write_bytes(content)
-    lines = Folder(str(tmp_path)).check()
-    assert lines[0] == "AMASS, SMPL+H, 60 fps: 1 motion, 90 frames, 1.5 s"
-    assert lines[1].startswith("Mixamo, unit 0.01, 30 fps: 1 motion, 2,000 frames, 66.7 s, legs 0.8")
-    assert lines[2].startswith(f"SMPL, unit 1, 30 fps: 2 motions, {2 * len(WALK)} frames, ")
-    assert len(lines) == 4, lines
-
-
 def test_a_first_frame_in_an_unusual_pose_is_not_an_error(tmp_path: Path):
     motion = WALK.copy()
     for side in ("left", "right"):  # as when kneeling

@@ -7,7 +7,7 @@ import os
 import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args
@@ -22,15 +22,15 @@ from flame_mdm.formats import ENDINGS, TREES
 from flame_mdm.formats.body import check_feet, check_size, head_height, leg_length
 from flame_mdm.formats.layouts import array_layout, layout_name, map_bvh, read_skeleton, read_tree, skeleton_file
 from flame_mdm.formats.readers import read_arrays, smpl_motion
-from flame_mdm.formats.resampling import resample, resampled_frames
+from flame_mdm.formats.resampling import resample
 from flame_mdm.representations import rotation
 from flame_mdm.representations.skeleton import SMPL22
 from flame_mdm.representations.smpl import SMPL
-from flame_mdm.safe_io import read_json, read_text, regular_file
+from flame_mdm.safe_io import naming, read_json, read_text, regular_file
 
 FORBIDDEN_CHARACTERS = re.compile("[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
 """Characters not allowed in the name of a motion: names are stored as text, one clip per line."""
-LOOK_FPS = 20.0  # frame rate for which `Folder.check` says whether motions can be resampled
+LOOK_FPS = 20.0  # frame rate to which `Folder.check` resamples motions
 SPLITTABLE = 10  # number of motions from which on each split has at least one
 TABLES = ("captions.csv", "captions.json")
 COLUMNS = ("id", "text", "action", "split", "source")
@@ -46,9 +46,6 @@ class Note:
     source: str | None = None
 
 
-Task = tuple[Path, str, dict[str, Any]]  # a motion, its skeleton.yaml or "", and the content of that file
-
-
 class Facts(NamedTuple):
     """Facts about a motion file: skeleton with unit and frame rate, frames and seconds as recorded, sizes in meters.
 
@@ -61,10 +58,6 @@ class Facts(NamedTuple):
     leg: float | None = None
     head: float | None = None
     upright: float | None = None
-
-
-class UnclearPose(Exception):
-    """The feet look wrong in a single frame, as those of a person who kneels."""
 
 
 class Folder(MotionSource):
@@ -99,7 +92,6 @@ class Folder(MotionSource):
         self.options = {"motion": motion, "mirror": mirror, "exclude": list(exclude)}
         if exclude:
             self.excluded["motions by data.source.exclude"] = len(exclude)
-        self._skeletons: dict[Path, dict[str, Any]] = {}
         self._facts: list[Facts] = []
 
     def count(self) -> int:
@@ -109,7 +101,7 @@ class Folder(MotionSource):
     def clips(self, fps: float) -> Iterator[Clip]:
         self.actions = tuple(sorted({note.action for note in self.notes.values() if note.action is not None}))
         self._facts = []
-        read = in_order(partial(_read, self.motion, fps), map(self._task, self.files.values()), self.workers)
+        read = in_order(partial(_read, self.motion, fps), self.files.values(), self.workers)
         for name, (motion, facts) in zip(self.files, read, strict=True):
             self._facts.append(facts)
             note, split = self.notes[name], self.splits[name]
@@ -146,24 +138,19 @@ class Folder(MotionSource):
         return motions
 
     def check(self) -> list[str]:
-        """Reads all captions and the header and first frame of each motion; returns lines on skeletons and failures."""
+        """Reads all captions and motions; returns lines on skeletons and failures."""
         self._facts = []
-        failed: dict[str, list[str]] = {}
-        tasks: dict[str, Task] = {}
-        for name, path in self.files.items():
-            try:
-                tasks[name] = self._task(path)
-            except ValueError as error:
-                failed.setdefault(f": {error}", []).append(name)
-        for name, facts in zip(tasks, in_order(partial(_look, self.motion), tasks.values(), self.workers), strict=True):
+        failed: dict[str, list[Path]] = {}
+        looked = in_order(partial(_look, self.motion), self.files.values(), self.workers)
+        for path, facts in zip(self.files.values(), looked, strict=True):
             if isinstance(facts, str):
-                failed.setdefault(facts.replace(str(self.files[name]), ""), []).append(name)
+                failed.setdefault(facts, []).append(path)
             else:
                 self._facts.append(facts)
         lines = self.findings()
-        for error, names in failed.items():
-            more = f" and {len(names) - 1} more" * (len(names) > 1)
-            lines.append(f"error: {self.files[names[0]]}{more}{error}")
+        for error, paths in failed.items():
+            more = f" and {len(paths) - 1} more" * (len(paths) > 1)
+            lines.append(f"error: {paths[0]}{more}{error}")
         try:
             self._check_upright()
             counts = Counter(self.splits.values())
@@ -232,15 +219,6 @@ class Folder(MotionSource):
                 )
         return notes
 
-    def _task(self, path: Path) -> Task:
-        """Returns a motion with the name and content of the nearest `skeleton.yaml` above it; "" and {} without one."""
-        file = skeleton_file(path)
-        if file is None:
-            return path, "", {}
-        if file not in self._skeletons:
-            self._skeletons[file] = read_skeleton(file)
-        return path, os.path.relpath(file), self._skeletons[file]
-
     @cached_property
     def splits(self) -> dict[str, Split]:
         """Split of each motion: that of the tables, else drawn by a hash of the source.
@@ -269,49 +247,38 @@ class Folder(MotionSource):
         return Clip(f"M{clip.id}", motion, [_swapped(text) for text in clip.captions], clip.split, clip.source, action)
 
 
-def _look(kind: str, task: Task) -> Facts | str:
-    """Returns what the header and the first frame of a motion say, or the error."""
+def _look(kind: str, path: Path) -> Facts | str:
+    """Returns the facts about a motion, or what is wrong, to be printed after its path."""
     try:
-        try:
-            return _read(kind, LOOK_FPS, task, header=True)[1]
-        except UnclearPose:
-            return _read(kind, LOOK_FPS, task)[1]
+        return _read(kind, LOOK_FPS, path)[1]
     except ValueError as error:
-        return str(error)
+        text = str(error)
+        return text.replace(str(path), "") if str(path) in text else f": {text}"
 
 
-def _read(kind: str, fps: float, task: Task, header: bool = False) -> tuple[np.ndarray, Facts]:
-    """Reads and checks joints or, if `kind` is "smpl", a raw motion; with `header`, only its header and first frame.
-
-    Raises `UnclearPose` if the feet look wrong in a single frame.
-    """
-    path, where, layout_options = task
-    try:
+def _read(kind: str, fps: float, path: Path) -> tuple[np.ndarray, Facts]:
+    """Reads and checks joints or, if `kind` is "smpl", a raw motion."""
+    skeleton = skeleton_file(path)
+    fields = read_skeleton(skeleton) if skeleton else {}
+    where = f" ({os.path.relpath(skeleton)})" if skeleton else ""
+    with naming(path, ValueError):
         if path.suffix.lower() in TREES:
-            file = read_tree(path, layout_options.get("fps") if path.suffix.lower() == ".amc" else None, header)
+            file = read_tree(path, fields.get("fps") if path.suffix.lower() == ".amc" else None)
             frames, rate = len(file.frames), file.fps
-            if header:
-                resampled_frames(frames, rate, fps, len(file.joints))
-                file = replace(file, frames=file.frames[:1])
-            joints, _, layout = map_bvh(path, file, None if header else fps, layout_options)
+            joints, _, layout = map_bvh(path, file, fps, fields)
         else:
-            data = read_arrays(path, header)
-            rate = data.setdefault("fps", layout_options.get("fps"))
+            data = read_arrays(path)
+            rate = data.setdefault("fps", fields.get("fps"))
             if rate is None:
                 raise UserError("no frame rate in the file. Write it into skeleton.yaml, for example `fps: 30`")
-            shape = data["poses" if "poses" in data else "joints"].shape
-            frames = shape[0]
-            if header:
-                resampled_frames(frames, rate, fps, math.prod(shape[1:]) // 3, slack=1e-6)
-                data |= {name: data[name][:1] for name in ("joints", "poses", "trans") if name in data}
             if "poses" in data:
-                width = math.prod(shape[1:])
+                frames, width = len(data["poses"]), math.prod(data["poses"].shape[1:])
                 model = {72: "SMPL", 156: "SMPL+H", 165: "SMPL-X"}.get(width, f"{width // 3} joints")
-                facts = Facts(f"AMASS, {model}, {rate:g} fps" + f" ({where})" * bool(where), frames, frames / rate)
-                return _from_smpl(kind, data, None if header else fps), facts
-            layout, names = array_layout(path, data["joints"], layout_options)
-            moved = data["joints"].astype(float)
-            joints = layout.apply(moved if header else resample(moved, rate, fps), names)
+                facts = Facts(f"AMASS, {model}, {rate:g} fps{where}", frames, frames / rate)
+                return _from_smpl(kind, data, fps), facts
+            layout, names = array_layout(path, data["joints"], fields)
+            frames = len(data["joints"])
+            joints = layout.apply(resample(data["joints"].astype(float), rate, fps), names)
         if kind == "smpl":
             raise UserError("contains no SMPL rotations; use AMASS .npz files, or set motion=joints")
         if not np.isfinite(joints).all():
@@ -319,21 +286,14 @@ def _read(kind: str, fps: float, task: Task, header: bool = False) -> tuple[np.n
             raise UserError(f"numbers in frame {frame} are not finite")
         leg = leg_length(joints)
         check_size(leg, layout.unit, layout.children)
-        try:
-            check_feet(joints)
-        except ValueError as error:
-            if header:
-                raise UnclearPose from error
-            raise
-        trunk = joints[:, SMPL22.joints.index("neck")] - joints[:, 0]
-        upright = float((trunk[:, 1] / np.linalg.norm(trunk, axis=1)).mean())
-        name = f"{layout_name(layout)}, unit {layout.unit:.4g}, {rate:g} fps" + f" ({where})" * bool(where)
-        return joints, Facts(name, frames, frames / rate, leg, head_height(joints), upright)
-    except ValueError as error:
-        raise UserError(str(error) if str(path) in str(error) else f"{path}: {error}") from error
+        check_feet(joints)
+    trunk = joints[:, SMPL22.joints.index("neck")] - joints[:, 0]
+    upright = float((trunk[:, 1] / np.linalg.norm(trunk, axis=1)).mean())
+    name = f"{layout_name(layout)}, unit {layout.unit:.4g}, {rate:g} fps{where}"
+    return joints, Facts(name, frames, frames / rate, leg, head_height(joints), upright)
 
 
-def _from_smpl(kind: str, data: dict[str, Any], fps: float | None) -> np.ndarray:
+def _from_smpl(kind: str, data: dict[str, Any], fps: float) -> np.ndarray:
     translation, turns = smpl_motion(data, fps)
     angles = rotation.quaternion_to_axis_angle(turns).flatten(1).numpy()
     motion = np.concatenate([translation.numpy(), angles], 1).astype(np.float32)

@@ -12,10 +12,8 @@ import math
 import re
 from collections import Counter
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from decimal import Decimal
-from itertools import islice
 from pathlib import Path
 from typing import NoReturn
 
@@ -27,8 +25,6 @@ from flame_mdm.formats.resampling import RATES, frame_pairs, slerp
 from flame_mdm.safe_io import TEXT_LIMIT, regular_file, write_text
 
 CHANNELS = tuple(f"{axis}{kind}" for kind in ("position", "rotation") for axis in "XYZ")
-HEADER = 1 << 16
-"""Bytes that contain the hierarchy and the first frame of most files: 15 KiB for a body with all its fingers."""
 MAX_JOINTS = 4096  # maximum number of joints and end sites of a file
 LARGEST = 1e9  # largest number that is read
 MAX_LABELED_LINE = 200
@@ -137,20 +133,8 @@ def read(path: str | Path) -> Bvh:
     return parse(Path(path).read_bytes(), str(path))
 
 
-def read_header(path: str | Path) -> Bvh:
-    """Reads a BVH file as if all its frames were equal to the first; a file with a damaged beginning is read whole."""
-    size = regular_file(path, TEXT_LIMIT)
-    with Path(path).open("rb") as stream:
-        data = stream.read(HEADER)
-    with suppress(UserError):
-        file = parse(data[: data.rfind(b"\n") + 1], str(path), header=True)
-        if size >= 2 * file.frames.size:  # a number and a space
-            return file
-    return read(path)
-
-
-def parse(data: bytes, name: str, header: bool = False) -> Bvh:
-    """Reads the bytes of a BVH file, called `name` in errors; `header` repeats the first frame, see above."""
+def parse(data: bytes, name: str) -> Bvh:
+    """Reads the bytes of a BVH file, called `name` in errors."""
     source = _Source(data, name)
     joints: list[str] = []
     parents: list[int] = []
@@ -212,7 +196,7 @@ def parse(data: bytes, name: str, header: bool = False) -> Bvh:
         tuple(channels),
         tuple(end_parents),
         np.array(end_offsets, float).reshape(-1, 3),
-        source.table(count, sum(map(len, channels)), header),
+        source.table(count, sum(map(len, channels))),
         fps,
     )
 
@@ -263,10 +247,10 @@ class _Source:
             self.fail(f"expected {expected}, found {line[:40] or 'the end of the file'}")
         return match[1]
 
-    def table(self, count: int, width: int, header: bool) -> np.ndarray:
-        """Returns the numbers (count, width) float64 in all remaining lines; `header`: repeats those in the first."""
+    def table(self, count: int, width: int) -> np.ndarray:
+        """Returns the numbers (count, width) float64 in all remaining lines."""
         rows, numbers = [], []
-        for number, line in islice(self.lines, 1 if header else None):
+        for number, line in self.lines:
             self.line = number
             try:
                 row = list(map(float, line.split()))
@@ -276,14 +260,14 @@ class _Source:
                 self.fail(f"{len(row)} numbers, but the joints have {width} channels")
             rows.append(row)
             numbers.append(number)
-        if len(rows) != (min(count, 1) if header else count) or not rows:
+        if len(rows) != count or not rows:
             self.fail(f"the file ends after {len(rows)} frames, but must have {max(count, 1)}")
         table = np.array(rows)
         valid = (np.abs(table) <= LARGEST).all(1)
         if not valid.all():
             self.line = numbers[int(np.argmin(valid))]
             self.fail("number is not finite, or too large")
-        return np.broadcast_to(table, (count, width)) if header else table
+        return table
 
 
 def write(bvh: Bvh, path: str | Path) -> None:

@@ -87,11 +87,11 @@ LAYOUTS: dict[str, Layout] = {
 _TOELESS = {f"{name} without toes": layout.without_toes() for name, layout in LAYOUTS.items()}
 
 
-def read_tree(path: Path, rate: float | None = None, header: bool = False) -> bvh.Bvh:
-    """Reads a BVH file, its header alone as `bvh.read_header` does, or an AMC file; `rate` overrides its frame rate."""
+def read_tree(path: Path, rate: float | None = None) -> bvh.Bvh:
+    """Reads a BVH or AMC file; `rate` overrides its frame rate."""
     if path.suffix.lower() == ".amc":
         return asf.read(path, rate)
-    file = bvh.read_header(path) if header else bvh.read(path)
+    file = bvh.read(path)
     return file if rate is None else replace(file, fps=rate)
 
 

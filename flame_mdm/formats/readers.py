@@ -123,25 +123,24 @@ def from_array(joints: Any, fps: float | None) -> Motion:
     if not _is_real(values):
         name = type(joints).__name__
         raise UserError(f"{name}: not a motion. Give a path, a Motion, or an array of joints (frames, joints, 3)")
-    _check_numbers("joints", values, False)
+    _check_numbers("joints", values)
     skeleton = _skeleton(values)
     if fps is None:
         raise UserError("an array has no frame rate: set it, for example with fps=20")
     return Motion(values, frame_rate(fps), skeleton)
 
 
-def read_arrays(path: Path, header: bool = False) -> dict[str, Any]:
+def read_arrays(path: Path) -> dict[str, Any]:
     """Reads the arrays of an .npz, .json or .npy motion: joints, or poses and trans as in AMASS; and fps if present.
 
-    `posed_joints`, as in files of NVIDIA's Kimodo, are returned as joints. With `header`, arrays of .npz and .npy files
-    repeat their first frame; the others are neither read nor checked. A `UserError` names the file.
+    `posed_joints`, as in files of NVIDIA's Kimodo, are returned as joints. A `UserError` names the file.
     """
     suffix = path.suffix.lower()
     with _named(path):
         if suffix == ".npz":
-            data: dict[str, Any] = read_npz(path, skip=("dmpls",), header=header)
+            data: dict[str, Any] = read_npz(path, skip=("dmpls",))
         elif suffix == ".npy":
-            data = {"joints": read_npy(path, header=header)}
+            data = {"joints": read_npy(path)}
         else:
             data = _read_json(path)
         if "posed_joints" in data:  # of NVIDIA's Kimodo, whose files do not contain their rate
@@ -150,7 +149,7 @@ def read_arrays(path: Path, header: bool = False) -> dict[str, Any]:
             names = ", ".join(data) or "nothing"
             raise UserError(f"contains {names}; a motion has joints and fps, or poses, trans and mocap_framerate")
         for name in {"joints", "poses", "trans"} & set(data):
-            _check_numbers(name, data[name], header)
+            _check_numbers(name, data[name])
         if "features" in data and (not _is_real(data["features"]) or data["features"].ndim != 2):
             raise UserError("features are not an array (frames, features) of real numbers")
         if "poses" in data and data.get("trans", np.zeros(0)).shape != (len(data["poses"]), 3):
@@ -166,13 +165,13 @@ def _is_real(values: np.ndarray) -> bool:
     return values.dtype.kind in "fiu" and values.dtype.itemsize <= 8
 
 
-def _check_numbers(name: str, values: np.ndarray, header: bool) -> None:
+def _check_numbers(name: str, values: np.ndarray) -> None:
     if not _is_real(values):
         raise UserError(f"{name} are not an array of real numbers")
     if not values.ndim or not len(values):
         raise UserError(f"{name} of shape {values.shape} have no frames")
     check_frames(len(values))
-    if (beyond := ~(np.abs(values[:1] if header else values) < 1e6)).any():
+    if (beyond := ~(np.abs(values) < 1e6)).any():
         raise UserError(f"numbers of {name} in frame {np.argwhere(beyond)[0][0]} are not finite, or exceed a million")
 
 

@@ -159,6 +159,11 @@ def test_precision_and_recall_equal_the_authors(stem: str):
     assert values == pytest.approx({name: float(array(f"pr/{name}")) for name in values}, rel=1e-12)
 
 
+def mid(real: Tensor, text: Tensor, generated: Tensor, eps: float) -> float:
+    requested = text[: len(generated)]
+    return alignment.pointwise_mutual_information(real, text, generated, requested, eps).mean().item()
+
+
 MID_EPS = {"mid": 0.0, "eps0": 0.0, "eps5e-4": 5e-4, "real_as_fake_eps5e-4": 5e-4}
 
 
@@ -170,7 +175,7 @@ def test_mid_equals_the_authors(case: str):
     ours, theirs = {}, {}
     for option in (option for option in MID_EPS if f"{case}/{option}" in FIXTURE):
         motions = real[: len(fake)] if option.startswith("real_as_fake") else fake
-        ours[option] = alignment.mutual_information_divergence(real, text, motions, MID_EPS[option]).item()
+        ours[option] = mid(real, text, motions, MID_EPS[option])
         theirs[option] = float(array(f"{case}/{option}"))
     if len(real) > real.shape[1] + text.shape[1]:
         assert ours == pytest.approx(theirs, rel=1e-6)
@@ -210,8 +215,7 @@ def test_flame_position_errors_equal_the_authors(stem: str):
 
 def averages(metric: reconstruction.PositionErrors, pairs: list[Any]) -> list[float]:
     """APE and AVE of pairs of parts, without what `update` does to motions."""
-    position = torch.stack([metric.position_errors(*pair) for pair in pairs])
-    variance = torch.stack([metric.variance_errors(*pair) for pair in pairs])
+    position, variance = map(torch.stack, zip(*(metric.errors(*pair) for pair in pairs), strict=True))
     frames = torch.tensor([[len(pair[0]["root"])] for pair in pairs])
     return [*metric.average(position, frames).tolist(), *variance.mean(0).tolist()]
 
@@ -323,7 +327,7 @@ def test_mid_of_normal_distributions():
     metric = alignment.MutualInformationDivergence(eps=0.0)
     value = computed(metric, generated=real, text=text, real=real, keys=torch.arange(500))
     assert value == pytest.approx(-math.log(1 - r**2) / 2, rel=1e-12)
-    assert alignment.mutual_information_divergence(real, text, real.roll(1, 0), 0.0).item() < 0 < value
+    assert mid(real, text, real.roll(1, 0), 0.0) < 0 < value
 
 
 def test_r_precision_of_perfect_random_and_blind_features():

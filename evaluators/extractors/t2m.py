@@ -237,13 +237,7 @@ class _TextEncoder(_Recurrent):
 
 
 def _read_numbers(path: Path) -> np.ndarray:
-    """Returns the array of an .npy file of real numbers; errors name the file."""
-    try:
-        array = read_npy(path)
-    except UserError:
-        raise
-    except ValueError as error:
-        raise UserError(f"{path}: {error}") from error
+    array = read_npy(path)
     if array.dtype.kind not in "fiu":
         raise UserError(f"{path}: an array of {array.dtype}, not of numbers")
     return array

@@ -155,8 +155,10 @@ class MotionCLIPScore(TextAndMotion):
         return F.cosine_similarity(generated, text).mean().item()
 
 
-def mutual_information_divergence(real: Tensor, text: Tensor, generated: Tensor, eps: float) -> Tensor:
-    """Computes MID of motions generated for the first texts, in float64; see `pointwise_mutual_information`.
+def pointwise_mutual_information(
+    real: Tensor, text: Tensor, generated: Tensor, requested: Tensor, eps: float
+) -> Tensor:
+    """Computes the terms (M,) whose mean is MID, in float64.
 
     Kim et al. 2022, "Mutual Information Divergence": the mean pointwise mutual information of generated motions and
     their texts under a normal distribution fitted to the real pairs,
@@ -165,14 +167,6 @@ def mutual_information_divergence(real: Tensor, text: Tensor, generated: Tensor,
 
     where x is real, y is text, and z is both; covariances of generated motions (') are about the means of the real
     ones; inverses are those of S + eps I. The denominators are N - 1 and M - 1.
-    """
-    return pointwise_mutual_information(real, text, generated, text[: len(generated)], eps).mean()
-
-
-def pointwise_mutual_information(
-    real: Tensor, text: Tensor, generated: Tensor, requested: Tensor, eps: float
-) -> Tensor:
-    """Computes the terms (M,) whose mean is MID; see `mutual_information_divergence`.
 
     Args:
         real, text: (N, E) features of real motions, and (N, T) of their texts.
@@ -192,7 +186,7 @@ def pointwise_mutual_information(
 
 
 class MutualInformationDivergence(SampleMetric):
-    """MID, in nats: `mutual_information_divergence` of generated motions, their texts and the real motions.
+    """MID, in nats: mean `pointwise_mutual_information` of generated motions, their texts and the real motions.
 
     It needs the real motion of each generated one, and more samples than motion and text have features together. With
     fewer, the joint covariance is singular and the value arbitrary (the authors' code requires half as many).
@@ -213,4 +207,4 @@ class MutualInformationDivergence(SampleMetric):
 
     def value(self, generated: Tensor, text: Tensor, real: Tensor) -> float:
         self.need(len(text), real.shape[1] + text.shape[1] + 1, "samples, one more than features of motion and text")
-        return mutual_information_divergence(real, text, generated, self.eps).item()
+        return pointwise_mutual_information(real, text, generated, text, self.eps).mean().item()

@@ -52,6 +52,7 @@ class PositionErrors(SampleMetric):
 
     higher_is_better = False
     states = ("groups", "position", "variance", "frames")
+    equal_clips = False  # whether position errors are averaged over clips instead of frames
 
     def __init__(self, samples: int = 1, upsampling: int = 1):
         super().__init__()
@@ -90,8 +91,8 @@ class PositionErrors(SampleMetric):
             length = min(len(a["root"]), len(b["root"]))
             self.need(length, 2, "frames of a motion")
             a, b = ({part: values[:length] for part, values in x.items()} for x in (a, b))
-            position.append(self.position_errors(a, b))
-            variance.append(self.variance_errors(a, b))
+            for errors, of_clip in zip((position, variance), self.errors(a, b), strict=True):
+                errors.append(of_clip)
             frames.append([length])
         if frames:
             self.keep(
@@ -117,17 +118,13 @@ class PositionErrors(SampleMetric):
         """Returns the compared quantities of a whole motion (F, J, 3), by the names of `PARTS`."""
         raise NotImplementedError
 
-    def position_errors(self, a: Mapping[str, Tensor], b: Mapping[str, Tensor]) -> Tensor:
-        """Returns the error of each part, summed over the frames of a clip, (4,)."""
-        raise NotImplementedError
-
-    def variance_errors(self, a: Mapping[str, Tensor], b: Mapping[str, Tensor]) -> Tensor:
-        """Returns the error of the variances of each part of a clip, (4,)."""
+    def errors(self, a: Mapping[str, Tensor], b: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
+        """Returns the errors of each part of a clip, (4,): of positions, summed over frames, and of variances."""
         raise NotImplementedError
 
     def average(self, position: Tensor, frames: Tensor) -> Tensor:
         """Averages the position errors (4,) of all clips from their sums (N, 4) and numbers of frames (N, 1)."""
-        raise NotImplementedError
+        return (position / frames).mean(0) if self.equal_clips else position.sum(0) / frames.sum(0)
 
 
 class TemosPositionErrors(PositionErrors):
@@ -152,15 +149,10 @@ class TemosPositionErrors(PositionErrors):
             raise UserError(f"TemosPositionErrors: {joints.shape[1]} joints, but defined only for KIT's 21 (MMM)")
         return {part: values / 1000 for part, values in temos_parts(joints * self.units_per_metre).items()}
 
-    def position_errors(self, a: Mapping[str, Tensor], b: Mapping[str, Tensor]) -> Tensor:
+    def errors(self, a: Mapping[str, Tensor], b: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
         distance = [(a[part] - b[part]).norm(dim=-1) for part in PARTS]
-        return torch.stack([d.sum() if d.ndim == 1 else d.mean(1).sum() for d in distance])
-
-    def variance_errors(self, a: Mapping[str, Tensor], b: Mapping[str, Tensor]) -> Tensor:
-        return torch.stack([(a[part].var(0) - b[part].var(0)).norm(dim=-1).mean() for part in PARTS])
-
-    def average(self, position: Tensor, frames: Tensor) -> Tensor:
-        return position.sum(0) / frames.sum(0)
+        variance = [(a[part].var(0) - b[part].var(0)).norm(dim=-1).mean() for part in PARTS]
+        return torch.stack([d.sum() if d.ndim == 1 else d.mean(1).sum() for d in distance]), torch.stack(variance)
 
 
 class FlamePositionErrors(PositionErrors):
@@ -176,6 +168,8 @@ class FlamePositionErrors(PositionErrors):
         samples: motions per text, see `PositionErrors`.
     """
 
+    equal_clips = True
+
     def __init__(self, parents: Sequence[int], samples: int = 1):
         super().__init__(samples)
         self.parents = tuple(parents)
@@ -183,17 +177,13 @@ class FlamePositionErrors(PositionErrors):
     def parts(self, joints: Tensor) -> dict[str, Tensor]:
         return flame_parts(joints, joints[:, 0], self.parents)
 
-    def position_errors(self, a: Mapping[str, Tensor], b: Mapping[str, Tensor]) -> Tensor:
+    def errors(self, a: Mapping[str, Tensor], b: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
         along_axes = (a["trajectory"] - b["trajectory"]).abs().sum(-1)
         root, local, all_joints = ((a[p] - b[p]).norm(dim=-1) for p in ("root", "mean_local", "mean_global"))
-        return torch.stack([root.sum(), along_axes.sum(), local.mean(1).sum(), all_joints.mean(1).sum()])
-
-    def variance_errors(self, a: Mapping[str, Tensor], b: Mapping[str, Tensor]) -> Tensor:
+        position = torch.stack([root.sum(), along_axes.sum(), local.mean(1).sum(), all_joints.mean(1).sum()])
         root, trajectory, local, all_joints = (a[part].var(0) - b[part].var(0) for part in PARTS)
-        return torch.stack([root.norm(), trajectory.norm(), local.norm(dim=-1).mean(), all_joints.mean(0).norm()])
-
-    def average(self, position: Tensor, frames: Tensor) -> Tensor:
-        return (position / frames).mean(0)
+        variance = [root.norm(), trajectory.norm(), local.norm(dim=-1).mean(), all_joints.mean(0).norm()]
+        return position, torch.stack(variance)
 
 
 class DisplacementErrors(SampleMetric):
@@ -249,8 +239,8 @@ class KeptDrift(SampleMetric):
     ) -> None:
         pairs = list(_distances(type(self).__name__, joints, mask, real_joints, real_mask, kept))
         edited = [number for number, (_, old) in enumerate(pairs) if old.any()]
-        kept_distances = [pairs[number][0][pairs[number][1]] for number in edited]
         if edited:
+            kept_distances = (pairs[number][0][pairs[number][1]] for number in edited)
             drift = torch.stack([torch.stack([distance.mean(), distance.max()]) for distance in kept_distances])
             self.keep(keys=keys[edited], drift=drift)
 

@@ -305,5 +305,4 @@ def _sorted_distances(nearest: Tensor) -> list[float]:
 
 def _select(extracted: Extracted, indices: list[int]) -> Extracted:
     rows = {n: v[indices] if isinstance(v, Tensor) else [v[i] for i in indices] for n, v in extracted.rows.items()}
-    kept = None if extracted.kept is None else [extracted.kept[i] for i in indices]
-    return Extracted(rows, [extracted.joints[i] for i in indices] if extracted.joints else [], kept)
+    return Extracted(rows)

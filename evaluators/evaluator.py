@@ -34,6 +34,9 @@ CHUNK = 64  # motions per metric update; more do not fit into a processor's cach
 
 FEATURES = {"generated", "real", "text", "logits"}  # inputs of metrics that an extractor provides
 
+PAIRED = {"generated": "real", "joints": "real_joints", "nearest": "real_nearest", "references": "references"}
+"""Inputs of paired real motions -> their names among the inputs of the generated motions."""
+
 
 @dataclass
 class Motions:
@@ -59,16 +62,21 @@ class Motions:
 class Extracted:
     """Metric inputs of N motions."""
 
-    rows: dict[str, Any]  # tensors or lists of N entries, by the names in `evaluators.metrics`
-    joints: list[Tensor]  # (F, J, 3) each; empty if no metric needs them
-    kept: list[Tensor] | None = None  # (F, J) each, True = kept by an edit; None if the motions are not edits
+    # tensors or lists of N entries, by the names in `evaluators.metrics`; joints, kept and contacts are lists of the
+    # values of one motion, and missing if no metric needs them
+    rows: dict[str, Any]
 
     def __len__(self) -> int:
         return len(self.rows["keys"])
 
+    @property
+    def joints(self) -> list[Tensor]:
+        """(F, J, 3) each."""
+        return self.rows["joints"]
+
     def without_joints(self) -> Extracted:
         """Returns the inputs of metrics that do not read these joints."""
-        return Extracted(self.rows, [])
+        return Extracted({name: values for name, values in self.rows.items() if name != "joints"})
 
 
 @dataclass
@@ -106,7 +114,7 @@ class Evaluator:
         texts = [text for indices in batches if (text := self._texts(motions, indices)) is not None]
         back = np.argsort(order, kind="stable")
         joints = [motion for batch, _ in parts for motion in batch]
-        joints = [joints[i] for i in back]
+        rows["joints"] = joints = [joints[i] for i in back]
         if batches:
             rows |= {name: torch.cat([features[name] for _, features in parts])[back] for name in parts[0][1]}
         if texts:
@@ -127,12 +135,13 @@ class Evaluator:
         contacts = self.representation.slices.get("contacts")
         if contacts is not None:
             rows["contacts"] = [torch.from_numpy(x[:, contacts] > 0.5) for x in motions.features]
-        kept = None
         if motions.edit is not None:
-            kept = [kept_parts(self.representation, len(motion), EditRequest(**motions.edit))[1] for motion in joints]
+            rows["kept"] = [
+                kept_parts(self.representation, len(motion), EditRequest(**motions.edit))[1] for motion in joints
+            ]
         if self.training is not None and joints:
             rows["nearest"] = self.training.nearest(joints, rows.get("generated"))
-        return Extracted(rows, joints, kept)
+        return Extracted(rows)
 
     def training_motions(self, whole: Motions, windows: Motions) -> TrainingMotions:
         """Returns the training motions to which others are compared: all their frames, and features of windows."""
@@ -150,7 +159,7 @@ class Evaluator:
         if features is None:
             return None
         names = [f"reference {number}" for number in range(len(features))]
-        return Extracted({"generated": features, "keys": self._keys(names)}, list(features))
+        return Extracted({"generated": features, "keys": self._keys(names)})
 
     def _keys(self, names: Sequence[str]) -> Tensor:
         return torch.tensor([key(name) for name in names], dtype=torch.long)
@@ -273,10 +282,7 @@ class Evaluator:
 
     def check(self, motions: Extracted, metrics: Mapping[str, Metric] | None = None) -> dict[str, Metric]:
         """Returns the metrics that can be computed, without `skip_features` all; `UserError` if an input is missing."""
-        available = {*motions.rows, "joints", "mask", "real_joints", "real_mask"}
-        available |= {"real"} if "generated" in motions.rows else set()
-        available |= {"kept"} if motions.kept is not None else set()
-        available |= {"real_nearest"} if "nearest" in motions.rows else set()
+        available = {*motions.rows, "mask", "real_mask", *(PAIRED[name] for name in PAIRED if name in motions.rows)}
         usable = {}
         for name, metric in (make_metrics(self.metrics) if metrics is None else metrics).items():
             needed = ["generated", "keys"] if isinstance(metric, TwoSets) else required_inputs(metric)
@@ -298,21 +304,10 @@ def _update(metrics: Mapping[str, Metric], generated: Extracted, paired: Extract
     sets = _two_sets(metrics)
     if sets:
         update_metrics(sets, generated=rows["generated"], keys=rows["keys"])
-    joints, mask = _pad(generated.joints[part])
-    if generated.kept is not None:
-        rows["kept"] = pad_sequence(generated.kept[part], batch_first=True)
-    if "contacts" in rows:
-        rows["contacts"] = pad_sequence(rows["contacts"], batch_first=True)
-    rows |= {"joints": joints, "mask": mask}
-    if paired.joints:
-        rows["real_joints"], rows["real_mask"] = _pad(paired.joints[part])
-    rows |= {"references": paired.rows["references"][part]} if "references" in paired.rows else {}
-    rows |= {"real_nearest": paired.rows["nearest"][part]} if "nearest" in paired.rows else {}
-    if "generated" in paired.rows:
-        rows["real"] = paired.rows["generated"][part]
+    rows |= {real: paired.rows[name][part] for name, real in PAIRED.items() if name in paired.rows}
+    for joints, mask in (("joints", "mask"), ("real_joints", "real_mask")):
+        if joints in rows:
+            rows[mask] = length_mask(torch.tensor([len(motion) for motion in rows[joints]]))
+    for name in {"joints", "real_joints", "kept", "contacts"} & rows.keys():
+        rows[name] = pad_sequence(rows[name], batch_first=True)
     update_metrics({name: metric for name, metric in metrics.items() if name not in sets}, **rows)
-
-
-def _pad(joints: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
-    lengths = torch.tensor([len(motion) for motion in joints])
-    return pad_sequence(list(joints), batch_first=True), length_mask(lengths)

@@ -272,7 +272,7 @@ def taken(extracted: Extracted, indices: list[int]) -> Extracted:
     rows = {
         n: v[indices] if isinstance(v, torch.Tensor) else [v[i] for i in indices] for n, v in extracted.rows.items()
     }
-    return Extracted(rows, [extracted.joints[i] for i in indices])
+    return Extracted(rows)
 
 
 def test_a_bootstrap_measures_each_motion_as_often_as_it_is_drawn(runs):
@@ -283,7 +283,7 @@ def test_a_bootstrap_measures_each_motion_as_often_as_it_is_drawn(runs):
 
     def again(extracted: Extracted, indices: np.ndarray) -> Extracted:
         drawn = taken(extracted, indices.tolist())
-        return Extracted(drawn.rows | {"keys": torch.arange(len(indices))}, drawn.joints)
+        return Extracted(drawn.rows | {"keys": torch.arange(len(indices))})
 
     drawn = evaluator.resample(first, first, second, 3, 2)
     generator = np.random.default_rng(key("bootstrap", 3))
@@ -391,7 +391,7 @@ def test_motions_of_others_are_measured_alike(runs, full, tmp_path):
 def test_every_protocol_can_be_read():
     representation = HumanML()
     evaluator = Evaluator(None, {}, representation)
-    nothing = Extracted({"keys": torch.zeros(0, dtype=torch.long)}, [])
+    nothing = Extracted({"keys": torch.zeros(0, dtype=torch.long)})
     for name in protocol_names():
         protocol = load_protocol(name, representation)
         assert protocol.name == name

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from support.fixtures import SHARED, needs_third_party, third_party
 from support.stores import BONES, TAKES, synthetic_take
 
-from flame_mdm.data import Clip, bandai
+from flame_mdm.data import Clip, archives, bandai
 from flame_mdm.data.bandai import (
     CONTENTS_1,
     JOINTS,
@@ -237,12 +237,12 @@ def test_archives_give_the_same_clips_and_leave_no_files(tiny, tmp_path, monkeyp
     temporary.mkdir()
     monkeypatch.setattr(tempfile, "tempdir", str(temporary))
     expected, count = clips(tiny), Bandai(str(tiny)).count()
-    archives = sorted(tmp_path.glob("set.*"))
-    for path in archives:
+    packed = sorted(tmp_path.glob("set.*"))
+    for path in packed:
         assert Bandai(str(path)).count() == count
         same(clips(path), expected)
     assert not list(temporary.iterdir())
-    assert sorted(tmp_path.iterdir()) == [*archives, temporary]
+    assert sorted(tmp_path.iterdir()) == [*packed, temporary]
 
 
 def test_wrong_input_is_explained(tiny, tmp_path):
@@ -268,18 +268,20 @@ CASES = [key.split("/")[0] for key in third_party("hml263_bandai") if key.endswi
 
 
 @pytest.fixture(scope="module")
-def originals() -> dict[str, bytes]:
+def originals(tmp_path_factory) -> dict[str, Path]:
     """BVH files of the clips in the fixture, by the name of the case."""
     if not ARCHIVE.exists():
         pytest.skip(f"{ARCHIVE} is not redistributed and not there")
     cases = {f"dataset-{d}_{case.split('_', 1)[1]}": case for case in CASES for d in (1, 2)}
-    contents: dict[str, bytes] = {}
-    for name, data in bandai._files(ARCHIVE, cases):
+    files: dict[str, Path] = {}
+    folder = tmp_path_factory.mktemp("originals")
+    for name, data in archives.members(ARCHIVE, lambda name: Path(name).stem in cases):
         if data:
-            contents[cases[Path(name).stem]] = data
-            if len(contents) == len(CASES):
+            file = files[cases[Path(name).stem]] = folder / Path(name).name
+            file.write_bytes(data)
+            if len(files) == len(CASES):
                 break
-    return contents
+    return files
 
 
 @needs_third_party
@@ -287,7 +289,7 @@ def originals() -> dict[str, bytes]:
 @pytest.mark.parametrize("case", CASES, ids=lambda case: f"hml263_bandai-{case}")
 def test_real_takes_against_the_joints_of_the_fixture(case, originals):
     expected = third_party("hml263_bandai")[f"{case}/joints_in"]
-    _, motion = bandai.convert((f"{case}.bvh", originals[case]), 20)
+    motion = bandai.convert(originals[case], 20)
     # The fixture's clips were cut. It takes the rounded frame time for exact, which is 6e-6 s and 6e-5 m of a fast
     # joint at its last frame, and it interpolates linearly between frames, where a fast joint leaves the straight line.
     assert len(motion) >= len(expected)
@@ -301,7 +303,7 @@ def test_real_takes_against_the_joints_of_the_fixture(case, originals):
 @pytest.mark.parametrize("case", CASES, ids=lambda case: f"hml263_bandai-{case}")
 def test_limbs_of_real_takes_point_the_same_way_on_smpls_body(case, originals):
     """Bones of arms and legs keep their directions, elbows bend inwards and knees do not twist."""
-    joints, motion = (bandai.convert((f"{case}.bvh", originals[case]), 20, kind)[1] for kind in ("joints", "smpl"))
+    joints, motion = (bandai.convert(originals[case], 20, kind) for kind in ("joints", "smpl"))
     one, other = (x[:, 1:22] - x[:, SMPL22.parents[1:]] for x in (joints, decoded(motion)))
     cosines = (one * other).sum(-1) / np.linalg.norm(one, axis=-1) / np.linalg.norm(other, axis=-1)
     vectors = dict(zip(SMPL24.joints, motion[:, 3:].reshape(-1, 24, 3).swapaxes(0, 1), strict=True))

@@ -7,7 +7,10 @@ import tarfile
 import zipfile
 from collections.abc import Callable, Iterator
 from pathlib import Path, PurePosixPath
+from shutil import rmtree
+from tempfile import mkdtemp
 from typing import IO, Any
+from weakref import finalize
 
 from flame_mdm.errors import UserError
 from flame_mdm.safe_io import MEBIBYTE, ZIP_ERRORS, check_expansion, check_member, naming, regular_file
@@ -41,9 +44,17 @@ def members(path: Path, read: Callable[[str], bool] = lambda name: False) -> Ite
                 yield from _tar_members(path, _Bounded(unpacked, size), read)
 
 
-def unpack(path: Path, folder: Path, is_wanted: Callable[[str], bool]) -> Path:
-    """Unpacks members and returns the deepest folder of them all; raises `UserError` if a name leads out."""
-    folder.mkdir(parents=True)
+def as_folder(path: Path, owner: object, is_wanted: Callable[[str], bool]) -> Path:
+    """Returns a folder unchanged; unpacks some members of an archive into one that is removed together with `owner`.
+
+    Returns the deepest folder that contains them all; raises `UserError` as `members`, and if a name leads out.
+    """
+    if not path.is_file():
+        return path
+    temporary = Path(mkdtemp(prefix="flame-mdm-"))
+    finalize(owner, rmtree, temporary, ignore_errors=True)
+    folder = temporary / path.name
+    folder.mkdir()
     for name, content in members(path, is_wanted):
         if is_wanted(name):
             if ".." in PurePosixPath(name).parts or PurePosixPath(name).is_absolute():

@@ -5,8 +5,7 @@ Stylization", arXiv 2306.08861, 2023; CC BY-NC 4.0. `docs/bandai.md` describes t
 """
 
 import re
-from collections.abc import Container, Generator, Iterator, Sequence
-from contextlib import closing
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property, partial
 from pathlib import Path, PurePosixPath
@@ -22,7 +21,7 @@ from flame_mdm.errors import UserError
 from flame_mdm.formats import bvh
 from flame_mdm.formats.layouts import LAYOUTS
 from flame_mdm.representations.skeleton import SMPL22
-from flame_mdm.safe_io import TEXT_LIMIT, read_yaml, regular_file
+from flame_mdm.safe_io import naming, read_yaml
 
 _MAP = LAYOUTS["Bandai-Namco"].map
 JOINTS = {name: own if isinstance(own := _MAP[name], str) else next(iter(own)) for name in SMPL22.joints}
@@ -104,6 +103,7 @@ class Take:
     """One BVH file; `content` is the action performed, which differs from the file name for takes in `WRONG_SIDE`."""
 
     id: str
+    file: Path
     dataset: int
     content: str
     style: str
@@ -157,35 +157,25 @@ class Bandai(MotionSource):
         return {"takes": len(takes), **{f"takes of data set {number}": takes.count(number) for number in (1, 2)}}
 
     def clips(self, fps: float) -> Iterator[Clip]:
-        takes = self.takes
-        ready: dict[str, np.ndarray] = {}  # members of an archive come in any order
-        with closing(self._motions({take.id for take in takes}, fps)) as motions:
-            for take in takes:
-                while take.id not in ready:
-                    id_, motion = next(motions)
-                    ready[id_] = motion
-                motion = ready.pop(take.id)
-                yield self._clip(take, motion, mirrored=False)
-                if self.mirror and take.split == "train":
-                    yield self._clip(take, motion, mirrored=True)
+        convert_one = partial(convert, fps=fps, kind=self.motion)
+        motions = in_order(convert_one, [take.file for take in self.takes], self.workers)
+        for take, motion in zip(self.takes, motions, strict=True):
+            yield self._clip(take, motion, mirrored=False)
+            if self.mirror and take.split == "train":
+                yield self._clip(take, motion, mirrored=True)
 
     @cached_property
     def takes(self) -> list[Take]:
         """The takes that are present and not excluded, sorted by name."""
-        names: dict[str, str] = {}
-        for name, _ in _files(self.path, ids=()):
-            id_ = PurePosixPath(name).stem
-            if id_ in names:
-                raise UserError(f"{self.path}: {id_} exists twice, as {names[id_]} and {name}; delete one")
-            names[id_] = name
-        if not names:
+        files: dict[str, Path] = {}
+        folder = archives.as_folder(required(self.path, GET_IT), self, _is_take)
+        for file in filter(lambda path: _is_take(path.name), sorted(folder.rglob("dataset-*.bvh"))):
+            if file.stem in files:
+                raise UserError(f"{self.path}: {file.stem} exists twice, as {files[file.stem]} and {file}; delete one")
+            files[file.stem] = file
+        if not files:
             raise FileNotFoundError(f"{self.path}: no file dataset-1_*.bvh or dataset-2_*.bvh in it; {GET_IT}")
-        return [_take(id_, self.split) for id_ in sorted(without(names, self.exclude, self.path))]
-
-    def _motions(self, ids: set[str], fps: float) -> Generator[tuple[str, np.ndarray]]:
-        """Yields id and motion of these takes in the order of the folder or archive."""
-        files = ((name, data) for name, data in _files(self.path, ids) if PurePosixPath(name).stem in ids)
-        yield from in_order(partial(convert, fps=fps, kind=self.motion), files, self.workers)
+        return [_take(file, self.split) for _, file in sorted(without(files, self.exclude, self.path).items())]
 
     def _clip(self, take: Take, motion: np.ndarray, mirrored: bool) -> Clip:
         content, side = take.content, side_of(take.content)
@@ -206,28 +196,26 @@ class Bandai(MotionSource):
         )
 
 
-def convert(file: tuple[str, bytes], fps: float, kind: Literal["joints", "smpl"] = "joints") -> tuple[str, np.ndarray]:
-    """Converts name and content of a BVH file to its id and motion, float32, at `fps`.
+def convert(file: Path, fps: float, kind: Literal["joints", "smpl"] = "joints") -> np.ndarray:
+    """Converts a BVH file to a motion, float32, at `fps`.
 
     The motion is joints (F, 22, 3) in meters, y up, or the SMPL motion (F, 75) described in `smpl_motion`. Local
     rotations and the position of the hips are interpolated, so bones keep their length.
     """
-    name, data = file
-    id_ = PurePosixPath(name).stem
     try:
-        motion = bvh.parse(data, name)
-        if missing := set(JOINTS.values()) - set(motion.joints):
-            raise UserError(f"not the skeleton of this data set: joint {', '.join(sorted(missing))} missing")
-        rotations, translations = motion.resample(fps)
-    except ValueError as error:
-        message = str(error) if name in str(error) else f"{name}: {error}"
-        raise UserError(f"{message}; to continue without it: data.source.exclude=[{id_}]") from error
+        with naming(file, ValueError):
+            motion = bvh.read(file)
+            if missing := set(JOINTS.values()) - set(motion.joints):
+                raise UserError(f"not the skeleton of this data set: joint {', '.join(sorted(missing))} missing")
+            rotations, translations = motion.resample(fps)
+    except UserError as error:
+        raise UserError(f"{error}; to continue without it: data.source.exclude=[{file.stem}]") from error
     if kind == "smpl":
-        return id_, smpl_motion(motion, rotations, translations)
+        return smpl_motion(motion, rotations, translations)
     positions, _ = bvh.forward_kinematics(motion.parents, rotations, translations)
     joints = positions[:, [motion.joints.index(joint) for joint in JOINTS.values()]] / 100
     joints[:, SPINE1] += 0.4 * (joints[:, SPINE2] - joints[:, SPINE1])
-    return id_, joints.astype(np.float32)
+    return joints.astype(np.float32)
 
 
 def smpl_motion(skeleton: bvh.Bvh, rotations: np.ndarray, translations: np.ndarray) -> np.ndarray:
@@ -316,34 +304,19 @@ def _blocks(content: str, style: str) -> dict[int, Split]:
     return split_blocks(f"dataset-2_{content}_{style}", takes, 5, val=0.05, test=0.1)
 
 
-def _take(id_: str, rule: SplitRule) -> Take:
+def _is_take(name: str) -> bool:
+    return FILE.fullmatch(PurePosixPath(name).name) is not None
+
+
+def _take(file: Path, rule: SplitRule) -> Take:
+    id_ = file.stem
     name, content, style, number = id_.split("_")
     dataset = int(name[-1])
     contents, styles = (CONTENTS_1, STYLES_1) if dataset == 1 else (TAKES_2, STYLES_2)
     if content not in contents or style not in styles:
         raise UserError(f"{id_}.bvh: data set {dataset} has no content {content} with style {style}")
     split = split_of(dataset, content, style, int(number), rule)
-    return Take(id_, dataset, swap_sides(content) if id_ in WRONG_SIDE else content, style, split)
-
-
-def _files(path: Path, ids: Container[str]) -> Iterator[tuple[str, bytes]]:
-    """Yields path and content, empty for other ids, of BVH files in a folder or archive, which is not unpacked."""
-
-    def belongs(name: str) -> bool:
-        return FILE.fullmatch(PurePosixPath(name).name) is not None
-
-    def is_read(name: str) -> bool:
-        return belongs(name) and PurePosixPath(name).stem in ids
-
-    if path.is_dir():
-        for file in sorted(path.rglob("dataset-*.bvh")):
-            if belongs(file.name):
-                regular_file(file, TEXT_LIMIT)
-                yield file.as_posix(), file.read_bytes() if is_read(file.name) else b""
-    else:
-        for name, content in archives.members(required(path, GET_IT), is_read):
-            if belongs(name):
-                yield f"{path}/{name}", content
+    return Take(id_, file, dataset, swap_sides(content) if id_ in WRONG_SIDE else content, style, split)
 
 
 def prompts() -> list[str]:

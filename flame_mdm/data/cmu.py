@@ -10,10 +10,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property, partial
 from pathlib import Path, PurePosixPath
-from shutil import rmtree
-from tempfile import mkdtemp
 from typing import Any, Literal, NamedTuple
-from weakref import finalize
 
 import numpy as np
 import torch
@@ -123,11 +120,7 @@ class CMU(MotionSource):
     @cached_property
     def path(self) -> Path:
         """The folder of the recordings."""
-        if not self.archive.is_file():
-            return self.archive
-        folder = Path(mkdtemp(prefix="cmu-"))
-        finalize(self, rmtree, folder, ignore_errors=True)
-        return archives.unpack(self.archive, folder / self.archive.name, _is_read)
+        return archives.as_folder(self.archive, self, _is_read)
 
     @property
     def captions(self) -> Path:

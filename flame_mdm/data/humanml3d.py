@@ -138,6 +138,12 @@ class HumanML3D(T2MFolder):
         """The clips of the index that are not excluded."""
         return [row for row in read_index(self.index) if row.name not in self.exclude]
 
+    @cached_property
+    def humanact12_files(self) -> dict[str, Path]:
+        """Files of joints of HumanAct12 by name; empty if they are missing."""
+        folder = archives.as_folder(self.humanact12, self, lambda n: n.endswith(".npy") and "__MACOSX" not in n)
+        return {file.stem: file for file in folder.rglob("*.npy")}
+
     def _todo(self) -> list[IndexedClip]:
         made = self._motions()
         return [row for row in self.rows if not {row.name, f"M{row.name}"} <= made]
@@ -151,7 +157,7 @@ class HumanML3D(T2MFolder):
                 missing.append(str(error))
         if amass.root.is_dir():
             missing += amass.missing({row.key for row in todo if not row.humanact12})
-        absent = {row.key for row in todo if row.humanact12} - _humanact12_files(self.humanact12).keys()
+        absent = {row.key for row in todo if row.humanact12} - self.humanact12_files.keys()
         if absent:
             missing.append(f"{self.humanact12}: {len(absent)} clips of HumanAct12 are missing, such as {min(absent)}")
         return missing
@@ -185,13 +191,12 @@ class HumanML3D(T2MFolder):
     def _make_motions(self, amass: Amass, todo: Sequence[IndexedClip], folder: Path) -> None:
         write = partial(_write_features, folder, HumanML("smpl22", "legacy", bone_lengths=self.bone_lengths))
         from_amass, from_humanact12 = by_recording(todo)
-        joints = _humanact12_files(self.humanact12)
         with ProgressBar(desc=f"creating {self.name}", total=len(todo), unit=" motions") as progress:
             for _, count in amass.map(from_amass, partial(_from_amass, write, self._bodies()), self.workers):
                 progress.update(count)
             for key, rows in sorted(from_humanact12.items()):
                 for row in rows:
-                    write(row, _read_joints(joints[key]))
+                    write(row, _read_joints(self.humanact12_files[key]))
                     progress.update()
 
     def _write_statistics(self) -> None:
@@ -244,26 +249,10 @@ def _beside(path: Path, *names: str) -> Path:
     return next((candidate for candidate in candidates if candidate.exists()), candidates[0])
 
 
-def _humanact12_files(path: Path) -> dict[str, Path | tuple[Path, str]]:
-    """Returns name -> file of joints in a folder; in a zip, name -> (path of the zip, name of the member)."""
-    if path.is_dir():
-        return {file.stem: file for file in path.rglob("*.npy")}
-    if not path.is_file():
-        return {}
-    names = [name for name, _ in archives.members(path) if name.endswith(".npy") and "__MACOSX" not in name]
-    return {PurePosixPath(name).stem: (path, name) for name in names}
-
-
-def _read_joints(source: Path | tuple[Path, str]) -> np.ndarray:
-    """Reads joints (F, 22, 3) of HumanAct12 from a file or from a member of a zip."""
-    if isinstance(source, Path):
-        file, content = source, source
-    else:
-        path, name = source
-        file = path / name
-        content = io.BytesIO(next(data for member, data in archives.members(path, name.__eq__) if member == name))
-    with naming(file):
-        joints = read_npy(content)
+def _read_joints(path: Path) -> np.ndarray:
+    """Reads joints (F, 22, 3) of HumanAct12."""
+    joints = read_npy(path)
+    with naming(path):
         if joints.dtype.kind not in "fiu":
             raise UserError(f"an array of {joints.dtype}, not of real numbers")
         if joints.ndim != 3 or joints.shape[1] < 22 or joints.shape[2] != 3:

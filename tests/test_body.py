@@ -6,12 +6,12 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from support.motions import posed, sway
+from support.motions import frames_array, posed, sway
 
 from flame_mdm.errors import UserError
 from flame_mdm.formats.motion import Motion
 from flame_mdm.representations.skeleton import KIT21, SMPL22
-from flame_mdm.visualize import frames_array, player_page, render
+from flame_mdm.visualize import player_page, render
 from flame_mdm.visualize.bodies import load_body
 from flame_mdm.visualize.body import ANCHORS, Mesh, fit_body, mannequin, rasterize, try_fit
 from flame_mdm.visualize.posture import JOINT

@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image, ImageSequence
-from support.motions import HOSTILE, Page, sway, unpacked
+from support.motions import HOSTILE, Page, frames_array, sway, unpacked
 
 from flame_mdm.errors import UserError
 from flame_mdm.formats.motion import Motion
 from flame_mdm.representations.skeleton import SKELETONS
-from flame_mdm.visualize import contact_sheet, frames_array, write_gif, write_mp4, write_player
+from flame_mdm.visualize import contact_sheet, write_gif, write_mp4, write_player
 from flame_mdm.visualize.render import SIDE_COLORS
 
 try:

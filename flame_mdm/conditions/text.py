@@ -15,8 +15,9 @@ from typing import Any, Literal
 import numpy as np
 import torch
 from torch import Tensor, nn
+from torch.nn.utils.rnn import pad_sequence
 
-from flame_mdm.batch import Condition, MotionBatch, sent
+from flame_mdm.batch import Condition, MotionBatch, length_mask, sent
 from flame_mdm.conditions import ConditionEncoder
 from flame_mdm.errors import UserError
 from flame_mdm.progress import ProgressBar
@@ -216,14 +217,10 @@ class PretrainedText(ConditionEncoder):
         missing = sorted(set(captions) - set(encoded), key=len)
         if missing:
             encoded |= zip(missing, self._encode_frozen(missing, device), strict=True)
-        pairs = [encoded[caption] for caption in captions]
-        lengths = np.array([len(t) for _, t in pairs])
-        tokens = np.zeros((len(pairs), lengths.max(), self.features), np.float16)
-        for row, (_, t) in zip(tokens, pairs, strict=True):
-            row[: len(t)] = t
-        token_mask = np.arange(tokens.shape[1]) < lengths[:, None]
-        first = torch.from_numpy(np.stack([f for f, _ in pairs])).to(device)
-        return first, torch.from_numpy(tokens).to(device).float(), torch.from_numpy(token_mask).to(device)
+        first = torch.from_numpy(np.stack([encoded[caption][0] for caption in captions]))
+        tokens = [torch.from_numpy(encoded[caption][1]) for caption in captions]
+        token_mask = length_mask(torch.tensor([len(rows) for rows in tokens])).to(device)
+        return first.to(device), pad_sequence(tokens, batch_first=True).to(device).float(), token_mask
 
 
 SAFE = {"trust_remote_code": False}

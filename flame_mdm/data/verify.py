@@ -34,12 +34,11 @@ def report(data: MotionDataModule) -> dict[str, Any]:
         split), frames, still (ids), duplicates (groups of ids), duplicates_across_splits, statistics, excluded.
 
     Raises:
-        FileNotFoundError, UserError: If the store is missing, has wrong hashes or numbers, or a source in two splits.
+        FileNotFoundError, UserError: If the store is missing, has wrong hashes or numbers.
     """
     store = data.open()
     store.verify()
     _check_frames(store)
-    _check_sources(store)
     needed = data.crop.shortest()
     lengths = [clip.length for clip in store.clips]
     captions = [caption for clip in store.clips for caption in clip.captions]
@@ -155,29 +154,12 @@ def _figures(store: Store) -> dict[str, dict[str, Any]]:
 
 
 def _check_frames(store: Store) -> None:
-    """Raises `UserError` if a clip has non-finite numbers or extends beyond the packed frames."""
-    finite = np.concatenate(
-        [np.isfinite(store.features[begin : begin + 65536]).all(1) for begin in range(0, len(store.features), 65536)]
-    )
+    """Raises `UserError` if a clip has non-finite numbers."""
     for clip in store.clips:
-        frames = finite[clip.start : clip.start + clip.length]
-        if len(frames) < clip.length or not frames.all():
-            what = "is not finite" if len(frames) == clip.length else "is missing"
-            frame = int(np.argmin(frames)) if len(frames) == clip.length else len(frames)
-            raise UserError(f"{store.folder}: damaged: frame {frame} of clip {clip.id} {what}; prepare it again")
-
-
-def _check_sources(store: Store) -> None:
-    splits: defaultdict[str, set[str]] = defaultdict(set)
-    for clip in store.clips:
-        splits[clip.source].add(clip.split)
-    leaks = {source: sorted(names) for source, names in splits.items() if len(names) > 1}
-    if leaks:
-        source, names = next(iter(leaks.items()))
-        raise UserError(
-            f"{store.folder}: damaged: {len(leaks)} sources are in two splits, such as {source} in "
-            f"{' and '.join(names)}; prepare it again"
-        )
+        finite = np.isfinite(store.motion(clip)).all(1)
+        if not finite.all():
+            frame = int(np.argmin(finite))
+            raise UserError(f"{store.folder}: damaged: frame {frame} of clip {clip.id} is not finite; prepare it again")
 
 
 def _motions(store: Store) -> list[list[Entry]]:

@@ -34,12 +34,6 @@ SMOOTH = 2
 """Images are drawn this many times larger and then reduced."""
 
 
-def frames_array(motion: Shown, size: int = 256, body: Mesh | None = None) -> np.ndarray:
-    """Returns each frame of a motion as an image: (F, size, size, 3) uint8, for the video panels of loggers."""
-    fitted, _ = try_fit(motion, body)
-    return np.stack([np.asarray(_figure(motion, fitted, frame, size)) for frame in range(len(motion.joints))])
-
-
 def write_gif(path: str | Path, motions: Sequence[Shown], size: int = 256, body: Mesh | None = None) -> None:
     """Writes a looping animation of motions side by side, with captions below, in panels of `size` pixels.
 

@@ -18,6 +18,8 @@ from flame_mdm.formats.motion import Motion, motion_of_poses
 from flame_mdm.formats.poses import Poses
 from flame_mdm.representations.skeleton import SMPL22, Skeleton
 from flame_mdm.representations.smpl import ADULT
+from flame_mdm.visualize import render
+from flame_mdm.visualize.body import try_fit
 
 HOSTILE = "</script><img src=x onerror=alert(1)><!-- __TITLE__ \u2028 \"'&amp; &"
 """A caption that tries to leave the element of a page that it is in."""
@@ -123,3 +125,9 @@ def wander(joints: int, frames: int, seed: int) -> torch.Tensor:
     generator = torch.Generator().manual_seed(seed)
     pose = torch.rand(joints, 3, generator=generator)
     return pose + torch.randn(frames, joints, 3, generator=generator).cumsum(0) * 0.02
+
+
+def frames_array(motion: Motion, size: int = 256) -> np.ndarray:
+    """Each frame of a motion as an image, (F, size, size, 3) uint8."""
+    fitted, _ = try_fit(motion)
+    return np.stack([np.asarray(render._figure(motion, fitted, frame, size)) for frame in range(len(motion.joints))])

@@ -103,7 +103,6 @@ def _measured(
     texts: Sequence[Text],
     bar: ProgressBar,
 ) -> dict[str, Any]:
-    """Returns the measured part of a card."""
     base = measure(inputs[BASE], texts)
     scores, listed = [measure.scores(inputs[BASE], texts)], []
     for perturbation in perturbations:
@@ -150,7 +149,6 @@ def _inputs(evaluator: Evaluator, path: Path, ids: list[str], make: Callable[[],
 
 
 def _totals(metric: Metric, joints: Tensor) -> list[float]:
-    """Returns the two states of a metric, for one motion."""
     metric.reset()
     mask = torch.ones(1, len(joints), dtype=torch.bool)
     update_metrics({"": metric}, joints=joints[None], mask=mask, keys=torch.zeros(1, dtype=torch.long))

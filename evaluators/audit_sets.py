@@ -95,7 +95,6 @@ class Scene:
         return real_motions(training, copies)
 
     def _representations(self) -> list[HumanML]:
-        """Returns the other representations of these joints."""
         files = sorted((EXPERIMENTS / "representation").glob("humanml*.yaml"))
         others: list[HumanML] = [instantiate(read_yaml(path)) for path in files]
         own = self.representation

@@ -166,7 +166,6 @@ class Evaluation:
         return self._paired(evaluator, self.protocol.rows(self.clips, self.seed, replication)), real.without_joints()
 
     def _paired(self, evaluator: Evaluator, rows: Sequence[DrawnClip]) -> Extracted:
-        """Returns metric inputs computed from the real motions of rows."""
         motions = self._motions(rows, real_motions(self.clips, rows))
         motions.references = self.clips.store.references([row.clip.id for row in rows])
         return evaluator.extract(motions)
@@ -251,7 +250,6 @@ class Evaluation:
         return self._motions(samples.rows, features, samples.captions)
 
     def _warnings(self, generated: Extracted, real: Extracted) -> list[str]:
-        """Returns warnings about biased Fréchet distances."""
         lines = []
         for name, config in self.protocol.metrics.items():
             if not config["_target_"].endswith(FrechetMotionDistance.__name__) or "generated" not in generated.rows:
@@ -270,7 +268,6 @@ class Evaluation:
     # Both -------------------------------------------------------------------------------------------------------------
 
     def _draws(self, replication: int) -> int:
-        """Returns the seed of the random draws of metrics."""
         return key("draws", self.seed, replication)
 
     def _motions(
@@ -299,7 +296,6 @@ def _tokens(row: DrawnClip, caption: str) -> list[str] | None:
 
 
 def _sorted_distances(nearest: Tensor) -> list[float]:
-    """Returns distances of joints in meters, rounded to 0.1 mm, for a figure."""
     return [round(distance, 4) for distance in nearest[:, 0].sort().values.tolist()]
 
 

@@ -165,7 +165,6 @@ class Evaluator:
         return torch.tensor([key(name) for name in names], dtype=torch.long)
 
     def _batch(self, motions: Motions, indices: Sequence[int]) -> tuple[list[Tensor], dict[str, Tensor]]:
-        """Returns joints and features of some motions."""
         for i in indices:
             if not np.isfinite(motions.features[i]).all():
                 raise UserError(f"motion {motions.ids[i]} is not finite. Did the model diverge?")
@@ -299,7 +298,6 @@ def _two_sets(metrics: Mapping[str, Metric]) -> dict[str, Metric]:
 
 
 def _update(metrics: Mapping[str, Metric], generated: Extracted, paired: Extracted, part: slice) -> None:
-    """Updates metrics with some of the generated motions."""
     rows = {name: values[part] for name, values in generated.rows.items()}
     sets = _two_sets(metrics)
     if sets:

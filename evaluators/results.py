@@ -110,7 +110,6 @@ def _checkpoint(plan: Plan) -> Checkpoint | None:
 
 
 def _excluded(data: MotionDataModule, split: Split) -> dict[str, int]:
-    """Returns the number of clips excluded from the data set and from the split, by reason."""
     short = data.clips(split).too_short
     reason = f"{split} clips shorter than {data.crop.shortest()} frames"
     return data.store.info["excluded"] | ({reason: short} if short else {})

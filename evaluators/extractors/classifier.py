@@ -96,7 +96,6 @@ class ClassifierTask(Task):
         return loss
 
     def _classified(self, batch: MotionBatch) -> tuple[Tensor, Tensor]:
-        """Returns scores and labels of a batch."""
         assert batch.action is not None
         joints = self.representation.to_joints(batch.x)
         past_end = ~batch.mask[..., None, None]  # features of 0 in the padding may not be a pose

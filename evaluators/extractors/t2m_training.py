@@ -238,14 +238,12 @@ class T2MTask(Task):
         return self.trainer.global_step < self.movement_steps
 
     def _idle(self) -> list[nn.Parameter]:
-        """Returns the parameters that are not trained in the current stage."""
         movement = [*self.network.movement_encoder.parameters(), *self.decoder.parameters()]
         matching = [*self.network.text_encoder.parameters(), *self.network.motion_encoder.parameters()]
         matching += self.words.parameters() if isinstance(self.words, LearnedWords) else []
         return matching if self._learns_movement else movement
 
     def _embed(self, batch: MotionBatch) -> tuple[Tensor, Tensor]:
-        """Returns embeddings (B, E) of motions and of their captions."""
         assert batch.text is not None
         tokens = [self.tokens[name][text] for name, text in zip(batch.ids, batch.text, strict=True)]
         return self(self.representation.denormalize(batch.x), batch.mask), self.text(tokens)

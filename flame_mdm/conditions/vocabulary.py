@@ -87,7 +87,6 @@ def check_known(text: str, facts: Mapping[str, Any]) -> None:
 
 
 def _content(text: str) -> list[str]:
-    """Returns the words of a text without function words, each once."""
     return [word for word in dict.fromkeys(words(text)) if word not in FUNCTION_WORDS]
 
 

@@ -152,7 +152,6 @@ class Babel(MotionSource):
         return labels
 
     def _annotations(self, path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
-        """Yields the key of the motion and the label, for every frame label of a file."""
         data = read_json(required(path, GET_IT))
         key = "frame_anns" if path.stem.startswith("extra_") else "frame_ann"
         with naming(path, AttributeError, KeyError, TypeError, IndexError, what="not in the layout of BABEL v1.0: "):

@@ -299,7 +299,6 @@ def split_of(dataset: int, content: str, style: str, number: int, rule: SplitRul
 
 @cache
 def _blocks(content: str, style: str) -> dict[int, Split]:
-    """Returns block -> split of a combination of data set 2: 10 % for testing, 5 % for validation."""
     takes = TAKES_2[content][STYLES_2.index(style)]
     return split_blocks(f"dataset-2_{content}_{style}", takes, 5, val=0.05, test=0.1)
 

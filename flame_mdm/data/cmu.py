@@ -269,7 +269,6 @@ def _rank(path: Path) -> int:
 
 
 def _recording(key: str) -> str:
-    """Returns the recording of an AMASS path, such as CMU/02/02_01_poses."""
     return PurePosixPath(key).stem.removesuffix("_poses")
 
 

@@ -305,7 +305,6 @@ def _from_smpl(kind: str, data: dict[str, Any], fps: float) -> np.ndarray:
 
 
 def _is_there(path: Path) -> bool:
-    """Returns whether the file exists; raises `UserError` if it is not a regular file."""
     if not os.path.lexists(path):
         return False
     regular_file(path)
@@ -344,7 +343,6 @@ def _json_rows(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
 
 
 def _take(notes: dict[str, Note], exclude: Sequence[str], where: str, row: Mapping[str, Any]) -> None:
-    """Adds a row of a table to the notes."""
     if row["id"] in exclude:
         return
     if row["id"] not in notes:

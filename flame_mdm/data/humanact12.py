@@ -58,7 +58,6 @@ class HumanAct12(MotionSource):
         return read(find(self.path, "humanact12poses.pkl"), len(self.actions))
 
     def _splits(self, actions: Sequence[int]) -> list[tuple[str, Split]]:
-        """Returns source and split of each clip."""
         if self.published_split:
             return [(f"humanact12_{number:04d}", "train") for number in range(len(actions))]
         clips, seen = Counter(actions), Counter[int]()

@@ -250,7 +250,6 @@ def _beside(path: Path, *names: str) -> Path:
 
 
 def _read_joints(path: Path) -> np.ndarray:
-    """Reads joints (F, 22, 3) of HumanAct12."""
     joints = read_npy(path)
     with naming(path):
         if joints.dtype.kind not in "fiu":
@@ -366,7 +365,6 @@ class HumanML3DSMPL(MotionSource):
 
 
 def _parameters(rows: Sequence[IndexedClip], recording: Recording) -> list[np.ndarray]:
-    """Returns translation and poses (F, 3 + 156) float32 of each clip of a recording."""
     recording = recording.every(FPS)
     motion = np.concatenate([recording.translation, recording.poses], 1).astype(np.float32)
     cuts = [row.frames(len(motion)) for row in rows]

@@ -141,7 +141,6 @@ def read_joints(path: Path, step: int = 8) -> np.ndarray:
 
 
 def _rows(path: Path) -> int:
-    """Returns the number of lines of a table without its header."""
     regular_file(path, TEXT_LIMIT)
     data = path.read_bytes()
     return data.count(b"\n") + (not data.endswith(b"\n")) - 1

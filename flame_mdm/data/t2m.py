@@ -232,7 +232,6 @@ class T2MFolder(MotionSource):
         return read_npy(required(path, self.get_it), mmap=mmap)
 
     def _account(self, name: str, frames: int, items: Sequence[Cut]) -> None:
-        """Counts what is left out of a motion, by reason."""
         lost = len(self.texts[name]) - sum(len(cut.descriptions) for cut in items)
         reason = ""
         if frames < self.shortest:
@@ -250,7 +249,6 @@ class T2MFolder(MotionSource):
 
 
 def _texts(path: Path) -> Iterator[tuple[str, str, str]]:
-    """Yields name, path and content of all text files, sorted."""
     if (path / "texts").is_dir():
         for file in sorted((path / "texts").glob("*.txt")):
             yield file.stem, str(file), read_text(file)

@@ -154,7 +154,6 @@ def _figures(store: Store) -> dict[str, dict[str, Any]]:
 
 
 def _check_frames(store: Store) -> None:
-    """Raises `UserError` if a clip has non-finite numbers."""
     for clip in store.clips:
         finite = np.isfinite(store.motion(clip)).all(1)
         if not finite.all():
@@ -171,7 +170,6 @@ def _motions(store: Store) -> list[list[Entry]]:
 
 
 def _still(store: Store, representation: Representation) -> list[str]:
-    """Returns the ids of clips without movement."""
     still = []
     for group in ProgressBar(_motions(store), "looking for movement", unit=" motions"):
         joints = representation.decode(torch.from_numpy(np.array(store.motion(group[0]))))

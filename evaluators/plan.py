@@ -1,7 +1,6 @@
 """From the request of an evaluation to its parts: model, data, protocol, extractor, source and file names."""
 
 import os
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -63,7 +62,7 @@ class Plan:
         if model is not None and self.file is not None:
             options, edit = sampling_options(protocol, model, request.options, request.editing)
             self.sampling = options.chosen() | {"edit": edit}
-            folder = _motions_folder(request, self.file, protocol, self.sampling, data, self.batch_size)
+            folder = self._motions_folder(request, self.file, protocol)
             self.source = Generator(
                 model, protocol, self.clips, options, edit, seed=request.seed, batch_size=self.batch_size, folder=folder
             )
@@ -80,6 +79,25 @@ class Plan:
         suffix = f"-{self.extractor.sha256[:8]}" if self.extractor else ""
         suffix += "-quick" if request.quick else f"-{protocol.replications}x" if "replications" in self.changed else ""
         self.path = Path(request.out or path.with_name(f"{path.name}{suffix}.json"))
+
+    def _motions_folder(self, request: EvaluationRequest, file: Path, protocol: Protocol) -> Path:
+        """Returns the folder of motions of a checkpoint and options, in its run directory or next to it.
+
+        Motions of models in this package or on the hub go to runs/NAME in the working directory.
+        """
+        if not Path(str(request.ckpt)).exists():
+            run = Path("runs") / str(request.ckpt)
+        else:
+            run = file.parent.parent if file.parent.name == "checkpoints" else file.parent
+        used = {
+            **self.sampling,
+            "seed": request.seed,
+            "split": request.split,
+            "data": self.data.store.fingerprint,
+            "samples": protocol.samples,
+        }
+        used |= {"batch_size": self.batch_size} if protocol.batch_size else {}
+        return run / "evaluation" / protocol.title / f"{sha256(file)[:16]}-{digest(used)[:8]}"
 
 
 def open_data(request: EvaluationRequest, model: MotionGenerator | None) -> MotionDataModule:
@@ -141,30 +159,3 @@ def sampling_options(
     options = options.over(model.sampler_options)
     model.process.find_sampler(options)
     return options, edit
-
-
-def _motions_folder(
-    request: EvaluationRequest,
-    file: Path,
-    protocol: Protocol,
-    sampling: Mapping[str, Any],
-    data: MotionDataModule,
-    batch_size: int,
-) -> Path:
-    """Returns the folder of motions of a checkpoint and options, in its run directory or next to it.
-
-    Motions of models in this package or on the hub go to runs/NAME in the working directory.
-    """
-    if not Path(str(request.ckpt)).exists():
-        run = Path("runs") / str(request.ckpt)
-    else:
-        run = file.parent.parent if file.parent.name == "checkpoints" else file.parent
-    used = {
-        **sampling,
-        "seed": request.seed,
-        "split": request.split,
-        "data": data.store.fingerprint,
-        "samples": protocol.samples,
-    }
-    used |= {"batch_size": batch_size} if protocol.batch_size else {}
-    return run / "evaluation" / protocol.title / f"{sha256(file)[:16]}-{digest(used)[:8]}"

@@ -17,7 +17,6 @@ class ActionGRU(nn.Module):
     features = 30
 
     def __init__(self, num_joints: int = 24, hidden: int = 128, num_layers: int = 2, *, num_actions: int = NUM_ACTIONS):
-        """Builds the network; sizes are those of the released weights."""
         super().__init__()
         self.recurrent = nn.GRU(3 * num_joints, hidden, num_layers, batch_first=True)
         self.linear1 = nn.Linear(hidden, self.features)

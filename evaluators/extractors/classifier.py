@@ -31,7 +31,6 @@ class ClassifierTask(Task):
     Args:
         network: the classifier.
         representation: of the motions; an extractor can only measure motions in this representation.
-        optimizer, seed: as for `MotionCLIPTask`.
     """
 
     noun = "an action classifier"

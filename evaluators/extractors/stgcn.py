@@ -143,7 +143,6 @@ class JointSTGCN(STGCN):
     """A classifier to train on the joints of any skeleton, relative to the first position of the root."""
 
     def __init__(self, parents: Sequence[int], num_actions: int, widths: Sequence[int], strides: Sequence[int]):
-        """Builds the network; arguments as for `STGCN`."""
         super().__init__(3, num_actions, parents, widths, strides)
 
     def forward(self, x: Tensor, mask: Tensor) -> Tensor:

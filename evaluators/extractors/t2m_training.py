@@ -107,7 +107,6 @@ class T2MTask(Task):
         movement_steps: steps of the first stage.
         sparsity, smoothness: weights of the mean magnitude of movement vectors, and of differences of successive ones.
         margin: of `matching_loss`.
-        optimizer, seed: as for `MotionCLIPTask`.
     """
 
     noun = "a trained evaluator of Guo et al."

@@ -86,7 +86,6 @@ class MotionsForText(RPrecision):
     every text counts once.
 
     Args:
-        pool, top, seed: see `RPrecision`.
         normalize: whether to scale features to length 1 first, which ranks by cosine. An extractor trained with
             cosines, such as motion-CLIP, does not constrain lengths; the motions with the shortest features would be
             nearest to every text.

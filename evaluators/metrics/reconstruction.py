@@ -137,7 +137,6 @@ class TemosPositionErrors(PositionErrors):
 
     Args:
         units_per_metre: KIT units per meter of `joints`, as in the KIT representations.
-        samples, upsampling: see `PositionErrors`.
     """
 
     def __init__(self, units_per_metre: float = 640.0, samples: int = 1, upsampling: int = 1):
@@ -165,7 +164,6 @@ class FlamePositionErrors(PositionErrors):
 
     Args:
         parents: parent of each joint of the skeleton, -1 for the root.
-        samples: motions per text, see `PositionErrors`.
     """
 
     equal_clips = True

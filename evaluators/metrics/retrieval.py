@@ -105,7 +105,6 @@ class MultiPositiveRPrecision(CaptionMetric):
     raise all values, `chance_top1`, ... are those of a random order, and `positives` is the mean of R.
 
     Args:
-        encoder: as for all metrics of this module.
         pool: motions in a pool.
         top: largest k.
         normalize: whether to rank by cosine instead of Euclidean distance, as for `MotionsForText`.
@@ -166,7 +165,7 @@ class TMRRetrieval(CaptionMetric):
     of the subset is that whose caption is the least similar to those taken before it, after the first by key.
 
     Args:
-        encoder: as for all metrics of this module; without an encoder, `dissimilar` has no value.
+        encoder: without one, `dissimilar` has no value.
         subset: number of dissimilar motions, at most half of all.
         ids: ids of the dissimilar motions, such as TMR's; None = chosen as above.
     """

@@ -145,7 +145,22 @@ def _write(folder: Path, source: MotionSource, representation: Representation, t
         mean, std = mean[: representation.features], std[: representation.features]
         with writing(folder, partial):
             np.savez(partial / "statistics.npz", mean=mean, std=std)
-            info = _describe(partial, source, representation, writer, mean, std)
+            info = {
+                "format": FORMAT,
+                "dataset": source.name,
+                "source": dict(source.options),
+                "actions": list(source.actions),
+                "published_split": source.published_split,
+                "excluded": dict(source.excluded),
+                "counts": source.counts(),
+                "representation": representation.name,
+                "fps": representation.fps,
+                "clips": {split: writer.splits[split] for split in SPLITS},
+                "shape": [writer.frames, representation.features],
+                "hours": round(writer.frames / representation.fps / 3600, 3),
+                "fingerprint": _fingerprint(partial, representation.name, representation.fps, mean, std),
+                "sha256": {path.name: _sha256(path) for path in sorted(partial.iterdir())},
+            }
             (partial / "store.json").write_text(json.dumps(info, indent=2) + "\n")
             shutil.rmtree(folder, ignore_errors=True)
             partial.rename(folder)
@@ -305,32 +320,6 @@ def _header(frames: int, features: int) -> bytes:
     content = np.lib.format.header_data_from_array_1_0(array) | {"shape": (frames, features)}
     np.lib.format.write_array_header_1_0(header, content)
     return header.getvalue()
-
-
-def _describe(
-    folder: Path,
-    source: MotionSource,
-    representation: Representation,
-    writer: _Writer,
-    mean: np.ndarray,
-    std: np.ndarray,
-) -> dict[str, Any]:
-    return {
-        "format": FORMAT,
-        "dataset": source.name,
-        "source": dict(source.options),
-        "actions": list(source.actions),
-        "published_split": source.published_split,
-        "excluded": dict(source.excluded),
-        "counts": source.counts(),
-        "representation": representation.name,
-        "fps": representation.fps,
-        "clips": {split: writer.splits[split] for split in SPLITS},
-        "shape": [writer.frames, representation.features],
-        "hours": round(writer.frames / representation.fps / 3600, 3),
-        "fingerprint": _fingerprint(folder, representation.name, representation.fps, mean, std),
-        "sha256": {path.name: _sha256(path) for path in sorted(folder.iterdir())},
-    }
 
 
 def _fingerprint(folder: Path, representation: str, fps: float, mean: np.ndarray, std: np.ndarray) -> str:

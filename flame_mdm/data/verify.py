@@ -1,7 +1,6 @@
 """Verification report of a prepared data set: contents, comparison with published figures, anomalies."""
 
 import json
-import re
 from collections import Counter, defaultdict
 from collections.abc import Iterable
 from hashlib import sha1
@@ -14,6 +13,7 @@ import torch
 from flame_mdm.data import SPLITS, some
 from flame_mdm.data.datamodule import MotionDataModule
 from flame_mdm.data.store import Entry, Store
+from flame_mdm.data.t2m import words_of
 from flame_mdm.errors import UserError
 from flame_mdm.progress import ProgressBar
 from flame_mdm.representations import Representation
@@ -51,7 +51,7 @@ def report(data: MotionDataModule) -> dict[str, Any]:
         "captions": {
             "captions": len(captions),
             "different captions": len(set(captions)),
-            "different words": len({word for text in set(captions) for word in re.findall(r"[^\W_]+", text.lower())}),
+            "different words": len({word for text in set(captions) for word in words_of(text)}),
             "clips without a caption": sum(not clip.captions for clip in store.clips),
         },
         "actions": {

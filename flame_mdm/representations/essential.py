@@ -22,14 +22,10 @@ class Essential(HumanML):
         bone_lengths: Sequence[float] | None = None,
         units_per_metre: float = 1.0,
     ):
-        """Takes the arguments of `HumanML`."""
         super().__init__(skeleton, variant, fps, bone_lengths, units_per_metre)
-        self.slices = {name: part for name, part in self.slices.items() if part.stop <= 3 * len(self.skeleton) + 1}
-        self.features, self.part_of, self.name = (
-            3 * len(self.skeleton) + 1,
-            self.name,
-            f"essential-{variant}-{skeleton}",
-        )
+        self.features = 3 * len(self.skeleton) + 1
+        self.slices = {name: part for name, part in self.slices.items() if part.stop <= self.features}
+        self.part_of, self.name = self.name, f"essential-{variant}-{skeleton}"
         self.mean, self.std = self.mean[: self.features], self.std[: self.features]
 
     def encode_many(self, motions: Sequence[Tensor]) -> list[Tensor]:

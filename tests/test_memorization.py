@@ -74,7 +74,7 @@ def test_copies_are_counted():
     metric = NearestTraining()
     real = torch.linspace(0.1, 0.2, 100, dtype=torch.float64)[:, None]
     nearest = torch.cat([torch.zeros(40, 1, dtype=torch.float64), torch.full((60, 1), 0.3, dtype=torch.float64)])
-    metric.update(torch.arange(100), nearest, real)
+    metric.update(keys=torch.arange(100), nearest=nearest, real_nearest=real)
     assert metric.compute() == {"joints": pytest.approx(0.3), "features": None, "copies": 0.4}
 
 

@@ -273,7 +273,7 @@ def test_equal_captions_count_as_correct_and_the_classic_value_stays():
     keys = torch.arange(count)
     metric, classic = MultiPositiveRPrecision(), MotionsForText()
     metric.update(motion, text, captions, keys)
-    classic.update(motion, text, keys % (count // 2), keys)
+    classic.update(keys=keys, generated=motion, text=text, text_keys=keys % (count // 2))
     values, single = metric.compute(), classic.compute()
     assert values["top1"] == values["proper"] == 1
     assert values["single_top1"] == single["top1"] < 1

@@ -142,7 +142,7 @@ class PooledLoss(TextAndMotion):
 
     def update(self, generated: Tensor, text: Tensor, keys: Tensor, scale: Tensor) -> None:
         """Adds features of motions and texts, (B, E) of length 1, with keys (B,), and the inverse temperature ()."""
-        super().update(scale * generated, text, keys)
+        super().update(keys=keys, generated=scale * generated, text=text)
 
     def value(self, motion: Tensor, text: Tensor) -> float:
         losses = []

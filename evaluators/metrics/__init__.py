@@ -59,9 +59,17 @@ def make_metrics(configs: Mapping[str, Config], **options: Any) -> dict[str, Met
     return metrics
 
 
+def inputs_of(metric: Metric) -> dict[str, bool]:
+    """Returns the names of the inputs that `update` takes, and whether it requires them."""
+    parameters = inspect.signature(metric.update).parameters
+    if "rows" in parameters:  # `SampleMetric.update`
+        return dict.fromkeys(("keys", *getattr(metric, "states", ())), True)
+    return {name: parameter.default is parameter.empty for name, parameter in parameters.items()}
+
+
 def required_inputs(metric: Metric) -> list[str]:
     """Returns the names of the inputs that `update` requires."""
-    return [p.name for p in inspect.signature(metric.update).parameters.values() if p.default is p.empty]
+    return [name for name, is_required in inputs_of(metric).items() if is_required]
 
 
 def update_metrics(metrics: Mapping[str, Metric], **features: Any) -> None:
@@ -70,8 +78,7 @@ def update_metrics(metrics: Mapping[str, Metric], **features: Any) -> None:
         missing = [needed for needed in required_inputs(metric) if needed not in features]
         if missing:
             raise UserError(missing_input(name, metric, missing[0]))
-        accepted = inspect.signature(metric.update).parameters.keys() & features
-        metric.update(**{name: features[name] for name in accepted})
+        metric.update(**{name: features[name] for name in inputs_of(metric).keys() & features})
 
 
 def missing_input(name: str, metric: Metric, needed: str) -> str:

@@ -41,9 +41,6 @@ class RPrecision(SampleMetric):
         self.pool, self.seed = pool, seed
         self.names = [f"top{k}" for k in range(1, top + 1)]
 
-    def update(self, generated: Tensor, text: Tensor, text_keys: Tensor, keys: Tensor) -> None:
-        self.keep(keys=keys, generated=generated, text=text, text_keys=text_keys)
-
     def value(self, generated: Tensor, text: Tensor, text_keys: Tensor) -> dict[str, float | None]:
         ranks = self.ranks(generated, text, text_keys, np.random.default_rng(self.seed))
         return {name: int((ranks < k).sum()) / len(ranks) for k, name in enumerate(self.names, 1)}
@@ -119,9 +116,6 @@ class TextAndMotion(SampleMetric):
     """A metric of pairs of motion and text."""
 
     states = ("generated", "text")
-
-    def update(self, generated: Tensor, text: Tensor, keys: Tensor) -> None:
-        self.keep(keys=keys, generated=generated, text=text)
 
 
 class MultimodalDistance(TextAndMotion):
@@ -200,9 +194,6 @@ class MutualInformationDivergence(SampleMetric):
     def __init__(self, eps: float = 5e-4):
         super().__init__()
         self.eps = eps
-
-    def update(self, generated: Tensor, text: Tensor, real: Tensor, keys: Tensor) -> None:
-        self.keep(keys=keys, generated=generated, text=text, real=real)
 
     def value(self, generated: Tensor, text: Tensor, real: Tensor) -> float:
         self.need(len(text), real.shape[1] + text.shape[1] + 1, "samples, one more than features of motion and text")

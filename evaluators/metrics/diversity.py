@@ -32,9 +32,6 @@ class Diversity(SampleMetric):
         super().__init__()
         self.pairs, self.replace, self.seed = pairs, replace, seed
 
-    def update(self, generated: Tensor, keys: Tensor) -> None:
-        self.keep(keys=keys, generated=generated)
-
     def value(self, features: Tensor) -> float:
         self.need(len(features), 2 if self.replace else self.pairs, f"motions for {self.pairs} pairs")
         generator = np.random.default_rng(self.seed)
@@ -51,9 +48,6 @@ class PromptMultimodality(SampleMetric):
     higher_is_better = None
     states = ("generated", "groups")
     samples: int  # motions per prompt
-
-    def update(self, generated: Tensor, groups: Tensor, keys: Tensor) -> None:
-        self.keep(keys=keys, generated=generated, groups=groups)
 
     def value(self, features: Tensor, groups: Tensor) -> float:
         return self.distance(features[self.by_group(groups, self.samples)])
@@ -124,9 +118,6 @@ class ActionMultimodality(SampleMetric):
     def __init__(self, pairs: int = 20, seed: int = 0):
         super().__init__()
         self.pairs, self.seed = pairs, seed
-
-    def update(self, generated: Tensor, labels: Tensor, keys: Tensor) -> None:
-        self.keep(keys=keys, generated=generated, labels=labels)
 
     def value(self, features: Tensor, labels: Tensor) -> float:
         generator = np.random.default_rng(self.seed)

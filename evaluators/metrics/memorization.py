@@ -80,9 +80,6 @@ class NearestTraining(SampleMetric):
     states = ("nearest", "real_nearest")
     names = ("joints", "features", "copies")
 
-    def update(self, keys: Tensor, nearest: Tensor, real_nearest: Tensor) -> None:
-        self.keep(keys=keys, nearest=nearest, real_nearest=real_nearest)
-
     def value(self, nearest: Tensor, real: Tensor) -> dict[str, float | None]:
         """Returns medians `joints` (meters) and `features`, and `copies` in [0, 1]."""
         joints, *features = nearest.quantile(0.5, dim=0).tolist()

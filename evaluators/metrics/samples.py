@@ -77,10 +77,11 @@ class SampleMetric(MotionMetric):
     """A metric that keeps one row per sample and computes its value from all rows, sorted by key.
 
     The value therefore does not depend on the batches, their order or the number of processes. Processes may hold any
-    number of samples, including none. `update` passes rows to `keep`; `value` is the formula.
+    number of samples, including none. `value` is the formula.
 
     Attributes:
-        states: names of the kept rows, in the order of the arguments of `value`. Each row also has a key.
+        states: names of the kept rows, in the order of the arguments of `value`. Each row also has a key. Unless
+            `update` is overridden, they are its inputs.
     """
 
     states: tuple[str, ...]
@@ -89,6 +90,10 @@ class SampleMetric(MotionMetric):
         super().__init__()
         for name in ("keys", *self.states):
             self.add_state(name, [], dist_reduce_fx="cat")
+
+    def update(self, **rows: Any) -> None:
+        """Adds rows by the names of their states, which include the keys."""
+        self.keep(**rows)
 
     def keep(self, **rows: Tensor) -> None:
         """Adds equally many rows by the names of their states, which include the keys; `ValueError` otherwise."""

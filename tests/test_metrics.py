@@ -16,11 +16,11 @@ from torchmetrics import Metric
 
 from evaluators.metrics import accuracy, alignment, distribution, diversity, physics, reconstruction, update_metrics
 from evaluators.metrics.alignment import MotionsForText, MultimodalDistance, TextsForMotion, retrieval_ranks
-from evaluators.metrics.confidence import mean_ci
 from evaluators.metrics.distribution import FrechetMotionDistance, PrecisionRecall, frechet_distance, polynomial_mmd2
 from evaluators.metrics.diversity import pair_distance
 from evaluators.metrics.reconstruction import FlamePositionErrors, TemosPositionErrors, flame_parts, temos_parts
 from evaluators.metrics.retrieval import TMRRetrieval, whole_set_retrieval
+from evaluators.results import mean_ci
 from flame_mdm.batch import length_mask
 from flame_mdm.errors import UserError
 from flame_mdm.reporting.intervals import percentiles

@@ -15,7 +15,7 @@ from support.stores import OwnClips, clip
 from flame_mdm.batch import MotionBatch, collate
 from flame_mdm.data import datamodule, resident
 from flame_mdm.data.crops import Crop, Fixed, Units, Whole
-from flame_mdm.data.datamodule import Clips, EvaluationBatches, MotionDataModule, TrainingBatches
+from flame_mdm.data.datamodule import Clips, MotionDataModule, TrainingBatches, evaluation_batches
 from flame_mdm.data.resident import ResidentLoader, free_memory
 from flame_mdm.data.store import Store, _fingerprint, write_store
 from flame_mdm.data.synthetic import Synthetic
@@ -161,7 +161,7 @@ def test_batches_are_a_function_of_their_number_and_processes_share_them():
     assert [batches(20, rank=rank, world=2) for rank in (0, 1)] == [stream[0::2], stream[1::2]]
     lengths = np.random.default_rng(0).integers(24, 60, 31)
     for world in (1, 2, 3):
-        parts = [EvaluationBatches(lengths, 4, rank=rank, world=world) for rank in range(world)]
+        parts = [evaluation_batches(lengths, 4, rank=rank, world=world) for rank in range(world)]
         assert sorted(index for part in parts for batch in part for index, _ in batch) == list(range(31))
 
 

@@ -5,7 +5,7 @@ batches as an uninterrupted one.
 """
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from functools import partial
 from itertools import islice
 from pathlib import Path
@@ -68,18 +68,10 @@ class TrainingBatches(Sampler[list[Draw]]):
         return [batches[i] for i in generator.permutation(len(batches))]
 
 
-class EvaluationBatches(Sampler[list[Draw]]):
-    """Every clip once across all processes, longest first, without the repeats of a distributed sampler."""
-
-    def __init__(self, lengths: np.ndarray, batch_size: int, *, rank: int, world: int):
-        mine = np.argsort(-lengths, kind="stable")[rank::world]
-        self.batches = [[(int(i), -1) for i in mine[b : b + batch_size]] for b in range(0, len(mine), batch_size)]
-
-    def __iter__(self) -> Iterator[list[Draw]]:
-        return iter(self.batches)
-
-    def __len__(self) -> int:
-        return len(self.batches)
+def evaluation_batches(lengths: np.ndarray, batch_size: int, *, rank: int, world: int) -> list[list[Draw]]:
+    """Returns batches with every clip once across all processes, longest first, without repeats."""
+    mine = np.argsort(-lengths, kind="stable")[rank::world]
+    return [[(int(i), -1) for i in mine[b : b + batch_size]] for b in range(0, len(mine), batch_size)]
 
 
 def _check_crop(crop: Crop) -> None:
@@ -280,16 +272,16 @@ class MotionDataModule(LightningDataModule):
         trainer = self.trainer
         shared = trainer is not None and len(self.val) >= trainer.world_size
         rank, world = (trainer.global_rank, trainer.world_size) if trainer and shared else (0, 1)
-        return self._loader(self.val, EvaluationBatches(self.val.lengths, self.batch_size, rank=rank, world=world))
+        return self._loader(self.val, evaluation_batches(self.val.lengths, self.batch_size, rank=rank, world=world))
 
-    def _loader(self, clips: Clips, sampler: Sampler[list[Draw]]) -> Loader:
+    def _loader(self, clips: Clips, batches: Iterable[list[Draw]]) -> Loader:
         if self.device is not None:
             if self.features is None:
                 self.features = resident_features(self.store, self.representation, self.device)
-            return ResidentLoader(clips, sampler, self.features, self.pad_multiple)
+            return ResidentLoader(clips, batches, self.features, self.pad_multiple)
         return DataLoader(
             clips,
-            batch_sampler=sampler,
+            batch_sampler=batches,
             num_workers=self.num_workers,
             collate_fn=partial(collate, multiple=self.pad_multiple, most=self.crop.longest()),
             pin_memory=torch.cuda.is_available(),

@@ -1,14 +1,13 @@
 """Data sets that are kept on the training device, where batches are gathered without workers and copies."""
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
-from torch.utils.data import Sampler
 
 from flame_mdm.batch import MotionBatch, padded_length, sent
 from flame_mdm.data.clips import Clips, Draw
@@ -66,7 +65,7 @@ class ResidentLoader:
         multiple: batches are padded to multiples of this number of frames.
     """
 
-    def __init__(self, clips: Clips, batches: Sampler[list[Draw]], features: Tensor, multiple: int):
+    def __init__(self, clips: Clips, batches: Iterable[list[Draw]], features: Tensor, multiple: int):
         self.clips, self.batches, self.features, self.multiple = clips, batches, features, multiple
         self.begin = np.array([clip.start for clip in clips.clips], np.int64)
         self.actions = np.array([-1 if clip.action is None else clip.action for clip in clips.clips], np.int64)

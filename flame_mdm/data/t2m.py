@@ -18,7 +18,7 @@ import numpy as np
 
 from flame_mdm.data import SPLITS, Clip, MotionSource, Split, archives, required, some, without
 from flame_mdm.errors import UserError
-from flame_mdm.safe_io import naming, read_npy, read_text
+from flame_mdm.safe_io import read_npy, read_text
 
 TAG_FPS = 20  # frames per second of the tags `from` and `to`, also in KIT-ML, whose motions have 12.5
 
@@ -141,7 +141,12 @@ class T2MFolder(MotionSource):
     @cached_property
     def texts(self) -> dict[str, list[Description]]:
         """Descriptions of each motion, from the folder `texts` or from `texts.zip`."""
-        return {name: parse(text, where) for name, where, text in _texts(self.path)}
+        folder, archive = self.path / "texts", self.path / "texts.zip"
+        if not folder.is_dir():
+            if not archive.is_file():
+                raise FileNotFoundError(f"{self.path}: contains neither a folder texts nor texts.zip")
+            folder = archives.as_folder(archive, self, _is_text)
+        return {file.stem: parse(read_text(file), str(file)) for file in sorted(folder.rglob("*.txt"))}
 
     @cached_property
     def frames(self) -> dict[str, int]:
@@ -248,23 +253,8 @@ class T2MFolder(MotionSource):
             self.excluded[f"names of {self.names[name]} {reason}"] += 1
 
 
-def _texts(path: Path) -> Iterator[tuple[str, str, str]]:
-    if (path / "texts").is_dir():
-        for file in sorted((path / "texts").glob("*.txt")):
-            yield file.stem, str(file), read_text(file)
-        return
-    archive = path / "texts.zip"
-    if not archive.is_file():
-        raise FileNotFoundError(f"{path}: contains neither a folder texts nor texts.zip")
-
-    def is_text(member: str) -> bool:
-        return member.endswith(".txt") and "__MACOSX" not in PurePosixPath(member).parts
-
-    for member, content in sorted(item for item in archives.members(archive, is_text) if is_text(item[0])):
-        where = f"{archive}/{member}"
-        with naming(where, UnicodeDecodeError, what="not a UTF-8 text file: "):
-            text = content.decode("utf-8").replace("\r\n", "\n").replace("\r", "\n")
-        yield PurePosixPath(member).stem, where, text
+def _is_text(member: str) -> bool:
+    return member.endswith(".txt") and "__MACOSX" not in PurePosixPath(member).parts
 
 
 def _exclusion(names: Collection[str]) -> str:

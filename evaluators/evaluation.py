@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -90,21 +91,11 @@ class Evaluation:
         Raises:
             UserError: If real motions do not have the expected values; nothing has been generated.
         """
-        evaluator = Evaluator(
-            self.extractor,
-            self.protocol.metrics,
-            self.representation,
-            batch_size=self.batch_size,
-            skip_features=self.extractor is None and self.protocol.extractor is not None,  # with extractor=none
-        )
-        several = self.protocol.multimodality and replace(evaluator, metrics=self.protocol.multimodality.metrics)
-        if evaluator.reads("nearest") and self.training is not None:
-            evaluator.training = evaluator.training_motions(*self._training(self.training))
         seeds = [self._draws(replication) for replication in range(self.protocol.replications)]
         measured = Measured(
             ground_truth=None, values=None, not_computed={}, invalid_because=[], cost=Cost(), seeds=seeds
         )
-        real_sets = self._measure_real(measured, source, evaluator, several, ground_truth)
+        real_sets = self._measure_real(measured, source, ground_truth)
         measured.invalid_because = shared(self._unexpected(measured.ground_truth or {}))
         if measured.invalid_because and source is not None:
             measured.forced = force
@@ -116,37 +107,49 @@ class Evaluation:
                     "extractor, or give force=true: the result is then marked as not valid"
                 )
         if source is not None:
-            self._measure(measured, source, evaluator, real_sets, resamples)
-        if source is not None and several:
-            self._measure_multimodality(measured, source, several)
-        if evaluator.skip_features:
+            self._measure(measured, source, real_sets, resamples)
+        if source is not None and self.several:
+            self._measure_multimodality(measured, source, self.several)
+        if self.evaluator.skip_features:
             measured.not_computed["extractor"] = "extractor=none: metrics that need features were not computed"
         return shared(measured)
+
+    @cached_property
+    def evaluator(self) -> Evaluator:
+        """Evaluator of the motions of each replication."""
+        skips = self.extractor is None and self.protocol.extractor is not None  # with extractor=none
+        evaluator = Evaluator(
+            self.extractor, self.protocol.metrics, self.representation, self.batch_size, skip_features=skips
+        )
+        if evaluator.reads("nearest") and self.training is not None:
+            evaluator.training = evaluator.training_motions(*self._training(self.training))
+        return evaluator
+
+    @cached_property
+    def several(self) -> Evaluator | None:
+        """Evaluator of several motions per prompt, if the protocol has one."""
+        several = self.protocol.multimodality
+        return several and replace(self.evaluator, metrics=several.metrics)
 
     # Real motions -----------------------------------------------------------------------------------------------------
 
     def _measure_real(
-        self,
-        measured: Measured,
-        source: Source | None,
-        evaluator: Evaluator,
-        several: Evaluator | None,
-        ground_truth: bool,
+        self, measured: Measured, source: Source | None, ground_truth: bool
     ) -> list[tuple[Extracted, Extracted]]:
         """Measures real motions; returns for each replication those that motions of the source are compared with."""
         scores: Scores = []
         real_sets = []
         for replication in range(self.protocol.replications):
-            paired, real = self._real(evaluator, replication)
+            paired, real = self._real(replication)
             if ground_truth:
-                values, reasons = evaluator.score(paired, paired, real, self._draws(replication))
+                values, reasons = self.evaluator.score(paired, paired, real, self._draws(replication))
                 scores.append((values, len(paired)))
                 measured.not_computed |= reasons
             if source is not None:
-                for checked in filter(None, (evaluator, several)):  # before motions are generated
+                for checked in filter(None, (self.evaluator, self.several)):  # before motions are generated
                     checked.check(paired)
                 # All replications are kept in memory; joints, the largest part, only if metrics compare them.
-                real_sets.append((paired if evaluator.reads("real_joints") else paired.without_joints(), real))
+                real_sets.append((paired if self.evaluator.reads("real_joints") else paired.without_joints(), real))
         if ground_truth:
             measured.ground_truth = averages(scores)
         return real_sets
@@ -157,18 +160,18 @@ class Evaluation:
         whole = [replace(row, frames=np.arange(row.clip.length)) for row in windows]
         return self._motions(whole, real_motions(clips, whole)), self._motions(windows, real_motions(clips, windows))
 
-    def _real(self, evaluator: Evaluator, replication: int) -> tuple[Extracted, Extracted]:
+    def _real(self, replication: int) -> tuple[Extracted, Extracted]:
         """Returns the real motions of a replication, and real motions for comparisons of sets."""
         again = self.protocol.rows(self.clips, self.seed, replication, purpose="real")
-        real = evaluator.reference()
+        real = self.evaluator.reference()
         if real is None:
-            real = replace(evaluator, training=None).extract(self._motions(again, real_motions(self.clips, again)))
-        return self._paired(evaluator, self.protocol.rows(self.clips, self.seed, replication)), real.without_joints()
+            real = replace(self.evaluator, training=None).extract(self._motions(again, real_motions(self.clips, again)))
+        return self._paired(self.protocol.rows(self.clips, self.seed, replication)), real.without_joints()
 
-    def _paired(self, evaluator: Evaluator, rows: Sequence[DrawnClip]) -> Extracted:
+    def _paired(self, rows: Sequence[DrawnClip]) -> Extracted:
         motions = self._motions(rows, real_motions(self.clips, rows))
         motions.references = self.clips.store.references([row.clip.id for row in rows])
-        return evaluator.extract(motions)
+        return self.evaluator.extract(motions)
 
     def _unexpected(self, values: Mapping[str, Value | None]) -> list[str]:
         """Returns a line for each value of real motions of the test split that differs from the expected one."""
@@ -190,12 +193,7 @@ class Evaluation:
     # Motions of the source --------------------------------------------------------------------------------------------
 
     def _measure(
-        self,
-        measured: Measured,
-        source: Source,
-        evaluator: Evaluator,
-        real_sets: Sequence[tuple[Extracted, Extracted]],
-        resamples: int,
+        self, measured: Measured, source: Source, real_sets: Sequence[tuple[Extracted, Extracted]], resamples: int
     ) -> None:
         """Measures the source's motions of each replication, compared with the real ones; fills in `measured`."""
         scores: Scores = []
@@ -208,13 +206,13 @@ class Evaluation:
             if len(samples.rows) != len(rows):  # motions from another system may not cover all clips
                 ids = {row.id for row in samples.rows}
                 paired = _select(paired, [i for i, row in enumerate(rows) if row.id in ids])
-            generated = evaluator.extract(self._generated(samples))
-            values, reasons = evaluator.score(generated, paired, real, self._draws(replication))
+            generated = self.evaluator.extract(self._generated(samples))
+            values, reasons = self.evaluator.score(generated, paired, real, self._draws(replication))
             scores.append((values, len(generated)))
             measured.not_computed |= reasons
             if not replication:
                 measured.warnings = self._warnings(generated, real)
-                resampled = evaluator.resample(generated, paired, real, self._draws(0), resamples)
+                resampled = self.evaluator.resample(generated, paired, real, self._draws(0), resamples)
                 if "nearest" in generated.rows:
                     sets = {"generated": generated, "real": paired}
                     measured.nearest = {name: _sorted_distances(x.rows["nearest"]) for name, x in sets.items()}
@@ -232,7 +230,7 @@ class Evaluation:
             if generates:
                 rows = self.protocol.prompts(self.clips, self.seed, replication)
                 motions = evaluator.extract(self._generated(source(f"multimodality_{replication}", rows, replication)))
-                real = self._paired(evaluator, rows[:: several.samples])
+                real = self._paired(rows[:: several.samples])
                 paired = _select(real, [i // several.samples for i in range(len(rows))])
             values, reasons = evaluator.score(motions, paired, nothing, self._draws(replication))
             scores.append((values, len(motions)))

@@ -275,7 +275,7 @@ def originals(tmp_path_factory) -> dict[str, Path]:
     cases = {f"dataset-{d}_{case.split('_', 1)[1]}": case for case in CASES for d in (1, 2)}
     files: dict[str, Path] = {}
     folder = tmp_path_factory.mktemp("originals")
-    for name, data in archives.members(ARCHIVE, lambda name: Path(name).stem in cases):
+    for name, data in archives.members(ARCHIVE, lambda name: name.endswith(".bvh") and Path(name).stem in cases):
         if data:
             file = files[cases[Path(name).stem]] = folder / Path(name).name
             file.write_bytes(data)

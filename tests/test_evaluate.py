@@ -279,7 +279,7 @@ def test_a_bootstrap_measures_each_motion_as_often_as_it_is_drawn(runs):
     evaluation = runs.evaluation(features=True)
     metrics = {name: metric for name, metric in evaluation.protocol.metrics.items() if name != "mid"}  # ill-conditioned
     evaluator = Evaluator(evaluation.extractor, metrics, evaluation.representation)
-    first, second = (evaluation._real(evaluator, replication)[0] for replication in range(2))
+    first, second = (evaluation._real(replication)[0] for replication in range(2))
 
     def again(extracted: Extracted, indices: np.ndarray) -> Extracted:
         drawn = taken(extracted, indices.tolist())

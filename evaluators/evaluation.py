@@ -4,14 +4,17 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import torch
 from scipy.ndimage import gaussian_filter1d
 from torch import Tensor
 
 from evaluators.collectives import is_first, processes, shared
-from evaluators.evaluator import Evaluator, Extracted, Motions
+from evaluators.evaluator import Evaluator, Extracted, Motions, keys_of
 from evaluators.extractors import Extractor
+from evaluators.metrics.attributes import ATTRIBUTES
 from evaluators.metrics.distribution import FrechetMotionDistance
 from evaluators.plan import Plan
 from evaluators.protocol import DrawnClip, Protocol
@@ -170,7 +173,8 @@ class Evaluation:
 
     def _paired(self, rows: Sequence[DrawnClip]) -> Extracted:
         motions = self._motions(rows, real_motions(self.clips, rows))
-        motions.references = self.clips.store.references([row.clip.id for row in rows])
+        if references := self.clips.store.references([row.clip.id for row in rows]):
+            motions.inputs["references"] = [torch.from_numpy(joints) for joints in references]
         return self.evaluator.extract(motions)
 
     def _unexpected(self, values: Mapping[str, Value | None]) -> list[str]:
@@ -274,15 +278,20 @@ class Evaluation:
         """Returns motions with the conditions of their rows; `captions` replace the captions of the rows."""
         condition = self.protocol.condition
         texts = captions or [row.text for row in rows] if condition == "text" else None
-        labels = [row.clip.action for row in rows]
+        attributes = [row.clip.attributes for row in rows]
+        inputs: dict[str, Any] = {"groups": keys_of([row.prompt for row in rows])}
+        if condition == "action":
+            inputs["labels"] = torch.tensor([row.clip.action for row in rows])
+        if condition != "none" and all("action" in x for x in attributes):
+            inputs["requested"] = [{k: v for k, v in x.items() if k in ATTRIBUTES} for x in attributes]
+        if condition != "none" and all("content" in x for x in attributes):
+            inputs["sides"] = [(x["content"], x.get("side", "")) for x in attributes]
         return Motions(
             ids=[row.id for row in rows],
             features=features,
             captions=texts,
             tokens=[_tokens(row, caption) for row, caption in zip(rows, texts, strict=True)] if texts else None,
-            labels=[int(label) for label in labels if label is not None] if condition == "action" else None,
-            groups=[row.prompt for row in rows],
-            requested=[row.clip.attributes for row in rows] if condition != "none" else None,
+            inputs=inputs,
             edit=self.protocol.edit,
         )
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
@@ -18,7 +18,6 @@ from torchmetrics import Metric
 from evaluators.collectives import dealt, is_first
 from evaluators.extractors import Extractor
 from evaluators.metrics import make_metrics, missing_input, required_inputs, update_metrics
-from evaluators.metrics.attributes import ATTRIBUTES
 from evaluators.metrics.memorization import TrainingMotions, poses
 from evaluators.metrics.samples import TwoSets
 from flame_mdm.batch import length_mask
@@ -46,13 +45,9 @@ class Motions:
     features: list[np.ndarray]  # (F, D) float32 each, in the data's units
     captions: list[str] | None = None  # of motions with text
     tokens: list[list[str] | None] | None = None  # "word/PART" tokens of the captions, if the data has them
-    labels: list[int] | None = None  # classes of motions with action labels
-    groups: list[str] | None = None  # names of the prompts, if several motions share a prompt
-    requested: list[Mapping[str, Any]] | None = None  # requested attributes, if the data has them
+    inputs: dict[str, Any] = field(default_factory=dict)  # further inputs, by the names in `evaluators.metrics`
     # parts kept from real motions, as `region` and `joints` of `flame_mdm.sampling.editing.kept_parts`
     edit: Mapping[str, Any] | None = None
-    # of real motions, joints (F', J, 3) at the frame rate of the recording, if the data has them
-    references: list[np.ndarray] | None = None
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -106,7 +101,7 @@ class Evaluator:
     @torch.no_grad()
     def extract(self, motions: Motions) -> Extracted:
         """Runs the feature pass over the same motions in all processes; raises `UserError` if one is not finite."""
-        rows: dict[str, Any] = {"keys": self._keys(motions.ids)}
+        rows: dict[str, Any] = {"keys": keys_of(motions.ids), **motions.inputs}
         # Batches of similar lengths need little padding.
         order = np.argsort([len(x) for x in motions.features], kind="stable").tolist()
         batches = [order[begin : begin + self.batch_size] for begin in range(0, len(order), self.batch_size)]
@@ -120,18 +115,7 @@ class Evaluator:
         if texts:
             rows["text"] = torch.cat(texts)[back]
         if motions.captions is not None:
-            rows["text_keys"] = self._keys(motions.captions)
-            rows["captions"] = motions.captions
-        if motions.labels is not None:
-            rows["labels"] = torch.tensor(motions.labels)
-        if motions.groups is not None:
-            rows["groups"] = self._keys(motions.groups)
-        if motions.requested is not None and all("action" in attributes for attributes in motions.requested):
-            rows["requested"] = [{k: v for k, v in x.items() if k in ATTRIBUTES} for x in motions.requested]
-        if motions.requested is not None and all("content" in attributes for attributes in motions.requested):
-            rows["sides"] = [(x["content"], x.get("side", "")) for x in motions.requested]
-        if motions.references is not None:
-            rows["references"] = [torch.from_numpy(joints) for joints in motions.references]
+            rows |= {"text_keys": keys_of(motions.captions), "captions": motions.captions}
         contacts = self.representation.slices.get("contacts")
         if contacts is not None:
             rows["contacts"] = [torch.from_numpy(x[:, contacts] > 0.5) for x in motions.features]
@@ -159,10 +143,7 @@ class Evaluator:
         if features is None:
             return None
         names = [f"reference {number}" for number in range(len(features))]
-        return Extracted({"generated": features, "keys": self._keys(names)})
-
-    def _keys(self, names: Sequence[str]) -> Tensor:
-        return torch.tensor([key(name) for name in names], dtype=torch.long)
+        return Extracted({"generated": features, "keys": keys_of(names)})
 
     def _batch(self, motions: Motions, indices: Sequence[int]) -> tuple[list[Tensor], dict[str, Tensor]]:
         for i in indices:
@@ -291,6 +272,11 @@ class Evaluator:
             elif not (self.skip_features and FEATURES.intersection(missing)):
                 raise UserError(missing_input(name, metric, missing[0]))
         return usable
+
+
+def keys_of(names: Sequence[str]) -> Tensor:
+    """Returns the keys (N,) of names."""
+    return torch.tensor([key(name) for name in names], dtype=torch.long)
 
 
 def _two_sets(metrics: Mapping[str, Metric]) -> dict[str, Metric]:

@@ -56,7 +56,7 @@ def scene(tmp_path_factory):
     features = [representation.encode(torch.from_numpy(np.asarray(clip.motion))).numpy() for clip in clips]
     ids, captions = [clip.id for clip in clips], [clip.captions[0] + "." * i for i, clip in enumerate(clips)]
     requested: list[Mapping[str, Any]] = [dict(clip.attributes) for clip in clips]
-    found = evaluator.extract(Motions(ids, features, captions, requested=requested))
+    found = evaluator.extract(Motions(ids, features, captions, inputs={"requested": requested}))
     other = evaluator.extract(Motions(ids, [x[8:] for x in features]))
     values, _ = evaluator.score(found, found, other.without_joints(), 0)
     folder = tmp_path_factory.mktemp("cache")

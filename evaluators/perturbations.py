@@ -160,14 +160,7 @@ PERTURBATIONS = [
     _P("fewer", "set", "only so many motions", "motions", (256, 128, 64)),
     _P("as stored", "plumbing", "features neither decoded nor encoded"),
     _P("half precision", "plumbing", "features rounded to float16"),
-    _P(
-        "frame rate",
-        "plumbing",
-        "resampled and back",
-        "fps",
-        (30, 15, 10),
-        lambda x, g, _, fps: through_rate(x, g, fps),
-    ),
+    _P("frame rate", "plumbing", "resampled and back", "fps", (30, 15, 10), lambda x, g, _, f: through_rate(x, g, f)),
     _P("cropped", "plumbing", "end removed", "% of time", (10, 25, 50), lambda x, g, *_: crop(x, g)),
 ]
 """All perturbations, apart from those that depend on the data: near misses by attribute, other representations."""

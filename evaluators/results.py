@@ -15,15 +15,7 @@ from flame_mdm.data.datamodule import MotionDataModule
 from flame_mdm.errors import say
 from flame_mdm.reporting.audit import card_of
 from flame_mdm.safe_io import sha256
-from flame_mdm.schemas import (
-    Checkpoint,
-    Cost,
-    Data,
-    ExtractorRecord,
-    ProtocolVersion,
-    Result,
-    Value,
-)
+from flame_mdm.schemas import Checkpoint, Cost, Data, ExtractorRecord, ProtocolVersion, Result, Value
 from flame_mdm.training.provenance import environment
 
 

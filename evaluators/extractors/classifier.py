@@ -36,12 +36,7 @@ class ClassifierTask(Task):
     noun = "an action classifier"
 
     def __init__(
-        self,
-        network: ActionGRU | JointSTGCN,
-        representation: Representation,
-        *,
-        optimizer: Config,
-        seed: int = 0,
+        self, network: ActionGRU | JointSTGCN, representation: Representation, *, optimizer: Config, seed: int = 0
     ):
         super().__init__(Unconditional(), representation, optimizer=optimizer, seed=seed)
         self.network = network

@@ -49,12 +49,7 @@ class STGCN(nn.Module):
     """
 
     def __init__(
-        self,
-        in_channels: int,
-        num_actions: int,
-        parents: Sequence[int],
-        widths: Sequence[int],
-        strides: Sequence[int],
+        self, in_channels: int, num_actions: int, parents: Sequence[int], widths: Sequence[int], strides: Sequence[int]
     ):
         super().__init__()
         graph = adjacency(parents)

@@ -111,12 +111,7 @@ class MultiPositiveRPrecision(CaptionMetric):
     """
 
     def __init__(
-        self,
-        encoder: Config | None = None,
-        pool: int = 32,
-        top: int = 3,
-        seed: int = 0,
-        normalize: bool = False,
+        self, encoder: Config | None = None, pool: int = 32, top: int = 3, seed: int = 0, normalize: bool = False
     ):
         super().__init__(encoder)
         self.pool, self.top, self.seed, self.normalize = pool, top, seed, normalize
@@ -174,11 +169,7 @@ class TMRRetrieval(CaptionMetric):
     PROTOCOLS = ("all", "threshold", "dissimilar", "batches")
 
     def __init__(
-        self,
-        encoder: Config | None = None,
-        subset: int = 100,
-        ids: Sequence[str] | None = None,
-        seed: int = 0,
+        self, encoder: Config | None = None, subset: int = 100, ids: Sequence[str] | None = None, seed: int = 0
     ):
         super().__init__(encoder)
         self.subset, self.seed = subset, seed

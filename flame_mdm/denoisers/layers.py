@@ -117,11 +117,7 @@ class Transformer(nn.Module):
         )
 
     def forward(
-        self,
-        x: Tensor,
-        mask: Tensor | None,
-        memory: Tensor | None = None,
-        memory_mask: Tensor | None = None,
+        self, x: Tensor, mask: Tensor | None, memory: Tensor | None = None, memory_mask: Tensor | None = None
     ) -> Tensor:
         """Transforms x (B, N, C), with memory (B, S, C) for a decoder; masks (B, N) and (B, S), None = all real."""
         for layer in self.layers:

@@ -1,6 +1,7 @@
 """Data sets: reading published releases, packing them into stores, and serving training batches."""
 
 import hashlib
+import re
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping
@@ -153,3 +154,15 @@ def split_blocks(name: str, clips: int, size: int, *, val: float, test: float) -
     tested, validated = (max(1, round(share * len(blocks))) for share in (test, val))
     counts: dict[Split, int] = {"test": tested, "val": validated, "train": len(blocks)}
     return dict(zip(blocks, (split for split, count in counts.items() for _ in range(count)), strict=False))
+
+
+def swap_sides(text: str) -> str:
+    """Swaps left and right, clockwise and counterclockwise in a text."""
+    pairs = {"left": "right", "right": "left", "clockwise": "counterclockwise"}
+    pairs |= {"counterclockwise": "clockwise", "anticlockwise": "clockwise"}
+
+    def swap(match: re.Match[str]) -> str:
+        word = pairs[match[0].lower()]
+        return word.capitalize() if match[0][0].isupper() else word
+
+    return re.sub(rf"(?<![a-z])({'|'.join(pairs)})(?![a-z])", swap, text, flags=re.IGNORECASE)

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from flame_mdm.data import Clip, MotionSource, Split, archives, name_hash, required, split_blocks, without
+from flame_mdm.data import Clip, MotionSource, Split, archives, name_hash, required, split_blocks, swap_sides, without
 from flame_mdm.data.parallel import in_order
 from flame_mdm.errors import UserError
 from flame_mdm.formats import bvh
@@ -252,11 +252,6 @@ def mirror_smpl(motion: np.ndarray) -> np.ndarray:
     vectors = vectors[:, [names.index(swap_sides(name)) for name in names]] * np.array([1, -1, -1], motion.dtype)
     translation = motion[:, :3] * np.array([-1, 1, 1], motion.dtype)
     return np.concatenate([translation, vectors.reshape(len(motion), -1)], 1)
-
-
-def swap_sides(text: str) -> str:
-    """Swaps "left" and "right" in a text."""
-    return re.sub("left|right", lambda match: "right" if match[0] == "left" else "left", text)
 
 
 def side_of(content: str) -> str:

@@ -7,7 +7,7 @@ import os
 import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args
@@ -15,7 +15,7 @@ from typing import Any, Literal, NamedTuple, get_args
 import numpy as np
 import torch
 
-from flame_mdm.data import Clip, MotionSource, Split, hashed_split, name_hash, without
+from flame_mdm.data import Clip, MotionSource, Split, hashed_split, name_hash, swap_sides, without
 from flame_mdm.data.parallel import in_order
 from flame_mdm.errors import UserError, printable
 from flame_mdm.formats import ENDINGS, TREES
@@ -241,10 +241,11 @@ class Folder(MotionSource):
 
     def _mirrored(self, clip: Clip, note: Note) -> Clip:
         action = clip.action
-        if note.action is not None and _swapped(note.action) in self.actions:
-            action = self.actions.index(_swapped(note.action))
+        if note.action is not None and swap_sides(note.action) in self.actions:
+            action = self.actions.index(swap_sides(note.action))
         motion = SMPL22.mirror(torch.from_numpy(clip.motion)).numpy()
-        return Clip(f"M{clip.id}", motion, [_swapped(text) for text in clip.captions], clip.split, clip.source, action)
+        captions = [swap_sides(text) for text in clip.captions]
+        return replace(clip, id=f"M{clip.id}", motion=motion, captions=captions, action=action)
 
 
 def _look(kind: str, path: Path) -> Facts | str:
@@ -360,15 +361,3 @@ def _take(notes: dict[str, Note], exclude: Sequence[str], where: str, row: Mappi
             setattr(note, key, str(value))
     if note.split not in (None, *get_args(Split)):
         raise UserError(f"{where}: unknown split {note.split!r}; use {', '.join(get_args(Split))}")
-
-
-def _swapped(text: str) -> str:
-    """Swaps left and right, clockwise and counterclockwise."""
-    pairs = {"left": "right", "right": "left", "clockwise": "counterclockwise"}
-    pairs |= {"counterclockwise": "clockwise", "anticlockwise": "clockwise"}
-
-    def swap(match: re.Match[str]) -> str:
-        word = pairs[match[0].lower()]
-        return word.capitalize() if match[0][0].isupper() else word
-
-    return re.sub(rf"(?<![a-z])({'|'.join(pairs)})(?![a-z])", swap, text, flags=re.IGNORECASE)

@@ -262,7 +262,8 @@ def packed(opener: Callable, content: bytes) -> bytes:
 def archive_cases() -> Iterator[tuple[bytes, str]]:
     whole = bvh_text().encode()
     yield sparse(TAKE, 40 * 10**9), "sparse"
-    yield member(TAKE, 10**12) + bytes(1024), "damaged archive"
+    yield member(TAKE, 10**12) + bytes(1024), "too many for a motion"
+    yield member("junk", 10**12) + bytes(1024), "damaged archive"
     for target in (TAKE, "/etc/passwd", "../../x", "none"):
         for kind in (tarfile.SYMTYPE, tarfile.LNKTYPE):
             yield member(TAKE, 0, kind, target) + bytes(1024), "a link"

@@ -78,7 +78,7 @@ def update_metrics(metrics: Mapping[str, Metric], **features: Any) -> None:
         missing = [needed for needed in required_inputs(metric) if needed not in features]
         if missing:
             raise UserError(missing_input(name, metric, missing[0]))
-        metric.update(**{name: features[name] for name in inputs_of(metric).keys() & features})
+        metric.update(**{name: features[name] for name in inputs_of(metric) if name in features})
 
 
 def missing_input(name: str, metric: Metric, needed: str) -> str:

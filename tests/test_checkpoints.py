@@ -232,9 +232,6 @@ def test_every_weight_is_used_or_the_import_fails() -> None:
             import_mdm(weights_, args)
 
 
-# Options of released models -------------------------------------------------------------------------------------------
-
-
 def released_file(folder: Path, state: dict, args: dict | str) -> list[str]:
     """Words of an import command for a released file of these contents."""
     torch.save(state, folder / "model.pt")
@@ -333,9 +330,6 @@ def test_pickles_of_objects_are_read_on_demand_only(refused, bad):
         (bad / "model.pt").write_bytes(content)
         refused("import", *words, says="model.pt: damaged, or not a ")
     refused("import", "mdm", str(bad / "absent.pt"), *words[2:], says="absent.pt: no such file")
-
-
-# Model files ----------------------------------------------------------------------------------------------------------
 
 
 def test_a_model_file_is_the_checkpoint(trained, data_root, tmp_path, capsys):

@@ -226,9 +226,6 @@ def test_wrong_folders_get_one_line(folder):
         _ = source(folder).kit
 
 
-# CMU's own files ------------------------------------------------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def real(tmp_path_factory):
     """Some files of the archive, unpacked."""

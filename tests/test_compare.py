@@ -148,9 +148,6 @@ def test_runs_are_sampled_for_texts_or_for_what_a_folder_of_motions_shows(tmp_pa
     assert again[0]["joints"] != made[0]["joints"]
 
 
-# Judgement ------------------------------------------------------------------------------------------------------------
-
-
 def test_a_rating_page_hides_whose_motions_it_shows(three, tmp_path):
     text = page(three, tmp_path / "rate.html", "rate=true")
     assert "Which animation better fits the following description?" in text

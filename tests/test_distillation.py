@@ -1,24 +1,39 @@
-"""Distillation: Gaussian data, for which everything is known; and runs of a student, from the command to the motion."""
+"""Students, on Gaussian data, for which everything is known, and of models; adapters, from clips to a prompt."""
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
+from safetensors import safe_open
+from safetensors.torch import load_file, save_file
 from support.analytic import NO_CONDITION, drawn, real, sample
-from support.runs import RUN, TWO, finish, reference, spawn
+from support.runs import RUN, TINY, TWO, finish, reference, spawn
 from torch import Tensor
 
 import flame_mdm
 from flame_mdm.__main__ import main
 from flame_mdm.batch import Denoise
-from flame_mdm.checkpoints.model_files import read_checkpoint, weights_sha256
+from flame_mdm.checkpoints.adapters import About, attach, copy_weights, word_rows, write_adapter
+from flame_mdm.checkpoints.hub import export
+from flame_mdm.checkpoints.model_files import read_checkpoint, weights_sha256, write_model_file
+from flame_mdm.conditions.tokens import LearnedTokens
+from flame_mdm.conditions.vocabulary import hashed
+from flame_mdm.config import compose, instantiate
+from flame_mdm.data.store import Store
+from flame_mdm.data.synthetic import Synthetic
+from flame_mdm.demo.request import DemoRequest
+from flame_mdm.demo.studio import Studio
 from flame_mdm.errors import UserError
 from flame_mdm.processes import Process
 from flame_mdm.processes.consistency import consistency_terms
 from flame_mdm.processes.diffusion import GaussianDiffusion
 from flame_mdm.processes.flow_matching import FlowMatching
 from flame_mdm.processes.samplers import CountedDenoise
+from flame_mdm.task import MotionGeneration
+from flame_mdm.training import adaptation
 
 MEAN, VARIANCE = torch.tensor([0.5, -1.0, 0.0]).double(), torch.tensor([0.3, 1.0, 2.0]).double()
 """Of the data: independent normal features."""
@@ -105,8 +120,6 @@ def test_fine_grids_lead_to_the_data_and_so_do_one_two_and_four_calls(process):
         torch.testing.assert_close(x.mean((0, 1)), MEAN, atol=0.05, rtol=0)
         torch.testing.assert_close(x.var((0, 1)), VARIANCE, atol=0.01, rtol=0.05)
 
-
-# Runs -----------------------------------------------------------------------------------------------------------------
 
 SHORT = ["callbacks.checkpoints.every_n_steps=2", "trainer.max_steps=4"]
 
@@ -211,3 +224,210 @@ def test_a_model_that_cannot_be_a_teacher_gets_one_line(trained, student, data_r
     line = error(capsys, "distill", trained, "out", *SHORT, "distillation.teacher=gone.ckpt")
     assert "distillation.teacher=gone.ckpt: no such checkpoint" in line
     assert sorted(path.name for path in tmp_path.iterdir()) == ["noise.ckpt", "other.ckpt", "untrained.ckpt"]
+
+
+ABOUT: About = {"name": "", "action": False, "rank": 2, "words": [], "rows": [], "captions": [], "base": ""}
+
+
+def build() -> MotionGeneration:
+    config = compose("quickstart", TINY)
+    task = MotionGeneration.build(config, instantiate(config["representation"]))
+    task.facts |= {"max_frames": 40, "vocabulary": ["a", "person", "walks"], "captions": ["a person walks"]}
+    return task.eval()
+
+
+@pytest.fixture(scope="module")
+def taught(tmp_path_factory):
+    """Files of a base, of the checkpoint of an adaptation to it, and of two adapters."""
+    folder = tmp_path_factory.mktemp("adapters")
+    torch.manual_seed(0)
+    base = build()
+    write_model_file(folder / "base.safetensors", base.state_dict(), config=base.config, facts=base.facts, origin={})
+    sha = weights_sha256(folder / "base.safetensors")
+    for name in ("limp", "march"):
+        task, new = build(), [name, "in", "style"]
+        assert isinstance(task.condition, LearnedTokens)
+        rows = word_rows(task.condition, new, base.facts["vocabulary"])
+        about: About = {**ABOUT, "name": name, "words": new, "rows": rows, "captions": ["a person limps"], "base": sha}
+        attach(task, about)
+        copy_weights(task, folder / "base.safetensors")
+        task.facts["vocabulary"] = [*base.facts["vocabulary"], name, "in", "style"]
+        trainable = [parameter for parameter in task.parameters() if parameter.requires_grad]
+        assert len(trainable) == 2 * 4 + 1  # two parts of four weights, and the words
+        for parameter in trainable:
+            torch.nn.init.normal_(parameter, std=0.3)
+        config = task.config | {"adapter": about, "base": "base.safetensors"}
+        torch.save(
+            {"config": config, "facts": task.facts, "state_dict": task.state_dict(), "global_step": 3}
+            | {"flame_mdm_format": 2},
+            folder / f"{name}.ckpt",
+        )
+        write_adapter(folder / f"{name}.safetensors", folder / f"{name}.ckpt")
+    return folder
+
+
+def sampled(model, text="a person walks in limp style") -> torch.Tensor:
+    (motion,) = flame_mdm.generate(model, text, frames=20, seed=1)
+    return torch.from_numpy(motion.features)
+
+
+def test_strength_0_is_the_base_and_1_the_trained_model(taught):
+    base = flame_mdm.load(taught / "base.safetensors")
+    adapted = [
+        flame_mdm.load(taught / "base.safetensors", adapter=taught / "limp.safetensors", strength=s) for s in (0, 1)
+    ]
+    assert torch.equal(sampled(adapted[0]), sampled(base))
+    unmerged, checkpoint = build(), read_checkpoint(taught / "limp.ckpt")
+    attach(unmerged, checkpoint["config"]["adapter"])
+    unmerged.load_state_dict(checkpoint["state_dict"])
+    unmerged.condition.seen = frozenset(checkpoint["facts"]["vocabulary"])
+    torch.testing.assert_close(sampled(adapted[1]), sampled(unmerged), rtol=0, atol=1e-5)
+    torch.testing.assert_close(sampled(adapted[1]), sampled(flame_mdm.load(taught / "limp.ckpt")), rtol=0, atol=1e-5)
+    assert not torch.allclose(sampled(adapted[1]), sampled(base), atol=1e-2)
+
+
+def test_several_adapters_add_up_and_export_merges_them(taught, tmp_path):
+    files = [taught / "limp.safetensors", taught / "march.safetensors"]
+    both = flame_mdm.load(taught / "base.safetensors", adapter=files, strength=[0.5, 2])
+    name, table = "denoiser.transformer.layers.0.feed_forward.0.weight", "condition.words.weight"
+    expected = read_checkpoint(taught / "base.safetensors")["state_dict"]
+    for strength, file in zip((0.5, 2), files, strict=True):
+        part, rows = load_file(file), read_checkpoint(file.with_suffix(".ckpt"))["config"]["adapter"]["rows"]
+        expected[name] = expected[name] + strength * part[f"{name}.up"] @ part[f"{name}.down"]
+        expected[table] = expected[table].index_add(0, torch.tensor(rows), strength * 10 * part[f"{table}.vectors"])
+    for key in (name, table):
+        torch.testing.assert_close(both.state_dict()[key], expected[key])
+    merged = export(taught / "base.safetensors", tmp_path / "merged.safetensors", adapter=files, strength=[0.5, 2])
+    assert torch.equal(sampled(flame_mdm.load(merged)), sampled(both))
+
+
+def test_what_is_no_adapter_of_the_base_is_refused(taught, tmp_path):
+    with safe_open(taught / "limp.safetensors", "pt") as file:
+        about = json.loads(file.metadata()["flame_mdm_adapter"])
+    for change, message in (
+        ({"base": "0" * 64}, "made for the weights 000000000000"),
+        ({"rank": "2"}, "rank"),
+        ({"rows": [10**6]}, "does not fit the weights"),
+        (None, "not an adapter"),
+    ):
+        metadata = {} if change is None else {"flame_mdm_adapter": json.dumps(about | change)}
+        save_file(load_file(taught / "limp.safetensors"), tmp_path / "x.safetensors", metadata)
+        with pytest.raises(UserError, match=message):
+            flame_mdm.load(taught / "base.safetensors", adapter=tmp_path / "x.safetensors")
+    with pytest.raises(UserError, match="give one number, or one for each of 1 adapters"):
+        flame_mdm.load(taught / "base.safetensors", adapter=taught / "limp.safetensors", strength=[1, 2])
+    with pytest.raises(UserError, match="an adapter, which changes a model"):
+        flame_mdm.load(taught / "limp.safetensors")
+    gru = [word for word in TINY if "ff_size" not in word and "num_heads" not in word]
+    config = compose("quickstart", ["denoiser=mdm_gru_small", *gru])
+    with pytest.raises(UserError, match="has no attention"):
+        attach(MotionGeneration.build(config, instantiate(config["representation"])), ABOUT)
+
+
+@pytest.mark.parametrize(("action", "kept"), [(False, {"1", "2"}), (True, {"0", "1", "2"})])
+def test_files_contain_the_changes_of_later_layers_and_for_actions_of_all(tmp_path, action, kept):
+    about: About = {**ABOUT, "action": action}
+    config = compose("quickstart", [*TINY, "denoiser.num_layers=3"])
+    model = MotionGeneration.build(config, instantiate(config["representation"]))
+    model.facts |= {"actions": [], "max_frames": 40}
+    attach(model, about)
+    assert len([parameter for parameter in model.parameters() if parameter.requires_grad]) == 3 * 2 * 4
+    state = {"config": model.config | {"adapter": about}, "facts": model.facts, "state_dict": model.state_dict()}
+    torch.save(state | {"global_step": 1, "flame_mdm_format": 2}, tmp_path / "last.ckpt")
+    write_adapter(tmp_path / "limp.safetensors", tmp_path / "last.ckpt")
+    assert {name.split("layers.")[1][0] for name in load_file(tmp_path / "limp.safetensors")} == kept
+
+
+def test_new_words_get_rows_that_no_known_word_has():
+    encoder = LearnedTokens(16, buckets=50, heads=2)
+    (row,) = word_rows(encoder, ["limp"], [])
+    first, second = hashed("limp", 50)
+    other = next(w for n in range(10**4) if first in hashed(w := f"w{n}", 50) and second not in hashed(w, 50))
+    assert (row, word_rows(encoder, ["limp"], [other])) == (first, [second])
+
+
+STYLED = "A person hobbles in limp style"
+STEPS = ["data.batch_size=4", "trainer.accelerator=cpu", "trainer.enable_progress_bar=false"]
+STEPS += ["callbacks.checkpoints.every_n_steps=2", "trainer.val_check_interval=2", "lr_decay=0"]
+
+
+@pytest.fixture
+def clips(tmp_path) -> Path:
+    folder = tmp_path / "clips"
+    folder.mkdir()
+    for clip in Synthetic(clips=3).clips(30.0):
+        np.savez(folder / clip.id, joints=clip.motion, fps=30)
+        (folder / f"{clip.id}.txt").write_text("A person hobbles.\n")
+    return folder
+
+
+@pytest.mark.slow
+def test_from_clips_to_a_prompt_and_resumed(trained, clips, tmp_path, monkeypatch, data_root, capsys):
+    monkeypatch.setattr(adaptation, "SAMPLED", 10)
+    monkeypatch.chdir(tmp_path)
+    words = ["adapt", str(trained), "whole", f"source={clips}", "name=limp", *STEPS]
+    for steps, out in ((4, "whole"), (2, "parts"), (4, "parts")):
+        words[2] = out
+        assert main([*words, f"trainer.max_steps={steps}"]) == 0
+    whole, parts = (load_file(Path(out) / "limp.safetensors") for out in ("whole", "parts"))
+    torch.testing.assert_close(parts, whole, rtol=0, atol=0)
+    assert any(value.any() for name, value in whole.items() if name.endswith(".up"))
+    page = Path("whole/adaptation.html").read_text()
+    assert "hobbles in limp style" in page
+    assert "sampling 10 motions of it instead" in capsys.readouterr().out
+    store, base = Store(next(Path("whole/data").glob("limp-*"))), flame_mdm.load(trained)
+    np.testing.assert_array_equal(store.mean, base.representation.mean)
+    assert {clip.captions[0] for clip in store.clips if not clip.source.startswith("prior/")} == {STYLED}
+    assert main(["sample", str(trained), "out", f"text={STYLED}", "adapter=whole/limp.safetensors", "samples=1"]) == 0
+    assert "never seen" not in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_all_weights_and_half_of_each_batch_from_the_data_of_the_base(trained, clips, tmp_path, data_root, monkeypatch):
+    monkeypatch.setenv("FLAME_MDM_DATA", str(data_root))
+    words = ["adapt", str(trained), str(tmp_path / "run"), f"source={clips}", "name=limp", "full=true", *STEPS]
+    assert main([*words, "trainer.max_steps=2"]) == 0
+    model, base = flame_mdm.load(tmp_path / "run" / "limp.safetensors"), flame_mdm.load(trained)
+    assert not torch.equal(*(of.state_dict()["denoiser.output.weight"] for of in (model, base)))
+    config = model.config
+    data = instantiate(config["data"] | {"root": str(tmp_path / "run" / "data")}, representation=model.representation)
+    data.setup("fit")
+    batches = iter(data.train_dataloader())
+    for _ in range(3):
+        sources = [name.startswith("prior/") for name in next(batches).ids]
+        assert sources == [False, False, True, True]
+
+
+def test_unusable_requests_are_refused(refused, trained, clips, tmp_path):
+    for name in ("limp 2", "", "../x"):
+        refused("adapt", str(trained), f"source={clips}", f"name={name}", says="give one word")
+    lesson = ["adapt", str(trained), f"source={clips}", "name=limp"]
+    refused(*lesson[:2], says="name the folder of motions and the adapter")
+    refused(*lesson, "rank=0", says="rank=0: give 1 or more")
+    refused(*lesson, "losses.velocity=3", says="keeps the losses of its base")
+    refused(*lesson[:2], f"source={tmp_path / 'none'}", "name=limp", says="no such folder")
+    joints = next(iter(Synthetic(clips=1).clips(20.0))).motion
+    np.savez(clips / "rising", joints=joints + np.linspace(0, 0.3, len(joints))[:, None, None] * [0, 1, 0], fps=20)
+    refused(*lesson, says="1 of 4 motions have no caption")
+    (clips / "rising.txt").write_text("a person rises")
+    refused(*lesson, says="rising drifts upward by")
+
+
+def test_the_demo_offers_a_model_with_and_without_an_adapter(taught):
+    base, adapter = str(taught / "base.safetensors"), str(taught / "limp.safetensors")
+    studio = Studio([base, f"{base} + {adapter}"], "cpu")
+    expected = flame_mdm.load(base, adapter=adapter).state_dict()
+    torch.testing.assert_close(studio.model(f"{base} + {adapter}").state_dict(), expected, rtol=0, atol=0)
+    request = DemoRequest(model=f"{base} + {adapter}", text="a person walks")
+    assert f"flame-mdm sample {base} 'text=a person walks'" in request.command("text", None)
+    assert f"adapter={adapter}" in request.command("text", None)
+    assert f"flame_mdm.load({base!r}, adapter={adapter!r})" in request.python("text", "cpu")
+
+
+@pytest.mark.slow
+def test_two_processes(trained, clips, tmp_path, data_root):
+    words = ["adapt", str(trained), str(tmp_path / "run"), f"source={clips}", "name=limp", *STEPS]
+    words.append("trainer.max_steps=2")
+    code, _, err = finish(spawn(["flame_mdm", *words, *TWO, f"data_root={data_root}"]))
+    assert code == 0, err
+    assert (tmp_path / "run" / "limp.safetensors").stat().st_size < 300_000

@@ -1,7 +1,6 @@
 """Evaluation by protocol: what the result says, what is kept and shared, and what is refused."""
 
 import json
-import math
 import multiprocessing
 import os
 import shutil
@@ -96,10 +95,10 @@ class Runs:
         extractor = MotionCLIPExtractor(str(self.clip)) if features else None
         return Evaluation(protocol, data.test, extractor, data.representation)
 
-    def generator(self, evaluation: Evaluation, folder: Path | None = None, batch_size: int = 8, **editing):
+    def generator(self, evaluation: Evaluation, folder: Path | None = None, **editing):
         model, protocol = load(self.model), evaluation.protocol
         options = sampling_options(protocol, model, editing=EditRequest(**editing))
-        size = {"seed": 0, "batch_size": batch_size}
+        size = {"seed": 0, "batch_size": 8}
         return Generator(model, protocol, evaluation.clips, *options, **size, folder=folder, progress=False)
 
 
@@ -130,9 +129,6 @@ def motions(out: Path) -> Path:
     return folder
 
 
-# Results --------------------------------------------------------------------------------------------------------------
-
-
 def test_a_result_says_what_it_is_and_where_it_comes_from(runs, full):
     result, out = full
     assert json.loads(out.read_text()) == result.model_dump(), "nothing is written that is not read"
@@ -154,15 +150,11 @@ def test_a_result_says_what_it_is_and_where_it_comes_from(runs, full):
     checkpoint = result.checkpoint
     assert {len(digest) for digest in (checkpoint.sha256, checkpoint.config_sha256, result.extractor.sha256)} == {64}
     assert (checkpoint.averaged_weights, checkpoint.selected_by) == (True, "none: last")
-    assert checkpoint.parameters > 0
     assert (checkpoint.guidance_scale, checkpoint.num_inference_steps, result.cost.nfe) == (2.5, 5, 5)
-    assert result.cost.seconds_per_sample > 0
-    assert result.environment["packages"]["torch"] == torch.__version__
-    assert (result.device, result.precision[:7]) == ("cpu", "float32")
+    assert (result.device, result.environment["packages"]["torch"]) == ("cpu", torch.__version__)
     assert not list(out.parent.rglob("*.partial"))
     value = means(result)
-    assert value["real attributes/all"] > 0.95
-    assert value["generated attributes/all"] < 0.5
+    assert value["real attributes/all"] > 0.95 > 0.5 > value["generated attributes/all"]
     assert value["generated fid"] > 5 * value["real fid"] > 0
     assert value["generated multimodality"] > 0
 
@@ -189,20 +181,20 @@ def test_quick_results_few_motions_and_clips_left_out_are_marked(runs, tmp_path,
 
 
 def test_clips_that_may_have_been_seen_in_training_are_marked():
-    def reasons(model: Any, extractor: Any, split: Any = "test") -> list[str]:
-        data = SimpleNamespace(store=SimpleNamespace(fingerprint="here"))
-        model = model and SimpleNamespace(facts={"fingerprint": model})
-        extractor = extractor and SimpleNamespace(fingerprint=extractor)
-        plan: Any = SimpleNamespace(data=data, model=model, extractor=extractor)
-        return _overlaps(EvaluationRequest(ckpt="a", split=split), plan)
-
-    assert reasons("here", "here") == reasons(None, None) == []
-    assert reasons("other", None) == ["training data other and evaluated data here differ: splits may overlap"]
-    assert "training data of the extractor other" in reasons("here", "other")[0]
-    assert reasons("here", "here", "train") == ["the extractor was trained on the evaluated split, train"]
-
-
-# Resuming and sharing -------------------------------------------------------------------------------------------------
+    data: Any = SimpleNamespace(store=SimpleNamespace(fingerprint="here"))
+    for model, extractor, split, reason in (
+        ("other", "here", "test", "training data other and evaluated data here differ: splits may overlap"),
+        ("here", "other", "test", "training data of the extractor other"),
+        ("here", "here", "train", "the extractor was trained on the evaluated split, train"),
+        ("here", "here", "test", None),
+    ):
+        parts = {
+            "model": SimpleNamespace(facts={"fingerprint": model}),
+            "extractor": SimpleNamespace(fingerprint=extractor),
+        }
+        plan: Any = SimpleNamespace(data=data, **parts)
+        reasons = _overlaps(EvaluationRequest(ckpt="a", split=split), plan)
+        assert [text[: len(reason or "")] for text in reasons] == ([reason] if reason else [])
 
 
 def killed(words: list[str]) -> None:
@@ -258,21 +250,13 @@ def test_other_metrics_need_no_new_motions(runs, full, tmp_path, monkeypatch):
         assert value.mean == (full[0].values[name].mean if name.startswith(of_joints) else None), name
 
 
-def test_the_batch_size_does_not_matter(runs, full):
-    evaluation = runs.evaluation(features=True)
-    values: Any = evaluation.run(runs.generator(evaluation, batch_size=7)).values
-    assert values.keys() == full[0].values.keys() - {"multimodality"}
-    for name, value in values.items():
-        expected = (full[0].values[name].per_replication or [None])[0]
-        # Shares may move by one sample in 40 where two distances are all but equal.
-        assert value.mean == (expected and pytest.approx(expected, rel=2e-3, abs=0.03)), name
-
-
-def taken(extracted: Extracted, indices: list[int]) -> Extracted:
+def again(extracted: Extracted, indices: np.ndarray) -> Extracted:
+    """The motions with these numbers, as if they were different ones."""
     rows = {
-        n: v[indices] if isinstance(v, torch.Tensor) else [v[i] for i in indices] for n, v in extracted.rows.items()
+        name: values[indices] if isinstance(values, torch.Tensor) else [values[i] for i in indices]
+        for name, values in extracted.rows.items()
     }
-    return Extracted(rows)
+    return Extracted(rows | {"keys": torch.arange(len(indices))})
 
 
 def test_a_bootstrap_measures_each_motion_as_often_as_it_is_drawn(runs):
@@ -280,11 +264,6 @@ def test_a_bootstrap_measures_each_motion_as_often_as_it_is_drawn(runs):
     metrics = {name: metric for name, metric in evaluation.protocol.metrics.items() if name != "mid"}  # ill-conditioned
     evaluator = Evaluator(evaluation.extractor, metrics, evaluation.representation)
     first, second = (evaluation._real(replication)[0] for replication in range(2))
-
-    def again(extracted: Extracted, indices: np.ndarray) -> Extracted:
-        drawn = taken(extracted, indices.tolist())
-        return Extracted(drawn.rows | {"keys": torch.arange(len(indices))})
-
     drawn = evaluator.resample(first, first, second, 3, 2)
     generator = np.random.default_rng(key("bootstrap", 3))
     for number in range(2):
@@ -352,9 +331,6 @@ def test_processes_share_the_work_and_get_one_result(runs, tmp_path, pool):
     assert ends == ["UserError", "SystemExit"], "one says why"
 
 
-# Motions of others ----------------------------------------------------------------------------------------------------
-
-
 def test_motions_of_others_are_measured_alike(runs, full, tmp_path):
     folder, out = tmp_path / "samples", tmp_path / "result.json"
     folder.mkdir()
@@ -385,10 +361,7 @@ def test_motions_of_others_are_measured_alike(runs, full, tmp_path):
         )
 
 
-# Protocols ------------------------------------------------------------------------------------------------------------
-
-
-def test_every_protocol_can_be_read():
+def test_every_protocol_can_be_read_and_one_is_the_default_for_condition_and_data():
     representation = HumanML()
     evaluator = Evaluator(None, {}, representation)
     nothing = Extracted({"keys": torch.zeros(0, dtype=torch.long)})
@@ -400,28 +373,6 @@ def test_every_protocol_can_be_read():
         assert (set(values.values()), reasons) == ({None} if protocol.metrics else set(), {}), name
         for table in protocol.expected.values():
             assert set(table) <= set(values), name
-
-
-def test_variants_replace_options_of_their_file(tmp_path):
-    assert {"editing_prediction", "editing_upper_body_t2m", "reconstruction_kit"} < set(protocol_names())
-    assert "editing" not in protocol_names()
-    with pytest.raises(UserError, match="choose a variant: editing_in_between, "):
-        protocol_config("editing")
-    with pytest.raises(UserError, match=r"editing_predicton.*Did you mean editing_prediction"):
-        protocol_config("editing_predicton")
-    plain, flame = (protocol_config(name) for name in ("text_to_motion", "text_to_motion_flame"))
-    assert flame == plain | {"name": "text_to_motion_flame", "smoothing": 1.0}
-    for name, quirk in (
-        ("text_to_motion_t2m", "'full_length': True"),
-        ("action_to_motion", "'random_start': True"),
-        ("unconditioned_humanact12", "KernelMotionDistance', 'replace': True"),
-    ):
-        assert [quirk in repr(protocol_config(name + suffix)) for suffix in ("_legacy", "")] == [True, False]
-    (tmp_path / "mine.yaml").write_text((FOLDER / "editing.yaml").read_text())
-    assert protocol_config(str(tmp_path / "mine_upper_body.yaml"))["edit"] == {"joints": "upper_body"}
-
-
-def test_the_default_protocol_follows_condition_and_data():
     for condition, dataset, name in (
         ("none", "humanact12", "unconditioned"),
         ("action", "humanact12", "action_to_motion"),
@@ -434,6 +385,20 @@ def test_the_default_protocol_follows_condition_and_data():
         assert default_protocol(model) == name
 
 
+def test_variants_replace_options_of_their_file(tmp_path):
+    assert {"editing_prediction", "editing_upper_body_t2m", "reconstruction_kit"} < set(protocol_names())
+    assert "editing" not in protocol_names()
+    with pytest.raises(UserError, match="choose a variant: editing_in_between, "):
+        protocol_config("editing")
+    with pytest.raises(UserError, match=r"editing_predicton.*Did you mean editing_prediction"):
+        protocol_config("editing_predicton")
+    plain, flame = (protocol_config(name) for name in ("text_to_motion", "text_to_motion_flame"))
+    assert flame == plain | {"name": "text_to_motion_flame", "smoothing": 1.0}
+
+    (tmp_path / "mine.yaml").write_text((FOLDER / "editing.yaml").read_text())
+    assert protocol_config(str(tmp_path / "mine_upper_body.yaml"))["edit"] == {"joints": "upper_body"}
+
+
 def test_captions_crops_and_second_draws_are_functions_of_seed_replication_and_id(runs):
     data = runs.data()
     protocol = load_protocol("synthetic", data.representation)
@@ -444,10 +409,14 @@ def test_captions_crops_and_second_draws_are_functions_of_seed_replication_and_i
     for replication, seed, purpose in ((1, 1, {}), (0, 2, {}), (0, 1, {"purpose": "real"})):
         others = protocol.rows(data.test, replication, seed, **purpose)
         assert any(row.caption != rows[row.id].caption for row in others)
-    size = {"samples": len(data.test) + 5, "real_samples": 12}
-    many = protocol.model_copy(update=size)
+    many = protocol.model_copy(update={"samples": len(data.test) + 5, "real_samples": 12})
     assert len({row.id for row in many.rows(data.test, 0, 1)}) == len(data.test) + 5
     assert len(many.rows(data.test, 0, 0, purpose="real")) == 12
+
+
+def unused(name: str, rows: list[DrawnClip], replication: int) -> Samples:
+    """A source that is not to be asked."""
+    raise AssertionError("sampled before all was checked")
 
 
 def test_unexpected_values_of_real_motions_stop_before_anything_is_generated(runs):
@@ -466,12 +435,15 @@ def test_unexpected_values_of_real_motions_stop_before_anything_is_generated(run
     assert others.run(None).invalid_because
 
 
-def unused(name: str, rows: list[DrawnClip], replication: int) -> Samples:
-    """A source that is not to be asked."""
-    raise AssertionError("sampled before all was checked")
+def own(folder: Path, old: str, new: str) -> str:
+    """The path of the protocol `synthetic` with one replacement."""
+    text = (FOLDER / "synthetic.yaml").read_text()
+    assert old in text
+    (folder / "mine.yaml").write_text(text.replace(old, new))
+    return str(folder / "mine.yaml")
 
 
-def test_what_does_not_fit_is_refused(runs):
+def test_what_does_not_fit_is_refused(runs, tmp_path):
     for message, keys in (
         ("resamples=20: give 0, or 100 or more", {"resamples": 20}),
         ("needs a feature extractor", {"extractor": None, "protocol": "text_to_motion"}),
@@ -488,29 +460,14 @@ def test_what_does_not_fit_is_refused(runs):
         with pytest.raises((UserError, FileNotFoundError)) as refusal:
             Plan(EvaluationRequest(**values), "cpu")
         assert message in str(refusal.value)
-
-
-def own(folder: Path, old: str, new: str) -> str:
-    """The path of the protocol `synthetic` with one replacement."""
-    text = (FOLDER / "synthetic.yaml").read_text()
-    assert old in text
-    (folder / "mine.yaml").write_text(text.replace(old, new))
-    return str(folder / "mine.yaml")
-
-
-def test_options_that_protocols_or_metrics_do_not_have_are_refused(tmp_path):
     for old, new, message in (
-        ("normalize: true", "normalise: true", "Did you mean metrics.motions_for_text.normalize?"),
+        ("normalize: true", "normalise: true", r"Did you mean metrics\.motions_for_text\.normalize\?"),
         ("  prompts: 20", "  promts: 20", "Did you mean prompts"),
         ("condition: text", "condition: music", "condition"),
         ("replications: 5", "replications: many", "not a whole number"),
     ):
-        with pytest.raises(UserError) as refusal:
+        with pytest.raises(UserError, match=message):
             load_protocol(own(tmp_path, old, new), HumanML())
-        assert message in str(refusal.value)
-
-
-def test_missing_inputs_of_metrics_are_refused_before_anything_is_generated(runs, tmp_path):
     accuracy, drift = "accuracy.ActionAccuracy", "reconstruction.KeptDrift"
     clip = "extractor: {_target_: evaluators.extractors.MotionCLIPExtractor, path: motion_clip_synthetic}"
     for old, new, features, message in (
@@ -522,14 +479,9 @@ def test_missing_inputs_of_metrics_are_refused_before_anything_is_generated(runs
         evaluation = runs.evaluation(own(tmp_path, old, new), features, multimodality=True)
         with pytest.raises(UserError, match=message):
             evaluation.run(unused)
-
-
-def test_an_extractor_of_other_motions_is_refused(runs):
-    extractor = MotionCLIPExtractor(str(runs.clip))
-    extractor.check(HumanML(variant="clean"), "synthetic")
     for representation, dataset in ((HumanML(variant="clean"), "bandai"), (Rot6D(), "synthetic")):
         with pytest.raises(UserError, match="the motions are"):
-            extractor.check(representation, dataset)
+            MotionCLIPExtractor(str(runs.clip)).check(representation, dataset)
 
 
 def test_metrics_of_2026(runs):
@@ -553,12 +505,10 @@ def test_smoothing_takes_each_motion_for_itself(runs):
     assert other.values["jitter"].mean < 0.5 * one.values["jitter"].mean
     assert other.ground_truth == one.ground_truth
     step = np.repeat([[0.0], [1.0]], 20, axis=0)
-    rows = smooth.protocol.rows(smooth.clips, 0, 0)[:1]
-    (smoothed,) = smooth._generated(Samples(rows, [step])).features
-    expected = 0.5 * (1 + 2 * math.exp(-0.5) + 2 * math.exp(-2)) / (1 + 2 * math.exp(-0.5) + 2 * math.exp(-2))
-    assert smoothed[0, 0] == pytest.approx(0, abs=1e-9)
-    assert smoothed[19:21].mean() == pytest.approx(expected)
-    assert 0.25 < smoothed[19, 0] < 0.35
+    (smoothed,) = smooth._generated(Samples(smooth.protocol.rows(smooth.clips, 0, 0)[:1], [step])).features
+    assert smoothed[[0, 39], 0] == pytest.approx([0, 1], abs=1e-9)
+    assert smoothed[19:21].mean() == pytest.approx(0.5)
+    assert 0.25 < smoothed[19, 0] < 0.35, "a normal distribution with a deviation of one frame"
 
 
 def test_latency_is_that_of_one_motion_at_a_time_after_a_first_one(runs, tmp_path, monkeypatch):
@@ -579,9 +529,6 @@ def test_latency_is_that_of_one_motion_at_a_time_after_a_first_one(runs, tmp_pat
     result = runs.evaluate(tmp_path / "eight.json", "protocol=latency", "extractor=none", "batch_size=8")
     assert sizes == [8] * 3, "sampled again, not read from the motions of batches of 1"
     assert (result.cost.batch_size, result.changed) == (8, {"batch_size": 8})
-
-
-# Edits and baselines --------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", ["prediction", "interpolation", "upper_body"])
@@ -630,9 +577,6 @@ def test_shuffled_motions_are_all_there_and_belong_to_what_others_ask_for(runs):
         Baseline("shuffled", clips, "none", 0)
 
 
-# Evaluation during training -------------------------------------------------------------------------------------------
-
-
 def test_a_missing_extractor_of_the_selection_stops_before_training(runs, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     words = [*GENERATOR, f"data_root={runs.root}", "run.dir=run", "trainer.max_steps=2"]
@@ -646,17 +590,16 @@ def test_a_missing_extractor_of_the_selection_stops_before_training(runs, tmp_pa
     assert 'assets/t2m/synthetic is missing; see "Extractors" in docs/evaluation.md' in capsys.readouterr().err
 
 
-def test_the_synthetic_set_has_an_evaluator_in_the_package(runs):
-    """It is the default of the protocol, and finds texts with the attributes of real motions."""
+def test_the_evaluator_in_the_package_finds_texts_with_the_attributes_of_real_motions(runs):
     plan = Plan(EvaluationRequest(ckpt=str(runs.model), data_root=str(runs.root)), "cpu")
     assert isinstance(plan.extractor, MotionCLIPExtractor)
     assert plan.extractor.path == SHIPPED["motion_clip_synthetic"]
     assert plan.extractor.path.stat().st_size < 3e6
-    clips = [clip for number in range(700) if (clip := Synthetic(clips=4000).clip(number, 20)).split == "test"]
+    clips = [clip for number in range(400) if (clip := Synthetic(clips=4000).clip(number, 20)).split == "test"]
     lines = [plan.representation.encode(torch.from_numpy(clip.motion)) for clip in clips]
     motions = torch.cat([plan.extractor.task(x[None], torch.ones(1, len(x), dtype=torch.bool)) for x in lines])
     texts = plan.extractor.task.text([clip.captions[0] for clip in clips])
     nearest = torch.cdist(motions, texts).argmin(1).tolist()
     right = [clips[other].attributes == clip.attributes for clip, other in zip(clips, nearest, strict=True)]
-    assert len(clips) > 50
+    assert len(clips) > 30
     assert np.mean(right) > 0.9

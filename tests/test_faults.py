@@ -45,9 +45,6 @@ def prepared(root: Path, clips: int) -> list[str]:
     return ["data=synthetic", f"data.source.clips={clips}", f"data_root={root}"]
 
 
-# Full disks -----------------------------------------------------------------------------------------------------------
-
-
 @contextmanager
 def file_limit(size: int) -> Iterator[None]:
     """Sets the size that files may have; writing more fails as on a full disk."""
@@ -79,9 +76,6 @@ def test_a_preparation_without_room_leaves_nothing(tmp_path, capsys):
         assert line.startswith(f"error: {file}: cannot be written: File too large. ")
         assert f" are free on the disk of {tmp_path / 'data'}" in line
         assert list(tmp_path.iterdir()) == []
-
-
-# Loading processes ----------------------------------------------------------------------------------------------------
 
 
 def running(pids: list[int]) -> list[int]:
@@ -155,8 +149,6 @@ def test_torch_messages_about_lost_workers_are_understood(tmp_path, monkeypatch)
         assert list(tmp_path.iterdir()) == []
 
 
-# Kills ----------------------------------------------------------------------------------------------------------------
-
 KILLS = int(os.environ.get("FLAME_MDM_KILLS", "4"))
 """Kills, half of them SIGKILL and half SIGTERM."""
 
@@ -229,9 +221,6 @@ def test_kills_at_random_moments_change_nothing(data_root, tmp_path):
             shutil.rmtree(folder)  # too late
     killed(line(folder), log)
     assert result(folder) == result(whole)
-
-
-# Two processes that prepare the same data, and signals in libraries that hide them ------------------------------------
 
 
 class Preparation:

@@ -32,9 +32,6 @@ FIXTURE_SUBSETS = (
 SHORTEST = {"t2m": HumanML3D.shortest, "kit": 24}
 
 
-# The published rules --------------------------------------------------------------------------------------------------
-
-
 def published_items(group):
     """The cuts of the fixture's files in the order of the published list: by length, else as they come."""
     rules = golden("rules")
@@ -107,8 +104,6 @@ def test_parameters_of_a_clip_make_flames_features(stem):
     [motion] = humanml3d._parameters([IndexedClip("a", "CMU/a", 0, len(poses))], recording)
     np.testing.assert_allclose(SMPL().encode(torch.from_numpy(motion)), expected, atol=2e-6)
 
-
-# A processed folder ---------------------------------------------------------------------------------------------------
 
 MOTIONS = {
     "000000": (120, [line("a person walks"), line("he waves his hand", 1.0, 3.5), line("he waves", 1.0, 3.5)]),
@@ -221,9 +216,6 @@ def test_damaged_motions_can_be_excluded(folder, tmp_path):
     assert store.info["excluded"]["names by data.source.exclude"] == 3
     with pytest.raises(ValueError, match=r"data\.source\.exclude: .* has no 7"):
         HumanML3D(str(folder), exclude=["7"]).count()
-
-
-# From AMASS -----------------------------------------------------------------------------------------------------------
 
 
 def test_keys_do_not_depend_on_how_a_subset_is_called():
@@ -389,9 +381,6 @@ def test_the_dry_run_lists_all_that_is_missing(mine, capsys):
     assert main(["prepare", "data=humanml3d", "check=true", *words]) == 0
     assert "missing: BioMotionLab_NTroje: missing" in capsys.readouterr().out
     assert not (mine / "HumanML3D" / "HumanML3D" / "new_joint_vecs").exists()
-
-
-# As FLAME reads it ----------------------------------------------------------------------------------------------------
 
 
 def smpl(root, **options):

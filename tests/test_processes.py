@@ -338,9 +338,6 @@ def test_flow_times_are_drawn_as_named(distribution, in_the_middle):
     assert ((seen[0] > 0.25) & (seen[0] < 0.75)).float().mean() == pytest.approx(in_the_middle, abs=0.03)
 
 
-# Classifier-free guidance ---------------------------------------------------------------------------------------------
-
-
 MASK = length_mask(torch.tensor([4, 2]))
 NULL = Condition(torch.tensor([[10.0]]), torch.zeros(1, 0, 1), None)
 COND = Condition(torch.tensor([[1.0], [2.0]]), torch.zeros(2, 0, 1), None, NULL)

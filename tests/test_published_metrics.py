@@ -58,9 +58,6 @@ def y_up(joints: np.ndarray) -> Tensor:
     return torch.from_numpy(joints).double()[..., [0, 2, 1]] * torch.tensor([1.0, 1.0, -1.0])
 
 
-# The authors' code ----------------------------------------------------------------------------------------------------
-
-
 MBENCH_NAMES = dict(zip(MBenchQuality.NAMES, ("jitter", "dynamic", "penetration", "sliding", "floating"), strict=True))
 
 
@@ -244,9 +241,6 @@ def test_retrieval_in_small_batches_and_by_protocol_equals_tmrs(stem: str, monke
         part = {name.removeprefix(f"{ours}_"): value for name, value in values.items() if name.startswith(ours)}
         # Their similarities are float32, which moves single queries whose answers are nearly equal.
         assert_recall(part, f"out/driver_bs256/{theirs}", within=1.01 * 100 / len(ids))
-
-
-# Closed forms ---------------------------------------------------------------------------------------------------------
 
 
 def test_multi_positive_r_precision_of_an_example_and_dissimilar_captions():

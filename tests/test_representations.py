@@ -109,9 +109,6 @@ def wander(skeleton: str = "smpl22", frames: int = 60, seed: int = 0, turns: flo
     return forward_kinematics(body, rotation.axis_angle_to_matrix(bend), offsets, across)
 
 
-# Skeletons
-
-
 @pytest.mark.golden
 @pytest.mark.parametrize("stem", ["hml263", "kit251"])
 def test_skeleton_constants_and_mirrored_joints(stem: str):
@@ -137,9 +134,6 @@ def test_skeletons_are_trees():
         exchanged = sum(a != b for a, b in enumerate(skeleton.mirrored))
         assert exchanged == 2 * sum("left" in joint for joint in skeleton.joints)
         close(skeleton.assemble(skeleton.bones(joints), joints[:, 0]), joints, 1e-12)
-
-
-# HumanML3D's features as published
 
 
 @pytest.mark.golden
@@ -196,9 +190,6 @@ def test_published_statistics_and_normalization(stem: str):
         close(representation.denormalize(representation.normalize(features)), features, 1e-5)
         joints = representation.to_joints(representation.normalize(features))
         close(joints, fixture(stem, "official", "joints"), 2e-5)
-
-
-# HumanML3D's features, mended
 
 
 def test_clean_motions_are_canonical_and_come_back():
@@ -285,9 +276,6 @@ def test_bad_motions_and_options():
             HumanML(**options)
 
 
-# SMPL rotations
-
-
 @golden_case("smpl147")
 def test_flame_features_of_smplh_poses(stem: str):
     poses, translation = (torch.from_numpy(golden(stem)[f"prep/{key}"]) for key in ("poses156", "trans"))
@@ -338,9 +326,6 @@ def test_smpl_bodies_stand_upright(representation: SMPL | Rot6D):
     assert [name for name, m in zip(SMPL24.joints, moved.tolist(), strict=True) if m] == ["left_wrist", "left_hand"]
 
 
-# All representations
-
-
 def test_every_recipe_builds_decodes_and_passes_gradients():
     for path in sorted(ROOT.glob("experiments/representation/*.yaml")):
         representation = instantiate(OmegaConf.load(path))
@@ -360,8 +345,6 @@ def test_every_recipe_builds_decodes_and_passes_gradients():
         assert owners.shape == (joints, size)
         assert (owners.sum(0) >= 1).all()
 
-
-# TEMOS's features ---------------------------------------------------------------------------------------------------
 
 TEMOS = "temos64"
 temos = golden_case(TEMOS)
@@ -411,8 +394,6 @@ def test_normalization_is_temos(stem: str):
     close(ours * rifke.std, x * rifke.std, 2e-3)
     close(rifke.to_joints(x) * 640, in_kit_units("norm/joints_back_clip0"), 5e-3)
 
-
-# MotionStreamer's and MARDM's features ------------------------------------------------------------------------------
 
 FIXTURE272 = golden("motion272")
 

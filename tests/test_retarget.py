@@ -32,9 +32,6 @@ def kick() -> Motion:
     return synthetic("kick")
 
 
-# Known skeletons ------------------------------------------------------------------------------------------------------
-
-
 def test_a_known_skeleton_brings_the_joints_back_and_does_not_change_the_body_of_a_glb(kick: Motion, tmp_path: Path):
     kick.save(tmp_path / "b.glb")
     plain = Glb(tmp_path / "b.glb")
@@ -90,9 +87,6 @@ def test_rotations_of_the_source_are_kept(kick: Motion):
             turned[:, joint] = turned[:, parent] @ turned[:, joint]
     body = world_rotations(poses.rotations.numpy())
     np.testing.assert_allclose(turned @ rig.neutral.swapaxes(1, 2), body[:, list(rig.sources)], atol=1e-9)
-
-
-# Own characters -------------------------------------------------------------------------------------------------------
 
 
 def limbs_off(at: dict[str, np.ndarray], joints: np.ndarray, limbs: tuple[str, ...] = tuple(LIMBS)) -> float:
@@ -174,9 +168,6 @@ def test_a_bvh_character_keeps_its_skeleton(kick: Motion, tmp_path: Path):
         assert limbs_off(at, kick.joints) < 1
         low = np.minimum(at["left_foot"][:, 1], at["right_foot"][:, 1])
         np.testing.assert_allclose(np.median(low), np.median(kick.joints[..., 1].min(1)), atol=0.01)
-
-
-# Bad input ------------------------------------------------------------------------------------------------------------
 
 
 def test_names_of_joints_are_read_from_a_file(kick: Motion, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
@@ -268,9 +259,6 @@ def test_characters_that_cannot_be_used_are_refused(kick: Motion, tmp_path: Path
         characters.read(tmp_path / "missing.glb")
     with pytest.raises(UserError, match=r"out\.bvh: this character is a \.glb file"):
         kick.save(tmp_path / "out.bvh", character=tmp_path / "mixamo.glb")
-
-
-# Many files, and Blender ----------------------------------------------------------------------------------------------
 
 
 def test_a_folder_is_converted(kick: Motion, tmp_path: Path, capsys: pytest.CaptureFixture[str]):

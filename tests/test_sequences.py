@@ -203,9 +203,6 @@ def test_bad_words_and_scorers_are_one_line(model, tmp_path, capsys):
         assert message in capsys.readouterr().err
 
 
-# Targets in the world: way points, joint positions and poses ----------------------------------------------------------
-
-
 TEXT = "a person walks forward"
 
 
@@ -310,9 +307,6 @@ def test_targets_that_the_text_does_not_suggest_do_not_stretch_bones(model):
     target = {"joints": [{"time": 1.5, "joint": "right_wrist", "position": [None, 1.4, None]}]}
     lengths = bones(flame_mdm.generate(model, TEXT, seconds=3, targets=target, num_inference_steps=20)[0])
     assert np.abs(lengths / np.median(lengths, 0) - 1).max() < 0.15  # 0.6, if kept in the frame of the target alone
-
-
-# What sampling makes of texts: known forms of words, unknown words, and sentences of several actions ------------------
 
 
 CAPTIONS = ["A person walks forward.", "a person waves with the left hand", "someone jumps"]

@@ -156,9 +156,6 @@ def test_prompts_cover_actions_and_sides():
     assert ("a person waves with the left hand", {"action": "wave", "side": "left"}) in prompts()
 
 
-# Attributes read back from joints, and the skating of feet ------------------------------------------------------------
-
-
 def accuracy(motions: list[np.ndarray], requested: list[dict]) -> dict[str, float | None]:
     metric = AttributeAccuracy(FPS)
     for motion, attributes in zip(motions, requested, strict=True):

@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -31,15 +32,18 @@ from flame_mdm.sampler_options import SamplerOptions
 from flame_mdm.seeds import key, seeded_noise
 from flame_mdm.task import MotionGeneration
 
-SIZES = {"latent_dim": 16, "ff_size": 24, "num_layers": 2, "num_heads": 2, "channels": [8, 8, 16], "num_groups": 4}
+SIZES = {"latent_dim": 16, "ff_size": 24, "num_layers": 1, "num_heads": 2, "channels": [8, 16], "num_groups": 4}
 CONFIGS = {  # those that differ in more than their sizes
-    repr(config | {name: value for name, value in SIZES.items() if name in config}): path
+    repr(
+        [(key, SIZES.get(key, value)) for key, value in read_yaml(path).items() if key not in ("dropout", "max_frames")]
+    ): path
     for path in sorted((ROOT / "experiments" / "denoiser").glob("*.yaml"))
-    for config in [{key: value for key, value in read_yaml(path).items() if key not in ("dropout", "max_frames")}]
 }.values()
 NETWORKS = [(path, "learned") for path in CONFIGS]
 NETWORKS += [
-    (p, name) for p in CONFIGS if p.stem in ("flame_small", "mdm_encoder_small") for name in ("action", "none")
+    (p, "none" if p.stem == "flame_small" else "action")
+    for p in CONFIGS
+    if p.stem in ("flame_small", "mdm_encoder_small")
 ]
 NOTHING = Condition(torch.zeros(1, 0), torch.zeros(1, 0, 0), None)
 
@@ -92,18 +96,15 @@ def test_a_plan_leads_to_the_motion_of_the_sampler(process: Process, sampler: st
     )
 
 
-@pytest.mark.parametrize(
-    ("process", "sampler", "says"),
-    [
+def test_samplers_of_another_form_are_refused_in_one_line() -> None:
+    for process, sampler, says in (
         (GaussianDiffusion(50, variance="learned_range"), "ancestral", "learned variance"),
         (FlowMatching(), "rk4", "combines more than two"),
         (FlowMatching(), "dopri5", "chooses its own steps"),
         (FlowMatching(), "ddim", "unknown sampler"),
-    ],
-)
-def test_samplers_of_another_form_are_refused_in_one_line(process: Process, sampler: str, says: str) -> None:
-    with pytest.raises(UserError, match=says):
-        onnx.sampling_plan(process, SamplerOptions(sampler=sampler, num_inference_steps=6))
+    ):
+        with pytest.raises(UserError, match=says):
+            onnx.sampling_plan(process, SamplerOptions(sampler=sampler, num_inference_steps=6))
 
 
 def test_noise_and_words_of_the_runner_are_those_of_the_package() -> None:
@@ -128,7 +129,7 @@ def tiny(path: Path, condition: str) -> MotionGeneration:
     config["representation"] = {"_target_": "flame_mdm.representations.essential.Essential"}
     torch.manual_seed(0)
     model = MotionGeneration.build(config, instantiate(config["representation"]), actions=["walk", "run", "sit"])
-    model.facts |= {"max_frames": 40}
+    model.facts |= {"max_frames": 20}
     return model.eval()
 
 
@@ -143,17 +144,15 @@ def test_graphs_of_each_denoiser_compute_what_pytorch_does(path: Path, condition
         onnx.write_graph(graph, tmp_path / "denoiser.onnx", half=False)
         session = onnxruntime.InferenceSession(tmp_path / "denoiser.onnx")
         for batch, frames, words in ((1, 4, 3), (3, 17, 9)):
-            frames = 40 if isinstance(model.denoiser, onnx.FIXED_LENGTH) else frames
+            frames = 20 if isinstance(model.denoiser, onnx.FIXED_LENGTH) else frames
             lengths = torch.randint(2, frames + 1, (batch,))
-            inputs = {"x_t": torch.randn(batch, frames, model.representation.features), "t": torch.rand(batch) * 999}
-            inputs |= {"lengths": lengths}
+            x_t, t = torch.randn(batch, frames, model.representation.features), torch.rand(batch) * 999
+            inputs = {"x_t": x_t, "t": t, "lengths": lengths}
             if condition == "learned":
-                inputs |= {
-                    "condition": torch.randint(50, (batch, words, 2)),
-                    "counts": torch.randint(1, words + 1, (batch,)),
-                }
+                inputs["condition"] = torch.randint(50, (batch, words, 2))
+                inputs["counts"] = torch.randint(1, words + 1, (batch,))
             elif condition == "action":
-                inputs |= {"condition": torch.arange(batch)}
+                inputs["condition"] = torch.arange(batch)
             expected = graph.module(*inputs.values())
             output = torch.from_numpy(session.run(None, {name: x.numpy() for name, x in inputs.items()})[0])
             mask = length_mask(lengths, frames)
@@ -172,7 +171,7 @@ def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_the_runner_samples_the_motions_of_the_package_without_pytorch(exported: Path, tmp_path: Path) -> None:
     model = flame_mdm.load("quickstart")
     text, seconds = "a person kicks with the left foot twice", 2.2
-    for seed in (0, 1, 2):
+    for seed in (0, 1):
         out = tmp_path / f"{seed}.npz"
         words = [str(exported), text, str(out), f"seconds={seconds}", f"seed={seed}"]
         script = f"import sys, runpy; sys.argv = ['runner.py', *{words}]; sys.modules['torch'] = None\n"
@@ -195,28 +194,26 @@ def test_the_runner_samples_the_motions_of_the_package_without_pytorch(exported:
 
 @pytest.mark.slow
 @pytest.mark.timeout(900)
-@pytest.mark.parametrize(
-    ("file", "change", "says"),
-    [
-        ("joints.onnx", lambda data: data[:-9] + b"x" * 9, "joints.onnx has changed"),
-        ("model.json", lambda data: data[:-9], "not an exported model"),
-        ("model.json", lambda data: data.replace(b'"format": 1', b'"format": 2'), "not of format 1"),
-        ("model.json", lambda data: data.replace(b'"fps": 20', b'"fps": "x"'), "damaged: fps"),
-        ("model.json", lambda data: data.replace(b"[[49.0,", b"[[49.0, 1,"), "not an exported model"),
-        ("model.json", lambda data: data.replace(b'"fps": 20', b'"fps": 0'), "damaged: fps"),
-        ("model.json", lambda data: data.replace(b'"clip_x0"', b'"x0"'), "damaged: clip_x0"),
-        ("model.json", lambda data: re.sub(rb'"features": \d+', b'"features": 9', data), "do not match"),
-    ],
-)
-def test_a_changed_folder_is_refused_in_one_line(
-    exported: Path, tmp_path: Path, capfd: Any, file: str, change: Any, says: str
-) -> None:
-    for path in exported.iterdir():
-        (tmp_path / path.name).write_bytes(change(path.read_bytes()) if path.name == file else path.read_bytes())
-    assert runner.main([str(tmp_path), "walk", str(tmp_path / "out.npz")]) == 1
-    error = capfd.readouterr().err
-    assert says in error
-    assert error.count("\n") == 1
+def test_a_changed_folder_is_refused_in_one_line(exported: Path, tmp_path: Path, capfd: Any) -> None:
+    shutil.copytree(exported, tmp_path, dirs_exist_ok=True)
+    description = (exported / "model.json").read_bytes()
+    for changed, says in (
+        (description[:-9], "not an exported model"),
+        (description.replace(b'"format": 1', b'"format": 2'), "not of format 1"),
+        (description.replace(b'"fps": 20', b'"fps": "x"'), "damaged: fps"),
+        (description.replace(b"[[49.0,", b"[[49.0, 1,"), "not an exported model"),
+        (description.replace(b'"fps": 20', b'"fps": 0'), "damaged: fps"),
+        (description.replace(b'"clip_x0"', b'"x0"'), "damaged: clip_x0"),
+        (re.sub(rb'"features": \d+', b'"features": 9', description), "do not match"),
+        (description, "joints.onnx has changed"),
+    ):
+        (tmp_path / "model.json").write_bytes(changed)
+        if changed == description:
+            (tmp_path / "joints.onnx").write_bytes((exported / "joints.onnx").read_bytes()[:-9] + b"x" * 9)
+        assert runner.main([str(tmp_path), "walk", str(tmp_path / "out.npz")]) == 1
+        error = capfd.readouterr().err
+        assert says in error
+        assert error.count("\n") == 1
 
 
 def test_models_with_a_language_model_and_unknown_formats_are_refused(refused: Any, tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 import ast
 import importlib
 import importlib.util
+import pkgutil
 import re
 import shlex
 import shutil
@@ -55,16 +56,10 @@ def unknown_names(text: str) -> list[str]:
 
 def exists(name: str) -> bool:
     """Returns whether a dotted name is a module, or an attribute of one."""
-    parts = name.split(".")
-    for count in range(len(parts), 0, -1):
-        try:
-            value: Any = importlib.import_module(".".join(parts[:count]))
-        except ModuleNotFoundError:
-            continue
-        for part in parts[count:]:
-            value = getattr(value, part, None)
-        return value is not None
-    return False
+    try:
+        return pkgutil.resolve_name(name) is not None
+    except (ImportError, AttributeError):
+        return False
 
 
 def unknown_paths(text: str) -> list[str]:
@@ -226,8 +221,6 @@ def test_make_forwards_every_command_and_refuses_a_text_without_quotes():
     assert done.returncode == 2
     assert 'sample person walks: one command at a time; quote a value with spaces, as in TEXT="a' in done.stderr
 
-
-# The notebook and the site --------------------------------------------------------------------------------------------
 
 PACKAGES = ("flame_mdm", "evaluators", "docs")
 

@@ -182,6 +182,7 @@ def test_quick_results_few_motions_and_clips_left_out_are_marked(runs, tmp_path,
 
 def test_clips_that_may_have_been_seen_in_training_are_marked():
     data: Any = SimpleNamespace(store=SimpleNamespace(fingerprint="here"))
+    split: Any
     for model, extractor, split, reason in (
         ("other", "here", "test", "training data other and evaluated data here differ: splits may overlap"),
         ("here", "other", "test", "training data of the extractor other"),

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, TypeVar, get_type_hints
 
 from flame_mdm.config.composition import LAUNCH, choices, parse
-from flame_mdm.config.entry import STOP, guarded, make_variables
+from flame_mdm.config.entry import STOP, guarded, make_variables, sweep_flags
 from flame_mdm.config.signatures import check_kind
 from flame_mdm.errors import UserError, did_you_mean, say
 
@@ -114,9 +114,7 @@ def _jobs(kind: type[Settings], words: Sequence[str]) -> tuple[list[Settings], l
     """Returns the settings of each job of a command line, and the words for a launcher of Hydra, if there are any."""
     words = _with_keys(words, getattr(kind, "OBJECTS", ()), _annotations(kind))
     launcher = [word for word in words if word.partition("=")[0] == LAUNCH or word.startswith("hydra.")]
-    flags = [word for word in words if word.startswith("-")]
-    if unknown := [flag for flag in flags if flag not in ("-m", "--multirun")]:
-        raise UserError(f"unknown option {unknown[0]}. Available: --help, --multirun, and keys as key=value")
+    flags = sweep_flags(words)
     rest = [word for word in words if word not in launcher and word not in flags]
     if not flags and not launcher:
         return [read_settings(kind, rest)], []

@@ -23,8 +23,7 @@ _PACKAGE = Path(__file__).parent.parent
 EXPERIMENTS = _PACKAGE / "experiments" if (_PACKAGE / "experiments").is_dir() else _PACKAGE.parent / "experiments"
 """Folder of the recipes: inside the installed package, or next to it in a clone."""
 
-LAUNCH = "launch"
-"""The folder of `experiments/` with launchers, which start jobs on a cluster."""
+LAUNCH = "launch"  # the folder of `experiments/` with launchers, which start jobs on a cluster
 
 LONGEST_WORD = 2**17
 """Maximum length of a `key=value` argument in characters, as in Linux. Hydra parses longer ones slowly."""

@@ -10,11 +10,9 @@ from collections.abc import Callable, Sequence
 from flame_mdm.errors import UserError, first_line, say
 from flame_mdm.signals import stoppable
 
-STOP = (signal.SIGINT, signal.SIGTERM)
-"""Signals that end a command after it has cleaned up."""
+STOP = (signal.SIGINT, signal.SIGTERM)  # signals that end a command after it has cleaned up
 
-BUG = 70
-"""Exit code of a bug, as in sysexits.h."""
+BUG = 70  # exit code of a bug, as in sysexits.h
 REPORT = "this is a bug in flame_mdm. Please report it with the lines above and the command that you ran"
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
 
@@ -34,6 +32,14 @@ def make_variables() -> list[str]:
     names = [value for key, _, value in pairs if key == "EXP"]
     keys = [(key.lower() if key.isupper() else key, value) for key, _, value in pairs]
     return names + [f"{key}={value}" for key, value in keys if key not in ("exp", "python", "venv")]
+
+
+def sweep_flags(words: Sequence[str]) -> list[str]:
+    """Returns the words that request a sweep; raises `UserError` if there is another option."""
+    flags = [word for word in words if word.startswith("-")]
+    if unknown := [flag for flag in flags if flag not in ("-m", "--multirun")]:
+        raise UserError(f"unknown option {unknown[0]}. Available: --help, --multirun, and keys as key=value")
+    return flags
 
 
 def guarded(action: Callable[[], None], signums: Sequence[int] = ()) -> int:

@@ -24,21 +24,17 @@ from flame_mdm.config.composition import (
     recipes,
     resolve,
 )
-from flame_mdm.config.entry import STOP, guarded, make_variables
+from flame_mdm.config.entry import STOP, guarded, make_variables, sweep_flags
 from flame_mdm.config.signatures import Config, check
 from flame_mdm.errors import UserError, say
 
-FLAGS = ("--help", "--multirun", "-m", "--cfg", "--resolve", "--package")
-"""Options of Hydra that `train` accepts."""
-
 QUIET = ["hydra/job_logging=disabled", "hydra/hydra_logging=disabled", "hydra.output_subdir=null"]
 
-INTERRUPT = STOP[:1]
-"""Signals that end training before the first step; then training handles them itself."""
+INTERRUPT = STOP[:1]  # signals that end training before the first step; then training handles them itself
 
 
 def run_recipe(command: Callable[[Config], None], usage: str, argv: Sequence[str]) -> int:
-    """Runs a command line `RECIPE key=value ...` and returns the exit code; options of Hydra are passed on.
+    """Runs a command line `RECIPE key=value ... [--multirun]` and returns the exit code.
 
     `launch=...` passes each job of a sweep, or the only job, to that launcher, and waits for them.
     """
@@ -59,13 +55,11 @@ def _serve(command: Callable[[Config], None], words: Sequence[str], codes: list[
     if name.startswith("-") or "=" in name:
         raise UserError(f"the first word must name an experiment, such as quickstart, not '{name}'")
     recipe = find_recipe(name)
-    flags = [w for i, w in enumerate(words) if w.startswith("-") or (i and words[i - 1] in ("--cfg", "--package"))]
-    if unknown := [w for w in flags if w.startswith("-") and w.partition("=")[0] not in FLAGS]:
-        raise UserError(f"unknown option {unknown[0]}. Available: {', '.join(FLAGS)}, and keys as key=value")
+    flags = sweep_flags(words)
     plan = plan_composition(recipe, [w for w in words if w not in flags])
     parsed = parse(plan.overrides)
     launcher = [str(o.value()) for o in parsed if o.key_or_group == LAUNCH]
-    sweep = bool(launcher) or any(flag in ("-m", "--multirun") for flag in flags)
+    sweep = bool(launcher or flags)
     config = resolve(plan._replace(overrides=[first_choice(o) for o in parsed] if sweep else plan.overrides))
     check(config)
     _check_whole(config, name)
@@ -78,14 +72,13 @@ def _serve(command: Callable[[Config], None], words: Sequence[str], codes: list[
         codes.append(guarded(lambda: command(config), INTERRUPT))
         return codes[-1]
 
-    if not flags and not sweep:
+    if not sweep:
         start(config, [word for word in plan.overrides if not word.startswith("hydra.")])
         return
 
     def job(config: Any) -> None:
         hydra = HydraConfig.get()
-        if sweep:
-            config = OmegaConf.merge(config, {"run": {"dir": hydra.runtime.output_dir}})
+        config = OmegaConf.merge(config, {"run": {"dir": hydra.runtime.output_dir}})
         resolved: Config = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)  # type: ignore[assignment]
         check(resolved)
         HydraConfig.instance().cfg = None  # otherwise Lightning adds words for Hydra's command line
@@ -96,22 +89,17 @@ def _serve(command: Callable[[Config], None], words: Sequence[str], codes: list[
 
     fixed = [repr(o.key_or_group) for o in parsed if not o.is_sweep_override()]
     output = [
-        "hydra.run.dir=${run.dir}",
         "hydra.sweep.dir=${run.dir}",
         "hydra.sweep.subdir=${hydra.job.override_dirname}",
         f"hydra.job.config.override_dirname.exclude_keys=[{','.join(fixed)}]",
     ]
     if launcher:
         say(f"waiting for the jobs; their output is in {config['run']['dir']}/.submitit")
-    if sweep and not {"-m", "--multirun"} & set(flags):
-        flags.append("--multirun")
-    _hydra(job, plan.folder, plan.stem, [*flags, *output, *plan.overrides])
+    _hydra(job, plan.folder, plan.stem, [*output, *plan.overrides])
 
 
 def launch(jobs: Sequence[Callable[[], int]], words: Sequence[str], folder: Path) -> None:
-    """Passes jobs to a launcher of Hydra, given as `launch=NAME` and its keys, and waits; output is written to
-    `folder`.
-    """
+    """Passes jobs to a launcher of Hydra, given as `launch=NAME` and its keys, and waits; they write to `folder`."""
     resolve(plan_composition(find_recipe("quickstart"), words))  # checks the words
     say(f"waiting for the jobs; their output is in {folder}/.submitit")
 
@@ -122,11 +110,11 @@ def launch(jobs: Sequence[Callable[[], int]], words: Sequence[str], folder: Path
     numbers = ",".join(map(str, range(len(jobs))))
     launcher = [f"+{word}" if word.startswith(f"{LAUNCH}=") else word for word in words]
     output = [f"hydra.sweep.dir={folder}", "hydra.sweep.subdir=${job}"]
-    _hydra(job, EXPERIMENTS, None, ["--multirun", *output, *launcher, f"+job={numbers}"])
+    _hydra(job, EXPERIMENTS, None, [*output, *launcher, f"+job={numbers}"])
 
 
 def _hydra(job: Callable[[Any], None], folder: Path, name: str | None, words: Sequence[str]) -> None:
-    sys.argv = [sys.argv[0], *words, *QUIET]
+    sys.argv = [sys.argv[0], "--multirun", *words, *QUIET]
     GlobalHydra.instance().clear()
     hydra_main(version_base="1.3", config_path=str(folder), config_name=name)(job)()
 
@@ -136,7 +124,6 @@ POSITIVE = ("val_check_interval", "log_every_n_steps", "accumulate_grad_batches"
 
 
 def _check_whole(config: Config, name: str) -> None:
-    """Raises `UserError` if a part or key that a run needs is missing, or a value is out of range."""
     plain(config, name)  # otherwise the checkpoints of the run would be refused
     values = ("experiment", "seed", "ema", "logger")
     for key in ("run", "trainer", "data", "representation", "task", "optimizer", "callbacks", *values):

@@ -58,13 +58,13 @@ class MotionGenerator(Model, nn.Module):
 
         process: Process = part("process")
         condition: ConditionEncoder = part("condition", num_actions=len(actions))
-        width = representation.features
+        width, crop = representation.features, config.get("data", {}).get("crop")
         denoiser: Denoiser = part(
             "denoiser",
             in_features=width,
             out_features=process.out_features(width),
             cond_features=condition.features,
-            length_unit=_length_unit(config),
+            length_unit=crop.get("unit", 1) if isinstance(crop, dict) else 1,  # of all lengths in training
         )
         model = cls.of_parts(config, denoiser, process, condition, representation)
         model.config, model.facts = config, {"actions": list(actions)}
@@ -175,11 +175,7 @@ class DistilledGenerator(MotionGenerator):
         self.process.edit_modes = tuple(mode for mode in self.process.edit_modes if mode != "trajectory")
 
     def generate(self, batch: MotionBatch, options: SamplerOptions | None = None, **keywords: Any) -> Tensor:
-        """See `MotionGenerator.generate`.
-
-        Raises:
-            UserError: If guidance or motions without condition are requested, as the student has learned neither.
-        """
+        """See `MotionGenerator.generate`; a student has learned neither guidance nor motions without condition."""
         scale = None if options is None else options.guidance_scale
         if scale not in (None, 1):
             raise UserError(f"guidance_scale={scale}: the guidance is built into this distilled model. Omit it")
@@ -187,10 +183,3 @@ class DistilledGenerator(MotionGenerator):
             needed = self.condition.reads
             raise UserError(f"this distilled model needs a {needed}: it did not learn to sample without. Add one")
         return super().generate(batch, options, **keywords)
-
-
-def _length_unit(config: Config) -> Any:
-    """Returns the number of which all lengths in training are multiples; 1 for imported models without a data set."""
-    data = config.get("data")
-    crop = data.get("crop") if isinstance(data, dict) else None
-    return crop.get("unit", 1) if isinstance(crop, dict) else 1

@@ -3,10 +3,12 @@
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 
+import torch
 from torch import Tensor, nn
 
 from flame_mdm.batch import Condition, Denoise, Edit, Noise
 from flame_mdm.errors import UserError
+from flame_mdm.losses import masked_mse
 from flame_mdm.processes.samplers import Sampler
 from flame_mdm.sampler_options import SamplerOptions
 
@@ -58,7 +60,6 @@ class Process(nn.Module, ABC):
     def grid(self, count: int) -> list[float]:
         """Returns `count` evenly spaced times, at most all, from pure noise to one interval before the data."""
 
-    @abstractmethod
     def loss(
         self,
         denoise: Denoise,
@@ -70,10 +71,20 @@ class Process(nn.Module, ABC):
         noise: Tensor | None = None,
         auxiliary: Auxiliary | None = None,
     ) -> dict[str, Tensor]:
-        """Returns training losses per sample, (B,) each, by name; "loss" is their sum.
+        """Returns training losses (B,) per sample: "mse" of the target, those of `auxiliary`, and "loss", their sum.
 
         Times t (B,) and noise (B, F, D) are drawn from torch's default generator if not given.
         """
+        if t is None:
+            t = self.training_times(torch.rand(len(x), device=x.device))
+        if noise is None:
+            noise = torch.randn_like(x)
+        x_t = self.corrupt(x, noise, t)
+        output = denoise(x_t, self.table_time(t), mask, cond).to(x_t.dtype)
+        terms = {"mse": masked_mse(output, self.target(x, noise, t), mask)}
+        if auxiliary is not None:
+            terms |= auxiliary(self.to_x0(output, x_t, t), x, mask)
+        return terms | {"loss": torch.stack(list(terms.values())).sum(0)}
 
     @abstractmethod
     def sample(

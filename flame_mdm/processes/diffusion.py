@@ -87,9 +87,6 @@ class GaussianDiffusion(Process):
             noise.
         min_snr: weight of a step's squared error is that of min(SNR, min_snr) on the clean motion (Hang et al.
             2023, eq. 4, there 5). None = 1, whatever is predicted.
-
-    Raises:
-        UserError: If an option has an unknown value, or needs prediction epsilon.
     """
 
     edit_modes = ("x0", "x_t")
@@ -225,10 +222,11 @@ class GaussianDiffusion(Process):
         divergence with the clipped posterior variance, as in FLAME's code.
         """
         real = self.schedule.posterior_mean(x, x_t, t)
-        real_log_variance = self.schedule.at("posterior_log_variance", t, x_t)
         mean = self.schedule.posterior_mean(self.to_x0(output, x_t, t).detach(), x_t, t)
         log_variance = torch.as_tensor(self.log_variance(output, x_t, t, self.schedule))
-        return _normal_kl(real, torch.as_tensor(real_log_variance), mean, log_variance)
+        # KL divergence of two normal distributions
+        difference = torch.as_tensor(self.schedule.at("posterior_log_variance", t, x_t)) - log_variance
+        return 0.5 * (difference.exp() - 1 - difference + (real - mean).square() * (-log_variance).exp())
 
     def sample(
         self,
@@ -299,9 +297,3 @@ class GaussianDiffusion(Process):
                 f"sampling steps must be at least 2 distinct steps from 0 to {total - 1}, increasing: got {steps}"
             )
         return steps
-
-
-def _normal_kl(mean: Tensor, log_variance: Tensor, other_mean: Tensor, other_log_variance: Tensor) -> Tensor:
-    """Returns the elementwise KL divergence of one normal distribution from another, in nats."""
-    difference = log_variance - other_log_variance
-    return 0.5 * (difference.exp() - 1 - difference + (mean - other_mean).square() * (-other_log_variance).exp())

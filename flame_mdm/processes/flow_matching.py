@@ -9,8 +9,7 @@ from torch import Tensor
 
 from flame_mdm.batch import Condition, Denoise, Edit, Noise
 from flame_mdm.errors import UserError
-from flame_mdm.losses import masked_mse
-from flame_mdm.processes import Auxiliary, Process, check_choice, samplers
+from flame_mdm.processes import Process, check_choice, samplers
 from flame_mdm.sampler_options import SamplerOptions
 
 TimeDistribution = Literal["uniform", "logit_normal"]
@@ -28,9 +27,6 @@ class FlowMatching(Process):
         quantize_time: pass floor(1000 t), a row of the time table, to the denoiser, as in MFM's code.
         odeint_grid: use float32 multiples of 1 / N as times, like torchdiffeq's Euler steps in MFM's code. For some
             N, a time is one row of the table lower than with N equal steps (never for 10, 20 or 30).
-
-    Raises:
-        UserError: If the prediction or time distribution is unknown, or sigma_min is not in [0, 1).
     """
 
     edit_modes = ("trajectory", "x0")
@@ -66,6 +62,7 @@ class FlowMatching(Process):
         return t * x + (1 - (1 - self.sigma_min) * t) * noise
 
     def target(self, x: Tensor, noise: Tensor, t: Tensor) -> Tensor:
+        """See `Process.target`: the velocity (Lipman et al. 2023, eq. 23) or the clean motion."""
         return x if self.prediction == "x0" else x - (1 - self.sigma_min) * noise
 
     def to_x0(self, output: Tensor, x_t: Tensor, t: Tensor) -> Tensor:
@@ -79,38 +76,14 @@ class FlowMatching(Process):
         # Always in float32: models were trained with this rounding.
         return (t.to(torch.float32) * 1000).floor() if self.quantize_time else t * 1000
 
-    def times(self, num_inference_steps: int) -> list[float]:
-        """Returns the N + 1 times from 0 to 1 that bound the steps."""
-        count = num_inference_steps
+    def times(self, count: int) -> list[float]:
+        """Returns the N + 1 times from 0 to 1 that bound N = `count` steps."""
         if self.odeint_grid:
             return [*(torch.arange(count, dtype=torch.float32) * (1 / count)).tolist(), 1.0]
         return [i / count for i in range(count + 1)]
 
     def grid(self, count: int) -> list[float]:
         return self.times(count)[:-1]
-
-    def loss(
-        self,
-        denoise: Denoise,
-        x: Tensor,
-        mask: Tensor,
-        cond: Condition,
-        *,
-        t: Tensor | None = None,
-        noise: Tensor | None = None,
-        auxiliary: Auxiliary | None = None,
-    ) -> dict[str, Tensor]:
-        """Returns the terms "mse" of the velocity (Lipman et al. 2023, eq. 23), those of `auxiliary`, and "loss"."""
-        if t is None:
-            t = self.training_times(torch.rand(len(x), device=x.device))
-        if noise is None:
-            noise = torch.randn_like(x)
-        x_t = self.corrupt(x, noise, t)
-        output = denoise(x_t, self.table_time(t), mask, cond).to(x_t.dtype)
-        terms = {"mse": masked_mse(output, self.target(x, noise, t), mask)}
-        if auxiliary is not None:
-            terms |= auxiliary(self.to_x0(output, x_t, t), x, mask)
-        return terms | {"loss": torch.stack(list(terms.values())).sum(0)}
 
     def sample(
         self,

@@ -1,7 +1,7 @@
 """Noise schedules of Gaussian diffusion: coefficients, and selection of sampling steps."""
 
 import math
-from typing import Literal, get_args
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -30,9 +30,8 @@ def linear_betas(num_train_timesteps: int) -> Tensor:
     reached below T = 21.
     """
     scale = 1000 / num_train_timesteps
-    return torch.linspace(scale * 1e-4, scale * 0.02, num_train_timesteps, dtype=torch.float64, device="cpu").clamp(
-        max=0.999
-    )
+    betas = torch.linspace(scale * 1e-4, scale * 0.02, num_train_timesteps, dtype=torch.float64, device="cpu")
+    return betas.clamp(max=0.999)
 
 
 class Schedule:
@@ -96,11 +95,12 @@ class Schedule:
 
 def build_schedule(name: ScheduleName, num_train_timesteps: int) -> Schedule:
     """Returns the schedule of this name with 2 to `MAX_STEPS` steps."""
-    if name not in get_args(ScheduleName):
-        raise UserError(f"unknown schedule '{name}': choose from {', '.join(get_args(ScheduleName))}")
+    betas = {"cosine": cosine_betas, "linear": linear_betas}
+    if name not in betas:
+        raise UserError(f"unknown schedule '{name}': choose from {', '.join(betas)}")
     if not 2 <= num_train_timesteps <= MAX_STEPS:
         raise UserError(f"num_train_timesteps is {num_train_timesteps}: a diffusion has 2 to {MAX_STEPS:,} steps")
-    return Schedule({"cosine": cosine_betas, "linear": linear_betas}[name](num_train_timesteps))
+    return Schedule(betas[name](num_train_timesteps))
 
 
 def timesteps(num_train_timesteps: int, num_inference_steps: int, spacing: str = "linspace") -> list[int]:
@@ -108,10 +108,8 @@ def timesteps(num_train_timesteps: int, num_inference_steps: int, spacing: str =
 
     The spacing "linspace" gives evenly spaced steps including both ends, rounded half to even ("N" in the code of MDM
     and FLAME, after Nichol and Dhariwal 2021). "stride" counts from 0 with the smallest integer stride that gives N
-    steps, so that the last, noisiest step may be well below T - 1 ("ddimN" there, after Song et al. 2021).
-
-    Raises:
-        UserError: If N is not in 1 ... T, the spacing is unknown, or no stride gives N steps.
+    steps, so that the last, noisiest step may be well below T - 1 ("ddimN" there, after Song et al. 2021). Raises
+    `UserError` if N is not in 1 ... T, the spacing is unknown, or no stride gives N steps.
     """
     total, count = num_train_timesteps, num_inference_steps
     if not 1 <= count <= total:

@@ -17,7 +17,7 @@ from support.motions import synthetic
 import flame_mdm
 from flame_mdm.errors import UserError
 from flame_mdm.formats import characters
-from flame_mdm.formats.joint_names import known_skeletons
+from flame_mdm.formats.characters import known_skeletons
 
 pytestmark = [pytest.mark.tools, pytest.mark.slow, pytest.mark.timeout(900)]
 WALK = {"sentence": "a person walks forward", "seconds": 2.2, "seed": 1, "in_place": False, "onto_selected": False}

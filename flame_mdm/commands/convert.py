@@ -58,11 +58,11 @@ def main(settings: ConvertSettings) -> None:
     if wrong := [target for target in targets if target.suffix.lower() not in WRITTEN]:
         raise UserError(f"{wrong[0]}: unknown kind of motion file. Use one of {', '.join(WRITTEN)}")
 
-    from flame_mdm.formats import characters, joint_names
+    from flame_mdm.formats import characters
 
     try:
         character = None if hero is None else characters.read(hero)
-    except joint_names.UnknownJoints as error:
+    except characters.UnknownJoints as error:
         say(*error.template)
         raise
     for target, file in ProgressBar(targets.items(), desc="convert", unit="file", disable=not path.is_dir()):
@@ -70,7 +70,6 @@ def main(settings: ConvertSettings) -> None:
 
 
 def _targets(settings: ConvertSettings, folder: Path, out: Path) -> dict[Path, Path]:
-    """Returns the files to write, and the motion file of each, for all motion files of a folder."""
     ending = settings.format or (Path(settings.character).suffix[1:].lower() if settings.character else None)
     if ending is None:
         raise UserError(f"{folder} is a folder: name the format of the files too, such as format=glb")

@@ -39,15 +39,12 @@ def read(path: Path, fps: float | None) -> Bvh:
     """Reads an AMC file and its skeleton as a tree of joints; each bone gives a joint of its name at its start.
 
     AMC files do not contain `fps`: it is 120 for most of CMU's recordings.
-
-    Raises:
-        FileNotFoundError, UserError: If a file is missing or damaged, with its line, or there is no frame rate.
     """
-    text = read_text(path)
+    lines = _Lines(path)
     bones, parents = read_skeleton(skeleton_of(path))
     if fps is None:
         raise UserError(f"{path}: AMC files contain no frame rate: give fps=120, or `fps: 120` in skeleton.yaml")
-    angles = _angles(_Lines(text, str(path)), bones)
+    angles = _angles(lines, bones)
     names = tuple(bones)
     columns, channels = [], []
     for name, bone in bones.items():
@@ -86,7 +83,7 @@ def skeleton_of(path: Path) -> Path:
 
 def read_skeleton(path: Path) -> tuple[dict[str, Bone], dict[str, str]]:
     """Returns the bones of an ASF file, parents before their children, and the parent of each bone but the root."""
-    lines = _Lines(read_text(path), str(path))
+    lines = _Lines(path)
     root = Bone(np.zeros(3), Rotation.identity(), "XYZ", (*MOVES, *TURNS))
     read: dict[str, Bone] = {"root": root}
     parents: dict[str, str] = {}
@@ -156,8 +153,8 @@ def _angles(lines: _Lines, bones: dict[str, Bone]) -> dict[str, np.ndarray]:
 class _Lines:
     """The lines of a file as words, without comments; tracks the line number for error messages."""
 
-    def __init__(self, text: str, name: str):
-        self.text, self.name, self.line = text, name, 1
+    def __init__(self, path: Path):
+        self.path, self.text, self.line = path, read_text(path), 1
 
     def __iter__(self) -> Iterator[list[str]]:
         for number, line in enumerate(self.text.removeprefix("\ufeff").splitlines(), 1):
@@ -166,7 +163,7 @@ class _Lines:
                 yield words
 
     def fail(self, what: str) -> NoReturn:
-        raise UserError(f"{self.name}, line {self.line}: {what}")
+        raise UserError(f"{self.path}, line {self.line}: {what}")
 
     def numbers(self, words: list[str], count: int) -> list[float]:
         """Returns the words as `count` finite numbers."""

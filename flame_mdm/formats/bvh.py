@@ -97,13 +97,10 @@ class Bvh:
         return forward_kinematics(self.parents, self.rotations(), self.translations())[0]
 
     def resample(self, fps: float) -> tuple[np.ndarray, np.ndarray]:
-        """Resamples the local motion to times 0, 1/fps, 2/fps, ... up to the last frame.
+        """Returns rotations (F', J, 3, 3) and translations (F', J, 3) at times 0, 1/fps, ... up to the last frame.
 
         Rotations are interpolated on the sphere (slerp) and translations linearly. Unlike with interpolated joint
         positions, bones whose translation does not change keep their exact length.
-
-        Returns:
-            Rotations (F', J, 3, 3) and translations (F', J, 3), F' = floor((F - 1) * fps / self.fps) + 1.
         """
         before, after, share = frame_pairs(len(self.frames), self.fps, fps, len(self.joints), slack=0)
         translations = self.translations()
@@ -184,11 +181,14 @@ def parse(data: bytes, name: str) -> Bvh:
         source.fail(f"expected MOTION at the end of its line, found {source.text[:40]}")
 
     count = int(source.labeled(r"Frames:\s*(\d{1,18})", "Frames: and a number"))
-    fps = _fps(
-        source.labeled(r"Frame Time:\s*((?:\d+(?:\.\d+)?|\.\d+)(?:E[-+]?\d+)?)", "Frame Time: and a number of seconds")
-    )
-    if fps is None:
+    pattern = r"Frame Time:\s*((?:\d+(?:\.\d+)?|\.\d+)(?:E[-+]?\d+)?)"
+    seconds = source.labeled(pattern, "Frame Time: and a number of seconds")
+    time = float(seconds)
+    if not 1 / RATES[1] <= time <= 1 / RATES[0]:
         source.fail(f"the frame time must be between {1 / RATES[1]:g} and {1 / RATES[0]:g} seconds")
+    # a rounded time (0.0333333 for 1/30) means the integer, or resampling could move the last frame past the end
+    whole, last_digit = max(round(1 / time), 1), 10.0 ** int(Decimal(seconds).as_tuple().exponent)
+    fps = float(whole) if abs(1 / whole - time) < min(last_digit, 0.01 * time) else 1 / time
     return Bvh(
         tuple(joints),
         tuple(parents),
@@ -297,19 +297,6 @@ def write(bvh: Bvh, path: str | Path) -> None:
     lines += ["MOTION", f"Frames: {len(bvh.frames)}", f"Frame Time: {1 / bvh.fps!r}"]
     lines += map(_numbers, bvh.frames[:, np.r_[tuple(columns[joint] for joint in order)]])
     write_text(path, "\n".join(lines) + "\n")
-
-
-def _fps(seconds: str) -> float | None:
-    """Returns frames per second from a frame time in text; None if it is out of range.
-
-    A rounded time (0.0333333 for 1/30) means the integer, or resampling could move the last frame past the end.
-    """
-    time = float(seconds)
-    if not 1 / RATES[1] <= time <= 1 / RATES[0]:
-        return None
-    whole = max(round(1 / time), 1)
-    last_digit = 10.0 ** int(Decimal(seconds).as_tuple().exponent)
-    return float(whole) if abs(1 / whole - time) < min(last_digit, 0.01 * time) else 1 / time
 
 
 def _numbers(row: np.ndarray) -> str:

@@ -8,20 +8,23 @@ that they have in the rest pose.
 """
 
 import copy
+import json
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from flame_mdm.errors import UserError
+from flame_mdm.errors import UserError, did_you_mean
 from flame_mdm.formats import bvh, glb
-from flame_mdm.formats.joint_names import identify
-from flame_mdm.formats.retarget import continuous_euler
-from flame_mdm.formats.rig import RestPose, Rig, follow, rest_pose
+from flame_mdm.formats.layouts import LAYOUTS
+from flame_mdm.formats.retarget import continuous_euler, joint_names, presets
+from flame_mdm.formats.rig import RestPose, Rig, follow, matched, plain, recognized, rest_pose
 from flame_mdm.representations.skeleton import SMPL22
+from flame_mdm.safe_io import read_yaml
 from flame_mdm.visualize.body import fit_body
-from flame_mdm.visualize.posture import world_rotations
+from flame_mdm.visualize.posture import JOINT, world_rotations
 from flame_mdm.visualize.scene import Shown
 
 
@@ -35,9 +38,7 @@ class Character(RestPose):
 def read(path: str | Path) -> Character:
     """Reads a character. Names of joints are those of a known skeleton, or are in a `.yaml` file of the same name.
 
-    Raises:
-        FileNotFoundError, UserError: If the file is missing or damaged, or has no skin, known joints (`UnknownJoints`)
-            or usable rest pose.
+    Raises `UserError` if the file is damaged, or has no skin, known joints (`UnknownJoints`) or usable rest pose.
     """
     path = Path(path)
     if path.suffix.lower() == ".glb":
@@ -115,14 +116,66 @@ def _rest(file: glb.Glb, pelvis: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def moved(character: Character, motion: Shown) -> tuple[np.ndarray, np.ndarray, Rig]:
-    """Moves a character as in a motion; see `follow`.
-
-    Raises:
-        UserError: If the skeleton of the motion is not SMPL's, or a limb is much longer or shorter than people's.
-    """
+    """Moves a character as in a motion; see `follow`."""
     poses, body = motion.posed(), fit_body(motion)
     joints, world = motion.joints[:, : len(SMPL22)], world_rotations(body.local()) @ body.neutral
     return follow(character, joints, poses.offsets.numpy(), body.neutral, world)
+
+
+# Names of joints ------------------------------------------------------------------------------------------------------
+
+
+class UnknownJoints(UserError):
+    """Some joints could not be identified; `template` has the lines of a file of names, to be completed by the user."""
+
+    def __init__(self, message: str, template: list[str]):
+        super().__init__(message)
+        self.template = template
+
+
+def identify(path: Path, names: Mapping[int, str]) -> dict[str, int]:
+    """Returns the numbers of the joints that correspond to SMPL's, among numbers -> names of a character.
+
+    They are those of a known skeleton, or are listed in a file of the character's name that ends in .yaml. Raises
+    `UnknownJoints` if required joints are missing.
+    """
+    listed = path.with_suffix(".yaml")
+    chosen = read_yaml(listed) if listed.exists() else None
+    candidates = _listed(path, listed, chosen, names) if chosen else recognized(names, known_skeletons())
+    numbers, missing = matched(path, names, candidates)
+    if twice := next((joint for joint, number in numbers.items() if list(numbers.values()).count(number) > 1), None):
+        raise UserError(f"{listed}: {names[numbers[twice]]} is listed for {twice} and for another joint. Remove one")
+    if missing:
+        own = {joint: f" {json.dumps(names[number])}" for joint, number in numbers.items()}
+        template = [f"# Joints of {path.name}: {', '.join(names.values())}"]
+        template += [f"{joint}:{own.get(joint, '')}" for joint in JOINT]
+        raise UnknownJoints(
+            f"{path}: no joint found for {', '.join(missing)}. Write the names of the joints into {listed}, as in the "
+            "lines above; only spine, neck, head, collars and feet may stay empty",
+            template,
+        )
+    return numbers
+
+
+def _listed(path: Path, listed: Path, chosen: object, names: Mapping[int, str]) -> dict[str, list[int]]:
+    if not isinstance(chosen, dict) or not all(isinstance(name, str | None) for name in chosen.values()):
+        raise UserError(f"{listed}: not a list of names, each on a line such as `left_knee: Calf L`")
+    if unknown := next((joint for joint in chosen if joint not in JOINT), None):
+        raise UserError(f"{listed}: {unknown} is no joint of SMPL.{did_you_mean(str(unknown), JOINT)}")
+    candidates = {}
+    for joint, name in chosen.items():
+        if name is not None:
+            candidates[joint] = [number for number, own in names.items() if own == name]
+            if not candidates[joint]:
+                similar = did_you_mean(name, names.values())
+                raise UserError(f"{listed}: {joint}: {path} has no joint {name}.{similar}")
+    return candidates
+
+
+def known_skeletons() -> list[dict[str, str]]:
+    """Returns the joints of known skeletons: `plain` name -> joint of SMPL."""
+    skeletons = [*map(joint_names, presets().values()), LAYOUTS["SMPL"].map, LAYOUTS["Bandai-Namco"].map]
+    return [{plain(name): joint for joint, name in map.items() if isinstance(name, str)} for map in skeletons]
 
 
 # Writing --------------------------------------------------------------------------------------------------------------

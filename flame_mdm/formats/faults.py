@@ -119,10 +119,8 @@ def _bends(joints: np.ndarray, names: Sequence[str]) -> tuple[np.ndarray, np.nda
     """Finds knees that bend forward, judged by the direction of the foot, and knees and elbows folded into the limb."""
     limit, flags, worst = LIMITS["limit"][0], np.zeros(joints.shape[:2], bool), np.zeros(joints.shape[:2])
     for side in ("left", "right"):
-        for chain in (
-            (f"{side}_hip", f"{side}_knee", f"{side}_ankle"),
-            (f"{side}_shoulder", f"{side}_elbow", f"{side}_wrist"),
-        ):
+        for limb in (("hip", "knee", "ankle"), ("shoulder", "elbow", "wrist")):
+            chain = [f"{side}_{name}" for name in limb]
             upper, middle, lower = (joints[:, names.index(name)] for name in chain)
             a, b = unit(middle - upper), unit(lower - middle)
             bend = np.degrees(np.arccos(np.clip((a * b).sum(-1), -1, 1)))

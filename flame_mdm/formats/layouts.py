@@ -95,28 +95,20 @@ def read_tree(path: Path, rate: float | None = None) -> bvh.Bvh:
     return file if rate is None else replace(file, fps=rate)
 
 
-def read_bvh(
-    path: Path, fps: float | None = None, fields: Mapping[str, Any] = {}, rate: float | None = None
+def map_bvh(
+    path: Path, file: bvh.Bvh, fps: float | None, fields: Mapping[str, Any]
 ) -> tuple[np.ndarray, float, Layout]:
-    """Reads the joints of SMPL from a BVH or AMC file with a known skeleton.
+    """Returns the joints of SMPL in a BVH or AMC file with a known skeleton.
 
     Args:
-        path: the file.
+        path, file: the file, and what `read_tree` read.
         fps: target frames per second; None = those of the file. Rotations are interpolated, so bones keep their length.
         fields: fields of `Layout` that override the known ones. Known skeletons whose arrays are in meters are in
             centimeters in BVH files, as written by `flame_mdm.formats`.
-        rate: overrides the frame rate of the file; AMC files have none.
 
     Returns:
         Joints (F, 22, 3) float32 in meters, y up; frames per second; the layout of the file, with its frame rate.
     """
-    return map_bvh(path, read_tree(path, rate), fps, fields)
-
-
-def map_bvh(
-    path: Path, file: bvh.Bvh, fps: float | None, fields: Mapping[str, Any]
-) -> tuple[np.ndarray, float, Layout]:
-    """Returns what `read_bvh` returns, of a file that is already read."""
     ended = file.with_end_joints()
     names = [name.rpartition(":")[2] for name in ended.joints]
     if "map" not in fields:

@@ -38,11 +38,9 @@ def depths(joints: np.ndarray, names: Sequence[str], side: str) -> tuple[np.ndar
 
 def _away(points: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:
     """Returns vectors (F, P, 3) to points (F, P, 3) from the nearest point of a segment with ends (F, 3)."""
-    axis = (end - start)[:, None]
-    share = ((points - start[:, None]) * axis).sum(-1, keepdims=True) / np.maximum(
-        (axis**2).sum(-1, keepdims=True), 1e-9
-    )
-    return points - start[:, None] - np.clip(share, 0, 1) * axis
+    axis, points = (end - start)[:, None], points - start[:, None]
+    share = (points * axis).sum(-1, keepdims=True) / np.maximum((axis**2).sum(-1, keepdims=True), 1e-9)
+    return points - np.clip(share, 0, 1) * axis
 
 
 def _length(bones: np.ndarray) -> float:

@@ -160,7 +160,9 @@ class Motion:
         elif ending == ".json":
             what = _write_json(self, path)
         elif ending == ".npy":
-            what = _write_npy(self, path)
+            with atomic_write(path) as temporary:
+                np.save(temporary, self.joints)
+            what = f"joints {self.joints.shape} in meters, y up; the file does not contain the frame rate"
         else:
             what = _write_video(self, path, body)
         return f"{path}: {len(self.joints)} frames at {self.fps:g} per second, {what}"
@@ -237,25 +239,18 @@ def _write_bvh(motion: Motion, path: Path, rest_pose: bool, rig: str | None) -> 
     moving = [skeleton.moving or joint <= skeleton.hips for joint in range(len(offsets))]
     offsets[skeleton.hips] = 0  # programs disagree on whether the channels replace the offset or add to it
     ends = {skeleton.sources.index(SMPL22.joints.index(name)): site for name, site in END_SITES.items()}
+    moves = [("Xposition", "Yposition", "Zposition") * free for free in moving]
+    turning = [tuple(f"{axis}rotation" for axis in order) for order in skeleton.orders]
+    columns = [part for j, free in enumerate(moving) for part in ([positions[:, j]] * free + [angles[:, j]])]
     bvh.write(
         bvh.Bvh(
             joints=skeleton.joints,
             parents=skeleton.parents,
             offsets=offsets,
-            channels=tuple(
-                ("Xposition", "Yposition", "Zposition") * moves + tuple(f"{axis}rotation" for axis in order)
-                for moves, order in zip(moving, skeleton.orders, strict=True)
-            ),
+            channels=tuple(first + then for first, then in zip(moves, turning, strict=True)),
             end_parents=tuple(ends),
             end_offsets=np.stack([site @ skeleton.neutral[joint] for joint, site in ends.items()]) / skeleton.unit,
-            frames=np.concatenate(
-                [
-                    part
-                    for joint, moves in enumerate(moving)
-                    for part in ([positions[:, joint]] * moves + [angles[:, joint]])
-                ],
-                axis=1,
-            ),
+            frames=np.concatenate(columns, axis=1),
             fps=motion.fps,
         ),
         path,
@@ -279,12 +274,6 @@ def _write_json(motion: Motion, path: Path) -> str:
     }
     write_text(path, json.dumps(content, separators=(",", ":"), ensure_ascii=False))
     return f"{len(motion.skeleton)} joints in meters, y up"
-
-
-def _write_npy(motion: Motion, path: Path) -> str:
-    with atomic_write(path) as temporary:
-        np.save(temporary, motion.joints)
-    return f"joints {motion.joints.shape} in meters, y up; the file does not contain the frame rate"
 
 
 def _write_video(motion: Motion, path: Path, body: Mesh | None) -> str:

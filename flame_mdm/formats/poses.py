@@ -61,12 +61,8 @@ def solve(joints: Tensor, fps: float) -> Poses:
     and elbows bend like hinges, the spine twists evenly from pelvis to chest, and all other joints follow their parent.
     The rotations of head, hands and toes are not observable.
 
-    Args:
-        joints: (F, 22, 3) positions in meters, y up, in the order of `SMPL22`.
-        fps: frames per second.
-
-    Raises:
-        UserError: If the joints are of another skeleton, or a bone has no length.
+    Joints (F, 22, 3) are in meters, y up, in the order of `SMPL22`. Raises `UserError` if they are of another skeleton,
+    or a bone has no length.
     """
     if joints.ndim != 3 or not len(joints) or joints.shape[1:] != (len(SMPL22), 3):
         raise UserError(

@@ -1,8 +1,7 @@
 """Readers of motion files; writers are in `flame_mdm.formats.motion`. `docs/formats.md` describes the files."""
 
 import math
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,7 @@ from torch import Tensor
 from flame_mdm.errors import UserError
 from flame_mdm.formats import ENDINGS, TREES
 from flame_mdm.formats.body import check_size, leg_length
-from flame_mdm.formats.layouts import array_layout, read_bvh
+from flame_mdm.formats.layouts import array_layout, map_bvh, read_tree
 from flame_mdm.formats.motion import AMASS_AXES, Motion, motion_of_poses
 from flame_mdm.formats.poses import Poses
 from flame_mdm.formats.resampling import check_frames, frame_pairs, frame_rate, resample
@@ -21,7 +20,7 @@ from flame_mdm.representations import rotation
 from flame_mdm.representations.motion272 import Motion272
 from flame_mdm.representations.skeleton import SKELETONS, SMPL22, Skeleton
 from flame_mdm.representations.smpl import ADULT, read_pose
-from flame_mdm.safe_io import MEBIBYTE, read_json, read_npy, read_npz, regular_file
+from flame_mdm.safe_io import MEBIBYTE, naming, read_json, read_npy, read_npz, regular_file
 
 CAMERA_AXES = torch.diag(torch.tensor([1.0, -1, -1], dtype=torch.float64))
 """Rotates the camera coordinates of the action data sets, y down, to y up."""
@@ -64,12 +63,12 @@ def read(
     if unit is not None and suffix in (".npz", ".json"):
         raise UserError(f"{path}: lengths in {suffix} files are in meters; unit is only for .bvh, .amc and .npy")
     fields = fields if unit is None else {**fields, "unit": unit}
-    with _named(path):
+    with naming(path):
         rate = None if fps is None else frame_rate(fps)
         if suffix not in TREES:
             return _of_arrays(path, rate, resample_to, fields, any_size)
         rate = fields.get("fps") if suffix == ".amc" and rate is None else rate
-        joints, rate, layout = read_bvh(path, resample_to, fields, rate)
+        joints, rate, layout = map_bvh(path, read_tree(path, rate), resample_to, fields)
         if not any_size:
             check_size(leg_length(joints), layout.unit, layout.children)
         return Motion(joints, rate, id=path.stem)
@@ -102,23 +101,8 @@ def _of_arrays(
     return _of_joints(path, data, text, resample_to)
 
 
-@contextmanager
-def _named(path: Path) -> Iterator[None]:
-    """Adds the path to errors that do not name it."""
-    try:
-        yield
-    except UserError as error:
-        if str(path) in str(error):
-            raise
-        raise UserError(f"{path}: {error}") from error
-
-
 def from_array(joints: Any, fps: float | None) -> Motion:
-    """Returns a motion of joints (F, J, 3) in meters, y up, of the built-in skeleton with this number of joints.
-
-    Raises:
-        UserError: If the shape is another one, the values are not numbers, or there is no frame rate.
-    """
+    """Returns a motion of joints (F, J, 3) in meters, y up, of the built-in skeleton with this number of joints."""
     values = joints.detach().cpu().numpy() if isinstance(joints, Tensor) else np.asarray(joints)
     if not _is_real(values):
         name = type(joints).__name__
@@ -136,7 +120,7 @@ def read_arrays(path: Path) -> dict[str, Any]:
     `posed_joints`, as in files of NVIDIA's Kimodo, are returned as joints. A `UserError` names the file.
     """
     suffix = path.suffix.lower()
-    with _named(path):
+    with naming(path):
         if suffix == ".npz":
             data: dict[str, Any] = read_npz(path, skip=("dmpls",))
         elif suffix == ".npy":

@@ -35,10 +35,8 @@ def check_frames(frames: int) -> None:
 def resampled_frames(frames: int, rate: float, fps: float, joints: int, slack: float = 0.0) -> int:
     """Returns the number of frames after resampling from `rate` to `fps`, from the first to the last frame.
 
-    The last frame may be past the end by `slack` of a frame.
-
-    Raises:
-        UserError: If there are more than `MAX_FRAMES` frames before, or more than `MAX_RESAMPLED` positions after.
+    The last frame may be past the end by `slack` of a frame. Raises `UserError` if there are more than `MAX_FRAMES`
+    frames before, or more than `MAX_RESAMPLED` positions after.
     """
     check_frames(frames)
     count = math.floor((frames - 1) * fps / rate + slack) + 1

@@ -18,9 +18,7 @@ from flame_mdm.representations.skeleton import SMPL22
 from flame_mdm.safe_io import read_yaml
 from flame_mdm.visualize.posture import JOINT, world_rotations
 
-DIRECTIONS = {
-    **{"up": (0, 1, 0), "down": (0, -1, 0), "forward": (0, 0, 1), "back": (0, 0, -1)},
-}
+DIRECTIONS = {"up": (0, 1, 0), "down": (0, -1, 0), "forward": (0, 0, 1), "back": (0, 0, -1)}
 SMPL_ORDERS = tuple("YXZ" if name.endswith("shoulder") else "YZX" for name in SMPL22.joints)
 """Euler order of each of SMPL's joints, chosen to keep gimbal lock (middle angle at 90 degrees) away from common poses:
 bent knees, elbows and hips, a hanging arm, a body that turns or bows."""
@@ -79,7 +77,8 @@ def preset(name: str, poses: Poses) -> Rig:
             name = name.replace("*", mark)
             if isinstance(source, str):
                 joint = JOINT[side + source]
-                local = _axes(data.get("axes", {}), part, source, offsets[_end(joint)], side == "right_")
+                end = SMPL22.parents.index(joint) if joint in SMPL22.parents else joint  # continues the bone before it
+                local = _axes(data.get("axes", {}), part, source, offsets[end], side == "right_")
                 joints.append(_RigJoint(name, parent, joint, rest[joint], posed[joint] @ local, local))
             else:
                 above, following = joints[parent], next(ours for _, ours in names[number:] if isinstance(ours, str))
@@ -109,11 +108,6 @@ class _RigJoint(NamedTuple):
     position: np.ndarray
     turn: np.ndarray
     neutral: np.ndarray
-
-
-def _end(joint: int) -> int:
-    """Returns the joint at the end of a joint's bone; the last joint of a limb continues the bone before it."""
-    return SMPL22.parents.index(joint) if joint in SMPL22.parents else joint
 
 
 def _axes(axes: dict[str, Any], part: str, joint: str, bone: np.ndarray, right: bool) -> np.ndarray:

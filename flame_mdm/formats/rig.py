@@ -171,9 +171,6 @@ def rest_pose(
         joints: SMPL's joint -> index of the character's.
         lowest: points that include the lowest one.
         vertical: (3,), up; None = the one of y and z along which the trunk points.
-
-    Raises:
-        UserError: If the rest pose is not upright, a limb has no length, or left and right are exchanged.
     """
     at = {joint: positions[number] for joint, number in joints.items()}
 
@@ -289,10 +286,8 @@ def follow(
             target[:, 1] += rig.positions[toe, 1] - character.floor
         forward = turned[:, JOINT[f"{side}_hip"], :, 2]
         bent = _bent(positions[:, hip], positions[:, knee], positions[:, ankle], target, forward)
-        for name, bone, start, end in (
-            ("hip", bent - positions[:, hip], hip, knee),
-            ("knee", target - bent, knee, ankle),
-        ):
+        bones = (("hip", bent - positions[:, hip], hip, knee), ("knee", target - bent, knee, ankle))
+        for name, bone, start, end in bones:
             number = JOINT[f"{side}_{name}"]
             turned[:, number] = shortest_turns(positions[:, end] - positions[:, start], bone) @ turned[:, number]
     world = rig.turned(turned)

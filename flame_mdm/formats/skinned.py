@@ -61,12 +61,9 @@ def write(path: Path, poses: Poses, rig: Rig, fps: float, text: str, name: str, 
             nodes[parent].setdefault("children", []).append(joint)
     nodes.append({"name": "figure", "mesh": 0, "skin": 0})
     nodes.append({"name": "lifted", "children": [0], "translation": [0, body.lift if body else 0, 0]})
+    extras = {"fps": fps, "text": text, "unit": "metre", "up": "y"}
     document = {
-        "asset": {
-            "version": "2.0",
-            "generator": "flame_mdm",
-            "extras": {"fps": fps, "text": text, "unit": "metre", "up": "y"},
-        },
+        "asset": {"version": "2.0", "generator": "flame_mdm", "extras": extras},
         "scene": 0,
         "scenes": [{"nodes": [len(rig.joints), len(rig.joints) + 1]}],
         "nodes": nodes,
@@ -122,6 +119,7 @@ def _limbs(rest: np.ndarray) -> tuple[np.ndarray, ...]:
     counts = [len(position) for _, _, position, _, _ in limbs]
     starts = np.cumsum([0, *counts[:-1]])
     color = np.repeat(np.array([SIDE_COLORS[side] for _, side, *_ in limbs]), counts, axis=0)
+    triangles = np.concatenate([start + corners for (*_, corners), start in zip(limbs, starts, strict=True)])
     moved, weight = np.zeros((2, sum(counts), 4), "u1")
     moved[:, 0], weight[:, 0] = np.repeat([joint for joint, *_ in limbs], counts), 255
     bind = np.tile(np.eye(4, dtype="<f4"), (len(rest), 1, 1))
@@ -132,9 +130,7 @@ def _limbs(rest: np.ndarray) -> tuple[np.ndarray, ...]:
         _linear(color),
         moved,
         weight,
-        np.concatenate([start + triangles for (*_, triangles), start in zip(limbs, starts, strict=True)])
-        .astype("<u2")
-        .ravel(),
+        triangles.astype("<u2").ravel(),
         bind,
     )
 

@@ -16,8 +16,7 @@ COMMITTED = "docs/benchmarks/audit"
 """Folder of the cards in the repository; audited.json in this package lists their names."""
 PHYSICS = ("foot_skating", "penetration", "floating", "jitter", "static_share")
 """Metrics of joints, which are not expected to see the meaning of a motion."""
-ROUNDING = 1e-6
-"""Relative differences below this are not seen."""
+ROUNDING = 1e-6  # relative differences below this are not seen
 WIDE, HIGH = 132, 48
 LEGEND = (
     "Smallest strength from which on the metric differs from real motions in a paired comparison; a → b: only from b "
@@ -232,11 +231,8 @@ def _markdown(cards: Sequence[AuditCard], title: str, metrics: Sequence[str]) ->
         assert isinstance(about, AuditedPerturbation)
         assert isinstance(cells, list)
         head = f"{about.name} ({about.unit})" if about.unit else about.name
-        text += (
-            f"| {markdown_text(head)} | "
-            + " | ".join(markdown_text(" / ".join(t for t, _ in c)) for c in cells)
-            + " |\n"
-        )
+        texts = [head, *(" / ".join(t for t, _ in cell) for cell in cells)]
+        text += f"| {' | '.join(map(markdown_text, texts))} |\n"
     return text + f"\n{LEGEND}\n"
 
 

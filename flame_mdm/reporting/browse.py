@@ -22,8 +22,7 @@ if TYPE_CHECKING:
     from flame_mdm.representations import Representation
     from flame_mdm.visualize.body import Mesh
 
-SECONDS = 15
-"""Seconds shown of a longer clip, to keep the page small."""
+SECONDS = 15  # seconds shown of a longer clip, to keep the page small
 BARS = 30
 
 
@@ -147,10 +146,8 @@ def _lengths(splits: dict[str, list[Entry]], fps: float) -> Markup:
     """
     seconds = {name: np.array([clip.length for clip in clips]) / fps for name, clips in splits.items()}
     last = float(np.percentile(np.concatenate(list(seconds.values())), 99)) or 1
-    counts = {
-        name: np.bincount(np.minimum(BARS * s / last, BARS - 1).astype(int), minlength=BARS).tolist()
-        for name, s in seconds.items()
-    }
+    bars = {name: np.minimum(BARS * s / last, BARS - 1).astype(int) for name, s in seconds.items()}
+    counts = {name: np.bincount(bar, minlength=BARS).tolist() for name, bar in bars.items()}
     edges = [k * last / BARS for k in range(BARS + 1)]
     plot = svg("Clip lengths", [Panel(Histogram(edges, counts, "s"), "seconds", "clips")])
     return Markup(standalone(plot or ""))

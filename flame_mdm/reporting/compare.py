@@ -6,7 +6,7 @@ import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -27,8 +27,7 @@ if TYPE_CHECKING:
 
 MOTIONS = (".npz", ".bvh", ".json")
 """Suffixes of the motion files that are compared. Not .npy, which does not store its frame rate."""
-Prompt = tuple[str, int]
-"""Requested caption or action, and the index of the motion among those with the same request."""
+Prompt = tuple[str, int]  # requested caption or action, and the index of the motion among those with the same request
 
 
 @dataclass
@@ -98,15 +97,11 @@ def _facts(runs: Mapping[str, Run]) -> list[list[str]]:
         facts = run.provenance
         row = [label, f"{run.steps:,}", number(last(run.curves.get("train/epochs", {})))]
         row += [f"{facts.parameters / 1e6:.2f} M" if facts and facts.parameters else "–"]
-        row += [number(_median(run, f"train/{name}")) for name in ("seconds_per_step", "samples_per_second")]
+        curves = [run.curves.get(f"train/{name}") for name in ("seconds_per_step", "samples_per_second")]
+        row += [number(statistics.median(curve.values()) if curve else None) for curve in curves]
         row += [facts.device, facts.data.fingerprint] if facts else ["–", "–"]
         rows.append([*row, str(run.folder)])
     return rows
-
-
-def _median(run: Run, name: str) -> float | None:
-    curve = run.curves.get(name)
-    return statistics.median(curve.values()) if curve else None
 
 
 def _differences(runs: Mapping[str, Run]) -> list[list[str]]:
@@ -127,34 +122,7 @@ def _player(compared: Sequence[ComparedRun], shown: Sequence[Mapping[Prompt, Mot
     return player_page(scene, "", columns=len(compared), body=body) if scene else ""
 
 
-class Difference(NamedTuple):
-    """A metric of two results on the same texts and noise: second - first, with 95 % intervals where computable."""
-
-    metric: str
-    mean: float
-    over_replications: tuple[float, float] | None
-    over_motions: tuple[float, float] | None
-
-    @property
-    def shown(self) -> str:
-        """Whether the difference is shown: all intervals must exclude 0."""
-        intervals = [interval for interval in (self.over_replications, self.over_motions) if interval is not None]
-        if not intervals:
-            return "not tested: one replication"
-        if all(low > 0 for low, _ in intervals):
-            return "higher"
-        return "lower" if all(high < 0 for _, high in intervals) else "no difference shown"
-
-    @property
-    def cells(self) -> list[str]:
-        intervals = [
-            f"[{number(x[0])}, {number(x[1])}]" if x else "–" for x in (self.over_replications, self.over_motions)
-        ]
-        return [self.metric, number(self.mean), *intervals, self.shown]
-
-
-HEAD = ["", "difference", "95 % over replications", "95 % over motions", ""]
-"""Column titles of differences."""
+HEAD = ["", "difference", "95 % over replications", "95 % over motions", ""]  # column titles of differences
 EXPLAINED = (
     "Differences of motions for the same texts and noise. Over replications: other captions, crops and noise; over "
     "motions: other test clips (flame-mdm evaluate with resamples=200). Neither covers another training run. A "
@@ -162,8 +130,8 @@ EXPLAINED = (
 )
 
 
-def differences(first: Result, second: Result) -> list[Difference] | str:
-    """Returns the differences of all metrics of two results of the same evaluation, or why there are none.
+def differences(first: Result, second: Result) -> list[list[str]] | str:
+    """Returns rows for `HEAD`, the differences of all metrics of two results of the same evaluation, or why not.
 
     The interval over replications is Student's for the paired replications, whose captions, crops and noise differ. The
     one over motions is a bootstrap over the test clips, from the sets that `flame-mdm evaluate resamples=...` drew.
@@ -175,24 +143,27 @@ def differences(first: Result, second: Result) -> list[Difference] | str:
         return "not compared: other seed, limits of length or skeleton, so that the motions are not paired"
     values = [result.values or {} for result in (first, second)]
     names = sorted(values[0].keys() & values[1].keys())
-    computed = [_difference(name, values[0][name], values[1][name]) for name in names]
-    return [difference for difference in computed if difference is not None] or (
+    rows = [_difference(name, values[0][name], values[1][name]) for name in names]
+    return [row for row in rows if row] or (
         "not compared: no metric has values per replication of the same number of motions. Results of earlier versions "
         "have none: evaluate both again; motions are not generated again"
     )
 
 
-def _difference(name: str, first: Value | None, second: Value | None) -> Difference | None:
+def _difference(name: str, first: Value | None, second: Value | None) -> list[str]:
+    """Returns a row of cells, second - first; [] if the results have no pairs of values of the metric."""
     if first is None or second is None or first.n != second.n:
-        return None
+        return []
     if (replicated := _paired(first.per_replication, second.per_replication)) is None:
-        return None
-    mean, low, high = paired_difference(*replicated)
-    over_motions = None
-    if (drawn := _paired(first.resampled, second.resampled)) is not None:
-        bounds = percentiles(drawn[1] - drawn[0], mean)
-        over_motions = (float(bounds[0]), float(bounds[1]))
-    return Difference(name, mean, (low, high) if len(replicated[0]) > 1 else None, over_motions)
+        return []
+    drawn = _paired(first.resampled, second.resampled)
+    mean, *over_replications = paired_difference(*replicated)
+    over_motions = [] if drawn is None else [float(x) for x in percentiles(drawn[1] - drawn[0], mean)]
+    intervals = [over_replications if len(replicated[0]) > 1 else [], over_motions]
+    signs = {(low > 0) - (high < 0) for low, high in filter(None, intervals)}
+    shown = "higher" if signs == {1} else "lower" if signs == {-1} else "no difference shown"
+    cells = [f"[{number(x[0])}, {number(x[1])}]" if x else "–" for x in intervals]
+    return [name, number(mean), *cells, shown if any(intervals) else "not tested: one replication"]
 
 
 def _paired(first: Sequence[float | None], second: Sequence[float | None]) -> np.ndarray | None:
@@ -231,7 +202,7 @@ def tested(columns: Sequence[tuple[str, Result]]) -> list[tuple[str, list[list[s
     for index, (label, result) in enumerate(others, 2):
         rows = differences(base, result)
         title = f"[{index}] {label} − [1] {first}"
-        tables.append((f"{title}: {rows}", []) if isinstance(rows, str) else (title, [row.cells for row in rows]))
+        tables.append((f"{title}: {rows}", []) if isinstance(rows, str) else (title, rows))
     return tables
 
 

@@ -14,18 +14,13 @@ if TYPE_CHECKING:
 
 WIDE, HIGH = 460, 230
 LEFT, RIGHT, TOP, BOTTOM = 58, 10, 8, 24
-ROW = 16
-"""Height of a line of text."""
-MOST = 300
-"""Maximum number of segments per curve; the lowest and the highest point of each are drawn."""
-LOG_RANGE = 15
-"""Positive values that span more than this factor get a logarithmic axis."""
+ROW = 16  # height of a line of text
+MOST = 300  # maximum number of segments per curve; the lowest and the highest point of each are drawn
+LOG_RANGE = 15  # positive values that span more than this factor get a logarithmic axis
 COLORS = 8
-SMALLEST = 1e-300
-"""Numbers closer to 0 are treated as 0 on axes, since steps between ticks would underflow."""
+SMALLEST = 1e-300  # numbers closer to 0 are treated as 0 on axes, since steps between ticks would underflow
 
-Curve = Mapping[int, float]
-"""Values by step."""
+Curve = Mapping[int, float]  # values by step
 
 
 @dataclass

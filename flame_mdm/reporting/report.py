@@ -42,10 +42,7 @@ def write_report(folder: Path, mesh: Mesh | None = None) -> Path:
         faulty=faulty,
         player=_player(run, mesh),
         step=int(run.samples.name.removeprefix("step_")) if run.samples else 0,
-        evaluations=[
-            (evaluation_title(r), sampling(r), _card(folder, r), marks(r), r.not_computed, _values(r))
-            for r in run.results.values()
-        ],
+        evaluations=[_evaluation(folder, result) for result in run.results.values()],
         groups=groups,
         history=HISTORY,
         constant=constants(run.curves),
@@ -115,15 +112,15 @@ def charted(curves: Mapping[str, Curve]) -> dict[str, dict[str, list[str]]]:
 
 
 def constants(curves: Mapping[str, Curve]) -> dict[str, float]:
-    values = {
-        name: set(curve.values()) for name, curve in curves.items() if len(curve) > 1 and not name.endswith("/ci")
-    }
-    return {name: next(iter(level)) for name, level in values.items() if len(level) == 1}
+    values = {name: set(curve.values()) for name, curve in curves.items() if len(curve) > 1}
+    return {name: level.pop() for name, level in values.items() if len(level) == 1 and not name.endswith("/ci")}
 
 
-def _values(result: Result) -> list[list[str]]:
+def _evaluation(folder: Path, result: Result) -> tuple[object, ...]:
     values, real = result.values or {}, result.ground_truth or {}
-    return [[name, printed(real.get(name)), printed(values.get(name))] for name in sorted(values | real)]
+    rows = [[name, printed(real.get(name)), printed(values.get(name))] for name in sorted(values | real)]
+    card = _card(folder, result)
+    return evaluation_title(result), sampling(result), card, marks(result), result.not_computed, rows
 
 
 def evaluation_title(result: Result) -> str:

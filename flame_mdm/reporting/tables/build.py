@@ -19,10 +19,9 @@ from flame_mdm.reporting.study import Ratings, wilson
 from flame_mdm.reporting.tables.format import ABOUT, Cell, Line, Part, Plot, Table, ranks
 from flame_mdm.reporting.tables.specs import PUBLISHED, SWEPT, Lengths, as_list, evaluations, load_mapping
 from flame_mdm.runs import made_by
-from flame_mdm.schemas import Checkpoint, Result, Value, read_json, read_result
+from flame_mdm.schemas import Result, Value, read_json, read_result
 
-NOT_VALID = "NOT VALID"
-"""State of a row that is shown, but not ranked."""
+NOT_VALID = "NOT VALID"  # state of a row that is shown, but not ranked
 
 
 def build(name: str, spec: Config, results: Path, sizes: Sizes | None = None) -> Table:
@@ -143,6 +142,10 @@ def _conditions(result: Result, timed: bool) -> dict[str, str]:
     card = card_of(data.dataset, extractor.sha256 if extractor else None)
     first = next((v for v in (result.values or {}).values() if v and v.n), None)  # later ones may have fewer motions
     changed = ", ".join(f"{k} = {v}" for k, v in result.changed.items())
+    smpl = result.skeleton and result.skeleton.smpl_sha256
+    skeleton = f"joints of SMPL's model file, sha256 {smpl[:12]}" if smpl else ""
+    if result.stand_in_skeleton:
+        skeleton = "joints of a stand-in skeleton, whose bones are not SMPL's"
     return {
         "protocol": f"protocol {protocol.name} version {protocol.version}",
         "data": f"{result.split} split of {data.dataset} (fingerprint {data.fingerprint})",
@@ -153,7 +156,7 @@ def _conditions(result: Result, timed: bool) -> dict[str, str]:
         "extractor": f"extractor sha256 {extractor.sha256[:12]}" if extractor else "no extractor",
         "audit": f"audit {card.as_posix()}" if card else "not audited",
         "exclusions": _left_out(data.excluded),
-        "skeleton": _joints_of(result),
+        "skeleton": skeleton,
         "changes": f"differs from the protocol: {changed}" if changed else "",
         "published split": "published split: test clips are also used for training, or there are no validation clips"
         * result.published_split,
@@ -163,16 +166,9 @@ def _conditions(result: Result, timed: bool) -> dict[str, str]:
     }
 
 
-def _joints_of(result: Result) -> str:
-    if result.stand_in_skeleton:
-        return "joints of a stand-in skeleton, whose bones are not SMPL's"
-    smpl = result.skeleton and result.skeleton.smpl_sha256
-    return f"joints of SMPL's model file, sha256 {smpl[:12]}" if smpl else ""
-
-
 def _left_out(excluded: Mapping[str, int]) -> str:
     listed = ", ".join(f"{count:,} {reason}" for reason, count in excluded.items())
-    return f"excluded from the data set: {listed}" if listed else ""
+    return f"excluded from the data set: {listed}" * bool(listed)
 
 
 def _line(
@@ -192,6 +188,8 @@ def _line(
     reasons = list(dict.fromkeys(reason for r in results if r is not None for reason in r.invalid_because))
     line.state = NOT_VALID if reasons else "QUICK" if first.quick else ""
     checkpoint = first.checkpoint
+    sampler = [f"eta {checkpoint.eta}"] if checkpoint and checkpoint.eta is not None else []
+    sampler += [f"spacing {checkpoint.spacing}"] if checkpoint and checkpoint.spacing is not None else []
     counts = {
         name: f"{entry.replications} x {entry.n}"
         for result, name in zip(results, values, strict=True)
@@ -208,7 +206,7 @@ def _line(
         "weights": weights[checkpoint.averaged_weights if checkpoint else None],
         "guidance": _text(checkpoint and checkpoint.guidance_scale),
         "predicts": _text(checkpoint and checkpoint.prediction),
-        "sampler": _sampler(checkpoint) if checkpoint else "",
+        "sampler": ", ".join([checkpoint.sampler, *sampler]) if checkpoint else "",
         "steps": _text(checkpoint and checkpoint.num_inference_steps),
         "replications x motions": most + others,
         "seed": _text(first.seed),
@@ -229,11 +227,6 @@ def _text(value: Any) -> str:
     if isinstance(value, list):  # chosen steps
         return ", ".join(map(str, value))
     return "" if value is None else f"{value:g}" if isinstance(value, float) else str(value)
-
-
-def _sampler(checkpoint: Checkpoint) -> str:
-    options = {"eta": checkpoint.eta, "spacing": checkpoint.spacing}
-    return ", ".join([checkpoint.sampler, *(f"{name} {value}" for name, value in options.items() if value is not None)])
 
 
 def _about(result: Result, name: str) -> Any:

@@ -48,10 +48,8 @@ KINDS = {
     "reported real": "Real motions, as reported",
     "reported": "As reported",
 }
-NO_RESULTS = ("NOT VALID", "QUICK")
-"""States of rows whose values must not be mistaken for results."""
-CARD = re.compile(r"(?<=\baudit )([\w./-]+\.html)")
-"""Paths of audit cards in footnotes."""
+NO_RESULTS = ("NOT VALID", "QUICK")  # states of rows whose values must not be mistaken for results
+CARD = re.compile(r"(?<=\baudit )([\w./-]+\.html)")  # paths of audit cards in footnotes
 SHARED = ("checkpoint sha256", "recipe", "sampler")
 """Facts that rows must have in common to be listed together as sources."""
 LEGEND = (
@@ -70,8 +68,7 @@ class Cell:
     rank: int = 0
 
 
-NEAREST = "nearest"
-"""`Plot.x` of the cumulative distribution of the distances from the nearest training motion."""
+NEAREST = "nearest"  # `Plot.x` of the cumulative distribution of the distances from the nearest training motion
 
 
 @dataclass
@@ -208,12 +205,9 @@ def markdown(table: Table) -> str:
                 page += f"\n![{markdown_text(part.name)}]({quote(name)}.svg)\n"
     page += "".join(f"\n- {markdown_text(note)}" for note in table.notes) + "\n" * bool(table.notes)
     page += f"\n{LEGEND}\n" if _is_ranked(table) else ""
-    rows = _sources(table)
-    if rows:
-        page += "\n<details><summary>Sources of the rows</summary>\n\n" + "\n".join(
-            f"- {markdown_text(row)}" for row in rows
-        )
-        page += "\n\n</details>\n"
+    if rows := [f"- {markdown_text(row)}" for row in _sources(table)]:
+        listed = "\n".join(rows)
+        page += f"\n<details><summary>Sources of the rows</summary>\n\n{listed}\n\n</details>\n"
     return page
 
 

@@ -40,8 +40,7 @@ if TYPE_CHECKING:
 ORIGINAL, CHANGE = ".parametrizations.weight.original", ".parametrizations.weight.0."
 FARTHER = 10.0
 """Factor of the vectors of words, which have farther to go than weights: the rows of a table are from N(0, 1)."""
-Paths = str | Path | Sequence[str | Path]
-"""One file, or several."""
+Paths = str | Path | Sequence[str | Path]  # one file, or several
 
 
 class About(TypedDict):
@@ -135,10 +134,8 @@ def read_merged(path: Path, adapter: Paths = (), strength: float | Sequence[floa
     for file, weight in zip(paths, strengths, strict=True):
         about, changes = _read(Path(file))
         if about["base"] != own:
-            theirs = about["base"][:12]
-            raise UserError(
-                f"adapter={file}: made for the weights {theirs}, not {own[:12]}. Give the model it was made for"
-            )
+            which = f"made for the weights {about['base'][:12]}, not {own[:12]}"
+            raise UserError(f"adapter={file}: {which}. Give the model it was made for")
         _merge(plain, changes, about["rows"], weight, file)
         for key, more in (("vocabulary", about["words"]), ("captions", about["captions"])):
             if key in facts and weight:  # the base leaves out words that it does not know

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from flame_mdm.checkpoints.adapters import read_merged
-from flame_mdm.checkpoints.loading import find
+from flame_mdm.checkpoints.locating import find
 from flame_mdm.checkpoints.model_files import FILE, read_model_file, without_own_paths, write_model_file
 from flame_mdm.config import save
 from flame_mdm.errors import UserError, first_line, markdown_text
@@ -79,27 +79,20 @@ def push(
 
         try:
             HfApi().create_repo(repository, private=private, exist_ok=True)
-            HfApi().upload_folder(
-                repo_id=repository, folder_path=file.parent, allow_patterns=[FILE, "config.yaml", "README.md"]
-            )
+            HfApi().upload_folder(repo_id=repository, folder_path=file.parent, allow_patterns=[FILE, *WRITTEN])
         except Exception as error:  # the client raises many kinds: no network, no token, no permission ...
-            raise UserError(
-                f"{repository}: upload failed: {first_line(error)}. The files are in {file.parent}"
-            ) from error
+            where = f"The files are in {file.parent}"
+            raise UserError(f"{repository}: upload failed: {first_line(error)}. {where}") from error
     return file.parent
 
 
 def card(model: Mapping[str, Any], repository: str) -> str:
     config, facts, origin = model["config"], model["facts"], model["origin"]
     license_id, terms = LICENSES.get(facts.get("dataset", ""), OTHER_LICENSE)
-    parts = {
-        name: config[name]["_target_"].rpartition(".")[2]
-        for name in ("denoiser", "process", "condition", "representation")
-        if name in config
-    }
-    request = {"ActionLabels": f"actions={facts['actions'][:1]}", "Unconditional": ""}.get(
-        parts.get("condition", ""), '"a person walks forward"'
-    )
+    names = [name for name in ("denoiser", "process", "condition", "representation") if name in config]
+    parts = {name: config[name]["_target_"].rpartition(".")[2] for name in names}
+    other = {"ActionLabels": f"actions={facts['actions'][:1]}", "Unconditional": ""}
+    request = other.get(parts.get("condition", ""), '"a person walks forward"')
     weights = sum(value.numel() for value in model["state_dict"].values())
     rows = [
         ("experiment", config["experiment"]),

@@ -48,8 +48,7 @@ GENERATORS = {
 }
 """Classes of the task in recipes of generators, and those that are loaded instead, without Lightning."""
 
-PARTS = ("task", "representation", "process", "condition", "denoiser")
-"""Parts of a recipe from which a model is built."""
+PARTS = ("task", "representation", "process", "condition", "denoiser")  # parts of a recipe from which a model is built
 
 
 def load_task(path: Path, kind: type[Trained], device: str | torch.device = "cpu", **adapted: Any) -> Trained:

@@ -43,14 +43,11 @@ def find(source: str | Path, which: Which = "last") -> Path:
     try:
         return Path(hf_hub_download(match[1], FILE, revision=match[2]))
     except Exception as error:  # the client raises many kinds: no network, no such repository, no permission ...
-        raise UserError(
-            f"{source}: no such file or folder, and {FILE} of a model with this name cannot be downloaded from the "
-            f"hub: {first_line(error)}"
-        ) from error
+        what = f"{FILE} of a model with this name cannot be downloaded from the hub: {first_line(error)}"
+        raise UserError(f"{source}: no such file or folder, and {what}") from error
 
 
 def _find_in_folder(folder: Path, which: Which) -> Path:
-    """Returns a checkpoint of a run directory, or the only model file in another folder."""
     weights = [file for file in sorted(folder.glob("*.safetensors")) if not file.name.startswith(".")]  # half-written
     is_run = (folder / "config.yaml").is_file() and not weights
     if is_run or (folder / "checkpoints").is_dir():

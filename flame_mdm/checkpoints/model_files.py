@@ -23,12 +23,9 @@ from flame_mdm.schemas import Number, check_shape
 if TYPE_CHECKING:
     from torch import Tensor
 
-FORMAT = 2
-"""Format of checkpoints and model files: 2 since version 0.2.0."""
-FORMAT_KEY = "flame_mdm_format"
-"""Key of the format in a checkpoint."""
-KEY, ADAPTER = "flame_mdm", "flame_mdm_adapter"
-"""Keys of the metadata of model files and of adapters."""
+FORMAT = 2  # format of checkpoints and model files: 2 since version 0.2.0
+FORMAT_KEY = "flame_mdm_format"  # key of the format in a checkpoint
+KEY, ADAPTER = "flame_mdm", "flame_mdm_adapter"  # keys of the metadata of model files and of adapters
 FILE = "model.safetensors"
 MOST_FRAMES = 100_000
 """Maximum number of frames that a model file may declare: more than an hour at 20 frames per second."""
@@ -39,11 +36,10 @@ def read_model_file(path: Path) -> dict[str, Any]:
     metadata, state = read_safetensors(path)
     text = metadata.get(KEY)
     if text is None:
+        what = "weights without a recipe. Import released weights of MDM, MFM and FLAME with `flame-mdm import`"
         if ADAPTER in metadata:
-            raise UserError(f"{path}: an adapter, which changes a model. Name its base first: BASE adapter={path}")
-        raise UserError(
-            f"{path}: weights without a recipe. Import released weights of MDM, MFM and FLAME with `flame-mdm import`"
-        )
+            what = f"an adapter, which changes a model. Name its base first: BASE adapter={path}"
+        raise UserError(f"{path}: {what}")
     try:
         content = parse_json(text)
         check_format(path, content["format"])
@@ -224,10 +220,6 @@ def weights_sha256(path: Path) -> str:
 
 def without_own_paths(config: Mapping[str, Any]) -> dict[str, Any]:
     """Returns a recipe with default paths of data and run in place of absolute paths on this machine."""
-    default = {
-        config.get("data_root"): "data",
-        config.get("run", {}).get("dir"): f"runs/{config['experiment']}/default",
-    }
-    return moved(
-        dict(config), {folder: other for folder, other in default.items() if folder and Path(folder).is_absolute()}
-    )
+    own = {config.get("data_root"): "data", config.get("run", {}).get("dir"): f"runs/{config['experiment']}/default"}
+    moves = {folder: other for folder, other in own.items() if folder and Path(folder).is_absolute()}
+    return moved(dict(config), moves)

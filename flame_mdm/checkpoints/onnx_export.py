@@ -31,12 +31,10 @@ from flame_mdm.safe_io import atomic_folder, sha256, write_json
 from flame_mdm.sampler_options import SamplerOptions
 
 RUNNER = Path(__file__).with_name("runner.py")
-TOLERANCE = 1e-4
-"""Maximum difference between the outputs of a graph and of PyTorch, relative to the largest output."""
+TOLERANCE = 1e-4  # maximum difference between the outputs of a graph and of PyTorch, relative to the largest output
 FIXED_LENGTH = (MDMGRU, MDMUNet)
 """Networks whose graphs have a fixed number of frames, that of the longest motion: shorter ones are padded."""
-TINY = 1e-6
-"""Probe of `to_x0` that no clipping of the clean estimate changes."""
+TINY = 1e-6  # probe of `to_x0` that no clipping of the clean estimate changes
 
 
 def export_onnx(source: str | Path, out: str | Path, *, half: bool = False, **adapted: Any) -> Path:
@@ -263,9 +261,8 @@ def write_graph(graph: Graph, path: Path, half: bool) -> None:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            exported = torch.export.export(
-                graph.module.eval(), tuple(examples), dynamic_shapes=dimensions, strict=False
-            )
+            module = graph.module.eval()
+            exported = torch.export.export(module, tuple(examples), dynamic_shapes=dimensions, strict=False)
             names = {"input_names": list(graph.examples), "output_names": graph.outputs}
             program = torch.onnx.export(exported, dynamo=True, verbose=False, optimize=False, **names)
             assert program is not None

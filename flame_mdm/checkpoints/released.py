@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import torch
+from hydra.utils import get_class
 from pydantic import Field
 from torch import Tensor
 from typing_extensions import TypedDict
@@ -69,7 +70,7 @@ NORMALIZED = ("humanml3d", "kit")
 PADDED_FRAMES = 196
 ACTION_FRAMES = 60
 ENCODERS = {"clip": "clip", "bert": "distilbert"}
-POOLER = "lm.pooler.dense."
+POOLER, ACTIONS = "lm.pooler.dense.", "embed_action.action_embedding"
 
 
 # Networks -------------------------------------------------------------------------------------------------------------
@@ -108,16 +109,15 @@ def import_mdm(
     network, stack, layer = NETWORKS[arch]
     dropped = ("sequence_pos_encoder.pe", "embed_timestep.sequence_pos_encoder.pe", "clip_model.")
     learned = {key: value for key, value in state.items() if not key.startswith(dropped)}
-    embedding = learned.pop("embed_action.action_embedding", None)
+    cond_features = shape_of(learned, ACTIONS)[1] if ACTIONS in learned else 0
+    embedding = learned.pop(ACTIONS, None)
     names, num_layers = layer_names(learned, stack, layer)
     ours = renamed(learned, {**_MDM, **names})
 
     out_features, latent_dim = shape_of(ours, "output.weight")
     in_features = shape_of(ours, "input.weight")[1]
     options: dict[str, Any] = {"latent_dim": latent_dim, "num_layers": num_layers, "dropout": 0.1}
-    cond_features = 0
     if embedding is not None:
-        cond_features = shape_of({"embed_action.action_embedding": embedding}, "embed_action.action_embedding")[1]
         options["project_condition"] = False
     if "condition.projection.weight" in ours:
         cond_features = shape_of(ours, "condition.projection.weight")[1]
@@ -217,9 +217,8 @@ def _mdm_recipe(kind: str, released: Released, args: Mapping[str, Any]) -> tuple
     elif released.features[2]:
         encoder = args.get("text_encoder_type", "clip")
         if encoder not in ENCODERS:
-            raise ValueError(
-                f"text_encoder_type={encoder} of the released model is not supported, only {', '.join(ENCODERS)}"
-            )
+            only = ", ".join(ENCODERS)
+            raise ValueError(f"text_encoder_type={encoder} of the released model is not supported, only {only}")
         condition = option("condition", ENCODERS[encoder]) | {"features": released.features[2]}
     drop = float(args.get("cond_mask_prob", 0.1))
     process = option("process", "flow_matching" if kind == "mfm" else "diffusion")
@@ -275,7 +274,9 @@ def import_released(
         state = released_state(checkpoint, ema=averaged and kind != "mclip")
         check_weights(state, file)
         if kind == "mclip":
-            model = _motion_clip(state, num_heads)
+            sizes = [] if num_heads is None else [f"task.network.num_heads={num_heads}"]
+            config = compose("motion_clip/humanml3d_smpl", sizes)
+            model: Task = get_class(config["task"]["_target_"]).import_released(state, without_own_paths(config))
         else:
             model = _model(kind, state, options, statistics, num_heads, time_token)
     except (OSError, MemoryError):
@@ -286,10 +287,10 @@ def import_released(
         what = f"{type(error).__name__}: {first_line(error)}"
         raise UserError(f"{file}: cannot build a model from it and its options: {what}") from error
     out = out if out.suffix == ".safetensors" else out / FILE
-    origin = {"made": f"released by the authors of {kind.upper()}", "file": file.name, "sha256": sha256(file)}
-    write_model_file(
-        out, model.state_dict(), config=model.config, facts=model.facts, origin=origin | {"averaged": averaged}
-    )
+    origin: dict[str, Any] = {"made": f"released by the authors of {kind.upper()}", "file": file.name}
+    origin |= {"sha256": sha256(file)}
+    origin |= {"averaged": averaged}
+    write_model_file(out, model.state_dict(), config=model.config, facts=model.facts, origin=origin)
     return out
 
 
@@ -301,7 +302,6 @@ def _model(
     num_heads: int | None,
     time_token: bool,
 ) -> MotionGeneration:
-    """Builds a model from released weights, with the sampling of the authors' code; see `import_released`."""
     if args.get("dynamic", "flow") != "flow":
         raise ValueError(f"dynamic={args['dynamic']}: only the flow models of MFM can be imported")
     if kind == "mfm" and args.get("text_emebed", "clip") != "clip":  # spelled like this by the authors
@@ -321,11 +321,8 @@ def _model(
             f"{facts['dataset']}, has {representation.features}"
         )
     if (statistics is not None) != (facts["dataset"] in NORMALIZED):
-        missing = statistics is None
-        raise ValueError(
-            f"features of {facts['dataset']} are {'' if missing else 'not '}normalized. "
-            f"{'Give' if missing else 'Leave out'} stats=FOLDER with Mean.npy and Std.npy"
-        )
+        what, advice = ("normalized", "Give") if statistics is None else ("not normalized", "Leave out")
+        raise ValueError(f"features of {facts['dataset']} are {what}. {advice} stats=FOLDER with Mean.npy and Std.npy")
     extra: dict[str, Tensor] = {}
     if released.action_embedding is not None:
         extra["condition.table"] = released.action_embedding
@@ -336,24 +333,14 @@ def _model(
             extra[f"condition.pooler_{name}"] = state[POOLER + name]
     for name, value in zip(("mean", "std"), statistics or (), strict=False):
         if value.shape != (width,) or not value.isfinite().all() or (name == "std" and (value <= 0).any()):
-            raise ValueError(
-                f"{name.capitalize()}.npy: shape {tuple(value.shape)}, expected ({width},) finite numbers, positive in "
-                "Std.npy"
-            )
+            what = f"shape {tuple(value.shape)}, expected ({width},) finite numbers, positive in Std.npy"
+            raise ValueError(f"{name.capitalize()}.npy: {what}")
         extra[f"representation.{name}"] = value
     model = MotionGeneration.build(config, representation, actions=facts["actions"])
     model.facts = facts
     model.denoiser.load_state_dict(released.state)
     model.load_state_dict(extra, strict=False)
     return model.eval()
-
-
-def _motion_clip(state: Mapping[str, Tensor], num_heads: int | None) -> Task:
-    from hydra.utils import get_class
-
-    sizes = [] if num_heads is None else [f"task.network.num_heads={num_heads}"]
-    config = compose("motion_clip/humanml3d_smpl", sizes)
-    return get_class(config["task"]["_target_"]).import_released(state, without_own_paths(config))
 
 
 class _Solver(TypedDict, total=False):

@@ -19,8 +19,7 @@ from typing import Any
 import numpy as np
 
 FORMAT = 1
-MIN_WORDS = 3
-"""Least number of tokens of a graph, with padding."""
+MIN_WORDS = 3  # least number of tokens of a graph, with padding
 WORD = re.compile(r"[^\W_]+")
 NUMBERS, LARGEST = {"features": 1, "max_frames": 2, "padded_frames": 0}, 100_000
 """Whole numbers of `model.json` and the smallest valid ones; the largest one of all numbers."""

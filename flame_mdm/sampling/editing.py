@@ -145,11 +145,7 @@ def _part_length(parts: Sequence[Part], length: int, fps: float) -> int:
 
 
 def kept_parts(representation: Representation, length: int, editing: EditRequest) -> tuple[Tensor, Tensor]:
-    """Returns which features (F, D) and joints (F, J) of each frame an edit of a motion with `length` frames keeps.
-
-    Raises:
-        UserError: If a range is outside of the motion, or a joint is unknown.
-    """
+    """Returns which features (F, D) and joints (F, J) of each frame an edit of a motion with `length` frames keeps."""
     new_frames, joints = _new_frames(length, representation.fps, editing), editing.joints
     part = torch.zeros(len(representation.skeleton), dtype=torch.bool)
     part[list(range(len(part))) if joints is None else find_joints(representation.skeleton, joints)] = True
@@ -161,7 +157,6 @@ def kept_parts(representation: Representation, length: int, editing: EditRequest
 
 
 def _new_frames(length: int, fps: float, editing: EditRequest) -> Tensor:
-    """Returns (F,) bool, True if this frame is resampled."""
     frame = torch.arange(length)
     first, last = int(0.25 * length), int(0.75 * length)
     if isinstance(editing.region, str):
@@ -192,11 +187,7 @@ def _new_frames(length: int, fps: float, editing: EditRequest) -> Tensor:
 def method_options(
     process: Process, editing: EditRequest, options: SamplerOptions
 ) -> tuple[dict[str, Any], SamplerOptions]:
-    """Returns the options of `Edit` for the requested method, by default that of the process, and those of the sampler.
-
-    Raises:
-        UserError: If the process does not support the method, or the method does not have an option.
-    """
+    """Returns the options of `Edit` for the requested method, by default that of the process, and of the sampler."""
     possible = [name for name, how in METHODS.items() if how["mode"] in process.edit_modes]
     method = editing.method
     if method is None:

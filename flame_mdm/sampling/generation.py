@@ -116,10 +116,15 @@ class _Plan:
         for caption in self.captions:
             self.ids.append(f"{caption}#{counts[caption]}")
             counts[caption] += 1
-        self.before = None if request.after is None else _features_before(model, request.after)
-        lengths = motion_lengths(model, request)
-        if self.before is not None:  # its last frames are generated again, but kept
-            shared = overlap(model)
+        self.before: Tensor | None = None
+        lengths, shared = motion_lengths(model, request), overlap(model)
+        if request.after is not None:  # its last frames are generated again, but kept
+            read = with_features if isinstance(request.after, Motion) else read_motion
+            motion = read(model.representation, request.after)
+            if shared > len(motion.features):
+                what = f"{len(motion.features)} frames are too short. Give at least {shared}"
+                raise UserError(f"after={motion.id}: {what}")
+            self.before = torch.from_numpy(motion.features)
             lengths = [[shared + first, *others] for first, *others in lengths]
             ending = model.representation.normalize(self.before[-shared:].to(model.device))[None]
             self.edit = Edit(ending, torch.ones_like(ending, dtype=torch.bool))
@@ -128,17 +133,7 @@ class _Plan:
         self.targets = None if request.targets is None else read_targets(model.representation, request.targets)
 
 
-def _features_before(model: MotionGenerator, after: str | Path | Motion) -> Tensor:
-    """Returns the features (F, D) of the motion that is continued."""
-    representation = model.representation
-    motion = with_features(representation, after) if isinstance(after, Motion) else read_motion(representation, after)
-    if (least := overlap(model)) > len(motion.features):
-        raise UserError(f"after={motion.id}: {len(motion.features)} frames are too short. Give at least {least}")
-    return torch.from_numpy(motion.features)
-
-
 def _sample(model: MotionGenerator, plan: _Plan, rows: slice, trajectory: list[Tensor] | None) -> list[Motion]:
-    """Returns some motions of a plan, sampled in one batch."""
     request, conditions, lengths = plan.request, plan.conditions[rows], plan.lengths[rows]
     mask = length_mask(torch.tensor([sum(parts) for parts in lengths], device=model.device))
     x = torch.zeros(*mask.shape, model.representation.features, device=model.device)
@@ -206,14 +201,14 @@ def best(candidates: Sequence[Motion], score: Score | None = None) -> Motion:
     return passed[scores.index(max(scores))]
 
 
-class _First(list[torch.Tensor]):
+class _First(list[Tensor]):
     """Keeps the first motion (1, F, D) of each batch that is appended, on the CPU."""
 
-    def append(self, x: torch.Tensor) -> None:
+    def append(self, x: Tensor) -> None:
         super().append(x[:1].cpu())
 
 
-def _stages(model: MotionGenerator, trajectory: Sequence[torch.Tensor], result: Motion) -> list[Motion]:
+def _stages(model: MotionGenerator, trajectory: Sequence[Tensor], result: Motion) -> list[Motion]:
     """Returns up to `STAGES` of the first motion's clean estimates at equal intervals of the calls, and the motion."""
     count, stages = len(trajectory), []
     for call in sorted({index * count // STAGES for index in range(STAGES)}):

@@ -55,9 +55,8 @@ def read_motion(
     elif ":" in name:
         motion = _read_clip(representation, name, Path(data_root))
     else:
-        raise UserError(
-            f"{name}: not a motion. Give a {', '.join(ENDINGS)} file, or dataset:id for a clip of a prepared data set"
-        )
+        kinds = f"Give a {', '.join(ENDINGS)} file, or dataset:id for a clip of a prepared data set"
+        raise UserError(f"{name}: not a motion. {kinds}")
     if cut is not None:
         if not is_range(cut):
             raise UserError(f"cut={cut}: write [begin, end], in seconds")
@@ -70,11 +69,7 @@ def read_motion(
 
 
 def with_features(representation: Representation, motion: Motion) -> Motion:
-    """Returns the motion if it has features of this representation, otherwise computes them from its joints.
-
-    Raises:
-        UserError: If shape or size are wrong, the motion is too long, or its joints cannot be encoded.
-    """
+    """Returns the motion if it has features of this representation, otherwise computes them from its joints."""
     name = f"{motion.id}: " if motion.id else ""
     fits = motion.representation == representation.name and math.isclose(motion.fps, representation.fps)
     if fits:
@@ -107,13 +102,10 @@ def _decoded(representation: Representation, features: np.ndarray, text: str, na
 def _read_clip(representation: Representation, source: str, data_root: Path) -> Motion:
     dataset, _, clip_id = source.partition(":")
     store = Store(data_root / f"{dataset}-{representation.name}")
-    if store.info["fps"] != representation.fps:
-        raise UserError(
-            f"{store.folder}: prepared at {store.info['fps']:g} fps, but the model has {representation.fps:g}"
-        )
+    if (fps := store.info["fps"]) != representation.fps:
+        raise UserError(f"{store.folder}: prepared at {fps:g} fps, but the model has {representation.fps:g}")
     clips = {clip.id: clip for clip in store.clips}
     if clip_id not in clips:
         raise UserError(f"{store.folder} has no clip '{clip_id}'.{did_you_mean(clip_id, list(clips))}")
     clip = clips[clip_id]
-    text = clip.captions[0] if clip.captions else ""
-    return _decoded(representation, np.array(store.motion(clip)), text, source)
+    return _decoded(representation, np.array(store.motion(clip)), next(iter(clip.captions), ""), source)

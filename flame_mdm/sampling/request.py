@@ -169,11 +169,7 @@ class SamplingRequest:
 
     @classmethod
     def of(cls, function: str, editing: bool = False, /, **keywords: Any) -> SamplingRequest:
-        """Returns the request of keywords: fields of this class, `SamplerOptions` and, of edits, `EditRequest`.
-
-        Raises:
-            UserError: If a keyword is unknown, or a value is invalid.
-        """
+        """Returns the request of keywords: fields of this class, `SamplerOptions` and, of edits, `EditRequest`."""
         names = [entry.name for entry in fields(cls) if entry.name not in ("options", "editing")]
         sampler = [entry.name for entry in fields(SamplerOptions)]
         edits = [entry.name for entry in fields(EditRequest)] if editing else []
@@ -216,17 +212,13 @@ class SamplingRequest:
             if not isinstance(prompt, str):
                 raise UserError(f"{self.kind}={prompt!r} is not a string. Give a string, such as {self.kind}='walk'")
             if len(prompt) > MAX_TEXT_LENGTH:
-                raise UserError(
-                    f"{shortened(prompt, 60)}: {len(prompt):,} characters are too many. Give at most "
-                    f"{MAX_TEXT_LENGTH:,}"
-                )
+                long = f"{len(prompt):,} characters are too many. Give at most {MAX_TEXT_LENGTH:,}"
+                raise UserError(f"{shortened(prompt, 60)}: {long}")
         if self.texts is not None and not all(text.strip() for text in self.prompts):
             raise UserError("empty text. Omit the text to sample without condition")
         if len(self.prompts) * self.samples * self.candidates > MAX_SAMPLES:
-            raise UserError(
-                f"{len(self.prompts):,} texts with samples={self.samples * self.candidates}: at most {MAX_SAMPLES:,} "
-                "motions per request"
-            )
+            texts = f"{len(self.prompts):,} texts with samples={self.samples * self.candidates}"
+            raise UserError(f"{texts}: at most {MAX_SAMPLES:,} motions per request")
         _ = self.parts  # raises if a part is invalid
 
     def _check_lengths(self) -> None:
@@ -300,11 +292,7 @@ def understood(request: SamplingRequest, model: MotionGenerator) -> SamplingRequ
 
 
 def check_model(request: SamplingRequest, model: MotionGenerator) -> None:
-    """Checks that a model can do what is requested; the planning of a sampling run also checks the lengths.
-
-    Raises:
-        UserError: If the model lacks the condition, the action, sequences, the sampler or one of its options.
-    """
+    """Checks that a model can do what is requested; the planning of a sampling run also checks the lengths."""
     model.process.find_sampler(request.options.over(model.sampler_options))
     if request.kind not in ("none", model.conditioned_on):
         trained, instead = TRAINED_ON[model.conditioned_on]
@@ -340,11 +328,8 @@ def read_parts(text: str) -> list[Part]:
 
 def is_range(value: Any) -> bool:
     """Returns whether the value is a pair of finite numbers."""
-    return (
-        isinstance(value, list | tuple)
-        and len(value) == 2
-        and all(isinstance(v, int | float) and math.isfinite(v) for v in value)
-    )
+    pair = isinstance(value, list | tuple) and len(value) == 2
+    return pair and all(isinstance(v, int | float) and math.isfinite(v) for v in value)
 
 
 def read_path(text: str) -> list[tuple[float, float]]:

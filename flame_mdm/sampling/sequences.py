@@ -29,9 +29,8 @@ def motion_lengths(model: MotionGenerator, request: SamplingRequest) -> list[lis
     lengths = [min(round(3 * fps), longest) if length is None else round(length) for length in frames]
     for length in lengths:
         if length < 2:
-            raise UserError(
-                f"{length / fps:g} seconds ({length} frames) are too short: give at least {2 / fps:g} seconds"
-            )
+            shown = f"{length / fps:g} seconds ({length} frames)"
+            raise UserError(f"{shown} are too short: give at least {2 / fps:g} seconds")
         if length > longest:
             raise UserError(
                 f"{length / fps:g} seconds ({length} frames) cannot be sampled: the model was trained on motions of up "

@@ -82,15 +82,11 @@ class Targets:
             imposed[0, frame] = representation.normalize(features.to(device))
             keep[0, frame] = representation.joint_features(range(1, len(representation.skeleton))).to(device)
         positions = Positions(*(x.to(device) for x in vars(self.positions).values()))
-        bones = self._bones(representation).to(device)
+        stretched = sorted(set(self.positions.frames[self.positions.joints > 0].tolist()))  # not by moving the root
+        edges = [(frame, *edge) for frame in stretched for edge in representation.skeleton.edges]
+        bones = torch.tensor(edges, dtype=torch.long, device=device).reshape(-1, 3).T
         guide = PositionGuide(representation, positions, bones, imposed, keep)
         return Edit(imposed, keep, guide=guide if len(positions.values) else None)
-
-    def _bones(self, representation: Representation) -> Tensor:
-        """Returns frame, parent and child (3, N) of all bones, in each frame with a target for a joint but the root."""
-        frames = sorted(set(self.positions.frames[self.positions.joints > 0].tolist()))
-        bones = [(frame, *edge) for frame in frames for edge in representation.skeleton.edges]
-        return torch.tensor(bones, dtype=torch.long).reshape(-1, 3).T
 
 
 def errors(motion: Motion, targets: Targets) -> np.ndarray:
@@ -102,11 +98,7 @@ def errors(motion: Motion, targets: Targets) -> np.ndarray:
 
 
 def read_targets(representation: Representation, source: str | Path | Mapping[str, Any]) -> Targets:
-    """Reads targets from a JSON file, or from its content; docs/targets.md describes it.
-
-    Raises:
-        UserError: If the file is not such a file, a joint is unknown, or a target cannot be reached.
-    """
+    """Reads targets from a JSON file, or from its content (docs/targets.md); raises `UserError` if they are invalid."""
     name, folder = ("targets", Path()) if isinstance(source, Mapping) else (f"targets={source}", Path(source).parent)
     content = source if isinstance(source, Mapping) else _read(source, name)
     if not isinstance(content, Mapping) or not content:
@@ -148,7 +140,6 @@ def read_targets(representation: Representation, source: str | Path | Mapping[st
 
 
 def _frame(kind: str, entry: Any, where: str, fps: float) -> int:
-    """Checks the keys of an entry, and returns the frame of its time."""
     needed, possible = KEYS[kind]
     if not isinstance(entry, Mapping) or not needed <= entry.keys() <= needed | possible:
         optional = f", and possibly {', '.join(sorted(possible))}" if possible else ""
@@ -169,7 +160,6 @@ def _read(source: str | Path, name: str) -> Any:
 
 
 def _numbers(entry: Mapping[str, Any], key: str, where: str, count: int = 1) -> list[float]:
-    """Returns the numbers of an entry; NaN for null."""
     listed = entry[key] if isinstance(entry[key], list | tuple) else [entry[key]]
     values = [math.nan if value is None else value for value in listed]
     if len(values) != count or not all(isinstance(v, int | float) and not abs(v) > 1e4 for v in values):
@@ -206,14 +196,12 @@ def _pose(
 
 
 def _check_reach(goals: list[Goal], fps: float) -> None:
-    """Checks that heights are possible, and that a person can move from position to position in time."""
     before, start, begin = "the start", np.zeros(2), 0
     for goal in sorted(goals, key=lambda goal: goal.frame):
         height, floor = goal.position[1], goal.position[[0, 2]]
         if not (np.isnan(height) or -0.1 <= height <= REACH):
-            raise UserError(
-                f"{goal.source}: height {height:g} m is impossible. Give 0 to {REACH:g} meters above the floor"
-            )
+            impossible = f"height {height:g} m is impossible. Give 0 to {REACH:g} meters above the floor"
+            raise UserError(f"{goal.source}: {impossible}")
         if np.isnan(floor).any():
             continue
         distance, seconds = float(np.linalg.norm(floor - start)), (goal.frame - begin) / fps

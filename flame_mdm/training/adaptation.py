@@ -134,7 +134,6 @@ def _recipe(model: MotionGeneration, captions: Sequence[str], name: str, out: Pa
 
 
 def _prior(model: MotionGeneration, root: Path, own: Path, captions: Sequence[str]) -> Path:
-    """Returns the store of the base's training data if it is in `root`, otherwise one of motions sampled from it."""
     representation = model.representation
     folder = root / f"{(model.config.get('data') or {}).get('name')}-{representation.name}"
     if (folder / "store.json").exists() and Store(folder).fingerprint == model.facts.get("fingerprint"):

@@ -44,9 +44,7 @@ class MovingAverage(WeightAveraging):
         assert self._average_model is not None
         self.begun = int(self._average_model.n_averaged) > 0
 
-    def on_train_batch_end(
-        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
-    ) -> None:
+    def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
         step = trainer.global_step
         if step <= self._latest_update_step or step % self.update_every_n_steps:
             return

@@ -18,6 +18,7 @@ from lightning import Callback, LightningModule, Trainer
 from lightning.pytorch.callbacks import Checkpoint
 from torch import Tensor
 from torch.nn.utils import get_total_norm
+from torch.optim import Optimizer
 from torchmetrics import Metric
 
 from flame_mdm.batch import MotionBatch
@@ -38,8 +39,7 @@ from flame_mdm.task import MotionGeneration, Task
 from flame_mdm.training.loggers import log_video
 from flame_mdm.training.provenance import device_name
 
-REAL = 64
-"""Training clips that metrics of samples are compared with."""
+REAL = 64  # training clips that metrics of samples are compared with
 
 
 class Interrupted(Exception):
@@ -72,9 +72,7 @@ class Checkpoints(Checkpoint):
         self.step = trainer.global_step
         self.stop.install()
 
-    def on_train_batch_end(
-        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
-    ) -> None:
+    def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
         if trainer.global_step == self.step:  # gradients are still being accumulated
             return
         self.step = trainer.global_step
@@ -146,9 +144,7 @@ class Measurements(Callback):
     def _restart(self) -> None:
         self.since, self.steps, self.samples = time.perf_counter(), 0, 0
 
-    def on_before_optimizer_step(
-        self, trainer: Trainer, pl_module: LightningModule, optimizer: torch.optim.Optimizer
-    ) -> None:
+    def on_before_optimizer_step(self, trainer: Trainer, pl_module: LightningModule, optimizer: Optimizer) -> None:
         if (trainer.global_step + 1) % trainer.log_every_n_steps == 0:  # type: ignore[attr-defined]
             gradients = [p.grad for p in pl_module.parameters() if p.grad is not None]
             pl_module.log("train/grad_norm", get_total_norm(gradients))

@@ -23,11 +23,9 @@ from flame_mdm.safe_io import write_failure
 from flame_mdm.task import Task
 
 LAST, PREVIOUS = "last.ckpt", "previous.ckpt"
-OLDEST_LIGHTNING = Version("2.6")
-"""Lightning migrates checkpoints of older versions, by code that trusts them."""
+OLDEST_LIGHTNING = Version("2.6")  # Lightning migrates checkpoints of older versions, by code that trusts them
 SCALAR = torch.tensor(0.0)
-LARGEST = 2**53
-"""Numbers of steps and learning rates are smaller."""
+LARGEST = 2**53  # numbers of steps and learning rates are smaller
 
 
 class Resumed(NamedTuple):

@@ -43,16 +43,11 @@ class ConsistencyDistillation(DistilledGenerator, MotionGeneration):
         return super().train(False)
 
     def setup(self, stage: str) -> None:
-        """Also starts from the teacher."""
         super().setup(stage)
         self.start_from_teacher()
 
     def start_from_teacher(self) -> None:
-        """Reads the teacher, and takes over its weights.
-
-        Raises:
-            FileNotFoundError, UserError: If the recipe names no teacher, or one that does not suit.
-        """
+        """Reads the teacher, and takes over its weights; raises `UserError` if there is none, or it does not suit."""
         options = self.config["distillation"]
         try:
             path = find(options["teacher"])
@@ -68,11 +63,7 @@ class ConsistencyDistillation(DistilledGenerator, MotionGeneration):
         self.teacher, self.target = [copy.deepcopy(self.denoiser).requires_grad_(False)], [self.denoiser]
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Checks that a resumed run has the same teacher.
-
-        Raises:
-            UserError: If the weights of the teacher have changed.
-        """
+        """Raises `UserError` if the weights of the teacher have changed since the run began."""
         if checkpoint["facts"].get("teacher") != self.facts["teacher"]:
             raise UserError(
                 f"distillation.teacher={self.config['distillation']['teacher']}: its weights have changed since this "
@@ -122,12 +113,7 @@ class ConsistencyDistillation(DistilledGenerator, MotionGeneration):
 
 
 def read_teacher(path: Path) -> MotionGenerator:
-    """Loads a model that can be a teacher.
-
-    Raises:
-        FileNotFoundError: If there is no such checkpoint.
-        UserError: If it is not a model that generates motions, predicts noise, or is a student itself.
-    """
+    """Loads a model that can be a teacher; raises `UserError` if it predicts noise, or is a student itself."""
     teacher = load_task(path, MotionGenerator)
     if isinstance(teacher, DistilledGenerator):
         raise UserError(f"{path}: distilled already. Give its teacher, {teacher.config['distillation']['teacher']}")
@@ -140,7 +126,6 @@ def read_teacher(path: Path) -> MotionGenerator:
 
 
 def _check_same(teacher: MotionGenerator, student: ConsistencyDistillation) -> None:
-    """Raises `UserError` if teacher and student differ in a part, or in the data."""
     name = student.config["distillation"]["teacher"]
     for part in PARTS[1:]:
         theirs, ours = flatten(teacher.config[part]), flatten(student.config[part])

@@ -114,23 +114,19 @@ def check_devices(trainer: Config) -> None:
 
 
 def _requeue() -> None:
-    job = os.environ.get("SLURM_JOB_ID")
-    if job is None:
+    if (job := os.environ.get("SLURM_JOB_ID")) is None:
         return
     command = ["scontrol", "requeue", job]
     try:
-        result = subprocess.run(command, capture_output=True, text=True, check=False)
-        failure = result.stderr.strip() if result.returncode else None
-    except OSError as error:
-        failure = str(error)
-    if failure is None:
-        say(f"job {job} was requeued")
-    else:
+        subprocess.run(command, capture_output=True, text=True, check=True)
+    except (OSError, subprocess.CalledProcessError) as error:
+        failure = error.stderr.strip() if isinstance(error, subprocess.CalledProcessError) else error
         say(f"error: {' '.join(command)}: {failure}. Submit the job again", error=True)
+    else:
+        say(f"job {job} was requeued")
 
 
 def _check_same_data(resumed: Resumed, data: MotionDataModule) -> None:
-    """Checks, on the first process, that a resumed run has the data that it was trained on."""
     if rank_zero_only.rank:
         return
     data.prepare_data()
@@ -143,7 +139,6 @@ def _check_same_data(resumed: Resumed, data: MotionDataModule) -> None:
 
 
 def _quiet() -> None:
-    """Silences Lightning's warnings about choices that are intended here."""
     logging.getLogger("lightning.pytorch").setLevel(logging.ERROR)
     for message in (
         ".*isinstance\\(treespec, LeafSpec\\).*",  # Lightning's own

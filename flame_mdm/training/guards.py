@@ -54,24 +54,15 @@ class BadLoss(Callback):
         self.seen: list[tuple[int, int, Sequence[str], Tensor]] = []
         self.shape: tuple[int, ...] = ()
 
-    def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: MotionBatch, _: int) -> None:
+    def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: MotionBatch, *_: Any) -> None:
         self.shape = tuple(batch.x.shape)
 
-    def on_validation_batch_start(
-        self, trainer: Trainer, pl_module: LightningModule, batch: MotionBatch, *_: Any
-    ) -> None:
-        self.shape = tuple(batch.x.shape)
+    on_validation_batch_start = on_train_batch_start
 
     def on_train_batch_end(
-        self,
-        trainer: Trainer,
-        pl_module: LightningModule,
-        outputs: Tensor | Mapping[str, Any] | None,
-        batch: MotionBatch,
-        batch_idx: int,
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: MotionBatch, batch_idx: int
     ) -> None:
         loss = outputs["loss"] if isinstance(outputs, Mapping) else outputs
-        assert loss is not None
         self.seen.append((trainer.global_step, batch_idx, batch.ids, loss.detach()))
         if (batch_idx + 1) % trainer.log_every_n_steps == 0:  # type: ignore[attr-defined]
             self.check(trainer)
@@ -83,11 +74,11 @@ class BadLoss(Callback):
         """Raises `UserError` if a loss since the last check is bad, on all processes at the same step."""
         if not self.seen:
             return
-        mine = torch.stack([s[-1].float() for s in self.seen])
-        parts = [torch.empty_like(mine) for _ in range(trainer.world_size)]
+        parts = [torch.stack([s[-1].float() for s in self.seen])]
         if trainer.world_size > 1:
+            mine, parts = parts[0], [torch.empty_like(parts[0]) for _ in range(trainer.world_size)]
             torch.distributed.all_gather(parts, mine)
-        losses = torch.stack(parts if trainer.world_size > 1 else [mine]).cpu()
+        losses = torch.stack(parts).cpu()
         bad = ~losses.isfinite() | (losses > self.factor * self.usual)
         if bad.any():
             first = int(bad.any(0).nonzero()[0])

@@ -23,10 +23,8 @@ from flame_mdm.batch import Condition, MotionBatch
 from flame_mdm.config import compose, instantiate
 from flame_mdm.task import MotionGeneration, Task
 
-TOKENS = 30
-"""Tokens of a caption: 20 in FLAME, 30 in MFM's T5, about that many at most in CLIP's 22."""
-COPIES = 4
-"""Float32 numbers per parameter: the weight, its gradient and the two moments of Adam."""
+TOKENS = 30  # tokens of a caption: 20 in FLAME, 30 in MFM's T5, about that many at most in CLIP's 22
+COPIES = 4  # float32 numbers per parameter: the weight, its gradient and the two moments of Adam
 
 
 def training_step(task: Task, batch: MotionBatch) -> Tensor:

@@ -41,10 +41,13 @@ RUNS = [
 ]
 
 
+BATCH, FEATURES, GUIDANCE = 4, 263, 2.5
+
+
 def inputs(batch: int, args: argparse.Namespace) -> tuple[Tensor, Tensor, Condition]:
     """Returns noise (B, F, D), mask (B, F) and a condition with a null."""
     null = Condition(torch.zeros(1, 512, device=args.device), torch.zeros(1, 0, 512, device=args.device), None)
-    noise = torch.randn(batch, args.frames, args.features, device=args.device)
+    noise = torch.randn(batch, args.frames, FEATURES, device=args.device)
     pooled = torch.randn(batch, 512, device=args.device)
     cond = Condition(pooled, torch.zeros(batch, 0, 512, device=args.device), None, null)
     return noise, torch.ones(noise.shape[:2], dtype=torch.bool, device=args.device), cond
@@ -64,7 +67,7 @@ def measure_loops(args: argparse.Namespace) -> list[Row]:
     keep = torch.zeros_like(fixed, dtype=torch.bool)
     keep[:, : args.frames // 4] = True
     stored = {rows: torch.randn(rows, *fixed.shape[1:], device=args.device) for rows in (1, 2)}
-    guided = classifier_free_guidance(lambda x_t, *_: stored[len(x_t)], args.guidance_scale, args.features)
+    guided = classifier_free_guidance(lambda x_t, *_: stored[len(x_t)], GUIDANCE, FEATURES)
     rows: list[Row] = []
     for process, sampler in {(type(process), sampler): (process, sampler) for process, sampler, _ in RUNS}.values():
         cells: list[float | None] = []
@@ -81,20 +84,15 @@ def measure_loops(args: argparse.Namespace) -> list[Row]:
     for batch in (1, 64):
         ids = [str(number) for number in range(batch)]
         noise = seeded_noise(ids, *fixed.shape[1:], seed=0, replication=0, like=fixed)
-        rows.append(
-            {
-                "sampler": f"noise, batch {batch}",
-                "alone": 1e3 * seconds(partial(noise, 1), 2 * args.repeats, args.device),
-            }
-        )
-        rows[-1] |= dict.fromkeys(names[1:])
+        taken = seconds(partial(noise, 1), 2 * args.repeats, args.device)
+        rows.append({"sampler": f"noise, batch {batch}", "alone": 1e3 * taken, **dict.fromkeys(names[1:])})
     return rows
 
 
 def measure_steps(denoise: Denoise, args: argparse.Namespace) -> list[Row]:
     """Returns seconds per run and motions per second by batch size and number of steps, distilled and ancestral."""
     rows: list[Row] = []
-    guided = classifier_free_guidance(denoise, args.guidance_scale, args.features)
+    guided = classifier_free_guidance(denoise, GUIDANCE, FEATURES)
     first = 0.0
     for batch in (1, 64):
         fixed, mask, cond = inputs(batch, args)
@@ -115,8 +113,8 @@ def measure_steps(denoise: Denoise, args: argparse.Namespace) -> list[Row]:
 
 
 def measure_samplers(denoise: Denoise, args: argparse.Namespace) -> list[Row]:
-    fixed, mask, cond = inputs(args.batch, args)
-    guided = classifier_free_guidance(denoise, args.guidance_scale, args.features)
+    fixed, mask, cond = inputs(BATCH, args)
+    guided = classifier_free_guidance(denoise, GUIDANCE, FEATURES)
     counted = [CountedDenoise(guided) for _ in RUNS]
     runs = {
         f"{sampler} {count}": partial(process.sample, own, lambda draw: fixed, mask, cond, options(sampler, count))
@@ -127,37 +125,33 @@ def measure_samplers(denoise: Denoise, args: argparse.Namespace) -> list[Row]:
     for own, (_, sampler, count) in zip(counted, RUNS, strict=True):
         taken, calls = times[f"{sampler} {count}"], own.calls // (args.repeats + 1)
         row: Row = {"sampler": sampler, "steps": "" if sampler == "dopri5" else str(count), "network calls": calls}
-        rows.append(
-            row | {"ms": 1e3 * taken, "ms per call": 1e3 * taken / calls, "ratio": taken / next(iter(times.values()))}
-        )
+        row |= {"ms": 1e3 * taken, "ms per call": 1e3 * taken / calls, "ratio": taken / next(iter(times.values()))}
+        rows.append(row)
     return rows
 
 
 @torch.no_grad()
 def measure(*words: str) -> Section:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--batch", type=int, default=4)
     parser.add_argument("--frames", type=int, default=60)
-    parser.add_argument("--features", type=int, default=263)
     parser.add_argument("--latent-dim", type=int, default=128)
     parser.add_argument("--num-layers", type=int, default=4)
-    parser.add_argument("--guidance-scale", type=float, default=2.5)
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--longest", type=float, default=20, help="seconds above which more steps are estimated")
     parser.add_argument("--device", default="cpu")
     args = parser.parse_args(words)
     torch.manual_seed(0)
     size = {"latent_dim": args.latent_dim, "ff_size": 2 * args.latent_dim, "num_layers": args.num_layers}
-    encoder = MDMEncoder(args.features, args.features, 512, num_heads=4, dropout=0.1, **size).eval().to(args.device)
+    encoder = MDMEncoder(FEATURES, FEATURES, 512, num_heads=4, dropout=0.1, **size).eval().to(args.device)
     loops, samplers, steps = measure_loops(args), measure_samplers(encoder, args), measure_steps(encoder, args)
     seconds = {(row["batch"], str(row["steps"])[:2]): row for row in steps}
     latency, throughput = seconds["1", "10"]["seconds"], seconds["64", "10"]["motions per second"]
     return section(
         "Sampling",
         f"MDM's encoder with {sum(p.numel() for p in encoder.parameters()):,} parameters, motions of {args.frames} "
-        f"frames of {args.features} features, on {args.device}, guidance {args.guidance_scale} (two rows per motion in "
+        f"frames of {FEATURES} features, on {args.device}, guidance {GUIDANCE} (two rows per motion in "
         "one call). Latency and throughput are those of the ancestral sampler, with noise; the samplers have "
-        f"{args.batch} motions per batch; the loops alone run without a network, at batch 1.",
+        f"{BATCH} motions per batch; the loops alone run without a network, at batch 1.",
         f"With 10 steps, one motion takes {1000 * float(latency or 0):.0f} ms, and batches of 64 give "
         f"{float(throughput or 0):.0f} motions per second.",
         latency_at_batch_1_and_throughput_at_batch_64=steps,

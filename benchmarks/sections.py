@@ -8,8 +8,7 @@ from typing import Any
 import torch
 
 Row = dict[str, str | float | None]
-Section = dict[str, Any]
-"""A title, a text, a summary in one sentence, and tables by caption."""
+Section = dict[str, Any]  # a title, a text, a summary in one sentence, and tables by caption
 
 
 def section(title: str, text: str, summary: str, **tables: list[Row]) -> Section:

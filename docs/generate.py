@@ -99,8 +99,7 @@ DEVIATIONS = {("humanml3d/mdm_unet", "parameters"): "no code is public; the widt
 def same(ours: Any, papers: Any) -> bool:
     """Returns whether a value agrees with the paper's, to the paper's digits."""
     if isinstance(papers, float) and isinstance(ours, float):
-        digits = len(f"{papers}".partition(".")[2]) if papers > 1 else 12
-        return round(ours, digits) == papers
+        ours = round(ours, len(f"{papers}".partition(".")[2]) if papers > 1 else 12)
     return ours == papers
 
 
@@ -132,13 +131,10 @@ of a text encoder (MFM: CLIP, T5; MDM: sentence-BERT), the checkpoint is our cho
 
 
 def _cell(ours: Any, papers: Any) -> str:
-    if papers is None:
-        return _text(ours)
-    return f"**{_text(papers)}**" if same(ours, papers) else f"{_text(ours)} (paper: {_text(papers)})"
-
-
-def _text(value: Any) -> str:
-    return "–" if value is None else setting_text(value)
+    if papers is not None and same(ours, papers):
+        return f"**{setting_text(papers)}**"
+    text = "–" if ours is None else setting_text(ours)
+    return text if papers is None else f"{text} (paper: {setting_text(papers)})"
 
 
 PAGES = {"recipes.md": recipes_page, "hyperparameters.md": hyperparameters_page}

@@ -41,8 +41,6 @@ class MotionBatch:
 
     def to(self, device: torch.device) -> MotionBatch:
         """Returns the batch on a device, without waiting for the copy; Lightning calls this."""
-        if self.x.device == device:
-            return self
         action = None if self.action is None else sent(self.action, device)
         return replace(self, x=sent(self.x, device), mask=sent(self.mask, device), action=action)
 

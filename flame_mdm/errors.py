@@ -9,8 +9,7 @@ from collections.abc import Iterable
 
 MAX_LINE = 2_000
 """Maximum number of characters shown of an error line. The framework's own messages are shorter."""
-DIRECTIONS = re.compile("[\u061c\u200e\u200f\u202a-\u202e\u2066-\u2069]")
-"""Bidirectional control characters of Unicode."""
+DIRECTIONS = re.compile("[\u061c\u200e\u200f\u202a-\u202e\u2066-\u2069]")  # bidirectional control characters of Unicode
 
 
 class UserError(ValueError):

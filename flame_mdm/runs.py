@@ -14,8 +14,7 @@ from flame_mdm.errors import UserError
 from flame_mdm.schemas import Int, Number, Result, Schema, check_shape, read_json, read_result
 
 CONFIG, PROVENANCE, FAULT = "config.yaml", "provenance.json", "bad_batch.json"
-HISTORY = "metrics.jsonl"
-"""Training curves, one line per log step."""
+HISTORY = "metrics.jsonl"  # training curves, one line per log step
 RESULTS = "evaluation/**/result*.json"
 SAMPLES = "samples/step_*"
 HISTORY_LIMIT = 256 * safe_io.MEBIBYTE

@@ -35,10 +35,8 @@ TEXT_LIMIT = 512 * MEBIBYTE
 """Maximum size of a text or JSON file. The largest known, BABEL's annotations, has 175 MiB."""
 YAML_LIMIT = MEBIBYTE // 4
 """Maximum size of a YAML file: recipes, skeletons, protocols and table specs are far smaller, and parsing is slow."""
-YAML_NODES = 100_000
-"""Maximum number of keys and values in a YAML file after its aliases are expanded."""
-YAML_DIGITS = 20
-"""Maximum number of characters of an integer in a YAML file; 2^63 has 19."""
+YAML_NODES = 100_000  # maximum number of keys and values in a YAML file after its aliases are expanded
+YAML_DIGITS = 20  # maximum number of characters of an integer in a YAML file; 2^63 has 19
 ARRAYS_LIMIT = 128 * MEBIBYTE
 """Total size that the arrays of a compressed file may always have. Beyond that, they may have up to `INFLATION` times
 the size of the file; motion data compresses less than 10 times."""

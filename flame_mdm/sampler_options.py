@@ -7,8 +7,7 @@ from typing import Any, Self
 
 from flame_mdm.errors import UserError
 
-MAX_STEPS = 100_000
-"""Maximum number of steps of a diffusion or sampler."""
+MAX_STEPS = 100_000  # maximum number of steps of a diffusion or sampler
 SPACINGS = ("linspace", "stride")
 """How diffusion places a number of steps; see `flame_mdm.processes.schedules.timesteps`."""
 

@@ -10,14 +10,12 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError,
 from flame_mdm import safe_io
 from flame_mdm.errors import UserError, did_you_mean
 
-MAX_INTEGER = 2**63 - 1
-"""Maximum integer in a file; larger ones overflow when they are plotted or logged."""
+MAX_INTEGER = 2**63 - 1  # maximum integer in a file; larger ones overflow when they are plotted or logged
 LIMIT = 4 * safe_io.MEBIBYTE
 """Maximum size of a file of results, ratings, lengths or provenance. Typical files have 10 to 300 KiB."""
 T = TypeVar("T")
 Int = Annotated[int, Field(gt=-(2**63), lt=2**63)]
-Number = Annotated[float, Field(gt=-1e300, lt=1e300)]
-"""A finite number that does not overflow when it is plotted."""
+Number = Annotated[float, Field(gt=-1e300, lt=1e300)]  # a finite number that does not overflow when it is plotted
 Plain = str | bool | Int | Number | None
 
 
@@ -230,14 +228,8 @@ class AuditCard(ClosedSchema):
 
 EXPECTED = {
     **{"string": "a text", "bool": "true or false", "int": "a whole number", "float": "a number", "finite": "a number"},
-    **{
-        "less": "a smaller number",
-        "greater": "a larger number",
-        "none": "null",
-        "dict": "a mapping",
-        "model": "a mapping",
-        "list": "a list",
-    },
+    **{"less": "a smaller number", "greater": "a larger number", "none": "null"},
+    **{"dict": "a mapping", "model": "a mapping", "list": "a list"},
     **{"string_too_short": "a non-empty text", "too_short": "a longer list or mapping", "too_long": "a shorter list"},
 }
 """Expected content, by the type of a pydantic error or its first word."""
@@ -287,16 +279,12 @@ def _first_error(error: ValidationError, content: Any) -> str:
 
 
 def read_json(path: Path, kind: type[T] | Any, remedy: str = "") -> T:
-    """Returns the content of a JSON file of at most `LIMIT` bytes, as for `check_shape`; a `UserError` ends with
-    `remedy`.
-    """
+    """Returns the content of a JSON file of at most `LIMIT` bytes, as `check_shape` does; errors end with `remedy`."""
     message = f"; {remedy}" if remedy else ""
     try:
-        content = safe_io.read_json(path, LIMIT)
+        return check_shape(safe_io.read_json(path, LIMIT), kind)
     except UserError as error:
         raise UserError(f"{error}{message}") from error
-    try:
-        return check_shape(content, kind)
     except (ValueError, RecursionError) as error:
         raise UserError(f"{path}: damaged: {error}{message}") from error
 

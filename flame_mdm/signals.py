@@ -10,8 +10,7 @@ from multiprocessing import active_children
 from types import FrameType
 from typing import Any, NoReturn
 
-_received: BaseException | None = None
-"""The exception of the first signal that the running command received."""
+_received: BaseException | None = None  # the exception of the first signal that the running command received
 
 
 @contextmanager

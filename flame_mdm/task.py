@@ -85,9 +85,7 @@ class Task(Model, LightningModule):
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": decay, "interval": "step"}}
 
     def on_train_start(self) -> None:
-        """Enables gradient clipping for fused optimizers in bfloat16, whose gradients are not scaled; Lightning refuses
-        it.
-        """
+        """Enables clipping for fused optimizers in bfloat16, whose gradients are not scaled; Lightning refuses it."""
         if self.trainer.precision == "bf16-mixed":
             for optimizer in self.trainer.optimizers:
                 optimizer._step_supports_amp_scaling = False  # type: ignore[attr-defined]
@@ -209,9 +207,7 @@ class MotionGeneration(MotionGenerator, Task):
         for name, value in self.losses_of(batch).items():
             if name not in self.val_losses:
                 self.val_losses[name] = MeanMetric().to(self.device)
-            metric = self.val_losses[name]
-            assert isinstance(metric, MeanMetric)
-            metric.update(value)
+            self.val_losses[name].update(value)  # type: ignore[operator]
 
     def on_validation_epoch_end(self) -> None:
         """Logs each loss as the mean over all clips of all processes; every clip has the same weight."""

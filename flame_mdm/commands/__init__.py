@@ -20,6 +20,10 @@ from flame_mdm.sampler_options import option
 STORE = "store.json"
 
 
+def data_root() -> str:
+    return os.environ.get("FLAME_MDM_DATA", "data")
+
+
 @dataclass(frozen=True, kw_only=True)
 class ModelSettings:
     """Keys that name a model."""
@@ -28,7 +32,7 @@ class ModelSettings:
     which: Which = option("last", "or best: the checkpoint of a run directory")
 
     def model_file(self) -> Path:
-        """Returns the file of the model; see `flame_mdm.checkpoints.locating.find`."""
+        """Returns the file of the model; see `flame_mdm.checkpoints.model_files.find`."""
         if self.ckpt is None:
             raise UserError("no checkpoint given. Add ckpt=runs/.../checkpoints/last.ckpt")
         return find(self.ckpt, self.which)
@@ -67,10 +71,7 @@ class DataSettings:
 
     data: str | None = option(None, "data set: a file in experiments/data; data.KEY=... overrides its keys")
     representation: str | None = option(None, "a file in experiments/representation; default: the data set's")
-    data_root: str = option(
-        lambda: os.environ.get("FLAME_MDM_DATA", "data"),
-        "folder of the prepared data sets; default: FLAME_MDM_DATA, or data",
-    )
+    data_root: str = option(data_root, "folder of the prepared data sets; default: FLAME_MDM_DATA, or data")
     seed: int = option(0, "seed of generated data")
     composed: tuple[str, ...] = ()
 
@@ -155,14 +156,12 @@ def about_key(key: str) -> Iterator[None]:
 def check_words(settings: BodySettings) -> None:
     """Checks the name of the body, before torch is imported."""
     if settings.body.split()[:1] not in (["mannequin"], ["anny"]):
-        raise UserError(
-            f'body={settings.body}: unknown. Use mannequin, anny, or anny with its shape: body="anny age=0.9"'
-        )
+        choices = 'mannequin, anny, or anny with its shape: body="anny age=0.9"'
+        raise UserError(f"body={settings.body}: unknown. Use {choices}")
 
 
 def check_device(device: str | None) -> None:
     """Checks the name of a device, before torch is imported."""
     if device is not None and not re.fullmatch(r"cpu|mps|xpu|cuda(:\d+)?", device):
-        raise UserError(
-            f"device={device}: unknown.{did_you_mean(device, ['cpu', 'cuda'])} Give cpu, cuda or cuda:NUMBER"
-        )
+        near = did_you_mean(device, ["cpu", "cuda"])
+        raise UserError(f"device={device}: unknown.{near} Give cpu, cuda or cuda:NUMBER")

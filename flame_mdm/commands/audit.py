@@ -42,9 +42,8 @@ def main(settings: AuditSettings) -> None:
         say(*write_card([read_card(Path(card)) for card in settings.cards], out))
         return
     if settings.data is None or settings.extractor is None:
-        raise UserError(
-            "an audit needs a data set and an extractor. Give data=NAME and extractor=FILE, or extractor=none"
-        )
+        lacking = "an audit needs a data set and an extractor"
+        raise UserError(f"{lacking}. Give data=NAME and extractor=FILE, or extractor=none")
     if settings.resamples == 0 or (settings.samples or 64) < 8:
         raise UserError(f"resamples={settings.resamples}, samples={settings.samples}: give 100, and 8 or more")
     check_extractor(settings.extractor)

@@ -58,10 +58,9 @@ def main(settings: CompareSettings) -> None:
         write_json(out, {"format": 1, "question": QUESTION, "pairs": pairs})
         for pair in pairs:
             low, high = pair["interval_a"]
-            say(
-                f"{pair['a']} over {pair['b']}: {pair['wins_a']} of {pair['wins_a'] + pair['wins_b']} answers, "
-                f"{pair['share_a']:.1%} ({low:.1%} to {high:.1%}), {pair['raters']} raters"
-            )
+            answers = f"{pair['wins_a']} of {pair['wins_a'] + pair['wins_b']} answers"
+            share = f"{pair['share_a']:.1%} ({low:.1%} to {high:.1%})"
+            say(f"{pair['a']} over {pair['b']}: {answers}, {share}, {pair['raters']} raters")
         say(f"written: {out}")
         return
     assert settings.runs is not None
@@ -81,7 +80,6 @@ def main(settings: CompareSettings) -> None:
 
 
 def _tested(runs: Mapping[str, Run]) -> list[str]:
-    """Returns lines about the differences of evaluations that two runs have in common."""
     lines = in_common(runs)
     for title, columns in grouped(runs).items():
         for heading, rows in tested(columns):

@@ -19,8 +19,7 @@ if TYPE_CHECKING:
     from flame_mdm.formats.motion import Motion
 
 FAULTY = 3
-MOST_LINES = 20
-"""Faults that are printed per motion; the player shows all."""
+MOST_LINES = 20  # faults that are printed per motion; the player shows all
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,7 +94,6 @@ def _files(name: str) -> list[Path]:
 
 
 def _read(settings: InspectSettings, files: Sequence[Path]) -> tuple[str, int, Iterator[Motion]]:
-    """Returns a name, the number of motions, and the motions of files."""
     from flame_mdm.formats.layouts import find_skeleton
     from flame_mdm.formats.readers import read
 

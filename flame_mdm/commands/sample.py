@@ -127,10 +127,8 @@ class SampleSettings(OutputSettings):
         return replace(request, targets=path_targets(way, sum(seconds or usual for _, seconds in request.parts[0])))
 
 
-GALLERY = 200
-"""Maximum number of motions on the page of a file of prompts, which has about 20 kB for each."""
-LENGTHS = ("seconds", "frames")
-"""Keys that take one value, or one per prompt."""
+GALLERY = 200  # maximum number of motions on the page of a file of prompts, which has about 20 kB for each
+LENGTHS = ("seconds", "frames")  # keys that take one value, or one per prompt
 IN_NAME = (
     *LENGTHS,
     *(entry.name for entry in fields(SamplerOptions)),
@@ -218,7 +216,6 @@ def summary(folder: Path, motions: Sequence[Motion], settings: OutputSettings) -
 
 
 def _gallery(settings: SampleSettings, folders: Mapping[Path, list[Motion]], body: Mesh) -> str:
-    """Writes one page with the first motion of each prompt next to their folders, and returns a line about it."""
     from flame_mdm.visualize import write_player
 
     page = next(iter(folders)).with_name(f"{Path(str(settings.prompts)).stem}.html")

@@ -17,8 +17,7 @@ from flame_mdm.sampler_options import option
 if TYPE_CHECKING:
     from flame_mdm.reporting.tables.specs import Evaluation
 
-INVALID = 3
-"""Exit code if a requested row is not valid."""
+INVALID = 3  # exit code if a requested row is not valid
 
 
 @dataclass(frozen=True, kw_only=True)

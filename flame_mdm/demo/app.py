@@ -22,12 +22,11 @@ from flame_mdm.demo.guard import Guard
 from flame_mdm.demo.page import build_page
 from flame_mdm.demo.request import parse_query
 from flame_mdm.demo.studio import Studio
-from flame_mdm.errors import UserError, first_line, one_line
+from flame_mdm.errors import UserError, first_line, one_line, say
 
 SESSIONS = 64
 """Number of open pages that gradio remembers; it keeps half a megabyte for each, and the page needs none of it."""
-CONNECTIONS = 256
-"""Maximum number of open connections; further ones get status 503."""
+CONNECTIONS = 256  # maximum number of open connections; further ones get status 503
 WRITERS, WAITING_FILES = 2, 32
 """Number of motion files that are written at the same time, and of those that wait for it."""
 FONT, MONO = ("system-ui", "sans-serif"), ("ui-monospace", "monospace")
@@ -45,8 +44,6 @@ def serve(
     `sources` are as for `Studio`; the other arguments are the keys of `flame-mdm demo`.
     """
     import torch
-
-    from flame_mdm.errors import say
 
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     with socket.socket(family) as listening:

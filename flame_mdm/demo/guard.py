@@ -13,10 +13,8 @@ from starlette.datastructures import Headers
 from starlette.responses import PlainTextResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-MAX_BODY = 64 * 1024
-"""Maximum number of bytes of a request's body, counted as they arrive."""
-BODY_TIME = 10.0
-"""Maximum number of seconds in which a body arrives."""
+MAX_BODY = 64 * 1024  # maximum number of bytes of a request's body, counted as they arrive
+BODY_TIME = 10.0  # maximum number of seconds in which a body arrives
 READ = re.compile(
     r"/|/theme\.css|/favicon\.ico|/manifest\.json|/(assets|static)(/[\w-]+(\.[\w-]+)*)+|/motion\.\w{3}"
     r"|/gradio_api/(queue/data|heartbeat/\w{1,40})"
@@ -128,7 +126,6 @@ class Guard:
                 task.cancel()
 
     def _check_sender(self, headers: Headers, path: str) -> None:
-        """Raises `Refused` if the request is for another server, or comes from a page of another site."""
         host = headers.get("host", "")
         name = _host_name(f"//{host}")
         if name not in self.hosts | {"localhost"} and not _is_address(name):

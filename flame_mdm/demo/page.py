@@ -25,8 +25,7 @@ from flame_mdm.processes.guidance import STEERING_STEPS
 from flame_mdm.visualize import player_page
 from flame_mdm.visualize.render import thumbnail
 
-QUEUE = 64
-"""Maximum number of waiting requests; further ones are told to come back."""
+QUEUE = 64  # maximum number of waiting requests; further ones are told to come back
 PARTS = ("left_arm", "right_arm", "left_leg", "right_leg", "upper_body", "lower_body")
 RIGGED = (".bvh", ".glb")
 OFF = {} if find_spec("av") else {".mp4": "<span>MP4 is off: it needs the package av (pip install av)</span>"}
@@ -74,12 +73,9 @@ def build_page(studio: Studio, device: str | None = None) -> gr.Blocks:
         return '<p class="warning" role="alert">Canceled</p>'
 
     def switch(name: str) -> list[Any]:
-        choices = list(studio.model(name).process.samplers)
-        return [
-            _buttons(_examples(studio.model(name))),
-            gr.Dropdown(choices=choices, value=None),
-            _vocabulary(studio.model(name)),
-        ]
+        model = studio.model(name)
+        samplers = gr.Dropdown(choices=list(model.process.samplers), value=None)
+        return [_buttons(_examples(model)), samplers, _vocabulary(model)]
 
     with gr.Blocks(title="flame_mdm", analytics_enabled=False) as blocks:
         ui = _layout(studio)
@@ -89,9 +85,8 @@ def build_page(studio: Studio, device: str | None = None) -> gr.Blocks:
         fields, edit = list(form.values()), [ui.query, ui.chosen, ui.new, ui.begin, ui.end, ui.parts, ui.again]
         quick: dict[str, Any] = {"queue": False, "show_progress": "hidden", "api_visibility": "private"}
         read, compose = (f"(...values) => links.{name}({list(form)}, values)" for name in ("read", "compose"))
-        change, vary, sketch = (
-            f"(...values) => {name}(...values)" for name in ("links.change", "links.vary", "editor")
-        )
+        calls = ("links.change", "links.vary", "editor")
+        change, vary, sketch = (f"(...values) => {name}(...values)" for name in calls)
         first = [
             blocks.load(None, fields, [ui.request, *fields], js=read, **quick),
             ui.go.click(None, fields, ui.request, js=compose, **quick),
@@ -125,10 +120,8 @@ def _layout(studio: Studio) -> SimpleNamespace:
     ui.examples = gr.HTML(_buttons(examples), elem_id="examples")
     with gr.Row(elem_id="stage"):
         with gr.Column(elem_id="ask"):
-            label = "What the person does"
-            ui.text = gr.Textbox(
-                next(iter(examples)), label=label, max_length=MAX_TEXT, lines=2, autofocus=True, elem_id="text"
-            )
+            options: dict[str, Any] = {"max_length": MAX_TEXT, "lines": 2, "autofocus": True, "elem_id": "text"}
+            ui.text = gr.Textbox(next(iter(examples)), label="What the person does", **options)
             gr.HTML(EDITORS, js_on_load="editor()")
             label = "Way points: meters to the left, meters ahead"
             ui.path = gr.Textbox(label=label, placeholder="0,1 0.5,2", max_length=MAX_TEXT, elem_id="path")

@@ -19,8 +19,7 @@ MAX_TEXT, MAX_SECONDS, MAX_SAMPLES, MAX_STEPS, MAX_EDITS = 300, 30, 4, 1000, 8
 """Limits of a request: characters, seconds, motions, sampling steps, edits."""
 MAX_SEED = 2**31 - 1
 ALL = -1  # as the number of a motion: all motions so far
-PLUS = " + "
-"""Between the names of a model and of its adapter."""
+PLUS = " + "  # between the names of a model and of its adapter
 MAX_WAY_POINTS, FAR = 16, 20.0  # a path: way points, and meters along x and z
 
 PLAIN = r"^[^\x00-\x1f\x7f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069]*$"

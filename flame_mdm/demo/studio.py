@@ -19,12 +19,9 @@ from flame_mdm.sampling.editing import edit
 from flame_mdm.sampling.generation import generate
 from flame_mdm.sampling.request import SamplingRequest, read_parts, understood
 
-KEPT = 64
-"""Number of requests whose motions stay in memory; a download or an edit of them needs no model."""
-TIME_LIMIT = 300.0
-"""Maximum number of seconds of one request on the model."""
-FORMATS = {".bvh": "BVH", ".glb": "GLB", ".npz": "NPZ", ".mp4": "MP4"}
-"""Files to download, and their names on the page."""
+KEPT = 64  # number of requests whose motions stay in memory; a download or an edit of them needs no model
+TIME_LIMIT = 300.0  # maximum number of seconds of one request on the model
+FORMATS = {".bvh": "BVH", ".glb": "GLB", ".npz": "NPZ", ".mp4": "MP4"}  # files to download, and their names on the page
 
 
 class Stopped(UserError):
@@ -139,7 +136,6 @@ class Studio:
 
 
 def _plan(model: MotionGenerator, request: DemoRequest) -> tuple[list[tuple[int | None, dict[str, Any]]], bool]:
-    """Returns the steps of a request, and whether the motions are cleaned up at the end."""
     if model.conditioned_on != "none" and not request.text:
         raise UserError("the text is empty. Describe what the person does")
     parts = read_parts(request.text) if request.text else []

@@ -20,7 +20,7 @@ from flame_mdm.sampler_options import option
 STORE = "store.json"
 
 
-def data_root() -> str:
+def usual_data_root() -> str:
     return os.environ.get("FLAME_MDM_DATA", "data")
 
 
@@ -71,7 +71,7 @@ class DataSettings:
 
     data: str | None = option(None, "data set: a file in experiments/data; data.KEY=... overrides its keys")
     representation: str | None = option(None, "a file in experiments/representation; default: the data set's")
-    data_root: str = option(data_root, "folder of the prepared data sets; default: FLAME_MDM_DATA, or data")
+    data_root: str = option(usual_data_root, "folder of the prepared data sets; default: FLAME_MDM_DATA, or data")
     seed: int = option(0, "seed of generated data")
     composed: tuple[str, ...] = ()
 

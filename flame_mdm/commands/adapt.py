@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import ClassVar
 
-from flame_mdm.commands import ModelSettings, data_root
+from flame_mdm.commands import ModelSettings, usual_data_root
 from flame_mdm.errors import UserError
 from flame_mdm.sampler_options import option
 
@@ -26,7 +26,7 @@ class AdaptSettings(ModelSettings):
     full: bool = option(False, "true = train all weights; the result is a model instead of an adapter")
     force: bool = option(False, "true = accept clips that drift upward or float")
     rank: int = option(8, "of the changes of the weights; more for motions far from what the model knows")
-    data_root: str = option(data_root, "folder of the prepared data sets")
+    data_root: str = option(usual_data_root, "folder of the prepared data sets")
     composed: tuple[str, ...] = ()
 
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import ClassVar
 
-from flame_mdm.commands import FileSettings, check_motion, data_root
+from flame_mdm.commands import FileSettings, check_motion, usual_data_root
 from flame_mdm.commands.sample import OutputSettings, check_condition, default_folder, summary
 from flame_mdm.errors import UserError, say
 from flame_mdm.sampler_options import SamplerOptions, option
@@ -25,7 +25,7 @@ class EditSettings(OutputSettings, EditRequest, FileSettings):
     OBJECTS: ClassVar = ("ckpt", "motion", "out")
     motion: str | None = option(None, "FILE (.npz, .bvh, .json, .npy) or dataset:id")
     cut: Sequence[float] | None = option(None, "[begin, end] in seconds: use only this part of the motion")
-    data_root: str = option(data_root, "folder of the prepared data sets")
+    data_root: str = option(usual_data_root, "folder of the prepared data sets")
     out: str | None = option(None, "folder; default samples/<experiment>/edit-<motion>-...-<hash>")
 
     def __post_init__(self) -> None:

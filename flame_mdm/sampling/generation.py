@@ -119,8 +119,8 @@ class _Plan:
         self.before: Tensor | None = None
         lengths, shared = motion_lengths(model, request), overlap(model)
         if request.after is not None:  # its last frames are generated again, but kept
-            read = with_features if isinstance(request.after, Motion) else read_motion
-            motion = read(model.representation, request.after)
+            after, own = request.after, model.representation
+            motion = with_features(own, after) if isinstance(after, Motion) else read_motion(own, after)
             if shared > len(motion.features):
                 what = f"{len(motion.features)} frames are too short. Give at least {shared}"
                 raise UserError(f"after={motion.id}: {what}")

@@ -57,7 +57,8 @@ class BadLoss(Callback):
     def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: MotionBatch, *_: Any) -> None:
         self.shape = tuple(batch.x.shape)
 
-    on_validation_batch_start = on_train_batch_start
+    def on_validation_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, *_: Any) -> None:
+        self.shape = tuple(batch.x.shape)
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: MotionBatch, batch_idx: int

@@ -43,8 +43,10 @@ def find(source: str | Path, which: Which = "last") -> Path:
     try:
         return Path(hf_hub_download(match[1], FILE, revision=match[2]))
     except Exception as error:  # the client raises many kinds: no network, no such repository, no permission ...
-        what = f"{FILE} of a model with this name cannot be downloaded from the hub: {first_line(error)}"
-        raise UserError(f"{source}: no such file or folder, and {what}") from error
+        raise UserError(
+            f"{source}: no such file or folder, and {FILE} of a model with this name cannot be downloaded from the "
+            f"hub: {first_line(error)}"
+        ) from error
 
 
 def _find_in_folder(folder: Path, which: Which) -> Path:

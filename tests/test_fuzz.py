@@ -71,7 +71,7 @@ def fill(bad, trained, tmp_path) -> Callable[[str], str]:
 
 
 def test_words(refused, fill):
-    refused.every = 4
+    refused.every = 8
     for command, key in CASES["keys"].items():
         for word in (*CASES["misspelled"], f"{key}q=1", f"{key}.deeper=1", f"~{key}"):
             refused(*command.split(), word)
@@ -82,7 +82,7 @@ def test_words(refused, fill):
 
 
 def test_values(refused, fill):
-    refused.every = 6
+    refused.every = 12
     for command, wrong in CASES["values"].items():
         for key, values in wrong.items():
             for value in values:
@@ -90,7 +90,7 @@ def test_values(refused, fill):
 
 
 def test_values_of_training(refused, tmp_path, data_root):
-    refused.every = 9
+    refused.every = 18
     refused.watched = [data_root]  # a run that has begun to log leaves its folder
     tiny = [*TINY, f"data_root={data_root}", "callbacks.best=null", "trainer.max_steps=1", "logger=csv"]
     for key, values in CASES["training"].items():
@@ -102,7 +102,7 @@ def test_values_of_training(refused, tmp_path, data_root):
 
 
 def test_recipes(refused, bad):
-    refused.every = 3
+    refused.every = 6
     whole = "# @package _global_\ndefaults:\n  - /quickstart\n  - _self_\ntrainer: {max_steps: 5}\n"
     for text in (*CASES["recipes"], *(f"{whole}{line}\n" for line in CASES["recipe_lines"])):
         path = bad / f"recipe{refused.count}.yaml"
@@ -139,7 +139,7 @@ def mangled(data: bytes, count: int, seed: int) -> Iterator[bytes]:
 
 
 def test_damaged_checkpoints(refused, trained, bad):
-    refused.every = 6
+    refused.every = 12
     model = Path(export(trained, bad / "whole.safetensors")).read_bytes()
     for suffix, data in (("ckpt", trained.read_bytes()), ("safetensors", model)):
         path = bad / f"bad.{suffix}"
@@ -194,7 +194,7 @@ def written(content: dict[str, Any] | np.ndarray) -> bytes:
 
 
 def test_damaged_motions(refused, bad):
-    refused.every = 6
+    refused.every = 12
     cases = [("bvh", text.encode()) for text in broken_bvh()] + [("bvh", b"HIERARCHY\n\xff\xfe")]
     cases += [("npz", written(content)) for content in broken_arrays()] + [("json", text.encode()) for text in NO_JSON]
     for suffix, whole in (("npz", {"joints": FOUR, "fps": 20.0}), ("npy", FOUR)):

@@ -103,20 +103,6 @@ def test_the_norm_is_that_before_clipping_and_taken_for_the_log_alone(tmp_path, 
     assert pace == pytest.approx(16, rel=1e-4), "samples of a step, not of a batch"
 
 
-def test_a_resumed_history_is_that_of_the_uninterrupted_run(tmp_path, data_root):
-    parts = run(tmp_path / "parts", data_root, "trainer.max_steps=4", "callbacks.samples=null")
-    with (parts / "metrics.jsonl").open("a") as file:  # what a killed run leaves behind
-        file.write('{"step": 5, "train/loss": 77.0}\n{"step": 7, "train/lo')
-    run(parts, data_root, "trainer.max_steps=8", "callbacks.samples=null")
-    whole = run(tmp_path / "whole", data_root, "trainer.max_steps=8", "callbacks.samples=null")
-    a, b = read_history(parts), read_history(whole)
-    assert a.keys() == b.keys()
-    for name in ("train/loss", "train/grad_norm", "val/loss", "train/epochs"):
-        assert a[name] == b[name]
-    steps = [json.loads(line)["step"] for line in (parts / "metrics.jsonl").read_text().splitlines()]
-    assert steps == sorted(steps)
-
-
 # Weights & Biases -----------------------------------------------------------------------------------------------------
 
 

@@ -32,7 +32,6 @@ SENTENCES = read_yaml(ROOT / "tests" / "fixtures" / "sentences.yaml")
 @pytest.mark.parametrize(
     ("every", "least"),
     [
-        (10, 0.8),
         pytest.param(3, 0.85, marks=pytest.mark.slow),
         pytest.param(1, 0.85, marks=[pytest.mark.slow, pytest.mark.robustness]),
     ],

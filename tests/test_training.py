@@ -23,6 +23,7 @@ from flame_mdm.checkpoints.loading import load, load_task
 from flame_mdm.checkpoints.model_files import read_checkpoint
 from flame_mdm.config import compose, instantiate
 from flame_mdm.progress import ProgressBar
+from flame_mdm.runs import read_history
 from flame_mdm.sampling.editing import edit
 from flame_mdm.sampling.generation import generate
 from flame_mdm.task import MotionGeneration
@@ -80,7 +81,7 @@ def test_training_learns(tiny):
 
 
 def test_a_resumed_run_is_the_uninterrupted_one_and_adds_up_what_it_cost(tiny, tmp_path):
-    overrides = [*tiny, *STEPS, "denoiser.dropout=0.1"]
+    overrides = [*tiny, *STEPS, "denoiser.dropout=0.1", "trainer.log_every_n_steps=2"]
     parts = run(overrides, 5, tmp_path / "parts")
     first = read_checkpoint(parts)
     training = first["facts"]["training"]
@@ -89,8 +90,14 @@ def test_a_resumed_run_is_the_uninterrupted_one_and_adds_up_what_it_cost(tiny, t
     assert training["processes"] == 1
     training |= {"hours": 100.0, "memory_gib": 2000.0}
     torch.save(first, parts)
+    with (tmp_path / "parts" / "metrics.jsonl").open("a") as file:  # what a killed run leaves behind
+        file.write('{"step": 6, "train/loss": 77.0}\n{"step": 7, "train/lo')
     run(overrides, 11, tmp_path / "parts")
     assert same_weights(parts, run(overrides, 11, tmp_path / "whole"))
+    a, b = (read_history(tmp_path / name) for name in ("parts", "whole"))
+    assert a.keys() == b.keys()
+    for name in ("train/loss", "train/grad_norm", "val/loss", "train/epochs"):
+        assert a[name] == b[name]
     resumed = read_checkpoint(parts)["facts"]["training"]
     assert 100 < resumed["hours"] < 101
     assert resumed["memory_gib"] == 2000

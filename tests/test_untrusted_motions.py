@@ -65,18 +65,12 @@ def zipped(members: dict[str, bytes], method: int = zipfile.ZIP_DEFLATED) -> byt
     return stream.getvalue()
 
 
-def changed(data: bytes, *, flags: int | None = None, method: int | None = None) -> bytes:
-    """A zip archive with other flags or another method in all headers of its members."""
-    content = bytearray(data)
+def encrypted(data: bytes) -> bytes:
+    """A zip archive whose headers say that its members are encrypted."""
     for magic, at in ((b"PK\3\4", 6), (b"PK\1\2", 8)):
-        start = content.find(magic)
-        while start >= 0:
-            if flags is not None:
-                content[start + at : start + at + 2] = struct.pack("<H", flags)
-            if method is not None:
-                content[start + at + 2 : start + at + 4] = struct.pack("<H", method)
-            start = content.find(magic, start + 4)
-    return bytes(content)
+        head, *members = data.split(magic)
+        data = head + b"".join(magic + part[: at - 4] + b"\1\0" + part[at - 2 :] for part in members)
+    return data
 
 
 def zip_bomb(name: str, start: bytes = b"") -> bytes:
@@ -103,16 +97,13 @@ MOTIONS: list[tuple[str, bytes, str]] = [
     ("a.bvh", bvh_at("0.0000011"), "frame time"),
     ("a.bvh", bvh_text().replace("Frames: 3", "Frames: 1000000000").encode(), "1000000000"),
     ("a.bvh", bvh_at("1" * 40_000 + "x"), "Frame Time"),
-    ("a.npz", npz(joints=JOINTS, fps=1e-7), "fps is 1e-07, not a number"),
     ("a.npz", b"PK\x03\x04 cut", "damaged"),
     ("a.npz", npz(poses=LONG, trans=np.zeros((4, 3)), mocap_framerate=20), "poses are not an array of real numbers"),
     ("a.npz", npz(joints=JOINTS, fps=20, representation="smpl147", features=FIELDS), "features are not an array"),
     ("a.npz", zipped({"joints.npy": header((10**12, 22, 3)), "fps.npy": b"x"}), "declares"),
     ("a.npz", BOMB, "expand to"),
-    ("a.npz", changed(npz(joints=JOINTS, fps=20), flags=1), "encrypted"),
-    ("a.npz", changed(npz(joints=JOINTS, fps=20), method=99), "method 99"),
+    ("a.npz", encrypted(npz(joints=JOINTS, fps=20)), "encrypted"),
     ("a.npz", zipped({"joints.npy": header((4, 22, 3))}, zipfile.ZIP_LZMA), "method 14"),
-    ("a.npz", zipped({"joints.npy": header((4, 22, 3))}, zipfile.ZIP_BZIP2), "method 12"),
     ("a.npz", npz(joints=np.array([{}]), fps=20), "Python objects"),
     ("a.npy", header((10**12, 22, 3)), "declares"),
     ("a.npy", header((2**62, 2**62)), "declares"),
@@ -191,11 +182,7 @@ def test_links_pipes_and_folders(tmp_path: Path, folder: Callable):
         refuses(shown, of_folder, path)
 
 
-ALIASES = "a0: &a0 [x, x, x, x, x, x, x, x, x, x]\n" + "".join(
-    f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 10)}]\n" for n in range(1, 9)
-)
 TABLES: list[tuple[str, bytes, str]] = [
-    ("skeleton.yaml", ALIASES.encode(), "skeleton.yaml"),
     ("skeleton.yaml", b"a: &x [*x]", "skeleton.yaml"),
     ("skeleton.yaml", b"[" * 10**5, "skeleton.yaml"),
     ("skeleton.yaml", b"map: \xff", "skeleton.yaml: not a UTF-8"),
@@ -204,10 +191,8 @@ TABLES: list[tuple[str, bytes, str]] = [
     ("skeleton.yaml", b"map: {pelvis: [a]}", "skeleton.yaml: map"),
     ("skeleton.yaml", b"map: {pelvis: {a: x}}", "skeleton.yaml: map"),
     ("captions.json", b"[" * 10**6, "captions.json"),
-    ("captions.json", b'{"a": ' * 10**5, "captions.json"),
     ("captions.json", b'{"a": {"text": "\xff"}}', "captions.json: not a UTF-8"),
     ("captions.csv", b"id,text\na," + b"x" * 200_000, "captions.csv, line"),
-    ("captions.csv", b"id," + b"x" * 200_000, "captions.csv, line"),
     ("captions.csv", b"i\0d,text\n", "captions.csv"),
     ("captions.csv", b"id,text\na,\xff\n", "captions.csv: not a UTF-8"),
     ("a.txt", b"\xff\n", "a.txt: not a UTF-8"),
@@ -282,10 +267,8 @@ def archive_cases() -> Iterator[tuple[bytes, str]]:
         yield packed(opener, member("junk", 8 * MEBIBYTE) + bytes(8 * MEBIBYTE)), "expand to"
     yield zipped({TAKE: bytes(8 * MEBIBYTE)}), "expand to"
     yield zipped({f"{TAKE}{n}": bytes(3 * MEBIBYTE) for n in range(2)}), "expand to"
-    yield changed(zipped({TAKE: whole}), flags=1), "encrypted"
-    yield changed(zipped({TAKE: whole}), method=99), "method 99"
+    yield encrypted(zipped({TAKE: whole})), "encrypted"
     yield zipped({TAKE: whole}, zipfile.ZIP_LZMA), "method 14"
-    yield zipped({TAKE: whole}, zipfile.ZIP_BZIP2), "method 12"
     yield zipped({TAKE: whole})[:-30], "damaged archive"
     yield b"PK\3\4", "damaged archive"
     yield b"", "neither a folder nor"
@@ -325,20 +308,15 @@ def test_recordings_of_amass_are_bounded(tmp_path: Path):
 # Workers --------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("case", ["killed", "memory", "bomb", "pipe"])
-def test_one_bad_task_ends_all_workers(case: str, tmp_path: Path):
+@pytest.mark.parametrize(("case", "says"), [("killed", "a worker process was killed"), ("bomb", "frame time")])
+def test_one_bad_task_ends_all_workers(case: str, says: str, tmp_path: Path):
     (tmp_path / "bomb").write_bytes(bvh_at("999999"))
-    os.mkfifo(tmp_path / "pipe")
-    tasks: dict[str, tuple] = {"killed": (signal.raise_signal, 9), "memory": (bytes, 2**60)}
-    task = tasks.get(case, (bvh_files.read, tmp_path / case))
+    tasks: dict[str, list[tuple]] = {"killed": [(abs, 1), (signal.raise_signal, 9)]}
+    tasks["bomb"] = [(signal.raise_signal, signal.SIGSTOP), (bvh_files.read, tmp_path / "bomb")]  # the first has no end
     before, start = active_children(), time.monotonic()
-    first = (abs, 1) if case == "killed" else (signal.raise_signal, signal.SIGSTOP)  # an end that does not come
-    with pytest.raises((UserError, ValueError, MemoryError)) as error:
-        list(in_order(carry_out, [first, task, *[(abs, -2)] * 9], workers=2))
+    with pytest.raises((UserError, ValueError), match=says) as error:
+        list(in_order(carry_out, [*tasks[case], *[(abs, -2)] * 9], workers=2))
     assert "\n" not in str(error.value)
-    assert {"killed": "a worker process was killed", "bomb": "frame time", "pipe": "a pipe"}.get(case, "") in str(
-        error.value
-    )
     assert no_children(before)
     assert time.monotonic() - start < 60  # most of it for the processes to start
 
@@ -353,7 +331,6 @@ def doubled(levels: int) -> bytes:
 
 PICKLES = {
     "bytes": (b"\x80\x04\x8e" + struct.pack("<Q", 10**12) + b"x.", "too early"),
-    "number": (b"\x80\x04\x8b" + struct.pack("<i", 2**31 - 1) + b"x.", "too early"),
     "frame": (b"\x80\x04\x95" + struct.pack("<Q", 10**12) + b"N.", "too early"),
     "memo": (b"\x80\x04Nr\xff\xff\xff\x7f.", "must contain"),
     "tuples": (b"\x80\x04})" + b"\x85" * 10**6 + b"Ns.", "is not text"),
@@ -363,7 +340,6 @@ PICKLES = {
     "integers": (pickle.dumps({n * (2**61 - 1): 0 for n in range(2**10)}, 4), "is not text"),
     "complex": (pickle.dumps({complex(-1_000_003 * n, n): 0 for n in range(1, 2**10)}, 4), "it names builtins.complex"),
     "frozen": (pickle.dumps(frozenset([(1, 2), (3, 4)]), 4), "a set"),
-    "old set": (pickle.dumps({(1, 2), (3, 4)}, 2), "it names __builtin__.set"),
     "old dictionary": (b"((I1\nI2\ntI3\nd.", "is not text"),
     "digits": (b"L" + b"9" * 30 + b"L\n.", "must contain"),
     "attributes": (b"\x80\x04c_codecs\nencode\n}\x8c\x01aNsb.", "sets attributes"),

@@ -1,6 +1,5 @@
 """The extension of Blender, built by tools/blender.py and used in Blender without a window."""
 
-import importlib.util
 import json
 import os
 import subprocess
@@ -10,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.fixtures import ROOT, blender
+from support.fixtures import ROOT, blender, script
 from support.glb import Glb
 from support.motions import synthetic
 
@@ -27,12 +26,7 @@ WAVE = {"sentence": "a person waves with both hands", "seconds": 3, "seed": 2, "
 
 @pytest.fixture(scope="module")
 def tool() -> Any:
-    spec = importlib.util.spec_from_file_location("blender_tool", ROOT / "tools" / "blender.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return script("tools/blender.py")
 
 
 @pytest.fixture(scope="module")

@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 import torch
 from support.motions import synthetic
-from support.runs import TINY
+from support.runs import TINY, untrained
 
 import flame_mdm
 from flame_mdm.__main__ import main
-from flame_mdm.config import compose, instantiate
 from flame_mdm.data.store import write_store
 from flame_mdm.data.synthetic import Synthetic
 from flame_mdm.errors import UserError
@@ -30,13 +29,10 @@ CLIP = "synthetic:synthetic_0_000003"
 
 
 def build(overrides: list[str], max_frames: int = 60) -> MotionGeneration:
-    config = compose("quickstart", overrides)
-    torch.manual_seed(0)
-    model = MotionGeneration.build(config, instantiate(config["representation"]))
+    model = untrained(overrides, max_frames)
     model.representation.std.uniform_(0.5, 2)
     model.representation.mean.normal_()
-    model.facts |= {"max_frames": max_frames, "dataset": "synthetic", "fingerprint": "f00d"}
-    return model.eval()
+    return model
 
 
 @pytest.fixture(scope="module")
@@ -72,9 +68,6 @@ def motion(diffusion) -> Motion:
     joints = diffusion.representation.decode(features).numpy()
     name = diffusion.representation.name
     return Motion(joints, 20.0, SMPL22, "a person walks", "walk", features=features.numpy(), representation=name)
-
-
-# What is kept ---------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("length", [8, 37])
@@ -137,9 +130,6 @@ def test_features_of_joints_move_these_joints(representation):
         expected = set(range(24)) if joint == 0 else below - {joint}
         assert {i for i, way in enumerate(distance.tolist()) if way > 1e-3} == expected
     assert sum(representation.joint_features([j]).int() for j in range(24)).tolist() == [1] * representation.features  # type: ignore[union-attr]
-
-
-# What the methods promise ---------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("method", ["mdm", "flame"])
@@ -232,9 +222,6 @@ def test_models_that_attend_to_the_padding_know_it_as_empty(motion):
     assert beyond.mean().abs() < 0.1
 
 
-# Where motions come from ----------------------------------------------------------------------------------------------
-
-
 def npz(folder: Path, **arrays) -> Path:
     np.savez(folder / "motion.npz", **arrays)
     return folder / "motion.npz"
@@ -249,9 +236,6 @@ def test_joints_of_any_rate_and_facing(diffusion, motion, tmp_path, fps, turned)
     assert np.abs(read.joints[:count] - motion.joints).max() < (0.15 if fps == 10 else 0.01)
     if fps == 20:
         np.testing.assert_allclose(read.features[:count], motion.features, atol=2e-3)  # facing is smoothed over time
-
-
-# Bad requests ---------------------------------------------------------------------------------------------------------
 
 
 def test_bad_edits_are_one_line(diffusion, flow, motion):
@@ -304,9 +288,6 @@ def test_motions_that_cannot_be_read_are_one_line(diffusion, store, tmp_path):
             read_motion(diffusion.representation, source, data_root=store, **options)  # type: ignore[arg-type]
     with pytest.raises(UserError, match=r"motion.npz: motion: shape \(9, 22, 3\), expected \(frames, 3 \+ 3 x joints"):
         read_motion(SMPL(), npz(tmp_path, joints=joints, fps=20))
-
-
-# The command ----------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.slow

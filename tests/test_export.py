@@ -68,9 +68,6 @@ def circle() -> Motion:
     return Motion(two_circles().joints().float().numpy(), FPS, text="a person walks </b> é", id="circle")
 
 
-# Inverse kinematics ---------------------------------------------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def clips() -> list[Tensor]:
     """Joints (F, 22, 3) of some actions of the synthetic set."""
@@ -134,9 +131,6 @@ def test_euler_angles_are_those_rotations_however_they_are_unwound(clips):
         again = euler_to_matrix(angles[:, joint], order)
         torch.testing.assert_close(again, poses.rotations[:, joint], rtol=0, atol=1e-6)
     assert torch.rad2deg(angles.diff(dim=0).abs().max()) < 100
-
-
-# Files ----------------------------------------------------------------------------------------------------------------
 
 
 def test_files_bring_joints_back(tmp_path, circle):

@@ -20,6 +20,7 @@ from support.fixtures import (
     third_party,
     weights,
 )
+from support.stores import write_words
 from torch import Tensor, nn
 
 from evaluators.extractors import ClassifierExtractor, MARDMClipExtractor, T2MExtractor
@@ -45,8 +46,6 @@ def assert_padding_is_not_seen(network: nn.Module, x: Tensor, lengths: list[int]
             alone = network(x[row : row + 1, :length], torch.ones(1, length, dtype=torch.bool))
             torch.testing.assert_close(alone[0], together[row], atol=atol, rtol=1e-4)
 
-
-# T2M and MARDM --------------------------------------------------------------------------------------------------------
 
 STATISTICS = (("mean", 0.0), ("std", 1.0))
 T2M_PARTS = ("movement_encoder", "text_encoder", "motion_encoder")
@@ -131,12 +130,8 @@ def test_t2m_normalizes_with_its_own_statistics_and_sees_nothing_past_the_end():
 
 
 WORDS = ["unk", "sos", "eos", "a", "person", "walk", "left", "hand", "hop"]
-
-
-def write_words(folder: Path) -> None:
-    """Writes word vectors by the authors' names: row times 300 and the 299 numbers after it."""
-    np.save(folder / "our_vab_data.npy", np.arange(len(WORDS) * 300, dtype=np.float64).reshape(len(WORDS), 300))
-    (folder / "our_vab_idx.pkl").write_bytes(pickle.dumps({word: row for row, word in enumerate(WORDS)}))
+VECTORS = np.arange(len(WORDS) * 300, dtype=np.float64).reshape(len(WORDS), 300)
+"""Row times 300 and the 299 numbers after it."""
 
 
 def slots(words: Words, caption: int) -> list[tuple[int, str]]:
@@ -147,7 +142,7 @@ def slots(words: Words, caption: int) -> list[tuple[int, str]]:
 
 
 def test_words_have_vectors_and_parts_of_speech(tmp_path):
-    write_words(tmp_path)
+    write_words(tmp_path, WORDS, VECTORS)
     vectors = WordVectors.read(tmp_path)
     captions = [["a/DET", "person/NOUN", "walk/VERB", "zigzag/NOUN", "left/ADJ", "hand/NOUN", "hop/X"], ["a/DET"] * 25]
     words = vectors(captions)
@@ -191,7 +186,7 @@ def test_the_released_t2m_is_read_whole_or_not_at_all(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"lacks finest\.tar, mean\.npy"):
         T2MExtractor(str(tmp_path))
     made = released_folder(tmp_path, 251)
-    write_words(tmp_path)
+    write_words(tmp_path, WORDS, VECTORS)
     extractor, legacy = T2MExtractor(str(tmp_path)), T2MExtractor(str(tmp_path), full_length=True)
     x, mask = torch.randn(1, 40, 251), torch.ones(1, 40, dtype=torch.bool)
     with torch.no_grad():
@@ -266,9 +261,6 @@ def test_released_evaluators_of_mardm_are_read(tmp_path):
         extractor.check(HumanML(), "humanml3d")
 
 
-# HumanAct12 -----------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.golden
 @needs_third_party
 @pytest.mark.parametrize("start", [pytest.param(s, id=f"humanact12_gru-{s or 'given'}") for s in ("", "_h0_zero")])
@@ -296,8 +288,6 @@ def test_the_gru_stops_at_the_end_and_starts_at_the_origin():
     moved = network(joints + torch.tensor([3.0, -1.0, 2.0]), mask)
     torch.testing.assert_close(moved, features, atol=1e-4, rtol=0)
 
-
-# ST-GCN ---------------------------------------------------------------------------------------------------------------
 
 NETWORKS = {"uestc": UESTC, "unconstrained": Unconstrained}
 
@@ -374,9 +364,6 @@ def test_a_classifier_of_joints_does_not_see_where_the_motion_stands():
     torch.testing.assert_close(network(x + torch.tensor([5.0, 1, -3]), mask), network(x, mask), atol=1e-5, rtol=1e-4)
     way = torch.linspace(0, 1, 9)[:, None, None]
     assert not torch.allclose(network(x + way, mask), network(x, mask), atol=1e-3), "but which way it goes"
-
-
-# Files ----------------------------------------------------------------------------------------------------------------
 
 
 class _Runs:

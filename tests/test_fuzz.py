@@ -67,9 +67,6 @@ def fill(bad, trained, tmp_path) -> Callable[[str], str]:
     return fill
 
 
-# Words of command lines -----------------------------------------------------------------------------------------------
-
-
 def test_words(refused, fill):
     refused.every = 8
     for command, key in CASES["keys"].items():
@@ -121,9 +118,6 @@ def test_real_processes(tmp_path, monkeypatch):
     assert not list(tmp_path.iterdir())
 
 
-# Checkpoints ----------------------------------------------------------------------------------------------------------
-
-
 def mangled(data: bytes, count: int, seed: int) -> Iterator[bytes]:
     """The data cut at, with bytes changed at, or with garbage at random positions."""
     draw = np.random.default_rng(seed)
@@ -150,9 +144,6 @@ def test_damaged_checkpoints(refused, trained, bad):
                 refused("sample", f"ckpt={path}", TEXT)
                 refused("evaluate", f"ckpt={path}", "extractor=none", "quick=true")
                 refused("push", str(path), "a/b", "dry_run=true")
-
-
-# Motion files and data ------------------------------------------------------------------------------------------------
 
 
 def broken_bvh() -> Iterator[str]:
@@ -220,8 +211,6 @@ def test_strange_texts_are_legal(trained, tmp_path, monkeypatch):
         with np.load(tmp_path / f"out{number}" / "motion_000.npz") as file:
             assert str(file["text"]) == text
 
-
-# Files of results and runs --------------------------------------------------------------------------------------------
 
 WRONG: dict[type, list[Any]] = {
     dict: [3, "x", [1], True],

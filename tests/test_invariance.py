@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from support.distributed import GlooPool
-from support.motions import wander
+from support.motions import keys, wander
 from torch import Tensor
 from torchmetrics import Metric
 
@@ -34,13 +34,6 @@ from flame_mdm.errors import UserError
 from flame_mdm.representations.humanml import HumanML
 from flame_mdm.representations.skeleton import KIT21
 from flame_mdm.seeds import key
-
-
-def keys(count: int, *name: str | int) -> Tensor:
-    return torch.tensor([key(*name, i) for i in range(count)], dtype=torch.long)
-
-
-# Properties of all metrics --------------------------------------------------------------------------------------------
 
 
 def all_metrics() -> dict[str, Metric]:
@@ -231,9 +224,6 @@ def test_wrong_inputs_are_errors():
     del values["real"]
     with pytest.raises(UserError, match=r"metric mid \(Mut.*\): missing input: real\. Remove the metric"):
         update_metrics({"mid": alignment.MutualInformationDivergence()}, **values)
-
-
-# Training of extractors -----------------------------------------------------------------------------------------------
 
 
 MEANING = torch.tensor([[1, 10], [2, 20], [3, 30], [1, 40], [4, 50], [5, 20]])

@@ -38,9 +38,6 @@ def test_a_processed_folder_becomes_a_store(tmp_path):
     assert source.counts().keys() >= published("kit").keys()
 
 
-# TEMOS's joints -------------------------------------------------------------------------------------------------------
-
-
 @pytest.fixture
 def mmm(tmp_path):
     return write_mmm(tmp_path)

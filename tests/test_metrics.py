@@ -9,7 +9,7 @@ import torch
 from scipy.linalg import sqrtm
 from scipy.spatial.transform import Rotation
 from support.fixtures import golden, golden_case, groups
-from support.motions import wander
+from support.motions import keys, wander
 from torch import Tensor
 from torch.nn.functional import normalize
 from torchmetrics import Metric
@@ -25,7 +25,6 @@ from flame_mdm.batch import length_mask
 from flame_mdm.errors import UserError
 from flame_mdm.reporting.intervals import percentiles
 from flame_mdm.representations.skeleton import KIT21, SMPL22
-from flame_mdm.seeds import key
 
 FIXTURE = golden("metrics")
 
@@ -40,10 +39,6 @@ def tensor(name: str) -> Tensor:
     return values.double() if values.is_floating_point() else values.long()
 
 
-def keys(count: int, *name: str | int) -> Tensor:
-    return torch.tensor([key(*name, i) for i in range(count)], dtype=torch.long)
-
-
 def computed(metric: Metric, **inputs: Any) -> Any:
     """The value of a metric for one batch of inputs."""
     metric.update(**inputs)
@@ -55,9 +50,6 @@ def cases(suffix: str, under: str) -> list[Any]:
 
 
 one = golden_case("metrics")
-
-
-# The authors' code ----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.golden
@@ -257,9 +249,6 @@ def test_whole_set_retrieval_equals_the_authors(stem: str):
         for k in TMRRetrieval.TOP:
             assert values[f"{way}_top{k}"] == pytest.approx(float(array(f"tmr/{way}_R{k:02}")) / 100, rel=1e-12)
         assert values[f"{way}_median"] == float(array(f"tmr/{way}_MedR"))
-
-
-# Closed forms and other implementations -------------------------------------------------------------------------------
 
 
 def exactly_normal(mean: np.ndarray, covariance: np.ndarray, count: int, seed: int) -> Tensor:

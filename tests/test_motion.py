@@ -10,12 +10,11 @@ import numpy as np
 import pytest
 import torch
 from support.motions import synthetic
-from support.runs import TINY
+from support.runs import TINY, untrained
 
 import flame_mdm
 from flame_mdm.__main__ import main
 from flame_mdm.commands import compare
-from flame_mdm.config import compose, instantiate
 from flame_mdm.data.folder import Folder
 from flame_mdm.errors import UserError
 from flame_mdm.formats.motion import Motion
@@ -52,11 +51,7 @@ def folder(walk: Motion, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def model() -> MotionGeneration:
-    torch.manual_seed(0)
-    config = compose("quickstart", TINY)
-    model = MotionGeneration.build(config, instantiate(config["representation"]))
-    model.facts |= {"max_frames": 196, "dataset": "synthetic", "fingerprint": "f00d"}
-    return model.eval()
+    return untrained(TINY, max_frames=196)
 
 
 def tolerance(kind: str) -> float:

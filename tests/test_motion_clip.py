@@ -26,6 +26,7 @@ from flame_mdm.data.synthetic import Synthetic
 from flame_mdm.errors import UserError
 from flame_mdm.representations.humanml import HumanML
 from flame_mdm.representations.smpl import SMPL
+from flame_mdm.runs import read_history
 
 SMALL = {"latent_dim": 16, "ff_size": 24, "num_layers": 2, "num_heads": 4, "embedding_dim": 8, "max_frames": 20}
 
@@ -129,9 +130,6 @@ def test_padding_and_company_do_not_change_features(roughness):
         clip(torch.zeros(1, 21, 7), length_mask(torch.tensor([21])))
 
 
-# Contrast -------------------------------------------------------------------------------------------------------------
-
-
 MEANING = torch.tensor([[1, 10], [2, 20], [3, 30], [1, 40], [4, 50], [5, 20]])
 
 
@@ -171,9 +169,6 @@ def test_the_validation_loss_is_that_of_pools():
         ways = [functional.cross_entropy(table, own, reduction="none")[-new:] for table in (logits, logits.T)]
         terms.append((ways[0] + ways[1]) / 2)
     assert metric.compute() == pytest.approx(torch.cat(terms).mean().item(), rel=1e-6)
-
-
-# Calibration ----------------------------------------------------------------------------------------------------------
 
 
 def test_roughness_alone_sees_noise_and_no_steady_change():
@@ -229,8 +224,6 @@ def test_only_representations_of_joints_are_calibrated():
         CalibratedMotionCLIPTask.build(config, SMPL())
 
 
-# Training -------------------------------------------------------------------------------------------------------------
-
 RUN = ["data.source.clips=1100", "data.batch_size=32", "condition=learned", "condition.features=32", "logger=csv"]
 RUN += ["trainer.accelerator=cpu", "trainer.enable_progress_bar=false", "trainer.log_every_n_steps=5"]
 RUN += [f"task.network.{size}" for size in ("latent_dim=32", "ff_size=32", "num_layers=1", "embedding_dim=16")]
@@ -248,15 +241,15 @@ def trained(tmp_path_factory, data_root):
 
 @pytest.mark.slow
 def test_training_by_recipe_learns_to_retrieve(trained):
-    lines = [line.split(",") for line in (trained.parent.parent / "csv" / "metrics.csv").read_text().splitlines()]
-    rows = [dict(zip(lines[0], line, strict=True)) for line in lines[1:]]
-    last = [row for row in rows if row["val/loss"]][-1]
-    assert float(last["val/loss"]) < 0.8 * math.log(32)
+    curves = read_history(trained.parent.parent)
+    last = max(curves["val/loss"])
+    assert curves["val/loss"][last] < 0.8 * math.log(32)
     for way in ("texts_for_motion", "motions_for_text"):
-        tops = [float(last[f"val/{way}_top{k}"]) for k in (1, 2, 3)]
+        tops = [curves[f"val/{way}_top{k}"][last] for k in (1, 2, 3)]
         assert tops == sorted(tops)
         assert tops[0] > 3 / 32, way  # by chance: 1 / 32
-    assert float(rows[0]["train/temperature"]) == pytest.approx(0.07, rel=0.1)
+    temperature = curves["train/temperature"]
+    assert temperature[min(temperature)] == pytest.approx(0.07, rel=0.1)
 
 
 @pytest.mark.slow
@@ -319,6 +312,6 @@ def test_few_captions_train_without_retrieval(tmp_path, capsys):
     options = ["data.source.clips=60", "data.batch_size=8", f"data_root={tmp_path}/data", f"run.dir={tmp_path}/run"]
     steps = ["trainer.max_steps=2", "trainer.val_check_interval=2"]
     assert main(["train", "motion_clip/synthetic", *RUN, *options, *steps]) == 0, capsys.readouterr().err
-    header = (tmp_path / "run" / "csv" / "metrics.csv").read_text().splitlines()[0]
-    assert "val/loss" in header
-    assert "top1" not in header
+    curves = read_history(tmp_path / "run")
+    assert "val/loss" in curves
+    assert not [name for name in curves if "top1" in name]

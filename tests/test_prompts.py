@@ -125,9 +125,6 @@ def test_a_video_is_written_when_asked_for(here, trained, monkeypatch, capsys):
     assert not Path("other").exists()
 
 
-# Where motions are written if no folder is given ----------------------------------------------------------------------
-
-
 def folder(experiment: Any, text: str = "a person walks", seed: int = 0, run: Any = "default", **options: Any) -> str:
     model: Any = SimpleNamespace(config={"experiment": experiment, "run": {"name": run}}, steps=3000)
     return default_folder(model, "f00d", text, seed, options).as_posix()

@@ -1,13 +1,11 @@
 """The recipes against the papers' tables, the pages that are written from them, and a training step of each."""
 
-import importlib.util
-import sys
 from functools import cache
 from typing import Any
 
 import pytest
 import torch
-from support.fixtures import GENERATION, ROOT, recipe
+from support.fixtures import GENERATION, ROOT, recipe, script
 
 from flame_mdm.batch import Condition, MotionBatch, length_mask
 from flame_mdm.conditions import ConditionEncoder
@@ -17,12 +15,7 @@ from flame_mdm.processes.flow_matching import FlowMatching
 from flame_mdm.reporting.settings import value
 from flame_mdm.task import MotionGeneration
 
-SPEC = importlib.util.spec_from_file_location("generate", ROOT / "docs" / "generate.py")
-assert SPEC is not None
-assert SPEC.loader is not None
-generate: Any = importlib.util.module_from_spec(SPEC)
-sys.modules["generate"] = generate
-SPEC.loader.exec_module(generate)
+generate = script("docs/generate.py")
 generate.values = cache(generate.values)  # the tables and the pages show the same ones
 pytestmark = pytest.mark.usefixtures("composed_once")
 
@@ -93,8 +86,6 @@ def test_samplers_steps_and_prompts_suit_process_and_condition():
         if kind == "ActionLabels" and not name.startswith("uestc"):  # UESTC's names are in its files
             assert set(prompts) <= set(instantiate(config["data"]["source"]).actions), name
 
-
-# A step of each recipe at its own widths, with few layers -----------------------------------------------------------
 
 FRAMES, ACTIONS = 24, 40
 

@@ -103,9 +103,6 @@ def test_the_norm_is_that_before_clipping_and_taken_for_the_log_alone(tmp_path, 
     assert pace == pytest.approx(16, rel=1e-4), "samples of a step, not of a batch"
 
 
-# Weights & Biases -----------------------------------------------------------------------------------------------------
-
-
 def rows(file: Path) -> Iterator[dict[str, Any]]:
     """The history in a .wandb file: LevelDB's log format, blocks of 32 KiB after 7 bytes, of protocol buffers."""
     from wandb.proto.wandb_internal_pb2 import Record  # type: ignore[attr-defined]
@@ -144,9 +141,6 @@ def test_wandb_has_one_run_through_resume(tmp_path, data_root, monkeypatch):
         step: pytest.approx(loss) for step, loss in read_history(folder)["train/loss"].items()
     }
     assert any("samples/_type" in row for row in second)
-
-
-# The page -------------------------------------------------------------------------------------------------------------
 
 
 def test_training_ends_with_a_report_that_needs_nothing_else(evaluated):
@@ -198,9 +192,6 @@ def test_missing_files_are_named(tmp_path, capsys):
         assert message in capsys.readouterr().err
 
 
-# The end of training --------------------------------------------------------------------------------------------------
-
-
 def test_training_ends_with_what_its_numbers_mean(evaluated, printed, tmp_path):
     out, curves = printed.getvalue(), read_history(evaluated)
     samples, evaluation = out.split("evaluation after 8 steps, synthetic, validation clips:\n")
@@ -218,9 +209,6 @@ def test_training_ends_with_what_its_numbers_mean(evaluated, printed, tmp_path):
     command = re.findall(r"^next: flame-mdm (sample .*)$", out, re.MULTILINE)[0]
     assert main([*shlex.split(command), f"out={tmp_path / 'samples'}", "samples=1"]) == 0
     assert f"flame-mdm evaluate {evaluated} extractor=none quick=true" in out
-
-
-# Charts ---------------------------------------------------------------------------------------------------------------
 
 
 def points(svg: str) -> list[tuple[float, float]]:

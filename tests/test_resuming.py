@@ -72,9 +72,6 @@ def one_error(capsys: pytest.CaptureFixture[str]) -> str:
     return line
 
 
-# Foreign checkpoints --------------------------------------------------------------------------------------------------
-
-
 @pytest.fixture
 def best(run) -> tuple[dict[str, Any], dict[str, Any]]:
     """The content of the last checkpoint, and in it the state of the callback that keeps the best one."""
@@ -194,9 +191,6 @@ def test_a_checkpoint_does_not_switch_compilation_on(best, tmp_path, monkeypatch
     assert load(tmp_path / "compiled.ckpt").config["task"]["compile"]
 
 
-# Other data -----------------------------------------------------------------------------------------------------------
-
-
 def prepared(root: Path, clips: int, *more: str) -> list[str]:
     return ["data=synthetic", f"data.source.clips={clips}", f"data_root={root}", *more]
 
@@ -245,9 +239,6 @@ def test_options_that_decide_the_data_count_but_paths_do_not():
     assert source.options == {"motion": "joints", "mirror": True, "exclude": ["b", "a"]}
     assert Folder("there", "joints", True, ["b", "a"]).options == source.options
     assert Synthetic(3).options == {"clips": 3, "seed": 0, "min_seconds": 2.0, "max_seconds": 3.0}
-
-
-# Damage, bad losses --------------------------------------------------------------------------------------------------
 
 
 def test_a_damaged_checkpoint_gives_way_to_the_one_before(resume, tmp_path, capsys):
@@ -312,9 +303,6 @@ def test_out_of_memory_names_the_batch(tmp_path, data_root, monkeypatch, capsys)
     message = one_error(capsys)
     assert message.startswith("error: out of memory at step 2 with a batch of 8 clips, ")
     assert "263 features. Lower data.batch_size" in message
-
-
-# One run per directory ------------------------------------------------------------------------------------------------
 
 
 def hold(folder: Path, held: Any) -> None:

@@ -54,9 +54,6 @@ def steps_of(section: str | list[int], total: int) -> list[int]:
     return spaced(total, section if isinstance(section, str) else ",".join(map(str, section)))
 
 
-# The authors' loops ---------------------------------------------------------------------------------------------------
-
-
 def skipped(case: str, options: dict[str, Any]) -> int:
     """How many of the noisiest steps a loop leaves out: MDM's `skip_timesteps`."""
     named = re.search(r"skip(\d+)", case)
@@ -187,9 +184,6 @@ def test_flow_run(case):
     np.testing.assert_allclose(times, expected, rtol=0, atol=1e-6)
 
 
-# Loops of the authors' networks ---------------------------------------------------------------------------------------
-
-
 def built(released: Released) -> Denoise:
     network = instantiate(released.config, *released.features)
     network.load_state_dict(released.state)
@@ -273,9 +267,6 @@ def test_flame_loss_of_the_network(case):
         assert_golden(FLAME, f"out/loss_{name.replace('vlb', 'vb')}", terms[name])
 
 
-# Oracles: what they return is the data, whatever the sampler and the number of steps ----------------------------------
-
-
 @pytest.mark.parametrize("count", [2, 50])
 @pytest.mark.parametrize("sampler", DIFFUSION)
 @pytest.mark.parametrize("prediction", ["x0", "epsilon", "velocity"])
@@ -342,8 +333,6 @@ def test_order_of_diffusion_solvers():
     assert error("dpm_solver_pp_2m", 100) < error("ddim", 100) / 2
 
 
-# Diffusers and torchdiffeq: their formulas of steps, not their choice of steps ----------------------------------------
-
 MIXING = linear_denoiser(np.array([[0.3, -0.2], [0.1, 0.4]]), np.array([[0.2], [-0.1]]), 0.3)
 
 
@@ -391,9 +380,6 @@ def test_fixed_steps_agree_with_torchdiffeq(sampler):
     times, method = torch.linspace(0, 1, 8, dtype=torch.float64), "heun2" if sampler == "heun" else sampler
     theirs = odeint(lambda t, x: field(x, 1000 * t.expand(2), real(x), NO_CONDITION), start, times, method=method)
     torch.testing.assert_close(ours, theirs[-1], rtol=1e-9, atol=1e-9)
-
-
-# Editing --------------------------------------------------------------------------------------------------------------
 
 
 def half_kept(x: Tensor) -> Tensor:
@@ -488,9 +474,6 @@ def test_rewriting_ends_at_its_threshold(sampler):
         assert time == pytest.approx(i / count)
         torch.testing.assert_close(x[keep], ((1 - share) * start + share * known)[keep])
         torch.testing.assert_close(x[~keep], start[~keep])
-
-
-# Refusals and invariance ----------------------------------------------------------------------------------------------
 
 
 REFUSED: dict[type[Process], list[tuple[dict[str, Any], str]]] = {

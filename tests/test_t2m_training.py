@@ -1,14 +1,13 @@
 """Guo et al.'s evaluator to train: its two parts, what it learns, and text-to-motion measured with it."""
 
 import json
-import pickle
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from support.stores import line, write_folder
+from support.stores import line, write_folder, write_words
 
 from evaluators.extractors import OwnT2MExtractor
 from evaluators.extractors.t2m import LearnedWords
@@ -17,6 +16,7 @@ from flame_mdm.__main__ import main
 from flame_mdm.config import compose, instantiate
 from flame_mdm.data.t2m import T2MFolder
 from flame_mdm.errors import UserError
+from flame_mdm.runs import read_history
 
 VERBS = ["walks", "runs", "hops", "bows", "waves", "kicks"]
 MANNERS = ["slowly", "quickly", "left", "right", "happily", "sadly"]
@@ -25,15 +25,6 @@ SIZES = {"movement_hidden": 32, "movement_latent": 32, "text_hidden": 32, "motio
 RUN = ["data.num_workers=0", "data.batch_size=16", "trainer.accelerator=cpu", "trainer.enable_progress_bar=false"]
 RUN += ["trainer.log_every_n_steps=10", "optimizer.lr=0.003", f"task.movement_steps={MOVEMENT}"]
 RUN += [*(f"task.network.{name}={size}" for name, size in SIZES.items()), "task.network.max_frames=40"]
-
-
-def write_words(folder: Path) -> Path:
-    """Word vectors of all captions, random ones."""
-    folder.mkdir(parents=True)
-    words = ["unk", "sos", "eos", *VERBS, *MANNERS]
-    np.save(folder / "our_vab_data.npy", np.random.default_rng(0).normal(size=(len(words), 300)))
-    (folder / "our_vab_idx.pkl").write_bytes(pickle.dumps({word: row for row, word in enumerate(words)}))
-    return folder
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +45,9 @@ def words(tmp_path_factory) -> list[str]:
     for name, (verb, manner) in captions.items():
         x = patterns[verb] + patterns[manner] + generator.normal(size=(32, 251)) / 3
         np.save(folder / "new_joint_vecs" / f"{name}.npy", (2 + 3 * x).astype(np.float32))
-    return [*RUN, f"data.source.path={folder}", f"data_root={root}", f"task.words={write_words(root / 'glove')}"]
+    known = ["unk", "sos", "eos", *VERBS, *MANNERS]
+    glove = write_words(root / "glove", known, np.random.default_rng(0).normal(size=(len(known), 300)))
+    return [*RUN, f"data.source.path={folder}", f"data_root={root}", f"task.words={glove}"]
 
 
 def fit(folder: Path, words: list[str], *more: str) -> Path:
@@ -70,8 +63,7 @@ def trained(tmp_path_factory, words) -> Path:
 
 
 def logged(checkpoint: Path, name: str) -> dict[int, float]:
-    lines = (checkpoint.parent.parent / "metrics.jsonl").read_text().splitlines()
-    return {int(row["step"]): row[name] for row in map(json.loads, lines) if name in row}
+    return read_history(checkpoint.parent.parent)[name]
 
 
 @pytest.mark.slow

@@ -81,9 +81,6 @@ def model_file(path: Path, trained: Path, text: str | None = None, **recipe: Any
     return file
 
 
-# Code and environment -------------------------------------------------------------------------------------------------
-
-
 def test_interpolations_in_models_are_refused(attacked, trained, changed, bad, tmp_path):
     marker, says = tmp_path / "owned", "holds an interpolation"
     for value in (exploit(marker), [{"a": exploit(marker)}], {exploit(marker): 1}, "x${oc.env:HOME}"):
@@ -179,9 +176,6 @@ def test_a_recipe_cannot_make_checkpoints_that_are_refused(attacked):
     attacked("train", "quickstart", r"run.dir='x\${a}'", says="holds an interpolation")
 
 
-# Sizes ----------------------------------------------------------------------------------------------------------------
-
-
 def test_absurd_sizes(attacked, changed):
     sizes: dict[str, list[Any]] = {"process__num_train_timesteps": [10**9], "denoiser__num_layers": [10**7, 90_000]}
     sizes |= {"denoiser__latent_dim": [10**7, 60_000], "denoiser__ff_size": [10**12]}
@@ -246,9 +240,6 @@ def test_packed_checkpoints(attacked, trained, bad):
                 file.write(bytes(2**20))
     refuses(path, "bomb.ckpt: damaged")
     attacked("import", "flame", str(path), "out=x", says="bomb.ckpt: damaged")
-
-
-# Malformed values -----------------------------------------------------------------------------------------------------
 
 
 def test_values_of_wrong_kinds_are_refused_when_a_model_is_loaded(attacked, trained, changed, bad):

@@ -170,8 +170,6 @@ def test_many_nodes_are_read_in_time(heroes: list[Path], tmp_path: Path):
     assert len(characters.read(path).rig.joints) == glb.MAX_NODES
 
 
-# Many mutations -------------------------------------------------------------------------------------------------------
-
 VALUES = [None, True, -1, 0, 1, 7, 99, 2**31, 2**70, HUGE, 0.5, -1e-300, 1e30, 1e308, "", "x", "0", [], [0], [-1], [[]]]
 VALUES += [{}, {"a": 1}, [1e9] * 3, [0] * 4, [0] * 16, [1] * 16, list(range(50)), [{}], [None]]
 

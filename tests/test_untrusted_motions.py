@@ -214,8 +214,6 @@ def test_long_motions_are_not_resampled_without_end():
     assert resampling.resampled_frames(3, 0.1, 20, 22) == 401
 
 
-# Archives -------------------------------------------------------------------------------------------------------------
-
 TAKE = "dataset-1_walk_happy_001.bvh"
 
 
@@ -305,9 +303,6 @@ def test_recordings_of_amass_are_bounded(tmp_path: Path):
             read_amass(npz(**whole | {key: value}), "here")
 
 
-# Workers --------------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(("case", "says"), [("killed", "a worker process was killed"), ("bomb", "frame time")])
 def test_one_bad_task_ends_all_workers(case: str, says: str, tmp_path: Path):
     (tmp_path / "bomb").write_bytes(bvh_at("999999"))
@@ -319,9 +314,6 @@ def test_one_bad_task_ends_all_workers(case: str, says: str, tmp_path: Path):
     assert "\n" not in str(error.value)
     assert no_children(before)
     assert time.monotonic() - start < 60  # most of it for the processes to start
-
-
-# Pickles --------------------------------------------------------------------------------------------------------------
 
 
 def doubled(levels: int) -> bytes:
@@ -365,9 +357,6 @@ def test_repeated_arrays_of_a_pickle_count_each_time(tmp_path: Path):
     (tmp_path / "many.pkl").write_bytes(pickle.dumps([array] * 1000))
     with pytest.raises(ValueError, match="expand to"):
         restricted_pickle.read(tmp_path / "many.pkl")
-
-
-# Stores ---------------------------------------------------------------------------------------------------------------
 
 
 def small_store(folder: Path, clip: dict[str, Any], info: dict[str, Any]) -> None:

@@ -55,8 +55,6 @@ pytestmark = pytest.mark.slow
 
 TEXT = "text=a person walks"
 
-# Table specs ----------------------------------------------------------------------------------------------------------
-
 ROWS = """title: t
 parts:
   P:
@@ -91,9 +89,6 @@ def test_table_specs(attacked, bad):
     for content, says in SPECS.items():
         (bad / "spec.yaml").write_bytes(content.encode(errors="surrogateescape"))
         attacked("tables", f"table={bad / 'spec.yaml'}", "evaluate=false", says=says)
-
-
-# Files that cannot be read --------------------------------------------------------------------------------------------
 
 
 def huge(path: Path) -> None:
@@ -152,9 +147,6 @@ def test_long_names_are_shortened(attacked, bad, capfd):
     assert len(capfd.readouterr().err) < 2_010
 
 
-# Texts ----------------------------------------------------------------------------------------------------------------
-
-
 def test_long_and_many_texts(attacked, tmp_path, trained):
     attacked("sample", f"ckpt={trained}", f"text={'a person walks ' * 66_667}", says=" characters are too many")
     with pytest.raises(UserError, match=r"5,001 texts with samples=2: at most 10,000 motions"):
@@ -180,9 +172,6 @@ def test_a_text_given_twice_has_two_motions(trained):
     assert np.abs(twice[0] - twice[2]).max() > 1e-3
     ids = [made.id for made in flame_mdm.generate(model, ["walk", "jump", "walk"], seconds=1, samples=2)]
     assert ids == ["walk#0", "walk#1", "jump#0", "jump#1", "walk#2", "walk#3"]
-
-
-# Races and failures ---------------------------------------------------------------------------------------------------
 
 
 def _made(text: str = "a person walks") -> list[Motion]:
@@ -279,8 +268,6 @@ def test_a_file_that_is_half_written_when_the_disk_is_full_leaves_the_old_one(tm
     assert path in before
 
 
-# What is shown --------------------------------------------------------------------------------------------------------
-
 HOSTILE = "x\n# Heading\n\n<b>|`[a](http://b)\r\x1b[31m\u202e\t~~_*"
 
 
@@ -355,9 +342,6 @@ def test_a_report_plays_the_motions_not_the_page_of_others(tmp_path):
     assert "example.com" not in text
     assert "a person jumps" in text
     assert "Samples at step 9" in text
-
-
-# Push -----------------------------------------------------------------------------------------------------------------
 
 
 def test_push_takes_names_not_paths_and_overwrites_only_its_own_files(attacked, bad, trained):

@@ -2,7 +2,6 @@
 
 import functools
 import http.server
-import importlib.util
 import json
 import shutil
 import threading
@@ -13,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from support.browser import CHROMIUM, Tab, browser
-from support.fixtures import ROOT
+from support.fixtures import script
 from support.glb import Glb
 
 import flame_mdm
@@ -38,13 +37,8 @@ class Handler(http.server.SimpleHTTPRequestHandler):
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    spec = importlib.util.spec_from_file_location("web", ROOT / "tools" / "web.py")
-    assert spec is not None
-    assert spec.loader is not None
-    web = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(web)
     out = tmp_path_factory.mktemp("web") / "page"
-    web.build("quickstart", out)
+    script("tools/web.py").build("quickstart", out)
     return out
 
 

@@ -6,6 +6,7 @@ that need them skip where that folder is absent.
 """
 
 import hashlib
+import importlib.util
 import json
 import os
 import subprocess
@@ -39,6 +40,16 @@ def blender() -> str:
     if subprocess.run([python, "-c", "import bpy"], capture_output=True, check=False).returncode:
         pytest.skip("no package bpy: set FLAME_MDM_BLENDER to a Python that has it")
     return python
+
+
+def script(path: str) -> Any:
+    """The module in a file of the repository that is in no package, such as tools/web.py."""
+    spec = importlib.util.spec_from_file_location(Path(path).stem, ROOT / path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = sys.modules[spec.name] = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
 
 
 @cache

@@ -18,6 +18,7 @@ from flame_mdm.formats.motion import Motion, motion_of_poses
 from flame_mdm.formats.poses import Poses
 from flame_mdm.representations.skeleton import SMPL22, Skeleton
 from flame_mdm.representations.smpl import ADULT
+from flame_mdm.seeds import key
 from flame_mdm.visualize import render
 from flame_mdm.visualize.body import try_fit
 
@@ -118,6 +119,11 @@ def unpacked(packed: dict[str, Any]) -> np.ndarray:
     """Joints (F, J, 3) of a motion in a page."""
     quanta = np.frombuffer(base64.b64decode(packed["joints"]), "<i2").reshape(packed["frames"], -1, 3)
     return packed["center"] + quanta * packed["step"]
+
+
+def keys(count: int, *name: str | int) -> torch.Tensor:
+    """Keys (N,) of the samples of a metric."""
+    return torch.tensor([key(*name, i) for i in range(count)], dtype=torch.long)
 
 
 def wander(joints: int, frames: int, seed: int) -> torch.Tensor:

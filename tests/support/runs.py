@@ -104,6 +104,15 @@ def reference(words: list[str], steps: int, name: str = "quickstart") -> dict[st
     return task.state_dict()
 
 
+def untrained(words: list[str], max_frames: int) -> MotionGeneration:
+    """The model of the quick-start experiment with random weights."""
+    config = compose("quickstart", words)
+    torch.manual_seed(0)
+    model = MotionGeneration.build(config, instantiate(config["representation"]))
+    model.facts |= {"max_frames": max_frames, "dataset": "synthetic", "fingerprint": "f00d"}
+    return model.eval()
+
+
 def free_port() -> int:
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))

@@ -75,6 +75,14 @@ def write_folder(
     return folder
 
 
+def write_words(folder: Path, words: list[str], vectors: np.ndarray) -> Path:
+    """Word vectors (N, 300) under the names that Guo et al. gave their files."""
+    folder.mkdir(parents=True, exist_ok=True)
+    np.save(folder / "our_vab_data.npy", vectors)
+    (folder / "our_vab_idx.pkl").write_bytes(pickle.dumps({word: row for row, word in enumerate(words)}))
+    return folder
+
+
 # HumanAct12 and UESTC -----------------------------------------------------------------------------------------------
 
 

@@ -133,7 +133,7 @@ def card() -> AuditCard:
     return check_shape(content, AuditCard)
 
 
-def test_a_grade_is_seen_from_where_all_stronger_ones_differ(card):
+def test_a_grade_is_seen_from_where_all_stronger_ones_differ_and_findings_are_sentences(card):
     noise, still = card.perturbations
     assert seen(card, noise, "fid") == Seen(2.0, 5.0, rewarded=False, monotone=True)
     assert seen(card, noise, "jitter") == Seen(1.0, None, rewarded=True, monotone=True)
@@ -142,9 +142,6 @@ def test_a_grade_is_seen_from_where_all_stronger_ones_differ(card):
     back = noise.model_dump()
     back["grades"][2]["values"]["fid"] = [1.1, 0.3, 0.1, 0.2]
     assert seen(card, check_shape(back, AuditedPerturbation), "fid") == Seen(None, None, rewarded=False, monotone=False)
-
-
-def test_findings_are_sentences(card):
     assert findings(card) == ["No metric sees: still.", "jitter rates better than real motions: noise."]
 
 

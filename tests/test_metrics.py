@@ -277,7 +277,7 @@ def test_frechet_distance_of_normal_distributions():
     assert frechet_distance(a, b).item() == pytest.approx(expected, rel=1e-10)
 
 
-def test_frechet_distance_without_full_rank():
+def test_frechet_distance_without_full_rank_and_of_a_set_to_itself():
     generator = torch.Generator().manual_seed(0)
     a, b = (torch.randn(n, 12, generator=generator, dtype=torch.float64) for n in (40, 30))
     dead = torch.ones(1, 5, dtype=torch.float64)
@@ -287,9 +287,6 @@ def test_frechet_distance_without_full_rank():
     eigenvalues = np.linalg.eigvals(np.cov(a[:5].T.numpy()) @ np.cov(b[:5].T.numpy())).real.clip(0)
     trace = a[:5].var(0).sum() + b[:5].var(0).sum() - 2 * np.sqrt(eigenvalues).sum()
     assert few.item() == pytest.approx(((a[:5].mean(0) - b[:5].mean(0)) ** 2).sum().item() + trace.item(), rel=1e-6)
-
-
-def test_frechet_distance_of_a_set_to_itself_is_not_negative():
     x, ids = torch.randn(64, 32, generator=torch.Generator().manual_seed(0)), torch.arange(64)
     assert 0 <= computed(FrechetMotionDistance(), generated=x, keys=ids, real=x.flip(0), real_keys=ids) < 1e-10
 

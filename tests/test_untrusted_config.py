@@ -117,14 +117,11 @@ def test_interpolations_in_saved_runs_and_protocols_are_refused(attacked, traine
     assert not marker.exists()
 
 
-def test_parts_are_built_without_resolving_anything(tmp_path):
+def test_parts_are_built_as_hydra_builds_them_without_resolving_anything(tmp_path):
     node = {"_target_": "builtins.dict", "a": exploit(tmp_path / "owned"), "b": ["${oc.env:HOME}"]}
     assert instantiate({"_target_": "collections.OrderedDict", "x": {"y": "${z}"}}) == {"x": {"y": "${z}"}}
     assert instantiate(node) == {"a": node["a"], "b": node["b"]}
     assert not (tmp_path / "owned").exists()
-
-
-def test_parts_are_built_as_hydra_builds_them():
     inner = {"_target_": "fractions.Fraction", "numerator": 3}
     assert instantiate({"_target_": "builtins.dict", "a": [inner], "b": {"c": inner}}) == {"a": [3], "b": {"c": 3}}
     kept = instantiate({"_target_": "builtins.dict", "_recursive_": False, "a": inner})

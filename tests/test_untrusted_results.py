@@ -102,8 +102,6 @@ UNREADABLE: dict[str, tuple[Callable[[Path], object], str]] = {
     "folder": (Path.mkdir, "a folder, not a file"),
     "huge": (huge, "1 TiB, but such a file may have at most"),
     "latin": (lambda path: path.write_bytes(b'{"a": "\xe9"}\n'), "not a UTF-8 text file"),
-    "deep": (lambda path: path.write_text('{"a": ' * 20_000 + "\n"), ""),
-    "flat": (lambda path: path.write_text("[" * 300 + "]" * 300 + "\n"), ""),
 }
 
 
@@ -323,25 +321,19 @@ def test_all_that_is_printed_is_printable():
     assert wrong == [], "use errors.say"
 
 
-def test_pages_use_no_network(tmp_path):
+def test_pages_use_no_network_and_play_the_motions_not_the_pages_of_others(tmp_path):
     policy = f'<meta http-equiv="Content-Security-Policy" content="{POLICY}">'
     assert "default-src 'none'" in POLICY
     assert "Content-Security-Policy" in player_page([Motion(np.zeros((2, 22, 3)), 20.0, SMPL22)])
     runs = [motions(a_run(tmp_path / name, name=name) / "samples" / "step_0000009").parent.parent for name in "ab"]
     assert main(["compare", f"runs={runs[0]} {runs[1]}", f"out={tmp_path / 'out.html'}", "rate=true"]) == 0
-    for path in (tmp_path / "out.html", write_report(runs[0]), _table(tmp_path)):
+    (runs[0] / "samples" / "step_0000009" / "player.html").write_text("<script>fetch('https://example.com')</script>")
+    report = write_report(runs[0])
+    for path in (tmp_path / "out.html", report, _table(tmp_path)):
         assert policy in path.read_text()
-
-
-def test_a_report_plays_the_motions_not_the_page_of_others(tmp_path):
-    folder = a_run(tmp_path / "run")
-    samples = motions(folder / "samples" / "step_0000009")
-    (samples / "player.html").write_text("<script>fetch('https://example.com')</script>")
-    assert main(["report", str(folder)]) == 0
-    text = (folder / "report.html").read_text()
-    assert "example.com" not in text
-    assert "a person jumps" in text
-    assert "Samples at step 9" in text
+    assert "example.com" not in report.read_text()
+    assert "a person jumps" in report.read_text()
+    assert "Samples at step 9" in report.read_text()
 
 
 def test_push_takes_names_not_paths_and_overwrites_only_its_own_files(attacked, bad, trained):

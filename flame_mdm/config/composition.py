@@ -96,6 +96,8 @@ def plan_composition(recipe: ConfigSource, overrides: Sequence[str], first: Sequ
     first = [*first, *([f"hydra.searchpath=[file://{EXPERIMENTS}]"] if recipe.folder != EXPERIMENTS else [])]
     if recipe.experiment:
         first.append(f"experiment={recipe.experiment}")
+    if not parsed:
+        return Plan(recipe.folder, recipe.stem, first)  # nothing to compare with the recipe
     parts = [o for o in parsed if _is_group(o)]
     composed = resolve(Plan(recipe.folder, recipe.stem, [*first, *map(first_choice, parts)]))
     keys = [_legal(composed, o) for o in parsed if not _is_group(o)]

@@ -197,7 +197,7 @@ def test_the_released_t2m_is_read_whole_or_not_at_all(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"lacks finest\.tar, mean\.npy"):
         T2MExtractor(str(tmp_path))
     made = released_folder(tmp_path, 251)
-    write_words(tmp_path, WORDS, VECTORS)
+    write_words(tmp_path, WORDS, np.random.default_rng(0).normal(size=VECTORS.shape))
     extractor, legacy = T2MExtractor(str(tmp_path)), T2MExtractor(str(tmp_path), full_length=True)
     x, mask = torch.randn(1, 40, 251), torch.ones(1, 40, dtype=torch.bool)
     with torch.no_grad():

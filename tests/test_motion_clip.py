@@ -231,10 +231,10 @@ RUN += [f"task.network.{size}" for size in ("latent_dim=32", "ff_size=32", "num_
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory, data_root):
-    """Checkpoint of a tiny motion-CLIP after 60 steps."""
+    """Checkpoint of a tiny motion-CLIP after 90 steps."""
     folder = tmp_path_factory.mktemp("motion_clip")
-    options = [f"data_root={data_root}/clip", f"run.dir={folder}", "trainer.max_steps=60"]
-    options += ["trainer.val_check_interval=30", "optimizer.lr=0.005"]
+    options = [f"data_root={data_root}/clip", f"run.dir={folder}", "trainer.max_steps=90"]
+    options += ["trainer.val_check_interval=30", "optimizer.lr=0.003"]
     assert main(["train", "motion_clip/synthetic", *RUN, *options]) == 0
     return folder / "checkpoints" / "last.ckpt"
 

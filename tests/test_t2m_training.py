@@ -168,9 +168,8 @@ def test_a_motion_that_a_text_describes_is_no_wrong_one():
 
 @pytest.mark.slow
 def test_words_are_learned_from_captions_without_tags(words, tmp_path):
-    steps = ["task.movement_steps=10", "trainer.max_steps=90", "trainer.val_check_interval=90"]
-    learned = fit(tmp_path, words, "task.words=learned", *steps)
-    assert logged(learned, "val/motions_for_text_top3")[89] > 0.5  # by chance 3 in 32
+    learned = fit(tmp_path, words, "task.words=learned", "trainer.max_steps=120", "trainer.val_check_interval=120")
+    assert logged(learned, "val/motions_for_text_top3")[119] > 0.5  # by chance 3 in 32
     extractor = OwnT2MExtractor(str(learned))
     features = extractor.texts(["Walks slowly.", "runs left"], [None, None])
     assert torch.allclose(extractor.texts(["walks slowly"], [["another/VERB"]]), features[:1], atol=1e-5)

@@ -1,4 +1,4 @@
-"""Full disks, killed loading processes, kills at random moments, preparations at the same time, and hidden signals."""
+"""Full disks, loading processes that die or stop, kills at random moments; what the start of a command imports."""
 
 import io
 import multiprocessing
@@ -11,7 +11,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -23,10 +23,7 @@ from support.runs import TINY, finish, spawn
 from flame_mdm.__main__ import main
 from flame_mdm.checkpoints.model_files import read_checkpoint
 from flame_mdm.commands import train
-from flame_mdm.config import guarded
-from flame_mdm.data.store import Store
 from flame_mdm.errors import UserError
-from flame_mdm.progress import ProgressBar
 from flame_mdm.signals import StopRequest
 from flame_mdm.training.checkpointing import LAST, AtomicCheckpoints, newest
 from flame_mdm.training.guards import lost_worker
@@ -43,6 +40,9 @@ def words(root: Path, run: Path, *more: str) -> list[str]:
 
 def prepared(root: Path, clips: int) -> list[str]:
     return ["data=synthetic", f"data.source.clips={clips}", f"data_root={root}"]
+
+
+# Full disks -----------------------------------------------------------------------------------------------------------
 
 
 @contextmanager
@@ -76,6 +76,9 @@ def test_a_preparation_without_room_leaves_nothing(tmp_path, capsys):
         assert line.startswith(f"error: {file}: cannot be written: File too large. ")
         assert f" are free on the disk of {tmp_path / 'data'}" in line
         assert list(tmp_path.iterdir()) == []
+
+
+# Loading processes ----------------------------------------------------------------------------------------------------
 
 
 def running(pids: list[int]) -> list[int]:
@@ -149,6 +152,8 @@ def test_torch_messages_about_lost_workers_are_understood(tmp_path, monkeypatch)
         assert list(tmp_path.iterdir()) == []
 
 
+# Kills ----------------------------------------------------------------------------------------------------------------
+
 KILLS = int(os.environ.get("FLAME_MDM_KILLS", "4"))
 """Kills, half of them SIGKILL and half SIGTERM."""
 
@@ -221,120 +226,3 @@ def test_kills_at_random_moments_change_nothing(data_root, tmp_path):
             shutil.rmtree(folder)  # too late
     killed(line(folder), log)
     assert result(folder) == result(whole)
-
-
-class Preparation:
-    """A process that prepares data, forked from this one, and what it prints."""
-
-    def __init__(self, root: Path, name: str):
-        self.out, self.err = (root.with_name(f"{name}.{kind}") for kind in ("out", "err"))
-        self.process = multiprocessing.get_context("fork").Process(target=self.run, args=(root,))
-        self.process.start()
-
-    def run(self, root: Path) -> None:
-        sys.stdout, sys.stderr = self.out.open("w", 1), self.err.open("w")
-        code = main(["prepare", "data=synthetic", "data.source.clips=100", f"data_root={root}"])
-        sys.stdout.close()
-        sys.stderr.close()
-        os._exit(code)
-
-    def wait_for(self, condition: Callable[[], object]) -> None:
-        end = time.monotonic() + 60
-        while not condition():
-            assert self.process.is_alive(), self.err.read_text()
-            assert time.monotonic() < end, "it never came to that"
-            time.sleep(0.002)
-
-    def end(self) -> tuple[int | None, str, str]:
-        """Exit code and what was printed."""
-        self.process.join(120)
-        return self.process.exitcode, self.out.read_text(), self.err.read_text()
-
-
-@pytest.fixture
-def both(tmp_path) -> Iterator[tuple[Preparation, Preparation]]:
-    """One process that is halted while it prepares, and another that waits for it."""
-    root = tmp_path / "data"
-    first = Preparation(root, "first")
-    first.wait_for((root / f"{STORE}.partial").exists)
-    os.kill(first.process.pid or 0, signal.SIGSTOP)
-    second = Preparation(root, "second")
-    second.wait_for(lambda: second.out.exists() and "another process is preparing it" in second.out.read_text())
-    yield first, second
-    for preparation in (first, second):
-        preparation.process.kill()
-        preparation.process.join()
-
-
-def test_two_processes_prepare_the_same_data_once(both, tmp_path):
-    os.kill(both[0].process.pid, signal.SIGCONT)
-    (first, out, err), (second, other_out, other_err) = (preparation.end() for preparation in both)
-    assert (first, second) == (0, 0), err + other_err
-    assert [path.name for path in (tmp_path / "data").iterdir()] == [STORE]
-    assert "preparing" in err
-    assert "preparing" not in other_err, "it opens what the other has written"
-    assert out.splitlines()[-1] == other_out.splitlines()[-1], "the fingerprint is the same"
-    Store(tmp_path / "data" / STORE).verify()
-
-
-def test_the_second_process_takes_over_from_one_that_is_killed(both, tmp_path):
-    both[0].process.kill()
-    code, _, err = both[1].end()
-    assert code == 0, err
-    assert "preparing" in err
-    assert [path.name for path in (tmp_path / "data").iterdir()] == [STORE]
-    Store(tmp_path / "data" / STORE).verify()
-
-
-@pytest.mark.parametrize(
-    ("signum", "code", "fails"), [(signal.SIGTERM, 143, True), (signal.SIGINT, 130, True), (signal.SIGINT, 130, False)]
-)
-def test_a_library_that_fails_after_a_signal_does_not_hide_it(signum, code, fails, capsys):
-    def command() -> None:
-        try:
-            os.kill(os.getpid(), signum)
-            time.sleep(1)
-        finally:
-            if fails:
-                raise OSError("cannot close the file")
-
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # shells ignore it for jobs in the background
-    handlers = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
-    try:
-        assert guarded(command, (signal.SIGINT, signal.SIGTERM)) == code
-        assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == handlers
-    finally:
-        signal.signal(signal.SIGINT, before)
-    assert "cannot close" not in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("advance", [lambda bar: [None for _ in bar], lambda bar: bar.update()])
-def test_a_signal_that_a_library_swallows_stops_the_next_step_of_a_progress_bar(advance, capsys):
-    class Unfinished:
-        def __del__(self) -> None:
-            os.kill(os.getpid(), signal.SIGTERM)
-            time.sleep(1)
-
-    reached = []
-
-    def command() -> None:
-        bar = ProgressBar(range(3))
-        Unfinished()  # Python swallows exceptions of __del__, and prints them
-        reached.append("bar")
-        advance(bar)
-        reached.append("end")
-
-    before = sys.unraisablehook
-    assert guarded(command, (signal.SIGTERM,)) == 143
-    assert reached == ["bar"]
-    assert "Traceback" not in capsys.readouterr().err
-    assert sys.unraisablehook is before
-    assert list(ProgressBar(range(3))) == [0, 1, 2], "the next command is not stopped"
-
-
-def test_an_ignored_signal_stays_ignored():
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)  # as a shell does for a job in the background
-    try:
-        assert guarded(lambda: os.kill(os.getpid(), signal.SIGINT), (signal.SIGINT,)) == 0
-    finally:
-        signal.signal(signal.SIGINT, before)

@@ -12,7 +12,7 @@ from flame_mdm.errors import UserError, did_you_mean
 
 MAX_INTEGER = 2**63 - 1  # maximum integer in a file; larger ones overflow when they are plotted or logged
 LIMIT = 4 * safe_io.MEBIBYTE
-"""Maximum size of a file of results, ratings, lengths or provenance. Typical files have 10 to 300 KiB."""
+"""Maximum size of a file of results, lengths or provenance. Typical files have 10 to 300 KiB."""
 T = TypeVar("T")
 Int = Annotated[int, Field(gt=-(2**63), lt=2**63)]
 Number = Annotated[float, Field(gt=-1e300, lt=1e300)]  # a finite number that does not overflow when it is plotted

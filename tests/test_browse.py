@@ -13,7 +13,6 @@ from support.stores import OwnClips
 from flame_mdm.__main__ import main
 from flame_mdm.data import Clip
 from flame_mdm.data.store import Entry, Store, write_store
-from flame_mdm.formats.readers import read
 from flame_mdm.reporting.browse import choose, describe, find, write_page
 from flame_mdm.representations.humanml import HumanML
 
@@ -99,8 +98,8 @@ def test_statistics_count_all_clips_whether_shown_or_not(store):
         assert sum(int(bar.split(": ")[1].split()[0]) for bar in bars if bar.endswith(split)) == count
 
 
-def test_the_command_shows_writes_and_refuses(tmp_path, data_root, capsys):
-    out, folder = tmp_path / "page.html", tmp_path / "real motions"
+def test_the_command_shows_what_is_searched(tmp_path, data_root, capsys):
+    out = tmp_path / "page.html"
 
     def run(*words: str) -> int:
         out.unlink(missing_ok=True)
@@ -114,22 +113,6 @@ def test_the_command_shows_writes_and_refuses(tmp_path, data_root, capsys):
     assert run("split=train", "search=walks") == 0
     assert Page(out).motions
     assert all("walks" in m["caption"] and m["group"] == "train" for m in Page(out).motions)
-
-    assert run("split=test", "clips=4", f"motions={folder}") == 0
-    motions, files = Page(out).motions, sorted(folder.glob("*.npz"))
-    assert [path.name for path in files] == [f"motion_{n:03d}_{m['id']}.npz" for n, m in enumerate(motions)]
-    for path, shown in zip(files, motions, strict=True):
-        file = read(path)
-        assert (file.fps, len(file.joints)) == (20, min(shown["frames"], 60)), "cut as for evaluation"
-        assert file.text
-        assert file.text in shown["caption"].split(" · ")
-        with np.load(path) as arrays:
-            assert str(arrays["clip"]) == shown["id"]
-            decoded = HumanML().decode(torch.from_numpy(arrays["features"])).numpy()
-            np.testing.assert_allclose(decoded, arrays["joints"], atol=1e-6)
-
-    assert run("split=test", "clips=1", f"motions={folder}") == 1
-    assert "holds other motions, such as motion_001_" in capsys.readouterr().err
 
 
 @pytest.mark.tools

@@ -114,16 +114,13 @@ def test_unreadable_files(attacked, bad, trained):
         path.parent.mkdir(parents=True, exist_ok=True)
         make(path)
         attacked("report", str(folder), says=f"{path}: {says}")
-    ratings, lengths = bad / "ratings.json", bad / "results" / "lengths" / "kit.json"
-    (bad / "study.yaml").write_text(f"title: t\nparts: {{P: {{ratings: {ratings}}}}}\n")
+    lengths = bad / "results" / "lengths" / "kit.json"
     (bad / "lengths.yaml").write_text("title: t\nparts: {P: {lengths: [kit]}}\n")
     lengths.parent.mkdir(parents=True)
-    for path in (ratings, lengths, bad / "texts.txt"):
+    for path in (lengths, bad / "texts.txt"):
         os.mkfifo(path)
-    for spec, path in (("study", ratings), ("lengths", lengths)):
-        words = [f"table={bad / spec}.yaml", "evaluate=false", f"results={bad / 'results'}"]
-        attacked("tables", *words, says=f"{path}: ")
-    attacked("compare", f"ratings={ratings}", says=f"{ratings}: ")
+    words = [f"table={bad / 'lengths.yaml'}", "evaluate=false", f"results={bad / 'results'}"]
+    attacked("tables", *words, says=f"{lengths}: ")
     words = [f"runs={trained.parent.parent} {motions(bad / 'real')}", f"texts={bad / 'texts.txt'}"]
     attacked("compare", *words, says=f"{bad / 'texts.txt'}: ")
 
@@ -326,7 +323,7 @@ def test_pages_use_no_network_and_play_the_motions_not_the_pages_of_others(tmp_p
     assert "default-src 'none'" in POLICY
     assert "Content-Security-Policy" in player_page([Motion(np.zeros((2, 22, 3)), 20.0, SMPL22)])
     runs = [motions(a_run(tmp_path / name, name=name) / "samples" / "step_0000009").parent.parent for name in "ab"]
-    assert main(["compare", f"runs={runs[0]} {runs[1]}", f"out={tmp_path / 'out.html'}", "rate=true"]) == 0
+    assert main(["compare", f"runs={runs[0]} {runs[1]}", f"out={tmp_path / 'out.html'}"]) == 0
     (runs[0] / "samples" / "step_0000009" / "player.html").write_text("<script>fetch('https://example.com')</script>")
     report = write_report(runs[0])
     for path in (tmp_path / "out.html", report, _table(tmp_path)):

@@ -7,19 +7,17 @@ from typing import ClassVar
 from flame_mdm.commands import STORE, BodySettings, PreparedSettings, check_words
 from flame_mdm.config import instantiate
 from flame_mdm.errors import UserError, say
-from flame_mdm.reporting.browse import choose, find, write_clips, write_page
+from flame_mdm.reporting.browse import choose, find, write_page
 from flame_mdm.sampler_options import option
 
 
 @dataclass(frozen=True, kw_only=True)
 class BrowseSettings(BodySettings, PreparedSettings):
     """usage: flame-mdm browse data=NAME [source=PATH] [split=train] [search="waves left"] [clips=200] [out=FILE.html]
-           flame-mdm browse data=NAME split=test clips=10 motions=FOLDER
 
     NAME is a data set, as for `prepare`, or the name of your own prepared set (data.name).
     Writes a single web page that opens from disk. It shows clips of a data set with their captions, mirrored copies
     next to their originals, a search field, a choice of splits, the distribution of clip lengths and other statistics.
-    motions=FOLDER also writes the shown clips as motion files, to compare generated motions with them.
     """
 
     OBJECTS: ClassVar = ("data", "out")
@@ -28,7 +26,6 @@ class BrowseSettings(BodySettings, PreparedSettings):
     split: str | None = option(None, "train, val or test; default: all")
     search: str | None = option(None, "words that must occur in the id or the captions of a clip")
     clips: int = option(200, "maximum number on the page, evenly spaced; mirrored copies come with their originals")
-    motions: str | None = option(None, "folder: also write the shown clips as motion files")
 
 
 def main(settings: BrowseSettings) -> None:
@@ -63,6 +60,3 @@ def main(settings: BrowseSettings) -> None:
     write_page(out, store, representation, clips, title, body)
     say(f"{out}: {len(clips)} of {matching} clips, {out.stat().st_size / 1e6:.1f} MB")
     say(*data.counts(store))
-    if settings.motions is not None:
-        write_clips(Path(settings.motions), store, representation, clips, data.crop.longest())
-        say(f"{settings.motions}: {len(clips)} motions")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,10 +10,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from markupsafe import Markup
 
-from flame_mdm.errors import UserError
 from flame_mdm.reporting.page import render
 from flame_mdm.reporting.plots import Histogram, Panel, standalone, svg
-from flame_mdm.safe_io import atomic_folder
 
 if TYPE_CHECKING:
     from flame_mdm.data.store import Entry, Store
@@ -88,38 +85,6 @@ def write_page(
         beside=[clip.id[1:] if clip.id.startswith("M") else "" for clip in clips],
         body=body,
     )
-
-
-def write_clips(
-    folder: Path, store: Store, representation: Representation, clips: Sequence[Entry], longest: int
-) -> None:
-    """Writes clips as `motion_000_ID.npz` ..., in the layout of generated motions, each with one caption.
-
-    A clip with several captions gets the first one that no earlier clip has, so captions are unique if possible. Clips
-    are cut to `longest` frames. Raises `UserError` if the folder holds other motions, which would be mistaken for
-    these.
-    """
-    import torch
-
-    from flame_mdm.formats.motion import Motion
-
-    ids = [re.sub(r"[^\w.-]+", "_", clip.id)[:100] for clip in clips]
-    paths = [folder / f"motion_{number:03d}_{name}.npz" for number, name in enumerate(ids)]
-    if others := sorted(p for p in set(folder.glob("*.npz")) - set(paths) if not p.name.startswith(".")):
-        raise UserError(
-            f"motions={folder}: the folder holds other motions, such as {others[0].name}. Delete it, or choose another"
-        )
-    used: set[str] = set()
-    with atomic_folder(folder) as made:
-        for path, clip in zip(paths, clips, strict=True):
-            names = clip.captions or ([] if clip.action is None else [store.info["actions"][clip.action]])
-            caption = next((name for name in names if name not in used), names[0] if names else "")
-            used.add(caption)
-            features = representation.rebase(store.motion(clip)[:longest])
-            joints = representation.decode(torch.from_numpy(features.copy())).numpy()
-            motion = Motion(joints, representation.fps, representation.skeleton, caption, clip.id)
-            motion.features, motion.representation = features, representation.name
-            motion.save(made / path.name, clip=clip.id, split=clip.split, data=store.fingerprint)
 
 
 def describe(store: Store) -> Markup:

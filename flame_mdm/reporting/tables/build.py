@@ -1,4 +1,4 @@
-"""Builds tables from existing results, published numbers, recipes, lengths and ratings."""
+"""Builds tables from existing results, published numbers, recipes and lengths."""
 
 import difflib
 import functools
@@ -15,7 +15,6 @@ from flame_mdm.config import Config
 from flame_mdm.errors import UserError
 from flame_mdm.reporting.audit import card_of
 from flame_mdm.reporting.settings import LABELS, Sizes, setting_text, values
-from flame_mdm.reporting.study import Ratings, wilson
 from flame_mdm.reporting.tables.format import ABOUT, Cell, Line, Part, Plot, Table, ranks
 from flame_mdm.reporting.tables.specs import PUBLISHED, SWEPT, Lengths, as_list, evaluations, load_mapping
 from flame_mdm.runs import made_by
@@ -40,8 +39,6 @@ def build(name: str, spec: Config, results: Path, sizes: Sizes | None = None) ->
             built = _hyperparameters(part_name, part, reported, sizes)
         elif "lengths" in part:
             built = _lengths(part_name, part, results)
-        elif "ratings" in part:
-            built = _ratings(part_name, part, reported)
         else:
             built = _measured(part_name, part, reported, results)
             built.figures = [
@@ -386,25 +383,3 @@ def _lengths(name: str, part: Config, results: Path) -> Part:
             counts[length // step] += 1
         histograms[dataset] = ([float(i * step) for i in range(len(counts) + 1)], counts)
     return Part(name, columns, lines, notes, histograms=histograms)
-
-
-def _ratings(name: str, part: Config, reported: Config | None) -> Part:
-    """Builds the table of a user study: how often one model was preferred to another."""
-    columns = {"Preferred": "none", "votes": "none", "raters": "none"}
-    lines = []
-    path = Path(part["ratings"])
-    if path.exists():
-        ratings: Ratings = read_json(path, Ratings, "run `flame-mdm compare ratings=...` to count again")
-        for pair in ratings.pairs:
-            votes = pair.wins_a + pair.wins_b
-            share, low, high = wilson(pair.wins_a, votes)
-            shares = Cell(f"{share:.1%} [{low:.1%}, {high:.1%}]", share)
-            cells: list[Cell | None] = [shares, Cell(str(votes), votes), Cell(str(pair.raters))]
-            lines.append(Line(f"{pair.a} over {pair.b}", "measured", cells))
-    notes = [("", "share of votes, with its 95 % interval (Wilson)")]
-    if not lines:
-        notes = [("", f'{path} is missing. make compare RUNS="a b" RATE=true writes a page for rating motions')]
-    if reported:
-        more, sources = _reported(reported, columns, ["", "", ""], name)
-        lines, notes = lines + more, notes + sources
-    return Part(name, columns, lines, notes)

@@ -83,20 +83,19 @@ class RowSpec(Options):
 
 
 class PartSpec(Options):
-    """A part of a table: either columns and rows, recipes and keys, lengths, or ratings."""
+    """A part of a table: either columns and rows, recipes and keys, or lengths."""
 
     columns: dict[str, ColumnSpec] = Field({}, min_length=1)
     rows: list[RowSpec] = Field([])
     recipes: dict[str, str] = Field({}, min_length=1)
     keys: dict[str, str] = Field({}, min_length=1)
     lengths: list[str] = Field([])
-    ratings: str = ""
 
     @model_validator(mode="after")
     def _one_kind(self) -> Self:
-        kinds = [{"columns", "rows"}, {"recipes", "keys"}, {"lengths"}, {"ratings"}]
+        kinds = [{"columns", "rows"}, {"recipes", "keys"}, {"lengths"}]
         if sum(kind <= self.model_fields_set for kind in kinds) != 1:
-            raise ValueError("needs columns and rows, or recipes and keys, or lengths, or ratings")
+            raise ValueError("needs columns and rows, or recipes and keys, or lengths")
         options = [[len(as_list(getattr(row, n))) for n in SWEPT if n in row.model_fields_set] for row in self.rows]
         _at_most("rows", sum(map(math.prod, options)), MOST_ROWS)
         _at_most("keys", len(self.keys), MOST_ROWS)

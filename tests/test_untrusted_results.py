@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from markupsafe import Markup
 from support.pages import a_run, motions
 from support.refusals import bounded
 from test_architecture import FILES
@@ -277,7 +278,7 @@ def hostile_table() -> Table:
 
 def test_tables_hold_text_not_markup_and_no_formulas():
     table = hostile_table()
-    table.drawn["t](x) -x-heading-b-a-http-b-31m-figure"] = ""
+    table.parts[0].drawn = [("t](x) -x-heading-b-a-http-b-31m-figure", Markup("<svg/>"))]
     text, tex, html = markdown(table), latex(table), str(fragment(table))
     assert "<b>" not in html
     assert html.count("&lt;b&gt;") > 3

@@ -89,28 +89,20 @@ def read_card(path: Path) -> AuditCard:
 
 def write_card(cards: Sequence[AuditCard], out: Path) -> list[Path]:
     """Writes one card, or two side by side, as a web page and as Markdown; returns the paths."""
-    names = [card_name(card) for card in cards]
-    title = " and ".join(f"Audit of {_evaluator(card)} on {card.data.dataset}" for card in cards)
-    body = render(
-        "audit.html",
-        title=title,
-        cards=[(_facts(card), findings(card), _truth(card)) for card in cards],
-        names=[_evaluator(card) for card in cards],
-        metrics=(metrics := _metrics(cards)),
-        rows=_rows(cards, metrics),
-        legend=LEGEND,
-        wide=WIDE,
-        high=HIGH,
-    )
-    path = out / "-and-".join(names)
-    write_text(path.with_name(f"{path.name}.html"), page(title, body))
-    write_text(path.with_name(f"{path.name}.md"), _markdown(cards, title, metrics))
-    return [path.with_name(f"{path.name}{suffix}") for suffix in (".html", ".md")]
-
-
-def _metrics(cards: Sequence[AuditCard]) -> list[str]:
-    names = dict.fromkeys(metric for card in cards for metric in card.metrics)
-    return sorted(names, key=lambda name: name.startswith("attributes"))
+    metrics = list(dict.fromkeys(metric for card in cards for metric in card.metrics))
+    metrics.sort(key=lambda name: name.startswith("attributes"))
+    values = {
+        "title": " and ".join(f"Audit of {_evaluator(card)} on {card.data.dataset}" for card in cards),
+        "cards": [(_evaluator(card), _facts(card), findings(card), _truth(card), _real(card)) for card in cards],
+        "metrics": metrics,
+        "rows": _rows(cards, metrics),
+        "legend": LEGEND,
+    }
+    name = "-and-".join(map(card_name, cards))
+    paths = [out / f"{name}.html", out / f"{name}.md"]
+    write_text(paths[0], page(values["title"], render("audit.html", **values, wide=WIDE, high=HIGH)))
+    write_text(paths[1], str(render("audit.md", **values, metric_text=_metric_text)))
+    return paths
 
 
 def _evaluator(card: AuditCard) -> str:
@@ -132,6 +124,10 @@ def _facts(card: AuditCard) -> list[list[str]]:
 
 def _truth(card: AuditCard) -> list[list[str]]:
     return [[name, number(scores["auc"]), number(scores["correlation"])] for name, scores in card.truth.items()]
+
+
+def _real(card: AuditCard) -> list[tuple[str, str]]:
+    return [(name, interval(*pair)) for name, pair in card.real.items()]
 
 
 def findings(card: AuditCard) -> list[str]:
@@ -213,27 +209,6 @@ def _curve(card: AuditCard, perturbation: AuditedPerturbation, metric: str) -> d
         "level": at(0, real).partition(",")[2],
         "text": f"{number(real)} to {number(points[-1][1])}",
     }
-
-
-def _markdown(cards: Sequence[AuditCard], title: str, metrics: Sequence[str]) -> str:
-    text = f"# {markdown_text(title)}\n"
-    for card in cards:
-        text += f"\n## {markdown_text(_evaluator(card))}\n\n" if len(cards) > 1 else "\n"
-        text += "".join(f"- {markdown_text(': '.join(fact))}\n" for fact in _facts(card))
-        text += "\nFindings:\n\n" + "".join(f"- {markdown_text(line)}\n" for line in findings(card))
-        for name, auc, correlation in _truth(card):
-            text += f"- {markdown_text(name)} against exact attributes: AUC {auc}, rank correlation {correlation}\n"
-        text += "\n| value | real motions |\n|---|---|\n"
-        text += "".join(f"| {_metric_text(m)} | {markdown_text(interval(*pair))} |\n" for m, pair in card.real.items())
-    text += f"\n| seen from | {' | '.join(map(_metric_text, metrics))} |\n|---{'|---' * len(metrics)}|\n"
-    for row in _rows(cards, metrics):
-        about, cells = row["about"], row["cells"]
-        assert isinstance(about, AuditedPerturbation)
-        assert isinstance(cells, list)
-        head = f"{about.name} ({about.unit})" if about.unit else about.name
-        texts = [head, *(" / ".join(t for t, _ in cell) for cell in cells)]
-        text += f"| {' | '.join(map(markdown_text, texts))} |\n"
-    return text + f"\n{LEGEND}\n"
 
 
 def _metric_text(name: str) -> str:

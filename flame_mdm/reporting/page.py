@@ -11,6 +11,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from flame_mdm.errors import markdown_text, one_line
+
 if TYPE_CHECKING:
     from jinja2 import Environment
     from markupsafe import Markup
@@ -25,7 +27,7 @@ TEMPLATES = Path(__file__).parent / "templates"
 
 
 def render(template: str, **values: Any) -> Markup:
-    """Renders a file of `templates/`. All text is escaped, except the output of other templates."""
+    """Renders a file of `templates/`. In HTML and SVG, all text is escaped, except the output of other templates."""
     from markupsafe import Markup
 
     return Markup(_environment().get_template(template).render(**values))
@@ -40,9 +42,15 @@ def page(title: str, body: str) -> str:
 def _environment() -> Environment:
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-    options: dict[str, Any] = {"trim_blocks": True, "lstrip_blocks": True, "keep_trailing_newline": True}
-    environment = Environment(loader=FileSystemLoader(TEMPLATES), autoescape=True, undefined=StrictUndefined, **options)
-    environment.filters["number"] = number
+    environment = Environment(
+        loader=FileSystemLoader(TEMPLATES),
+        autoescape=lambda name: not str(name).endswith((".md", ".tex")),
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+    )
+    environment.filters.update(number=number, markdown=markdown_text, one_line=one_line)
     return environment
 
 

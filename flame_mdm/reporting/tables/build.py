@@ -1,19 +1,20 @@
 """Builds tables from existing results, published numbers, recipes and lengths."""
 
-import difflib
 import functools
 import math
 import re
 import string
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from flame_mdm.config import Config
-from flame_mdm.errors import UserError
+from flame_mdm.errors import UserError, did_you_mean
 from flame_mdm.reporting.audit import card_of
+from flame_mdm.reporting.plots import Histogram
 from flame_mdm.reporting.settings import LABELS, Sizes, setting_text, values
 from flame_mdm.reporting.tables.format import ABOUT, Cell, Line, Part, Plot, Table, ranks
 from flame_mdm.reporting.tables.specs import PUBLISHED, SWEPT, Lengths, as_list, evaluations, load_mapping
@@ -21,6 +22,8 @@ from flame_mdm.runs import made_by
 from flame_mdm.schemas import Result, Value, read_json, read_result
 
 NOT_VALID = "NOT VALID"  # state of a row that is shown, but not ranked
+PUBLISHED_SPLIT = "published split: test clips are also used for training, or there are no validation clips"
+FORCED = "forced: real motions do not have the values that the protocol expects"
 
 
 def build(name: str, spec: Config, results: Path, sizes: Sizes | None = None) -> Table:
@@ -56,32 +59,10 @@ def _published(path: Path, changed: int) -> Config:
     return load_mapping(path)
 
 
-@dataclass
-class _Marks:
-    """Footnote letters by what the footnote says; see `_conditions`."""
-
-    letters: dict[tuple[tuple[str, str], ...], str] = field(default_factory=dict)
-
-    def of(self, facts: Mapping[str, str]) -> str:
-        mark = string.ascii_lowercase[len(self.letters) % 26] * (1 + len(self.letters) // 26)
-        return self.letters.setdefault(tuple(facts.items()), mark)
-
-    @property
-    def notes(self) -> list[tuple[str, str]]:
-        """The footnotes. One with up to three differences from the first lists only these."""
-        notes = []
-        for facts, mark in self.letters.items():
-            pairs = zip(facts, next(iter(self.letters)), strict=True)
-            different = [text or f"no {name}" for (name, text), first in pairs if (name, text) != first]
-            whole = "; ".join(text for _, text in facts if text)
-            notes.append((mark, f"as a, but {'; '.join(different)}" if 0 < len(different) <= 3 else whole))
-        return notes
-
-
 def _measured(name: str, part: Config, reported: Config | None, results: Path) -> Part:
     columns = {label: column.get("better", "none") for label, column in part["columns"].items()}
     values = [column["value"] for column in part["columns"].values()]
-    marks = _Marks()
+    known: list[dict[str, str]] = []  # conditions of all rows; each has a footnote
     lines: list[Line] = []
     truths: dict[str, Line] = {}
     missing: list[tuple[str, str]] = []
@@ -89,6 +70,7 @@ def _measured(name: str, part: Config, reported: Config | None, results: Path) -
         paths = [evaluation.path(results) for evaluation in needed]
         read = [read_result(path) if path.exists() else None for path in paths]
         line = _line(row, read, values, [path.name for path in paths])
+        lines.append(line)
         if not any(read):
             line.state = next(iter(needed[0].absent), "not evaluated")
         for evaluation, result in zip(needed, read, strict=True):
@@ -97,14 +79,15 @@ def _measured(name: str, part: Config, reported: Config | None, results: Path) -
                 missing += [(line.label, command) for command in commands]
         timed = {path for path, value in zip(paths, values, strict=True) if value == "seconds_per_sample"}
         pairs = [(path, result) for path, result in zip(paths, read, strict=True) if result is not None]
-        line.marks = ",".join(dict.fromkeys(marks.of(_conditions(r, path in timed)) for path, r in pairs))
-        lines.append(line)
+        line.marks = ",".join(dict.fromkeys(_letter(_conditions(r, path in timed), known) for path, r in pairs))
         if line.marks and line.marks not in truths:
-            truth = Line("Real motions", "real", [_truth(r, v) for r, v in zip(read, values, strict=True)], line.marks)
+            cells = [
+                _entry(r.ground_truth, v) if r and v not in ABOUT else None for r, v in zip(read, values, strict=True)
+            ]
+            truth = truths[line.marks] = Line("Real motions", "real", cells, line.marks)
             truth.nearest = next((result.nearest["real"] for _, result in pairs if "real" in result.nearest), [])
-            truths[line.marks] = truth
     lines = [line for line in truths.values() if any(line.cells)] + lines
-    notes = [*marks.notes, *_by_text(missing), *_warnings(lines, [v == "fid" for v in values], list(columns))]
+    notes = [*_condition_notes(known), *_by_text(missing), *_warnings(lines, values, list(columns))]
     if reported is not None:
         more, sources = _reported(reported, columns, values, name)
         lines, notes = lines + more, notes + sources
@@ -113,17 +96,37 @@ def _measured(name: str, part: Config, reported: Config | None, results: Path) -
     return Part(name, columns, lines, notes)
 
 
-def _warnings(lines: Sequence[Line], distances: Sequence[bool], columns: Sequence[str]) -> list[tuple[str, str]]:
+def _letter(facts: dict[str, str], known: list[dict[str, str]]) -> str:
+    """Returns the footnote letter of the conditions of a row, which are added to the known ones."""
+    if facts not in known:
+        known.append(facts)
+    again, index = divmod(known.index(facts), 26)
+    return string.ascii_lowercase[index] * (1 + again)
+
+
+def _condition_notes(known: list[dict[str, str]]) -> list[tuple[str, str]]:
+    """Returns the footnotes on conditions. One with up to three differences from the first lists only these."""
+    notes = []
+    for facts in known:
+        different = [text or f"no {name}" for name, text in facts.items() if text != known[0][name]]
+        whole = "; ".join(filter(None, facts.values()))
+        notes.append((_letter(facts, known), f"as a, but {'; '.join(different)}" if 0 < len(different) <= 3 else whole))
+    return notes
+
+
+def _warnings(lines: Sequence[Line], values: Sequence[str], columns: Sequence[str]) -> list[tuple[str, str]]:
     """Returns the footnotes on invalid rows, on the choice of checkpoints, and on columns whose distances are 0."""
-    reasons = [(line.label, line.facts.get("not valid because")) for line in lines]
-    notes = _by_text([(label, f"NOT VALID: {reason}") for label, reason in reasons if reason])
-    selected = [(line.label, line.facts.get("chosen by", "").partition(" ")) for line in lines]
-    texts = {"best": "best checkpoint by {}", "none:": "{} checkpoint, not chosen by validation"}
-    notes += _by_text([(label, texts[kind].format(name)) for label, (kind, _, name) in selected if kind in texts])
-    reals = [zip(columns, distances, line.cells, strict=True) for line in lines if line.kind == "real"]
-    zero = {label for cells in reals for label, distance, cell in cells if distance and cell and cell.value == 0}
+    invalid = [(line.label, line.facts.get("not valid because")) for line in lines]
+    texts = [(label, f"NOT VALID: {reason}") for label, reason in invalid if reason]
+    for line in lines:
+        kind, _, name = line.facts.get("chosen by", "").partition(" ")
+        if kind in ("best", "none:"):
+            chosen = f"best checkpoint by {name}" if kind == "best" else f"{name} checkpoint, not chosen by validation"
+            texts.append((line.label, chosen))
+    reals = [zip(columns, values, line.cells, strict=True) for line in lines if line.kind == "real"]
+    zero = {label for cells in reals for label, value, cell in cells if value == "fid" and cell and cell.value == 0}
     why = "clips are taken whole, so that both draws of real motions, which are compared, are the same"
-    return notes + [("", f"{label} of real motions is 0 by construction: {why}") for label in sorted(zero)]
+    return _by_text(texts) + [("", f"{label} of real motions is 0 by construction: {why}") for label in sorted(zero)]
 
 
 def _by_text(lines: Sequence[tuple[str, str]]) -> list[tuple[str, str]]:
@@ -155,17 +158,16 @@ def _conditions(result: Result, timed: bool) -> dict[str, str]:
         "exclusions": _left_out(data.excluded),
         "skeleton": skeleton,
         "changes": f"differs from the protocol: {changed}" if changed else "",
-        "published split": "published split: test clips are also used for training, or there are no validation clips"
-        * result.published_split,
-        "force": "forced: real motions do not have the values that the protocol expects" * result.forced,
+        "published split": PUBLISHED_SPLIT if result.published_split else "",
+        "force": FORCED if result.forced else "",
         "warnings": "; ".join(result.warnings),
-        "quick run": "QUICK RUN, NOT FOR PUBLICATION" * result.quick,
+        "quick run": "QUICK RUN, NOT FOR PUBLICATION" if result.quick else "",
     }
 
 
 def _left_out(excluded: Mapping[str, int]) -> str:
     listed = ", ".join(f"{count:,} {reason}" for reason, count in excluded.items())
-    return f"excluded from the data set: {listed}" * bool(listed)
+    return f"excluded from the data set: {listed}" if listed else ""
 
 
 def _line(
@@ -185,39 +187,46 @@ def _line(
     reasons = list(dict.fromkeys(reason for r in results if r is not None for reason in r.invalid_because))
     line.state = NOT_VALID if reasons else "QUICK" if first.quick else ""
     checkpoint = first.checkpoint
-    sampler = [f"eta {checkpoint.eta}"] if checkpoint and checkpoint.eta is not None else []
-    sampler += [f"spacing {checkpoint.spacing}"] if checkpoint and checkpoint.spacing is not None else []
-    counts = {
-        name: f"{entry.replications} x {entry.n}"
-        for result, name in zip(results, values, strict=True)
-        if result and (entry := (result.values or {}).get(name)) and entry.n
-    }
-    most = Counter(counts.values()).most_common(1)[0][0] if counts else ""
-    others = "".join(f"; {name} {count}" for name, count in counts.items() if count != most)
+
+    def fact(name: str) -> str:
+        return _text(getattr(checkpoint, name, None))
+
+    sampler = [fact("sampler"), *(f"{name} {fact(name)}" for name in ("eta", "spacing") if fact(name))]
     weights = {True: "averaged", False: "raw", None: ""}
     line.facts = {
         "checkpoint sha256": (checkpoint.sha256 if checkpoint else first.samples_sha256 or "")[:16],
-        "recipe": (checkpoint and checkpoint.experiment) or "",
+        "recipe": fact("experiment"),
         "baseline": first.baseline or "",
-        "chosen by": _text(checkpoint and checkpoint.selected_by),
+        "chosen by": fact("selected_by"),
         "weights": weights[checkpoint.averaged_weights if checkpoint else None],
-        "guidance": _text(checkpoint and checkpoint.guidance_scale),
-        "predicts": _text(checkpoint and checkpoint.prediction),
-        "sampler": ", ".join([checkpoint.sampler, *sampler]) if checkpoint else "",
-        "steps": _text(checkpoint and checkpoint.num_inference_steps),
-        "replications x motions": most + others,
-        "seed": _text(first.seed),
+        "guidance": fact("guidance_scale"),
+        "predicts": fact("prediction"),
+        "sampler": ", ".join(sampler),
+        "steps": fact("num_inference_steps"),
+        "replications x motions": _counts(results, values),
+        "seed": str(first.seed),
         "device": first.device,
-        "speed of training": _text(checkpoint and checkpoint.training_speed),
-        "precision of training": _text(checkpoint and checkpoint.training_precision),
-        "training steps": _text(checkpoint and checkpoint.training_steps),
-        "training hours": _text(checkpoint and checkpoint.training_hours),
-        "device of training": _text(checkpoint and checkpoint.training_device),
-        "peak memory of training, GiB": _text(checkpoint and checkpoint.training_memory_gib),
+        "speed of training": fact("training_speed"),
+        "precision of training": fact("training_precision"),
+        "training steps": fact("training_steps"),
+        "training hours": fact("training_hours"),
+        "device of training": fact("training_device"),
+        "peak memory of training, GiB": fact("training_memory_gib"),
         "result": " ".join(dict.fromkeys(file for r, file in zip(results, files, strict=True) if r is not None)),
         "not valid because": "; ".join(reasons),
     }
     return line
+
+
+def _counts(results: Sequence[Result | None], values: Sequence[str]) -> str:
+    """Returns the number of replications and motions of most metrics, and of those that have others."""
+    counts = {}
+    for result, name in zip(results, values, strict=True):
+        entry = (result.values or {}).get(name) if result else None
+        if entry and entry.n:
+            counts[name] = f"{entry.replications} x {entry.n}"
+    most = Counter(counts.values()).most_common(1)[0][0] if counts else ""
+    return most + "".join(f"; {name} {count}" for name, count in counts.items() if count != most)
 
 
 def _text(value: Any) -> str:
@@ -234,19 +243,16 @@ def _about(result: Result, name: str) -> Any:
 
 
 def _cell(result: Result | None, value: str, row: Mapping[str, Any]) -> Cell | None:
-    if value in ABOUT:
-        fact = row.get(value) if result is None else _about(result, value)
-        if fact is None:
-            return None
-        return Cell(f"{float(fact):,g}", float(fact)) if isinstance(fact, int | float) else Cell(_text(fact))
-    return None if result is None else _entry((result.values or {}).get(value))
+    if value not in ABOUT:
+        return _entry(result.values, value) if result else None
+    fact = row.get(value) if result is None else _about(result, value)
+    if fact is None:
+        return None
+    return Cell(f"{float(fact):,g}", float(fact)) if isinstance(fact, int | float) else Cell(_text(fact))
 
 
-def _truth(result: Result | None, value: str) -> Cell | None:
-    return None if result is None or value in ABOUT else _entry((result.ground_truth or {}).get(value))
-
-
-def _entry(entry: Value | None) -> Cell | None:
+def _entry(values: Mapping[str, Value | None] | None, name: str) -> Cell | None:
+    entry = (values or {}).get(name)
     if entry is None or entry.mean is None:
         return None
     return Cell("", entry.mean, entry.ci if (entry.replications or 0) > 1 else None)
@@ -328,9 +334,8 @@ def _hyperparameters(name: str, part: Config, reported: Config | None, sizes: Si
     """
     for key in part["keys"].values():
         if key not in LABELS:
-            near = difflib.get_close_matches(key, LABELS, 3)
-            hint = f"Did you mean {', '.join(near)}?" if near else f"there are: {', '.join(LABELS)}"
-            raise UserError(f"part {name}: no setting is called '{key}'; {hint}")
+            hint = did_you_mean(key, LABELS) or f" There are: {', '.join(LABELS)}"
+            raise UserError(f"part {name}: no setting is called '{key}'.{hint}")
     recipes = {label: values(recipe, sizes) for label, recipe in part["recipes"].items()}
     printed = {row["label"]: row["values"] for row in reported["rows"]} if reported else {}
     ours: dict[tuple[str, str], Cell | None] = {}
@@ -357,29 +362,24 @@ def _hyperparameters(name: str, part: Config, reported: Config | None, sizes: Si
 
 
 def _lengths(name: str, part: Config, results: Path) -> Part:
-    columns = dict.fromkeys(["motions", "hours", "shortest", "median", "mean", "longest"], "none")
+    formats = {"motions": ",", "hours": ".2f", "shortest": "d", "median": "d", "mean": ".1f", "longest": "d"}
     lines, histograms = [], {}
     notes = [("", "lengths are in frames, at the frame rate of each data set")]
     for dataset in part["lengths"]:
         path = results / "lengths" / f"{dataset}.json"
         if not path.exists():
-            lines.append(Line(dataset, "measured", [None] * len(columns), state="not prepared"))
+            lines.append(Line(dataset, "measured", [None] * len(formats), state="not prepared"))
             continue
         counted: Lengths = read_json(path, Lengths, "delete it; `flame-mdm tables` then counts again")
-        lengths, fps = sorted(counted.lengths), counted.fps
-        numbers = [
-            (f"{len(lengths):,}", len(lengths)),
-            (f"{sum(lengths) / fps / 3600:.2f}", sum(lengths) / fps / 3600),
-            *((f"{x:g}", x) for x in (lengths[0], lengths[len(lengths) // 2])),
-            (f"{sum(lengths) / len(lengths):.1f}", sum(lengths) / len(lengths)),
-            (f"{lengths[-1]}", lengths[-1]),
-        ]
-        facts = {"fingerprint": counted.fingerprint, "frames per second": _text(float(fps))}
-        lines.append(Line(dataset, "measured", [Cell(t, float(v)) for t, v in numbers], facts=facts))
-        notes += [("", f"{dataset}; {_left_out(counted.excluded)}")] if counted.excluded else []
+        lengths, count, total = sorted(counted.lengths), len(counted.lengths), sum(counted.lengths)
+        numbers = [count, total / counted.fps / 3600, lengths[0], lengths[count // 2], total / count, lengths[-1]]
+        cells = [Cell(format(x, style), float(x)) for x, style in zip(numbers, formats.values(), strict=True)]
+        facts = {"fingerprint": counted.fingerprint, "frames per second": _text(float(counted.fps))}
+        lines.append(Line(dataset, "measured", [*cells], facts=facts))
+        if counted.excluded:
+            notes.append(("", f"{dataset}; {_left_out(counted.excluded)}"))
         step = max(1, math.ceil(lengths[-1] / 40))
-        counts = [0] * (lengths[-1] // step + 1)
-        for length in lengths:
-            counts[length // step] += 1
-        histograms[dataset] = ([float(i * step) for i in range(len(counts) + 1)], counts)
-    return Part(name, columns, lines, notes, histograms=histograms)
+        counts = np.bincount([length // step for length in lengths]).tolist()
+        edges = [float(i * step) for i in range(len(counts) + 1)]
+        histograms[dataset] = Histogram(edges, {"motions": counts}, "frames")
+    return Part(name, dict.fromkeys(formats, "none"), lines, notes, histograms=histograms)

@@ -6,14 +6,13 @@ import csv
 import io
 import os
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from itertools import compress, groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-from urllib.parse import quote
 
-from flame_mdm.errors import markdown_text, one_line, shortened
+from flame_mdm.errors import one_line, shortened
 from flame_mdm.reporting.page import page, render
 from flame_mdm.reporting.plots import Histogram, Panel, Series, standalone, svg
 from flame_mdm.safe_io import write_text
@@ -41,7 +40,6 @@ ABOUT = {
 }
 """Labels of the values that a column may show besides metrics, and of the x-axes of figures."""
 ARROWS = {"higher": "↑", "lower": "↓", "real": "→", "none": ""}
-LATEX_ARROWS = {"higher": r"$\uparrow$", "lower": r"$\downarrow$", "real": r"$\rightarrow$", "none": ""}
 KINDS = {
     "real": "Real motions, measured here",
     "measured": "Measured here",
@@ -52,10 +50,6 @@ NO_RESULTS = ("NOT VALID", "QUICK")  # states of rows whose values must not be m
 CARD = re.compile(r"(?<=\baudit )([\w./-]+\.html)")  # paths of audit cards in footnotes
 SHARED = ("checkpoint sha256", "recipe", "sampler")
 """Facts that rows must have in common to be listed together as sources."""
-LEGEND = (
-    "↑ higher is better, ↓ lower is better, → closer to real motions is better. **Best** and <u>second best</u> of the "
-    "rows with the same mark."
-)
 
 
 @dataclass
@@ -105,7 +99,8 @@ class Part:
     """One table within the table of a paper.
 
     `columns` are label -> which values are better, a key of `ARROWS`; `notes` mark (may be empty) and text of each
-    footnote; `histograms` name -> edges and counts.
+    footnote; `histograms` are figures by title; `drawn`, set by `write`, has file name and SVG of each figure, None if
+    it has no points.
     """
 
     name: str
@@ -113,21 +108,70 @@ class Part:
     lines: list[Line]
     notes: list[tuple[str, str]] = field(default_factory=list)
     figures: list[Plot] = field(default_factory=list)
-    histograms: dict[str, tuple[list[float], list[int]]] = field(default_factory=dict)
+    histograms: dict[str, Histogram] = field(default_factory=dict)
+    drawn: list[tuple[str, Markup | None]] = field(default_factory=list)
 
 
 @dataclass
 class Table:
-    """A table of one or more parts, like one table of a paper."""
+    """A table of one or more parts, like one table of a paper; links are relative to the folder it is written to."""
 
     name: str
     title: str
     parts: list[Part]
     notes: list[str] = field(default_factory=list)
-    drawn: dict[str, str] = field(default_factory=dict)
-    """SVG of each figure that has points, by its name from `figure_names`."""
     folder: Path = Path()
-    """Where it is written; links to audits are relative to it."""
+
+
+def write(table: Table, out: Path) -> Markup:
+    """Writes a table in all formats and its figures; returns its HTML, without the head of the page."""
+    table.folder = out
+    for part in table.parts:
+        drawn = [draw(part, figure) for figure in part.figures]
+        for title, histogram in part.histograms.items():
+            drawn.append(svg(title, [Panel(histogram, "frames", shortened(title, 40))]))
+        slug = re.sub(r"[^a-z0-9]+", "-", f"-{part.name.lower()}").rstrip("-") if len(table.parts) > 1 else ""
+        numbers = range(1, len(drawn) + 1) if len(drawn) > 1 else [""]
+        part.drawn = [(f"{table.name}{slug}-figure{n}", plot) for n, plot in zip(numbers, drawn, strict=False)]
+        for name, plot in part.drawn:
+            if plot:
+                write_text(out / f"{name}.svg", standalone(plot))
+    for suffix, writer in {"md": markdown, "tex": latex, "csv": comma_separated}.items():
+        write_text(out / f"{table.name}.{suffix}", writer(table))
+    body = fragment(table)
+    write_text(out / f"{table.name}.html", page(table.title, body))
+    return body
+
+
+def markdown(table: Table) -> str:
+    return str(_rendered("table.md", table))
+
+
+def latex(table: Table) -> str:
+    """Returns the table as LaTeX, for the packages booktabs and threeparttable."""
+    return str(_rendered("table.tex", table))
+
+
+def fragment(table: Table) -> Markup:
+    """Returns the table as HTML, without the head of the page."""
+    return _rendered("table.html", table)
+
+
+def _rendered(template: str, table: Table) -> Markup:
+    functions = {"blocks": _blocks, "head": _head, "label": _label, "linked": _linked, "filled": _filled, "tex": _tex}
+    ranked = any(better != "none" for part in table.parts for better in part.columns.values())
+    return render(
+        template,
+        table=table,
+        several=len(table.parts) > 1,
+        sources=_sources(table),
+        ranked=ranked,
+        bad=NO_RESULTS,
+        **functions,
+    )
+
+
+# What the templates read ----------------------------------------------------------------------------------------------
 
 
 def _linked(table: Table, text: str) -> list[tuple[str, str]]:
@@ -163,54 +207,6 @@ def _head(column: str, better: str) -> str:
     return f"{column}\u00a0{ARROWS[better]}" if ARROWS[better] else column
 
 
-def _is_ranked(table: Table) -> bool:
-    return any(better != "none" for part in table.parts for better in part.columns.values())
-
-
-def figure_names(table: Table) -> list[tuple[Part, Plot | str, str]]:
-    """Returns the figures of a table with their parts and file names, without suffix."""
-    names: list[tuple[Part, Plot | str, str]] = []
-    for part in table.parts:
-        slug = re.sub(r"[^a-z0-9]+", "-", f"-{part.name.lower()}").rstrip("-") if len(table.parts) > 1 else ""
-        figures = [*part.figures, *part.histograms]
-        for number, figure in enumerate(figures, 1):
-            names.append((part, figure, f"{table.name}{slug}-figure{number if len(figures) > 1 else ''}"))
-    return names
-
-
-# Markdown -------------------------------------------------------------------------------------------------------------
-
-
-def markdown(table: Table) -> str:
-    page = f"# {markdown_text(table.title)}\n"
-    for part in table.parts:
-        page += f"\n## {markdown_text(part.name)}\n\n" if len(table.parts) > 1 else "\n"
-        page += "| | " + " | ".join(markdown_text(_head(c, b)) for c, b in part.columns.items()) + " |\n"
-        page += "|---" * (len(part.columns) + 1) + "|\n"
-        blocks = _blocks(part)
-        for title, lines in blocks:
-            if len(blocks) > 1:
-                page += f"| *{title}* |" + " |" * len(part.columns) + "\n"
-            for line in lines:
-                cells = [_styled(c, markdown_text, "**{}**", "<u>{}</u>") for c in line.cells]
-                marks = f" <sup>{line.marks}</sup>" if line.marks else ""
-                page += f"| {markdown_text(_label(line))}{marks} | " + " | ".join(cells) + " |\n"
-        for mark, text in part.notes:
-            parts = ((markdown_text(words), quote(link)) for words, link in _linked(table, text))
-            text = "".join(f"[{words}]({link})" if link else words for words, link in parts)
-            page += f"\n{mark}: {text}  " if mark else f"\n{text}  "
-        page += "\n"
-        for owner, _, name in figure_names(table):
-            if owner is part and name in table.drawn:
-                page += f"\n![{markdown_text(part.name)}]({quote(name)}.svg)\n"
-    page += "".join(f"\n- {markdown_text(note)}" for note in table.notes) + "\n" * bool(table.notes)
-    page += f"\n{LEGEND}\n" if _is_ranked(table) else ""
-    if rows := [f"- {markdown_text(row)}" for row in _sources(table)]:
-        listed = "\n".join(rows)
-        page += f"\n<details><summary>Sources of the rows</summary>\n\n{listed}\n\n</details>\n"
-    return page
-
-
 def _sources(table: Table) -> list[str]:
     """Returns the provenance of rows. Those that agree in `SHARED` share a line, with `/` between other facts."""
     rows = []
@@ -226,38 +222,6 @@ def _sources(table: Table) -> list[str]:
             prefix = f"{part.name}: " if len(table.parts) > 1 else ""
             rows.append(f"{prefix}{' / '.join(dict.fromkeys(line.label for line in some))}: {facts}")
     return rows
-
-
-def _styled(cell: Cell | None, escape: Callable[[str], str], best: str, second: str) -> str:
-    if cell is None:
-        return escape("–")
-    text = escape(cell.text)
-    return best.format(text) if cell.rank == 1 else second.format(text) if cell.rank == 2 else text
-
-
-# LaTeX ----------------------------------------------------------------------------------------------------------------
-
-
-def latex(table: Table) -> str:
-    """Returns the table as LaTeX, for the packages booktabs and threeparttable."""
-    page = "% \\usepackage{booktabs,threeparttable}\n"
-    for part in table.parts:
-        title = f"{table.title}: {part.name}" if len(table.parts) > 1 else table.title
-        page += "\\begin{table}\n\\centering\n\\begin{threeparttable}\n"
-        page += f"\\caption{{{_tex(title)}}}\n\\begin{{tabular}}{{l{'r' * len(part.columns)}}}\n\\toprule\n"
-        page += " & ".join(["", *(f"{_tex(c)} {LATEX_ARROWS[b]}".strip() for c, b in part.columns.items())]) + " \\\\\n"
-        for title, lines in _blocks(part):
-            page += f"\\midrule\n\\multicolumn{{{len(part.columns) + 1}}}{{l}}{{\\emph{{{_tex(title)}}}}} \\\\\n"
-            for line in lines:
-                marks = f"\\tnote{{{_tex(line.marks)}}}" if line.marks else ""
-                cells = [_styled(c, _tex, "\\textbf{{{}}}", "\\underline{{{}}}") for c in line.cells]
-                page += " & ".join([_tex(_label(line)) + marks, *cells]) + " \\\\\n"
-        page += "\\bottomrule\n\\end{tabular}\n"
-        if part.notes:
-            items = "".join(f"\\item[{_tex(mark)}] {_tex(text)}\n" for mark, text in part.notes)
-            page += f"\\begin{{tablenotes}}\n\\footnotesize\n{items}\\end{{tablenotes}}\n"
-        page += "\\end{threeparttable}\n\\end{table}\n"
-    return page + "".join(f"% {one_line(note)}\n" for note in table.notes)
 
 
 def _tex(text: str) -> str:
@@ -301,25 +265,15 @@ def _plain(value: float | None) -> str:
     return "" if value is None else repr(value)
 
 
-# HTML and plots -------------------------------------------------------------------------------------------------------
+# Plots ----------------------------------------------------------------------------------------------------------------
 
 
-def fragment(table: Table) -> Markup:
-    figures = {part.name: [name for owner, _, name in figure_names(table) if owner is part] for part in table.parts}
-    values = {"blocks": _blocks, "head": _head, "label": _label, "bad": NO_RESULTS, "figures": figures}
-    values |= {"linked": _linked, "filled": _filled}
-    return render("table.html", table=table, sources=_sources(table), ranked=_is_ranked(table), **values)
-
-
-def draw(part: Part, figure: Plot | str) -> str | None:
-    """Draws a figure of a part, or the histogram of that name, as SVG; None if it has no points.
+def draw(part: Part, figure: Plot) -> Markup | None:
+    """Draws a figure of a part as SVG; None if it has no points.
 
     Curves are named after rows; measured ones are solid, reported ones dashed. If closer to real motions is better in
     a column, real motions are a dotted line. `points` makes it a scatter plot.
     """
-    if isinstance(figure, str):
-        edges, counts = part.histograms[figure]
-        return svg(figure, [Panel(Histogram(edges, {"motions": counts}, "frames"), "frames", shortened(figure, 40))])
     if figure.x == NEAREST:
         lines = [line for line in part.lines if line.nearest and not line.state]
         kinds = {"real": "dashed"}
@@ -367,9 +321,6 @@ def _series(part: Part, figure: Plot, column: str) -> tuple[list[Series], list[f
     return series, levels
 
 
-WRITERS: dict[str, Callable[[Table], str]] = {"md": markdown, "tex": latex, "csv": comma_separated}
-
-
 def ranks(values: Sequence[float | None], better: str, real: float | None) -> list[int]:
     """Ranks values: 1 for the best, 2 for the second best, 0 for all others. A single value is not ranked.
 
@@ -384,17 +335,3 @@ def ranks(values: Sequence[float | None], better: str, real: float | None) -> li
 
     order = sorted({badness(v) for v in there})
     return [0 if v is None else order.index(badness(v)) + 1 if badness(v) in order[:2] else 0 for v in values]
-
-
-def write(table: Table, out: Path) -> str:
-    """Writes a table in all formats and its figures; returns its HTML, without the head of the page."""
-    table.folder = out
-    for part, figure, name in figure_names(table):
-        if drawn := draw(part, figure):
-            table.drawn[name] = drawn
-            write_text(out / f"{name}.svg", standalone(drawn))
-    for suffix, writer in WRITERS.items():
-        write_text(out / f"{table.name}.{suffix}", writer(table))
-    body = fragment(table)
-    write_text(out / f"{table.name}.html", page(table.title, body))
-    return body

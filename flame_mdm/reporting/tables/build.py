@@ -62,7 +62,7 @@ def _published(path: Path, changed: int) -> Config:
 def _measured(name: str, part: Config, reported: Config | None, results: Path) -> Part:
     columns = {label: column.get("better", "none") for label, column in part["columns"].items()}
     values = [column["value"] for column in part["columns"].values()]
-    known: list[dict[str, str]] = []  # conditions of all rows; each has a footnote
+    conditions: list[dict[str, str]] = []  # conditions of all rows; each has a footnote
     lines: list[Line] = []
     truths: dict[str, Line] = {}
     missing: list[tuple[str, str]] = []
@@ -79,7 +79,7 @@ def _measured(name: str, part: Config, reported: Config | None, results: Path) -
                 missing += [(line.label, command) for command in commands]
         timed = {path for path, value in zip(paths, values, strict=True) if value == "seconds_per_sample"}
         pairs = [(path, result) for path, result in zip(paths, read, strict=True) if result is not None]
-        line.marks = ",".join(dict.fromkeys(_letter(_conditions(r, path in timed), known) for path, r in pairs))
+        line.marks = ",".join(dict.fromkeys(_letter(_conditions(r, path in timed), conditions) for path, r in pairs))
         if line.marks and line.marks not in truths:
             cells = [
                 _entry(r.ground_truth, v) if r and v not in ABOUT else None for r, v in zip(read, values, strict=True)
@@ -87,7 +87,7 @@ def _measured(name: str, part: Config, reported: Config | None, results: Path) -
             truth = truths[line.marks] = Line("Real motions", "real", cells, line.marks)
             truth.nearest = next((result.nearest["real"] for _, result in pairs if "real" in result.nearest), [])
     lines = [line for line in truths.values() if any(line.cells)] + lines
-    notes = [*_condition_notes(known), *_by_text(missing), *_warnings(lines, values, list(columns))]
+    notes = [*_condition_notes(conditions), *_by_text(missing), *_warnings(lines, values, list(columns))]
     if reported is not None:
         more, sources = _reported(reported, columns, values, name)
         lines, notes = lines + more, notes + sources
@@ -96,21 +96,23 @@ def _measured(name: str, part: Config, reported: Config | None, results: Path) -
     return Part(name, columns, lines, notes)
 
 
-def _letter(facts: dict[str, str], known: list[dict[str, str]]) -> str:
-    """Returns the footnote letter of the conditions of a row, which are added to the known ones."""
-    if facts not in known:
-        known.append(facts)
-    again, index = divmod(known.index(facts), 26)
+def _letter(facts: dict[str, str], conditions: list[dict[str, str]]) -> str:
+    """Returns the footnote letter of the conditions of a row, which are added to the conditions ones."""
+    if facts not in conditions:
+        conditions.append(facts)
+    again, index = divmod(conditions.index(facts), 26)
     return string.ascii_lowercase[index] * (1 + again)
 
 
-def _condition_notes(known: list[dict[str, str]]) -> list[tuple[str, str]]:
+def _condition_notes(conditions: list[dict[str, str]]) -> list[tuple[str, str]]:
     """Returns the footnotes on conditions. One with up to three differences from the first lists only these."""
     notes = []
-    for facts in known:
-        different = [text or f"no {name}" for name, text in facts.items() if text != known[0][name]]
+    for facts in conditions:
+        different = [text or f"no {name}" for name, text in facts.items() if text != conditions[0][name]]
         whole = "; ".join(filter(None, facts.values()))
-        notes.append((_letter(facts, known), f"as a, but {'; '.join(different)}" if 0 < len(different) <= 3 else whole))
+        notes.append(
+            (_letter(facts, conditions), f"as a, but {'; '.join(different)}" if 0 < len(different) <= 3 else whole)
+        )
     return notes
 
 

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from importlib import import_module
 from typing import get_type_hints
 
-from flame_mdm.errors import UserError, did_you_mean, say
+from flame_mdm.errors import did_you_mean, say
 
 COMMANDS = {
     "train": "train or resume a recipe",
@@ -34,34 +34,22 @@ COMMANDS = {
 def main(argv: Sequence[str] | None = None) -> int:
     words = list(sys.argv[1:] if argv is None else argv)
     if not words or words[0] in ("-h", "--help"):
-        say(*_help())
+        say("usage: flame-mdm COMMAND OBJECT [OUT] [key=value ...]", "")
+        say(*(f"  {name:10} {purpose}" for name, purpose in COMMANDS.items()), "")
+        say("An object is an existing path, the name of a recipe or data set, or a model on the Hugging Face hub.")
+        say("`flame-mdm COMMAND --help` explains a command.")
         return 0 if words else 2
     name, *rest = words
     if name not in COMMANDS:
-        from flame_mdm.config import guarded  # imports Hydra, for which --help does not wait
-
-        return guarded(lambda: _unknown(name))
+        near = did_you_mean(name, COMMANDS)
+        say(f"error: unknown command: {name}.{near} `flame-mdm --help` lists the commands", error=True)
+        return 1
     command = import_module(f"flame_mdm.commands.{'import_released' if name == 'import' else name}").main
     if name == "train":  # Hydra composes its recipe
         return command(rest)
-    from flame_mdm.config import run
+    from flame_mdm.config import run  # imports Hydra, for which --help does not wait
 
     return run(command, get_type_hints(command)["settings"], rest)
-
-
-def _help() -> list[str]:
-    return [
-        "usage: flame-mdm COMMAND OBJECT [OUT] [key=value ...]",
-        "",
-        *(f"  {name:10} {purpose}" for name, purpose in COMMANDS.items()),
-        "",
-        "An object is an existing path, the name of a recipe or data set, or a model on the Hugging Face hub.",
-        "`flame-mdm COMMAND --help` explains a command.",
-    ]
-
-
-def _unknown(name: str) -> None:
-    raise UserError(f"unknown command: {name}.{did_you_mean(name, COMMANDS)} `flame-mdm --help` lists the commands")
 
 
 if __name__ == "__main__":

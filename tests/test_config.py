@@ -222,7 +222,7 @@ def test_wrong_words_are_one_line(capsys):
         (["steps=1.5"], "steps=1.5: must be a whole number or a list"),
         (["loop=yes"], "loop=yes: must be true or false"),
         (["rate=nan"], "rate=nan: must be a finite number or null"),
-        (["rate=1,2"], "Add --multirun"),
+        (["rate=1,2"], "rate=1,2: several values. Give one, or a list: rate=[1,2]"),
         (["which=first"], "which=first: must be one of last, best"),
         (["names='a"], "No closing quotation"),
         (["--fast"], "unknown option --fast"),
@@ -232,19 +232,6 @@ def test_wrong_words_are_one_line(capsys):
         assert error.startswith("error: ")
         assert message in error
         assert error.count("\n") == 1
-
-
-def test_a_sweep_runs_each_combination(capsys):
-    seen: list[Example] = []
-    assert run(seen.append, Example, ["rate=1,2", "steps=3,4", "text=a,b", "-m"]) == 0
-    jobs = [(job.rate, job.steps, job.text) for job in seen]
-    assert jobs == [(1, 3, "a,b"), (1, 4, "a,b"), (2, 3, "a,b"), (2, 4, "a,b")]
-
-    def fail(job: Example) -> None:
-        raise UserError(f"failed at {job.rate}")
-
-    assert run(fail, Example, ["rate=1,2", "-m"]) == 1
-    assert capsys.readouterr().err == "error: failed at 1\nerror: failed at 2\n"
 
 
 def test_every_command_lists_its_keys_with_defaults_and_help(capsys):

@@ -11,11 +11,9 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import cast
 
-import numpy as np
 import pytest
 import torch
 from support.fixtures import ROOT
-from support.motions import sway
 from support.runs import RUN, TWO, alarm, finish, free_port, reference, spawn
 from torchmetrics import MeanMetric
 
@@ -163,17 +161,18 @@ def test_a_slurm_job_that_runs_out_of_time_is_requeued_and_ends_as_if_it_had_not
 
 
 @pytest.mark.slow
-def test_jobs_of_a_sweep_run_in_processes_and_folders_of_their_own(tmp_path, monkeypatch):
-    """On this machine; the first one is refused."""
-    monkeypatch.chdir(tmp_path)
-    np.savez("walk.npz", joints=sway(20).joints, fps=30.0)
-    words = ["convert", "walk.npz", "out.bvh", "fps=1e9,20", "launch=local", "hydra.launcher.timeout_min=5"]
+def test_jobs_of_a_sweep_run_in_processes_and_folders_of_their_own(tiny, tmp_path):
+    """On this machine; the second one is refused."""
+    (tmp_path / "sweep" / "seed=2").mkdir(parents=True)
+    (tmp_path / "sweep" / "seed=2" / "config.yaml").write_text("run: {dir: another}\n")
+    words = ["train", "quickstart", *tiny[:-1], f"run.dir={tmp_path / 'sweep'}", "trainer.max_steps=0", "seed=1,2"]
+    words += ["launch=local", "hydra.launcher.timeout_min=5"]
     code, out, err = finish(spawn(["flame_mdm", *words], PYTHONPATH=str(ROOT)))
     assert code == 1, out + err
-    assert "waiting for the jobs; their output is in runs/sweeps/.submitit" in out
-    logs = "\n".join(path.read_text() for path in Path("runs/sweeps/.submitit").rglob("*log.err"))
-    assert "error: walk.npz: fps is" in logs
-    assert (tmp_path / "out.bvh").exists()
+    assert f"waiting for the jobs; their output is in {tmp_path}/sweep/.submitit" in out
+    logs = "\n".join(path.read_text() for path in (tmp_path / "sweep" / ".submitit").rglob("*log.*"))
+    assert "seed=1: already trained for 0 steps" in logs
+    assert "seed=2 holds a run with another configuration" in logs
 
 
 REFUSED = {
@@ -181,7 +180,8 @@ REFUSED = {
     "train quickstart launch=local trainer.devices=2": "launch=local runs each job in one process",
     "train quickstart launch=slurm seed=1,2 logger=csv,nothing": "no logger is called 'nothing'",
     "train quickstart launch=slurm hydra.launcher.partitionn=gpu": "partitionn",
-    "convert a b launch=slurm fps=1,x": "fps=x: must be a finite number",
+    "convert a b launch=slurm": "unknown config key 'launch'",
+    "convert a b --multirun": "unknown option --multirun",
 }
 
 

@@ -4,14 +4,12 @@ import shlex
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields
-from functools import partial
 from inspect import cleandoc
-from itertools import product
 from pathlib import Path
 from typing import Any, TypeVar, get_type_hints
 
-from flame_mdm.config.composition import LAUNCH, choices, parse
-from flame_mdm.config.entry import STOP, guarded, make_variables, sweep_flags
+from flame_mdm.config.composition import parse
+from flame_mdm.config.entry import STOP, guarded, make_variables
 from flame_mdm.config.signatures import check_kind
 from flame_mdm.errors import UserError, did_you_mean, say
 
@@ -24,36 +22,16 @@ A field `composed` receives the words for Hydra: keys with a dot, such as `data.
 
 
 def run(command: Callable[[Settings], None], kind: type[Settings], argv: Sequence[str]) -> int:
-    """Runs a command line `[OBJECT [OUT]] key=value ...` and returns the exit code.
-
-    With `--multirun`, values separated by commas are a sweep, whose jobs run one after the other. `launch=...` passes
-    the jobs to a launcher of Hydra, and waits for them.
-    """
+    """Runs a command line `[OBJECT [OUT]] key=value ...` and returns the exit code."""
     words = make_variables() if "--from-make" in argv else list(argv)
     if any(word in ("-h", "--help") for word in words):
         say(*_help(kind))
         return 0
-    codes = [0]
-
-    def serve() -> None:
-        jobs, launcher = _jobs(kind, words)
-        if launcher:
-            from flame_mdm.config.sweeps import launch
-
-            launch([partial(guarded, partial(command, job), STOP) for job in jobs], launcher, Path("runs/sweeps"))
-        elif len(jobs) == 1:
-            command(jobs[0])
-        else:
-            for job in jobs:
-                codes.append(guarded(partial(command, job), STOP))
-                if codes[-1] > 128:  # a signal ends the whole sweep
-                    return
-
-    return guarded(serve, STOP) or max(codes)
+    return guarded(lambda: command(read_settings(kind, words)), STOP)
 
 
 def read_settings(kind: type[Settings], words: Sequence[str]) -> Settings:
-    """Returns the settings of a command from words `key=value`; raises `UserError` for unknown keys and wrong types.
+    """Returns the settings of a command from its words; raises `UserError` for unknown keys and wrong types.
 
     Values of keys of type `str` are taken literally; lists of texts are split like words of a shell; other values are
     read with Hydra's grammar.
@@ -61,15 +39,16 @@ def read_settings(kind: type[Settings], words: Sequence[str]) -> Settings:
     annotations = _annotations(kind)
     values: dict[str, Any] = {}
     composed: list[str] = []
-    for word in words:
+    takes_composed = "composed" in {entry.name for entry in fields(kind)}  # type: ignore[arg-type]
+    for word in _with_keys(words, getattr(kind, "OBJECTS", ()), annotations):
         key, separator, text = word.partition("=")
+        if word.startswith("-"):
+            raise UserError(f"unknown option {word}. Available: --help, and keys as key=value")
         if not separator:
             raise UserError(f"unexpected word '{word}'. Write key=value, and quote text: key='a b'")
         if key in annotations:
             values[key] = _value(key, text, annotations[key])
-        elif "composed" in {entry.name for entry in fields(kind)} and (  # type: ignore[arg-type]
-            "." in key or key in getattr(kind, "COMPOSED", ())
-        ):
+        elif takes_composed and ("." in key or key in getattr(kind, "COMPOSED", ())):
             composed.append(word)
         else:
             raise UserError(f"unknown config key '{key}'.{did_you_mean(key, annotations)}")
@@ -88,7 +67,7 @@ def _annotations(kind: type[Any]) -> Mapping[str, str]:
 def _value(key: str, text: str, annotation: str) -> Any:
     if text == "null" and "None" in annotation:
         return None
-    if _is_literal(annotation):
+    if annotation in ("str", "str | None"):
         return text
     if annotation.startswith("list[str]"):
         try:
@@ -100,32 +79,10 @@ def _value(key: str, text: str, annotation: str) -> Any:
         return names
     override = parse([f"{key}={text}"])[0]
     if override.is_sweep_override():
-        raise UserError(f"{key}={text}: several values are a sweep. Add --multirun, or write a list: {key}=[{text}]")
+        raise UserError(f"{key}={text}: several values. Give one, or a list: {key}=[{text}]")
     value = override.value()
     check_kind(key, value, annotation)
     return value
-
-
-def _is_literal(annotation: str) -> bool:
-    return annotation in ("str", "str | None")
-
-
-def _jobs(kind: type[Settings], words: Sequence[str]) -> tuple[list[Settings], list[str]]:
-    """Returns the settings of each job of a command line, and the words for a launcher of Hydra, if there are any."""
-    words = _with_keys(words, getattr(kind, "OBJECTS", ()), _annotations(kind))
-    launcher = [word for word in words if word.partition("=")[0] == LAUNCH or word.startswith("hydra.")]
-    flags = sweep_flags(words)
-    rest = [word for word in words if word not in launcher and word not in flags]
-    if not flags and not launcher:
-        return [read_settings(kind, rest)], []
-    literal = [key for key, annotation in _annotations(kind).items() if _is_literal(annotation)]
-    alternatives = [
-        [f"{word.partition('=')[0]}={choice}" for choice in choices(parse([word])[0])]
-        if word.partition("=")[0] not in literal and "=" in word
-        else [word]
-        for word in rest
-    ]
-    return [read_settings(kind, job) for job in product(*alternatives)], launcher
 
 
 def _with_keys(words: Sequence[str], objects: Sequence[str], annotations: Mapping[str, str]) -> list[str]:

@@ -101,21 +101,14 @@ def plan_composition(recipe: ConfigSource, overrides: Sequence[str], first: Sequ
     parts = [o for o in parsed if _is_group(o)]
     composed = resolve(Plan(recipe.folder, recipe.stem, [*first, *map(first_choice, parts)]))
     keys = [_legal(composed, o) for o in parsed if not _is_group(o)]
-    return Plan(recipe.folder, recipe.stem, [*first, *map(override_word, parts), *keys], composed)
-
-
-def override_word(override: Override) -> str:
-    line = override.input_line or ""
-    return f"+{line}" if override.key_or_group == LAUNCH and not override.is_add() else line
+    return Plan(recipe.folder, recipe.stem, [*first, *(str(o.input_line) for o in parts), *keys], composed)
 
 
 def first_choice(override: Override) -> str:
     """Returns the override; for a sweep, the override with its first value."""
-    return (
-        f"{override.get_key_element()}={choices(override)[0]}"
-        if override.is_sweep_override()
-        else override_word(override)
-    )
+    if override.is_sweep_override():
+        return f"{override.get_key_element()}={choices(override)[0]}"
+    return str(override.input_line)
 
 
 def choices(override: Override) -> list[str]:
@@ -145,8 +138,7 @@ def find_recipe(name: str) -> ConfigSource:
         raise UserError(
             f"unknown experiment '{name}'.{did_you_mean(name, recipes())} `flame-mdm train --help` lists them all"
         )
-    path = EXPERIMENTS / name
-    return ConfigSource(path.parent, path.name, experiment=name)  # Hydra looks up `launch` relative to the recipe
+    return ConfigSource(EXPERIMENTS, name, experiment=name)
 
 
 def quoted(word: str) -> str:
@@ -176,9 +168,9 @@ def _is_group(override: Override) -> bool:
 def _check_groups(overrides: Sequence[Override], recipe: ConfigSource) -> None:
     for override in overrides:
         group = override.key_or_group
-        if _is_group(override) and recipe.saved and group != LAUNCH:
+        if _is_group(override) and recipe.saved:
             raise UserError(
-                f"{override_word(override)} replaces a part of a recipe, but {recipe.stem}.yaml is a saved "
+                f"{override.input_line} replaces a part of a recipe, but {recipe.stem}.yaml is a saved "
                 "configuration, whose parts are fixed. Start from the experiment, or override single keys"
             )
         if not _is_group(override) or override.is_delete():
@@ -190,9 +182,7 @@ def _check_groups(overrides: Sequence[Override], recipe: ConfigSource) -> None:
                     f"no {group} is called '{option}'.{did_you_mean(option, options)} Available: {', '.join(options)}"
                 )
         if group == LAUNCH and source_file("submitit") is None:
-            raise UserError(
-                f"{override_word(override).lstrip('+')} needs hydra-submitit-launcher: pip install flame-mdm[slurm]"
-            )
+            raise UserError(f"{override.input_line} needs hydra-submitit-launcher: pip install flame-mdm[slurm]")
 
 
 def resolve(plan: Plan) -> Config:
@@ -210,7 +200,7 @@ def resolve(plan: Plan) -> Config:
 
 def _legal(config: Config, override: Override) -> str:
     """Returns the override as text for Hydra; raises `UserError` if neither recipe nor `_target_` has its key."""
-    line = override_word(override)
+    line = str(override.input_line)
     if override.is_delete() or override.is_force_add() or override.is_add() or line.startswith("hydra."):
         return line
     node: Any = config

@@ -34,14 +34,6 @@ def make_variables() -> list[str]:
     return names + [f"{key}={value}" for key, value in keys if key not in ("exp", "python", "venv")]
 
 
-def sweep_flags(words: Sequence[str]) -> list[str]:
-    """Returns the words that request a sweep; raises `UserError` if there is another option."""
-    flags = [word for word in words if word.startswith("-")]
-    if unknown := [flag for flag in flags if flag not in ("-m", "--multirun")]:
-        raise UserError(f"unknown option {unknown[0]}. Available: --help, --multirun, and keys as key=value")
-    return flags
-
-
 def guarded(action: Callable[[], None], signums: Sequence[int] = ()) -> int:
     """Runs `action` and returns the exit code; a signal of `signums` ends it after it has cleaned up.
 

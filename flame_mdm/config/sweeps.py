@@ -3,18 +3,15 @@
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from itertools import groupby
-from pathlib import Path
-from typing import Any
 
 from hydra import main as hydra_main
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
-from omegaconf import OmegaConf
 
 from flame_mdm.config.building import plain
 from flame_mdm.config.composition import (
-    EXPERIMENTS,
     LAUNCH,
+    compose,
     find_recipe,
     first_choice,
     groups,
@@ -24,7 +21,7 @@ from flame_mdm.config.composition import (
     recipes,
     resolve,
 )
-from flame_mdm.config.entry import STOP, guarded, make_variables, sweep_flags
+from flame_mdm.config.entry import STOP, guarded, make_variables
 from flame_mdm.config.signatures import Config, check
 from flame_mdm.errors import UserError, say
 
@@ -55,8 +52,10 @@ def _serve(command: Callable[[Config], None], words: Sequence[str], codes: list[
     if name.startswith("-") or "=" in name:
         raise UserError(f"the first word must name an experiment, such as quickstart, not '{name}'")
     recipe = find_recipe(name)
-    flags = sweep_flags(words)
-    plan = plan_composition(recipe, [w for w in words if w not in flags])
+    flags = [word for word in words if word.startswith("-")]
+    if unknown := [flag for flag in flags if flag not in ("-m", "--multirun")]:
+        raise UserError(f"unknown option {unknown[0]}. Available: --help, --multirun, and keys as key=value")
+    plan = plan_composition(recipe, [word for word in words if word not in flags])
     parsed = parse(plan.overrides)
     launcher = [str(o.value()) for o in parsed if o.key_or_group == LAUNCH]
     sweep = bool(launcher or flags)
@@ -76,14 +75,11 @@ def _serve(command: Callable[[Config], None], words: Sequence[str], codes: list[
         start(config, [word for word in plan.overrides if not word.startswith("hydra.")])
         return
 
-    def job(config: Any) -> None:
+    def job(_: object) -> None:
         hydra = HydraConfig.get()
-        config = OmegaConf.merge(config, {"run": {"dir": hydra.runtime.output_dir}})
-        resolved: Config = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)  # type: ignore[assignment]
-        check(resolved)
         HydraConfig.instance().cfg = None  # otherwise Lightning adds words for Hydra's command line
-        task = [str(word) for word in hydra.overrides.task if not str(word).startswith(f"+{LAUNCH}=")]
-        code = start(resolved, task)
+        task = [str(word) for word in hydra.overrides.task if not str(word).startswith(f"{LAUNCH}=")]
+        code = start(compose(name, [*task, quoted(f"run.dir={hydra.runtime.output_dir}")]), task)
         if code > 128 or (launcher and code):  # a signal ends the whole sweep; a launched job counts as failed
             raise SystemExit(code)
 
@@ -95,28 +91,9 @@ def _serve(command: Callable[[Config], None], words: Sequence[str], codes: list[
     ]
     if launcher:
         say(f"waiting for the jobs; their output is in {config['run']['dir']}/.submitit")
-    _hydra(job, plan.folder, plan.stem, [*output, *plan.overrides])
-
-
-def launch(jobs: Sequence[Callable[[], int]], words: Sequence[str], folder: Path) -> None:
-    """Passes jobs to a launcher of Hydra, given as `launch=NAME` and its keys, and waits; they write to `folder`."""
-    resolve(plan_composition(find_recipe("quickstart"), words))  # checks the words
-    say(f"waiting for the jobs; their output is in {folder}/.submitit")
-
-    def job(config: Any) -> None:
-        if code := jobs[config["job"]]():
-            raise SystemExit(code)
-
-    numbers = ",".join(map(str, range(len(jobs))))
-    launcher = [f"+{word}" if word.startswith(f"{LAUNCH}=") else word for word in words]
-    output = [f"hydra.sweep.dir={folder}", "hydra.sweep.subdir=${job}"]
-    _hydra(job, EXPERIMENTS, None, [*output, *launcher, f"+job={numbers}"])
-
-
-def _hydra(job: Callable[[Any], None], folder: Path, name: str | None, words: Sequence[str]) -> None:
-    sys.argv = [sys.argv[0], "--multirun", *words, *QUIET]
+    sys.argv = [sys.argv[0], "--multirun", *output, *plan.overrides, *QUIET]
     GlobalHydra.instance().clear()
-    hydra_main(version_base="1.3", config_path=str(folder), config_name=name)(job)()
+    hydra_main(version_base="1.3", config_path=str(plan.folder), config_name=plan.stem)(job)()
 
 
 POSITIVE = ("val_check_interval", "log_every_n_steps", "accumulate_grad_batches")

@@ -1,7 +1,7 @@
 """Options of the samplers, shared by Python, command line, demo, evaluation and tables."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, Self
 
@@ -12,17 +12,30 @@ SPACINGS = ("linspace", "stride")
 """How diffusion places a number of steps; see `flame_mdm.processes.schedules.timesteps`."""
 
 
-def option(default: Any, help: str) -> Any:
-    """Returns a dataclass field with a help text, which the command line shows; a function `default` computes it."""
+Check = Callable[[str, Any], None]
+"""Check of the value of a key, by name and value; raises `UserError` or `FileNotFoundError`."""
+
+
+def option(default: Any, help: str, check: Check | None = None) -> Any:
+    """Returns a dataclass field with a help text, which the command line shows; a function `default` computes it.
+
+    The command line also calls `check`, before torch is imported.
+    """
+    metadata = {"help": help, "check": check}
     if callable(default):
-        return field(default_factory=default, metadata={"help": help})
-    return field(default=default, metadata={"help": help})
+        return field(default_factory=default, metadata=metadata)
+    return field(default=default, metadata=metadata)
 
 
-def same_option(kind: type[Any], name: str, **default: Any) -> Any:
+def required(help: str, check: Check | None = None) -> Any:
+    """Returns a dataclass field as `option` does, but without a default."""
+    return field(metadata={"help": help, "check": check})
+
+
+def same_option(kind: type[Any], name: str, check: Check | None = None, **default: Any) -> Any:
     """Returns a dataclass field with the help text, and unless given the default, of the field of another dataclass."""
     original = next(entry for entry in fields(kind) if entry.name == name)
-    return option(default.get("default", original.default), original.metadata["help"])
+    return option(default.get("default", original.default), original.metadata["help"], check)
 
 
 @dataclass(frozen=True, kw_only=True)

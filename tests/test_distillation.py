@@ -207,7 +207,7 @@ def test_two_processes_are_one_with_both_batches(student, tmp_path):
 def test_a_model_that_cannot_be_a_teacher_gets_one_line(trained, student, data_root, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("FLAME_MDM_DATA", str(data_root))
-    assert "no checkpoint given" in error(capsys, "distill", "trainer.max_steps=4")
+    assert "no ckpt given. Write flame-mdm distill CKPT" in error(capsys, "distill", "trainer.max_steps=4")
     assert "runs/no/model: no such checkpoint" in error(capsys, "distill", "runs/no/model")
     assert f"distilled already. Give its teacher, {trained}" in error(capsys, "distill", student)
     content = torch.load(trained, weights_only=True)
@@ -402,7 +402,7 @@ def test_unusable_requests_are_refused(refused, trained, clips, tmp_path):
     for name in ("limp 2", "", "../x"):
         refused("adapt", str(trained), f"source={clips}", f"name={name}", says="give one word")
     lesson = ["adapt", str(trained), f"source={clips}", "name=limp"]
-    refused(*lesson[:2], says="name the folder of motions and the adapter")
+    refused(*lesson[:2], says="no source given")
     refused(*lesson, "rank=0", says="rank=0: give 1 or more")
     refused(*lesson, "losses.velocity=3", says="keeps the losses of its base")
     refused(*lesson[:2], f"source={tmp_path / 'none'}", "name=limp", says="no such folder")

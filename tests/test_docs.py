@@ -33,7 +33,6 @@ NOT_COMPOSED = {
     "data.md": ["make evaluate baseline=real data=bandai data.source.mirror=false ..."],
     "evaluation.md": [f"make train EXP={folder}/..." for folder in ("motion_clip", "t2m", "classifier")],
     "first-problems.md": ["make prepare DATA=... SOURCE=/path/to/what/you/downloaded"],
-    "own-data.md": ["make browse DATA=mine"],
     "tables.md": ["make train EXP=..."],
 }
 """Commands of each page that are not composed: they name a part that the reader writes (mine, my_set), or leave a name

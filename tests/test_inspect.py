@@ -134,7 +134,7 @@ def test_the_command_prints_faults_marks_them_and_exits_with_3(tmp_path, capsys,
 def test_nothing_to_inspect_is_an_error(tmp_path, capsys):
     (tmp_path / "empty").mkdir()
     for words, message in (
-        ([], "no data set named"),
+        ([], "no motion given. Write flame-mdm inspect MOTION|FOLDER|DATASET"),
         ([str(tmp_path / "empty")], "the folder has no motion files"),
         ([str(tmp_path / "absent.npz")], "absent.npz: no such file. Give a motion file (.npz"),
         (["bandia"], "bandia"),

@@ -191,7 +191,7 @@ def test_missing_files_are_named(tmp_path, capsys):
     (folder / "metrics.jsonl").unlink()
     assert "there is no metrics.jsonl in the folder" in write_report(folder).read_text()
     assert read_run(folder).label == "mine"
-    for words, message in (([str(tmp_path)], "contains no config.yaml"), ([], "no run named")):
+    for words, message in (([str(tmp_path)], "contains no config.yaml"), ([], "no runs given")):
         assert main(["report", *words]) == 1
         assert message in capsys.readouterr().err
 

@@ -6,16 +6,14 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
-from glob import escape
 from pathlib import Path
 from typing import Any
 
 from flame_mdm.checkpoints.locating import Which, find
-from flame_mdm.config import EXPERIMENTS, Config, compose_data, instantiate
+from flame_mdm.config import EXPERIMENTS, Config, compose_data
 from flame_mdm.errors import UserError, did_you_mean
 from flame_mdm.formats import ENDINGS
-from flame_mdm.safe_io import read_yaml
-from flame_mdm.sampler_options import option
+from flame_mdm.sampler_options import option, required
 
 STORE = "store.json"
 
@@ -24,17 +22,63 @@ def usual_data_root() -> str:
     return os.environ.get("FLAME_MDM_DATA", "data")
 
 
+def existing(key: str, source: str) -> None:
+    """Checks that a file or folder exists."""
+    if not Path(source).exists():
+        raise FileNotFoundError(f"{source}: no such file")
+
+
+def motion_file(key: str, source: str) -> None:
+    """Checks that a motion file exists and has a known ending; `dataset:id` is left to its reader."""
+    known = Path(source).suffix.lower() in ENDINGS
+    if not known and ":" not in source:
+        raise UserError(f"{key}={source}: neither a motion file ({', '.join(ENDINGS)}) nor dataset:id")
+    if known:
+        existing(key, source)
+
+
+def model_source(key: str, source: str) -> None:
+    """Checks that the files of an extractor or of another model exist."""
+    if source != "none" and not Path(source).exists():
+        with about_key(key):
+            find(source)
+
+
+@contextmanager
+def about_key(key: str) -> Iterator[None]:
+    """Adds the key to errors about the model that it names."""
+    try:
+        yield
+    except (UserError, FileNotFoundError) as error:
+        raise UserError(f"{key}: {error}") from error
+
+
+def body_name(key: str, body: str) -> None:
+    if body.split()[:1] not in (["mannequin"], ["anny"]):
+        choices = 'mannequin, anny, or anny with its shape: body="anny age=0.9"'
+        raise UserError(f"{key}={body}: unknown. Use {choices}")
+
+
+def device_name(key: str, device: str) -> None:
+    if not re.fullmatch(r"cpu|mps|xpu|cuda(:\d+)?", device):
+        near = did_you_mean(device, ["cpu", "cuda"])
+        raise UserError(f"{key}={device}: unknown.{near} Give cpu, cuda or cuda:NUMBER")
+
+
+def above_zero(key: str, number: int) -> None:
+    if number < 1:
+        raise UserError(f"{key}={number}: must be at least 1")
+
+
 @dataclass(frozen=True, kw_only=True)
 class ModelSettings:
     """Keys that name a model."""
 
-    ckpt: str | None = option(None, "a checkpoint, run directory, model file, shipped model (quickstart), or hub id")
+    ckpt: str = required("a checkpoint, run directory, model file, shipped model (quickstart), or hub id")
     which: Which = option("last", "or best: the checkpoint of a run directory")
 
     def model_file(self) -> Path:
-        """Returns the file of the model; see `flame_mdm.checkpoints.model_files.find`."""
-        if self.ckpt is None:
-            raise UserError("no checkpoint given. Add ckpt=runs/.../checkpoints/last.ckpt")
+        """Returns the file of the model; see `flame_mdm.checkpoints.locating.find`."""
         return find(self.ckpt, self.which)
 
 
@@ -62,7 +106,9 @@ class FileSettings:
 class BodySettings:
     """The body in pictures, pages and files."""
 
-    body: str = option("mannequin", 'or anny, also with a shape, such as "anny gender=1 age=0.9": docs/formats.md')
+    body: str = option(
+        "mannequin", 'or anny, also with a shape, such as "anny gender=1 age=0.9": docs/formats.md', body_name
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,12 +133,8 @@ class DataSettings:
         if self.data is None:
             names = ", ".join(sorted(path.stem for path in (EXPERIMENTS / "data").glob("*.yaml")))
             raise UserError(f"no data set named. Add data=NAME, one of: {names}; folder is for your own motions")
-        name, words = self.choice(self.data)
-        return compose_data(name, words, data_root=self.data_root or "data", seed=self.seed)
-
-    def choice(self, name: str) -> tuple[str, list[str]]:
-        """Returns the file in experiments/data of a data set, and the overrides of its keys."""
-        return name, [*([f"representation={self.representation}"] if self.representation else []), *self.composed]
+        chosen = [f"representation={self.representation}"] if self.representation else []
+        return compose_data(self.data, [*chosen, *self.composed], data_root=self.data_root or "data", seed=self.seed)
 
     def data_node(self, source: str | None = None) -> Config:
         """Returns the configuration of the data set, with the path given as `source`."""
@@ -104,64 +146,3 @@ class DataSettings:
                 raise UserError(f"source={source}: {node['name']} is generated and has no source. Drop source=")
             node["source"]["path"] = source
         return node
-
-
-@dataclass(frozen=True, kw_only=True)
-class PreparedSettings(DataSettings):
-    """Keys of commands that open a prepared data set, which may also be named by its `data.name`."""
-
-    def choice(self, name: str) -> tuple[str, list[str]]:
-        """See `DataSettings`; the name of a prepared set of the user's own motions stands for its keys."""
-        root = Path(self.data_root)
-        file, words = super().choice(name)
-        if (EXPERIMENTS / "data" / f"{name}.yaml").exists() or not any(root.glob(f"{escape(name)}-*/{STORE}")):
-            return file, words
-        files = sorted((EXPERIMENTS / "representation").glob("*.yaml"))
-        prepared = [p.stem for p in files if (root / f"{name}-{instantiate(read_yaml(p)).name}" / STORE).exists()]
-        if self.representation is not None:
-            prepared = []
-        if len(prepared) > 1:
-            listed = " and as ".join(prepared)
-            raise UserError(f"data={name} was prepared as {listed}. Add representation={prepared[0]}")
-        return "folder", [f"data.name={name}", *(f"representation={part}" for part in prepared), *words]
-
-
-def check_motion(key: str, source: str | None) -> None:
-    """Checks that a motion file exists and has a known ending; `dataset:id` is left to its reader."""
-    if source is None or (":" in source and Path(source).suffix.lower() not in ENDINGS):
-        return
-    if Path(source).suffix.lower() not in ENDINGS:
-        kinds = ", ".join(ENDINGS)
-        raise UserError(f"{key}={source}: neither a motion file ({kinds}) nor dataset:id")
-    if not Path(source).exists():
-        raise FileNotFoundError(f"{source}: no such file")
-
-
-def check_extractor(source: str | None) -> None:
-    """Checks that the files of an extractor exist, before torch is imported."""
-    if source not in (None, "none") and not Path(source).exists():
-        with about_key("extractor"):
-            find(source)
-
-
-@contextmanager
-def about_key(key: str) -> Iterator[None]:
-    """Adds the key to errors about the model that it names."""
-    try:
-        yield
-    except (UserError, FileNotFoundError) as error:
-        raise UserError(f"{key}: {error}") from error
-
-
-def check_words(settings: BodySettings) -> None:
-    """Checks the name of the body, before torch is imported."""
-    if settings.body.split()[:1] not in (["mannequin"], ["anny"]):
-        choices = 'mannequin, anny, or anny with its shape: body="anny age=0.9"'
-        raise UserError(f"body={settings.body}: unknown. Use {choices}")
-
-
-def check_device(device: str | None) -> None:
-    """Checks the name of a device, before torch is imported."""
-    if device is not None and not re.fullmatch(r"cpu|mps|xpu|cuda(:\d+)?", device):
-        near = did_you_mean(device, ["cpu", "cuda"])
-        raise UserError(f"device={device}: unknown.{near} Give cpu, cuda or cuda:NUMBER")

@@ -4,8 +4,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from flame_mdm.commands import ModelSettings, usual_data_root
-from flame_mdm.errors import UserError
-from flame_mdm.sampler_options import option
+from flame_mdm.sampler_options import option, required
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -19,8 +18,8 @@ class AdaptSettings(ModelSettings):
 
     OBJECTS: ClassVar = ("ckpt", "out")
     COMPOSED: ClassVar = ("ema", "logger", "lr_decay", "seed")
-    source: str | None = option(None, "folder of motions with captions: docs/own-data.md")
-    name: str | None = option(None, "one word for prompts: 'a person walks in NAME style'")
+    source: str = required("folder of motions with captions: docs/own-data.md")
+    name: str = required("one word for prompts: 'a person walks in NAME style'")
     out: str | None = option(None, "run directory; default runs/adapt/NAME")
     action: bool = option(False, "true = the clips show an action that the model does not know, instead of a style")
     full: bool = option(False, "true = train all weights; the result is a model instead of an adapter")
@@ -31,8 +30,6 @@ class AdaptSettings(ModelSettings):
 
 
 def main(settings: AdaptSettings) -> None:
-    if settings.source is None or settings.name is None:
-        raise UserError("name the folder of motions and the adapter: flame-mdm adapt CKPT source=my_clips name=limp")
     file = settings.model_file()
     keys = ("source", "name", "out", "action", "full", "force", "rank", "data_root")
 

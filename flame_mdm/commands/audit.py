@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
-from flame_mdm.commands import DataSettings, check_extractor
+from flame_mdm.commands import DataSettings, device_name, model_source
 from flame_mdm.errors import UserError, say
 from flame_mdm.reporting.audit import card_name, read_card, write_card
 from flame_mdm.safe_io import write_json
@@ -22,14 +22,16 @@ class AuditSettings(DataSettings):
     """
 
     OBJECTS: ClassVar = ("data", "extractor")
-    extractor: str | None = option(None, "a motion-CLIP, or as the protocol requires; none = metrics of joints")
+    extractor: str | None = option(
+        None, "a motion-CLIP, or as the protocol requires; none = metrics of joints", model_source
+    )
     protocol: str | None = option(None, "whose metrics are audited; default: synthetic or text_to_motion")
     split: str = option("test", "train, val or test")
     samples: int | None = option(None, "number of motions; default: all of the split")
     resamples: int = option(100, "bootstrap resamples of motions, for the intervals")
     cards: list[str] | None = option(None, "one or two cards (.json) to render again, side by side")
     batch_size: int = option(64, "motions at once")
-    device: str | None = option(None, "default: cpu")
+    device: str | None = option(None, "default: cpu", device_name)
     data_root: str = option("", "folder of the prepared data sets; default: FLAME_MDM_DATA, or data")
     out: str = option("runs/audit", "folder of the cards")
 
@@ -42,11 +44,11 @@ def main(settings: AuditSettings) -> None:
         say(*write_card([read_card(Path(card)) for card in settings.cards], out))
         return
     if settings.data is None or settings.extractor is None:
-        lacking = "an audit needs a data set and an extractor"
-        raise UserError(f"{lacking}. Give data=NAME and extractor=FILE, or extractor=none")
+        raise UserError(
+            "an audit needs a data set and an extractor. Give data=NAME and extractor=FILE, or extractor=none"
+        )
     if settings.resamples == 0 or (settings.samples or 64) < 8:
         raise UserError(f"resamples={settings.resamples}, samples={settings.samples}: give 100, and 8 or more")
-    check_extractor(settings.extractor)
     from evaluators.audit import audit as measure
     from evaluators.request import EvaluationRequest
 

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
-from flame_mdm.commands import STORE, BodySettings, PreparedSettings, check_words
+from flame_mdm.commands import STORE, BodySettings, DataSettings, above_zero
 from flame_mdm.config import instantiate
 from flame_mdm.errors import UserError, say
 from flame_mdm.reporting.browse import choose, find, write_page
@@ -12,10 +12,10 @@ from flame_mdm.sampler_options import option
 
 
 @dataclass(frozen=True, kw_only=True)
-class BrowseSettings(BodySettings, PreparedSettings):
+class BrowseSettings(BodySettings, DataSettings):
     """usage: flame-mdm browse data=NAME [source=PATH] [split=train] [search="waves left"] [clips=200] [out=FILE.html]
 
-    NAME is a data set, as for `prepare`, or the name of your own prepared set (data.name).
+    NAME is a data set, as for `prepare`; of your own motions, data=folder data.name=NAME.
     Writes a single web page that opens from disk. It shows clips of a data set with their captions, mirrored copies
     next to their originals, a search field, a choice of splits, the distribution of clip lengths and other statistics.
     """
@@ -25,14 +25,13 @@ class BrowseSettings(BodySettings, PreparedSettings):
     source: str | None = option(None, "folder or archive, if the data set is not prepared yet and needs one")
     split: str | None = option(None, "train, val or test; default: all")
     search: str | None = option(None, "words that must occur in the id or the captions of a clip")
-    clips: int = option(200, "maximum number on the page, evenly spaced; mirrored copies come with their originals")
+    clips: int = option(
+        200, "maximum number on the page, evenly spaced; mirrored copies come with their originals", above_zero
+    )
 
 
 def main(settings: BrowseSettings) -> None:
-    check_words(settings)
     node = settings.data_node(settings.source)
-    if settings.clips < 1:
-        raise UserError(f"clips={settings.clips}: must be at least 1")
 
     from flame_mdm.data.store import Store
     from flame_mdm.visualize.bodies import load_body

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
-from flame_mdm.commands import BodySettings, check_words
+from flame_mdm.commands import BodySettings
 from flame_mdm.commands.sample import read_prompts
 from flame_mdm.errors import UserError, say
 from flame_mdm.reporting.compare import HEAD, MOTIONS, ComparedRun, Prompt, comparison, find, grouped, in_common, tested
@@ -43,7 +43,6 @@ class CompareSettings(BodySettings):
 
 
 def main(settings: CompareSettings) -> None:
-    check_words(settings)
     compared = find([Path(folder) for folder in settings.runs or ()])
     from flame_mdm.visualize.bodies import load_body
 

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
-from flame_mdm.commands import BodySettings, FileSettings, check_motion, check_words
+from flame_mdm.commands import BodySettings, FileSettings, existing, motion_file
 from flame_mdm.errors import UserError, say
 from flame_mdm.formats import ENDINGS, WRITTEN
 from flame_mdm.progress import ProgressBar
-from flame_mdm.sampler_options import option
+from flame_mdm.sampler_options import option, required
 
 if TYPE_CHECKING:
     from flame_mdm.formats.characters import Character
@@ -32,28 +32,25 @@ class ConvertSettings(BodySettings, FileSettings):
     """
 
     OBJECTS: ClassVar = ("motion", "out")
-    motion: str | None = option(None, "a file, or a folder of files; .npy holds joint positions (frames, joints, 3)")
-    out: str | None = option(None, ".bvh, .glb, .npz (layout of AMASS), .json or .npy; .mp4 or .gif to look at")
+    motion: str = required("a file, or a folder of files; .npy holds joint positions (frames, joints, 3)")
+    out: str = required(".bvh, .glb, .npz (layout of AMASS), .json or .npy; .mp4 or .gif to look at")
     format: str | None = option(None, "if MOTION is a folder: ending of the files that are written to the folder OUT")
     figure: str = option("body", "mesh of .glb: body, or bones for rounded limbs")
     rest_pose: bool = option(False, "true = .bvh begins with a frame of the rest pose, arms out")
     rig: str | None = option(None, "skeleton: mixamo, unreal, unity, rigify, lafan1, soma, cmu, geno or 100style")
-    character: str | None = option(None, "your own .glb or .bvh file, written with the motion: docs/characters.md")
+    character: str | None = option(
+        None, "your own .glb or .bvh file, written with the motion: docs/characters.md", existing
+    )
 
 
 def main(settings: ConvertSettings) -> None:
-    if settings.motion is None or settings.out is None:
-        raise UserError("name an input and an output file: flame-mdm convert motion.npz walk.bvh")
-    check_words(settings)
     path, out, hero = Path(settings.motion), Path(settings.out), settings.character
-    if hero is not None and not Path(hero).exists():
-        raise FileNotFoundError(f"{hero}: no such file")
     if path.is_dir():
         targets = _targets(settings, path, out)
     elif settings.format is not None:
         raise UserError("format=... is for folders; the ending of OUT is the format of one file")
     else:
-        check_motion("motion", settings.motion)
+        motion_file("motion", settings.motion)
         targets = {out: path}
     if wrong := [target for target in targets if target.suffix.lower() not in WRITTEN]:
         raise UserError(f"{wrong[0]}: unknown kind of motion file. Use one of {', '.join(WRITTEN)}")

@@ -1,14 +1,14 @@
 """`flame-mdm edit CKPT motion=FILE`: keeps part of a motion and resamples the rest."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import ClassVar
 
-from flame_mdm.commands import FileSettings, check_motion, usual_data_root
+from flame_mdm.commands import FileSettings, motion_file, usual_data_root
 from flame_mdm.commands.sample import OutputSettings, check_condition, default_folder, summary
-from flame_mdm.errors import UserError, say
-from flame_mdm.sampler_options import SamplerOptions, option
+from flame_mdm.errors import say
+from flame_mdm.sampler_options import SamplerOptions, option, required
 from flame_mdm.sampling.request import EditRequest
 
 
@@ -23,29 +23,18 @@ class EditSettings(OutputSettings, EditRequest, FileSettings):
     """
 
     OBJECTS: ClassVar = ("ckpt", "motion", "out")
-    motion: str | None = option(None, "FILE (.npz, .bvh, .json, .npy) or dataset:id")
+    motion: str = required("FILE (.npz, .bvh, .json, .npy) or dataset:id", motion_file)
     cut: Sequence[float] | None = option(None, "[begin, end] in seconds: use only this part of the motion")
     data_root: str = option(usual_data_root, "folder of the prepared data sets")
-    out: str | None = option(None, "folder; default samples/<experiment>/edit-<motion>-...-<hash>")
+    out: str | None = option(None, "folder; default samples/<experiment>/edit-<motion>-<text>-<hash>")
 
     def __post_init__(self) -> None:
         SamplerOptions.__post_init__(self)
         EditRequest.__post_init__(self)
 
 
-IN_NAME = (
-    *("region", "region_seconds", "joints", "method", "until", "strength"),
-    *(entry.name for entry in fields(SamplerOptions)),
-    *("cut", "cleanup", "resample", "targets", "adapter", "adapter_strength"),
-)
-"""Keys that change the motions: the name of the folder contains those that differ from their defaults."""
-
-
 def main(settings: EditSettings) -> None:
     request = settings.request(editing=True)
-    if settings.motion is None:
-        raise UserError("no motion to edit. Give motion=FILE (.npz, .bvh, .json, .npy) or motion=dataset:id")
-    check_motion("motion", settings.motion)
     file = settings.model_file()
 
     from flame_mdm.safe_io import sha256
@@ -60,8 +49,8 @@ def main(settings: EditSettings) -> None:
     stages = [] if settings.trajectory else None
     edits = edit_request(model, original, request, stages=stages)
     digest, what = sha256(file), f"edit {Path(original.id).stem} {edits[0].text}"
-    name = default_folder(model, digest, what, settings.seed, settings.changed(IN_NAME))
-    folder = Path(settings.out or name)
+    general = (settings.motion, settings.cut, settings.adapter, settings.adapter_strength)
+    folder = Path(settings.out or default_folder(model, what, digest, replace(request, samples=1), *general))
     shown = replace(original, text=f"original: {original.text or original.id}")
     facts = {"seed": settings.seed, "checkpoint": digest, "keep": edits[0].keep}
     write_motions(folder, [shown, *edits], facts, stages, settings.mp4, body)

@@ -4,8 +4,8 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from evaluators.request import EvaluationKeys, EvaluationRequest
-from flame_mdm.commands import DataSettings, ModelSettings, check_device, check_extractor
-from flame_mdm.sampler_options import SamplerOptions
+from flame_mdm.commands import DataSettings, ModelSettings, device_name, model_source
+from flame_mdm.sampler_options import SamplerOptions, same_option
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -21,6 +21,9 @@ class EvaluateSettings(EvaluationKeys, SamplerOptions, DataSettings, ModelSettin
     """
 
     OBJECTS: ClassVar = ("ckpt", "out")
+    ckpt: str | None = same_option(ModelSettings, "ckpt", default=None)
+    extractor: str | None = same_option(EvaluationKeys, "extractor", model_source)
+    device: str | None = same_option(EvaluationKeys, "device", device_name)
 
     def __post_init__(self) -> None:
         SamplerOptions.__post_init__(self)
@@ -28,12 +31,10 @@ class EvaluateSettings(EvaluationKeys, SamplerOptions, DataSettings, ModelSettin
 
 
 def main(settings: EvaluateSettings) -> None:
-    check_device(settings.device)
     nodes = settings.nodes if settings.data is not None else {"data": None, "representation": None}
     request = EvaluationRequest.of(vars(settings) | nodes)
     if settings.ckpt is not None:
         settings.model_file()  # reports a missing file before torch is imported
-    check_extractor(settings.extractor)
     from evaluators.evaluation import evaluate
 
     evaluate(request)

@@ -5,7 +5,7 @@ from typing import ClassVar
 
 from flame_mdm.commands import AdaptedSettings
 from flame_mdm.errors import UserError, say
-from flame_mdm.sampler_options import option
+from flame_mdm.sampler_options import option, required
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -17,14 +17,12 @@ class ExportSettings(AdaptedSettings):
     """
 
     OBJECTS: ClassVar = ("ckpt", "out")
-    out: str | None = option(None, "a .safetensors file, or a folder; for format=onnx, a folder")
+    out: str = required("a .safetensors file, or a folder; for format=onnx, a folder")
     format: str = option("safetensors", "or onnx: graphs for onnxruntime, with a script that samples from them")
     half: bool = option(False, "true = weight matrices in half precision")
 
 
 def main(settings: ExportSettings) -> None:
-    if settings.ckpt is None or settings.out is None:
-        raise UserError("name a checkpoint and an output file: flame-mdm export CKPT model.safetensors")
     if settings.format not in ("safetensors", "onnx"):
         raise UserError(f"format={settings.format}: unknown. Use safetensors or onnx")
     file = settings.model_file()

@@ -1,13 +1,11 @@
 """`flame-mdm import KIND FILE [ARGS] out=FILE`: imports a checkpoint released by the authors of a paper."""
 
 from dataclasses import dataclass
-from pathlib import Path
-from typing import ClassVar
+from typing import ClassVar, Literal
 
-from flame_mdm.errors import UserError, say
-from flame_mdm.sampler_options import option
-
-KINDS = ("mdm", "mfm", "flame", "mclip")
+from flame_mdm.commands import existing
+from flame_mdm.errors import say
+from flame_mdm.sampler_options import option, required
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -21,11 +19,11 @@ class ImportSettings:
     """
 
     OBJECTS: ClassVar = ("kind", "file", "args")
-    kind: str | None = option(None, "mdm, mfm, flame, or mclip (FLAME's motion-CLIP)")
-    file: str | None = option(None, "the released file: model000475000.pt, or FLAME's .ckpt")
-    args: str | None = option(None, "MDM's args.json, or MFM's .hydra/config.yaml")
-    out: str | None = option(None, "a .safetensors file, or a folder for model.safetensors")
-    stats: str | None = option(None, "folder with Mean.npy and Std.npy of HumanML3D or KIT-ML")
+    kind: Literal["mdm", "mfm", "flame", "mclip"] = required("mdm, mfm, flame, or mclip (FLAME's motion-CLIP)")
+    file: str = required("the released file: model000475000.pt, or FLAME's .ckpt", existing)
+    args: str | None = option(None, "MDM's args.json, or MFM's .hydra/config.yaml", existing)
+    out: str = required("a .safetensors file, or a folder for model.safetensors")
+    stats: str | None = option(None, "folder with Mean.npy and Std.npy of HumanML3D or KIT-ML", existing)
     averaged: bool = option(True, "false = the raw weights, if the file also has averaged ones")
     num_heads: int | None = option(None, "number of attention heads, if it differs from the released models")
     time_token: bool = option(False, "decoder whose input token is the time alone, as in MDM's code since 2025")
@@ -33,13 +31,6 @@ class ImportSettings:
 
 
 def main(settings: ImportSettings) -> None:
-    if settings.kind not in KINDS:
-        raise UserError(f"unknown kind of released model: {settings.kind}. Use {', '.join(KINDS[:-1])} or mclip")
-    if settings.file is None or settings.out is None:
-        raise UserError("name FILE and out=...: flame-mdm import mdm model.pt args.json out=mdm.safetensors")
-    for path in (settings.file, settings.args, settings.stats):
-        if path is not None and not Path(path).exists():
-            raise FileNotFoundError(f"{path}: no such file")
     from flame_mdm.checkpoints.released import import_released
 
     say(f"written: {import_released(**vars(settings))}")

@@ -8,12 +8,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
-from flame_mdm.commands import BodySettings, FileSettings, PreparedSettings, check_words
+from flame_mdm.commands import BodySettings, DataSettings, FileSettings, above_zero
 from flame_mdm.config import instantiate
 from flame_mdm.errors import UserError, say
 from flame_mdm.formats import ENDINGS
 from flame_mdm.progress import ProgressBar
-from flame_mdm.sampler_options import option
+from flame_mdm.sampler_options import option, required
 
 if TYPE_CHECKING:
     from flame_mdm.formats.motion import Motion
@@ -23,7 +23,7 @@ MOST_LINES = 20  # faults that are printed per motion; the player shows all
 
 
 @dataclass(frozen=True, kw_only=True)
-class InspectSettings(BodySettings, FileSettings, PreparedSettings):
+class InspectSettings(BodySettings, FileSettings, DataSettings):
     """usage: flame-mdm inspect MOTION|FOLDER|DATASET [OUT.html] [split=train] [clips=24] [fps=20] [unit=0.01] [up=z]
 
     Finds physical faults of a motion file, of all motion files in a folder, or of a prepared data set: sliding feet,
@@ -35,26 +35,22 @@ class InspectSettings(BodySettings, FileSettings, PreparedSettings):
     """
 
     OBJECTS: ClassVar = ("motion", "out")
-    motion: str | None = option(None, "a motion file, a folder of them, or the name of a prepared data set")
+    motion: str = required("a motion file, a folder of them, or the name of a data set")
     out: str | None = option(None, "HTML file; default runs/inspect/<name>.html")
-    clips: int = option(24, "maximum number of motions in the player, the worst ones")
+    clips: int = option(24, "maximum number of motions in the player, the worst ones", above_zero)
     split: str | None = option(None, "train, val or test of a data set; default: all")
     source: str | None = option(None, "folder or archive of a data set that is not prepared yet")
 
     def __post_init__(self) -> None:
         name = self.motion
-        if name and not (Path(name).suffix or Path(name).exists() or "/" in name):  # not a file: a prepared data set
+        if not (Path(name).suffix or Path(name).exists() or "/" in name):  # not a file: a data set
             object.__setattr__(self, "data", name)
-            object.__setattr__(self, "motion", None)
         super().__post_init__()
 
 
 def main(settings: InspectSettings) -> None:
-    if settings.clips < 1:
-        raise UserError(f"clips={settings.clips}: must be at least 1")
-    check_words(settings)
-    files = _files(settings.motion) if settings.motion is not None else []
-    if settings.motion is None:
+    files = [] if settings.data is not None else _files(settings.motion)
+    if not files:
         settings.data_node(settings.source)
     from flame_mdm.formats.faults import LIMITS, find_faults
     from flame_mdm.visualize import write_player
@@ -86,7 +82,7 @@ def main(settings: InspectSettings) -> None:
 def _files(name: str) -> list[Path]:
     path, kinds = Path(name), ", ".join(ENDINGS)
     if not path.exists():
-        raise UserError(f"{path}: no such file. Give a motion file ({kinds}), a folder of them, or a prepared data set")
+        raise UserError(f"{path}: no such file. Give a motion file ({kinds}), a folder of them, or a data set")
     below = sorted(file for file in path.rglob("*") if file.suffix.lower() in ENDINGS and not file.is_dir())
     if path.is_dir() and not below:
         raise UserError(f"{path}: the folder has no motion files ({kinds})")
@@ -97,7 +93,7 @@ def _read(settings: InspectSettings, files: Sequence[Path]) -> tuple[str, int, I
     from flame_mdm.formats.layouts import find_skeleton
     from flame_mdm.formats.readers import read
 
-    path = Path(str(settings.motion))
+    path = Path(settings.motion)
 
     def motion(file: Path) -> Motion:
         content = read(file, settings.fps, settings.unit, fields=find_skeleton(file, settings.up))

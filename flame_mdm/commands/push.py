@@ -5,8 +5,8 @@ from pathlib import Path
 from typing import ClassVar
 
 from flame_mdm.commands import ModelSettings
-from flame_mdm.errors import UserError, say
-from flame_mdm.sampler_options import option
+from flame_mdm.errors import say
+from flame_mdm.sampler_options import option, required
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -17,15 +17,13 @@ class PushSettings(ModelSettings):
     """
 
     OBJECTS: ClassVar = ("ckpt", "repository", "out")
-    repository: str | None = option(None, "user/name on the Hugging Face hub")
+    repository: str = required("user/name on the Hugging Face hub")
     out: str | None = option(None, "local folder for the files; default push/<name>")
     private: bool = option(False, "true = the repository is private")
     dry_run: bool = option(False, "true = write the folder, upload nothing")
 
 
 def main(settings: PushSettings) -> None:
-    if settings.ckpt is None or settings.repository is None:
-        raise UserError("name a checkpoint and a repository: flame-mdm push CKPT user/name")
     file = settings.model_file()
     from flame_mdm.checkpoints.hub import push
 

@@ -4,11 +4,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
-from flame_mdm.commands import BodySettings, check_words
-from flame_mdm.errors import UserError, say
+from flame_mdm.commands import BodySettings
+from flame_mdm.errors import say
 from flame_mdm.reporting.report import write_report
 from flame_mdm.runs import check_run
-from flame_mdm.sampler_options import option
+from flame_mdm.sampler_options import required
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -20,13 +20,10 @@ class ReportSettings(BodySettings):
     """
 
     OBJECTS: ClassVar = ("runs",)
-    runs: list[str] | None = option(None, "run directories, separated by spaces")
+    runs: list[str] = required("run directories, separated by spaces")
 
 
 def main(settings: ReportSettings) -> None:
-    if settings.runs is None:
-        raise UserError("no run named. Name a run directory: flame-mdm report runs/synthetic/mdm/default")
-    check_words(settings)
     for folder in settings.runs:
         check_run(Path(folder))
     from flame_mdm.visualize.bodies import load_body

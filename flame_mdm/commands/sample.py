@@ -5,14 +5,21 @@ from __future__ import annotations
 import hashlib
 import re
 import webbrowser
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from flame_mdm.checkpoints.locating import find
-from flame_mdm.commands import AdaptedSettings, BodySettings, about_key, check_device, check_motion, check_words
+from flame_mdm.commands import (
+    AdaptedSettings,
+    BodySettings,
+    about_key,
+    device_name,
+    existing,
+    model_source,
+    motion_file,
+)
 from flame_mdm.errors import UserError, say, shortened
 from flame_mdm.safe_io import MEBIBYTE, read_text
 from flame_mdm.sampler_options import SamplerOptions, option, same_option
@@ -22,6 +29,11 @@ if TYPE_CHECKING:
     from flame_mdm.formats.motion import Motion
     from flame_mdm.generator import MotionGenerator
     from flame_mdm.visualize.body import Mesh
+
+
+def video(key: str, wanted: bool) -> None:
+    if wanted and find_spec("av") is None:
+        raise UserError(f'{key}=true: MP4 needs the package av. Run pip install "flame-mdm[video]", or write a GIF')
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,11 +46,11 @@ class OutputSettings(BodySettings, SamplerOptions, AdaptedSettings):
     samples: int = same_option(SamplingRequest, "samples", default=3)
     seed: int = same_option(SamplingRequest, "seed")
     cleanup: bool = same_option(SamplingRequest, "cleanup")
-    targets: str | None = same_option(SamplingRequest, "targets")
+    targets: str | None = same_option(SamplingRequest, "targets", existing)
     trajectory: bool = option(False, "draw the clean estimates along the sampling of the first motion: trajectory.png")
-    mp4: bool = option(False, 'also write motions.mp4; needs pip install "flame-mdm[video]"')
+    mp4: bool = option(False, 'also write motions.mp4; needs pip install "flame-mdm[video]"', video)
     open: bool = option(False, "open the player in the browser")
-    device: str | None = option(None, "default: cuda if available")
+    device: str | None = option(None, "default: cuda if available", device_name)
 
     def load(self, file: Path) -> tuple[MotionGenerator, Mesh]:
         """Returns the model with its adapters, and the body to draw."""
@@ -60,28 +72,14 @@ class OutputSettings(BodySettings, SamplerOptions, AdaptedSettings):
 
     def request(self, editing: bool = False) -> SamplingRequest:
         """Returns what is requested of the model; raises `UserError` if it is more than one condition, or invalid."""
-        check_words(self)
-        check_device(self.device)
-        if self.text is not None and not self.text.strip():
-            raise UserError("the text is empty. Describe what the person does, or use unconditioned=true")
-        choices = [name for name in ("text", "prompts", "action") if hasattr(self, name)]
-        conditions = [name for name in choices if getattr(self, name) is not None]
-        conditions += ["unconditioned"] * self.unconditioned
+        conditions = [name for name in ("text", "prompts", "action") if getattr(self, name, None) is not None]
+        conditions += ["unconditioned"] if self.unconditioned else []
         if len(conditions) > 1:
-            listed = "=..., ".join(choices)
-            raise UserError(f"give only one of {listed}=... and unconditioned=true, not {' and '.join(conditions)}")
-        if self.mp4 and find_spec("av") is None:
-            raise UserError('mp4=true: MP4 needs the package av. Run pip install "flame-mdm[video]", or write a GIF')
-        if self.targets is not None and not Path(self.targets).exists():
-            raise FileNotFoundError(f"{self.targets}: no such file")
+            raise UserError(f"{' and '.join(conditions)} exclude each other. Give only one of them")
         kinds = [SamplingRequest, SamplerOptions, *([EditRequest] if editing else [])]
         names = {entry.name for kind in kinds for entry in fields(kind)}
         values = {entry.name: getattr(self, entry.name) for entry in fields(self) if entry.name in names}
         return SamplingRequest.of("sample", editing, texts=self.texts(), actions=self.action, **values)
-
-    def changed(self, names: Iterable[str]) -> dict[str, Any]:
-        defaults = {entry.name: entry.default for entry in fields(self)}
-        return {name: value for name in names if (value := getattr(self, name)) != defaults[name]}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -101,19 +99,17 @@ class SampleSettings(OutputSettings):
     prompts: str | None = option(None, "instead of text: a file with one prompt per line; each gets its own folder")
     seconds: float | Sequence[float] | None = same_option(SamplingRequest, "seconds")
     frames: int | Sequence[int] | None = same_option(SamplingRequest, "frames")
-    after: str | None = same_option(SamplingRequest, "after")
+    after: str | None = same_option(SamplingRequest, "after", motion_file)
     split: bool = same_option(SamplingRequest, "split")
     loop: bool = same_option(SamplingRequest, "loop")
     path: str | None = option(None, 'way points on the floor, x,z in meters, instead of targets: "0,1 0.5,2"')
     candidates: int = same_option(SamplingRequest, "candidates")
-    scorer: str | None = option(None, "a motion-CLIP that chooses the candidate that fits the text best")
+    scorer: str | None = option(None, "a motion-CLIP that chooses the candidate that fits the text best", model_source)
     shared_noise: bool = same_option(SamplingRequest, "shared_noise")
     out: str | None = option(None, "folder; default samples/<experiment>/<text>-<hash>")
 
     def texts(self) -> list[str] | None:
         """Returns the text or the lines of the file of prompts; None if there are none."""
-        if self.text is not None and self.text.endswith(".txt") and Path(self.text).exists():
-            raise UserError(f"text={self.text}: a file. To sample the prompts in it, give prompts={self.text}")
         return super().texts() if self.prompts is None else read_prompts(self.prompts)
 
     def request(self, editing: bool = False) -> SamplingRequest:
@@ -128,25 +124,13 @@ class SampleSettings(OutputSettings):
 
 
 GALLERY = 200  # maximum number of motions on the page of a file of prompts, which has about 20 kB for each
-LENGTHS = ("seconds", "frames")  # keys that take one value, or one per prompt
-IN_NAME = (
-    *LENGTHS,
-    *(entry.name for entry in fields(SamplerOptions)),
-    *("shared_noise", "cleanup", "loop", "after", "targets", "path", "scorer", "candidates"),
-    *("adapter", "adapter_strength"),
-)
-"""Keys that change the motions: the name of the folder contains those that differ from their defaults."""
 
 
 def main(settings: SampleSettings) -> None:
     request = settings.request()
     if settings.scorer is not None and (request.kind != "text" or settings.candidates == 1):
         raise UserError(f"scorer={settings.scorer} chooses among motions for a text: give text=... and candidates=8")
-    check_motion("after", settings.after)
     file = settings.model_file()
-    if settings.scorer is not None:
-        with about_key("scorer"):
-            find(settings.scorer)
 
     from flame_mdm.safe_io import sha256
     from flame_mdm.sampling.generation import sample_request, write_motions
@@ -167,7 +151,7 @@ def main(settings: SampleSettings) -> None:
     stages = [] if settings.trajectory else None
     motions = sample_request(model, request, score=score, stages=stages)
     digest = sha256(file)
-    folders = _folders(settings, model, digest, motions)
+    folders = _folders(settings, request, model, digest, motions)
     for folder, made in folders.items():
         facts = {"seed": settings.seed, "checkpoint": digest}
         write_motions(folder, made, facts, stages if made[0] is motions[0] else None, settings.mp4, body)
@@ -183,18 +167,23 @@ def main(settings: SampleSettings) -> None:
 
 
 def _folders(
-    settings: SampleSettings, model: MotionGenerator, digest: str, motions: Sequence[Motion]
+    settings: SampleSettings,
+    request: SamplingRequest,
+    model: MotionGenerator,
+    digest: str,
+    motions: Sequence[Motion],
 ) -> dict[Path, list[Motion]]:
     """Returns the folders to write, with the motions of each; a prompt that is listed twice has one folder."""
-    changed = settings.changed(IN_NAME)
+    shared = replace(request, texts=None, actions=None, seconds=None, frames=None, samples=1)
+    general = (digest, request.kind, shared, settings.scorer, settings.adapter, settings.adapter_strength)
+    lengths = request.lengths(model.representation.fps)
     folders: dict[Path, list[Motion]] = {}
-    for number in range(len(motions) // settings.samples):
-        part = motions[number * settings.samples :][: settings.samples]
-        lists = {key: changed[key][number] for key in LENGTHS if isinstance(changed.get(key), list)}
-        folder = default_folder(model, digest, part[0].text or "unconditioned", settings.seed, changed | lists)
+    for number, (prompt, length) in enumerate(zip(request.prompts, lengths, strict=True)):
+        folder = default_folder(model, prompt or "unconditioned", length, *general)
         if settings.out:
             folder = Path(settings.out, folder.name if settings.prompts is not None else "")
-        folders.setdefault(folder, []).extend(part)
+        made = motions[number * request.samples : (number + 1) * request.samples]
+        folders.setdefault(folder, []).extend(made)
     return folders
 
 
@@ -209,10 +198,10 @@ def _distance(targets: Any, model: MotionGenerator, motions: Sequence[Motion]) -
 
 def summary(folder: Path, motions: Sequence[Motion], settings: OutputSettings) -> str:
     """Opens the player if requested, and returns the line that tells what was written to a folder."""
-    count = "1 motion" if len(motions) == 1 else f"{len(motions)} motions"
     settings.show(folder / "player.html")
-    files = [str(folder / "player.html"), "motions.gif", *["motions.mp4"] * settings.mp4]
-    return f"{count} of {len(motions[0].joints)} frames: {', '.join(files)}"
+    count = "1 motion" if len(motions) == 1 else f"{len(motions)} motions"
+    files = f"{folder / 'player.html'}, motions.gif" + (", motions.mp4" if settings.mp4 else "")
+    return f"{count} of {len(motions[0].joints)} frames: {files}"
 
 
 def _gallery(settings: SampleSettings, folders: Mapping[Path, list[Motion]], body: Mesh) -> str:
@@ -240,20 +229,15 @@ def read_prompts(path: str, key: str = "prompts") -> list[str]:
     return prompts
 
 
-def default_folder(model: MotionGenerator, digest: str, what: str, seed: int, options: Mapping[str, Any]) -> Path:
-    """Returns `samples/<experiment>/<what>[-seed<seed>][-<option>=<value> ...]-<hash>`; omits options that are None.
+def default_folder(model: MotionGenerator, what: str, *request: object) -> Path:
+    """Returns `samples/<experiment>/<what>-<hash>`; the hash is that of `what` and of everything in `request`.
 
-    The hash is that of the checkpoint (`digest`, SHA-256) and of the request. Requests for different motions thus go to
-    different folders, also where the file system ignores case. The name of the experiment comes from the checkpoint,
-    which may be untrusted; it is cleaned, so the folder is always within `samples`.
+    Requests for different motions thus go to different folders, also where the file system ignores case. The name of
+    the experiment comes from the checkpoint, which may be untrusted; it is cleaned, so the folder is within `samples`.
     """
-    values = {key: str(value) for key, value in sorted(options.items()) if value is not None}
-    request = repr((digest, model.config.get("run"), what, seed, values))
-    chosen = re.sub(r"[^\w=.,-]+", "", "".join(f"-{key}={value}" for key, value in values.items()))[:60]
-    cleaned = re.sub(r"[^\w]+", "-", what.lower()).strip("-")[:40].strip("-")
-    name = f"{cleaned}{f'-seed{seed}' * (seed != 0)}{chosen}"
-    experiment = re.findall(r"[\w-][\w.-]*", str(model.config["experiment"]))
-    return Path("samples", *experiment, f"{name}-{hashlib.sha256(request.encode()).hexdigest()[:6]}")
+    digest = hashlib.sha256(repr((what, request)).encode()).hexdigest()[:6]
+    name = re.sub(r"[^\w]+", "-", what.lower()).strip("-")[:40].strip("-")
+    return Path("samples", *re.findall(r"[\w-][\w.-]*", str(model.config["experiment"])), f"{name}-{digest}")
 
 
 def check_condition(settings: OutputSettings, request: SamplingRequest, model: MotionGenerator) -> None:
@@ -262,7 +246,8 @@ def check_condition(settings: OutputSettings, request: SamplingRequest, model: M
         from flame_mdm.conditions.vocabulary import advice
 
         for text in dict.fromkeys(part for parts in request.parts for part, _ in parts):
-            of = f"'{shortened(text, 60)}': " * (len(request.prompts) > 1 or text not in request.prompts)
+            several = len(request.prompts) > 1 or text not in request.prompts
+            of = f"'{shortened(text, 60)}': " if several else ""
             for line in advice(text, model.facts, model.condition.max_words):
                 say(f"warning: {of}{line}")
     elif request.kind == "none" and not settings.unconditioned:
@@ -270,4 +255,4 @@ def check_condition(settings: OutputSettings, request: SamplingRequest, model: M
         examples = list(choices[model.conditioned_on])
         shown = "; ".join(examples[:: max(1, len(examples) // 5)][:5])
         key = {"none": "unconditioned=true", "text": "text=...", "action": "action=..."}[model.conditioned_on]
-        raise UserError(f"say what to sample: {key}" + f", for example {shown}" * bool(shown))
+        raise UserError(f"say what to sample: {key}" + (f", for example {shown}" if shown else ""))

@@ -3,7 +3,7 @@
 import shlex
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import fields
+from dataclasses import MISSING, fields
 from inspect import cleandoc
 from pathlib import Path
 from typing import Any, TypeVar, get_type_hints
@@ -52,6 +52,12 @@ def read_settings(kind: type[Settings], words: Sequence[str]) -> Settings:
             composed.append(word)
         else:
             raise UserError(f"unknown config key '{key}'.{did_you_mean(key, annotations)}")
+    for entry in fields(kind):  # type: ignore[arg-type]
+        if entry.default is entry.default_factory is MISSING and entry.name not in values:
+            usage = cleandoc(kind.__doc__ or "").splitlines()[0].removeprefix("usage: ")
+            raise UserError(f"no {entry.name} given. Write {usage}")
+        if (check := entry.metadata.get("check")) and values.get(entry.name) is not None:
+            check(entry.name, values[entry.name])
     return kind(**values, **({"composed": tuple(composed)} if composed else {}))
 
 
@@ -115,7 +121,7 @@ def _help(kind: type[Any]) -> list[str]:
     ranks = {entry.name: next(rank for rank, names in enumerate(own) if entry.name in names) for entry in keys}
     for entry in sorted(keys, key=lambda entry: (entry.name not in objects[:1], ranks[entry.name])):
         default = entry.default_factory() if callable(entry.default_factory) else entry.default
-        default = " ".join(default) if isinstance(default, list) else default
+        default = "..." if default is MISSING else " ".join(default) if isinstance(default, list) else default
         shown = "null" if default is None else str(default).lower() if isinstance(default, bool) else default
         text = textwrap.wrap(entry.metadata["help"], 84)
         lines += [f"  {f'{entry.name}={shown}':30} {text[0]}", *(f"{'':33}{line}" for line in text[1:])]

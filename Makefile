@@ -51,7 +51,7 @@ lint: $(READY) ## check style and types
 	@$(VENV)/bin/ruff format --check .
 	@$(VENV)/bin/pyright
 
-bench: $(READY) ## measure speed, write docs/benchmarks/speed.md; ONLY=steps repeats some, DEVICE=cuda adds a GPU
+bench: $(READY) ## measure the speed of training, write docs/benchmarks/speed.md; DEVICE=cuda adds a GPU
 	@$(VENV)/bin/python benchmarks/run.py "only=$(ONLY)" "device=$(DEVICE)"
 
 docs: $(READY) ## write the pages that are generated from the code, and build the site in build/docs

@@ -69,11 +69,6 @@ def cost(config: dict[str, Any], rows: int = 0, frames: int = 0) -> tuple[float,
     return counter.get_total_flops(), 4 * copies * parameters + sum(s.nbytes() for s in kept.values()), parameters
 
 
-def hours(operations: float, steps: int, rate: float) -> float:
-    """Returns the hours of `steps` steps at `rate` floating-point operations per second."""
-    return operations * steps / rate / 3600
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("recipes", nargs="+")
@@ -86,10 +81,10 @@ def main() -> None:
         operations, size, parameters = cost(config)
         steps, rows = config["trainer"]["max_steps"], config["data"]["batch_size"]
         calls = config["task"].get("num_inference_steps", 0) * (1 + (config["task"].get("guidance_scale") != 1))
-        duration = hours(operations, steps, 1e12 * options.tflops)
+        hours = operations * steps / (1e12 * options.tflops) / 3600
         print(
             f"| `{name}` | {parameters / 1e6:.1f} | {rows} | {steps:,} | "
-            f"{operations / 1e12:.2f} | {size / 2**30:.1f} | {duration:.0f} | {operations / 3e12 / rows * calls:.2f} |"
+            f"{operations / 1e12:.2f} | {size / 2**30:.1f} | {hours:.0f} | {operations / 3e12 / rows * calls:.2f} |"
         )
 
 

@@ -1,34 +1,31 @@
-"""Runs the benchmarks and writes docs/benchmarks/speed.md: `python benchmarks/run.py [only=a,b] [device=cuda]`.
+"""Runs the benchmark and writes docs/benchmarks/speed.md: `python benchmarks/run.py [only=steps] [device=cuda]`.
 
-Each benchmark runs in a process, one after another. With `only`, the other sections keep their figures. `device=cuda`
-adds the sections of a GPU to the page. Sections that were measured once, by a script of an earlier commit, stay.
+The section of a GPU is next to that of the CPU. Sections that were measured once, by a script of an earlier commit,
+keep their figures.
 """
 
 import datetime
-import importlib
 import json
 import os
 import platform
-import subprocess
 import sys
-import time
 from pathlib import Path
 from typing import Any
 
 import torch
-from sections import body
 
 from flame_mdm.training.provenance import environment
 
+Row = dict[str, str | float | None]
+Section = dict[str, Any]  # a title, a text, a summary in one sentence, and tables by caption
+
 PAGE = Path(__file__).parent.parent / "docs" / "benchmarks" / "speed.md"
-SECTIONS = ["steps", "sampling"]
 HEAD = """# Speed
 
-`make bench` measures the speed of the framework and writes this page and [speed.json](speed.json). Every comparison is
+`make bench` measures the speed of training steps and writes this page and [speed.json](speed.json). Every comparison is
 a ratio of two measurements in one run, on an idle machine unless the section says otherwise; the absolute figures next
-to it hold for that machine alone. `make bench ONLY=steps` repeats some sections, `make bench DEVICE=cuda` adds those
-of a GPU. Sections that name a commit were measured once, by a script of that commit.
-[Which options to choose](../speed.md) is a page of its own.
+to it hold for that machine alone. `make bench DEVICE=cuda` adds the section of a GPU. Sections that name a commit were
+measured once, by a script of that commit. [Which options to choose](../speed.md) is a page of its own.
 """
 
 
@@ -49,24 +46,25 @@ def machine() -> dict[str, str | int]:
     return facts
 
 
-def child(name: str, out: str, *words: str) -> None:
-    Path(out).write_text(json.dumps(importlib.import_module(name).measure(*words)))
+def cell(value: str | float | None) -> str:
+    """Returns text with three significant digits."""
+    if value is None or isinstance(value, str):
+        return value or ""
+    return f"{value:,.0f}" if abs(value) >= 100 or value == round(value) else f"{value:#.3g}".rstrip(".")
 
 
-def run(name: str, *words: str) -> dict[str, Any]:
-    out = PAGE.with_suffix(f".{name}.part")
-    try:
-        line = [sys.executable, __file__, "--child", name, str(out), *words]
-        done = subprocess.run(line, capture_output=True, text=True, check=False)
-        if done.returncode:
-            raise SystemExit(f"{done.stdout}{done.stderr}\nbenchmarks/{name}.py failed")
-        return json.loads(out.read_text())
-    finally:
-        out.unlink(missing_ok=True)
+def table(rows: list[Row]) -> str:
+    lines = [list(rows[0]), ["---", *["---:"] * (len(rows[0]) - 1)], *([cell(v) for v in row.values()] for row in rows)]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def body(section: Section) -> str:
+    tables = (f"{caption[:1].upper()}{caption[1:]}:\n\n{table(rows)}" for caption, rows in section["tables"].items())
+    return "\n\n".join([section["text"], *tables])
 
 
 def render(sections: dict[str, Any]) -> str:
-    order = sorted(sections, key=lambda name: ("script" in sections[name], name.endswith("_cuda"), _rank(name)))
+    order = sorted(sections, key=lambda name: ("script" in sections[name], name.endswith("_cuda")))
     machines = list(dict.fromkeys(json.dumps(sections[name]["machine"]) for name in order))
     lines = [HEAD, "## In short\n", *(f"- {sections[name]['summary']}" for name in order), "\n## Machine\n"]
     for number, facts in enumerate(machines, 1):
@@ -74,43 +72,32 @@ def render(sections: dict[str, Any]) -> str:
     for name in order:
         section = sections[name]
         where = machines.index(json.dumps(section["machine"])) + 1
-        script = section.get("script", f"benchmarks/{name.removesuffix('_cuda')}.py")
-        title = section["title"] + " on a GPU" * name.endswith("_cuda")
+        script = section.get("script", "benchmarks/steps.py")
+        title = section["title"] + (" on a GPU" if name.endswith("_cuda") else "")
         lines += [f"\n## {title}\n", body(section), f"\n`{script}`, {section['date']}, machine {where}."]
     return "\n".join(lines) + "\n"
 
 
-def _rank(name: str) -> int:
-    name = name.removesuffix("_cuda")
-    return SECTIONS.index(name) if name in SECTIONS else len(SECTIONS)
-
-
 def main(*words: str) -> None:
+    import steps
+
     options = dict(word.split("=", 1) for word in words)
     device = options.get("device") or "cpu"
     if device not in ("cpu", "cuda"):
         raise SystemExit(f"DEVICE={device}: give cpu or cuda")
     if device == "cuda" and not torch.cuda.is_available():
         raise SystemExit("DEVICE=cuda: torch finds no CUDA GPU on this machine")
-    chosen = options["only"].split(",") if options.get("only") else SECTIONS
-    if unknown := [name for name in chosen if name not in SECTIONS]:
-        raise SystemExit(f"ONLY={','.join(unknown)}: give some of {', '.join(SECTIONS)}")
+    if options.get("only") not in (None, "", "steps"):
+        raise SystemExit(f"ONLY={options['only']}: give steps, the only benchmark")
     data = PAGE.with_suffix(".json")
     sections: dict[str, Any] = json.loads(data.read_text()) if data.exists() else {}
-    for number, name in enumerate(chosen, 1):
-        print(f"{number}/{len(chosen)} {name}", flush=True)
-        start = time.perf_counter()
-        section = run(name, *(["--device", "cuda"] if device == "cuda" else []))
-        section |= {"date": datetime.date.today().isoformat(), "machine": machine()}
-        sections[name + "_cuda" * (device == "cuda")] = section
-        data.write_text(json.dumps(sections, indent=1) + "\n")
-        PAGE.write_text(render(sections))
-        print(f"    {section['summary']} ({time.perf_counter() - start:.0f} s)", flush=True)
-    print(f"page: {PAGE}")
+    section = steps.measure("--device", device)
+    section |= {"date": datetime.date.today().isoformat(), "machine": machine()}
+    sections["steps_cuda" if device == "cuda" else "steps"] = section
+    data.write_text(json.dumps(sections, indent=1) + "\n")
+    PAGE.write_text(render(sections))
+    print(f"{section['summary']}\npage: {PAGE}")
 
 
 if __name__ == "__main__":
-    if sys.argv[1:2] == ["--child"]:
-        child(*sys.argv[2:])
-    else:
-        main(*sys.argv[1:])
+    main(*sys.argv[1:])

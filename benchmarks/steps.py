@@ -2,8 +2,8 @@
 
 The full-size step is that of humanml3d/mdm with lengths as in HumanML3D. A plain PyTorch loop trains
 `nn.TransformerEncoder` of the same size on the same clips, padded to 196 frames, as the published codes do. Then follow
-a step of every network in its size for CPU runs, and the quickstart by the complete framework. All take turns in one
-run. On CUDA, the section also has the memory and an estimate of the hours of each published recipe.
+a step of every network in its size for CPU runs, and on the CPU the quickstart by the complete framework. All take
+turns in one run. On CUDA, the section also has the memory.
 """
 
 import argparse
@@ -13,7 +13,7 @@ import sys
 import tempfile
 import time
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
 from functools import partial
 from pathlib import Path
@@ -22,10 +22,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from cost import cost, hours, training_step
+from cost import cost, training_step
 from hydra.utils import get_class
 from lightning import Callback
-from sections import Row, Section, section, show, take_turns
+from run import Row, Section, body
 from torch import Tensor, nn
 
 from flame_mdm.batch import MotionBatch, padded_length
@@ -44,10 +44,6 @@ BACKBONES = {
     "FLAME": ["synthetic/flame"],
     "MFM": ["synthetic/mfm"],
 }
-RECIPES = [
-    *(f"humanml3d/{name}" for name in ("mdm", "mdm_decoder", "mdm_decoder_token", "mdm_gru", "mdm_unet", "mfm")),
-    *("humanml3d/flame", "kit/mdm", "kit/mfm", "kit/flame"),
-]
 SPEEDS = ("reference", "fast")
 QUIET = [
     *("trainer.accelerator=cpu", "trainer.enable_progress_bar=false", "trainer.val_check_interval=1000000"),
@@ -121,8 +117,24 @@ def matrix_peak(device: str, size: int) -> dict[str, float]:
     return rates
 
 
-def full_size(size: list[str], batches: int, peak: dict[str, float], device: str) -> tuple[list[Row], float, str]:
-    """Returns rows of the full-size step, the sustained rate of `fast`, and a text about the batches."""
+def take_turns(runs: Mapping[str, Callable[[], object]], rounds: int, device: str = "cpu") -> dict[str, float]:
+    """Returns the median seconds of each function. They take turns, so that a busy machine slows all of them.
+
+    The first round warms up.
+    """
+    times: dict[str, list[float]] = {name: [] for name in runs}
+    for _ in range(rounds + 1):
+        for name, run in runs.items():
+            start = time.perf_counter()
+            run()
+            if device == "cuda":
+                torch.cuda.synchronize()
+            times[name].append(time.perf_counter() - start)
+    return {name: statistics.median(taken[1:]) for name, taken in times.items()}
+
+
+def full_size(size: list[str], batches: int, peak: dict[str, float], device: str) -> tuple[list[Row], str]:
+    """Returns rows of the full-size step, and a text about the batches."""
     config = compose("humanml3d/mdm", ["data.batch_size=16", *size])
     rows = config["data"]["batch_size"]
     lengths = 4 * np.random.default_rng(0).integers(10, 50, TrainingBatches.BUCKETS * rows)
@@ -158,7 +170,7 @@ def full_size(size: list[str], batches: int, peak: dict[str, float], device: str
         table.append(row | {"frames per second": real / taken, "share of the matrix peak": share})
     mean = sum(batch.x.shape[1] for batch in bucketed) / batches
     text = f"{rows} clips of {real / rows / batches:.0f} frames on average, padded to {mean:.0f} by the framework"
-    return table, operations / times["speed=fast"], text
+    return table, text
 
 
 def backbones(names: Sequence[str], rounds: int, peak: dict[str, float], device: str) -> list[Row]:
@@ -213,17 +225,6 @@ def quickstart(clips: int, steps: int, rounds: int) -> list[Row]:
     return [{"training": f"speed={s}", "ms per step": t, "times as fast": slow / t} for s, t in medians.items()]
 
 
-def recipe_hours(rate: float) -> list[Row]:
-    """Returns the estimated training time of each published recipe at `rate` floating-point operations per second."""
-    rows: list[Row] = []
-    for name in RECIPES:
-        config = compose(name)
-        operations, steps = cost(config)[0], config["trainer"]["max_steps"]
-        row: Row = {"recipe": f"`{name}`", "steps": steps, "TFLOP per step": operations / 1e12}
-        rows.append(row | {"hours": hours(operations, steps, rate)})
-    return rows
-
-
 def measure(*words: str) -> Section:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--device", choices=["cpu", "cuda"], default="cpu")
@@ -235,33 +236,31 @@ def measure(*words: str) -> Section:
     torch.set_float32_matmul_precision("high")  # as in training
     peak = matrix_peak(device, 64 if quick else 2048 if device == "cpu" else 8192)
     size = ["data.batch_size=2", "denoiser.latent_dim=16", "denoiser.ff_size=32", "denoiser.num_layers=1"]
-    full, rate, batches = full_size(size if quick else [], 1 if quick else 8, peak, device)
-    tables = {"full_size": full}
+    full, batches = full_size(size if quick else [], 1 if quick else 8, peak, device)
+    tables = {"full size": full}
     if device == "cuda":
         memory = torch.cuda.max_memory_allocated() / 2**30
         batches += f"; at most {memory:.1f} GiB of memory for all three models together"
     names = ["FLAME", "MFM"] if quick else list(BACKBONES)
-    tables["networks_in_their_size_for_CPU_runs"] = backbones(names, 1 if quick else 15, peak, device)
+    tables["networks in their size for CPU runs"] = backbones(names, 1 if quick else 15, peak, device)
     if device == "cpu":
         tables["quickstart"] = quickstart(60, 4, 1) if quick else quickstart(600, 150, 2)
-    else:
-        tables["estimated_training_time_at_the_sustained_rate_of_fast"] = recipe_hours(rate)
     reference, fast = full[1]["times as fast"], full[2]["times as fast"]
-    return section(
-        "Training steps",
-        f"The full-size step is that of `humanml3d/mdm` (8 layers of 512, dropout 0.1), {batches}. Lengths are uniform "
-        "from 40 to 196 frames, in units of 4, as a stand-in for HumanML3D's, and batches are those of the framework's "
-        "sampler. Plain PyTorch trains `nn.TransformerEncoder` with AdamW on the same clips, padded to 196 frames as "
-        "in the published codes, in float32. Everything takes turns; medians of 3 rounds over all batches. The share "
-        f"of the matrix peak compares the operations of a step with a measured matrix product: "
-        f"{peak['reference'] / 1e9:,.0f} GFLOP/s in float32 (`reference`) and {peak['fast'] / 1e9:,.0f} in bfloat16 "
-        "(`fast`). The small networks have 32 clips per batch and no text encoder; the quickstart is trained by the "
-        "complete framework, with its text encoder.",
-        f"At full size, `speed=reference` is {reference:.1f} times as fast as plain PyTorch, and `speed=fast` "
-        f"{fast:.1f} times.",
-        **tables,
-    )
+    return {
+        "title": "Training steps",
+        "text": "The full-size step is that of `humanml3d/mdm` (8 layers of 512, dropout 0.1), "
+        f"{batches}. Lengths are uniform from 40 to 196 frames, in units of 4, as a stand-in for HumanML3D's, and "
+        "batches are those of the framework's sampler. Plain PyTorch trains `nn.TransformerEncoder` with AdamW on the "
+        "same clips, padded to 196 frames as in the published codes, in float32. Everything takes turns; medians of 3 "
+        "rounds over all batches. The share of the matrix peak compares the operations of a step with a measured "
+        f"matrix product: {peak['reference'] / 1e9:,.0f} GFLOP/s in float32 (`reference`) and "
+        f"{peak['fast'] / 1e9:,.0f} in bfloat16 (`fast`). The small networks have 32 clips per batch and no text "
+        "encoder; the quickstart is trained by the complete framework, with its text encoder.",
+        "summary": f"At full size, `speed=reference` is {reference:.1f} times as fast as plain PyTorch, "
+        f"and `speed=fast` {fast:.1f} times.",
+        "tables": tables,
+    }
 
 
 if __name__ == "__main__":
-    show(measure(*sys.argv[1:]))
+    print(body(measure(*sys.argv[1:])))

@@ -194,9 +194,9 @@ def test_bad_words_and_scorers_are_one_line(model, tmp_path, capsys):
         text_fit(str(tmp_path / "none.ckpt"), model)
     for options, message in (
         ([], "say what to sample: text=..., for example "),
-        (["text=walks", "unconditioned=true"], "not text and unconditioned"),
-        (["text=walks", "scorer=none.ckpt"], "scorer=none.ckpt chooses among motions for a text"),
-        (["text=walks", "scorer=none.ckpt", "candidates=2"], "scorer: none.ckpt: no such checkpoint. Give a run"),
+        (["text=walks", "unconditioned=true"], "text and unconditioned exclude each other"),
+        (["text=walks", "scorer=quickstart"], "scorer=quickstart chooses among motions for a text"),
+        (["text=walks", "scorer=none.ckpt"], "scorer: none.ckpt: no such checkpoint. Give a run"),
         (["text=walks", "scorer=quickstart", "candidates=2"], "holds a motion generator, not a motion-CLIP"),
     ):
         assert main(["sample", "quickstart", *options]) == 1

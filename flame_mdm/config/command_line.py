@@ -27,7 +27,16 @@ def run(command: Callable[[Settings], None], kind: type[Settings], argv: Sequenc
     if any(word in ("-h", "--help") for word in words):
         say(*_help(kind))
         return 0
-    return guarded(lambda: command(read_settings(kind, words)), STOP)
+
+    def serve() -> None:
+        settings = read_settings(kind, words)
+        for entry in fields(kind):  # type: ignore[arg-type]
+            value, check = getattr(settings, entry.name), entry.metadata.get("check")
+            if check is not None and value is not None:
+                check(entry.name, value)
+        command(settings)
+
+    return guarded(serve, STOP)
 
 
 def read_settings(kind: type[Settings], words: Sequence[str]) -> Settings:
@@ -56,8 +65,6 @@ def read_settings(kind: type[Settings], words: Sequence[str]) -> Settings:
         if entry.default is entry.default_factory is MISSING and entry.name not in values:
             usage = cleandoc(kind.__doc__ or "").splitlines()[0].removeprefix("usage: ")
             raise UserError(f"no {entry.name} given. Write {usage}")
-        if (check := entry.metadata.get("check")) and values.get(entry.name) is not None:
-            check(entry.name, values[entry.name])
     return kind(**values, **({"composed": tuple(composed)} if composed else {}))
 
 

@@ -68,11 +68,11 @@ def test_a_chosen_folder_gets_a_folder_per_prompt(here, trained, monkeypatch):
 
 def test_a_bad_request_is_one_line_and_writes_nothing(here, trained, capsys):
     for content, words, message in (
-        (None, [], "prompts=p.txt: no such file. Give a text file with one prompt per line"),
-        (b" \n\t\r\n\n", [], "prompts=p.txt: contains no text. Write one prompt per line"),
-        (b"PK\x03\x04\xff\xfe\x00", [], "prompts=p.txt: not a UTF-8 text file"),
-        (b"a\n" * 2**20, [], "prompts=p.txt: 2 MiB, but such a file may have at most 1 MiB"),
-        (b"walks", ["prompts=."], "prompts=.: a folder, not a file"),
+        (None, [], "prompts: p.txt: no such file"),
+        (b" \n\t\r\n\n", [], "prompts: p.txt: no prompts. Write one per line"),
+        (b"PK\x03\x04\xff\xfe\x00", [], "prompts: p.txt: not a UTF-8 text file"),
+        (b"a\n" * 2**20, [], "prompts: p.txt: 2 MiB, but such a file may have at most 1 MiB"),
+        (b"walks", ["prompts=."], "prompts: .: a folder, not a file"),
         (b"walks", ["text=jumps"], "text and prompts exclude each other. Give only one of them"),
         (b"walks\njumps", ["seconds=[1,2,3]"], "seconds=[1, 2, 3]: 3 lengths for 2 prompts. Give one length, or one"),
         (b"walks\njumps", ["seconds=[1,30]"], "30 seconds (600 frames) cannot be sampled"),

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, ClassVar
 
 from flame_mdm.commands import BodySettings
 from flame_mdm.commands.sample import read_prompts
-from flame_mdm.errors import UserError, say
+from flame_mdm.errors import say
 from flame_mdm.reporting.compare import HEAD, MOTIONS, ComparedRun, Prompt, comparison, find, grouped, in_common, tested
 from flame_mdm.safe_io import write_text
-from flame_mdm.sampler_options import option
+from flame_mdm.sampler_options import option, required
 
 if TYPE_CHECKING:
     from flame_mdm.formats.motion import Motion
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class CompareSettings(BodySettings):
-    """usage: flame-mdm compare A B C [texts="a person walks; a person jumps"]
+    """usage: flame-mdm compare A B C [prompts=FILE.txt] [seconds=3]
 
     Compares runs side by side on one page: configuration differences, curves, evaluations and motions for the same
     prompts. If the runs have results of the same protocol, data and extractor, prints the difference of each metric
@@ -31,11 +31,9 @@ class CompareSettings(BodySettings):
     """
 
     OBJECTS: ClassVar = ("runs",)
-    runs: list[str] | None = option(None, "run directories, or folders of motion files, separated by spaces")
-    texts: str | None = option(
-        None,
-        '"a person walks; a person jumps", or a .txt file with one text per line, sampled by each last.ckpt; default: '
-        "the newest samples of each run",
+    runs: list[str] = required("run directories, or folders of motion files, separated by spaces")
+    prompts: str | None = option(
+        None, "a file with one prompt per line, sampled by each last.ckpt; default: the newest samples of each run"
     )
     seconds: float | None = option(None, "length of the sampled motions; default 3")
     seed: int = option(0, "seed of sampling")
@@ -43,7 +41,7 @@ class CompareSettings(BodySettings):
 
 
 def main(settings: CompareSettings) -> None:
-    compared = find([Path(folder) for folder in settings.runs or ()])
+    compared = find([Path(folder) for folder in settings.runs])
     from flame_mdm.visualize.bodies import load_body
 
     content = comparison(compared, motions(compared, settings), load_body(settings.body))
@@ -62,8 +60,8 @@ def _tested(runs: Mapping[str, Run]) -> list[str]:
 
 
 def motions(compared: Sequence[ComparedRun], settings: CompareSettings) -> list[dict[Prompt, Motion]]:
-    """Returns the motions of each compared run, by prompt: sampled for `texts`, or else its newest samples."""
-    texts = None if settings.texts is None else read_texts(settings.texts)
+    """Returns the motions of each compared run, by prompt: sampled for `prompts`, or else its newest samples."""
+    texts = None if settings.prompts is None else list(dict.fromkeys(read_prompts(settings.prompts)))
     shown = []
     for entry in compared:
         folder = entry.run.samples if entry.run else entry.folder
@@ -84,16 +82,6 @@ def _read(folder: Path) -> dict[Prompt, Motion]:
         numbered[motion.text, counts[motion.text]] = motion
         counts[motion.text] += 1
     return numbered
-
-
-def read_texts(texts: str) -> list[str]:
-    """Returns texts that are separated by semicolons, or the lines of a .txt file, without duplicates."""
-    if texts.endswith(".txt"):
-        return list(dict.fromkeys(read_prompts(texts, "texts")))
-    parts = [part.strip() for part in texts.split(";") if part.strip()]
-    if not parts:
-        raise UserError(f'texts={texts}: contains no text. Give texts="a person walks; a person jumps" or a .txt file')
-    return list(dict.fromkeys(parts))
 
 
 def _sampled(run: Path, texts: list[str], settings: CompareSettings) -> dict[Prompt, Motion]:

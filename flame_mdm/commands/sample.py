@@ -214,18 +214,13 @@ def _gallery(settings: SampleSettings, folders: Mapping[Path, list[Motion]], bod
     return f"{sum(map(len, folders.values()))} motions for {len(folders)} prompts, a folder for each: {page}"
 
 
-def read_prompts(path: str, key: str = "prompts") -> list[str]:
-    """Returns the lines of a text file that are not blank; error messages name `key`, which names the file."""
-    try:
+def read_prompts(path: str) -> list[str]:
+    """Returns the lines of a file of prompts that are not blank."""
+    with about_key("prompts"):
         text = read_text(path, MEBIBYTE)
-    except FileNotFoundError:
-        raise UserError(f"{key}={path}: no such file. Give a text file with one prompt per line") from None
-    except UserError as error:
-        raise UserError(f"{key}={error}") from error
-    if "\0" in text:
-        raise UserError(f"{key}={path}: not a text file. Give a text file with one prompt per line")
-    if not (prompts := [line.strip() for line in text.removeprefix("\ufeff").splitlines() if line.strip()]):
-        raise UserError(f"{key}={path}: contains no text. Write one prompt per line")
+        prompts = [line.strip() for line in text.removeprefix("\ufeff").splitlines() if line.strip()]
+        if not prompts or "\0" in text:
+            raise UserError(f"{path}: no prompts. Write one per line")
     return prompts
 
 

@@ -30,11 +30,10 @@ def existing(key: str, source: str) -> None:
 
 def motion_file(key: str, source: str) -> None:
     """Checks that a motion file exists and has a known ending; `dataset:id` is left to its reader."""
-    known = Path(source).suffix.lower() in ENDINGS
-    if not known and ":" not in source:
-        raise UserError(f"{key}={source}: neither a motion file ({', '.join(ENDINGS)}) nor dataset:id")
-    if known:
+    if Path(source).suffix.lower() in ENDINGS:
         existing(key, source)
+    elif ":" not in source:
+        raise UserError(f"{key}={source}: neither a motion file ({', '.join(ENDINGS)}) nor dataset:id")
 
 
 def model_source(key: str, source: str) -> None:

@@ -31,8 +31,8 @@ if TYPE_CHECKING:
     from flame_mdm.visualize.body import Mesh
 
 
-def video(key: str, wanted: bool) -> None:
-    if wanted and find_spec("av") is None:
+def video(key: str, requested: bool) -> None:
+    if requested and find_spec("av") is None:
         raise UserError(f'{key}=true: MP4 needs the package av. Run pip install "flame-mdm[video]", or write a GIF')
 
 

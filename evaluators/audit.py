@@ -15,7 +15,7 @@ from torch import Tensor
 from torchmetrics import Metric
 
 from evaluators.audit_sets import BASE, REAL, Inputs, Scene, Text, text_of
-from evaluators.evaluator import Evaluator, Extracted, Motions
+from evaluators.evaluator import Evaluator, Motions, Rows
 from evaluators.extractors import OwnExtractor
 from evaluators.metrics import alignment, make_metrics, physics, update_metrics
 from evaluators.metrics.attributes import AttributeAccuracy, read_attributes, right_attributes
@@ -43,7 +43,7 @@ TOTALS: dict[type[Metric], tuple[str, str]] = {
 TRUTH = "attributes/all"  # share of motions that show every requested attribute
 
 
-def audit(request: EvaluationRequest, cache: Path) -> AuditCard:
+def audit(request: EvaluationRequest, cache: Path, resamples: int) -> AuditCard:
     """Measures perturbations of the motions of a split; see docs/audit.md.
 
     `samples` of the request limits the motions; `resamples` is the number of bootstrap resamples, for the intervals. A
@@ -87,12 +87,10 @@ def audit(request: EvaluationRequest, cache: Path) -> AuditCard:
         for name, make in sets.items():
             inputs[name] = _inputs(evaluator, folder / f"{name.replace(' ', '-')}.npz", [row.id for row in rows], make)
             bar.update()
-        measure = _Measure(evaluator, inputs, texts, scene.draws("bootstrap"), request.resamples)
+        measure = _Measure(evaluator, inputs, texts, scene.draws("bootstrap"), resamples)
         measured = _measured(measure, scene, perturbations, inputs, texts, bar)
     packages = environment()["packages"]
-    return check_shape(
-        {"format": FORMAT, **facts, "resamples": request.resamples, "packages": packages, **measured}, AuditCard
-    )
+    return check_shape({"format": FORMAT, **facts, "resamples": resamples, "packages": packages, **measured}, AuditCard)
 
 
 def _measured(
@@ -133,15 +131,15 @@ def _inputs(evaluator: Evaluator, path: Path, ids: list[str], make: Callable[[],
     if path.exists():
         return read_npz(path)
     extracted = evaluator.extract(Motions(ids, make()))
-    features = extracted.rows.get("generated")
+    features = extracted.get("generated")
     inputs: Inputs = {} if features is None else {"features": features.double().numpy()}
     for name, metric in make_metrics(evaluator.metrics).items():
         if type(metric) in TOTALS:
-            inputs[name] = np.array([_totals(metric, joints) for joints in extracted.joints])
+            inputs[name] = np.array([_totals(metric, joints) for joints in extracted["joints"]])
         elif isinstance(metric, MeanOverMotions):
             inputs |= _values(name, metric, extracted)
         elif isinstance(metric, AttributeAccuracy):
-            inputs["seen"] = np.array([json.dumps(read_attributes(x.numpy(), metric.fps)) for x in extracted.joints])
+            inputs["seen"] = np.array([json.dumps(read_attributes(x.numpy(), metric.fps)) for x in extracted["joints"]])
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_write(path) as temporary:
         np.savez(temporary, allow_pickle=False, **inputs)
@@ -162,12 +160,12 @@ def _higher_is_better(metrics: Mapping[str, Metric], name: str, part: str) -> bo
     return other.get(part, metric.higher_is_better)
 
 
-def _values(name: str, metric: MeanOverMotions, extracted: Extracted) -> Inputs:
+def _values(name: str, metric: MeanOverMotions, extracted: Rows) -> Inputs:
     """Returns the value, or 0, and whether it is defined, for each motion; nothing if no motion may have one."""
     if metric.required_fps not in (None, metric.fps):
         return {}
-    for i, joints in enumerate(extracted.joints):
-        rows = {row: extracted.rows[row][i : i + 1] for row in ("keys", "contacts") if row in extracted.rows}
+    for i, joints in enumerate(extracted["joints"]):
+        rows = {row: extracted[row][i : i + 1] for row in ("keys", "contacts") if row in extracted}
         rows |= {"contacts": rows["contacts"][0][None]} if "contacts" in rows else {}
         update_metrics({name: metric}, joints=joints[None], mask=torch.ones(1, len(joints), dtype=torch.bool), **rows)
     values, defined = (torch.cat(getattr(metric, state)).double().numpy() for state in ("values", "defined"))

@@ -12,7 +12,7 @@ from scipy.ndimage import gaussian_filter1d
 from torch import Tensor
 
 from evaluators.collectives import is_first, processes, shared
-from evaluators.evaluator import Evaluator, Extracted, Motions, keys_of
+from evaluators.evaluator import Evaluator, Motions, Rows, keys_of
 from evaluators.extractors import Extractor
 from evaluators.metrics.attributes import ATTRIBUTES
 from evaluators.metrics.distribution import FrechetMotionDistance
@@ -34,9 +34,8 @@ Scores = list[tuple[dict[str, float | None], int]]  # values by metric, and numb
 def evaluate(request: EvaluationRequest) -> None:
     """Evaluates a checkpoint, motion files or a baseline, and writes the result file.
 
-    Raises:
-        UserError: If model, data, protocol and extractor do not match, or real motions do not have the expected values.
-        FileNotFoundError: If a file is missing.
+    Raises `UserError` if model, data, protocol and extractor do not match, or real motions do not have the expected
+    values.
     """
     if request.out is not None:  # checked here, before hours of work
         if Path(request.out).is_dir():
@@ -45,16 +44,11 @@ def evaluate(request: EvaluationRequest) -> None:
     with processes(request.device) as device:
         plan = Plan(request, device)
         result = make_result(request, plan)
+        training, size = plan.data.clips("train"), {"seed": request.seed, "batch_size": plan.batch_size}
         evaluation = Evaluation(
-            plan.protocol,
-            plan.clips,
-            plan.extractor,
-            plan.representation,
-            seed=request.seed,
-            batch_size=plan.batch_size,
-            training=plan.data.clips("train"),
+            plan.protocol, plan.clips, plan.extractor, plan.representation, training=training, **size
         )
-        measured = evaluation.run(plan.source, force=request.force, resamples=request.resamples)
+        measured = evaluation.run(plan.source, force=request.force)
         if is_first():
             reasons = measured.invalid_because + result.invalid_because
             result = result.model_copy(update=dict(measured) | {"invalid_because": reasons})
@@ -77,22 +71,17 @@ class Evaluation:
     batch_size: int = 64  # of the extractor
     training: Clips | None = None  # the training split, for metrics that look for copies of its motions
 
-    def run(
-        self, source: Source | None, *, ground_truth: bool = True, force: bool = False, resamples: int = 0
-    ) -> Measured:
+    def run(self, source: Source | None, *, ground_truth: bool = True, force: bool = False) -> Measured:
         """Evaluates real motions of all replications, and then the motions of the source, if there is one.
 
         Of several processes, each generates and extracts a share of the batches. The first one computes the metrics;
-        all return the result.
+        all return the result. Raises `UserError` before anything is generated if real motions do not have the expected
+        values.
 
         Args:
             source: source of the motions.
             ground_truth: whether real motions are measured.
             force: generate even if real motions do not have the values that the protocol expects.
-            resamples: number of sets drawn from the motions of the first replication, for intervals by bootstrap.
-
-        Raises:
-            UserError: If real motions do not have the expected values; nothing has been generated.
         """
         seeds = [self._draws(replication) for replication in range(self.protocol.replications)]
         measured = Measured(
@@ -110,9 +99,9 @@ class Evaluation:
                     "extractor, or give force=true: the result is then marked as not valid"
                 )
         if source is not None:
-            self._measure(measured, source, real_sets, resamples)
-        if source is not None and self.several:
-            self._measure_multimodality(measured, source, self.several)
+            self._measure(measured, source, real_sets)
+            if self.several:
+                self._measure_multimodality(measured, source, self.several)
         if self.evaluator.skip_features:
             measured.not_computed["extractor"] = "extractor=none: metrics that need features were not computed"
         return shared(measured)
@@ -136,26 +125,30 @@ class Evaluation:
 
     # Real motions -----------------------------------------------------------------------------------------------------
 
-    def _measure_real(
-        self, measured: Measured, source: Source | None, ground_truth: bool
-    ) -> list[tuple[Extracted, Extracted]]:
+    def _measure_real(self, measured: Measured, source: Source | None, ground_truth: bool) -> list[tuple[Rows, Rows]]:
         """Measures real motions; returns for each replication those that motions of the source are compared with."""
         scores: Scores = []
         real_sets = []
         for replication in range(self.protocol.replications):
             paired, real = self._real(replication)
             if ground_truth:
-                values, reasons = self.evaluator.score(paired, paired, real, self._draws(replication))
-                scores.append((values, len(paired)))
-                measured.not_computed |= reasons
+                scores.append(self._score(self.evaluator, measured, paired, paired, real, replication))
             if source is not None:
                 for checked in filter(None, (self.evaluator, self.several)):  # before motions are generated
                     checked.check(paired)
                 # All replications are kept in memory; joints, the largest part, only if metrics compare them.
-                real_sets.append((paired if self.evaluator.reads("real_joints") else paired.without_joints(), real))
+                real_sets.append((paired if self.evaluator.reads("real_joints") else _without_joints(paired), real))
         if ground_truth:
             measured.ground_truth = averages(scores)
         return real_sets
+
+    def _score(
+        self, evaluator: Evaluator, measured: Measured, motions: Rows, paired: Rows, real: Rows, replication: int
+    ) -> tuple[dict[str, float | None], int]:
+        """Returns the values of motions, and their number; adds the reasons for missing values to `measured`."""
+        values, reasons = evaluator.score(motions, paired, real, self._draws(replication))
+        measured.not_computed |= reasons
+        return values, len(motions["keys"])
 
     def _training(self, clips: Clips) -> tuple[Motions, Motions]:
         """Returns the training motions: all frames of each, and a window of each for its features."""
@@ -163,15 +156,15 @@ class Evaluation:
         whole = [replace(row, frames=np.arange(row.clip.length)) for row in windows]
         return self._motions(whole, real_motions(clips, whole)), self._motions(windows, real_motions(clips, windows))
 
-    def _real(self, replication: int) -> tuple[Extracted, Extracted]:
+    def _real(self, replication: int) -> tuple[Rows, Rows]:
         """Returns the real motions of a replication, and real motions for comparisons of sets."""
         again = self.protocol.rows(self.clips, self.seed, replication, purpose="real")
         real = self.evaluator.reference()
         if real is None:
             real = replace(self.evaluator, training=None).extract(self._motions(again, real_motions(self.clips, again)))
-        return self._paired(self.protocol.rows(self.clips, self.seed, replication)), real.without_joints()
+        return self._paired(self.protocol.rows(self.clips, self.seed, replication)), _without_joints(real)
 
-    def _paired(self, rows: Sequence[DrawnClip]) -> Extracted:
+    def _paired(self, rows: Sequence[DrawnClip]) -> Rows:
         motions = self._motions(rows, real_motions(self.clips, rows))
         if references := self.clips.store.references([row.clip.id for row in rows]):
             motions.inputs["references"] = [torch.from_numpy(joints) for joints in references]
@@ -196,13 +189,10 @@ class Evaluation:
 
     # Motions of the source --------------------------------------------------------------------------------------------
 
-    def _measure(
-        self, measured: Measured, source: Source, real_sets: Sequence[tuple[Extracted, Extracted]], resamples: int
-    ) -> None:
+    def _measure(self, measured: Measured, source: Source, real_sets: Sequence[tuple[Rows, Rows]]) -> None:
         """Measures the source's motions of each replication, compared with the real ones; fills in `measured`."""
         scores: Scores = []
         costs = []
-        resampled: dict[str, list[float | None]] = {}
         for replication, (paired, real) in enumerate(real_sets):
             rows = self.protocol.rows(self.clips, self.seed, replication)
             samples = source(f"rep_{replication}", rows, replication)
@@ -211,16 +201,13 @@ class Evaluation:
                 ids = {row.id for row in samples.rows}
                 paired = _select(paired, [i for i, row in enumerate(rows) if row.id in ids])
             generated = self.evaluator.extract(self._generated(samples))
-            values, reasons = self.evaluator.score(generated, paired, real, self._draws(replication))
-            scores.append((values, len(generated)))
-            measured.not_computed |= reasons
+            scores.append(self._score(self.evaluator, measured, generated, paired, real, replication))
             if not replication:
                 measured.warnings = self._warnings(generated, real)
-                resampled = self.evaluator.resample(generated, paired, real, self._draws(0), resamples)
-                if "nearest" in generated.rows:
+                if "nearest" in generated:
                     sets = {"generated": generated, "real": paired}
-                    measured.nearest = {name: _sorted_distances(x.rows["nearest"]) for name, x in sets.items()}
-        measured.values, measured.cost = averages(scores, resampled), mean_cost(costs)
+                    measured.nearest = {name: _sorted_distances(x["nearest"]) for name, x in sets.items()}
+        measured.values, measured.cost = averages(scores), mean_cost(costs)
 
     def _measure_multimodality(self, measured: Measured, source: Source, evaluator: Evaluator) -> None:
         """Computes the metrics that need several motions per prompt."""
@@ -236,9 +223,7 @@ class Evaluation:
                 motions = evaluator.extract(self._generated(source(f"multimodality_{replication}", rows, replication)))
                 real = self._paired(rows[:: several.samples])
                 paired = _select(real, [i // several.samples for i in range(len(rows))])
-            values, reasons = evaluator.score(motions, paired, nothing, self._draws(replication))
-            scores.append((values, len(motions)))
-            measured.not_computed |= reasons
+            scores.append(self._score(evaluator, measured, motions, paired, nothing, replication))
         if not generates:
             why = "not computed in a quick evaluation" if self.protocol.quick else "there is one sample per clip"
             measured.not_computed["multimodality"] = f"{why}: it needs several samples per prompt"
@@ -251,19 +236,21 @@ class Evaluation:
             features = [gaussian_filter1d(motion, sigma, axis=0) for motion in features]
         return self._motions(samples.rows, features, samples.captions)
 
-    def _warnings(self, generated: Extracted, real: Extracted) -> list[str]:
+    def _warnings(self, generated: Rows, real: Rows) -> list[str]:
         lines = []
+        if "generated" not in generated:
+            return lines
+        count, others, width = len(generated["keys"]), len(real["keys"]), generated["generated"].shape[1]
+        few = min(count, others)
         for name, config in self.protocol.metrics.items():
-            if not config["_target_"].endswith(FrechetMotionDistance.__name__) or "generated" not in generated.rows:
+            if not config["_target_"].endswith(FrechetMotionDistance.__name__):
                 continue
-            width = generated.rows["generated"].shape[1]
-            few = min(len(generated), len(real))
             if few < 2 * width:
                 lines.append(f"{name}: biased upwards: {few} motions are fewer than twice the {width} features")
-            if len(generated) != len(real):
+            if count != others:
                 lines.append(
-                    f"{name}: {len(generated)} generated and {len(real)} real motions. Compare it only with values for "
-                    "the same two numbers"
+                    f"{name}: {count} generated and {others} real motions. Compare it only with values for the same "
+                    "two numbers"
                 )
         return lines
 
@@ -306,6 +293,9 @@ def _sorted_distances(nearest: Tensor) -> list[float]:
     return [round(distance, 4) for distance in nearest[:, 0].sort().values.tolist()]
 
 
-def _select(extracted: Extracted, indices: list[int]) -> Extracted:
-    rows = {n: v[indices] if isinstance(v, Tensor) else [v[i] for i in indices] for n, v in extracted.rows.items()}
-    return Extracted(rows)
+def _without_joints(rows: Rows) -> Rows:
+    return {name: values for name, values in rows.items() if name != "joints"}
+
+
+def _select(rows: Rows, indices: list[int]) -> Rows:
+    return {n: v[indices] if isinstance(v, Tensor) else [v[i] for i in indices] for n, v in rows.items()}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -23,7 +22,6 @@ from evaluators.metrics.samples import TwoSets
 from flame_mdm.batch import length_mask
 from flame_mdm.config import Config
 from flame_mdm.errors import UserError
-from flame_mdm.progress import ProgressBar
 from flame_mdm.representations import Representation
 from flame_mdm.sampling.editing import kept_parts
 from flame_mdm.sampling.request import EditRequest
@@ -53,25 +51,12 @@ class Motions:
         return len(self.ids)
 
 
-@dataclass
-class Extracted:
-    """Metric inputs of N motions."""
+Rows = dict[str, Any]
+"""Metric inputs of N motions: tensors or lists of N entries, by the names in `evaluators.metrics`.
 
-    # tensors or lists of N entries, by the names in `evaluators.metrics`; joints, kept and contacts are lists of the
-    # values of one motion, and missing if no metric needs them
-    rows: dict[str, Any]
-
-    def __len__(self) -> int:
-        return len(self.rows["keys"])
-
-    @property
-    def joints(self) -> list[Tensor]:
-        """(F, J, 3) each."""
-        return self.rows["joints"]
-
-    def without_joints(self) -> Extracted:
-        """Returns the inputs of metrics that do not read these joints."""
-        return Extracted({name: values for name, values in self.rows.items() if name != "joints"})
+"keys" (N,) identify the motions. joints, kept and contacts are lists of the values of one motion, and missing if no
+metric needs them.
+"""
 
 
 @dataclass
@@ -85,8 +70,6 @@ class Evaluator:
     Attributes:
         extractor: computes the features for metrics; None = no features.
         metrics: mappings with the `_target_` of a metric, by name; each replication uses a different seed.
-        representation: of the motions.
-        batch_size: of the extractor.
         skip_features: whether metrics of features have no value, instead of raising for lack of input.
         training: motions that generated ones may be copies of; None = this is not measured.
     """
@@ -99,9 +82,9 @@ class Evaluator:
     training: TrainingMotions | None = None
 
     @torch.no_grad()
-    def extract(self, motions: Motions) -> Extracted:
+    def extract(self, motions: Motions) -> Rows:
         """Runs the feature pass over the same motions in all processes; raises `UserError` if one is not finite."""
-        rows: dict[str, Any] = {"keys": keys_of(motions.ids), **motions.inputs}
+        rows: Rows = {"keys": keys_of(motions.ids), **motions.inputs}
         # Batches of similar lengths need little padding.
         order = np.argsort([len(x) for x in motions.features], kind="stable").tolist()
         batches = [order[begin : begin + self.batch_size] for begin in range(0, len(order), self.batch_size)]
@@ -120,30 +103,27 @@ class Evaluator:
         if contacts is not None:
             rows["contacts"] = [torch.from_numpy(x[:, contacts] > 0.5) for x in motions.features]
         if motions.edit is not None:
-            rows["kept"] = [
-                kept_parts(self.representation, len(motion), EditRequest(**motions.edit))[1] for motion in joints
-            ]
+            edit = EditRequest(**motions.edit)
+            rows["kept"] = [kept_parts(self.representation, len(motion), edit)[1] for motion in joints]
         if self.training is not None and joints:
             rows["nearest"] = self.training.nearest(joints, rows.get("generated"))
-        return Extracted(rows)
+        return rows
 
     def training_motions(self, whole: Motions, windows: Motions) -> TrainingMotions:
         """Returns the training motions to which others are compared: all their frames, and features of windows."""
-        extracted = self.extract(windows)
         facing = self.representation.skeleton.facing
-        joints = replace(self, extractor=None).extract(whole).joints
+        joints = replace(self, extractor=None).extract(whole)["joints"]
         frames = [poses(motion, facing) for motion in joints]
         lengths = torch.tensor([len(motion) for motion in frames])
-        return TrainingMotions(torch.cat(frames), lengths, extracted.rows.get("generated"), facing)
+        return TrainingMotions(torch.cat(frames), lengths, self.extract(windows).get("generated"), facing)
 
     @torch.no_grad()
-    def reference(self) -> Extracted | None:
+    def reference(self) -> Rows | None:
         """Returns features of the extractor's own real motions; None = sets are compared with motions of the data."""
         features = self.extractor.reference() if self.extractor is not None else None
         if features is None:
             return None
-        names = [f"reference {number}" for number in range(len(features))]
-        return Extracted({"generated": features, "keys": keys_of(names)})
+        return {"generated": features, "keys": keys_of([f"reference {number}" for number in range(len(features))])}
 
     def _batch(self, motions: Motions, indices: Sequence[int]) -> tuple[list[Tensor], dict[str, Tensor]]:
         for i in indices:
@@ -169,100 +149,42 @@ class Evaluator:
         return None if text is None else text.float().cpu()
 
     def score(
-        self, generated: Extracted, paired: Extracted, real: Extracted, seed: int
+        self, generated: Rows, paired: Rows, real: Rows, seed: int
     ) -> tuple[dict[str, float | None], dict[str, str]]:
         """Computes all metrics of generated motions and of the real ones paired with them, in the same order.
 
-        Comparisons of sets use `real`, a separate draw, since the distance of a set from itself is 0.
+        Comparisons of sets use `real`, a separate draw, since the distance of a set from itself is 0. Raises
+        `UserError` if the motions lack an input that a metric needs.
 
         Returns:
             The values by name, `metric` or `metric/part`, None if not computable; and by metric, why a value is
             missing. Both are empty in all processes but the first.
-
-        Raises:
-            UserError: If the motions lack an input that a metric needs.
         """
         if not is_first():
             return {}, {}
-        metrics, usable = self._metrics(generated, seed)
-        for begin in range(0, len(generated), CHUNK):
-            _update(usable, generated, paired, slice(begin, begin + CHUNK))
-        if "generated" in real.rows:
-            update_metrics(_two_sets(usable), real=real.rows["generated"], real_keys=real.rows["keys"])
-        return self._values(metrics)
-
-    def resample(
-        self, generated: Extracted, paired: Extracted, real: Extracted, seed: int, resamples: int
-    ) -> dict[str, list[float | None]]:
-        """Computes all metrics of `resamples` sets of motions drawn with replacement, for a bootstrap; see `score`.
-
-        Both sets of comparisons of sets are drawn. The draws are functions of `seed` and the numbers of motions alone,
-        so that those of two models are of the same clips. Returns (resamples,) values by name, like `score`.
-        """
-        if not is_first() or not len(generated) or not resamples:
-            return {}
-        metrics, usable = self._metrics(generated, seed)
-        # Each motion adds a row to a state that is a list, or a summand to a state that is a sum.
-        states = [(name, state) for name, metric in usable.items() for state in metric._reductions]
-        sums: dict[tuple[str, str], list[Tensor]] = {
-            (name, state): [] for name, state in states if isinstance(getattr(usable[name], state), Tensor)
-        }
-        for i in range(len(generated)):
-            before = {(name, state): getattr(usable[name], state).clone() for name, state in sums}
-            _update(usable, generated, paired, slice(i, i + 1))
-            for name, state in sums:
-                sums[name, state].append(getattr(usable[name], state) - before[name, state])
-        added = {state: torch.stack(parts) for state, parts in sums.items()}
-        lists = [(name, state) for name, state in states if (name, state) not in sums and getattr(usable[name], state)]
-        added |= {(name, state): torch.cat(getattr(usable[name], state)) for name, state in lists}
-        generator = np.random.default_rng(key("bootstrap", seed))
-        drawn: list[dict[str, float | None]] = []
-        for _ in ProgressBar(range(resamples), desc="bootstrap", unit=" sets"):
-            own, others = (torch.from_numpy(generator.integers(n, size=n)) for n in (len(generated), len(real)))
-            for (name, state), parts in added.items():
-                taken = torch.arange(len(own)) if state == "keys" else parts[own]  # a repeated motion has its own key
-                setattr(usable[name], state, taken.sum(0) if (name, state) in sums else [taken])
-            for metric in _two_sets(usable).values():
-                for state, rows in (("real", real.rows["generated"][others]), ("real_keys", torch.arange(len(others)))):
-                    setattr(metric, state, [rows])
-            drawn.append(self._values(metrics)[0])
-        return {name: [values[name] for values in drawn] for name in drawn[0]}
-
-    def _metrics(self, generated: Extracted, seed: int) -> tuple[dict[str, Metric], dict[str, Metric]]:
-        """Returns all metrics, and those of them that can be computed."""
         metrics = make_metrics(self.metrics, seed=key("metric", seed) % 2**32)
         for metric in metrics.values():
             metric.distributed_available_fn = bool  # returns False: no synchronization, this process has all motions
-            metric.compute_with_cache = False
-        return metrics, self.check(generated, metrics) if len(generated) else {}
-
-    def _values(self, metrics: Mapping[str, Metric]) -> tuple[dict[str, float | None], dict[str, str]]:
-        """Returns the values of metrics that have been updated, and the reasons for missing ones."""
-        values: dict[str, float | None] = {}
-        reasons: dict[str, str] = {}
-        with warnings.catch_warnings():  # a metric without samples returns None
-            warnings.filterwarnings("ignore", message=".*was called before the ``update`` method.*")
-            for name, metric in metrics.items():
-                try:
-                    result = metric.compute()
-                except UserError as error:
-                    reasons[name] = str(error)
-                    metric.reset()
-                    result = metric.compute()
-                for part, value in result.items() if isinstance(result, dict) else [("", result)]:
-                    if value is not None and not math.isfinite(value):
-                        reasons[name] = f"{type(metric).__name__}: the value is {value}: too few or degenerate samples"
-                        value = None
-                    values[f"{name}/{part}".rstrip("/")] = value
-        return values, reasons
+        count = len(generated["keys"])
+        usable = self.check(generated, metrics) if count else {}
+        sets = {name: metric for name, metric in usable.items() if isinstance(metric, TwoSets)}
+        others = {name: metric for name, metric in usable.items() if name not in sets}
+        for begin in range(0, count, CHUNK):
+            part = slice(begin, begin + CHUNK)
+            if sets:
+                update_metrics(sets, generated=generated["generated"][part], keys=generated["keys"][part])
+            update_metrics(others, **_chunk(generated, paired, part))
+        if "generated" in real:
+            update_metrics(sets, real=real["generated"], real_keys=real["keys"])
+        return _values(metrics)
 
     def reads(self, name: str) -> bool:
         """Returns whether a metric requires an input."""
         return any(name in required_inputs(metric) for metric in make_metrics(self.metrics).values())
 
-    def check(self, motions: Extracted, metrics: Mapping[str, Metric] | None = None) -> dict[str, Metric]:
+    def check(self, motions: Rows, metrics: Mapping[str, Metric] | None = None) -> dict[str, Metric]:
         """Returns the metrics that can be computed, without `skip_features` all; `UserError` if an input is missing."""
-        available = {*motions.rows, "mask", "real_mask", *(PAIRED[name] for name in PAIRED if name in motions.rows)}
+        available = {*motions, "mask", "real_mask", *(PAIRED[name] for name in PAIRED if name in motions)}
         usable = {}
         for name, metric in (make_metrics(self.metrics) if metrics is None else metrics).items():
             needed = ["generated", "keys"] if isinstance(metric, TwoSets) else required_inputs(metric)
@@ -279,19 +201,32 @@ def keys_of(names: Sequence[str]) -> Tensor:
     return torch.tensor([key(name) for name in names], dtype=torch.long)
 
 
-def _two_sets(metrics: Mapping[str, Metric]) -> dict[str, Metric]:
-    return {name: metric for name, metric in metrics.items() if isinstance(metric, TwoSets)}
-
-
-def _update(metrics: Mapping[str, Metric], generated: Extracted, paired: Extracted, part: slice) -> None:
-    rows = {name: values[part] for name, values in generated.rows.items()}
-    sets = _two_sets(metrics)
-    if sets:
-        update_metrics(sets, generated=rows["generated"], keys=rows["keys"])
-    rows |= {real: paired.rows[name][part] for name, real in PAIRED.items() if name in paired.rows}
+def _chunk(generated: Rows, paired: Rows, part: slice) -> Rows:
+    """Returns the inputs of some motions and of the real ones paired with them, padded, with masks."""
+    rows = {name: values[part] for name, values in generated.items()}
+    rows |= {real: paired[name][part] for name, real in PAIRED.items() if name in paired}
     for joints, mask in (("joints", "mask"), ("real_joints", "real_mask")):
         if joints in rows:
             rows[mask] = length_mask(torch.tensor([len(motion) for motion in rows[joints]]))
     for name in {"joints", "real_joints", "kept", "contacts"} & rows.keys():
         rows[name] = pad_sequence(rows[name], batch_first=True)
-    update_metrics({name: metric for name, metric in metrics.items() if name not in sets}, **rows)
+    return rows
+
+
+def _values(metrics: Mapping[str, Metric]) -> tuple[dict[str, float | None], dict[str, str]]:
+    """Returns the values of metrics that have been updated, and the reasons for missing ones."""
+    values: dict[str, float | None] = {}
+    reasons: dict[str, str] = {}
+    for name, metric in metrics.items():
+        try:
+            result = metric.compute()
+        except UserError as error:
+            reasons[name] = str(error)
+            metric.reset()
+            result = metric.compute()
+        for part, value in result.items() if isinstance(result, dict) else [("", result)]:
+            if value is not None and not math.isfinite(value):
+                reasons[name] = f"{type(metric).__name__}: the value is {value}: too few or degenerate samples"
+                value = None
+            values[f"{name}/{part}".rstrip("/")] = value
+    return values, reasons

@@ -12,8 +12,6 @@ from flame_mdm.errors import UserError
 from flame_mdm.sampler_options import SamplerOptions, option, same_option
 from flame_mdm.sampling.request import EditRequest
 
-MIN_RESAMPLES = 100
-
 
 @dataclass(frozen=True, kw_only=True)
 class EvaluationKeys:
@@ -28,7 +26,6 @@ class EvaluationKeys:
     seed: int = option(0, "seed of the noise and of the drawn motions")
     replications: int | None = option(None, "replications and samples: override the protocol; the result says so")
     samples: int | None = option(None, "number of motions")
-    resamples: int = option(0, "sets of motions drawn for 95 % intervals over motions, such as 200")
     multimodality: bool = option(True, "false = skip metrics that need several samples per prompt; the result says so")
     quick: bool = option(False, "two replications of 64 motions, to check that everything works; the result says so")
     force: bool = option(False, "generate even if real motions miss the expected values; the result says so")
@@ -85,7 +82,5 @@ class EvaluationRequest(EvaluationKeys):
             raise UserError("from_samples evaluates all motions of the files. Remove quick, samples and replications")
         if self.split not in ("train", "val", "test"):
             raise UserError(f"unknown split: {self.split}. Choose train, val or test")
-        if self.resamples and self.resamples < MIN_RESAMPLES:
-            raise UserError(f"resamples={self.resamples}: give 0, or {MIN_RESAMPLES} or more for a 95 % interval")
         if self.batch_size is not None and self.batch_size < 1:
             raise UserError(f"batch_size={self.batch_size}: must be at least 1")

@@ -29,20 +29,14 @@ def mean_ci(values: Sequence[float]) -> tuple[float, float]:
     return float(np.mean(values)), float(1.96 * np.std(values) / len(values) ** 0.5)
 
 
-def averages(
-    scores: Sequence[tuple[Mapping[str, float | None], int]],
-    resampled: Mapping[str, list[float | None]] | None = None,
-) -> dict[str, Value | None]:
-    """Returns means over replications, None if one has no value, with the values `resampled` by a bootstrap."""
+def averages(scores: Sequence[tuple[Mapping[str, float | None], int]]) -> dict[str, Value | None]:
+    """Returns means over replications, None if one has no value."""
     table: dict[str, Value | None] = {}
     for name in scores[0][0] if scores else ():
         values = [replication[name] for replication, _ in scores]
         numbers = [value for value in values if value is not None]
         mean, ci = mean_ci(numbers) if len(numbers) == len(values) else (None, None)
-        drawn = (resampled or {}).get(name, [])
-        table[name] = Value(
-            mean=mean, ci=ci, replications=len(values), n=scores[0][1], per_replication=values, resampled=drawn
-        )
+        table[name] = Value(mean=mean, ci=ci, replications=len(values), n=scores[0][1], per_replication=values)
     return table
 
 

@@ -41,10 +41,8 @@ class ClosedSchema(Schema):
 
 
 class Value(Schema):
-    """A metric over replications: mean, half-width of its 95 % interval, number of motions; None if not computable.
-
-    `per_replication` holds the value of each replication, and `resampled` that of each set of a bootstrap over the
-    motions of the first one.
+    """A metric over replications: mean, half-width of its 95 % interval, number of motions, and the value of each
+    replication; None if not computable.
     """
 
     mean: Number | None
@@ -52,7 +50,6 @@ class Value(Schema):
     replications: Int | None
     n: Int | None
     per_replication: list[Number | None] = []
-    resampled: list[Number | None] = []
 
 
 class ProtocolVersion(Schema):

@@ -58,7 +58,7 @@ def scene(tmp_path_factory):
     requested: list[Mapping[str, Any]] = [dict(clip.attributes) for clip in clips]
     found = evaluator.extract(Motions(ids, features, captions, inputs={"requested": requested}))
     other = evaluator.extract(Motions(ids, [x[8:] for x in features]))
-    values, _ = evaluator.score(found, found, other.without_joints(), 0)
+    values, _ = evaluator.score(found, found, other, 0)
     folder = tmp_path_factory.mktemp("cache")
     sets = {
         name: _inputs(evaluator, folder / f"{name}.npz", ids, lambda x=x: x)
@@ -83,7 +83,7 @@ def test_values_without_resampling_are_those_of_an_evaluation(scene):
 def test_retrieval_is_the_mean_over_pools(scene):
     measure, sets, texts, _, extracted = scene
     values = measure(sets[BASE], texts)
-    rows = {name: extracted.rows[name] for name in ("generated", "text", "text_keys", "keys")}
+    rows = {name: extracted[name] for name in ("generated", "text", "text_keys", "keys")}
     for name, metric in (
         ("texts_for_motion", TextsForMotion),
         ("motions_for_text", partial(MotionsForText, normalize=True)),

@@ -17,7 +17,7 @@ import torch
 from support.runs import TINY
 
 from evaluators.evaluation import Evaluation
-from evaluators.evaluator import Evaluator, Extracted, Motions
+from evaluators.evaluator import Evaluator, Motions, Rows
 from evaluators.extractors import MotionCLIPExtractor
 from evaluators.plan import Plan, sampling_options
 from evaluators.protocol import FOLDER, DrawnClip, default_protocol, load_protocol, protocol_config, protocol_names
@@ -38,7 +38,6 @@ from flame_mdm.representations.rot6d import Rot6D
 from flame_mdm.representations.skeleton import find_joints
 from flame_mdm.sampling.request import EditRequest
 from flame_mdm.schemas import Measured, read_result
-from flame_mdm.seeds import key
 
 pytestmark = pytest.mark.slow
 
@@ -242,38 +241,11 @@ def test_a_killed_evaluation_goes_on_to_the_same_result(runs, tmp_path, monkeypa
 def test_other_metrics_need_no_new_motions(runs, full, tmp_path, monkeypatch):
     monkeypatch.setattr(Generator, "_generate", lambda *_: pytest.fail("sampled again"))
     model = full[1].parent / "model" / "checkpoints" / "last.ckpt"
-    words = ["replications=2", "extractor=none", "resamples=100"]
-    result = runs.evaluate(tmp_path / "result.json", *words, model=model)
-    assert {len(value.resampled) for value in result.values.values()} == {0, 100}  # not of multimodality
+    result = runs.evaluate(tmp_path / "result.json", "replications=2", "extractor=none", model=model)
     assert "extractor" in result.not_computed
     of_joints = ("attributes", "foot_skating", "penetration", "floating", "jitter", "static_share")
     for name, value in result.values.items():
         assert value.mean == (full[0].values[name].mean if name.startswith(of_joints) else None), name
-
-
-def again(extracted: Extracted, indices: np.ndarray) -> Extracted:
-    """The motions with these numbers, as if they were different ones."""
-    rows = {
-        name: values[indices] if isinstance(values, torch.Tensor) else [values[i] for i in indices]
-        for name, values in extracted.rows.items()
-    }
-    return Extracted(rows | {"keys": torch.arange(len(indices))})
-
-
-def test_a_bootstrap_measures_each_motion_as_often_as_it_is_drawn(runs):
-    evaluation = runs.evaluation(features=True)
-    metrics = {name: metric for name, metric in evaluation.protocol.metrics.items() if name != "mid"}  # ill-conditioned
-    evaluator = Evaluator(evaluation.extractor, metrics, evaluation.representation)
-    first, second = (evaluation._real(replication)[0] for replication in range(2))
-    drawn = evaluator.resample(first, first, second, 3, 2)
-    generator = np.random.default_rng(key("bootstrap", 3))
-    for number in range(2):
-        own, others = (generator.integers(len(first), size=len(first)) for _ in range(2))
-        values, _ = evaluator.score(again(first, own), again(first, own), again(second, others), 3)
-        assert values.keys() == drawn.keys()
-        for name, value in values.items():
-            assert drawn[name][number] == (None if value is None else pytest.approx(value, rel=1e-5)), name
-    assert drawn["fid"][0] != drawn["fid"][1]
 
 
 def shares(runs: Runs, samples: int, folder: Path | None) -> Any:
@@ -289,7 +261,7 @@ def of_baseline(runs: Runs) -> tuple[Any, int]:
     """The result of a baseline as one of several processes gets it, and the number of feature passes."""
     passes, extract = [], Evaluator.extract
 
-    def counted(self: Evaluator, motions: Motions) -> Extracted:
+    def counted(self: Evaluator, motions: Motions) -> Rows:
         passes.append(len(motions))
         return extract(self, motions)
 
@@ -365,7 +337,7 @@ def test_motions_of_others_are_measured_alike(runs, full, tmp_path):
 def test_every_protocol_can_be_read_and_one_is_the_default_for_condition_and_data():
     representation = HumanML()
     evaluator = Evaluator(None, {}, representation)
-    nothing = Extracted({"keys": torch.zeros(0, dtype=torch.long)})
+    nothing = {"keys": torch.zeros(0, dtype=torch.long)}
     for name in protocol_names():
         protocol = load_protocol(name, representation)
         assert protocol.name == name
@@ -446,7 +418,6 @@ def own(folder: Path, old: str, new: str) -> str:
 
 def test_what_does_not_fit_is_refused(runs, tmp_path):
     for message, keys in (
-        ("resamples=20: give 0, or 100 or more", {"resamples": 20}),
         ("needs a feature extractor", {"extractor": None, "protocol": "text_to_motion"}),
         ("holds a motion generator, not a motion-CLIP", {"extractor": str(runs.model)}),
         ("Did you mean synthetic", {"protocol": "synthetical"}),

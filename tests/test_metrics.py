@@ -23,7 +23,6 @@ from evaluators.metrics.retrieval import TMRRetrieval, whole_set_retrieval
 from evaluators.results import mean_ci
 from flame_mdm.batch import length_mask
 from flame_mdm.errors import UserError
-from flame_mdm.reporting.intervals import percentiles
 from flame_mdm.representations.skeleton import KIT21, SMPL22
 
 FIXTURE = golden("metrics")
@@ -498,24 +497,6 @@ def test_physics_of_simple_motions():
         values = measured(joints)
         assert values["above"] == pytest.approx(above, rel=1e-6)
         assert values["below"] == pytest.approx(below, rel=1e-6)
-
-
-def test_a_bootstrap_of_a_mean_is_the_interval_in_closed_form():
-    generator = np.random.default_rng(0)
-    x = generator.normal(3, 2, 200)
-    drawn = x[generator.integers(200, size=(4000, 200))].mean(1)
-    half = 1.96 * x.std() / 200**0.5
-    low, high = percentiles(drawn, np.asarray(x.mean()))
-    np.testing.assert_allclose([low, high], [x.mean() - half, x.mean() + half], atol=0.05 * half)
-
-
-def test_a_bootstrap_of_a_distance_is_at_its_value():
-    generator, draws = torch.Generator().manual_seed(0), np.random.default_rng(0)
-    real, noise = torch.randn(2, 150, 8, generator=generator, dtype=torch.float64)
-    value = frechet_distance(noise, real).item()
-    drawn = [frechet_distance(noise[draws.integers(150, size=150)], real).item() for _ in range(300)]
-    low, high = percentiles(np.array(drawn), np.asarray(value))
-    assert low < value < high, "sets with repetitions are farther away, which is not the value's error"
 
 
 def test_normalized_features_compare_directions_alone():

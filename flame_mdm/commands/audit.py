@@ -47,13 +47,13 @@ def main(settings: AuditSettings) -> None:
         raise UserError(
             "an audit needs a data set and an extractor. Give data=NAME and extractor=FILE, or extractor=none"
         )
-    if settings.resamples == 0 or (settings.samples or 64) < 8:
-        raise UserError(f"resamples={settings.resamples}, samples={settings.samples}: give 100, and 8 or more")
+    if settings.resamples < 100 or (settings.samples or 64) < 8:
+        raise UserError(f"resamples={settings.resamples}, samples={settings.samples}: give 100, and 8, or more")
     from evaluators.audit import audit as measure
     from evaluators.request import EvaluationRequest
 
     protocol = settings.protocol or ("synthetic" if settings.nodes["data"]["name"] == "synthetic" else "text_to_motion")
     request = EvaluationRequest.of(vars(settings) | settings.nodes | {"baseline": "real", "protocol": protocol})
-    card = measure(request, out / "cache")
+    card = measure(request, out / "cache", settings.resamples)
     write_json(out / f"{card_name(card)}.json", card.model_dump(), indent=None)
     say(*write_card([card], out))

@@ -26,7 +26,7 @@ class CompareSettings(BodySettings):
 
     Compares runs side by side on one page: configuration differences, curves, evaluations and motions for the same
     prompts. If the runs have results of the same protocol, data and extractor, prints the difference of each metric
-    with its 95 % intervals, and whether it is shown.
+    with its 95 % interval, and whether it is shown.
     A run may also be a folder of motion files, for example those of another program.
     """
 
@@ -55,7 +55,7 @@ def _tested(runs: Mapping[str, Run]) -> list[str]:
     for title, columns in grouped(runs).items():
         for heading, rows in tested(columns):
             cells = [[*HEAD], *rows] if rows else []
-            lines += [title, heading, *("{:34}{:>12}{:>26}{:>26}  {}".format(*row) for row in cells), ""]
+            lines += [title, heading, *("{:34}{:>12}{:>26}  {}".format(*row) for row in cells), ""]
     return lines
 
 

@@ -12,7 +12,6 @@ import numpy as np
 
 from flame_mdm.config import flatten
 from flame_mdm.errors import UserError
-from flame_mdm.reporting.intervals import paired_difference, percentiles
 from flame_mdm.reporting.page import filled, number, page, render
 from flame_mdm.reporting.plots import Curve, charts
 from flame_mdm.reporting.report import charted, evaluation_title, last, marks, printed, sampling
@@ -21,6 +20,7 @@ from flame_mdm.schemas import Result, Value
 
 if TYPE_CHECKING:
     from markupsafe import Markup
+    from numpy.typing import ArrayLike
 
     from flame_mdm.formats.motion import Motion
     from flame_mdm.visualize.body import Mesh
@@ -122,19 +122,18 @@ def _player(compared: Sequence[ComparedRun], shown: Sequence[Mapping[Prompt, Mot
     return player_page(scene, "", columns=len(compared), body=body) if scene else ""
 
 
-HEAD = ["", "difference", "95 % over replications", "95 % over motions", ""]  # column titles of differences
+HEAD = ["", "difference", "95 % over replications", ""]  # column titles of differences
 EXPLAINED = (
-    "Differences of motions for the same texts and noise. Over replications: other captions, crops and noise; over "
-    "motions: other test clips (flame-mdm evaluate with resamples=200). Neither covers another training run. A "
-    "difference is shown if no interval contains 0; of 20 metrics that do not differ, one is shown by chance."
+    "Differences of motions for the same texts and noise, over replications: other captions, crops and noise. The "
+    "intervals do not cover another training run. A difference is shown if its interval does not contain 0; of 20 "
+    "metrics that do not differ, one is shown by chance."
 )
 
 
 def differences(first: Result, second: Result) -> list[list[str]] | str:
     """Returns rows for `HEAD`, the differences of all metrics of two results of the same evaluation, or why not.
 
-    The interval over replications is Student's for the paired replications, whose captions, crops and noise differ. The
-    one over motions is a bootstrap over the test clips, from the sets that `flame-mdm evaluate resamples=...` drew.
+    The intervals are Student's for the paired replications, whose captions, crops and noise differ.
     """
     if invalid := [*first.invalid_because, *second.invalid_because]:
         return f"not compared: not valid: {invalid[0]}"
@@ -154,23 +153,25 @@ def _difference(name: str, first: Value | None, second: Value | None) -> list[st
     """Returns a row of cells, second - first; [] if the results have no pairs of values of the metric."""
     if first is None or second is None or first.n != second.n:
         return []
-    if (replicated := _paired(first.per_replication, second.per_replication)) is None:
+    both = list(zip(first.per_replication, second.per_replication, strict=False))
+    pairs = [(a, b) for a, b in both if a is not None and b is not None]
+    if not pairs or len(pairs) < len(both):
         return []
-    drawn = _paired(first.resampled, second.resampled)
-    mean, *over_replications = paired_difference(*replicated)
-    over_motions = [] if drawn is None else [float(x) for x in percentiles(drawn[1] - drawn[0], mean)]
-    intervals = [over_replications if len(replicated[0]) > 1 else [], over_motions]
-    signs = {(low > 0) - (high < 0) for low, high in filter(None, intervals)}
-    shown = "higher" if signs == {1} else "lower" if signs == {-1} else "no difference shown"
-    cells = [f"[{number(x[0])}, {number(x[1])}]" if x else "–" for x in intervals]
-    return [name, number(mean), *cells, shown if any(intervals) else "not tested: one replication"]
+    mean, low, high = paired_difference([a for a, _ in pairs], [b for _, b in pairs])
+    if len(pairs) == 1:
+        return [name, number(mean), "–", "not tested: one replication"]
+    shown = "higher" if low > 0 else "lower" if high < 0 else "no difference shown"
+    return [name, number(mean), f"[{number(low)}, {number(high)}]", shown]
 
 
-def _paired(first: Sequence[float | None], second: Sequence[float | None]) -> np.ndarray | None:
-    """Returns the values (2, N) that both have; None if there are none, or one is missing."""
-    count = min(len(first), len(second))
-    values = np.array([first[:count], second[:count]], np.float64)  # None becomes NaN
-    return values if values.size and not np.isnan(values).any() else None
+def paired_difference(first: ArrayLike, second: ArrayLike) -> tuple[float, float, float]:
+    """Returns the mean of second - first over R pairs, and its 95 % interval by Student's t, which is NaN if R is 1."""
+    from scipy.stats import t
+
+    difference = np.subtract(second, first)
+    count, mean = len(difference), float(difference.mean())
+    half = float(t.ppf(0.975, count - 1) * difference.std(ddof=1) / count**0.5) if count > 1 else float("nan")
+    return mean, mean - half, mean + half
 
 
 def grouped(runs: Mapping[str, Run]) -> dict[str, list[tuple[str, Result]]]:

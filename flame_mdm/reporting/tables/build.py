@@ -97,7 +97,7 @@ def _measured(name: str, part: Config, reported: Config | None, results: Path) -
 
 
 def _letter(facts: dict[str, str], conditions: list[dict[str, str]]) -> str:
-    """Returns the footnote letter of the conditions of a row, which are added to the conditions ones."""
+    """Returns the footnote letter of the conditions of a row, adding new ones to `conditions`."""
     if facts not in conditions:
         conditions.append(facts)
     again, index = divmod(conditions.index(facts), 26)

@@ -45,18 +45,15 @@ def serve(
     """
     import torch
 
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    with socket.socket(family) as listening:
-        listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            listening.bind((host, port))
-            listening.listen()
-        except OSError as error:
-            raise UserError(f"host={host} port={port}: {error.strerror}. Choose another host or port") from error
+    try:
+        listening = socket.create_server((host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET)
+    except OSError as error:
+        raise UserError(f"host={host} port={port}: {error.strerror}. Choose another host or port") from error
+    with listening:
         studio = Studio(sources, device or ("cuda" if torch.cuda.is_available() else "cpu"))
         with tempfile.TemporaryDirectory(prefix="flame_mdm_demo_") as folder:
             os.environ["GRADIO_TEMP_DIR"] = folder
-            app = web_app(studio, device, {host, *hosts})
+            app = web_app(studio, {host, *hosts})
             say(f"http://{f'[{host}]' if ':' in host else host}:{listening.getsockname()[1]}  (Ctrl+C stops the demo)")
             limits: dict[str, Any] = {"limit_concurrency": CONNECTIONS, "timeout_graceful_shutdown": 3}
             Server(uvicorn.Config(app, log_level="warning", ws="none", **limits)).run([listening])
@@ -70,11 +67,10 @@ class Server(uvicorn.Server):
         await super().shutdown(sockets)
 
 
-def web_app(studio: Studio, device: str | None = None, hosts: Collection[str] = ()) -> Guard:
+def web_app(studio: Studio, hosts: Collection[str] = ()) -> Guard:
     """Returns the application: the page at `/`, files at `/motion.bvh?...` with the query string of a link.
 
-    `device` is named in command lines, None = the default; `hosts` are names of this server, besides localhost and
-    numbers.
+    `hosts` are names of this server, besides localhost and numbers.
     """
     app = FastAPI(openapi_url=None)
     writers, waiting = asyncio.Semaphore(WRITERS), 0
@@ -106,7 +102,7 @@ def web_app(studio: Studio, device: str | None = None, hosts: Collection[str] = 
         headers = {"Content-Disposition": f'attachment; filename="{name}"'}
         return Response(content, media_type="application/octet-stream", headers=headers)
 
-    blocks = build_page(studio, device)
+    blocks = build_page(studio)
     blocks.state_session_capacity = SESSIONS
     blocks.has_launched = True  # otherwise gradio does not check which files it may read
     gr.mount_gradio_app(

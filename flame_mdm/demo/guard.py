@@ -60,6 +60,15 @@ class Reset(BaseModel):
     event_id: Id
 
 
+POSTS: dict[str, type[BaseModel]] = {
+    "/gradio_api/cancel": Cancellation,
+    "/gradio_api/reset": Reset,
+    "/gradio_api/queue/join": Call,
+    "/gradio_api/run/predict": Call,
+}
+"""What the page sends with POST."""
+
+
 class Refused(Exception):
     """A request that is not one of this page; with the status and the line of the answer."""
 
@@ -138,22 +147,18 @@ class Guard:
             raise Refused(HTTPStatus.FORBIDDEN, "this request comes from a page of another site")
 
     def _check_content(self, method: str, path: str, body: bytes) -> None:
+        if method in ("GET", "HEAD") and READ.fullmatch(path) and not body:
+            return
+        if method != "POST" or path not in POSTS:
+            raise Refused(HTTPStatus.NOT_FOUND, "this page has nothing at that address")
         try:
-            if method in ("GET", "HEAD") and READ.fullmatch(path) and not body:
-                return
-            if method == "POST" and path == "/gradio_api/cancel":
-                Cancellation.model_validate_json(body)
-            elif method == "POST" and path == "/gradio_api/reset":
-                Reset.model_validate_json(body)
-            elif method == "POST" and path in ("/gradio_api/queue/join", "/gradio_api/run/predict"):
-                call = Call.model_validate_json(body)
-                address, accepts = self.calls.get(call.fn_index, ("", bool))
-                if address != path or not accepts(call.data):
-                    raise Refused(HTTPStatus.BAD_REQUEST, "this is not a request of this page")
-            else:
-                raise Refused(HTTPStatus.NOT_FOUND, "this page has nothing at that address")
+            content = POSTS[path].model_validate_json(body)
         except ValidationError as error:
             raise Refused(HTTPStatus.BAD_REQUEST, "this is not a request of this page") from error
+        if isinstance(content, Call):
+            address, accepts = self.calls.get(content.fn_index, ("", bool))
+            if address != path or not accepts(content.data):
+                raise Refused(HTTPStatus.BAD_REQUEST, "this is not a request of this page")
 
 
 async def _body(receive: Receive) -> bytes:

@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cache
 from html import escape
-from importlib.util import find_spec
 from threading import Event
 from types import SimpleNamespace
 from typing import Any
@@ -28,8 +27,6 @@ from flame_mdm.visualize.render import thumbnail
 QUEUE = 64  # maximum number of waiting requests; further ones are told to come back
 PARTS = ("left_arm", "right_arm", "left_leg", "right_leg", "upper_body", "lower_body")
 RIGGED = (".bvh", ".glb")
-OFF = {} if find_spec("av") else {".mp4": "<span>MP4 is off: it needs the package av (pip install av)</span>"}
-"""Formats that cannot be written here, and why."""
 PROGRAMS = {"Blender": "", "Unreal": "&amp;rig=unreal", "Unity": "&amp;rig=unity", "Mixamo": "&amp;rig=mixamo"}
 """Programs with a button of their own: the .glb file in their skeleton. Other skeletons are under "More"."""
 EXAMPLES = 12
@@ -42,8 +39,8 @@ FOLD = "() => ({ __type__: 'update', open: innerWidth > 760 })"
 SHOW_LINK = "(query) => { history.replaceState(null, '', '?' + query); return location.href }"
 
 
-def build_page(studio: Studio, device: str | None = None) -> gr.Blocks:
-    """Returns the page; command lines name `device`. The server calls its functions `show`, `halt` and `switch`."""
+def build_page(studio: Studio) -> gr.Blocks:
+    """Returns the page. The server calls its functions `show`, `halt` and `switch`."""
     stops: dict[str, Event] = {}
 
     def show(query: str, web: gr.Request, progress: gr.Progress = gr.Progress()) -> dict[Any, Any]:  # noqa: B008
@@ -58,7 +55,7 @@ def build_page(studio: Studio, device: str | None = None) -> gr.Blocks:
             def report(calls: int) -> None:
                 progress((calls, max(total, calls + 1)), "Generating", unit="steps")
 
-            return _result(ui, studio, device, request, studio.motions(request, report, stop))
+            return _result(ui, studio, request, studio.motions(request, report, stop))
         except UserError as error:
             return {ui.notes: _note("error", first_line(error))}
         finally:
@@ -95,7 +92,7 @@ def build_page(studio: Studio, device: str | None = None) -> gr.Blocks:
             ui.new.submit(None, edit, ui.request, js=change, **quick),
             ui.variations.click(None, [ui.query, ui.chosen, ui.again], ui.request, js=vary, **quick),
         ]
-        outputs = [ui.player, ui.notes, ui.query, ui.files, ui.command, ui.python, ui.chosen, ui.text]
+        outputs = [ui.player, ui.notes, ui.query, ui.files, ui.python, ui.chosen, ui.text]
         run: dict[str, Any] = {"show_progress_on": ui.player, "concurrency_limit": 1, "concurrency_id": "model"}
         running = [event.then(show, ui.request, outputs, api_visibility="private", **run) for event in first]
         for event in running:
@@ -161,20 +158,17 @@ def _layout(studio: Studio) -> SimpleNamespace:
         with gr.Row():
             ui.apply = gr.Button("Change")
             ui.variations = gr.Button("Three variations of the whole motion")
-    with gr.Accordion("The same motion by link, command line and Python", open=False, elem_id="same"):
+    with gr.Accordion("The same motion by link and Python", open=False, elem_id="same"):
         ui.link = gr.Textbox(label="Link", interactive=False, buttons=["copy"], elem_id="link")
-        ui.command = gr.Code(label="Command line", language="shell", lines=2, interactive=False, wrap_lines=True)
         ui.python = gr.Code(label="Python", language="python", lines=2, interactive=False, wrap_lines=True)
     ui.request = gr.Textbox(visible="hidden", elem_id="request")
     ui.query = gr.Textbox(visible="hidden", elem_id="query")
     return ui
 
 
-def _result(
-    ui: SimpleNamespace, studio: Studio, device: str | None, request: DemoRequest, motions: Sequence[Motion]
-) -> dict[Any, Any]:
+def _result(ui: SimpleNamespace, studio: Studio, request: DemoRequest, motions: Sequence[Motion]) -> dict[Any, Any]:
     kind = studio.model(request.model).conditioned_on
-    names = [f"Motion {number + 1}" * (len(motions) > 1) for number in range(len(motions))]
+    names = [f"Motion {number + 1}" if len(motions) > 1 else "" for number in range(len(motions))]
     scene = [replace(motion, id=name) for motion, name in zip(motions, names, strict=True)]
     if request.edits:  # next to the motion before the last edit
         *before, last = request.edits
@@ -184,11 +178,11 @@ def _result(
     links = ""
     for number in range(len(motions)):
         address = f"?{query}&amp;motion={number}"
-        files = [(f"motion{extension}{address}", name) for extension, name in FORMATS.items() if extension not in OFF]
+        files = [(f"motion{extension}{address}", name) for extension, name in FORMATS.items()]
         programs = [(f"motion.glb{address}{rig}", name) for name, rig in PROGRAMS.items()]
         rigs = [(f"motion{end}{address}&amp;rig={rig}", f"{rig} {end[1:]}") for rig in presets() for end in RIGGED]
         links += f"<div>{names[number]} For {_links(programs)}</div>"
-        links += f"<div>Files {_links(files)}{''.join(OFF.values())}</div>"
+        links += f"<div>Files {_links(files)}</div>"
         links += f"<details><summary>More</summary><div>{_links(rigs)}</div></details>"
     text = (request.edits[-1].text if request.edits else "") or request.text
     player = escape(player_page(scene, text or "Motion"))
@@ -198,7 +192,6 @@ def _result(
         ui.notes: "".join(_note("warning", line) for line in studio.advice(request)),
         ui.query: request.query(),
         ui.files: links,
-        ui.command: request.command(kind, device),
         ui.python: request.python(kind, studio.device),
         ui.chosen: gr.Radio([(str(k + 1), k) for k in range(len(motions))], value=0, visible=len(motions) > 1),
     }

@@ -1,10 +1,9 @@
-"""Requests of the demo: the link of a motion, and the command lines and the Python program that make the same one.
+"""Requests of the demo: the link of a motion, and the Python program that makes the same one.
 
 They are a `SamplingRequest`, which checks the values, and its edits, within the limits of a public page.
 """
 
 import json
-import shlex
 from collections.abc import Iterable
 from typing import Annotated, Any, Literal
 from urllib.parse import urlencode
@@ -18,7 +17,6 @@ from flame_mdm.sampling.request import path_targets, read_parts
 MAX_TEXT, MAX_SECONDS, MAX_SAMPLES, MAX_STEPS, MAX_EDITS = 300, 30, 4, 1000, 8
 """Limits of a request: characters, seconds, motions, sampling steps, edits."""
 MAX_SEED = 2**31 - 1
-ALL = -1  # as the number of a motion: all motions so far
 PLUS = " + "  # between the names of a model and of its adapter
 MAX_WAY_POINTS, FAR = 16, 20.0  # a path: way points, and meters along x and z
 
@@ -59,7 +57,7 @@ class DemoEdit(BaseModel):
         region_seconds: begin and end of the new part; None = all of the motion.
         joints: body parts to resample; none = all.
         strength: None = from noise; otherwise a variation, as in `flame_mdm.sampling.editing.edit`. One of the entire
-            motion keeps text, parts and path of the request, and repeats the edits since.
+            motion keeps text, parts and path of the request.
     """
 
     model_config = RULES
@@ -123,60 +121,26 @@ class DemoRequest(BaseModel):
 
         first = keywords(self, self.text, seconds=self.seconds, **split, **path)
         steps: list[tuple[int | None, dict[str, Any]]] = [(None, first)]
-        whole = 1  # number of steps up to the last one that makes entire motions
         for part in self.edits:
             region = None if part.region_seconds is None else list(part.region_seconds)
             editing = {"region_seconds": region, "joints": list(part.joints) or None, "strength": part.strength}
             editing = {name: value for name, value in editing.items() if value is not None}
-            if editing.keys() != {"strength"}:
+            if editing.keys() == {"strength"}:
+                steps.append((part.motion, keywords(part, part.text or self.text, **editing, **path)))
+            else:
                 steps.append((part.motion, keywords(part, part.text, **editing)))
-                continue
-            sources = [*(source for source, _ in steps[whole:]), part.motion]
-            source = next(source for source in sources if source != ALL)
-            again = [(ALL, others | {"samples": 1}) for _, others in steps[whole:]]
-            steps[whole:] = [(source, keywords(part, part.text or self.text, **editing, **path)), *again]
-            whole += 1
         if self.cleanup and not self.path:  # cleanup moves the root off the way points, by 0.3 m in one example
             steps[-1][1]["cleanup"] = True
         return steps
 
-    def command(self, kind: str, device: str | None) -> str:
-        """Returns the command lines that write the same motions; `device` if it is not the default."""
-        lines, files, (model, _, adapter) = [], [""], self.model.partition(PLUS)
-        for number, (source, keywords) in enumerate(self.steps(kind)):
-            keys = {{"texts": "text", "actions": "action"}.get(key, key): value for key, value in keywords.items()}
-            keys |= {} if keys.keys() & {"text", "action"} else {"unconditioned": True}
-            keys |= {"adapter": adapter} if adapter else {}
-            keys |= {"device": device} if device else {}
-            if "targets" in keys:
-                lines.append(f"echo {shlex.quote(json.dumps(keys['targets']))} > path.json")
-                keys["targets"] = "path.json"
-            edited = [files[source or 0]] if source != ALL else files
-            files = []
-            for index, file in enumerate(edited, 1):
-                folder = f"edit_{number}" + f"_{index}" * (len(edited) > 1) if number else "motions"
-                words = ["edit", model, f"motion={file}"] if number else ["sample", model]
-                words += [f"{key}={_word(value)}" for key, value in keys.items()]
-                lines.append(shlex.join(["flame-mdm", *words, f"out={folder}"]))
-                # the folder of an edit begins with the original
-                files += [f"{folder}/motion_{k + (number > 0):03d}.npz" for k in range(keys["samples"])]
-        return "\n".join(lines)
-
     def python(self, kind: str, device: str) -> str:
         model, _, adapter = self.model.partition(PLUS)
-        options = f", {device!r}" * (device != "cpu") + f", adapter={adapter!r}" * bool(adapter)
+        options = ("" if device == "cpu" else f", {device!r}") + (f", adapter={adapter!r}" if adapter else "")
         lines = ["import flame_mdm", "", f"model = flame_mdm.load({model!r}{options})"]
         for source, keywords in self.steps(kind):
-            call = {None: "generate(model", ALL: "edit(model, motion"}.get(source, f"edit(model, motions[{source}]")
-            call = f"flame_mdm.{call}" + "".join(f", {key}={value!r}" for key, value in keywords.items()) + ")"
-            lines.append(f"motions = [{call}[0] for motion in motions]" if source == ALL else f"motions = {call}")
+            call = "generate(model" if source is None else f"edit(model, motions[{source}]"
+            lines.append(f"motions = flame_mdm.{call}, {', '.join(f'{k}={v!r}' for k, v in keywords.items())})")
         return "\n".join([*lines, 'motions[0].save("motion.bvh")  # or .glb, .npz, .mp4'])
-
-
-def _word(value: Any) -> str:
-    if isinstance(value, list):
-        return f"[{','.join(map(str, value))}]"
-    return str(value).lower() if isinstance(value, bool) else str(value)
 
 
 def parse_query(pairs: Iterable[tuple[str, str]]) -> DemoRequest:

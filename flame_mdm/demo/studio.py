@@ -10,7 +10,7 @@ from typing import Any
 
 from flame_mdm.checkpoints.loading import find, load
 from flame_mdm.conditions.vocabulary import advice
-from flame_mdm.demo.request import ALL, MAX_SECONDS, PLUS, DemoRequest, checked
+from flame_mdm.demo.request import MAX_SECONDS, PLUS, DemoRequest, checked
 from flame_mdm.errors import UserError, did_you_mean, one_line
 from flame_mdm.formats.cleanup import cleaned
 from flame_mdm.formats.motion import Motion
@@ -83,11 +83,10 @@ class Studio:
                         made = self._made[key]
                     elif source is None:
                         made = generate(model, **arguments)
-                    elif source >= len(motions):
-                        raise UserError(f"motion={source}: there are {len(motions)} motions, numbered from 0")
+                    elif source < len(motions):
+                        made = [*edit(model, motions[source], **arguments)]
                     else:
-                        chosen = motions if source == ALL else [motions[source]]
-                        made = [result for motion in chosen for result in edit(model, motion, **arguments)]
+                        raise UserError(f"motion={source}: there are {len(motions)} motions, numbered from 0")
                     with self._memory:
                         self._made[key] = motions = made
                         self._made.move_to_end(key)

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class ConvertSettings(BodySettings, FileSettings):
-    """usage: flame-mdm convert MOTION OUT [fps=20] [unit=0.01] [up=z] [figure=bones] [rest_pose=true]
+    """usage: flame-mdm convert MOTION OUT [fps=20] [unit=0.01] [up=z] [rest_pose=true]
            flame-mdm convert MOTION OUT rig=mixamo
            flame-mdm convert MOTION OUT character=hero.glb
            flame-mdm convert FOLDER OUT format=glb ...
@@ -35,7 +35,6 @@ class ConvertSettings(BodySettings, FileSettings):
     motion: str = required("a file, or a folder of files; .npy holds joint positions (frames, joints, 3)")
     out: str = required(".bvh, .glb, .npz (layout of AMASS), .json or .npy; .mp4 or .gif to look at")
     format: str | None = option(None, "if MOTION is a folder: ending of the files that are written to the folder OUT")
-    figure: str = option("body", "mesh of .glb: body, or bones for rounded limbs")
     rest_pose: bool = option(False, "true = .bvh begins with a frame of the rest pose, arms out")
     rig: str | None = option(None, "skeleton: mixamo, unreal, unity, rigify, lafan1, soma, cmu, geno or 100style")
     character: str | None = option(
@@ -80,24 +79,17 @@ def _targets(settings: ConvertSettings, folder: Path, out: Path) -> dict[Path, P
 
 
 def _convert(settings: ConvertSettings, path: Path, out: Path, character: Character | None) -> None:
-    from flame_mdm.formats.body import LEG, head_height, leg_length
-    from flame_mdm.formats.layouts import find_skeleton
+    from flame_mdm.formats.layouts import find_skeleton, head_height, leg_length
     from flame_mdm.formats.readers import read
     from flame_mdm.representations.skeleton import SMPL22
     from flame_mdm.visualize.bodies import load_body
 
     body = load_body(settings.body)
-    facts = find_skeleton(path, settings.up)
-    # a BVH file keeps proportions in any unit; the other files are in meters
-    copied = path.suffix.lower() == out.suffix.lower() == ".bvh"
-    motion = read(path, settings.fps, settings.unit, fields=facts, any_size=copied)
+    motion = read(path, settings.fps, settings.unit, fields=find_skeleton(path, settings.up))
     if out.exists() and out.samefile(path):
         raise UserError(f"{out}: the same file as the input, which stays as it is. Choose another name for the output")
     if out.suffix.lower() == ".npz":
         motion.poses = motion.posed()  # other programs expect AMASS's keys
-    say(motion.save(out, settings.figure, settings.rest_pose, settings.rig, character, body))
+    say(motion.save(out, settings.rest_pose, settings.rig, character, body))
     if motion.skeleton.joints[: len(SMPL22)] == SMPL22.joints:
-        leg, head = leg_length(motion.joints), head_height(motion.joints)
-        say(f"legs {leg:.2f} m, head joint at {head:.2f} m")
-        if not LEG[0] <= leg <= LEG[1]:
-            say(f"adults have legs of {LEG[0]:g} to {LEG[1]:g} m: if the unit of {path} is wrong, set unit=...")
+        say(f"legs {leg_length(motion.joints):.2f} m, head joint at {head_height(motion.joints):.2f} m")

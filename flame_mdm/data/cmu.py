@@ -20,9 +20,8 @@ from flame_mdm.data.humanml3d import FPS, HumanML3D, IndexedClip, read_index
 from flame_mdm.data.parallel import in_order
 from flame_mdm.data.t2m import MAX_LENGTH, Cut, Description, cuts
 from flame_mdm.errors import UserError
-from flame_mdm.formats.body import check_feet, check_size, leg_length
 from flame_mdm.formats.bvh import Bvh
-from flame_mdm.formats.layouts import LAYOUTS, find_skeleton, map_bvh, read_tree
+from flame_mdm.formats.layouts import LAYOUTS, check_feet, check_size, find_skeleton, leg_length, map_bvh, read_tree
 from flame_mdm.formats.motion import amass_parameters
 from flame_mdm.formats.poses import solve
 from flame_mdm.representations.skeleton import SMPL22
@@ -373,9 +372,9 @@ def _read(kind: str, task: Task) -> Outcome:
             tree, fields = standardize(read_tree(file, None if _rank(file) else RATES[0]))
             header = tree.fps if _rank(file) else None
             rate, reason = decide_rate(len(tree.frames), header, *evidence)
-            joints, _, layout = map_bvh(file, replace(tree, fps=rate), FPS, fields or find_skeleton(file))
             with naming(file):
-                check_size(leg_length(joints), layout.unit)
+                joints, layout = map_bvh(replace(tree, fps=rate), FPS, fields or find_skeleton(file))
+                check_size(joints, layout.unit)
                 check_feet(joints)
                 if (speed := np.linalg.norm(np.diff(joints[:, 0], axis=0), axis=1).max(initial=0.0) * FPS) > FASTEST:
                     raise UserError(f"the body jumps, it moves at {speed:.0f} m/s: a damaged conversion")

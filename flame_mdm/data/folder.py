@@ -19,8 +19,18 @@ from flame_mdm.data import Clip, MotionSource, Split, hashed_split, name_hash, s
 from flame_mdm.data.parallel import in_order
 from flame_mdm.errors import UserError, printable
 from flame_mdm.formats import ENDINGS, TREES
-from flame_mdm.formats.body import check_feet, check_size, head_height, leg_length
-from flame_mdm.formats.layouts import array_layout, layout_name, map_bvh, read_skeleton, read_tree, skeleton_file
+from flame_mdm.formats.layouts import (
+    array_layout,
+    check_feet,
+    check_size,
+    head_height,
+    layout_name,
+    leg_length,
+    map_bvh,
+    read_skeleton,
+    read_tree,
+    skeleton_file,
+)
 from flame_mdm.formats.readers import read_arrays, smpl_motion
 from flame_mdm.formats.resampling import resample
 from flame_mdm.representations import rotation
@@ -266,7 +276,7 @@ def _read(kind: str, fps: float, path: Path) -> tuple[np.ndarray, Facts]:
         if path.suffix.lower() in TREES:
             file = read_tree(path, fields.get("fps") if path.suffix.lower() == ".amc" else None)
             frames, rate = len(file.frames), file.fps
-            joints, _, layout = map_bvh(path, file, fps, fields)
+            joints, layout = map_bvh(file, fps, fields)
         else:
             data = read_arrays(path)
             rate = data.setdefault("fps", fields.get("fps"))
@@ -277,7 +287,7 @@ def _read(kind: str, fps: float, path: Path) -> tuple[np.ndarray, Facts]:
                 model = {72: "SMPL", 156: "SMPL+H", 165: "SMPL-X"}.get(width, f"{width // 3} joints")
                 facts = Facts(f"AMASS, {model}, {rate:g} fps{where}", frames, frames / rate)
                 return _from_smpl(kind, data, fps), facts
-            layout, names = array_layout(path, data["joints"], fields)
+            layout, names = array_layout(data["joints"], fields)
             frames = len(data["joints"])
             joints = layout.apply(resample(data["joints"].astype(float), rate, fps), names)
         if kind == "smpl":
@@ -285,13 +295,12 @@ def _read(kind: str, fps: float, path: Path) -> tuple[np.ndarray, Facts]:
         if not np.isfinite(joints).all():
             frame = int(np.argmin(np.isfinite(joints).all((1, 2))))
             raise UserError(f"numbers in frame {frame} are not finite")
-        leg = leg_length(joints)
-        check_size(leg, layout.unit, layout.children)
+        check_size(joints, layout.unit, layout.children)
         check_feet(joints)
     trunk = joints[:, SMPL22.joints.index("neck")] - joints[:, 0]
     upright = float((trunk[:, 1] / np.linalg.norm(trunk, axis=1)).mean())
     name = f"{layout_name(layout)}, unit {layout.unit:.4g}, {rate:g} fps{where}"
-    return joints, Facts(name, frames, frames / rate, leg, head_height(joints), upright)
+    return joints, Facts(name, frames, frames / rate, leg_length(joints), head_height(joints), upright)
 
 
 def _from_smpl(kind: str, data: dict[str, Any], fps: float) -> np.ndarray:

@@ -5,14 +5,14 @@ Khronos Group, "glTF 2.0 Specification", https://registry.khronos.org/glTF/specs
 
 import json
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, TypeVar
 
 import numpy as np
 import torch
-from pydantic import BaseModel, ConfigDict, FailFast, Field, FiniteFloat, ValidationError
+from pydantic import BaseModel, ConfigDict, FailFast, Field, ValidationError
 from scipy.spatial.transform import Rotation
 
 from flame_mdm.errors import UserError, first_line
@@ -20,12 +20,8 @@ from flame_mdm.representations import rotation
 from flame_mdm.safe_io import MEBIBYTE, atomic_write, parse_json, regular_file
 
 UNSIGNED_BYTE, UNSIGNED_SHORT, FLOAT = 5121, 5123, 5126
-BYTES = {5120: 1, UNSIGNED_BYTE: 1, 5122: 2, UNSIGNED_SHORT: 2, 5125: 4, FLOAT: 4}
-"""Component type of an accessor -> bytes per number."""
 WHOLE = {5120: 127, UNSIGNED_BYTE: 255, 5122: 32767, UNSIGNED_SHORT: 65535}
 """Component type of a normalized accessor -> the integer that means 1."""
-NUMBERS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
-"""Type of an accessor -> numbers per element."""
 KINDS = {1: "SCALAR", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
 LIMIT, DOCUMENT_LIMIT = 512 * MEBIBYTE, 16 * MEBIBYTE
 """Maximum size of a file that is read, and of its JSON part, which takes many times its size in memory."""
@@ -33,7 +29,7 @@ MAX_NODES, MAX_ITEMS = 4096, 65_536
 """Maximum number of nodes, and of all other items of one list. Characters have some hundreds of nodes."""
 LARGEST = 1e9  # largest coordinate or matrix entry that is read
 
-# The document ---------------------------------------------------------------------------------------------------------
+# The parts of the document that are read; all others are copied as they are -------------------------------------------
 
 Item = TypeVar("Item")
 Index = Annotated[int, Field(ge=0, lt=2**40)]
@@ -72,7 +68,6 @@ class _Node(_Object):
 
 class _Primitive(_Object):
     attributes: dict[str, Index]
-    indices: Index = -1
 
 
 class _Mesh(_Object):
@@ -82,53 +77,27 @@ class _Mesh(_Object):
 class _Skin(_Object):
     joints: Annotated[list[Index], Field(min_length=1, max_length=MAX_NODES)]
     inverseBindMatrices: Index = -1
-    skeleton: Index = -1
 
 
 class _Buffer(_Object):
-    byteLength: Index
-    uri: str | None = None
+    uri: None = None
 
 
 class _View(_Object):
     buffer: Index
     byteOffset: Index = 0
-    byteLength: Index
     byteStride: Index = 0
 
 
 class _Accessor(_Object):
     bufferView: Index = -1
     byteOffset: Index = 0
-    componentType: Literal[5120, 5121, 5122, 5123, 5125, 5126]
-    type: Literal["SCALAR", "VEC2", "VEC3", "VEC4", "MAT2", "MAT3", "MAT4"]
+    componentType: Index
+    type: str
     count: Index
     normalized: bool = False
-    min: Annotated[list[FiniteFloat], Field(max_length=16)] = []
-    max: Annotated[list[FiniteFloat], Field(max_length=16)] = []
-
-
-class _Sampler(_Object):
-    input: Index
-    output: Index
-
-
-class _Target(_Object):
-    node: Index = -1
-
-
-class _Channel(_Object):
-    sampler: Index
-    target: _Target
-
-
-class _Animation(_Object):
-    samplers: Items[_Sampler]
-    channels: Items[_Channel]
-
-
-class _SceneNodes(_Object):
-    nodes: NodeItems[Index] = []
+    min: Annotated[list[Number], Field(max_length=16)] = []
+    max: Annotated[list[Number], Field(max_length=16)] = []
 
 
 class _Asset(_Object):
@@ -137,62 +106,20 @@ class _Asset(_Object):
 
 class _Document(_Object):
     asset: _Asset
-    scene: Index = -1
-    scenes: NodeItems[_SceneNodes] = []
     nodes: NodeItems[_Node] = []
     meshes: NodeItems[_Mesh] = []
     skins: Annotated[list[_Skin], Field(max_length=256), FailFast()] = []
     buffers: NodeItems[_Buffer] = []
     bufferViews: Items[_View] = []
     accessors: Items[_Accessor] = []
-    animations: NodeItems[_Animation] = []
+    animations: NodeItems[dict[str, Any]] = []
 
-    def indices(self) -> Iterator[tuple[str, Sequence[object], int]]:
-        """Yields what each index of the document is for, the list that it points into, and the index."""
-        yield "scene", self.scenes, self.scene
-        for node in self.nodes:
-            yield from (("child", self.nodes, child) for child in node.children)
-            yield from (("mesh of a node", self.meshes, node.mesh), ("skin of a node", self.skins, node.skin))
-        for skin in self.skins:
-            yield from (("joint of a skin", self.nodes, joint) for joint in (*skin.joints, skin.skeleton))
-            yield "inverseBindMatrices", self.accessors, skin.inverseBindMatrices
-        for primitive in (primitive for mesh in self.meshes for primitive in mesh.primitives):
-            used = (*primitive.attributes.values(), primitive.indices)
-            yield from (("accessor of a mesh", self.accessors, accessor) for accessor in used)
-        yield from (("bufferView of an accessor", self.bufferViews, accessor.bufferView) for accessor in self.accessors)
-        yield from (("buffer of a bufferView", self.buffers, view.buffer) for view in self.bufferViews)
-        for animation in self.animations:
-            for sampler in animation.samplers:
-                yield from (("accessor of an animation", self.accessors, k) for k in (sampler.input, sampler.output))
-            for channel in animation.channels:
-                yield "sampler of an animation", animation.samplers, channel.sampler
-                yield "node of an animation", self.nodes, channel.target.node
-        yield from (("node of a scene", self.nodes, node) for scene in self.scenes for node in scene.nodes)
 
-    def check(self, size: int) -> None:
-        """Raises `ValueError` if indices, byte ranges in the binary part of `size` bytes, or rotations do not fit."""
-        for purpose, items, index in self.indices():
-            if index >= len(items):
-                raise ValueError(f"{purpose}: there is no number {index}, only {len(items)} of them")
-        if any(buffer.uri is not None for buffer in self.buffers):
-            raise ValueError("its data are in another file")
-        lengths = [buffer.byteLength for buffer in self.buffers]
-        if lengths and lengths[0] > size:
-            raise ValueError(f"a buffer of {lengths[0]} bytes, but the file has {size}")
-        for number, view in enumerate(self.bufferViews):
-            if view.byteOffset + view.byteLength > lengths[view.buffer]:
-                raise ValueError(f"bufferView {number} is longer than its buffer")
-        for number, accessor in enumerate(self.accessors):
-            width = BYTES[accessor.componentType] * NUMBERS[accessor.type]
-            view = self.bufferViews[accessor.bufferView] if accessor.bufferView >= 0 else None
-            last = (accessor.count - 1) * ((view and view.byteStride) or width)
-            if view and accessor.count and accessor.byteOffset + last + width > view.byteLength:
-                raise ValueError(f"accessor {number} is longer than its bufferView")
-        if any(not np.linalg.norm(node.rotation) > 1e-6 for node in self.nodes):
-            raise ValueError("a node has a rotation of length 0")
-        drawn = [len(self.meshes[node.mesh].primitives) for node in self.nodes if min(node.mesh, node.skin) >= 0]
-        if sum(drawn) > MAX_ITEMS:
-            raise ValueError(f"{sum(drawn):,} parts of meshes with a skin, but at most {MAX_ITEMS:,} are read")
+def _item(items: Sequence[Item], index: int, name: str) -> Item:
+    """Returns an item of a list in the document; raises `ValueError` if there is none."""
+    if not 0 <= index < len(items):
+        raise ValueError(f"{name}: there is no number {index}, only {len(items)} of them")
+    return items[index]
 
 
 def _ordered(nodes: Sequence[_Node]) -> tuple[list[int], dict[int, int]]:
@@ -202,7 +129,7 @@ def _ordered(nodes: Sequence[_Node]) -> tuple[list[int], dict[int, int]]:
         raise ValueError("a node has two parents")
     order = [number for number in range(len(nodes)) if number not in above]
     for number in order:
-        order += nodes[number].children
+        order += _item(nodes, number, "child").children
     if len(order) != len(nodes):
         raise ValueError("a node is its own parent")
     return order, above
@@ -243,9 +170,8 @@ def read(path: Path) -> Glb:
     try:
         document, data = _chunks(content)
         parts = _Document.model_validate(document)
-        parts.check(len(data))
         order, above = _ordered(parts.nodes)
-        rank = {number: k for k, number in enumerate(order)}
+        rank = np.argsort(order).tolist()  # index in the document -> number
         parents = tuple(rank[above[number]] if number in above else -1 for number in order)
         with np.errstate(all="ignore"):
             local = np.array([parts.nodes[number].local() for number in order]).reshape(-1, 4, 4)
@@ -255,12 +181,12 @@ def read(path: Path) -> Glb:
         if not (np.abs(worlds) <= LARGEST).all():
             raise ValueError("numbers are not finite, or too large")
         skins = _skins(parts, data, rank)
-    except ValidationError as error:
-        first = error.errors(include_url=False, include_input=False)[0]
-        reason = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
-        raise UserError(f"{path}: damaged, or not glTF 2.0 in one file: {reason}") from error
     except (ValueError, struct.error) as error:
-        raise UserError(f"{path}: damaged, or not glTF 2.0 in one file: {first_line(error)}") from error
+        reason = first_line(error)
+        if isinstance(error, ValidationError):
+            first = error.errors(include_url=False, include_input=False)[0]
+            reason = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
+        raise UserError(f"{path}: damaged, or not glTF 2.0 in one file: {reason}") from error
     names = tuple(parts.nodes[number].name or f"node {number}" for number in order)
     for name in ("buffers", "bufferViews", "accessors"):
         document.setdefault(name, [])
@@ -283,37 +209,45 @@ def _chunks(content: bytes) -> tuple[Any, bytes]:
     return document, content[28 + size : 28 + size + length]
 
 
-def _skins(parts: _Document, data: bytes, rank: dict[int, int]) -> tuple[Skin, ...]:
-    """Returns the skins, whose bounds and matrices must be usable; `rank` converts indices to numbers of nodes."""
+def _skins(parts: _Document, data: bytes, rank: Sequence[int]) -> tuple[Skin, ...]:
+    """Returns the skins; `rank` converts indices of the document to numbers of nodes."""
     corners: list[list[np.ndarray]] = [[np.zeros((0, 3))] for _ in parts.skins]
     for node in (node for node in parts.nodes if min(node.mesh, node.skin) >= 0):
-        for primitive in parts.meshes[node.mesh].primitives:
-            accessor = parts.accessors[primitive.attributes.get("POSITION", -1)]
-            if "POSITION" not in primitive.attributes or {len(accessor.min), len(accessor.max)} != {3}:
-                raise ValueError("a mesh without positions, or without their bounds")
-            box = np.array([accessor.min, accessor.max], float)
-            if not (np.abs(box) <= LARGEST).all():
-                raise ValueError("bounds of a mesh are too large")
-            box /= WHOLE.get(accessor.componentType, 1) if accessor.normalized else 1
-            ends = [box[[i, j, k], [0, 1, 2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)]
-            corners[node.skin].append(np.stack(ends))
+        own = _item(corners, node.skin, "skin")
+        own += [_corners(parts, primitive) for primitive in _item(parts.meshes, node.mesh, "mesh").primitives]
+        if sum(map(len, corners)) > MAX_ITEMS:
+            raise ValueError(f"more than {MAX_ITEMS:,} parts of meshes with a skin")
     skins = []
     for skin, own in zip(parts.skins, corners, strict=True):
-        binds = np.zeros((0, 4, 4))
-        if skin.inverseBindMatrices >= 0:
-            accessor = parts.accessors[skin.inverseBindMatrices]
-            view = parts.bufferViews[accessor.bufferView] if accessor.bufferView >= 0 else None
-            fits = (accessor.componentType, accessor.type) == (FLOAT, "MAT4") and accessor.count >= len(skin.joints)
-            if view is None or view.buffer or view.byteStride not in (0, 64) or not fits:
-                raise ValueError("inverse bind matrices are not floats, or not one per joint")
-            start = view.byteOffset + accessor.byteOffset
-            values = np.frombuffer(data, "<f4", 16 * len(skin.joints), start)
-            binds = values.reshape(-1, 4, 4).mT.astype(float)
-            usable = (np.abs(binds) <= LARGEST).all() and (np.abs(np.linalg.det(binds)) > 1e-30).all()
-            if not usable:
-                raise ValueError("inverse bind matrices are not finite, or have no inverse")
-        skins.append(Skin([rank[joint] for joint in skin.joints], binds, np.concatenate(own)))
+        joints = [_item(rank, joint, "joint of a skin") for joint in skin.joints]
+        skins.append(Skin(joints, _binds(parts, skin, data), np.concatenate(own)))
     return tuple(skins)
+
+
+def _corners(parts: _Document, primitive: _Primitive) -> np.ndarray:
+    """Returns the corners (8, 3) of the box around a part of a mesh."""
+    accessor = _item(parts.accessors, primitive.attributes.get("POSITION", -1), "POSITION")
+    if {len(accessor.min), len(accessor.max)} != {3}:
+        raise ValueError("a mesh without bounds of its positions")
+    box = np.array([accessor.min, accessor.max], float)
+    box /= WHOLE.get(accessor.componentType, 1) if accessor.normalized else 1
+    return np.array([box[[i, j, k], [0, 1, 2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
+
+
+def _binds(parts: _Document, skin: _Skin, data: bytes) -> np.ndarray:
+    """Returns the inverse bind matrices (K, 4, 4) of a skin, or (0, 4, 4) if it has none."""
+    if skin.inverseBindMatrices < 0:
+        return np.zeros((0, 4, 4))
+    accessor = _item(parts.accessors, skin.inverseBindMatrices, "inverseBindMatrices")
+    view = _item(parts.bufferViews, accessor.bufferView, "bufferView")
+    fits = (accessor.componentType, accessor.type) == (FLOAT, "MAT4") and accessor.count >= len(skin.joints)
+    if view.buffer or view.byteStride not in (0, 64) or not fits:
+        raise ValueError("inverse bind matrices are not floats, or not one per joint")
+    values = np.frombuffer(data, "<f4", 16 * len(skin.joints), view.byteOffset + accessor.byteOffset)
+    binds = values.reshape(-1, 4, 4).mT.astype(float)
+    if not ((np.abs(binds) <= LARGEST).all() and (np.abs(np.linalg.det(binds)) > 1e-30).all()):
+        raise ValueError("inverse bind matrices are not finite, or have no inverse")
+    return binds
 
 
 # Writing --------------------------------------------------------------------------------------------------------------

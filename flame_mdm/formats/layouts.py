@@ -1,11 +1,12 @@
-"""Skeletons of motion files and their mapping to the 22 joints of SMPL; `layouts.yaml` contains the known ones."""
+"""Skeletons of motion files, their mapping to SMPL's joints, and checks of units and maps by the size of the body."""
 
 from __future__ import annotations
 
+import math
 import os
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -25,21 +26,30 @@ UP = {
     "-y": ((1, 0, 0), (0, -1, 0), (0, 0, -1)),
 }
 """The axis that points up -> rows of the rotation that maps it to +y."""
+LEG = (0.6, 1.2)  # shortest and longest leg of an adult, in meters: hip to knee to ankle
+CHILD = 0.25  # shortest leg of a child in meters, at about one year
+USUAL_LEG = 0.83
+FOOT = 0.02  # shortest foot in meters, ankle to toes
+UNITS = {
+    **{"meters": 1.0, "centimeters": 0.01, "millimeters": 0.001, "inches": 0.0254, "feet": 0.3048},
+    **{"the unit of CMU's recordings": 0.0564444},
+}
+"""Units of motion files, in meters."""
 
-Source = str | Mapping[str, float]
+Source = str | Annotated[dict[str, FiniteFloat], Field(min_length=1)]
 """A joint of a file, or weights of several joints whose weighted mean is the position."""
 
 
-@dataclass(frozen=True)
-class Layout:
-    """Mapping from the joints of files to the 22 joints of SMPL, in meters, y up."""
+class Layout(BaseModel):
+    """Mapping from the joints of files to the 22 joints of SMPL, in meters, y up; the keys of `skeleton.yaml`."""
 
-    map: Mapping[str, Source]  # for each of SMPL's joints, the corresponding joint in the files
-    joints: tuple[str, ...] = ()  # names of the joints of arrays, in order; BVH files contain their own
-    unit: float = 1.0  # meters per unit of length in the files
-    up: str = "y"  # the axis that points up
+    model_config = ConfigDict(strict=True, extra="forbid", frozen=True)
+    map: dict[str, Source] = {joint: joint for joint in SMPL22.joints}  # for SMPL's joints, those of the files
+    joints: list[str] = []  # names of the joints of arrays, in order; BVH files contain their own
+    unit: Annotated[FiniteFloat, Field(gt=0)] = 1.0  # meters per unit of length in the files
+    up: Literal["y", "z", "-y"] = "y"  # the axis that points up
+    fps: Annotated[float, Field(ge=RATES[0], le=RATES[1])] | None = None  # of files that do not contain it
     mirrored: bool = False  # the files contain mirrored motion; the sign of x is changed
-    fps: float | None = None  # frames per second, for files that do not contain it
     children: bool = False  # the bodies may be those of children
 
     @property
@@ -50,7 +60,7 @@ class Layout:
     def without_toes(self) -> Layout:
         """Returns the layout of the same skeleton with the end sites of the ankles instead of toes."""
         ends = {f"{side}_foot": f"{next(iter(_shares(self.map[f'{side}_ankle'])))}.end" for side in ("left", "right")}
-        return replace(self, map={**self.map, **ends})
+        return self.model_copy(update={"map": {**self.map, **ends}})
 
     def apply(self, positions: np.ndarray, names: Sequence[str]) -> np.ndarray:
         """Maps joints (F, J, 3) of a file with these names to (F, 22, 3) float32, meters, y up."""
@@ -66,18 +76,17 @@ def _shares(source: Source) -> Mapping[str, float]:
     return {source: 1.0} if isinstance(source, str) else source
 
 
-def _layout(joints: str | Sequence[str] | None = None, rig: str = "", map: Mapping = {}, **fields: Any) -> Layout:
+def _layout(joints: str | Sequence[str] = (), rig: str = "", map: Mapping = {}, **fields: Any) -> Layout:
     """Returns a layout of `layouts.yaml`, which describes the arguments."""
     parts = {key: fields.pop(key) for key in ("sides", "trunk", "arm", "leg") if key in fields}
     skeleton = presets()[rig] if rig else parts
-    same = {joint: joint for joint in SMPL22.joints}
-    sources: dict[str, Source] = dict(joint_names(skeleton) if skeleton else same)
+    sources: dict[str, Source] = dict(joint_names(skeleton)) if skeleton else dict(Layout().map)
     for joint, shares in map.items():
         sides = [("", "")] if joint in SMPL22.joints else zip(("left_", "right_"), skeleton["sides"], strict=True)
         for side, mark in sides:
             sources[side + joint] = {name.replace("*", mark): share for name, share in shares.items()}
-    names = SKELETONS[joints].joints if isinstance(joints, str) else tuple(joints or ())
-    return Layout({joint: sources[joint] for joint in SMPL22.joints}, names, **fields)
+    names = SKELETONS[joints].joints if isinstance(joints, str) else joints
+    return Layout(map={joint: sources[joint] for joint in SMPL22.joints}, joints=list(names), **fields)
 
 
 LAYOUTS: dict[str, Layout] = {
@@ -95,56 +104,42 @@ def read_tree(path: Path, rate: float | None = None) -> bvh.Bvh:
     return file if rate is None else replace(file, fps=rate)
 
 
-def map_bvh(
-    path: Path, file: bvh.Bvh, fps: float | None, fields: Mapping[str, Any]
-) -> tuple[np.ndarray, float, Layout]:
-    """Returns the joints of SMPL in a BVH or AMC file with a known skeleton.
+def map_bvh(file: bvh.Bvh, fps: float | None, fields: Mapping[str, Any]) -> tuple[np.ndarray, Layout]:
+    """Returns the joints of SMPL, (F, 22, 3) float32 in meters, y up, in a file with a known skeleton, and its layout.
 
     Args:
-        path, file: the file, and what `read_tree` read.
+        file: what `read_tree` read.
         fps: target frames per second; None = those of the file. Rotations are interpolated, so bones keep their length.
         fields: fields of `Layout` that override the known ones. Known skeletons whose arrays are in meters are in
             centimeters in BVH files, as written by `flame_mdm.formats`.
-
-    Returns:
-        Joints (F, 22, 3) float32 in meters, y up; frames per second; the layout of the file, with its frame rate.
     """
     ended = file.with_end_joints()
     names = [name.rpartition(":")[2] for name in ended.joints]
     if "map" not in fields:
         names = [re.sub(r"^mixamorig\d*_?", "", name) for name in names]
-    layout = find_layout(path, names, fields)
-    in_meters = layout.unit == 1 and not {"map", "unit"} & set(fields)
-    layout = replace(layout, fps=file.fps, unit=0.01 if in_meters else layout.unit)
-    if any(name in names[len(file.joints) :] for name in layout.used):
+    layout = find_layout(names, fields)
+    if layout.unit == 1 and not {"map", "unit"} & set(fields):
+        layout = layout.model_copy(update={"unit": 0.01})
+    if not layout.used.isdisjoint(names[len(file.joints) :]):
         file = ended
-    names = names[: len(file.joints)]
-    if fps is None:
-        return layout.apply(file.positions(), names), file.fps, layout
-    try:
-        moved = file.resample(fps)
-    except UserError as error:
-        raise UserError(f"{path}: {error}") from error
-    return layout.apply(bvh.forward_kinematics(file.parents, *moved)[0], names), fps, layout
+    positions = file.positions() if fps is None else bvh.forward_kinematics(file.parents, *file.resample(fps))[0]
+    return layout.apply(positions, names[: len(file.joints)]), layout
 
 
-def array_layout(path: Path, joints: np.ndarray, fields: Mapping[str, Any]) -> tuple[Layout, tuple[str, ...]]:
+def array_layout(joints: np.ndarray, fields: Mapping[str, Any]) -> tuple[Layout, Sequence[str]]:
     """Returns layout and joint names of an array (F, J, 3), from `fields` or inferred from their number."""
     if joints.ndim != 3 or joints.shape[2] != 3 or not len(joints):
-        raise UserError(f"{path}: joints of shape {joints.shape}, not (frames, joints, 3)")
+        raise UserError(f"joints of shape {joints.shape}, not (frames, joints, 3)")
     count = joints.shape[1]
-    names = next((layout.joints for layout in LAYOUTS.values() if count == len(layout.joints)), ())
-    if fields.get("joints"):
-        names = tuple(fields["joints"])
-        if len(names) != count:
-            raise UserError(f"{path}: {count} joints, but skeleton.yaml names {len(names)}")
-    elif count in (22, 24, 52):
+    names: Sequence[str] = fields.get("joints", ())
+    if not names and count in (22, 24, 52):
         names = (*SMPL22.joints, *(f"joint{number}" for number in range(len(SMPL22), count)))
-    elif not names and count < len(SMPL22):
-        raise UserError(f"{path}: {count} joints with unknown names; write their names and a map into skeleton.yaml")
     elif not names:
-        raise UserError(f"{path}: {count} joints, not the 22, 24 or 52 of SMPL or 77 of SOMA; write a skeleton.yaml")
-    return find_layout(path, names, fields), names
+        names = next((layout.joints for layout in LAYOUTS.values() if count == len(layout.joints)), ())
+    if len(names) != count:
+        rest = f"but skeleton.yaml names {len(names)}" if names else "not the 22, 24 or 52 of SMPL or 77 of SOMA"
+        raise UserError(f"{count} joints, {rest}: write the names of all joints and a map into skeleton.yaml")
+    return find_layout(names, fields), names
 
 
 def layout_name(layout: Layout) -> str:
@@ -152,39 +147,25 @@ def layout_name(layout: Layout) -> str:
     return next((name for name, own in (LAYOUTS | _TOELESS).items() if own.map is layout.map), "own map")
 
 
-def find_layout(path: Path, names: Sequence[str], fields: Mapping[str, Any]) -> Layout:
+def find_layout(names: Sequence[str], fields: Mapping[str, Any]) -> Layout:
     """Returns the known layout for joints with these names, overridden by `fields`; errors begin with missing ones."""
-    candidates = {"the map": Layout(fields["map"])} if "map" in fields else LAYOUTS | _TOELESS
+    candidates = {"the map": Layout(map=fields["map"])} if "map" in fields else LAYOUTS | _TOELESS
     name, nearest = min(candidates.items(), key=lambda item: len(item[1].used - set(names)))
     if missing := sorted(nearest.used - set(names)):
         lacking = ", ".join(missing)[:500]
+        which = f"unknown skeleton. {name} is the nearest known one; missing: {lacking}"
         if "map" in fields:
             which = f"the map in skeleton.yaml uses joints that the file lacks: {lacking}"
         elif len(missing) > len(SMPL22) / 2:
             which = f"unknown skeleton, like none of {', '.join(LAYOUTS)}"
-        else:
-            which = f"unknown skeleton. {name} is the nearest known one; missing: {lacking}"
         raise UserError(
-            f"{path}: {which}. Map the joints of SMPL in skeleton.yaml (docs/own-data.md) to those of the file: "
+            f"{which}. Map the joints of SMPL in skeleton.yaml (docs/own-data.md) to those of the file: "
             f"{', '.join(names)[:1000]}"
         )
-    return replace(nearest, **fields)
+    return nearest.model_copy(update=dict(fields))
 
 
 # skeleton.yaml --------------------------------------------------------------------------------------------------------
-
-
-class _Fields(BaseModel):
-    """The fields of `Layout` in a skeleton file."""
-
-    model_config = ConfigDict(strict=True, extra="forbid")
-    map: dict[str, str | Annotated[dict[str, FiniteFloat], Field(min_length=1)]] = {}
-    joints: list[str] = []
-    unit: Annotated[FiniteFloat, Field(gt=0)] = 1.0
-    up: Literal["y", "z", "-y"] = "y"
-    fps: Annotated[float, Field(ge=RATES[0], le=RATES[1])] = 1.0
-    mirrored: bool = False
-    children: bool = False
 
 
 def skeleton_file(path: Path) -> Path | None:
@@ -207,23 +188,70 @@ def find_skeleton(path: Path, up: str | None = None) -> dict[str, Any]:
 def read_skeleton(path: Path) -> dict[str, Any]:
     """Reads some fields of `Layout` from a skeleton file; a `UserError` names the file and the key."""
     data = read_yaml(path)
-    allowed = _Fields.model_fields.keys()
-    if not isinstance(data, dict) or not set(data) <= allowed:
-        unknown = ", ".join(map(str, set(data) - allowed)) if isinstance(data, dict) else type(data).__name__
-        raise UserError(f"{path}: unknown key {unknown}; use {', '.join(allowed)}")
+    allowed = ", ".join(Layout.model_fields)
+    if not isinstance(data, dict) or not set(data) <= Layout.model_fields.keys():
+        unknown = ", ".join(map(str, set(data) - Layout.model_fields.keys())) if isinstance(data, dict) else str(data)
+        raise UserError(f"{path}: unknown key {unknown[:100]}; use {allowed}")
     try:
-        fields = _Fields.model_validate(data).model_dump(exclude_unset=True)
+        fields = Layout.model_validate(data).model_dump(exclude_unset=True)
     except ValidationError as error:
-        key = error.errors(include_url=False, include_input=False)[0]["loc"][0]
-        raise UserError(
-            f"{path}: {key}: {str(data[key])[:100]} is not valid. map is a mapping and joints a list of names, unit "
-            f"(meters per unit) a number above 0, fps one from {RATES[0]:g} to {RATES[1]:g}, up one of "
-            f"{', '.join(UP)}, mirrored and children true or false"
-        ) from error
-    if "map" in fields:
-        if missing := sorted(set(SMPL22.joints) - set(fields["map"])):
-            raise UserError(f"{path}: map: no joint given for {', '.join(missing)}")
-        named = {name for source in fields["map"].values() for name in _shares(source)}
-        if "joints" in fields and not named <= set(fields["joints"]):
-            raise UserError(f"{path}: map: {', '.join(sorted(named - set(fields['joints'])))} is not among the joints")
+        first = error.errors(include_url=False, include_input=False)[0]
+        raise UserError(f"{path}: {'.'.join(map(str, first['loc']))}: {first['msg']} (docs/own-data.md)") from error
+    if missing := sorted(set(SMPL22.joints) - set(fields.get("map", SMPL22.joints))):
+        raise UserError(f"{path}: map: no joint given for {', '.join(missing)}")
     return fields
+
+
+# Size and feet --------------------------------------------------------------------------------------------------------
+
+
+def leg_length(joints: np.ndarray) -> float:
+    """Returns the mean length in meters of the left leg, hip to knee to ankle, of joints (F, 22, 3) of SMPL."""
+    return _bone(joints, "left_hip", "left_knee") + _bone(joints, "left_knee", "left_ankle")
+
+
+def head_height(joints: np.ndarray) -> float:
+    """Returns the median height in meters of the head joint above the lowest joint of a frame."""
+    return float(np.median(joints[:, SMPL22.joints.index("head"), 1] - joints[..., 1].min(1)))
+
+
+def check_size(joints: np.ndarray, unit: float, children: bool = False) -> None:
+    """Raises `UserError` if legs are too short or too long; the message says which unit would fit.
+
+    `unit` is that of the file, in meters; `children` accepts their legs, too.
+    """
+    leg, shortest = leg_length(joints), CHILD if children else LEG[0]
+    if shortest <= leg <= LEG[1]:
+        return
+    fitting = {name: u for name, u in UNITS.items() if LEG[0] <= leg / unit * u <= LEG[1]}
+    name = min(fitting, key=lambda name: abs(math.log(leg / unit * fitting[name] / USUAL_LEG)), default=None)
+    right = f"{fitting[name]:.6g}" if name else "..."
+    small = " If these are children, set `children: true`." if not children and CHILD <= leg < LEG[0] else ""
+    raise UserError(
+        f"the legs are {leg:.3g} m long (unit {unit:.6g}), but people's are {shortest:g} to {LEG[1]:g} m.{small} "
+        f"{f'The unit may be {right} ({name})' if name else 'The unit is wrong'}: set `unit: {right}` in skeleton.yaml"
+        f" (unit={right} in convert and edit)"
+    )
+
+
+def check_feet(joints: np.ndarray) -> None:
+    """Raises `UserError` if a foot of SMPL's joints (F, 22, 3) has no length, or the toes point backwards."""
+    at = {name: joints[:, number] for number, name in enumerate(SMPL22.joints)}
+    for side in ("left", "right"):
+        if _bone(joints, f"{side}_ankle", f"{side}_foot") < FOOT:
+            raise UserError(
+                f"the {side} foot has no length: {side}_foot and {side}_ankle are the same point. Map {side}_foot in "
+                "skeleton.yaml to the toes, or to the end site of the ankle, such as LeftAnkle.end"
+            )
+    across, trunk = at["left_hip"] - at["right_hip"], at["neck"] - at["pelvis"]
+    toes = at["left_foot"] + at["right_foot"] - at["left_ankle"] - at["right_ankle"]
+    if np.median((np.cross(across, trunk) * toes).sum(1)) < 0:
+        raise UserError(
+            "the toes point backwards: left and right are swapped, or the axes are mirrored (mirrored: true in "
+            "skeleton.yaml)"
+        )
+
+
+def _bone(joints: np.ndarray, start: str, end: str) -> float:
+    first, last = (joints[:, SMPL22.joints.index(name)] for name in (start, end))
+    return float(np.linalg.norm(first - last, axis=1).mean())

@@ -36,7 +36,6 @@ END_SITES = {
     **{"left_wrist": ADULT[22], "right_wrist": ADULT[23]},
 }
 """Tips of head, toes and hands beyond the last joints, in meters; without them programs do not draw these bones."""
-FIGURES = ("body", "bones")  # meshes of .glb files; the first is the default
 
 
 @dataclass(eq=False, repr=False)
@@ -108,7 +107,6 @@ class Motion:
     def save(
         self,
         path: str | Path,
-        figure: str = "body",
         rest_pose: bool = False,
         rig: str | None = None,
         character: str | Path | Character | None = None,
@@ -122,7 +120,6 @@ class Motion:
 
         Args:
             path: the file; its extension selects the format.
-            figure: the mesh of a `.glb` file: body, or bones for rounded limbs.
             rest_pose: begin a `.bvh` file with a frame of the rest pose, arms out, which some programs expect.
             rig: the skeleton of a `.bvh` or `.glb` file, one of `flame_mdm.formats.retarget.presets`; default: SMPL's.
             character: a `.bvh` or `.glb` file, or what `flame_mdm.formats.characters.read` returned; the same kind of
@@ -140,21 +137,19 @@ class Motion:
         ending = path.suffix.lower()
         if ending not in WRITTEN:
             raise UserError(f"{path}: unknown kind of motion file. Use one of {', '.join(WRITTEN)}")
-        if figure not in FIGURES:
-            raise UserError(f"figure={figure}: unknown. Use {' or '.join(FIGURES)}")
-        if (figure != FIGURES[0] and ending != ".glb") or (rest_pose and ending != ".bvh"):
-            raise UserError(f"{path}: figure is only for .glb files, and rest_pose only for .bvh files")
+        if rest_pose and ending != ".bvh":
+            raise UserError(f"{path}: rest_pose is only for .bvh files")
         if rig is not None and ending not in (".bvh", ".glb"):
             raise UserError(f"{path}: rig is only for .bvh and .glb files, which contain a skeleton")
         if character is not None:
-            if figure != FIGURES[0] or rest_pose or rig is not None:
-                raise UserError(f"{path}: figure, rest_pose and rig do not apply to a character's own file")
+            if rest_pose or rig is not None:
+                raise UserError(f"{path}: rest_pose and rig do not apply to a character's own file")
             character = character if isinstance(character, Character) else characters.read(character)
             what = characters.write(path, character, self, self.text or self.id or "motion")
         elif ending == ".bvh":
             what = _write_bvh(self, path, rest_pose, rig)
         elif ending == ".glb":
-            what = _write_glb(self, path, figure, rig, body)
+            what = _write_glb(self, path, rig, body)
         elif ending == ".npz":
             what = _write_npz(self, path, facts)
         elif ending == ".json":
@@ -259,9 +254,9 @@ def _write_bvh(motion: Motion, path: Path, rest_pose: bool, rig: str | None) -> 
     return f"{unit}, y up; {_error(motion, poses)}" + "; the first frame is the rest pose" * rest_pose
 
 
-def _write_glb(motion: Motion, path: Path, figure: str, rig: str | None, body: Mesh | None) -> str:
+def _write_glb(motion: Motion, path: Path, rig: str | None, body: Mesh | None) -> str:
     poses = motion.posed()
-    fitted, reason = try_fit(motion, body) if figure == FIGURES[0] else (None, "")
+    fitted, reason = try_fit(motion, body)
     skinned.write(path, poses, _rig(poses, rig), motion.fps, motion.text, motion.id, fitted)
     return f"meters, y up; {_error(motion, poses)}" + (reason and f"; without a body: {reason}")
 

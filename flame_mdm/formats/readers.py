@@ -11,8 +11,7 @@ from torch import Tensor
 
 from flame_mdm.errors import UserError
 from flame_mdm.formats import ENDINGS, TREES
-from flame_mdm.formats.body import check_size, leg_length
-from flame_mdm.formats.layouts import array_layout, map_bvh, read_tree
+from flame_mdm.formats.layouts import array_layout, check_size, map_bvh, read_tree
 from flame_mdm.formats.motion import AMASS_AXES, Motion, motion_of_poses
 from flame_mdm.formats.poses import Poses
 from flame_mdm.formats.resampling import check_frames, frame_pairs, frame_rate, resample
@@ -36,7 +35,6 @@ def read(
     unit: float | None = None,
     resample_to: float | None = None,
     fields: Mapping[str, Any] = {},
-    any_size: bool = False,
 ) -> Motion:
     """Reads a motion: `.npz` of this project, of AMASS or with joints and fps, `.bvh`, `.amc`, `.json`, or `.npy`.
 
@@ -49,7 +47,6 @@ def read(
             the sphere. Default: frames are not resampled.
         fields: fields of `Layout` that override those of a known skeleton, as from `find_skeleton`; `fps` and `unit`
             override them in turn. Not for .json and .npz files written by this project, nor for AMASS.
-        any_size: accept bodies of any size in .bvh files and arrays; otherwise their legs must be those of people.
 
     Raises:
         FileNotFoundError: If the file does not exist.
@@ -66,17 +63,14 @@ def read(
     with naming(path):
         rate = None if fps is None else frame_rate(fps)
         if suffix not in TREES:
-            return _of_arrays(path, rate, resample_to, fields, any_size)
-        rate = fields.get("fps") if suffix == ".amc" and rate is None else rate
-        joints, rate, layout = map_bvh(path, read_tree(path, rate), resample_to, fields)
-        if not any_size:
-            check_size(leg_length(joints), layout.unit, layout.children)
-        return Motion(joints, rate, id=path.stem)
+            return _of_arrays(path, rate, resample_to, fields)
+        file = read_tree(path, fields.get("fps") if suffix == ".amc" and rate is None else rate)
+        joints, layout = map_bvh(file, resample_to, fields)
+        check_size(joints, layout.unit, layout.children)
+        return Motion(joints, resample_to or file.fps, id=path.stem)
 
 
-def _of_arrays(
-    path: Path, rate: float | None, resample_to: float | None, fields: Mapping[str, Any], any_size: bool
-) -> Motion:
+def _of_arrays(path: Path, rate: float | None, resample_to: float | None, fields: Mapping[str, Any]) -> Motion:
     """Returns the motion in an .npz, .json or .npy file; the arguments are those of `read`."""
     data = read_arrays(path)
     if "text" in data:  # written by this project
@@ -91,13 +85,13 @@ def _of_arrays(
         poses = _smpl_poses(translation, rotation.quaternion_to_matrix(turns), AMASS_AXES)
         return motion_of_poses(poses, resample_to or data["fps"], text, path.stem)
     if {"joints", "map", "up", "mirrored"} & set(fields) or data["joints"].shape[1:2] in ((52,), (77,)):
-        layout, names = array_layout(path, data["joints"], fields)
+        layout, names = array_layout(data["joints"], fields)
         data = {"fps": data["fps"], "joints": layout.apply(data["joints"].astype(float), names)}
         fields = {"unit": layout.unit, "children": layout.children}
     elif "unit" in fields:
         data["joints"] = data["joints"] * fields["unit"]
-    if fields and not any_size and data["joints"].shape[1:] == (len(SMPL22), 3):
-        check_size(leg_length(data["joints"]), fields.get("unit", 1.0), fields.get("children", False))
+    if fields and data["joints"].shape[1:] == (len(SMPL22), 3):
+        check_size(data["joints"], fields.get("unit", 1.0), fields.get("children", False))
     return _of_joints(path, data, text, resample_to)
 
 
@@ -227,11 +221,6 @@ def _of_joints(path: Path, data: dict[str, Any], text: str, resample_to: float |
 
 def _skeleton(joints: np.ndarray) -> Skeleton:
     """Returns the skeleton of joints (F, J, 3), identified by the number of joints."""
-    if joints.ndim == 2 and joints.shape[1] in (263, 251):
-        raise UserError(
-            f"{joints.shape[1]} features of HumanML3D, not joints; their rotations are not SMPL's and cannot be "
-            "exported: decode joint positions (flame_mdm.representations.humanml) and convert those"
-        )
     for skeleton in SKELETONS.values():
         if joints.ndim == 3 and joints.shape[1:] == (len(skeleton), 3):
             return skeleton

@@ -10,8 +10,7 @@ import torch
 
 from flame_mdm.data.store import Store
 from flame_mdm.errors import UserError, did_you_mean
-from flame_mdm.formats.body import check_size, leg_length
-from flame_mdm.formats.layouts import find_skeleton
+from flame_mdm.formats.layouts import check_size, find_skeleton
 from flame_mdm.formats.motion import Motion
 from flame_mdm.formats.readers import ENDINGS, read
 from flame_mdm.formats.resampling import resample as resample_joints
@@ -87,7 +86,7 @@ def with_features(representation: Representation, motion: Motion) -> Motion:
             longer = np.concatenate([joints, joints[-1:] + [1, 0, 1] * (joints[-1:] - joints[-2:-1])])
             features = representation.encode(torch.from_numpy(longer)).numpy()
         if motion.skeleton.joints[: len(SMPL22)] == SMPL22.joints:
-            check_size(leg_length(joints), 1.0, children=True)
+            check_size(joints, 1.0, children=True)
     except ValueError as error:
         raise UserError(f"{name}{error}") from error
     return _decoded(representation, features, motion.text, motion.id)

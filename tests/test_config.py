@@ -20,8 +20,7 @@ from flame_mdm.checkpoints.loading import NO_GPU
 from flame_mdm.commands.evaluate import EvaluateSettings
 from flame_mdm.commands.inspect import InspectSettings
 from flame_mdm.config import check, compose, compose_data, guarded, instantiate, parameters, recipes, trust
-from flame_mdm.config.command_line import read_settings, run
-from flame_mdm.config.entry import make_variables
+from flame_mdm.config.command_line import make_variables, read_settings, run
 from flame_mdm.config.signatures import check_kind, source_file
 from flame_mdm.errors import UserError
 from flame_mdm.sampler_options import option

@@ -22,8 +22,7 @@ from support.motions import synthetic
 
 from flame_mdm.__main__ import COMMANDS
 from flame_mdm.config import composition, guarded, sweeps
-from flame_mdm.config.command_line import read_settings
-from flame_mdm.config.entry import make_variables
+from flame_mdm.config.command_line import make_variables, read_settings
 
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 OWN = ("mine", "my_", "NAME", "...")
@@ -123,9 +122,9 @@ def resolved_once(monkeypatch):
     """Hydra composes once what several commands name."""
     resolve, known = composition.resolve, {}
 
-    def once(plan: composition.Plan) -> dict[str, Any]:
-        key = repr(plan[:3])
-        known[key] = known.get(key) or resolve(plan)
+    def once(source: composition.ConfigSource, overrides: list[str], base: Any = None) -> dict[str, Any]:
+        key = repr((source, overrides))
+        known[key] = known.get(key) or resolve(source, overrides, base)
         return deepcopy(known[key])
 
     for module in (composition, sweeps):

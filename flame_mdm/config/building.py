@@ -1,16 +1,33 @@
-"""Instantiation of configurations, and validation, reading and writing of configuration files."""
+"""Instantiation of configurations, checks of those from untrusted files, reading and writing of configuration files."""
 
+import ast
 import copy
+import functools
 import importlib
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from omegaconf import OmegaConf
 
-from flame_mdm.config.signatures import Config
+from flame_mdm.config.signatures import Config, check, definition, walk
 from flame_mdm.errors import UserError, first_line
 from flame_mdm.safe_io import read_yaml, write_text
+
+_PACKAGE = Path(__file__).parent.parent
+EXPERIMENTS = _PACKAGE / "experiments" if (_PACKAGE / "experiments").is_dir() else _PACKAGE.parent / "experiments"
+"""Folder of the recipes: inside the installed package, or next to it in a clone."""
+
+MODULES = {
+    "task": ("flame_mdm.task", "flame_mdm.training.distillation"),
+    "denoiser": ("flame_mdm.denoisers",),
+    "process": ("flame_mdm.processes",),
+    "condition": ("flame_mdm.conditions",),
+    "representation": ("flame_mdm.representations",),
+    "data": ("flame_mdm.data",),
+}
+"""Modules whose classes a configuration from a checkpoint may name, by part of the configuration."""
 
 MOST_VALUES, MOST_LEVELS = 1_000_000, 50
 """Limits of a configuration in a file: number of values, and depth of nested mappings and lists."""
@@ -124,3 +141,50 @@ def save(config: Config, path: Path, head: str = "") -> None:
     """Writes the configuration as YAML, atomically, after the comment lines of `head`."""
     comment = "".join(f"# {line}\n" for line in head.splitlines())
     write_text(path, comment + OmegaConf.to_yaml(OmegaConf.create(config)))
+
+
+def trust(config: Config) -> None:
+    """Checks that parts of a configuration from a checkpoint only name classes of their kind, with legal arguments.
+
+    A class is of the kind of a part if it is defined in a module that `MODULES` lists for this part, or named by a file
+    in the folder of `experiments/` for this part. The environment variable FLAME_MDM_TRUST adds packages, separated by
+    commas, of which any part may name anything. Nothing that the configuration names is imported here.
+    """
+    added = [name for name in os.environ.get("FLAME_MDM_TRUST", "").split(",") if name]
+    for where, target in foreign(config).items():
+        package = target.partition(".")[0]
+        if package not in added:
+            raise UserError(
+                f"the checkpoint's configuration names {target} at {where}. Its code is only run if "
+                f"you trust it: set FLAME_MDM_TRUST={package}"
+            )
+    check(config)
+
+
+def foreign(config: Config) -> dict[str, str]:
+    """Returns what parts of a configuration name besides the classes of their kind in this framework: place -> name."""
+    named = [(path, node["_target_"]) for path, node in walk(config) if "_target_" in node]
+    return {
+        ".".join(path): str(target)
+        for path, target in named
+        if not (isinstance(target, str) and _is_of_kind(target, path[0] if path else ""))
+    }
+
+
+def _is_of_kind(target: str, kind: str) -> bool:
+    modules = MODULES.get(kind, ())
+    if modules and target in _shipped(kind):
+        return True
+
+    def is_listed(name: str) -> bool:
+        return any(f"{name}.".startswith(f"{module}.") for module in modules)
+
+    module, _, name = target.rpartition(".")
+    defined = definition(module, name) if is_listed(module) else None
+    return defined is not None and isinstance(defined[1], ast.ClassDef) and is_listed(defined[0])
+
+
+@functools.cache
+def _shipped(kind: str) -> frozenset[str]:
+    nodes = [node for file in (EXPERIMENTS / kind).glob("*.yaml") for _, node in walk(read_yaml(file))]
+    return frozenset(node["_target_"] for node in nodes if "_target_" in node)

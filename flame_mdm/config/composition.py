@@ -14,14 +14,10 @@ from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from flame_mdm.config.building import RUN_DIR, plain
+from flame_mdm.config.building import EXPERIMENTS, RUN_DIR, plain
 from flame_mdm.config.signatures import Config, check, check_same_kinds, parameters, source_file, unknown_key
 from flame_mdm.errors import UserError, did_you_mean, first_line
 from flame_mdm.safe_io import read_yaml
-
-_PACKAGE = Path(__file__).parent.parent
-EXPERIMENTS = _PACKAGE / "experiments" if (_PACKAGE / "experiments").is_dir() else _PACKAGE.parent / "experiments"
-"""Folder of the recipes: inside the installed package, or next to it in a clone."""
 
 LAUNCH = "launch"  # the folder of `experiments/` with launchers, which start jobs on a cluster
 
@@ -47,7 +43,8 @@ def compose(name: str, overrides: Sequence[str] = ()) -> Config:
     `name` is a file in `experiments/` without its suffix, or the path of a recipe or of a saved `config.yaml`. Raises
     `UserError` if an experiment, group, option or key is unknown (with the nearest names), or a value is malformed.
     """
-    config = resolve(plan_composition(find_recipe(name), overrides))
+    source = find_recipe(name)
+    config = resolve(source, *prepare_overrides(source, overrides))
     check(config)
     return config
 
@@ -58,8 +55,8 @@ def compose_data(name: str, overrides: Sequence[str] = (), *, data_root: str = "
     Overrides are such as `representation=smpl` or `data.source.clips=100`; errors as for `compose`. `data_root` is the
     folder of the prepared data sets, and `seed` that of generated data.
     """
-    first = [f"+seed={seed}", quoted(f"+data_root={data_root}")]
-    config = resolve(plan_composition(ConfigSource(EXPERIMENTS, None), [f"+data={name}", *overrides], first))
+    source, first = ConfigSource(EXPERIMENTS, None), [f"+seed={seed}", quoted(f"+data_root={data_root}")]
+    config = resolve(source, *prepare_overrides(source, [f"+data={name}", *overrides], first))
     check(config)
     return {key: config[key] for key in ("data", "representation")}
 
@@ -76,20 +73,13 @@ class ConfigSource(NamedTuple):
     """Name of the recipe."""
 
 
-class Plan(NamedTuple):
-    """Input of Hydra's composition."""
-
-    folder: Path
-    stem: str | None
-    overrides: list[str]
-    base: Config | None = None
-    """The recipe without overrides of single keys. An override must have the type of the value in it."""
-
-
-def plan_composition(recipe: ConfigSource, overrides: Sequence[str], first: Sequence[str] = ()) -> Plan:
+def prepare_overrides(
+    recipe: ConfigSource, overrides: Sequence[str], first: Sequence[str] = ()
+) -> tuple[list[str], Config]:
     """Checks overrides and prepares them for Hydra. Keys that the recipe lacks but a `_target_` accepts get a `++`.
 
-    Overrides in `first` are passed to Hydra unchecked.
+    Overrides in `first` are passed to Hydra unchecked. Also returns the recipe without overrides of single keys, empty
+    if there are no overrides. An override must have the type of the value in it.
     """
     parsed = parse(overrides)
     _check_groups(parsed, recipe)
@@ -97,11 +87,11 @@ def plan_composition(recipe: ConfigSource, overrides: Sequence[str], first: Sequ
     if recipe.experiment:
         first.append(f"experiment={recipe.experiment}")
     if not parsed:
-        return Plan(recipe.folder, recipe.stem, first)  # nothing to compare with the recipe
+        return first, {}  # nothing to compare with the recipe
     parts = [o for o in parsed if _is_group(o)]
-    composed = resolve(Plan(recipe.folder, recipe.stem, [*first, *map(first_choice, parts)]))
+    composed = resolve(recipe, [*first, *map(first_choice, parts)])
     keys = [_legal(composed, o) for o in parsed if not _is_group(o)]
-    return Plan(recipe.folder, recipe.stem, [*first, *(str(o.input_line) for o in parts), *keys], composed)
+    return [*first, *(str(o.input_line) for o in parts), *keys], composed
 
 
 def first_choice(override: Override) -> str:
@@ -185,16 +175,17 @@ def _check_groups(overrides: Sequence[Override], recipe: ConfigSource) -> None:
             raise UserError(f"{override.input_line} needs hydra-submitit-launcher: pip install flame-mdm[slurm]")
 
 
-def resolve(plan: Plan) -> Config:
+def resolve(source: ConfigSource, overrides: list[str], base: Config | None = None) -> Config:
+    """Composes a configuration with prepared overrides; values must have the same type as in `base`."""
     GlobalHydra.instance().clear()
     try:
-        with initialize_config_dir(version_base="1.3", config_dir=str(plan.folder)):
-            composed = hydra_compose(plan.stem, plan.overrides)
+        with initialize_config_dir(version_base="1.3", config_dir=str(source.folder)):
+            composed = hydra_compose(source.stem, overrides)
             resolved = OmegaConf.to_container(composed, resolve=True, throw_on_missing=True)
     except (HydraException, OmegaConfBaseException, ValueError, TypeError, RecursionError) as error:
-        raise UserError(f"{plan.stem or 'data'}: {first_line(error)}") from error
+        raise UserError(f"{source.stem or 'data'}: {first_line(error)}") from error
     config: Config = {str(key): value for key, value in resolved.items()}  # type: ignore[union-attr]
-    check_same_kinds(plan.base or {}, config)
+    check_same_kinds(base or {}, config)
     return config
 
 

@@ -9,6 +9,7 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 
 from flame_mdm.config.building import plain
+from flame_mdm.config.command_line import STOP, guarded, make_variables
 from flame_mdm.config.composition import (
     LAUNCH,
     compose,
@@ -16,12 +17,11 @@ from flame_mdm.config.composition import (
     first_choice,
     groups,
     parse,
-    plan_composition,
+    prepare_overrides,
     quoted,
     recipes,
     resolve,
 )
-from flame_mdm.config.entry import STOP, guarded, make_variables
 from flame_mdm.config.signatures import Config, check
 from flame_mdm.errors import UserError, say
 
@@ -55,11 +55,11 @@ def _serve(command: Callable[[Config], None], words: Sequence[str], codes: list[
     flags = [word for word in words if word.startswith("-")]
     if unknown := [flag for flag in flags if flag not in ("-m", "--multirun")]:
         raise UserError(f"unknown option {unknown[0]}. Available: --help, --multirun, and keys as key=value")
-    plan = plan_composition(recipe, [word for word in words if word not in flags])
-    parsed = parse(plan.overrides)
+    overrides, base = prepare_overrides(recipe, [word for word in words if word not in flags])
+    parsed = parse(overrides)
     launcher = [str(o.value()) for o in parsed if o.key_or_group == LAUNCH]
     sweep = bool(launcher or flags)
-    config = resolve(plan._replace(overrides=[first_choice(o) for o in parsed] if sweep else plan.overrides))
+    config = resolve(recipe, [first_choice(o) for o in parsed] if sweep else overrides, base)
     check(config)
     _check_whole(config, name)
     if "local" in launcher and config["trainer"].get("devices", 1) != 1:
@@ -72,7 +72,7 @@ def _serve(command: Callable[[Config], None], words: Sequence[str], codes: list[
         return codes[-1]
 
     if not sweep:
-        start(config, [word for word in plan.overrides if not word.startswith("hydra.")])
+        start(config, [word for word in overrides if not word.startswith("hydra.")])
         return
 
     def job(_: object) -> None:
@@ -91,9 +91,9 @@ def _serve(command: Callable[[Config], None], words: Sequence[str], codes: list[
     ]
     if launcher:
         say(f"waiting for the jobs; their output is in {config['run']['dir']}/.submitit")
-    sys.argv = [sys.argv[0], "--multirun", *output, *plan.overrides, *QUIET]
+    sys.argv = [sys.argv[0], "--multirun", *output, *overrides, *QUIET]
     GlobalHydra.instance().clear()
-    hydra_main(version_base="1.3", config_path=str(plan.folder), config_name=plan.stem)(job)()
+    hydra_main(version_base="1.3", config_path=str(recipe.folder), config_name=recipe.stem)(job)()
 
 
 POSITIVE = ("val_check_interval", "log_every_n_steps", "accumulate_grad_batches")

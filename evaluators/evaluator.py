@@ -192,7 +192,7 @@ class Evaluator:
             if not missing:
                 usable[name] = metric
             elif not (self.skip_features and FEATURES.intersection(missing)):
-                raise UserError(missing_input(name, metric, missing[0]))
+                raise missing_input(name, metric, missing[0])
         return usable
 
 

@@ -19,19 +19,18 @@ from evaluators.metrics.published_physics import (
     PhysicalFootContact,
     TransitionJerk,
     constraint_errors,
-    kimodo_quality,
     mbench_contact,
     mbench_floating,
-    mbench_quality,
     peak_and_area,
-    physical_foot_contact,
     transition_jerk,
 )
 from evaluators.metrics.retrieval import (
+    TMR_TOP,
     MultiPositiveRPrecision,
     TMRRetrieval,
     batched_retrieval,
     best_ranks,
+    dissimilar,
     multi_positive,
     plain_caption,
     whole_set_retrieval,
@@ -40,11 +39,9 @@ from flame_mdm.representations import rotation
 from flame_mdm.representations.humanml import HumanML
 from flame_mdm.seeds import key
 
-FEET = (7, 10, 8, 11)
 MBENCH, PFC, KIMODO, FLOWMDM, TMR = (
     golden(name) for name in ("mbench_quality", "pfc", "kimodo_metrics", "transition", "tmr_retrieval")
 )
-TOP = (1, 2, 3, 5, 10)
 one = golden_case("kimodo_metrics")
 
 
@@ -78,7 +75,7 @@ def test_mbench_equals_the_authors(case: str):
     if f"aux/{case}/floating_parts" in MBENCH:
         parts = mbench_floating(motion, motion[:, toes], contact)
         np.testing.assert_array_equal(parts, MBENCH[f"aux/{case}/floating_parts"])
-    ours = mbench_quality(motion, toes)
+    ours = MBenchQuality(20.0).measure(motion)
     for name, theirs in MBENCH_NAMES.items():
         expected = float(MBENCH.get(f"f64/{case}/{theirs}", math.nan))  # without a value where the code fails
         assert float(ours[name]) == pytest.approx(expected, rel=1e-8, abs=1e-8, nan_ok=True), name
@@ -94,7 +91,7 @@ def test_mbench_equals_the_authors_in_the_mean(stem: str):
 @pytest.mark.golden
 @pytest.mark.parametrize("case", cases(PFC, "", "pfc"))
 def test_physical_foot_contact_equals_the_authors(case: str):
-    ours = physical_foot_contact(y_up(PFC[f"in/{case}/joints"]), FEET)
+    ours = float(PhysicalFootContact(30.0).measure(y_up(PFC[f"in/{case}/joints"]))["pfc"])
     expected = float(PFC.get(f"f64/{case}/pfc", math.nan))  # their code fails for two frames
     assert ours == pytest.approx(expected, rel=1e-9, nan_ok=True)
 
@@ -115,13 +112,12 @@ def test_kimodos_skating_equals_the_authors(stem: str):
     config = meta(KIMODO)["config"]
     theirs = {name: f"foot_{name}" for name in ("skate_from_height", "skate_ratio", "contact_consistency")}
     theirs |= {"skate_from_contacts": "foot_skate_from_pred_contacts", "skate_max": "foot_skate_max_vel"}
+    metric = KimodoQuality(config["fps"], config["foot_joint_idx"])
     for row, length in enumerate(lengths.tolist()):
-        feet = joints[row, :length, config["foot_joint_idx"]].double()
-        ours = kimodo_quality(feet, contacts[row, :length], config["fps"])
+        ours = metric.measure(joints[row, :length].double(), contacts[row, :length])
         for name, key_ in theirs.items():
             assert float(ours[name]) == pytest.approx(float(KIMODO[f"f64/quality/{key_}"][row]), abs=2e-7), (name, row)
     frames = torch.arange(joints.shape[1]) < lengths[:, None]
-    metric = KimodoQuality(config["fps"], config["foot_joint_idx"])
     metric.update(joints, frames, torch.arange(len(joints)), contacts)
     values = metric.compute()
     for name, key_ in theirs.items():
@@ -165,8 +161,8 @@ def test_kimodos_retrieval_distances_and_angles_equal_the_authors(stem: str):
     text, motion, real = (torch.from_numpy(KIMODO[f"in/tmr/{n}"]).double() for n in ("text", "motion", "gt_motion"))
     same = text @ text.T > 0.96  # their threshold 0.99 is converted to 0.98 of (cosine + 1) / 2
     for group, query, gallery in (("t2m_R", text, motion), ("m2m_R", motion, real), ("t2m_gt_R", text, real)):
-        ours = whole_set_retrieval(query @ gallery.T, TOP, same)
-        for k in TOP:
+        ours = whole_set_retrieval(query @ gallery.T, same)
+        for k in TMR_TOP:
             assert ours[f"t2m_top{k}"] == pytest.approx(float(KIMODO[f"f64/tmr/{group}/R{k:02}"]) / 100, abs=1e-12)
         assert ours["t2m_median"] == float(KIMODO[f"f64/tmr/{group}/MedR"])
     alone = best_ranks(text @ motion.T, torch.eye(len(text), dtype=torch.bool))
@@ -199,7 +195,7 @@ def test_jerk_of_transitions_equals_the_authors(stem: str, kind: str):
 
 def assert_recall(ours: dict, group: str, within: float = 1e-10):
     for way in ("t2m", "m2t"):
-        for k in TOP:
+        for k in TMR_TOP:
             value = ours[f"{way}_top{k}"] * 100
             assert value == pytest.approx(float(TMR[f"{group}/{way}/R{k:02}"]), abs=within)
         assert ours[f"{way}_median"] == float(TMR[f"{group}/{way}/MedR"])
@@ -222,18 +218,21 @@ def test_ranks_equal_tmrs(group: str):
     for way, table in (("t2m", similarity), ("m2t", similarity.T)):
         if f"{group}/ranks_{way}" in TMR:
             np.testing.assert_array_equal(best_ranks(table, correct), TMR[f"{group}/ranks_{way}"])
-    assert_recall(whole_set_retrieval(similarity, TOP, correct), group)
+    assert_recall(whole_set_retrieval(similarity, correct), group)
 
 
 @golden_case("tmr_retrieval")
 def test_retrieval_in_small_batches_and_by_protocol_equals_tmrs(stem: str, monkeypatch):
     similarity, batches = torch.from_numpy(TMR["in/sims"]).double(), torch.from_numpy(TMR["out/guo/batches"])
-    assert_recall(batched_retrieval(similarity, batches, TOP), "out/guo")
+    assert_recall(batched_retrieval(similarity, batches), "out/guo")
 
     ids, chosen = TMR["in/keyids"].tolist(), TMR["in/nsim_idx"]
     vectors = dict(zip(ids, torch.from_numpy(TMR["in/sent_emb"]), strict=True))
     monkeypatch.setattr("evaluators.metrics.retrieval.embedding", lambda encoder, caption: vectors[caption])
-    metric = TMRRetrieval(encoder={"_target_": "stand-in"}, ids=[ids[i] for i in chosen])
+    by_key = sorted(ids, key=key)
+    theirs_chosen = [by_key.index(ids[i]) for i in chosen]
+    monkeypatch.setattr("evaluators.metrics.retrieval.dissimilar", lambda meaning: theirs_chosen)
+    metric = TMRRetrieval(encoder={"_target_": "stand-in"})
     motion, text = (torch.from_numpy(TMR[f"in/{kind}_latent"]) for kind in ("motion", "text"))
     metric.update(motion, text, ids, torch.tensor([key(name) for name in ids]))
     values = metric.compute()
@@ -245,16 +244,13 @@ def test_retrieval_in_small_batches_and_by_protocol_equals_tmrs(stem: str, monke
 
 def test_multi_positive_r_precision_of_an_example_and_dissimilar_captions():
     similarity = torch.tensor([[0.9, 0.8, 0.8, 0.1]])
-    values = multi_positive(similarity, torch.tensor([[True, False, True, False]]), 2)
-    assert values == pytest.approx(
-        {"top1": 1, "top2": 1, "proper": 0.75, "positives": 2, "chance_top1": 0.5, "chance_top2": 5 / 6}
-    )
-    values = multi_positive(similarity, torch.tensor([[False, True, True, False]]), 2)
+    values = multi_positive(similarity, torch.tensor([[True, False, True, False]]))
+    expected = {"top1": 1, "top2": 1, "top3": 1, "proper": 0.75, "positives": 2}
+    assert values == pytest.approx(expected | {"chance_top1": 0.5, "chance_top2": 5 / 6, "chance_top3": 1})
+    values = multi_positive(similarity, torch.tensor([[False, True, True, False]]))
     assert (values["top1"], values["top2"], values["proper"]) == (0, 1, 0.5)
-    metric = TMRRetrieval(subset=2)
     angles = torch.linspace(0, math.pi / 2, 5)
-    assert metric._dissimilar(torch.stack([angles.cos(), angles.sin()], 1)).tolist() == [0, 4]
-    assert not len(metric._dissimilar(torch.zeros(5, 0)))
+    assert dissimilar(torch.stack([angles.cos(), angles.sin()], 1)) == [0, 4]
 
 
 def test_equal_captions_count_as_correct_and_the_classic_value_stays():

@@ -11,7 +11,8 @@ from torch import Tensor, nn
 from torch.distributed.nn.functional import all_gather
 
 from evaluators.extractors.validation import log_validation, update_pairs
-from evaluators.metrics.alignment import MotionsForText, TextAndMotion, TextsForMotion
+from evaluators.metrics.alignment import MotionsForText, TextsForMotion
+from evaluators.metrics.samples import SampleMetric
 from flame_mdm.batch import MotionBatch
 from flame_mdm.checkpoints.released_weights import ENCODER_LAYER, layer_names, load_strictly, renamed, shape_of
 from flame_mdm.conditions import ConditionEncoder
@@ -132,13 +133,14 @@ def _of_all_processes(x: Tensor) -> Tensor:
     return torch.cat(all_gather(x)) if several else x
 
 
-class PooledLoss(TextAndMotion):
+class PooledLoss(SampleMetric):
     """InfoNCE in pools of 32, formed by key and thus independent of batch size and number of processes.
 
     The pairs of an incomplete last pool are compared with the last 32 pairs; fewer than 32 pairs form one smaller pool.
     """
 
     higher_is_better = False
+    states = ("generated", "text")
 
     def update(self, generated: Tensor, text: Tensor, keys: Tensor, scale: Tensor) -> None:
         """Adds features of motions and texts, (B, E) of length 1, with keys (B,), and the inverse temperature ()."""

@@ -10,7 +10,8 @@ from torchmetrics import MeanMetric
 
 from evaluators.extractors.t2m import UNIT, LearnedWords, T2MEvaluator, WordVectors
 from evaluators.extractors.validation import log_validation, update_pairs
-from evaluators.metrics.alignment import MotionsForText, MultimodalDistance, TextAndMotion
+from evaluators.metrics.alignment import MotionsForText, MultimodalDistance
+from evaluators.metrics.samples import SampleMetric
 from flame_mdm.batch import MotionBatch
 from flame_mdm.conditions import Unconditional
 from flame_mdm.conditions.vocabulary import words as words_of
@@ -78,10 +79,11 @@ def matching_loss(motion: Tensor, text: Tensor, margin: float, fits: Tensor | No
     return (near.square() + (margin - far).clamp(min=0).square() * wrong.any(1)).mean()
 
 
-class MatchingLoss(TextAndMotion):
+class MatchingLoss(SampleMetric):
     """`matching_loss` over all pairs in the order of their keys, independent of batches and number of processes."""
 
     higher_is_better = False
+    states = ("generated", "text")
 
     def __init__(self, margin: float):
         super().__init__()

@@ -45,17 +45,11 @@ if TYPE_CHECKING:
 
 
 def make_metrics(configs: Mapping[str, Config], **options: Any) -> dict[str, Metric]:
-    """Creates metrics from mappings with a `_target_`, by name; `options` are further arguments, where they are legal.
-
-    Raises:
-        UserError: If a mapping has no `_target_`.
-    """
+    """Creates metrics from mappings with a `_target_`, by name; `options` are passed to those that take them."""
     metrics = {}
     for name, config in configs.items():
-        if not isinstance(config, Mapping) or "_target_" not in config:
-            raise UserError(f"metric {name}: no _target_. Name the class of the metric")
-        legal = parameters(config["_target_"])
-        metrics[name] = instantiate(config, **{option: options[option] for option in options if option in legal})
+        legal = parameters(config["_target_"]) if "_target_" in config else ()
+        metrics[name] = instantiate(config, **{option: value for option, value in options.items() if option in legal})
     return metrics
 
 
@@ -68,7 +62,6 @@ def inputs_of(metric: Metric) -> dict[str, bool]:
 
 
 def required_inputs(metric: Metric) -> list[str]:
-    """Returns the names of the inputs that `update` requires."""
     return [name for name, is_required in inputs_of(metric).items() if is_required]
 
 
@@ -77,13 +70,12 @@ def update_metrics(metrics: Mapping[str, Metric], **features: Any) -> None:
     for name, metric in metrics.items():
         missing = [needed for needed in required_inputs(metric) if needed not in features]
         if missing:
-            raise UserError(missing_input(name, metric, missing[0]))
+            raise missing_input(name, metric, missing[0])
         metric.update(**{name: features[name] for name in inputs_of(metric) if name in features})
 
 
-def missing_input(name: str, metric: Metric, needed: str) -> str:
-    """Returns the error message for a metric that lacks an input."""
-    return (
+def missing_input(name: str, metric: Metric, needed: str) -> UserError:
+    return UserError(
         f"metric {name} ({type(metric).__name__}): missing input: {needed}. Remove the metric from the protocol, or "
         "choose data, an extractor or a protocol with this input"
     )

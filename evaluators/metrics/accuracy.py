@@ -3,7 +3,6 @@
 from torch import Tensor
 
 from evaluators.metrics.samples import Share
-from flame_mdm.errors import UserError
 
 
 class ActionAccuracy(Share):
@@ -12,8 +11,7 @@ class ActionAccuracy(Share):
     higher_is_better = True
 
     def update(self, logits: Tensor, labels: Tensor) -> None:
-        """Raises `UserError` if scores contain NaN or infinity."""
         if not logits.isfinite().all():
-            raise UserError("ActionAccuracy: class scores are not finite. Look for motions that are not finite")
+            raise self.error("class scores are not finite. Look for motions that are not finite")
         self.hits += (logits.argmax(1) == labels).sum()
         self.total += len(labels)

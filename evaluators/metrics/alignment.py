@@ -7,6 +7,8 @@ from torch import Tensor
 
 from evaluators.metrics.samples import SampleMetric
 
+TOP = (1, 2, 3)  # k of R-precision
+
 
 def retrieval_ranks(queries: Tensor, candidates: Tensor, pools: Tensor, own: Tensor) -> Tensor:
     """Returns (N,) how many candidates are closer than the correct one, or equally close and earlier in the pool.
@@ -16,6 +18,7 @@ def retrieval_ranks(queries: Tensor, candidates: Tensor, pools: Tensor, own: Ten
         pools: (N, P) indices of the candidates of each query.
         own: (N,) position of the correct candidate in each pool.
     """
+    pools, own = pools.to(queries.device), own.to(queries.device)
     ranks = []
     for query, pool, right in zip(queries.split(16), pools.split(16), own.split(16), strict=True):
         distance = torch.linalg.vector_norm(query[:, None] - candidates[pool], dim=-1)
@@ -26,26 +29,21 @@ def retrieval_ranks(queries: Tensor, candidates: Tensor, pools: Tensor, own: Ten
 
 
 class RPrecision(SampleMetric):
-    """R-precision: the fraction of queries with fewer than k candidates before the correct one, `top1`, `top2`, ...
-
-    Args:
-        pool: candidates in a pool, including the correct one.
-        top: largest k.
-    """
+    """R-precision: the fraction of queries with fewer than k candidates before the correct one in a pool of `pool`."""
 
     higher_is_better = True
     states = ("generated", "text", "text_keys")
+    names = tuple(f"top{k}" for k in TOP)
 
-    def __init__(self, pool: int = 32, top: int = 3, seed: int = 0):
+    def __init__(self, pool: int = 32, seed: int = 0):
         super().__init__()
         self.pool, self.seed = pool, seed
-        self.names = [f"top{k}" for k in range(1, top + 1)]
 
     def value(self, generated: Tensor, text: Tensor, text_keys: Tensor) -> dict[str, float | None]:
-        ranks = self.ranks(generated, text, text_keys, np.random.default_rng(self.seed))
-        return {name: int((ranks < k).sum()) / len(ranks) for k, name in enumerate(self.names, 1)}
+        ranks = self.ranks(generated, text, text_keys)
+        return {f"top{k}": int((ranks < k).sum()) / len(ranks) for k in TOP}
 
-    def ranks(self, generated: Tensor, text: Tensor, text_keys: Tensor, generator: np.random.Generator) -> Tensor:
+    def ranks(self, generated: Tensor, text: Tensor, text_keys: Tensor) -> Tensor:
         """Returns the rank (N,) of the correct candidate for each query, 0 = first."""
         raise NotImplementedError
 
@@ -59,7 +57,8 @@ class TextsForMotion(RPrecision):
     have 32 texts. The own text is at a random position, so that an extractor that cannot tell texts apart gets k / 32.
     """
 
-    def ranks(self, generated: Tensor, text: Tensor, text_keys: Tensor, generator: np.random.Generator) -> Tensor:
+    def ranks(self, generated: Tensor, text: Tensor, text_keys: Tensor) -> Tensor:
+        generator = np.random.default_rng(self.seed)
         _, first, own = np.unique(text_keys.cpu().numpy(), return_index=True, return_inverse=True)
         self.need(len(first), self.pool, "different captions")
         others = self.pool - 1
@@ -68,8 +67,7 @@ class TextsForMotion(RPrecision):
         position = generator.integers(self.pool, size=len(own))
         rows = np.arange(len(own))
         pools[rows, others], pools[rows, position] = pools[rows, position], own
-        texts = text[torch.from_numpy(first).to(text.device)]
-        return retrieval_ranks(generated, texts, _tensor(pools, text), _tensor(position, text))
+        return retrieval_ranks(generated, text[first], torch.from_numpy(pools), torch.from_numpy(position))
 
 
 class MotionsForText(RPrecision):
@@ -82,52 +80,38 @@ class MotionsForText(RPrecision):
     number). Here, pools are drawn at random, and the texts of an incomplete last pool rank the last 32 motions, so that
     every text counts once.
 
-    Args:
-        normalize: whether to scale features to length 1 first, which ranks by cosine. An extractor trained with
-            cosines, such as motion-CLIP, does not constrain lengths; the motions with the shortest features would be
-            nearest to every text.
+    `normalize` scales features to length 1 first, which ranks by cosine. An extractor trained with cosines, such as
+    motion-CLIP, does not constrain lengths; the motions with the shortest features would be nearest to every text.
     """
 
-    def __init__(self, pool: int = 32, top: int = 3, seed: int = 0, normalize: bool = False):
-        super().__init__(pool, top, seed)
+    def __init__(self, pool: int = 32, seed: int = 0, normalize: bool = False):
+        super().__init__(pool, seed)
         self.normalize = normalize
 
-    def ranks(self, generated: Tensor, text: Tensor, text_keys: Tensor, generator: np.random.Generator) -> Tensor:
-        count = len(generated)
+    def ranks(self, generated: Tensor, text: Tensor, text_keys: Tensor) -> Tensor:
+        self.need(len(generated), self.pool, "motions")
         if self.normalize:
             generated, text = F.normalize(generated, dim=-1), F.normalize(text, dim=-1)
-        self.need(count, self.pool, "motions")
-        order, pools, position = (_tensor(indices, text) for indices in own_pools(count, self.pool, generator))
+        order, pools, position = own_pools(len(generated), self.pool, self.seed)
         return retrieval_ranks(text[order], generated, pools, position)
 
 
-def own_pools(count: int, pool: int, seed: int | np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def own_pools(count: int, pool: int, seed: int) -> tuple[Tensor, Tensor, Tensor]:
     """Returns samples in random order (N,), the pool of each (N, P) for `MotionsForText`, and its place there (N,)."""
-    order = np.random.default_rng(seed).permutation(count)
-    start = np.minimum(np.arange(count) // pool * pool, count - pool)
-    return order, order[start[:, None] + np.arange(pool)], np.arange(count) - start
+    order = torch.from_numpy(np.random.default_rng(seed).permutation(count))
+    start = (torch.arange(count) // pool * pool).clamp(max=count - pool)
+    return order, order[start[:, None] + torch.arange(pool)], torch.arange(count) - start
 
 
-def _tensor(indices: np.ndarray, like: Tensor) -> Tensor:
-    return torch.from_numpy(indices).to(like.device)
-
-
-class TextAndMotion(SampleMetric):
-    """A metric of pairs of motion and text."""
-
-    states = ("generated", "text")
-
-
-class MultimodalDistance(TextAndMotion):
+class MultimodalDistance(SampleMetric):
     """MM-Dist, "matching score" in the code of Guo et al. 2022: mean Euclidean distance of motions and their texts.
 
-    MFM, eq. 10. The authors' code computes distances in float32 and drops an incomplete last batch.
-
-    Args:
-        normalize: whether to scale features to length 1 first, as for `MotionsForText`; the value is then in [0, 2].
+    MFM, eq. 10. The authors' code computes distances in float32 and drops an incomplete last batch. `normalize` is as
+    for `MotionsForText`; the value is then in [0, 2].
     """
 
     higher_is_better = False
+    states = ("generated", "text")
 
     def __init__(self, normalize: bool = False):
         super().__init__()
@@ -139,10 +123,11 @@ class MultimodalDistance(TextAndMotion):
         return torch.linalg.vector_norm(generated - text, dim=-1).mean().item()
 
 
-class MotionCLIPScore(TextAndMotion):
+class MotionCLIPScore(SampleMetric):
     """mCLIP score of FLAME ("Evaluation Metrics"): mean cosine of the features of motions and texts, in [-1, 1]."""
 
     higher_is_better = True
+    states = ("generated", "text")
 
     def value(self, generated: Tensor, text: Tensor) -> float:
         return F.cosine_similarity(generated, text).mean().item()
@@ -164,7 +149,6 @@ def pointwise_mutual_information(
     Args:
         real, text: (N, E) features of real motions, and (N, T) of their texts.
         generated, requested: (M, E) features of generated motions, and (M, T) of the texts they were generated for.
-        eps: added to the diagonal of covariances before they are inverted.
     """
     both, fake = torch.cat([real, text], 1), torch.cat([generated, requested], 1)
     value = real.new_zeros(len(generated))
@@ -182,10 +166,8 @@ class MutualInformationDivergence(SampleMetric):
     """MID, in nats: mean `pointwise_mutual_information` of generated motions, their texts and the real motions.
 
     It needs the real motion of each generated one, and more samples than motion and text have features together. With
-    fewer, the joint covariance is singular and the value arbitrary (the authors' code requires half as many).
-
-    Args:
-        eps: added to the diagonal of covariances before they are inverted. 5e-4 in FLAME, 0 in the authors' release.
+    fewer, the joint covariance is singular and the value arbitrary (the authors' code requires half as many). `eps` is
+    5e-4 in FLAME, 0 in the authors' release.
     """
 
     higher_is_better = True

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 from torch import Tensor
 
-from evaluators.metrics.samples import Share
+from evaluators.metrics.samples import Share, Timed
 
 PELVIS, NECK, HEAD = 0, 12, 15
 HIPS, ANKLES, TOES, COLLARS = (1, 2), (7, 8), (10, 11), (13, 14)
@@ -237,25 +237,14 @@ def right_attributes(seen: Mapping[str, Any], requested: Mapping[str, Any]) -> d
     return right | {"action_and_side": right["action"] and right.get("side", True), "all": all(right.values())}
 
 
-class AttributeAccuracy(Share):
+class AttributeAccuracy(Timed, Share):
     """Fraction of motions that show the requested value, by attribute; see `right_attributes`."""
 
     higher_is_better = True
     names = (*ATTRIBUTES, "action_and_side", "all")
 
-    def __init__(self, fps: float):
-        super().__init__()
-        self.fps = fps
-
     def update(self, joints: Tensor, mask: Tensor, requested: Sequence[Mapping[str, str | int | float]]) -> None:
-        """Raises `ValueError` unless there is one request per motion, with an action and no unknown attribute."""
-        if len(requested) != len(joints):
-            raise ValueError(f"attributes: {len(joints)} motions but {len(requested)} sets of requested attributes")
         for motion, real, attributes in zip(joints.detach().cpu(), mask.cpu(), requested, strict=True):
-            if set(attributes) - set(ATTRIBUTES) or "action" not in attributes:
-                raise ValueError(
-                    f"attributes: {dict(attributes)} requested. Give an action, and only keys of {ATTRIBUTES}"
-                )
             self.count(right_attributes(read_attributes(motion[real].numpy(), self.fps), attributes))
 
 
@@ -276,7 +265,7 @@ def read_side(joints: np.ndarray, content: str, fps: float) -> str:
     return "left" if toward > 0 else "right"
 
 
-class SideAccuracy(Share):
+class SideAccuracy(Timed, Share):
     """Share of motions that show the requested side, left or right, on the Bandai set; see `read_side`.
 
     `hand` is about gestures, `path` about turns and sideways walks, `hand_or_path` about both; chance is 0.5.
@@ -284,10 +273,6 @@ class SideAccuracy(Share):
 
     higher_is_better = True
     names = ("hand", "path", "hand_or_path")
-
-    def __init__(self, fps: float):
-        super().__init__()
-        self.fps = fps
 
     def update(self, joints: Tensor, mask: Tensor, sides: Sequence[tuple[str, str]]) -> None:
         """Adds motions; those requested with another side than left and right are ignored."""

@@ -6,6 +6,8 @@ from torch import Tensor
 
 from evaluators.metrics.samples import TwoSets
 
+NEIGHBORS = 3  # of a sample of `PrecisionRecall`, as in MoDi and MDM
+
 
 def frechet_distance(a: Tensor, b: Tensor) -> Tensor:
     """Computes the Fréchet distance of normal distributions fitted to the rows of a (N, E) and b (M, E), float64.
@@ -30,8 +32,8 @@ class FrechetMotionDistance(TwoSets):
     higher_is_better = False
 
     def value(self, generated: Tensor, real: Tensor) -> float:
-        for name, features in (("generated", generated), ("real", real)):
-            self.need(len(features), 2, f"{name} motions")
+        self.need(len(generated), 2, "generated motions")
+        self.need(len(real), 2, "real motions")
         return max(frechet_distance(generated, real).item(), 0.0)  # rounding may give a value slightly below 0
 
 
@@ -51,8 +53,7 @@ class KernelMotionDistance(TwoSets):
     """Kernel distance of motion features, "KID" (Bińkowski et al. 2018): mean `polynomial_mmd2` of random subsets.
 
     Args:
-        subsets: number of subsets.
-        subset_size: samples per subset, from either set.
+        subsets, subset_size: number of subsets, and samples per subset from either set.
         replace: whether to draw with replacement, as the code of MoDi and MDM does if there are more real motions than
             `subset_size`. Samples that are drawn twice then increase the value.
     """
@@ -76,13 +77,13 @@ class KernelMotionDistance(TwoSets):
         return {"mean": mmd2.mean().item(), "std": mmd2.std(unbiased=False).item()}
 
 
-def manifold_coverage(points: Tensor, samples: Tensor, neighbors: int) -> Tensor:
+def manifold_coverage(points: Tensor, samples: Tensor) -> Tensor:
     """Returns the fraction of points (M, E) within the manifold of samples (N, E).
 
-    A point is within the manifold if it is no farther from a sample than the sample's k-th nearest neighbor
+    A point is within the manifold if it is no farther from a sample than the sample's third-nearest neighbor
     (Kynkäänniemi et al. 2019, eq. 1 and 2). A sample is not a neighbor of itself.
     """
-    reach = _squared_distances(samples, samples).kthvalue(neighbors + 1, dim=1).values
+    reach = _squared_distances(samples, samples).kthvalue(NEIGHBORS + 1, dim=1).values
     return (_squared_distances(points, samples) <= reach).any(1).double().mean()
 
 
@@ -97,23 +98,14 @@ class PrecisionRecall(TwoSets):
     motions within that of the generated ones (see `manifold_coverage`). Since neighbor distances shrink with the number
     of samples, both sets are cut to the size of the smaller one, in the order of the keys; the authors' code cuts in
     the order of the files.
-
-    Args:
-        neighbors: k, 3 in MoDi and MDM.
     """
 
     higher_is_better = True
     names = ("precision", "recall")
 
-    def __init__(self, neighbors: int = 3):
-        super().__init__()
-        self.neighbors = neighbors
-
     def value(self, generated: Tensor, real: Tensor) -> dict[str, float | None]:
         size = min(len(generated), len(real))
-        self.need(size, self.neighbors + 1, "motions in the smaller set")
+        self.need(size, NEIGHBORS + 1, "motions in the smaller set")
         generated, real = generated[:size], real[:size]
-        return {
-            "precision": manifold_coverage(generated, real, self.neighbors).item(),
-            "recall": manifold_coverage(real, generated, self.neighbors).item(),
-        }
+        precision, recall = manifold_coverage(generated, real), manifold_coverage(real, generated)
+        return {"precision": precision.item(), "recall": recall.item()}

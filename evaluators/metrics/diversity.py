@@ -4,13 +4,19 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from evaluators.metrics.samples import SampleMetric, real_frames
-from flame_mdm.errors import UserError
+from evaluators.metrics.samples import SampleMetric
 
 
 def pair_distance(a: Tensor, b: Tensor) -> float:
     """Returns the mean Euclidean distance of features a (..., E) and b (..., E)."""
     return torch.linalg.vector_norm(a - b, dim=-1).mean().item()
+
+
+def _random_pairs(count: int, pairs: int, replace: bool, seed: int) -> tuple[Tensor, Tensor]:
+    """Draws both sides (pairs,) of pairs of `count` motions, each with or without replacement."""
+    generator = np.random.default_rng(seed)
+    first, second = (torch.from_numpy(generator.choice(count, pairs, replace=replace)) for _ in range(2))
+    return first, second
 
 
 class Diversity(SampleMetric):
@@ -19,10 +25,6 @@ class Diversity(SampleMetric):
     Published values use 300 pairs, drawn as two sets without replacement, for text-to-motion, and 200 pairs with
     replacement for action-to-motion and unconstrained synthesis. In both cases, a motion may be paired with itself,
     which counts as 0.
-
-    Args:
-        pairs: number of pairs.
-        replace: whether a motion may be drawn twice for the same side.
     """
 
     higher_is_better = None
@@ -34,30 +36,11 @@ class Diversity(SampleMetric):
 
     def value(self, features: Tensor) -> float:
         self.need(len(features), 2 if self.replace else self.pairs, f"motions for {self.pairs} pairs")
-        generator = np.random.default_rng(self.seed)
-        first, second = (
-            torch.from_numpy(generator.choice(len(features), self.pairs, replace=self.replace)).to(features.device)
-            for _ in range(2)
-        )
+        first, second = _random_pairs(len(features), self.pairs, self.replace, self.seed)
         return pair_distance(features[first], features[second])
 
 
-class PromptMultimodality(SampleMetric):
-    """Multimodality of several motions per prompt, the same number for each prompt."""
-
-    higher_is_better = None
-    states = ("generated", "groups")
-    samples: int  # motions per prompt
-
-    def value(self, features: Tensor, groups: Tensor) -> float:
-        return self.distance(features[self.by_group(groups, self.samples)])
-
-    def distance(self, features: Tensor) -> float:
-        """Returns the mean distance within features (C, S, E) of S motions of each of C prompts."""
-        raise NotImplementedError
-
-
-class TextMultimodality(PromptMultimodality):
+class TextMultimodality(SampleMetric):
     """Multimodality of Guo et al. 2022 (MDM, B.2; MFM, eq. 12): 10 random pairs out of 30 motions per text.
 
     As in their code, two sets of 10 are drawn without replacement from the 30, with the same indices for all texts; a
@@ -65,39 +48,38 @@ class TextMultimodality(PromptMultimodality):
     batches, that is 128 texts.
 
     Args:
-        samples: motions per text.
-        pairs: pairs per text.
+        samples, pairs: motions and pairs per text.
     """
+
+    higher_is_better = None
+    states = ("generated", "groups")
 
     def __init__(self, samples: int = 30, pairs: int = 10, seed: int = 0):
         super().__init__()
         self.samples, self.pairs, self.seed = samples, pairs, seed
 
-    def distance(self, features: Tensor) -> float:
-        generator = np.random.default_rng(self.seed)
-        first, second = (
-            torch.from_numpy(generator.choice(self.samples, self.pairs, replace=False)).to(features.device)
-            for _ in range(2)
-        )
+    def value(self, features: Tensor, groups: Tensor) -> float:
+        features = features[self.by_group(groups, self.samples)]
+        first, second = _random_pairs(self.samples, self.pairs, False, self.seed)
         return pair_distance(features[:, first], features[:, second])
 
 
-class PairedMultimodality(PromptMultimodality):
+class PairedMultimodality(SampleMetric):
     """Multimodality of FLAME (eq. 19): two sets of 10 motions per text, compared one by one.
 
     FLAME published no code for it. Its Table 3 has 10 motions per text, but eq. 19 uses two sets of 10. This is the
-    latter, with 20 motions per text.
-
-    Args:
-        samples: motions in each of the two sets.
+    latter, with 20 motions per text: `samples` motions in each of the two sets.
     """
+
+    higher_is_better = None
+    states = ("generated", "groups")
 
     def __init__(self, samples: int = 10):
         super().__init__()
-        self.samples = 2 * samples
+        self.samples = samples
 
-    def distance(self, features: Tensor) -> float:
-        first, second = features.chunk(2, dim=1)
+    def value(self, features: Tensor, groups: Tensor) -> float:
+        first, second = features[self.by_group(groups, 2 * self.samples)].chunk(2, dim=1)
         return pair_distance(first, second)
 
 
@@ -107,9 +89,6 @@ class ActionMultimodality(SampleMetric):
     As in the authors' code, a motion may be drawn repeatedly and be paired with itself. The authors divide the sum by
     the number of all classes, including those without motions; here, it is divided by the number of classes that have
     motions.
-
-    Args:
-        pairs: pairs per class.
     """
 
     higher_is_better = None
@@ -137,10 +116,7 @@ class JointVariance(SampleMetric):
     FLAME (Table 3) averages "the variance of joints for the 10 generated motions" and says that eq. 18, a variance over
     the frames of one motion, is used; it published no code. Here, the variance over the motions of a text (n - 1 in the
     denominator) is computed for each frame and joint, summed over x, y and z, and averaged over joints, frames and
-    texts. It is not comparable with FLAME's numbers. The motions of a text must have the same length.
-
-    Args:
-        samples: motions per text.
+    texts. It is not comparable with FLAME's numbers. The `samples` motions of a text must have the same length.
     """
 
     higher_is_better = None
@@ -153,18 +129,15 @@ class JointVariance(SampleMetric):
         self.add_state("motions", [], dist_reduce_fx="cat")
 
     def update(self, joints: Tensor, mask: Tensor, groups: Tensor, keys: Tensor) -> None:
-        self.motions += real_frames("JointVariance", joints, mask)
-        self.keep(keys=keys, groups=groups)
+        self.motions += self.real_frames(joints, mask)
+        super().update(keys=keys, groups=groups)
 
     def value(self, groups: Tensor) -> float:
-        motions = [self.motions[index] for index in self.order("keys").tolist()]
-        values = []
-        for members in self.by_group(groups, self.samples).tolist():
-            lengths = {len(motions[index]) for index in members}
+        order, values = self.order("keys"), []
+        for members in self.by_group(groups, self.samples):
+            motions = [self.motions[index].double() for index in order[members].tolist()]
+            lengths = {len(motion) for motion in motions}
             if len(lengths) > 1:
-                raise UserError(
-                    f"JointVariance: motions of one text have {sorted(lengths)} frames. Generate them at one length"
-                )
-            joints = torch.stack([motions[index] for index in members]).double()
-            values.append(joints.var(0).sum(-1).mean())
+                raise self.error(f"motions of one text have {sorted(lengths)} frames. Generate them at one length")
+            values.append(torch.stack(motions).var(0).sum(-1).mean())
         return torch.stack(values).mean().item()

@@ -1,16 +1,18 @@
 """Physical plausibility: foot skating, floor contact, jitter and static motions."""
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
-from evaluators.metrics.samples import SampleMetric, Share, real_frames
+from evaluators.metrics.samples import SampleMetric, Share, Timed
 from flame_mdm.formats.faults import LIMITS, LOW
 
 TOLERANCE = 0.005  # distance from the floor, in meters, that counts as 0
 STANDING = 0.03  # speed in meters per second below which a motion counts as static
 
 
-class FootSkating(Share):
+class FootSkating(Timed, Share):
     """Foot skating ratio: fraction of frame transitions in which a foot that touches the floor slides.
 
     A toe joint touches the floor if it is below 5 cm in two adjacent frames, and slides if it moves more than 2.5 cm
@@ -19,25 +21,22 @@ class FootSkating(Share):
     released with the paper: that code also requires this speed in the mean of five frames, which the paper does not;
     and it averages the ratios of the motions, while here every frame transition has the same weight.
 
-    Args:
-        toes: indices of the toe joints; the default is for the 22 SMPL joints.
+    The default `toes` are those of the 22 SMPL joints.
     """
 
     higher_is_better = False
 
-    def __init__(self, fps: float, toes: tuple[int, ...] = (10, 11)):
-        super().__init__()
-        self.fps, self.toes = fps, list(toes)
+    def __init__(self, fps: float, toes: Sequence[int] = (10, 11)):
+        super().__init__(fps)
+        self.toes = list(toes)
 
     def update(self, joints: Tensor, mask: Tensor) -> None:
-        real_frames("FootSkating", joints, mask)
-        toes = joints[:, :, self.toes].double()
-        moved = (toes[:, 1:, :, [0, 2]] - toes[:, :-1, :, [0, 2]]).norm(dim=-1)
-        low = toes[..., 1] < LOW
-        slides = (low[:, 1:] & low[:, :-1] & (moved * self.fps > LIMITS["skating"][0])).any(-1)
-        real = mask[:, 1:] & mask[:, :-1]
-        self.hits += (slides & real).sum()
-        self.total += real.sum()
+        for motion in self.real_frames(joints, mask):
+            toes = motion[:, self.toes].double()
+            fast = toes[..., [0, 2]].diff(dim=0).norm(dim=-1) * self.fps > LIMITS["skating"][0]
+            low = toes[..., 1] < LOW
+            self.hits += (low[1:] & low[:-1] & fast).any(1).sum()
+            self.total += len(fast)
 
 
 class MeanOverFrames(SampleMetric):
@@ -47,11 +46,10 @@ class MeanOverFrames(SampleMetric):
     states = ("total", "frames")
 
     def update(self, joints: Tensor, mask: Tensor, keys: Tensor) -> None:
-        motions = real_frames(type(self).__name__, joints, mask)
-        values = [self.frame_values(motion.double()) for motion in motions]
+        values = [self.frame_values(motion.double()) for motion in self.real_frames(joints, mask)]
         if values:
             total = torch.stack([v.sum() for v in values])
-            self.keep(keys=keys, total=total[:, None], frames=total.new_tensor([[len(v)] for v in values]))
+            super().update(keys=keys, total=total[:, None], frames=total.new_tensor([[len(v)] for v in values]))
 
     def value(self, total: Tensor, frames: Tensor) -> float | None:
         return (total.sum() / frames.sum()).item() if frames.sum() else None
@@ -61,53 +59,39 @@ class MeanOverFrames(SampleMetric):
         raise NotImplementedError
 
 
-class DistanceFromFloor(MeanOverFrames):
-    """Mean distance of the lowest joint from the floor, y = 0, in meters, on one side of it."""
+class Penetration(MeanOverFrames):
+    """Mean depth of the lowest joint below the floor, y = 0, in meters; depths up to 5 mm count as 0.
 
-    side: int
+    Yuan et al. 2023 (PhysDiff) measure the lowest vertex of a mesh instead.
+    """
+
+    side = -1  # of the floor
 
     def frame_values(self, motion: Tensor) -> Tensor:
         distance = self.side * motion[..., 1].amin(1)
         return torch.where(distance > TOLERANCE, distance, 0.0)
 
 
-class Penetration(DistanceFromFloor):
-    """Mean depth of the lowest joint below the floor, y = 0, in meters.
+class Floating(Penetration):
+    """Mean height of the lowest joint above the floor, as for `Penetration`.
 
-    Yuan et al. 2023 (PhysDiff) measure the lowest vertex of a mesh instead. In both cases, depths up to 5 mm count as
-    0.
-    """
-
-    side = -1
-
-
-class Floating(DistanceFromFloor):
-    """Mean height of the lowest joint above the floor, y = 0, in meters.
-
-    Jumps count as floating, too: compare with the value of real motions. Yuan et al. 2023 (PhysDiff) measure the lowest
-    vertex of a mesh instead. In both cases, heights up to 5 mm count as 0.
+    Jumps count as floating, too: compare with the value of real motions.
     """
 
     side = 1
 
 
-class Jitter(MeanOverFrames):
-    """Mean jerk of the joints, the third derivative of their positions, in m/s^3.
+class Jitter(Timed, MeanOverFrames):
+    """Mean jerk of the joints, the third difference of their positions, in m/s^3, as in Yi et al. 2022 (PIP).
 
-    Computed by third differences, as in Yi et al. 2022 (PIP). It grows with the frame rate: compare only values for
-    equal frame rates.
+    It grows with the frame rate: compare only values for equal frame rates.
     """
 
-    def __init__(self, fps: float):
-        super().__init__()
-        self.fps = fps
-
     def frame_values(self, motion: Tensor) -> Tensor:
-        """Returns the jerk of every four consecutive frames, averaged over joints."""
         return motion.diff(n=3, dim=0).norm(dim=-1).mean(1) * self.fps**3
 
 
-class StaticShare(Share):
+class StaticShare(Timed, Share):
     """Fraction of motions that hardly move: less than 3 cm/s on average over joints and frames.
 
     A generator that stands still has many static motions, but so do real data sets with standing people: compare with
@@ -116,12 +100,8 @@ class StaticShare(Share):
 
     higher_is_better = False
 
-    def __init__(self, fps: float):
-        super().__init__()
-        self.fps = fps
-
     def update(self, joints: Tensor, mask: Tensor) -> None:
-        for motion in real_frames("StaticShare", joints, mask):
+        for motion in self.real_frames(joints, mask):
             moved = motion.double().diff(dim=0).norm(dim=-1)
             if len(moved):
                 self.hits += (moved.mean() * self.fps < STANDING).long()

@@ -11,12 +11,13 @@ import torch
 from scipy.signal import find_peaks
 from torch import Tensor
 
-from evaluators.metrics.samples import SampleMetric, real_frames
-from flame_mdm.errors import UserError
+from evaluators.metrics.samples import SampleMetric
 
-PFC_FPS = 30
+FEET = (7, 10, 8, 11)  # left ankle or heel, left toe, right ankle or heel and right toe of the 22 SMPL joints
 JERK_OF_REAL_MOTIONS: dict[float, float] = {20: 0.033031363, 30: 0.016383045}
 """Mean jerk of FlowMDM by frame rate: of HumanML3D at 20 frames per second, and of BABEL at 30."""
+
+Values = Mapping[str, Tensor | float]
 
 
 class MeanOverMotions(SampleMetric):
@@ -31,30 +32,34 @@ class MeanOverMotions(SampleMetric):
     DIRECTIONS: Mapping[str, bool | None] = {}  # values for which higher is better (True), or neither (None)
     required_fps: float | None = None  # the only frame rate at which the values are defined; None = any
 
-    def __init__(self, fps: float = 0):
+    def __init__(self, fps: float, feet: Sequence[int] = FEET):
         super().__init__()
-        self.fps, self.names = fps, (*self.NAMES, "measured")
+        self.fps, self.feet, self.names = fps, list(feet), (*self.NAMES, "measured")
 
-    def keep_values(self, keys: Tensor, motions: Sequence[Mapping[str, Tensor | float]]) -> None:
-        """Adds the values of motions by name; NaN = undefined."""
+    def update(self, joints: Tensor, mask: Tensor, keys: Tensor) -> None:
+        self.keep_values(keys, [self.measure(motion) for motion in self.real_frames(joints, mask)])
+
+    def measure(self, motion: Tensor) -> Values:
+        """Computes the values of a motion (F, J, 3); NaN = undefined."""
+        raise NotImplementedError
+
+    def keep_values(self, keys: Tensor, motions: Sequence[Values]) -> None:
+        """Adds the values of motions; NaN = undefined."""
         if motions:
             values = torch.tensor([[float(m[name]) for name in self.NAMES] for m in motions], dtype=torch.float64)
-            self.keep(keys=keys, values=values.nan_to_num(), defined=~values.isnan())
+            super().update(keys=keys, values=values.nan_to_num(), defined=~values.isnan())
 
     def value(self, values: Tensor, defined: Tensor) -> dict[str, float | None]:
         """Returns the mean of each value, and `measured`; raises `UserError` at any but the required frame rate."""
         if self.required_fps and self.fps != self.required_fps:
-            raise UserError(
-                f"{type(self).__name__}: defined at {self.required_fps:g} frames per second, but the motions have "
-                f"{self.fps:g}"
-            )
+            raise self.error(f"defined at {self.required_fps:g} frames per second, but the motions have {self.fps:g}")
         sums = zip(values.sum(0).tolist(), defined.sum(0).tolist(), strict=True)
         means = [total / count if count else None for total, count in sums]
         return dict(zip(self.names, (*means, defined.all(1).double().mean().item()), strict=True))
 
 
 class MBenchQuality(MeanOverMotions):
-    """Motion quality of MBench (ViMoGen, bf891de), in meters per frame at 20 frames per second.
+    """Motion quality of MBench (ViMoGen, bf891de), in meters per frame, only at 20 frames per second.
 
     `jitter_degree`: mean length of the second difference of joint positions, plus the same relative to the root;
     `dynamic_degree`: the same of the first difference, higher = more motion; `ground_penetration`: mean depth of the
@@ -63,11 +68,7 @@ class MBenchQuality(MeanOverMotions):
     in contact if it moves less than 1 cm per frame or is lower than 2 cm, so a foot held still in the air is, too.
 
     The code takes z as height. Its published pipeline passes motions in which y is height; here, the height is that
-    which the functions are meant to read.
-
-    Args:
-        fps: frames per second of the motions; at other rates than 20 there is no value.
-        toes: indices of the left and the right toe.
+    which the functions are meant to read. `toes` are the indices of the left and the right toe.
     """
 
     NAMES = ("jitter_degree", "dynamic_degree", "ground_penetration", "foot_sliding", "foot_floating")
@@ -75,28 +76,22 @@ class MBenchQuality(MeanOverMotions):
     required_fps = 20
 
     def __init__(self, fps: float, toes: Sequence[int] = (10, 11)):
-        super().__init__(fps)
-        self.toes = list(toes)
+        super().__init__(fps, toes)
 
-    def update(self, joints: Tensor, mask: Tensor, keys: Tensor) -> None:
-        self.keep_values(keys, [mbench_quality(x, self.toes) for x in real_frames("MBenchQuality", joints, mask)])
-
-
-def mbench_quality(motion: Tensor, toes: Sequence[int]) -> dict[str, Tensor | float]:
-    """Computes the values of `MBenchQuality` of one motion (F, J, 3); undefined ones are NaN."""
-    motion = motion.double()
-    local, feet = motion - motion[:, :1], motion[:, list(toes)]
-    height, contact = feet[..., 1], mbench_contact(feet)
-    sliding = (_speed(feet[..., [0, 2]]) * contact).sum(0) / (contact.sum(0) + 1e-6)
-    deep = height[height < -0.005]
-    floating = sum(w * n for w, n in zip((1, 0.5, 1), mbench_floating(motion, feet, contact), strict=True))
-    return {
-        "jitter_degree": sum(x.diff(n=2, dim=0).norm(dim=-1).mean() for x in (motion, local)),
-        "dynamic_degree": sum(x.diff(dim=0).norm(dim=-1).mean() for x in (motion, local)),
-        "ground_penetration": -deep.mean() if len(deep) else 0.0,
-        "foot_sliding": sliding.mean(),
-        "foot_floating": floating / len(motion) if len(motion) > 1 else math.nan,
-    }
+    def measure(self, motion: Tensor) -> Values:
+        motion = motion.double()
+        local, feet = motion - motion[:, :1], motion[:, self.feet]
+        height, contact = feet[..., 1], mbench_contact(feet)
+        sliding = (_speed(feet[..., [0, 2]]) * contact).sum(0) / (contact.sum(0) + 1e-6)
+        deep = height[height < -0.005]
+        carried, lagging, swinging = mbench_floating(motion, feet, contact)
+        return {
+            "jitter_degree": sum(x.diff(n=2, dim=0).norm(dim=-1).mean() for x in (motion, local)),
+            "dynamic_degree": sum(x.diff(dim=0).norm(dim=-1).mean() for x in (motion, local)),
+            "ground_penetration": -deep.mean() if len(deep) else 0.0,
+            "foot_sliding": sliding.mean(),
+            "foot_floating": (carried + 0.5 * lagging + swinging) / len(motion) if len(motion) > 1 else math.nan,
+        }
 
 
 def mbench_contact(feet: Tensor) -> Tensor:
@@ -156,45 +151,37 @@ class KimodoQuality(MeanOverMotions):
     contact; `contact_consistency` is the fraction of contacts that agree with a heuristic (slower than 0.15 m/s and
     lower than 10 cm), higher is better.
 
-    All speeds are in three dimensions. A motion of one frame has no values.
-
-    Args:
-        feet: indices of left heel, left toe, right heel and right toe.
+    All speeds are in three dimensions. A motion of one frame has no values. `feet` are the indices of left heel, left
+    toe, right heel and right toe.
     """
 
-    JOINTS, CONTACTS = ("skate_from_height", "skate_ratio", "low"), ("skate_from_contacts", "skate_max")
-    NAMES = (*JOINTS, *CONTACTS, "contact_consistency")
+    NAMES = ("skate_from_height", "skate_ratio", "low", "skate_from_contacts", "skate_max", "contact_consistency")
     DIRECTIONS: Mapping[str, bool | None] = {"low": None, "contact_consistency": True}
 
-    def __init__(self, fps: float, feet: Sequence[int] = (7, 10, 8, 11)):
-        super().__init__(fps)
-        self.feet = list(feet)
-
     def update(self, joints: Tensor, mask: Tensor, keys: Tensor, contacts: Tensor | None = None) -> None:
-        motions = real_frames("KimodoQuality", joints, mask)
+        motions = self.real_frames(joints, mask)
         labels = [None] * len(motions) if contacts is None else contacts[mask].split(mask.sum(1).tolist())
-        pairs = zip(motions, labels, strict=True)
-        self.keep_values(keys, [kimodo_quality(x[:, self.feet], labels, self.fps) for x, labels in pairs])
+        self.keep_values(keys, [self.measure(*pair) for pair in zip(motions, labels, strict=True)])
 
-
-def kimodo_quality(feet: Tensor, contacts: Tensor | None, fps: float) -> dict[str, Tensor | float]:
-    """Computes the values of `KimodoQuality` from feet (F, 4, 3) and contacts (F, 4) bool; undefined ones are NaN."""
-    values: dict[str, Tensor | float] = dict.fromkeys(KimodoQuality.NAMES, math.nan)
-    if len(feet) < 2:
+    def measure(self, motion: Tensor, contacts: Tensor | None = None) -> Values:
+        """Computes the values of a motion (F, J, 3) with contacts (F, 4) bool of its feet; NaN = undefined."""
+        values: dict[str, Tensor | float] = dict.fromkeys(self.NAMES, math.nan)
+        if len(motion) < 2:
+            return values
+        feet = motion[:, self.feet]
+        speed = feet.double().diff(dim=0).norm(dim=-1) * self.fps
+        low, toes = feet[:, 1::2, 1] < 0.05, speed[:, 1::2]
+        first, both = low[:-1], low[:-1] & low[1:]
+        values["skate_from_height"] = (toes * first).sum() / (first.sum() + 1e-6)
+        values["skate_ratio"] = ((toes > 0.2) & both).sum() / (both.sum() + 1e-6)
+        values["low"] = first.double().mean()
+        if contacts is not None:
+            on = contacts[:-1]
+            values["skate_from_contacts"] = (speed * on).sum() / (on.sum() + 1e-6)
+            values["skate_max"] = (speed * on).max()
+            heuristic = (speed < 0.15) & (feet[:-1, :, 1] < 0.10)
+            values["contact_consistency"] = (heuristic == on).double().mean()
         return values
-    speed = feet.double().diff(dim=0).norm(dim=-1) * fps
-    low, toes = feet[:, 1::2, 1] < 0.05, speed[:, 1::2]
-    first, both = low[:-1], low[:-1] & low[1:]
-    values["skate_from_height"] = (toes * first).sum() / (first.sum() + 1e-6)
-    values["skate_ratio"] = ((toes > 0.2) & both).sum() / (both.sum() + 1e-6)
-    values["low"] = first.double().mean()
-    if contacts is not None:
-        on = contacts[:-1]
-        values["skate_from_contacts"] = (speed * on).sum() / (on.sum() + 1e-6)
-        values["skate_max"] = (speed * on).max()
-        heuristic = (speed < 0.15) & (feet[:-1, :, 1] < 0.10)
-        values["contact_consistency"] = (heuristic == on).double().mean()
-    return values
 
 
 class KimodoConstraints(MeanOverMotions):
@@ -209,11 +196,11 @@ class KimodoConstraints(MeanOverMotions):
     NAMES = ("root2d_err", "root2d_acc", "fullbody_keyframe", "end_effector")
 
     def __init__(self):
-        super().__init__()
+        super().__init__(fps=0)
         self.names = (*self.NAMES, "root2d_err_p95")
 
     def update(self, joints: Tensor, real_joints: Tensor, mask: Tensor, kept: Tensor, keys: Tensor) -> None:
-        motions = real_frames("KimodoConstraints", joints, mask)
+        motions = self.real_frames(joints, mask)
         parts = kept[mask].split(mask.sum(1).tolist())
         errors = []
         for motion, real, part in zip(motions, real_joints, parts, strict=True):
@@ -241,38 +228,26 @@ class PhysicalFootContact(MeanOverMotions):
 
     Mean over frames of the product of both feet's steps over the ground and the root's acceleration, which is divided
     by its largest value; downward accelerations count as 0. A foot's step is that of its ankle or toe, whichever is
-    smaller. It has no value for motions without acceleration, which the code averages as NaN.
-
-    Args:
-        fps: frames per second of the motions; at other rates than 30 there is no value. Steps are in meters per frame,
-            so that half the rate would give about four times the score.
-        feet: indices of left ankle, left toe, right ankle and right toe.
+    smaller. It has no value for motions without acceleration, which the code averages as NaN, and none at other rates
+    than 30 frames per second: steps are in meters per frame, so that half the rate would give about four times the
+    score. `feet` are the indices of left ankle, left toe, right ankle and right toe.
     """
 
     NAMES = ("pfc",)
-    required_fps = PFC_FPS
+    required_fps = 30
 
-    def __init__(self, fps: float, feet: Sequence[int] = (7, 10, 8, 11)):
-        super().__init__(fps)
-        self.feet = list(feet)
-
-    def update(self, joints: Tensor, mask: Tensor, keys: Tensor) -> None:
-        motions = real_frames("PhysicalFootContact", joints, mask)
-        self.keep_values(keys, [{"pfc": physical_foot_contact(x, self.feet)} for x in motions])
-
-
-def physical_foot_contact(motion: Tensor, feet: Sequence[int]) -> float:
-    """Returns the score of a motion (F, J, 3); NaN if the root does not accelerate or frames are fewer than 3."""
-    motion = motion.double()
-    # The code divides by the frame duration first, which decides whether rounding errors of a steady root are 0.
-    acceleration = (motion[:, 0].diff(dim=0) * PFC_FPS).diff(dim=0) * PFC_FPS
-    acceleration[:, 1].clamp_(min=0)
-    acceleration = acceleration.norm(dim=-1)
-    if not len(acceleration) or not acceleration.max():
-        return math.nan
-    steps = motion[1:, list(feet)][..., [0, 2]].diff(dim=0).norm(dim=-1)
-    left, right = steps[:, :2].amin(1), steps[:, 2:].amin(1)
-    return 1e4 * (left * right * acceleration / acceleration.max()).mean().item()
+    def measure(self, motion: Tensor) -> Values:
+        """Computes the score of a motion (F, J, 3); NaN if the root does not accelerate or frames are fewer than 3."""
+        motion = motion.double()
+        # The code divides by the frame duration first, which decides whether rounding errors of a steady root are 0.
+        acceleration = (motion[:, 0].diff(dim=0) * self.fps).diff(dim=0) * self.fps
+        acceleration[:, 1].clamp_(min=0)
+        acceleration = acceleration.norm(dim=-1)
+        if not len(acceleration) or not acceleration.max():
+            return {"pfc": math.nan}
+        steps = motion[1:, self.feet][..., [0, 2]].diff(dim=0).norm(dim=-1)
+        left, right = steps[:, :2].amin(1), steps[:, 2:].amin(1)
+        return {"pfc": 1e4 * (left * right * acceleration / acceleration.max()).mean()}
 
 
 class TransitionJerk(SampleMetric):
@@ -280,35 +255,32 @@ class TransitionJerk(SampleMetric):
 
     The jerk of a frame is the largest L1 norm of the third difference of a joint's position, in meters per frame^3.
     Windows of `window` frames are centered at the first frame after each change from kept to generated frames or back;
-    windows that the motion does not contain are left out. `peak` is the maximum of the mean over windows, frame by
-    frame; `area` is the sum of its distances from the jerk of real motions, which is also large for motions smoother
-    than those, and grows with the window; `windows` is the number of windows.
-
-    Args:
-        fps: frames per second of the motions. The published jerk of real motions is of HumanML3D at 20 frames per
-            second and of BABEL at 30; at other rates there is no area.
-        window: frames of a window; None = as published, 60 at 20 frames per second and otherwise 30.
+    windows that the motion does not contain are left out. The published windows have 60 frames at 20 frames per second
+    and 30 at 30. `peak` is the maximum of the mean over windows, frame by frame; `area` is the sum of its distances
+    from the jerk of real motions, which is also large for motions smoother than those, and grows with the window;
+    `windows` is the number of windows. The published jerk of real motions is of HumanML3D at 20 frames per second and
+    of BABEL at 30; at other rates there is no area.
     """
 
     higher_is_better = False
     states = ("total", "windows")
     names = ("peak", "area", "windows")
 
-    def __init__(self, fps: float, window: int | None = None):
+    def __init__(self, fps: float, window: int):
         super().__init__()
-        self.real, self.window = JERK_OF_REAL_MOTIONS.get(round(fps, 6)), window or (60 if fps == 20 else 30)
+        self.real, self.window = JERK_OF_REAL_MOTIONS.get(round(fps, 6)), window
 
     def update(self, joints: Tensor, mask: Tensor, kept: Tensor, keys: Tensor) -> None:
-        lengths = mask.sum(1).tolist()
+        parts = kept[mask].split(mask.sum(1).tolist())
         totals, counts = [], []
-        for motion, part in zip(real_frames("TransitionJerk", joints, mask), kept[mask].split(lengths), strict=True):
+        for motion, part in zip(self.real_frames(joints, mask), parts, strict=True):
             seams = (part[1:] != part[:-1]).any(1).nonzero()[:, 0] + 1
             starts = [int(seam) - self.window // 2 for seam in seams]
             windows = [motion[s : s + self.window] for s in starts if 0 <= s <= len(motion) - self.window]
             totals.append(sum(map(transition_jerk, windows), torch.zeros(self.window - 3, dtype=torch.float64)))
             counts.append([len(windows)])
         if totals:
-            self.keep(keys=keys, total=torch.stack(totals), windows=torch.tensor(counts))
+            super().update(keys=keys, total=torch.stack(totals), windows=torch.tensor(counts))
 
     def value(self, total: Tensor, windows: Tensor) -> dict[str, float | None]:
         count = int(windows.sum())

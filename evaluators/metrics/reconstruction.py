@@ -1,12 +1,11 @@
 """Errors of generated motions against the real motion of the same text, or the motion that was edited."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor
 
-from evaluators.metrics.samples import SampleMetric, real_frames
-from flame_mdm.errors import UserError
+from evaluators.metrics.samples import SampleMetric
 from flame_mdm.representations import rotation
 from flame_mdm.representations.rifke import Rifke, upsample
 
@@ -73,29 +72,25 @@ class PositionErrors(SampleMetric):
     ) -> None:
         """Compares pairs of motions up to the end of the shorter one; upsampling needs `references`.
 
-        Raises:
-            UserError: If a motion has fewer than two frames, or a needed reference is missing.
+        Raises `UserError` if a motion has fewer than two frames, or references are missing.
         """
-        name = type(self).__name__
-        generated, real_motions = real_frames(name, joints, mask), real_frames(name, real_joints, real_mask)
+        motions, real_motions = self.real_frames(joints, mask), self.real_frames(real_joints, real_mask)
         if self.upsampling > 1:
             if references is None:
-                raise UserError(
-                    f"{name}: the store has no recordings at their own frame rate. Prepare the data set again with "
-                    "force=true"
-                )
-            generated, real_motions = [upsample(motion, self.upsampling) for motion in generated], list(references)
+                missing = "the store has no recordings at their own frame rate"
+                raise self.error(f"{missing}. Prepare the data set again with force=true")
+            motions, real_motions = [upsample(motion, self.upsampling) for motion in motions], list(references)
         position, variance, frames = [], [], []
-        for motion, real in zip(generated, real_motions, strict=True):
+        for motion, real in zip(motions, real_motions, strict=True):
             a, b = self.parts(motion.double()), self.parts(real.double())
             length = min(len(a["root"]), len(b["root"]))
             self.need(length, 2, "frames of a motion")
-            a, b = ({part: values[:length] for part, values in x.items()} for x in (a, b))
-            for errors, of_clip in zip((position, variance), self.errors(a, b), strict=True):
-                errors.append(of_clip)
+            errors = self.errors(*({part: values[:length] for part, values in x.items()} for x in (a, b)))
+            position.append(errors[0])
+            variance.append(errors[1])
             frames.append([length])
         if frames:
-            self.keep(
+            super().update(
                 keys=keys,
                 groups=keys if groups is None or self.samples == 1 else groups,
                 position=torch.stack(position),
@@ -134,19 +129,14 @@ class TemosPositionErrors(PositionErrors):
     the variances over time (n - 1 in the denominator) of each coordinate, averaged over joints, then over clips. Both
     are in units of 1000 KIT units, which the tables call meters and which are 1.56 m. TEMOS compares at 100 frames per
     second: `upsampling=8`.
-
-    Args:
-        units_per_metre: KIT units per meter of `joints`, as in the KIT representations.
     """
 
-    def __init__(self, units_per_metre: float = 640.0, samples: int = 1, upsampling: int = 1):
-        super().__init__(samples, upsampling)
-        self.units_per_metre = units_per_metre
+    units_per_meter = 640.0  # KIT units per meter of `joints`, as in the KIT representations
 
     def parts(self, joints: Tensor) -> dict[str, Tensor]:
         if joints.shape[1] != 21:
-            raise UserError(f"TemosPositionErrors: {joints.shape[1]} joints, but defined only for KIT's 21 (MMM)")
-        return {part: values / 1000 for part, values in temos_parts(joints * self.units_per_metre).items()}
+            raise self.error(f"{joints.shape[1]} joints, but defined only for KIT's 21 (MMM)")
+        return {part: values / 1000 for part, values in temos_parts(joints * self.units_per_meter).items()}
 
     def errors(self, a: Mapping[str, Tensor], b: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
         distance = [(a[part] - b[part]).norm(dim=-1) for part in PARTS]
@@ -160,10 +150,7 @@ class FlamePositionErrors(PositionErrors):
     Compares `flame_parts`. The error of the trajectory is the sum of the distances along its two axes; the local error
     is that of bones. Variances of global positions are averaged over joints before they are compared. Each clip has the
     same weight. FLAME's joints lack the orientation of the root and start from its translation; here, `joints` are
-    compared unchanged, and the first one is the root.
-
-    Args:
-        parents: parent of each joint of the skeleton, -1 for the root.
+    compared unchanged, and the first one is the root. `parents` are those of the skeleton's joints, -1 for the root.
     """
 
     equal_clips = True
@@ -184,18 +171,11 @@ class FlamePositionErrors(PositionErrors):
         return position, torch.stack(variance)
 
 
-class DisplacementErrors(SampleMetric):
-    """ADE and FDE: mean distance of the joints in all predicted frames, and in the last of them, in meters.
-
-    This is the usual definition in motion prediction (Yuan and Kitani 2020): the average over joints and frames of a
-    clip, then over clips. Frames and joints that an edit kept are ignored. If lengths differ, motions are compared up
-    to the end of the shorter one. MFM (Table 3) gives no formula, code or unit for its numbers, which are too large for
-    meters: they are not comparable.
-    """
+class EditErrors(SampleMetric):
+    """Distances of the joints from those of real motions, of the part that an edit kept or generated."""
 
     higher_is_better = False
     states = ("errors",)
-    names = ("ade", "fde")
 
     def update(
         self,
@@ -206,54 +186,63 @@ class DisplacementErrors(SampleMetric):
         keys: Tensor,
         kept: Tensor | None = None,
     ) -> None:
-        """Raises `UserError` if nothing of a motion was generated; without `kept`, all of it was."""
-        errors = []
-        for distance, old in _distances(type(self).__name__, joints, mask, real_joints, real_mask, kept):
-            new = ~old
-            if not new.any():
-                raise UserError("DisplacementErrors: a motion has no generated frame to compare")
-            last = int(new.any(1).nonzero()[-1])
-            errors.append(torch.stack([distance[new].mean(), distance[last][new[last]].mean()]))
-        if errors:
-            self.keep(keys=keys, errors=torch.stack(errors))
+        motions = zip(self.real_frames(joints, mask), self.real_frames(real_joints, real_mask), strict=True)
+        rows, errors = [], []
+        for row, (motion, real) in enumerate(motions):
+            length = min(len(motion), len(real))  # motions are compared up to the end of the shorter one
+            distance = (motion[:length].double() - real[:length].double()).norm(dim=-1)
+            old = torch.zeros_like(distance, dtype=torch.bool) if kept is None else kept[row][mask[row]][:length]
+            error = self.errors_of(distance, old)
+            if error:
+                rows.append(row)
+                errors.append(torch.stack(error))
+        if rows:
+            super().update(keys=keys[rows], errors=torch.stack(errors))
+
+    def errors_of(self, distance: Tensor, kept: Tensor) -> list[Tensor]:
+        """Returns the errors of a motion from distances (F, J) and kept joints (F, J) bool; [] if it has none."""
+        raise NotImplementedError
+
+
+class DisplacementErrors(EditErrors):
+    """ADE and FDE: mean distance of the joints in all predicted frames, and in the last of them, in meters.
+
+    This is the usual definition in motion prediction (Yuan and Kitani 2020): the average over joints and frames of a
+    clip, then over clips. Frames and joints that an edit kept are ignored; without `kept`, there are none. Raises
+    `UserError` if nothing of a motion was generated. MFM (Table 3) gives no formula, code or unit for its numbers,
+    which are too large for meters: they are not comparable.
+    """
+
+    names = ("ade", "fde")
+
+    def errors_of(self, distance: Tensor, kept: Tensor) -> list[Tensor]:
+        new = ~kept
+        if not new.any():
+            raise self.error("a motion has no generated frame to compare")
+        last = int(new.any(1).nonzero()[-1])
+        return [distance[new].mean(), distance[last][new[last]].mean()]
 
     def value(self, errors: Tensor) -> dict[str, float | None]:
         return dict(zip(self.names, errors.mean(0).tolist(), strict=True))
 
 
-class KeptDrift(SampleMetric):
+class KeptDrift(EditErrors):
     """Distance in the world, in meters, by which the kept part of an edit has moved. A metric of this project.
 
-    With features relative to the root, an edit can keep steps and poses exactly, and still move a kept ending to where
-    the new part before it leads.
+    `mean` is over the kept joints and frames of a motion and then over motions, `largest` over all. With features
+    relative to the root, an edit can keep steps and poses exactly, and still move a kept ending to where the new part
+    before it leads.
     """
 
-    higher_is_better = False
-    states = ("drift",)
     names = ("mean", "largest")
 
     def update(
         self, joints: Tensor, mask: Tensor, real_joints: Tensor, real_mask: Tensor, keys: Tensor, kept: Tensor
     ) -> None:
-        pairs = list(_distances(type(self).__name__, joints, mask, real_joints, real_mask, kept))
-        edited = [number for number, (_, old) in enumerate(pairs) if old.any()]
-        if edited:
-            kept_distances = (pairs[number][0][pairs[number][1]] for number in edited)
-            drift = torch.stack([torch.stack([distance.mean(), distance.max()]) for distance in kept_distances])
-            self.keep(keys=keys[edited], drift=drift)
+        super().update(joints, mask, real_joints, real_mask, keys, kept)
 
-    def value(self, drift: Tensor) -> dict[str, float | None]:
-        """Returns `mean`, over the kept joints and frames of a motion and then over motions, and `largest`."""
-        return {"mean": drift[:, 0].mean().item(), "largest": drift[:, 1].max().item()}
+    def errors_of(self, distance: Tensor, kept: Tensor) -> list[Tensor]:
+        return [distance[kept].mean(), distance[kept].max()] if kept.any() else []
 
-
-def _distances(
-    name: str, joints: Tensor, mask: Tensor, real_joints: Tensor, real_mask: Tensor, kept: Tensor | None
-) -> Iterator[tuple[Tensor, Tensor]]:
-    """Yields distances (F, J) in float64 and a mask of the kept joints (F, J), up to the end of the shorter motion."""
-    motions = zip(real_frames(name, joints, mask), real_frames(name, real_joints, real_mask), strict=True)
-    for number, (motion, real) in enumerate(motions):
-        length = min(len(motion), len(real))
-        distance = (motion[:length].double() - real[:length].double()).norm(dim=-1)
-        old = torch.zeros_like(distance, dtype=torch.bool) if kept is None else kept[number][mask[number]][:length]
-        yield distance, old
+    def value(self, errors: Tensor) -> dict[str, float | None]:
+        return {"mean": errors[:, 0].mean().item(), "largest": errors[:, 1].max().item()}

@@ -10,7 +10,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from evaluators.metrics.alignment import own_pools
+from evaluators.metrics.alignment import TOP, own_pools
 from evaluators.metrics.samples import SampleMetric
 from flame_mdm.batch import MotionBatch
 from flame_mdm.conditions import ConditionEncoder
@@ -18,7 +18,8 @@ from flame_mdm.config import Config, instantiate
 from flame_mdm.seeds import key
 
 SAME = 0.9  # cosine above which TMR considers captions the same: its threshold 0.95 is of (cosine + 1) / 2
-BATCH = 32  # size of TMR's batches
+TMR_TOP = (1, 2, 3, 5, 10)  # k of recall
+BATCH, DISSIMILAR = 32, 100  # motions in a batch, and most dissimilar motions, of TMR
 
 
 @functools.cache
@@ -43,8 +44,8 @@ def plain_caption(caption: str) -> str:
     return " ".join(re.sub(r"[^\w\s]", "", caption.lower()).split())
 
 
-def whole_set_retrieval(similarity: Tensor, top: tuple[int, ...], correct: Tensor | None = None) -> dict[str, float]:
-    """Computes recall and median rank from similarities (N, N) of texts (rows) and motions (columns).
+def whole_set_retrieval(similarity: Tensor, correct: Tensor | None = None) -> dict[str, float]:
+    """Computes recall and median rank of TMR from similarities (N, N) of texts (rows) and motions (columns).
 
     `correct` (N, N) bool, symmetric: pairs that count as correct, of which the best one sets the rank; None = the
     diagonal.
@@ -52,7 +53,7 @@ def whole_set_retrieval(similarity: Tensor, top: tuple[int, ...], correct: Tenso
     values: dict[str, float] = {}
     for way, table in (("t2m", similarity), ("m2t", similarity.T)):
         rank = best_ranks(table, torch.eye(len(table), dtype=torch.bool) if correct is None else correct)
-        values |= {f"{way}_top{k}": (rank < k).double().mean().item() for k in top}
+        values |= {f"{way}_top{k}": (rank < k).double().mean().item() for k in TMR_TOP}
         values[f"{way}_median"] = rank.double().quantile(0.5).item() + 1
     return values
 
@@ -69,17 +70,16 @@ def best_ranks(similarity: Tensor, correct: Tensor) -> Tensor:
 class CaptionMetric(SampleMetric):
     """A metric of motions and captions, some of which are the same.
 
-    Args:
-        encoder: a mapping with the `_target_` of a text encoder: captions with a cosine above `SAME` are the same;
-            None = only captions equal but for case, punctuation and spaces.
+    `encoder` is a mapping with the `_target_` of a text encoder: captions with a cosine above `SAME` are the same. None
+    = only captions equal but for case, punctuation and spaces.
     """
 
     higher_is_better = True
     states = ("generated", "text", "caption_keys", "meaning")
 
-    def __init__(self, encoder: Config | None = None):
+    def __init__(self, encoder: Config | None = None, seed: int = 0):
         super().__init__()
-        self.encoder = None if encoder is None else json.dumps(encoder, sort_keys=True)
+        self.encoder, self.seed = None if encoder is None else json.dumps(encoder, sort_keys=True), seed
 
     def update(self, generated: Tensor, text: Tensor, captions: Sequence[str], keys: Tensor) -> None:
         if not len(captions):
@@ -88,11 +88,7 @@ class CaptionMetric(SampleMetric):
         meaning = torch.zeros(len(captions), 0)
         if self.encoder is not None:
             meaning = torch.stack([embedding(self.encoder, caption) for caption in captions])
-        self.keep(keys=keys, generated=generated, text=text, caption_keys=caption_keys, meaning=meaning)
-
-    def same(self, caption_keys: Tensor, meaning: Tensor) -> Tensor:
-        """Returns which captions are the same, (..., N, N) bool, from keys (..., N) and vectors (..., N, C)."""
-        return (caption_keys[..., None, :] == caption_keys[..., None]) | (meaning @ meaning.mT > SAME)
+        super().update(keys=keys, generated=generated, text=text, caption_keys=caption_keys, meaning=meaning)
 
 
 class MultiPositiveRPrecision(CaptionMetric):
@@ -104,41 +100,36 @@ class MultiPositiveRPrecision(CaptionMetric):
     R-precision of information retrieval: the fraction of their R motions among the R nearest. Since similar captions
     raise all values, `chance_top1`, ... are those of a random order, and `positives` is the mean of R.
 
-    Args:
-        pool: motions in a pool.
-        top: largest k.
-        normalize: whether to rank by cosine instead of Euclidean distance, as for `MotionsForText`.
+    `normalize` ranks by cosine instead of Euclidean distance, as for `MotionsForText`.
     """
 
-    def __init__(
-        self, encoder: Config | None = None, pool: int = 32, top: int = 3, seed: int = 0, normalize: bool = False
-    ):
-        super().__init__(encoder)
-        self.pool, self.top, self.seed, self.normalize = pool, top, seed, normalize
-        tops = [f"{kind}top{k}" for kind in ("", "single_", "chance_") for k in range(1, top + 1)]
-        self.names = (*tops, "proper", "positives")
+    names = (*(f"{kind}top{k}" for kind in ("", "single_", "chance_") for k in TOP), "proper", "positives")
+
+    def __init__(self, encoder: Config | None = None, pool: int = 32, seed: int = 0, normalize: bool = False):
+        super().__init__(encoder, seed)
+        self.pool, self.normalize = pool, normalize
 
     def value(self, motion: Tensor, text: Tensor, caption_keys: Tensor, meaning: Tensor) -> dict[str, float | None]:
         self.need(len(motion), self.pool, "motions")
         if self.normalize:
             motion, text = F.normalize(motion, dim=-1), F.normalize(text, dim=-1)
-        order, pools, position = (torch.from_numpy(x) for x in own_pools(len(motion), self.pool, self.seed))
+        order, pools, position = own_pools(len(motion), self.pool, self.seed)
         similarity, correct = [], []
         for query, pool in zip(order.split(16), pools.split(16), strict=True):
             similarity.append(-torch.linalg.vector_norm(text[query, None] - motion[pool], dim=-1))
             similar = (meaning[query, None] * meaning[pool]).sum(-1) > SAME
             correct.append((caption_keys[query, None] == caption_keys[pool]) | similar | (query[:, None] == pool))
-        values = multi_positive(torch.cat(similarity), torch.cat(correct), self.top)
         single = best_ranks(torch.cat(similarity), F.one_hot(position, self.pool).bool())
-        return values | {f"single_top{k}": (single < k).double().mean().item() for k in range(1, self.top + 1)}
+        singles = {f"single_top{k}": (single < k).double().mean().item() for k in TOP}
+        return multi_positive(torch.cat(similarity), torch.cat(correct)) | singles
 
 
-def multi_positive(similarity: Tensor, correct: Tensor, top: int) -> dict[str, float | None]:
+def multi_positive(similarity: Tensor, correct: Tensor) -> dict[str, float | None]:
     """Computes hit rates, R-precision and chance from similarity and correctness (N, M) of candidates."""
     rank, count, size = best_ranks(similarity, correct), correct.sum(1), similarity.shape[1]
-    values: dict[str, float | None] = {f"top{k}": (rank < k).double().mean().item() for k in range(1, top + 1)}
+    values: dict[str, float | None] = {f"top{k}": (rank < k).double().mean().item() for k in TOP}
     missed = torch.ones(len(count), dtype=torch.float64)
-    for k in range(1, top + 1):
+    for k in TOP:
         missed = missed * ((size - count - k + 1).clamp(min=0) / (size - k + 1))
         values[f"chance_top{k}"] = (1 - missed).mean().item()
     last = similarity.sort(1, descending=True).values.gather(1, count[:, None] - 1)
@@ -152,63 +143,48 @@ class TMRRetrieval(CaptionMetric):
     """Retrieval by cosine with the protocols of Petrovich et al. 2023 (TMR, 6d74688), both ways.
 
     `all`: all motions, the own one is correct; `threshold`: motions of the same captions are correct, too;
-    `dissimilar`: only among `subset` motions with different captions; `batches`: in batches of 32, the rest is left
-    out; their medians are averaged. Each has recall `t2m_top1`, ... in [0, 1] and median rank `t2m_median` (1 = best)
-    of motions for texts, and `m2t_` of texts for motions. TMR's encoder of captions is all-mpnet-base-v2.
+    `dissimilar`: only among 100 motions with different captions, at most half of all, and none without an encoder;
+    `batches`: in batches of 32, the rest is left out; their medians are averaged. Each has recall `t2m_top1`, ... in
+    [0, 1] and median rank `t2m_median` (1 = best) of motions for texts, and `m2t_` of texts for motions. TMR's encoder
+    of captions is all-mpnet-base-v2.
 
-    TMR's lists of dissimilar motions and of batches are for HumanML3D and KIT; here, batches are drawn, and each motion
-    of the subset is that whose caption is the least similar to those taken before it, after the first by key.
-
-    Args:
-        encoder: without one, `dissimilar` has no value.
-        subset: number of dissimilar motions, at most half of all.
-        ids: ids of the dissimilar motions, such as TMR's; None = chosen as above.
+    TMR's lists of dissimilar motions and of batches are for HumanML3D and KIT; here, batches are drawn, and each
+    dissimilar motion is that whose caption is the least similar to those taken before it, after the first by key.
     """
 
-    TOP = (1, 2, 3, 5, 10)
-    PROTOCOLS = ("all", "threshold", "dissimilar", "batches")
-
-    def __init__(
-        self, encoder: Config | None = None, subset: int = 100, ids: Sequence[str] | None = None, seed: int = 0
-    ):
-        super().__init__(encoder)
-        self.subset, self.seed = subset, seed
-        self.ids = None if ids is None else [key(name) for name in ids]
-        values = [f"{way}_{name}" for way in ("t2m", "m2t") for name in (*(f"top{k}" for k in self.TOP), "median")]
-        self.names = [f"{protocol}_{value}" for protocol in self.PROTOCOLS for value in values]
+    names = tuple(
+        f"{protocol}_{way}_{value}"
+        for protocol in ("all", "threshold", "dissimilar", "batches")
+        for way in ("t2m", "m2t")
+        for value in (*(f"top{k}" for k in TMR_TOP), "median")
+    )
 
     def value(self, motion: Tensor, text: Tensor, caption_keys: Tensor, meaning: Tensor) -> dict[str, float | None]:
         similarity = F.normalize(text, dim=-1) @ F.normalize(motion, dim=-1).T
-        values = {
-            "all": whole_set_retrieval(similarity, self.TOP),
-            "threshold": whole_set_retrieval(similarity, self.TOP, self.same(caption_keys, meaning)),
-        }
-        chosen = self._dissimilar(meaning)
-        if len(chosen):
-            values["dissimilar"] = whole_set_retrieval(similarity[chosen][:, chosen], self.TOP)
+        same = (caption_keys[None] == caption_keys[:, None]) | (meaning @ meaning.T > SAME)
+        values = {"all": whole_set_retrieval(similarity), "threshold": whole_set_retrieval(similarity, same)}
+        if meaning.shape[1]:
+            chosen = dissimilar(meaning)
+            values["dissimilar"] = whole_set_retrieval(similarity[chosen][:, chosen])
         order = np.random.default_rng(self.seed).permutation(len(motion))
         batches = torch.from_numpy(order[: len(order) // BATCH * BATCH]).view(-1, BATCH)
         if len(batches):
-            values["batches"] = batched_retrieval(similarity, batches, self.TOP)
+            values["batches"] = batched_retrieval(similarity, batches)
         computed = {f"{protocol}_{name}": x for protocol, result in values.items() for name, x in result.items()}
         return dict.fromkeys(self.names) | computed
 
-    def _dissimilar(self, meaning: Tensor) -> Tensor:
-        """Returns the indices of the dissimilar motions, among all sorted by key; none without an encoder or ids."""
-        if self.ids is not None:
-            rows = self.rows("keys", "keys") or [torch.zeros(0, dtype=torch.long)]
-            return torch.isin(rows[0], torch.tensor(self.ids)).nonzero()[:, 0]
-        if not meaning.shape[1]:
-            return torch.zeros(0, dtype=torch.long)
-        chosen = [0]
-        nearest = meaning @ meaning[0]
-        while len(chosen) < min(self.subset, len(meaning) // 2):
-            chosen.append(int(nearest.argmin()))
-            nearest = nearest.maximum(meaning @ meaning[chosen[-1]])
-        return torch.tensor(chosen)
+
+def dissimilar(meaning: Tensor) -> list[int]:
+    """Returns the indices of the `dissimilar` motions of `TMRRetrieval` from the vectors (N, C) of their captions."""
+    chosen = [0]
+    nearest = meaning @ meaning[0]
+    while len(chosen) < min(DISSIMILAR, len(meaning) // 2):
+        chosen.append(int(nearest.argmin()))
+        nearest = nearest.maximum(meaning @ meaning[chosen[-1]])
+    return chosen
 
 
-def batched_retrieval(similarity: Tensor, batches: Tensor, top: tuple[int, ...]) -> dict[str, float]:
+def batched_retrieval(similarity: Tensor, batches: Tensor) -> dict[str, float]:
     """Returns the means over batches (N, B) of indices of `whole_set_retrieval` in each."""
-    results = [whole_set_retrieval(similarity[batch][:, batch], top) for batch in batches]
+    results = [whole_set_retrieval(similarity[batch][:, batch]) for batch in batches]
     return {name: float(np.mean([result[name] for result in results])) for name in results[0]}

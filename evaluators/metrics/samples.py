@@ -14,26 +14,8 @@ Value = float | dict[str, float | None] | None
 """What `compute` returns: a number, or numbers by name; None without samples."""
 
 
-def real_frames(name: str, joints: Tensor, mask: Tensor) -> list[Tensor]:
-    """Splits joints (B, F, J, 3) with mask (B, F) into motions (F, J, 3), whose sums round the same way in every batch.
-
-    Raises:
-        UserError: If a motion contains NaN or infinity; the message begins with `name`.
-    """
-    frames = joints.detach()[mask]
-    motions = list(frames.split(mask.sum(1).tolist()))
-    # A sum is finite only if all numbers are, and is faster to compute.
-    bad = 0 if frames.sum().isfinite() else sum(not bool(motion.isfinite().all()) for motion in motions)
-    if bad:
-        raise UserError(f"{name}: {bad} of {len(motions)} motions are not finite. Did the model diverge?")
-    return motions
-
-
 class MotionMetric(Metric):
-    """Base class of all metrics.
-
-    Several of them take `fps`, the frame rate of the motions, and `seed`, of the random draws.
-    """
+    """Base class of all metrics. Several take `seed`, that of their random draws."""
 
     full_state_update = False
     names: Sequence[str] = ()  # names of the values; empty if there is only one
@@ -43,10 +25,34 @@ class MotionMetric(Metric):
         """Always True: a metric without samples returns None, without a warning."""
         return True
 
+    def error(self, message: str) -> UserError:
+        return UserError(f"{type(self).__name__}: {message}")
+
     def need(self, count: int, least: int, what: str) -> None:
         """Raises `UserError` if `count` is less than `least`."""
         if count < least:
-            raise UserError(f"{type(self).__name__}: got {count} {what}, needs at least {least}")
+            raise self.error(f"got {count} {what}, needs at least {least}")
+
+    def real_frames(self, joints: Tensor, mask: Tensor) -> list[Tensor]:
+        """Splits joints (B, F, J, 3) with mask (B, F) into motions (F, J, 3), whose sums are the same in every batch.
+
+        Raises `UserError` if a motion contains NaN or infinity.
+        """
+        frames = joints.detach()[mask]
+        motions = list(frames.split(mask.sum(1).tolist()))
+        # A sum is finite only if all numbers are, and is faster to compute.
+        bad = 0 if frames.sum().isfinite() else sum(not bool(motion.isfinite().all()) for motion in motions)
+        if bad:
+            raise self.error(f"{bad} of {len(motions)} motions are not finite. Did the model diverge?")
+        return motions
+
+
+class Timed(MotionMetric):
+    """A metric that depends on `fps`, the frame rate of the motions."""
+
+    def __init__(self, fps: float):
+        super().__init__()
+        self.fps = fps
 
 
 class Share(MotionMetric):
@@ -92,32 +98,30 @@ class SampleMetric(MotionMetric):
             self.add_state(name, [], dist_reduce_fx="cat")
 
     def update(self, **rows: Any) -> None:
-        """Adds rows by the names of their states, which include the keys."""
-        self.keep(**rows)
-
-    def keep(self, **rows: Tensor) -> None:
         """Adds equally many rows by the names of their states, which include the keys; `ValueError` otherwise."""
         if len({len(values) for values in rows.values()}) > 1:
             sizes = ", ".join(f"{len(values)} {name}" for name, values in rows.items())
-            raise ValueError(f"{type(self).__name__}: got {sizes}. Give one of each per sample")
+            raise ValueError(f"{type(self).__name__}: got {sizes}")
         for name, values in rows.items():
             getattr(self, name).append(values.detach())
 
     def compute(self) -> Any:
         """Returns the `value` of all rows; None, or None by name, if there are none."""
         rows = self.rows("keys", *self.states)
-        if rows is None:
-            return dict.fromkeys(self.names) if self.names else None
-        return self.value(*rows)
+        return self.value(*rows) if rows else self.nothing
+
+    @property
+    def nothing(self) -> Value:
+        return dict.fromkeys(self.names) if self.names else None
 
     def value(self, *rows: Tensor) -> Value:
         """Computes the value from all rows, in the order of their keys."""
         raise NotImplementedError
 
-    def rows(self, keys: str, *names: str) -> list[Tensor] | None:
-        """Returns finite rows in the order of their keys, floats as float64; None if there are none."""
+    def rows(self, keys: str, *names: str) -> list[Tensor]:
+        """Returns finite rows in the order of their keys, floats as float64; [] if there are none."""
         if not getattr(self, keys):
-            return None
+            return []
         order = self.order(keys)
         sorted_rows = []
         for name in names:
@@ -126,21 +130,21 @@ class SampleMetric(MotionMetric):
                 values = values.double()
                 bad = int((~values.isfinite().reshape(len(values), -1).all(1)).sum())
                 if bad:
-                    raise UserError(
-                        f"{type(self).__name__}: {bad} of {len(values)} rows of {name!r} are not finite. "
+                    raise self.error(
+                        f"{bad} of {len(values)} rows of {name!r} are not finite. "
                         "Look for damaged motions in the data, or a model that diverged"
                     )
             sorted_rows.append(values)
-        return sorted_rows if len(order) else None
+        return sorted_rows if len(order) else []
 
     def order(self, keys: str) -> Tensor:
         """Returns the indices that sort samples by their keys. Raises `UserError` if two samples have the same key."""
         values, order = dim_zero_cat(getattr(self, keys)).sort()
         twice = int((values[1:] == values[:-1]).sum())
         if twice:
-            raise UserError(
-                f"{type(self).__name__}: {twice} samples were given twice ({keys}). Evaluate each once: use a sampler "
-                "that does not pad, and a different key for each sample of a prompt"
+            raise self.error(
+                f"{twice} samples were given twice ({keys}). Evaluate each once: use a sampler that does not pad, and "
+                "a different key for each sample of a prompt"
             )
         return order
 
@@ -149,9 +153,9 @@ class SampleMetric(MotionMetric):
         names, sizes = groups.unique(return_counts=True)
         wrong = int((sizes != samples).sum())
         if wrong:
-            raise UserError(
-                f"{type(self).__name__}: {wrong} of {len(names)} prompts do not have {samples} motions but "
-                f"{int(sizes.min())} to {int(sizes.max())}. Generate {samples} for each"
+            raise self.error(
+                f"{wrong} of {len(names)} prompts do not have {samples} motions but {int(sizes.min())} to "
+                f"{int(sizes.max())}. Generate {samples} for each"
             )
         return groups.argsort(stable=True).unflatten(0, (len(names), samples))
 
@@ -183,21 +187,12 @@ class TwoSets(SampleMetric):
         real_keys: Tensor | None = None,
     ) -> None:
         """Adds generated (B, E) and real (R, E) features with their keys, in the same call or separately."""
-        for name, features, of in (("generated", generated, keys), ("real", real, real_keys)):
-            if features is not None:
-                key_name = "keys" if name == "generated" else "real_keys"
-                if of is None:
-                    raise ValueError(f"{type(self).__name__}: {name!r} given without {key_name!r}")
-                self.keep(**{key_name: of, name: features})
+        if generated is not None:
+            super().update(keys=keys, generated=generated)
+        if real is not None:
+            super().update(real_keys=real_keys, real=real)
 
     def compute(self) -> Any:
         """Returns the value of generated (N, E) and real (M, E) features; None, or None by name, if a set is empty."""
         generated, real = self.rows("keys", "generated"), self.rows("real_keys", "real")
-        if generated is None or real is None:
-            return dict.fromkeys(self.names) if self.names else None
-        widths = generated[0].shape[1], real[0].shape[1]
-        if widths[0] != widths[1]:
-            raise UserError(
-                f"{type(self).__name__}: generated motions have {widths[0]} features, but real ones have {widths[1]}"
-            )
-        return self.value(generated[0], real[0])
+        return self.value(*generated, *real) if generated and real else self.nothing

@@ -47,10 +47,8 @@ def audit(request: EvaluationRequest, cache: Path, resamples: int) -> AuditCard:
     """Measures perturbations of the motions of a split; see docs/audit.md.
 
     `samples` of the request limits the motions; `resamples` is the number of bootstrap resamples, for the intervals. A
-    killed audit continues with the metric inputs in the folder `cache`.
-
-    Raises:
-        UserError: If data, protocol and extractor do not match, or the data is not represented by joint positions.
+    killed audit continues with the metric inputs in the folder `cache`. Raises `UserError` if data, protocol and
+    extractor do not match, or the data is not represented by joint positions.
     """
     data = open_data(request, None)
     info, representation = data.store.info, data.representation.to(request.device or "cpu")

@@ -34,8 +34,7 @@ class Evaluate(Callback):
         replications: number of replications.
         batch_size: motions per batch.
 
-    Raises:
-        UserError: If the extractor does not exist, before training begins.
+    Raises `UserError` before training begins if the extractor does not exist.
     """
 
     def __init__(

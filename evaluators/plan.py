@@ -26,6 +26,8 @@ from flame_mdm.schemas import UsedSkeleton
 class Plan:
     """All parts of an evaluation, opened and checked before anything is measured.
 
+    Raises `UserError` or `FileNotFoundError` if a file is missing, or model, data, protocol and extractor do not match.
+
     Attributes:
         model, file: the model that generates the motions, and its checkpoint; None without a model.
         sampling: sampling options of the model.
@@ -34,13 +36,8 @@ class Plan:
         skeleton: the bones of joints computed from SMPL's rotations; None if the data has joint positions.
         protocol: in the requested size; `changed` has the options that differ.
         extractor: None = metrics that need features are skipped.
-        source: of the motions.
-        batch_size: motions per batch.
+        source: of the motions; `batch_size` motions per batch.
         path: of the result file.
-
-    Raises:
-        UserError: If model, data, protocol and extractor do not match.
-        FileNotFoundError: If a file is missing.
     """
 
     source: Source
@@ -103,8 +100,7 @@ class Plan:
 def open_data(request: EvaluationRequest, model: MotionGenerator | None) -> MotionDataModule:
     """Returns the prepared data, with its own representation. The model keeps the statistics of its training data.
 
-    Raises:
-        UserError: If no data set is named, or it is not prepared, or the model generates another representation.
+    Raises `UserError` if no data set is named, or it is not prepared, or the model generates another representation.
     """
     module, encoding, root = request.data, request.representation, "data"
     if model is not None and not module:
@@ -147,8 +143,7 @@ def sampling_options(
 ) -> tuple[SamplerOptions, dict[str, Any]]:
     """Returns the options of the sampler and those of `Edit`: the requested ones, otherwise those of the recipe.
 
-    Raises:
-        UserError: If nothing is edited but an editing option is given, or the process does not allow an option.
+    Raises `UserError` if nothing is edited but an editing option is given, or the process does not allow an option.
     """
     options, editing = options or SamplerOptions(), editing or EditRequest()
     edit: dict[str, Any] = {}

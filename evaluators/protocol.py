@@ -105,20 +105,17 @@ class Protocol(ClosedSchema):
     ) -> tuple[Protocol, dict[str, Any]]:
         """Returns the protocol with another size for a split of `clips`, and the options that changed; None = as it is.
 
-        A quick evaluation has few motions and replications. `batch_size` is for protocols that measure time.
-
-        Raises:
-            UserError: If a number is less than 1.
+        A quick evaluation has few motions and replications. `batch_size` is for protocols that measure time. Raises
+        `UserError` if a number is less than 1.
         """
         if quick:
             replications = QUICK_REPLICATIONS if replications is None else replications
             samples = min(QUICK_SAMPLES, clips) if samples is None else samples
-        size = {"replications": replications, "samples": samples, "batch_size": batch_size if self.batch_size else None}
         changed: dict[str, Any] = {}
-        for name, value in size.items():
+        for name, value in {"replications": replications, "samples": samples, "batch_size": batch_size}.items():
             if value is not None and value < 1:
                 raise UserError(f"{name}={value}: must be at least 1")
-            if value is not None and value != getattr(self, name):
+            if value not in (None, getattr(self, name)) and (name != "batch_size" or self.batch_size):
                 changed[name] = value
         several = self.multimodality
         if several and replications is not None:
@@ -130,8 +127,7 @@ class Protocol(ClosedSchema):
     def open_extractor(self, path: str | None, representation: Representation, dataset: str) -> Extractor | None:
         """Opens an extractor at `path`, or that of the protocol; None if it is not needed, or `path` is "none".
 
-        Raises:
-            FileNotFoundError, UserError: If it is missing, or belongs to another representation or data set.
+        Raises `UserError` or `FileNotFoundError` if it is missing, or belongs to another representation or data set.
         """
         if self.extractor is None or path == "none":
             return None
@@ -147,7 +143,6 @@ class Protocol(ClosedSchema):
 
     @property
     def title(self) -> str:
-        """Name and version."""
         return f"{self.name}-{self.version}"
 
     # Motions to generate ----------------------------------------------------------------------------------------------
@@ -159,8 +154,7 @@ class Protocol(ClosedSchema):
     def rows(self, clips: Clips, seed: int, replication: int, *, purpose: str = "generated") -> list[DrawnClip]:
         """Returns the motions of one replication; another `purpose` gives another draw of clips, captions and crops.
 
-        Raises:
-            UserError: If the split has no clip to evaluate on.
+        Raises `UserError` if the split has no clip to evaluate on.
         """
         drawn = () if purpose == "generated" else (purpose,)
         entries = sorted(self.selected(clips), key=lambda clip: key("sample", *drawn, seed, replication, clip.id))
@@ -198,25 +192,15 @@ class Protocol(ClosedSchema):
         again = several.replications * several.samples * min(several.prompts or rows, rows) if several else 0
         return self.replications * rows + again
 
-    # Whether data and model fit ---------------------------------------------------------------------------------------
-
-    def check_data(self, clips: Clips) -> None:
-        """Raises `UserError` if there is no clip, or one lacks the caption or label that the protocol needs."""
-        rows = self.rows(clips, 0, 0)
-        incomplete = {
-            "text": any(row.caption is None for row in rows),
-            "action": any(row.clip.action is None for row in rows),
-            "none": False,
-        }
-        if incomplete[self.condition]:
+    def check(self, clips: Clips, model: MotionGenerator | None) -> None:
+        """Raises `UserError` if there is no clip, one lacks the caption or label, or the model another condition."""
+        lacking = {"text": lambda row: row.caption is None, "action": lambda row: row.clip.action is None}
+        if any(map(lacking.get(self.condition, lambda row: False), self.rows(clips, 0, 0))):
             raise UserError(
                 f"protocol {self.name} generates motions from {self.condition}, but the data set "
                 f"{clips.store.info['dataset']} has clips without {self.condition}. Choose another protocol"
             )
-
-    def check_model(self, model: MotionGenerator) -> None:
-        """Raises `UserError` if the model was trained with another condition."""
-        if self.condition not in ("none", model.conditioned_on):
+        if model is not None and self.condition not in ("none", model.conditioned_on):
             raise UserError(
                 f"protocol {self.name} generates motions from {self.condition}, but the checkpoint was trained "
                 f"with condition {model.conditioned_on}. Choose another protocol, such as {default_protocol(model)}"
@@ -239,10 +223,7 @@ def protocol_config(name: str) -> Config:
     """Returns the options of a protocol, named in experiments/evaluation, or of a .yaml file.
 
     A file may hold `variants`. Protocol `editing_in_between` is the variant `in_between` of editing.yaml: its options
-    replace those of the file.
-
-    Raises:
-        UserError: If there is no such protocol.
+    replace those of the file. Raises `UserError` if there is no such protocol.
     """
     path = Path(name) if name.endswith((".yaml", ".yml")) else FOLDER / f"{name}.yaml"
     for file in [path] if path.is_file() else sorted(path.parent.glob("*.yaml")):
@@ -274,10 +255,7 @@ def load_protocol(name: str, representation: Representation) -> Protocol:
     """Loads a protocol, see `protocol_config`, for motions of a representation.
 
     Its file may use ${representation.fps}, ${representation.feet}, ${representation.toes} and
-    ${representation.parents}.
-
-    Raises:
-        UserError: If the protocol does not exist, or an option of it or of a metric is missing or unknown.
+    ${representation.parents}. Raises `UserError` if it does not exist, or an option is missing or unknown.
     """
     skeleton = representation.skeleton
     feet, parents = list(skeleton.feet), list(skeleton.parents)
@@ -290,12 +268,11 @@ def load_protocol(name: str, representation: Representation) -> Protocol:
         return [filled(value) for value in node] if isinstance(node, list) else placeholders.get(str(node), node)
 
     config = filled(protocol_config(name))
-    where = f"protocol {name}"
-    plain(config, where)
+    plain(config, f"protocol {name}")
     try:
         protocol = check_shape(config | {"sha256": digest(config | {"name": ""})}, Protocol)
     except ValueError as error:
-        raise UserError(f"{where}: {error}") from error
+        raise UserError(f"protocol {name}: {error}") from error
     check(config)
     several = protocol.multimodality
     make_metrics(protocol.metrics | (several.metrics if several else {}))  # raises if one cannot be created
@@ -310,16 +287,10 @@ def digest(values: Any) -> str:
 def open_protocol(
     name: str, clips: Clips, representation: Representation, model: MotionGenerator | None, **size: Any
 ) -> tuple[Protocol, dict[str, Any]]:
-    """Returns a protocol for a split and a model, and the options changed by `Protocol.resized`.
-
-    Raises:
-        UserError: If the protocol does not exist, or does not match the clips or the model.
-    """
+    """Returns a protocol that matches a split and a model, and the options changed by `Protocol.resized`."""
     protocol = load_protocol(name, representation)
     protocol, changed = protocol.resized(len(protocol.selected(clips)), **size)
-    protocol.check_data(clips)
-    if model is not None:
-        protocol.check_model(model)
+    protocol.check(clips, model)
     return protocol, changed
 
 

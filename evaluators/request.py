@@ -42,8 +42,7 @@ class EvaluationKeys:
 class EvaluationRequest(EvaluationKeys):
     """What is evaluated, and how: the keys of `flame-mdm evaluate`, with data set and representation composed.
 
-    Raises:
-        UserError: If keys contradict each other, or a value is out of range.
+    Raises `UserError` if keys contradict each other, or a value is out of range.
     """
 
     ckpt: str | None = None
@@ -80,7 +79,3 @@ class EvaluationRequest(EvaluationKeys):
             raise UserError(f"{what[0]} needs a protocol. Add protocol=NAME, such as protocol=text_to_motion")
         if what == ["from_samples"] and (self.quick or self.samples or self.replications):
             raise UserError("from_samples evaluates all motions of the files. Remove quick, samples and replications")
-        if self.split not in ("train", "val", "test"):
-            raise UserError(f"unknown split: {self.split}. Choose train, val or test")
-        if self.batch_size is not None and self.batch_size < 1:
-            raise UserError(f"batch_size={self.batch_size}: must be at least 1")

@@ -27,6 +27,7 @@ from flame_mdm.sampling.request import EditRequest
 from flame_mdm.seeds import key, normal
 
 NOISE = 0.5  # standard deviation of the noise in noisy baselines, in normalized features
+COST = ("nfe", "seconds_per_sample", "batch_size")  # denoiser calls and seconds per motion, and batch size
 
 
 @dataclass
@@ -35,8 +36,7 @@ class Samples:
 
     rows: list[DrawnClip]  # what was requested, in order
     features: list[np.ndarray]  # (F, D) float32 each, in the data's units
-    # denoiser calls per motion, seconds per motion, and batch size; empty if no model was used
-    cost: dict[str, float] = field(default_factory=dict)
+    cost: dict[str, float] = field(default_factory=dict)  # by the names in `COST`; empty if no model was used
     captions: list[str] | None = None  # captions of the motions, if they differ from those of the rows
 
 
@@ -93,15 +93,13 @@ class Generator:
     def __call__(self, name: str, rows: list[DrawnClip], replication: int) -> Samples:
         """Returns the motions of the rows, from the cache or else from the model; see `Source`.
 
-        Raises:
-            UserError: If the folder holds other motions or a damaged file, or the model returns NaN or infinity.
+        Raises `UserError` if the folder holds other motions or a damaged file, or the model returns NaN or infinity.
         """
         path = self.folder / f"{name}.npz" if self.folder else None
-        if shared(path is not None and path.exists()):
-            assert path is not None
-            cached = shared(self._read(path, rows) if is_first() else None)
-            assert cached is not None
-            return Samples(rows, *cached)
+        if path is not None and shared(path.exists()):
+            content = shared(self._read(path, rows) if is_first() else None)
+            assert content is not None
+            return Samples(rows, _split(content), {name: float(content[name]) for name in COST})
         order = np.argsort([-len(row.frames) for row in rows], kind="stable").tolist()
         batches = [order[first : first + self.batch_size] for first in range(0, len(order), self.batch_size)]
         if self.protocol.batch_size is not None:
@@ -113,22 +111,19 @@ class Generator:
             raise
         motions = [motion for batch, _, _ in parts for motion in batch]
         features = [motions[i] for i in np.argsort(order)]
-        cost = {
-            "nfe": sum(calls for _, calls, _ in parts) / len(parts),
-            "seconds_per_sample": sum(seconds for _, _, seconds in parts) / len(rows),
-            "batch_size": float(len(batches[0])),
-        }
+        nfe = sum(calls for _, calls, _ in parts) / len(parts)
+        seconds = sum(seconds for _, _, seconds in parts) / len(rows)
+        cost = dict(zip(COST, (nfe, seconds, float(len(batches[0]))), strict=True))
         if path is not None and is_first():
             _write(path, rows, features, cost, self.protocol.condition)
         return Samples(rows, features, cost)
 
-    def _read(self, path: Path, rows: list[DrawnClip]) -> tuple[list[np.ndarray], dict[str, float]]:
+    def _read(self, path: Path, rows: list[DrawnClip]) -> dict[str, np.ndarray]:
         content = read_samples(path)
         if content["ids"].tolist() != [row.id for row in rows]:
             raise UserError(f"{path}: holds motions of other clips. Delete it")
         self.bar.update(len(rows))
-        cost = {name: float(content[name]) for name in ("nfe", "seconds_per_sample", "batch_size")}
-        return _split(content), cost
+        return content
 
     def _generate(self, rows: Sequence[DrawnClip], replication: int) -> tuple[list[np.ndarray], int, float]:
         """Returns the motions of a batch, the number of denoiser calls, and seconds."""
@@ -192,16 +187,14 @@ class SampleFolder:
 
     Each file holds `ids` (N,), names of clips of the split; `lengths` (N,); `features` (sum of lengths, D) in the
     data's units, or `joints` (sum of lengths, J, 3) in meters, y up, at the data's frame rate; and `captions` (N,), if
-    the motions were generated for other captions than those drawn by the protocol.
-
-    Raises:
-        UserError: If the folder has no such files.
+    the motions were generated for other captions than those drawn by the protocol. Raises `UserError` if the folder has
+    no such files.
     """
 
     def __init__(self, folder: Path, representation: Representation):
         self.representation = representation
-        self.files = sorted(folder.glob("*.npz"), key=lambda path: (len(path.name), path.name))
-        self.files = [path for path in self.files if not path.name.startswith((".", "multimodality_"))]
+        files = [path for path in folder.glob("*.npz") if not path.name.startswith((".", "multimodality_"))]
+        self.files = sorted(files, key=lambda path: (len(path.name), path.name))
         if not self.files:
             raise UserError(f"from_samples={folder}: no .npz file in this folder")
         for path in self.files:
@@ -218,21 +211,16 @@ class SampleFolder:
     def __call__(self, name: str, rows: list[DrawnClip], replication: int) -> Samples:
         """Returns the motions of one file that belong to the rows, with their captions; see `Source`.
 
-        Raises:
-            UserError: If the file is damaged, names clips that are not in the split, or repeats one.
+        Raises `UserError` if the file is damaged, names clips that are not in the split, or repeats one.
         """
         path = self.files[replication]
         content = read_samples(path)
-        by_id = {row.id: row for row in rows}
         ids = content["ids"].tolist()
-        unknown = sorted(set(ids) - by_id.keys())
-        if unknown or len(set(ids)) < len(ids):
-            what = (
-                f"names {len(unknown)} clips that are not in the split, such as {unknown[0]}"
-                if unknown
-                else "repeats ids"
-            )
-            raise UserError(f"{path}: {what}. Give each clip of the split at most once")
+        unknown = sorted(set(ids) - {row.id for row in rows})
+        if unknown:
+            raise UserError(f"{path}: names {len(unknown)} clips that are not in the split, such as {unknown[0]}")
+        if len(set(ids)) < len(ids):
+            raise UserError(f"{path}: repeats ids. Give each clip of the split at most once")
         if "joints" in content:
             joints = [torch.from_numpy(np.ascontiguousarray(x, np.float32)) for x in _split(content, "joints")]
             features = [x.numpy().astype(np.float32) for x in self.representation.encode_many(joints)]
@@ -260,14 +248,7 @@ class Baseline:
     | noisy | real motions plus Gaussian noise of `NOISE` in normalized features | FID, jitter, foot skating |
     | static | the first frame, held | FID, diversity, static share |
 
-    Args:
-        kind: one of these.
-        clips: the split.
-        condition: "text", "action" or "none".
-        seed: of all random draws.
-
-    Raises:
-        UserError: If the kind is unknown, or there is nothing to shuffle.
+    Raises `UserError` if the kind is unknown, or there is nothing to shuffle.
     """
 
     KINDS = ("real", "shuffled", "noisy", "static")

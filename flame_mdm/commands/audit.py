@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 from flame_mdm.commands import DataSettings, device_name, model_source
 from flame_mdm.errors import UserError, say
@@ -14,11 +14,11 @@ from flame_mdm.sampler_options import option
 @dataclass(frozen=True, kw_only=True)
 class AuditSettings(DataSettings):
     """usage: flame-mdm audit data=NAME extractor=FILE|none [key=value ...]
-           flame-mdm audit cards="A.json B.json"
+           flame-mdm audit cards=CARD.json
 
     Perturbs the real motions of a data set at graded strengths, measures them like generated ones, and writes a card:
     what each metric sees, from which strength, and what it cannot see. extractor=none audits the metrics of joint
-    positions. If interrupted, the same command continues where it stopped. cards= compares two cards side by side.
+    positions. If interrupted, the same command continues where it stopped. cards= renders cards again.
     """
 
     OBJECTS: ClassVar = ("data", "extractor")
@@ -26,10 +26,10 @@ class AuditSettings(DataSettings):
         None, "a motion-CLIP, or as the protocol requires; none = metrics of joints", model_source
     )
     protocol: str | None = option(None, "whose metrics are audited; default: synthetic or text_to_motion")
-    split: str = option("test", "train, val or test")
+    split: Literal["train", "val", "test"] = option("test", "train, val or test")
     samples: int | None = option(None, "number of motions; default: all of the split")
     resamples: int = option(100, "bootstrap resamples of motions, for the intervals")
-    cards: list[str] | None = option(None, "one or two cards (.json) to render again, side by side")
+    cards: list[str] | None = option(None, "cards (.json) to render again")
     batch_size: int = option(64, "motions at once")
     device: str | None = option(None, "default: cpu", device_name)
     data_root: str = option("", "folder of the prepared data sets; default: FLAME_MDM_DATA, or data")
@@ -39,9 +39,8 @@ class AuditSettings(DataSettings):
 def main(settings: AuditSettings) -> None:
     out = Path(settings.out)
     if settings.cards is not None:
-        if len(settings.cards) > 2:
-            raise UserError(f"cards={' '.join(settings.cards)}: {len(settings.cards)} cards. Give one or two")
-        say(*write_card([read_card(Path(card)) for card in settings.cards], out))
+        for card in settings.cards:
+            say(*write_card(read_card(Path(card)), out))
         return
     if settings.data is None or settings.extractor is None:
         raise UserError(
@@ -56,4 +55,4 @@ def main(settings: AuditSettings) -> None:
     request = EvaluationRequest.of(vars(settings) | settings.nodes | {"baseline": "real", "protocol": protocol})
     card = measure(request, out / "cache", settings.resamples)
     write_json(out / f"{card_name(card)}.json", card.model_dump(), indent=None)
-    say(*write_card([card], out))
+    say(*write_card(card, out))

@@ -1,9 +1,8 @@
-"""Cards of evaluator audits: one page per extractor and data set, or two cards side by side."""
+"""Cards of evaluator audits: one page per extractor and data set."""
 
 import itertools
 import os
 import re
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -87,19 +86,25 @@ def read_card(path: Path) -> AuditCard:
     return read_json(path, AuditCard, "run `flame-mdm audit` again")
 
 
-def write_card(cards: Sequence[AuditCard], out: Path) -> list[Path]:
-    """Writes one card, or two side by side, as a web page and as Markdown; returns the paths."""
-    metrics = list(dict.fromkeys(metric for card in cards for metric in card.metrics))
-    metrics.sort(key=lambda name: name.startswith("attributes"))
+def write_card(card: AuditCard, out: Path) -> list[Path]:
+    """Writes a card as a web page and as Markdown; returns the paths."""
+    metrics = sorted(card.metrics, key=lambda name: name.startswith("attributes"))
+    rows = []
+    for perturbation in card.perturbations:
+        cells = [_cell(card, perturbation, metric) for metric in metrics]
+        curves = [(metric, curve) for metric in metrics if (curve := _curve(card, perturbation, metric))]
+        rows.append({"about": perturbation, "cells": cells, "curves": curves})
     values = {
-        "title": " and ".join(f"Audit of {_evaluator(card)} on {card.data.dataset}" for card in cards),
-        "cards": [(_evaluator(card), _facts(card), findings(card), _truth(card), _real(card)) for card in cards],
+        "title": f"Audit of {_evaluator(card)} on {card.data.dataset}",
+        "facts": _facts(card),
+        "findings": findings(card),
+        "truth": [(name, number(x["auc"]), number(x["correlation"])) for name, x in card.truth.items()],
+        "real": [(name, interval(*pair)) for name, pair in card.real.items()],
         "metrics": metrics,
-        "rows": _rows(cards, metrics),
+        "rows": rows,
         "legend": LEGEND,
     }
-    name = "-and-".join(map(card_name, cards))
-    paths = [out / f"{name}.html", out / f"{name}.md"]
+    paths = [out / f"{card_name(card)}{suffix}" for suffix in (".html", ".md")]
     write_text(paths[0], page(values["title"], render("audit.html", **values, wide=WIDE, high=HIGH)))
     write_text(paths[1], str(render("audit.md", **values, metric_text=_metric_text)))
     return paths
@@ -120,14 +125,6 @@ def _facts(card: AuditCard) -> list[list[str]]:
         ["versions", ", ".join(f"{name} {version}" for name, version in card.packages.items())],
         *([f"not computed: {name}", reason] for name, reason in card.not_computed.items()),
     ]
-
-
-def _truth(card: AuditCard) -> list[list[str]]:
-    return [[name, number(scores["auc"]), number(scores["correlation"])] for name, scores in card.truth.items()]
-
-
-def _real(card: AuditCard) -> list[tuple[str, str]]:
-    return [(name, interval(*pair)) for name, pair in card.real.items()]
 
 
 def findings(card: AuditCard) -> list[str]:
@@ -160,37 +157,20 @@ def findings(card: AuditCard) -> list[str]:
     return lines
 
 
-def _cell(card: AuditCard, perturbation: AuditedPerturbation | None, metric: str) -> tuple[str, str]:
-    response = seen(card, perturbation, metric) if perturbation and metric in card.metrics else None
+def _cell(card: AuditCard, perturbation: AuditedPerturbation, metric: str) -> tuple[str, str]:
+    response = seen(card, perturbation, metric)
     if response is None or response.grade is None:
         return ("not computed", "faint") if response is None else ("–", "faint")
-    graded = perturbation is not None and len(perturbation.grades) > 1
+    graded = len(perturbation.grades) > 1
     first, then = (("–" if g is None else f"{g:g}" if graded else "yes") for g in (response.grade, response.outside))
-    text = (first if first == then else f"{first} → {then}") + " ~" * (not response.monotone)
+    text = first if first == then else f"{first} → {then}"
+    if not response.monotone:
+        text += " ~"
     return text, "bad" if response.rewarded else "seen" if first == then else "weak"
-
-
-def _rows(cards: Sequence[AuditCard], metrics: Sequence[str]) -> list[dict[str, object]]:
-    """Returns the perturbations of all cards, each with its cells and curves by metric."""
-    rows = []
-    by_name = [{perturbation.name: perturbation for perturbation in card.perturbations} for card in cards]
-    for name in dict.fromkeys(name for names in by_name for name in names):
-        pairs = [(card, perturbations.get(name)) for card, perturbations in zip(cards, by_name, strict=True)]
-        curves = [(m, [curve for card, p in pairs if p and (curve := _curve(card, p, m))]) for m in metrics]
-        rows.append(
-            {
-                "about": next(perturbation for _, perturbation in pairs if perturbation),
-                "cells": [[_cell(card, perturbation, metric) for card, perturbation in pairs] for metric in metrics],
-                "curves": [(metric, drawn) for metric, drawn in curves if drawn],
-            }
-        )
-    return rows
 
 
 def _curve(card: AuditCard, perturbation: AuditedPerturbation, metric: str) -> dict[str, str] | None:
     """Returns a response curve over real motions and all grades; None if the metric never changes."""
-    if metric not in card.metrics:
-        return None
     pairs = [card.real[metric], *(grade.values[metric][:2] for grade in perturbation.grades)]
     points = [(i, value, half) for i, (value, half) in enumerate(pairs) if value is not None and half is not None]
     real = card.real[metric][0]

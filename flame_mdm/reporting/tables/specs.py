@@ -32,7 +32,7 @@ class Options(ClosedSchema):
     protocol: str = ""
     extractor: str = ""
     data: str = ""
-    split: str = ""
+    split: Literal["train", "val", "test"] = "test"
     seed: Int = 0
     replications: Int = 0
     samples: Int = 0

@@ -13,7 +13,7 @@ import numpy as np
 from flame_mdm.config import flatten
 from flame_mdm.errors import UserError
 from flame_mdm.reporting.page import filled, number, page, render
-from flame_mdm.reporting.plots import Curve, charts
+from flame_mdm.reporting.plots import Curve, chart
 from flame_mdm.reporting.report import charted, evaluation_title, last, marks, printed, sampling
 from flame_mdm.runs import CONFIG, Run, read_run
 from flame_mdm.schemas import Result, Value
@@ -223,13 +223,12 @@ def _evaluations(runs: Mapping[str, Run]) -> list[tuple[str, list[str], list[lis
 
 
 def _charts(runs: Mapping[str, Run]) -> dict[str, list[Markup]]:
-    names = {name for run in runs.values() for name in run.curves}
     groups: dict[str, list[Markup]] = {}
-    for heading, titles in charted({name: {0: 0.0} for name in names}).items():
-        shown: dict[str, tuple[dict[str, Curve], dict[str, Curve]]] = {}
+    for heading, titles in charted({name for run in runs.values() for name in run.curves}).items():
+        groups[heading] = []
         for name in (f"{family}/{rest}" for rest, families in titles.items() for family in families):
-            lines: dict[str, Curve] = {k: run.curves.get(name, {}) for k, run in runs.items()}  # one color per run
+            lines: dict[str, Curve] = {label: run.curves.get(name, {}) for label, run in runs.items()}
             if len({value for line in lines.values() for value in line.values()}) > 1:
-                shown[name] = lines, {label: runs[label].curves.get(f"{name}/ci", {}) for label in lines}
-        groups[heading] = charts(shown)
+                bands = {label: run.curves.get(f"{name}/ci", {}) for label, run in runs.items()}
+                groups[heading].append(chart(name, lines, bands))
     return groups

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from flame_mdm.reporting.page import TEMPLATES, interval, number, render, short
+from flame_mdm.reporting.page import TEMPLATES, number, render, short
 
 if TYPE_CHECKING:
     from markupsafe import Markup
@@ -66,22 +66,6 @@ def svg(title: str, panels: Sequence[Panel]) -> Markup | None:
 
 def standalone(plot: str) -> str:
     return str(plot).replace(">", f"><style>{(TEMPLATES / 'plot.css').read_text(encoding='utf-8')}</style>", 1)
-
-
-def charts(curves: Mapping[str, tuple[Mapping[str, Curve], Mapping[str, Curve]]]) -> list[Markup]:
-    """Draws a chart of each title, and lists those whose curves have a single point in one table; values as for
-    `chart`.
-    """
-    single = {title for title, (lines, _) in curves.items() if {len(line) for line in lines.values()} <= {0, 1}}
-    names = list(dict.fromkeys(name for title in curves if title in single for name in curves[title][0]))
-    rows = []
-    for title, (lines, widths) in curves.items():
-        if title in single:
-            cells = [[interval(y, widths.get(n, {}).get(x)) for x, y in lines.get(n, {}).items()] for n in names]
-            steps = sorted({x + 1 for line in lines.values() for x in line})
-            rows.append([title, ", ".join(map(short, steps)), *("".join(cell) or "–" for cell in cells)])
-    table = [render("points.html", head=["", "step", *names], rows=rows)] if rows else []
-    return [chart(title, *parts) for title, parts in curves.items() if title not in single] + table
 
 
 def chart(title: str, curves: Mapping[str, Curve], bands: Mapping[str, Curve] | None = None) -> Markup:

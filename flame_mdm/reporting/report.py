@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Collection
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from flame_mdm.reporting.audit import card_of
 from flame_mdm.reporting.page import interval, number, page, render
-from flame_mdm.reporting.plots import Curve, charts
+from flame_mdm.reporting.plots import Curve, chart
 from flame_mdm.runs import FAULT, HISTORY, Fault, Provenance, Run, read_run
 from flame_mdm.safe_io import write_text
 from flame_mdm.schemas import Result, Value, read_json
@@ -31,7 +31,7 @@ def write_report(folder: Path, mesh: Mesh | None = None) -> Path:
         fault = read_json(folder / FAULT, Fault, "delete it to write the page without it")
     faulty = [[f"process {b.rank}, batch {b.batch}", b.loss, ", ".join(b.ids)] for b in fault.batches] if fault else []
     groups = {
-        heading: charts({name: _curves(run, name, families) for name, families in titles.items()})
+        heading: [chart(name, *_curves(run, name, families)) for name, families in titles.items()]
         for heading, titles in charted(run.curves).items()
     }
     body = render(
@@ -45,7 +45,6 @@ def write_report(folder: Path, mesh: Mesh | None = None) -> Path:
         evaluations=[_evaluation(folder, result) for result in run.results.values()],
         groups=groups,
         history=HISTORY,
-        constant=constants(run.curves),
         provenance=_provenance(run.provenance) if run.provenance else [],
         recipe=OmegaConf.to_yaml(OmegaConf.create(run.config)),
     )
@@ -96,11 +95,11 @@ def _curves(run: Run, name: str, families: list[str]) -> tuple[dict[str, Curve],
     return lines, {family: run.curves.get(f"{family}/{name}/ci", {}) for family in families}
 
 
-def charted(curves: Mapping[str, Curve]) -> dict[str, dict[str, list[str]]]:
+def charted(curves: Collection[str]) -> dict[str, dict[str, list[str]]]:
     """Groups curves into charts: heading -> rest of the name (`loss`) -> families that share it (`train`, `val`)."""
     samples = "Samples for the fixed prompts"
     groups: dict[str, dict[str, list[str]]] = {"Losses": {}, "Validation": {}, samples: {}, "Training curves": {}}
-    for name in curves.keys() - constants(curves).keys():
+    for name in curves:
         family, _, rest = name.partition("/")
         if rest.endswith("/ci") or rest in ("", "epochs"):  # "": a name without a family; runs write none
             continue
@@ -109,11 +108,6 @@ def charted(curves: Mapping[str, Curve]) -> dict[str, dict[str, list[str]]]:
             heading = "Losses"
         groups[heading].setdefault(rest, []).append(family)
     return {title: {n: sorted(g[n]) for n in sorted(g)} for title, g in groups.items() if g}
-
-
-def constants(curves: Mapping[str, Curve]) -> dict[str, float]:
-    values = {name: set(curve.values()) for name, curve in curves.items() if len(curve) > 1}
-    return {name: level.pop() for name, level in values.items() if len(level) == 1 and not name.endswith("/ci")}
 
 
 def _evaluation(folder: Path, result: Result) -> tuple[object, ...]:

@@ -27,11 +27,7 @@ from flame_mdm.sampling.request import EditRequest
 from flame_mdm.seeds import key, normal
 
 NOISE = 0.5  # standard deviation of the noise in noisy baselines, in normalized features
-COST: Sequence[str] = ("nfe", "seconds_per_sample", "batch_size")  # denoiser calls and seconds per motion
-    "nfe",
-    "seconds_per_sample",
-    "batch_size",
-)  # denoiser calls and seconds per motion, and batch size
+COST: Sequence[str] = ("nfe", "seconds_per_sample", "batch_size")  # denoiser calls and seconds are per motion
 
 
 @dataclass

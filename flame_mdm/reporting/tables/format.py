@@ -248,9 +248,10 @@ def comma_separated(table: Table) -> str:
             values: list[Any] = []
             for name in columns:
                 cell = by_column.get(name)
-                values += [_plain(cell.value), cell.text, _plain(cell.ci), cell.rank or ""] if cell else [""] * 4
+                values += [cell.value, cell.text, cell.ci, cell.rank or ""] if cell else [""] * 4
             row = [part.name, line.label, line.kind, line.state, line.marks, *values]
-            writer.writerow([_inert(str(x)) for x in (*row, *(line.facts.get(name, "") for name in facts))])
+            row += [line.facts.get(name, "") for name in facts]
+            writer.writerow(["" if x is None else _inert(str(x)) for x in row])
     return out.getvalue()
 
 
@@ -259,10 +260,6 @@ def _inert(text: str) -> str:
     text = one_line(text)
     number = re.fullmatch(r"[-+]?[\d.,]+([eE][-+]?\d+)?( ?± ?[\d.,]+)?", text)
     return text if number or not text.lstrip().startswith(("=", "+", "-", "@")) else f"'{text}"
-
-
-def _plain(value: float | None) -> str:
-    return "" if value is None else repr(value)
 
 
 # Plots ----------------------------------------------------------------------------------------------------------------
@@ -276,8 +273,10 @@ def draw(part: Part, figure: Plot) -> Markup | None:
     """
     if figure.x == NEAREST:
         lines = [line for line in part.lines if line.nearest and not line.state]
-        kinds = {"real": "dashed"}
-        series = [Series(_short(x.label), cumulative(x.nearest), kind=kinds.get(x.kind, "line")) for x in lines]
+        series = [
+            Series(_short(line.label), cumulative(line.nearest), kind="dashed" if line.kind == "real" else "line")
+            for line in lines
+        ]
         return svg(part.name, [Panel(series, "distance from the nearest training motion, m", "share of motions")])
     panels = []
     for column in figure.y:

@@ -204,9 +204,6 @@ class Evaluation:
             scores.append(self._score(self.evaluator, measured, generated, paired, real, replication))
             if not replication:
                 measured.warnings = self._warnings(generated, real)
-                if "nearest" in generated:
-                    sets = {"generated": generated, "real": paired}
-                    measured.nearest = {name: _sorted_distances(x["nearest"]) for name, x in sets.items()}
         measured.values, measured.cost = averages(scores), mean_cost(costs)
 
     def _measure_multimodality(self, measured: Measured, source: Source, evaluator: Evaluator) -> None:
@@ -287,10 +284,6 @@ def _tokens(row: DrawnClip, caption: str) -> list[str] | None:
     """Returns the "word/PART" tokens of a caption of the clip, if the data has them."""
     tagged = row.clip.attributes.get("tokens")
     return tagged[row.clip.captions.index(caption)] if tagged and caption in row.clip.captions else None
-
-
-def _sorted_distances(nearest: Tensor) -> list[float]:
-    return [round(distance, 4) for distance in nearest[:, 0].sort().values.tolist()]
 
 
 def _without_joints(rows: Rows) -> Rows:

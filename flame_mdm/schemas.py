@@ -122,9 +122,8 @@ class Measured(Schema):
     """What an evaluation measures: `values` and, of real motions, `ground_truth`, by metric; None = not measured.
 
     `not_computed` has reasons by metric; `invalid_because` is [] if the values are valid. They are `forced` if motions
-    were generated although real motions do not have the expected values. `nearest` has sorted distances in meters from
-    the nearest training motion, of the "generated" and "real" motions of the first replication, if a metric reads them;
-    `seeds` those of the draws of metrics, by replication.
+    were generated although real motions do not have the expected values. `seeds` are those of the draws of
+    metrics, by replication.
     """
 
     ground_truth: dict[str, Value | None] | None
@@ -134,7 +133,6 @@ class Measured(Schema):
     forced: bool = False
     warnings: list[str] = []
     cost: Cost | None = None
-    nearest: dict[str, list[Number]] = {}
     seeds: list[Int] = []
 
 

@@ -21,14 +21,10 @@ from flame_mdm.reporting.tables.format import (
     Cell,
     Line,
     Part,
-    Plot,
     Table,
-    cumulative,
-    draw,
     fragment,
     markdown,
     ranks,
-    write,
 )
 from flame_mdm.reporting.tables.specs import Evaluation, evaluations, load_spec, spec_names
 
@@ -371,30 +367,6 @@ def test_an_index_lists_the_tables_with_their_measured_rows(tmp_path, capsys):
     assert '<a href="flame_9.html">' in rows[0]
     names = spec_names()
     assert names.index("flame_9") + 1 == names.index("flame_10")
-
-
-def test_distances_from_the_training_motions_are_drawn(folder):
-    real = Line("Real motions", "real", [], nearest=[0.01 * i for i in range(1, 1001)])
-    copied = Line("copies", "measured", [], nearest=[0.0, 0.0, 0.5, 1.0])
-    part = Part("Text", {}, [real, copied, Line("unmeasured", "measured", [])])
-    drawn = draw(part, Plot("nearest", []))
-    assert drawn is not None
-    assert "distance from the nearest training motion, m" in drawn
-    assert "copies" in drawn
-    assert "unmeasured" not in drawn
-    assert draw(Part("Text", {}, [Line("unmeasured", "measured", [])]), Plot("nearest", [])) is None
-    shares = cumulative(real.nearest)
-    assert len(shares) == 100
-    assert shares[-1] == (10.0, 1.0)
-    assert all(share == pytest.approx(distance / 10) for distance, share in shares)
-    assert cumulative(copied.nearest) == [(0.0, 0.25), (0.0, 0.5), (0.5, 0.75), (1.0, 1.0)]
-    spec = (folder / "spec.yaml").read_text().partition("figures:")[0]
-    (folder / "spec.yaml").write_text(spec + "figures: [{part: Text-to-motion, x: nearest}]\n")
-    change(folder, "MDM", nearest={"generated": [0.01, 0.02], "real": [0.03, 0.07]})
-    table = made(folder)
-    write(table, folder / "out")
-    assert [line.nearest for line in table.parts[0].lines if line.nearest] == [[0.03, 0.07], [0.01, 0.02]]
-    assert "share of motions" in (folder / "out" / "spec-text-to-motion-figure.svg").read_text()
 
 
 def test_ranks():

@@ -122,7 +122,7 @@ def test_unreadable_files(attacked, bad, trained):
         os.mkfifo(path)
     words = [f"table={bad / 'lengths.yaml'}", "evaluate=false", f"results={bad / 'results'}"]
     attacked("tables", *words, says=f"{lengths}: ")
-    words = [f"runs={trained.parent.parent} {motions(bad / 'real')}", f"texts={bad / 'texts.txt'}"]
+    words = [f"runs={trained.parent.parent} {a_run(bad / 'other')}", f"prompts={bad / 'texts.txt'}"]
     attacked("compare", *words, says=f"{bad / 'texts.txt'}: ")
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, ClassVar
 from flame_mdm.commands import BodySettings
 from flame_mdm.commands.sample import read_prompts
 from flame_mdm.errors import say
-from flame_mdm.reporting.compare import HEAD, MOTIONS, ComparedRun, Prompt, comparison, find, grouped, in_common, tested
+from flame_mdm.reporting.compare import HEAD, Prompt, comparison, find, grouped, in_common, tested
 from flame_mdm.safe_io import write_text
 from flame_mdm.sampler_options import option, required
 
@@ -27,11 +27,10 @@ class CompareSettings(BodySettings):
     Compares runs side by side on one page: configuration differences, curves, evaluations and motions for the same
     prompts. If the runs have results of the same protocol, data and extractor, prints the difference of each metric
     with its 95 % interval, and whether it is shown.
-    A run may also be a folder of motion files, for example those of another program.
     """
 
     OBJECTS: ClassVar = ("runs",)
-    runs: list[str] = required("run directories, or folders of motion files, separated by spaces")
+    runs: list[str] = required("run directories, separated by spaces")
     prompts: str | None = option(
         None, "a file with one prompt per line, sampled by each last.ckpt; default: the newest samples of each run"
     )
@@ -41,12 +40,13 @@ class CompareSettings(BodySettings):
 
 
 def main(settings: CompareSettings) -> None:
-    compared = find([Path(folder) for folder in settings.runs])
+    runs = find([Path(folder) for folder in settings.runs])
     from flame_mdm.visualize.bodies import load_body
 
-    content = comparison(compared, motions(compared, settings), load_body(settings.body))
-    say(*_tested({c.label: c.run for c in compared if c.run is not None}))
-    write_text(settings.out, content)
+    texts = None if settings.prompts is None else list(dict.fromkeys(read_prompts(settings.prompts)))
+    shown = [_sampled(run.folder, texts, settings) if texts else _newest(run) for run in runs.values()]
+    write_text(settings.out, comparison(runs, shown, load_body(settings.body)))
+    say(*_tested(runs))
     say(settings.out)
 
 
@@ -59,26 +59,13 @@ def _tested(runs: Mapping[str, Run]) -> list[str]:
     return lines
 
 
-def motions(compared: Sequence[ComparedRun], settings: CompareSettings) -> list[dict[Prompt, Motion]]:
-    """Returns the motions of each compared run, by prompt: sampled for `prompts`, or else its newest samples."""
-    texts = None if settings.prompts is None else list(dict.fromkeys(read_prompts(settings.prompts)))
-    shown = []
-    for entry in compared:
-        folder = entry.run.samples if entry.run else entry.folder
-        if texts and entry.run:
-            shown.append(_sampled(entry.folder, texts, settings))
-        else:
-            shown.append(_read(folder) if folder else {})
-    return shown
-
-
-def _read(folder: Path) -> dict[Prompt, Motion]:
+def _newest(run: Run) -> dict[Prompt, Motion]:
+    """Returns the newest samples of a run, by prompt."""
     from flame_mdm.formats.readers import read
 
-    files = [path for path in sorted(folder.iterdir()) if path.suffix.lower() in MOTIONS and path.name[0] != "."]
     numbered: dict[Prompt, Motion] = {}
     counts: Counter[str] = Counter()
-    for motion in map(read, files):
+    for motion in map(read, sorted(run.samples.glob("motion_*.npz")) if run.samples else ()):
         numbered[motion.text, counts[motion.text]] = motion
         counts[motion.text] += 1
     return numbered

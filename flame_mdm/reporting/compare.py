@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +15,7 @@ from flame_mdm.errors import UserError
 from flame_mdm.reporting.page import filled, number, page, render
 from flame_mdm.reporting.plots import Curve, chart
 from flame_mdm.reporting.report import charted, evaluation_title, last, marks, printed, sampling
-from flame_mdm.runs import CONFIG, Run, read_run
+from flame_mdm.runs import Run, read_run
 from flame_mdm.schemas import Result, Value
 
 if TYPE_CHECKING:
@@ -25,59 +25,30 @@ if TYPE_CHECKING:
     from flame_mdm.formats.motion import Motion
     from flame_mdm.visualize.body import Mesh
 
-MOTIONS = (".npz", ".bvh", ".json")
-"""Suffixes of the motion files that are compared. Not .npy, which does not store its frame rate."""
 Prompt = tuple[str, int]  # requested caption or action, and the index of the motion among those with the same request
 
 
-@dataclass
-class ComparedRun:
-    """A run, or a folder of motions, with its name on pages."""
-
-    label: str
-    folder: Path
-    run: Run | None
-
-
-def find(folders: Sequence[Path]) -> list[ComparedRun]:
-    """Returns the runs in two or more folders, labeled by recipe and run name, or by folder if ambiguous."""
+def find(folders: Sequence[Path]) -> dict[str, Run]:
+    """Returns two or more runs by recipe and run name, or by folder if these are ambiguous."""
     if len(set(folders)) < 2:
         raise UserError(f'a comparison needs two or more runs: runs="A B", not {" ".join(map(str, folders))}')
-    compared = []
-    for folder in folders:
-        if (folder / CONFIG).exists():
-            content = read_run(folder)
-            compared.append(ComparedRun(content.label, folder, content))
-        elif any(path.suffix.lower() in MOTIONS for path in folder.glob("*")):
-            compared.append(ComparedRun(folder.name, folder, None))
-        else:
-            raise UserError(
-                f"{folder}: neither a run (no config.yaml) nor a folder of motions (no {', '.join(MOTIONS)} files)"
-            )
-    labels = [entry.label for entry in compared]
-    return [replace(c, label=str(c.folder)) if labels.count(c.label) > 1 else c for c in compared]
-
-
-def shared(shown: Sequence[Mapping[Prompt, Motion]]) -> list[Prompt]:
-    """Returns the prompts for which every run has a motion, in the order of the first run."""
-    return [prompt for prompt in shown[0] if all(prompt in those for those in shown[1:])]
+    runs = [read_run(folder) for folder in folders]
+    labels = [run.label for run in runs]
+    return {run.label if labels.count(run.label) == 1 else str(run.folder): run for run in runs}
 
 
 # Side by side ---------------------------------------------------------------------------------------------------------
 
 
-def comparison(
-    compared: Sequence[ComparedRun], shown: Sequence[Mapping[Prompt, Motion]], mesh: Mesh | None = None
-) -> str:
+def comparison(runs: Mapping[str, Run], shown: Sequence[Mapping[Prompt, Motion]], mesh: Mesh | None = None) -> str:
     """Returns the page that compares runs side by side. The same runs give the same bytes."""
-    runs = {c.label: c.run for c in compared if c.run is not None}
     body = render(
         "compare.html",
-        title=" · ".join(c.label for c in compared),
+        title=" · ".join(runs),
         labels=list(runs),
-        facts=filled(FACTS, _facts(runs)) if runs else None,
+        facts=filled(FACTS, _facts(runs)),
         differences=_differences(runs),
-        player=_player(compared, shown, mesh),
+        player=_player(list(runs), shown, mesh),
         evaluations=_evaluations(runs),
         unpaired=in_common(runs),
         columns=HEAD,
@@ -111,15 +82,17 @@ def _differences(runs: Mapping[str, Run]) -> list[list[str]]:
     return [row for row in rows if len(set(row[1:])) > 1]
 
 
-def _player(compared: Sequence[ComparedRun], shown: Sequence[Mapping[Prompt, Motion]], body: Mesh | None) -> str:
+def _player(labels: Sequence[str], shown: Sequence[Mapping[Prompt, Motion]], body: Mesh | None) -> str:
+    """Plays the motions for the prompts that all runs have, in the order of the first run."""
     from flame_mdm.visualize import player_page
 
     scene = [
-        replace(those[prompt], id=c.label, text=prompt[0] or "unconditioned")
-        for prompt in shared(shown)
-        for c, those in zip(compared, shown, strict=True)
+        replace(motions[prompt], id=label, text=prompt[0] or "unconditioned")
+        for prompt in shown[0]
+        if all(prompt in motions for motions in shown)
+        for label, motions in zip(labels, shown, strict=True)
     ]
-    return player_page(scene, "", columns=len(compared), body=body) if scene else ""
+    return player_page(scene, "", columns=len(labels), body=body) if scene else ""
 
 
 HEAD = ["", "difference", "95 % over replications", ""]  # column titles of differences
@@ -187,7 +160,7 @@ def grouped(runs: Mapping[str, Run]) -> dict[str, list[tuple[str, Result]]]:
 def in_common(runs: Mapping[str, Run]) -> list[str]:
     """Returns why no evaluation can be compared, one line per run; [] if two runs have the same evaluation."""
     groups = grouped(runs)
-    if len(runs) < 2 or any(len({label for label, _ in columns}) > 1 for columns in groups.values()):
+    if any(len({label for label, _ in columns}) > 1 for columns in groups.values()):
         return []
     lines = ["No evaluation in common: differences need the same protocol, data and extractor."]
     for label, run in runs.items():

@@ -45,7 +45,7 @@ def build(name: str, spec: Config, results: Path, sizes: Sizes | None = None) ->
         else:
             built = _measured(part_name, part, reported, results)
             built.figures = [
-                Plot(f["x"], as_list(f.get("y", [])), f.get("log", False), f.get("points", False))
+                Plot(f["x"], as_list(f["y"]), f.get("log", False), f.get("points", False))
                 for f in spec.get("figures", [])
                 if f["part"] == part_name
             ]
@@ -84,8 +84,7 @@ def _measured(name: str, part: Config, reported: Config | None, results: Path) -
             cells = [
                 _entry(r.ground_truth, v) if r and v not in ABOUT else None for r, v in zip(read, values, strict=True)
             ]
-            truth = truths[line.marks] = Line("Real motions", "real", cells, line.marks)
-            truth.nearest = next((result.nearest["real"] for _, result in pairs if "real" in result.nearest), [])
+            truths[line.marks] = Line("Real motions", "real", cells, line.marks)
     lines = [line for line in truths.values() if any(line.cells)] + lines
     notes = [*_condition_notes(conditions), *_by_text(missing), *_warnings(lines, values, list(columns))]
     if reported is not None:
@@ -185,7 +184,6 @@ def _line(
         value = _about(result, name) if result is not None and name in ABOUT else None
         if isinstance(value, int | float):
             line.options.setdefault(name, float(value))
-    line.nearest = first.nearest.get("generated", [])
     reasons = list(dict.fromkeys(reason for r in results if r is not None for reason in r.invalid_because))
     line.state = NOT_VALID if reasons else "QUICK" if first.quick else ""
     checkpoint = first.checkpoint

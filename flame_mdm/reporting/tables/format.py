@@ -62,16 +62,13 @@ class Cell:
     rank: int = 0
 
 
-NEAREST = "nearest"  # `Plot.x` of the cumulative distribution of the distances from the nearest training motion
-
-
 @dataclass
 class Line:
     """One row of a table, of a kind in `KINDS`, with one cell per column; None if there is no value.
 
     Only rows with the same footnote marks are compared. `state` is "" if the row is complete and valid, otherwise the
-    reason: "no checkpoint", "NOT VALID". `options` are numbers for the x-axis of figures, `facts` the provenance of the
-    values, and `nearest` sorted distances of the motions from the nearest training motion, in meters.
+    reason: "no checkpoint", "NOT VALID". `options` are numbers for the x-axis of figures, and `facts` the provenance
+    of the values.
     """
 
     label: str
@@ -81,12 +78,11 @@ class Line:
     state: str = ""
     options: dict[str, float] = field(default_factory=dict)
     facts: dict[str, str] = field(default_factory=dict)
-    nearest: list[float] = field(default_factory=list)
 
 
 @dataclass
 class Plot:
-    """A figure that plots columns of a part over an option of its rows, or the distances of `NEAREST`; see `draw`."""
+    """A figure that plots columns of a part over an option of its rows; see `draw`."""
 
     x: str
     y: list[str]
@@ -271,30 +267,12 @@ def draw(part: Part, figure: Plot) -> Markup | None:
     Curves are named after rows; measured ones are solid, reported ones dashed. If closer to real motions is better in
     a column, real motions are a dotted line. `points` makes it a scatter plot.
     """
-    if figure.x == NEAREST:
-        lines = [line for line in part.lines if line.nearest and not line.state]
-        series = [
-            Series(_short(line.label), cumulative(line.nearest), kind="dashed" if line.kind == "real" else "line")
-            for line in lines
-        ]
-        return svg(part.name, [Panel(series, "distance from the nearest training motion, m", "share of motions")])
     panels = []
     for column in figure.y:
         series, levels = _series(part, figure, column)
         head = f"{shortened(one_line(column), 40)} {ARROWS[part.columns[column]]}".strip()
         panels.append(Panel(series, ABOUT[figure.x], head, figure.log, levels=levels))
     return svg(part.name, panels)
-
-
-def _short(label: str) -> str:
-    return shortened(one_line(label), 60)
-
-
-def cumulative(values: Sequence[float]) -> list[tuple[float, float]]:
-    """Returns the share of values up to each value, at most 100 points."""
-    count = len(values)
-    ranks = sorted({round(i * (count - 1) / 99) for i in range(100)})
-    return [(values[rank], (rank + 1) / count) for rank in ranks]
 
 
 def _series(part: Part, figure: Plot, column: str) -> tuple[list[Series], list[float]]:
@@ -313,7 +291,7 @@ def _series(part: Part, figure: Plot, column: str) -> tuple[list[Series], list[f
     series = []
     for (kind, label), points in curves.items():
         reported = kind == "reported"
-        name = _short(label) + ", reported" * reported
+        name = shortened(one_line(label), 60) + (", reported" if reported else "")
         xy = [(x, y) for x, y, _ in sorted(points)]
         spread = {x: ci for x, _, ci in points if ci}
         series.append(Series(name, xy, spread, "dots" if figure.points else "dashed" if reported else "line"))

@@ -14,7 +14,7 @@ from pydantic import FailFast, Field, model_validator
 
 from flame_mdm.config import EXPERIMENTS, Config, plain
 from flame_mdm.errors import UserError, did_you_mean
-from flame_mdm.reporting.tables.format import ABOUT, NEAREST
+from flame_mdm.reporting.tables.format import ABOUT
 from flame_mdm.safe_io import read_yaml
 from flame_mdm.schemas import ClosedSchema, Int, Number, Schema, check_shape
 
@@ -107,13 +107,11 @@ class PartSpec(Options):
 
 
 class FigureSpec(ClosedSchema):
-    """A figure that plots columns of a part over an option of its rows; x: nearest plots the distances of its motions
-    from the nearest training motion.
-    """
+    """A figure that plots columns of a part over an option of its rows."""
 
     part: str
     x: str
-    y: str | list[str] = Field([])
+    y: str | list[str]
     log: bool = False
     points: bool = False
 
@@ -131,10 +129,8 @@ class Spec(ClosedSchema):
         _at_most("figures", sum(len(as_list(figure.y)) for figure in self.figures), MOST_FIGURES)
         for figure in self.figures:
             part = self.parts.get(figure.part)
-            if part is None or figure.x not in (*ABOUT, NEAREST):
-                raise ValueError(f"a figure needs a part of the table and x, one of {', '.join([*ABOUT, NEAREST])}")
-            if not as_list(figure.y) and figure.x != NEAREST:
-                raise ValueError(f"figure: x={figure.x} needs y, a column or several of {figure.part}")
+            if part is None or figure.x not in ABOUT:
+                raise ValueError(f"a figure needs a part of the table and x, one of {', '.join(ABOUT)}")
             for column in as_list(figure.y):
                 if column not in part.columns:
                     raise ValueError(f"figure: y={column} is not a column of {figure.part}")
